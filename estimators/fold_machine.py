@@ -24,7 +24,7 @@ from .interpreted import fold_loop
 from .interpreted.fold_loop import UNSET
 from .interpreted.view import View, driven
 from .log import Log
-from .model.mode_as_number import indicator
+from .model.indicator import indicator
 from .model.state_space import LARGE, StateSpaceModel
 from .numerics.quantiles import chi_square_quantile
 from .plausibility import fresh_screen, limits_of

@@ -21,7 +21,7 @@ from .events.batch import (
     Events,
     truth_of,
 )
-from .events.checks import Layout, admitted
+from .events.checks import EventLayout, admitted
 from .events.maintenance import versions_dropped
 
 if TYPE_CHECKING:
@@ -47,7 +47,7 @@ class Log:
     def __init__(self, width: int, capacity: int = 1024) -> None:
         self.width = width
         self.model: StateSpaceModel | None = None
-        self.layout: Layout | None = None
+        self.layout: EventLayout | None = None
         self.n = 0
         self.first = 0
         self.changes = 0

@@ -17,7 +17,7 @@ import numpy as np
 from numba import types
 
 from .compiled.context import circular_rows, context_type, sensor_rows
-from .model.limits import NOISES, Stuck
+from .model.sensor import RATE_NOISE_STDS, Stuck
 from .model.state_space import StateSpaceModel
 from .numerics.jit import F1, floats, i64, inlined, ints, jit, part
 from .numerics.linalg import wrap
@@ -67,7 +67,7 @@ def limits_of(model: StateSpaceModel) -> dict[str, np.ndarray]:
         if given.saturation:
             own[:, [_CLIP_LOW, _CLIP_HIGH]] = given.saturation
         if given.rate:
-            own[:, _RATE], own[:, _SLACK] = given.rate, NOISES * std
+            own[:, _RATE], own[:, _SLACK] = given.rate, RATE_NOISE_STDS * std
         if given.stuck is not None:
             _be_stuck(own, given.stuck, std)
     return {"limits": limits, "limited": limited, "duplicates": duplicates}

@@ -10,8 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from .errors import LARGEST, ConfigError, nearest, quoted, shown_name
-from .model.state_space import StateSpaceModel
-from .model.units import squared
+from .model.state_space import StateSpaceModel, squared
 
 _versions = count(1)
 

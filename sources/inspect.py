@@ -14,9 +14,8 @@ from estimators.log import READING
 
 from .can.databases import load_database, same_bus
 from .can.decoder import Decoder
-from .can.frames import EXTENDED, BusName, Found, Raw
 from .can.log import CanLog, check_log
-from .can.readers import read_frames
+from .can.readers import EXTENDED, BusName, LogSummary, Raw, read_frames
 from .formats import CAN_LOGS, suffix_of
 from .reader_process import IsolatedReader
 from .source import Channel
@@ -137,7 +136,7 @@ def _logs(files: list[Path], databases: list[tuple[Path, BusName]]) -> Recording
                         rows = np.flatnonzero(item.bus == place)
                         for key in np.unique(item.key[rows]).tolist():
                             found[bus, key].append(item.t[rows[item.key[rows] == key]])
-                elif isinstance(item, Found):
+                elif isinstance(item, LogSummary):
                     errors += item.errors
                     if item.fault:
                         faults.append(f"{path.name}: damaged: {item.fault}")

@@ -1,4 +1,4 @@
-"""Values to events: units, conditions and kinds, the same for frames of a bus and rows of a table."""
+"""Map values to events: units, conditions and kinds, the same for frames of a bus and rows of a table."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from .source import Accuracy, Channel, Report
 from .units import conversion, spread_factor
 
 PRESENT, ABSENT, SHORT = range(3)
-"""A value is there; the frame does not carry the signal (multiplexing); the frame ends before it."""
+"""The value is present; the frame does not carry the signal (multiplexing); the frame ends before it."""
 
 
 class Tables(NamedTuple):
-    """Channels of all groups (messages, or one table), one a row; see `Mapping`.
+    """Channels of all groups (messages, or one table), one a row; see `ChannelMapping`.
 
-    `own_slot` is where a row's own spread is, -1 where it has none.
+    `own_slot` is the position of a row's own accuracy, -1 if it has none.
     """
 
     group: np.ndarray
@@ -45,10 +45,10 @@ class Tables(NamedTuple):
     high: np.ndarray
 
 
-WHOLE = ("group", "kind", "target", "row", "slot", "own_slot", "own_squared", "where", "where_slot", "selects")
+INT_COLUMNS = ("group", "kind", "target", "row", "slot", "own_slot", "own_squared", "where", "where_slot", "selects")
 """Columns of `Tables` that are int64; the others are float64."""
 
-tables_type = types.NamedTuple([I1 if name in WHOLE else F1 for name in Tables._fields], Tables)
+tables_type = types.NamedTuple([I1 if name in INT_COLUMNS else F1 for name in Tables._fields], Tables)
 emit_signature = i64(
     tables_type, I1, B1, F2, types.Array(types.int8, 2, "C"), i64, I1, B1, types.int32[::1], F2, I1, I1, I1
 )
@@ -56,7 +56,7 @@ emit_signature = i64(
 
 @jit
 def _own_variance(tables, r, values, state, i):
-    """The variance that frame i tells of row r's noise; NaN if what it tells is none."""
+    """Return the noise variance of row r that frame i reports; NaN if it is not positive."""
     slot = tables.own_slot[r]
     own = tables.own_factor[r] * values[i, slot]
     if state[i, slot] != PRESENT or not own > 0.0:
@@ -67,11 +67,11 @@ def _own_variance(tables, r, values, state, i):
 
 
 @jit
-def emit(tables, plan, skip, values, state, width, source, kind, channel, value, refused, cut, unsaid):
-    """Write the events of each frame: its inputs as one event, then readings, then true states in blocks.
+def emit(tables, plan, skip, values, state, width, source, kind, channel, value, refused, cut, unreported):
+    """Write the events of each frame: inputs as one event, then measurements, then true states in blocks.
 
-    Returns how many. A block begins with a state that is known, and takes what follows as far as it reaches. Columns of
-    `value` from `width` on take the variances that readings bring.
+    Returns their number. A block begins with a known state and extends over the width of an event. Columns of `value`
+    from `width` on hold reported variances.
     """
     n = 0
     for i in range(plan.size):
@@ -80,21 +80,21 @@ def emit(tables, plan, skip, values, state, width, source, kind, channel, value,
             continue
         input_event = truth_event = -1
         for c in range(tables.group[g], tables.group[g + 1]):
-            said = False
+            reported = False
             for r in range(tables.row[c], tables.row[c + 1]):
                 here = state[i, tables.slot[r]]
-                said = said or here != ABSENT
+                reported = reported or here != ABSENT
                 if here == SHORT:
                     cut[c] += 1
-            if not said:
+            if not reported:
                 continue
-            good, meant = True, True
+            good, selected = True, True
             for w in range(tables.where[c], tables.where[c + 1]):
                 tested = values[i, tables.where_slot[w]]
                 if state[i, tables.where_slot[w]] != PRESENT or not (tables.low[w] <= tested <= tables.high[w]):
                     good = False
-                    meant = meant and tables.selects[w] == 0
-            if not meant:
+                    selected = selected and tables.selects[w] == 0
+            if not selected:
                 continue
             if not good:
                 refused[c] += 1
@@ -132,21 +132,21 @@ def emit(tables, plan, skip, values, state, width, source, kind, channel, value,
                         value[event, width + column] = own
                         vague = vague or np.isnan(own)
                 if vague:
-                    unsaid[c] += 1
+                    unreported[c] += 1
                 if tables.kind[c] == TRUTH and np.isnan(value[event, 0]):
                     n -= 1
                     truth_event = -1
     return n
 
 
-class Mapping:
-    """Turns rows of values into events.
+class ChannelMapping:
+    """Maps rows of values to events.
 
     Args:
         groups: For each message (or the one table): its channels, the names of its values in their order, and the
             unit that each value has where the channel declares none.
         width: Value columns of an event.
-        report: Told of readings that a condition refused, that a short frame cut, or whose accuracy is not told.
+        report: Receives measurements that a condition rejected, short frames, and missing accuracies.
 
     Raises:
         SourceError: If a unit does not convert to the model's.
@@ -168,7 +168,7 @@ class Mapping:
         own_slot, own_factor, own_squared = [], [], []
         for channels, names, units in groups:
             positions = {name: k for k, name in enumerate(names)}
-            # True states in their order, for the blocks.
+            # True states in order, for the blocks.
             for channel in sorted(channels, key=lambda c: (order.index(c.kind), c.index if c.kind == TRUTH else 0)):
                 self._channels.append(channel)
                 kind.append(channel.kind)
@@ -177,7 +177,7 @@ class Mapping:
                     slot.append(positions[name])
                     unit = channel.units[k] or units[positions[name]]
                     factors.append(self._factor(channel, name, unit, channel.model_units[k]))
-                    # Of a position, scale and offset hold for metres, not for degrees.
+                    # Scale and offset of a position apply to metres, not to degrees.
                     scale.append(1.0 if channel.convert else channel.scale[k])
                     offset.append(0.0 if channel.convert else channel.offset[k])
                     own = channel.accuracy
@@ -215,7 +215,7 @@ class Mapping:
         )
         self._columns = width + max((len(c.signals) for c in self._channels if c.accuracy is not None), default=0)
         self._most = int(np.diff(self._tables.group).max(initial=0))
-        # By sensor: a message that comes under two ids has its channels twice here.
+        # By sensor: a message with two ids has its channels twice here.
         self._positions = {c.index: c for c in self._channels if c.convert == "east_north"}
         self._origins = {index: channel.origin for index, channel in self._positions.items()}
 
@@ -241,38 +241,38 @@ class Mapping:
         state: np.ndarray,
         skip: np.ndarray,
     ) -> Events:
-        """The events of rows of values.
+        """Return the events of rows of values.
 
         Args:
-            plan: Group of each row, (n,); -1 has none.
-            t: When each was measured, ns.
-            arrival: When each arrived, ns.
+            plan: Group of each row, (n,); -1 for none.
+            t: Measurement times, ns.
+            arrival: Arrival times, ns.
             values: (n, most values of a group), NaN is missing.
             state: Same shape: PRESENT, ABSENT or SHORT.
-            skip: (n,), not 0 where a row must be left out.
+            skip: (n,), nonzero for rows to leave out.
         """
         room = plan.size * self._most
         source = np.empty(room, np.int64)
         kind, channel = np.empty(room, np.int8), np.empty(room, np.int32)
         value = np.empty((room, self._columns))
-        counts = refused, cut, unsaid = np.zeros((3, len(self._channels)), np.int64)
+        counts = refused, cut, unreported = np.zeros((3, len(self._channels)), np.int64)
         n = emit(
-            self._tables, plan, skip, values, state, self._width, source, kind, channel, value, refused, cut, unsaid
+            self._tables, plan, skip, values, state, self._width, source, kind, channel, value, refused, cut, unreported
         )
         source = source[:n]
         batch = Events(t[source], arrival[source], kind[:n].copy(), channel[:n].copy(), value[:n].copy())
         if counts.any():
-            self._tell(refused, cut, unsaid)
+            self._report_losses(refused, cut, unreported)
         for item in self._positions.values():
             self._place(batch, item)
         return batch
 
-    def _tell(self, refused: np.ndarray, cut: np.ndarray, unsaid: np.ndarray) -> None:
+    def _report_losses(self, refused: np.ndarray, cut: np.ndarray, unreported: np.ndarray) -> None:
         for c in np.flatnonzero(refused):
             channel = self._channels[c]
             rule = " and ".join(f"{w.signal} in {w.low:g} to {w.high:g}" for w in channel.where)
             for _ in range(refused[c]):
-                self._report(f"condition {channel.name}", f"{channel.name}: reading refused; it needs {rule}")
+                self._report(f"condition {channel.name}", f"{channel.name}: measurement rejected; it needs {rule}")
         for c in np.flatnonzero(cut):
             channel = self._channels[c]
             for _ in range(cut[c]):
@@ -281,19 +281,19 @@ class Mapping:
                     f"{channel.name}: a frame of {channel.message} ends before {', '.join(channel.signals)}",
                 )
 
-        for c in np.flatnonzero(unsaid):
+        for c in np.flatnonzero(unreported):
             channel = self._channels[c]
             assert channel.accuracy is not None
             names = ", ".join(dict.fromkeys(channel.accuracy.signals))
             what = "variance" if channel.accuracy.squared else "standard deviation"
-            for _ in range(unsaid[c]):
+            for _ in range(unreported[c]):
                 self._report(
                     f"accuracy {channel.name}",
-                    f"{channel.name}: {names} tells no {what} of a reading, which must be positive; the tuned R holds",
+                    f"{channel.name}: {names} has no positive {what} of a measurement; the tuned R is used",
                 )
 
     def _place(self, batch: Events, channel: Channel) -> None:
-        """Latitude and longitude to east and north, in place; the first valid fix is the origin unless one is given."""
+        """Convert latitude and longitude to east and north in place; the first valid fix is the default origin."""
         rows = np.flatnonzero((batch.kind == READING) & (batch.channel == channel.index))
         if not rows.size:
             return

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from estimators.log import READING, Events, Log
-from estimators.model.limits import Limits, Pair
+from estimators.model.sensor import Limits, Pair
 from estimators.model.state_space import StateSpaceModel
 from estimators.plausibility import reasons_by_sensor
 from estimators.track import FAILED, GATED, MISSING, REASONS, SCREENED, VERDICT_NAMES, Track

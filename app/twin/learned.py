@@ -11,23 +11,23 @@ import numpy as np
 from config.files import shown_path
 from config.learned_schema import CorrectionSection, load_correction
 from config.loader import Loaded
-from estimators.errors import ConfigError, ModelError
+from estimators.errors import ConfigError
 from estimators.model.correction import Correction, GaussianProcess, Net, Ridge
-from estimators.model.hybrid import Learned, hybrid
+from estimators.model.hybrid import LearnedCorrection
 from estimators.model.state_space import StateSpaceModel
 
 INSTALL = "pip install 'nisus[learned]'"
 
 
-def with_correction(model: StateSpaceModel, loaded: Loaded) -> StateSpaceModel:
-    """The model with the correction that the YAML names, if it names one.
+def load_learned(model: StateSpaceModel, loaded: Loaded) -> tuple[LearnedCorrection | None, str]:
+    """Return the correction that the YAML names, if it names one, and its file as errors name it.
 
     Raises:
-        ConfigError: If its file is not there, is wrong, or is of another model.
+        ConfigError: If its file is missing, is wrong, or is of another model.
     """
     files = correction_files(loaded)
     if not files:
-        return model
+        return None, ""
     path = files[0]
     if not path.is_file():
         raise loaded.error(("learned",), f"is {loaded.config.learned!r}; there is no file {shown_path(path)}; "
@@ -38,10 +38,7 @@ def with_correction(model: StateSpaceModel, loaded: Loaded) -> StateSpaceModel:
             f"{places.at(('learned', 'model'))}: learned.model is {section.learned.model!r}; that of "
             f"{loaded.path.stem} is {model.name!r}, whose states and inputs are others; learn it anew"
         )
-    try:
-        return hybrid(model, learned_of(section, path))
-    except ModelError as error:
-        raise ConfigError(f"{places.at(())}: {error}") from None
+    return learned_of(section, path), places.at(())
 
 
 def correction_files(loaded: Loaded) -> list[Path]:
@@ -51,7 +48,7 @@ def correction_files(loaded: Loaded) -> list[Path]:
     return [loaded.path.absolute().parent / Path(loaded.config.learned).expanduser()]
 
 
-def learned_of(section: CorrectionSection, path: Path) -> Learned:
+def learned_of(section: CorrectionSection, path: Path) -> LearnedCorrection:
     """What a correction's file at `path` says; of the same content the same object, so that it is compiled once.
 
     Raises:
@@ -63,7 +60,7 @@ def learned_of(section: CorrectionSection, path: Path) -> Learned:
 
 
 @lru_cache(maxsize=16)
-def _learned_of(text: str, net: Path | None, stamp: int) -> Learned:
+def _learned_of(text: str, net: Path | None, stamp: int) -> LearnedCorrection:
     section = CorrectionSection.model_validate_json(text)
     points = np.array(section.points, float)
     rates = np.array(section.rates or (), float)
@@ -76,7 +73,7 @@ def _learned_of(text: str, net: Path | None, stamp: int) -> Learned:
         assert net is not None
         correction = Net(points, run_net(net, len(section.features), len(section.corrects)))
     noise = tuple(section.noise[name] for name in section.corrects)
-    return Learned(section.corrects, section.features, noise, correction)
+    return LearnedCorrection(section.corrects, section.features, noise, correction)
 
 
 def run_net(path: Path, features: int, corrects: int) -> Callable[[np.ndarray], np.ndarray]:

@@ -9,7 +9,7 @@ from config.limits_schema import bounds
 from config.loader import Loaded
 from config.schema import SensorSection, TwinSection
 from config.source_schema import AssetSection
-from estimators.model.limits import Limits, Stuck
+from estimators.model.sensor import Limits, Stuck
 from estimators.model.state_space import Sensor
 from estimators.plausibility import DAY, surprise
 

@@ -14,16 +14,18 @@ import numpy as np
 
 from config.limits_schema import bounds
 from config.loader import Loaded, shown_path
-from config.yaml_lines import Key
-from estimators.errors import ModelError, NisusError, nearest
-from estimators.model.correlation import Correlation, flaw
-from estimators.model.joint import Unknown, joint
+from config.yaml_lines import Key, dotted
+from estimators.errors import ConfigError, ModelError, NisusError, nearest
+from estimators.model.assemble import AppendError, assemble
+from estimators.model.coloured import ColouredError, disturbance_time, error_time
+from estimators.model.hybrid import learned_noise
+from estimators.model.joint import JointParameter
+from estimators.model.sensor import Correlation, correlation_error
 from estimators.model.state_space import Field, State, StateSpaceModel
 from estimators.model.user_file import imported_beside, run_file
 from estimators.models import MODELS
 
-from .lasting import with_lasting_errors
-from .learned import with_correction
+from .learned import load_learned
 from .limits import limits_of
 from .names import check_named, check_names, one_each
 
@@ -106,34 +108,63 @@ def _blame(error: BaseException, path: Path) -> ModelError:
 
 
 def configure(model: StateSpaceModel, loaded: Loaded) -> StateSpaceModel:
-    """The model with the YAML's parameters, prior and noise in place of its own.
+    """Return the model with what the YAML appends, and with its parameters, prior and noise.
 
     Raises:
-        ConfigError: With file and line, if the YAML names what the model lacks or a value breaks its rule.
+        ConfigError: With file and line, if the YAML names something that the model lacks, or a value breaks its rule.
     """
     config = loaded.config
-    model = with_lasting_errors(with_correction(with_parameters(model, loaded), loaded), loaded)
-    names = [item.name for item in model.parameters]
-    check_names(loaded, ("estimate",), config.estimate, names, "parameter", model)
-    unknowns = {name: Unknown(section.std, section.drift) for name, section in config.estimate.items()}
-    model = joint(model, unknowns)
-    places = [*(() if isinstance(model.states, Field) else model.state_names), *(item.name for item in model.inputs)]
-    check_names(loaded, ("valid",), config.valid, places, "state or input", model)
+    model = _assembled(_with_noise(with_parameters(model, loaded), loaded), loaded)
     field = isinstance(model.states, Field)
+    places = [*(() if field else model.state_names), *(item.name for item in model.inputs)]
+    check_names(loaded, ("valid",), config.valid, places, "state or input", model)
     known = (model.states.name,) if isinstance(model.states, Field) else model.state_names
     check_names(loaded, ("prior",), config.prior, known, "field" if field else "state", model)
     check_names(loaded, ("noise",), config.noise, [item.name for item in model.noises], "noise", model)
     check_names(loaded, ("sensors",), config.sensors, model.sensor_names, "sensor", model)
     return replace(
-        model,
+        _with_noise(model, loaded),
         states=_states(model, loaded),
         inputs=tuple(_in_range(item, loaded) for item in model.inputs),
-        noises=tuple(
-            replace(noise, variance=config.noise[noise.name].value) if noise.name in config.noise else noise
-            for noise in model.noises
-        ),
         sensors=tuple(_sensor(sensor, loaded) for sensor in model.sensors),
     )
+
+
+def _assembled(model: StateSpaceModel, loaded: Loaded) -> StateSpaceModel:
+    """Return the model with the correction, coloured noise, sensor errors and joint parameters of the YAML."""
+    config = loaded.config
+    learned, learned_place = load_learned(model, loaded)
+    noises = {name: section.over for name, section in config.noise.items() if section.over is not None}
+    given = {name: section.error for name, section in config.sensors.items() if section.error is not None}
+    known = [*(item.name for item in model.noises), *map(learned_noise, learned.corrects if learned else ())]
+    check_names(loaded, ("noise",), noises, known, "noise", model)
+    check_names(loaded, ("sensors",), given, model.sensor_names, "sensor", model)
+    errors = {}
+    for name, error in given.items():
+        rows = [row.name for row in model.sensors[model.sensor_names.index(name)].rows]
+        key = ("sensors", name, "error", "std" if error.std is not None else "variance")
+        errors[name] = ColouredError(one_each(loaded, key, error.variances, rows), error.over)
+    times = [*map(disturbance_time, noises), *map(error_time, errors)]
+    parameters = [*(item.name for item in model.parameters), *times]
+    check_names(loaded, ("estimate",), config.estimate, parameters, "parameter", model)
+    estimated = {name: JointParameter(section.std, section.drift) for name, section in config.estimate.items()}
+    try:
+        return assemble(model, learned=learned, noises=noises, errors=errors, estimated=estimated)
+    except AppendError as error:
+        kind, name = error.part
+        if kind == "learned":
+            raise ConfigError(f"{learned_place}: {error}") from None
+        keys = {"noise": ("noise", name, "over"), "error": ("sensors", name, "error"), "estimate": ("estimate", name)}
+        raise ConfigError(f"{loaded.places.at(keys[kind])}: {dotted(keys[kind])}: {error}") from None
+
+
+def _with_noise(model: StateSpaceModel, loaded: Loaded) -> StateSpaceModel:
+    """Return the model with the YAML's variances of its process noises."""
+    given = loaded.config.noise
+    noises = (
+        replace(noise, variance=given[noise.name].value) if noise.name in given else noise for noise in model.noises
+    )
+    return replace(model, noises=tuple(noises))
 
 
 def physics_of(loaded: Loaded) -> StateSpaceModel:
@@ -210,7 +241,7 @@ def _sensor(sensor: Any, loaded: Loaded) -> Any:
 
 def _correlation(sensor: Any, given: Correlation, loaded: Loaded) -> Correlation | None:
     """The correlation of a sensor's rows; None of rows that are independent, which every filter takes."""
-    wrong = flaw(given, len(sensor.rows))
+    wrong = correlation_error(given, len(sensor.rows))
     if wrong:
         raise loaded.error(("sensors", sensor.name, "correlation"), wrong)
     return None if np.array_equal(given, np.eye(len(given))) else given

@@ -16,8 +16,7 @@ import numba
 import numpy as np
 
 from ..errors import ModelError
-from ..model.check import probe, probe_angles, probe_likelihoods, uncompilable
-from ..model.claims import check_parts
+from ..model.check import check_parts, probe, probe_angles, probe_likelihoods, uncompilable
 from ..model.state_space import LARGE, Field, StateSpaceModel
 from ..numerics.helpers import with_helpers
 from ..numerics.jit import address, jit, plain

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..log import MARK, TRUTH, Log
-from ..model.field import Field
+from ..model.states import Field
 from ..numerics.quantiles import normal_quantile
 
 SIDE = 200

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..compiled.model import compile_model
-from ..model.mode_as_number import indicator
+from ..model.indicator import indicator
 from ..model.state_space import Input, State, StateSpaceModel
 from ..tuning import Tuning
 

@@ -13,7 +13,7 @@ import numpy as np
 from numba import types
 
 from ..errors import LARGEST, EventError
-from ..model.layout import Layout
+from ..model.state_space import EventLayout
 from ..numerics.jit import i64, jit_brief
 from .batch import BEFORE, INPUT, KIND_NAMES, MAINTENANCE, MARK, READING, TRUTH, Events
 
@@ -99,7 +99,7 @@ def _looking() -> Any:
 _TYPES = {"t": np.int64, "arrival": np.int64, "kind": np.int8, "channel": np.int32}
 
 
-def admitted(batch: Events, width: int, layout: Layout | None) -> Events:
+def admitted(batch: Events, width: int, layout: EventLayout | None) -> Events:
     """The batch, with infinite values as missing ones, if a log may take it.
 
     Args:
@@ -157,7 +157,7 @@ def _integers(name: str, column: np.ndarray, wanted: type) -> np.ndarray:
     return column.astype(wanted)
 
 
-def _broken(batch: Events, at: int, rule: int, width: int, layout: Layout | None) -> str:
+def _broken(batch: Events, at: int, rule: int, width: int, layout: EventLayout | None) -> str:
     """What is wrong with an event, and what would be right."""
     t, kind, channel = int(batch.t[at]), int(batch.kind[at]), int(batch.channel[at])
     value = batch.value[at]

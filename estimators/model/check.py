@@ -1,4 +1,7 @@
-"""A model's functions tried at its prior, before they are compiled: what is wrong is said of their file and line."""
+"""Checks of a model's functions before a filter uses them; errors name the function's file and line.
+
+Functions are called at the prior and near it; declared properties (mode, linear part, linearity) are tested there.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +22,7 @@ from .state_space import LARGE, StateSpaceModel
 
 
 def place(function: Any, error: BaseException | None = None) -> str:
-    """File and line of a function, or of the last line in its file that an error came through, as `file:line: `."""
+    """Return file and line of a function, or of the last line in its file that an error passed, as `file:line: `."""
     code = _code(function)
     if code is None:
         return ""
@@ -33,12 +36,12 @@ def place(function: Any, error: BaseException | None = None) -> str:
 
 
 def _code(function: Any) -> CodeType | None:
-    """The code of a function, of what a `partial` holds, or of an object that can be called."""
+    """Return the code of a function, of a `partial`, or of a callable object."""
     function = plain(function)
     function = function.func if isinstance(function, partial) else function
     code = getattr(function, "__code__", None) or getattr(type(function).__call__, "__code__", None)
     if code and "inner" in code.co_freevars and Path(code.co_filename).parent == Path(__file__).parent:
-        # A wrapper of joint.py or mode_as_number.py: the model's own function is inside.
+        # A wrapper of this package: the model's own function is inside.
         return _code(function.__closure__[code.co_freevars.index("inner")].cell_contents)
     return code
 
@@ -49,14 +52,14 @@ def _shown(file: str, line: int) -> str:
 
 
 def uncompilable(model: StateSpaceModel, what: str, function: Callable | None, error: Exception) -> ModelError:
-    """What Numba says of a function, in one line: of its long message, what went wrong, and where."""
+    """Return the error of a function that Numba cannot compile, in one line with its place."""
     where = re.findall(r'File "([^"]+)", line (\d+)', str(error))
     at = _shown(str(Path(where[-1][0]).resolve()), int(where[-1][1])) if where else place(function)
     return ModelError(f"{at}model {model.name}: {what} cannot be compiled: {_gist(error)}; {_compilable(error)}")
 
 
 def _compilable(error: Exception) -> str:
-    """What to do about a function that Numba does not take."""
+    """Return the remedy for a function that Numba cannot compile."""
     text = str(error)
     if "of type Module" in text:
         return "import the function that it calls by its name (from helpers import decay), so that it is compiled too"
@@ -64,19 +67,19 @@ def _compilable(error: Exception) -> str:
 
 
 def _gist(error: Exception) -> str:
-    """The line of a long message that says what went wrong."""
+    """Return the line of a long message that holds the error."""
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
     rows = [line for line in lines if not line.startswith(("Failed in", "File ", "During:", "^", "[1]", "[2]"))]
     return (rows or lines or ["no message"])[0]
 
 
 def numbers(values: np.ndarray) -> str:
-    """The first entries of a vector."""
+    """Return the first entries of a vector as text."""
     return f"[{', '.join(f'{value:.4g}' for value in values[:4])}{', …' if values.size > 4 else ''}]"
 
 
 def _remedy(error: Exception, function: Any, takes: str, sizes: str, at: str) -> str:
-    """What to do about an error that a function of the model raises at the prior."""
+    """Return the remedy for an error that a function of the model raises at the prior."""
     if isinstance(error, (NameError, AttributeError, ImportError)):
         return "correct the name, or define it in the model's file"
     own = getattr(plain(function), "__code__", None)
@@ -85,11 +88,11 @@ def _remedy(error: Exception, function: Any, takes: str, sizes: str, at: str) ->
         return f"it takes {takes}"
     if isinstance(error, IndexError) or any(word in str(error) for word in ("broadcast", "unpack", "shape")):
         return f"check it against the declared sizes: {sizes}"
-    return f"it may not fail at {at}; mend it, or the prior"
+    return f"it may not fail at {at}; correct it, or the prior"
 
 
 def indefinite(Q: np.ndarray) -> str | None:
-    """Why a matrix of finite numbers is not a covariance; None if it is one."""
+    """Return why a matrix of finite numbers is not a covariance; None if it is one."""
     # Beside its own variances: a Q of nanometres may be lopsided too.
     if np.any(np.abs(Q - Q.T) > 1e-9 * np.sqrt(np.abs(np.outer(np.diag(Q), np.diag(Q))))):
         return "is not symmetric (fill both triangles)"
@@ -101,11 +104,11 @@ def indefinite(Q: np.ndarray) -> str | None:
 
 
 Values = dict[str, Any]
-"""What the functions of a model are called with, by the names that they have in the model's docstring."""
+"""Arguments of a model's functions, by their names in the model's docstring."""
 
 
 def prior_values(model: StateSpaceModel) -> Values:
-    """The arguments at the prior, with default inputs and the declared parameters and noises."""
+    """Return the arguments at the prior, with default inputs and the declared parameters and noises."""
     return {
         "x": model.prior_mean.copy(),
         "u": np.array([item.default for item in model.inputs], float),
@@ -116,10 +119,10 @@ def prior_values(model: StateSpaceModel) -> Values:
     }
 
 
-def _elsewhere(model: StateSpaceModel, values: Values) -> Iterator[Values]:
-    """The arguments at two places away from the prior, where no entry is zero.
+def _near_prior(model: StateSpaceModel, values: Values) -> Iterator[Values]:
+    """Yield the arguments at two points away from the prior, where no entry is zero.
 
-    Of a large field there are none: a plain function takes seconds for so many cells.
+    A large field has none: a plain function takes seconds for so many cells.
     """
     rng = np.random.default_rng(1)
     for _ in range(2 if model.nx <= LARGE else 0):
@@ -137,16 +140,16 @@ def _elsewhere(model: StateSpaceModel, values: Values) -> Iterator[Values]:
 def refuse_writing(
     model: StateSpaceModel, what: str, function: Callable, takes: str, *out: np.ndarray, more: Values | None = None
 ) -> None:
-    """Refuse a function that changes what it is called with, at the prior or away from it.
+    """Refuse a function that changes its arguments, at the prior or away from it.
 
-    At the prior alone it would pass where it scales or turns an entry that is zero there. Away from it the function may
-    fail, as not every state need have an answer.
+    At the prior alone, a function that scales an entry that is zero there would pass. Away from it the function may
+    fail, as not every state need have a result.
 
     Raises:
         ModelError: With the function's file and line.
     """
     prior = prior_values(model) | (more or {})
-    for values in (prior, *_elsewhere(model, prior)):
+    for values in (prior, *_near_prior(model, prior)):
         names = takes.split(", ")
         given = [values[name] for name in names]
         copies = [item.copy() if isinstance(item, np.ndarray) else item for item in given]
@@ -161,7 +164,7 @@ def refuse_writing(
 
 
 def probe(model: StateSpaceModel) -> None:
-    """Run the plain functions with arrays of the declared sizes, where an index that is too large is an error."""
+    """Run the plain functions with arrays of the declared sizes, so that an index out of range is an error."""
     values = prior_values(model)
     x, u, p, n = values["x"], values["u"], values["p"], model.nx
     calls: list[tuple[str, Callable | None, str, tuple[int, ...]]] = [
@@ -209,7 +212,7 @@ def probe(model: StateSpaceModel) -> None:
 
 
 def probe_angles(model: StateSpaceModel, h: Sequence[Callable]) -> None:
-    """Refuse a sensor row that tells a full turn of a circular state, whose filters turn it back to within ±π."""
+    """Refuse a sensor row that changes with a full turn of a circular state, which filters wrap to ±π."""
     if model.nx > LARGE or not np.any(model.circular):
         return
     x = model.prior_mean + 0.3 * model.prior_std
@@ -235,7 +238,7 @@ def probe_angles(model: StateSpaceModel, h: Sequence[Callable]) -> None:
 
 
 def probe_likelihoods(model: StateSpaceModel) -> None:
-    """Run each sensor's own log_likelihood once, at the reading that the prior predicts."""
+    """Run each sensor's own log_likelihood once, at the measurement that the prior predicts."""
     x = np.array([state.mean for state in model.states], float)
     u = np.array([item.default for item in model.inputs], float)
     p = np.array([item.value for item in model.parameters], float)
@@ -260,4 +263,129 @@ def probe_likelihoods(model: StateSpaceModel) -> None:
             raise ModelError(
                 f"{place(sensor.log_likelihood)}{named} is {value} at the prior; it must be a finite number, or -inf "
                 "where the reading is impossible"
+            )
+
+
+def check_parts(model: StateSpaceModel, f: Callable, h: Sequence[Callable]) -> None:
+    """Test the declared mode, the declared linear part and declared linearity at states around the prior.
+
+    Args:
+        model: The model.
+        f: Its compiled f.
+        h: The compiled h of each of its sensors.
+
+    Raises:
+        ModelError: If the chances are not probabilities, f or Q moves the mode, or f or h is not linear as declared.
+    """
+    if model.jump is None and not model.conditionally_linear and not model.linear:
+        return
+    rng = np.random.default_rng(0)
+    u = np.array([item.default for item in model.inputs], float)
+    p = np.array([item.value for item in model.parameters], float)
+    q = np.array([max(noise.variance, 1e-12) for noise in model.noises], float)
+    dt = min(0.1, model.max_step)
+    for _ in range(8):
+        x = model.prior_mean + model.prior_std * rng.standard_normal(model.nx)
+        if model.jump is not None:
+            x[model.mode] = rng.integers(len(model.jump.modes))
+            _check_jump(model, x, u, p, q, dt)
+        if model.linear:
+            _check_linear(model, np.arange(model.nx), f, h, x, u, p, dt, rng)
+        if model.conditionally_linear:
+            _check_linear(model, model.linear_states, f, h, x, u, p, dt, rng)
+            _check_independent(model, x, u, p, q, dt, rng)
+
+
+def _check_jump(model: StateSpaceModel, x: Any, u: Any, p: Any, q: Any, dt: float) -> None:
+    assert model.jump is not None
+    name = model.jump.state
+    c = np.full(len(model.jump.modes), np.nan)
+    after = np.full(model.nx, np.nan)
+    try:
+        plain(model.jump.chances)(x.copy(), u, p, dt, c)
+    except Exception as error:  # noqa: BLE001  the user's own function may raise anything
+        raise ModelError(
+            f"model {model.name}: jump.chances fails with {model.nx} states and {c.size} modes: "
+            f"{type(error).__name__}: {error}; it takes (x, u, p, dt, out)"
+        ) from None
+    refuse_writing(model, "jump.chances", model.jump.chances, "x, u, p, dt", c.copy())
+    if not (np.all(c >= 0.0) and abs(c.sum() - 1.0) < 1e-9):
+        raise ModelError(
+            f"model {model.name}: jump.chances gives {np.round(c, 6).tolist()} from mode {x[model.mode]:g}; it must "
+            "give the probability of each mode, which sum to 1"
+        )
+    plain(model.f)(x.copy(), u, p, dt, after)
+    if after[model.mode] != x[model.mode]:
+        raise ModelError(
+            f"model {model.name}: f moves the mode {name} from {x[model.mode]:g} to {after[model.mode]:g}; it must "
+            "keep it: jump.chances says how it jumps"
+        )
+    if model.Q is not None:
+        Q = np.zeros((model.nx, model.nx))
+        plain(model.Q)(x.copy(), u, p, q, dt, Q)
+        if np.any(Q[model.mode]):
+            raise ModelError(f"model {model.name}: Q acts on the mode {name}, which jumps; leave its row zero")
+
+
+def _away(model: StateSpaceModel, x: Any, states: Any, rng: Any) -> Any:
+    """Return x with other values of some states, far enough that curvature exceeds the rounding of a large mean."""
+    other = x.copy()
+    reach = model.prior_std[states] + np.abs(model.prior_mean[states])
+    other[states] += reach * rng.standard_normal(len(states))
+    return other
+
+
+def _check_linear(
+    model: StateSpaceModel, states: Any, f: Callable, h: Sequence[Callable], x: Any, u: Any, p: Any, dt: float, rng: Any
+) -> None:
+    """Superposition: at the middle of two points a linear function, also with a constant, is the middle of its values.
+
+    It is tried with the compiled functions, since a field may be linear too.
+    """
+    other = _away(model, x, states, rng)
+    points = (x, other, 0.5 * (x + other))
+    calls: list[tuple[str, Callable, int]] = [("f", lambda z, out: f(z, u, p, dt, out), model.nx)]
+    for sensor, expected in zip(model.sensors, h, strict=True):
+        call = lambda z, out, expected=expected: expected(z, u, p, out)  # noqa: E731
+        calls.append((f"h of sensor {sensor.name}", call, len(sensor.rows)))
+    for what, call, size in calls:
+        a, b, middle = np.empty((3, size))
+        for z, out in zip(points, (a, b, middle), strict=True):
+            call(z.copy(), out)
+        with np.errstate(all="ignore"):
+            bend = np.abs(middle - 0.5 * (a + b)) / np.maximum(np.abs(a) + np.abs(b) + np.abs(middle), 1e-300)
+        if not np.any(bend > 1e-9):
+            continue
+        if model.linear:
+            raise ModelError(
+                f"model {model.name}: {what} is not linear, though the model says linear=True; leave that "
+                "out, or correct it"
+            )
+        names = ", ".join(model.conditionally_linear)
+        raise ModelError(
+            f"model {model.name}: {what} is not linear in {names} when the others are known; take out of "
+            "conditionally_linear what bends it"
+        )
+
+
+def _check_independent(model: StateSpaceModel, x: Any, u: Any, p: Any, q: Any, dt: float, rng: Any) -> None:
+    """Neither the chances of a jump nor the noise may depend on the conditionally linear states."""
+    names = ", ".join(model.conditionally_linear)
+    other = _away(model, x, model.linear_states, rng)
+    if model.jump is not None:
+        chances = np.empty((2, len(model.jump.modes)))
+        for z, out in zip((x, other), chances, strict=True):
+            plain(model.jump.chances)(z.copy(), u, p, dt, out)
+        if not np.allclose(chances[0], chances[1], rtol=1e-9, atol=1e-15):
+            raise ModelError(
+                f"model {model.name}: jump.chances depends on {names}, which conditionally_linear names; those of a "
+                "jump may not: take out what they depend on"
+            )
+    if model.Q is not None:
+        first, second = np.zeros((model.nx, model.nx)), np.zeros((model.nx, model.nx))
+        plain(model.Q)(x.copy(), u, p, q, dt, first)
+        plain(model.Q)(other, u, p, q, dt, second)
+        if not np.allclose(first, second, rtol=1e-9, atol=0.0):
+            raise ModelError(
+                f"model {model.name}: Q depends on {names}, which conditionally_linear names; its noise may not"
             )

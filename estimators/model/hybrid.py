@@ -2,9 +2,9 @@
 
     x' = f(x, u, p, dt) + dt m(z),   Q = Q_f(x, u, p, q, dt) + dt s(z) diag(q_learned),   z of x and u
 
-m and s are those of correction.py, at the state from which the step begins, so steps must be short beside what changes
-z. q_learned, a noise NAME_learned for each corrected state, is what a second adds where the correction knows nothing:
-there the model is its physics, and as uncertain as that.
+m and s are those of correction.py, at the state from which the step begins, so steps must be short compared with the
+changes of z. q_learned, a noise NAME_learned for each corrected state, is the variance that a second adds where the
+correction has no data: there the model is its physics, with that uncertainty.
 
 Source: Ko & Fox (2009), GP-BayesFilters, doi:10.1007/s10514-009-9119-x, 3.3, for a process on the residual of a model.
 """
@@ -19,14 +19,13 @@ from typing import Any
 import numpy as np
 
 from ..errors import ModelError, nearest
-from .correction import Correction, Net
-from .joint import as_inner
-from .state_space import LARGE, Field, Noise, Sensor, StateSpaceModel
-from .units import squared
+from .correction import Correction
+from .state_space import LARGE, Field, Noise, Sensor, StateSpaceModel, squared
+from .wrapping import as_inner, noise_function
 
 
 @dataclass(frozen=True, eq=False)
-class Learned:
+class LearnedCorrection:
     """A correction of the states `corrects`, by `features`, states or inputs, with q_learned of each, `noise`."""
 
     corrects: tuple[str, ...]
@@ -36,15 +35,15 @@ class Learned:
 
 
 def learned_noise(state: str) -> str:
-    """The noise that says how uncertain a corrected state is where the correction knows nothing."""
+    """Return the name of the noise of a corrected state where the correction has no data."""
     return f"{state}_learned"
 
 
-def hybrid(model: StateSpaceModel, learned: Learned) -> StateSpaceModel:
-    """The model with a correction beside its f.
+def hybrid(model: StateSpaceModel, learned: LearnedCorrection) -> StateSpaceModel:
+    """Return the model with a correction beside its f.
 
     Raises:
-        ModelError: If it has no such state or input, or is none that can be corrected.
+        ModelError: If it has no such state or input, or cannot be corrected.
     """
     check_places(model, learned.corrects, learned.features)
     added = tuple(
@@ -55,18 +54,21 @@ def hybrid(model: StateSpaceModel, learned: Learned) -> StateSpaceModel:
         if item.name in (noise.name for noise in model.noises):
             raise ModelError(f"model {model.name} has a noise {item.name} already; it is corrected once")
     given = learned, tuple(places(model, learned.features)), tuple(places(model, learned.corrects))
-    acts_on = () if model.Q else tuple(model.acts_on(noise.name).start for noise in model.noises)
-    Q = _noise(model.Q, acts_on, len(model.noises), *given)
     moved = {name for name in learned.features if name in model.state_names}
-    kept = tuple(name for name in model.conditionally_linear if name not in moved)
     changed = replace(
-        model, noises=(*model.noises, *added), Q=Q, F=None, linear=model.linear and not moved, conditionally_linear=kept
+        model,
+        noises=(*model.noises, *added),
+        Q=_noise(noise_function(model), len(model.noises), *given),
+        F=None,
+        linear=model.linear and not moved,
+        conditionally_linear=tuple(name for name in model.conditionally_linear if name not in moved),
     )
-    if model.black_box or isinstance(learned.correction, Net):
+    add_rate, add_slope, _ = learned.correction.functions
+    if model.black_box or add_rate is None:
         f = _step_of_blocks(model.f, model.black_box, *given)
-        return replace(changed, f=f, sensors=_heard_by_blocks(model), black_box=True, linear=False)
-    F = None if model.F is None else _slope(model.F, *given)
-    return replace(changed, f=_step(model.f, *given), F=F)
+        return replace(changed, f=f, sensors=_block_sensors(model), black_box=True, linear=False)
+    F = None if model.F is None else _added(model.F, add_slope, *given)
+    return replace(changed, f=_added(model.f, add_rate, *given), F=F)
 
 
 def check_places(model: StateSpaceModel, corrects: Sequence[str], features: Sequence[str]) -> None:
@@ -92,17 +94,15 @@ def check_places(model: StateSpaceModel, corrects: Sequence[str], features: Sequ
             raise ModelError(f"model {model.name}: {name} is its mode, which jumps; a correction cannot use it")
     for name in features:
         if name in model.state_names and model.circular[model.state_names.index(name)]:
-            raise ModelError(
-                f"model {model.name}: {name} is an angle, which is no feature of a correction; leave it out"
-            )
+            raise ModelError(f"model {model.name}: {name} is an angle, which cannot be a feature; leave it out")
     if model.executor == "processes":
         raise ModelError(
-            f"model {model.name}: its executor is 'processes', which a corrected model cannot be sent to; take threads"
+            f"model {model.name}: its executor is 'processes', which a corrected model cannot be sent to; use threads"
         )
 
 
 def places(model: StateSpaceModel, names: Sequence[str]) -> np.ndarray:
-    """Where each state or input is: its index in x, or -1 less that in u."""
+    """Return where each state or input is: its index in x, or -1 less that in u."""
     found = [
         model.state_names.index(name) if name in model.state_names else -1 - model.input_names.index(name)
         for name in names
@@ -111,51 +111,35 @@ def places(model: StateSpaceModel, names: Sequence[str]) -> np.ndarray:
 
 
 def gathered(X: np.ndarray, u: np.ndarray, place: np.ndarray) -> np.ndarray:
-    """Features (N, d) of states X (N, nx) at inputs u (nu,), or (N, nu)."""
+    """Return the features (N, d) of states X (N, nx) at inputs u (nu,), or (N, nu)."""
     u = np.broadcast_to(u, (len(X), u.shape[-1]))
     return np.stack([X[:, j] if j >= 0 else u[:, -1 - j] for j in place], axis=1)
 
 
 @lru_cache(maxsize=64)
-def _step(function: Callable, learned: Learned, place: tuple[int, ...], target: tuple[int, ...]) -> Callable:
-    inner, add = as_inner(function), as_inner(learned.correction.functions[0])
+def _added(
+    function: Callable, addition: Any, learned: LearnedCorrection, place: tuple[int, ...], target: tuple[int, ...]
+) -> Callable:
+    """Return f or F followed by what the correction adds to its result."""
+    inner, add = as_inner(function), as_inner(addition)
     features, states, data = np.array(place), np.array(target), learned.correction.data
 
-    def f(x, u, p, dt, out):  # noqa: ANN001, ANN202
+    def corrected(x, u, p, dt, out):  # noqa: ANN001, ANN202
         inner(x, u, p, dt, out)
         add(x, u, dt, features, states, data, out)
 
-    return f
-
-
-@lru_cache(maxsize=64)
-def _slope(function: Callable, learned: Learned, place: tuple[int, ...], target: tuple[int, ...]) -> Callable:
-    inner, add = as_inner(function), as_inner(learned.correction.functions[1])
-    features, states, data = np.array(place), np.array(target), learned.correction.data
-
-    def F(x, u, p, dt, out):  # noqa: ANN001, ANN202
-        inner(x, u, p, dt, out)
-        add(x, u, dt, features, states, data, out)
-
-    return F
+    return corrected
 
 
 @lru_cache(maxsize=64)
 def _noise(
-    function: Callable | None, acts_on: tuple[int, ...], m: int, learned: Learned, place: tuple[int, ...],
-    target: tuple[int, ...],
-) -> Callable:  # fmt: skip
-    given = function is not None
-    inner, share = as_inner(function or _nothing), as_inner(learned.correction.functions[2])
-    white = np.array(acts_on, np.int64)
+    function: Callable, m: int, learned: LearnedCorrection, place: tuple[int, ...], target: tuple[int, ...]
+) -> Callable:
+    inner, share = as_inner(function), as_inner(learned.correction.functions[2])
     features, states, data = np.array(place), np.array(target), learned.correction.data
 
     def Q(x, u, p, q, dt, out):  # noqa: ANN001, ANN202
-        if given:
-            inner(x, u, p, q[:m], dt, out)
-        else:
-            for i in range(white.size):
-                out[white[i], white[i]] += q[i] * dt
+        inner(x, u, p, q[:m], dt, out)
         left = share(x, u, features, data)
         for i in range(states.size):
             out[states[i], states[i]] += q[m + i] * dt * left
@@ -163,13 +147,9 @@ def _noise(
     return Q
 
 
-def _nothing(x, u, p, q, dt, out):  # noqa: ANN001, ANN202
-    """The Q of a model whose noises are added by name."""
-
-
 @lru_cache(maxsize=64)
 def _step_of_blocks(
-    function: Callable, black_box: bool, learned: Learned, place: tuple[int, ...], target: tuple[int, ...]
+    function: Callable, black_box: bool, learned: LearnedCorrection, place: tuple[int, ...], target: tuple[int, ...]
 ) -> Callable:
     inner = function if black_box else _of_blocks(function)
     features, states = np.array(place), np.array(target)
@@ -182,8 +162,8 @@ def _step_of_blocks(
     return f
 
 
-def _heard_by_blocks(model: StateSpaceModel) -> tuple[Sensor, ...]:
-    """The model's sensors, as a black box has them."""
+def _block_sensors(model: StateSpaceModel) -> tuple[Sensor, ...]:
+    """Return the model's sensors with functions of blocks of states, as a black box has them."""
     if model.black_box:
         return model.sensors
     for sensor in model.sensors:
@@ -196,7 +176,7 @@ def _heard_by_blocks(model: StateSpaceModel) -> tuple[Sensor, ...]:
 
 @lru_cache(maxsize=64)
 def _of_blocks(function: Callable, columns: int | None = None) -> Callable:
-    """A model's function of one state as one of a block of states (N, nx), with `columns` results, or as many."""
+    """Return a function of one state as one of a block of states (N, nx), with `columns` results, or nx."""
     inner = as_inner(function)
 
     def block(X: np.ndarray, *rest: Any) -> np.ndarray:

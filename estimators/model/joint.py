@@ -3,8 +3,8 @@
     x⁺ = (x, θ),   x' = f(x, u, p(θ), dt) + w,   θ' = θ + w_θ,   y = h(x, u, p(θ)) + v
 
 A moved parameter drifts as a random walk; with a drift of zero it is an unknown constant. It acts on the model only
-within its range, so that an estimate that strays makes no divisor zero. Derivatives are by complex step: the model's
-own do not know θ.
+within its range, so that an estimate outside cannot make a divisor zero. Derivatives are by complex step, since the
+model's own do not include θ.
 
 Source: Ljung (1979), Asymptotic behavior of the extended Kalman filter as a parameter estimator for linear systems,
 doi:10.1109/TAC.1979.1101943, for the method and its limits: θ can be biased where Q and R are wrong.
@@ -12,64 +12,57 @@ doi:10.1109/TAC.1979.1101943, for the method and its limits: θ can be biased wh
 
 from __future__ import annotations
 
-import hashlib
-import inspect
-import uuid
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import lru_cache
-from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from ..errors import ModelError
-from ..numerics.helpers import with_helpers
-from ..numerics.jit import jit, plain
-from .state_space import Noise, State, StateSpaceModel
-from .units import squared
+from ..numerics.jit import jit
+from .state_space import Noise, State, StateSpaceModel, squared
+from .wrapping import as_inner
 
 
-class Unknown(NamedTuple):
+class JointParameter(NamedTuple):
     """A parameter to estimate: `std` of the prior about its value, and `drift`, the std that a second adds to it."""
 
     std: float
     drift: float = 0.0
 
 
-def joint(model: StateSpaceModel, unknowns: Mapping[str, Unknown]) -> StateSpaceModel:
-    """The model with these parameters as its last states, in the order of the model's parameters.
+def joint(model: StateSpaceModel, estimated: Mapping[str, JointParameter]) -> StateSpaceModel:
+    """Return the model with these parameters as its last states, in the order of the model's parameters.
 
     Raises:
         ModelError: If it has no such parameter, or has a state of that name.
     """
-    if not unknowns:
+    if not estimated:
         return model
     names = [item.name for item in model.parameters]
-    for name in unknowns:
+    for name, given in estimated.items():
         if name not in names:
             raise ModelError(f"model {model.name} has no parameter {name!r} to estimate; it has {', '.join(names)}")
         if name in model.state_names:
             raise ModelError(f"model {model.name} has a state {name!r}; a parameter of that name cannot become one")
-        if not unknowns[name].std > 0.0:
+        if not given.std > 0.0:
             raise ModelError(
-                f"model {model.name}: the prior of {name} has std {unknowns[name].std:g}; an estimated one must be "
+                f"model {model.name}: the prior of {name} has std {given.std:g}; an estimated parameter must be "
                 "uncertain: give a positive std"
             )
-    moved = [item for item in model.parameters if item.name in unknowns]
-    kept = [item for item in model.parameters if item.name not in unknowns]
+    moved = [item for item in model.parameters if item.name in estimated]
+    kept = [item for item in model.parameters if item.name not in estimated]
     # Where each of the model's parameters comes from: θ[k], or -1 - k for p[k] of those that stay.
     place = tuple(moved.index(item) if item in moved else -1 - kept.index(item) for item in model.parameters)
     low, high = (tuple(float(getattr(item, end)) for item in moved) for end in ("low", "high"))
     layout = (model.nx, place, low, high)
-    noises = model.noises + tuple(
-        Noise(item.name, f"{squared(item.unit)}/s", unknowns[item.name].drift ** 2) for item in moved
-    )
+    noises = tuple(Noise(item.name, f"{squared(item.unit)}/s", estimated[item.name].drift ** 2) for item in moved)
     return replace(
         model,
-        states=(*model.states, *(State(m.name, m.unit, m.value, unknowns[m.name].std) for m in moved)),
+        states=(*model.states, *(State(m.name, m.unit, m.value, estimated[m.name].std) for m in moved)),
         parameters=tuple(kept),
-        noises=noises,
+        noises=(*model.noises, *noises),
         f=_step(model.f, *layout),
         F=None,
         Q=None if model.Q is None else _noise(model.Q, len(model.noises), *layout),
@@ -81,7 +74,7 @@ def joint(model: StateSpaceModel, unknowns: Mapping[str, Unknown]) -> StateSpace
 
 @jit
 def _parameters(theta, p, place, low, high):
-    """p(θ): the model's own parameters, the moved ones held within their ranges."""
+    """Return p(θ): the model's own parameters, the moved ones held within their ranges."""
     full = np.empty(len(place), theta.dtype)
     for k in range(len(place)):
         j = place[k]
@@ -94,22 +87,6 @@ def _parameters(theta, p, place, low, high):
         else:
             full[k] = theta[j]
     return full
-
-
-@lru_cache(maxsize=256)
-def as_inner(function: Callable) -> Any:
-    """A model's function for a wrapper to call, with a name by which Numba's cache knows it again.
-
-    The cache tells closures apart by what they hold, and a compiled function by an identifier that is random in every
-    process; one made from the source finds the code that another process compiled, and never code of another source.
-    """
-    python = with_helpers(plain(function))
-    inner = jit(python)
-    file = inspect.getsourcefile(python)
-    source = Path(file).read_bytes() if file and Path(file).is_file() else uuid.uuid4().bytes
-    key = hashlib.sha256(source + f"{python.__module__}.{python.__qualname__}".encode()).hexdigest()
-    inner._set_uuid(str(uuid.UUID(key[:32])))
-    return inner
 
 
 @lru_cache(maxsize=64)

@@ -1,4 +1,4 @@
-"""What a model is: names, units, prior, noise and plain functions of ONE state.
+"""State-space models: names, units, prior, noise and plain functions of ONE state.
 
 x' = f(x, u, p, dt) + w,   w ~ N(0, Q(x, u, p, dt))
 y  = h(x, u, p) + v,       v ~ N(0, R)
@@ -17,20 +17,17 @@ from functools import cached_property
 import numpy as np
 
 from ..errors import LARGEST, ModelError
-from .correlation import Correlation, as_correlation, flaw
-from .field import CellNames, Field, State
-from .jump import Jump
-from .layout import Layout
-from .limits import Limits, Stuck, check_limits, check_range
+from .sensor import Limits, Row, Sensor, Stuck, check_limits, check_range, correlation_error
+from .states import CellNames, Field, State
 
 LARGE = 1024
 """States beyond which no filter forms an (nx, nx) matrix: priors are diagonal, moments are means and variances."""
 
 TRUTH_BLOCK = 32
-"""Most states for which an event of the log must have room to tell the truth."""
+"""States up to which one event of the log holds the whole true state."""
 
 SHOWN = 64
-"""States that a track keeps where the model does not say which."""
+"""States that a track keeps of a model that does not choose them."""
 
 __all__ = [
     "LARGE", "Field", "Input", "Jump", "Limits", "Noise", "Parameter", "Row", "Sensor", "State", "StateSpaceModel",
@@ -40,7 +37,7 @@ __all__ = [
 
 @dataclass(frozen=True)
 class Noise:
-    """One source of process noise: `variance` is what it adds in one second, in `unit`.
+    """A process noise: `variance` is the variance that it adds in one second, in `unit`.
 
     Without the model's Q, `name` is the state that it acts on, or the field on each of whose cells it acts.
     """
@@ -52,7 +49,7 @@ class Noise:
 
 @dataclass(frozen=True)
 class Input:
-    """One entry of u, a known input, held between its readings; `default` until the first; `fitted` as in `State`."""
+    """One entry of u, a known input, held until it changes; `default` until the first value; `fitted` as in `State`."""
 
     name: str
     unit: str
@@ -60,13 +57,13 @@ class Input:
     fitted: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
-        """Refuse a range that holds nothing."""
+        """Refuse an empty range."""
         check_range(f"input {self.name}: fitted", self.fitted)
 
 
 @dataclass(frozen=True)
 class Parameter:
-    """One entry of p, a constant of the model, with the range in which it makes sense."""
+    """One entry of p, a constant of the model, with its admissible range."""
 
     name: str
     unit: str
@@ -76,43 +73,54 @@ class Parameter:
 
 
 @dataclass(frozen=True)
-class Row:
-    """One entry of a sensor's reading, with the variance of its noise; `circular` and `position` as in `State`."""
+class Jump:
+    """A discrete mode: the state that takes the values 0, 1, …, their names, and how it jumps.
 
-    name: str
-    unit: str
-    variance: float
-    circular: bool = False
-    position: tuple[float, ...] | None = None
+        m' ~ chances(x, u, p, dt),   then   x' = f(x with m', u, p, dt) + w
 
+    chances(x, u, p, dt, out) fills `out` (modes,) with the probability of each mode `dt` seconds on, from the state x,
+    its mode included. The mode's prior is that of its state: of two modes, the mean is the probability of the second;
+    of more, that of a Gaussian at the whole numbers. f keeps the mode (out[mode] = x[mode]) and no noise acts on it. f
+    and h must take any number for it, since filters that do not sample give them its mean (`indicator`).
 
-@dataclass(frozen=True)
-class Sensor:
-    """One sensor: the rows that one reading of it holds, and what the model expects it to say.
-
-    h(x, u, p, out) fills `out` (ny,). The optional H(x, u, p, out) fills the Jacobian (ny, nx). A sensor whose noise is
-    not Gaussian gives log_likelihood(y, x, u, p, r) -> log p(y | x), with r (ny,) the rows' variances as they are tuned
-    now; rows of y that are missing are NaN. Particle filters use it; the others use h and r.
-
-    `correlation` is the correlation matrix (ny, ny) of the rows' noise, where they are not independent: anything that
-    NumPy takes for a matrix. R_ij = correlation_ij √(r_i r_j), so the rows' variances are tuned as ever. Of a
-    covariance R, give the rows its diagonal and the sensor `correlation_of(R)`.
-
-    `limits` say what it can say at all; readings beyond are kept and never used.
+    Source: Doucet, Gordon & Krishnamurthy (2001), Particle filters for state estimation of jump Markov linear systems,
+    doi:10.1109/78.905890, section II (the mode jumps first, then the state moves in the new mode).
     """
 
-    name: str
-    rows: tuple[Row, ...]
-    h: Callable
-    H: Callable | None = None
-    log_likelihood: Callable | None = None
-    correlation: Correlation | None = None
-    limits: Limits | None = None
+    state: str
+    modes: tuple[str, ...]
+    chances: Callable
 
-    def __post_init__(self) -> None:
-        """Hold a matrix, which cannot be hashed, as its rows."""
-        if self.correlation is not None:
-            object.__setattr__(self, "correlation", as_correlation(self.correlation))
+
+class EventLayout:
+    """Sizes of a model's events: rows of each sensor, inputs and states.
+
+    Args:
+        name: Of the model, for messages.
+        sensors: Names of its sensors.
+        rows: Rows of each.
+        nu: Inputs.
+        nx: States.
+    """
+
+    def __init__(self, name: str, sensors: tuple[str, ...], rows: tuple[int, ...], nu: int, nx: int) -> None:
+        self.name, self.sensors, self.rows, self.nu, self.nx = name, sensors, rows, nu, nx
+
+    def same(self, other: EventLayout | None) -> bool:
+        """Return whether both take the same events."""
+        if other is None or self is other:
+            return self is other
+        return (self.rows, self.nu, self.nx) == (other.rows, other.nu, other.nx)
+
+    @cached_property
+    def least(self) -> int:
+        """Columns of an event that a fold reads: those of the longest reading, or all inputs."""
+        return max(*self.rows, self.nu)
+
+    @cached_property
+    def counts(self) -> np.ndarray:
+        """Rows of each sensor."""
+        return np.array(self.rows, np.int64)
 
 
 @dataclass(frozen=True)
@@ -127,11 +135,11 @@ class StateSpaceModel:
     (nx,) with L z, where L Lᵀ has ones on its diagonal: the noise of the process, √(q·dt) L z, and the spread of the
     prior, std L z, are correlated in space by it, without a matrix.
 
-    A `jump` makes one state a discrete mode (see jump.py). `conditionally_linear` names states in which f and h are
+    A `jump` makes one state a discrete mode. `conditionally_linear` names states in which f and h are
     linear once the other states are known, with noise that does not depend on them: `rbpf` carries these by a Kalman
     filter.
 
-    Steps longer than `max_step` seconds are split, so an f that integrates crudely need not integrate far.
+    Steps longer than `max_step` seconds are split, so that f may use a simple integration scheme.
 
     A `black_box` is not compiled: f(X, u, p, dt) takes a block of states X (N, nx) and returns the next ones (N, nx), a
     sensor's h(X, u, p) returns (N, ny). Row i of the result depends on row i alone, and on no chance. `executor` splits
@@ -160,7 +168,7 @@ class StateSpaceModel:
     conditionally_linear: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        """Refuse what no filter could run: nothing to estimate, names used twice, numbers out of range."""
+        """Refuse models that no filter could run: nothing to estimate, duplicate names, numbers out of range."""
         for kind in ("states", "sensors", "noises"):
             if not getattr(self, kind):
                 raise ModelError(f"model {self.name}: {kind} is empty; name at least one")
@@ -192,7 +200,7 @@ class StateSpaceModel:
                 raise ModelError(f"model {self.name}: sensor {sensor.name} has no rows; name at least one")
             if len(set(rows)) < len(rows):
                 raise ModelError(f"model {self.name}: sensor {sensor.name} names a row twice; every name must differ")
-            wrong = flaw(sensor.correlation, len(rows)) if sensor.correlation is not None else None
+            wrong = correlation_error(sensor.correlation, len(rows)) if sensor.correlation is not None else None
             if wrong:
                 raise ModelError(f"model {self.name}: the correlation of sensor {sensor.name} {wrong}")
             check_limits(f"model {self.name}: sensor {sensor.name}", sensor.limits, len(rows))
@@ -238,7 +246,7 @@ class StateSpaceModel:
             raise ModelError(f"model {self.name}: max_step is {self.max_step} s; it must be positive")
 
     def _check_parts(self) -> None:
-        """Refuse a mode or a linear part that the states do not have."""
+        """Refuse a mode or a linear part that is not among the states."""
         if isinstance(self.states, Field) and (self.jump or self.conditionally_linear):
             raise ModelError(f"model {self.name}: a field has no mode and no linear part; list the states")
         for name in self.conditionally_linear:
@@ -276,15 +284,15 @@ class StateSpaceModel:
         return np.array(sorted(self.state_names.index(name) for name in self.conditionally_linear), np.int64)
 
     def label(self, state: str) -> str:
-        """What an estimate of that state is called: its name, or, of a mode with two values, a probability."""
+        """Return the label of a state's estimate: its name, or that of a probability, for a mode with two values."""
         two = self.jump is not None and state == self.jump.state and len(self.jump.modes) == 2
         return f"probability of {state}" if two else state
 
     @cached_property
-    def layout(self) -> Layout:
-        """What an event of this model may hold."""
+    def layout(self) -> EventLayout:
+        """Sizes of this model's events."""
         rows = tuple(len(sensor.rows) for sensor in self.sensors)
-        return Layout(self.name, self.sensor_names, rows, self.nu, self.nx)
+        return EventLayout(self.name, self.sensor_names, rows, self.nu, self.nx)
 
     @property
     def nx(self) -> int:
@@ -331,7 +339,7 @@ class StateSpaceModel:
 
     @property
     def grid(self) -> Field | None:
-        """The field, if it has too many cells for each to have a chart; it is then drawn as pictures."""
+        """The field, if it has too many cells for a chart each; it is then drawn as pictures."""
         return self.states if isinstance(self.states, Field) and self.nx > SHOWN else None
 
     @cached_property
@@ -353,7 +361,7 @@ class StateSpaceModel:
         return tuple(self.states[int(j)] for j in self.shown)
 
     def acts_on(self, noise: str) -> range:
-        """The states to which a noise of that name adds: one, or a whole field; none if there is no such name."""
+        """Return the states to which a noise of that name adds: one, a whole field, or none."""
         if isinstance(self.states, Field):
             return range(self.nx if noise == self.states.name else 0)
         if noise not in self.state_names:
@@ -362,7 +370,7 @@ class StateSpaceModel:
         return range(first, first + 1)
 
     def positions(self) -> np.ndarray | None:
-        """Where every state is, (nx, axes); None if one of them does not say."""
+        """Return the positions of the states, (nx, axes); None if one has none."""
         if isinstance(self.states, Field):
             return self.states.positions()
         places = [state.position for state in self.states]
@@ -370,7 +378,7 @@ class StateSpaceModel:
 
     @property
     def periods(self) -> tuple[float, ...] | None:
-        """Length after which space repeats along each axis (infinite where it does not); None where nothing does."""
+        """Length after which space repeats along each axis (infinite where it does not); None without a field."""
         return self.states.periods if isinstance(self.states, Field) else None
 
     @cached_property
@@ -385,7 +393,7 @@ class StateSpaceModel:
 
     @cached_property
     def certain(self) -> str | None:
-        """What the model takes for certain, so that covariances may be singular; None if it is nothing."""
+        """The first noise-free row or certain state, which can make covariances singular; None if there is none."""
         exact = [f"{sensor.name}.{row.name}" for sensor in self.sensors for row in sensor.rows if row.variance == 0.0]
         known = [] if isinstance(self.states, Field) else [state.name for state in self.states if state.std == 0.0]
         return f"{exact[0]} reads without noise" if exact else f"{known[0]} is certain at first" if known else None
@@ -411,8 +419,22 @@ class StateSpaceModel:
 
     @cached_property
     def width(self) -> int:
-        """Columns that one event of the log needs: the longest of a reading, the inputs, and a block of true states.
+        """Columns of an event of the log: as many as the longest measurement, the inputs, or a block of true states.
 
         A block holds the whole state of a small model, and `TRUTH_BLOCK` states of a large one.
         """
         return max(min(self.nx, TRUTH_BLOCK), self.nu, self.ny)
+
+
+def squared(unit: str) -> str:
+    """Return the unit of a variance: °C → °C², m/s → (m/s)²."""
+    if not unit or unit == "1":
+        return unit
+    return f"({unit})²" if "/" in unit or " " in unit or "·" in unit else f"{unit}²"
+
+
+def per_second(unit: str) -> str:
+    """Return the unit of a change a second: °C → °C/s, m/s → m/s²."""
+    if unit.endswith("/s"):
+        return f"{unit}²"
+    return f"({unit})/s" if "/" in unit else f"{unit}/s"

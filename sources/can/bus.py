@@ -7,28 +7,29 @@ import socket
 import sys
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import can
 
 from estimators.errors import SourceError
 from estimators.log import Events
 
-from ..source import Report, ignore
-from .decoder import Decoder
-from .heard import Heard
+from ..source import NEVER, Report, ignore
+from .decoder import Decoder, Expected, shown_id
+from .readers import EXTENDED, BusName
 
-MOST_FRAMES = 4096
-"""Frames taken at once; what is queued beyond them comes next."""
+MAX_READ_FRAMES = 4096
+"""Frames of one read; those queued beyond come with the next."""
 
 IP_MULTICAST_ALL = (socket.IPPROTO_IP, 49)
 IPV6_MULTICAST_ALL = (socket.IPPROTO_IPV6, 29)
 """Socket options of Linux (linux/in.h, linux/in6.h), which Python does not name."""
 
-WAITS = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0)
-"""Seconds before each attempt to open a bus again; the last for all that follow."""
+RECONNECT_WAITS_S = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0)
+"""Seconds before each attempt to open a bus again; the last one repeats."""
 
 
 def open_bus(interface: str, channel: str | int, options: Mapping[str, Any], filters: list | None = None) -> Any:
@@ -69,19 +70,19 @@ def _keep_own_group(bus: Any) -> None:
 
 
 class CanBus:
-    """Listens on a bus and decodes what the channels need; a bus that fails is opened again, until `close`.
+    """Live source: decodes the frames of a bus that the channels need. A bus that fails is opened again, until `close`.
 
     Args:
-        interface: python-can's name: virtual, udp_multicast, socketcan, ...
-        channel: The bus, as the interface names it.
-        decoder: What to take from the frames; its ids are set as the bus's filters.
+        interface: Interface of python-can: virtual, udp_multicast, socketcan, ...
+        channel: Channel of the interface.
+        decoder: Decoder of the frames; its ids are the bus's filters.
         bus_options: Further arguments of the interface.
-        report: Told of error frames, of the bus failing and coming back, and of messages that do not come.
-        connect: Opens the bus; for tests.
-        clock: Seconds, for the waits between attempts; for tests.
+        report: Receives error frames, failures and reconnections of the bus, and messages that are never received.
+        connect: Opens the bus, for tests.
+        clock: Seconds, for the waits between attempts, for tests.
 
     Raises:
-        SourceError: If the bus cannot be opened at first.
+        SourceError: If the bus cannot be opened the first time.
     """
 
     live = True
@@ -107,10 +108,10 @@ class CanBus:
         self._next_attempt = 0.0
         self._failed_before = False
         self._bus: Any = self._connect()
-        self._heard = Heard(f"CAN bus {self._name}", decoder, clock, report)
+        self._monitor = MessageMonitor(f"CAN bus {self._name}", decoder, clock, report)
 
     def read(self, timeout: float) -> Events | None:
-        """The events of the frames that are queued; waits up to `timeout` seconds for the first. None once closed."""
+        """Return the events of the queued frames; wait up to `timeout` seconds for the first. None once closed."""
         if self._closed.is_set():
             return None
         if self._bus is None and not self._reconnect(timeout):
@@ -122,29 +123,29 @@ class CanBus:
             while message is not None:
                 messages.append(message)
                 arrivals.append(time.time_ns())
-                message = self._bus.recv(0) if len(messages) < MOST_FRAMES else None
+                message = self._bus.recv(0) if len(messages) < MAX_READ_FRAMES else None
             self._failed_before = False
-        except Exception as error:  # noqa: BLE001  drivers raise anything; the twin goes on
+        except Exception as error:  # noqa: BLE001  drivers raise anything; the twin continues
             self._failed(error)
         for message in messages:
             if message.is_error_frame:
                 self._report("error frame", f"CAN bus {self._name}: error frame")
         batch = self._decoder.decode(self._decoder.gather(messages, arrivals))
-        self._heard.note(messages)
+        self._monitor.note(messages)
         return batch
 
     def _failed(self, error: Exception) -> None:
-        """Once may be one bad packet; twice in a row the bus is given up and opened again."""
+        """Report an error. One may be a bad packet; after two in a row the bus is opened again."""
         self._report("bus error", f"CAN bus {self._name}: {' '.join(str(error).split()) or type(error).__name__}")
         if not self._failed_before:
             self._failed_before = True
             return
         self._shut()
         self._attempts = 0
-        self._next_attempt = self._clock() + WAITS[0]
+        self._next_attempt = self._clock() + RECONNECT_WAITS_S[0]
 
     def _reconnect(self, timeout: float) -> bool:
-        """Try to open the bus when it is time; wait no longer than `timeout`."""
+        """Try to open the bus when its time has come; wait no longer than `timeout`."""
         wait = self._next_attempt - self._clock()
         if wait > 0:
             self._closed.wait(min(wait, timeout))
@@ -154,7 +155,7 @@ class CanBus:
             self._bus = self._connect()
         except SourceError as error:
             self._attempts += 1
-            wait = WAITS[min(self._attempts, len(WAITS) - 1)]
+            wait = RECONNECT_WAITS_S[min(self._attempts, len(RECONNECT_WAITS_S) - 1)]
             self._next_attempt = self._clock() + wait
             self._report("bus error", f"{error}; next attempt in {wait:g} s")
             return False
@@ -167,14 +168,81 @@ class CanBus:
         if bus is not None:
             try:
                 bus.shutdown()
-            except Exception as error:  # noqa: BLE001  a broken driver may not even close
+            except Exception as error:  # noqa: BLE001  a failed driver may not close
                 self._report("bus error", f"CAN bus {self._name}: it did not close ({error})")
 
     def now(self) -> int:
-        """Wall-clock time, ns."""
+        """Return the wall-clock time, ns."""
         return time.time_ns()
 
     def close(self) -> None:
-        """Leave the bus."""
+        """Close the bus."""
         self._closed.set()
         self._shut()
+
+
+if TYPE_CHECKING:
+    from .decoder import Decoder
+
+MISSING_AFTER_S = 5.0
+MISSING_PERIODS = 3.0
+"""Seconds, or periods of the message if they are longer, after which a message is reported as never received."""
+
+MIN_MULTIPLEXED_FRAMES = 20
+"""Frames of a message after which a signal is reported as missing, since a multiplexer may send it rarely."""
+
+
+class MessageMonitor:
+    """Reports once each message that the decoder needs and the bus does not carry."""
+
+    def __init__(self, name: str, decoder: Decoder, clock: Callable[[], float], report: Report) -> None:
+        """Start now; `name` begins each line, `clock` gives seconds."""
+        self._name, self._decoder, self._clock, self._report = name, decoder, clock, report
+        self._seen: Counter[tuple[BusName, int]] = Counter()
+        self._since = self._next = clock()
+        self._reported: set[int] = set()
+        self._silence_reported = False
+        self._done = False
+
+    def note(self, messages: Iterable[Any]) -> None:
+        """Count the messages since the last call, which may be none."""
+        if self._done:
+            return
+        now = self._clock()
+        for message in messages:
+            if not message.is_error_frame and not message.is_remote_frame:
+                if not self._seen:
+                    # The bus has been silent until now: the time of each message starts here.
+                    self._since = now
+                key = message.arbitration_id | EXTENDED if message.is_extended_id else message.arbitration_id
+                self._seen[message.channel, key] += 1
+        waited = now - self._since
+        if waited >= MISSING_AFTER_S and now >= self._next:
+            self._next = now + 1.0
+            self._check(waited)
+
+    def _check(self, waited: float) -> None:
+        waiting = [item for item in self._decoder.expected if item.key not in self._reported]
+        if not self._seen:
+            if not self._silence_reported:
+                self._silence_reported = True
+                self._report(NEVER, self._silence(waiting))
+            return
+        left = False
+        for item in waiting:
+            texts = self._decoder.missing(item, self._seen, least=MIN_MULTIPLEXED_FRAMES)
+            if not texts or waited < MISSING_PERIODS * item.period:
+                left = True
+                continue
+            self._reported.add(item.key)
+            for text in texts:
+                self._report(NEVER, f"{self._name}: after {waited:.0f} s {text}")
+        self._done = not left
+
+    def _silence(self, waiting: list[Expected]) -> str:
+        named = ", ".join(f"{item.name} ({shown_id(item.key)})" for item in waiting[:4])
+        more = ", ..." if len(waiting) > 4 else ""
+        return (
+            f"{self._name}: none of {named}{more} was received in {MISSING_AFTER_S:g} s; check interface, "
+            "channel and bit rate, and the ids in the DBC"
+        )

@@ -1,4 +1,4 @@
-"""DBC files: which message and which signals a channel means."""
+"""DBC files, and the messages and signals that channels name."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ import cantools
 from estimators.errors import SourceError, nearest
 
 from ..source import Channel
-from .frames import BusName
+from .readers import BusName
 
 
 def load_database(path: Path) -> Any:
-    """A database file (DBC, and whatever else cantools reads), kept while the file is unchanged.
+    """Load a database file (DBC, or any other that cantools reads), cached while the file is unchanged.
 
     Raises:
-        SourceError: If it is missing or no database.
+        SourceError: If it is missing or not a database.
     """
     try:
         stamp = path.stat().st_mtime_ns
@@ -32,9 +32,9 @@ def load_database(path: Path) -> Any:
 def _load(path: Path, stamp: int) -> Any:
     logger = logging.getLogger("cantools")
     level = logger.level
-    logger.setLevel(logging.ERROR)  # It warns of names that are used twice, which do no harm.
+    logger.setLevel(logging.ERROR)  # It warns of duplicate names, which are harmless.
     try:
-        # Not strict: DBC files in use have signals that overlap, and those that nobody asks for do no harm.
+        # Not strict: signals of DBC files in use overlap, which is harmless where they are not read.
         database = cantools.database.load_file(path, strict=False)
     except (cantools.database.UnsupportedDatabaseFormatError, cantools.database.Error, OSError, ValueError) as error:
         gist = " ".join(str(error).split())[:200]
@@ -47,7 +47,7 @@ def _load(path: Path, stamp: int) -> Any:
 
 
 def same_bus(wanted: BusName, actual: BusName) -> bool:
-    """Whether a frame of bus `actual` is on the bus `wanted`: None is any, and can0 and 0 are the same bus."""
+    """Return whether bus `actual` is the bus `wanted`: None is any, and can0 and 0 are the same bus."""
     if wanted is None or actual is None or wanted == actual or str(wanted) == str(actual):
         return True
     if isinstance(wanted, str) == isinstance(actual, str):
@@ -58,16 +58,16 @@ def same_bus(wanted: BusName, actual: BusName) -> bool:
 
 
 def find_messages(databases: list[tuple[Path, BusName]], channel: Channel) -> tuple[list[Any], BusName, Path]:
-    """The messages that carry a channel, their bus and their database: the first database that has one.
+    """Return the messages that carry a channel, with bus and path of the first database that has them.
 
-    There are several where a DBC gives one name to messages of different ids (two devices of a kind).
+    There are several if a DBC gives one name to messages of different ids (two devices of a kind).
 
     Raises:
         SourceError: If no database has the message, or it lacks a signal.
     """
     name = channel.message
     if name is None:
-        raise SourceError(f"{channel.name}: it names no message; say which one of the DBC carries it")
+        raise SourceError(f"{channel.name}: it names no message; add the message of the DBC that carries it")
     known: list[str] = []
     for path, bus in databases:
         database = load_database(path)

@@ -1,8 +1,8 @@
-"""CAN frames to events, by DBC."""
+"""Decode CAN frames to events by DBC, and describe messages that are never received."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -12,16 +12,15 @@ from estimators.errors import SourceError
 from estimators.log import READING, Events
 
 from ..clock import second_ns
-from ..mapping import ABSENT, PRESENT, SHORT, Mapping
+from ..mapping import ABSENT, PRESENT, SHORT, ChannelMapping
 from ..source import Channel, Report, ignore
 from .databases import find_messages, load_database, same_bus
-from .frames import EXTENDED, BusName, Raw
+from .readers import EXTENDED, BusName, Raw
 from .signals import extract, ordered, tabulate, vectorises
-from .unseen import Expected, Seen, unheard, unsaid
 
 
 class Frames(NamedTuple):
-    """Frames that some channel needs: times (ns), the message that each is, its length and its bytes (n, longest)."""
+    """Frames that some channel needs: times (ns), index of the message, length, and bytes (n, longest)."""
 
     t: np.ndarray
     arrival: np.ndarray
@@ -31,13 +30,13 @@ class Frames(NamedTuple):
 
 
 class Decoder:
-    """Decodes the messages that the channels need and rejects all others by their id.
+    """Decodes the messages that the channels need; frames of other ids are skipped.
 
     Args:
-        databases: Database files, each with the bus on which it holds (None: every one).
-        channels: What feeds the model.
+        databases: Database files, each with the bus that it describes (None: every one).
+        channels: Signals that feed the model.
         width: Value columns of an event.
-        report: Told of frames that do not decode.
+        report: Receives frames that do not decode.
 
     Raises:
         SourceError: If a database lacks a message or signal, or a unit does not convert.
@@ -79,7 +78,7 @@ class Decoder:
         self._most = max((len(signals) for signals in needed), default=1)
         self.longest = max((message.length for message in self._messages), default=8)
         """Bytes of the longest message."""
-        self._mapping = Mapping(
+        self._mapping = ChannelMapping(
             [
                 (channels, names, [signal.unit for signal in signals])
                 for (_, _, _, channels), names, signals in zip(self._plans, self._names, needed, strict=True)
@@ -87,8 +86,8 @@ class Decoder:
             width=width,
             report=report,
         )
-        self._silent = {(channel.kind, channel.index) for *_, own in self._plans for channel in own}
-        """Channels that no value has come for."""
+        self._unfed = {(channel.kind, channel.index) for *_, own in self._plans for channel in own}
+        """Channels without a value so far."""
 
     def _check_unique(self) -> None:
         for k, key in enumerate(self._keys):
@@ -102,7 +101,7 @@ class Decoder:
 
     @property
     def filters(self) -> list[dict[str, Any]]:
-        """Filters of python-can's that let through what is wanted."""
+        """Filters of python-can for the wanted ids."""
         return [
             {
                 "can_id": key & ~EXTENDED,
@@ -114,36 +113,36 @@ class Decoder:
 
     @property
     def expected(self) -> list[Expected]:
-        """The messages of which some channel has had no value yet, with these channels."""
+        """Messages of which some channel has had no value yet, with these channels."""
         found = []
         for key, (message, bus, _, channels) in zip(self._keys, self._plans, strict=True):
-            feeds = {c.name: c.signals for c in channels if (c.kind, c.index) in self._silent}
+            feeds = {c.name: c.signals for c in channels if (c.kind, c.index) in self._unfed}
             if feeds:
                 found.append(Expected(message.name, key, bus, feeds, (message.cycle_time or 0) / 1000))
         return found
 
     @staticmethod
-    def missing(item: Expected, seen: Seen, *, least: int = 1) -> list[str]:
-        """What to say of a message whose channels have had no value; nothing if it came fewer than `least` times."""
+    def missing(item: Expected, seen: FrameCounts, *, least: int = 1) -> list[str]:
+        """Describe a message whose channels have had no value; nothing if it was received fewer than `least` times."""
         count = sum(n for (bus, key), n in seen.items() if key == item.key and same_bus(item.bus, bus))
         if not count:
-            return [unheard(item, seen)]
-        return [unsaid(item, channel, count) for channel in item.feeds] if count >= least else []
+            return [never_received(item, seen)]
+        return [never_valued(item, channel, count) for channel in item.feeds] if count >= least else []
 
     def plan_of(self, key: int, bus: BusName) -> int:
-        """The message that a frame is, or -1 if nobody needs it; `key` is its id, with EXTENDED added."""
+        """Return the index of a frame's message, -1 if no channel needs it; `key` is its id, with EXTENDED added."""
         try:
             return self._plan_of[key, bus]
         except KeyError:
             fits = [k for k, known in enumerate(self._keys) if known == key and same_bus(self._plans[k][1], bus)]
-            # A frame whose format does not tell its bus may fit several messages; the first it is.
+            # A frame of a format without bus names may fit several messages; the first one counts.
             plan = fits[0] if fits else -1
             if key in self.wanted:
                 self._plan_of[key, bus] = plan
             return plan
 
     def frames_of(self, raw: Raw) -> Frames:
-        """Those frames of a log that are wanted."""
+        """Return the wanted frames of a log."""
         plan = np.full(raw.key.size, -1, np.int64)
         for key in self.wanted:
             rows = np.flatnonzero(raw.key == key)
@@ -154,7 +153,7 @@ class Decoder:
         return Frames(t, t, plan[rows], raw.length[rows], raw.data[rows])
 
     def gather(self, messages: Sequence[Any], arrivals: Sequence[int] | None) -> Frames:
-        """Those of python-can's messages that are wanted, as arrays; `arrivals` (ns) None takes the frames' own times.
+        """Return the wanted messages of python-can as arrays; `arrivals` (ns) None takes the frames' own times.
 
         Error and remote frames carry no data and are left out.
         """
@@ -184,7 +183,7 @@ class Decoder:
         )
 
     def decode(self, frames: Frames) -> Events:
-        """The events of frames, in their order; the same for a live frame and for a whole recording."""
+        """Return the events of frames, in their order; the same for live frames and a recording."""
         values = np.empty((frames.plan.size, self._most))
         state = np.empty((frames.plan.size, self._most), np.int8)
         bad = np.zeros(frames.plan.size, np.int8)
@@ -194,14 +193,14 @@ class Decoder:
             for i in np.flatnonzero(fast != frames.plan).tolist():
                 self._by_cantools(frames, i, values, state, bad)
         if bad.any():
-            self._tell(frames, bad)
+            self._report_undecodable(frames, bad)
         batch = self._mapping.events(frames.plan, frames.t, frames.arrival, values, state, bad)
-        if self._silent and len(batch):
-            self._silent = {item for item in self._silent if not _valued(batch, self.width, *item)}
+        if self._unfed and len(batch):
+            self._unfed = {item for item in self._unfed if not _valued(batch, self.width, *item)}
         return batch
 
     def _by_cantools(self, frames: Frames, i: int, values: np.ndarray, state: np.ndarray, bad: np.ndarray) -> None:
-        """Decode one frame of a message with signals that the compiled loop does not know."""
+        """Decode one frame of a message with signals that the compiled loop does not support."""
         message, names = self._messages[frames.plan[i]], self._names[frames.plan[i]]
         data = frames.data[i, : frames.length[i]].tobytes()
         try:
@@ -212,12 +211,12 @@ class Decoder:
         for j, name in enumerate(names):
             value = found.get(name)
             values[i, j] = np.nan if value is None else float(value)
-            missing = ABSENT if self._elsewhere(message, name, found) else SHORT
+            missing = ABSENT if self._excluded(message, name, found) else SHORT
             state[i, j] = missing if value is None else PRESENT
 
     @staticmethod
-    def _elsewhere(message: Any, name: str, found: dict[str, Any]) -> bool:
-        """Whether a multiplexer says that the frame does not carry the signal."""
+    def _excluded(message: Any, name: str, found: dict[str, Any]) -> bool:
+        """Return whether a multiplexer excludes the signal from the frame."""
         signal = message.get_signal_by_name(name)
         while signal.multiplexer_signal is not None:
             selector = found.get(signal.multiplexer_signal)
@@ -226,7 +225,7 @@ class Decoder:
             signal = message.get_signal_by_name(signal.multiplexer_signal)
         return False
 
-    def _tell(self, frames: Frames, bad: np.ndarray) -> None:
+    def _report_undecodable(self, frames: Frames, bad: np.ndarray) -> None:
         for i in np.flatnonzero(bad):
             message = self._messages[frames.plan[i]]
             data = frames.data[i, : frames.length[i]].tobytes().hex()
@@ -240,7 +239,7 @@ class Decoder:
 
 
 def _valued(batch: Events, width: int, kind: int, index: int) -> bool:
-    """Whether a batch has a value for the sensor, input or state `index` in its first `width` columns."""
+    """Return whether a batch has a value of the sensor, input or state `index` in its first `width` columns."""
     rows = batch.kind == kind
     if kind == READING:
         rows = rows & (batch.channel == index)
@@ -248,3 +247,68 @@ def _valued(batch: Events, width: int, kind: int, index: int) -> bool:
     column = index - batch.channel[rows]
     inside = np.flatnonzero((column >= 0) & (column < width))
     return bool(np.isfinite(batch.value[rows][inside, column[inside]]).any())
+
+
+FrameCounts = Mapping[tuple[BusName, int], int]
+"""Data frames by bus and id (EXTENDED added)."""
+
+MAX_NAMED_IDS = 3
+"""Ids, or buses, named in place of a missing one."""
+
+
+class Expected(NamedTuple):
+    """A message that channels need: its name, id (EXTENDED added), bus, and the channels with their signals.
+
+    `period` is its cycle time by the DBC in seconds, 0 if the DBC has none.
+    """
+
+    name: str
+    key: int
+    bus: BusName
+    feeds: Mapping[str, Sequence[str]]
+    period: float
+
+
+def shown_id(key: int) -> str:
+    """Return an id as text: 0x7e8, or 0x18fef100x of an extended frame."""
+    return f"{key & ~EXTENDED:#x}{'x' if key & EXTENDED else ''}"
+
+
+def never_received(item: Expected, seen: FrameCounts) -> str:
+    """Describe a message without a frame, with the nearest match: its id on another bus, near ids, or the buses."""
+    where = "" if item.bus is None else f" on bus {item.bus}"
+    return (
+        f"{item.name} ({shown_id(item.key)}{where}) was never received, so {', '.join(item.feeds)} has no values; "
+        + (_nearest_match(item, seen))
+    )
+
+
+def never_valued(item: Expected, channel: str, count: int) -> str:
+    """Describe a channel without a value although frames of its message were received."""
+    signals = ", ".join(item.feeds[channel])
+    return (
+        f"{channel}: {item.name} ({shown_id(item.key)}) was received {count} times, never with {signals}; check its "
+        "multiplexer in the DBC, and the conditions (where, only) of the channel"
+    )
+
+
+def _nearest_match(item: Expected, seen: FrameCounts) -> str:
+    if not seen:
+        return "no frame was received at all"
+    buses = sorted({bus for bus, _ in seen}, key=str)
+    other = sorted({bus for bus, key in seen if key == item.key}, key=str)
+    if other:
+        return f"its id was received on bus {_list(other)}; check the DBC's channel"
+    if any(key == item.key ^ EXTENDED for _, key in seen):
+        kind = "standard" if item.key & EXTENDED else "extended"
+        return f"its id was received as {kind} one, {shown_id(item.key ^ EXTENDED)}; check the id in the DBC"
+    ids = {key for _, key in seen}
+    near = sorted(ids, key=lambda key: (abs(key - item.key), key))[:MAX_NAMED_IDS]
+    there = f"there are {len(ids)} ids" if len(ids) > 1 else "there is one id"
+    on = f" on bus {_list(buses)}" if buses != [None] else ""
+    return f"{there}{on}, the nearest {', '.join(map(shown_id, near))}; check the DBC"
+
+
+def _list(buses: Sequence[BusName]) -> str:
+    shown = ", ".join("without a name" if bus is None else str(bus) for bus in buses[:MAX_NAMED_IDS])
+    return shown + (", ..." if len(buses) > MAX_NAMED_IDS else "")

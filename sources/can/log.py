@@ -3,30 +3,33 @@
 from __future__ import annotations
 
 import os
+import re
 from collections import Counter
 from collections.abc import Generator, Sequence
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
+
+import can
 
 from estimators.errors import SourceError
 from estimators.log import Events
 
+from ..clock import second_ns
 from ..formats import CAN_LOGS, is_compressed, suffix_of
-from ..reader_process import IsolatedReader
+from ..reader_process import IsolatedReader, read_isolated
 from ..source import NEVER, TRUNCATED, Report, ignore
 from .decoder import Decoder
-from .frames import BusName, Found, Raw, unreadable
-from .readers import open_reader, read_frames
-from .span import log_span
+from .mf4 import mf4_span
+from .readers import BusName, LogSummary, Raw, open_reader, read_frames, unreadable
 
 
 class CanLog:
-    """Reads log files one after the other, as one log.
+    """Source of recorded CAN logs: files read one after the other, as one log.
 
     Args:
         files: Recordings in their order.
-        decoder: What to take from their frames.
-        report: Told of error frames, of files that are damaged, and at the end of messages that were never seen.
+        decoder: Decoder of their frames.
+        report: Receives error frames, damaged files, and at the end messages that were never received.
 
     Raises:
         SourceError: If a file is missing, empty, or of no known format.
@@ -52,7 +55,7 @@ class CanLog:
 
     @cached_property
     def span(self) -> tuple[int, int] | None:
-        """First and last time, ns; None where the format does not tell without being read."""
+        """First and last time, ns; None if the format does not store them."""
         return log_span(self._files)
 
     def _all(self) -> Generator[Events, None, None]:
@@ -74,7 +77,7 @@ class CanLog:
                     batch = self._decoder.decode(self._decoder.frames_of(item))
                     if len(batch):
                         yield batch
-                elif isinstance(item, Found):
+                elif isinstance(item, LogSummary):
                     self._seen.update(item.seen)
                     for _ in range(item.errors):
                         self._report("error frame", f"{path.name}: error frame")
@@ -83,7 +86,7 @@ class CanLog:
                     yield Events.empty(self._decoder.width)
         except SourceError as error:
             if self.frames == before and path == self._files[0]:
-                # What the reader itself raised names the file; what became of the reader does not.
+                # An error of the reader names the file; one of its process does not.
                 raise error if str(path) in str(error) else unreadable(path, error) from None
             fault = str(error).removeprefix(f"{path}: ")
         finally:
@@ -94,21 +97,21 @@ class CanLog:
             self._report(TRUNCATED, f"{path.name}: the file is damaged after {count} frames ({fault})")
 
     def read(self, timeout: float) -> Events | None:
-        """The events of the next frames; none if there are none within `timeout` seconds; None at the end."""
+        """Return the events of the next frames; none if none come within `timeout` seconds; None at the end."""
         self._timeout = timeout
         return next(self._batches, None)
 
     def now(self) -> int | None:
-        """A recording has no clock."""
+        """Return None: a recording has no clock."""
         return None
 
     def close(self) -> None:
-        """Close the file that is open."""
+        """Close the open file."""
         self._batches.close()
 
 
 def check_log(path: Path) -> None:
-    """Refuse at once what could not be read later.
+    """Refuse a file that cannot be read.
 
     Raises:
         SourceError: If the file is missing, empty, or of no known format.
@@ -127,3 +130,51 @@ def check_log(path: Path) -> None:
                 raise SourceError(f"{path}: it cannot be read as MF4; check that it is one")
         return
     open_reader(path).stop()
+
+
+SPAN_TIMEOUT_S = 5.0
+"""Seconds to wait for the span, which only draws a slider."""
+
+TAIL_BYTES = 4096
+"""Bytes at the end of a text log that hold its last lines."""
+
+
+def log_span(files: list[Path]) -> tuple[int, int] | None:
+    """Return first and last time of consecutive logs, ns; None if the format does not store them."""
+    first, last = _span(files[0]), _span(files[-1])
+    return None if first is None or last is None or last[1] < first[0] else (first[0], last[1])
+
+
+def _span(path: Path) -> tuple[int, int] | None:
+    kind = path.suffix.lower()
+    try:
+        if kind == ".mf4":
+            stat = path.stat()
+            return _mf4(path, stat.st_mtime_ns, stat.st_size)
+        if kind == ".blf":
+            with can.BLFReader(path) as reader:
+                span = second_ns(reader.start_timestamp), second_ns(reader.stop_timestamp)
+            # A logger that lost power has not written the end.
+            return span if span[1] > span[0] > 0 else None
+        if kind == ".log":
+            return _candump(path)
+    except (OSError, ValueError, SourceError):
+        # Errors are reported when the file is read.
+        return None
+    return None
+
+
+@lru_cache(maxsize=64)
+def _mf4(path: Path, stamp: int, size: int) -> tuple[int, int] | None:
+    """Return the span of an MF4 file, cached while it is unchanged: a replay reads it again after each seek back."""
+    return next(iter(read_isolated(mf4_span, path, timeout=SPAN_TIMEOUT_S)), None)
+
+
+def _candump(path: Path) -> tuple[int, int] | None:
+    with path.open("rb") as file:
+        head = file.read(TAIL_BYTES)
+        file.seek(max(0, path.stat().st_size - TAIL_BYTES))
+        tail = file.read()
+    stamp = re.compile(rb"^\((\d+\.\d+)\) ", re.MULTILINE)
+    first, last = stamp.search(head), stamp.findall(tail)
+    return (second_ns(float(first[1])), second_ns(float(last[-1]))) if first and last else None

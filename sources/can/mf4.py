@@ -1,12 +1,16 @@
-"""CAN frames of an MF4 recording, whole columns at a time (python-can makes an object of each frame: 30 µs).
+"""CAN frames of an MF4 recording by columns (python-can makes an object of each frame: 30 µs).
 
-It runs in the process that reads the file; see `apart`.
+Runs in the process that reads the file. asammdf stops silently at a record of unknown id, and trusts a group's record
+count; so the bytes of records that the file's blocks declare are compared with those that were read (`lost_records`).
+
+Source: ASAM MDF 4.1, blocks HD, DG, CG, DT, DZ, DL and HL.
 """
 
 from __future__ import annotations
 
 import gc
 import logging
+import struct
 import sys
 from collections import Counter
 from collections.abc import Iterator
@@ -17,13 +21,12 @@ from typing import Any
 
 import numpy as np
 
-from .frames import CHUNK, EXTENDED, BusName, Found, Raw, unreadable
-from .mf4_blocks import lost_records
+from .readers import CHUNK_FRAMES, EXTENDED, BusName, LogSummary, Raw, unreadable
 
 
 @contextmanager
-def _hushed() -> Iterator[None]:
-    """Without the lines that asammdf writes when a half-opened file is let go of."""
+def _quiet() -> Iterator[None]:
+    """Suppress messages of asammdf when a partly opened file is released."""
     logger, hook = logging.getLogger("asammdf"), sys.unraisablehook
     level = logger.level
     logger.setLevel(logging.CRITICAL + 1)
@@ -36,7 +39,7 @@ def _hushed() -> Iterator[None]:
 
 
 def _open(path: Path) -> tuple[Any, BytesIO]:
-    from asammdf import MDF  # Here, not above: it takes long, and most logs are of other formats.
+    from asammdf import MDF  # Here, not above: it takes long, and most logs have other formats.
 
     # From memory: asammdf completes an unfinished file (a logger that lost power) in place.
     content = BytesIO(path.read_bytes())
@@ -46,18 +49,18 @@ def _open(path: Path) -> tuple[Any, BytesIO]:
         raise
     except Exception as error:  # noqa: BLE001  a damaged file makes asammdf raise anything
         fault = unreadable(path, error)
-    # What was half opened complains when it is let go of, so that is done here, where nobody listens.
+    # A partly opened file prints messages when it is released; do that here, where they are suppressed.
     gc.collect()
     raise fault
 
 
-def read_mf4(path: Path, wanted: frozenset[int] | None, longest: int) -> Iterator[Raw | Found]:
-    """The wanted frames of a file in order of time, and at last what was found; see `readers.read_frames`.
+def read_mf4(path: Path, wanted: frozenset[int] | None, longest: int) -> Iterator[Raw | LogSummary]:
+    """Yield the wanted frames of a file in order of time, and its summary; see `readers.read_frames`.
 
     Raises:
         SourceError: If nothing can be read.
     """
-    with _hushed():
+    with _quiet():
         mdf, content = _open(path)
         try:
             yield from _read(path, mdf, content, wanted, longest)
@@ -66,12 +69,12 @@ def read_mf4(path: Path, wanted: frozenset[int] | None, longest: int) -> Iterato
 
 
 def mf4_span(path: Path) -> Iterator[tuple[int, int]]:
-    """First and last time of a file's frames, ns; nothing if it has none.
+    """Yield first and last time of a file's frames, ns; nothing if it has none.
 
     Raises:
         SourceError: If nothing can be read.
     """
-    with _hushed():
+    with _quiet():
         mdf, _ = _open(path)
         try:
             ends = []
@@ -87,11 +90,13 @@ def mf4_span(path: Path) -> Iterator[tuple[int, int]]:
 
 
 def _start(mdf: Any) -> int:
-    """When the file's clock began, ns: start_time knows the zone, abs_time the part of the second."""
+    """Return the start of the file's clock, ns: start_time has the zone, abs_time the fraction of the second."""
     return int(mdf.header.start_time.timestamp() // 1) * 1_000_000_000 + int(mdf.header.abs_time) % 1_000_000_000
 
 
-def _read(path: Path, mdf: Any, content: BytesIO, wanted: frozenset[int] | None, longest: int) -> Iterator[Raw | Found]:
+def _read(
+    path: Path, mdf: Any, content: BytesIO, wanted: frozenset[int] | None, longest: int
+) -> Iterator[Raw | LogSummary]:
     start = _start(mdf)
     parts: list[Raw] = []
     named: list[tuple[np.ndarray, np.ndarray | None]] = []
@@ -116,7 +121,7 @@ def _read(path: Path, mdf: Any, content: BytesIO, wanted: frozenset[int] | None,
             continue
         total += len(signal)
         if len(signal) < cycles:
-            fault = fault or f"{cycles - len(signal)} of {cycles} frames are gone"
+            fault = fault or f"{cycles - len(signal)} of {cycles} frames are missing"
         named.append((keys, buses))
         parts.append(part)
     fault = fault or lost_records(mdf, content.getvalue())
@@ -124,19 +129,19 @@ def _read(path: Path, mdf: Any, content: BytesIO, wanted: frozenset[int] | None,
         yield from _in_order(parts, total)
     elif fault:
         raise unreadable(path, fault)
-    # Counted last: nothing waits for it.
-    yield Found(_counted(named), errors, fault)
+    # Counted last: the frames are needed first.
+    yield LogSummary(_counted(named), errors, fault)
 
 
 def _in_order(parts: list[Raw], total: int) -> Iterator[Raw]:
-    """The frames of all groups in order of time, some thousands at once."""
+    """Yield the frames of all groups in order of time, some thousands at once."""
     buses = tuple(dict.fromkeys(bus for part in parts for bus in part.buses))
     places = [np.array([buses.index(bus) for bus in part.buses], np.int64)[part.bus] for part in parts]
     t, key, length, data = (np.concatenate([part[k] for part in parts]) for k in (0, 1, 3, 4))
     bus = np.concatenate(places)
     order = np.argsort(t, kind="stable")
-    for first in range(0, max(1, t.size), CHUNK):
-        rows = order[first : first + CHUNK]
+    for first in range(0, max(1, t.size), CHUNK_FRAMES):
+        rows = order[first : first + CHUNK_FRAMES]
         yield Raw(t[rows], key[rows], bus[rows], length[rows], data[rows], buses, 0 if first else total)
 
 
@@ -146,7 +151,7 @@ def _field(signal: Any, name: str) -> np.ndarray | None:
 
 
 def _names(signal: Any) -> tuple[np.ndarray, np.ndarray | None]:
-    """Ids of the frames of a group, and their buses if it tells them."""
+    """Return the ids of a group's frames, and their buses if it has them."""
     ids = np.asarray(_field(signal, "ID"), np.int64)
     keys = (ids & 0x1FFFFFFF) | (ids & EXTENDED)
     extended = _field(signal, "IDE")
@@ -176,7 +181,7 @@ def _wanted(
     wanted: frozenset[int] | None,
     longest: int,
 ) -> Raw:
-    """The wanted frames of one group."""
+    """Return the wanted frames of one group."""
     if wanted is None:
         rows = np.arange(keys.size)
     else:
@@ -199,7 +204,89 @@ def _wanted(
             item = np.frombuffer(bytes(given[row]), np.uint8)[:longest]
             data[i, : item.size] = item
     length = np.minimum(np.asarray(_field(signal, "DataLength"), np.int64)[rows], longest)
-    # What is stored after a frame's end is not part of it.
+    # Bytes stored after a frame's end are not part of it.
     data[np.arange(longest) >= length[:, None]] = 0
     t = start + np.round(np.asarray(signal.timestamps, np.float64)[rows] * 1e9).astype(np.int64)
     return Raw(t, keys[rows], places, length, data, names, len(signal))
+
+
+VLSD = 1
+"""Flag of a channel group whose records are of varying length."""
+
+_HEADER = struct.Struct("<4sIQQ")
+
+
+def lost_records(mdf: Any, content: Any) -> str:
+    """Describe the records of an opened file that were not read; empty if there are none.
+
+    Args:
+        mdf: asammdf's file, opened.
+        content: Its bytes, as asammdf completed them.
+    """
+    groups: dict[int, list[Any]] = {}
+    for group in mdf.groups:
+        groups.setdefault(int(group.data_group.address), []).append(group)
+    if mdf.version < "4":
+        return ""
+    lost = kept = records = 0
+    for members in groups.values():
+        data = members[0].data_group
+        if any(group.channel_group.flags & VLSD and _has_data(group) for group in members):
+            continue  # Only the records themselves hold their lengths.
+        try:
+            promised = _size(content, int(data.data_block_addr), set())
+        except (struct.error, ValueError) as error:
+            return f"a block of records cannot be found: {error}"
+        fixed = [group.channel_group for group in members if not group.channel_group.flags & VLSD]
+        head = int(data.record_id_len)
+        sizes = [head + int(item.samples_byte_nr) + int(item.invalidation_bytes_nr) for item in fixed]
+        cycles = [int(item.cycles_nr) for item in fixed]
+        taken = sum(size * count for size, count in zip(sizes, cycles, strict=True))
+        if promised is None:
+            continue
+        kept += taken
+        records += sum(cycles)
+        lost += abs(promised - taken)
+    if not lost:
+        return ""
+    about = f", about {max(1, round(lost * records / kept))} records," if kept else ""
+    return f"{lost} of {kept + lost} bytes of records{about} were not read"
+
+
+def _has_data(group: Any) -> bool:
+    return any(bool(blocks) for blocks in (group.signal_data or ()))
+
+
+def _block(content: Any, address: int) -> tuple[bytes, int, tuple[int, ...]]:
+    """Return a block's name, its length, and the addresses of its links."""
+    name, _, length, links = _HEADER.unpack_from(content, address)
+    if links > len(content) // 8:
+        raise ValueError(f"the block at {address:#x} has {links} links")
+    return name, length, struct.unpack_from(f"<{links}Q", content, address + _HEADER.size)
+
+
+def _size(content: Any, address: int, seen: set[int]) -> int | None:
+    """Return the bytes of records in a data block, or in a list of them; None if they are stored by column."""
+    total = 0
+    waiting = [address]
+    while waiting:
+        address = waiting.pop()
+        if not address:
+            continue
+        if address in seen:
+            raise ValueError(f"the block at {address:#x} is linked to twice")
+        seen.add(address)
+        name, length, links = _block(content, address)
+        if name == b"##DT":
+            total += length - _HEADER.size
+        elif name == b"##DZ":
+            total += struct.unpack_from("<Q", content, address + _HEADER.size + 8)[0]
+        elif name == b"##HL":
+            waiting += links[:1]
+        elif name == b"##DL":
+            waiting += links
+        elif name in (b"##DV", b"##LD"):
+            return None
+        else:
+            raise ValueError(f"there is no block of data at {address:#x}")
+    return total

@@ -1,7 +1,8 @@
-"""Plays a simulated asset on a CAN bus, in real time, as an asset of its own would speak."""
+"""Send the events of a simulated asset as CAN frames, in real time."""
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -10,35 +11,36 @@ from typing import Any
 
 import can
 
+from estimators.errors import SourceError
 from estimators.log import INPUT, READING, TRUTH, Events
 
 from ..source import Channel, Report, Source, ignore
+from ..units import conversion
 from .bus import open_bus
-from .databases import BusName
-from .encoder import Encoder
+from .databases import BusName, find_messages
 
-REPEAT = 1_000_000_000
-"""ns after which inputs are said again."""
+INPUT_REPEAT_NS = 1_000_000_000
+"""ns after which an unchanged input is sent again."""
 
-LATE = 1_000_000_000
-"""ns of lateness (the process was suspended) that are skipped, not made up for with a burst of frames."""
+MAX_DELAY_NS = 1_000_000_000
+"""ns of delay (the process was suspended) beyond which time is skipped instead of sending a burst of frames."""
 
 
 class Player:
-    """Sends what a simulator says as DBC-encoded frames, each when its time has come.
+    """Sends the events of a simulator as DBC-encoded frames, each at its arrival time.
 
-    Use `run` in a process of its own, or `start` for a thread beside the listener.
+    Use `run` in a process of its own, or `start` for a thread.
 
     Args:
-        source: What the asset says, each event when it arrives; it is used up.
-        databases: Database files, each with its bus (which matters to listeners only).
-        channels: The twin's own channels, read backwards; true states go out too where a message has them.
-        interface: python-can's name.
-        channel: The bus, as the interface names it.
+        source: The simulator, read to its end.
+        databases: Database files, each with its bus, which is ignored.
+        channels: The twin's own channels; true states are sent too if a message has them.
+        interface: Interface of python-can.
+        channel: Channel of the interface.
         bus_options: Further arguments of the interface.
-        report: Told of frames that could not be sent.
-        connect: Opens the bus; for tests.
-        clock: Monotonic time, ns; for tests.
+        report: Receives frames that could not be sent.
+        connect: Opens the bus, for tests.
+        clock: Monotonic time, ns, for tests.
 
     Raises:
         SourceError: If the bus cannot be opened or a channel cannot be encoded.
@@ -71,27 +73,27 @@ class Player:
         self.sent = 0
         """Frames sent so far."""
         self.listeners: list[Callable[[can.Message], object]] = []
-        """Called with every frame that was sent, with the wall clock's time; a `can.Logger`, for example."""
+        """Called with every sent frame, whose timestamp is the wall clock; a `can.Logger`, for example."""
 
     @property
     def finished(self) -> bool:
-        """Whether `start` was called and all has been played."""
+        """Whether a started player has reached the end."""
         return self._thread is not None and not self._thread.is_alive()
 
     def start(self) -> None:
-        """Play in a thread until `close`, or until the simulation ends."""
+        """Send in a thread until `close`, or until the simulation ends."""
         self._thread = threading.Thread(target=self.run, name="asset", daemon=True)
         self._thread.start()
 
     def close(self) -> None:
-        """Stop playing and leave the bus."""
+        """Stop sending and close the bus."""
         self._stop.set()
         if self._thread is not None:
             self._thread.join(timeout=2.0)
         self._bus.shutdown()
 
     def run(self) -> None:
-        """Play here until the simulation ends or another thread calls `close`."""
+        """Send until the simulation ends or another thread calls `close`."""
         begun = self._clock()
         while not self._stop.is_set():
             batch = self._source.read(0.0)
@@ -101,13 +103,13 @@ class Player:
                 wait = begun + t - self._clock()
                 if wait > 0 and self._stop.wait(wait * 1e-9):
                     return
-                if wait < -LATE:
-                    self._report("asset late", f"CAN bus {self._name}: the asset was held up for {-wait * 1e-9:.1f} s")
+                if wait < -MAX_DELAY_NS:
+                    self._report("asset late", f"CAN bus {self._name}: the asset was delayed by {-wait * 1e-9:.1f} s")
                     begun -= wait
-                self._say(t, events)
+                self._send(t, events)
 
     def _moments(self, batch: Events) -> list[tuple[int, list[tuple[int, int, Sequence[float]]]]]:
-        """The events of a batch by the time of their arrival; every input and every true state is one by itself."""
+        """Return the events of a batch by arrival time; every input and every true state is an event of its own."""
         moments: list[tuple[int, list[tuple[int, int, Sequence[float]]]]] = []
         columns = (batch.arrival.tolist(), batch.kind.tolist(), batch.channel.tolist(), batch.value.tolist())
         for t, kind, channel, value in zip(*columns, strict=True):
@@ -123,8 +125,8 @@ class Player:
                 events.append((READING, channel, value))
         return moments
 
-    def _say(self, t: int, events: list[tuple[int, int, Sequence[float]]]) -> None:
-        for frame in self._encoder.frames(t, events, REPEAT):
+    def _send(self, t: int, events: list[tuple[int, int, Sequence[float]]]) -> None:
+        for frame in self._encoder.frames(t, events, INPUT_REPEAT_NS):
             try:
                 frame.timestamp = time.time()
                 self._bus.send(frame)
@@ -134,3 +136,133 @@ class Player:
             self.sent += 1
             for listener in self.listeners:
                 listener(frame)
+
+
+class _Frame:
+    """A message and its current values."""
+
+    def __init__(self, message: Any) -> None:
+        self.message = message
+        self.values: dict[str, float] = {}
+        for signal in message.signals:
+            low, high = _range(signal)
+            start = signal.initial if isinstance(signal.initial, (int, float)) else 0.0
+            self.values[signal.name] = min(max(float(start), low), high)
+        self.known: set[str] = set()
+        self.wanted: set[str] = set()
+        self.lost = False
+        self.reads = False
+        self.sent_at: int | None = None
+
+    def frame(self) -> can.Message:
+        """Return the message as a frame with its current values."""
+        data = self.message.encode(self.values, strict=False)
+        return can.Message(
+            arbitration_id=self.message.frame_id,
+            is_extended_id=self.message.is_extended_frame,
+            is_fd=bool(getattr(self.message, "is_fd", False)) or len(data) > 8,
+            data=data,
+            check=True,
+        )
+
+
+def _range(signal: Any) -> tuple[float, float]:
+    """Return the range of a signal: that of its bits, within the one that the DBC declares."""
+    if signal.is_float:
+        bits = (-math.inf, math.inf)
+    else:
+        top = 2 ** (signal.length - 1) if signal.is_signed else 2**signal.length
+        raw = (-top if signal.is_signed else 0, top - 1)
+        bits = tuple(sorted(r * signal.conversion.scale + signal.conversion.offset for r in raw))
+    low, high = signal.minimum, signal.maximum
+    if low is None or high is None or not low < high:
+        return bits
+    return max(bits[0], float(low)), min(bits[1], float(high))
+
+
+class Encoder:
+    """Encodes the events of a simulated asset as frames.
+
+    A message is sent with each event of its channels and the last values of the others; one that carries measurements
+    only with a new measurement, so that an old one is not repeated. If a measurement is lost, the frame is lost. Values
+    beyond the range of a signal are clipped.
+
+    Raises:
+        SourceError: If a message or signal is missing, a unit does not convert, or a channel cannot be encoded.
+    """
+
+    def __init__(self, databases: Sequence[tuple[Path, BusName]], channels: Iterable[Channel]) -> None:
+        self._frames: dict[str, _Frame] = {}
+        # By an event's kind and index: its frame and, for each row, signal, slope, offset and range of the conversion.
+        self._routes: dict[tuple[int, int], tuple[_Frame, list[tuple[str, float, float, float, float]]]] = {}
+        found = [(Path(path), bus) for path, bus in databases]
+        for channel in channels:
+            if channel.convert is not None:
+                raise SourceError(
+                    f"{channel.name}: convert is {channel.convert}; it cannot be encoded, so leave it out"
+                )
+            if channel.only:
+                raise SourceError(f"{channel.name}: only picks frames; it cannot be encoded, so leave it out")
+            if channel.accuracy is not None:
+                raise SourceError(
+                    f"{channel.name}: accuracy comes from the asset; it cannot be encoded, so leave it out"
+                )
+            messages, _, path = find_messages(found, channel)
+            message = messages[0]
+            if any(signal.multiplexer_ids for signal in message.signals):
+                raise SourceError(f"{path.name}: message {message.name} is multiplexed; it cannot be encoded")
+            frame = self._frames.setdefault(message.name, _Frame(message))
+            frame.reads = frame.reads or channel.kind == READING
+            rows = []
+            for k, name in enumerate(channel.signals):
+                signal = message.get_signal_by_name(name)
+                where = f"{channel.name}: {name}"
+                factor, shift = conversion(channel.units[k] or signal.unit, channel.model_units[k], where)
+                slope = channel.scale[k] * factor
+                if slope == 0.0:
+                    raise SourceError(f"{where}: scale is 0; it must differ from 0")
+                rows.append((name, slope, channel.scale[k] * shift + channel.offset[k], *_range(signal)))
+                frame.wanted.add(name)
+            for condition in channel.where:
+                signal = message.get_signal_by_name(condition.signal)
+                low, high = _range(signal)
+                frame.values[condition.signal] = min(max(0.0, condition.low, low), condition.high, high)
+            self._routes[channel.kind, channel.index] = (frame, rows)
+
+    def set(self, kind: int, index: int, values: Sequence[float]) -> _Frame | None:
+        """Put an event's values into its message, and return the message, if there is one."""
+        route = self._routes.get((kind, index))
+        if route is None:
+            return None
+        frame, rows = route
+        for (name, slope, shift, low, high), value in zip(rows, values, strict=False):
+            if math.isnan(value):
+                frame.lost = frame.lost or kind != INPUT  # an input that is NaN keeps its value
+            else:
+                frame.values[name] = min(max((value - shift) / slope, low), high)
+                frame.known.add(name)
+        return frame
+
+    def frames(self, t: int, events: Sequence[tuple[int, int, Sequence[float]]], repeat: int) -> list[can.Message]:
+        """Return the frames of the events of one time: (kind, index, values), inputs and true states one by one.
+
+        Args:
+            t: Time of the events, ns.
+            events: The events.
+            repeat: ns after which an unchanged input is sent again, for listeners that joined later.
+        """
+        touched: dict[int, _Frame] = {}
+        for kind, index, values in events:
+            frame = self.set(kind, index, values)
+            if frame is not None and (kind == READING or not frame.reads):
+                touched[id(frame)] = frame
+        for (kind, _), (frame, _) in self._routes.items():
+            if kind == INPUT and not frame.reads and (frame.sent_at is None or t - frame.sent_at >= repeat):
+                touched[id(frame)] = frame
+        out = []
+        for frame in touched.values():
+            if not frame.lost and frame.wanted <= frame.known:
+                out.append(frame.frame())
+                frame.sent_at = t
+            frame.lost = False
+        return out

@@ -1,4 +1,4 @@
-"""Reads the frames of a CAN log of any format: what runs in the process that reads the file."""
+"""Read the frames of a CAN log of any format as columns; runs in the process that reads the file."""
 
 from __future__ import annotations
 
@@ -9,28 +9,29 @@ from collections.abc import Iterator
 from contextlib import suppress
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from estimators.errors import SourceError
+
 from ..clock import second_ns
 from ..formats import suffix_of
-from .frames import CHUNK, EXTENDED, BusName, Found, Raw, unreadable
 
-FIRST_CHUNK = 256
-"""Frames read before the first are given, so that they come at once."""
+FIRST_CHUNK_FRAMES = 256
+"""Frames of the first chunk, so that it arrives at once."""
 
-FARTHEST = 2.0**62 / 1e9
-"""Seconds from 1970 that a time may lie; beyond, it is none."""
+MAX_TIME_S = 2.0**62 / 1e9
+"""Distance of a valid time from 1970, s."""
 
 
-def read_frames(path: Path, wanted: frozenset[int] | None, longest: int) -> Iterator[Raw | Found]:
-    """Frames of a log in their order, and at last what was found.
+def read_frames(path: Path, wanted: frozenset[int] | None, longest: int) -> Iterator[Raw | LogSummary]:
+    """Yield the frames of a log in their order, and at last its summary.
 
     Args:
         path: The log.
-        wanted: Ids of the frames to give, EXTENDED added; None is all.
-        longest: Bytes of a frame to give.
+        wanted: Ids of the wanted frames, EXTENDED added; None is all.
+        longest: Bytes of a frame to return.
 
     Raises:
         SourceError: If nothing can be read.
@@ -43,10 +44,10 @@ def read_frames(path: Path, wanted: frozenset[int] | None, longest: int) -> Iter
 
 
 def open_reader(path: Path) -> Any:
-    """python-can's reader of a file.
+    """Open a file with the reader of python-can.
 
     Raises:
-        SourceError: If it is not of the format that its name says.
+        SourceError: If it is not of the format of its name.
     """
     import can
 
@@ -56,7 +57,7 @@ def open_reader(path: Path) -> Any:
         raise unreadable(path, error) from None
 
 
-def _read_messages(path: Path, wanted: frozenset[int] | None, longest: int) -> Iterator[Raw | Found]:
+def _read_messages(path: Path, wanted: frozenset[int] | None, longest: int) -> Iterator[Raw | LogSummary]:
     reader = open_reader(path)
     seen: Counter[tuple[BusName, int]] = Counter()
     buses: dict[BusName, int] = {}
@@ -64,11 +65,11 @@ def _read_messages(path: Path, wanted: frozenset[int] | None, longest: int) -> I
     fault = ""
     try:
         messages = iter(reader)
-        size = FIRST_CHUNK
+        size = FIRST_CHUNK_FRAMES
         while True:
             chunk: list[Any] = []
             try:
-                # One by one into the list, so that what came before the fault is kept.
+                # One by one, so that frames before the fault are kept.
                 for message in islice(messages, size):
                     chunk.append(message)
             except Exception as error:  # noqa: BLE001  as above
@@ -80,17 +81,17 @@ def _read_messages(path: Path, wanted: frozenset[int] | None, longest: int) -> I
             yield raw
             if fault or len(chunk) < size:
                 break
-            size = CHUNK
+            size = CHUNK_FRAMES
         fault = fault or _missing_end(path, reader)
         if broken:
             fault = fault or f"{broken} frames hold no numbers"
     finally:
-        # SQLite lets only the thread that opened a file close it; else it is closed with its last reference.
+        # SQLite lets only the opening thread close a file; otherwise it is closed with its last reference.
         with suppress(sqlite3.ProgrammingError):
             reader.stop()
     if fault and not count:
         raise unreadable(path, fault)
-    yield Found(dict(seen), errors, fault)
+    yield LogSummary(dict(seen), errors, fault)
 
 
 def _columns(
@@ -100,14 +101,14 @@ def _columns(
     buses: dict[BusName, int],
     seen: Counter[tuple[BusName, int]],
 ) -> tuple[Raw, int]:
-    """python-can's messages as columns, and how many are damaged; error and remote frames carry no data."""
+    """Return the messages of python-can as columns, and how many are damaged; error and remote frames have no data."""
     t, keys, places, length, chunks = [], [], [], [], []
     broken = 0
     for message in messages:
         if message.is_error_frame or message.is_remote_frame:
             continue
         try:
-            # A damaged database holds numbers of other kinds, or none.
+            # A damaged database holds other types.
             key = int(message.arbitration_id) & 0x1FFFFFFF
             if message.is_extended_id:
                 key |= EXTENDED
@@ -115,7 +116,7 @@ def _columns(
             seen[bus, key] += 1
             if wanted is not None and key not in wanted:
                 continue
-            if not abs(message.timestamp) <= FARTHEST:
+            if not abs(message.timestamp) <= MAX_TIME_S:
                 raise ValueError("no time")
             time, data = second_ns(message.timestamp), bytes(message.data[:longest])
         except (TypeError, ValueError, OverflowError):
@@ -139,14 +140,14 @@ def _columns(
 
 
 def _missing_end(path: Path, reader: Any) -> str:
-    """Why a file that was read without a fault is not whole, or nothing."""
+    """Return why a file that was read without a fault is incomplete, or an empty text."""
     import can
 
     if isinstance(reader, can.BLFReader):
         size = path.stat().st_size
         return f"{size} of {reader.file_size} bytes are there" if reader.file_size > size else ""
     if path.suffix.lower() == ".db":
-        # SQLite takes what a cut last page lacks for zeros, and gives rows of them without a word.
+        # SQLite silently reads the missing part of a cut last page as zeros.
         with path.open("rb") as file:
             header = file.read(100)
         page, pages = int.from_bytes(header[16:18], "big"), int.from_bytes(header[28:32], "big")
@@ -155,5 +156,44 @@ def _missing_end(path: Path, reader: Any) -> str:
     if path.suffix.lower() in (".asc", ".csv", ".log", ".trc"):
         with path.open("rb") as file:
             file.seek(-1, os.SEEK_END)
-            return "" if file.read(1) in (b"\n", b"\r") else "its last line has no end"
+            return "" if file.read(1) in (b"\n", b"\r") else "its last line is incomplete"
     return ""
+
+
+EXTENDED = 1 << 31
+"""Added to the arbitration id of an extended frame, so that one number identifies it."""
+
+CHUNK_FRAMES = 8192
+"""Frames of a chunk."""
+
+BusName = int | str | None
+
+
+class Raw(NamedTuple):
+    """Frames of a log, not decoded.
+
+    Columns of one length n: times (ns), ids (EXTENDED added to extended ones), positions of their buses in `buses`,
+    lengths, and bytes (n, longest). `total` counts all frames read for them, wanted or not.
+    """
+
+    t: np.ndarray
+    key: np.ndarray
+    bus: np.ndarray
+    length: np.ndarray
+    data: np.ndarray
+    buses: tuple[BusName, ...]
+    total: int
+
+
+class LogSummary(NamedTuple):
+    """Summary after a file's last frames: data frames by bus and id, error frames, and damage."""
+
+    seen: dict[tuple[BusName, int], int]
+    errors: int
+    fault: str
+
+
+def unreadable(path: Path, reason: object) -> SourceError:
+    """Return the error of a file of which nothing can be read."""
+    gist = " ".join(str(reason).split())[:160] or type(reason).__name__
+    return SourceError(f"{path}: it cannot be read as {suffix_of(path)[1:].upper()} ({gist}); check that it is one")

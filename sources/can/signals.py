@@ -1,6 +1,6 @@
-"""Bits to numbers: the signals of CAN messages as tables, and the compiled loop that reads them.
+"""Signals of CAN messages as tables, and the compiled loop that extracts their values from frames.
 
-A live bus gives a few frames at a time and a recording thousands; one compiled loop serves both.
+The same loop serves a live bus, a few frames at a time, and recordings, thousands at a time.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ extract_signature = types.void(
 
 @jit
 def _bits(data: Any, i: int, start: int, length: int, big: bool) -> Any:
-    """`length` bits of frame i as an unsigned integer."""
+    """Return `length` bits of frame i as an unsigned integer."""
     raw = np.uint64(0)
     got = 0
     position = start
@@ -69,7 +69,7 @@ def _bits(data: Any, i: int, start: int, length: int, big: bool) -> Any:
 
 @jit
 def extract(signals, plan, length, data, values, state, bad):
-    """Physical values of every signal of every frame.
+    """Compute the physical values of every signal of every frame.
 
     Args:
         signals: The tables.
@@ -142,27 +142,27 @@ def extract(signals, plan, length, data, values, state, bad):
 
 
 def _network_start(signal: Any) -> int:
-    """Bits from the front of the frame to the signal's first one, in the order in which its bytes are read."""
+    """Return the number of bits before the signal's first one, in the order in which its bytes are read."""
     if signal.byte_order == "little_endian":
         return int(signal.start)
     return 8 * (int(signal.start) // 8) + (7 - int(signal.start) % 8)
 
 
 def vectorises(signal: Any) -> bool:
-    """Whether `extract` gives exactly what cantools gives: else cantools decodes the message, frame by frame."""
+    """Return whether `extract` gives the values of cantools; otherwise cantools decodes the message, frame by frame."""
     conversion = signal.conversion
     whole = float(conversion.scale).is_integer() and float(conversion.offset).is_integer()
     if signal.is_float:
         return signal.length in (32, 64)
     if signal.length > 64:
         return False
-    # cantools keeps integers whole, and these may be longer than a float can hold.
+    # cantools keeps integers exact, which may have more digits than a float.
     identity = conversion.scale == 1 and conversion.offset == 0
     return identity or not whole or signal.length + int(abs(conversion.scale)).bit_length() <= 52
 
 
 def ordered(message: Any, names: tuple[str, ...]) -> list[Any]:
-    """The signals called `names` and the multiplexers above them, each multiplexer before what it selects."""
+    """Return the signals of these names and their multiplexers, each multiplexer before the signals that it selects."""
     by_name = {signal.name: signal for signal in message.signals}
     found: dict[str, Any] = {}
 
@@ -178,7 +178,7 @@ def ordered(message: Any, names: tuple[str, ...]) -> list[Any]:
 
 
 def tabulate(messages: list[tuple[Any, list[Any]]]) -> Signals:
-    """The tables of messages (cantools) and the signals of each that are wanted, in the order of `ordered`."""
+    """Return the tables of messages (cantools) and their wanted signals, in the order of `ordered`."""
     first, ids_first, known_first = [0], [0], [0]
     columns: list[list[Any]] = [[] for _ in range(9)]
     start, length, big, kind, scale, offset, parent, ids, known = columns

@@ -12,7 +12,7 @@ from estimators.errors import SourceError, nearest
 from estimators.log import Events
 
 from ..formats import suffix_of
-from ..mapping import ABSENT, PRESENT, Mapping
+from ..mapping import ABSENT, PRESENT, ChannelMapping
 from ..source import NEVER, TRUNCATED, Channel, Report, ignore
 from .order import Order
 from .rows import UNITS, Rows, is_text, names_of, rows_of
@@ -70,7 +70,9 @@ class Table:
         self._valued: set[str] = set()
         self._count = 0
         self._timeout = 0.0
-        self._mapping = Mapping([(channels, self._columns, [None] * len(self._columns))], width=width, report=report)
+        self._mapping = ChannelMapping(
+            [(channels, self._columns, [None] * len(self._columns))], width=width, report=report
+        )
         self._order = Order(time_column, time_unit, None if horizon is None else round(horizon * 1e9), report)
         self._batches = self._all()
 

@@ -13,7 +13,7 @@ from estimators.diagnostics.episodes import episodes
 from estimators.errors import ModelError
 from estimators.fold import Fold, fold
 from estimators.log import READING, Events, Log
-from estimators.model.limits import NOISES, Limits, Stuck
+from estimators.model.sensor import RATE_NOISE_STDS, Limits, Stuck
 from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
 from estimators.models import MODELS
 from estimators.track import DUPLICATE, MISSING, RANGE, RATE, REPEATED, SATURATED, SCREENED, SUSPECT, USED
@@ -86,7 +86,7 @@ def plain_screen(limits: list[Limits | None], rows: list[tuple[int, int, tuple[f
                     kept = [m for m in before if rows[m][2][k] == rows[m][2][k] and verdicts[m][k] == 0]
                     if kept:
                         seconds = (t - rows[kept[-1]][0]) * BEAT * 1e-9
-                        most = entry(own.rate, k) * seconds + NOISES * 0.25
+                        most = entry(own.rate, k) * seconds + RATE_NOISE_STDS * 0.25
                         bits |= RATE if abs(value - rows[kept[-1]][2][k]) > most else 0
                 if own.stuck and repeats(own.stuck, k, t, value, [rows[m] for m in before]):
                     bits |= REPEATED

@@ -210,13 +210,13 @@ def test_what_never_comes_is_named_with_what_does(tmp_path, messages):  # noqa: 
     assert texts([engine, sensor(1, "FIX", "Lat")]) == [
         (
             "never seen",
-            "a.log: FIX (0x102) never came, so sensor1 gets nothing; there are 2 ids on bus can0, the nearest 0x100, "
-            "0x12c; check the DBC",
+            "a.log: FIX (0x102) was never received, so sensor1 has no values; there are 2 ids on bus can0, the nearest "
+            "0x100, 0x12c; check the DBC",
         )
     ]
     [(_, text)] = texts([engine], bus=2)
     assert text == (
-        "a.log: ENGINE (0x100 on bus 2) never came, so sensor0 gets nothing; that id came on bus can0; "
+        "a.log: ENGINE (0x100 on bus 2) was never received, so sensor0 has no values; its id was received on bus can0; "
         "check the DBC's channel"
     )
 
@@ -230,7 +230,7 @@ def test_a_signal_that_a_message_never_carries_is_named(tmp_path):
     channels = [sensor(0, "MUX", "Speed"), sensor(1, "MUX", "Revs")]
     read_all(CanLog([path], Decoder([(dbc(tmp_path), None)], channels, width=1), report=reports))
     assert reports.counts == {"never seen": 1}
-    assert reports.texts["never seen"].startswith("a.log: sensor1: MUX (0x103) came 30 times and never gave Revs;")
+    assert reports.texts["never seen"].startswith("a.log: sensor1: MUX (0x103) was received 30 times, never with Revs;")
 
 
 @pytest.mark.parametrize("ending", [".csv", ".parquet"])

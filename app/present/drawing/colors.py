@@ -12,8 +12,8 @@ from typing import NamedTuple
 import numpy as np
 
 from estimators.diagnostics.field_pictures import Picture, plane_shape, reduction
-from estimators.model.field import Field
 from estimators.model.state_space import StateSpaceModel
+from estimators.model.states import Field
 
 RGB = tuple[int, int, int]
 

@@ -21,7 +21,7 @@ from estimators.fit.objective import Cancelled, Objective, maximise
 from estimators.fit.recording import Recording, without_queries
 from estimators.fold import Fold
 from estimators.log import READING, Log
-from estimators.model.coloured import Lasting, coloured, disturbance_time, error_time, errors_of
+from estimators.model.coloured import ColouredError, coloured, disturbance_time, error_time, errors_of
 from estimators.model.state_space import StateSpaceModel
 from estimators.tuning import Tuning
 
@@ -180,7 +180,7 @@ def _can(model: StateSpaceModel, one: Appended) -> bool:
 
 def _model(model: StateSpaceModel, appended: tuple[Appended, ...]) -> StateSpaceModel:
     noises = {each.noise: each.over for each in appended if each.noise is not None}
-    errors = {each.sensor: Lasting((each.variance,), each.over) for each in appended if each.sensor is not None}
+    errors = {each.sensor: ColouredError((each.variance,), each.over) for each in appended if each.sensor is not None}
     return coloured(model, noises, errors)
 
 

@@ -96,8 +96,8 @@ def test_a_time_may_have_a_unit(given: str, seconds: float) -> None:
         (
             "variance: 0.5",
             "variance: 0",
-            "motor.yaml:3: noise.temperature.over: model motor_winding: noise temperature has variance 0, and an error "
-            "of nothing cannot last",
+            "motor.yaml:3: noise.temperature.over: model motor_winding: noise temperature has variance 0, so it "
+            "cannot have a correlation time",
         ),
         ("{std: 2, over: 5 min}", "{std: 2}", "motor.yaml:6: sensors.winding.error.over is missing; add it"),
         (
@@ -116,7 +116,7 @@ def test_what_cannot_last_is_one_line_with_its_place(old: str, new: str, words: 
 def test_a_field_has_no_lasting_error() -> None:
     field = "model: thermal_field\nnoise: {temperature: {std: 1, over: 9}}\nsource: {type: simulator}\n"
     assert refused(field) == (
-        "motor.yaml:2: noise.temperature.over: model thermal_field is a field, whose errors cannot be given a "
+        "motor.yaml:2: noise.temperature.over: model thermal_field is a field, whose noise cannot have a "
         "correlation time"
     )
 

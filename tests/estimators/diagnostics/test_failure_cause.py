@@ -10,7 +10,7 @@ from estimators.diagnostics.failure_cause import failures
 from estimators.fold import Fold
 from estimators.fold_failures import cause_of
 from estimators.log import INPUT, READING, TICK, Events, Log
-from estimators.model.joint import Unknown, joint
+from estimators.model.joint import JointParameter, joint
 from estimators.model.state_space import Input, Noise, Parameter, Row, Sensor, State, StateSpaceModel
 from estimators.track import FAILED
 from estimators.tuning import Tuning
@@ -141,7 +141,7 @@ def test_the_inputs_that_held_are_taken():
 @pytest.mark.parametrize(("changes", "culprit"), [({"f": root_step}, root_step), ({"Q": shrinking}, shrinking)])
 def test_the_models_own_function_is_named_where_a_parameter_is_estimated(changes, culprit):
     gain = Parameter("gain", "1", 1.0)
-    growing = driven(joint(walk(parameters=(gain,), **changes), {"gain": Unknown(0.1, 0.0)}))
+    growing = driven(joint(walk(parameters=(gain,), **changes), {"gain": JointParameter(0.1, 0.0)}))
     line = cause_of(growing, int(failures(growing.track)[0]))
     assert f"test_failure_cause.py:{culprit.__code__.co_firstlineno}: model walk: " in line
 

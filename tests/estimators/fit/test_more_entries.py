@@ -9,7 +9,7 @@ from estimators.fit.entries import entries_of
 from estimators.fit.fit import fit
 from estimators.fit.objective import Objective, maximise, search
 from estimators.fit.recording import Recording
-from estimators.model.coloured import Lasting, coloured
+from estimators.model.coloured import ColouredError, coloured
 from estimators.tuning import Tuning
 from tests.estimators.fit.test_fit import DECADES, MODEL, log_of, simulated
 
@@ -70,7 +70,7 @@ def test_the_prior_is_found_from_many_starts():
 
 
 def test_how_long_errors_last_is_a_group():
-    lasting = coloured(MODEL, {"level": 20.0}, {"float": Lasting((0.3,), 5.0)})
+    lasting = coloured(MODEL, {"level": 20.0}, {"float": ColouredError((0.3,), 5.0)})
     log = log_of(simulated(5, 50))
     keys = [item.key for item in entries_of("kf", Tuning.of(lasting), [log], ["over"])[0]]
     assert keys == ["p.level_disturbance_time", "p.float_error_time"]

@@ -13,8 +13,8 @@ from estimators.compiled.model import compile_model
 from estimators.errors import ModelError
 from estimators.fold import fold
 from estimators.log import READING, Events, Log
-from estimators.model.coloured import Lasting, channels, coloured
-from estimators.model.joint import Unknown, joint
+from estimators.model.coloured import ColouredError, channels, coloured
+from estimators.model.joint import JointParameter, joint
 from estimators.model.state_space import Noise, Parameter, Row, Sensor, State, StateSpaceModel
 from estimators.models import MODELS
 from estimators.registry import find_estimator
@@ -112,7 +112,7 @@ def agree(estimator, model, level, readings, times):
 def test_both_kinds_of_lasting_error_are_the_regression_on_their_covariance(estimator):
     times = np.cumsum(STEPS)
     level = STD**2 + wandered(times)
-    model = coloured(WALK, {"level": TAU}, {"gauge": Lasting((ERROR**2,), ERROR_TIME)})
+    model = coloured(WALK, {"level": TAU}, {"gauge": ColouredError((ERROR**2,), ERROR_TIME)})
     assert model.linear and model.state_names == ("level", "level_disturbance", "gauge_error")
     agree(estimator, model, level, level + lasted(times) + R * np.eye(len(times)), times)
 
@@ -123,7 +123,7 @@ def test_a_disturbance_alone_and_an_error_alone(estimator):
     level, noise = STD**2 + wandered(times), R * np.eye(len(times))
     agree(estimator, coloured(WALK, {"level": TAU}), level, level + noise, times)
     level = STD**2 + Q * np.minimum(times[:, None], times[None, :])
-    error = {"gauge": Lasting((ERROR**2,), ERROR_TIME)}
+    error = {"gauge": ColouredError((ERROR**2,), ERROR_TIME)}
     agree(estimator, coloured(WALK, errors=error), level, level + lasted(times) + noise, times)
 
 
@@ -132,7 +132,7 @@ def test_derivatives_of_the_models_own_are_carried_along(estimator):
     times = np.cumsum(STEPS)
     level = STD**2 + wandered(times)
     own = replace(WALK, F=slope_of_stay, sensors=(replace(WALK.sensors[0], H=slope_of_told),))
-    model = coloured(own, {"level": TAU}, {"gauge": Lasting((ERROR**2,), ERROR_TIME)})
+    model = coloured(own, {"level": TAU}, {"gauge": ColouredError((ERROR**2,), ERROR_TIME)})
     assert model.F is not None and model.sensors[0].H is not None
     agree(estimator, model, level, level + lasted(times) + R * np.eye(len(times)), times)
 
@@ -164,7 +164,7 @@ def discrete(model, dt):
 
 @pytest.mark.parametrize("a", [1e-7, 1e-4, 0.0499, 0.0501, 1.0, 3.0])
 def test_a_step_is_that_of_the_exponential_of_a_matrix(a):
-    model = coloured(WALK, {"level": TAU}, {"gauge": Lasting((ERROR**2,), ERROR_TIME)})
+    model = coloured(WALK, {"level": TAU}, {"gauge": ColouredError((ERROR**2,), ERROR_TIME)})
     dt = a * TAU
     A = np.array([[0.0, 1.0, 0.0], [0.0, -1.0 / TAU, 0.0], [0.0, 0.0, -1.0 / ERROR_TIME]])
     G = np.diag([0.0, Q / TAU**2, 2.0 * ERROR**2 / ERROR_TIME])
@@ -179,7 +179,7 @@ def test_a_step_is_that_of_the_exponential_of_a_matrix(a):
 @pytest.mark.parametrize("dt", [0.01, 3.0, 900.0])
 @pytest.mark.parametrize("parts", [2, 7, 1000])
 def test_a_step_is_as_many_shorter_ones(parts, dt):
-    model = coloured(WALK, {"level": TAU}, {"gauge": Lasting((ERROR**2,), ERROR_TIME)})
+    model = coloured(WALK, {"level": TAU}, {"gauge": ColouredError((ERROR**2,), ERROR_TIME)})
     F, noise = discrete(model, dt)
     G, more = discrete(model, dt / parts)
     together, spread = np.eye(3), np.zeros((3, 3))
@@ -191,7 +191,7 @@ def test_a_step_is_as_many_shorter_ones(parts, dt):
 
 
 def test_it_begins_in_its_steady_state_which_a_step_keeps():
-    model = coloured(WALK, {"level": TAU}, {"gauge": Lasting((ERROR**2,), ERROR_TIME)})
+    model = coloured(WALK, {"level": TAU}, {"gauge": ColouredError((ERROR**2,), ERROR_TIME)})
     spread = np.diag(model.prior_std**2)[1:, 1:]
     assert spread[0, 0] == pytest.approx(0.5 * Q / TAU) and spread[1, 1] == pytest.approx(ERROR**2)
     F, noise = discrete(model, 2.5)
@@ -199,7 +199,7 @@ def test_it_begins_in_its_steady_state_which_a_step_keeps():
 
 
 def test_statsmodels_finds_the_same_likelihood():
-    error = {"gauge": Lasting((ERROR**2,), ERROR_TIME)}
+    error = {"gauge": ColouredError((ERROR**2,), ERROR_TIME)}
     model = coloured(WALK, errors=error)
     y = 1.0 + np.cumsum(np.random.default_rng(1).normal(0.0, 0.7, 200))
     kept = np.exp(-1.0 / ERROR_TIME)
@@ -213,7 +213,7 @@ def test_statsmodels_finds_the_same_likelihood():
 
 
 def test_a_steady_gain_is_that_of_the_kalman_filter_in_the_end():
-    model = coloured(WALK, {"level": TAU}, {"gauge": Lasting((ERROR**2,), ERROR_TIME)})
+    model = coloured(WALK, {"level": TAU}, {"gauge": ColouredError((ERROR**2,), ERROR_TIME)})
     y = 1.0 + np.cumsum(np.random.default_rng(2).normal(0.0, 0.7, 600))
     log = log_of(np.arange(600.0), y)
     exact, steady = (fold(name, model, Tuning.of(model), log) for name in ("kf", "kf-steady"))
@@ -224,7 +224,7 @@ def test_a_steady_gain_is_that_of_the_kalman_filter_in_the_end():
 
 @pytest.mark.parametrize("estimator", ["pf", "pf-reg", "rbpf", "enkf", "etkf", "ensrf", "letkf"])
 def test_members_agree_with_the_kalman_filter_within_chance(estimator):
-    model = coloured(WALK, {"level": TAU}, {"gauge": Lasting((ERROR**2,), ERROR_TIME)})
+    model = coloured(WALK, {"level": TAU}, {"gauge": ColouredError((ERROR**2,), ERROR_TIME)})
     rng = np.random.default_rng(4)
     log = log_of(np.arange(40.0), 1.0 + np.cumsum(rng.normal(0.0, 0.5, 40)))
     exact = fold("kf", model, Tuning.of(model), log)
@@ -240,7 +240,7 @@ def test_members_agree_with_the_kalman_filter_within_chance(estimator):
 
 def test_a_sensors_own_likelihood_is_that_of_what_the_error_leaves():
     own = replace(WALK, sensors=(replace(WALK.sensors[0], log_likelihood=density),))
-    plain, mine = (coloured(m, {"level": TAU}, {"gauge": Lasting((ERROR**2,), ERROR_TIME)}) for m in (WALK, own))
+    plain, mine = (coloured(m, {"level": TAU}, {"gauge": ColouredError((ERROR**2,), ERROR_TIME)}) for m in (WALK, own))
     log = log_of(np.arange(30.0), 1.0 + 0.3 * np.arange(30.0))
     a, b = (fold("pf", model, Tuning.of(model).with_options({"particles": 500.0}), log) for model in (plain, mine))
     np.testing.assert_allclose(a.mean, b.mean, rtol=1e-9)
@@ -278,7 +278,7 @@ def test_a_noise_on_several_states_lasts_in_each_channel():
     walk = channels(THREE, "walk")
     assert [j for j, _, _ in walk] == [0, 2] and [share for _, share, _ in walk] == pytest.approx([4.0, 4.0])
     assert [b.tolist() for _, _, b in walk] == [[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
-    model = coloured(THREE, {"walk": 3.0, "slip": TAU}, {"gauge": Lasting((0.01, 0.04), 5.0)})
+    model = coloured(THREE, {"walk": 3.0, "slip": TAU}, {"gauge": ColouredError((0.01, 0.04), 5.0)})
     assert [(state.name, state.unit) for state in model.states[3:]] == [
         ("slip_disturbance", "m/s"),
         ("walk_a_disturbance", "m/s"),
@@ -312,12 +312,12 @@ def two_rows(x, u, p, out):
 
 
 def test_correlation_times_and_variances_are_turned_while_it_runs():
-    model = coloured(WALK, {"level": TAU}, {"gauge": Lasting((ERROR**2,), ERROR_TIME)})
+    model = coloured(WALK, {"level": TAU}, {"gauge": ColouredError((ERROR**2,), ERROR_TIME)})
     log = log_of(np.arange(50.0), np.sin(np.arange(50.0)))
     tuning = Tuning.of(model).set("p.level_disturbance_time", 2.0).set("p.gauge_error_time", 3.0)
     turned = fold("kf", model, tuning.set("Q.level", 0.1).set("Q.gauge_error", 0.5), log)
     walk = replace(WALK, noises=(replace(WALK.noises[0], variance=0.1),))
-    declared = coloured(walk, {"level": 2.0}, {"gauge": Lasting((0.5,), 3.0)})
+    declared = coloured(walk, {"level": 2.0}, {"gauge": ColouredError((0.5,), 3.0)})
     # The belief at the start is the model's, as ever; the rest is what it is turned to.
     declared = replace(declared, states=model.states)
     np.testing.assert_allclose(fold("kf", declared, Tuning.of(declared), log).mean, turned.mean, rtol=1e-12)
@@ -327,7 +327,7 @@ def test_correlation_times_and_variances_are_turned_while_it_runs():
 
 
 def test_a_correlation_time_can_be_estimated_with_the_state():
-    model = joint(coloured(WALK, {"level": TAU}), {"level_disturbance_time": Unknown(3.0)})
+    model = joint(coloured(WALK, {"level": TAU}), {"level_disturbance_time": JointParameter(3.0)})
     assert model.state_names == ("level", "level_disturbance", "level_disturbance_time")
     fixed, log = coloured(WALK, {"level": TAU}), log_of(np.arange(20.0), np.sin(np.arange(20.0)))
     sure = replace(model, states=(*model.states[:2], replace(model.states[2], std=1e-9)))
@@ -342,7 +342,7 @@ def test_two_wrapped_models_are_told_apart_when_both_are_wrapped_again():
     base = replace(WALK, parameters=(Parameter("leak", "1/s", 0.1, 0.0, 1.0),), linear=False)
     ends = []
     for f in (leaking, growing):
-        model = joint(coloured(replace(base, f=f), {"level": TAU}), {"leak": Unknown(0.01)})
+        model = joint(coloured(replace(base, f=f), {"level": TAU}), {"leak": JointParameter(0.01)})
         ends.append(fold("ekf", model, Tuning.of(model), log).mean[-1, 0])
     assert abs(ends[0] - ends[1]) > 1e-3
 
@@ -356,7 +356,7 @@ def growing(x, u, p, dt, out):
 
 
 def test_linear_parts_and_modes_stay_what_they_are():
-    model = coloured(MODELS["gripper_contact"], {"slip": 0.5}, {"force": Lasting((0.01,), 10.0)})
+    model = coloured(MODELS["gripper_contact"], {"slip": 0.5}, {"force": ColouredError((0.01,), 10.0)})
     compiled = compile_model(model)  # the claims are checked on the way
     assert set(model.linear_states) > set(MODELS["gripper_contact"].linear_states)
     assert model.state_names[-2:] == ("slip_disturbance", "force_error")
@@ -375,17 +375,17 @@ def warm(x, u, p, q, dt, out):
 
 REFUSED = [
     (WALK, {"levle": 1.0}, {}, "walk has no noise 'levle'; it has level"),
-    (WALK, {}, {"gage": Lasting((1.0,), 1.0)}, "walk has no sensor 'gage'; it has gauge"),
-    (WALK, {"level": 0.0}, {}, "level lasts over 0 s; it must be a positive time"),
-    (WALK, {"level": np.inf}, {}, "level lasts over inf s; it must be a positive time"),
+    (WALK, {}, {"gage": ColouredError((1.0,), 1.0)}, "walk has no sensor 'gage'; it has gauge"),
+    (WALK, {"level": 0.0}, {}, "level has the correlation time 0 s; it must be positive"),
+    (WALK, {"level": np.inf}, {}, "level has the correlation time inf s; it must be positive"),
     (
         WALK,
         {},
-        {"gauge": Lasting((1.0, 2.0), 1.0)},
+        {"gauge": ColouredError((1.0, 2.0), 1.0)},
         "the error of gauge has variance 1, 2; it must be positive, one for each of 1 rows",
     ),
     (replace(WALK, noises=(Noise("level", "m²/s", 0.0),)), {"level": 1.0}, {}, "noise level has variance 0"),
-    (MODELS["thermal_field"], {"temperature": 9.0}, {}, "model thermal_field is a field, whose errors cannot"),
+    (MODELS["thermal_field"], {"temperature": 9.0}, {}, "model thermal_field is a field, whose noise cannot"),
     (MODELS["uwb_rover"], {"bias": 9.0}, {}, "Q does not add bias as q·dt times a constant matrix"),
     (
         replace(THREE, Q=warm, parameters=(Parameter("warmth", "1", 1.0, 0.0, 9.0),)),
@@ -396,7 +396,7 @@ REFUSED = [
     (
         replace(WALK, states=(*WALK.states, State("gauge_error", "m"))),
         {},
-        {"gauge": Lasting((1.0,), 1.0)},
+        {"gauge": ColouredError((1.0,), 1.0)},
         "states names 'gauge_error' twice",
     ),
 ]

@@ -13,8 +13,8 @@ from estimators.fold import fold
 from estimators.log import Log
 from estimators.model.coloured import coloured
 from estimators.model.correction import GaussianProcess, Net, Ridge
-from estimators.model.hybrid import Learned, hybrid
-from estimators.model.joint import Unknown, joint
+from estimators.model.hybrid import LearnedCorrection, hybrid
+from estimators.model.joint import JointParameter, joint
 from estimators.model.state_space import Input, Noise, Parameter, Row, Sensor, State, StateSpaceModel
 from estimators.tuning import Tuning
 
@@ -66,7 +66,7 @@ PLACES = RNG.normal((60.0, 10.0, -2.0), (12.0, 4.0, 0.7), (40, 3))
 
 
 def learned(correction, corrects=("body", "shell"), features=FEATURES):
-    return Learned(corrects, features, (0.3, 0.5)[: len(corrects)], correction)
+    return LearnedCorrection(corrects, features, (0.3, 0.5)[: len(corrects)], correction)
 
 
 def called(model, place, dt=0.5):
@@ -217,7 +217,7 @@ def test_filters_that_are_compiled_see_what_filterpy_sees(name):
 
 def test_it_goes_with_noise_that_lasts_and_with_parameters_that_are_estimated():
     corrected = hybrid(PHYSICS, learned(CORRECTIONS["gp"]))
-    model = joint(coloured(corrected, {"shell": 4.0}), {"loss": Unknown(0.01)})
+    model = joint(coloured(corrected, {"shell": 4.0}), {"loss": JointParameter(0.01)})
     assert model.state_names == ("body", "shell", "shell_disturbance", "loss")
     compiled = compile_model(model)
     place = PLACES[0]
@@ -252,7 +252,7 @@ def test_a_black_box_is_corrected_too():
 
 
 def test_a_linear_model_stays_linear_only_where_no_state_is_a_feature():
-    by_load = Learned(("body",), ("load",), (0.1,), Ridge(POINTS[:, 2:], RATES[:, :1], 1.0))
+    by_load = LearnedCorrection(("body",), ("load",), (0.1,), Ridge(POINTS[:, 2:], RATES[:, :1], 1.0))
     assert hybrid(PHYSICS, by_load).linear
     assert not hybrid(PHYSICS, learned(CORRECTIONS["gp"])).linear
 
@@ -273,7 +273,7 @@ def test_names_are_checked(change, said):
 
 def test_what_cannot_be_corrected_is_refused():
     angle = replace(PHYSICS, states=(replace(PHYSICS.states[0], circular=True), PHYSICS.states[1]))
-    with pytest.raises(ModelError, match="body is an angle, which is no feature of a correction"):
+    with pytest.raises(ModelError, match="body is an angle, which cannot be a feature"):
         hybrid(angle, learned(CORRECTIONS["gp"]))
     with pytest.raises(ModelError, match="has a noise body_learned already"):
         hybrid(hybrid(PHYSICS, learned(CORRECTIONS["gp"])), learned(CORRECTIONS["gp"]))

@@ -16,7 +16,7 @@ from estimators.diagnostics.score import score
 from estimators.errors import ModelError
 from estimators.fold import fold
 from estimators.log import READING, Events, Log
-from estimators.model.joint import Unknown, joint
+from estimators.model.joint import JointParameter, joint
 from estimators.model.state_space import Noise, Parameter, Row, Sensor, State, StateSpaceModel
 from estimators.models import MODELS
 from estimators.tuning import Tuning
@@ -82,7 +82,7 @@ def readings(n: int = 80) -> Log:
 @pytest.mark.parametrize("estimator", ["ekf", "ukf"])
 def test_an_unknown_inflow_is_estimated_as_by_a_kalman_filter_augmented_by_hand(estimator: str, with_q: bool) -> None:
     tank = replace(TANK, Q=spread) if with_q else TANK
-    model = joint(tank, {"inflow": Unknown(0.2, 0.03)})
+    model = joint(tank, {"inflow": JointParameter(0.2, 0.03)})
     assert model.state_names == ("level", "inflow")
     assert [item.name for item in model.parameters] == ["leak", "offset"]
     log = readings()
@@ -95,7 +95,7 @@ def test_an_unknown_inflow_is_estimated_as_by_a_kalman_filter_augmented_by_hand(
 
 
 def test_parameters_keep_their_places_whichever_move() -> None:
-    model = joint(TANK, {"offset": Unknown(0.1), "leak": Unknown(0.1)})
+    model = joint(TANK, {"offset": JointParameter(0.1), "leak": JointParameter(0.1)})
     assert model.state_names == ("level", "leak", "offset")
     compiled = compile_model(model)
     out, y = np.empty(3), np.empty(1)
@@ -107,7 +107,7 @@ def test_parameters_keep_their_places_whichever_move() -> None:
 
 
 def test_a_parameter_acts_within_its_range_only() -> None:
-    compiled = compile_model(joint(TANK, {"leak": Unknown(0.1)}))
+    compiled = compile_model(joint(TANK, {"leak": JointParameter(0.1)}))
     for strayed, held in ((-3.0, 0.0), (5.0, 1.0)):
         out = np.empty(2)
         compiled.f(np.array([2.0, strayed]), np.zeros(0), np.array([0.3, 0.0]), 1.0, out)
@@ -116,15 +116,15 @@ def test_a_parameter_acts_within_its_range_only() -> None:
 
 def test_what_cannot_move_is_refused() -> None:
     with pytest.raises(ModelError, match="tank has no parameter 'drain' to estimate; it has leak, inflow, offset"):
-        joint(TANK, {"drain": Unknown(1.0)})
+        joint(TANK, {"drain": JointParameter(1.0)})
     with pytest.raises(ModelError, match="prior of leak"):
-        joint(TANK, {"leak": Unknown(0.0)})
+        joint(TANK, {"leak": JointParameter(0.0)})
     assert joint(TANK, {}) is TANK
 
 
 def test_the_motors_derivatives_reach_the_resistance() -> None:
     model = MODELS["motor_drive"]
-    moved = joint(model, {"yoke_coolant": Unknown(0.01)})
+    moved = joint(model, {"yoke_coolant": JointParameter(0.01)})
     compiled = compile_model(moved)
     x = np.array([80.0, 75.0, 70.0, 60.0, 0.03])
     u = np.array([-50.0, 120.0, 300.0, 40.0, 25.0])
@@ -145,9 +145,9 @@ def test_the_motors_derivatives_reach_the_resistance() -> None:
 
 def test_another_process_finds_the_compiled_code() -> None:
     code = (
-        "from estimators.models import MODELS; from estimators.model.joint import joint, Unknown;"
+        "from estimators.models import MODELS; from estimators.model.joint import joint, JointParameter;"
         "from estimators.compiled.model import compile_model;"
-        "m = compile_model(joint(MODELS['motor_drive'], {'yoke_coolant': Unknown(0.01)}));"
+        "m = compile_model(joint(MODELS['motor_drive'], {'yoke_coolant': JointParameter(0.01)}));"
         "print(m.f.stats.cache_hits, *[len(h.stats.cache_hits) for h in m.h], sum(m.f.stats.cache_misses.values()))"
     )
     for _ in range(2):

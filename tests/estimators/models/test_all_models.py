@@ -15,7 +15,7 @@ from estimators.diagnostics.score import score
 from estimators.errors import ModelError
 from estimators.fold import fold
 from estimators.log import INPUT, READING, Events, Log, truth_of
-from estimators.model.coloured import Lasting, coloured
+from estimators.model.coloured import ColouredError, coloured
 from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
 from estimators.models import MODELS
 from estimators.models.motor_drive import COPPER, MOTOR_DRIVE
@@ -25,7 +25,7 @@ from tests.support import as_log, read_all
 
 P = {item.name: k for k, item in enumerate(MOTOR_DRIVE.parameters)}
 
-CAR = coloured(ROAD_CAR, errors={"gnss_position": Lasting((1.0, 1.0), 100.0)})
+CAR = coloured(ROAD_CAR, errors={"gnss_position": ColouredError((1.0, 1.0), 100.0)})
 """As its twins have it: the error of a fix lasts."""
 
 

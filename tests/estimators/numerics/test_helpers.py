@@ -11,7 +11,7 @@ from estimators.compiled.model import compile_model
 from estimators.errors import ModelError
 from estimators.fold import fold
 from estimators.log import READING, Events, Log
-from estimators.model.joint import Unknown, joint
+from estimators.model.joint import JointParameter, joint
 from estimators.model.state_space import Noise, Parameter, Row, Sensor, State, StateSpaceModel
 from estimators.numerics.helpers import with_helpers
 from estimators.tuning import Tuning
@@ -63,7 +63,7 @@ def log():
 def test_a_model_with_helpers_is_the_same_model(name, unknown):
     tracks = []
     for model in (tank(), tank(f_in_one, h_in_one)):
-        model = joint(model, {"rate": Unknown(0.01, 1e-6)}) if unknown else model
+        model = joint(model, {"rate": JointParameter(0.01, 1e-6)}) if unknown else model
         tracks.append(fold(name, model, Tuning.of(model), log()))
     np.testing.assert_allclose(tracks[0].mean, tracks[1].mean, rtol=1e-12)
     np.testing.assert_allclose(tracks[0].std, tracks[1].std, rtol=1e-9)

@@ -9,7 +9,7 @@ import pytest
 
 from estimators.errors import SourceError
 from estimators.log import Events
-from sources.can.bus import WAITS, CanBus, open_bus
+from sources.can.bus import RECONNECT_WAITS_S, CanBus, open_bus
 from sources.can.decoder import Decoder
 from tests.sources.can.can_tools import DBC, Reports, dbc, frame, sensor
 
@@ -127,7 +127,7 @@ def test_a_bus_that_fails_is_opened_again_with_longer_and_longer_waits(decoder):
     assert len(got) == 1
     waits = [b - a for a, b in zip(opened_at, opened_at[1:], strict=False)]
     # Attempts fall on the first read after their time; reads come every 0.05 s here.
-    assert waits == pytest.approx(WAITS[:3], abs=0.051)
+    assert waits == pytest.approx(RECONNECT_WAITS_S[:3], abs=0.051)
     assert reports.counts == {"bus error": 4, "bus reconnected": 1}
     assert "next attempt in 0.5 s" in reports.texts["bus error"]
 
@@ -197,7 +197,7 @@ def test_a_message_that_never_comes_is_named_once(tmp_path):
     source.read(0.0)
     assert reports.counts == {"never seen": 1}
     assert reports.texts["never seen"].startswith(
-        "CAN bus x:y: none of ENGINE (0x100), WIDE (0x200x), FIX (0x102) came"
+        "CAN bus x:y: none of ENGINE (0x100), WIDE (0x200x), FIX (0x102) was received"
     )
     bus.script = [frame(256, DATA), None]
     source.read(0.0)
@@ -207,10 +207,14 @@ def test_a_message_that_never_comes_is_named_once(tmp_path):
         bus.script = [frame(256, DATA), None]
         source.read(0.0)
     assert reports.counts == {"never seen": 1}
-    assert reports.texts["never seen"].startswith("CAN bus x:y: after 6 s WIDE (0x200x) never came, so sensor1 gets")
+    assert reports.texts["never seen"].startswith(
+        "CAN bus x:y: after 6 s WIDE (0x200x) was never received, so sensor1 has"
+    )
     for _ in range(20):
         clock.now += 2.0
         source.read(0.0)
     assert reports.counts == {"never seen": 2}
-    assert "FIX (0x102) never came" in reports.texts["never seen"] and "after 30 s" in reports.texts["never seen"]
+    assert (
+        "FIX (0x102) was never received" in reports.texts["never seen"] and "after 30 s" in reports.texts["never seen"]
+    )
     source.close()

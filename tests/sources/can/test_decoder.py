@@ -119,7 +119,7 @@ def test_units_scale_offset_and_conditions(tmp_path):
     assert batch.value[1, 0] == pytest.approx(283.15, rel=1e-14)
     assert np.isnan(batch.value[3, 0]) and batch.value[2, 0] == batch.value[0, 0]
     assert reports.counts == {"condition sensor1": 1}
-    assert reports.texts["condition sensor1"] == "sensor1: reading refused; it needs Ok in 1 to 1"
+    assert reports.texts["condition sensor1"] == "sensor1: measurement rejected; it needs Ok in 1 to 1"
 
 
 def test_inputs_of_a_frame_are_one_event_before_its_readings_and_truths(tmp_path):
@@ -274,7 +274,9 @@ def test_a_frame_brings_the_noise_of_its_reading(tmp_path):
         rtol=1e-14,
     )
     assert reports.counts == {"accuracy engine": 3}
-    assert reports.texts["accuracy engine"].startswith("engine: Torque tells no standard deviation of a reading")
+    assert reports.texts["accuracy engine"].startswith(
+        "engine: Torque has no positive standard deviation of a measurement"
+    )
 
 
 def test_an_accuracy_is_no_value_of_its_sensor(tmp_path):

@@ -11,8 +11,7 @@ from estimators.log import INPUT, READING, TRUTH, truth_of
 from estimators.model.state_space import Input, Noise, Row, Sensor, State, StateSpaceModel
 from sources.can.bus import CanBus
 from sources.can.decoder import Decoder
-from sources.can.encoder import Encoder
-from sources.can.player import Player
+from sources.can.player import Encoder, Player
 from sources.simulation.profile import Steps
 from sources.simulation.simulator import SensorPlan, Simulator
 from sources.source import Channel
@@ -163,7 +162,7 @@ def test_time_in_which_the_process_stood_still_is_skipped(tmp_path):
 
     reports = Reports()
     bus, _, times, _ = play(tmp_path, clock=Sleepy(), report=reports)
-    assert reports.counts == {"asset late": 1} and "held up for" in reports.texts["asset late"]
+    assert reports.counts == {"asset late": 1} and "delayed by" in reports.texts["asset late"]
     gaps = np.diff(times)
     assert (gaps > 0).all() and (gaps > 10**9).sum() == 1, "no burst follows"
 

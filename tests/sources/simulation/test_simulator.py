@@ -5,8 +5,7 @@ import pytest
 
 from estimators.errors import SourceError
 from estimators.log import INPUT, READING, TICK, TRUTH, truth_of
-from estimators.model.jump import Jump
-from estimators.model.state_space import Input, Noise, Parameter, Row, Sensor, State, StateSpaceModel
+from estimators.model.state_space import Input, Jump, Noise, Parameter, Row, Sensor, State, StateSpaceModel
 from estimators.models import MODELS
 from sources.simulation.profile import Constant, Sine, Steps, Sum
 from sources.simulation.simulator import SensorPlan, Simulator

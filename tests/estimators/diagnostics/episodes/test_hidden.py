@@ -8,7 +8,7 @@ import pytest
 from estimators.diagnostics.episodes import course_of, found_in
 from estimators.fold import Fold
 from estimators.log import READING, Events
-from estimators.model.limits import Limits
+from estimators.model.sensor import Limits
 from estimators.tuning import Tuning
 from tests.support import SECOND, as_log
 

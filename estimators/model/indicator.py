@@ -1,7 +1,7 @@
-"""A discrete mode as filters see it that know means and covariances only: a continuous number.
+"""A discrete mode as a continuous number, for filters that use means and covariances only.
 
-It has the mean and the variance that a jump gives it (see jump.py). The estimate of it can leave its range, and one
-Gaussian must stand for a mixture: that is where these filters fail.
+It has the mean and the variance that a jump gives it (see `Jump`). Its estimate can leave its range, and one Gaussian
+stands for a mixture: these filters fail where that is a poor approximation.
 """
 
 from __future__ import annotations
@@ -13,17 +13,17 @@ from functools import lru_cache
 import numpy as np
 
 from ..numerics.jit import jit
-from .joint import as_inner
 from .state_space import StateSpaceModel
+from .wrapping import as_inner, noise_function
 
-LEAST = 1e-6
-"""Variance that the mode keeps: a filter that was certain of it could never change its mind, and some need one."""
+MIN_MODE_VARIANCE = 1e-6
+"""Variance that the mode keeps: with none, its estimate could never change, and some filters need a positive one."""
 
 
 def indicator(model: StateSpaceModel) -> StateSpaceModel:
-    """The model for filters that do not sample: the mode is continuous, with a jump's first two moments.
+    """Return the model for filters that do not sample: the mode is continuous, with a jump's first two moments.
 
-    m' = Σ k c_k and its noise has the variance Σ k² c_k - m'² (no less than `LEAST`), where c are the chances,
+    m' = Σ k c_k, and its noise has the variance Σ k² c_k - m'² (at least `MIN_MODE_VARIANCE`); c are the chances,
     interpolated between those of the two modes next to m. Between the modes f and h are the model's own.
     """
     return model if model.jump is None else _indicator(model)
@@ -34,12 +34,11 @@ def _indicator(model: StateSpaceModel) -> StateSpaceModel:
     if model.jump is None:
         return model
     j, count = model.mode, len(model.jump.modes)
-    acts_on = tuple((k, i) for k, noise in enumerate(model.noises) for i in model.acts_on(noise.name))
     return replace(
         model,
         f=_step(model.f, model.jump.chances, j, count),
         F=None,
-        Q=_noise(model.Q, model.jump.chances, j, count, () if model.Q else acts_on),
+        Q=_noise(noise_function(model), model.jump.chances, j, count),
         jump=None,
         conditionally_linear=(),
     )
@@ -47,7 +46,7 @@ def _indicator(model: StateSpaceModel) -> StateSpaceModel:
 
 @jit
 def _between(m, count):
-    """The modes next to m, held between the first and the last: the lower one, and how far m is on from there."""
+    """Return the lower of the two modes next to m, and the fraction of the way to the upper one."""
     low = 0
     while low < count - 2 and m.real >= low + 1:
         low += 1
@@ -60,7 +59,7 @@ def _between(m, count):
 
 @jit
 def _moments(c, part):
-    """Mean and variance of the next mode, from the chances c (2, modes) of two modes, the second's part given."""
+    """Return mean and variance of the next mode, from the chances c (2, modes) of two modes and the second's weight."""
     mean = 0.0 * part
     square = 0.0 * part
     for i in range(c.shape[1]):
@@ -70,7 +69,7 @@ def _moments(c, part):
     return mean, square - mean * mean
 
 
-# Each of the two calls the chances itself: a compiled function that takes another as an argument is not cached.
+# Each wrapper calls the chances itself: a compiled function that takes another as an argument is not cached.
 def _step(function: Callable, chances: Callable, j: int, count: int) -> Callable:
     inner, jumping = as_inner(function), as_inner(chances)
 
@@ -89,10 +88,8 @@ def _step(function: Callable, chances: Callable, j: int, count: int) -> Callable
     return f
 
 
-def _noise(function: Callable | None, chances: Callable, j: int, count: int, acts_on: tuple) -> Callable:
-    given = function is not None
-    inner, jumping = as_inner(function or _nothing), as_inner(chances)
-    pairs = np.array(acts_on, np.int64).reshape(-1, 2)
+def _noise(function: Callable, chances: Callable, j: int, count: int) -> Callable:
+    inner, jumping = as_inner(function), as_inner(chances)
 
     def Q(x, u, p, q, dt, out):  # noqa: ANN001, ANN202
         z = x.copy()
@@ -104,13 +101,6 @@ def _noise(function: Callable | None, chances: Callable, j: int, count: int, act
         mean, variance = _moments(c, part)
         z[j] = mean
         inner(z, u, p, q, dt, out)
-        if not given:
-            for k in range(pairs.shape[0]):
-                out[pairs[k, 1], pairs[k, 1]] += q[pairs[k, 0]] * dt
-        out[j, j] = max(variance, LEAST)
+        out[j, j] = max(variance, MIN_MODE_VARIANCE)
 
     return Q
-
-
-def _nothing(x, u, p, q, dt, out):  # noqa: ANN001, ANN202
-    """The Q of a model whose noises are added by name."""

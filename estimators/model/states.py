@@ -11,7 +11,7 @@ from typing import Any, overload
 import numpy as np
 
 from ..errors import ModelError
-from .limits import check_range
+from .sensor import check_range
 
 
 @dataclass(frozen=True)

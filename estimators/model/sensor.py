@@ -1,0 +1,205 @@
+"""Sensors: their rows, the correlation of the rows' noise, and the limits of their measurements.
+
+    R_ij = c_ij √(r_i r_j)
+
+The variances r are tuned while the twin runs; the correlation c is a property of the instrument and stays, so R remains
+a covariance for any variances.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ..errors import ModelError
+
+Correlation = tuple[tuple[float, ...], ...]
+"""A correlation matrix (ny, ny) by rows, which a frozen sensor can hold and compare."""
+
+MIN_CORRELATION_EIGENVALUE = 1e-9
+"""Smallest eigenvalue of a correlation; below it rows repeat each other up to rounding."""
+
+
+def as_correlation(matrix: Any) -> Correlation:
+    """Return the rows of a matrix, or of anything that NumPy takes for one."""
+    return tuple(tuple(float(c) for c in row) for row in np.atleast_2d(np.asarray(matrix, float)))
+
+
+def correlation_of(R: Any) -> Correlation:
+    """Return the correlation c_ij = R_ij / √(R_ii R_jj) of a covariance R (ny, ny)."""
+    R = np.asarray(R, float)
+    std = np.sqrt(np.diag(R))
+    c = R / np.outer(std, std)
+    np.fill_diagonal(c, 1.0)
+    return as_correlation(c)
+
+
+def covariance_of(correlation: Correlation | None, r: np.ndarray) -> np.ndarray:
+    """Return R (ny, ny) of rows with variances r (ny,); diagonal if they have no correlation."""
+    if correlation is None:
+        return np.diag(r)
+    std = np.sqrt(r)
+    R = np.array(correlation) * np.outer(std, std)
+    np.fill_diagonal(R, r)
+    return R
+
+
+def correlation_error(correlation: Correlation, ny: int) -> str | None:
+    """Return what is wrong with the correlation of ny rows, with the remedy; None if nothing is."""
+    if len(correlation) != ny or any(len(row) != ny for row in correlation):
+        return (
+            f"has {len(correlation)} rows of {', '.join(str(len(row)) for row in correlation)}; it must be {ny} × {ny}"
+        )
+    c = np.array(correlation)
+    if not np.all(np.isfinite(c)) or np.any(np.diag(c) != 1.0):
+        return "must be finite, with ones on its diagonal; of a covariance R give R_ij / √(R_ii R_jj)"
+    if not np.array_equal(c, c.T):
+        return "is not symmetric; fill both triangles alike"
+    least = np.linalg.eigvalsh(c)[0]
+    if not least > MIN_CORRELATION_EIGENVALUE:
+        remedy = (
+            "leave out rows that repeat others" if least > -MIN_CORRELATION_EIGENVALUE else "lessen the correlations"
+        )
+        return f"is not positive definite (smallest eigenvalue {least:.2g}); {remedy}"
+    return None
+
+
+Pair = tuple[float, float]
+
+RATE_NOISE_STDS = 8.0
+"""Standard deviations by which noise alone may move two readings apart: chance does that once in 10⁸ readings, as the
+difference of two has √2 standard deviations."""
+
+
+@dataclass(frozen=True)
+class Stuck:
+    """When a row that repeats its value is stuck.
+
+    It is from its `readings`-th equal value on, or from the one that comes `seconds` after the first of them. Values
+    less than half a `quantum` apart are equal. Where neither number nor time is given, the run is as long as noise of
+    standard deviation `std` makes less than once a day at the sensor's rate: see screen.py. `quantum` and `std` have
+    one entry for all rows, or one a row; without `std`, the noise of the sensor's rows.
+    """
+
+    readings: int | None = None
+    seconds: float | None = None
+    quantum: tuple[float, ...] = ()
+    std: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Refuse rules that always or never hold."""
+        if self.readings is None and self.seconds is None and not self.quantum:
+            raise ModelError("stuck gives neither readings nor seconds nor quantum; add one")
+        if self.readings is not None and self.readings < 2:
+            raise ModelError(f"stuck.readings is {self.readings}; it must be 2 or more")
+        for key, values in (("seconds", () if self.seconds is None else (self.seconds,)), ("quantum", self.quantum)):
+            for value in values:
+                if not value > 0:
+                    raise ModelError(f"stuck.{key} is {value:g}; it must be positive")
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Limits of a sensor's measurements, in the units of its rows; each has one entry for all rows, or one a row.
+
+    range: the smallest and largest possible value. saturation: where its converter clips: a value at either end or
+    beyond is only a bound. rate: the largest change a second since the last measurement within all limits; noise may
+    add `RATE_NOISE_STDS` standard deviations. duplicates: seconds after a measurement within which one of equal values
+    is a copy of it; of the same time it always is.
+    """
+
+    range: tuple[Pair, ...] = ()
+    saturation: tuple[Pair, ...] = ()
+    rate: tuple[float, ...] = ()
+    stuck: Stuck | None = None
+    duplicates: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Refuse limits that no measurement, or every one, would break."""
+        for pair in self.range:
+            check_range("range", pair)
+        for pair in self.saturation:
+            check_range("saturation", pair)
+        for rate in self.rate:
+            if not rate > 0:
+                raise ModelError(f"rate is {rate:g}; it must be positive")
+        if not self.duplicates >= 0:
+            raise ModelError(f"duplicates is {self.duplicates:g} s; it must be zero or positive")
+
+    def flaw(self, rows: int) -> str | None:
+        """Return what does not fit a sensor of so many rows, as `key has 2 entries; ...`; None if all does."""
+        stuck = self.stuck or Stuck(readings=2)
+        for key, values in (
+            ("range", self.range),
+            ("saturation", self.saturation),
+            ("rate", self.rate),
+            ("stuck.quantum", stuck.quantum),
+            ("stuck.std", stuck.std),
+        ):
+            if len(values) not in (0, 1, rows):
+                return f"{key} has {len(values)} entries; give one, or {rows}, one a row"
+        return None
+
+
+def check_range(what: str, pair: Pair | None) -> None:
+    """Refuse an empty range.
+
+    Raises:
+        ModelError: Beginning with `what`.
+    """
+    if pair is not None and not pair[0] < pair[1]:
+        raise ModelError(f"{what} is {pair[0]:g} to {pair[1]:g}; the first must be below the second")
+
+
+def check_limits(what: str, limits: Limits | None, rows: int) -> None:
+    """Refuse limits that do not fit a sensor of so many rows.
+
+    Raises:
+        ModelError: Beginning with `what`.
+    """
+    wrong = limits.flaw(rows) if limits is not None else None
+    if wrong:
+        raise ModelError(f"{what}: {wrong}")
+
+
+@dataclass(frozen=True)
+class Row:
+    """One row of a sensor, with the variance of its noise; `circular` and `position` as in `State`."""
+
+    name: str
+    unit: str
+    variance: float
+    circular: bool = False
+    position: tuple[float, ...] | None = None
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """A sensor: the rows of one measurement, and its prediction from the state.
+
+    h(x, u, p, out) fills `out` (ny,). The optional H(x, u, p, out) fills the Jacobian (ny, nx). A sensor whose noise is
+    not Gaussian gives log_likelihood(y, x, u, p, r) -> log p(y | x), with r (ny,) the rows' variances as they are tuned
+    now; rows of y that are missing are NaN. Particle filters use it; the others use h and r.
+
+    `correlation` is the correlation matrix (ny, ny) of the rows' noise, where they are not independent: anything that
+    NumPy takes for a matrix. R_ij = correlation_ij √(r_i r_j), so the rows' variances are tuned as ever. Of a
+    covariance R, give the rows its diagonal and the sensor `correlation_of(R)`.
+
+    `limits` bound what it can measure; measurements beyond are kept in the log and never used.
+    """
+
+    name: str
+    rows: tuple[Row, ...]
+    h: Callable
+    H: Callable | None = None
+    log_likelihood: Callable | None = None
+    correlation: Correlation | None = None
+    limits: Limits | None = None
+
+    def __post_init__(self) -> None:
+        """Hold a matrix, which cannot be hashed, as its rows."""
+        if self.correlation is not None:
+            object.__setattr__(self, "correlation", as_correlation(self.correlation))

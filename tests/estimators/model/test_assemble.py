@@ -1,0 +1,56 @@
+"""One function appends everything to a model, in one order, and names the part that it cannot append."""
+
+import numpy as np
+import pytest
+
+from estimators.model.assemble import AppendError, assemble
+from estimators.model.coloured import ColouredError
+from estimators.model.correction import Ridge
+from estimators.model.hybrid import LearnedCorrection
+from estimators.model.joint import JointParameter
+from estimators.models import MODELS
+
+MODEL = MODELS["motor_winding"]
+RIDGE = Ridge(np.array([[20.0], [30.0], [40.0]]), np.array([[0.1], [0.2], [0.1]]), 1.0)
+
+
+def learned(state="temperature"):
+    return LearnedCorrection((state,), ("temperature",), (0.25,), RIDGE)
+
+
+def test_the_physics_keeps_its_states_first_and_parameters_come_last():
+    model = assemble(
+        MODEL,
+        learned=learned(),
+        noises={"temperature": 40.0},
+        errors={"winding": ColouredError((4.0,), 300.0)},
+        estimated={"winding_error_time": JointParameter(50.0)},
+    )
+    assert model.state_names == (
+        *MODEL.state_names, "temperature_disturbance", "winding_error", "winding_error_time"
+    )  # fmt: skip
+    assert [item.name for item in model.noises] == [
+        *(item.name for item in MODEL.noises), "temperature_learned", "winding_error", "winding_error_time"
+    ]  # fmt: skip
+    assert [item.name for item in model.parameters] == [
+        *(item.name for item in MODEL.parameters), "temperature_disturbance_time"
+    ]  # fmt: skip
+
+
+def test_nothing_appended_is_the_model_itself():
+    assert assemble(MODEL) is MODEL
+
+
+@pytest.mark.parametrize(
+    ("given", "part", "words"),
+    [
+        ({"learned": learned("speed")}, ("learned", ""), "no state 'speed'"),
+        ({"noises": {"rate": 1.0, "temperature": -1.0}}, ("noise", "temperature"), "-1 s; it must be positive"),
+        ({"errors": {"winding": ColouredError((1.0, 2.0), 3.0)}}, ("error", "winding"), "one for each of 1 rows"),
+        ({"estimated": {"mass": JointParameter(1.0)}}, ("estimate", "mass"), "no parameter 'mass' to estimate"),
+    ],
+)
+def test_what_cannot_be_appended_is_named(given, part, words):
+    with pytest.raises(AppendError, match=words) as caught:
+        assemble(MODEL, **given)
+    assert caught.value.part == part
