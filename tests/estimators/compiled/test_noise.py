@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
-from estimators.model.sensor import correlation_of, covariance_of
 
 from estimators.compiled.noise import add_noise, belief_root, has_correlated_rows, independent_rows, semidefinite_root
 from estimators.errors import ModelError
 from estimators.fold import Fold
 from estimators.log import READING, Log
+from estimators.model.sensor import correlation_of, covariance_of
 from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
 from estimators.tuning import Tuning
 from sources.simulation.simulator import Simulator
