@@ -14,8 +14,9 @@ from estimators.log import READING
 
 from .can.databases import load_database, same_bus
 from .can.decoder import Decoder
+from .can.frames import EXTENDED, BusName, LogSummary, Raw
 from .can.log import CanLog, check_log
-from .can.readers import EXTENDED, BusName, LogSummary, Raw, read_frames
+from .can.readers import read_frames
 from .formats import CAN_LOGS, suffix_of
 from .reader_process import IsolatedReader
 from .source import Channel

@@ -14,7 +14,7 @@ from rich.table import Table
 
 from estimators.errors import ConfigError
 from sources.can.decoder import shown_id
-from sources.can.readers import EXTENDED, BusName
+from sources.can.frames import EXTENDED, BusName
 from sources.inspect import Message, RecordingContents, Series, inspect_recordings
 from sources.tables.rows import UNITS
 

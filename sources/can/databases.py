@@ -12,7 +12,7 @@ import cantools
 from estimators.errors import SourceError, nearest
 
 from ..source import Channel
-from .readers import BusName
+from .frames import BusName
 
 
 def load_database(path: Path) -> Any:

@@ -15,7 +15,7 @@ from ..clock import second_ns
 from ..mapping import ABSENT, PRESENT, SHORT, ChannelMapping
 from ..source import Channel, Report, ignore
 from .databases import find_messages, load_database, same_bus
-from .readers import EXTENDED, BusName, Raw
+from .frames import EXTENDED, BusName, Raw
 from .signals import extract, ordered, tabulate, vectorises
 
 

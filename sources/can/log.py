@@ -19,8 +19,9 @@ from ..formats import CAN_LOGS, is_compressed, suffix_of
 from ..reader_process import IsolatedReader, read_isolated
 from ..source import NEVER, TRUNCATED, Report, ignore
 from .decoder import Decoder
+from .frames import BusName, LogSummary, Raw, unreadable
 from .mf4 import mf4_span
-from .readers import BusName, LogSummary, Raw, open_reader, read_frames, unreadable
+from .readers import open_reader, read_frames
 
 
 class CanLog:

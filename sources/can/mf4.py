@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from .readers import CHUNK_FRAMES, EXTENDED, BusName, LogSummary, Raw, unreadable
+from .frames import CHUNK_FRAMES, EXTENDED, BusName, LogSummary, Raw, unreadable
 
 
 @contextmanager
