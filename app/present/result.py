@@ -78,7 +78,7 @@ class Bar(NamedTuple):
 class Topic(NamedTuple):
     """One topic of a result: a title, sentences, then a list of figures and one table.
 
-    `marks` rates the second cell of each row ("good", "partly", "bad" or ""). HTML also draws `svgs` and `bars` with
+    `marks` rates the second cell of each row ("good", "partly", "bad" or ""). HTML adds `html`, draws `bars` with
     their `legend`, and prints `notes` in small type at the end.
     """
 
@@ -89,7 +89,7 @@ class Topic(NamedTuple):
     bars: tuple[Bar, ...] = ()
     legend: tuple[str, str] = ("", "")
     marks: tuple[str, ...] = ()
-    svgs: tuple[str, ...] = ()
+    html: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
     figures: tuple[Figure, ...] = ()
 
@@ -189,6 +189,9 @@ def _paragraphs(topic: Topic) -> list[str]:
     return lines
 
 
+POLICY = "default-src 'none'; script-src 'unsafe-inline' data:; style-src 'unsafe-inline'; img-src data:"
+"""Of HTML results: scripts and styles in the file, nothing from elsewhere."""
+
 STYLE = """
 @page { size: A4; margin: 14mm }
 body { font: 14px/1.45 system-ui, sans-serif; color: #1f2937; background: #fff; max-width: 62em; margin: 2em auto;
@@ -216,7 +219,7 @@ RED_CLASS = ' class="worse"'
 
 
 def to_html(title: str, topics: Sequence[Topic], *, now: float | None = None) -> str:
-    """Return one HTML page that needs no other file and runs no script.
+    """Return one HTML page that needs no other file; its security policy forbids to load anything.
 
     Args:
         title: Title of the page.
@@ -230,6 +233,7 @@ def to_html(title: str, topics: Sequence[Topic], *, now: float | None = None) ->
         body += [f"<h2>{escape(topic.title)}</h2>", *_sentences(topic), *_content(topic)]
     return (
         '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
+        f'<meta http-equiv="Content-Security-Policy" content="{POLICY}">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
         f"<title>{escape(title)}</title>\n<style>{STYLE}</style>\n</head>\n<body>\n"
         + "\n".join(body)
@@ -251,7 +255,7 @@ def _sentences(topic: Topic) -> list[str]:
 
 
 def _content(topic: Topic) -> list[str]:
-    body = list(topic.svgs)
+    body = list(topic.html)
     if any(np.isfinite(bar.first) or np.isfinite(bar.second) for bar in topic.bars):
         body.append(_bars(topic.bars, topic.legend))
     if topic.figures:

@@ -45,6 +45,9 @@ if TYPE_CHECKING:
 AWAITED_PERIOD_S = 0.5
 """Between two looks at whether the first filter is compiled."""
 
+CHART_FILES = sorted(path.name for path in (PAGE / "charts").glob("*.js"))
+"""Kinds of charts, one a file."""
+
 FOR_EVER = "public, max-age=31536000, immutable"
 MEDIA_TYPES = {".js": "text/javascript", ".wasm": "application/wasm"}
 
@@ -161,6 +164,7 @@ class PageServer:
 
     def _page(self, name: str) -> Response:
         settings = {"viewer": f"/viewer/{viewer_version()}", "boot": self._boot, "viser": self._viser is not None}
+        settings["charts"] = CHART_FILES
         return page_file(name, settings | {"gallery": self.door.furnished, "stage_pass": self.door.stage_pass})
 
     def _alarms(self) -> Response:

@@ -16,8 +16,8 @@ from ..live.changes import began_as, turned
 from ..live.interface import Running
 from ..live.outputs import Status
 from ..live.revisions import Revisions
-from ..present.drawing.direct_readings import observed
-from ..present.series.columns import columns_of, rows_of
+from ..present.export.report_charts import charted_model
+from ..present.series.columns import columns_of
 
 
 def status_json(engine: Running) -> dict[str, Any]:
@@ -132,31 +132,12 @@ def model_json(engine: Running) -> dict[str, Any]:
     """The twin in names, units and configured values; every estimator with its options, or why it does not apply."""
     model, twin = engine.model, engine.twin
     view = twin.config.view
-    direct = {(dot.sensor, dot.row): int(dot.state) for dot in observed(model)}
-    rows = rows_of(model)
-    units = {name: model.sensors[sensor].rows[row].unit for name, sensor, row in rows}
-    readers: dict[str, list[str]] = {state.name: [] for state in model.shown_states}
-    for name, sensor, row in rows:
-        state = direct.get((sensor, row))
-        if state is not None and model.state_names[state] in readers:
-            readers[model.state_names[state]].append(name)
     return {
         "twin": twin.name,
         "title": twin.title,
         "model": model.name,
-        "states": [
-            {
-                "name": state.name,
-                "label": model.label(state.name).replace("_", " "),
-                "unit": state.unit,
-                "circular": bool(getattr(state, "circular", False)),
-                "probability": j == model.mode,
-                "rows": readers[state.name],
-            }
-            for j, state in enumerate(model.shown_states)
-        ],
+        **charted_model(model),
         "field": model.grid is not None,
-        "rows": [{"name": name, "sensor": model.sensor_names[sensor], "unit": units[name]} for name, sensor, _ in rows],
         "sensors": list(model.sensor_names),
         "inputs": [{"name": item.name, "unit": item.unit, "value": item.default} for item in model.inputs],
         "parameters": [item.name for item in model.parameters],

@@ -1,6 +1,6 @@
 """The colours of the page, for Viser's scenes and Rerun's charts: one meaning each, in light and in dark.
 
-`app/web/page/style.css` has the same under the same names (a test compares them), chosen so that who sees no red or no
+`app/web/page/chart.css` has the same under the same names (a test compares them), chosen so that who sees no red or no
 green tells them apart (after Okabe and Ito, 2008).
 """
 

@@ -26,8 +26,7 @@ from ...twin.twin import Twin
 from ..result import Bar, Topic
 from .alarm_guide import advice
 from .calibration_lines import calibration_lines
-from .run_charts import run_charts
-from .svg import clock
+from .report_charts import charts_html
 
 MOST = 60
 """Rows of a table; of more the rest is counted."""
@@ -61,16 +60,18 @@ def report(run: Reported) -> list[Topic]:
     """The report, from top to bottom."""
     model = run.twin.model
     found = score(run.track, run.events, model, run.pictures, gate=run.tuning.gate, baseline=run.tuning.baseline)
-    charts = run_charts(model, run.events, run.track, run.episodes, run.smoothed)
-    said: tuple[str, ...] = ("Time counts from the first event. Red strips: episodes. Extremes are kept.",)
+    charts = charts_html(run.tuning, run.events, run.track, run.episodes, run.bounds, run.smoothed)
+    said: tuple[str, ...] = (
+        "Time counts from the first event. Red strips mark episodes. Drag to zoom, double-click for all.",
+    )
     if run.smoothed is not None:
-        said += ("Dark lines: the states given the readings after each moment too, with their ± 2σ.",)
+        said += ("Dark lines: smoothed states, which also use later measurements, with ± 2σ.",)
     return [
         _head(run),
         _scores(run, found),
         _episodes(run),
         *_before(run),
-        Topic("Charts", said, svgs=tuple(charts)),
+        Topic("Charts", said, html=(charts,)),
         *_checks(run),
         _tuning(run),
         *([_runs(run)] if run.others else []),
@@ -224,3 +225,12 @@ def _value(value: float | bool | str | None) -> str:
 def _runs(run: Reported) -> Topic:
     head = ("run", "what was changed", "mean NIS", "log L a reading", "RMSE, or held out")
     return Topic("Runs of the session", (), head, _cut(run.others))
+
+
+def clock(seconds: float) -> str:
+    """Return seconds as a clock: 0:07.3, 12:31, 3:05:00."""
+    sign, rest = "-" if seconds < 0 else "", abs(seconds)
+    minutes, part = divmod(round(rest, 3), 60)
+    hours, minutes = divmod(int(minutes), 60)
+    tail = f"{part:06.3f}".rstrip("0").rstrip(".")
+    return f"{sign}{hours}:{minutes:02d}:{tail}" if hours else f"{sign}{minutes}:{tail}"

@@ -1,49 +1,62 @@
-// One chart: a canvas of uPlot's with a line above it that says what it is and what it reads at the cursor.
+// One chart over time: a canvas of uPlot's, below a line with its name and its values at the cursor. A chart is declared
+// by an object, with columns by name; the page, its SVG files and the HTML report draw it by this file.
+//
+//   key, title, unit, note, help       help: tooltip of the values
+//   weight                             share of the height
+//   columns                            columns of the main stream that it needs
+//   series                             {name: line() | dots() | edge()}, drawn in this order
+//   bands                              [band(tone, upper, lower)], by names of series
+//   data()                             {x, name: values}; times in seconds since the first event
+//   range(data, span)                  [low, high] of the value axis
+//   says(value)                        text of the values at the cursor; value(name) is a number or NaN
+//   curves()                           curves of other streams (drawing.js): drawn above the bands, `over: true` on top
+//   paint(plot), over(plot)            further drawings, behind and on top of everything
+//   axis, amount(value)                labels of the value axis, a value as text; where the axis is not a plain one
+//   filled()                           whether it shows something without data of its own
+//   names                              {tone: legend text} of a file, where it differs from NAMES; "" for none
+//   further                            hidden at first
+//   sync                               charts of one name share their cursor
 
 import { element, setText } from "./dom.js";
-import { drawOutsiders } from "./edges.js";
-import { compact } from "./format.js";
+import { colour, drawOutsiders, trace } from "./drawing.js";
+import { bracketed, clock, compact } from "./format.js";
 import { within } from "./ranges.js";
+import { drawnOn, svgFile } from "./svg.js";
 
-export const GAP = 52; // px for the labels of the value axis
-export const CURSOR = "time";
+const LABELS = 52; // px for the labels of the value axis
+const TIME = 22; // px for those of the time axis
+const FILE = [960, 330]; // px of a file
 
-const styles = getComputedStyle(document.documentElement);
-export const colour = (name) => styles.getPropertyValue(`--${name}`).trim();
+const NAMES = {
+  estimate: "estimate", truth: "truth", reading: "measurement", "reading ring": "held out", refused: "rejected",
+  "refused ring": "implausible", bound: "bounds", quiet: "single value", band: "± 2σ", bounds: "bounds",
+};
 
-// A value of the value axis in words.
-export const amount = (what, value) => what.amount?.(value) ?? `${compact(value, 3)} ${what.unit.replace(/^\[|\]$/g, "")}`.trim();
-
-// The context of a plot in which nothing leaves its frame, until it is restored.
-export function clipped({ ctx, bbox }) {
-  ctx.save();
-  ctx.beginPath();
-  ctx.rect(bbox.left, bbox.top, bbox.width, bbox.height);
-  ctx.clip();
-  return ctx;
-}
-
-// What uPlot draws, and for a file: the name of its colour, and which mark it is.
-export const line = (name, options = {}) => ({
-  mark: "line", tone: name, stroke: () => colour(name), width: 1.5, points: { show: false }, spanGaps: false, ...options,
+export const line = (tone, options = {}) => ({
+  mark: "line", tone, stroke: () => colour(tone), width: 1.5, points: { show: false }, spanGaps: false, ...options,
 });
 
-export const edge = (options = {}) => ({ stroke: () => "transparent", width: 0, points: { show: false }, ...options });
+export const edge = () => ({ stroke: () => "transparent", width: 0, points: { show: false } });
 
-export const band = (name, series) => ({ series, tone: name, fill: () => colour(name) });
-
-export const dots = (name, size = 4, ring = false) => ({
-  mark: "dots", tone: name, ring, stroke: () => colour(name),
+export const dots = (tone, size = 4, ring = false) => ({
+  mark: "dots", tone, ring, stroke: () => colour(tone),
   paths: () => null,
-  points: { show: true, size, width: ring ? 1.5 : 0, stroke: () => colour(name), fill: () => (ring ? "transparent" : colour(name)) },
+  points: { show: true, size, width: ring ? 1.5 : 0, stroke: () => colour(tone), fill: () => (ring ? "transparent" : colour(tone)) },
 });
+
+export const band = (tone, upper, lower) => ({ tone, edges: [upper, lower] });
+
+// "magnet [°C]"
+export const heading = (what) => `${what.title} ${bracketed(what.unit.replace(/^\[|\]$/g, ""))}`.trim();
+
+// kinds: modules of the folder charts. Gives the declarations of all charts, from top to bottom; see chart.js.
+export const declared = (kinds, context) => kinds.toSorted((a, b) => a.order - b.order).flatMap((kind) => kind.default(context));
 
 export class Chart {
-  // what: {title, unit, note, weight, series, bands, range(self, low, high), scale, draw: [hook], values: [label of a tick],
-  // sync: charts of one name share their cursor, names: what a file calls its colours, help: on what it reads, extras: more lines of a file,
-  // amount(value): a value in words, where the axis is no plain one; filled(): whether it draws beside its data}
-  constructor(what, { select, home, wheel, save }) {
+  // select(since, until), home(), wheel(event, plot), save(chart, button): on gestures
+  constructor(what, { select, home, wheel, save } = {}) {
     this.what = what;
+    this.names = Object.keys(what.series);
     this.reading = element("output", { class: "reading", title: what.help });
     this.head = element(
       "header", {},
@@ -54,50 +67,35 @@ export class Chart {
     );
     this.canvas = element("div", { class: "plot" });
     this.node = element("article", { class: "chart", style: `--weight:${what.weight}`, "aria-label": `Chart of ${what.title}` }, this.head, this.canvas);
-    this.data = [[], ...what.series.map(() => [])];
+    this.data = { x: [], ...Object.fromEntries(this.names.map((name) => [name, []])) };
     this.actions = { select, home, wheel };
     this.visible = true;
     this.empty = true;
   }
 
-  // Once it is in the page, and has a size.
-  begin() {
-    const { what } = this;
+  // Once it is in the page, and has a size. withTime: labels of time below it.
+  begin(withTime = false) {
+    const options = this.options(Math.max(50, this.canvas.clientWidth), Math.max(40, this.canvas.clientHeight), withTime);
     this.plot = new uPlot(
       {
-        width: Math.max(50, this.canvas.clientWidth),
-        height: Math.max(40, this.canvas.clientHeight),
-        legend: { show: false },
-        padding: [6, 10, null, 0],
+        ...options,
         cursor: {
-          sync: { key: what.sync ?? CURSOR, scales: ["x", null] },
+          sync: { key: this.what.sync ?? "time", scales: ["x", null] },
           drag: { x: true, y: false, setScale: false },
           points: { show: false },
           y: false,
-          bind: { dblclick: () => () => (this.actions.home(), null) },
+          bind: { dblclick: () => () => (this.actions.home?.(), null) },
         },
-        scales: {
-          x: { time: false, range: () => this.span },
-          y: { ...what.scale, range: (self, low, high) => what.range(this, low, high) },
-        },
-        axes: [
-          { ...axis(), size: 3, values: (self, splits) => splits.map(() => null) }, // time stands below all charts
-          { ...axis(), size: GAP, splits, values: (self, values) => (this.empty ? [] : values.map((value) => compact(value, 7))), ...(what.axis ?? {}) },
-        ],
-        series: [{}, ...what.series],
-        bands: what.bands ?? [],
         hooks: {
+          ...options.hooks,
           setSelect: [(self) => this.selected(self)],
-          drawAxes: what.under ? [(self) => what.under(self, this)] : [],
-          drawSeries: what.between ? [(self, series) => what.between(self, series)] : [],
-          draw: [(self) => what.over?.(self, this), (self) => this.outside(self)],
           setCursor: [(self) => this.pointed(self)],
         },
       },
-      this.data,
+      this.table,
       this.canvas,
     );
-    this.plot.over.addEventListener("wheel", (event) => this.actions.wheel(event, this.plot), { passive: false });
+    if (this.actions.wheel) this.plot.over.addEventListener("wheel", (event) => this.actions.wheel(event, this.plot), { passive: false });
     this.sized = new ResizeObserver(() => {
       const { clientWidth: width, clientHeight: height } = this.canvas;
       if (width > 0 && height > 0 && (width !== this.plot.width || height !== this.plot.height)) this.plot.setSize({ width, height });
@@ -110,20 +108,58 @@ export class Chart {
     this.seen.observe(this.node);
   }
 
-  // span: seconds at both ends of the axis; moment: that which is looked at, or null; origin-based times in data[0].
+  // Options of uPlot. The axes and marks of a file are the page's.
+  options(width, height, withTime) {
+    const { what } = this;
+    const index = (name) => this.names.indexOf(name) + 1;
+    const bands = what.bands ?? [];
+    const last = Math.max(0, ...bands.flatMap(({ edges }) => edges.map(index)));
+    let curves = [];
+    const draw = (self, over) => curves.forEach((curve) => Boolean(curve.over) === over && trace(self, curve));
+    return {
+      width, height,
+      legend: { show: false },
+      padding: [6, 10, null, 0],
+      scales: {
+        x: { time: false, range: () => this.span },
+        y: { range: () => what.range(this.data, this.span) },
+      },
+      axes: [
+        withTime ? timeAxis() : { ...axis(), size: 3, values: (self, splits) => splits.map(() => null) },
+        { ...axis(), size: LABELS, splits, values: (self, values) => (this.empty ? [] : values.map((value) => compact(value, 7))), ...(what.axis ?? {}) },
+      ],
+      series: [{}, ...Object.values(what.series)],
+      bands: bands.map(({ tone, edges }) => ({ series: edges.map(index), fill: () => colour(tone) })),
+      hooks: {
+        drawAxes: [(self) => what.paint?.(self), (self) => ((curves = what.curves?.() ?? []), last || draw(self, false))],
+        drawSeries: [(self, series) => series === last && draw(self, false)],
+        draw: [
+          (self) => draw(self, true),
+          (self) => what.over?.(self),
+          (self) => (this.outsiders = drawOutsiders(self, Object.values(what.series), (value) => this.amount(value))),
+        ],
+      },
+    };
+  }
+
+  get table() {
+    const { x } = this.data;
+    return [x, ...this.names.map((name) => this.data[name] ?? new Array(x.length).fill(null))];
+  }
+
+  // span: seconds at both ends of the axis; moment: that which is looked at, or null.
   show(data, span, moment = null) {
-    this.data = data;
-    this.span = span;
-    this.moment = moment;
+    Object.assign(this, { data, span, moment });
     if (this.visible) this.draw();
     else this.waiting = true;
   }
 
   draw() {
     this.waiting = false;
-    this.empty = !this.what.filled?.() && !this.data.slice(1).some((values) => values.some((value) => typeof value === "number"));
+    const { table } = this;
+    this.empty = !this.what.filled?.() && !table.slice(1).some((values) => values.some((value) => typeof value === "number"));
     this.plot.batch(() => {
-      this.plot.setData(this.data, false);
+      this.plot.setData(table, false);
       this.plot.setScale("x", { min: this.span[0], max: this.span[1] });
     });
     this.pointed(this.plot);
@@ -135,28 +171,53 @@ export class Chart {
     const ends = [self.posToVal(left, "x"), self.posToVal(left + width, "x")];
     self.setSelect({ left: 0, top: 0, width: 0, height: 0 }, false);
     if (width < 4 || !self.cursor.event) return;
-    this.actions.select(...ends);
+    this.actions.select?.(...ends);
   }
 
-  // What the line above says: at the cursor, else at the moment that is looked at, else of the newest row.
+  // Show the values at the cursor, else at the moment that is looked at, else the newest ones.
   pointed(self) {
     const { left, idx } = self.cursor;
-    const [x] = this.data;
+    const { x } = this.data;
     const here = this.moment === null || this.moment === undefined ? x.length - 1 : within(x, [-Infinity, this.moment])[1];
     const at = left >= 0 && idx !== null && idx !== undefined ? idx : here;
-    setText(this.reading, at < 0 ? "" : this.what.says((series) => this.at(series, at)));
+    setText(this.reading, at < 0 ? "" : this.what.says((name) => this.at(name, at)));
   }
 
-  // What does not fit the axis is marked at its edge.
-  outside(self) {
-    this.outsiders = drawOutsiders(self, this.what.series, (value) => amount(this.what, value), colour);
-  }
-
-  // The value of a series there, or the last one before it.
-  at(series, index) {
-    const values = this.data[series];
+  // The value of a column there, or the last one before it.
+  at(name, index) {
+    const values = this.data[name];
     for (let k = index; k >= Math.max(0, index - 64); k--) if (typeof values?.[k] === "number") return values[k];
     return NaN;
+  }
+
+  // A value of the value axis as text.
+  amount(value) {
+    return this.what.amount?.(value) ?? `${compact(value, 3)} ${this.what.unit.replace(/^\[|\]$/g, "")}`.trim();
+  }
+
+  // The chart as the text of an SVG file, as it is shown now.
+  svg(lines, size = FILE) {
+    return svgFile(size, lines, this.legend, (context, width, height) => {
+      const options = this.options(width, height, true);
+      const { min, max } = this.plot.scales.y;
+      options.scales.y.range = () => [min, max];
+      const plot = drawnOn(context, () => new uPlot({ ...options, pxAlign: 0, cursor: { show: false } }, this.table));
+      plot.batch(() => plot.setScale("x", { min: this.span[0], max: this.span[1] }));
+      plot.destroy();
+    });
+  }
+
+  // Legend of a file: [[text, style]] of everything that has values.
+  get legend() {
+    const { what } = this;
+    const found = new Map();
+    const add = (text, style) => text && !found.has(text) && found.set(text, style);
+    const named = (key) => what.names?.[key] ?? NAMES[key] ?? key;
+    const shown = (name) => this.data[name]?.some((value) => typeof value === "number");
+    for (const { tone, edges } of what.bands ?? []) if (shown(edges[0])) add(named(tone), { tone, mark: "area" });
+    for (const [name, style] of Object.entries(what.series)) if (style.mark && shown(name)) add(named(style.ring ? `${style.tone} ring` : style.tone), style);
+    for (const curve of what.curves?.() ?? []) if (curve.x.length) add(curve.legend, { ...curve, mark: curve.fill ? "area" : "line" });
+    return [...found];
   }
 
   end() {
@@ -167,10 +228,12 @@ export class Chart {
   }
 }
 
+// Value axis
+
 const LABEL = 15; // px from one label of the value axis to the next, at least
 const ROOMY = 26; // px where there is room
 
-// Round values along the value axis: two of them at least, or a low chart would say nothing of its scale.
+// Round values along the value axis: two of them at least, or a low chart would have no scale.
 function splits(self, axis, low, high) {
   const height = self.over.clientHeight || self.bbox.height / devicePixelRatio;
   if (!(high > low) || !(height > 0)) return [low];
@@ -182,19 +245,19 @@ function splits(self, axis, low, high) {
   return [fine[0], fine[fine.length - 1]];
 }
 
-const multiples = (low, high, step) => {
+export const multiples = (low, high, step) => {
   const first = Math.ceil(low / step - 1e-9);
   const count = Math.floor(high / step + 1e-9) - first + 1;
   return Array.from({ length: count }, (_, k) => Number(((first + k) * step).toPrecision(12)));
 };
 
 // The smallest of 1, 2, 5 · 10ⁿ that is at least so much.
-function rounded(least) {
+export function rounded(least) {
   const power = 10 ** Math.floor(Math.log10(least));
   return [1, 2, 5, 10].find((factor) => factor * power >= least * (1 - 1e-9)) * power;
 }
 
-// Those of some values, in the order of their weight, whose labels do not lie on each other.
+// Those of some values, in the order of their weight, whose labels do not overlap.
 export function apart(values, self, scale) {
   const height = self.over.clientHeight || self.bbox.height / devicePixelRatio;
   const { min, max } = self.scales[scale];
@@ -204,10 +267,57 @@ export function apart(values, self, scale) {
   return found.sort((a, b) => a - b);
 }
 
-export const axis = () => ({
+const axis = () => ({
   stroke: () => colour("faint"),
   font: "11px system-ui, sans-serif",
   grid: { stroke: () => colour("grid"), width: 1 },
   ticks: { show: false },
   gap: 4,
 });
+
+// Time axis
+
+const HALF = 24; // px that a label at the right end may take from the axis to its left
+
+// Steps of a clock, s.
+const STEPS = [
+  0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 10800,
+  21600, 43200, 86400, 172800, 345600, 864000, 2592000, 8640000, 31536000,
+];
+
+const timeAxis = () => ({ ...axis(), size: TIME, values: clocks, incrs: STEPS, space: 60 });
+
+function clocks(self, splits) {
+  const step = splits.length > 1 ? splits[1] - splits[0] : 1;
+  const fraction = step >= 1 ? 0 : Math.min(3, Math.ceil(-Math.log10(step)));
+  // One at the very end would be cut off.
+  const last = self.posToVal((self.over.clientWidth || self.bbox.width / devicePixelRatio) + 10 - HALF, "x");
+  return splits.map((value) => (value > last ? "" : clock(value, fraction)));
+}
+
+// Labels of time alone, below a stack of charts wherever it is scrolled to.
+export class TimeAxis {
+  constructor(node) {
+    this.node = node;
+    this.span = [0, 1];
+    const height = TIME + 2;
+    this.plot = new uPlot(
+      {
+        width: Math.max(50, node.clientWidth), height, padding: [0, 10, 0, 0],
+        legend: { show: false }, cursor: { show: false },
+        scales: { x: { time: false, range: () => this.span }, y: { range: () => [0, 1] } },
+        axes: [timeAxis(), { ...axis(), size: LABELS, values: () => [], splits: () => [] }],
+        series: [{}, { show: false }],
+      },
+      [[], []],
+      node,
+    );
+    new ResizeObserver(() => this.plot.setSize({ width: node.clientWidth, height })).observe(node);
+  }
+
+  show(span) {
+    this.span = span;
+    this.plot.setData([span, [0, 0]], false);
+    this.plot.setScale("x", { min: span[0], max: span[1] });
+  }
+}

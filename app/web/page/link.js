@@ -1,5 +1,7 @@
 // The page's connection to the twin: what it says arrives here, what the user asks leaves here.
 
+import { unpack } from "./stream.js";
+
 const SLOWEST = 8000; // ms between two attempts to connect
 const QUIET = 1000; // ms without news after which the last status is told again
 const SETTLED = 700; // ms after the last edit or revision
@@ -71,7 +73,7 @@ export class Link extends EventTarget {
     this.dispatchEvent(new CustomEvent(type, { detail }));
   }
 
-  // Show a lane (see app/present/series/lane.py), in place of what it was; null closes it.
+  // Ask for a chart stream (app/present/series/chart_stream.py) in place of the one of that name; null closes it.
   look(name, wanted, take) {
     if (wanted === null) {
       delete this.lanes[name];
@@ -91,7 +93,7 @@ export class Link extends EventTarget {
 
   take(data) {
     if (typeof data !== "string") {
-      const [header, seconds, columns] = unpacked(data);
+      const [header, seconds, columns] = unpack(data);
       this.takers[header.lane]?.(header, seconds, columns);
       return;
     }
@@ -129,18 +131,4 @@ export class Link extends EventTarget {
       return "the twin does not answer";
     }
   }
-}
-
-// A frame: the length of its header, the header, times in seconds, and each column around its offset.
-function unpacked(buffer) {
-  const length = new DataView(buffer).getUint32(0, true);
-  const header = JSON.parse(new TextDecoder().decode(new Uint8Array(buffer, 4, length)));
-  const n = header.points;
-  let at = 4 + length;
-  const seconds = new Float64Array(buffer, at, n);
-  at += 8 * n;
-  const columns = [];
-  for (let left = buffer.byteLength - at; left > 0 && n; left -= 4 * n, at += 4 * n)
-    columns.push(new Float32Array(buffer, at, n));
-  return [header, seconds, columns];
 }

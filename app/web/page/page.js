@@ -62,7 +62,8 @@ link.addEventListener("notices", (event) => {
 });
 
 const view = new View(model.window);
-const charts = new Charts($("charts"), model, link, view);
+const kinds = await Promise.all(settings.charts.map((name) => import(`/page/charts/${name}`)));
+const charts = new Charts($("charts"), model, link, view, kinds);
 window.nisus.charts = charts;
 window.nisus.view = view;
 
@@ -82,7 +83,7 @@ const panes = { explore, whatif: new WhatIf($("whatif"), model, link), diagnose:
 const middle = new Tabs($("middle-tabs"), null, (shown) => {
   for (const [name, pane] of Object.entries(panes)) if (name !== shown) pane.hide();
   panes[shown]?.show();
-  charts.visible(shown === "charts-panel");
+  charts.show(shown === "charts-panel");
   $("layout").hidden = shown !== "charts-panel";
   $("legend").hidden = shown === "diagnose" || shown === "explore";
 });

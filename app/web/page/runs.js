@@ -3,7 +3,7 @@
 
 import { element, setText } from "./dom.js";
 import { compact, spaced, span } from "./format.js";
-import { swatch } from "./pins.js";
+import { swatch } from "./layers.js";
 import { gone } from "./save.js";
 import { Versions } from "./versions.js";
 

@@ -1,11 +1,11 @@
 // What can be saved: a chart as a picture, the track as a table, a report, a link to what is shown. One menu for all,
 // which opens beside the button that was pressed.
 
+import { heading } from "./chart.js";
 import { element } from "./dom.js";
 import { clock, words } from "./format.js";
 import { link as momentLink } from "./moment.js";
-import { chartSvg, heading, pngOf } from "./svg_chart.js";
-import { plotSvg } from "./svg_plot.js";
+import { plotSvg, pngOf } from "./svg.js";
 
 // Why there is nothing to save of a run.
 export const gone = (number) => `the track of run ${number} is gone: load it, and it is folded again`;
@@ -44,7 +44,7 @@ export class Save {
 
   chart(chart, button) {
     const { what } = chart;
-    const draw = () => chartSvg(chart, [`${this.model.twin}: ${heading(what)}`, this.about(chart.span, what.note)], what.under ? this.link.episodes : []);
+    const draw = () => chart.svg([`${this.model.twin}: ${heading(what)}`, this.about(chart.span, what.note)]);
     this.offer(button, draw, (what.key ?? what.title).replace(/^state:/, ""));
   }
 

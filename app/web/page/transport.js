@@ -2,7 +2,7 @@
 
 import { $, element, setAttribute, setText } from "./dom.js";
 import { clock } from "./format.js";
-import { Lane } from "./lane.js";
+import { Stream } from "./stream.js";
 import { SIGNS } from "./trust.js";
 
 const HEALTH = ["waiting", "tracking", "suspect", "degraded", "diverged", "stale"];
@@ -13,7 +13,7 @@ const POINTS = 400;
 export class Transport {
   constructor(model, link, view, charts) {
     Object.assign(this, { model, link, view, charts });
-    this.lane = charts.overview = new Lane();
+    this.stream = charts.overview = new Stream(link, "overview");
     this.episodes = [];
     this.canvas = $("timeline");
     const spans = [...new Set([...WINDOWS, model.window])].sort((a, b) => a - b);
@@ -28,7 +28,7 @@ export class Transport {
     this.canvas.addEventListener("pointerdown", (event) => this.press(event));
     this.canvas.addEventListener("pointermove", (event) => this.hover(event));
     this.canvas.addEventListener("keydown", (event) => this.keyed(event));
-    link.look("overview", { columns: ["health"], points: POINTS }, (...frame) => this.lane.take(...frame));
+    this.stream.ask({ columns: ["health"], points: POINTS });
     link.addEventListener("frames", () => this.draw());
     link.addEventListener("episodes", (event) => {
       this.episodes = event.detail;
@@ -41,7 +41,7 @@ export class Transport {
 
   // Ends of the track in seconds: of the whole recording where that is known.
   get ends() {
-    const { x } = this.lane;
+    const { x } = this.stream;
     const [first, last] = x.length ? [x[0], x[x.length - 1]] : [0, 1];
     const length = this.status?.length;
     return [Math.min(0, first), Math.max(last, typeof length === "number" ? length : last, first + 1)];
@@ -74,7 +74,7 @@ export class Transport {
   }
 
   get now() {
-    const { x } = this.lane;
+    const { x } = this.stream;
     return x.length ? x[x.length - 1] : NaN;
   }
 
@@ -97,8 +97,8 @@ export class Transport {
     const place = (seconds) => ((seconds - start) / (end - start)) * width;
     ctx.fillStyle = tone("rule");
     ctx.fillRect(0, 14, width, 10);
-    const { x } = this.lane;
-    const health = this.lane.column("health");
+    const { x } = this.stream;
+    const health = this.stream.column("health");
     for (let k = 0; k < x.length; ) {
       let next = k + 1;
       while (next < x.length && health[next] === health[k]) next += 1;

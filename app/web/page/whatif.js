@@ -1,15 +1,13 @@
 // What if: the twin goes on from now without readings, with inputs that are chosen here. A fan for each state, and when
 // it reaches a limit. Nothing is asked while this is hidden.
 
-import { Chart, band, dots, edge, line } from "./chart.js";
-import { unbroken } from "./charts.js";
+import { Chart, TimeAxis, band, dots, edge, line } from "./chart.js";
 import { element, setText } from "./dom.js";
-import { lines, probability } from "./fan_marks.js";
-import { bracketed, compact, spaced, span, words } from "./format.js";
-import { Lane } from "./lane.js";
+import { aboutMean, unbroken, wrapped } from "./drawing.js";
+import { bracketed, compact, spaced, span } from "./format.js";
 import { Range, shownExtent, within } from "./ranges.js";
-import { TimeAxis } from "./time_axis.js";
-import { inputChart, inputRow, profile } from "./whatif_inputs.js";
+import { Stream } from "./stream.js";
+import { inputChart, inputRow, levels, probability, profile } from "./whatif_inputs.js";
 
 const AGAIN = 2000; // ms between two forecasts, while the twin goes on
 const REST = 2; // times as long as a forecast took, at least
@@ -29,7 +27,7 @@ export class WhatIf {
     const names = model.states.map((state) => state.name);
     this.limits = Object.fromEntries(Object.entries(kept.limits ?? {}).filter(([name]) => names.includes(name)));
     this.inputs = {}; // what was chosen: {kind, value, after}, by name
-    this.lane = new Lane();
+    this.stream = new Stream(link, "whatif");
     this.states = [...model.states].sort((a, b) => (a.rows.length > 0) - (b.rows.length > 0)).slice(0, MOST);
     this.shown = false;
     link.addEventListener("frames", () => this.shown && this.draw());
@@ -46,7 +44,7 @@ export class WhatIf {
     if (!this.shown) return;
     this.shown = false;
     clearTimeout(this.timer);
-    this.link.look("whatif", null);
+    this.stream.ask(null);
   }
 
   begin() {
@@ -85,7 +83,7 @@ export class WhatIf {
     ];
     // More than is shown: what is forecast may be seconds old.
     const past = 1.5 * PAST * (this.horizon ?? this.model.window) + LONGEST_REST / 1000;
-    this.link.look("whatif", { span: past, points: 400, columns }, (...frame) => this.lane.take(...frame));
+    this.stream.ask({ span: past, points: 400, columns });
   }
 
   // Charts of the inputs that were chosen stand beneath the fans.
@@ -177,7 +175,7 @@ export class WhatIf {
     this.origin = Number(this.link.status.origin ?? 0) / 1e9;
     this.times = found.t.map((t) => found.now - this.origin + t);
     setText(this.method, `Limits: ${found.method}.`);
-    for (const [name, row] of this.rows) row.show(found.inputs[name], this.lane.columns[`input:${name}`] ?? []);
+    for (const [name, row] of this.rows) row.show(found.inputs[name], this.stream.columns[`input:${name}`] ?? []);
     this.showInputs();
     for (const [name, output] of Object.entries(this.said ?? {})) setText(output, sentence(this, name, found.limits[name]));
     this.draw();
@@ -188,7 +186,7 @@ export class WhatIf {
     if (!this.found) return;
     const now = this.times[0];
     const horizon = this.found.t.at(-1);
-    const first = Math.max(now - PAST * horizon, Math.min(now, this.lane.x[0] ?? now));
+    const first = Math.max(now - PAST * horizon, Math.min(now, this.stream.x[0] ?? now));
     const range = [first - MARGIN * horizon, this.times.at(-1)];
     const inputs = [...this.rows.values()].flatMap((row) => row.chart ?? []);
     for (const chart of [...this.parts, ...inputs]) chart.show(chart.what.data(), range);
@@ -238,10 +236,10 @@ function sentence(whatif, name, found) {
 // A chart of one state: what was, and to the right of now the fan of what may be.
 function fan(whatif, state) {
   const range = new Range();
-  const { lane } = whatif;
-  const past = ["upper", "lower", ...state.rows.map((row) => `reading:${row}`), "truth", "mean"].map((name) => (name.includes(":") ? name : `${name}:${state.name}`));
-  const future = ["upper2", "lower2", "upper1", "lower1", "mean"];
-  const first = past.length + 1; // series of the fan's outer edge
+  const { stream } = whatif;
+  const readings = state.rows.map((row) => `reading:${row}`);
+  const past = { upper: `upper:${state.name}`, lower: `lower:${state.name}`, truth: `truth:${state.name}`, mean: `mean:${state.name}`, ...Object.fromEntries(readings.map((name) => [name, name])) };
+  const future = { upper2: "upper2", lower2: "lower2", upper1: "upper1", lower1: "lower1", forecast: "mean" };
   return {
     key: `whatif:${state.name}`,
     title: state.label,
@@ -250,42 +248,42 @@ function fan(whatif, state) {
     names: { band: "± 1σ, ± 2σ" },
     weight: state.rows.length ? 1 : 1.4,
     sync: "future",
-    series: [
-      edge(), edge(), ...state.rows.map(() => dots("reading", 4)), line("truth", { width: 1.5, dash: [5, 3], spanGaps: true }), line("estimate", { width: 1.75 }),
-      edge(), edge(), edge(), edge(), line("estimate", { width: 1.75, dash: [6, 3] }),
-    ],
-    bands: [
-      band("band", [1, 2]),
-      band("band", [first, first + 1]),
-      band("band", [first + 2, first + 3]),
-    ],
+    series: {
+      upper: edge(), lower: edge(), ...Object.fromEntries(readings.map((name) => [name, dots("reading", 4)])),
+      truth: line("truth", { dash: [5, 3], spanGaps: true }), mean: line("estimate", { width: 1.75 }),
+      upper2: edge(), lower2: edge(), upper1: edge(), lower1: edge(), forecast: line("estimate", { width: 1.75, dash: [6, 3] }),
+    },
+    bands: [band("band", "upper", "lower"), band("band", "upper2", "lower2"), band("band", "upper1", "lower1")],
     over: (plot) => {
       probability(plot, whatif.times, whatif.found?.limits[state.name]);
-      lines(plot, whatif.times?.[0], whatif.limits[state.name]);
+      levels(plot, whatif.times?.[0], whatif.limits[state.name]);
     },
     data: () => {
       const { found, times } = whatif;
-      const count = within(lane.x, [-Infinity, times[0]])[1] + 1;
-      const before = lane.x.length && lane.x[0] <= times[0] ? Math.min(count, lane.x.length) : 0;
+      const count = within(stream.x, [-Infinity, times[0]])[1] + 1;
+      const before = stream.x.length && stream.x[0] <= times[0] ? Math.min(count, stream.x.length) : 0;
       const none = new Array(times.length).fill(null);
       const empty = new Array(before).fill(null);
       const told = found.states[state.name];
-      const was = past.map((name) => lane.column(name).slice(0, before));
-      const will = future.map((name) => told[name] ?? none);
-      if (state.circular) [[was, -1, [0, 1]], [will, -1, [0, 1, 2, 3]]].forEach(([columns, mean, edges]) => around(columns, mean, edges));
-      return [[...lane.x.slice(0, before), ...times], ...was.map((values) => [...values, ...none]), ...will.map((values) => [...empty, ...values])];
+      const was = Object.fromEntries(Object.entries(past).map(([kind, name]) => [kind, stream.column(name).slice(0, before)]));
+      const will = Object.fromEntries(Object.entries(future).map(([kind, name]) => [kind, told[name] ?? none]));
+      if (state.circular) [[was, "mean"], [will, "forecast"]].forEach(([columns, mean]) => turn(columns, mean));
+      return {
+        x: [...stream.x.slice(0, before), ...times],
+        ...Object.fromEntries(Object.entries(was).map(([name, values]) => [name, [...values, ...none]])),
+        ...Object.fromEntries(Object.entries(will).map(([name, values]) => [name, [...empty, ...values]])),
+      };
     },
-    range: (chart) => {
+    range: (data) => {
       if (state.probability) return [-0.03, 1.03];
-      const [x, ...columns] = chart.data;
       const limit = whatif.limits[state.name];
-      // The fan is in view as far as it opens; of what was, only what is not wild.
-      const drawn = { bands: [columns.slice(0, 2)], dots: columns.slice(2, first - 3), lines: columns.slice(first - 3) };
-      const [low, high] = shownExtent(drawn, 0, x.length - 1);
+      // The fan is in view as far as it opens; of the past, only what is not wild.
+      const drawn = { bands: [[data.upper, data.lower]], dots: readings.map((name) => data[name]), lines: ["truth", "mean", ...Object.keys(future)].map((name) => data[name]) };
+      const [low, high] = shownExtent(drawn, 0, data.x.length - 1);
       return range.fit(Math.min(low, limit ?? low), Math.max(high, limit ?? high));
     },
     says: (value) => {
-      const [x, upper, lower, mean] = [value(0), value(first), value(first + 1), value(first + 4)];
+      const [x, upper, lower, mean] = ["x", "upper2", "lower2", "forecast"].map(value);
       const now = whatif.times?.[0] ?? 0;
       if (!(x >= now)) return "";
       const around = Number.isFinite(upper) ? ` ± ${compact((upper - lower) / 2, 2)}` : "";
@@ -294,12 +292,9 @@ function fan(whatif, state) {
   };
 }
 
-// Columns of an angle, the edges of a band about its mean.
-function around(columns, place, edges) {
-  const mean = columns.at(place);
-  const broken = unbroken(mean);
-  columns.forEach((values, k) => {
-    const side = (value, i) => (value === null || broken[i] === null ? null : broken[i] + value - mean[i]);
-    columns[k] = edges.includes(k) ? values.map(side) : unbroken(values);
-  });
+// Columns of an angle: the edges of bands about their mean, everything else between -π and π.
+function turn(columns, mean) {
+  const center = columns[mean];
+  for (const [name, values] of Object.entries(columns))
+    columns[name] = /^(upper|lower)/.test(name) ? aboutMean(center, values) : name.startsWith("reading:") ? values.map(wrapped) : unbroken(values);
 }

@@ -2,7 +2,7 @@
 
 import { line } from "./chart.js";
 import { element } from "./dom.js";
-import { lines } from "./fan_marks.js";
+import { colour } from "./drawing.js";
 import { bracketed, compact, span, words } from "./format.js";
 import { Range, extent, shownExtent, within } from "./ranges.js";
 
@@ -85,7 +85,7 @@ const number = (field) => (field.value.trim() === "" ? NaN : Number(field.value.
 // A chart of one input that was chosen: what it was, and what it will be.
 export function inputChart(whatif, input) {
   const range = new Range();
-  const { lane } = whatif;
+  const { stream } = whatif;
   return {
     key: `input:${input.name}`,
     title: words(input.name),
@@ -94,19 +94,22 @@ export function inputChart(whatif, input) {
     names: { quiet: "recorded", ink: "chosen" },
     weight: 0.7,
     sync: "future",
-    series: [line("quiet", { width: 1.5 }), line("ink", { width: 1.75, dash: [6, 3] })],
-    over: (plot) => lines(plot, whatif.times?.[0]),
+    series: { recorded: line("quiet"), chosen: line("ink", { width: 1.75, dash: [6, 3] }) },
+    over: (plot) => levels(plot, whatif.times?.[0]),
     data: () => {
       const { found, times } = whatif;
-      const chosen = stairs(found.chosen[input.name], found.inputs[input.name], found.t.at(-1));
-      const before = lane.x.length && lane.x[0] <= times[0] ? within(lane.x, [-Infinity, times[0]])[1] + 1 : 0;
-      const was = held(lane.column(`input:${input.name}`).slice(0, before));
-      const [t, values] = [chosen.map(([seconds]) => times[0] + seconds), chosen.map(([, value]) => value)];
-      return [[...lane.x.slice(0, before), ...t], [...was, ...t.map(() => null)], [...was.map(() => null), ...values]];
+      const steps = stairs(found.chosen[input.name], found.inputs[input.name], found.t.at(-1));
+      const before = stream.x.length && stream.x[0] <= times[0] ? within(stream.x, [-Infinity, times[0]])[1] + 1 : 0;
+      const was = held(stream.column(`input:${input.name}`).slice(0, before));
+      return {
+        x: [...stream.x.slice(0, before), ...steps.map(([seconds]) => times[0] + seconds)],
+        recorded: [...was, ...steps.map(() => null)],
+        chosen: [...was.map(() => null), ...steps.map(([, value]) => value)],
+      };
     },
-    range: (chart) => range.fit(...shownExtent({ dots: chart.data.slice(1) }, 0, chart.data[0].length - 1)),
+    range: (data) => range.fit(...shownExtent({ dots: [data.recorded, data.chosen] }, 0, data.x.length - 1)),
     says: (value) => {
-      const [x, chosen] = [value(0), value(2)];
+      const [x, chosen] = [value("x"), value("chosen")];
       const now = whatif.times?.[0] ?? 0;
       return Number.isFinite(chosen) && x >= now ? `in ${span(x - now)} ${compact(chosen, 4)} ${input.unit}` : "";
     },
@@ -128,4 +131,60 @@ function stairs({ t, value }, now, end) {
 function held(values) {
   let last = null;
   return values.map((value) => (last = value ?? last));
+}
+
+// On a chart of a forecast
+
+const SURE = 0.25; // of a chart's height, of certainty
+
+// At the foot of the chart, as high as a quarter of it: how likely the limit has been passed by each time.
+export function probability(plot, times, found) {
+  if (!found || !times || !(found.overall >= 0.005)) return;
+  const { ctx, bbox } = plot;
+  const foot = bbox.top + bbox.height;
+  const place = (share, k) => [plot.valToPos(times[k], "x", true), foot - SURE * bbox.height * share];
+  ctx.save();
+  ctx.setLineDash([]);
+  ctx.beginPath();
+  ctx.moveTo(plot.valToPos(times[0], "x", true), foot);
+  found.probability.forEach((share, k) => ctx.lineTo(...place(share ?? 0, k)));
+  ctx.lineTo(plot.valToPos(times.at(-1), "x", true), foot);
+  ctx.fillStyle = colour("bounds");
+  ctx.fill();
+  ctx.beginPath();
+  found.probability.forEach((share, k) => ctx.lineTo(...place(share ?? 0, k)));
+  ctx.strokeStyle = colour("ink");
+  ctx.lineWidth = devicePixelRatio;
+  ctx.stroke();
+  const [x, y] = place(found.probability.at(-1) ?? 0, times.length - 1);
+  ctx.fillStyle = colour("faint");
+  ctx.font = `${11 * devicePixelRatio}px system-ui, sans-serif`;
+  ctx.textAlign = "right";
+  ctx.textBaseline = "bottom";
+  ctx.fillText(`P ${Math.round(100 * found.probability.at(-1))} %`, x - 4 * devicePixelRatio, y - 2 * devicePixelRatio);
+  ctx.restore();
+}
+
+// Now, upright; the limit, level.
+export function levels(plot, now, limit) {
+  const { ctx, bbox } = plot;
+  ctx.save();
+  ctx.lineWidth = devicePixelRatio;
+  const draw = (name, dash, ...points) => {
+    ctx.strokeStyle = colour(name);
+    ctx.setLineDash(dash.map((length) => length * devicePixelRatio));
+    ctx.beginPath();
+    ctx.moveTo(...points[0]);
+    ctx.lineTo(...points[1]);
+    ctx.stroke();
+  };
+  if (now !== undefined) {
+    const x = plot.valToPos(now, "x", true);
+    draw("faint", [], [x, bbox.top], [x, bbox.top + bbox.height]);
+  }
+  if (limit !== undefined) {
+    const y = plot.valToPos(limit, "y", true);
+    draw("ink", [8, 4], [bbox.left, y], [bbox.left + bbox.width, y]);
+  }
+  ctx.restore();
 }

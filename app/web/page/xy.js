@@ -1,20 +1,21 @@
 // Any two states against each other: where the estimate came from, its ellipses of 1 and 2 σ, particles or sigma points.
 
+import { multiples, rounded } from "./chart.js";
 import { element } from "./dom.js";
+import { clipped, colour } from "./drawing.js";
 import { bracketed, compact, words } from "./format.js";
-import { Lane } from "./lane.js";
-import { CanvasPen, SvgPen } from "./pens.js";
 import { within } from "./ranges.js";
-import { lightColours, ticks } from "./svg_chart.js";
+import { Stream } from "./stream.js";
+import { svgFile } from "./svg.js";
 
 const ROOM = { left: 46, right: 10, top: 8, bottom: 34 };
 const POINTS = 600;
-const FILE = [640, 480]; // px of a file's drawing
+const FILE = [640, 530]; // px of a file
 
 export class XY {
   constructor(node, model, link, view, charts) {
     Object.assign(this, { node, model, link, view, charts });
-    this.lane = new Lane();
+    this.stream = new Stream(link, "xy");
     this.belief = null;
     const names = model.states.map((state) => state.name);
     const first = model.pairs[0] ?? names.slice(0, 2);
@@ -56,13 +57,13 @@ export class XY {
 
   ask() {
     if (!this.shown) {
-      this.link.look("xy", null);
+      this.stream.ask(null);
       this.link.watch(null);
       return;
     }
     this.belief = null;
     const columns = this.pair.flatMap((name) => [`mean:${name}`, `truth:${name}`]);
-    this.link.look("xy", { ...this.view.wanted(), columns, points: POINTS }, (...frame) => this.lane.take(...frame));
+    this.stream.ask({ ...this.view.wanted(), columns, points: POINTS });
     this.link.watch(this.pair);
   }
 
@@ -74,21 +75,19 @@ export class XY {
     canvas.height = height * devicePixelRatio;
     const ctx = canvas.getContext("2d");
     ctx.scale(devicePixelRatio, devicePixelRatio);
-    const belief = this.paint(new CanvasPen(ctx), width, height);
+    const belief = this.paint(ctx, width, height);
     this.text.textContent = belief ? `correlation ${compact(belief.cov[1] / Math.sqrt(belief.cov[0] * belief.cov[2]), 2)}` : "ellipses are those of the newest row; follow to see them";
   }
 
   // As a file.
   svg(lines) {
-    const pen = new SvgPen(lightColours());
-    this.paint(pen, ...FILE);
-    return pen.file(...FILE, lines);
+    return svgFile(FILE, lines, [], (...drawing) => this.paint(...drawing), 1);
   }
 
-  // What is shown, with any pen; the belief that was drawn, or null.
-  paint(pen, width, height) {
-    const [from, to] = within(this.lane.x, this.charts.range);
-    const [mx, tx, my, ty] = this.pair.flatMap((name) => [this.lane.column(`mean:${name}`), this.lane.column(`truth:${name}`)]);
+  // Draw in pixels of the page; returns the estimate that was drawn, or null.
+  paint(ctx, width, height) {
+    const [from, to] = within(this.stream.x, this.charts.range);
+    const [mx, tx, my, ty] = this.pair.flatMap((name) => [this.stream.column(`mean:${name}`), this.stream.column(`truth:${name}`)]);
     const belief = this.view.following ? this.belief : null;
     const places = [];
     for (let k = from; k <= to; k++) if (typeof mx[k] === "number" && typeof my[k] === "number") places.push([mx[k], my[k]]);
@@ -100,7 +99,7 @@ export class XY {
       if ((tx[k] !== null || ty[k] !== null) && lastX !== null && lastY !== null) truth.push([lastX, lastY]);
     }
     const ellipses = belief ? [1, 2].map((size) => ellipse(belief, size)) : [];
-    const axes = new Axes(pen, width, height, [...places, ...truth, ...(ellipses[1] ?? [])], this.model.states, this.pair);
+    const axes = new Axes(ctx, width, height, [...places, ...truth, ...(ellipses[1] ?? [])], this.model.states, this.pair);
     axes.frame();
     axes.dots(belief?.points ?? [], "quiet", 1.5);
     axes.curve(truth, "truth", 1.5, [5, 3]);
@@ -127,8 +126,9 @@ function ellipse({ mean, cov }, size) {
 }
 
 class Axes {
-  constructor(pen, width, height, points, states, pair) {
-    Object.assign(this, { pen, width, height });
+  constructor(ctx, width, height, points, states, pair) {
+    Object.assign(this, { ctx, width, height });
+    ctx.font = "11px system-ui, sans-serif";
     this.labels = pair.map((name) => {
       const state = states.find((item) => item.name === name);
       return `${words(state.label)} ${bracketed(state.unit)}`.trim();
@@ -165,24 +165,55 @@ class Axes {
     const [right, bottom] = [this.width - ROOM.right, this.height - ROOM.bottom];
     for (const value of ticks(...this.spans[0], 4)) {
       const [x] = this.place([value, 0]);
-      this.pen.curve([[x, ROOM.top], [x, bottom]], "grid");
-      this.pen.text(compact(value), [x, bottom + 13]);
+      this.line([[x, ROOM.top], [x, bottom]], "grid");
+      this.text(compact(value), [x, bottom + 13]);
     }
     for (const value of ticks(...this.spans[1], 5)) {
       const [, y] = this.place([0, value]);
-      this.pen.curve([[ROOM.left, y], [right, y]], "grid");
-      this.pen.text(compact(value), [ROOM.left - 5, y + 4], "right");
+      this.line([[ROOM.left, y], [right, y]], "grid");
+      this.text(compact(value), [ROOM.left - 5, y + 4], "right");
     }
-    this.pen.text(this.labels[0], [(ROOM.left + right) / 2, this.height - 5]);
-    this.pen.text(this.labels[1], [10, (ROOM.top + bottom) / 2], "center", true);
+    this.text(this.labels[0], [(ROOM.left + right) / 2, this.height - 5]);
+    this.text(this.labels[1], [10, (ROOM.top + bottom) / 2], "center", true);
+  }
+
+  line(points, tone, width = 1, dash = []) {
+    const { ctx } = this;
+    ctx.strokeStyle = colour(tone);
+    ctx.lineWidth = width;
+    ctx.setLineDash(dash);
+    ctx.beginPath();
+    for (const point of points) ctx.lineTo(...point);
+    ctx.stroke();
+    ctx.setLineDash([]);
+  }
+
+  text(words, [x, y], align = "center", upright = false) {
+    const { ctx } = this;
+    ctx.save();
+    ctx.fillStyle = colour("faint");
+    ctx.textAlign = align;
+    ctx.translate(x, y);
+    if (upright) ctx.rotate(-Math.PI / 2);
+    ctx.fillText(words, 0, 0);
+    ctx.restore();
   }
 
   curve(points, tone, width, dash) {
-    this.pen.curve(points.map((point) => this.place(point)), tone, width, dash);
+    this.line(points.map((point) => this.place(point)), tone, width, dash);
   }
 
   dots(points, tone, radius) {
-    const frame = [ROOM.left, ROOM.top, this.width - ROOM.left - ROOM.right, this.height - ROOM.top - ROOM.bottom];
-    this.pen.dots(points.map((point) => this.place(point)), tone, radius, frame);
+    const ctx = clipped({ ctx: this.ctx, bbox: { left: ROOM.left, top: ROOM.top, width: this.width - ROOM.left - ROOM.right, height: this.height - ROOM.top - ROOM.bottom } });
+    ctx.fillStyle = colour(tone);
+    for (const point of points) {
+      ctx.beginPath();
+      ctx.arc(...this.place(point), radius, 0, 2 * Math.PI);
+      ctx.fill();
+    }
+    ctx.restore();
   }
 }
+
+// About so many round numbers in a span.
+const ticks = (low, high, about) => multiples(low, high, rounded((high - low) / about));

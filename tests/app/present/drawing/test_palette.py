@@ -8,7 +8,7 @@ import pytest
 
 from app.present.drawing.colors import THEMES, mixed, rgb
 
-STYLE = Path("app/web/page/style.css")
+STYLE = Path("app/web/page/chart.css")
 
 
 def variables(selector):

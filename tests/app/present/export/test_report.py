@@ -1,15 +1,18 @@
 """A report is one file that needs no other, and says what the fold says."""
 
+import base64
+import json
 import re
-from xml.etree import ElementTree
+import shutil
 
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
 from app.cli.main import main
+from app.present.export import report_charts
 from app.present.export.alarm_guide import advice
-from app.present.export.run_charts import run_charts
+from app.present.export.report_charts import charts_html
 from estimators.diagnostics.episodes import CAUSES
 from estimators.fold import fold
 from estimators.log import Log
@@ -33,18 +36,31 @@ def made(tmp_path_factory):
     return html.read_text(encoding="utf-8"), pq.read_table(track)
 
 
-def test_it_is_one_file_and_refers_to_nothing(made):
+def data_of(html):
+    """The data of the charts, and the frame of a stream as times and columns by name."""
+    data = json.loads(re.search(r'<script id="chart-data" type="application/json">(.*?)</script>', html)[1])
+
+    def columns(stream):
+        frame = base64.b64decode(data["streams"][stream])
+        size = int.from_bytes(frame[:4], "little")
+        header = json.loads(frame[4 : 4 + size])
+        n, names = header["points"], header["columns"]
+        seconds = np.frombuffer(frame, "<f8", n, 4 + size)
+        values = np.frombuffer(frame, "<f4", n * len(names), 4 + size + 8 * n).reshape(len(names), n)
+        return seconds, dict(zip(names, values + np.array(header["offsets"])[:, None], strict=True))
+
+    return data, columns
+
+
+def test_it_is_one_file_and_may_load_nothing(made):
     html, _ = made
     page = parsed(html)
-    assert not page.tags & {"script", "link", "iframe", "img", "object", "embed", "form", "input", "a"}
+    assert not page.tags & {"link", "iframe", "object", "embed", "form", "input", "a"}
+    policy = next(value for tag, name, value in page.attributes if tag == "meta" and "default-src" in (value or ""))
+    assert "default-src 'none'" in policy and "http" not in policy and "*" not in policy
     for tag, name, value in page.attributes:
-        assert name not in ("src", "href", "xlink:href", "srcset", "action") and not name.startswith("on"), (tag, value)
-    # A chart refers to its own clip path, and to nothing else.
-    ids = re.findall(r'id="([^"]+)"', html)
-    assert len(ids) == len(set(ids))
-    assert {found for found in re.findall(r"url\(([^)]*)\)", html)} == {f"#{name}" for name in ids}
-    assert "://" not in html and "@import" not in html
-    assert "a <motor> & more" in " ".join(page.text)
+        assert name not in ("src", "href", "srcset", "action") and not name.startswith("on"), (tag, value)
+    assert "@import" not in html and "a <motor> & more" in " ".join(page.text)
 
 
 def test_it_says_who_made_it_when_and_of_what(made):
@@ -76,20 +92,15 @@ def test_the_episode_is_there_with_its_remedy(made):
 
 
 def test_charts_hold_the_extremes(made):
-    """The estimate's curve reaches as high and as low as the track does."""
+    """The estimate's column reaches as high and as low as the track does."""
     html, track = made
-    charts = [ElementTree.fromstring(svg) for svg in re.findall(r"<svg.*?</svg>", html, re.DOTALL)]
-    chart = next(root for root in charts if root.get("aria-label", "").startswith("temperature"))
-    (curve,) = [node for node in chart.find("g").iter("path") if node.get("stroke") == "#0b62c4"]
-    ys = np.array([float(y) for y in re.findall(r"[ML][-\d.]+ ([-\d.]+)", curve.get("d"))])
+    data, columns = data_of(html)
+    seconds, found = columns("live")
     mean = track["temperature"].to_numpy()
-    texts = [node for node in chart.iter("text") if node.get("text-anchor") == "end"]
-    marks = [(float(node.get("y")) - 4, float(node.text)) for node in texts]
-    (y0, v0), (y1, v1) = marks[0], marks[-1]
-    values = v0 + (ys - y0) * (v1 - v0) / (y1 - y0)
-    a_pixel = abs((v1 - v0) / (y1 - y0))
-    assert values.max() == pytest.approx(mean.max(), abs=0.1 * a_pixel)
-    assert values.min() == pytest.approx(mean.min(), abs=0.1 * a_pixel)
+    assert found["mean:temperature"].max() == pytest.approx(mean.max(), rel=1e-6)
+    assert found["mean:temperature"].min() == pytest.approx(mean.min(), rel=1e-6)
+    assert seconds[0] == 0.0 and seconds[-1] == pytest.approx(300.0, abs=0.2)
+    assert data["episodes"][0]["from"] == pytest.approx(100.0, abs=1.0)
 
 
 def test_one_row_among_thousands_is_seen():
@@ -98,14 +109,57 @@ def test_one_row_among_thousands_is_seen():
     track = fold("kf", MODEL, Tuning.of(MODEL), log).copy()
     track.mean[:, 0], track.std[:, 0] = 0.0, 1.0
     track.mean[5003, 0] = 77.0
-    svg = next(chart for chart in run_charts(MODEL, log.events, track, []) if 'aria-label="temperature' in chart)
-    (curve,) = [node for node in ElementTree.fromstring(svg).find("g").iter("path") if node.get("stroke") == "#0b62c4"]
-    points = [(float(x), float(y)) for x, y in re.findall(r"[ML]([-\d.]+) ([-\d.]+)", curve.get("d"))]
-    x, y = min(points, key=lambda point: point[1])
-    others = [height for _, height in points if height > y + 1]
-    assert len(points) <= 802 and len(points) - len(others) == 1 and max(others) - y > 80
-    left, right = points[0][0], points[-1][0]
-    assert (x - left) / (right - left) == pytest.approx(5003 / rows, abs=2 / 400)
+    _, columns = data_of(charts_html(Tuning.of(MODEL), log.events, track, [], None, None))
+    seconds, found = columns("live")
+    values = found["mean:temperature"]
+    assert len(values) <= 802 and values.max() == 77.0 and np.sum(values > 1.0) == 1
+    assert seconds[values.argmax()] == pytest.approx(5003, abs=2 * rows / 400)
+
+
+CHART = """
+import { line } from "../chart.js";
+export const order = 0;
+export default (charts) => [{
+  key: "own", title: "a chart of one file", unit: "", weight: 1, columns: ["nis_mean"],
+  series: { nis: line("estimate") }, data: () => ({ x: charts.live.x, nis: charts.live.column("nis_mean") }),
+  range: () => [0, 10], says: (value) => value("nis").toFixed(1),
+}];
+"""
+
+
+@pytest.mark.browser
+def test_it_draws_the_page_s_charts_without_a_network(browser, made, tmp_path, monkeypatch):
+    """Also one that is a file more in the folder of charts; on paper each is a picture."""
+    pages = tmp_path / "page"
+    shutil.copytree(report_charts.PAGE, pages)
+    (pages / "charts" / "own.js").write_text(CHART)
+    monkeypatch.setattr(report_charts, "PAGE", pages)
+    yaml, path = tmp_path / "quiet.yaml", tmp_path / "report.html"
+    yaml.write_text(
+        "title: quiet\nmodel: motor_winding\nestimator: kf\nsensors: {winding: {std: 1}}\n"
+        "source: {type: simulator, seed: 5, step: 0.1, duration: 60}\n"
+    )
+    assert main(["fold", str(yaml), "--html", str(path)]) == 0
+    context = browser.new_context(viewport={"width": 1000, "height": 900}, offline=True)
+    page, wrong = context.new_page(), []
+    page.on("pageerror", lambda error: wrong.append(str(error)))
+    page.on("console", lambda message: wrong.append(message.text))
+    page.on("request", lambda request: request.url.startswith(("file:", "data:")) or wrong.append(request.url))
+    page.goto(path.as_uri())
+    page.locator(".paper").nth(4).wait_for(state="attached")
+    titles = page.locator("#charts article > header b").all_inner_texts()
+    assert titles == ["a chart of one file", "rate", "temperature", "NIS", "winding"]
+    blue = """[...document.querySelectorAll("#charts canvas")].map((canvas) => {
+        const { data } = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height);
+        let count = 0;
+        for (let k = 0; k < data.length; k += 4) if (data[k + 3] > 100 && data[k + 2] > data[k] + 60) count++;
+        return count;
+    })"""
+    assert min(page.evaluate(blue)[:3]) > 200
+    page.emulate_media(media="print")
+    assert page.locator(".paper").first.is_visible() and not page.locator("#charts canvas").first.is_visible()
+    context.close()
+    assert wrong == []
 
 
 @pytest.mark.parametrize("cause", sorted(set(CAUSES) - {"stale", "diverged"}))

@@ -93,7 +93,9 @@ def test_an_input_steps_ramps_or_repeats_what_was_recorded(page, session):
     winding = page.evaluate("window.nisus.panes.whatif.found.states.winding.mean")
     t = page.evaluate("window.nisus.panes.whatif.found.t")
     assert winding[-1] > winding[max(k for k, time in enumerate(t) if time <= 60.0)] + 50.0
-    drawn = page.evaluate("window.nisus.panes.whatif.rows.get('i_q').chart.data[2].filter((value) => value !== null)")
+    drawn = page.evaluate(
+        "window.nisus.panes.whatif.rows.get('i_q').chart.data.chosen.filter((value) => value !== null)"
+    )
     assert drawn[-1] == drawn[-2] == 600.0 and drawn[0] == drawn[1] != 600.0
     assert page.get_by_label("Chart of i q", exact=True).is_visible() and charts.count() == 5
 

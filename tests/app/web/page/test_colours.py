@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-STYLE = Path("app/web/page/style.css").read_text()
+STYLE = Path("app/web/page/chart.css").read_text()
 TEXT, GRAPHIC = 4.5, 3.0
 APART = 8.0
 """CIEDE2000 between two lines, between dots, or between health colours: three to four just noticeable differences."""

@@ -101,7 +101,7 @@ def test_many_states_of_a_kind_are_one_chart_in_which_the_odd_one_stands_out(sho
     assert (low, median, high) == pytest.approx(
         (soc[lowest], float(np.median(list(soc.values()))), soc[highest]), abs=1e-4
     )
-    strong = page.evaluate("window.nisus.charts.charts[0].data.at(-1).at(-1)")
+    strong = page.evaluate("window.nisus.charts.charts[0].data.furthest.at(-1)")
     assert strong == pytest.approx(soc[lowest], rel=1e-6)
     # The band is that of the strong one alone, and no other is asked for.
     until(page, "window.nisus.charts.strong.edges('soc_5')[0].length > 0")
@@ -115,10 +115,10 @@ def test_many_states_of_a_kind_are_one_chart_in_which_the_odd_one_stands_out(sho
             const { ctx, bbox } = plot;
             const [x] = plot.data;
             const middle = x[Math.floor(0.7 * x.length)];
-            const { x: times } = window.nisus.charts.strong.lane;
+            const { x: times } = window.nisus.charts.strong.stream;
             const at = times.findLastIndex((time) => time <= middle);
             const lower = window.nisus.charts.strong.edges("soc_5")[1][at]; // beneath it there is no other line
-            const strong = what.data().at(-1)[Math.floor(0.7 * x.length)];
+            const strong = what.data().furthest[Math.floor(0.7 * x.length)];
             const left = plot.valToPos(middle, "x", true);
             const place = (value) => ctx.getImageData(left, plot.valToPos(value, "y", true), 1, 1).data;
             const [inside, outside] = [(lower + strong) / 2, lower - (strong - lower) / 2].map(place);
@@ -136,31 +136,33 @@ def test_a_dozen_states_and_more_are_a_picture_of_space_and_time(shown):
     page, session = shown("lorenz96", **{"source.duration": "20"})
     until(page, "window.nisus.charts.live.x.length > 100")
     assert page.evaluate("window.nisus.charts.layout.shown()[0][0]") == "group:x"
-    pixels = page.evaluate(
-        """async () => {
-            const { groups, live } = window.nisus.charts;
-            const image = new Image();
-            image.src = groups[0].image().url;
-            await image.decode();
-            const canvas = document.createElement("canvas");
-            [canvas.width, canvas.height] = [image.width, image.height];
-            const context = canvas.getContext("2d");
-            context.drawImage(image, 0, 0);
-            const { data } = context.getImageData(image.width - 1, 0, 1, image.height);
-            const values = groups[0].columns.map((name) => live.column(name).at(-1));
-            return [[...data], values, image.width === live.x.length];
+    page.evaluate("window.nisus.view.show(window.nisus.charts.live.x.at(-1) - 2, window.nisus.charts.live.x.at(-1))")
+    until(page, "window.nisus.charts.live.x[0] > 17")
+    data, values = page.evaluate(
+        """() => {
+            const { charts: [{ plot, what, data }] } = window.nisus.charts;
+            const { ctx, bbox } = plot;
+            const left = Math.round(bbox.left + 0.95 * bbox.width);
+            const shown = plot.posToVal((left - bbox.left) / devicePixelRatio, "x");
+            const at = data.x.findLastIndex((time) => time <= shown);
+            const rows = what.columns.map((_, k) => bbox.top + bbox.height * (1 - (k + 0.5) / what.columns.length));
+            const colours = rows.map((top) => [...ctx.getImageData(left, Math.round(top), 1, 1).data]);
+            return [colours, [...what.columns.map((name) => data[name.split(":")[1]][at]), data.x[at]]];
         }"""
     )
-    data, values, wide = pixels
-    assert wide and len(values) == 40
-    np.testing.assert_allclose(values, pull_all(session.engine).track.mean[-1], rtol=1e-5, atol=1e-6)
-    light = np.array(data).reshape(-1, 4)[::-1, :3].sum(axis=1)  # the first state below
+    pull = pull_all(session.engine)
+    row = np.searchsorted(pull.events.t, pull.events.t[0] + round(values.pop() * 1e9) + 1) - 1
+    np.testing.assert_allclose(values, pull.track.mean[row], rtol=1e-5, atol=1e-6)
+    assert len(values) == 40
+    light = np.array(data)[:, :3].sum(axis=1)
     # The scale goes from dark to light: lightness has the order of the values.
     assert np.all(np.diff(light[np.argsort(values)]) >= 0)
     # Beneath it how far they are apart, and how sure the estimate is of one.
     assert page.evaluate("window.nisus.charts.layout.shown()[1][0]") == "spread:x"
-    until(page, "window.nisus.charts.charts[1].data[3].at(-1) !== null")
-    rows = page.evaluate("window.nisus.charts.charts[1].data.slice(1).map((values) => values.at(-1))")
+    until(page, "window.nisus.charts.charts[1].data.upper?.at(-1) != null")
+    rows = page.evaluate(
+        "['highest', 'lowest', 'upper', 'lower', 'mean'].map((name) => window.nisus.charts.charts[1].data[name].at(-1))"
+    )
     track = pull_all(session.engine).track
     mean, half = track.mean[-1].mean(), 2 * np.sqrt(np.mean(track.std[-1] ** 2))
     expected = (track.mean[-1].max(), track.mean[-1].min(), mean + half, mean - half, mean)

@@ -63,7 +63,7 @@ TINTED = """() => {
   const { data } = ctx.getImageData(bbox.left, y, bbox.width, 1);
   let tinted = 0;
   for (let k = 0; k < data.length; k += 4) tinted += data[k] - data[k + 2] > 20;
-  return [window.nisus.charts.live.each, tinted / (data.length / 4), chart.what.extras(chart)[0].x.length];
+  return [window.nisus.charts.live.each, tinted / (data.length / 4), chart.what.curves()[0].x.length];
 }"""
 
 

@@ -18,7 +18,7 @@ from tests.app.web.page.browsed import PATIENCE, browsed, until
 pytestmark = pytest.mark.browser
 
 PINNED = (176, 51, 143)
-"""The colour of the first place, in the light theme: app/web/page/style.css, --pin-0."""
+"""The colour of the first place, in the light theme: app/web/page/chart.css, --pin-0."""
 
 
 @pytest.fixture

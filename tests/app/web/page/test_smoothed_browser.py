@@ -10,7 +10,7 @@ from tests.app.web.page.test_runs_browser import page, session  # noqa: F401  fi
 pytestmark = pytest.mark.browser
 
 SMOOTHED = (38, 76, 70)
-"""app/web/page/style.css, --smoothed, in the light theme."""
+"""app/web/page/chart.css, --smoothed, in the light theme."""
 
 
 def test_it_is_drawn_while_it_is_on(page, monkeypatch):  # noqa: F811

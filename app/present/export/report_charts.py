@@ -1,0 +1,150 @@
+"""Charts of a report: the page's own chart code with its data, embedded in one HTML file.
+
+Every kind of chart of the page (`app/web/page/charts`) is in the report too.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import posixpath
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from estimators.diagnostics.episodes import Episode
+from estimators.diagnostics.sensitivity import Bound
+from estimators.log import Events
+from estimators.model.state_space import StateSpaceModel
+from estimators.smoothing.walk import Smoothed
+from estimators.track import Track
+from estimators.tuning import Tuning
+
+from ...live.outputs import Pull
+from ..drawing.direct_readings import observed
+from ..series.chart_stream import ChartQuery, ChartStream
+from ..series.charted_run import KeptRun
+from ..series.columns import columns_of, rows_of
+
+PAGE = Path(__file__).resolve().parents[2] / "web" / "page"
+"""The page's files, as installed beside this package."""
+
+MAX_GROUPS = 400
+"""Groups of rows, of each of which the extremes are drawn."""
+
+IMPORT = re.compile(r'(?<=from )"(\.{1,2}/[\w./]+)"')
+
+FRAME = """<style>
+{style}
+</style>
+<div id="charts"></div>
+<noscript>Open this file in a browser that runs scripts to see the charts.</noscript>
+<script id="chart-data" type="application/json">{data}</script>
+<script type="importmap">{modules}</script>
+<script>{uplot}</script>
+<script type="module">import "nisus/report.js";</script>"""
+
+
+def charts_html(
+    tuning: Tuning,
+    events: Events,
+    track: Track,
+    episodes: Sequence[Episode],
+    bounds: Mapping[str, Bound] | None,
+    smoothed: Smoothed | None,
+) -> str:
+    """Return the charts of a run as HTML that loads nothing; times count from the first event."""
+    model = tuning.model
+    streams = {"live": _frame(tuning, events, track)}
+    if smoothed is not None:
+        streams["smoothed"] = _frame(tuning, events, smoothed.instead_of(track), ("mean:", "upper:", "lower:"))
+    start = float(events.t[0]) * 1e-9
+    kinds = sorted(path.name for path in (PAGE / "charts").glob("*.js"))
+    data = {
+        "model": charted_model(model) | {"commissioned": tuning.baseline is not None},
+        "kinds": kinds,
+        "streams": streams,
+        "episodes": [
+            {"from": item.start - start, "to": None if item.end is None else item.end - start} for item in episodes
+        ],
+        "integrity": {
+            name: {"bound": float(item.bound)} for name, item in (bounds or {}).items() if np.isfinite(item.bound)
+        },
+    }
+    css = (PAGE / "chart.css").read_text(), (PAGE / "vendor" / "uPlot.min.css").read_text()
+    return FRAME.format(
+        style="\n".join(css),
+        data=_script(data),
+        modules=_script({"imports": _modules(["report.js", *(f"charts/{name}" for name in kinds)])}),
+        uplot=(PAGE / "vendor" / "uPlot.iife.min.js").read_text(),
+    )
+
+
+def _frame(tuning: Tuning, events: Events, track: Track, kinds: tuple[str, ...] = ("",)) -> str:
+    """Return the rows as a frame of a chart stream, without columns that have no value."""
+    columns = columns_of(tuning.model)
+    pull = Pull(0, False, 0, events, track)
+    names = tuple(
+        name
+        for name, column in columns.items()
+        if name.startswith(kinds) and np.isfinite(column.values(events, track)).any()
+    )
+    run, origin = KeptRun(pull, columns), int(events.t[0])
+    stream = ChartStream("report", ChartQuery(names, points=MAX_GROUPS), columns)
+    stream.look(run, origin, int(events.t[-1]))
+    run.sync(stream.levelled)
+    return base64.b64encode(stream.frame(run, origin) or b"").decode()
+
+
+def _modules(names: Sequence[str]) -> dict[str, str]:
+    """Return an import map with these modules of the page, and all that they import, as data URLs."""
+    found: dict[str, str] = {}
+    left = list(names)
+    while left:
+        name = left.pop()
+        if f"nisus/{name}" in found:
+            continue
+
+        def absolute(match: re.Match[str], folder: str = posixpath.dirname(name)) -> str:
+            left.append(posixpath.normpath(posixpath.join(folder, match[1])))
+            return f'"nisus/{left[-1]}"'
+
+        code = base64.b64encode(IMPORT.sub(absolute, (PAGE / name).read_text()).encode()).decode()
+        found[f"nisus/{name}"] = f"data:text/javascript;base64,{code}"
+    return found
+
+
+def _script(value: Any) -> str:
+    """Return JSON that cannot end the script element around it."""
+    return json.dumps(value, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
+
+
+def charted_model(model: StateSpaceModel) -> dict[str, Any]:
+    """Return states and sensor rows as charts need them: names, units, and which rows measure which state."""
+    rows = rows_of(model)
+    names = {(sensor, row): name for name, sensor, row in rows}
+    readers: dict[str, list[str]] = {state.name: [] for state in model.shown_states}
+    for dot in observed(model):
+        name = model.state_names[int(dot.state)]
+        if name in readers:
+            readers[name].append(names[dot.sensor, dot.row])
+    return {
+        "states": [
+            {
+                "name": state.name,
+                "label": model.label(state.name).replace("_", " "),
+                "unit": state.unit,
+                "circular": bool(getattr(state, "circular", False)),
+                "probability": j == model.mode,
+                "rows": readers[state.name],
+            }
+            for j, state in enumerate(model.shown_states)
+        ],
+        "rows": [
+            {"name": name, "sensor": model.sensor_names[sensor], "unit": model.sensors[sensor].rows[row].unit}
+            for name, sensor, row in rows
+        ],
+    }

@@ -1,0 +1,90 @@
+// Each state: estimate and band, truth, the sensors that measure it directly, and what other runs say.
+
+import { band, dots, edge, line } from "../chart.js";
+import { aboutMean, boxes, marks, unbroken, wrapped } from "../drawing.js";
+import { bracketed, compact, decimals, fixed, withDeviation } from "../format.js";
+import { Range, shownExtent, within } from "../ranges.js";
+import { groupsOf } from "./group.js";
+
+export const order = 2;
+
+const MAX_CHARTS = 24;
+const FEW_STATES = 6; // up to so many, those that nobody measures have more room
+const UNBOUNDED = 100; // times the band, or the value itself, from which on a protection level says nothing
+
+const MEASURED = {
+  reading: () => dots("reading", 4),
+  held: () => dots("reading", 5, true),
+  refused: () => dots("refused", 6),
+  screened: () => dots("refused", 7, true),
+};
+
+export default function (charts) {
+  const states = charts.model.states.toSorted((a, b) => (a.rows.length > 0) - (b.rows.length > 0));
+  const grouped = new Set(groupsOf(states).flatMap(({ members }) => members.map((state) => state.name)));
+  return states.slice(0, MAX_CHARTS).map((state) => ({ ...chartOf(charts, state), further: grouped.has(state.name) }));
+}
+
+function chartOf(charts, state) {
+  const axisRange = new Range();
+  const { live } = charts;
+  const measured = state.rows.flatMap((row) => Object.keys(MEASURED).map((kind) => `${kind}:${row}`));
+  const between = state.circular ? [] : measured.filter((name) => name.startsWith("reading:"));
+  const own = Object.fromEntries(["upper", "lower", "truth", "mean"].map((kind) => [kind, `${kind}:${state.name}`]));
+  const level = () => charts.integrity?.[state.name]?.bound;
+  return {
+    key: `state:${state.name}`,
+    title: state.label,
+    unit: bracketed(state.unit),
+    note: state.rows.length ? null : "not measured",
+    help: "Estimate ± 2σ; in brackets the protection level: the largest error that one undetected fault can cause",
+    weight: state.rows.length || charts.model.states.length > FEW_STATES ? 1 : 1.5,
+    columns: [...Object.values(own), ...measured],
+    // What matters most lies on top.
+    series: {
+      upper: edge(),
+      lower: edge(),
+      ...Object.fromEntries(measured.map((name) => [name, MEASURED[name.split(":")[0]]()])),
+      truth: line("truth", { dash: [5, 3], spanGaps: true }),
+      mean: line("estimate", { width: 1.75 }),
+    },
+    bands: [band("band", "upper", "lower")],
+    data: () => {
+      const columns = Object.fromEntries(Object.entries(own).map(([kind, name]) => [kind, live.column(name)]));
+      const dotted = measured.map((name) => [name, state.circular ? live.column(name).map(wrapped) : live.column(name)]);
+      if (state.circular) {
+        for (const side of ["upper", "lower"]) columns[side] = aboutMean(columns.mean, columns[side]);
+        for (const kind of ["truth", "mean"]) columns[kind] = unbroken(columns[kind]);
+      }
+      return { x: live.x, ...columns, ...Object.fromEntries(dotted) };
+    },
+    curves: () => [
+      ...boxes(live, between),
+      ...charts.layers.flatMap((layer) => layer.curves(state)),
+      ...protection(live.x, live.column(own.mean), level()),
+    ],
+    paint: (plot) => marks(plot, charts.episodes, charts.view.at),
+    range: (data, span) => {
+      if (state.probability) return [-0.03, 1.03];
+      const drawn = { lines: [data.truth, data.mean], bands: [[data.lower, data.upper]], dots: measured.map((name) => data[name]) };
+      const shown = shownExtent(drawn, ...within(data.x, span));
+      return axisRange.fit(...charts.layers.reduce((range, layer) => layer.widened?.(range, state, span) ?? range, shown));
+    },
+    says: (value) => {
+      const [upper, truth, mean] = ["upper", "truth", "mean"].map(value);
+      const deviation = upper - mean;
+      const bound = level();
+      const known = !Number.isFinite(bound) ? "" : bound > UNBOUNDED * Math.max(deviation, Math.abs(mean)) ? "  (unbounded)" : `  (≤ ${compact(bound, 2)})`;
+      const off = !Number.isFinite(truth) ? "" : `  truth ${deviation > 0 ? fixed(truth, decimals(deviation)) : compact(truth, 4)}`;
+      if (state.probability) return `${fixed(mean, 3)}${off && `  truth ${fixed(truth, 0)}`}`;
+      return withDeviation(mean, deviation, state.unit) + known + off;
+    },
+  };
+}
+
+// The protection level to either side of the estimate.
+function protection(x, mean, bound) {
+  if (!Number.isFinite(bound)) return [];
+  const values = (side) => mean.map((value) => (typeof value === "number" ? value + side * bound : value));
+  return [-1, 1].map((side) => ({ over: true, legend: "protection level", tone: "integrity", dash: [2, 3], x, values: values(side) }));
+}

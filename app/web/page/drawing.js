@@ -1,0 +1,214 @@
+// Drawings on a plot beside its series: curves of other streams, episodes, values beyond the axis. They draw alike on
+// the page's canvas and into a file (svg.js).
+
+import { within } from "./ranges.js";
+
+const styles = getComputedStyle(document.documentElement);
+let light = null;
+
+// A colour of the page's theme, or of the light one while a file is drawn.
+export const colour = (name) => light?.get(`--${name}`) ?? styles.getPropertyValue(`--${name}`).trim();
+
+// Draw in the colours of the light theme, which stand in the page's own style.
+export function inLight(draw) {
+  light = lightPalette();
+  try {
+    return draw();
+  } finally {
+    light = null;
+  }
+}
+
+export function lightPalette() {
+  for (const sheet of document.styleSheets)
+    for (const rule of sheet.cssRules)
+      if (rule.selectorText === ":root" && rule.style.getPropertyValue("--estimate"))
+        return new Map([...rule.style].filter((name) => name.startsWith("--")).map((name) => [name, rule.style.getPropertyValue(name).trim()]));
+  throw new Error("the page has no style");
+}
+
+// The context of a plot in which nothing leaves its frame, until it is restored.
+export function clipped({ ctx, bbox }) {
+  ctx.save();
+  ctx.beginPath();
+  ctx.rect(bbox.left, bbox.top, bbox.width, bbox.height);
+  ctx.clip();
+  return ctx;
+}
+
+// A curve {x, values, tone, width, dash}, broken where a value is null; undefined values are skipped. With `fill`, a
+// share of opacity, an area with that outline.
+export function trace(plot, { x, values, tone, width = 1, dash = [], fill }) {
+  if (!x.length) return;
+  const ctx = clipped(plot);
+  const scale = devicePixelRatio;
+  const [from, to] = fill ? [0, x.length - 1] : within(x, [plot.scales.x.min, plot.scales.x.max]);
+  ctx.beginPath();
+  let open = false;
+  for (let k = Math.max(0, from - 1); k <= Math.min(x.length - 1, to + 1); k++) {
+    if (values[k] === null) open = false;
+    if (typeof values[k] !== "number") continue;
+    const place = [plot.valToPos(x[k], "x", true), plot.valToPos(values[k], "y", true)];
+    if (open) ctx.lineTo(...place);
+    else ctx.moveTo(...place);
+    open = true;
+  }
+  if (fill) {
+    ctx.globalAlpha = fill;
+    ctx.fillStyle = colour(tone);
+    ctx.fill();
+  } else {
+    ctx.strokeStyle = colour(tone);
+    ctx.lineWidth = width * scale;
+    ctx.setLineDash(dash.map((length) => length * scale));
+    ctx.stroke();
+  }
+  ctx.restore();
+}
+
+// The outline of a band, for `trace`.
+export function area(x, upper, lower) {
+  const rows = x.flatMap((_, k) => (typeof upper[k] === "number" && typeof lower[k] === "number" ? [k] : []));
+  const back = rows.toReversed();
+  return { x: [...rows, ...back].map((k) => x[k]), values: [...rows.map((k) => upper[k]), ...back.map((k) => lower[k])] };
+}
+
+// Of grouped rows only the extremes arrive: a faint box from one to the other stands for the points between, so that
+// noise does not look like two rows of marks.
+export const boxes = (stream, names) => names.map((name) => {
+  const column = stream.each === 2 ? stream.column(name) : [];
+  const found = { legend: "", tone: "reading", fill: 0.22, x: [], values: [] };
+  for (let k = 0; k + 1 < column.length; k += 2) {
+    if (typeof column[k] !== "number" || typeof column[k + 1] !== "number") continue;
+    const [since, until] = [stream.x[k], stream.x[k + 1]];
+    found.x.push(since, until, until, since, since);
+    found.values.push(column[k], column[k], column[k + 1], column[k + 1], null);
+  }
+  return found;
+});
+
+// An angle between -π and π; and a curve of such, which leaves the chart at one edge and comes back at the other.
+export const wrapped = (value) => (typeof value === "number" ? value - 2 * Math.PI * Math.round(value / (2 * Math.PI)) : value);
+
+export function unbroken(values) {
+  const angles = values.map(wrapped);
+  return angles.map((value, k) => (k && Math.abs(value - angles[k - 1]) > Math.PI ? null : value));
+}
+
+// The edge of a band of an angle, about its wrapped mean.
+export const aboutMean = (mean, values) => values.map((value, k) => (typeof value === "number" && typeof mean[k] === "number" ? wrapped(mean[k]) + value - mean[k] : value));
+
+// Episodes
+
+const STRIP = 2; // px
+const SHARE = 0.15; // of a chart, beyond which the tint of episodes fades; their strip stays
+
+// Episodes between two times as stretches that do not overlap, [[from, to]], and the strength of their tint, up to 1.
+function stretches(episodes, [low, high]) {
+  const found = [];
+  const inside = episodes
+    .map(({ from, to }) => [Math.max(from ?? low, low), Math.min(to ?? high, high)])
+    .filter(([from, to]) => to >= from)
+    .sort(([a], [b]) => a - b);
+  for (const [from, to] of inside) {
+    const last = found.at(-1);
+    if (last && from <= last[1]) last[1] = Math.max(last[1], to);
+    else found.push([from, to]);
+  }
+  const covered = found.reduce((sum, [from, to]) => sum + to - from, 0);
+  return { found, strength: Math.min(1, (SHARE * (high - low)) / (covered || 1e-9)) };
+}
+
+// Behind the curves of a chart: episodes, and the moment that is looked at.
+export function marks(plot, episodes, at = null) {
+  const { ctx, bbox } = plot;
+  const [low, high] = [plot.scales.x.min, plot.scales.x.max];
+  const { found, strength } = stretches(episodes, [low, high]);
+  ctx.save();
+  for (const [from, to] of found) {
+    const left = plot.valToPos(from, "x", true);
+    const width = Math.max(2, plot.valToPos(to, "x", true) - left);
+    ctx.fillStyle = colour("episode");
+    ctx.globalAlpha = strength;
+    ctx.fillRect(left, bbox.top, width, bbox.height);
+    ctx.fillStyle = colour("episode-strip");
+    ctx.globalAlpha = 1;
+    ctx.fillRect(left, bbox.top, width, STRIP * devicePixelRatio);
+  }
+  if (at !== null && at > low && at < high) {
+    ctx.fillStyle = colour("faint");
+    ctx.fillRect(Math.round(plot.valToPos(at, "x", true)), bbox.top, devicePixelRatio, bbox.height);
+  }
+  ctx.restore();
+}
+
+// Values beyond the axis. The axis does not follow every outlier (ranges.js); each is marked at the edge of the chart,
+// and the furthest with its value.
+
+const APART = 7; // px from one mark to the next
+const UNMARKED = new Set(["bound"]); // tones of lines that may leave a chart
+
+// [{x, value, tone, above, furthest}] of columns in the order of `series`; place(x) in px.
+function outsiders(data, series, [since, until], [low, high], place) {
+  const found = [];
+  const x = data[0];
+  for (const above of [true, false]) {
+    const slots = new Map();
+    series.forEach(({ mark, tone }, k) => {
+      if (!mark || UNMARKED.has(tone)) return;
+      const values = data[k + 1] ?? [];
+      for (let i = 0; i < x.length; i++) {
+        const value = values[i];
+        if (typeof value !== "number" || (above ? value <= high : value >= low) || x[i] < since || x[i] > until) continue;
+        const slot = Math.round(place(x[i]) / APART);
+        const known = slots.get(slot);
+        if (!known || (above ? value > known.value : value < known.value)) slots.set(slot, { x: x[i], value, tone, above });
+      }
+    });
+    const marks = [...slots.values()];
+    const furthest = marks.reduce((most, mark) => (most === null || (above ? mark.value > most.value : mark.value < most.value) ? mark : most), null);
+    if (furthest) furthest.furthest = true;
+    found.push(...marks);
+  }
+  return found;
+}
+
+// says(value): text beside the furthest. Returns the marks.
+export function drawOutsiders(plot, series, says) {
+  const { ctx, bbox } = plot;
+  const scale = devicePixelRatio;
+  const { x: { min: since, max: until }, y: { min: low, max: high } } = plot.scales;
+  const place = (time) => plot.valToPos(time, "x", true) / scale;
+  const found = outsiders(plot.data, series, [since, until], [low, high], place);
+  if (!found.length) return found;
+  const size = 4.5 * scale;
+  ctx.save();
+  ctx.font = `${11 * scale}px system-ui, sans-serif`;
+  for (const { x, tone, above } of found) {
+    const at = plot.valToPos(x, "x", true);
+    const [tip, base] = above ? [bbox.top + scale, bbox.top + 2 * size] : [bbox.top + bbox.height - scale, bbox.top + bbox.height - 2 * size];
+    ctx.fillStyle = colour(tone);
+    ctx.beginPath();
+    ctx.moveTo(at, tip);
+    ctx.lineTo(at - size, base);
+    ctx.lineTo(at + size, base);
+    ctx.fill();
+  }
+  for (const { x, value, above } of found.filter((mark) => mark.furthest)) {
+    const at = plot.valToPos(x, "x", true);
+    const tip = above ? bbox.top + scale : bbox.top + bbox.height - scale;
+    const late = at > bbox.left + 0.8 * bbox.width;
+    const text = says(value);
+    const { width } = ctx.measureText(text);
+    const left = at + (late ? -1.6 * size - width : 1.6 * size);
+    // On a plate, as there may be much beneath it.
+    ctx.fillStyle = colour("panel");
+    ctx.fillRect(left - 2 * scale, above ? tip : tip - 12 * scale, width + 4 * scale, 12 * scale);
+    ctx.fillStyle = colour("faint");
+    ctx.textAlign = "left";
+    ctx.textBaseline = above ? "top" : "bottom";
+    ctx.fillText(text, left, tip);
+  }
+  ctx.restore();
+  return found;
+}
