@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import sys
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Iterator
 from dataclasses import replace
 from time import perf_counter
 from typing import NamedTuple
@@ -30,7 +30,8 @@ from estimators.numerics.jit import jit_brief
 from estimators.tuning import Tuning
 
 from ..support import SECOND
-from . import ring
+from .filters import ring
+from .timing import BenchmarkRow, Bound, run_sections
 
 DAY = 86400.0
 
@@ -66,8 +67,8 @@ CASES = (
     Case("kf", MODELS["motor_winding"], 1.0, 0.2),
     Case("ukf", MODELS["motor_winding"], 1.0, 0.1),
     Case("sr-ekf", MODELS["motor_winding"], 1.0, 0.1, gate=0.999),
-    Case("kf", ring.ring(4, 2, linear=True), 0.1, 0.15),
-    Case("ekf", ring.ring(4, 2), 0.1, 0.1),
+    Case("kf", ring(4, 2, linear=True), 0.1, 0.15),
+    Case("ekf", ring(4, 2), 0.1, 0.1),
     Case("ekf", MODELS["motor_drive"], 0.1, 0.2, gate=0.99999),
     Case("ekf", MODELS["lorenz63"], 0.05, 0.1),
     Case("enkf", MODELS["motor_drive"], 0.1, 0.02, options={"members": 50}),
@@ -166,32 +167,39 @@ def count_alarms(case: Case, readings: int, every: float, seed: int) -> tuple[fl
     return seconds, found
 
 
-def table(readings: int, every: float, say: Callable[[str], None] = print) -> None:
-    """One line a case, and their sum."""
-    say(f"False alarms on consistent readings; asked for: one in {every:g} s at most")
-    say(f"  {'case':26s} {'readings':>11s} {'hours':>8s} {'at most':>8s} {'seen':>5s}  causes")
-    whole, expected, seen = 0, 0.0, 0
+def rows(readings: int, every: float) -> Iterator[BenchmarkRow]:
+    """Count false alarms of every case where one in `every` seconds is allowed, and of all together."""
+    total, expected, seen = 0, 0.0, 0
     for k, case in enumerate(CASES):
         n = max(1, round(readings * case.share))
         begun = perf_counter()
         seconds, found = count_alarms(case, n, every, seed=k)
         alarms = sum(count for name, count in found.items() if name in ALARM_NAMES)
-        whole, expected, seen = whole + n, expected + seconds / every, seen + alarms
-        name = f"{case.estimator} {case.model.name}"
-        took = f"{(perf_counter() - begun) / n * 1e6:.1f} µs"
+        total, expected, seen = total + n, expected + seconds / every, seen + alarms
+        figures = {"readings": n, "hours": seconds / 3600, "allowed": seconds / every, "alarms": alarms}
+        figures["time [µs]"] = (perf_counter() - begun) / n * 1e6
         causes = ", ".join(f"{cause} {count}" for cause, count in found.most_common())
-        say(f"  {name:26s} {n:11,d} {seconds / 3600:8.1f} {seconds / every:8.2f} {alarms:5d}  {causes}   [{took}]")
-    chance = poisson.sf(seen - 1, expected)
-    word = "kept" if chance > 0.01 else "NOT KEPT"
-    say(f"  {'all':26s} {whole:11,d} {'':8s} {expected:8.2f} {seen:5d}  {word}")
+        yield BenchmarkRow(f"{case.estimator} {case.model.name}, {every:g} s", figures, remark=causes)
+    chance = float(poisson.sf(seen - 1, expected))
+    figures = {"readings": total, "allowed": expected, "alarms": seen, "chance": chance}
+    yield BenchmarkRow(f"all, {every:g} s", figures, (Bound("chance", 0.01, at_least=True),))
 
 
-def false_alarms() -> None:
-    """A day between false alarms, as is the default, and ten minutes, so that there is something to count."""
+def false_alarms(readings: int = 300_000) -> Iterator[BenchmarkRow]:
+    """False alarms on consistent measurements, one a day allowed (default) and one in ten minutes."""
     for every in (DAY, 600.0):
-        table(300_000, every)
+        yield from rows(readings, every)
+
+
+def main() -> None:
+    """Count alarms on as many readings as the command line names."""
+
+    def of_so_many() -> Iterator[BenchmarkRow]:
+        """False alarms on consistent measurements."""
+        return false_alarms(int(sys.argv[1]))
+
+    run_sections([of_so_many])
 
 
 if __name__ == "__main__":
-    for seconds in (DAY, 600.0):
-        table(int(sys.argv[1]), seconds)
+    main()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from datetime import datetime, timedelta
 
 import numpy as np
@@ -11,19 +11,71 @@ from filterpy.kalman import ExtendedKalmanFilter, KalmanFilter, MerweScaledSigma
 from estimators.estimator import call_predict, call_update
 from estimators.fold import Fold
 from estimators.log import READING, Events, Log
-from estimators.model.state_space import StateSpaceModel
+from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
 from estimators.models import MODELS
 from estimators.numerics.jit import borrowed, floats, jit
 from estimators.registry import ESTIMATORS
 from estimators.tuning import Tuning
 
 from ..support import SECOND
-from . import ring
-from .timing import compare, judged, medians
+from .timing import BenchmarkRow, Bound, compare, medians
 
 STEPS = 4096
 THEIR_STEPS = 200
 REPETITIONS = 15
+
+RING_STD, RING_Q, RING_R = 0.5, 0.01, 0.04
+
+
+def ring_f(x, u, p, dt, out):
+    n = x.size
+    for i in range(n):
+        flow = x[i - 1 if i > 0 else n - 1] - 2.0 * x[i] + x[i + 1 if i < n - 1 else 0]
+        out[i] = x[i] + dt * (0.5 * flow - 0.1 * x[i] * x[i] * x[i])
+
+
+def ring_f_linear(x, u, p, dt, out):
+    n = x.size
+    for i in range(n):
+        flow = x[i - 1 if i > 0 else n - 1] - 2.0 * x[i] + x[i + 1 if i < n - 1 else 0]
+        out[i] = x[i] + dt * 0.5 * flow
+
+
+def ring_h(x, u, p, out):
+    for j in range(out.size):
+        out[j] = x[3 * j] + 0.1 * x[3 * j] * x[3 * j]
+
+
+def ring_h_linear(x, u, p, out):
+    for j in range(out.size):
+        out[j] = x[3 * j]
+
+
+def ring_f_numpy(x, dt):
+    """The same for FilterPy, as a user of it would write it."""
+    return x + dt * (0.5 * (np.roll(x, 1) - 2.0 * x + np.roll(x, -1)) - 0.1 * x**3)
+
+
+def ring_h_numpy(x):
+    every_third = x[::3]
+    return every_third + 0.1 * every_third**2
+
+
+def ring(n: int, m: int, *, linear: bool = False) -> StateSpaceModel:
+    """Return a ring of n coupled masses of heat, of which every third is measured, m in all.
+
+    x_i' = x_i + dt (0.5 (x_{i-1} - 2 x_i + x_{i+1}) - 0.1 x_i³),      y_j = x_{3j} + 0.1 x_{3j}²
+    """
+    h = ring_h_linear if linear else ring_h
+    return StateSpaceModel(
+        name=f"ring{n}",
+        title=f"ring of {n}",
+        states=tuple(State(f"x{i}", "K", mean=0.1 * (i % 5), std=RING_STD) for i in range(n)),
+        noises=tuple(Noise(f"x{i}", "K²/s", RING_Q) for i in range(n)),
+        sensors=(Sensor("y", tuple(Row(f"y{j}", "K", RING_R) for j in range(m)), h=h),),
+        f=ring_f_linear if linear else ring_f,
+        linear=linear,
+    )
 
 
 def noisy_log(model: StateSpaceModel, events: int, *, step: float = 1.0) -> Log:
@@ -100,63 +152,34 @@ def theirs_ukf(n: int, m: int, x: np.ndarray, P: np.ndarray, Q: np.ndarray, R: n
     return steps
 
 
-def beside_filterpy() -> None:
-    """Each filter beside FilterPy's, in one run."""
-    motor, ring24 = MODELS["motor_winding"], ring.ring(24, 8)
+def beside_filterpy() -> Iterator[BenchmarkRow]:
+    """A step (predict, update, NIS, verdict, health) beside FilterPy's: processor time, medians, interleaved."""
+    motor, ring24 = MODELS["motor_winding"], ring(24, 8)
     small, large = noisy_log(motor, STEPS), noisy_log(ring24, STEPS // 16, step=0.1)
     x24 = np.array([state.mean for state in ring24.states])
+    x2, P2, Q2 = np.array([35.0, 0.0]), np.diag([25.0, 1.0]), np.diag([0.01, 0.001])
+    I24, I8 = np.eye(24), np.eye(8)
 
     def f2(x, dt):
         return np.array([x[0] + dt * x[1], x[1]])
 
-    rows = [
-        ("KF   n=2  m=1", folding("kf", motor, small), theirs_kf(), STEPS, THEIR_STEPS, 15.0),
-        ("EKF  n=2  m=1", folding("ekf", motor, small), theirs_ekf(), STEPS, THEIR_STEPS, None),
-        (
-            "UKF  n=2  m=1",
-            folding("ukf", motor, small),
-            theirs_ukf(
-                2,
-                1,
-                np.array([35.0, 0.0]),
-                np.diag([25.0, 1.0]),
-                np.diag([0.01, 0.001]),
-                np.eye(1) * 4,
-                f2,
-                lambda x: x[:1],
-            ),
-            STEPS,
-            THEIR_STEPS,
-            100.0,
-        ),
-        (
-            "UKF  n=24 m=8",
-            folding("ukf", ring24, large),
-            theirs_ukf(
-                24,
-                8,
-                x24,
-                np.eye(24) * ring.STD**2,
-                np.eye(24) * ring.Q * 0.1,
-                np.eye(8) * ring.R,
-                ring.f_numpy,
-                ring.h_numpy,
-            ),
-            STEPS // 16,
-            THEIR_STEPS // 4,
-            15.0,
-        ),
-    ]
-    print("A step: predict and update, with NIS, verdict and health on our side; processor time, medians, interleaved")
-    print(f"  {'filter':15s} {'Nisus µs':>9s} {'FilterPy µs':>12s} {'ratio':>7s}   wanted")
-    for name, ours, theirs, our_steps, their_steps, bound in rows:
-        pair = compare(ours, theirs, steps=(our_steps, their_steps), repetitions=REPETITIONS)
-        verdict = f">= {bound:3.0f}   {judged(pair.ratio, bound, at_least=True)}" if bound else "   -"
-        print(f"  {name:15s} {pair.ours * 1e6:9.3f} {pair.theirs * 1e6:12.1f} {pair.ratio:7.1f}   {verdict}")
+    ukf2 = theirs_ukf(2, 1, x2, P2, Q2, np.eye(1) * 4, f2, lambda x: x[:1])
+    ukf24 = theirs_ukf(
+        24, 8, x24, I24 * RING_STD**2, I24 * RING_Q * 0.1, I8 * RING_R, ring_f_numpy, ring_h_numpy
+    )  # fmt: skip
+    for name, ours, theirs, steps, bound in (
+        ("KF n=2 m=1", folding("kf", motor, small), theirs_kf(), (STEPS, THEIR_STEPS), 15.0),
+        ("EKF n=2 m=1", folding("ekf", motor, small), theirs_ekf(), (STEPS, THEIR_STEPS), None),
+        ("UKF n=2 m=1", folding("ukf", motor, small), ukf2, (STEPS, THEIR_STEPS), 100.0),
+        ("UKF n=24 m=8", folding("ukf", ring24, large), ukf24, (STEPS // 16, THEIR_STEPS // 4), 15.0),
+    ):
+        pair = compare(ours, theirs, steps=steps, repetitions=REPETITIONS)
+        figures = {"Nisus [µs]": pair.ours * 1e6, "FilterPy [µs]": pair.theirs * 1e6, "ratio": pair.ratio}
+        yield BenchmarkRow(name, figures, (Bound("ratio", bound, at_least=True),) if bound else ())
 
 
 def alone(estimator: str, model: StateSpaceModel) -> Callable[[], None]:
-    """Predictions and updates as the fold calls them, but nothing else: no estimate, health or log is written."""
+    """Return a call of predictions and updates alone: no estimate, health or log is written."""
     log = noisy_log(model, STEPS, step=0.1)
     fold = Fold(estimator, model, Tuning.of(model), log)
     fold.advance()
@@ -171,7 +194,7 @@ def alone(estimator: str, model: StateSpaceModel) -> Callable[[], None]:
 
 @jit
 def _steps(predict, update, context, n, u, state, work, score, value, innovation, innovation_std):
-    # What the fold does too: counted arrays cost more than the filter.
+    # As in the fold: reference-counted arrays cost more than the filter.
     u, state, work, score = borrowed(u), borrowed(state), borrowed(work), borrowed(score)
     innovation, innovation_std = borrowed(innovation), borrowed(innovation_std)
     for k in range(n):
@@ -180,30 +203,25 @@ def _steps(predict, update, context, n, u, state, work, score, value, innovation
         call_update(update, context, u, 0, y, k, state, work, innovation, innovation_std, score)
 
 
-def step_alone() -> None:
-    """A step of the unscented filter as the issue of speed is usually put: prediction and update alone."""
-    calls = [
-        alone("ukf", ring.ring(4, 2)),
-        folding("ukf", ring.ring(4, 2), noisy_log(ring.ring(4, 2), STEPS, step=0.1)),
-    ]
+def step_alone() -> Iterator[BenchmarkRow]:
+    """A step of the unscented filter alone, and with estimate, NIS bounds, health and history: µs."""
+    model = ring(4, 2)
+    calls = [alone("ukf", model), folding("ukf", model, noisy_log(model, STEPS, step=0.1))]
     step, whole = (value / STEPS * 1e6 for value in medians(calls, REPETITIONS))
-    print(f"UKF n=4 m=2: predict and update {step:.2f} µs   <= 1   {judged(step, 1.0, at_least=False)}")
-    print(f"             with estimate, NIS bounds, health and history {whole:.2f} µs")
+    figures = {"step [µs]": step, "with history [µs]": whole}
+    yield BenchmarkRow("UKF n=4 m=2", figures, (Bound("step [µs]", 1.0),))
 
 
-def beside_stone_soup() -> None:
-    """Kalman and unscented filters of Stone Soup on the motor: a prediction and an update of one state object."""
-    try:
-        from stonesoup.models.measurement.linear import LinearGaussian
-        from stonesoup.models.transition.linear import CombinedLinearGaussianTransitionModel, ConstantVelocity
-        from stonesoup.predictor.kalman import KalmanPredictor, UnscentedKalmanPredictor
-        from stonesoup.types.detection import Detection
-        from stonesoup.types.hypothesis import SingleHypothesis
-        from stonesoup.types.state import GaussianState
-        from stonesoup.updater.kalman import KalmanUpdater, UnscentedKalmanUpdater
-    except ImportError:
-        print("Stone Soup is not installed: pip install nisus[bench]")
-        return
+def beside_stone_soup() -> Iterator[BenchmarkRow]:
+    """A step beside Stone Soup's, n=2 m=1: processor time, medians, interleaved."""
+    from stonesoup.models.measurement.linear import LinearGaussian
+    from stonesoup.models.transition.linear import CombinedLinearGaussianTransitionModel, ConstantVelocity
+    from stonesoup.predictor.kalman import KalmanPredictor, UnscentedKalmanPredictor
+    from stonesoup.types.detection import Detection
+    from stonesoup.types.hypothesis import SingleHypothesis
+    from stonesoup.types.state import GaussianState
+    from stonesoup.updater.kalman import KalmanUpdater, UnscentedKalmanUpdater
+
     moving = CombinedLinearGaussianTransitionModel([ConstantVelocity(0.001)])
     reading = LinearGaussian(2, (0,), np.array([[4.0]]))
     begun = datetime(2026, 1, 1)
@@ -211,73 +229,61 @@ def beside_stone_soup() -> None:
 
     def theirs(predictor, updater):
         def steps() -> None:
-            belief = GaussianState([[35.0], [0.0]], np.diag([25.0, 1.0]), timestamp=begun)
+            estimate = GaussianState([[35.0], [0.0]], np.diag([25.0, 1.0]), timestamp=begun)
             for detection in detections:
-                ahead = predictor.predict(belief, timestamp=detection.timestamp)
-                belief = updater.update(SingleHypothesis(ahead, detection))
+                ahead = predictor.predict(estimate, timestamp=detection.timestamp)
+                estimate = updater.update(SingleHypothesis(ahead, detection))
 
         return steps
 
     motor = MODELS["motor_winding"]
-    print("A step beside Stone Soup's, n=2 m=1; processor time, medians, interleaved")
     for name, predictor, updater in (
         ("kf", KalmanPredictor(moving), KalmanUpdater(reading)),
         ("ukf", UnscentedKalmanPredictor(moving), UnscentedKalmanUpdater(reading)),
     ):
         ours = folding(name, motor, noisy_log(motor, STEPS))
         pair = compare(ours, theirs(predictor, updater), steps=(STEPS, THEIR_STEPS), repetitions=7)
-        print(f"  {name:4s} {pair.ours * 1e6:7.3f} µs, theirs {pair.theirs * 1e6:7.0f} µs, ratio {pair.ratio:6.0f}")
+        yield BenchmarkRow(
+            name, {"Nisus [µs]": pair.ours * 1e6, "Stone Soup [µs]": pair.theirs * 1e6, "ratio": pair.ratio}
+        )
 
 
-def growing_n() -> None:
-    """The cost of n: as n³ where the matrices rule, and what is left of that at small n."""
-    sizes = (2, 4, 8, 16, 24, 32, 48)
-    print("A step against n (ring of n states, every third read): µs, and ns / n³ in brackets")
-    print(f"  {'n':>4s} {'m':>3s}" + "".join(f"{name:>20s}" for name in ("kf (linear)", "ekf", "ukf")))
-    for n in sizes:
-        m = (n + 2) // 3
-        steps = max(64, 60_000 // n**2)
-        calls = []
-        for name in ("kf", "ekf", "ukf"):
-            model = ring.ring(n, m, linear=name == "kf")
-            calls.append(folding(name, model, noisy_log(model, steps, step=0.1)))
-        each = [value / steps for value in medians(calls, 7)]
-        print(f"  {n:4d} {m:3d}" + "".join(f"{s * 1e6:11.2f} [{s * 1e9 / n**3:6.2f}]" for s in each))
+def growing_n() -> Iterator[BenchmarkRow]:
+    """A step against n (ring of n states, every third measured): µs, which grow as n³ where matrices dominate."""
+    for n in (2, 4, 8, 16, 24, 32, 48):
+        m, steps = (n + 2) // 3, max(64, 60_000 // n**2)
+        models = {name: ring(n, m, linear=name == "kf") for name in ("kf", "ekf", "ukf")}
+        calls = [folding(name, model, noisy_log(model, steps, step=0.1)) for name, model in models.items()]
+        each = [value / steps * 1e6 for value in medians(calls, 7)]
+        yield BenchmarkRow(f"n={n} m={m}", dict(zip(models, each, strict=True)))
 
 
-def growing_m() -> None:
-    """The cost of m at n = 24: as n² m where the covariance's update rules, as m³ in the factor of S."""
+def growing_m() -> Iterator[BenchmarkRow]:
+    """A step against m (ring of 24 states): µs, a constant part and one as n² m."""
     sizes = (1, 2, 4, 8)
-    print("A step against m (ring of 24 states): µs; expected: a part that does not depend on m, and one as n² m")
     for name in ("kf", "ekf", "ukf"):
-        models = [ring.ring(24, m, linear=name == "kf") for m in sizes]
-        each = [
-            value / 256 * 1e6 for value in medians([folding(name, a, noisy_log(a, 256, step=0.1)) for a in models], 7)
-        ]
-        print(f"  {name:4s} " + "   ".join(f"m = {m}: {value:6.2f}" for m, value in zip(sizes, each, strict=True)))
+        models = [ring(24, m, linear=name == "kf") for m in sizes]
+        each = medians([folding(name, model, noisy_log(model, 256, step=0.1)) for model in models], 7)
+        yield BenchmarkRow(name, {f"m={m}": value / 256 * 1e6 for m, value in zip(sizes, each, strict=True)})
 
 
-def gaussian_family() -> None:
-    """Every Gaussian filter on the same rings, and what its options cost when they are on."""
+def gaussian_family() -> Iterator[BenchmarkRow]:
+    """A step of each Gaussian filter and option (ring of n states, linear for the Kalman filters): µs."""
     variants: list[tuple[str, dict[str, float]]] = [
         *((name, {"period": 0.1} if name == "kf-steady" else {}) for name, entry in ESTIMATORS.items()
           if entry.family == "Gaussian"),
         ("ekf", {"joseph": 0}),
         *((name, option) for name in ("ekf", "ukf") for option in ({"robust": 1.0}, {"robust": 2.0}, {"adapt": 1.0})),
     ]  # fmt: skip
-    sizes = ((2, 1), (4, 2), (8, 3), (24, 8))
-    print(
-        "A step of each Gaussian filter (ring of n states, every third read; linear for the three Kalman filters): µs"
-    )
-    print(f"  {'filter':24s}" + "".join(f"{f'n={n} m={m}':>12s}" for n, m in sizes))
-    columns = []
-    for n, m in sizes:
+    columns = {}
+    for n, m in ((2, 1), (4, 2), (8, 3), (24, 8)):
         steps = max(64, 20_000 // n**2)
-        calls = []
-        for name, options in variants:
-            model = ring.ring(n, m, linear=name in ("kf", "kf-steady", "sr-kf"))
-            calls.append(folding(name, model, noisy_log(model, steps, step=0.1), options))
-        columns.append([value / steps for value in medians(calls, 7)])
-    for row, (name, options) in enumerate(variants):
+        models = [ring(n, m, linear=name in ("kf", "kf-steady", "sr-kf")) for name, _ in variants]
+        calls = [
+            folding(name, model, noisy_log(model, steps, step=0.1), options)
+            for (name, options), model in zip(variants, models, strict=True)
+        ]
+        columns[f"n={n} m={m}"] = [value / steps * 1e6 for value in medians(calls, 7)]
+    for k, (name, options) in enumerate(variants):
         label = " ".join([name, *(f"{key}={value:g}" for key, value in options.items())])
-        print(f"  {label:24s}" + "".join(f"{column[row] * 1e6:12.2f}" for column in columns))
+        yield BenchmarkRow(label, {title: column[k] for title, column in columns.items()})

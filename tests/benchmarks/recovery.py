@@ -19,10 +19,13 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from time import process_time
 
 import numpy as np
+from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
+from scipy.optimize import minimize
 
 from app.twin.log_reader import read_log
 from app.twin.twin import Twin, load_twin
@@ -31,8 +34,10 @@ from estimators.fit.entries import Entry, entries_of, with_values
 from estimators.fit.fit import Fitted, fit
 from estimators.fit.recording import Recording
 from estimators.fold import Fold
-from estimators.log import Log
+from estimators.log import INPUT, READING, Log
 from estimators.track import USED
+
+from .timing import BenchmarkRow, Bound, both
 
 Z, Z99 = 1.959963984540054, 2.5758293035489004
 
@@ -227,6 +232,91 @@ def lines(case: Case, found: Recovered) -> list[str]:
         else:
             text.append(f"  {key:22} {truth:10.4g} {'':>10} {'':>8} {0:5d}")
     return text
+
+
+SIZES = ((10_000, 3.0), (100_000, 30.0))
+"""Readings, and seconds of each of two processors within which seven noises should be fitted to them."""
+
+PUBLISHED = (("LowLevelParticleFilters.jl", 0.017676814), ("FilterPy, there", 6.390492916))
+"""Seconds of one fold of 50,000 steps, n = 4, m = 2, from docs/src/benchmark.md of LowLevelParticleFilters.jl."""
+
+THEIR_READINGS = 300
+"""Readings of the loop over FilterPy, which takes as long for one as the fit for a thousand."""
+
+
+def tuning() -> Iterator[BenchmarkRow]:
+    """Fit of seven noises (UKF, n = 4, with intervals and judgement) beside a loop of SciPy over FilterPy.
+
+    Of other tuners no time is published; MATLAB's `trackingFilterTuner` shows costs per iteration and needs the truth
+    (https://www.mathworks.com/help/fusion/ref/trackingfiltertuner.parametercost.html).
+    """
+    case = replace(next(case for case in CASES if case.twin == "motor_joint"), duration=17_000.0)
+    twin, logs = logs_of(case, 1)
+    fit(twin.estimator, twin.tuning, [Recording(_first(logs[0], 300))])
+    for readings, bound in SIZES:
+        log = _first(logs[0], readings)
+        done: list[Fitted] = []
+        clock, spent = both(lambda log=log, done=done: done.append(fit(twin.estimator, twin.tuning, [Recording(log)])))  # type: ignore[misc]
+        figures = {"clock [s]": clock, "each of two processors [s]": spent / 2, "folds": done[0].folds}
+        yield BenchmarkRow(f"{readings:,} readings", figures, (Bound("each of two processors [s]", bound),))
+    spent, evaluations = _theirs(twin, _first(logs[0], THEIR_READINGS))
+    yield BenchmarkRow(f"SciPy, {THEIR_READINGS} readings", {"processor [s]": spent, "folds": evaluations})
+    yield BenchmarkRow("published, one step", {f"{name} [µs]": 1e6 * fold / 50_000 for name, fold in PUBLISHED})
+
+
+def _first(log: Log, readings: int) -> Log:
+    """Return the part with so many readings."""
+    cut = log.copy()
+    cut.n = int(np.flatnonzero(log.kind[: log.n] == READING)[readings - 1]) + 1
+    return cut
+
+
+def _theirs(twin: Twin, log: Log) -> tuple[float, int]:
+    """Return seconds and evaluations of a plain loop of SciPy over FilterPy."""
+    model, n = twin.model, twin.model.nx
+    p = np.array([item.value for item in model.parameters])
+    events = log.events
+    prior = model.prior_mean, np.diag(model.prior_std**2)
+
+    def fx(x: np.ndarray, dt: float, u: np.ndarray) -> np.ndarray:
+        out = np.empty(n)
+        model.f(x, u, p, dt, out)
+        return out
+
+    def hx(x: np.ndarray, u: np.ndarray) -> np.ndarray:
+        out = np.empty(3)
+        for sensor in model.sensors:
+            k = model.sensor_names.index(sensor.name)
+            sensor.h(x, u, p, out[k : k + 1])
+        return out
+
+    def negative(theta: np.ndarray) -> float:
+        q, r = np.exp(theta[:n]), np.exp(theta[n:])
+        points = MerweScaledSigmaPoints(n, alpha=0.5, beta=2.0, kappa=0.0)
+        ukf = UnscentedKalmanFilter(n, 3, 1.0, hx, fx, points)
+        ukf.x, ukf.P, ukf.R = prior[0].copy(), prior[1].copy(), np.diag(r)
+        u, clock, total = np.array([item.default for item in model.inputs], float), events.t[0], 0.0
+        for t in np.unique(events.t):
+            if t > clock:
+                ukf.Q = np.diag(q * (t - clock) * 1e-9)
+                ukf.predict(dt=(t - clock) * 1e-9, u=u)
+                clock = t
+            now = np.flatnonzero(events.t == t)
+            for k in now[events.kind[now] == INPUT]:
+                u = np.where(np.isfinite(events.value[k, : u.size]), events.value[k, : u.size], u)
+            readings = now[events.kind[now] == READING]
+            # Its update uses the points of the last prediction, so simultaneous measurements are joined.
+            if readings.size == 3 and t > events.t[0]:
+                y = np.empty(3)
+                y[events.channel[readings]] = events.value[readings, 0]
+                ukf.update(y, u=u)
+                total += ukf.log_likelihood
+        return -total
+
+    start = np.log(np.concatenate([twin.tuning.q, twin.tuning.r]))
+    begun = process_time()
+    found = minimize(negative, start, method="L-BFGS-B", bounds=[(value - 9.0, value + 9.0) for value in start])
+    return process_time() - begun, int(found.nfev)
 
 
 def main() -> None:

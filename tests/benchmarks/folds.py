@@ -1,0 +1,235 @@
+"""Cost of folds: long histories, refolds, smoothing, defences, and reading a CAN log."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from functools import lru_cache, partial
+from types import FunctionType
+from typing import Any
+
+import numpy as np
+
+from app.studies.stress.scenario import plain_log
+from app.twin.log_reader import read_log
+from app.twin.twin import load_twin
+from estimators import fold_kernel
+from estimators.diagnostics.health import NORMALS, assess
+from estimators.errors import SourceError
+from estimators.fold import Fold
+from estimators.log import READING, Events, Log
+from estimators.models import MODELS
+from estimators.numerics.jit import floats, jit_brief
+from estimators.smoothing.smooth import smooth
+from estimators.tuning import Tuning
+from sources.can.decoder import Decoder
+from sources.can.log import CanLog
+from sources.source import Channel
+
+from ..conftest import data_folder
+from ..estimators.smoothing.test_textbook import CAR
+from ..support import SECOND
+from .filters import STEPS, noisy_log
+from .timing import BenchmarkRow, Bound, both, medians, seconds
+
+REFOLD_READINGS = 100_000
+DEFAULT_TWIN = "motor_can"
+
+SMOOTHED, SHORT = 100_000, 10_000
+"""Readings that are smoothed, and that the peers smooth."""
+
+SMOOTHERS = ("kf", "ekf", "iekf", "ukf", "ckf", "sr-kf", "sr-ekf", "sr-ukf")
+F = np.kron(np.array([[1.0, 0.1], [0.0, 1.0]]), np.eye(2))
+Q = np.kron(np.array([[0.1**3 / 3, 0.1**2 / 2], [0.1**2 / 2, 0.1]]), np.eye(2))
+H, R = np.eye(2, 4), 0.25 * np.eye(2)
+
+
+DEFENDED = (("motor_can", "ekf"), ("motor_can", "ukf"), ("road_car", "ekf"), ("motor_can", "pf"))
+PARTICLE_EVENTS = 1000
+
+
+def again(fold: Fold) -> None:
+    """Fold from the start."""
+    fold.rewind(0)
+    fold.advance()
+
+
+def growing_history() -> Iterator[BenchmarkRow]:
+    """History (KF n=2 m=1): µs per event of the whole fold, of one event appended, of one reading 100 events late."""
+    model = MODELS["motor_winding"]
+    for size in (1_000, 10_000, 100_000, 1_000_000):
+        # Capacity for what is appended: the growth of the arrays is not measured.
+        log = Log.of(model, capacity=size + 4096)
+        log.extend(noisy_log(model, size).events)
+        growing = Fold("kf", model, Tuning.of(model), log)
+        growing.advance()
+
+        def add(behind: int, log: Log = log, growing: Fold = growing) -> None:
+            t = int(log.t[log.n - behind]) + (1 if behind > 1 else SECOND)
+            start, _ = log.extend(Events.one(t, t, READING, 0, 35.0, 1))
+            if behind > 1:
+                growing.rewind(start)
+            growing.advance()
+
+        (whole,) = medians([partial(again, growing)], 5 if size < 1_000_000 else 3)
+        one, late = medians([partial(add, 1), partial(add, 100)], 301)
+        yield BenchmarkRow(
+            f"{size:,} events", {"fold [µs]": whole / size * 1e6, "append [µs]": one * 1e6, "late [µs]": late * 1e6}
+        )
+
+
+def endless_log(twin, readings: int) -> Log:
+    """Return a simulated log with so many readings.
+
+    Repeating the twin's recording would jump at each seam, where the gate would weigh two explanations.
+    """
+    duration = 60.0
+    while np.count_nonzero((events := plain_log(twin, 0, duration)).kind == READING) < readings:
+        duration *= 2.0
+    enough = int(np.searchsorted(np.cumsum(events.kind == READING), readings)) + 1
+    log = Log.of(twin.model, capacity=enough)
+    log.extend(events.select(slice(0, enough)))
+    return log
+
+
+def refold() -> Iterator[BenchmarkRow]:
+    """Refold of 100,000 readings of the default twin after a slider moved, seconds."""
+    twin = load_twin(DEFAULT_TWIN)
+    log = endless_log(twin, REFOLD_READINGS)
+    for name in ("ekf", "ukf"):
+        tunings = [twin.tuning.set(twin.tuning.items()[0].key, 0.01 + 0.001 * k) for k in range(5)]
+        calls = [partial(_fold_once, name, twin, tuning, log) for tuning in tunings]
+        clock, processor = np.median([both(call) for call in calls][1:], axis=0)
+        bounds = (Bound("clock [s]", 0.2),) if name == twin.estimator else ()
+        yield BenchmarkRow(name, {"clock [s]": clock, "processor [s]": processor}, bounds)
+
+
+def _fold_once(name: str, twin: Any, tuning: Tuning, log: Log) -> None:
+    Fold(name, twin.model, tuning, log, pairs=twin.pairs).advance()
+
+
+def smoothing() -> Iterator[BenchmarkRow]:
+    """Smoothing of 100,000 readings of a car (4 states, 2 rows) beside the fold and beside peers, processor seconds."""
+    ys = np.cumsum(np.random.default_rng(0).normal(0, 0.1, (SMOOTHED, 2)), axis=0)
+    t = np.arange(SMOOTHED) * (SECOND // 10)
+    log = Log.of(CAR)
+    log.extend(Events(t, t, np.full(SMOOTHED, READING, np.int8), np.zeros(SMOOTHED, np.int32), ys))
+    for name in SMOOTHERS:
+        fold = Fold(name, CAR, Tuning.of(CAR), log)
+        folded, smoothed = medians([partial(again, fold), partial(smooth, fold)], 5)
+        yield BenchmarkRow(name, {"fold [s]": folded, "smooth [s]": smoothed}, (Bound("smooth [s]", 0.3),))
+    peers: dict[str, Callable[[np.ndarray], None]] = {"FilterPy": filterpy_rts, "statsmodels": statsmodels_smoother}
+    for name, peer in peers.items():
+        (spent,) = medians([partial(peer, ys[:SHORT])], 3)
+        yield BenchmarkRow(name, {"smooth [s]": spent * SMOOTHED / SHORT}, remark=f"from {SHORT:,} readings")
+
+
+def filterpy_rts(ys: np.ndarray) -> None:
+    """Filter and smooth."""
+    from filterpy.kalman import KalmanFilter
+
+    its = KalmanFilter(4, 2)
+    its.x, its.P, its.F, its.Q, its.H, its.R = np.zeros((4, 1)), np.eye(4), F, Q, H, R
+    means, covs, _, _ = its.batch_filter(ys[:, :, None])
+    its.rts_smoother(means, covs)
+
+
+def statsmodels_smoother(ys: np.ndarray) -> None:
+    """Filter and smooth."""
+    from statsmodels.tsa.statespace.kalman_smoother import KalmanSmoother
+
+    its = KalmanSmoother(2, 4, design=H, transition=F, selection=np.eye(4), obs_cov=R, state_cov=Q)
+    its.bind(ys)
+    its.initialize_known(np.zeros(4), np.eye(4))
+    its.smooth()
+
+
+@jit_brief
+def _nothing_to_refuse(i, now, s, y, context, state, screened):
+    return False
+
+
+@jit_brief
+def _nothing_to_note(doubt, most, beyond, index, t):
+    return False
+
+
+@lru_cache(maxsize=1)
+def bare_kernel() -> Any:
+    """Compile the fold's own loop without plausibility checks, isolation and detectors.
+
+    Left are predict, update, describe, NIS and its window.
+    """
+    own = {**fold_kernel.__dict__, "screen_reading": _nothing_to_refuse, "note": _nothing_to_note}
+    loop = jit_brief(cache=False)(FunctionType(fold_kernel.run.py_func.__code__, own, "run"))
+
+    @jit_brief(cache=False)
+    def kernel(
+        code, context, rule, first, start, end, t, kind, channel, value, width,
+        clock, u, state, doubt, edge, spare, work, score, track, policy, bounds, evidence,
+    ):  # fmt: skip
+        loop(
+            code, context, rule, first, start, end, t, kind, channel, value, width,
+            clock, u, state, doubt, edge, spare, work, score, track,
+        )  # fmt: skip
+        normal = floats(context.normal, NORMALS * context.n_sensors)
+        assess(start, end, t, kind, channel, track, normal, policy, bounds)
+        return -1
+
+    kernel.compile(fold_kernel.run_signature.args)
+    return kernel
+
+
+def defences() -> Iterator[BenchmarkRow]:
+    """Folds with plausibility checks, isolation and detectors, and without: µs per event, minima."""
+    winding = MODELS["motor_winding"]
+    rows = [("motor_winding", "kf", winding, Tuning.of(winding), noisy_log(winding, STEPS))]
+    for name, estimator in DEFENDED:
+        twin = load_twin(name)
+        log, _ = read_log(twin, None)
+        if estimator == "pf":
+            log.n = min(log.n, PARTICLE_EVENTS)
+        tuning = twin.tuning if estimator == twin.estimator else twin.tuning.with_options({})
+        rows.append((name, estimator, twin.model, tuning, log))
+    for name, estimator, model, tuning, log in rows:
+        defended, bare = (Fold(estimator, model, tuning, log) for _ in range(2))
+        bare._machine._run = bare_kernel()
+        times = np.array([[seconds(partial(again, fold)) for fold in (defended, bare)] for _ in range(9)])
+        least = times[1:].min(axis=0) / log.n * 1e6
+        figures = {"all [µs]": least[0], "bare [µs]": least[1], "ratio": least[0] / least[1]}
+        yield BenchmarkRow(f"{name} {estimator}", figures, (Bound("ratio", 2.0),))
+
+
+def wheels() -> list[Channel]:
+    """Return the channels of four wheel speeds, one sensor each."""
+    return [
+        Channel(
+            kind=READING,
+            index=k,
+            name=f"wheel {name}",
+            signals=(f"WHEEL_SPEED_{name}",),
+            message="WHEEL_SPEEDS",
+            units=(None,),
+            model_units=("m/s",),
+        )
+        for k, name in enumerate(("FR", "FL", "RR", "RL"))
+    ]
+
+
+def blf() -> Iterator[BenchmarkRow]:
+    """Reading a BLF file: one minute of a RAV4, 98,800 frames, of which the wheel speeds are decoded, seconds."""
+    folder = data_folder() / "can_comma2k19_rav4"
+    if not folder.exists():
+        raise SourceError(f"no recording in {folder}; set NISUS_DATA to the folder that holds can_comma2k19_rav4")
+    counts = {}
+
+    def read() -> None:
+        decoder = Decoder([(folder / "dbc" / "toyota_2017.dbc", 0)], wheels(), width=1)
+        source = CanLog([folder / "rav4_2018-08-02_seg40.blf"], decoder)
+        events = 0
+        while (batch := source.read(1.0)) is not None:
+            events += len(batch)
+        counts["frames"], counts["readings"] = source.frames, events
+        source.close()
+
+    clock, processor = np.median([both(read) for _ in range(3)], axis=0)
+    yield BenchmarkRow("RAV4", {**counts, "clock [s]": clock, "processor [s]": processor}, (Bound("clock [s]", 3.0),))

@@ -1,0 +1,258 @@
+"""`python -m tests.benchmarks.page [PART...]`: cost and latency of the page in Chromium.
+
+`nisus run` runs in its own process, so that its processor time is measured apart from the browser's. Clock times on a
+busy machine mean little; the load is printed with them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import json
+import os
+import re
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+import urllib.request
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from estimators.errors import SourceError
+from tests.chromium import find_chromium, launched
+
+from .timing import BenchmarkRow, Bound, Section, run_sections
+
+MOVES = 20
+
+HISTORY = 20_000
+"""Events kept in a soak, which arrive in two minutes; after that memory must stay flat."""
+
+SLIDER = """async (value) => {
+  const box = document.querySelector('.knob[data-key^="Q."] .field input');
+  const before = window.nisus.revision, begun = performance.now();
+  box.value = String(value);
+  box.dispatchEvent(new Event('change'));
+  await new Promise((done) => {
+    const over = () => window.nisus.revision > before || performance.now() - begun > 20000;
+    const look = () => (over() ? done() : requestAnimationFrame(look));
+    look();
+  });
+  return performance.now() - begun;
+}"""
+"""Type a value into the field of a slider, and return the milliseconds until the charts are redrawn."""
+
+
+class Running:
+    """`nisus run` in its own process."""
+
+    def __init__(self, twin: str, *arguments: str, cache: Path | None = None) -> None:
+        environment = dict(os.environ) if cache is None else {**os.environ, "XDG_CACHE_HOME": str(cache)}
+        command = [sys.executable, "-m", "app.cli.main", "run", twin, "--port", "0", "--no-browser", *arguments]
+        self.begun = time.monotonic()
+        self._process = subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True)
+        assert self._process.stdout is not None
+        self.url = next(found[0] for line in self._process.stdout if (found := re.search(r"http://\S+", line)))
+        self.address, token = self.url.split("/?token=")
+        self.headers = {"Authorization": f"Bearer {token}", "Origin": self.address}
+
+    def ask(self, path: str, body: Any = None) -> Any:
+        """Return an answer of the API."""
+        data = None if body is None else json.dumps(body).encode()
+        headers = self.headers | ({"Content-Type": "application/json"} if data else {})
+        with urllib.request.urlopen(urllib.request.Request(self.address + path, data, headers)) as answer:
+            return json.loads(answer.read())
+
+    @property
+    def readings(self) -> int:
+        """Number of readings so far."""
+        return int(self.ask("/api/status")["counts"]["readings"])
+
+    def cpu(self) -> float:
+        """Return processor seconds so far."""
+        fields = Path(f"/proc/{self._process.pid}/stat").read_text().rpartition(")")[2].split()
+        return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+    def resident(self) -> float:
+        """Return resident memory, MB."""
+        return int(Path(f"/proc/{self._process.pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
+
+    def stop(self) -> None:
+        """End it."""
+        self._process.terminate()
+        self._process.wait()
+
+
+@contextmanager
+def running(twin: str, *arguments: str, cache: Path | None = None) -> Iterator[Running]:
+    """Run `nisus run` in the context."""
+    run = Running(twin, *arguments, cache=cache)
+    try:
+        yield run
+    finally:
+        run.stop()
+
+
+@contextmanager
+def opened(run: Running) -> Iterator[tuple[Any, float]]:
+    """Open the page in Chromium; give it once a curve is drawn, with the seconds until its charts appeared.
+
+    Raises:
+        SourceError: If there is no Chromium.
+    """
+    path = find_chromium()
+    if path is None:
+        raise SourceError("no Chromium was found")
+    with launched(path) as browser:
+        page = browser.new_context(viewport={"width": 1440, "height": 900}).new_page()
+        begun = time.monotonic()
+        page.goto(run.url, wait_until="commit")
+        page.wait_for_selector("#charts .chart canvas")
+        paint = time.monotonic() - begun
+        while not page.evaluate("window.nisus?.drawn > 0"):
+            time.sleep(0.02)
+        yield page, paint
+
+
+def first() -> Iterator[BenchmarkRow]:
+    """Start of motor_can from an empty compile cache, seconds."""
+    with tempfile.TemporaryDirectory() as folder, running("motor_can", cache=Path(folder)) as run:
+        address = time.monotonic() - run.begun
+        with opened(run) as (_, paint):
+            figures = {"address [s]": address, "charts [s]": paint, "first curve [s]": time.monotonic() - run.begun}
+            yield BenchmarkRow("motor_can", figures, (Bound("charts [s]", 1.5), Bound("first curve [s]", 20.0)))
+
+
+def slider() -> Iterator[BenchmarkRow]:
+    """From a slider to the redrawn charts, without Explore, ms."""
+    for events, bound in ((10_000, 150.0), (100_000, 400.0)):
+        # One reading in fifteen is lost.
+        with running("motor_winding", "--speed", "inf", "--set", f"source.duration={events * 15 / 14:.0f}") as run:
+            with opened(run) as (page, paint):
+                while not run.ask("/api/status")["finished"]:
+                    time.sleep(0.1)
+                time.sleep(3.0)
+                took = [page.evaluate(SLIDER, 0.01 * (1.0 + 0.1 * k)) for k in range(MOVES)]
+            figures = {"median [ms]": statistics.median(took), "longest [ms]": max(took), "charts [s]": paint}
+            yield BenchmarkRow(f"{events:,} readings", figures, (Bound("median [ms]", bound),))
+
+
+def share(seconds: float = 15.0) -> Iterator[BenchmarkRow]:
+    """Share of a processor that the server takes, with one browser and with none."""
+    with running("motor_can") as run:
+        with opened(run):
+            time.sleep(15.0)
+            cpu, begun = run.cpu(), time.monotonic()
+            time.sleep(seconds)
+            percent = 100.0 * (run.cpu() - cpu) / (time.monotonic() - begun)
+            yield BenchmarkRow("one browser", {"of a core [%]": percent}, (Bound("of a core [%]", 8.0),))
+        time.sleep(2.0)
+        cpu, begun = run.cpu(), time.monotonic()
+        time.sleep(seconds / 2)
+        yield BenchmarkRow("none", {"of a core [%]": 100.0 * (run.cpu() - cpu) / (time.monotonic() - begun)})
+
+
+async def _watch(run: Running, seconds: float) -> int:
+    import websockets
+
+    columns = run.ask("/api/model")["columns"]
+    address = run.address.replace("http", "ws", 1)
+    headers = {"Authorization": run.headers["Authorization"]}
+    got, end = 0, time.monotonic() + seconds
+    origin: Any = run.address
+    async with websockets.connect(address + "/api/stream", additional_headers=headers, origin=origin) as stream:
+        await stream.send(json.dumps({"lanes": {"charts": {"columns": columns, "span": 120, "points": 600}}}))
+        while time.monotonic() < end:
+            try:
+                message = await asyncio.wait_for(stream.recv(), 1.0)
+            except TimeoutError:
+                continue
+            got += len(message)
+            if isinstance(message, str) and "frames" in message:
+                await stream.send('{"drawn":true}')
+    return got
+
+
+def crowd(seconds: float = 15.0) -> Iterator[BenchmarkRow]:
+    """Load of 0, 1 and 10 clients at a thousand readings per second."""
+    with running("motor_can", "--set", "source.asset.step=0.003") as run:
+        time.sleep(3.0)
+        for clients in (0, 1, 10, 0):
+
+            async def all_of_them(count: int = clients) -> int:
+                return sum(await asyncio.gather(*(_watch(run, seconds) for _ in range(count))))
+
+            readings, cpu, begun, sent = run.readings, run.cpu(), time.monotonic(), 0
+            if clients:
+                sent = asyncio.run(all_of_them())
+            else:
+                time.sleep(seconds)
+            gone = time.monotonic() - begun
+            status = run.ask("/api/status")
+            figures = {
+                "rows per s": (status["counts"]["readings"] - readings) / gone,
+                "p99 to row [ms]": status["latency_ms"],
+                "of a core [%]": 100.0 * (run.cpu() - cpu) / gone,
+                "sent [kB/s]": sent / gone / 1000,
+            }
+            yield BenchmarkRow(f"{clients} clients", figures)
+
+
+def arrival(seconds: float = 15.0) -> Iterator[BenchmarkRow]:
+    """From arrival to row at 1 kHz with a browser, p99 over 4096 readings, ms."""
+    with running("motor_can", "--set", "source.asset.step=0.003") as run, opened(run):
+        worst = []
+        for _ in range(max(1, int(seconds / 4))):
+            time.sleep(4.0)
+            worst.append(run.ask("/api/status")["latency_ms"])
+    figures = {"median [ms]": statistics.median(worst), "longest [ms]": max(worst)}
+    yield BenchmarkRow("motor_can", figures, (Bound("median [ms]", 5.0),))
+
+
+def soak(minutes: float = 10.0) -> Iterator[BenchmarkRow]:
+    """Memory of server and page at 200 readings per second with 10,000 particles and a history that is soon full."""
+    options = ("--estimator", "pf", "--set", 'filters.pf={"particles": 10000}', "--set", "source.asset.step=0.015",
+               "--set", f"history={HISTORY}")  # fmt: skip
+    with running("motor_can", *options) as run, opened(run) as (page, _):
+        session = page.context.new_cdp_session(page)
+        begun, before = time.monotonic(), run.readings
+        while (gone := time.monotonic() - begun) < 60.0 * minutes:
+            time.sleep(30.0)
+            session.send("HeapProfiler.collectGarbage")
+            heap = session.send("Runtime.getHeapUsage")["usedSize"] / 1e6
+            gone, status = time.monotonic() - begun, run.ask("/api/status")
+            figures = {
+                "readings per s": (status["counts"]["readings"] - before) / gone,
+                "server [MB]": run.resident(),
+                "heap [MB]": heap,
+                "p99 to row [ms]": status["latency_ms"],
+            }
+            yield BenchmarkRow(f"{gone / 60:.1f} min", figures)
+
+
+PARTS: dict[str, Section] = {part.__name__: part for part in (crowd, first, slider, share, arrival)}
+
+
+def page() -> Iterator[BenchmarkRow]:
+    """Cost and latency of the page: see `python -m tests.benchmarks.page`."""
+    for name, part in PARTS.items():
+        for row in part():
+            yield row._replace(name=f"{name}, {row.name}")
+
+
+def main() -> None:
+    """Run the parts that the command line names."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("parts", nargs="*", default=list(PARTS), help=f"among {', '.join(PARTS)} and soak")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write all figures to this file")
+    given = parser.parse_args()
+    print(f"load {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores")
+    run_sections([{**PARTS, "soak": soak}[name] for name in given.parts], given.json)
+
+
+if __name__ == "__main__":
+    main()
