@@ -19,7 +19,7 @@ from .http import PAGE
 PASSED_ON = ("content-type", "content-encoding", "etag", "last-modified", "cache-control")
 ASKED = ("accept", "accept-encoding", "if-none-match")
 HEAD = b"<head>"
-SCRIPTS = PAGE / "viser_labels.js", PAGE / "viser_shown.js"
+SCRIPT = PAGE / "viser_frame.js"
 AHEAD = "<script>{script}</script>"
 """What goes into Viser's page ahead of its own script; in the text, as a frame under another name may fetch no more."""
 
@@ -54,7 +54,7 @@ class ViserProxy:
         except (OSError, http.client.HTTPException) as error:
             return PlainTextResponse(f"Nisus: the Viser pane does not answer ({error}).\n", 502)
         if path == "/":
-            ahead = "".join(AHEAD.format(script=script.read_text()) for script in SCRIPTS)
+            ahead = AHEAD.format(script=SCRIPT.read_text())
             ahead += SCENE_ALONE if "scene" in request.query_params else ""
             body = body.replace(HEAD, HEAD + ahead.encode(), 1)
         answer = Response(body, status)

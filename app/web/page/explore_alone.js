@@ -2,7 +2,7 @@
 
 import { $, setText } from "./dom.js";
 import { Explore } from "./explore.js";
-import { RemoteView } from "./shared_time.js";
+import { RemoteView } from "./view.js";
 
 const settings = JSON.parse(document.body.dataset.settings);
 window.nisus = {};

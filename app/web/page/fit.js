@@ -1,12 +1,11 @@
 // Fit: a small panel beside the Tune column. What is fitted and over what, how far it is, and what came of it, which is
 // offered only if it won on what it had not seen.
 
+import { Panel } from "./controls.js";
 import { element, setText } from "./dom.js";
-import { fitted } from "./fitted.js";
-import { span, words } from "./format.js";
-import { Panel } from "./panel.js";
+import { clock, compact, spaced, span, words } from "./format.js";
 
-const LOOK = 300; // ms between two looks at how far it is
+const FIT_PERIOD = 300; // ms between two looks at how far it is
 const GROUPS = { Q: "Q", R: "R", p: "parameters", options: "options" };
 const FIRST = ["Q", "R"]; // what is ticked at first
 const LAST = [100_000, 20_000, 5_000]; // of so many events, where there are more
@@ -63,7 +62,7 @@ export class Fit {
     const told = answer?.headers.get("content-type")?.includes("json") ? await answer.json() : { error: "the twin does not answer" };
     this.say(told.error ?? "");
     if (!told.error) this.take(told);
-    else if (BUSY.includes(this.told?.state)) this.timer = setTimeout(() => this.ask("GET"), 10 * LOOK);
+    else if (BUSY.includes(this.told?.state)) this.timer = setTimeout(() => this.ask("GET"), 10 * FIT_PERIOD);
   }
 
   say(reason) {
@@ -87,7 +86,7 @@ export class Fit {
     setText(this.button, busy ? "Fitting…" : "Fit…");
     if (busy) {
       setText(this.count, `${told.state === "cancelling" ? "ending … " : ""}${told.folds} folds of ${told.events.toLocaleString("en")} events, ${span(told.elapsed)}`);
-      this.timer = setTimeout(() => this.ask("GET"), LOOK);
+      this.timer = setTimeout(() => this.ask("GET"), FIT_PERIOD);
     }
     if (told.state === "failed") this.say(told.reason);
     const key = `${told.number}/${told.state}/${told.current}`;
@@ -148,3 +147,221 @@ function group(prefix, title, keys) {
   const wanted = () => (all.checked ? [prefix] : boxes.filter((box) => box.checked).map((box) => box.value));
   return { head: element("label", { title: keys.join(", ") }, all, `${title} `, element("small", {}, String(keys.length))), list, wanted };
 }
+
+// What came of a fit: the verdict in words, every entry before and after, and what both predict, of what was fitted to
+// and of what was held out.
+
+const ALONE = "left alone: the data cannot tell";
+const EDGE = "at the edge of its range: the best may lie beyond";
+const BOUND = "only a bound: the data cannot tell it from none";
+
+// told: the answer of /api/fit; offers: buttons
+function fitted(told, offers) {
+  const { result } = told;
+  return [verdict(result), element("div", { class: "offers" }, ...offers), entries(result), scores(result), about(told)];
+}
+
+function verdict({ proposed, verdict: { gain, error, reasons } }) {
+  const gained = gain === null ? "" : `${gain < 0 ? "−" : "+"}${compact(Math.abs(gain), 3)} ± ${compact(error, 2)} nats a reading`;
+  const said = proposed ? `Better on the blocks held out: ${gained}.` : "Not better on what was held out: it is not proposed.";
+  return element("div", { class: "verdict", dataset: { proposed } },
+    element("p", {}, element("b", {}, said)), ...(proposed ? [] : [element("ul", {}, ...reasons.map((reason) => element("li", {}, reason)))]));
+}
+
+function entries(result) {
+  const head = ["entry", "before", "after", "95 % interval"].map((text) => element("th", { scope: "col" }, text));
+  const rows = result.entries.map((line) => {
+    const name = element("th", { scope: "row", title: line.unit }, words(line.key));
+    if (line.alone) return element("tr", {}, name, element("td", {}, compact(line.before)), element("td", { class: "faint", colspan: 2 }, ALONE));
+    const ends = `${compact(line.low, 3)} … ${compact(line.high, 3)}`;
+    return element("tr", {}, name, element("td", {}, compact(line.before)), element("td", {}, element("b", {}, compact(line.after))),
+      element("td", { title: !line.told ? BOUND : line.edge ? EDGE : line.profile ? "By profile likelihood" : null }, !line.told ? `${ends} (bound)` : line.edge ? `${ends} (edge)` : ends));
+  });
+  const skipped = result.skipped.map((item) => element("tr", {}, element("th", { scope: "row" }, words(item.key)), element("td", { class: "faint", colspan: 3 }, `not fitted: ${item.reason}`)));
+  const pairs = result.correlated.map((pair) => `${pair.entries.map(words).join(" with ")} (${pair.correlation.toFixed(2)})`);
+  return element("div", {}, element("table", { class: "entries" }, element("thead", {}, element("tr", {}, ...head)), element("tbody", {}, ...rows, ...skipped)),
+    pairs.length ? element("p", { class: "faint" }, `Hardly told apart: ${pairs.join(", ")}.`) : "");
+}
+
+function scores({ before, after }) {
+  const parts = [before.fitted, after.fitted, before.held_out, after.held_out];
+  const row = (title, hint, text) => element("tr", {}, element("th", { scope: "row", title: hint }, title), ...parts.map((part) => element("td", {}, text(part))));
+  const share = (value, digits = 1) => (value === null ? "–" : `${(100 * value).toFixed(digits)} %`);
+  const rows = [
+    row("log density", "Of a reading, nats: greater is better", (part) => compact(part.log_density, 4)),
+    row("NIS / dof", "1 where the filter is consistent", (part) => compact(part.nis, 3)),
+    row("in 95 %", "Share of innovations inside their 95 % band", (part) => share(part.coverage)),
+  ];
+  for (const [group, title] of [["sensors", "Sensors, each predicted by the others: RMS error, in 95 %"], ["withheld", "Sensors that are never used: RMS error, in 95 %"], ["states", "States, against the truth: RMS error, in 95 %"]]) {
+    const names = new Set(parts.flatMap((part) => Object.keys(part[group])));
+    if (names.size) rows.push(element("tr", {}, element("th", { scope: "rowgroup", colspan: 5, class: "faint" }, title)));
+    for (const name of names) {
+      const unit = parts.map((part) => part[group][name]?.unit).find(Boolean);
+      rows.push(row(`${words(name)}${spaced(unit)}`, null, (part) => (part[group][name] ? `${compact(part[group][name].rms, 3)}, ${share(part[group][name].coverage, 0)}` : "–")));
+    }
+  }
+  const group = (title, readings) => element("th", { scope: "colgroup", colspan: 2 }, `${title}, ${readings.toLocaleString("en")} readings`);
+  const head = element("thead", {},
+    element("tr", {}, element("td", {}), group("fitted to", before.fitted.readings), group("held out", before.held_out.readings)),
+    element("tr", {}, element("td", {}), ...["before", "after", "before", "after"].map((text) => element("th", { scope: "col" }, text))));
+  return element("table", { class: "scores" }, head, element("tbody", {}, ...rows));
+}
+
+const about = ({ result, revision, events, elapsed }) =>
+  element("p", { class: "about" }, `From run ${revision}, ${result.estimator}: ${result.folds} folds of ${events.toLocaleString("en")} events in ${compact(elapsed, 2)} s.${result.power < 1 ? ` Of what the fitted blocks say ${compact(result.power, 2)} is believed, in the intervals too: with more of it the others are predicted no better.` : ""}`);
+
+// Dual estimation: what was fitted on the last window beside the running twin. What won is a card above the knobs, to be
+// accepted or dismissed; every fit, with its evidence, is in a panel.
+
+export class Refit {
+  constructor(model, link, tune) {
+    Object.assign(this, { model, link, opened: new Set() });
+    this.said = element("span", { class: "faint", role: "status" });
+    this.button = element("button", { type: "button", id: "refit-open", title: "Every fit, with its evidence" }, "Fits…");
+    this.offer = element("div", {});
+    this.error = element("p", { class: "error", role: "alert", hidden: true });
+    const head = element("div", { class: "refit-head" }, element("h3", { title: "A fit of parameters on the last readings, at set times, beside the filter of the state" }, "Dual estimation"), this.said, element("span", { class: "space" }), this.button);
+    this.card = element("section", { id: "refit", "aria-label": "Dual estimation", hidden: true }, head, this.offer, this.error);
+    tune.sections.before(this.card);
+    this.about = element("p", { class: "about" });
+    this.begin = element("button", { type: "button", id: "refit-begin", class: "go", title: "Fit the last window at once", onclick: () => this.post("/api/refit", {}) }, "Fit now");
+    this.list = element("div", { class: "fits" });
+    this.panel = new Panel(this.button, "refit-panel", "Dual estimation", () => this.look(), this.about, element("div", { class: "progress" }, this.begin), this.list);
+    link.addEventListener("status", ({ detail }) => {
+      this.card.hidden = !detail.refit;
+      if (this.card.hidden) return;
+      const key = JSON.stringify([detail.refit, detail.reloads]);
+      if (key === this.key) return;
+      this.key = key;
+      this.look();
+    });
+  }
+
+  async look() {
+    const answer = await fetch("/api/refit").catch(() => null);
+    if (answer?.ok) this.show(await answer.json());
+  }
+
+  // Says why where it is refused.
+  async post(path, fields) {
+    const answer = await fetch(path, { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(fields) }).catch(() => null);
+    const reason = answer?.ok ? "" : ((await answer?.json().catch(() => null))?.error ?? "the twin does not answer");
+    setText(this.error, reason);
+    this.error.hidden = !reason;
+    await this.look();
+  }
+
+  show({ section, due, fits }) {
+    if (!section) return;
+    const origin = Number(this.link.status.origin ?? 0);
+    const at = (time) => clock((Number(time) - origin) / 1e9);
+    const busy = fits[0]?.state === "fitting";
+    setText(this.said, busy ? "fitting …" : due ? `next at ${at(due)}` : "");
+    this.begin.disabled = busy;
+    const rule = section.adopt === "by hand" ? "what is better waits here for you" : "what is better is adopted, and said";
+    setText(this.about, `${section.entries.map(words).join(", ")}: fitted every ${span(section.every)} on the last ${span(section.window)}; ${rule}.`);
+    const proposed = fits.find((fit) => fit.state === "proposed");
+    const held = this.offer.contains(document.activeElement);
+    this.offer.replaceChildren(...(proposed ? this.proposal(proposed) : []));
+    if (held) (this.offer.querySelector("button") ?? this.button).focus();
+    this.list.replaceChildren(...fits.map((fit) => this.fit(fit, at)));
+  }
+
+  proposal(fit) {
+    const { verdict, entries } = fit.result;
+    const rows = entries.filter((line) => !line.alone).map((line) => element("tr", {},
+      element("th", { scope: "row" }, words(line.key)),
+      element("td", { title: `95 % interval ${compact(line.low, 3)} … ${compact(line.high, 3)}${spaced(line.unit)}` }, `${compact(line.before)} → `, element("b", {}, compact(line.after)), spaced(line.unit)),
+      element("td", { title: "Standard deviations of its estimate by which it moved" }, `${line.sigma < 0 ? "−" : "+"}${Math.abs(line.sigma).toFixed(1)} σ`)));
+    const decide = (what) => () => this.post(`/api/refit/${what}`, { number: fit.number });
+    return [
+      element("table", {}, element("tbody", {}, ...rows)),
+      element("p", { class: "about" }, `Better on the blocks held out: +${compact(verdict.gain, 3)} ± ${compact(verdict.error, 2)} nats a reading.`),
+      element("div", { class: "offers" },
+        element("button", { type: "button", id: "refit-accept", class: "go first", title: "Keep it as a tuning version with its evidence, and fold again with it", onclick: decide("accept") }, "Accept"),
+        element("button", { type: "button", id: "refit-dismiss", class: "go", title: "Leave things as they are, until the data say something else", onclick: decide("dismiss") }, "Dismiss")),
+    ];
+  }
+
+  fit(fit, at) {
+    const done = fit.name ? `${fit.state} as ${fit.name}` : fit.state;
+    const node = element("details", { open: this.opened.has(fit.number), dataset: { state: fit.state } },
+      element("summary", { title: fit.text }, element("b", {}, `${fit.number}`), ` ${at(fit.start)} to ${at(fit.end)}: ${done}`),
+      element("p", {}, fit.text), ...(fit.result ? fitted(fit, []) : []));
+    node.addEventListener("toggle", () => (node.open ? this.opened.add(fit.number) : this.opened.delete(fit.number)));
+    return node;
+  }
+}
+
+// Advice: which estimator the log speaks for, as cards. One for what is recommended, which applies itself, and one for each
+// claim with the figure that made it; where noises are off, its card opens the fit.
+
+const ADVICE_PERIOD = 500; // ms between two looks at whether it is there
+
+export class Advice {
+  constructor(model, link, tune) {
+    Object.assign(this, { model, link, tune });
+    this.button = element("button", { type: "button", id: "advise", title: "Which estimator what was read speaks for, and why" }, "Advice…");
+    tune.restoreButton.before(this.button);
+    this.measure = element("button", { type: "button", id: "advice-begin", class: "go", onclick: () => this.ask("POST") }, "Measure");
+    this.said = element("span", { class: "faint", role: "status" });
+    this.error = element("p", { class: "error", role: "alert", hidden: true });
+    this.cards = element("div", { class: "claims" });
+    this.panel = new Panel(this.button, "advice-panel", "Which estimator, and why", () => this.ask("GET"),
+      element("div", { class: "progress" }, this.measure, this.said), this.error, this.cards);
+    link.addEventListener("status", ({ detail }) => {
+      if (this.told?.advice && this.revision !== detail.revision && this.panel.open) this.ask("GET");
+      this.revision = detail.revision;
+    });
+  }
+
+  async ask(method) {
+    clearTimeout(this.timer);
+    const answer = await fetch("/api/advice", { method, ...(method === "POST" ? { headers: { "Content-Type": "application/json" }, body: "{}" } : {}) }).catch(() => null);
+    const told = answer?.headers.get("content-type")?.includes("json") ? await answer.json() : { error: "the twin does not answer" };
+    this.say(told.error ?? told.reason);
+    if (told.error) return;
+    const busy = told.state === "running";
+    if (busy && this.panel.open) this.timer = setTimeout(() => this.ask("GET"), ADVICE_PERIOD);
+    this.measure.disabled = busy;
+    setText(this.said, busy ? "folding the log by one filter after another …" : told.advice && !told.current ? `of run ${told.revision}; another runs now` : told.advice ? "" : "nothing measured yet: it folds the log by one filter after another");
+    const key = `${told.state}/${told.revision}/${told.current}`;
+    if (key === this.key) return;
+    this.key = key;
+    this.told = told;
+    this.cards.replaceChildren(...(told.advice ? [this.recommended(told), ...told.advice.claims.map((claim) => this.claim(claim, told.advice.because))] : []));
+  }
+
+  say(reason) {
+    setText(this.error, reason ?? "");
+    this.error.hidden = !reason;
+  }
+
+  recommended({ advice }) {
+    const title = this.model.estimators.find((entry) => entry.name === advice.estimator)?.title ?? advice.estimator;
+    const options = Object.entries(advice.options).map(([name, value]) => `${words(name)} ${compact(value)}`).join(", ");
+    const has = advice.has === advice.estimator && !options;
+    return element("article", { class: "first" },
+      element("header", {}, element("h3", {}, has ? `${title}: as it is` : title), element("span", { class: "space" }),
+        has ? null : element("button", { type: "button", id: "advice-apply", class: "go first", title: "One edit, which U takes back", onclick: () => this.apply(advice) }, "Apply")),
+      options ? element("p", {}, options) : null, ...advice.reasons.map((reason) => element("p", {}, `because ${reason}`)));
+  }
+
+  claim(claim, because) {
+    const figure = claim.figure === null || claim.threshold === null ? null : element("p", { class: "faint" }, `${compact(claim.figure, 3)} ${claim.of}, limit ${compact(claim.threshold, 3)}`);
+    const fit = claim.key === "consistent" && claim.answer === "no" ? element("button", { type: "button", class: "go", onclick: () => this.tune.fit.box.toggle(true) }, "Fit…") : null;
+    return element("article", { dataset: { decides: because.includes(claim.key) } },
+      element("header", {}, element("h3", {}, claim.question), element("span", { class: "space" }), element("b", {}, claim.answer)),
+      figure, element("p", {}, claim.reason), claim.remedy ? element("p", { class: "remedy" }, claim.remedy) : null, fit);
+  }
+
+  async apply(advice) {
+    const { estimator: name, options } = this.link.status;
+    this.say(await this.tune.edit(`estimator ${advice.estimator}`, "SetEstimator", { name: advice.estimator, options: advice.options }, { name, options: numbers(options) }));
+    // Its card is about to be another.
+    this.measure.focus();
+  }
+}
+
+// What a status gives as text is infinite: that is the option's own default.
+const numbers = (options) => Object.fromEntries(Object.entries(options).filter(([, value]) => typeof value === "number"));

@@ -1,7 +1,5 @@
 // Numbers, units and times as text.
 
-const EXPONENTS = { 2: "²", 3: "³", "-1": "⁻¹" };
-
 // A value with its deviation: as many digits as the deviation justifies.
 export function withDeviation(value, deviation, unit) {
   if (!Number.isFinite(value)) return "–";
@@ -52,4 +50,3 @@ export function span(seconds) {
 
 export const words = (name) => name.replaceAll("_", " ");
 
-export const exponent = (n) => EXPONENTS[n] ?? `^${n}`;

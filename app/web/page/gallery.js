@@ -1,11 +1,9 @@
 // The gallery: every twin with a picture, what it teaches and the question it answers; beside them the recordings.
 
-import { card } from "./card.js";
+import { keys } from "./controls.js";
 import { $, element, setText } from "./dom.js";
-import { drops } from "./drop.js";
-import { keys } from "./keys.js";
-import { Recordings } from "./recordings.js";
-import { post, progress, Session } from "./session.js";
+import { drops, Recordings } from "./recordings.js";
+import { card, post, progress, Session } from "./session.js";
 
 const settings = JSON.parse(document.body.dataset.settings);
 const session = new Session(settings.boot);

@@ -93,7 +93,7 @@ export class Strong {
 }
 
 // A colour of its own for each place, and a dash for who cannot distinguish the colours.
-export const DASHES = [[], [9, 3], [3, 2], [10, 3, 2, 3]];
+const DASHES = [[], [9, 3], [3, 2], [10, 3, 2, 3]];
 const REACH = 1; // spans of a chart's own by which pinned runs may widen its axis to either side
 
 // Pinned runs: their lines on each state's chart, and below the charts their difference from the running one. The head

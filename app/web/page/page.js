@@ -1,25 +1,21 @@
 // The page: trust on top, tuning to the left, charts in the middle, scene and lists to the right, time below.
 
 import { Charts } from "./charts.js";
+import { keys, Tabs } from "./controls.js";
 import { Diagnose } from "./diagnose.js";
 import { $, element, setAttribute, setText } from "./dom.js";
-import { Episodes } from "./episodes.js";
 import { Explore } from "./explore.js";
 import { Faults } from "./faults.js";
 import { clock } from "./format.js";
-import { keys } from "./keys.js";
-import { Leave } from "./leave.js";
 import { Link } from "./link.js";
-import { goTo, twinOf } from "./moment.js";
 import { Runs } from "./runs.js";
 import { Save } from "./save.js";
-import { SharedTime } from "./shared_time.js";
+import { Leave } from "./session.js";
 import { Stage } from "./stage.js";
-import { Tabs } from "./tabs.js";
 import { Transport } from "./transport.js";
-import { Trust } from "./trust.js";
+import { Episodes, Trust } from "./trust.js";
 import { Tune } from "./tune.js";
-import { View } from "./view.js";
+import { goTo, SharedTime, twinOf, View } from "./view.js";
 import { WhatIf } from "./whatif.js";
 import { XY } from "./xy.js";
 

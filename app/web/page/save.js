@@ -4,8 +4,8 @@
 import { heading } from "./chart.js";
 import { element } from "./dom.js";
 import { clock, words } from "./format.js";
-import { link as momentLink } from "./moment.js";
 import { plotSvg, pngOf } from "./svg.js";
+import { link as momentLink } from "./view.js";
 
 // Why there is nothing to save of a run.
 export const gone = (number) => `the track of run ${number} is gone: load it, and it is folded again`;
@@ -129,4 +129,3 @@ function download(blob, name) {
   element("a", { href: url, download: name }).click();
   setTimeout(() => URL.revokeObjectURL(url), 60_000);
 }
-

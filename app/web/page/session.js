@@ -1,5 +1,8 @@
 // What runs at this address, what is being started, and what could not be; asked again and again while it is looked at.
 
+import { $, element, setAttribute, setText } from "./dom.js";
+import { drops } from "./recordings.js";
+
 const REST = 700; // ms
 const HASTE = 250; // while something is being started
 
@@ -61,5 +64,137 @@ export async function post(path, body, method = "POST") {
     return answer.headers.get("content-type")?.includes("json") ? JSON.parse(text) : { error: text.trim() };
   } catch {
     return { error: "Nisus does not answer" };
+  }
+}
+
+// One twin of the gallery: picture, question, what it teaches, and a button to start it, or why it cannot.
+
+const many = (count, word) => `${count.toLocaleString("en")} ${word}${count === 1 ? "" : "s"}`;
+
+// The name of a twin without folder and ending, as its page and its links have it; and the card of that name that can
+// be started, if there is one.
+const brief = (name) => name.split(/[\\/]/).pop().replace(/\.ya?ml$/, "");
+const named = (items, short) => items.find((item) => brief(item.name) === short && !item.missing && !item.error);
+
+// `item` is a card of /api/gallery; `act` has start(name) and open().
+export function card(item, act) {
+  const short = brief(item.name);
+  const ready = !item.missing && !item.error;
+  const button = element("button", { type: "button", class: "start", onclick: () => (button.dataset.runs === "true" ? act.open() : act.start(item.name)) }, "Start");
+  const facts = item.error ? "" : [item.source, many(item.states, "state"), many(item.rows, "row"), item.estimator].join(" · ");
+  const node = element(
+    "li", { class: "card", dataset: { ready: String(ready), name: item.name, ...(item.log ? { log: "true" } : {}) } },
+    picture(item),
+    element("div", { class: "words" },
+      item.question ? element("p", { class: "question" }, item.question) : null,
+      element("h2", {}, ready ? element("button", { type: "button", class: "name", onclick: () => button.click() }, short) : short), element("p", { class: "title" }, item.title),
+      item.teaches ? element("p", { class: "teaches" }, item.teaches) : null,
+      reason(item),
+    ),
+    element("footer", {}, element("span", { class: "facts" }, facts), ready ? button : null),
+  );
+  const sync = ({ running, starting }) => {
+    const runs = Boolean(running) && running.name === item.name;
+    const begins = Boolean(starting) && starting.name === item.name;
+    setAttribute(node, "data-runs", runs ? "true" : null);
+    button.dataset.runs = String(runs);
+    button.disabled = Boolean(starting);
+    setText(button, runs ? "Back to it" : begins ? progress(starting) : "Start");
+    setAttribute(button, "aria-label", `${runs ? "Back to" : "Start"} ${short}`);
+  };
+  const words = [item.name, item.title, item.question, item.teaches, facts].join(" ").toLowerCase();
+  return { node, sync, ready, words, name: item.name, short, title: item.title, log: item.log };
+}
+
+// The reason, and on demand the place and the remedy, which take some lines.
+function reason(item) {
+  if (item.error) return element("p", { class: "error" }, item.error);
+  if (!item.missing) return null;
+  const [what, ...remedy] = item.missing.replace(/^\S+?:\d+: \S+ /, "").split("; ");
+  return element(
+    "details", { class: "missing" },
+    element("summary", {}, "Its recording is not here: how to get it"),
+    element("p", {}, `It ${what}.`), ...remedy.map((line) => element("p", {}, `${line[0].toUpperCase()}${line.slice(1)}.`)),
+  );
+}
+
+function picture(item) {
+  const place = element("div", { class: "picture", "aria-hidden": "true" });
+  if (item.picture) draw(place, item.name);
+  else place.append(element("span", { class: "faint" }, "no picture yet"));
+  return place;
+}
+
+// Into the page itself, so that it has the colours of the theme.
+async function draw(place, name) {
+  // A page that is being left gets none.
+  const answer = await fetch(`/api/gallery/picture?twin=${encodeURIComponent(name)}`).catch(() => null);
+  if (!answer?.ok) return;
+  const svg = new DOMParser().parseFromString(await answer.text(), "image/svg+xml").documentElement;
+  if (svg.nodeName === "svg") place.replaceChildren(document.importNode(svg, true));
+}
+
+// From a twin's page to what else there is: the gallery, the recordings, and files that are dropped here.
+
+const READ = 8000; // ms that a line stays
+
+export class Leave {
+  constructor(model, boot) {
+    for (const id of ["gallery", "others"]) setAttribute($(id), "href", "/gallery");
+    this.boot = boot;
+    this.model = model;
+    drops({ twins: () => this.twins(), say: (text, wrong) => this.say(text, wrong), follow: () => this.follow() });
+    const go = (where) => location.assign(where);
+    this.commands = [
+      ["g", "gallery: another twin", () => go("/gallery")],
+      ["", "recordings: open, download, delete", () => go("/gallery#recordings")],
+    ];
+  }
+
+  // Those that could read a log, this one first.
+  async twins() {
+    const all = (await (await fetch("/api/gallery")).json()).filter((item) => item.log && !item.error);
+    const short = (name) => name.split(/[\\/]/).pop().replace(/\.ya?ml$/, "");
+    return all.map((item) => ({ ...item, short: short(item.name) })).sort((a, b) => (b.short === this.model.twin) - (a.short === this.model.twin));
+  }
+
+  // A link of another twin was opened: what runs goes on, unless that is started. The address stays, and with it the
+  // moment to which the other twin's page goes.
+  async offer(twin, reason) {
+    const all = await fetch("/api/gallery").then((answer) => answer.json()).catch(() => []);
+    const item = named(all, twin);
+    if (!item) return this.say(`${reason}. No twin of that name can be started here`, true);
+    const start = async () => {
+      const answer = await post("/api/gallery/start", { twin: item.name });
+      if (answer.error) this.say(answer.error, true);
+      else this.follow();
+    };
+    this.say(`${reason}. `);
+    $("toast").append(
+      element("button", { type: "button", class: "go", onclick: start }, `Start ${twin}`),
+      element("button", { type: "button", class: "go", onclick: () => (history.replaceState(null, "", location.pathname), this.say("")) }, `Stay with ${this.model.twin}`),
+    );
+  }
+
+  // What becomes of a file that was dropped: while another twin is being started this page goes on.
+  say(text, wrong = false) {
+    setText($("toast"), text);
+    $("toast").hidden = !text;
+    $("toast").dataset.wrong = String(wrong);
+    clearTimeout(this.timer);
+    if (wrong) this.timer = setTimeout(() => this.say(""), READ);
+  }
+
+  follow() {
+    this.session?.close();
+    this.session = new Session(this.boot);
+    this.session.addEventListener("state", ({ detail: { starting, failed } }) => {
+      if (starting) setText($("toast"), `${starting.title}: ${progress(starting)}`);
+      $("toast").hidden = !starting;
+      if (starting) return;
+      this.session.close();
+      this.session = null;
+      if (failed) this.say(`${failed.title} did not start. ${failed.text}`, true);
+    });
   }
 }

@@ -1,12 +1,9 @@
 // The Tune panel: filter and options, noises, parameters, gate, sensors. Undo and redo.
 
-import { Advice } from "./advice.js";
-import { Around } from "./around.js";
 import { $, element, setAttribute, setText } from "./dom.js";
-import { Fit } from "./fit.js";
-import { Knob } from "./knob.js";
-import { Refit } from "./refit.js";
+import { Advice, Fit, Refit } from "./fit.js";
 import { words } from "./format.js";
+import { Around, Knob } from "./knob.js";
 
 const GROUPS = { Q: "Process noise Q", R: "Sensor noise R", p: "Parameters" };
 const HINTS = {

@@ -22,7 +22,7 @@ MEAN, ROW = f"mean:{MODEL.states[0].name}", MODEL.row_names[0]
 
 
 class Browser:
-    """Takes frames as the page does (app/web/page/lane.js)."""
+    """Takes frames as the page does (app/web/page/stream.js)."""
 
     def __init__(self) -> None:
         self.x: list[float] = []

@@ -17,7 +17,7 @@ CURSOR = """() => {
 }"""
 
 SCRUB = """async ([seconds, play]) => {
-    const { setTimeCursor } = await import("/page/rerun_wire.js");
+    const { setTimeCursor } = await import("/page/rerun.js");
     const { viewer } = window.nisus;
     await viewer.control(setTimeCursor(viewer.id, "time", BigInt(Math.round(seconds * 1e9)), BigInt(play)));
 }"""

@@ -133,7 +133,7 @@ def test_the_scene_is_hidden_until_it_is_drawn(context, scene):
     page.clock.install(time=0)
     page.clock.pause_at(1000)
     page.set_content("<p>axes</p>")
-    page.add_script_tag(path=PAGE / "viser_shown.js")
+    page.add_script_tag(path=PAGE / "viser_frame.js")
     assert opacity(page) == "0" and counted(page)
     draw(page, 4)
     page.clock.run_for(1000)
