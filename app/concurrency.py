@@ -1,4 +1,4 @@
-"""Several things side by side: an end that waits for many threads takes as long as the slowest, not as their sum."""
+"""Run callables concurrently: an end that waits for many threads takes as long as the slowest, not as their sum."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from typing import Any
 
 
 def run_all(*works: Callable[[], Any]) -> None:
-    """Do all of these, each in a thread of its own but the first, and wait for them.
+    """Run callables concurrently, the first in this thread, and wait for all.
 
     Raises:
-        BaseException: What the first of them that failed raised, once all are done.
+        BaseException: The error of the first one that failed, once all are done.
     """
     failures: list[BaseException] = []
 

@@ -1,15 +1,15 @@
-"""A time of a log in words."""
+"""Format times of a log."""
 
 from __future__ import annotations
 
 import time
 
 FIRST_DATED_NS = 10**18
-"""Nanoseconds since 1970 from which on a time is one of this century, and has a date."""
+"""Nanoseconds since 1970 from which on a time has a date: those of this century."""
 
 
 def format_time(t: int) -> str:
-    """A time of the log (ns): with its date where it has one, else in seconds."""
+    """Format a time of the log (ns): with its date if it has one, else in seconds."""
     if t < FIRST_DATED_NS:
         return f"{t * 1e-9:.6g} s"
     return time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime(t // 10**9))

@@ -33,5 +33,5 @@ def restore(previous: Mapping[int, Any]) -> None:
 
 
 def complain(text: object) -> None:
-    """Say what is wrong."""
+    """Print an error or warning."""
     print(f"nisus: {printable(str(text))}", file=sys.stderr, flush=True)

@@ -1,1 +1,1 @@
-"""The thread that folds, and what it takes and gives."""
+"""The running twin: engine, commands, status, background jobs, revisions and tuning versions."""

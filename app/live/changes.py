@@ -1,9 +1,9 @@
-"""What differs between two settings of a twin: what has been turned since the session began, or between two runs."""
+"""Differences between the settings of two runs, and between a twin and the same one as it was saved anew."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -19,12 +19,12 @@ if TYPE_CHECKING:
 
 
 def began_as(twin: Twin) -> str:
-    """Where the first settings come from, in a word."""
+    """Return the origin of the first settings in a word."""
     return "recorded" if twin.recorded else "configured"
 
 
-class Change(NamedTuple):
-    """One entry that differs: `estimator`, a key of the tuning, or `options.<name>` where the estimator is the same."""
+class SettingChange(NamedTuple):
+    """One entry that differs: `estimator`, a key of the tuning, or `options.<name>` of the same estimator."""
 
     key: str
     before: float | bool | str | None
@@ -32,33 +32,36 @@ class Change(NamedTuple):
 
 
 def turned(twin: Twin, estimator: str, tuning: Tuning) -> dict[str, Any]:
-    """What differs from the beginning, with the value that it had there."""
+    """Return the entries that differ from those of the twin, with the twin's values."""
     return {change.key: change.before for change in difference(twin.estimator, twin.tuning, estimator, tuning)}
 
 
-def difference(estimator: str, tuning: Tuning, other_estimator: str, other: Tuning) -> tuple[Change, ...]:
-    """What differs between two settings of a twin, in the order of a panel.
+def difference(estimator: str, tuning: Tuning, other_estimator: str, other: Tuning) -> tuple[SettingChange, ...]:
+    """Return the differences between two settings of a twin, in the order of a panel.
 
-    The many rows of a sensor that share an entry are one, unless only their mean is the same.
+    The rows of a sensor that share an entry are one change, unless only their mean is the same.
     """
     model = tuning.model
-    found: list[Change] = []
+    found: list[SettingChange] = []
     if estimator != other_estimator:
-        found.append(Change("estimator", estimator, other_estimator))
+        found.append(SettingChange("estimator", estimator, other_estimator))
     else:
         entry = ESTIMATORS[estimator]
         options, others = (entry.complete(dict(each.options)) for each in (tuning, other))
-        found += [Change(f"options.{name}", was, others[name]) for name, was in options.items() if others[name] != was]
+        found += [
+            SettingChange(f"options.{name}", was, others[name]) for name, was in options.items() if others[name] != was
+        ]
     found += _entries("Q", [noise.name for noise in model.noises], tuning.q, other.q)
     found += _of_readings(tuning, other)
     found += _entries("p", [parameter.name for parameter in model.parameters], tuning.p, other.p)
     used = np.flatnonzero(tuning.used != other.used)
-    found += [Change(f"use.{model.sensor_names[k]}", bool(tuning.used[k]), bool(other.used[k])) for k in used]
-    return (*found, *(Change(key, tuning.get(key), other.get(key)) for key in GATE_KEYS if _differ(tuning, other, key)))
+    found += [SettingChange(f"use.{model.sensor_names[k]}", bool(tuning.used[k]), bool(other.used[k])) for k in used]
+    gates = [(key, tuning.get(key), other.get(key)) for key in GATE_KEYS]
+    return (*found, *(SettingChange(*gate) for gate in gates if gate[1] != gate[2]))
 
 
-def in_words(changes: Sequence[Change], most: int = 3) -> str:
-    """The first of them in one line: Q.winding 0.01 → 0.1, ekf → ukf, yoke held out."""
+def in_words(changes: Sequence[SettingChange], most: int = 3) -> str:
+    """Return the first changes in one line: Q.winding 0.01 → 0.1, ekf → ukf, yoke held out."""
     said = [_words(*change) for change in changes[:most]]
     return ", ".join(said) + (f" and {len(changes) - most} more" if len(changes) > most else "")
 
@@ -74,52 +77,36 @@ def _words(key: str, before: float | bool | str | None, after: float | bool | st
     return f"{key.removeprefix('options.')} {first} → {second}"
 
 
-def _entries(group: str, names: Sequence[str], before: np.ndarray, after: np.ndarray) -> list[Change]:
+def _entries(group: str, names: Sequence[str], before: np.ndarray, after: np.ndarray) -> list[SettingChange]:
     # Most edits leave the group as it is, which is then the same array.
     rows: list[int] = [] if before is after else np.flatnonzero(before != after).tolist()
-    return [Change(f"{group}.{names[k]}", float(before[k]), float(after[k])) for k in rows]
+    return [SettingChange(f"{group}.{names[k]}", float(before[k]), float(after[k])) for k in rows]
 
 
-def _of_readings(tuning: Tuning, other: Tuning) -> list[Change]:
+def _of_readings(tuning: Tuning, other: Tuning) -> list[SettingChange]:
     if tuning.r is other.r:
         return []
     model = tuning.model
-    found: list[Change] = []
+    found: list[SettingChange] = []
     shared = {item.key for item in tuning.items()} - {f"R.{name}" for name in model.row_names}
     for sensor, start in zip(model.sensors, model.row_start, strict=True):
         own, key = slice(start, start + len(sensor.rows)), f"R.{sensor.name}"
         if key in shared and tuning.get(key) != other.get(key):
-            found.append(Change(key, tuning.get(key), other.get(key)))
+            found.append(SettingChange(key, tuning.get(key), other.get(key)))
         else:
             found += _entries("R", model.row_names[own], tuning.r[own], other.r[own])
     return found
-
-
-def _differ(tuning: Tuning, other: Tuning, key: str) -> bool:
-    return tuning.get(key) != other.get(key)
 
 
 if TYPE_CHECKING:
     from ..twin.twin import Twin
 
 RESTART_SECTIONS = ("name", "source", "faults", "time", "maintenance", "history", "view")
-"""Sections of the YAML that a running engine has already acted upon."""
-
-
-@dataclass(frozen=True)
-class Reloaded:
-    """In the engine's inbox: go on with this twin, of the same shape; `why` says what was saved or loaded.
-
-    If not `exact`, what was turned since stays turned, where the twin does not say something new.
-    """
-
-    twin: Twin
-    why: str
-    exact: bool = False
+"""Sections of the YAML that only a restart applies."""
 
 
 def obstacle(before: Twin, after: Twin) -> str | None:
-    """Why what runs cannot go on with a twin as it was saved, and must be started anew; None if it can."""
+    """Return why a running twin cannot go on with the one that was saved, but must be restarted; None if it can."""
     old, new = shape(before.model), shape(after.model)
     for what in old:
         if old[what] != new[what]:
@@ -131,7 +118,7 @@ def obstacle(before: Twin, after: Twin) -> str | None:
 
 
 def shape(model: StateSpaceModel) -> Mapping[str, Any]:
-    """What logs, tracks, tunings and charts of a model are laid out by."""
+    """Return everything that logs, tracks, tunings and charts of a model are laid out by."""
     field = model.grid
     return {
         "states": field.shape if field is not None else [(item.name, item.unit) for item in model.states],
@@ -145,7 +132,7 @@ def shape(model: StateSpaceModel) -> Mapping[str, Any]:
 
 
 def merged(before: Twin, after: Twin, estimator: str, tuning: Tuning) -> tuple[str, Tuning]:
-    """Estimator and tuning to go on with: what the files changed as they say, the rest as it was turned on the page."""
+    """Return estimator and tuning after a reload: entries that the files changed, all others as set on the page."""
     old, new = before.tuning, after.tuning
 
     def taken(name: str) -> np.ndarray:

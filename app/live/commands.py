@@ -1,7 +1,7 @@
-"""What a user can ask of a running twin.
+"""Commands of users to a running twin.
 
-A page, an API call or a test builds one of these and hands it to `engine.submit`, from any thread; the engine carries
-them out in order, between two events, so nothing else ever touches the estimate.
+A page, an API call or a test passes one to `engine.submit`, from any thread. The engine carries them out in order,
+between two events, so nothing else ever changes the estimate.
 """
 
 from __future__ import annotations
@@ -13,9 +13,9 @@ from pathlib import Path
 
 @dataclass(frozen=True)
 class SetEstimator:
-    """Fold the history with another estimator of the catalogue, and go on with it.
+    """Fold the history with another estimator of the catalogue and go on with it.
 
-    With the options with which it was left, and these.
+    `options` are added to its last ones.
     """
 
     name: str
@@ -24,7 +24,7 @@ class SetEstimator:
 
 @dataclass(frozen=True)
 class SetTuning:
-    """Turn one entry of the tuning: `Q.<noise>`, `R.<row>`, `p.<parameter>`, `use.<sensor>`, or one of the gate.
+    """Set one entry of the tuning: `Q.<noise>`, `R.<row>`, `p.<parameter>`, `use.<sensor>`, or one of the gate.
 
     These are `gate` (None: no gate), `gate.kind` (hard or soft) and `gate.reopen` (None: never).
     """
@@ -35,7 +35,7 @@ class SetTuning:
 
 @dataclass(frozen=True)
 class SetTunings:
-    """Turn several entries of the tuning at once, by key: Q, R, parameters, and `options.<name>` of the estimator.
+    """Set several entries of the tuning at once, by key: Q, R, parameters, and `options.<name>` of the estimator.
 
     One refold, one revision.
     """
@@ -45,7 +45,7 @@ class SetTunings:
 
 @dataclass(frozen=True)
 class SetOption:
-    """Turn one option of the estimator that runs."""
+    """Set one option of the running estimator."""
 
     name: str
     value: float | bool | str
@@ -53,7 +53,7 @@ class SetOption:
 
 @dataclass(frozen=True)
 class UseSensor:
-    """Use a sensor's readings, or hold them out: predicted and scored, never used."""
+    """Use a sensor's measurements or hold them out: predicted and scored, never used."""
 
     name: str
     used: bool
@@ -61,33 +61,33 @@ class UseSensor:
 
 @dataclass(frozen=True)
 class Restore:
-    """Back to the estimator and the tuning that the session began with: as recorded in a review, else as configured."""
+    """Return to the first estimator and tuning of the session: as recorded in a review, else as configured."""
 
 
 @dataclass(frozen=True)
 class Load:
-    """Back to the estimator and the tuning of the run of that number."""
+    """Return to the estimator and tuning of an earlier run."""
 
     number: int
 
 
 @dataclass(frozen=True)
 class Pin:
-    """Keep the track of a run, the running one or the last before it, to compare with; four at most."""
+    """Keep the track of a run (the running or the previous one) for comparison; four at most."""
 
     number: int
 
 
 @dataclass(frozen=True)
 class Unpin:
-    """Keep it no longer."""
+    """Drop the track of a pinned run."""
 
     number: int
 
 
 @dataclass(frozen=True)
 class Note:
-    """Give a run a name, and write a note on it; empty ones take them away."""
+    """Set name and note of a run; empty ones remove them."""
 
     number: int
     name: str = ""
@@ -96,14 +96,14 @@ class Note:
 
 @dataclass(frozen=True)
 class Reset:
-    """Forget the estimate: back to the model's prior at the present time."""
+    """Reset the estimate to the model's prior at the present time."""
 
 
 @dataclass(frozen=True)
 class Maintenance:
-    """Something of the asset was changed now, `what` in words: the states that it concerns, by name, start again.
+    """Record a change of the asset, described by `what`; the named states start again.
 
-    Their covariance is that of the prior, their mean stays, and a new version of the model begins.
+    Their covariance becomes that of the prior, their mean stays, and a new version of the model begins.
     """
 
     what: str
@@ -112,26 +112,26 @@ class Maintenance:
 
 @dataclass(frozen=True)
 class Pause:
-    """Hold a replay or a simulation where it is, or let it go on."""
+    """Pause a replay or a simulation, or continue it."""
 
     paused: bool
 
 
 @dataclass(frozen=True)
 class Speed:
-    """Play `factor` times as fast as real time; infinity is as fast as the estimator can."""
+    """Play at `factor` times real time; infinity is as fast as possible."""
 
     factor: float
 
 
 @dataclass(frozen=True)
 class Step:
-    """While paused: play the next event."""
+    """Play the next event while paused."""
 
 
 @dataclass(frozen=True)
 class Seek:
-    """Go to a place in a recording, in seconds after its first event."""
+    """Go to a time of a recording, in seconds after its first event."""
 
     seconds: float
 
@@ -145,10 +145,10 @@ class Record:
 
 @dataclass(frozen=True)
 class InjectFault:
-    """Put a fault into what the source says from now on; kinds and their numbers are those of sources/faults/kinds.py.
+    """Inject a fault into the source from now on; kinds and their numbers are those of sources/faults/kinds.py.
 
     `target` is a sensor, an input or a true parameter of a simulated asset; None is the whole source. `row` is one of a
-    sensor, `other` the sensor with which a swap exchanges it. It ends after `duration` seconds, or by `ClearFault`.
+    sensor, `other` the sensor for a swap. The fault ends after `duration` seconds, or by `ClearFault`.
     """
 
     kind: str
@@ -164,7 +164,7 @@ class InjectFault:
 
 @dataclass(frozen=True)
 class ClearFault:
-    """End the fault of that number, or all with None."""
+    """End the fault of that number, or all faults with None."""
 
     number: int | None = None
 
@@ -173,4 +173,4 @@ Command = (
     SetEstimator | SetTuning | SetTunings | SetOption | UseSensor | Restore | Load | Pin | Unpin | Note | Reset
     | Maintenance | Pause | Speed | Step | Seek | Record | InjectFault | ClearFault
 )  # fmt: skip
-"""Any of them."""
+"""Any command."""

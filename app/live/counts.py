@@ -1,4 +1,4 @@
-"""Counts for the status line and complaints for the events: verdicts, and the time from arrival to row."""
+"""Row counts and latency for the status, and notices about rejected measurements."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from estimators.plausibility import reasons_by_sensor
 from estimators.track import FAILED, GATED, MISSING, REASONS, SCREENED, VERDICT_NAMES, Track
 
 UNSETTLED = 8192
-"""Rows at the end that are counted each time; a late reading rarely reaches back beyond them."""
+"""Last rows, which are counted each time; a late measurement rarely reaches back further."""
 
 LATENCIES = 4096
 
 
 class RowCounts:
-    """Rows by verdict, and by reason why the edge refused them, of each sensor, since the start.
+    """Rows of each sensor by verdict and by reason of the plausibility checks, since the start.
 
-    Those that are settled are counted once.
+    Settled rows are counted once.
     """
 
     def __init__(self, model: StateSpaceModel) -> None:
@@ -31,21 +31,21 @@ class RowCounts:
         self.again()
 
     def again(self) -> None:
-        """Rows moved or changed: count them again, on top of what the forgotten ones held."""
+        """Count all rows again, on top of the dropped ones."""
         self._settled, self._counts = 0, self._forgotten.copy()
 
     def changed(self, index: int) -> None:
-        """Rows from `index` on changed."""
+        """Note that the rows from `index` on changed."""
         if index < self._settled:
             self.again()
 
     def forget(self, track: Track, channel: np.ndarray) -> None:
-        """The oldest rows, with these channels, are dropped."""
+        """Drop the oldest rows, with these channels."""
         self._forgotten = self._forgotten + self._of(track, channel, slice(0, len(track)))
         self.again()
 
     def count(self, track: Track, channel: np.ndarray) -> dict[str, int]:
-        """Events in all and by verdict, given all rows and their channels; and what went wrong where."""
+        """Return counts in total, by verdict, and by sensor and reason, given all rows and their channels."""
         settled = max(self._settled, len(track) - UNSETTLED)
         self._counts += self._of(track, channel, slice(self._settled, settled))
         self._settled = settled
@@ -63,7 +63,7 @@ class RowCounts:
         return counts
 
     def _of(self, track: Track, channel: np.ndarray, rows: slice) -> np.ndarray:
-        """How many rows have each verdict, then each reason (columns), by sensor; without a reading it is verdict 0."""
+        """Return the rows with each verdict, then each reason (columns), by sensor; verdict 0 is no measurement."""
         verdict, channel = track.verdict[rows], channel[rows]
         sensors, kinds = len(self._sensors), len(VERDICT_NAMES)
         flat = np.where(verdict == 0, 0, channel * kinds + verdict)
@@ -72,18 +72,18 @@ class RowCounts:
 
 
 def complaints(model: StateSpaceModel, channel: np.ndarray, track: Track, first: int) -> Iterator[tuple[str, str]]:
-    """Key and text for each kind of reading among the rows from `first` on that could not be used: its last one."""
-    for code, what in ((GATED, "refused by the gate"), (MISSING, "has no value"), (FAILED, "could not be used")):
+    """Yield key and text of the last measurement of each kind that was not used, from row `first` on."""
+    for code, what in ((GATED, "rejected by the gate"), (MISSING, "has no value"), (FAILED, "could not be used")):
         rows = np.flatnonzero(track.verdict[first:] == code)
         if rows.size:
             row = first + int(rows[-1])
             sensor = model.sensors[channel[row]].name
             nis = f" (NIS {track.nis[row]:.3g})" if np.isfinite(track.nis[row]) else ""
-            yield f"{VERDICT_NAMES[code]} {sensor}", f"{sensor}: reading {what}{nis}"
+            yield f"{VERDICT_NAMES[code]} {sensor}", f"{sensor}: measurement {what}{nis}"
 
 
 def last_run(codes: np.ndarray) -> int:
-    """The first of the equal codes at the end of an array that is not empty."""
+    """Return the index of the first of the equal codes at the end of an array that is not empty."""
     end = len(codes)
     while end > 0:
         start = max(0, end - UNSETTLED)
@@ -95,14 +95,14 @@ def last_run(codes: np.ndarray) -> int:
 
 
 class Latency:
-    """The last times from arrival to row."""
+    """Recent times from arrival to row."""
 
     def __init__(self) -> None:
         self._ms = np.zeros(LATENCIES)
         self._n = 0
 
     def note(self, batch: Events) -> None:
-        """The rows of a batch are there."""
+        """Note a batch that was folded."""
         arrivals = batch.arrival[batch.kind == READING]
         if not arrivals.size:
             return
@@ -112,13 +112,13 @@ class Latency:
         self._n += took.size
 
     def percentile(self, percent: float) -> float | None:
-        """Milliseconds that so many percent did not exceed."""
+        """Return a percentile, ms; None while there is none."""
         count = min(self._n, LATENCIES)
         return float(np.percentile(self._ms[:count], percent)) if count else None
 
 
 def refusals(model: StateSpaceModel, log: Log, track: Track, first: int) -> Iterator[tuple[str, str]]:
-    """Key and text for each sensor and reason of which rows from `first` on were refused: the last of them."""
+    """Yield key and text of the last row that a plausibility check rejected, by sensor and reason, from `first` on."""
     found = np.argwhere(track.screened[first:])
     last = {}
     for i, k in found.tolist():

@@ -1,4 +1,4 @@
-"""Carries out what a user asks of the twin, on the engine's thread, between two events."""
+"""Carry out the commands of users on the engine's thread, between two events."""
 
 from __future__ import annotations
 
@@ -24,25 +24,65 @@ from .interface import Running
 if TYPE_CHECKING:
     from estimators.tuning import Tuning
 
-    from ..twin.twin import Twin
-
-
-Refolding = (
+REFOLDING = (
     commands.SetEstimator | commands.SetTuning | commands.SetTunings | commands.SetOption | commands.UseSensor
     | commands.Restore | commands.Load
 )  # fmt: skip
 """Commands that fold the history again."""
 
+PLAYBACK = (commands.Pause, commands.Speed, commands.Step, commands.Seek)
+"""Commands that only a paced source can carry out."""
 
 OPTION = "options."
-"""Before an option's name among the keys of `SetTunings`."""
+"""Prefix of an option's name among the keys of `SetTunings`."""
+
+MAX_MAINTENANCE_TEXT = 200
+"""Characters that describe a maintenance."""
+
+MAX_SEEK_S = 1e9
+"""32 years; times are int64 nanoseconds."""
+
+MAX_SPEED = 1e9
+"""Times real time. Anything faster is infinity: as fast as possible."""
 
 
-def retuned(command: Refolding, engine: Running) -> tuple[str, Tuning]:
-    """The estimator and the tuning that a command asks for.
+def execute(command: commands.Command, engine: Running) -> None:
+    """Carry one command out.
 
     Raises:
-        NisusError: If the engine would refuse them, with the reason.
+        NisusError: If it cannot be done, with the reason; nothing is changed then.
+    """
+    if isinstance(command, REFOLDING):
+        engine.retune(*retuned(command, engine))
+    elif isinstance(command, commands.Pin):
+        engine.revisions.pin(command.number)
+    elif isinstance(command, commands.Unpin):
+        engine.revisions.unpin(command.number)
+    elif isinstance(command, commands.Note):
+        engine.revisions.describe(command.number, command.name, command.note)
+    elif isinstance(command, commands.Reset):
+        # An event of the log, so that refolds and recordings have it at its time.
+        engine.insert(Events.one(_now(engine), time.time_ns(), RESET, 0, [], engine.model.width))
+        engine.notices.say("estimate reset to the prior")
+    elif isinstance(command, commands.Maintenance):
+        states = check_maintenance(command.what, command.states, engine.model)
+        engine.insert(maintained(_now(engine), time.time_ns(), states, engine.model.width))
+        engine.notices.say(maintenance_text(command.what, states, engine.model))
+    elif isinstance(command, commands.Record):
+        if engine.recorder is None:
+            raise ConfigError("this session cannot record")
+        engine.recorder.record(command.path)
+    elif isinstance(command, commands.InjectFault | commands.ClearFault):
+        engine.notices.say(carry_out(command, engine.source, engine.model))
+    elif isinstance(command, PLAYBACK):
+        play(engine.source, command, engine.span()[0])
+
+
+def retuned(command: REFOLDING, engine: Running) -> tuple[str, Tuning]:
+    """Return the estimator and the tuning that a command asks for.
+
+    Raises:
+        NisusError: If the engine would reject them, with the reason.
     """
     if isinstance(command, commands.Restore):
         return engine.twin.estimator, engine.twin.tuning
@@ -66,134 +106,66 @@ def retuned(command: Refolding, engine: Running) -> tuple[str, Tuning]:
     values = command.values if isinstance(command, commands.SetTunings) else {command.key: command.value}
     if not values:
         raise ConfigError("SetTunings: values is empty; it takes the value of each key")
-    given: dict[str, Any] = {key.removeprefix(OPTION): value for key, value in values.items() if key.startswith(OPTION)}
-    if given and isinstance(command, commands.SetTuning):
-        raise ConfigError(f"{command.key} is an option of the estimator; turn it with SetOption")
+    changed: dict[str, Any] = {
+        key.removeprefix(OPTION): value for key, value in values.items() if key.startswith(OPTION)
+    }
+    if changed and isinstance(command, commands.SetTuning):
+        raise ConfigError(f"{command.key} is an option of the estimator; set it with SetOption")
     for key, value in values.items():
         if not key.startswith(OPTION):
             tuning = tuning.set(key, value)
-    return estimator, _with_options(estimator, tuning, given, engine) if given else tuning
+    return estimator, _with_options(estimator, tuning, changed, engine) if changed else tuning
 
 
-def _with_options(estimator: str, tuning: Tuning, given: Mapping[str, Any], engine: Running) -> Tuning:
+def _with_options(estimator: str, tuning: Tuning, changed: Mapping[str, Any], engine: Running) -> Tuning:
     entry = find_estimator(estimator, engine.model)
-    known = entry.complete(given)
-    options = {**tuning.options, **{name: known[name] for name in given}}
+    known = entry.complete(changed)
+    options = {**tuning.options, **{name: known[name] for name in changed}}
     _check(entry, engine, options)
     return tuning.with_options(options)
 
 
 def _check(entry: Estimator, engine: Running, options: Mapping[str, float]) -> None:
-    """Refuse what a fold would refuse, also of readings that are still to come."""
+    """Reject options that a fold would reject, also for measurements that are still to come."""
     values = checked(entry, engine.model, options)
     if engine.twin.plan.brings_variances or engine.twin.late.inflate:
         check_variances(entry, values)
 
 
-def execute(command: commands.Command, engine: Running) -> None:
-    """Carry one command out.
-
-    Raises:
-        NisusError: If it cannot be done, with the reason; nothing is changed then.
-    """
-    if isinstance(command, Refolding):
-        engine.retune(*retuned(command, engine))
-    elif isinstance(command, commands.Pin):
-        engine.revisions.pin(command.number)
-    elif isinstance(command, commands.Unpin):
-        engine.revisions.unpin(command.number)
-    elif isinstance(command, commands.Note):
-        engine.revisions.describe(command.number, command.name, command.note)
-    elif isinstance(command, commands.Reset):
-        engine.insert(_reset_now(engine))
-        engine.notices.say("estimate reset to the prior")
-    elif isinstance(command, commands.Maintenance):
-        states = check_maintenance(command.what, command.states, engine.model)
-        engine.insert(maintained(_now(engine), time.time_ns(), states, engine.model.width))
-        engine.notices.say(maintenance_text(command.what, states, engine.model))
-    elif isinstance(command, commands.Record):
-        if engine.recorder is None:
-            raise ConfigError("this session cannot record")
-        engine.recorder.record(command.path)
-    elif isinstance(command, commands.InjectFault | commands.ClearFault):
-        engine.notices.say(carry_out(command, engine.source, engine.model))
-    elif isinstance(command, PLAYBACK):
-        play(engine.source, command, engine.span()[0])
-
-
-def _reset_now(engine: Running) -> Events:
-    """A reset now: an event of the log, so that refolds and recordings have it where it was."""
-    return Events.one(_now(engine), time.time_ns(), RESET, 0, [], engine.model.width)
-
-
 def _now(engine: Running) -> int:
-    """The time of the last event, ns."""
+    """Return the time of the last event, ns."""
     now = engine.span()[1]
     if not now:
-        raise ConfigError("nothing to reset: no reading has come yet")
+        raise ConfigError("nothing to reset: no measurement has arrived yet")
     return now
 
 
-class Remembered:
-    """The options with which each filter was left, for when it is chosen again; at first those of the YAML."""
-
-    def __init__(self, twin: Twin) -> None:
-        self._twin = twin
-        self._left: dict[str, Mapping[str, float]] = {}
-
-    def begin(self, twin: Twin) -> None:
-        """The YAML was saved: what it says of a filter's options counts again."""
-        self._twin, self._left = twin, {}
-
-    def leave(self, estimator: str, tuning: Tuning) -> None:
-        """The filter ran with this tuning."""
-        self._left[estimator] = tuning.options
-
-    def of(self, estimator: str) -> Mapping[str, float]:
-        """What a filter starts with."""
-        return self._left.get(estimator, self._twin.options_of(estimator))
-
-
-MAX_MAINTENANCE_TEXT = 200
-"""Characters that say what was done."""
-
-
 def check_maintenance(what: str, states: Sequence[str], model: StateSpaceModel) -> list[int]:
-    """The indices of the states, ascending.
+    """Return the indices of the states that a maintenance concerns, ascending.
 
     Raises:
-        ConfigError: If nothing says what was done, or a state is missing, unknown or named twice.
+        ConfigError: If the description is missing or too long, or a state is missing, unknown or named twice.
     """
     if not what.strip() or len(what) > MAX_MAINTENANCE_TEXT or printable(what) != what or "\n" in what:
         raise ConfigError(
-            f"Maintenance: what is {quoted(what)}; say what was changed, in 1 to {MAX_MAINTENANCE_TEXT} characters"
+            f"Maintenance: what is {quoted(what)}; describe the change in 1 to {MAX_MAINTENANCE_TEXT} characters"
         )
     if not states:
         raise ConfigError("Maintenance: states is empty; name the states that it concerns")
     for name in states:
         if name not in model.state_names:
-            raise ConfigError(
-                f"Maintenance: {model.name} has no state {quoted(name)}; {nearest(name, model.state_names[:1000])}"
-            )
+            near = nearest(name, model.state_names[:1000])
+            raise ConfigError(f"Maintenance: {model.name} has no state {quoted(name)}; {near}")
     if len(set(states)) != len(states):
         raise ConfigError("Maintenance: states names one twice; name each once")
     return sorted(model.state_names.index(name) for name in states)
 
 
-MAX_SEEK_S = 1e9
-"""Seconds that a seek may go, 32 years; times are int64 nanoseconds."""
-
-MAX_SPEED = 1e9
-"""Times real time; faster is as fast as possible, which is said as infinity."""
-
-PLAYBACK = (commands.Pause, commands.Speed, commands.Step, commands.Seek)
-
-
 def check_playback(command: Any) -> None:
-    """Refuse a speed or a place that cannot be.
+    """Reject a speed or a time out of range.
 
     Raises:
-        ConfigError: If the speed is not positive or too large, or the place too far.
+        ConfigError: If the speed is not positive or too large, or the time too far.
     """
     if isinstance(command, commands.Speed) and not (0.0 < command.factor <= MAX_SPEED or command.factor == math.inf):
         raise ConfigError(
@@ -205,7 +177,7 @@ def check_playback(command: Any) -> None:
 
 
 def playback_status(source: Source) -> dict[str, Any]:
-    """What a panel shows of it: paused, speed, seekable, span (ns)."""
+    """Return the fields of a status that follow from the source: paused, speed, seekable, span (ns)."""
     paced = source if isinstance(source, Paced) else None
     return {
         "paused": paced is not None and paced.paused,

@@ -1,4 +1,4 @@
-"""Faults on demand: what a user asks for, found in the model and put into the running source."""
+"""Faults on demand: check a user's request against the model and inject it into the running source."""
 
 from __future__ import annotations
 
@@ -16,31 +16,31 @@ from sources.source import Source
 from . import commands
 
 FIELDS = {"end": "duration", "sensor": "target", "input": "target", "parameter": "target"}
-"""Fields of a fault that have another name in the command."""
+"""Fields of a fault with another name in the command."""
 
 
 @runtime_checkable
 class Faulty(Protocol):
-    """A source that stands behind a layer of faults."""
+    """A source behind a layer of faults."""
 
     faults: Faults
 
 
 def faults_of(source: Source) -> Faults:
-    """The faults of a running source.
+    """Return the fault layer of a running source.
 
     Raises:
         ConfigError: If it has none: a recording that is reviewed.
     """
     if not isinstance(source, Faulty):
-        raise ConfigError("a recording that is reviewed holds what came, faults included; nothing can be put into it")
+        raise ConfigError("this is the review of a recording; faults can be injected into a running source only")
     return source.faults
 
 
 def fault_of(command: commands.InjectFault, model: StateSpaceModel) -> Fault:
-    """The fault that a command asks for. A target is a sensor, an input or (of kind model) a parameter.
+    """Return the fault that a command asks for. A target is a sensor, an input or (of kind model) a parameter.
 
-    Where a sensor and an input have one name it is the sensor; `input.NAME` is the input.
+    A name that a sensor and an input share is the sensor; `input.NAME` is the input.
 
     Raises:
         ConfigError: If the kind or the target is not known, or a number is missing or cannot be.
@@ -74,7 +74,7 @@ def fault_of(command: commands.InjectFault, model: StateSpaceModel) -> Fault:
 
 
 def _target(kind: str, target: str, model: StateSpaceModel) -> tuple[str, str]:
-    """What a target is, sensor, input or parameter, and its name."""
+    """Return the kind of a target (sensor, input or parameter) and its name."""
     known = {
         "sensor": model.sensor_names,
         "input": model.input_names,
@@ -95,7 +95,7 @@ def _target(kind: str, target: str, model: StateSpaceModel) -> tuple[str, str]:
 
 
 def check_fault(command: commands.InjectFault | commands.ClearFault, source: Source, model: StateSpaceModel) -> None:
-    """Refuse what the source would refuse.
+    """Reject a command that the source would reject.
 
     Raises:
         ConfigError: With the reason.
@@ -112,7 +112,7 @@ def check_fault(command: commands.InjectFault | commands.ClearFault, source: Sou
 
 
 def carry_out(command: commands.InjectFault | commands.ClearFault, source: Source, model: StateSpaceModel) -> str:
-    """Begin a fault, or end one or all; a line about it.
+    """Begin a fault, or end one or all; return a line about it.
 
     Raises:
         NisusError: If it cannot be done.
@@ -131,7 +131,7 @@ def carry_out(command: commands.InjectFault | commands.ClearFault, source: Sourc
 
 
 def unit_of(fault: Fault, model: StateSpaceModel) -> str:
-    """Unit of the values that a fault is of; an empty text if they have several."""
+    """Return the unit of the values that a fault changes; empty if they have several."""
     if fault.input is not None:
         return model.inputs[model.input_names.index(fault.input)].unit
     if fault.sensor is None:
@@ -142,7 +142,7 @@ def unit_of(fault: Fault, model: StateSpaceModel) -> str:
 
 
 def fault_text(fault: Fault, model: StateSpaceModel) -> str:
-    """A fault in a few words: bias of winding, size 2 °C."""
+    """Describe a fault in a few words: bias of winding, size 2 °C."""
     own = unit_of(fault, model)
     kind = find_kind(fault.kind)
     units = {item.name: item.unit.replace("row", own or "units") for item in kind.parameters}
@@ -152,7 +152,7 @@ def fault_text(fault: Fault, model: StateSpaceModel) -> str:
 
 
 def status_json(items: tuple[FaultStatus, ...], model: StateSpaceModel) -> list[dict[str, Any]]:
-    """The faults that hold or will, for the API; `since` in ns, null for one that is to come."""
+    """Return the active and planned faults for the API; `since` in ns, null for a planned one."""
     return [
         {
             "number": item.number,
@@ -168,7 +168,7 @@ def status_json(items: tuple[FaultStatus, ...], model: StateSpaceModel) -> list[
 
 
 def catalogue_json(source: Source, model: StateSpaceModel) -> dict[str, Any]:
-    """The kinds of fault with what they take, and what they may be of, for a page."""
+    """Return the kinds of fault with their parameters and possible targets, for the page."""
     layer = source.faults if isinstance(source, Faulty) else None
     return {
         "available": layer is not None,

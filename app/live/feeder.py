@@ -1,4 +1,4 @@
-"""The thread that reads the source, so that the engine never waits for one; a live source that fails is reopened."""
+"""The thread that reads the source, so that the engine never waits for it; a live source that fails is reopened."""
 
 from __future__ import annotations
 
@@ -13,17 +13,13 @@ from sources.source import Paced
 if TYPE_CHECKING:
     from sources.source import Source
 
-READ_TIMEOUT = 0.05
-AHEAD = 32
-"""Batches that may wait for the engine; a source that can be asked later then waits, a bus is never held up."""
+READ_TIMEOUT_S = 0.05
 
+MAX_RETRY_S = 5.0
+"""Seconds between two attempts to reopen a source, at most."""
 
-class Restarted:
-    """In the queue before the first batch of a source that was started again from its beginning."""
-
-
-class Finished:
-    """In the queue after the last batch."""
+MAX_BATCHES_AHEAD = 32
+"""Batches that may wait for the engine. A replay waits then; a bus is never held up."""
 
 
 class Feeder:
@@ -34,19 +30,28 @@ class Feeder:
         open_source: Callable[[], Source],
         inbox: queue.SimpleQueue[Any],
         report: Callable[[str, str], None],
+        *,
+        restarted: Callable[[], None] = lambda: None,
+        finished: Callable[[], None] = lambda: None,
     ) -> None:
-        """Open the source at once, so that an error reaches who starts the twin.
+        """Open the source at once, so that the caller gets its error.
+
+        Args:
+            open_source: Opens the source.
+            inbox: Takes its batches.
+            report: Called with key and text of a failure.
+            restarted: Put into the inbox before the first batch of a source that began again.
+            finished: Put into the inbox after the last batch.
 
         Raises:
             SourceError: If the source cannot be opened.
         """
-        self._open = open_source
-        self._inbox = inbox
-        self._report = report
-        self._take(open_source())
+        self._open, self._inbox, self._report = open_source, inbox, report
+        self._restarted, self._finished = restarted, finished
+        self.source = open_source()
         self.live = self.source.live
         self._stop = threading.Event()
-        self._room = threading.Semaphore(AHEAD)
+        self._room = threading.Semaphore(MAX_BATCHES_AHEAD)
         self._thread = threading.Thread(target=self._run, name="source", daemon=True)
 
     def start(self) -> None:
@@ -62,57 +67,15 @@ class Feeder:
         self.source.close()
 
     def taken(self) -> None:
-        """The engine took one batch."""
+        """Make room for one batch more."""
         self._room.release()
-
-    def _run(self) -> None:
-        wait = 0.1
-        ended = False
-        while not self._stop.is_set():
-            try:
-                if self.read(READ_TIMEOUT) is not None:
-                    ended = False
-                elif self._paced is None:
-                    self._inbox.put(Finished())
-                    return
-                elif not ended:
-                    # A replay can still be sought back, so it is asked again.
-                    ended = True
-                    self._inbox.put(Finished())
-                wait = 0.1
-            except Exception as error:  # noqa: BLE001  whatever a driver raises, the twin goes on
-                if not isinstance(error, NisusError):
-                    error = NisusError(f"{type(error).__name__}: {error}")
-                self._report("source failed", f"source failed: {error}")
-                if not self.live:
-                    self._inbox.put(Finished())
-                    return
-                if self._stop.wait(wait):
-                    return
-                wait = min(5.0, 2 * wait)
-                self._reopen()
-
-    def _reopen(self) -> None:
-        try:
-            self.source.close()
-            self._take(self._open())
-            self._report("source reopened", "source reopened")
-        except Exception as error:  # noqa: BLE001  as above; the next round tries again
-            self._report("source failed", f"source cannot be reopened: {error}")
-
-    def _take(self, source: Source) -> None:
-        self.source = source
-        self._paced = source if isinstance(source, Paced) else None
-
-    def _restarts(self) -> int:
-        return self._paced.restarts if self._paced is not None else 0
 
     def read(self, timeout: float) -> int | None:
         """Pass one batch on and return its number of events; None at the end of the source."""
         before = self._restarts()
         batch = self.source.read(timeout)
         if self._restarts() != before:
-            self._inbox.put(Restarted())
+            self._inbox.put(self._restarted)
         if batch is None:
             return None
         if len(batch):
@@ -120,3 +83,39 @@ class Feeder:
                 self._room.acquire()
             self._inbox.put(batch)
         return len(batch)
+
+    def _restarts(self) -> int:
+        return self.source.restarts if isinstance(self.source, Paced) else 0
+
+    def _run(self) -> None:
+        wait, ended = 0.1, False
+        while not self._stop.is_set():
+            try:
+                if self.read(READ_TIMEOUT_S) is not None:
+                    ended = False
+                elif not isinstance(self.source, Paced):
+                    self._inbox.put(self._finished)
+                    return
+                elif not ended:
+                    # A replay can still be sought back, so it is read again.
+                    ended = True
+                    self._inbox.put(self._finished)
+                wait = 0.1
+            except Exception as error:  # noqa: BLE001  whatever a driver raises, the twin goes on
+                text = str(error) if isinstance(error, NisusError) else f"{type(error).__name__}: {error}"
+                self._report("source failed", f"source failed: {text}")
+                if not self.live:
+                    self._inbox.put(self._finished)
+                    return
+                if self._stop.wait(wait):
+                    return
+                wait = min(MAX_RETRY_S, 2 * wait)
+                self._reopen()
+
+    def _reopen(self) -> None:
+        try:
+            self.source.close()
+            self.source = self._open()
+            self._report("source reopened", "source reopened")
+        except Exception as error:  # noqa: BLE001  as above; the next round tries again
+            self._report("source failed", f"source cannot be reopened: {error}")

@@ -1,4 +1,4 @@
-"""All that a running twin holds, or the last of it, as a log of its own to be folded beside it."""
+"""Copy the history of a running twin in chunks, without holding the engine's lock for long."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ END_OF_TIME = 2**62
 """Later than every event, ns."""
 
 COPY_EVENTS = 4096
-"""Events that are copied at once, so that the engine never waits for long."""
+"""Events that are copied at once."""
 
 
 def copy_log(
     engine: Running, tuning: Tuning, most: int | None = None, check: Callable[[], None] = lambda: None
 ) -> tuple[Log, Base | None]:
-    """Copy the events, and where a fold of them starts; None for the prior.
+    """Copy the events, with the base of a fold of them; None for the prior.
 
     Args:
-        engine: Whose.
-        tuning: With which they were folded.
-        most: How many, the last; a few more, since a fold starts at a snapshot. None for all.
+        engine: The running twin.
+        tuning: The tuning of its fold.
+        most: Events, the last ones; a few more, since a fold starts at a snapshot. None for all.
         check: Called before each chunk; may raise to end the copy.
 
     Raises:
@@ -45,7 +45,7 @@ def copy_log(
         check()
         pull = engine.rows(start, min(start + COPY_EVENTS, end))
         if engine.folded_with()[0] is not tuning or pull.first != start:
-            raise ConfigError("the history became another while it was copied; ask again")
+            raise ConfigError("the history changed while it was copied; try again")
         pieces.append(pull.events)
     events = Events.concat(pieces, engine.model.width)
     log = Log.resume(engine.model, base, events)
@@ -59,7 +59,7 @@ COPY_ROWS = 16_384
 
 
 def copy_rows(engine: Running) -> Pull | None:
-    """All rows; None while there are none, or if a late reading or another revision came in between."""
+    """Copy all rows; None while there are none, or if a late measurement or another revision came in between."""
     cursor = engine.cursor()
     parts: list[Pull] = []
     pictures: dict[int, Picture] = {}

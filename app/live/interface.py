@@ -1,4 +1,4 @@
-"""What a running twin offers to commands, views, recorder and API. The engine is one; tests may bring another."""
+"""Interface of a running twin for commands, views, recorder and API; the engine implements it."""
 
 from __future__ import annotations
 
@@ -31,19 +31,19 @@ WINDOW_EVENTS = 4000
 
 
 class Records(Protocol):
-    """What records a running twin."""
+    """Recorder of a running twin."""
 
     finished: list[Path]
     failure: str
     folder: Path
-    """Where it puts what is given a name only."""
+    """Folder of recordings that are given by name."""
 
     @property
     def path(self) -> Path | None:
         """The file that is being written."""
 
     def record(self, path: Path | None) -> None:
-        """Record into a new file from now on, or finish the one that is open."""
+        """Record into a new file from now on, or finish the open one."""
 
 
 class Running(Protocol):
@@ -61,47 +61,47 @@ class Running(Protocol):
 
     @property
     def source(self) -> Source:
-        """Where the readings come from; it may be reopened."""
+        """The source of the measurements; it may be reopened."""
 
     @property
     def policy(self) -> HealthPolicy:
-        """When the estimate may be trusted."""
+        """Rules of the health."""
 
     def reload(self, twin: Twin, why: str, *, exact: bool = False) -> None:
-        """Queue going on with another twin of the same shape, or the same one as it was saved anew; see reload.py."""
+        """Queue a change to another twin of the same shape, or to the same one as it was saved anew."""
 
     def submit(self, command: Command) -> None:
         """Queue a command."""
 
     def status(self) -> Status:
-        """What a panel shows."""
+        """Return the status for panels."""
 
     def cursor(self, *, follows_log: bool = False, span: int | None = None) -> Cursor:
-        """A cursor for one consumer, for `pull`; give it back with `release`. See `Cursor`."""
+        """Return a cursor of one consumer for `pull`, to be given back with `release`; see `Cursor`."""
 
     def release(self, cursor: Cursor) -> None:
-        """Forget a cursor."""
+        """Give a cursor back."""
 
     def pull(self, cursor: Cursor, limit: int | None = None, *, align: int = 1) -> Pull:
-        """Copies of the rows since the cursor, from a multiple of `align` on, at most `limit`; the notices since."""
+        """Copy the rows since the cursor, from a multiple of `align` on and at most `limit`, and the notices since."""
 
     def rows(self, start: int, stop: int) -> Pull:
-        """Copies of the rows with these absolute indices, as far as they are there."""
+        """Copy the rows with these absolute indices, as far as they exist."""
 
     def index_at(self, t: int) -> int:
-        """Absolute index of the first folded event at or after a time, ns."""
+        """Return the absolute index of the first folded event at or after a time, ns."""
 
     def episodes(self) -> list[Episode]:
-        """What was and is wrong, in the order of its start."""
+        """Return all episodes in the order of their start."""
 
     def previous(self) -> Pull | None:
-        """The whole previous revision, for comparison."""
+        """Return all rows of the previous revision."""
 
     def belief(self) -> Belief:
-        """The estimate now."""
+        """Return the present estimate."""
 
     def here(self) -> Here | None:
-        """The filter as it stands, to fold on from; None while nothing has come."""
+        """Return the state of the filter, to fold on from; None before the first event."""
 
     def last_events(self, limit: int = WINDOW_EVENTS, *, rows: bool = False) -> EventWindow | None:
         """Copy the last events, to fold them again; None while there are none.
@@ -111,22 +111,22 @@ class Running(Protocol):
         """
 
     def span(self) -> tuple[int, int]:
-        """Times of the first and the last event, ns; zeros while there is none."""
+        """Return the times of the first and the last event, ns; zeros while there is none."""
 
     def base(self) -> Base | None:
-        """Where a fold of the present log starts, if its oldest events were dropped."""
+        """Return the start of a fold of the present log if its oldest events were dropped."""
 
     def origin(self, index: int) -> tuple[int, Base | None]:
-        """Where a fold that gives the rows from `index` on can start."""
+        """Return an event at or before `index` at which a fold can start, and its base."""
 
     def folded_with(self) -> tuple[Tuning, str]:
-        """Tuning and estimator of the fold that `pull` shows."""
+        """Return tuning and estimator of the fold that `pull` shows."""
 
     def options_of(self, estimator: str) -> Mapping[str, float]:
-        """The options with which an estimator starts."""
+        """Return the options with which an estimator starts."""
 
     def retune(self, estimator: str, tuning: Tuning) -> None:
-        """Fold the history again with another estimator or tuning; on the engine's own thread."""
+        """Fold the history again with another estimator or tuning, on the engine's own thread."""
 
     def insert(self, event: Events) -> None:
-        """Put in an event of our own; on the engine's own thread."""
+        """Put an event into the log, on the engine's own thread."""

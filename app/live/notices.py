@@ -1,4 +1,4 @@
-"""Counters and messages about the running twin; the messages are bounded in number."""
+"""Counters and messages about the running twin; the number of messages is bounded."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ from collections import Counter, deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
-SECONDS_APART = 1.0
-"""Between two lines under one key; those in between are counted only, so a flood of bad frames stays readable."""
+LINE_PERIOD_S = 1.0
+"""Seconds between two lines under one key; those in between are only counted, so that a flood stays readable."""
 
-KEPT = 1000
+MAX_LINES = 1000
 
 
 @dataclass(frozen=True)
 class Notice:
-    """One line for people: when (ns, the twin's time), how bad, what, in which pass over the source and revision."""
+    """One line for users: time (ns, the twin's), level, text, pass over the source, and revision."""
 
     number: int
     t: int
@@ -27,7 +27,7 @@ class Notice:
 
 
 class Notices:
-    """Counters and lines, written by any thread, read by views that remember the number of the last line they had."""
+    """Counters and lines, written by any thread; readers remember the number of their last line."""
 
     def __init__(self, now: Callable[[], int], clock: Callable[[], float] = time.monotonic) -> None:
         self._now = now
@@ -35,44 +35,48 @@ class Notices:
         self._lock = threading.Lock()
         self._counts: Counter[str] = Counter()
         self._elsewhere: set[str] = set()
-        self._lines: deque[Notice] = deque(maxlen=KEPT)
+        self._lines: deque[Notice] = deque(maxlen=MAX_LINES)
         self._next = 0
         self.passage = 0
-        """How often the source has begun again; what was said before that is of another life of the twin."""
+        """How often the source has begun again; earlier lines belong to another pass."""
         self.revision = 0
-        """Of the estimate that is shown, as the engine counts them."""
+        """Number of the revision that is shown."""
         self._last: dict[str, tuple[float, int]] = {}
 
     def report(self, key: str, text: str, level: str = "warn", *, counted: bool = True, times: int = 1) -> None:
         """Count under `key`, and add a line unless one of that key came within the last second.
 
-        Not `counted`: what is reported can be counted better elsewhere, and `counts` leaves the key out. One line may
-        tell of several `times`.
+        Args:
+            key: Of the counter.
+            text: Of the line.
+            level: Of the line: "info", "warn" or "error".
+            counted: Whether `counts` has the key; False if it is counted better elsewhere.
+            times: How many the line stands for.
         """
         with self._lock:
             self._counts[key] += times
             if not counted:
                 self._elsewhere.add(key)
-            when, at_count = self._last.get(key, (-SECONDS_APART, 0))
-            if self._clock() - when < SECONDS_APART:
+            when, at_count = self._last.get(key, (-LINE_PERIOD_S, 0))
+            if self._clock() - when < LINE_PERIOD_S:
                 return
             more = self._counts[key] - at_count - times
             self._last[key] = (self._clock(), self._counts[key])
             self._add(level, text if more < 1 else f"{text} ({more} more before)")
 
     def say(self, text: str, level: str = "info", t: int | None = None, *, passage: int | None = None) -> None:
-        """Add a line, of what happened now or at `t`; nothing if that was of another `passage` than the present one."""
+        """Add a line for now or the time `t`, unless it belongs to another `passage` than the present one."""
         with self._lock:
             if passage is None or passage == self.passage:
                 self._add(level, text, t)
 
     def begin_again(self) -> None:
-        """The source has begun again: lines from here on belong to another pass over it."""
+        """Begin another pass: the source has begun again."""
         with self._lock:
             self.passage += 1
 
     def restore(self, lines: Iterable[tuple[int, str, str]]) -> None:
-        """Add lines (t, level, text) of an earlier run."""
+        """Add lines (t, level, text) of an earlier session."""
         with self._lock:
             for t, level, text in lines:
                 self._add(level, text, t)
@@ -84,11 +88,11 @@ class Notices:
         self._next += 1
 
     def since(self, number: int) -> list[Notice]:
-        """Lines from `number` on."""
+        """Return the lines from `number` on."""
         with self._lock:
             return [line for line in self._lines if line.number >= number]
 
     def counts(self) -> dict[str, int]:
-        """The counters."""
+        """Return the counters."""
         with self._lock:
             return {key: count for key, count in self._counts.items() if key not in self._elsewhere}

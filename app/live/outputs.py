@@ -26,11 +26,10 @@ from .notices import Notice
 
 @dataclass
 class Cursor:
-    """How far one consumer has read. `next` is the absolute index of the next row; a rewritten row moves it back.
+    """Position of one consumer: `next` is the absolute index of its next row; a rewritten row moves it back.
 
-    `picture` is the index of the last picture of a large field that was read. One that `follows_log` starts again with
-    another log only; for the others another revision does so too. Whoever starts so gets no rows that are more than
-    `span` (ns) older than the newest; None gets all.
+    `picture` is the index of the last picture of a large field that was read. A cursor starts again with another log
+    and, unless it `follows_log`, with another revision; it then gets only rows of the last `span` (ns), or all.
     """
 
     follows_log: bool = False
@@ -46,11 +45,11 @@ class Cursor:
 class Pull:
     """Rows since the cursor.
 
-    `fresh`: these rows start afresh (another revision or log, or the first pull): forget what was drawn. `first` is the
-    absolute index of the first row; if it is below what was pulled before, a late reading rewrote the rows from there.
-    `pictures` are those of a large field since the cursor; one with an index that was seen before takes its place.
-    `oldest` is the absolute index of the first row that is still there, `changed` that of the first of these that is
-    new or another; those before it were asked for to be aligned. `version` is the model's at the row `oldest`.
+    `fresh`: the rows start again (another revision or log, or the first pull); discard earlier ones. `first` is the
+    absolute index of the first row; if it was pulled before, a late measurement rewrote the rows from there on.
+    `pictures` are those of a large field since the cursor; a picture replaces an earlier one of the same index.
+    `oldest` is the absolute index of the first row that still exists, `changed` that of the first row here that is new
+    or rewritten; those before it are here for alignment. `version` is the model's at the row `oldest`.
     """
 
     revision: int
@@ -67,7 +66,7 @@ class Pull:
 
 @dataclass(frozen=True)
 class Belief:
-    """The estimate now: time (ns), mean (nx,), covariance (nx, nx), points to draw (k, nx), its peaks if several."""
+    """Present estimate: time (ns), mean (nx,), covariance (nx, nx), points to draw (k, nx), its peaks if several."""
 
     t: int
     mean: np.ndarray
@@ -78,9 +77,9 @@ class Belief:
 
 @dataclass(frozen=True)
 class Here:
-    """The filter as it stands after the last event, of time `t` (ns), and what it takes to fold on from there.
+    """State of the filter after the last event, of time `t` (ns), with the settings to fold on from there.
 
-    `step` is how far readings were apart lately, s; NaN where there were not two.
+    `step` is the recent time between measurements, s; NaN if there were fewer than two.
     """
 
     revision: int
@@ -94,7 +93,7 @@ class Here:
 class EventWindow(NamedTuple):
     """The last events of a fold with their rows, and where a fold of them starts; `base` None is the prior.
 
-    `track` has the rows if they were asked for, else none.
+    `track` has the rows if they were requested, else none.
     """
 
     estimator: str
@@ -169,19 +168,18 @@ class ProtectionLevels:
 
 @dataclass(frozen=True)
 class Status:
-    """The state of the running twin, for panels and the API.
+    """State of the running twin, for panels and the API.
 
     `t` is the time of the last event (ns), `since` the time when the present health began, `lost` the time from which
     the estimate has not been a number (None if it is one). `cause` is the text of the leading episode while health is
-    not tracking; `sensors` gives each sensor's state (`detector_state.SENSOR_STATES`) and the text of its own episode.
-    `model_version` counts up with each maintenance. `clock` is
-    that of a live source against this machine's, None while it is not known. `counts` are those of the rows of this
-    revision, and of other things that happened to the twin. `account` is what the filter says of itself (see
-    `Fold.account`). `latency_ms` is the 99th percentile from a reading's arrival to its row. `faults` are those that
-    were put into the source, and hold or will. `integrity` bounds what could be wrong with each state unnoticed; None
-    until it is known. `compiling` are the filters that are not compiled yet: for how many seconds each has been, None
-    of one that waits; for `awaited` the running fold waits to give way. `nis_judged` is what of a commissioned twin
-    is compared with the bounds of the NIS (diagnostics/consistency.py).
+    not tracking; `sensors` has each sensor's state (`detector_state.SENSOR_STATES`) and the text of its own episode.
+    `model_version` increases with each maintenance. `clock` compares the clock of a live source with this machine's,
+    None while it is not known. `counts` are those of the rows of this revision, and of notices. `account` has the
+    filter's own figures (see `Fold.account`). `latency_ms` is the 99th percentile from a measurement's arrival to its
+    row. `faults` are the injected ones that are active or planned. `integrity` has the protection levels; None until
+    they are known. `compiling` are the filters that are not compiled yet: seconds since each was begun, None for one
+    that waits; `awaited` is the one for which a refold waits. `nis_judged` is the NIS relative to the baseline of a
+    commissioned twin (diagnostics/consistency.py).
     """
 
     estimator: str

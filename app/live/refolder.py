@@ -1,4 +1,4 @@
-"""Folds the whole history again beside the running twin: another estimator, another tuning."""
+"""Folds the whole history again beside the running twin, with another estimator or tuning."""
 
 from __future__ import annotations
 
@@ -7,17 +7,48 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 from estimators.errors import NisusError
 from estimators.fold import Fold
 
 from .watchdog import Watchdog
 
+BATCH_PERIOD_S = 0.02
+"""Seconds that a batch should take; one event of a large field may take longer."""
+
+MAX_BATCH_EVENTS = 16_384
+
+REFOLD_REMEDY = "the running estimate goes on. Correct the model, or choose another tuning"
+"""End of the line about a refold that does not return."""
+
+
+class BatchSizer:
+    """Folds in batches whose size follows from the time that the last ones took. The rows do not depend on it."""
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        """`clock` returns monotonic seconds."""
+        self._clock = clock
+        self.begin()
+
+    def begin(self) -> None:
+        """Begin with another fold, of unknown speed."""
+        self.size = 1
+
+    def advance(self, fold: Fold) -> int:
+        """Fold the next batch; return its number of events."""
+        begun = self._clock()
+        count = fold.advance(self.size)
+        took = self._clock() - begun
+        if took > BATCH_PERIOD_S:
+            self.size = max(1, int(self.size * BATCH_PERIOD_S / took))
+        elif took < BATCH_PERIOD_S / 8 and count == self.size:
+            self.size = min(MAX_BATCH_EVENTS, 4 * self.size)
+        return count
+
 
 @dataclass(frozen=True)
 class Refolded:
-    """A finished fold over a copy of the log, or why there is none; `ticket` says which request it answers."""
+    """A finished fold over a copy of the log, or the reason why there is none; `ticket` is that of the request."""
 
     ticket: int
     fold: Fold | None
@@ -25,7 +56,7 @@ class Refolded:
 
 
 class Requests:
-    """The refolds that were asked for, and from which event on the log has changed since each was."""
+    """Requested refolds, and from which event on the log has changed since each request."""
 
     def __init__(self) -> None:
         self.newest = 0
@@ -38,46 +69,41 @@ class Requests:
         return self._answered != self.newest
 
     def ask(self) -> int:
-        """Another one, over the log as it is now; its ticket."""
+        """Add a request over the log as it is now; return its ticket."""
         self.newest += 1
         self._open[self.newest] = None
         return self.newest
 
     def changed(self, index: int) -> None:
         """The log changed from an event (its absolute index) on."""
-        for ticket, known in self._open.items():
-            self._open[ticket] = index if known is None else min(known, index)
+        self._open = {ticket: index if known is None else min(known, index) for ticket, known in self._open.items()}
 
     def look(self, ticket: int) -> tuple[bool, int | None]:
-        """A refold is done: whether its log is still the present one, and from where on that has changed."""
+        """Return whether the log of a request is still the present one, and from where on that has changed."""
         return ticket in self._open, self._open.get(ticket)
 
     def answer(self, ticket: int) -> None:
-        """Of this request, and of those before it, nothing more comes."""
+        """Close this request and those before it."""
         self._answered = max(self._answered, ticket)
         self._open = {number: index for number, index in self._open.items() if number > ticket}
 
     def forget(self) -> None:
-        """The log has started again, so no answer fits it."""
+        """Close all requests: the log has started again, so no answer fits it."""
         self._answered = self.newest
         self._open.clear()
 
 
-GIVEN_UP = "what ran before goes on. Mend the model, or choose another tuning"
-
-
 class Refolder:
-    """One thread, one fold at a time; of the requests that come meanwhile only the latest counts."""
+    """One thread and one fold at a time; of the requests that arrive meanwhile only the latest counts."""
 
     def __init__(self, done: Callable[[Refolded], None]) -> None:
         self._done = done
         self._wake = threading.Condition()
         self._pending: tuple[int, Callable[[], Fold]] | None = None
-        self._busy = False
         self._stopping = False
         self._ticket = 0
-        # A long history may take minutes: only a function that does not answer ends a refold.
-        self._watchdog = Watchdog(self._give_up, then=GIVEN_UP, long=math.inf)
+        # A long history may take minutes: only a function that does not return ends a refold.
+        self._watchdog = Watchdog(self._give_up, then=REFOLD_REMEDY, long=math.inf)
         self._thread = threading.Thread(target=self._run, name="refold", daemon=True)
 
     def start(self) -> None:
@@ -86,7 +112,7 @@ class Refolder:
         self._watchdog.start()
 
     def stop(self) -> None:
-        """Give up what is under way."""
+        """Give up the fold that is under way."""
         with self._wake:
             self._stopping = True
             self._wake.notify()
@@ -94,44 +120,11 @@ class Refolder:
             self._thread.join(timeout=2.0)
         self._watchdog.stop()
 
-    def _give_up(self, text: str, level: str) -> None:
-        """A function of the model never returns: leave the thread in it, and go on with another."""
-        if level != "error":
-            return
-        with self._wake:
-            self._thread = threading.Thread(target=self._run, name="refold", daemon=True)
-            self._thread.start()
-        self._done(Refolded(self._ticket, None, text))
-
     def request(self, ticket: int, make: Callable[[], Fold]) -> None:
-        """Fold what `make` prepares (in this thread: it may have to compile), as soon as the present one is done."""
+        """Fold what `make` prepares (in the thread: it may have to compile) as soon as the present one is done."""
         with self._wake:
             self._pending = (ticket, make)
             self._wake.notify()
-
-    @property
-    def busy(self) -> bool:
-        """Whether a fold is under way or waiting."""
-        with self._wake:
-            return self._busy or self._pending is not None
-
-    def _run(self) -> None:
-        while True:
-            with self._wake:
-                self._busy = False
-                while self._pending is None and not self._stopping:
-                    self._wake.wait()
-                if self._stopping:
-                    return
-                assert self._pending is not None
-                ticket, make = self._pending
-                self._pending, self._ticket = None, ticket
-                self._busy = True
-            answer = self._fold(ticket, make)
-            with self._wake:
-                if threading.current_thread() is not self._thread:
-                    return
-            self._done(answer)
 
     def step(self) -> bool:
         """Carry out the waiting request in this thread; return whether there was one."""
@@ -141,7 +134,30 @@ class Refolder:
             self._done(self._fold(*pending))
         return pending is not None
 
-    def _fold(self, ticket: int, make: Callable[[], Any]) -> Refolded:
+    def _give_up(self, text: str, level: str) -> None:
+        """Leave the thread in a function that does not return, and go on with another."""
+        if level != "error":
+            return
+        with self._wake:
+            self._thread = threading.Thread(target=self._run, name="refold", daemon=True)
+            self._thread.start()
+        self._done(Refolded(self._ticket, None, text))
+
+    def _run(self) -> None:
+        while True:
+            with self._wake:
+                self._wake.wait_for(lambda: self._pending is not None or self._stopping)
+                if self._stopping or self._pending is None:
+                    return
+                (self._ticket, make), self._pending = self._pending, None
+                ticket = self._ticket
+            answer = self._fold(ticket, make)
+            with self._wake:
+                if threading.current_thread() is not self._thread:
+                    return
+            self._done(answer)
+
+    def _fold(self, ticket: int, make: Callable[[], Fold]) -> Refolded:
         try:
             fold, batches = make(), BatchSizer()
             with self._watchdog.watched(fold):
@@ -149,37 +165,6 @@ class Refolder:
                     pass
         except NisusError as error:
             return Refolded(ticket, None, str(error))
-        except (Exception, SystemExit) as error:  # noqa: BLE001  a user's model may raise anything; the running fold goes on
+        except (Exception, SystemExit) as error:  # noqa: BLE001  a user's model may raise anything; the twin goes on
             return Refolded(ticket, None, f"{type(error).__name__}: {error}")
         return Refolded(ticket, fold, "")
-
-
-BATCH_PERIOD_S = 0.02
-"""Seconds that a piece should take; one event of a large field may take longer."""
-
-MAX_BATCH_EVENTS = 16_384
-"""Events of a piece."""
-
-
-class BatchSizer:
-    """Folds in pieces whose size follows from what the last ones took. The rows are the same in whatever pieces."""
-
-    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
-        """`clock` gives seconds that only rise."""
-        self._clock = clock
-        self.begin()
-
-    def begin(self) -> None:
-        """Another fold, of which nothing is known."""
-        self.size = 1
-
-    def advance(self, fold: Fold) -> int:
-        """Fold the next piece; how many events it had."""
-        begun = self._clock()
-        count = fold.advance(self.size)
-        took = self._clock() - begun
-        if took > BATCH_PERIOD_S:
-            self.size = max(1, int(self.size * BATCH_PERIOD_S / took))
-        elif took < BATCH_PERIOD_S / 8 and count == self.size:
-            self.size = min(MAX_BATCH_EVENTS, 4 * self.size)
-        return count

@@ -1,7 +1,7 @@
-"""Every revision of a running twin: with what it was folded, what that changed, and the whole track of a few.
+"""Revisions of a running twin: settings and changes of each, and the whole track of a few.
 
-Bookkeeping alone. The engine says when a revision gives way to the next; what each was worth is computed elsewhere
-(app/live/runs/scores.py), when somebody asks.
+The engine adds a revision when one fold replaces another; their scores are computed on request in
+app/live/runs/scores.py.
 """
 
 from __future__ import annotations
@@ -14,36 +14,35 @@ from estimators.diagnostics.episodes import Episode
 from estimators.errors import ConfigError, printable
 from estimators.tuning import Tuning
 
-from .changes import Change, difference
+from .changes import SettingChange, difference
 from .outputs import Pull
 
-DRAG = 2.0
+DRAG_S = 2.0
 """Seconds within which edits of one entry are one edit."""
 
-MOST_PINNED = 4
+MAX_PINNED = 4
 
-MOST = 200
-"""Revisions that are kept; of more the oldest that nobody pinned or named are forgotten."""
+MAX_REVISIONS = 200
+"""Revisions that are kept; beyond that the oldest ones without pin, name or note are dropped."""
 
-LONGEST_NAME, LONGEST_NOTE = 60, 2000
+MAX_NAME_LENGTH, MAX_NOTE_LENGTH = 60, 2000
 
 
 @dataclass(frozen=True)
-class Run:
+class Revision:
     """One revision.
 
-    `began` is when it took the place of the one before, s since 1970, `changes` what differs from that. `loaded` is the
-    number of the earlier revision whose tuning it took up again. `place` is one of the `MOST_PINNED` while it is
-    pinned. `why` says what beside settings changed: a file that was saved. `track` is all that it concluded until it
-    gave way: of the newest previous revision and of pinned ones. `episodes` are what was wrong until then, which the
-    settings of the next one may hide.
+    `began` is the time of its start, s since 1970, `changes` the differences from the one before. `loaded` is the
+    number of the earlier revision whose tuning it took up again. `place` is one of the `MAX_PINNED` while it is
+    pinned. `why` names another reason than settings: a file that was saved. `track` has all its rows, of the newest
+    previous revision and of pinned ones. `episodes` are those at its end, which the settings of the next one may hide.
     """
 
     number: int
     estimator: str
     tuning: Tuning
     began: float
-    changes: tuple[Change, ...] = ()
+    changes: tuple[SettingChange, ...] = ()
     loaded: int | None = None
     name: str = ""
     note: str = ""
@@ -64,35 +63,35 @@ class Run:
 
 
 class Revisions:
-    """All of them, oldest first; the last is the one that runs. Changed by the engine's thread alone, read by any."""
+    """All revisions, oldest first; the last one runs. Changed by the engine's thread alone, read by any."""
 
     def __init__(self, estimator: str, tuning: Tuning, *, clock: Callable[[], float] = time.time) -> None:
         self._clock = clock
-        self.runs: tuple[Run, ...] = (Run(0, estimator, tuning, clock()),)
+        self.runs: tuple[Revision, ...] = (Revision(0, estimator, tuning, clock()),)
         self.version = 0
-        """Counts up with every change, so that a page knows when to ask again."""
+        """Incremented by every change, so that a page knows when to ask again."""
         self.why = ""
-        """Why the next revision is folded, if not for another setting."""
+        """Reason of the next revision, if not another setting."""
         self.watchers: set[Callable[[], None]] = set()
-        """Called at every change, by the thread that makes it: they must neither wait nor fail."""
+        """Called at every change, in its thread: they must neither wait nor fail."""
         self.said: Callable[[int], tuple[Episode, ...]] = lambda number: ()
-        """Gives the episodes of the revision that runs."""
+        """Returns the episodes of the running revision."""
 
     def began_with(self, estimator: str, tuning: Tuning) -> None:
-        """The first fold could be had; meanwhile its settings may have been turned."""
+        """Begin with the first fold, whose settings may have been changed while it was compiled."""
         *earlier, running = self.runs
         self._become([*earlier, replace(running, estimator=estimator, tuning=tuning)])
 
     def left(self, pull: Pull, estimator: str, tuning: Tuning) -> None:
-        """The revision that ran gives way to the next.
+        """Replace the running revision by the next.
 
-        Edits of one entry that follow each other quickly are one: those between the first and the last are forgotten.
-        A revision that is taken up again (`Run.loaded`) goes on under the new number, with its name.
+        Quick edits of one entry are one: those between the first and the last are dropped. A revision that is taken up
+        again (`Revision.loaded`) continues under the new number, with its name.
 
         Args:
-            pull: All of the revision that ends.
-            estimator: Of the one that begins.
-            tuning: The same.
+            pull: All rows of the revision that ends.
+            estimator: Estimator of the next one.
+            tuning: Its tuning.
         """
         *earlier, running = self.runs
         now = self._clock()
@@ -102,36 +101,38 @@ class Revisions:
             return
         changes = difference(running.estimator, running.tuning, estimator, tuning)
         why, self.why = self.why, ""
-        dragged = bool(earlier) and not same and not why and now - running.began < DRAG and _of_one(running, changes)
+        dragged = (
+            bool(earlier) and not same and not why and now - running.began < DRAG_S and _same_entry(running, changes)
+        )
         if dragged:
             before = earlier[-1]
             changes = difference(before.estimator, before.tuning, estimator, tuning)
         else:
             earlier = [*map(_without_track, earlier), replace(running, track=pull, episodes=self.said(running.number))]
-        begun = Run(pull.revision + 1, estimator, tuning, now, changes, why=why)
+        begun = Revision(pull.revision + 1, estimator, tuning, now, changes, why=why)
         if same:
             begun = replace(begun, loaded=same[0].number, name=same[-1].name, note=same[-1].note)
             earlier = [run for run in earlier if run.pinned or all(run.number != other.number for other in same)]
-        self._become(_few([*earlier, begun]))
+        self._become(_recent([*earlier, begun]))
 
     def restarted(self, number: int, *, keep: bool = False) -> None:
-        """What runs goes on under another number: folded again as it was, or over a log that has begun again.
+        """Continue the running revision under another number: folded again, or over a log that has begun again.
 
         Args:
-            number: The new one.
-            keep: Whether the log is still the same, so that the previous track can be compared with.
+            number: The new number.
+            keep: Whether the log is still the same, so that the previous track remains comparable.
         """
         *earlier, running = self.runs
         kept = earlier if keep else [replace(_without_track(run), episodes=()) for run in earlier]
         self._become([*kept, replace(running, number=number)])
 
     def previous(self) -> Pull | None:
-        """All of the newest previous revision; its arrays never change."""
+        """Return all rows of the newest previous revision; its arrays never change."""
         runs = self.runs
         return runs[-2].track if len(runs) > 1 else None
 
-    def find(self, number: int) -> Run:
-        """The revision of that number.
+    def find(self, number: int) -> Revision:
+        """Return the revision of that number.
 
         Raises:
             ConfigError: If it is not known.
@@ -142,10 +143,10 @@ class Revisions:
         raise ConfigError(f"run {number} is not known; /api/runs lists those that are")
 
     def free_place(self, number: int) -> int:
-        """Where a revision can be pinned: its own place, or the first that is free.
+        """Return the place for pinning a revision: its own, or the first free one.
 
         Raises:
-            ConfigError: If it is not known, its track is gone, or there is no place.
+            ConfigError: If it is not known, its track is gone, or no place is free.
         """
         run = self.find(number)
         if run.place is not None:
@@ -153,17 +154,17 @@ class Revisions:
         if run.track is None and run is not self.runs[-1]:
             raise ConfigError(f"run {number} cannot be pinned: its track is gone; load it, and it is folded again")
         taken = {other.place: other.number for other in self.runs if other.place is not None}
-        if len(taken) == MOST_PINNED:
+        if len(taken) == MAX_PINNED:
             names = ", ".join(map(str, sorted(taken.values())))
-            raise ConfigError(f"run {number} cannot be pinned: {MOST_PINNED} are ({names}); unpin one first")
-        return min(set(range(MOST_PINNED)) - set(taken))
+            raise ConfigError(f"run {number} cannot be pinned: {MAX_PINNED} are ({names}); unpin one first")
+        return min(set(range(MAX_PINNED)) - set(taken))
 
     def pin(self, number: int) -> None:
         """Keep a revision's track; raises as `free_place`."""
         self._change(number, place=self.free_place(number))
 
     def unpin(self, number: int) -> None:
-        """Keep it no longer.
+        """Unpin a revision, and drop its track.
 
         Raises:
             ConfigError: If the revision is not known.
@@ -177,13 +178,13 @@ class Revisions:
         self._change(number, name=" ".join(printable(name).split()), note=printable(note).strip())
 
     def check_words(self, number: int, name: str, note: str) -> None:
-        """Refuse words that are too long.
+        """Reject a name or note that is too long.
 
         Raises:
             ConfigError: If they are, or the revision is not known.
         """
         self.find(number)
-        for what, text, most in (("name", name, LONGEST_NAME), ("note", note, LONGEST_NOTE)):
+        for what, text, most in (("name", name, MAX_NAME_LENGTH), ("note", note, MAX_NOTE_LENGTH)):
             if len(text) > most:
                 raise ConfigError(f"run {number}: its {what} has {len(text)} characters; it may have {most}")
 
@@ -191,7 +192,7 @@ class Revisions:
         found = self.find(number)
         self._become([replace(run, **fields) if run is found else run for run in self.runs])  # type: ignore[arg-type]
 
-    def _become(self, runs: list[Run]) -> None:
+    def _become(self, runs: list[Revision]) -> None:
         # At once, so that a reader in another thread never sees half of it.
         self.runs = tuple(runs)
         self.version += 1
@@ -199,17 +200,17 @@ class Revisions:
             told()
 
 
-def _of_one(running: Run, changes: tuple[Change, ...]) -> bool:
-    """Whether both were edits of the same single entry, and nobody wants what lay between."""
+def _same_entry(running: Revision, changes: tuple[SettingChange, ...]) -> bool:
+    """Whether both were edits of the same single entry, and the one between is not marked."""
     keys = [change.key for change in changes]
     return len(keys) == 1 and keys == [change.key for change in running.changes] and not running.marked
 
 
-def _without_track(run: Run) -> Run:
+def _without_track(run: Revision) -> Revision:
     return run if run.pinned or run.track is None else replace(run, track=None)
 
 
-def _few(runs: list[Run]) -> list[Run]:
-    surplus = len(runs) - MOST
+def _recent(runs: list[Revision]) -> list[Revision]:
+    surplus = len(runs) - MAX_REVISIONS
     forgotten = [run.number for run in runs[:-2] if not run.marked][: max(0, surplus)]
     return [run for run in runs if run.number not in forgotten]

@@ -1,4 +1,4 @@
-"""The running fold and the log that it follows: moved by the engine's thread alone, read by all others as copies."""
+"""The running fold and its log: changed by the engine's thread alone, copied by all other readers."""
 
 from __future__ import annotations
 
@@ -32,25 +32,55 @@ if TYPE_CHECKING:
 
     from ..twin.twin import Twin
 
-LATELY = 1024
-"""Events of which it is told how far readings are apart."""
+RATE_EVENTS = 1024
+"""Last events from which the sample rate is found."""
+
+
+class FairLock:
+    """First-come, first-served lock: a thread that releases it and takes it again at once comes after the waiting one.
+
+    The engine folds in batches and lets readers in between; with an ordinary lock it would have it again before they
+    wake. The next thread waits at the inner lock, all others at the outer one.
+    """
+
+    def __init__(self) -> None:
+        self._outer, self._lock = threading.Lock(), threading.Lock()
+
+    def acquire(self, timeout: float = -1) -> bool:
+        """Take it within so many seconds at each of the two locks; return whether that was possible."""
+        if not self._outer.acquire(timeout=timeout):
+            return False
+        try:
+            return self._lock.acquire(timeout=timeout)
+        finally:
+            self._outer.release()
+
+    def release(self) -> None:
+        """Release it."""
+        self._lock.release()
+
+    def __enter__(self) -> None:
+        self.acquire()
+
+    def __exit__(self, *_: Any) -> None:
+        self.release()
 
 
 class RunningFold:
-    """The log, the fold that follows it, and the revisions before.
+    """The log, the fold that follows it, and earlier revisions.
 
-    Whoever moves it (the methods at the end) holds the lock, for a piece of the fold at most; whoever reads holds it
-    for no longer than copying takes. In between the log may have events that are not folded yet: nobody is shown them.
+    The methods at the end change it and hold the lock for one batch at most; readers hold it only to copy. In between
+    the log may have events that are not folded yet; readers never see them.
     """
 
     def __init__(self, twin: Twin, watchdog: Watchdog, base: Base | None, ready: Callable[[str], bool]) -> None:
         """Prepare the fold.
 
         Args:
-            twin: What to fold.
+            twin: The twin to fold.
             watchdog: Watches the thread that folds.
-            base: Where the fold starts; None: the prior.
-            ready: Whether a filter is compiled; while the first is not, an idle fold stands in its place.
+            base: Start of the fold; None for the prior.
+            ready: Whether a filter is compiled; while the first is not, an idle fold takes its place.
         """
         self.twin = twin
         self.model = twin.model
@@ -71,13 +101,13 @@ class RunningFold:
         self.notices = Notices(lambda: self._log.newest if self._log.n else 0)
 
     @contextmanager
-    def _reading(self, patience: float = np.inf) -> Iterator[bool]:
-        """Nothing changes meanwhile; also not beneath a fold that never returns, which keeps the lock for ever.
+    def _reading(self, timeout: float = np.inf) -> Iterator[bool]:
+        """Keep everything as it is meanwhile; yield False if the fold was at work for `timeout` seconds.
 
-        It says whether that is so: not if the fold was at work for `patience` seconds.
+        Beneath a fold that never returns, which keeps the lock for ever, nothing changes either.
         """
-        end = time.monotonic() + patience
-        while not (held := self._lock.acquire(timeout=min(0.05, patience))):
+        end = time.monotonic() + timeout
+        while not (held := self._lock.acquire(timeout=min(0.05, timeout))):
             if self._watchdog.text is not None or time.monotonic() >= end:
                 break
         try:
@@ -86,15 +116,15 @@ class RunningFold:
             if held:
                 self._lock.release()
 
-    # For everybody, from any thread
+    # From any thread
 
     @property
     def policy(self) -> HealthPolicy:
-        """When the estimate may be trusted."""
+        """Rules of the health."""
         return self._policy
 
     def cursor(self, *, follows_log: bool = False, span: int | None = None) -> Cursor:
-        """A cursor for one consumer, for `pull`; give it back with `release`. See `Cursor` for the rest."""
+        """Return a cursor of one consumer for `pull`, to be given back with `release`; for the options see `Cursor`."""
         cursor = Cursor(follows_log=follows_log, span=span)
         with self._changing_cursors:
             self._cursors = (*self._cursors, cursor)
@@ -106,7 +136,7 @@ class RunningFold:
             self._cursors = tuple(item for item in self._cursors if item is not cursor)
 
     def pull(self, cursor: Cursor, limit: int | None = None, *, align: int = 1) -> Pull:
-        """Copies of the rows since the cursor, from a multiple of `align` on, at most `limit`; the notices since."""
+        """Copy the rows since the cursor, from a multiple of `align` on and at most `limit`, and the notices since."""
         with self._reading():
             log, fold = self._log, self._fold
             fresh = cursor.log != self._logs or (cursor.revision != self._revision and not cursor.follows_log)
@@ -117,20 +147,10 @@ class RunningFold:
             end = log.first + fold.n
             if limit is not None:
                 end = min(end, start + limit)
-            rows = slice(start - log.first, max(start, end) - log.first)
-            readings = log.events.select(rows)
-            pull = Pull(
-                self._revision,
-                fresh,
-                start,
-                Events(*(column.copy() for column in readings)),
-                fold.track.select(rows).copy(),
-                pictures=_since(fold, cursor.picture, max(start, end)),
-                oldest=log.first,
-                changed=max(cursor.next, log.first),
-                version=log.version,
-            )
-            cursor.next = max(start, end)
+            end = max(start, end)
+            pictures = _since(fold, cursor.picture, end)
+            pull = self._copy(start, end, fresh=fresh, pictures=pictures, changed=max(cursor.next, log.first))
+            cursor.next = end
             if pull.pictures:
                 cursor.picture = pull.pictures[-1].before
         lines = self.notices.since(cursor.notice)
@@ -139,41 +159,42 @@ class RunningFold:
         return replace(pull, notices=lines)
 
     def _from(self, span: int | None) -> int:
-        """Absolute index of the first folded event in the last `span` ns; 0 of all."""
+        """Return the absolute index of the first folded event in the last `span` ns; 0 for all."""
         n = self._fold.n
         if span is None or not n:
             return 0
         return self._log.first + int(np.searchsorted(self._log.t[:n], self._log.t[n - 1] - span))
 
     def rows(self, start: int, stop: int) -> Pull:
-        """Copies of the rows with these absolute indices, as far as they are there; no cursor moves."""
+        """Copy the rows with these absolute indices, as far as they exist; no cursor moves."""
         with self._reading():
-            log, fold = self._log, self._fold
-            start = min(max(start, log.first), log.first + fold.n)
-            rows = slice(start - log.first, max(start, min(stop, log.first + fold.n)) - log.first)
-            readings = log.events.select(rows)
-            events = Events(*(column.copy() for column in readings))
-            track = fold.track.select(rows).copy()
-            return Pull(self._revision, False, start, events, track, oldest=log.first, version=log.version)
+            end = self._log.first + self._fold.n
+            start = min(max(start, self._log.first), end)
+            return self._copy(start, max(start, min(stop, end)))
+
+    def _copy(self, start: int, stop: int, **fields: Any) -> Pull:
+        log, rows = self._log, slice(start - self._log.first, stop - self._log.first)
+        events = Events(*(column.copy() for column in log.events.select(rows)))
+        pull = Pull(self._revision, False, start, events, self._fold.track.select(rows).copy(), oldest=log.first)
+        return replace(pull, version=log.version, **fields)
 
     def index_at(self, t: int) -> int:
-        """Absolute index of the first folded event at or after a time, ns; the number of events if there is none."""
+        """Return the absolute index of the first folded event at or after a time, ns; else that after the last."""
         with self._reading():
             return self._log.first + int(np.searchsorted(self._log.t[: self._fold.n], t))
 
     def span(self) -> tuple[int, int]:
-        """Times of the first and the last event, ns; zeros while there is none. Waits for nobody."""
+        """Return the times of the first and the last event, ns; zeros while there is none. Never waits."""
         return self._span
 
     def base(self) -> Base | None:
-        """Where a fold of the present log starts, if its oldest events were dropped; else None, for the prior."""
+        """Return the start of a fold of the present log if its oldest events were dropped; None for the prior."""
         return self._base
 
     def origin(self, index: int) -> tuple[int, Base | None]:
-        """Where a fold that gives the rows from `index` on can start: at an event at or before it, from a base.
+        """Return an event at or before `index` at which a fold can start, and its base; None for the prior.
 
-        That is None for the prior. Revisions that follow have a snapshot there too, unless their state is so large
-        that theirs are wider apart.
+        Later revisions have a snapshot there too, unless their state is so large that theirs are wider apart.
         """
         with self._reading():
             first = self._log.first
@@ -181,16 +202,16 @@ class RunningFold:
             return first + at, base if at else self._base
 
     def folded_with(self) -> tuple[Tuning, str]:
-        """Tuning and estimator of the fold that `pull` shows."""
+        """Return tuning and estimator of the fold that `pull` shows."""
         with self._reading():
             return self._fold.tuning, self._fold.estimator.name
 
     def previous(self) -> Pull | None:
-        """The whole previous revision, for comparison, before a drag if one goes on; its arrays never change."""
+        """Return all rows of the previous revision (before a drag that goes on); its arrays never change."""
         return self.revisions.previous()
 
     def belief(self) -> Belief:
-        """The estimate now."""
+        """Return the present estimate."""
         with self._reading():
             mean, cov = self._fold.moments()
             points, clock = self._fold.points(), self._fold.clock
@@ -200,12 +221,12 @@ class RunningFold:
         return Belief(clock, mean, cov, points, tuple(peaks) if len(peaks) > 1 else ())
 
     def here(self) -> Here | None:
-        """The filter as it stands, to fold on from; None while nothing has come. Copies its state, and no more."""
+        """Return the state of the filter, to fold on from; None before the first event. Copies nothing else."""
         with self._reading():
             fold, log = self._fold, self._log
             if not fold.n:
                 return None
-            lately = slice(max(0, fold.n - LATELY), fold.n)
+            lately = slice(max(0, fold.n - RATE_EVENTS), fold.n)
             read = log.t[lately][log.kind[lately] == READING]
             step = (
                 float(read[-1] - read[0]) * 1e-9 / (np.unique(read).size - 1)
@@ -222,11 +243,11 @@ class RunningFold:
                 return None
             return event_window(self._fold, self._revision, limit, origin=self._base, rows=rows)
 
-    # For the thread that moves it
+    # On the engine's thread
 
     @contextmanager
     def _moving(self) -> Iterator[None]:
-        """Nobody reads meanwhile; a fold that does not return is noticed."""
+        """Exclude readers meanwhile, under the watchdog."""
         with self._lock, self._watchdog.watched(self._fold):
             try:
                 yield
@@ -235,7 +256,7 @@ class RunningFold:
                 self._span = (int(log.t[0]), int(log.t[log.n - 1])) if log.n else (0, 0)
 
     def _clear(self, base: Base | None) -> None:
-        """An empty log and the fold that follows it."""
+        """Begin an empty log and the fold that follows it."""
         self._log = Log.resume(self.model, base, capacity=self._history + 4 * SPARSE_EVERY)
         self._logs += 1
         self._base = base
@@ -262,9 +283,9 @@ class RunningFold:
         )
 
     def _extend(self, batch: Events, horizon: int | None, settled: np.ndarray | None) -> tuple[int, int]:
-        """Put events where they belong, and fold the first of them; the first row that is new, and how many were stale.
+        """Put events into the log and fold the first of them; return the first new row and how many were stale.
 
-        What was shown already is folded again at once, so that nobody sees the twin go back in time.
+        Rows that were shown before are folded again at once, so that no reader sees the twin go back in time.
         """
         shown = self._fold.n
         newest = int(self._log.t[shown - 1]) if shown else 0
@@ -278,11 +299,11 @@ class RunningFold:
 
     @property
     def _behind(self) -> bool:
-        """Whether there are events that are to be folded."""
+        """Whether events wait to be folded."""
         return not self._fold.idle and self._fold.n < self._log.n
 
     def _go_back(self, index: int) -> None:
-        """Events at and after `index` changed: fold them again, and let every cursor fetch them again."""
+        """Fold the events from `index` on again, and let every cursor fetch them again."""
         self._fold.rewind(index)
         self._row_counts.changed(index)
         absolute = self._log.first + index
@@ -292,7 +313,7 @@ class RunningFold:
             cursor.picture = min(cursor.picture, absolute)
 
     def _forget(self) -> None:
-        """Once there are many, drop the oldest events, up to a snapshot, from which later refolds start."""
+        """Once there are many events, drop the oldest up to a snapshot, from which later refolds start."""
         if self._fold.idle or self._log.n <= self._history + 3 * SPARSE_EVERY:
             return
         count = (self._log.n - self._history) // SPARSE_EVERY * SPARSE_EVERY
@@ -303,40 +324,32 @@ class RunningFold:
             self._log.drop_front(count)
 
     def _begin_again(self, base: Base | None) -> None:
-        """Another log, and the fold of it that follows: a new revision."""
+        """Begin another log and its fold, a new revision."""
         self.estimator, self.tuning = self._fold.estimator.name, self._fold.tuning
         self._clear(base)
         self._count_up()
         self.revisions.restarted(self._revision)
 
     def _become(self, fold: Fold, row_counts: RowCounts) -> None:
-        """Go on with another fold of the same log, which has caught up with it: a new revision."""
+        """Go on with another fold of the same log, a new revision."""
         old, log = self._fold, self._log
         self._batches.begin()
         if old.idle:  # the first
             self._fold, self._row_counts = fold, row_counts
             self.revisions.began_with(fold.estimator.name, fold.tuning)
             return
+        # The old track is not copied: nobody changes it any more.
         events = Events(*(column[: old.n].copy() for column in log.events))
         pictures = _since(old, -1, log.first + old.n)
-        left = Pull(
-            self._revision,
-            False,
-            log.first,
-            events,
-            old.track,
-            pictures=pictures,
-            oldest=log.first,
-            version=log.version,
-        )
+        left = replace(self._copy(log.first, log.first), events=events, track=old.track, pictures=pictures)
         self.revisions.left(left, fold.estimator.name, fold.tuning)
         self._fold, self._row_counts = fold, row_counts
         self._count_up()
 
     def _caught_up(self, fold: Fold, changed_from: int | None, stopping: threading.Event) -> RowCounts | None:
-        """Let a refold follow the log, and fold what came meanwhile; None if it no longer fits the log.
+        """Let a refold follow the log, and fold the events that came meanwhile; None if it no longer fits the log.
 
-        What the new revision says of the readings counts, also of those that it loses here; not what others said.
+        Its row counts include the rows that it loses here.
 
         Raises:
             NisusError: If an event does not fit the model.
@@ -362,33 +375,7 @@ class RunningFold:
 
 
 def _since(fold: Fold, index: int, end: int) -> list[Picture]:
-    """The pictures of a fold after event `index`, up to event `end`."""
+    """Return the pictures of a fold after event `index`, up to event `end`."""
     if fold.pictures is None:
         return []
     return [picture for picture in fold.pictures.taken if index < picture.before <= end]
-
-
-class FairLock:
-    """Held by one thread at a time. Whoever is next stands at the door, and all others behind."""
-
-    def __init__(self) -> None:
-        self._door, self._lock = threading.Lock(), threading.Lock()
-
-    def acquire(self, timeout: float = -1) -> bool:
-        """Take it, within so many seconds at the door and as many before it; whether that was possible."""
-        if not self._door.acquire(timeout=timeout):
-            return False
-        try:
-            return self._lock.acquire(timeout=timeout)
-        finally:
-            self._door.release()
-
-    def release(self) -> None:
-        """Let it go."""
-        self._lock.release()
-
-    def __enter__(self) -> None:
-        self.acquire()
-
-    def __exit__(self, *_: Any) -> None:
-        self.release()

@@ -1,4 +1,4 @@
-"""The status: what a panel shows of a running twin, put together from its fold and from all that watches it."""
+"""The status of a running twin, from its fold and its watchers."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ from .watchers import Watchers
 if TYPE_CHECKING:
     from estimators.tuning import Tuning
 
-FOLDED = "the readings that came so far are being folded"
-"""Why there is no row yet."""
+FOLDED = "the measurements so far are being folded"
+"""Cause of a twin without a row yet."""
 
 
-class Asked(NamedTuple):
-    """What of a status needs no look at the fold.
+class Settings(NamedTuple):
+    """The part of a status that is known without the fold.
 
-    `estimator` and `tuning` are those that are asked for, others than the fold's while a refold is waited for
-    (`refolding`); `finished` says whether the source has ended, `recording` is the file that is being written,
+    `estimator` and `tuning` are the requested ones, which differ from the fold's while a refold is waited for
+    (`refolding`). `finished` says whether the source has ended, `recording` is the file that is being written,
     `awaited` the filter for whose compiling a refold waits, `compiling` see `Status`.
     """
 
@@ -49,17 +49,17 @@ class Asked(NamedTuple):
     compiling: Mapping[str, float | None]
 
     def fields(self, model: StateSpaceModel, source: Source) -> dict[str, Any]:
-        """These and what follows from them and from the source, as fields of a status."""
+        """Return these, and those that follow from them and from the source, as fields of a status."""
         options = find_estimator(self.estimator, model).complete(dict(self.tuning.options))
         return {**self._asdict(), "options": options, **playback_status(source)}
 
 
-def kept_status(kept: Status, asked: Asked, model: StateSpaceModel, source: Source, busy: float) -> Status:
-    """The last status of a fold that has been at work for `busy` seconds, with what is known without it."""
-    fields = asked.fields(model, source)
-    if kept.t is None and busy >= 1.0 and asked.awaited is None:
+def busy_status(last: Status, settings: Settings, model: StateSpaceModel, source: Source, busy: float) -> Status:
+    """Return the last status of a fold that has been at work for `busy` seconds, with the present settings."""
+    fields = settings.fields(model, source)
+    if last.t is None and busy >= 1.0 and settings.awaited is None:
         fields["cause"] = f"{FOLDED} ({busy:.0f} s so far)"
-    return replace(kept, **fields)
+    return replace(last, **fields)
 
 
 def status_of(
@@ -67,54 +67,52 @@ def status_of(
     rows: RowCounts,
     watchers: Watchers,
     source: Source,
-    asked: Asked,
+    settings: Settings,
     *,
     revision: int,
     inflated: int,
     held: int,
     notices: Mapping[str, int],
 ) -> Status:
-    """The status of a fold that stands still meanwhile.
+    """Return the status of a fold that does not change meanwhile.
 
     Args:
-        fold: The running one.
+        fold: The running fold.
         rows: Counts of its rows.
-        watchers: What they found.
-        source: Of its readings.
-        asked: What is known without it.
-        revision: Its number.
-        inflated: Late readings whose noise was inflated.
-        held: Events that wait for the next to tell whether their time is true.
-        notices: Counts of what was said.
+        watchers: Its watchers.
+        source: Of its measurements.
+        settings: The part that is known without the fold.
+        revision: Number of the fold.
+        inflated: Late measurements whose noise was inflated.
+        held: Events that wait for the next one to show whether their time is right.
+        notices: Counts of notices by key.
     """
     model, log, track = fold.model, fold.log, fold.track
     last = fold.n - 1
-    now = log.t[last] * 1e-9 if last >= 0 else 0.0
-    states = sensor_states(model, fold.tuning.used, fold.evidence, now, fold.policy)
+    t = int(log.t[last]) if last >= 0 else None
+    states = sensor_states(model, fold.tuning.used, fold.evidence, (t or 0) * 1e-9, fold.policy)
     health = int(track.health[last]) if last >= 0 else watchers.silence.health
     account = watchers.chronicle.account
     leading = account.leading(dict(zip(model.sensor_names, states, strict=True)))
     layer = source.faults if isinstance(source, Faulty) else None
-    silenced, recovered = layer.lost if layer is not None else 0, fold.recoveries()
+    optional = {"inflated": inflated, "held": held, "recovered": fold.recoveries()}
     return Status(
-        **asked.fields(model, source),
+        **settings.fields(model, source),
         revision=revision,
-        t=int(log.t[last]) if last >= 0 else None,
+        t=t,
         health=health,
         since=int(log.t[last_run(track.health)]) if last >= 0 else None,
-        cause=watchers.cause(leading, health) if last >= 0 else _before(fold, watchers, asked),
+        cause=watchers.cause(leading, health) if last >= 0 else _cause_without_rows(fold, watchers, settings),
         sensors=account.of_sensors(model.sensor_names, states),
         episodes_open=len(account.lasting),
         lost=watchers.alerts.lost,
-        model_version=model_version_at(log, int(log.t[last])) if last >= 0 else log.version,
+        model_version=log.version if t is None else model_version_at(log, t),
         clock=watchers.clock.estimate,
         counts={
             **notices,
-            **({"inflated": inflated} if inflated else {}),
-            **({"held": held} if held else {}),
             **rows.count(track, log.channel),
-            **({"recovered": recovered} if recovered else {}),
-            **({"silenced": silenced} if silenced else {}),
+            **{name: count for name, count in optional.items() if count},
+            **({"silenced": layer.lost} if layer is not None and layer.lost else {}),
         },
         account=fold.account(),
         nis=float(track.nis_mean[last]) if last >= 0 else np.nan,
@@ -129,7 +127,7 @@ def status_of(
 
 
 def _judged(fold: Fold) -> float:
-    """Of a commissioned twin the NIS of the readings in the window, as it is compared with what was normal."""
+    """Return the NIS of the last window relative to the baseline of a commissioned twin; NaN without a baseline."""
     baseline, n, window = fold.tuning.baseline, fold.n, fold.policy.window
     if baseline is None:
         return np.nan
@@ -141,12 +139,9 @@ def _judged(fold: Fold) -> float:
     return nis_verdict(track, events, fold.model, baseline).judged
 
 
-def _before(fold: Fold, watchers: Watchers, asked: Asked) -> str:
-    """Why there is no row."""
-    if fold.idle and asked.awaited is not None:
-        begun = asked.compiling.get(asked.awaited)
+def _cause_without_rows(fold: Fold, watchers: Watchers, settings: Settings) -> str:
+    if fold.idle and settings.awaited is not None:
+        begun = settings.compiling.get(settings.awaited)
         since = f" ({begun:.0f} s so far)" if begun else ""
-        return f"{asked.awaited} is being compiled, which happens once{since}; readings are kept meanwhile"
-    if fold.idle:
-        return FOLDED
-    return watchers.silence.cause
+        return f"{settings.awaited} is being compiled, which happens once{since}; measurements are kept meanwhile"
+    return FOLDED if fold.idle else watchers.silence.cause

@@ -1,4 +1,8 @@
-"""Looks for a call of a model's function that does not return, in whatever thread it is."""
+"""Watchdog for folds that do not return: name the function of the model that keeps them.
+
+Compiled code cannot be interrupted, so the engine's thread is lost then. It holds no interpreter lock, so signals,
+page and recorder still run; they read the last state, which nothing changes any more.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +26,7 @@ CALL_TIMEOUT_S = 10.0
 
 
 class CallWatch:
-    """Looks at what all threads are doing, for a call of a model's function that does not return."""
+    """Finds a call of a model's Python function that does not return, in whatever thread it is."""
 
     def __init__(self, model: StateSpaceModel, clock: Callable[[], float] = time.monotonic) -> None:
         functions = [("f", model.f), ("F", model.F), ("Q", model.Q), ("shape", model.shape)]
@@ -38,7 +42,7 @@ class CallWatch:
         self._seen: tuple[Any, float] | None = None
 
     def look(self) -> str | None:
-        """One line when a call has been under way for CALL_TIMEOUT_S, the first time that it has."""
+        """Return a line once a call has taken `CALL_TIMEOUT_S`; None otherwise."""
         frame = self._call()
         if frame is None:
             self._seen = None
@@ -47,17 +51,17 @@ class CallWatch:
         elif self._clock() - self._seen[1] >= CALL_TIMEOUT_S:
             self._seen = (frame, float("inf"))
             return (
-                f"{self._said(frame)} has not returned for {CALL_TIMEOUT_S:g} s; if it loops for ever, Ctrl-C ends the "
+                f"{self._place(frame)} has not returned for {CALL_TIMEOUT_S:g} s; if it never ends, Ctrl-C ends the "
                 "program"
             )
         return None
 
     def where(self) -> str | None:
-        """The call that is under way now, and where it is."""
+        """Return the present call and its place."""
         frame = self._call()
-        return None if frame is None else self._said(frame)
+        return None if frame is None else self._place(frame)
 
-    def _said(self, frame: Any) -> str:
+    def _place(self, frame: Any) -> str:
         code = frame.f_code
         return f"{shown_path(Path(code.co_filename))}:{frame.f_lineno}: {self._names[code]} of the model {self._model}"
 
@@ -75,20 +79,20 @@ if TYPE_CHECKING:
     from estimators.fold import Fold
 
 CHECK_AFTER_S = 3.0
-"""Seconds that a fold may take before the functions of its model are asked one by one."""
+"""Seconds that a fold may take before the functions of its model are called one by one."""
 
 STALLED_AFTER_S = 60.0
-"""Seconds after which a fold is said not to return although each of them answers."""
+"""Seconds after which a fold is reported although each of its functions returns."""
 
 ANSWER_TIMEOUT_S = 1.0
-"""Seconds for one of them to answer."""
+"""Seconds for one function to return."""
 
 
-STALLED_REMEDY = "nothing more is estimated. Ctrl-C ends the program; mend the model"
+STALLED_REMEDY = "the estimate stays as it is. Ctrl-C ends the program; correct the model"
 
 
 class Watchdog:
-    """Watches the work of one thread from another."""
+    """Watches the folds of one thread from another."""
 
     def __init__(
         self,
@@ -101,10 +105,10 @@ class Watchdog:
         """Begin to watch.
 
         Args:
-            say: Called with a line and how bad it is ("error", "info").
-            then: What becomes of it, at the end of the line.
-            long: Seconds after which a fold is said not to return although each function answers.
-            clock: Seconds that only rise.
+            say: Called with a line and its level ("error", "info").
+            then: Consequence and remedy, at the end of the line.
+            long: Seconds after which a fold is reported although each function returns.
+            clock: Monotonic seconds.
         """
         self._say = say
         self._then = then
@@ -113,7 +117,7 @@ class Watchdog:
         self._work: tuple[float, Fold] | None = None
         self._asked: tuple[float, Fold] | None = None
         self.text: str | None = None
-        """What does not return; None while all is well."""
+        """Line about the fold that does not return; None while all is well."""
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="stall", daemon=True)
 
@@ -122,18 +126,18 @@ class Watchdog:
         self._thread.start()
 
     def stop(self) -> None:
-        """Watch no longer."""
+        """Stop watching."""
         self._stop.set()
 
     @property
     def busy(self) -> float:
-        """For how many seconds the present work has been going on; 0 while there is none."""
+        """Seconds since the present fold began; 0 while there is none."""
         work = self._work
         return 0.0 if work is None else self._clock() - work[0]
 
     @contextmanager
     def watched(self, fold: Fold) -> Iterator[None]:
-        """Around work that folds."""
+        """Watch a block that folds."""
         self._work = (self._clock(), fold)
         try:
             yield
@@ -145,7 +149,7 @@ class Watchdog:
             self.look()
 
     def look(self) -> None:
-        """Look once at how long the present work has taken."""
+        """Look once at the duration of the present fold."""
         work = self._work
         if work is None or work is not self._asked:
             if self.text is not None:
@@ -167,14 +171,14 @@ class Watchdog:
 
 
 def interruptible(fold: Fold, work: Callable[[], Any]) -> None:
-    """Do work that folds in a thread that may be left behind, so that Ctrl-C ends it even in a call without end.
+    """Run work that folds in a thread that may be left behind, so that Ctrl-C ends even a call that never returns.
 
     Args:
-        fold: What is folded; a function of its model that does not return is named on standard error.
-        work: What to do.
+        fold: The fold; a function of its model that does not return is named on standard error.
+        work: The work.
 
     Raises:
-        BaseException: What the work raises.
+        BaseException: As the work.
     """
     failure: list[BaseException] = []
     watchdog = Watchdog(lambda text, level: complain(text))
@@ -196,14 +200,14 @@ def interruptible(fold: Fold, work: Callable[[], Any]) -> None:
 
 
 def _in_python(fold: Fold) -> str | None:
-    """The function of a model that is not compiled in which a thread is."""
+    """Return the function of a black box that a thread is in."""
     return CallWatch(fold.model).where() if fold.model.black_box else None
 
 
-def unanswered(questions: Iterable[tuple[str, Callable[[], Any]]], patience: float | None = None) -> str | None:
-    """The first question that is not answered within `patience` seconds (default: `ANSWER_TIMEOUT_S`); None if all are.
+def unanswered(questions: Iterable[tuple[str, Callable[[], Any]]], timeout: float | None = None) -> str | None:
+    """Return the name of the first function that does not return within `timeout` seconds; None if all do.
 
-    They are asked in a thread of its own, which is lost with the one that is not.
+    They are called in a thread of its own, which is lost with the one that does not return.
     """
     asking: list[str] = []
     over = threading.Event()
@@ -218,7 +222,7 @@ def unanswered(questions: Iterable[tuple[str, Callable[[], Any]]], patience: flo
 
     threading.Thread(target=ask, name="asking", daemon=True).start()
     known = -1
-    while not over.wait(ANSWER_TIMEOUT_S if patience is None else patience):
+    while not over.wait(ANSWER_TIMEOUT_S if timeout is None else timeout):
         if asking and len(asking) == known:
             return asking[-1]
         known = len(asking)

@@ -1,4 +1,4 @@
-"""All that watches the running fold, in threads of its own or as rows come, and says what is wrong."""
+"""Monitors of the running fold: episodes, alerts, protection levels, root causes, clock, latency, silence."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 
 class Watchers:
-    """The watchers of one engine."""
+    """The monitors of one engine."""
 
     def __init__(self, engine: Running) -> None:
         section, notices = engine.twin.config.time, engine.notices
@@ -40,52 +40,52 @@ class Watchers:
         self.blame = Blame(lambda: self.chronicle.account.episodes, engine.last_events, notices)
 
     def start(self) -> None:
-        """Begin to watch."""
+        """Begin to monitor."""
         self.chronicle.start()
         self._jobs.run("protection levels", self.integrity.look, every=PERIOD_S)
         self._jobs.run("root cause", self.blame.look, every=EVERY)
 
     def stop(self) -> None:
-        """Look at the last rows, and end."""
+        """Look at the last rows and end."""
         self.chronicle.stop()
 
     def arrived(self, batch: Events, passed: Events) -> None:
-        """A batch of a live source was folded; of it these passed."""
+        """Note a batch of a live source that was folded, and those of its events that passed."""
         self.latency.note(batch)
         self.clock.note(passed)
 
     def episodes(self) -> list[Episode]:
-        """What was and is wrong, in the order of its start, with who is most likely off."""
+        """Return all episodes in the order of their start, with their root cause where it is known."""
         return list(map(self.blame.told, self.chronicle.account.episodes))
 
     def episodes_of(self, revision: int) -> tuple[Episode, ...]:
-        """The same, if they are those of a revision; else none."""
+        """Return the episodes if they are those of a revision; else none."""
         account = self.chronicle.account
         return tuple(map(self.blame.told, account.episodes)) if account.revision == revision else ()
 
     def cause(self, leading: Episode | None, health: int) -> str:
-        """Why the twin is not to be trusted now, by the episode that leads, or that of a sensor which is behind it."""
+        """Return the cause of the present health: the leading episode, or that of the sensor behind it."""
         if leading is None or health in (WAITING, TRACKING):
             return ""
         return self.blame.told(self.blame.behind(leading)).text
 
 
 class IdleTicks:
-    """How long the source has said nothing, and when to ask."""
+    """Decides when to predict without measurements, so that the growing uncertainty shows."""
 
     def __init__(self, tick: float) -> None:
-        """`tick`: seconds of silence after which to ask first."""
+        """`tick`: seconds without events before the first prediction."""
         self._tick = tick
         self._since = time.monotonic()
         self._newest: int | None = None
 
     def broken(self, newest: int) -> None:
-        """Something arrived; `newest` is the time of the log's newest event, ns."""
+        """Note an arrival; `newest` is the time of the log's newest event, ns."""
         self._since = time.monotonic()
         self._newest = newest
 
     def asks(self, source: Source, last: int) -> int | None:
-        """The time (ns) for which to ask now, after the log's last event at `last`; None for not yet."""
+        """Return the time (ns) to predict for, after the log's last event at `last`; None for not yet."""
         silent = time.monotonic() - self._since
         if silent < self._tick:
             return None
@@ -98,32 +98,32 @@ class IdleTicks:
             now = None
         else:
             now = source.now()
-        # The longer the silence, the rarer the question: a night of it must not fill the log.
+        # The longer the dropout, the rarer the predictions: a night must not fill the log.
         apart = max(self._tick, silent / 20)
         return None if now is None or now <= last + apart * 0.9e9 else now
 
 
 MAX_DRIFT_PPM = 200.0
-"""Parts per million beyond which a drift is told; a crystal stays within 100."""
+"""Parts per million beyond which a drift is reported; a crystal stays within 100."""
 
 
 FIT_PERIOD_NS = 2 * 10**9
-"""Nanoseconds of arrival between two fits, which take a millisecond."""
+"""Nanoseconds of arrival between two fits, which take about a millisecond."""
 
 
 class HostClock:
-    """Follows t - arrival of what was let in; a clock that was found to be set has been corrected there."""
+    """Compares the times of a live source with their arrival; a clock that was set has been corrected before."""
 
     def __init__(self, notices: Notices, horizon: float) -> None:
-        """`horizon`: seconds of lateness allowed, beyond which an offset is told."""
+        """`horizon`: seconds of lateness allowed, beyond which an offset is reported."""
         self._notices, self._horizon = notices, horizon
         self._delays = LeastDelays()
         self._due = 0
-        self._told: set[str] = set()
+        self._reported: set[str] = set()
         self.estimate: ClockFit | None = None
 
     def note(self, events: Events) -> None:
-        """These have come."""
+        """Note events that were accepted."""
         stamped = (events.kind == READING) | (events.kind == INPUT)
         if not stamped.any():
             return
@@ -137,16 +137,16 @@ class HostClock:
     def _look(self, fit: ClockFit | None) -> None:
         if fit is None or math.isnan(fit.drift_ppm):
             return
-        if "offset" not in self._told and abs(fit.offset) > max(1.0, self._horizon):
-            self._told.add("offset")
+        if "offset" not in self._reported and abs(fit.offset) > max(1.0, self._horizon):
+            self._reported.add("offset")
             side = "ahead of" if fit.offset > 0 else "behind"
             self._notices.say(
-                f"the source's clock is {abs(fit.offset):.6g} s {side} this machine's, or its readings take that long; "
-                "times shown are the source's",
+                f"the source's clock is {abs(fit.offset):.3g} s {side} this machine's, or its measurements take that "
+                "long; times shown are the source's",
                 level="warn",
             )
-        if "drift" not in self._told and abs(fit.drift_ppm) - fit.drift_error_ppm > MAX_DRIFT_PPM:
-            self._told.add("drift")
+        if "drift" not in self._reported and abs(fit.drift_ppm) - fit.drift_error_ppm > MAX_DRIFT_PPM:
+            self._reported.add("drift")
             self._notices.say(
                 f"the source's clock drifts by {fit.drift_ppm:+.0f} ± {fit.drift_error_ppm:.0f} ppm against this "
                 "machine's; synchronise them",
@@ -155,7 +155,7 @@ class HostClock:
 
 
 def clock_text(fit: ClockFit) -> str:
-    """Offset and drift in a few words; what rounds to zero is not negative."""
+    """Return offset and drift in a few words; a value that rounds to zero has no minus."""
     offset = f"{fit.offset:+z.3f} s"
     if math.isnan(fit.drift_ppm):
         return offset

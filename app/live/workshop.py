@@ -1,7 +1,7 @@
-"""The workshop: processes of their own compile filters into the cache, so that nobody waits for one that is not chosen.
+"""The workshop compiles filters into the cache in processes of its own.
 
-Numba compiles in one thread at a time, and holds the interpreter while it does; beside the engine it would slow every
-reading for half a minute. What is asked for comes first, on several processors; all other filters that apply follow one
+Numba compiles in one thread at a time and holds the interpreter meanwhile; beside the engine it would delay every
+measurement for half a minute. Requested filters come first, on several processors; all others that apply follow one
 after another, at the lowest priority, in the order of the catalogue.
 """
 
@@ -18,12 +18,12 @@ from sources.pieces import KERNELS, is_made, make, needs, pieces_of
 from .compilers import MAX_COMPILERS, Compiler
 from .jobs import LOWEST_PRIORITY
 
-LOOK = 0.2
-"""Seconds between two looks at whether something else was asked for."""
+POLL_PERIOD_S = 0.2
+"""Seconds between two looks for new requests."""
 
 
 class Workshop:
-    """Compiles the filters of one twin, and what its source needs."""
+    """Compiles the filters of one twin and the decoders of its source."""
 
     def __init__(
         self,
@@ -34,14 +34,14 @@ class Workshop:
         is_done: Callable[[Piece], bool] = is_made,
         workers: Sequence[Compiler] = (),
     ) -> None:
-        """Look at what is in the cache; nothing is compiled yet.
+        """Look into the cache; nothing is compiled yet.
 
         Args:
-            names: Filters that are compiled here, and what a source needs (`KERNELS`); anything else is compiled where
-                it is used, and counts as ready.
-            pieces: Of one of these, or of `LOOP`.
+            names: Filters and decoders of sources (`KERNELS`) that are compiled here; anything else counts as ready and
+                is compiled where it is used.
+            pieces: Returns the pieces of one of these, or of `LOOP`.
             work: Compiles a piece, in another process.
-            is_done: Whether a piece needs no work.
+            is_done: Whether a piece is in the cache.
             workers: Processes that were started before.
         """
         self._work, self._workers = work, list(workers)
@@ -51,17 +51,17 @@ class Workshop:
             if left:
                 self._left[name] = left
         self._asked: dict[str, float] = {}
-        self._told: list[tuple[str, Callable[[str], None]]] = []
+        self._waiting: list[tuple[str, Callable[[str], None]]] = []
         self._under_way: dict[Compiler, Piece] = {}
         self._lost: list[Piece] = []
         self.report: Callable[[str], None] = lambda text: None
-        """Told of what went wrong, in another thread."""
+        """Called with a line about a failure, in another thread."""
         self._wake = threading.Condition()
         self._stopping = False
         self._thread = threading.Thread(target=self._run, name="workshop", daemon=True)
 
     def start(self) -> None:
-        """Begin; with nothing left to do there is no thread, and no process."""
+        """Begin; with nothing to compile there is no thread and no process."""
         if self._left:
             self._thread.start()
             return
@@ -69,7 +69,7 @@ class Workshop:
             worker.stop()
 
     def stop(self) -> None:
-        """Give up what is under way."""
+        """Stop compiling."""
         with self._wake:
             self._stopping = True
             self._wake.notify()
@@ -77,26 +77,26 @@ class Workshop:
             self._thread.join(timeout=2.0)
 
     def ready(self, name: str) -> bool:
-        """Whether a filter, or what a source needs, can be had from the cache."""
+        """Return whether a filter or decoder is in the cache."""
         return not any(part in self._left for part in needs(name))
 
     def ask(self, name: str, done: Callable[[str], None] = lambda name: None) -> None:
-        """Compile something at once, before any other; `done` is told its name when it is ready, in another thread."""
+        """Compile a filter or decoder before any other; `done` is called with its name, in another thread."""
         with self._wake:
             if not self.ready(name):
                 self._asked.setdefault(name, time.monotonic())
-            self._told.append((name, done))
+            self._waiting.append((name, done))
             self._tell()
             self._wake.notify()
 
     def wait(self, name: str) -> None:
-        """Until something is ready, or the workshop ends."""
+        """Wait until a filter or decoder is ready, or the workshop ends."""
         ready = threading.Event()
         self.ask(name, lambda name: ready.set())
         ready.wait()
 
     def states(self) -> dict[str, float | None]:
-        """Filters that are not ready: for how many seconds each has been compiled, None of one that waits."""
+        """Return the filters that are not ready: seconds since each was begun, None for one that waits."""
         with self._wake:
             left = [name for name in self._left if name != LOOP and name not in KERNELS]
             now = time.monotonic()
@@ -137,7 +137,7 @@ class Workshop:
                     if not self._under_way:
                         self._wake.wait()
                     answers = [worker.connection for worker in self._under_way]
-                wait(answers, LOOK)
+                wait(answers, POLL_PERIOD_S)
         finally:
             workers = [*hurried, *([quiet] if quiet else [])]
             for worker in workers:
@@ -153,7 +153,7 @@ class Workshop:
         self._under_way[worker] = piece
 
     def _next(self, names: Sequence[str]) -> Piece | None:
-        """A piece that can be begun now: what a source needs, which is waited for first, then what takes longest."""
+        """Return a piece that can be begun now: decoders, which are needed first, then the slowest."""
         busy = self._under_way.values()
         left = [piece for name in names for piece in self._left.get(name, ()) if piece not in busy]
         able = [
@@ -165,19 +165,19 @@ class Workshop:
         return next((piece for name in self._left if (piece := self._next([name])) is not None), None)
 
     def _take_answers(self) -> None:
-        """A piece that failed counts as done: who uses it compiles it, and says what is wrong.
+        """Take the finished pieces out.
 
-        So does one with which two processes were ended from outside; with the first it was perhaps the memory that was
-        short.
+        A piece that failed counts as done: its user compiles it and reports the error. So does one whose process was
+        killed twice; the first time memory may have been short.
         """
         for worker in [each for each in self._under_way if each.answered()]:
             piece = self._under_way.pop(worker)
             if worker.ended:
                 again = piece not in self._lost
                 self._lost.append(piece)
-                what = "what a source or any filter needs" if piece.of == LOOP or piece.of in KERNELS else piece.of
-                then = "another one begins anew" if again else "it is compiled where it is used, slowing all else"
-                self.report(f"a process that compiled {what} was ended, as where memory is short; {then}")
+                what = "a part of every filter or source" if piece.of == LOOP or piece.of in KERNELS else piece.of
+                then = "it is compiled again" if again else "it is compiled where it is used, which delays the twin"
+                self.report(f"the process that compiled {what} was killed, perhaps for lack of memory; {then}")
                 if again:
                     continue
             left = self._left[piece.of]
@@ -186,7 +186,7 @@ class Workshop:
                 del self._left[piece.of]
 
     def _tell(self) -> None:
-        for name, done in [item for item in self._told if self.ready(item[0])]:
-            self._told.remove((name, done))
+        for name, done in [item for item in self._waiting if self.ready(item[0])]:
+            self._waiting.remove((name, done))
             self._asked.pop(name, None)
             done(name)

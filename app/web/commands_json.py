@@ -11,7 +11,7 @@ from typing import Any
 from estimators.errors import ConfigError, nearest
 
 from ..live import commands, faults
-from ..live.execute import PLAYBACK, Refolding, check_maintenance, check_playback, retuned
+from ..live.execute import PLAYBACK, REFOLDING, check_maintenance, check_playback, retuned
 from ..live.interface import Running
 from .http import parse, shown
 
@@ -44,7 +44,7 @@ def command_from_json(body: Any, engine: Running) -> commands.Command:
 
 
 def _check(command: commands.Command, engine: Running) -> None:
-    if isinstance(command, Refolding):
+    if isinstance(command, REFOLDING):
         retuned(command, engine)
     elif isinstance(command, commands.Pin):
         engine.revisions.free_place(command.number)

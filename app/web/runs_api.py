@@ -17,7 +17,7 @@ from estimators.errors import ConfigError, printable
 
 from ..live.changes import difference
 from ..live.interface import Running
-from ..live.revisions import LONGEST_NOTE, Run
+from ..live.revisions import MAX_NOTE_LENGTH, Revision
 from ..live.runs.noise import noise
 from ..live.runs.runs_json import difference_json, noise_json, runs_json, swept_json, what_changed
 from ..live.runs.scores import RunScore, RunScores
@@ -146,7 +146,7 @@ class RunsApi:
         text = to_html(f"{engine.twin.name}, run {found.number}", report(reported))
         return HTMLResponse(text, headers=_attachment(f"{self._name(rows)}.html"))
 
-    def _earlier(self, run: Run, now: Sequence[Episode]) -> tuple[tuple[str, Sequence[Episode]], ...]:
+    def _earlier(self, run: Revision, now: Sequence[Episode]) -> tuple[tuple[str, Sequence[Episode]], ...]:
         """Return the episodes of earlier runs that no later run has as well, newest run first."""
         known, found = {(item.subject, item.cause) for item in now}, []
         for other in reversed(self._engine.revisions.runs):
@@ -174,8 +174,8 @@ def checked_note(note: str) -> str:
     Raises:
         ConfigError: If it is too long.
     """
-    if len(note) > LONGEST_NOTE:
-        raise ConfigError(f"note: it has {len(note)} characters; it may have {LONGEST_NOTE}")
+    if len(note) > MAX_NOTE_LENGTH:
+        raise ConfigError(f"note: it has {len(note)} characters; it may have {MAX_NOTE_LENGTH}")
     return printable(note)
 
 
@@ -194,7 +194,7 @@ def _attachment(name: str) -> dict[str, str]:
 def _scored(scores: RunScores) -> tuple[tuple[str, ...], ...]:
     """Return a line for each run: name, change, NIS, log-likelihood, errors."""
 
-    def line(run: Run, known: RunScore | None) -> tuple[str, ...]:
+    def line(run: Revision, known: RunScore | None) -> tuple[str, ...]:
         name = f"{run.number} {run.name}".rstrip()
         if known is None:
             return name, what_changed(run), "", "", "not scored: its track is gone"

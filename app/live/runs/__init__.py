@@ -1,1 +1,1 @@
-"""Runs compared: what each revision was worth, how two differ, and what the data say of a knob."""
+"""Runs: scores, sweeps over a parameter, noise estimates, fits and refits, as JSON for the page."""

@@ -76,7 +76,7 @@ class Fitting:
         self._engine = engine
         self._lock = threading.Lock()
         self.latest: FitAttempt | None = None
-        """The last that was begun."""
+        """The last one."""
 
     def begin(self, wanted: Sequence[str], most: int | None = None, *, since: int | None = None) -> FitAttempt:
         """Fit entries of the tuning that runs.
@@ -84,15 +84,15 @@ class Fitting:
         Args:
             wanted: Keys and groups, as `estimators.fit` takes them.
             most: Events, the last of the log; None for all that the engine holds.
-            since: In place of that, the time (ns) from which on they are fitted, to the event.
+            since: In place of that, the time (ns) of the first event, exactly.
 
         Raises:
-            ConfigError: If another fit is under way, nothing is asked for, or it would be too slow.
+            ConfigError: If another fit is under way, `wanted` is empty, or the model is too slow.
         """
         model = self._engine.model
         if model.black_box:
             raise ConfigError(
-                f"fit: {model.name} is a black box, too slow to be fitted beside what runs; use nisus tune"
+                f"fit: {model.name} is a black box, too slow to fit beside the running twin; use nisus tune"
             )
         if not wanted:
             raise ConfigError("fit: wanted is empty; name what is fitted, for example Q and R")

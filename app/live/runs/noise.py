@@ -1,4 +1,4 @@
-"""What the data say of Q and R: the noise that the last innovations would have."""
+"""Estimate the noise from the last innovations: each R, and all of Q scaled."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from estimators.diagnostics.innovations import SensorNoise, sensor_noise
 from estimators.tuning import Tuning
 
 from ..interface import Running
-from .sweep import MOST, Sweeps, Swept
+from .sweep import MAX_SWEEP_EVENTS, Sweeps, Swept
 
 CHANCE = 1e-3
 """Of innovations as correlated as they are, were the filter right, below which they are called so."""
 
 
 @dataclass(frozen=True)
-class Noise:
-    """By key of the tuning what the innovations say of each R, or the `reason` why not; and all of Q scaled, swept.
+class NoiseEstimates:
+    """Estimated R by key of the tuning, or the `reason` why there is none; and the sweep of all of Q.
 
-    `doubts` say by key why what is said there is not to be taken, also of "Q".
+    `doubts` has, by key, the reason not to use an estimate, also for "Q".
     """
 
     revision: int
@@ -31,24 +31,24 @@ class Noise:
     doubts: dict[str, str]
 
 
-def noise(engine: Running, sweeps: Sweeps) -> Noise:
-    """What the last events of the running twin say."""
-    taken, q = engine.last_events(MOST, rows=True), sweeps.around("Q")
+def noise(engine: Running, sweeps: Sweeps) -> NoiseEstimates:
+    """Estimate the noise from the last events of the running twin."""
+    taken, q = engine.last_events(MAX_SWEEP_EVENTS, rows=True), sweeps.around("Q")
     if taken is None:
-        return Noise(q.revision, {}, "no readings yet", q, {})
+        return NoiseEstimates(q.revision, {}, "no readings yet", q, {})
     reason = _reason_against(engine, taken.tuning.options.get("adapt", 0.0))
     rows = {} if reason else sensor_noise(taken.track, taken.events, taken.tuning)
     found = _by_key(engine, taken.tuning, rows)
     if any(_doubtful(noise) for noise in found.values()):
-        # An R that is wrong by itself leaves correlated innovations, too. Then they are white once it is mended.
+        # A wrong R alone leaves correlated innovations too; with the right one they are white.
         matched = sweeps.matched()
         if matched is not None:
             found = _by_key(engine, taken.tuning, matched.rows)
-    return Noise(taken.revision, found, reason, q, doubts(found, q.level))
+    return NoiseEstimates(taken.revision, found, reason, q, doubts(found, q.level))
 
 
 def _by_key(engine: Running, tuning: Tuning, rows: Mapping[str, SensorNoise]) -> dict[str, SensorNoise]:
-    """What is said of the rows by the tuning's keys: of one row, or of all that share an entry."""
+    """Return the estimates by the tuning's keys: of one row, or of all rows that share an entry."""
     found = {}
     for item in tuning.items():
         if item.key.startswith("R."):

@@ -28,10 +28,10 @@ if TYPE_CHECKING:
 CLOCK_PERIOD_S = 0.5
 """Seconds between two looks at the log's clock."""
 
-EDGE = ", at the edge of its range"
+AT_BOUND = ", at the bound of its range"
 
-KEPT = 50
-"""Fits of which it is told what came of them."""
+MAX_FITS = 50
+"""Fits that are kept with their result."""
 
 FITTING, OFFERED, ADOPTED, DISMISSED, OUTDATED, NOTHING, BROKEN = (
     "fitting", "proposed", "adopted", "dismissed", "outdated", "nothing better", "failed",
@@ -40,7 +40,7 @@ FITTING, OFFERED, ADOPTED, DISMISSED, OUTDATED, NOTHING, BROKEN = (
 
 @dataclass(frozen=True)
 class WindowFit:
-    """One fit of a window: which, of what, and what came of it, in a line (`text`).
+    """One fit of a window, with its state and its result in a line (`text`).
 
     start and end are the window's first and last time, ns. `name` is the tuning version that was made of it.
     """
@@ -55,12 +55,12 @@ class WindowFit:
 
     @property
     def fitted(self) -> Fitted | None:
-        """What was found; None while it is fitted, and if it failed."""
+        """The result; None while it is fitted, and if it failed."""
         return self.attempt.fitted
 
 
 class Refits:
-    """All of a running twin, the oldest first."""
+    """All fits of a running twin, the oldest first."""
 
     def __init__(self, engine: Running) -> None:
         """Nothing is fitted before `start`."""
@@ -72,21 +72,21 @@ class Refits:
         self._dismissed: Fitted | None = None
         self.known: tuple[WindowFit, ...] = ()
 
-    # For everybody, from any thread
+    # From any thread
 
     @property
     def section(self) -> RefitSection | None:
-        """What the twin's YAML says; None for nothing."""
+        """Section `refit` of the twin's YAML; None without it."""
         return self._engine.twin.config.refit
 
     @property
     def open(self) -> WindowFit | None:
-        """What is proposed now."""
+        """The present proposal."""
         return next((item for item in self.known if item.state == OFFERED), None)
 
     @property
     def due(self) -> int | None:
-        """When the next fit begins, ns of the log; None if nothing was read, or nothing is to be fitted."""
+        """Time of the next fit, ns of the log; None before the first measurement, or without the section."""
         return self._due
 
     def start(self) -> None:
@@ -108,7 +108,7 @@ class Refits:
             self._begin(section)
 
     def accept(self, number: int, *, why: str = "by hand") -> str:
-        """Keep a proposal as a tuning version with its evidence, and go on with that.
+        """Keep a proposal as a tuning version with its evidence, and load it.
 
         Returns:
             The version's name.
@@ -137,7 +137,7 @@ class Refits:
         return name
 
     def dismiss(self, number: int) -> None:
-        """Leave things as they are; it is not proposed again until the data say something else.
+        """Dismiss a proposal; it is not made again until the data differ.
 
         Raises:
             ConfigError: If it is not proposed any more.
@@ -151,7 +151,7 @@ class Refits:
     # In its job
 
     def look(self) -> None:
-        """Take what is done, and begin what is due."""
+        """Take the result of a finished fit, and begin one that is due."""
         with self._lock:
             last = self.known[-1] if self.known else None
             if last is not None and last.state == FITTING:
@@ -184,10 +184,10 @@ class Refits:
         self._due = newest + round(section.every * 1e9)
         attempt = self._fitting.begin(section.entries, since=first)
         number = self.known[-1].number + 1 if self.known else 1
-        self.known = (*self.known, WindowFit(number, first, newest, attempt))[-KEPT:]
+        self.known = (*self.known, WindowFit(number, first, newest, attempt))[-MAX_FITS:]
 
     def _take(self, refit: WindowFit) -> None:
-        """Say what came of a fit, and propose what won."""
+        """Report the result of a fit, and propose it if it won."""
         attempt, number = refit.attempt, refit.number
         fitted = attempt.fitted
         if attempt.state != DONE or fitted is None:
@@ -196,9 +196,9 @@ class Refits:
         elif reasons := _against(fitted):
             self._tell(number, NOTHING, "; ".join(reasons))
         elif not self._current(attempt):
-            self._tell(number, OUTDATED, f"{_moves(fitted)}; but another tuning runs by now")
+            self._tell(number, OUTDATED, f"{_moves(fitted)}; another tuning runs by now")
         elif self._dismissed is not None and _same(fitted, self._dismissed):
-            self._tell(number, DISMISSED, f"{_moves(fitted)}; the data say what they said when it was dismissed")
+            self._tell(number, DISMISSED, f"{_moves(fitted)}; the same result was dismissed before")
         else:
             self._offer(refit, fitted)
 
@@ -218,10 +218,10 @@ class Refits:
         self._engine.notices.say(f"refit {number}: {state}: {text}", level=level)
 
     def _outdate(self) -> None:
-        """A proposal holds for the tuning that it was fitted from."""
+        """Mark the proposal as outdated once another tuning runs."""
         refit = self.open
         if refit is not None and not self._current(refit.attempt):
-            self._tell(refit.number, OUTDATED, f"{refit.text}; but another tuning runs by now")
+            self._tell(refit.number, OUTDATED, f"{refit.text}; another tuning runs by now")
 
     def _current(self, attempt: FitAttempt) -> bool:
         return self._engine.tuning is attempt.tuning and self._engine.estimator == attempt.estimator
@@ -230,7 +230,7 @@ class Refits:
         refit = self.open
         if refit is None or refit.number != number:
             state = next((item.state for item in self.known if item.number == number), "not known")
-            raise ConfigError(f"refit {number}: it is {state}; only what is proposed can be adopted or dismissed")
+            raise ConfigError(f"refit {number}: it is {state}; only a proposed fit can be adopted or dismissed")
         return refit
 
     def _become(self, number: int, state: str, text: str, name: str = "") -> None:
@@ -253,15 +253,15 @@ def _same(fitted: Fitted, other: Fitted) -> bool:
 
 
 def _moves(fitted: Fitted) -> str:
-    """What moved, and what that is worth, in a line."""
+    """Describe the changed entries and the gain in a line."""
     from estimators.fit.dual import shift
 
     moved = [
         f"{line.key} {line.before:.4g} → {line.after:.4g}{line.unit and ' ' + line.unit} "
-        f"({shift(line):+.1f} σ{EDGE if line.edge else ''})"
+        f"({shift(line):+.1f} σ{AT_BOUND if line.edge else ''})"
         for line in fitted.lines
         if not line.alone
     ]
     verdict = fitted.verdict
-    gained = f"{verdict.gain:+.3g} ± {verdict.error:.2g} nats a reading on blocks held out"
+    gained = f"{verdict.gain:+.3g} ± {verdict.error:.2g} nats per measurement on held-out blocks"
     return f"{', '.join(moved)}; {gained}"

@@ -1,4 +1,4 @@
-"""Runs, and what the data say of a knob, as JSON for the page."""
+"""Runs, sweeps, noise estimates and fits as JSON for the page."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from estimators.registry import ESTIMATORS
 
 from ..changes import difference, in_words
 from ..interface import Running
-from ..revisions import Run
-from .noise import Noise
+from ..revisions import Revision
+from .noise import NoiseEstimates
 from .scores import RunScore, RunScores
 from .sweep import Swept
 
 
 def runs_json(scores: RunScores, engine: Running) -> list[dict[str, Any]]:
-    """Every run, oldest first, with what was changed for it and what it was worth."""
+    """Return every run, oldest first, with its changes and scores."""
     units = {state.name: state.unit for state in engine.model.shown_states}
     rows = [row.unit for sensor in engine.model.sensors for row in sensor.rows]
     units |= dict(zip(engine.model.row_names, rows, strict=True))
@@ -32,7 +32,7 @@ def runs_json(scores: RunScores, engine: Running) -> list[dict[str, Any]]:
     return [_run(run, known, run is running, units) for run, known in found]
 
 
-def _run(run: Run, known: RunScore | None, running: bool, units: dict[str, str]) -> dict[str, Any]:
+def _run(run: Revision, known: RunScore | None, running: bool, units: dict[str, str]) -> dict[str, Any]:
     kept = running or run.track is not None
     return {
         "number": run.number,
@@ -51,21 +51,21 @@ def _run(run: Run, known: RunScore | None, running: bool, units: dict[str, str])
     }
 
 
-def what_changed(run: Run) -> str:
-    """What of a run differs from the one before, in words."""
+def what_changed(run: Revision) -> str:
+    """Describe the changes of a run in words."""
     said = ": ".join(part for part in (run.why, in_words(run.changes)) if part)
     words = said or ("as it began" if run.loaded is None and not run.number else "as before")
     return words if run.loaded is None else f"back to run {run.loaded}: {words}"
 
 
-def difference_json(run: Run, other: Run) -> list[dict[str, Any]]:
-    """The entries in which two runs differ, with both values."""
+def difference_json(run: Revision, other: Revision) -> list[dict[str, Any]]:
+    """Return the entries in which two runs differ, with both values."""
     changes = difference(run.estimator, run.tuning, other.estimator, other.tuning)
     return [{"key": key, "values": [_plain(before), _plain(after)]} for key, before, after in changes]
 
 
 def swept_json(swept: Swept) -> dict[str, Any]:
-    """A sweep as far as it has come, its most likely point, and the value at which the NIS is as it should be."""
+    """Return a sweep as far as it is done, its most likely value, and the value at which the NIS is consistent."""
     best = swept.best
     return {
         **{key: _plain(value) for key, value in dataclasses.asdict(swept).items() if key != "points"},
@@ -75,8 +75,8 @@ def swept_json(swept: Swept) -> dict[str, Any]:
     }
 
 
-def noise_json(noise: Noise) -> dict[str, Any]:
-    """What the innovations say of each R, and by what all of Q would have to be scaled; `doubt` is why not to do so."""
+def noise_json(noise: NoiseEstimates) -> dict[str, Any]:
+    """Return the estimated R by key and the sweep of all of Q; `doubt` is the reason not to use an estimate."""
     estimates = {
         key: {
             "value": _plain(found.variance) if found.variance > 0.0 else None,
@@ -126,26 +126,26 @@ def _fit(name: str, against: str, fit: Fit, unit: str) -> dict[str, Any]:
 
 
 def _plain(value: Any) -> Any:
-    """JSON has no infinity and no NaN."""
+    """Replace infinity and NaN, which JSON does not have, by None."""
     if isinstance(value, (str, bool, int)) or value is None:
         return value
     return float(value) if math.isfinite(value) else None
 
 
-TOGETHER = 0.9
-"""Correlation of two estimates from which on one takes the blame for the other."""
+HIGH_CORRELATION = 0.9
+"""Correlation from which on two estimates are hardly identifiable separately."""
 
 
 def fit_json(fitted: Fitted) -> dict[str, Any]:
-    """All there is to know of a fit; null stands for what is not a number.
+    """Return a fit as JSON; null stands for a value that is not a number.
 
-    `entries` have before and after, the 95 % interval, by how many deviations of the estimate they moved (`sigma`),
-    whether the data tell them, and whether they were left alone; `correlated` names pairs of entries that the data
-    hardly tell apart. `power` is that of the likelihood that was believed, `left_out` the readings of sensors that
-    were stuck. `before` and `after` have scores of the part that was fitted and of that which was held out: log
-    density of a reading, mean NIS a degree of freedom, coverage of the 95 % bands; `sensors` held out in turn, those
-    `withheld`, which the twin never uses, and true `states`. `verdict` says whether the fit is proposed, by which
-    gain in nats on the blocks held out, and what speaks against it.
+    `entries` have before and after, the 95 % interval, the change in deviations of the estimate (`sigma`), whether
+    they are identifiable, and whether they were left alone; `correlated` has pairs of entries that are hardly
+    identifiable separately. `power` is the exponent of the tempered likelihood, `left_out` the measurements of stuck
+    sensors. `before` and `after` have scores of the fitted and the held-out part: log density per measurement, mean
+    NIS per degree of freedom, coverage of the 95 % bands; `sensors` held out in turn, those `withheld`, which the twin
+    never uses, and true `states`. `verdict` says whether the fit is proposed, its gain in nats on the held-out blocks,
+    and the reasons against it.
     """
     return {
         "estimator": fitted.estimator,
@@ -167,12 +167,12 @@ def fit_json(fitted: Fitted) -> dict[str, Any]:
 
 
 def correlated(fitted: Fitted) -> list[dict[str, Any]]:
-    """Pairs of entries of which one takes the blame for the other, the closest first."""
+    """Return pairs of entries that are hardly identifiable separately, the most correlated first."""
     found = [
         {"entries": [one.key, other.key], "correlation": float(fitted.correlation[i, j])}
         for i, one in enumerate(fitted.lines)
         for j, other in enumerate(fitted.lines[:i])
-        if abs(fitted.correlation[i, j]) >= TOGETHER
+        if abs(fitted.correlation[i, j]) >= HIGH_CORRELATION
     ]
     return sorted(found, key=lambda pair: -abs(pair["correlation"]))
 
@@ -183,7 +183,7 @@ def _line(line: Line) -> dict[str, Any]:
 
 
 def part_json(part: Part) -> dict[str, Any]:
-    """What the readings of one part of the recordings say."""
+    """Return the scores of one part of the recordings."""
     return {
         "readings": part.n,
         "log_density": _finite(part.log_density),

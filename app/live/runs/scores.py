@@ -1,4 +1,4 @@
-"""What each revision was worth, computed when somebody asks and never on the engine's thread."""
+"""Scores of revisions, computed on request and never on the engine's thread."""
 
 from __future__ import annotations
 
@@ -14,27 +14,23 @@ from estimators.errors import NisusError
 from ..history_copy import copy_rows
 from ..interface import Running
 from ..outputs import Pull
-from ..revisions import Run
+from ..revisions import Revision
 
-REST = 20.0
-"""Times as long as it took that the score of the running revision stands before it is computed again."""
+REST_FACTOR, MIN_AGE_S = 20.0, 1.0
+"""The score of the running revision is reused for so many times its own duration, and for so many seconds at least."""
 
-LEAST = 1.0
-"""Seconds that it stands at least."""
-
-TIMED, BEGUN = 2048, 64
+TIMED_EVENTS, WARM_UP_EVENTS = 2048, 64
 """Events that are folded again to time a step; those of them that are folded before the clock starts."""
 
-LONGEST = 0.1
+MAX_TIMING_S = 0.1
 """Seconds that this takes at most."""
 
 
 @dataclass(frozen=True)
 class RunScore:
-    """Scores of one revision over the `rows` events that it had folded, `seconds` of the log.
+    """Score of one revision over its `rows` events, `seconds` of the log.
 
-    `step_us` is the elapsed time of folding one event again, µs, beside whatever else this machine did; NaN if it could
-    not be timed.
+    `step_us` is the elapsed time of folding one event again, µs, on the loaded machine; NaN if it could not be timed.
     """
 
     score: Score
@@ -44,13 +40,13 @@ class RunScore:
 
     @property
     def log_likelihood_reading(self) -> float:
-        """Log-likelihood of a reading, used or refused: runs of different length can be compared by it."""
+        """Log-likelihood of a measurement, used or rejected, which compares runs of different length."""
         judged = self.score.nis_readings + self.score.gated
         return self.score.log_likelihood / judged if judged else np.nan
 
 
 class RunScores:
-    """Scores of all revisions of a twin, each computed once; of the running one again as it grows."""
+    """Scores of all revisions of a twin, each computed once; that of the running one again as it grows."""
 
     def __init__(self, engine: Running) -> None:
         self._engine = engine
@@ -59,8 +55,8 @@ class RunScores:
         self._final: set[int] = set()
         self._fresh_until = (-1, 0.0)
 
-    def all(self) -> list[tuple[Run, RunScore | None]]:
-        """Every revision with its scores; None where its track had gone before anybody asked."""
+    def all(self) -> list[tuple[Revision, RunScore | None]]:
+        """Return every revision with its score; None if its track was dropped before the first request."""
         with self._lock:
             runs = self._engine.revisions.runs
             *left, running = runs
@@ -73,8 +69,8 @@ class RunScores:
             self._known = {number: known for number, known in self._known.items() if number in numbers}
             return [(run, self._known.get(run.number)) for run in runs]
 
-    def _look(self, running: Run) -> None:
-        """Score what runs, unless that was done just now."""
+    def _look(self, running: Revision) -> None:
+        """Score the running revision, unless that was done just now."""
         begun = time.monotonic()
         if self._fresh_until[0] == running.number and begun < self._fresh_until[1]:
             return
@@ -83,9 +79,9 @@ class RunScores:
             return
         self._known[running.number] = self._scored(running, pull)
         took = time.monotonic() - begun
-        self._fresh_until = (running.number, begun + took + max(LEAST, REST * took))
+        self._fresh_until = (running.number, begun + took + max(MIN_AGE_S, REST_FACTOR * took))
 
-    def _scored(self, run: Run, pull: Pull) -> RunScore:
+    def _scored(self, run: Revision, pull: Pull) -> RunScore:
         gate, baseline, model = run.tuning.gate, run.tuning.baseline, self._engine.model
         found = score(pull.track, pull.events, model, pull.pictures, gate=gate, baseline=baseline)
         t, known = pull.events.t, self._known.get(run.number)
@@ -94,16 +90,16 @@ class RunScores:
         return made if np.isfinite(made.step_us) else replace(made, step_us=_step_us(self._engine, run))
 
 
-def _step_us(engine: Running, run: Run) -> float:
-    """Elapsed time of an event under a revision's settings, µs, over the last events of the log."""
-    part = engine.last_events(TIMED, rows=True)
+def _step_us(engine: Running, run: Revision) -> float:
+    """Return the elapsed time of an event under a revision's settings, µs, over the last events of the log."""
+    part = engine.last_events(TIMED_EVENTS, rows=True)
     if part is None:
         return np.nan
     try:
         fold = part.fold(run.estimator, run.tuning, engine.policy)
-        fold.advance(min(BEGUN, fold.log.n // 2))
+        fold.advance(min(WARM_UP_EVENTS, fold.log.n // 2))
         events, begun = 0, time.perf_counter()
-        while (done := fold.advance(BEGUN)) and time.perf_counter() - begun < LONGEST:
+        while (done := fold.advance(WARM_UP_EVENTS)) and time.perf_counter() - begun < MAX_TIMING_S:
             events += done
         seconds = time.perf_counter() - begun
     except NisusError:

@@ -1,4 +1,4 @@
-"""Around a knob: likelihood and NIS of the last events over several values of one entry of the tuning.
+"""Sweep a parameter: likelihood and NIS of the last events over several values of one entry of the tuning.
 
 A job folds them, one value after another, the nearest first, and ends as soon as another tuning runs.
 """
@@ -25,51 +25,41 @@ from ..outputs import EventWindow
 
 FACTORS = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0)
 
-MOST = 20_000
-"""Events that are folded again for every value, the last of the log."""
+MAX_SWEEP_EVENTS, MIN_SWEEP_EVENTS = 20_000, 2048
+"""Events that are folded again for every value, the last of the log; the minimum is for slow filters."""
 
-FEWEST = 2048
-"""The same of a filter so slow that no more can be afforded."""
+VALUE_TIME_S, MAX_VALUE_TIME_S = 2.0, 10.0
+"""Seconds that one value should take, and that the fewest events may take."""
 
-LONGEST = 2.0
-"""Seconds that one value should take."""
+TIMED_EVENTS = 32
+"""Events that are folded to find the time of one."""
 
-TOO_LONG = 10.0
-"""Seconds that the fewest events may take."""
+SETTLE_TIME_S = 0.3
+"""Seconds without a change of the tuning before a sweep begins."""
 
-TRIED = 32
-"""Events that are folded to know how long one takes."""
+CHUNK_EVENTS = 256
+"""Events between two looks whether the result is still wanted."""
 
-SETTLED = 0.3
-"""Seconds for which the tuning must rest before anything is folded around it."""
-
-CHUNK = 256
-"""Events between two looks at whether anybody still wants to know."""
-
-GROWN = 1.5
-"""Times as many events as were folded from which on a sweep is out of date."""
+STALE_GROWTH = 1.5
+"""A sweep is out of date once the log has so many times its events."""
 
 MATCHED = "R, matched"
-"""What is folded for `matched`, among the keys."""
+"""Key of the fold for `matched`."""
 
-TURNS = 5
-"""Folds after which R has come to rest, or does not."""
+MAX_MATCHING_FOLDS, MATCHING_TOLERANCE = 5, 0.05
+"""Folds in which R must converge, and the relative change that counts as converged."""
 
-AT_REST = 0.05
-"""Share by which R may still move then."""
-
-KEPT = 32
+MAX_SWEEPS = 32
 GROUPS = ("Q", "R")
 """Keys that scale all entries of a group."""
 
 
 @dataclass(frozen=True)
 class Point:
-    """One value: a `factor` of the present one, the value, and what it gave.
+    """One value: `factor` times the present one, and its result.
 
-    `log_likelihood` is that of the readings used and refused (estimators/diagnostics/refusals.py), `nis` their mean NIS
-    a degree of freedom, 1 where the filter is consistent (estimators/diagnostics/innovation_size.py). Both are None
-    where nothing can be said: a reading failed.
+    `log_likelihood` is that of the measurements used and rejected, `nis` their mean NIS per degree of freedom, 1 where
+    the filter is consistent (estimators/diagnostics/innovation_size.py). Both are None if a measurement failed.
     """
 
     factor: float
@@ -80,9 +70,9 @@ class Point:
 
 @dataclass(frozen=True)
 class Swept:
-    """The points of one key, by value, for a revision; `done` once all are there, or the `reason` why there are none.
+    """Points of one key, by value, for a revision; `done` once all exist, or the `reason` why there are none.
 
-    `value` is the present one; of a group it is 1, and the points' values are their factors.
+    `value` is the present one; for a group it is 1, and the points' values are their factors.
     """
 
     key: str
@@ -95,16 +85,16 @@ class Swept:
 
     @property
     def best(self) -> Point | None:
-        """The most likely of the points."""
+        """The point with the highest likelihood."""
         known = [point for point in self.points if point.log_likelihood is not None]
         return max(known, key=lambda point: point.log_likelihood or 0.0) if known else None
 
     @property
     def level(self) -> float | None:
-        """The value at which the innovations are as large as the filter says; None if it lies beyond the points.
+        """The value at which the mean NIS per degree of freedom is 1; None if it lies beyond the points.
 
-        Where the mean NIS a degree of freedom is 1, between two points by its logarithm over that of the value: what
-        covariance matching would choose if this entry alone were wrong.
+        Interpolated between two points, both logarithmic. Covariance matching would choose it if this entry alone
+        were wrong.
 
         Source: Mehra (1972), doi:10.1109/TAC.1972.1100100, section on covariance matching.
         """
@@ -118,7 +108,7 @@ class Swept:
 
 @dataclass(frozen=True)
 class Matched:
-    """What the innovations say of the noise of each sensor row once R is what they say, for a revision."""
+    """Noise of each sensor row by covariance matching, repeated until R converges, for a revision."""
 
     revision: int
     events: int
@@ -126,7 +116,7 @@ class Matched:
 
 
 class Sweeps:
-    """Folds what was asked for last, in one job."""
+    """Sweeps of the running twin, one after another in one job; the last request comes first."""
 
     def __init__(self, engine: Running) -> None:
         self._engine = engine
@@ -137,7 +127,7 @@ class Sweeps:
         self._matched: Matched | None = None
 
     def around(self, key: str) -> Swept:
-        """What is known of a key by now; the rest is folded from now on. Of several keys the last asked comes first.
+        """Return the sweep of a key as far as it is done, and queue the rest.
 
         Raises:
             ConfigError: If there is no such key, or its values are no numbers.
@@ -147,38 +137,42 @@ class Sweeps:
         if known is not None and known.revision == revision and not self._outdated(known):
             return known
         self._want(key)
-        # While there is another, older or of fewer events, it says more than nothing.
+        # Return the previous sweep until the new one is ready.
         return known if known is not None and known.revision == revision else Swept(key, revision, value, 0)
 
     def matched(self) -> Matched | None:
-        """R taken from the innovations again and again, all at once, until it rests; None as long as it is not known.
+        """Return the noise after covariance matching of all of R; None until it is known.
 
-        Where R alone was wrong, the innovations are white then; what else is wrong leaves them correlated.
+        If R alone was wrong, the innovations are white then; any other error leaves them correlated.
         """
         known, revision = self._matched, self._engine.revisions.runs[-1].number
         current = known is not None and known.revision == revision
-        if not current or (known is not None and known.events < self._engine.index_at(END_OF_TIME) / GROWN < MOST):
+        if not current or (
+            known is not None and known.events < self._engine.index_at(END_OF_TIME) / STALE_GROWTH < MAX_SWEEP_EVENTS
+        ):
             self._want(MATCHED)
         return known if current else None
 
     def _want(self, key: str) -> None:
         with self._lock:
-            self._wanted = [key, *(other for other in self._wanted if other != key)][:KEPT]
+            self._wanted = [key, *(other for other in self._wanted if other != key)][:MAX_SWEEPS]
             if self._job is None or self._job.over:
                 self._job = self._engine.jobs.run("sweep", self._work)
 
     def _outdated(self, known: Swept) -> bool:
-        return known.done and known.events < min(MOST - FEWEST, self._engine.index_at(END_OF_TIME) / GROWN)
+        return known.done and known.events < min(
+            MAX_SWEEP_EVENTS - MIN_SWEEP_EVENTS, self._engine.index_at(END_OF_TIME) / STALE_GROWTH
+        )
 
     def _work(self, job: Job) -> None:
         while (key := self._next(job)) is not None:
             self.sweep(key, job)
 
     def _next(self, job: Job) -> str | None:
-        """The key that was asked for last, once no slider has moved for `SETTLED` seconds; None if there is none."""
+        """Return the last requested key once no slider has moved for `SETTLE_TIME_S`; None if there is none."""
         while True:
             tuning = self._engine.tuning
-            job.rest(SETTLED)
+            job.rest(SETTLE_TIME_S)
             with self._lock:
                 if not self._wanted:
                     self._job = None
@@ -192,12 +186,12 @@ class Sweeps:
         Raises:
             Cancelled: If the job is, or another tuning runs by now.
         """
-        taken = self._engine.last_events(FEWEST, rows=True)
+        taken = self._engine.last_events(MIN_SWEEP_EVENTS, rows=True)
         if taken is None:
             return
         self._check(taken, job)
         most, reason = self._affordable(taken)
-        if most > FEWEST:
+        if most > MIN_SWEEP_EVENTS:
             taken = self._engine.last_events(most, rows=True) or taken
         if key == MATCHED:
             if not reason:
@@ -214,15 +208,15 @@ class Sweeps:
             points = sorted([*points, self._point(taken, key, factor, tuning, job)], key=lambda point: point.value)
             done = len(points) == len(values)
             self._known[key] = Swept(key, taken.revision, value, events, tuple(points), done)
-        self._known = dict(list(self._known.items())[-KEPT:])
+        self._known = dict(list(self._known.items())[-MAX_SWEEPS:])
 
     def _match(self, taken: EventWindow, job: Job) -> None:
-        """Fold with the R that the innovations of the fold before imply, until it rests."""
+        """Fold with the R that the innovations of the previous fold imply, until it converges."""
         tuning, track = taken.tuning, taken.track
-        for _ in range(TURNS):
+        for _ in range(MAX_MATCHING_FOLDS):
             following = _with(tuning, sensor_noise(track, taken.events, tuning))
             moved = np.abs(np.log(following.r[following.r > 0.0] / tuning.r[following.r > 0.0]))
-            if not moved.size or moved.max() < AT_REST:
+            if not moved.size or moved.max() < MATCHING_TOLERANCE:
                 break
             tuning = following
             try:
@@ -232,7 +226,7 @@ class Sweeps:
         self._matched = Matched(taken.revision, len(taken.events), sensor_noise(track, taken.events, tuning))
 
     def _point(self, taken: EventWindow, key: str, factor: float, tuning: Tuning, job: Job) -> Point:
-        """One value, folded."""
+        """Fold one value."""
         value = value_of(tuning, key) if key not in GROUPS else factor
         try:
             track = self._fold(taken, tuning, job)
@@ -245,7 +239,7 @@ class Sweeps:
 
     def _fold(self, taken: EventWindow, tuning: Tuning, job: Job) -> Track:
         fold = taken.fold(tuning=tuning, policy=self._engine.policy)
-        while fold.advance(CHUNK):
+        while fold.advance(CHUNK_EVENTS):
             self._check(taken, job)
         return fold.track
 
@@ -255,21 +249,22 @@ class Sweeps:
             raise Cancelled
 
     def _affordable(self, taken: EventWindow) -> tuple[int, str]:
-        """How many events can be folded in reasonable time, or why none."""
+        """Return how many events can be folded in reasonable time, or the reason why none."""
         if self._engine.model.black_box:
             return 0, f"{self._engine.model.name} is a black box, too slow to be folded again beside what runs"
         fold = taken.fold(policy=self._engine.policy)
-        fold.advance(min(TRIED, fold.log.n // 2))
+        fold.advance(min(TIMED_EVENTS, fold.log.n // 2))
         start = time.perf_counter()
-        events = fold.advance(TRIED)
+        events = fold.advance(TIMED_EVENTS)
         each = (time.perf_counter() - start) / max(1, events)
-        if each * len(taken.events) > TOO_LONG:
-            return 0, f"{taken.estimator} takes {each * FEWEST:.0f} s for {FEWEST} events, too slow to be folded again"
-        return int(min(MOST, max(FEWEST, LONGEST / max(each, 1e-9)))), ""
+        if each * len(taken.events) > MAX_VALUE_TIME_S:
+            slow = f"{taken.estimator} takes {each * MIN_SWEEP_EVENTS:.0f} s for {MIN_SWEEP_EVENTS} events"
+            return 0, f"{slow}, too slow to be folded again"
+        return int(min(MAX_SWEEP_EVENTS, max(MIN_SWEEP_EVENTS, VALUE_TIME_S / max(each, 1e-9)))), ""
 
 
 def value_of(tuning: Tuning, key: str) -> float:
-    """The present value of an entry; of a group, 1.
+    """Return the present value of an entry; 1 for a group.
 
     Raises:
         ConfigError: If there is no such entry, or it is no number.
@@ -278,12 +273,12 @@ def value_of(tuning: Tuning, key: str) -> float:
         return 1.0
     value = tuning.get(key)
     if isinstance(value, (bool, str)) or value is None or key.startswith("gate"):
-        raise ConfigError(f"{key} is no number that can be varied; Q., R. and p. are, and Q and R as a whole")
+        raise ConfigError(f"{key} cannot be swept; Q., R. and p. entries can, and all of Q or R")
     return float(value)
 
 
 def values_around(tuning: Tuning, key: str, factors: Sequence[float] = FACTORS) -> list[tuple[float, Tuning]]:
-    """A tuning for each factor that the entry's range allows, the nearest to 1 first; none if it is zero."""
+    """Return a tuning for each factor within the entry's range, the nearest to 1 first; none if the value is zero."""
     if key not in GROUPS and value_of(tuning, key) == 0.0:
         return []
     found = []
@@ -296,7 +291,7 @@ def values_around(tuning: Tuning, key: str, factors: Sequence[float] = FACTORS) 
 
 
 def scaled(tuning: Tuning, key: str, factor: float) -> Tuning:
-    """The tuning with an entry, or all of a group, times a factor.
+    """Return the tuning with an entry, or all of a group, times a factor.
 
     Raises:
         ConfigError: If the entry's range does not allow it.
@@ -308,10 +303,10 @@ def scaled(tuning: Tuning, key: str, factor: float) -> Tuning:
     return replace(tuning, q=tuning.q * factor) if key == "Q" else replace(tuning, r=tuning.r * factor)
 
 
-def _with(tuning: Tuning, said: Mapping[str, SensorNoise]) -> Tuning:
-    """A tuning with the R that is said of each row, where any is left."""
+def _with(tuning: Tuning, noises: Mapping[str, SensorNoise]) -> Tuning:
+    """Return the tuning with these variances in R, where they are positive."""
     r = tuning.r.copy()
-    for name, noise in said.items():
+    for name, noise in noises.items():
         if noise.variance > 0.0:
             r[tuning.model.row_names.index(name)] = noise.variance
     return replace(tuning, r=r)

@@ -1,1 +1,1 @@
-"""Tuning versions: made of what runs or was fitted, kept, accepted, loaded, listed and compared."""
+"""Tuning versions: made from a run or a fit, kept, accepted, loaded and listed."""

@@ -16,7 +16,7 @@ from estimators.registry import find_entry
 from ...live.history_copy import copy_rows
 from ...live.interface import Running
 from ...live.outputs import Pull
-from ...live.revisions import Run
+from ...live.revisions import Revision
 
 PIECE = 8192
 """Rows that are formatted at once."""
@@ -104,7 +104,7 @@ MAX_COPIES = 20
 class RunRows(NamedTuple):
     """A run, and the rows that it had folded."""
 
-    run: Run
+    run: Revision
     pull: Pull
 
     @property

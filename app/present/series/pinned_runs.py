@@ -18,7 +18,7 @@ from estimators.log import Events, Log
 from ...live.interface import Running
 from ...live.jobs import Job
 from ...live.outputs import Cursor, Pull
-from ...live.revisions import Run
+from ...live.revisions import Revision
 from .charted_run import ROWS, Levels, less
 from .columns import Column
 from .levels_of_detail import FIRST, Groups, grouped
@@ -36,7 +36,7 @@ CHUNK_EVENTS = 64
 class PinnedFold:
     """The fold of one run that is not the running one. Any thread may read its rows."""
 
-    def __init__(self, engine: Running, run: Run) -> None:
+    def __init__(self, engine: Running, run: Revision) -> None:
         self._engine, self.run = engine, run
         self._lock = threading.Lock()
         self._cursor = engine.cursor(follows_log=True)

@@ -23,7 +23,7 @@ import rerun as rr
 from estimators.log import Events
 from estimators.track import Track
 
-from ...live.notices import KEPT
+from ...live.notices import MAX_LINES
 from ...present.drawing.colors import EITHER, Palette
 from .rows import RerunRows
 from .sink import free_closed_streams
@@ -63,7 +63,7 @@ class RerunFeed:
         self._cursor = engine.cursor()
         self._layout, self._palette = layout, palette
         self._frame = 0
-        self._notices: deque[Notice] = deque(maxlen=KEPT)
+        self._notices: deque[Notice] = deque(maxlen=MAX_LINES)
         self._name = uuid.uuid4().hex[:8]
         self.application = f"nisus_{engine.twin.name}"
         self._stream: rr.RecordingStream | None = None

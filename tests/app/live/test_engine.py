@@ -493,7 +493,7 @@ def test_the_same_failure_is_said_once_however_long_it_lasts():
         watch.look(growing, k)
     texts = [line.text for line in notices.since(0)]
     assert sum("the solver is away" in text for text in texts) == 1
-    assert sum("reading could not be used" in text for text in texts) == 3
+    assert sum("measurement could not be used" in text for text in texts) == 3
     watch.again()
     watch.look(growing, growing.n)
     assert sum("the solver is away" in line.text for line in notices.since(0)) == 2

@@ -220,7 +220,7 @@ def test_a_refused_sensor_is_said_once_and_not_reading_by_reading(asset):
         new = [line.text for line in engine.notices.since(lines)]
         if np.any(engine._fold.track.verdict[-10:] == GATED):
             refused += known
-            told.append((known, any(text.startswith("winding: reading refused") for text in new)))
+            told.append((known, any(text.startswith("winding: measurement rejected") for text in new)))
         engine._watchers.chronicle.look()
     assert refused > 3 and all(line != known for known, line in told)
     assert sum("is refused by the gate" in text for text in said(engine)) == 1

@@ -56,7 +56,7 @@ def test_who_waits_comes_before_who_has_just_been_there():
     turns.acquire()
     waiting = threading.Thread(target=wait, daemon=True)
     waiting.start()
-    wait_for(turns._door.locked)
+    wait_for(turns._outer.locked)
     turns.release()
     with turns:
         order.append("again")
@@ -64,7 +64,7 @@ def test_who_waits_comes_before_who_has_just_been_there():
     assert order == ["waited", "again"]
 
 
-def test_whoever_waits_in_vain_leaves_the_door_to_others():
+def test_whoever_waits_in_vain_leaves_the_outer_to_others():
     turns = FairLock()
     turns.acquire()
     assert not turns.acquire(timeout=0.001)

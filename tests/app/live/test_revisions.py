@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import pytest
 
 from app.live.changes import difference, in_words
-from app.live.revisions import MOST_PINNED, Revisions
+from app.live.revisions import MAX_PINNED, Revisions
 from app.twin.twin import load_twin
 from estimators.errors import ConfigError
 from estimators.models import MODELS
@@ -103,7 +103,7 @@ def test_what_is_pinned_or_named_outlasts_a_drag_and_all_others(told):
 
 
 def test_four_can_be_pinned_and_their_places_stay(told):
-    for k in range(MOST_PINNED):
+    for k in range(MAX_PINNED):
         told.revisions.pin(k)
         told.edit(Q_rate=0.1 * (k + 1))
     with pytest.raises(ConfigError, match=r"run 4 cannot be pinned: 4 are \(0, 1, 2, 3\); unpin one first"):

@@ -99,7 +99,7 @@ def test_a_run_whose_f_loops_says_so_and_ends_when_asked(name, estimator, loopin
         (line,) = child.said("has not returned")
         where = MODEL.splitlines().index("def f(x, u, p, dt, out):") + 1
         assert (
-            f"looping.py:{where}: model looping: f(x, u, dt) at x = [" in line and "nothing more is estimated" in line
+            f"looping.py:{where}: model looping: f(x, u, dt) at x = [" in line and "the estimate stays" in line
         )
         os.kill(child.process.pid, getattr(signal, name))
         assert child.process.wait(60.0) == 0

@@ -250,7 +250,7 @@ def test_what_was_ended_from_outside_is_begun_once_more_and_said(shop, tmp_path)
     workshop.ask("enkf", told.append)
     process = killed(tmp_path, first)
     wait_for(lambda: len(said) == 1)
-    assert "enkf was ended" in said[0] and said[0].endswith("another one begins anew")
+    assert "enkf was killed" in said[0] and said[0].endswith("compiled again")
     wait_for(lambda: begun(tmp_path, first)[0] != process and paper(tmp_path, "done", last).exists())
     assert not told and not workshop.ready("enkf")
     # Twice is no accident: who uses it compiles it.
@@ -276,7 +276,7 @@ def test_the_engine_says_that_a_compiler_was_ended_and_folds_with_the_filter_all
     wait_for(lambda: row_count(engine) == 50)
     engine.submit(SetEstimator("ukf"))
     killed(tmp_path, Piece("ukf", 0))
-    wait_for(lambda: any("compiled ukf was ended" in line.text for line in engine.notices.since(0)))
+    wait_for(lambda: any("compiled ukf was killed" in line.text for line in engine.notices.since(0)))
     assert engine.folded_with()[1] == "kf" and fresh_status(engine).awaited == "ukf"
     (tmp_path / "go").touch()
     wait_for(lambda: fresh_status(engine).revision == 1)

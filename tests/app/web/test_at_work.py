@@ -106,7 +106,7 @@ def test_a_page_that_looks_at_charts_is_told_of_the_twin_while_the_fold_is_at_wo
         stream.send(json.dumps({"lanes": {"charts": lane}, "pair": ["winding", "rate"]}))
         said = ""
         # Every word on the twin, though its rows are asked for and do not come.
-        while "the readings that came so far are being folded (" not in said:
+        while "the measurements so far are being folded (" not in said:
             said = stream.recv(PATIENCE)
         stream.send(json.dumps({"lanes": {"charts": None}}))
     with connect(

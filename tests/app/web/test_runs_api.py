@@ -103,7 +103,7 @@ def test_what_the_data_say_is_folded_when_asked(page):
     noise = json.loads(page.client.get("/api/noise").text)
     assert noise["R"]["R.winding"]["n"] == 300 and noise["Q"]["key"] == "Q"
     refused = page.client.get("/api/around?key=gate")
-    assert refused.status == 400 and "no number that can be varied" in refused.text
+    assert refused.status == 400 and "cannot be swept" in refused.text
 
 
 def test_an_edit_of_a_drag_keeps_the_first_to_compare_with(page):

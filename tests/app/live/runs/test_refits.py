@@ -91,7 +91,7 @@ def test_what_does_not_win_is_not_proposed_and_is_said(begin):
     (line,) = twin.refit_notices()
     assert line.startswith("refit 1: nothing better: no better prediction of the held-out blocks")
     assert not version_files(twin.twin.path) and twin.engine.tuning is twin.engine.twin.tuning
-    with pytest.raises(ConfigError, match="refit 1: it is nothing better; only what is proposed"):
+    with pytest.raises(ConfigError, match="refit 1: it is nothing better; only a proposed fit"):
         twin.refits.accept(1)
 
 
@@ -127,12 +127,12 @@ def test_dismissed_it_does_not_come_again_until_the_data_say_something_else(begi
     assert twin.look() == OFFERED
     twin.refits.dismiss(1)
     assert twin.refits.open is None and twin.engine.revisions.runs[-1].number == 0
-    with pytest.raises(ConfigError, match="refit 1: it is dismissed; only what is proposed"):
+    with pytest.raises(ConfigError, match="refit 1: it is dismissed; only a proposed fit"):
         twin.refits.accept(1)
     for _ in range(2):
         twin.measure(EVERY, 5.0)
         assert twin.look() == DISMISSED and twin.refits.open is None
-    assert "the data say what they said when it was dismissed" in twin.refit_notices()[-1]
+    assert "the same result was dismissed before" in twin.refit_notices()[-1]
     twin.measure(WINDOW, 10.0)
     assert twin.look() == OFFERED and twin.refits.open.number == 4
 
@@ -164,7 +164,7 @@ def test_a_proposal_holds_for_the_tuning_that_it_was_fitted_from(begin):
     twin.submit(SetTuning("R.winding", 20.0))
     with pytest.raises(ConfigError, match="refit 1: it is outdated"):
         twin.refits.accept(1)
-    assert "but another tuning runs by now" in twin.refit_notices()[-1]
+    assert "another tuning runs by now" in twin.refit_notices()[-1]
     assert not version_files(twin.twin.path) and twin.engine.tuning.get("R.winding") == 20.0
 
 

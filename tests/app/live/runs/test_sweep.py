@@ -5,7 +5,17 @@ import pytest
 
 from app.live.jobs import Cancelled, Job
 from app.live.runs.noise import noise
-from app.live.runs.sweep import AT_REST, FACTORS, MATCHED, Point, Sweeps, Swept, scaled, value_of, values_around
+from app.live.runs.sweep import (
+    FACTORS,
+    MATCHED,
+    MATCHING_TOLERANCE,
+    Point,
+    Sweeps,
+    Swept,
+    scaled,
+    value_of,
+    values_around,
+)
 from estimators.errors import ConfigError
 from estimators.fold import Fold, fold
 from estimators.log import Log
@@ -79,14 +89,14 @@ def test_another_tuning_ends_a_sweep():
 def test_what_is_too_slow_says_so(monkeypatch):
     engine = started(600)
     sweeps = Sweeps(engine)
-    monkeypatch.setattr("app.live.runs.sweep.TOO_LONG", 0.0)
+    monkeypatch.setattr("app.live.runs.sweep.MAX_VALUE_TIME_S", 0.0)
     sweeps.sweep("Q.rate", Job("test"))
     found = sweeps.around("Q.rate")
     assert found.done and not found.points and "too slow to be folded again" in found.reason
 
 
 def test_one_job_folds_all_that_was_asked_for(monkeypatch):
-    monkeypatch.setattr("app.live.runs.sweep.SETTLED", 0.0)
+    monkeypatch.setattr("app.live.runs.sweep.SETTLE_TIME_S", 0.0)
     engine = started(600)
     sweeps = Sweeps(engine)
     sweeps.around("R.winding")
@@ -166,4 +176,6 @@ def test_an_r_that_is_wrong_alone_is_mended_and_a_wrong_q_is_not_laid_to_r(r, q,
     assert bool(found.doubts) == doubted
     if not doubted:
         # Four standard errors of the mean square of 4,000 innovations, and what is left at rest.
-        assert found.sensors["R.winding"].variance == pytest.approx(1.0, abs=4 * np.sqrt(2 / n) * 1.2 + AT_REST)
+        assert found.sensors["R.winding"].variance == pytest.approx(
+            1.0, abs=4 * np.sqrt(2 / n) * 1.2 + MATCHING_TOLERANCE
+        )
