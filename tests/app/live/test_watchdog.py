@@ -98,9 +98,7 @@ def test_a_run_whose_f_loops_says_so_and_ends_when_asked(name, estimator, loopin
         wait_for(lambda: child.said("has not returned") or child.process.poll() is not None, 180.0)
         (line,) = child.said("has not returned")
         where = MODEL.splitlines().index("def f(x, u, p, dt, out):") + 1
-        assert (
-            f"looping.py:{where}: model looping: f(x, u, dt) at x = [" in line and "the estimate stays" in line
-        )
+        assert f"looping.py:{where}: model looping: f(x, u, dt) at x = [" in line and "the estimate stays" in line
         os.kill(child.process.pid, getattr(signal, name))
         assert child.process.wait(60.0) == 0
     finally:
@@ -181,7 +179,7 @@ def test_a_refold_that_never_returns_is_given_up_and_the_next_one_made(monkeypat
         refolder.request(1, lambda: stuck)
         wait_for(lambda: answers)
         assert (answers[0].ticket, answers[0].fold) == (1, None)
-        assert answers[0].error.startswith("f at x has not returned for ") and "what ran before" in answers[0].error
+        assert answers[0].error.startswith("f at x has not returned for ") and "running estimate goes on" in answers[0].error
         refolder.request(2, lambda: good)
         wait_for(lambda: len(answers) == 2)
         assert (answers[1].ticket, answers[1].fold, answers[1].error) == (2, good, "")
