@@ -179,7 +179,8 @@ def test_a_refold_that_never_returns_is_given_up_and_the_next_one_made(monkeypat
         refolder.request(1, lambda: stuck)
         wait_for(lambda: answers)
         assert (answers[0].ticket, answers[0].fold) == (1, None)
-        assert answers[0].error.startswith("f at x has not returned for ") and "running estimate goes on" in answers[0].error
+        error = answers[0].error
+        assert error.startswith("f at x has not returned for ") and "running estimate goes on" in error
         refolder.request(2, lambda: good)
         wait_for(lambda: len(answers) == 2)
         assert (answers[1].ticket, answers[1].fold, answers[1].error) == (2, good, "")

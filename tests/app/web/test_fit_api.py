@@ -79,5 +79,5 @@ def test_options_go_with_the_rest(page):
     wait_for(lambda: page.engine.estimator == "ukf")
     name, tuning = retuned(command_from_json(ask, page.engine), page.engine)
     assert (name, tuning.get("Q.rate"), tuning.options["alpha"]) == ("ukf", 0.5, 0.3)
-    with pytest.raises(NisusError, match="is an option of the estimator; turn it with SetOption"):
+    with pytest.raises(NisusError, match="is an option of the estimator; set it with SetOption"):
         command_from_json({"command": "SetTuning", "key": "options.alpha", "value": 0.3}, page.engine)
