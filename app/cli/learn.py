@@ -30,7 +30,7 @@ from ..twin.learned import run_net
 from ..twin.log_reader import read_log
 from ..twin.model import physics_of
 from ..twin.twin import Twin, load_twin
-from .options import check_place, settings
+from .options import check_output, settings
 from .prepare import attend, prepare
 
 if TYPE_CHECKING:
@@ -137,7 +137,7 @@ def _check(arguments: Arguments) -> None:
     if arguments.keep is not None:
         if arguments.keep.suffix not in (".yaml", ".yml"):
             raise ConfigError(f"--keep {arguments.keep}: must end in .yaml")
-        check_place("--keep", arguments.keep)
+        check_output("--keep", arguments.keep)
 
 
 def _tuned_physics(twin: Twin) -> StateSpaceModel:

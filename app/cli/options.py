@@ -10,7 +10,7 @@ from typing import get_args, get_type_hints
 from estimators.errors import ConfigError, quoted
 
 
-def check_place(option: str, path: Path) -> None:
+def check_output(option: str, path: Path) -> None:
     """Refuse a file that could not be written, before the work of minutes that it is to keep.
 
     Raises:

@@ -28,7 +28,7 @@ from ..terminal import complain
 from ..twin.bounds import bounds_of, natural_aim
 from ..twin.log_reader import read_log, read_logs
 from ..twin.twin import Twin, load_twin
-from .options import check_place, settings
+from .options import check_output, settings
 from .prepare import attend, prepare
 
 if TYPE_CHECKING:
@@ -50,7 +50,7 @@ def tune_twin(arguments: Arguments) -> int:
     if arguments.save is not None:
         if arguments.save.suffix not in (".yaml", ".yml"):
             raise ConfigError(f"--save {arguments.save}: must end in .yaml")
-        check_place("--save", arguments.save)
+        check_output("--save", arguments.save)
     if arguments.keep is not None:
         check_free(find(arguments.twin), arguments.keep)
     if arguments.windows is not None:

@@ -28,7 +28,7 @@ from ..present.export.report import Reported, report
 from ..present.export.track_file import KINDS, RunRows, encoded, rows_of_run, tables
 from ..present.result import to_html
 from ..present.series.series import Series
-from ..studies.guard.baseline import last
+from ..studies.guard import last
 from ..twin.twin import with_version
 from .http import OneAtATime, get, post
 

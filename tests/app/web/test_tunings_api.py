@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from app.live.commands import SetTuning
-from app.studies.guard.baseline import Guarded, keep_last
-from app.studies.guard.figures import Judged
+from app.studies.baseline import ComparedFigure
+from app.studies.guard import GuardVerdict, keep_last
 from app.twin.twin import load_twin
 from config.loader import TWINS
 from estimators.fold import Fold
@@ -43,8 +43,8 @@ def tunings(page):
 
 def test_what_guard_said_last_is_listed_beside_the_versions(page):
     assert tunings(page)["guard"] == []
-    worse = Judged("rmse.temperature", 0.5, 0.6, 0.1, 0.01)
-    keep_last(page.engine.twin.path, [Guarded("winding", "own", [worse])])
+    worse = ComparedFigure("rmse.temperature", 0.5, 0.6, 0.1, 0.01)
+    keep_last(page.engine.twin.path, [GuardVerdict("winding", "own", [worse])])
     (said,) = tunings(page)["guard"]
     assert said["recording"] == "winding" and said["figures"] == 1
     assert said["worse"] == ["rmse.temperature was 0.5 and is 0.6: worse by 0.1, allowed 0.01"]

@@ -6,8 +6,8 @@ import pytest
 
 from app.cli.run import live_source
 from app.live.tunings.versions import listing
-from app.studies.guard.baseline import Guarded, keep_last
-from app.studies.guard.figures import Judged
+from app.studies.baseline import ComparedFigure
+from app.studies.guard import GuardVerdict, keep_last
 from app.twin.twin import load_twin, with_version
 from app.web.session import Page, Session
 from tests.app.scripted import wait_for
@@ -120,7 +120,9 @@ def test_single_entries_are_fitted_alone(page, session):
 
 def test_what_runs_is_kept_compared_and_loaded_again(page, session):
     engine = session.engine
-    keep_last(engine.twin.path, [Guarded("winding", "own", [Judged("rmse.temperature", 0.5, 0.6, 0.1, 0.01)])])
+    keep_last(
+        engine.twin.path, [GuardVerdict("winding", "own", [ComparedFigure("rmse.temperature", 0.5, 0.6, 0.1, 0.01)])]
+    )
     page.get_by_role("tab", name="Runs").click()
     guarded = page.locator('.versions [data-guarded="winding"]')
     wait_for(lambda: "1 of 1 figures worse: rmse.temperature was 0.5 and is 0.6" in guarded.inner_text(), PATIENCE)
