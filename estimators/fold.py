@@ -1,9 +1,9 @@
-"""The fold: an estimator over a log. Live, replay, retuning and review are all this function.
+"""The fold: an estimator applied to the events of a log. Live, replay, retuning and review all run this function.
 
     track = fold(estimator, model, tuning, log)
 
-Same log, same tuning, same seed: the same bits, in whatever pieces the events came. It runs without the GIL, however
-brief: a model's function that never returns must not keep the interpreter with it.
+The same log, tuning and seed give the same bits, however the events were cut into batches. The fold releases the GIL,
+so that a model function that never returns does not block the interpreter.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from .tuning import Tuning
 
 
 class Fold:
-    """A fold that grows with its log, and can be taken back to any event to fold again from there."""
+    """Incremental fold: it follows a growing log, and can be rewound to any event."""
 
     def __init__(
         self,
@@ -48,31 +48,31 @@ class Fold:
         idle: bool = False,
         room: int = 0,
     ) -> None:
-        """Prepare; nothing is folded yet.
+        """Prepare the fold; `advance` folds events.
 
         Args:
             estimator: Name in the registry.
-            model: The model; compiled on first use.
+            model: Model of the log; compiled on first use.
             tuning: Noise, parameters, gate, options.
-            log: Events; the fold follows it as it grows.
+            log: Events; the fold follows the log as it grows.
             pairs: Pairs of states whose covariance the track keeps, shape (k, 2).
-            policy: When the estimate may be trusted.
-            base: Where to start, where events before the log's first were dropped; without it, at the prior. The
-                filter that left it goes on from its whole state, also under another tuning, unless an option changed
-                the size of that; any other filter starts from the mean and covariance.
-            picture: Seconds of the log between two pictures of a large field; None for those that score it only.
+            policy: Thresholds of health.
+            base: Start of the fold if events before the log's first were dropped; None for the prior. The estimator
+                that left the base resumes its full state, also under another tuning, unless an option changed the size
+                of the state; any other estimator starts from mean and covariance.
+            picture: Seconds of the log between two pictures of a large field; None takes only pictures with a score.
             prior: Mean (nx,) and covariance (nx, nx), positive semidefinite, in place of the model's; beyond `LARGE`
-                states the variances (1, nx). It holds at the log's start, and a reset goes back to it.
-            expected: Sensors that must speak, (sensors,) of bool; None for those that have spoken.
-            idle: Folds nothing, ever, so that neither filter nor loop is compiled for it: what stands in the place of
-                a fold until one can be had. Its moments are those where it would start.
-            room: Events for which the track has room at once, if the log has less: one that it shall follow has more.
+                states the variances (1, nx). It holds at the log's start and after a reset.
+            expected: Sensors that must report, (sensors,) of bool; None for those that have reported.
+            idle: Fold no events and compile nothing: a placeholder until the estimator is compiled. Its moments are
+                those of the start.
+            room: Rows to allocate for the track, if the log has a smaller capacity.
 
         Raises:
-            EstimatorError: If the estimator does not exist, does not apply, an option is out of range, or log, tuning,
-                pairs, base or prior do not fit the model.
+            EstimatorError: If the estimator does not exist or does not apply, an option is out of range, or log,
+                tuning, pairs, base or prior do not fit the model.
             EventError: If an event does not fit the model.
-            ModelError: If the model's functions disagree with its declaration.
+            ModelError: If the model's functions contradict its declaration.
         """
         self.estimator: Estimator = find_estimator(estimator, model)
         self.model, self.tuning, self.log = model, tuning, log
@@ -90,7 +90,7 @@ class Fold:
         )
         self.marginal, self.gate_limits = self._machine.marginal, self._machine.gate_limits
         self.decisions: list[Decision] = []
-        """What was decided of sensors that stayed refused, see gate/reopening.py."""
+        """Decisions on sensors that stayed rejected, see gate/."""
         self._now = self._machine.fresh()
         self._spare = np.empty_like(self._now.state)
         self.idle, self._start = idle, self._machine.prior if base is None else (base.mean, base.cov)
@@ -112,7 +112,7 @@ class Fold:
 
     @property
     def track(self) -> Track:
-        """Views of the rows folded so far."""
+        """Rows folded so far, as views."""
         return self._rows.select(slice(0, self.n))
 
     @property
@@ -122,17 +122,17 @@ class Fold:
 
     @property
     def compiled(self) -> CompiledModel:
-        """The model's functions as the filter sees them."""
+        """The compiled functions of the model."""
         return self._machine.compiled
 
     @property
     def machine(self) -> Machine:
-        """What it folds with."""
+        """Estimator, context and scratch of this fold."""
         return self._machine
 
     @property
     def snapshots(self) -> Snapshots:
-        """Where it can go back to."""
+        """Snapshots to which the fold can be rewound."""
         return self._snapshots
 
     @property
@@ -142,50 +142,50 @@ class Fold:
 
     @property
     def u(self) -> np.ndarray:
-        """Inputs that hold now."""
+        """Inputs in effect now, (nu,)."""
         return self._now.u.copy()
 
     @property
     def prior(self) -> Moments:
-        """Mean (nx,) and covariance (nx, nx) with which it begins without a base, and after a reset."""
+        """Mean (nx,) and covariance (nx, nx) at the start without a base, and after a reset."""
         return self._machine.prior
 
     def moments(self) -> Moments:
-        """Mean (nx,) and covariance (nx, nx) at `clock`; beyond `LARGE` states the variances (1, nx) instead."""
+        """Return mean (nx,) and covariance (nx, nx) at `clock`; beyond `LARGE` states the variances (1, nx)."""
         return self._start if self.idle else self._machine.moments(self._now.state)
 
     def points(self) -> np.ndarray:
-        """What to draw beside the mean, (k, nx): sigma points, particles; none for most filters."""
+        """Return sigma points or particles (k, nx) to draw beside the mean; none for most filters."""
         nothing = np.empty((0, self.model.nx))
         return nothing if self.idle else self.estimator.points(self.options, self._now.state, self.model.nx)
 
     def recoveries(self) -> int:
-        """Number of recoveries since the filter started: a cloud of particles that had lost the asset was widened."""
+        """Return how often a particle cloud that had lost the asset was widened since the filter started."""
         return 0 if self.idle or self.estimator.recoveries is None else self.estimator.recoveries(self._now.state)
 
     def account(self) -> dict[str, float | list[float]]:
-        """What the filter says of itself: `spread`, see diagnostics/account.py, and what only this kind of it can say.
+        """Return figures of the filter itself: `spread` (see diagnostics/account.py) and those of its family.
 
-        Particles: how many there are (`particles`), how many count (`effective`), from how many of `lag` readings ago
-        they descend (`ancestors`), how often they were resampled and recovered. Ensembles: `members`, and the counts of
-        the rank histogram (`ranks`).
+        Particle filters: the number of particles (`particles`), the effective sample size (`effective`), the distinct
+        ancestors `lag` measurements ago (`ancestors`), the numbers of resamplings and recoveries. Ensembles: `members`,
+        and the counts of the rank histogram (`ranks`).
         """
         own = self.estimator.account
-        said = {} if own is None or self.idle else own(self.options, self._now.state, self.model.nx)
-        return {"spread": spread_ratio(self.track, self.policy.window), **said}
+        figures = {} if own is None or self.idle else own(self.options, self._now.state, self.model.nx)
+        return {"spread": spread_ratio(self.track, self.policy.window), **figures}
 
     @property
     def failures(self) -> int:
-        """How often a black box failed since this fold was made; the readings concerned have failed."""
+        """Number of failures of a black box since this fold was made; their measurements have the verdict failed."""
         return self._machine.failures
 
     @property
     def failure(self) -> ModelError | None:
-        """What a black box said when it failed last."""
+        """The last error of a black box."""
         return self._machine.failure
 
     def peaks(self) -> list[Peak]:
-        """The peaks of the estimate, the heaviest first; a Gaussian filter has one."""
+        """Return the peaks of the estimate, the heaviest first; a Gaussian filter has one."""
         if self.estimator.peaks is not None and not self.idle:
             return self.estimator.peaks(self.options, self._now.state, self.model.nx)
         return [Peak(1.0, *self.moments())]
@@ -196,9 +196,9 @@ class Fold:
             self._checked = self.log.changes
 
     def advance(self, limit: int | None = None) -> int:
-        """Fold the events that the log has beyond `n`, at most `limit`; return how many.
+        """Fold the log's events from `n` on, at most `limit`, and return how many.
 
-        A black box that fails stops nothing: see `failures`.
+        A black box that fails does not stop the fold: see `failures`.
 
         Raises:
             EventError: If the log was not made for this model, and an event does not fit it.
@@ -217,7 +217,7 @@ class Fold:
         while self.n < end:
             if self.pictures is not None and self.pictures.check(log, self.n):
                 self._take_picture()
-            # Dense where late readings fall, which is at the end of the log, not of each piece that is folded at once.
+            # Snapshots are dense at the end of the log, where late measurements fall, not at the end of this call.
             boundary = self._snapshots.next_stop(log.first + self.n, log.first + log.n) - log.first
             stop = min(end, boundary)
             if self.pictures is not None:
@@ -235,7 +235,7 @@ class Fold:
                     if asking >= 0:
                         changed = self._decide(asking)
             except BaseException:
-                # Python was stopped between two events: back to where the state is known.
+                # Interrupted between two events: return to the last consistent state.
                 self._machine.settle()
                 self._restore(begun_at)
                 raise
@@ -244,7 +244,7 @@ class Fold:
         return end - begun
 
     def _decide(self, row: int) -> bool:
-        """Decide on the sensor whose reading asks for it; whether the state is another now."""
+        """Decide on the sensor whose measurement asks for it; return whether the state changed."""
         assert self.tuning.reopen is not None
         decision, changed = decide(self, row, self._now.doubt, self.tuning.reopen)
         if decision is not None:
@@ -252,39 +252,39 @@ class Fold:
         return changed
 
     def second_story(self, start: int, stop: int, sensor: int) -> Story:
-        """Fold the events from `start` to `stop` apart, as if the twin had been wrong before the first of them.
+        """Fold events `start` to `stop` separately, under the hypothesis that the estimate was wrong before them.
 
         Args:
-            start: A refused reading of the sensor.
-            stop: The row after the last, folded already.
-            sensor: Its gate is off, and the covariance is widened before its reading.
+            start: Row of a rejected measurement of the sensor.
+            stop: Row after the last; these rows have been folded.
+            sensor: Sensor whose gate is off; the covariance is widened before its measurement.
         """
         at = self._snapshots.last(self.log.first + start)
         first = at - self.log.first, self._snapshots[at]
         return self._machine.second_story(self.log, *first, start, stop, sensor, self._rows.innovation[start])
 
     def go_on_with(self, story: Story) -> None:
-        """Take the state of the second story for one's own."""
+        """Adopt the state at the end of a story."""
         now, end = self._now, story.end
         now.clock[:], now.u[:], now.state[:] = end.clock, end.u, end.state
         self._asked = -1
 
     def _run_events(self, start: int, stop: int) -> int:
-        """Fold events in place; the row of a reading that asks for a decision, after which the loop stopped, or -1."""
+        """Fold events in place; return the row of a measurement that asks for a decision and ends the loop, or -1."""
         asking = self._machine.run(self.log, start, stop, self._now, self._spare, self._rows)
         self._asked = stop - 1 if asking < 0 else -1
         return asking
 
     def _maintenance(self, stop: int) -> int:
-        """Where to stop, at `stop` at the latest, so that an event of maintenance is dealt with by itself."""
-        # A search of the bytes: with one event at a time NumPy would take longer for it than the filter for a step.
+        """Return where to stop, at most `stop`, so that a maintenance event is handled by itself."""
+        # A search of bytes: for one event at a time, NumPy takes longer than a filter step.
         found = self.log.kind[self.n : stop].tobytes().find(MAINTENANCE)
         return stop if found < 0 else self.n + max(1, found)
 
     def _maintain(self, i: int) -> None:
-        """Predict to the event; there its state is as unknown as in the prior, and its mean stays.
+        """Predict to a maintenance event and reset the variance of its state to the prior's; the mean stays.
 
-        The filter begins again from these moments: of particles, members and modes it keeps no more than them.
+        The filter restarts from these moments, and so loses the shape of particles, members and modes.
         """
         self._run_events(i, i + 1)
         mean, cov = self._machine.moments(self._spare)
@@ -292,14 +292,14 @@ class Fold:
             self._run_events(i, i + 1)
 
     def finish(self) -> None:
-        """The log has ended: take the picture for which another event would have been waited."""
+        """Take the last picture, which would otherwise wait for one more event."""
         if self.pictures is not None and self.n:
             taken = self.pictures.taken
             if not taken or taken[-1].before < self.log.first + self.n:
                 self._take_picture()
 
     def _take_picture(self) -> None:
-        """Of what stands before event `n`; after a query, of what it was answered with."""
+        """Take a picture of the state before event `n`; after a query, of the predicted state that answered it."""
         assert self.pictures is not None
         last = self.n - 1
         query = self.log.kind[last] in (TRUTH, TICK, MARK)
@@ -314,7 +314,7 @@ class Fold:
         self._snapshots.keep(self.log.first + self.n, self.log.first, self._now.copy(), pinned)
 
     def rewind(self, index: int) -> None:
-        """Go back so that the event at `index` (and all after it) will be folded again."""
+        """Go back so that the event at `index` and all after it are folded again."""
         if index < self.n:
             self._restore(index)
 
@@ -329,12 +329,12 @@ class Fold:
             self.pictures.cut(at)
 
     def base_at(self, index: int) -> tuple[int, Base]:
-        """The last snapshot at or before the event `index`: its index, and the base of a fold that starts there."""
+        """Return the last snapshot at or before event `index`: its index, and the base of a fold that starts there."""
         at = self._snapshots.last(self.log.first + index)
         return at - self.log.first, self._base(at, self._snapshots[at])
 
     def base_here(self) -> Base:
-        """The base of a fold that goes on with the next event."""
+        """Return the base of a fold that continues with the next event."""
         return self._base(self.log.first + self.n, self._now)
 
     def _base(self, at: int, snapshot: Snapshot) -> Base:
@@ -355,14 +355,14 @@ class Fold:
         )
 
     def follow(self, log: Log, changed_from: int | None) -> None:
-        """Go on with the log of which the present one is an earlier copy.
+        """Continue with the log of which the present one is an earlier copy.
 
         Args:
-            log: The log that grew meanwhile, and may have dropped its oldest events.
-            changed_from: Absolute index from which its events differ from the copy's, if a late reading came.
+            log: The log, which may have grown and dropped its oldest events meanwhile.
+            changed_from: Absolute index from which its events differ from the copy's, if a late measurement arrived.
 
         Raises:
-            EstimatorError: If the log was cut where this fold has no snapshot.
+            EstimatorError: If the log was cut at an event without a snapshot of this fold.
         """
         cut = log.first - self.log.first
         if cut < 0 or cut > self.n:
@@ -374,9 +374,9 @@ class Fold:
             self.rewind(max(0, changed_from - log.first))
 
     def drop_front(self, count: int) -> None:
-        """Follow the log in forgetting its oldest `count` events, which must end at a snapshot (see `base_at`).
+        """Drop the rows of the log's oldest `count` events, which must end at a snapshot (see `base_at`).
 
-        Call it before the log's own `drop_front`.
+        Call it before `Log.drop_front`.
         """
         if self.log.first + count not in self._snapshots:
             raise EstimatorError(f"cannot drop {count} events: no snapshot there; drop up to one that base_at names")
@@ -400,14 +400,14 @@ def fold(
     policy: HealthPolicy | None = None,
     prior: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> Track:
-    """Fold an estimator over a whole log; see `Fold`.
+    """Fold an estimator over a log; see `Fold`.
 
     Returns:
-        The track, one row an event.
+        The track, one row per event.
 
     Raises:
         EstimatorError: If the estimator does not exist or does not apply to the model.
-        ModelError: If the model's functions disagree with its declaration, or those of a black box fail.
+        ModelError: If the model's functions contradict its declaration, or those of a black box fail.
     """
     growing = Fold(estimator, model, tuning, log, pairs=pairs, policy=policy, prior=prior)
     growing.advance()

@@ -1,4 +1,4 @@
-"""What a fold is given beside its log, checked against the model: compiled code trusts every size and index."""
+"""Checks of a fold's arguments against the model. Compiled code trusts every size and index."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from .snapshots import Base
 from .tuning import Tuning
 
 ROUNDING = 1e-12
-"""Share of the largest variance by which an eigenvalue of a covariance may be below zero, and two halves may differ."""
+"""Tolerance for negative eigenvalues and asymmetry of a covariance, as a share of the largest variance."""
 
 
 def check_pairs(pairs: Any, model: StateSpaceModel) -> np.ndarray:
-    """Pairs of states, (k, 2) int64.
+    """Return pairs of states as (k, 2) int64.
 
     Raises:
-        EstimatorError: If they are not pairs, or name a state that is not there.
+        EstimatorError: If they are not pairs, or an index is out of range.
     """
     if pairs is None:
         return np.zeros((0, 2), np.int64)
@@ -42,10 +42,10 @@ def check_pairs(pairs: Any, model: StateSpaceModel) -> np.ndarray:
 
 
 def check_log(log: Log, n: int, model: StateSpaceModel, estimator: Estimator, options: Options) -> None:
-    """Where log and model meet: refuse what the model has no place for, and variances that cannot be honoured.
+    """Check the log's events from the n-th on against the model.
 
     Raises:
-        EstimatorError: If the log is too narrow, or the estimator takes no variances of single readings.
+        EstimatorError: If the log is too narrow, or the estimator does not support variances of single measurements.
         EventError: If an event from the n-th on does not fit the model.
     """
     layout = model.layout
@@ -61,10 +61,10 @@ def check_log(log: Log, n: int, model: StateSpaceModel, estimator: Estimator, op
 
 
 def check_tuning(tuning: Tuning, model: StateSpaceModel) -> None:
-    """Refuse a tuning with more or fewer entries than the model has.
+    """Check the sizes of a tuning.
 
     Raises:
-        EstimatorError: With the first group that does not fit.
+        EstimatorError: With the first group of another size than in the model.
     """
     sizes = {
         "q": (tuning.q, len(model.noises), "noises"),
@@ -81,10 +81,10 @@ def check_tuning(tuning: Tuning, model: StateSpaceModel) -> None:
 
 
 def check_base(base: Base, model: StateSpaceModel) -> None:
-    """Refuse a base of another model.
+    """Check the sizes of a base.
 
     Raises:
-        EstimatorError: If mean, covariance or inputs are of other sizes.
+        EstimatorError: If mean, covariance or inputs have other sizes than in the model.
     """
     if base.u.shape != (model.nu,):
         raise EstimatorError(f"base: u has shape {base.u.shape}; {model.name} has {model.nu} inputs")
@@ -92,11 +92,11 @@ def check_base(base: Base, model: StateSpaceModel) -> None:
 
 
 def check_prior(prior: tuple[Any, Any], model: StateSpaceModel, entry: Estimator) -> tuple[np.ndarray, np.ndarray]:
-    """A prior's mean (nx,) and covariance (nx, nx), or variances (1, nx) where the model's filters keep only these.
+    """Return a prior's mean (nx,) and covariance (nx, nx), or variances (1, nx) of a large or shaped state.
 
     Raises:
-        EstimatorError: If a size does not fit, a number is not finite, the covariance is none, or is singular and the
-            estimator cannot start from it.
+        EstimatorError: If a size does not fit, a number is not finite, or the covariance is not positive semidefinite,
+            or is singular and the estimator needs its Cholesky factor.
     """
     if not (isinstance(prior, (tuple, list)) and len(prior) == 2):
         raise EstimatorError(f"prior is {type(prior).__name__}; it must be (mean, cov)")
@@ -118,7 +118,7 @@ def check_prior(prior: tuple[Any, Any], model: StateSpaceModel, entry: Estimator
         )
     cov = 0.5 * (cov + cov.T)
     std = np.sqrt(np.maximum(np.diag(cov), 0.0))
-    # Of the correlations: variances of states in different units say nothing of one another.
+    # Eigenvalues of the correlations, as variances in different units cannot be compared.
     unit = np.where(std > 0.0, std, 1.0)
     least = float(np.linalg.eigvalsh(cov / np.outer(unit, unit)).min())
     if np.any(np.diag(cov) < 0.0) or least < -ROUNDING * model.nx:
@@ -148,10 +148,10 @@ def _check_sizes(what: str, mean: np.ndarray, cov: np.ndarray, model: StateSpace
 
 
 def check_soft(entry: Estimator, options: Options) -> None:
-    """Refuse a soft gate, which inflates R, where a filter holds on to one R.
+    """Refuse a soft gate, which inflates R, for a filter with a fixed or adapted R.
 
     Raises:
-        EstimatorError: With what to do.
+        EstimatorError: With the remedy.
     """
     if entry.fixed_r:
         raise EstimatorError(f"estimator {entry.name}: a soft gate inflates R, but its gain is for one R; use kf")
@@ -163,10 +163,10 @@ def check_soft(entry: Estimator, options: Options) -> None:
 
 
 def check_variances(entry: Estimator, options: Options) -> None:
-    """Refuse readings that bring their own variance where a filter holds on to one R.
+    """Refuse measurements with variances of their own for a filter with a fixed or adapted R.
 
     Raises:
-        EstimatorError: With what to do.
+        EstimatorError: With the remedy.
     """
     if entry.fixed_r:
         raise EstimatorError(

@@ -1,4 +1,4 @@
-"""What in the model is to blame when a fold fails, or does not return."""
+"""Find the model function that causes a failed measurement, or a fold that does not return."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from .log import INPUT, READING
 
 
 def cause_of(fold: Fold, row: int) -> str | None:
-    """What in the model is to blame for a row whose reading failed or whose estimate is not a number, in one line.
+    """Return, in one line, the cause in the model of a failed measurement or an estimate of NaN; None if none is found.
 
-    Tried anew from the last estimate before it that is a number; None if nothing is found. Takes milliseconds.
+    Evaluates the model from the last finite estimate before the row, which takes milliseconds.
     """
     if fold.failure is not None:
         return str(fold.failure)
@@ -43,9 +43,9 @@ def cause_of(fold: Fold, row: int) -> str | None:
 
 
 def questions_of(fold: Fold) -> Iterator[tuple[str, Callable[[], object]]]:
-    """What the model is probably being asked by a fold that is under way in another thread, to be tried one by one.
+    """Return calls of the model that a fold running in another thread probably makes, to be tried one by one.
 
-    Each function at the filter's points, its mean and around it; nothing of a black box.
+    Each function at the filter's points, its mean and around it; none for a black box.
     """
     if fold.compiled.box is not None or fold.n >= fold.log.n:
         return iter(())
@@ -56,11 +56,11 @@ def questions_of(fold: Fold) -> Iterator[tuple[str, Callable[[], object]]]:
     later, then = fold.log.t[fold.n : fold.log.n], fold.clock
     ahead = later[later > then]
     dt = (int(ahead[0]) - then) * 1e-9 if ahead.size and then != UNSET else 0.0
-    # As the fold does: in equal steps that the model allows.
+    # The fold crosses the time in equal steps of at most `max_step`.
     dt /= max(1, int(np.ceil(dt / fold.model.max_step)))
     return questions(fold.compiled, finite, fold.u, *_tuned(fold), dt)
 
 
 def _tuned(fold: Fold) -> tuple[np.ndarray, np.ndarray]:
-    """Parameters and variances of the process noise, as compiled code takes them."""
+    """Return parameters and process variances as contiguous float64 arrays."""
     return np.ascontiguousarray(fold.tuning.p, float), np.ascontiguousarray(fold.tuning.q, float)

@@ -1,4 +1,4 @@
-"""What a fold folds with: a filter as machine code, the context in which it sees model and tuning, and its scratch."""
+"""The machine of a fold: the filter's code, the context of model and tuning that it reads, and its scratch."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ Moments = tuple[np.ndarray, np.ndarray]
 
 
 class Machine:
-    """Folds events in place; of itself it remembers nothing from one call to the next."""
+    """Folds events in place. It keeps no state between calls; that is in `Snapshot`."""
 
     def __init__(
         self,
@@ -50,10 +50,10 @@ class Machine:
         prior: Moments | None,
         expected: np.ndarray | None,
     ) -> None:
-        """All as `Fold` was given it, and checked."""
+        """Set up from the checked arguments of `Fold`."""
         self.estimator, self.options, self.model, self.tuning = estimator, options, model, tuning
         self.policy, self._pairs = policy, pairs
-        # Only particles can carry a mode that jumps; the others see it as a number.
+        # Only particle filters represent a jumping mode; the others treat it as a number.
         self.compiled = compile_model(model if estimator.family == "particle" else indicator(model))
         self._bounds: Bounds = chi_square_bounds(model.width * max(1, policy.window))
         self.marginal = estimator.family in ("particle", "ensemble")
@@ -72,12 +72,12 @@ class Machine:
 
     @cached_property
     def code(self) -> Code:
-        """The filter: compiled, or loaded from the cache, at its first use."""
+        """The filter's functions, compiled or loaded from the cache at first use."""
         return driven(self.estimator) if self.model.black_box else self.estimator.code()
 
     @cached_property
     def _run(self) -> Callable:
-        """The loop, as `code` is."""
+        """The loop over events, compiled or loaded from the cache at first use."""
         run, judge, _, _ = compiled()
         return partial(fold_loop.run_and_judge, judge, self._seen) if self._in_python else run
 
@@ -86,13 +86,13 @@ class Machine:
         return fold_loop.begin if self._in_python else compiled()[2]
 
     def _see(self, expected: np.ndarray | None, prior: Moments | None) -> np.void:
-        """The context of this model and tuning; the arrays that it points to are kept in `held`."""
+        """Make the context of this model and tuning; `held` keeps the arrays that it points to."""
         model, tuning = self.model, self.tuning
         baseline = no_baseline(model) if tuning.baseline is None else tuning.baseline
         own = {
             "p": np.ascontiguousarray(tuning.p, float),
             "q": np.ascontiguousarray(tuning.q, float),
-            # Its own: what a reading brings stands here while it is folded, and other folds have the same tuning.
+            # A copy: variances of a single measurement are written here while it is folded.
             "r": np.array(tuning.r, float),
             "used": tuning.used.astype(np.int8),
             "gate": np.tile(self.gate_limits, (len(model.sensors), 1)),
@@ -130,16 +130,16 @@ class Machine:
 
     @property
     def failures(self) -> int:
-        """How often a black box failed."""
+        """Number of failures of a black box."""
         return int(getattr(self.context, "failures", 0))
 
     @property
     def failure(self) -> ModelError | None:
-        """What a black box said when it failed last."""
+        """The last error of a black box."""
         return getattr(self.context, "failure", None)
 
     def fresh(self) -> Snapshot:
-        """Where a fold stands before the first event, but for the state of the filter, which is still to `begin`."""
+        """Return the snapshot before the first event; `begin` has yet to fill the filter's state."""
         model = self.model
         numbers = self.estimator.state_size(self.options, model.nx) + self.estimator.memory(self.options, model)
         return Snapshot(
@@ -152,16 +152,16 @@ class Machine:
         )
 
     def rows(self, count: int) -> Track:
-        """Room for the track of so many events."""
+        """Allocate the track of `count` events."""
         model = self.model
         return Track.allocate(count, len(model.shown), len(self._pairs), model.ny, model.width)
 
     def begin(self, mean: np.ndarray, cov: np.ndarray, state: np.ndarray) -> None:
-        """Make the state stand for N(mean, cov)."""
+        """Set a filter's state to N(mean, cov)."""
         self._begin(self.code, self.context, np.ascontiguousarray(mean), np.ascontiguousarray(cov), state)
 
     def begin_at(self, base: Base, now: Snapshot) -> None:
-        """Let a fold stand where events that were dropped have led; see `Base`."""
+        """Set a snapshot to a base."""
         now.clock[0], now.u[:] = base.clock, base.u
         self.begin(base.mean, base.cov, now.state)
         left = [(now.edge, base.edge)]
@@ -172,22 +172,22 @@ class Machine:
                 mine[:] = its
 
     def moments(self, state: np.ndarray) -> Moments:
-        """Mean and covariance (beyond `LARGE` states the variances) of a state."""
+        """Return mean and covariance (beyond `LARGE` states the variances) of a filter's state."""
         return self.estimator.moments(self.options, state, self.model.nx)
 
     def run(self, log: Log, start: int, stop: int, now: Snapshot, spare: np.ndarray, track: Track) -> int:
-        """Fold events `start` to `stop` of a log into the same rows of a track; `now` moves on with them.
+        """Fold events `start` to `stop` of a log into the same rows of a track.
 
         Args:
             log: The log.
             start: The first event.
             stop: The event after the last.
-            now: Where the fold stands; changed.
-            spare: For a state from which queries are answered, (numbers of `now.state`,); changed.
+            now: Snapshot before `start`; becomes the one before `stop`.
+            spare: Scratch of the size of `now.state`; holds the state that answered the last query.
             track: Its rows are filled.
 
         Returns:
-            The row of a reading that asks for a decision, after which the loop stopped, or -1.
+            The row of a measurement that asks for a decision, after which the loop stopped, or -1.
         """
         columns = log.t, log.kind, log.channel, log.value, log.width
         return self._call(self.rule, log.first, start, stop, *columns, now, spare, track)
@@ -195,14 +195,14 @@ class Machine:
     def run_apart(
         self, log: Log, start: int, stop: int, now: Snapshot, code: Code | None = None
     ) -> tuple[Track, np.ndarray]:
-        """Fold events into a track of their own; nothing is decided of sensors.
+        """Fold events into a separate track, without decisions on sensors.
 
         Args:
             log: The log.
             start: The first event.
             stop: The event after the last.
-            now: Where the fold stands; changed.
-            code: In place of the filter's.
+            now: Snapshot before `start`; becomes the one before `stop`.
+            code: Functions to use in place of the filter's.
 
         Returns:
             The track, and the state from which the last query was answered.
@@ -219,7 +219,7 @@ class Machine:
         channel: np.ndarray, value: np.ndarray, width: int, now: Snapshot, spare: np.ndarray, track: Track,
         code: Code | None = None,
     ) -> int:  # fmt: skip
-        """See `fold_kernel.run_and_judge`."""
+        """Call `fold_kernel.run_and_judge`."""
         asking = self._run(
             code or self.code, self.context, rule, first, start, stop, t, kind, channel, value, width,
             now.clock, now.u, now.state, now.doubt, now.edge, spare, self.work, self.score, track,
@@ -230,18 +230,18 @@ class Machine:
     def second_story(
         self, log: Log, at: int, snapshot: Snapshot, start: int, stop: int, sensor: int, innovation: np.ndarray
     ) -> Story:
-        """Fold events as if the twin had been wrong before a refused reading.
+        """Fold events under the hypothesis that the estimate was wrong before a rejected measurement.
 
         Args:
             log: The log.
-            at: An event at which the fold stood where `snapshot` says, not after `start`.
-            snapshot: Where it stood.
-            start: The refused reading.
+            at: Event of the snapshot, not after `start`.
+            snapshot: State of the fold before `at`.
+            start: The rejected measurement.
             stop: The event after the last.
-            sensor: Whose reading it is: its gate is off, and the covariance is widened before.
-            innovation: Of the reading, as it was refused, (width,).
+            sensor: Sensor of the measurement: its gate is off, and the covariance is widened before.
+            innovation: Innovation of the measurement when it was rejected, (width,).
         """
-        # No doubt is carried over: in this story no sensor is wrong.
+        # Under this hypothesis no sensor is wrong, so the record of rejected sensors starts empty.
         end = snapshot.copy()._replace(doubt=doubt.fresh(len(self.model.sensors)))
         self.run_apart(log, at, start, end)
         added = self.widen(end, sensor, innovation)
@@ -250,7 +250,7 @@ class Machine:
         return Story(track, end, np.sqrt(added))
 
     def widen(self, now: Snapshot, sensor: int, innovation: np.ndarray) -> np.ndarray:
-        """Widen the covariance so that an innovation (ny,) of a sensor is none to refuse; what was added, (nx,)."""
+        """Widen the covariance until an innovation (ny,) of a sensor passes; return the added variances (nx,)."""
         mean, cov = self.moments(now.state)
         H = self._slope(sensor, mean, now.u)
         added = widening(variances_of(cov), variances_of(self.prior[1]), H, innovation[: len(H)])
@@ -259,7 +259,7 @@ class Machine:
         return added
 
     def maintain(self, mean: np.ndarray, cov: np.ndarray, state: int, t: int, now: Snapshot) -> bool:
-        """Let a state of N(mean, cov) at time t begin again as in the prior; False if these are no numbers."""
+        """Restart from N(mean, cov) at time t with one state as in the prior; return False if these are not finite."""
         if not (np.all(np.isfinite(mean)) and np.all(np.isfinite(cov))):
             return False
         self.begin(mean, without(cov, self.prior[1], state), now.state)
@@ -267,7 +267,7 @@ class Machine:
         return True
 
     def _slope(self, sensor: int, x: np.ndarray, u: np.ndarray) -> np.ndarray:
-        """dh/dx (ny, nx) of a sensor; nothing depends on a mode."""
+        """Return dh/dx (ny, nx) of a sensor, with zeros for the mode."""
         if isinstance(self.context, View):
             H = self.context.H(sensor, x, u)
         else:
@@ -280,7 +280,7 @@ class Machine:
 
     @contextmanager
     def open(self, sensor: int) -> Iterator[None]:
-        """Meanwhile the sensor has no gate."""
+        """Context manager: switch the sensor's gate off."""
         self.held["gate"][sensor] = np.inf
         try:
             yield
@@ -288,19 +288,19 @@ class Machine:
             self.held["gate"][sensor] = self.gate_limits
 
     def settle(self) -> None:
-        """Python was stopped between two events: noise and gates are again what they were tuned to."""
+        """Restore the tuned noise and gates after an interrupt between two events."""
         self.held["r"][:] = self.tuning.r
         self.held["gate"][:] = self.gate_limits
 
 
 def variances_of(cov: np.ndarray) -> np.ndarray:
-    """The diagonal (nx,) of a covariance, or of the variances (1, nx) that stand for that of a large state."""
+    """Return the diagonal (nx,) of a covariance, or the variances (1, nx) of a large state as (nx,)."""
     variances: np.ndarray = cov[0] if len(cov) == 1 else np.diag(cov)
     return variances
 
 
 def _scratch(size: int) -> np.ndarray:
-    """`size` numbers that begin at a cache line, so that vectors at multiples of their length lie across none."""
+    """Return `size` numbers of NaN aligned to a cache line, so that aligned vectors never cross one."""
     numbers = np.full(size + 8, np.nan)
     first = -numbers.ctypes.data % 64 // 8
     return numbers[first : first + size]

@@ -1,14 +1,13 @@
-"""What if: a fold that goes on over a future without readings.
+"""Forecasts: a fold that continues over a future without measurements.
 
-The filter's state, as it stands, is the base of a fold over a log of inputs alone. Each step of that log is an event of
-its kind INPUT that changes no input or some, so the state moves on as it does between readings: what is forecast is
-what the fold itself would say. `f` is discrete, so the steps should be as long as those between the readings that the
-filter has had.
+The filter's present state is the base of a fold over a log of inputs alone. Each step of that log is an INPUT event, so
+the state is predicted exactly as between measurements. As `f` is discrete, the steps should be as long as those
+between the measurements so far.
 
-A filter that consists of its members (ensembles, bootstrap particles) is asked for them at every time and some between.
-A member keeps its place while no reading comes, so that their paths tell when each passes a limit for the first time.
-All others give moments, and of them the probability of being beyond the limit at each time, which is less than that of
-having been.
+Filters made of members (ensembles, bootstrap particles) are sampled at every time and some between. A member keeps its
+identity while no measurement arrives, so its path shows when it passes a limit for the first time. Other filters
+give moments, and from these the probability of being beyond the limit at each time, which is smaller than the
+probability of having passed it.
 """
 
 from __future__ import annotations
@@ -29,16 +28,16 @@ from .tuning import Tuning
 SIGMAS = (-2.0, -1.0, 1.0, 2.0)
 """Edges of the bands, in standard deviations; of members the quantiles that a normal variable has there."""
 
-LOOKS = 4
-"""Looks at the members from one time to the next, where there are so many steps: whoever comes back between two looks
-is not seen to have passed."""
+SAMPLES_PER_TIME = 4
+"""Samples of the members from one time to the next, if there are as many steps. A member that returns between two
+samples does not count as having passed a limit."""
 
 
 class Crossing(NamedTuple):
-    """A limit of one state, in its unit, and the probability (T,) of it.
+    """Limit of one state, in its unit, and the probability (T,) of crossing it.
 
-    `above` says from which side it is looked at: whether the mean is below it now. By members, `probability` is that of
-    having passed it up to each time; by moments, of being beyond it at each time.
+    `above` is True if the mean is below the limit now, so that crossing means exceeding it. From members, `probability`
+    is that of having passed the limit up to each time; from moments, of being beyond it at each time.
     """
 
     state: str
@@ -48,10 +47,10 @@ class Crossing(NamedTuple):
 
 
 class Forecast(NamedTuple):
-    """The future of the shown states at T times, the first of them now.
+    """Forecast of the shown states at T times, the first of them now.
 
     t (T,): seconds from now. mean and std (T, shown), bands (T, 4, shown) at `SIGMAS`, in the units of the states.
-    `members` is how many were looked at, 0 where moments speak.
+    `members` is the number of members, 0 for a forecast from moments.
     """
 
     t: np.ndarray
@@ -76,24 +75,24 @@ def forecast(
     most: int = 160,
     between: Callable[[], None] = lambda: None,
 ) -> Forecast:
-    """Fold on from a base without readings.
+    """Continue a fold from a base without measurements.
 
     Args:
-        estimator: Name in the registry; that which left the base goes on from its whole state.
-        model: Of the twin.
-        tuning: Of the twin.
-        base: The filter as it stands, see `Fold.base_here`.
-        now: Time from which on to look, ns; not before the base's clock.
-        horizon: How far, s.
-        step: Length of a step at most, s.
-        inputs: Events of inputs from now on; the others stay as they are.
-        limits: Of shown states, by name.
-        most: Times at most, without the first.
-        between: Called between two times; what it raises ends the forecast.
+        estimator: Name in the registry; the estimator that left the base resumes its full state.
+        model: Model of the twin.
+        tuning: Tuning of the twin.
+        base: Present state of the filter, see `Fold.base_here`.
+        now: Start of the forecast, ns; not before the base's clock.
+        horizon: Length of the forecast, s.
+        step: Longest step, s.
+        inputs: Events of inputs from now on; the other inputs keep their values.
+        limits: Limits of shown states, by name.
+        most: Largest number of times, without the first.
+        between: Called between two times; an exception from it ends the forecast.
 
     Raises:
-        EstimatorError: If horizon or step are not positive, `now` is before the base, a limit is of no shown state, or
-            of an angle or a mode, which has none; and as `Fold`.
+        EstimatorError: If horizon or step are not positive, `now` is before the base, or a limit is of a state that is
+            not shown, an angle or a mode; and as `Fold`.
         EventError: If an input does not fit the model.
     """
     if not (0.0 < horizon < np.inf and step > 0.0):
@@ -108,7 +107,7 @@ def forecast(
     by_members = fold.estimator.blocks is not None and model.nx <= LARGE
     rows = np.searchsorted(fold.log.t[: fold.log.n], instants, side="right")
     each = fine // times
-    apart = np.unique(np.linspace(0, each, min(LOOKS, each) + 1).astype(int))[1:]
+    apart = np.unique(np.linspace(0, each, min(SAMPLES_PER_TIME, each) + 1).astype(int))[1:]
     watch = _Watch(model, limits or {}, columns)
     bands = np.empty((times + 1, len(SIGMAS), len(model.shown)))
     points = np.zeros((0, model.nx))
@@ -129,12 +128,12 @@ def forecast(
 
 
 def first_time(t: np.ndarray, probability: np.ndarray, share: float) -> float:
-    """When a probability (T,) reaches a share for the first time, s, on a line between two times; NaN if it never does.
+    """Return when a probability first reaches a share, s, interpolated between two times; NaN if it never does.
 
     Args:
         t: Times (T,), s.
-        probability: At these times.
-        share: From 0 to 1.
+        probability: Probability (T,) at these times.
+        share: Threshold, from 0 to 1.
     """
     reached = np.flatnonzero(probability >= share)
     if not reached.size:
@@ -158,7 +157,7 @@ def _column(model: StateSpaceModel, name: str) -> int:
 
 
 def _future(model: StateSpaceModel, base: Base, instants: np.ndarray, inputs: Events | None) -> Log:
-    """A log that asks the state to move on to each instant, and holds the inputs between."""
+    """Return a log with an event at each instant, which predicts the state to it, and the events of inputs."""
     n = instants.size
     nothing = np.full((n, model.width), np.nan)
     steps = Events(instants, instants, np.full(n, INPUT, np.int8), np.zeros(n, np.int32), nothing)
@@ -166,7 +165,7 @@ def _future(model: StateSpaceModel, base: Base, instants: np.ndarray, inputs: Ev
 
 
 def _quantiles(points: np.ndarray, mean: np.ndarray, model: StateSpaceModel) -> np.ndarray:
-    """Of members (k, shown) about their mean (shown,), at `SIGMAS`: (4, shown); angles by the shorter way."""
+    """Return quantiles (4, shown) of members (k, shown) at `SIGMAS`, about their mean (shown,); angles are wrapped."""
     off = points - mean
     turns = np.array([state.circular for state in model.shown_states], bool)
     off[:, turns] = (off[:, turns] + np.pi) % (2.0 * np.pi) - np.pi
@@ -175,7 +174,7 @@ def _quantiles(points: np.ndarray, mean: np.ndarray, model: StateSpaceModel) -> 
 
 
 class _Watch:
-    """Watches limits while the states move."""
+    """Crossings of limits while the states move."""
 
     def __init__(self, model: StateSpaceModel, limits: Mapping[str, float], columns: Mapping[str, int]) -> None:
         self._model, self._limits, self._columns = model, limits, columns
@@ -184,7 +183,7 @@ class _Watch:
         self._found: dict[str, list[float]] = {name: [] for name in limits}
 
     def members(self, points: np.ndarray, mean: np.ndarray) -> None:
-        """Note the members (k, nx) that are beyond; the mean (shown,) says from which side to look."""
+        """Note the members (k, nx) beyond a limit; the mean (shown,) gives the side."""
         for name, limit in self._limits.items():
             above = self._above.setdefault(name, bool(mean[self._columns[name]] < limit))
             x = points[:, self._model.shown[self._columns[name]]]
@@ -192,7 +191,7 @@ class _Watch:
             self._passed[name] = self._passed[name] | beyond if name in self._passed else beyond
 
     def moments(self, mean: np.ndarray, std: np.ndarray, by_members: bool) -> None:
-        """One more time: of the members that have passed, or of a normal distribution, (shown,) both."""
+        """Add the probabilities at one time, from the members that have passed or from normal moments, (shown,)."""
         for name, limit in self._limits.items():
             j = self._columns[name]
             above = self._above.setdefault(name, bool(mean[j] < limit))
@@ -201,7 +200,7 @@ class _Watch:
             self._found[name].append(float(np.mean(self._passed[name])) if by_members else float(ndtr(far)))
 
     def crossings(self) -> tuple[Crossing, ...]:
-        """What was found."""
+        """Return the crossings of all limits."""
         return tuple(
             Crossing(name, limit, self._above[name], np.array(self._found[name]))
             for name, limit in self._limits.items()

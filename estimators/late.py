@@ -1,16 +1,16 @@
-"""Readings that come late: what a rewind for one costs, and the cheap way, a reading that is used now with a larger R.
+"""Late measurements: the cost of a rewind, and the cheap alternative, an update now with an inflated R.
 
-The exact way is the log's: the reading is put where it was measured and the fold goes back. The cheap way stamps it
-with the newest time and adds to the noise of each row what the predicted reading has moved by since,
+The exact way is to insert the measurement at its time and rewind the fold. The cheap way stamps it with the newest time
+and adds to the variance of each row the mean square by which the predicted measurement has moved since,
 
     R + (delay · dh/dt)² + H Q(delay) Hᵀ,    dh/dt ≈ (h(f(x, u, p, dt)) - h(x)) / dt
 
-at the present estimate. It treats a known shift as noise with that mean square, and leaves out that the error of the
-reading is correlated with the state's history. So it is for readings that are late now and then: where all of a sensor
-are late by the same, the shift is a bias, which no R tells the filter of, and its bands become too narrow.
+at the present estimate. It treats a known shift as noise, and neglects that the error of the measurement is correlated
+with the history of the state. It suits measurements that are late now and then. If all measurements of a sensor have
+the same delay, the shift is a bias, which no R describes, and the confidence bands become too narrow.
 
 Sources: Larsen, Andersen, Ravn & Poulsen (1998), doi:10.1109/CDC.1998.758571, and Alexander (1991),
-doi:10.1117/12.44531, for updates that carry the correlation along and would cost a filter of their own each.
+doi:10.1117/12.44531, for updates that carry the correlation; each would need a filter of its own.
 """
 
 from __future__ import annotations
@@ -24,24 +24,24 @@ from .events.batch import MARK, READING, TICK, Events
 if TYPE_CHECKING:
     from .fold import Fold
 
-NUMBER = 50e-9
-"""Seconds that one number of a filter's state takes in an event: 3 s for 50 members of a million cells each."""
+EVENT_S_PER_NUMBER = 50e-9
+"""Seconds per event and number of a filter's state: 3 s for 50 members of a million cells each."""
 
-MOST = 256
-"""States beyond which H Q Hᵀ is left out: an ensemble so large is what the cheap way is for."""
+MAX_NOISE_STATES = 256
+"""States beyond which H Q Hᵀ is neglected: larger ones are ensembles, whose Q is too large to form."""
 
 _STEP = 6e-6
 
 
 def rewind_seconds(numbers: int, events: int) -> float:
-    """What going back over so many events costs a filter whose state has so many numbers."""
-    return events * numbers * NUMBER
+    """Return the expected time, s, to fold so many events again with a filter whose state has so many numbers."""
+    return events * numbers * EVENT_S_PER_NUMBER
 
 
 def moved_variance(fold: Fold, sensor: int, delay: float) -> np.ndarray:
-    """The mean square by which each row (ny,) of a sensor's prediction moves in `delay` seconds, as the model says.
+    """Return the mean square by which each row (ny,) of a predicted measurement moves in `delay` seconds.
 
-    Zero where the model has no number for it.
+    Zero where the model returns no finite number.
     """
     made, model = fold.compiled, fold.model
     x, _ = fold.moments()
@@ -53,7 +53,7 @@ def moved_variance(fold: Fold, sensor: int, delay: float) -> np.ndarray:
     then = made.h_block(sensor, made.f_block(X, u, p, dt), u, p)[0]
     shift = _apart(then, now, circular)
     moved = (shift * (delay / dt)) ** 2
-    if model.nx <= MOST and made.box is None:
+    if model.nx <= MAX_NOISE_STATES and made.box is None:
         Q = np.zeros((model.nx, model.nx))
         made.Q(X[0], u, p, np.asarray(fold.tuning.q, float), dt, Q)
         h = _STEP * np.maximum(1.0, np.abs(x))
@@ -64,22 +64,22 @@ def moved_variance(fold: Fold, sensor: int, delay: float) -> np.ndarray:
 
 
 def inflated(events: Events, fold: Fold, newest: int, horizon: int) -> tuple[Events, int]:
-    """The events with their late readings stamped with the newest time before them, and with the R that this costs.
+    """Stamp late measurements with the newest time before them, and inflate their R.
 
-    Inputs and true states that are late stay where they are, and what is later than the horizon is left to the log.
+    Late inputs and true states are unchanged. Measurements later than the horizon are left for the log to drop.
 
     Args:
-        events: In the order of arrival.
-        fold: Its estimate says how fast the readings move.
+        events: Events in the order of arrival.
+        fold: Fold whose estimate gives the rate of change of the measurements.
         newest: Newest time of the log, ns.
-        horizon: Lateness allowed, ns.
+        horizon: Allowed delay, ns.
 
     Returns:
-        The events, and how many of them were late.
+        The events, and the number of late measurements.
     """
-    asks = (events.kind == TICK) | (events.kind == MARK)
-    said = np.where(asks, newest, events.t)
-    before = np.concatenate(([newest], np.maximum(np.maximum.accumulate(said), newest)[:-1]))
+    queries = (events.kind == TICK) | (events.kind == MARK)
+    times = np.where(queries, newest, events.t)
+    before = np.concatenate(([newest], np.maximum(np.maximum.accumulate(times), newest)[:-1]))
     if not np.any((events.kind == READING) & (events.t < before) & (events.t >= before - horizon)):
         return events, 0
     model, width = fold.model, fold.log.width
@@ -94,15 +94,15 @@ def inflated(events: Events, fold: Fold, newest: int, horizon: int) -> tuple[Eve
             own = value[i, width : width + rows]
             base = np.where(np.isnan(own), fold.tuning.r[start : start + rows], own)
             value[i, width : width + rows] = base + moved_variance(fold, sensor, float(newest - t[i]) * 1e-9)
-            # After all that is there: at the newest time itself it could come before another, and take the fold back.
+            # One nanosecond after the newest: at the same time it could precede another event and rewind the fold.
             t[i] = newest + 1
             count += 1
-        if not asks[i]:
+        if not queries[i]:
             newest = max(newest, int(t[i]))
     return wide._replace(t=t, value=value), count
 
 
 def _apart(a: np.ndarray, b: np.ndarray, circular: np.ndarray) -> np.ndarray:
-    """a - b, of angles the shorter way round."""
+    """Return a - b, wrapped to ±π for angles."""
     apart = a - b
     return np.where(circular, (apart + np.pi) % (2.0 * np.pi) - np.pi, apart)

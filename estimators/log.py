@@ -1,4 +1,4 @@
-"""The log: everything the asset said, in order of the time at which it was measured."""
+"""The log: all events of an asset, ordered by the time at which they were measured."""
 
 from __future__ import annotations
 
@@ -37,11 +37,11 @@ __all__ = [
 class Log:
     """A bounded, columnar log in the order of `sorted_order`: by measured time, and at one time by kind and channel.
 
-    Timestamps are int64 nanoseconds. `first` counts the events that were dropped from the front, so `first + i` names
-    an event for ever. Columns are full-length arrays of which the first `n` rows are valid. `changes` counts what was
-    put in. `start` is the time at which the prior holds, `BEFORE` for that of the first event; an event before `floor`
-    is stale: what it would change has been forgotten. `version` is the model's at the first event: it counts up with
-    each maintenance that was dropped.
+    Timestamps are int64 nanoseconds. Columns are full-length arrays of which the first `n` rows are valid. `first`
+    counts the events dropped from the front, so the absolute index `first + i` of an event never changes. `changes`
+    counts insertions. `start` is the time at which the prior holds, `BEFORE` for the time of the first event. An event
+    before `floor` is stale, as the rows that it would change have been dropped. `version` is the version of the model
+    at the first event.
     """
 
     def __init__(self, width: int, capacity: int = 1024) -> None:
@@ -58,7 +58,7 @@ class Log:
 
     @staticmethod
     def of(model: StateSpaceModel, *, start: float | None = None, capacity: int = 1024) -> Log:
-        """An empty log of a model: it refuses what the model has no place for, and takes arrays by name.
+        """Return an empty log of a model, which checks events against the model and takes arrays by name.
 
         Args:
             model: The model whose sensors, inputs and states the events are of.
@@ -66,7 +66,7 @@ class Log:
             capacity: Events that fit before it grows.
 
         Raises:
-            EventError: If `start` is not a time.
+            EventError: If `start` is not finite or beyond ±146 years.
         """
         log = Log(model.width, capacity)
         log.model, log.layout = model, model.layout
@@ -95,7 +95,7 @@ class Log:
         return log
 
     def _allocate(self, capacity: int, columns: int) -> None:
-        # Filled, not empty: the pages are paid for now, and memory stays flat while the log fills.
+        # Filled, not empty, so that memory is allocated now and stays flat while the log fills.
         self.t = np.full(capacity, 0, np.int64)
         self.arrival = np.full(capacity, 0, np.int64)
         self.kind = np.full(capacity, 0, np.int8)
@@ -104,7 +104,7 @@ class Log:
 
     @property
     def capacity(self) -> int:
-        """Events that fit before the log must grow or drop."""
+        """Number of events that fit before the log must grow or drop."""
         return self.t.size
 
     @property
@@ -114,39 +114,39 @@ class Log:
 
     @property
     def has_variances(self) -> bool:
-        """Whether a reading came with variances of its own."""
+        """Whether any measurement has variances of its own."""
         return self.value.shape[1] > self.width
 
     def _columns(self) -> tuple[np.ndarray, ...]:
         return self.t, self.arrival, self.kind, self.channel, self.value
 
     def add(self, sensor: str, seconds: Any, values: Any, *, variance: Any = None) -> int:
-        """Put readings of one sensor where they belong.
+        """Insert measurements of one sensor.
 
         Args:
-            sensor: Its name in the model.
-            seconds: When they were measured, s, shape (N,) or one number; in any order.
-            values: In the units of the sensor's rows, shape (N,), or (N, rows); NaN is missing.
-            variance: The noise's variance of each, in the units squared, if they tell it (a receiver does); shape as
-                `values`, or anything that can be broadcast to it. NaN leaves the tuned R.
+            sensor: Name of the sensor in the model.
+            seconds: Times of measurement, s, shape (N,) or one number; in any order.
+            values: Values in the units of the sensor's rows, shape (N,) or (N, rows); NaN is missing.
+            variance: Variances of the noise of each measurement, in the units squared, where the sensor reports them
+                (as GNSS receivers do); broadcast to the shape of `values`. NaN leaves the tuned R.
 
         Returns:
-            How many events the log has now.
+            Number of events in the log.
 
         Raises:
-            EventError: If the log is of no model, a name or a shape does not fit, or a time is before the start.
+            EventError: If the log has no model, a name or a shape does not fit, or a time is before the start.
         """
         return self._put(arrays.readings(self._named("add"), sensor, seconds, values, variance))
 
     def add_inputs(self, seconds: Any, **inputs: Any) -> int:
-        """Put inputs where they belong; each holds until its next value.
+        """Insert inputs; each holds until its next value.
 
         Args:
-            seconds: From when on they hold, s, shape (N,) or one number.
-            **inputs: Values by name, in the inputs' units, shape (N,) or one number; NaN leaves the value before.
+            seconds: Times from which the values hold, s, shape (N,) or one number.
+            **inputs: Values by name, in the inputs' units, shape (N,) or one number; NaN keeps the previous value.
 
         Returns:
-            How many events the log has now.
+            Number of events in the log.
 
         Raises:
             EventError: As `add`.
@@ -154,14 +154,14 @@ class Log:
         return self._put(arrays.inputs(self._named("add_inputs"), seconds, inputs))
 
     def add_truth(self, seconds: Any, **states: Any) -> int:
-        """Put true states where they belong: the estimate is scored against them, and never sees them.
+        """Insert true states, against which the estimate is scored. The filter never uses them.
 
         Args:
-            seconds: When they held, s, shape (N,) or one number.
-            **states: True values by name, in the states' units, shape (N,) or one number; NaN is not known.
+            seconds: Times of the values, s, shape (N,) or one number.
+            **states: True values by name, in the states' units, shape (N,) or one number; NaN is unknown.
 
         Returns:
-            How many events the log has now.
+            Number of events in the log.
 
         Raises:
             EventError: As `add`.
@@ -169,10 +169,10 @@ class Log:
         return self._put(arrays.truth(self._named("add_truth"), seconds, states))
 
     def add_ticks(self, seconds: Any) -> int:
-        """Ask for the estimate at these times, s, shape (N,) or one number: each is a row of the track.
+        """Insert queries at times `seconds`, shape (N,) or one number: each adds a row with the estimate to the track.
 
         Returns:
-            How many events the log has now.
+            Number of events in the log.
 
         Raises:
             EventError: If a time is not finite or before the start.
@@ -181,7 +181,7 @@ class Log:
 
     def _named(self, method: str) -> StateSpaceModel:
         if self.model is None:
-            raise EventError(f"{method}: this log is of no model, so it knows no names; make it by Log.of(model)")
+            raise EventError(f"{method}: this log has no model, so names are unknown; create it with Log.of(model)")
         return self.model
 
     def _put(self, batch: Events) -> int:
@@ -195,28 +195,28 @@ class Log:
         return self.n
 
     def extend(self, batch: Events, horizon: int | None = None, settled: np.ndarray | None = None) -> tuple[int, int]:
-        """Put a batch where it belongs in time.
+        """Insert a batch of events at their times.
 
         Args:
             batch: Events in any order. Value columns beyond `width` hold variances, see `Events`.
-            horizon: Nanoseconds; an event older than the newest before it by more than this is dropped as stale.
-                Judged event by event, so the outcome does not depend on how arrivals were cut into batches. One
-                before `floor` is stale with any horizon.
-            settled: Mask (N,) of the events to which no horizon applies: they came in time and were held on the way.
+            horizon: Nanoseconds; an event older by more than this than the newest event that arrived before it is
+                dropped as stale. The result does not depend on how arrivals were cut into batches. An event before
+                `floor` is stale with any horizon.
+            settled: Mask (N,) of events that arrived in time and were held by the clock guard; no horizon applies.
 
         Returns:
-            The lowest index whose event changed (the old `n` if all were appended) and the number dropped.
+            The lowest index whose event changed (the old `n` if all were appended) and the number of dropped events.
 
         Raises:
-            EventError: If an event does not fit; then the log is as it was.
+            EventError: If an event does not fit; the log is then unchanged.
         """
-        # Assigned as it is, a single column would be repeated in all, and a true value become that of other states.
+        # Broadcasting would repeat a single column, and give a true value to other states.
         batch = admitted(batch, self.width, self.layout).widened(self.width)
         if not len(batch):
             return self.n, 0
-        # A tick or a mark says nothing of the asset, so nothing is late because of it.
-        said = np.where((batch.kind == TICK) | (batch.kind == MARK), self.newest, batch.t)
-        newest = np.maximum(np.maximum.accumulate(said), self.newest)
+        # Ticks and marks carry no data of the asset, so no event is late relative to them.
+        times = np.where((batch.kind == TICK) | (batch.kind == MARK), self.newest, batch.t)
+        newest = np.maximum(np.maximum.accumulate(times), self.newest)
         self.newest = int(newest[-1])
         stale = 0
         if horizon is not None or batch.t.min() < self.floor:
@@ -239,7 +239,7 @@ class Log:
         return self._insert(batch), stale
 
     def _insert(self, batch: Events) -> int:
-        """Merge a batch that is in order; the lowest index that changed."""
+        """Merge an ordered batch and return the lowest index that changed."""
         n, end = self.n, self.n + len(batch)
         start = n
         if n and batch.t[0] <= self.t[n - 1]:
@@ -259,7 +259,7 @@ class Log:
         return changed
 
     def _reserve(self, extra: int, columns: int) -> None:
-        """Room for `extra` more events, and for variances where they are the first that bring any."""
+        """Make room for `extra` more events, and for variances if these are the first with any."""
         need, wide = self.n + extra, self.value.shape[1]
         if need <= self.capacity and columns <= wide:
             return
@@ -272,7 +272,7 @@ class Log:
         self.value[: self.n, :wide] = old[4][: self.n]
 
     def drop_front(self, count: int) -> None:
-        """Forget the oldest `count` events; what comes later of the time before their end is stale."""
+        """Drop the oldest `count` events; events before the last of these are stale from now on."""
         if count:
             self.floor = max(self.floor, int(self.t[count - 1]))
             self.version += versions_dropped(self.events, count)
@@ -282,7 +282,7 @@ class Log:
         self.first += count
 
     def copy(self) -> Log:
-        """A log of its own with the same events, for a fold that runs beside the one that grows."""
+        """Return an independent log with the same events."""
         twin = Log(self.width, 1)
         twin.__dict__.update(self.__dict__)
         twin._allocate(max(1, self.n), self.value.shape[1])
@@ -296,7 +296,7 @@ _RANK = np.array([_ORDER.index(kind) for kind in range(len(_ORDER))], np.int64) 
 
 
 def in_order(events: Events) -> bool:
-    """Whether each event comes after the one before it, with no two that only their values could order."""
+    """Return whether events are strictly in order, without a pair that only their values could order."""
     t = events.t
     if t.size < 2:
         return True
@@ -326,17 +326,17 @@ def sorted_order(events: Events) -> np.ndarray:
 
 
 def maintenance_times(log: Log) -> np.ndarray:
-    """Times (ns) of the maintenances that the log has kept, ascending."""
+    """Return the times (ns) of maintenance in the log, ascending."""
     return np.unique(log.t[: log.n][log.kind[: log.n] == MAINTENANCE])
 
 
 def model_version_at(log: Log, t: int) -> int:
-    """The version of the model at time t, ns."""
+    """Return the version of the model at time t, ns."""
     return log.version + int(np.searchsorted(maintenance_times(log), t, side="right"))
 
 
 def last_maintenance(log: Log, t: int) -> int | None:
-    """Time (ns) of the last maintenance at or before t that the log has kept; None if there is none."""
+    """Return the time (ns) of the last maintenance at or before t in the log; None if there is none."""
     times = maintenance_times(log)
     k = int(np.searchsorted(times, t, side="right"))
     return int(times[k - 1]) if k else None

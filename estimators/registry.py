@@ -1,4 +1,4 @@
-"""The catalogue of estimators, by name. An entry is written in the file of its filter."""
+"""Catalogue of estimators by name. Each entry stands in the file of its filter."""
 
 from __future__ import annotations
 
@@ -36,10 +36,10 @@ ESTIMATORS: dict[str, Estimator] = {entry.name: entry for entry in GAUSSIAN + PA
 
 
 def find_entry(name: str) -> Estimator:
-    """The entry of that name.
+    """Return the entry of that name.
 
     Raises:
-        EstimatorError: If there is none, with near names, or all.
+        EstimatorError: If there is none, with similar names, or all.
     """
     if name not in ESTIMATORS:
         raise EstimatorError(f"estimator {quoted(name)} does not exist; {nearest(name, ESTIMATORS)}")
@@ -47,10 +47,10 @@ def find_entry(name: str) -> Estimator:
 
 
 def find_estimator(name: str, model: StateSpaceModel) -> Estimator:
-    """The entry of that name, if it applies to the model.
+    """Return the entry of that name, if it applies to the model.
 
     Raises:
-        EstimatorError: If there is none, with near names; or if it does not apply, with the reason.
+        EstimatorError: If there is none, with similar names; or if it does not apply, with the reason.
     """
     entry = find_entry(name)
     reason = unfit(entry, model)
@@ -60,10 +60,10 @@ def find_estimator(name: str, model: StateSpaceModel) -> Estimator:
 
 
 def checked(entry: Estimator, model: StateSpaceModel, options: Mapping[str, float | str]) -> Options:
-    """The options, completed, if the estimator can run with them on the model; nothing is compiled for the answer.
+    """Return the completed options if the estimator can run with them on the model; nothing is compiled.
 
     Raises:
-        EstimatorError: If one is unknown, breaks its rule, or asks for what the model does not say.
+        EstimatorError: If one is unknown, breaks its rule, or needs a declaration that the model lacks.
     """
     values = entry.complete_for(model, options)
     try:
@@ -74,7 +74,7 @@ def checked(entry: Estimator, model: StateSpaceModel, options: Mapping[str, floa
 
 
 def unfit(entry: Estimator, model: StateSpaceModel) -> str | None:
-    """Why an estimator does not fit a model, or None: its own reason, or the size of what it carries."""
+    """Return why an estimator does not apply to a model, or None: its own reason, or the size of its state."""
     if model.black_box and entry.blocks is None and not entry.interpreted:
         able = ", ".join(e.name for e in ESTIMATORS.values() if e.interpreted or e.blocks is not None)
         return (
@@ -101,6 +101,6 @@ def unfit(entry: Estimator, model: StateSpaceModel) -> str | None:
 
 
 def _gigabytes(numbers: int) -> str:
-    """What so many float64s take."""
+    """Format the memory of so many float64s."""
     size = 8e-9 * numbers
     return f"{size:,.0f} GB" if size >= 1000.0 else f"{size:.3g} GB"

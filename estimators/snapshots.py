@@ -1,4 +1,4 @@
-"""Snapshots of a fold: where it can go back to, and where one begins whose oldest events were dropped."""
+"""Snapshots, to which a fold can be rewound, and bases, at which a fold starts whose oldest events were dropped."""
 
 from __future__ import annotations
 
@@ -12,26 +12,26 @@ EVERY, LATELY = 64, 1024
 """Events between snapshots of the last `LATELY` events, where late readings fall."""
 
 WIDER_EVERY, RECENT = 256, 4096
-"""The same of the last `RECENT`: the later a reading, the less a few events more count beside those behind it."""
+"""The same of the last `RECENT`: a later measurement takes the fold back further, so a few more events matter less."""
 
 SPARSE_EVERY = 1024
-"""Events between the snapshots kept for ever."""
+"""Events between the snapshots that are never dropped."""
 
 MEMORY = 256 * 2**20
-"""Bytes that the snapshots of a fold may take, half for the recent ones; large states are kept at wider steps."""
+"""Bytes for the snapshots of a fold, half for the recent ones; snapshots of large states are farther apart."""
 
 PINNED = 64
-"""Snapshots behind a decision that changed the state: the events before it do not lead to it by themselves."""
+"""Snapshots kept after decisions that changed the state, as folding the events before does not reproduce these."""
 
 
 class Base(NamedTuple):
-    """Where a fold starts whose log has lost its oldest events: clock, inputs, and what the dropped events left.
+    """Start of a fold whose log has dropped its oldest events.
 
-    mean (nx,) and cov (nx, nx), or the variances (1, nx) of a large state, stand for it in any filter. `state` is all
-    that the filter `estimator` had (modes, members, particles, what an adaptation learned), for that filter alone.
-    `first` is the absolute index of the first event that is folded from here. `evidence` is what had been gathered
-    against the filter, `doubt` what is remembered of sensors that were refused, for the same filter; `edge` what the
-    screen remembers of the sensors, for any. `version` is the model's there (events/maintenance.py).
+    mean (nx,) and cov (nx, nx), or the variances (1, nx) of a large state, start any filter. `state` is the full state
+    of the filter `estimator` (modes, members, particles, adapted variances), and of use to that filter only; so are
+    `evidence`, the state of the detectors, and `doubt`, the record of rejected sensors. `edge` is the state of the
+    screen. `clock` (ns) and `u` (nu,) are time and inputs, `first` the absolute index of the first event that is folded
+    from here, `version` the version of the model there (events/maintenance.py).
     """
 
     mean: np.ndarray
@@ -48,10 +48,9 @@ class Base(NamedTuple):
 
 
 class Snapshot(NamedTuple):
-    """What a fold goes on from before an event.
+    """State of a fold before an event.
 
-    Clock (1,) in ns, inputs (nu,), state of the filter, evidence against it, state of the screen, doubts of the
-    sensors.
+    Clock (1,) in ns, inputs (nu,), state of the filter, of the detectors and of the screen, record of rejected sensors.
     """
 
     clock: np.ndarray
@@ -62,17 +61,17 @@ class Snapshot(NamedTuple):
     doubt: np.ndarray
 
     def copy(self) -> Snapshot:
-        """Another one, which does not change with this."""
+        """Return an independent copy."""
         return Snapshot(*(part.copy() for part in self))
 
     def put(self, other: Snapshot) -> None:
-        """Take over what another one holds."""
+        """Copy the numbers of another snapshot into this one."""
         for mine, its in zip(self, other, strict=True):
             mine[:] = its
 
 
 class Story(NamedTuple):
-    """Events folded apart: their track, where that ended, and by how much each state was widened before (nx,)."""
+    """Events folded separately: track, snapshot at the end, and by how much each state was widened before (nx,)."""
 
     track: Track
     end: Snapshot
@@ -80,10 +79,10 @@ class Story(NamedTuple):
 
 
 class Snapshots:
-    """Snapshots by the absolute index of the event before which they were taken: the denser the later they are."""
+    """Snapshots by the absolute index of the event that follows; the older, the farther apart."""
 
     def __init__(self, nbytes: int) -> None:
-        """`nbytes`: of one state. At least one old snapshot, the start, and a recent one are kept, however large."""
+        """Plan for states of `nbytes` bytes. The start, an old and a recent snapshot are kept, however large."""
         self._most = max(1, MEMORY // 2 // nbytes)
         self._every = EVERY
         while RECENT // self._every > self._most:
@@ -95,30 +94,30 @@ class Snapshots:
 
     @property
     def every(self) -> int:
-        """Events between two of the latest: how far a reading that is a little late takes a fold back at worst."""
+        """Events between two of the latest: how far a slightly late measurement takes the fold back at most."""
         return self._every
 
     @property
     def places(self) -> list[int]:
-        """The absolute indices of the events before which they were taken, in order."""
+        """Absolute indices of the events that follow the snapshots, ascending."""
         return sorted(self._kept)
 
     def __contains__(self, at: int) -> bool:
-        """Whether there is one before the event at an absolute index."""
+        """Return whether there is a snapshot before the event at an absolute index."""
         return at in self._kept
 
     def __getitem__(self, at: int) -> Snapshot:
-        """The one before the event at an absolute index."""
+        """Return the snapshot before the event at an absolute index."""
         return self._kept[at]
 
     def next_stop(self, at: int, end: int) -> int:
-        """The absolute index, after `at`, at which a fold on its way to `end` should take the next one."""
-        # Before the end, only the snapshots that are kept there are worth stopping for.
+        """Return the absolute index after `at` at which a fold that goes on to `end` takes the next snapshot."""
+        # Stop only for snapshots that are still kept once the fold has reached the end.
         zones = (0, self._sparse), (end - RECENT, self._wider), (end - LATELY, self._every)
         return min(-(-max(at + 1, begin) // stride) * stride for begin, stride in zones)
 
     def keep(self, at: int, first: int, snapshot: Snapshot, pinned: bool = False) -> None:
-        """Keep one; drop what is too close to others for its age. `first`: absolute index of the log's first event."""
+        """Keep a snapshot; drop those too close to others for their age. `first`: index of the log's first event."""
         self._kept[at] = snapshot
         if pinned:
             self._pinned = [key for key in (*self._pinned, at) if key in self._kept][-min(PINNED, self._most) :]
@@ -133,15 +132,15 @@ class Snapshots:
                     del self._kept[key]
 
     def last(self, at: int) -> int:
-        """The absolute index of the last one at or before `at`."""
+        """Return the absolute index of the last snapshot at or before `at`."""
         return max(key for key in self._kept if key <= at)
 
     def forget_after(self, at: int) -> None:
-        """Drop those after `at`: their events will be folded again."""
+        """Drop the snapshots after `at`, whose events will be folded again."""
         for key in [key for key in self._kept if key > at]:
             del self._kept[key]
 
     def forget_before(self, at: int) -> None:
-        """Drop those before `at`: their events are gone."""
+        """Drop the snapshots before `at`, whose events have been dropped."""
         for key in [key for key in self._kept if key < at]:
             del self._kept[key]

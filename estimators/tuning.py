@@ -1,4 +1,4 @@
-"""The tuning: everything about a fold that a user may turn, in one frozen, versioned object."""
+"""The tuning: all parameters of a fold that a user may change, in one frozen, versioned object."""
 
 from __future__ import annotations
 
@@ -15,29 +15,29 @@ from .model.state_space import StateSpaceModel, squared
 _versions = count(1)
 
 GATE_KINDS = ("hard", "soft")
-"""What becomes of a reading beyond the gate: it is refused; it counts with its noise inflated."""
+"""Treatment of a measurement beyond the gate: rejected, or used with inflated noise."""
 
-LEAST_GATE = 0.5
-"""Probability with which a good reading passes, at least: a gate that refuses most of them is no gate."""
+MIN_GATE = 0.5
+"""Smallest probability that a good measurement passes the gate."""
 
-REOPEN = 30.0
-"""Seconds after which the asset is believed, if a tuning does not say otherwise."""
+REOPEN_S = 30.0
+"""Default time after which a sensor that stays rejected is trusted again."""
 
-LONGEST = 1e9
-"""Seconds of `reopen`, at most: 32 years."""
+MAX_REOPEN_S = 1e9
+"""Largest value of `reopen`: 32 years."""
 
 GATE_KEYS = {"gate": "gate", "gate.kind": "gate_kind", "gate.reopen": "reopen"}
-"""Keys of the gate, and the fields that they turn."""
+"""Keys of the gate, and the fields that they set."""
 
-TURNED = "*"
-"""Behind the name of a tuning of which an entry was turned since."""
+CHANGED_MARK = "*"
+"""Suffix of the name of a loaded tuning of which an entry has been changed."""
 
-TOGETHER = 16
-"""Rows of a sensor from which on they share one entry, `R.<sensor>`, in what a panel shows."""
+SHARED_ENTRY_ROWS = 16
+"""Number of rows of a sensor from which they share one entry, `R.<sensor>`, in a panel."""
 
 
 class Item(NamedTuple):
-    """One entry of a tuning, as a panel shows it."""
+    """Entry of a tuning with its unit and range."""
 
     key: str
     value: float
@@ -50,14 +50,15 @@ class Item(NamedTuple):
 class Tuning:
     """Noise variances, parameters, sensors in use, gate and options of one fold.
 
-    q (nw,) is the variance that each process noise adds in one second; r (rows,) the variance of each sensor row; p
-    (np,) the model's parameters; `used` (sensors,) is False where a sensor is held out: predicted and scored, never
-    used. `gate` is the probability that a good reading passes, or None; a reading beyond it is refused, or, where
-    `gate_kind` is "soft", counts with its noise inflated (gate/soften.py). A sensor that stays refused is judged
-    (gate/isolation.py); if nothing tells whether it or the twin is wrong, the asset is believed after `reopen` seconds,
-    None for never. `options` are the estimator's own. `baseline` (rows, ...) is what was normal of the innovations when
-    it was accepted (commission.py), or None for white ones. `name` is that of the version that was loaded, with
-    a `*` behind it once an entry was turned; empty if nobody gave one. `version` counts in this process.
+    q (nw,) is the variance that each process noise adds per second; r (rows,) the variance of each sensor row; p (np,)
+    the model's parameters; `used` (sensors,) is False for held-out sensors, which are predicted and scored, never used.
+    `gate` is the probability that a good measurement passes, or None. A measurement beyond it is rejected, or, if
+    `gate_kind` is "soft", used with inflated noise (gate/soften.py). For a sensor that stays rejected, the fold decides
+    whether the sensor or the estimate is wrong (gate/isolation.py); if that cannot be decided, the sensor is trusted
+    again after `reopen` seconds, None for never. `options` are the estimator's. `baseline` (rows, ...) is the baseline
+    of the innovations when the tuning was accepted (diagnostics/evidence/), None for white innovations. `name` is the
+    name of the loaded version, with a `*` once an entry has been changed, or empty. `version` counts the tunings of
+    this process.
     """
 
     model: StateSpaceModel
@@ -67,7 +68,7 @@ class Tuning:
     used: np.ndarray
     gate: float | None = None
     gate_kind: str = "hard"
-    reopen: float | None = REOPEN
+    reopen: float | None = REOPEN_S
     options: Mapping[str, float] = field(default_factory=dict)
     seed: int = 0
     baseline: np.ndarray | None = None
@@ -76,7 +77,7 @@ class Tuning:
 
     @staticmethod
     def of(model: StateSpaceModel) -> Tuning:
-        """What the model declares."""
+        """Return the tuning that a model declares."""
         return Tuning(
             model=model,
             q=np.array([noise.variance for noise in model.noises], float),
@@ -86,7 +87,7 @@ class Tuning:
         )
 
     def items(self) -> list[Item]:
-        """Every numeric entry with its unit and range; the many rows of one sensor are one entry, their mean."""
+        """Return every numeric entry; the many rows of one sensor share an entry, their mean."""
         model = self.model
         items = [
             Item(f"Q.{noise.name}", float(value), noise.unit, 0.0, np.inf)
@@ -95,7 +96,7 @@ class Tuning:
         for sensor, start in zip(model.sensors, model.row_start, strict=True):
             own = slice(start, start + len(sensor.rows))
             names, values, unit = model.row_names[own], self.r[own], squared(sensor.rows[0].unit)
-            if len(values) >= TOGETHER and len({row.unit for row in sensor.rows}) == 1:
+            if len(values) >= SHARED_ENTRY_ROWS and len({row.unit for row in sensor.rows}) == 1:
                 items.append(Item(f"R.{sensor.name}", _mean(values), unit, 0.0, np.inf))
             else:
                 units = [squared(row.unit) for row in sensor.rows]
@@ -110,13 +111,13 @@ class Tuning:
         return items
 
     def keys(self) -> list[str]:
-        """Every key that `set` takes."""
+        """Return every key of `get` and `set`."""
         rows = [f"R.{name}" for name in self.model.row_names]
         used = [f"use.{name}" for name in self.model.sensor_names]
         return [*dict.fromkeys([item.key for item in self.items()] + rows), *used, *GATE_KEYS]
 
     def get(self, key: str) -> float | bool | str | None:
-        """The value under a key."""
+        """Return the value of a key."""
         if key in GATE_KEYS:
             value: float | str | None = getattr(self, GATE_KEYS[key])
             return value
@@ -124,30 +125,30 @@ class Tuning:
         return bool(self.used[index]) if group == "used" else _mean(getattr(self, group)[index])
 
     def set(self, key: str, value: float | bool | str | None) -> Tuning:
-        """A new tuning with one entry changed; `R.<sensor>` is that of all rows of the sensor.
+        """Return a new tuning with one entry changed; `R.<sensor>` sets all rows of the sensor.
 
         Raises:
-            ConfigError: If there is no such key, or the value breaks its rule.
+            ConfigError: If the key does not exist, or the value is out of range.
         """
         if key == "gate":
             number = _number(value)
-            if value is not None and not LEAST_GATE <= number < 1.0:
+            if value is not None and not MIN_GATE <= number < 1.0:
                 raise ConfigError(
-                    f"gate is {_shown(value)}; it must lie between {LEAST_GATE:g} and 1, or be null for no gate"
+                    f"gate is {_shown(value)}; it must lie between {MIN_GATE:g} and 1, or be null for no gate"
                 )
-            return self._turned(gate=None if value is None else number)
+            return self._changed(gate=None if value is None else number)
         if key == "gate.kind":
             if value not in GATE_KINDS:
                 raise ConfigError(f"gate.kind is {_shown(value)}; it must be hard or soft")
-            return self._turned(gate_kind=str(value))
+            return self._changed(gate_kind=str(value))
         if key == "gate.reopen":
             number = _number(value)
-            if value is not None and not 0.0 < number <= LONGEST:
+            if value is not None and not 0.0 < number <= MAX_REOPEN_S:
                 raise ConfigError(
-                    f"gate.reopen is {_shown(value)}; it must be a positive number of seconds, {LONGEST:g} at most, or "
-                    "null for never"
+                    f"gate.reopen is {_shown(value)}; it must be a positive number of seconds, {MAX_REOPEN_S:g} at "
+                    "most, or null for never"
                 )
-            return self._turned(reopen=None if value is None else number)
+            return self._changed(reopen=None if value is None else number)
         group, index = self._locate(key)
         if group == "used":
             if not isinstance(value, (bool, np.bool_)):
@@ -164,8 +165,7 @@ class Tuning:
                 raise ConfigError(f"{key} is {number:g}; a variance must be zero or positive")
             if group == "r" and not (number > 0 or number == 0 and self._without_noise(index)):
                 raise ConfigError(
-                    f"{key} is {number:g}; a variance must be positive, or zero where the model says that there is no "
-                    "noise"
+                    f"{key} is {number:g}; a variance must be positive, or zero where the model declares zero noise"
                 )
             if group == "p":
                 parameter = self.model.parameters[index]
@@ -177,18 +177,18 @@ class Tuning:
             changed = getattr(self, group).copy()
             changed[index] = number
         entry: dict[str, Any] = {group: changed}
-        return self._turned(**entry)
+        return self._changed(**entry)
 
     def with_options(self, options: Mapping[str, float]) -> Tuning:
-        """A new tuning with other estimator options."""
-        return self._turned(options=dict(options))
+        """Return a new tuning with other estimator options."""
+        return self._changed(options=dict(options))
 
-    def _turned(self, **entries: Any) -> Tuning:
-        name = self.name if self.name.endswith(TURNED) else self.name and self.name + TURNED
+    def _changed(self, **entries: Any) -> Tuning:
+        name = self.name if self.name.endswith(CHANGED_MARK) else self.name and self.name + CHANGED_MARK
         return replace(self, version=next(_versions), name=name, **entries)
 
     def _without_noise(self, rows: Any) -> bool:
-        """Whether the model declares these rows to be without noise; only then are filters chosen that bear it."""
+        """Return whether the model declares zero noise for these rows; only then do all its filters support it."""
         declared = np.array([row.variance for sensor in self.model.sensors for row in sensor.rows])
         return not np.any(declared[rows])
 
@@ -211,12 +211,12 @@ class Tuning:
 
 
 def _number(value: float | bool | str | None) -> float:
-    """A value that should be a number; NaN if it is none."""
+    """Return a value as a number; NaN if it is not one."""
     return float("nan") if value is None or isinstance(value, (str, bool, np.bool_)) else float(value)
 
 
 def _shown(value: float | bool | str | None) -> str:
-    """A value as a message shows it, in the words of YAML and JSON."""
+    """Format a value for a message as YAML and JSON do."""
     if value is None:
         return "null"
     if isinstance(value, (bool, np.bool_)):
@@ -225,6 +225,6 @@ def _shown(value: float | bool | str | None) -> str:
 
 
 def _mean(values: Any) -> float:
-    """Their mean; exactly the value that they share."""
+    """Return the mean of values; exactly their common value if they are equal."""
     first = np.ravel(values)[0]
     return float(first if np.all(values == first) else np.mean(values))

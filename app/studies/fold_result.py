@@ -24,7 +24,7 @@ from estimators.plausibility import reasons_by_sensor
 from estimators.smoothing.smooth import consistency
 from estimators.smoothing.walk import Smoothed
 from estimators.track import FAILED, HEALTH_NAMES, REASONS, USED
-from estimators.tuning import TOGETHER
+from estimators.tuning import SHARED_ENTRY_ROWS
 from sources.source import WRONG_TIME
 
 from ..present.export.calibration_lines import calibration_lines
@@ -303,7 +303,7 @@ def _held_out(result: FoldResult, units: Mapping[str, str]) -> list[Figure]:
     found = []
     for sensor, start in zip(model.sensors, model.row_start, strict=True):
         names = [name for name in model.row_names[start : start + len(sensor.rows)] if name in fits]
-        if len(names) >= TOGETHER and len({row.unit for row in sensor.rows}) == 1:
+        if len(names) >= SHARED_ENTRY_ROWS and len({row.unit for row in sensor.rows}) == 1:
             own = [fits.pop(name) for name in names]
             rmse = float(np.sqrt(np.mean([fit.rmse**2 for fit in own])))
             share = 100 * float(np.mean([fit.coverage for fit in own]))

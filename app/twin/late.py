@@ -8,7 +8,7 @@ from config.schema import TwinSection
 from estimators.errors import EstimatorError
 from estimators.estimator import Estimator
 from estimators.fold_checks import check_variances
-from estimators.late import NUMBER, rewind_seconds
+from estimators.late import EVENT_S_PER_NUMBER, rewind_seconds
 from estimators.model.state_space import StateSpaceModel
 from estimators.snapshots import Snapshots
 from estimators.tuning import Tuning
@@ -30,7 +30,7 @@ def late_policy(config: TwinSection, model: StateSpaceModel, estimator: Estimato
     numbers = estimator.state_size(options, model.nx) + estimator.memory(options, model)
     events = Snapshots(8 * numbers).every
     seconds = rewind_seconds(numbers, events)
-    sum_ = f"{events} events x {numbers:,} numbers x {NUMBER * 1e9:g} ns = {seconds:.2g} s to go back"
+    sum_ = f"{events} events x {numbers:,} numbers x {EVENT_S_PER_NUMBER * 1e9:g} ns = {seconds:.2g} s to go back"
     if seconds <= section.late_allowed:
         return Late(False, f"{sum_}, allowed {section.late_allowed:g} s")
     try:

@@ -24,7 +24,7 @@ from estimators.errors import ConfigError, EstimatorError
 from estimators.fold_checks import check_variances
 from estimators.model.state_space import StateSpaceModel
 from estimators.registry import checked, find_entry, find_estimator
-from estimators.tuning import TURNED, Tuning
+from estimators.tuning import CHANGED_MARK, Tuning
 
 from ..intake import Planned
 from .commissioned import commissioned
@@ -281,7 +281,7 @@ def _assemble(loaded: Loaded, overrides: Mapping[str, str], log_files: Sequence[
         tuning = _set(tuning, key, value)
     name = OWN if loaded.version is None else loaded.version.name
     changed = bool(turned) or any(key.split(".")[0] in TuningSection.model_fields for key in overrides)
-    tuning = replace(tuning, name=name + (TURNED if changed else ""))
+    tuning = replace(tuning, name=name + (CHANGED_MARK if changed else ""))
     check_refit(loaded, first.name, tuning)
     for k, item in enumerate(config.maintenance):
         check_named(loaded, ("maintenance", k, "states"), item.states, model)

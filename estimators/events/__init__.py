@@ -1,1 +1,1 @@
-"""Events: what the asset said. Their columns, the checks at the log's door, their order, and arrays by name."""
+"""Events: their columns, the checks when they enter a log, arrays by name, and the guard of source clocks."""

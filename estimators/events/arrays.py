@@ -1,4 +1,4 @@
-"""Arrays by name to events: what `Log.add` and its like take, in seconds and in the units of the model."""
+"""Conversion of arrays by name, in seconds and the units of the model, to events; see `Log.add`."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 def nanoseconds(name: str, seconds: Any) -> np.ndarray:
-    """Seconds as int64 nanoseconds, shape (N,).
+    """Convert seconds to int64 nanoseconds, shape (N,).
 
     Raises:
         EventError: If one is not finite or beyond ±146 years.
@@ -32,7 +32,7 @@ def nanoseconds(name: str, seconds: Any) -> np.ndarray:
 
 
 def readings(model: StateSpaceModel, sensor: str, seconds: Any, values: Any, variance: Any = None) -> Events:
-    """Events of one sensor; see `Log.add`."""
+    """Return events of one sensor; see `Log.add`."""
     index = _index("sensor", sensor, model.sensor_names, model)
     rows = len(model.sensors[index].rows)
     t = nanoseconds("seconds", seconds)
@@ -58,7 +58,7 @@ def readings(model: StateSpaceModel, sensor: str, seconds: Any, values: Any, var
 
 
 def inputs(model: StateSpaceModel, seconds: Any, named: Mapping[str, Any]) -> Events:
-    """Inputs by name; see `Log.add_inputs`."""
+    """Return events of inputs by name; see `Log.add_inputs`."""
     if not named:
         raise EventError(f"add_inputs: no input is given; {nearest('', model.input_names)}")
     t = nanoseconds("seconds", seconds)
@@ -69,7 +69,7 @@ def inputs(model: StateSpaceModel, seconds: Any, named: Mapping[str, Any]) -> Ev
 
 
 def truth(model: StateSpaceModel, seconds: Any, named: Mapping[str, Any]) -> Events:
-    """True states by name, in as few events a time as their places in the state allow; see `Log.add_truth`."""
+    """Return events of true states by name, as few per time as their indices allow; see `Log.add_truth`."""
     if not named:
         raise EventError(f"add_truth: no state is given; {nearest('', model.state_names)}")
     t = nanoseconds("seconds", seconds)
@@ -88,12 +88,12 @@ def truth(model: StateSpaceModel, seconds: Any, named: Mapping[str, Any]) -> Eve
 
 
 def ticks(width: int, seconds: Any) -> Events:
-    """Queries; see `Log.add_ticks`."""
+    """Return queries; see `Log.add_ticks`."""
     return _blank(nanoseconds("seconds", seconds), TICK, 0, width)
 
 
 def _blank(t: np.ndarray, kind: int, channel: int, width: int) -> Events:
-    """Events that know nothing yet; they arrive when they are measured."""
+    """Return events with values of NaN, which arrive when they are measured."""
     n = t.size
     return Events(t, t.copy(), np.full(n, kind, np.int8), np.full(n, channel, np.int32), np.full((n, width), np.nan))
 
@@ -102,7 +102,7 @@ def _numbers(name: str, values: Any) -> np.ndarray:
     try:
         return np.asarray(values, float)
     except (TypeError, ValueError):
-        raise EventError(f"{name} holds what is no number, such as {_sample(values)!r}; give numbers") from None
+        raise EventError(f"{name} contains {_sample(values)!r}; all entries must be numbers") from None
 
 
 def _sample(values: Any) -> Any:
@@ -112,7 +112,7 @@ def _sample(values: Any) -> Any:
 
 
 def _rows(name: str, values: Any, n: int, rows: int) -> np.ndarray:
-    """Values as (n, rows)."""
+    """Return values as (n, rows)."""
     y = _numbers(name, values)
     if y.ndim == 0 and rows == 1:
         y = np.full((n, 1), float(y))
@@ -125,7 +125,7 @@ def _rows(name: str, values: Any, n: int, rows: int) -> np.ndarray:
 
 
 def _column(name: str, values: Any, n: int) -> np.ndarray:
-    """Values of one input or state as (n,)."""
+    """Return values of one input or state as (n,)."""
     y = _numbers(name, values)
     if y.ndim == 0:
         return np.full(n, float(y))

@@ -1,27 +1,28 @@
-"""The guard before the log: readings whose time cannot be true, and clocks that have moved.
+"""The clock guard between a source and the log: it rejects lone wrong timestamps and corrects clocks that were set.
 
-One reading stamped an hour ahead would make all that follow it stale. So a lone time far from where the clock of its
-source was expected is refused, and held until what comes next tells which it was:
+One measurement stamped an hour ahead would make all later ones stale. The guard therefore holds an event whose time is
+far from the expected time of its channel, until the following events show the cause:
 
-- *ahead*: after all that was said, by more than the horizon (half of it where arrival is known) and many of its own
-  periods, and, where arrival is known, ahead of it by more than ever lately. If the next readings are back in time it
-  was a lone one, and is refused. If they stay there, nothing was said for a while (a gap) and they are let in as they
-  are; or the clock was set.
-- *back*: before the newest of its own channel by more than the horizon, so that the log would drop it as stale. If the
-  next agree on it the clock was set back; else they go to the log, which drops and counts them, as any that is late.
+- *ahead*: later than all events so far by more than the horizon (half of it if arrivals are known) and by many periods
+  of the channel, and, if arrivals are known, with a larger t - arrival than lately. If the next events return to the
+  expected time, the held event is rejected as a lone wrong timestamp. If they continue from the held one, there was
+  either a gap in the data, and they pass unchanged, or the clock was set.
+- *back*: earlier than the newest event of the channel by more than the horizon, so that the log would drop it as stale.
+  If the following events continue from it, the clock was set back; otherwise they pass to the log, which drops and
+  counts them like any late event.
 
-Where a clock was set, what it stamps from then on is moved so that its time goes on without a step: with known arrivals
-by the step of the largest t - arrival, as a delay makes it only smaller, without by continuing its channel at its own
-pace. A clock that comes back to where it was, or to where that of another channel is, is taken to be there exactly:
-else the delays of the moment would add up from one step to the next.
+After a clock was set, its timestamps are shifted so that they continue without a step. With known arrivals the shift is
+the step of the largest t - arrival, since delays only reduce that; otherwise the channel continues at its own pace. A
+clock that returns to an earlier offset, or to the offset of another channel, gets exactly that offset, so that errors
+of the delay do not accumulate.
 
-With known arrivals that time comes to where the held ones are says nothing: a clock that is a little more ahead than
-the horizon would be let in after a while, and all that other clocks stamp would be stale from then on. And a reading
-that fits but was measured before the held ones had come says nothing of the clock now, so it does not contradict them.
+With known arrivals, held events do not pass merely because time has reached them: a clock slightly farther ahead than
+the horizon would be accepted after a while, and the events of all other clocks would be stale from then on. An event
+that fits but was measured before the held ones arrived does not contradict them.
 
-It is a pure function of the events in the order of arrival: the outcome does not depend on how they were cut into
-batches. Queries and resets, which are ours, pass. Readings are judged by sensor, inputs together, true states together:
-events do not tell their source.
+The guard is a pure function of the events in order of arrival: the outcome does not depend on how they were cut into
+batches. Queries and resets pass. Each sensor is a channel; so are all inputs together and all true states together,
+since events do not name their source.
 """
 
 from __future__ import annotations
@@ -54,20 +55,20 @@ from .clock_expected import (
 )
 
 SETTLED = 2 * SECOND
-"""Of the source's own time for which they must agree at least."""
+"""Time, by the source's clock, over which held events must agree before they pass."""
 
 ZONE = 900 * SECOND
 """Time zones, and daylight saving time, differ by a multiple of 15 minutes."""
 
-MOST, MOST_LIVE = 1 << 17, 4096
-"""Events that are held of one channel, without and with known arrivals; more that never settle are no clock."""
+MAX_HELD, MAX_HELD_LIVE = 1 << 17, 4096
+"""Largest number of held events of a channel, without and with known arrivals."""
 
 
 class ClockGuard:
-    """Stands between a source and a log; `take` each batch, and `finish` at the end."""
+    """Filter between a source and a log: `take` each batch, and `finish` at the end."""
 
     def __init__(self, sensors: int, horizon: int) -> None:
-        """Of a model with so many sensors; `horizon` is the log's, ns."""
+        """Guard the events of a model with `sensors` sensors; `horizon` is the log's, ns."""
         self._sensors, self._horizon = sensors, horizon
         self._agree = min(max(SECOND // 2, horizon // 2), SETTLED)
         self._settled = max(SETTLED, 2 * self._agree)
@@ -83,11 +84,11 @@ class ClockGuard:
 
     @property
     def held(self) -> int:
-        """How many events wait for what comes next."""
+        """Number of held events."""
         return len(self._held)
 
     def take(self, batch: Events) -> Passed:
-        """The next events, in the order of arrival: those that may go to the log now."""
+        """Take the next events, in order of arrival, and return those that may enter the log now."""
         if not len(batch):
             return Passed(batch, np.zeros(0, np.bool_), [], [])
         if not self._runs and not self._shift.any():
@@ -109,9 +110,9 @@ class ClockGuard:
         return self._leave(work)
 
     def finish(self) -> Passed:
-        """The source has ended, and nothing contradicts what is held ahead.
+        """Decide on the held events at the end of the source.
 
-        It is let in, but for a lone one that is farther ahead than all that was said is long: that is no gap.
+        Events held ahead pass, as nothing contradicts them, except a lone one farther ahead than the log is long.
         """
         work = self._work(Events.empty(0))
         for row in sorted(self._runs):
@@ -134,7 +135,7 @@ class ClockGuard:
         return Work(events, rows, np.concatenate((self._raw, batch.t)), len(self._held))
 
     def _rows_of(self, batch: Events) -> np.ndarray:
-        """The row of the state for each event, as `_row` has it."""
+        """Return the row of the state for each event, as `row_of` does."""
         rows = np.full(len(batch), -1, np.int64)
         readings = (batch.kind == READING) & (batch.channel >= 0) & (batch.channel < self._sensors)
         rows[readings] = batch.channel[readings]
@@ -153,7 +154,7 @@ class ClockGuard:
         self._note(self._state, work.rows[i], work.t[i], work.arrival[i], work.live[i], self._horizon)
 
     def _suspect(self, work: Work, i: int) -> None:
-        """Deal with an event that does not fit, or whose channel holds some."""
+        """Handle an event that does not fit, or whose channel has held events."""
         row = int(work.rows[i])
         run = self._runs.get(row)
         if run is not None and self._has_come(work, run):
@@ -162,7 +163,7 @@ class ClockGuard:
         verdict = self._verdict(work, i)
         if run is not None and run.ahead and run.live and verdict == BACK:
             if int(work.arrival[i]) - run.arrived <= self._settled:
-                # Late, whatever the clock says now.
+                # A late event; it tells nothing about the present clock.
                 work.emit([i])
                 return
         rest: list[int] = []
@@ -181,7 +182,7 @@ class ClockGuard:
         if run is None:
             live = self._is_live(work, i)
             begin = int(self._state[self._everything, LAST])
-            run = self._runs[row] = Run(verdict == AHEAD, live, begin, self._agree, MOST_LIVE if live else MOST)
+            run = self._runs[row] = Run(verdict == AHEAD, live, begin, self._agree, MAX_HELD_LIVE if live else MAX_HELD)
             self._state[row, HOLDING] = 1
         for k in (*rest, i):
             run.add(k, int(work.t[k]), int(work.arrival[k]))
@@ -195,23 +196,23 @@ class ClockGuard:
         return int(work.t[i]) - int(work.arrival[i])
 
     def _has_come(self, work: Work, run: Run) -> bool:
-        """Whether time has come to where those are that are held ahead; to their last one, if arrivals are known."""
+        """Return whether time has reached the events held ahead; the last of them, if arrivals are known."""
         return run.ahead and self._verdict(work, run.at[-1 if run.live else 0]) == FITS
 
     def _contradicts(self, work: Work, run: Run, i: int) -> bool:
-        """Whether an event that fits tells that those that are held do not.
+        """Return whether an event that fits contradicts the held ones.
 
-        By a clock that was not set it was measured at t - `OFFSET` of the host's time at the earliest. If that is
-        after the first of those that are held had come, it says so; else it may have been on its way meanwhile.
+        By an unchanged clock it was measured at t - `OFFSET` of the host's time at the earliest. It contradicts the
+        held events if that is after the arrival of the first of them; otherwise it may have been delayed.
         """
         return not run.live or int(work.t[i]) - int(self._state[work.rows[i], OFFSET]) > run.begun + self._agree
 
     def _agrees(self, work: Work, run: Run, i: int) -> bool:
-        """Whether an event says the same of its clock as those that are held, but for delays."""
+        """Return whether an event implies the same clock as the held ones, except for delays."""
         t = int(work.t[i])
         if run.live:
             lower = run.top - self._offset(work, i)
-            # On its way for long, while others come on time.
+            # Delayed, while others arrive on time.
             delayed = lower > 0 and int(work.arrival[i]) - run.arrived <= self._settled
             return delayed or abs(lower) <= self._spread
         if t < run.t[-1] - self._horizon:
@@ -263,10 +264,9 @@ class ClockGuard:
         return (step + ZONE // 2) // ZONE * ZONE
 
     def _can_be_set_back(self, work: Work, i: int) -> bool:
-        """Whether a time that went back may be a clock's, and not a block of late readings, or files in a wrong order.
+        """Return whether a time that went back may be due to a clock rather than to a block of late measurements.
 
-        With known arrivals it always may. Without, a channel cannot have measured twice at one time: what fills its
-        last gap is late.
+        With known arrivals it always may. Otherwise events that fill the channel's last gap are late ones.
         """
         if self._is_live(work, i):
             return True
@@ -274,7 +274,7 @@ class ClockGuard:
         return not (state[GAP_TO] > state[GAP_FROM] and state[GAP_FROM] - horizon <= t <= state[GAP_TO] + horizon)
 
     def _anchor(self, work: Work, row: int) -> None:
-        """What is held was true: let it in, with the clock set right if it was one that moved."""
+        """Accept the held events, and correct their clock if it was set."""
         run, state = self._runs[row], self._state[row]
         first = run.at[0]
         now = int(self._state[self._everything, LAST])
@@ -285,7 +285,7 @@ class ClockGuard:
         elif not run.ahead:
             step = self._step_back(run, row)
         elif now > run.begin:
-            # The others went on meanwhile, so this was no gap.
+            # Other channels continued meanwhile, so this was not a gap.
             step = run.begin - run.t[0]
         if step:
             step = self._likely(row, step)
@@ -298,9 +298,9 @@ class ClockGuard:
                 self._release(work, other)
 
     def _likely(self, row: int, step: int) -> int:
-        """The step that a clock made, of those that are near to the one measured; that itself, if there is none.
+        """Return a known step close to the measured one, or the measured step if there is none.
 
-        The sensors of one source share its clock, so they make its steps and are where it is. And it may come back.
+        Sensors of one source share its clock, and so its steps and offset; and a clock may return to an earlier offset.
         """
         shift = self._shift - self._shift[row]
         steps = [*self._steps, *(-known for known in self._steps), *shift.tolist(), -int(self._shift[row])]
@@ -317,9 +317,9 @@ class ClockGuard:
         work.emit(run.at, settled=True)
 
     def _dissolve(self, work: Work, row: int, rest: Sequence[int] = ()) -> None:
-        """What is held was not true: refused if it is ahead; what is back goes to the log, which counts it as stale.
+        """Reject the held events if they are ahead; pass those that are back to the log, which drops them as stale.
 
-        But for the `rest`, which stays held with what contradicted it.
+        The events of `rest` stay held.
         """
         run = self._end(row)
         gone = [i for i in run.at if i not in set(rest)] if rest else run.at
@@ -335,7 +335,7 @@ class ClockGuard:
         return self._runs.pop(row)
 
     def _leave(self, work: Work) -> Passed:
-        """What passes; what is still held is kept for the next batch."""
+        """Return the events that pass, and keep the held ones for the next batch."""
         kept = sorted(i for run in self._runs.values() for i in run.at)
         place = {i: k for k, i in enumerate(kept)}
         for run in self._runs.values():
@@ -345,7 +345,7 @@ class ClockGuard:
 
 
 class Refused(NamedTuple):
-    """A lone event whose time was far ahead: its kind, channel, time (ns) and where its clock was expected (ns)."""
+    """Rejected event whose time was far ahead: kind, channel, time (ns) and expected time (ns)."""
 
     kind: int
     channel: int
@@ -354,7 +354,7 @@ class Refused(NamedTuple):
 
 
 class Moved(NamedTuple):
-    """A clock that was set: kind and channel of its first event, its time as stamped, and by how much it moved (ns)."""
+    """Clock that was set: kind, channel and timestamp (ns) of its first event after the step, and the step (ns)."""
 
     kind: int
     channel: int
@@ -363,7 +363,7 @@ class Moved(NamedTuple):
 
 
 class Passed(NamedTuple):
-    """What may go to the log, in order. `settled` (N,) were held: they came in time, so no horizon applies to them."""
+    """Events for the log, in order. Those of the mask `settled` (N,) were held, so no horizon applies to them."""
 
     events: Events
     settled: np.ndarray
@@ -372,7 +372,7 @@ class Passed(NamedTuple):
 
 
 def plain_events(batch: Events) -> Events:
-    """The batch, its columns as the compiled functions read them; as it is, where it is so."""
+    """Return the batch with columns of the types that the compiled functions read; itself if it has them."""
     types_ = (np.int64, np.int64, np.int8, np.int32)
     columns = [np.ascontiguousarray(column, kind) for column, kind in zip(batch[:4], types_, strict=True)]
     if all(a is b for a, b in zip(columns, batch, strict=False)):
@@ -381,11 +381,11 @@ def plain_events(batch: Events) -> Events:
 
 
 class Run:
-    """Events of one channel that agree on another time, held until it is told whether that is true.
+    """Held events of one channel that agree on another time.
 
-    `ahead` or back; `live` where arrivals are known. `begin` is the newest time of all that was said before. `agree` is
-    how far apart t - arrival may be of those that count as on time. `top` is the largest t - arrival, `begun` the
-    first arrival, `arrived` the last of those on time, `highest` the largest time. All in ns.
+    `ahead` or back; `live` if arrivals are known. `begin` is the newest time of all events before. `agree` is the
+    largest spread of t - arrival among events on time. `top` is the largest t - arrival, `begun` the first arrival,
+    `arrived` the last arrival of events on time, `highest` the largest time. All in ns.
     """
 
     def __init__(self, ahead: bool, live: bool, begin: int, agree: int, most: int) -> None:
@@ -398,14 +398,14 @@ class Run:
 
     @property
     def full(self) -> bool:
-        """Whether it never settled."""
+        """Whether no more events may be held."""
         return len(self.at) >= self._most
 
     @property
     def span(self) -> int:
-        """For how long they agree, by their own time; where arrivals are known by those too, of the ones on time.
+        """Time over which the events agree, ns, by their own clock and, if arrivals are known, by arrivals too.
 
-        A block that was held up and comes in one go has no span.
+        A delayed block that arrives at once has no span.
         """
         if not self.live:
             return self.highest - self._lowest
@@ -413,7 +413,7 @@ class Run:
         return min(newest - t, arrived - arrival)
 
     def add(self, i: int, t: int, arrival: int) -> None:
-        """The next of them: its place in the work, its time and its arrival."""
+        """Add an event: its place in the work, its time and its arrival."""
         offset = t - arrival
         first = not self.at
         self.begun = arrival if first else self.begun
@@ -429,10 +429,10 @@ class Run:
 
 
 class Work:
-    """Events that were held and a batch, one after the other, and what becomes of them."""
+    """Held events followed by a batch, and the decisions on them."""
 
     def __init__(self, events: Events, rows: np.ndarray, raw: np.ndarray, begin: int) -> None:
-        """The rows of the state (n,), the times as stamped, and how many of the events were held."""
+        """`rows` (n,) of the state, timestamps `raw` (n,), and the number `begin` of held events."""
         self._events = events
         self.t, self.arrival, self.kind, self.channel = events[:4]
         self.rows, self.raw, self.begin = rows, raw, begin
@@ -443,16 +443,16 @@ class Work:
         self.moved: list[Moved] = []
 
     def emit(self, at: Sequence[int], *, settled: bool = False) -> None:
-        """These pass, in this order."""
+        """Pass the events at these places, in this order."""
         self.order.extend(at)
         self.settled.extend([settled] * len(at))
 
     def shift(self, row: int, held: list[int], step: int) -> None:
-        """The clock of a row was set: correct what is held, and what is still to come."""
+        """Shift the held and the following times of a row."""
         later = np.flatnonzero(self.rows == row)
         self.t[held] += step
         self.t[later[later > held[-1]]] += step
 
     def select(self, at: list[int]) -> Events:
-        """The events at these places."""
+        """Return the events at these places."""
         return self._events.select(np.array(at, np.int64))

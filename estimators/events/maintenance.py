@@ -1,7 +1,7 @@
-"""Maintenance: when something of the asset was changed, and which version of the model each event is of.
+"""Maintenance events, at which a part of the asset is replaced, and the versions of the model between them.
 
-A version of the model lasts from one maintenance to the next; the first is 1. The states that are named start again
-from the prior's variance, uncorrelated with the others, as what was known of them was of the part that is gone.
+A version of the model lasts from one maintenance to the next; the first is 1. The named states restart from the prior's
+variance, uncorrelated with the others, as the earlier estimate belongs to the replaced part.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from .batch import MAINTENANCE, Events
 
 
 def maintained(t: int, arrival: int, states: Sequence[int], width: int) -> Events:
-    """The events of one maintenance at t (ns): one for each state (its index) that starts again."""
+    """Return the events of one maintenance at t (ns), one for each state (its index) that restarts."""
     n = len(states)
     return Events(
         np.full(n, t, np.int64),
@@ -26,7 +26,7 @@ def maintained(t: int, arrival: int, states: Sequence[int], width: int) -> Event
 
 
 def model_versions(events: Events, before: int = 1) -> np.ndarray:
-    """The version of the model at each event (N,) of a log, in its order, where it begins with version `before`."""
+    """Return the version of the model at each event (N,) of an ordered log that begins with version `before`."""
     rows = np.flatnonzero(events.kind == MAINTENANCE)
     first = np.concatenate((rows[:1], rows[1:][np.diff(events.t[rows]) > 0]))
     begins = np.zeros(len(events), np.int64)
@@ -36,16 +36,16 @@ def model_versions(events: Events, before: int = 1) -> np.ndarray:
 
 
 def versions_dropped(events: Events, count: int) -> int:
-    """How many versions of the model end with the oldest `count` events, when these are dropped.
+    """Return how many versions of the model end within the oldest `count` events.
 
-    A maintenance whose events are dropped in part is told by those that stay.
+    A maintenance of which some events remain is not counted.
     """
     times = [events.t[part][events.kind[part] == MAINTENANCE] for part in (slice(0, count), slice(count, None))]
     return int(np.setdiff1d(times[0], times[1][:1]).size)
 
 
 def without(cov: np.ndarray, prior: np.ndarray, state: int) -> np.ndarray:
-    """A covariance (nx, nx), or variances (1, nx), in which one state is as unknown as in the prior's, and apart."""
+    """Return a covariance (nx, nx), or variances (1, nx), with one state's variance as in the prior, uncorrelated."""
     if cov.shape[0] == 1 < cov.shape[1]:
         variances = cov.copy()
         variances[0, state] = prior[0, state]

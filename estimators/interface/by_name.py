@@ -68,33 +68,33 @@ def fold(
 
     Args:
         estimator: Its name, such as "ukf"; all are in `ESTIMATORS`.
-        model: What the log is of.
-        log: Events, inputs, true states.
-        R: Variances of sensor noise, in the rows' units squared: by sensor (one number, or one for each row), or by
-            row, "gnss.east".
-        Q: Variances that the process noises add in a second, by name.
+        model: Model of the log.
+        log: Measurements, inputs, true states.
+        R: Variances of sensor noise, in the rows' units squared: by sensor (one number, or one per row), or by row,
+            "gnss.east".
+        Q: Variances that the process noises add per second, by name.
         p: Parameters by name.
         held_out: Sensors that are predicted and scored, never used.
-        gate: The probability that a good reading passes, such as 0.997; None for no gate.
-        seed: Of all that the filter draws.
+        gate: Probability that a good measurement passes, such as 0.997; None for no gate.
+        seed: Seed of the filter's random numbers.
         prior: Mean (nx,) and covariance (nx, nx), positive semidefinite, in place of the model's; a row of zeros is a
             state that is known exactly.
-        covariance: Keep the whole covariance at every event, for `Estimates.cov` and `Estimates.nees`.
-        smoothed: Give mean, deviations and covariances of the states given all readings, those that came later too;
-            innovations, verdicts and health stay the filter's.
-        policy: When the estimate may be trusted.
-        tuning: What the names above change; None for what the model declares.
-        **options: The estimator's own, by name; one of several words as the word: `resampling="stratified"`.
+        covariance: Keep the full covariance at every event, for `Estimates.cov` and `Estimates.nees`.
+        smoothed: Return mean, deviations and covariances of the states given all measurements, later ones included;
+            innovations, verdicts and health remain the filter's.
+        policy: Thresholds of health.
+        tuning: Tuning that the arguments above change; None for the one that the model declares.
+        **options: Options of the estimator by name; a choice by its word, `resampling="stratified"`.
 
     Returns:
-        The estimates, one row an event.
+        The estimates, one row per event.
 
     Raises:
-        EstimatorError: If the estimator does not exist, does not apply or cannot be smoothed, an option or the prior
-            breaks a rule.
-        ConfigError: If a name is unknown or a value breaks its rule.
+        EstimatorError: If the estimator does not exist, does not apply or cannot be smoothed, or an option or the prior
+            is invalid.
+        ConfigError: If a name is unknown or a value is out of range.
         EventError: If the log is of another model.
-        ModelError: If the model's functions disagree with its declaration, or those of a black box fail.
+        ModelError: If the model's functions contradict its declaration, or those of a black box fail.
     """
     tuned = tuned_by_name(estimator, model, tuning, R, Q, p, held_out, gate, seed, options)
     _check_named(log, model)
@@ -106,7 +106,7 @@ def fold(
         track = smooth(folded).instead_of(folded.track)
     else:
         track = fold_track(estimator, model, tuned, log, pairs=pairs, policy=policy, prior=prior)
-    return _estimates(estimator, model, tuned, _copied(log), track, covariance)
+    return Estimates(estimator, model, tuned, _copied(log), track, covariance)
 
 
 def fold_many(
@@ -130,23 +130,23 @@ def fold_many(
     """Fold an estimator over one log or several, with several seeds: a Monte Carlo study.
 
     Args:
-        estimator: As `fold`; so are all that are not named here.
-        model: What the logs are of.
-        log: One, or several.
-        seeds: Of the folds; each log is folded with each.
-        executor: "threads" (folds run beside each other, as compiled code gives up the interpreter), "processes" (for
-            FilterPy's filters and black boxes; `f` and `h` must stand by their names in a module), any
-            concurrent.futures.Executor, or None for one after the other. The results are the same bits.
-        R: As `fold`.
-        Q: As `fold`.
-        p: As `fold`.
-        held_out: As `fold`.
-        gate: As `fold`.
-        prior: As `fold`.
-        covariance: As `fold`.
-        policy: As `fold`.
-        tuning: As `fold`.
-        **options: As `fold`.
+        estimator: As in `fold`, and so are R, Q, p, held_out, gate, prior, covariance, policy, tuning and options.
+        model: Model of the logs.
+        log: One log, or several.
+        seeds: Seeds; each log is folded with each.
+        executor: "threads" (compiled code releases the GIL), "processes" (for FilterPy's filters and black boxes; `f`
+            and `h` must be module-level functions), any concurrent.futures.Executor, or None to fold one after the
+            other. The results are the same bits.
+        R: See `fold`.
+        Q: See `fold`.
+        p: See `fold`.
+        held_out: See `fold`.
+        gate: See `fold`.
+        prior: See `fold`.
+        covariance: See `fold`.
+        policy: See `fold`.
+        tuning: See `fold`.
+        **options: See `fold`.
 
     Returns:
         Estimates of the first log with every seed, then of the second, and so on.
@@ -161,44 +161,32 @@ def fold_many(
     jobs = [(each, _seeded(first, seed)) for each in logs for seed in list(seeds)]
     for each in logs:
         _check_named(each, model)
-        # Compiles, and finds what is wrong, before anybody waits for it.
+        # Compile, and check the arguments, before work is submitted.
         Fold(estimator, model, first, each, pairs=pairs, policy=policy, prior=prior)
-    given = [(estimator, model, tuned, each, pairs, policy, prior) for each, tuned in jobs]
+    kept: dict[str, Any] = {"pairs": pairs, "policy": policy, "prior": prior}
     with _pool(executor) as pool:
         if pool is None:
-            tracks = [_track(*one) for one in given]
+            tracks = [fold_track(estimator, model, tuned, each, **kept) for each, tuned in jobs]
         else:
             try:
-                futures = [pool.submit(_track, *one) for one in given]
+                futures = [pool.submit(fold_track, estimator, model, tuned, each, **kept) for each, tuned in jobs]
                 tracks = [future.result() for future in futures]
             except (PicklingError, AttributeError, TypeError) as error:
                 if "pickle" not in str(error):
                     raise
                 raise EstimatorError(
-                    f"fold_many: processes cannot be given {model.name} ({error}); let its functions stand by their "
-                    'names in a module, or use executor="threads"'
+                    f"fold_many: processes cannot be given {model.name} ({error}); define its functions in a "
+                    'module, or use executor="threads"'
                 ) from None
     copies = {id(each): _copied(each) for each in logs}
     return [
-        _estimates(estimator, model, tuned, copies[id(each)], track, covariance)
+        Estimates(estimator, model, tuned, copies[id(each)], track, covariance)
         for (each, tuned), track in zip(jobs, tracks, strict=True)
     ]
 
 
-def _track(
-    estimator: str,
-    model: StateSpaceModel,
-    tuning: Tuning,
-    log: Log,
-    pairs: np.ndarray | None,
-    policy: HealthPolicy | None,
-    prior: Prior | None,
-) -> Track:
-    return fold_track(estimator, model, tuning, log, pairs=pairs, policy=policy, prior=prior)
-
-
 def _pool(executor: Executor | str | None) -> Any:
-    """A context that gives an executor, which it ends if it is its own; or None."""
+    """Return a context manager for an executor, which it shuts down if it created it; or for None."""
     if executor is None or isinstance(executor, Executor):
         return nullcontext(executor)
     count = int(numba.config.NUMBA_NUM_THREADS)
@@ -213,10 +201,10 @@ def _pool(executor: Executor | str | None) -> Any:
 
 
 def _check_named(log: Log, model: StateSpaceModel) -> None:
-    """Refuse a log whose names mean other channels; a model with other states may well fold it.
+    """Check that the log's sensors and inputs are the model's; the states may differ.
 
     Raises:
-        EstimatorError: If its sensors or inputs are not the model's.
+        EstimatorError: If the sensors or inputs differ.
     """
     if log.model is None or log.model is model:
         return
@@ -232,18 +220,12 @@ def _check_named(log: Log, model: StateSpaceModel) -> None:
 
 
 def _copied(log: Log) -> Events:
-    """The log's events now, whatever comes later."""
+    """Return copies of the log's present events."""
     return Events(*(column.copy() for column in log.events))
 
 
-def _estimates(
-    estimator: str, model: StateSpaceModel, tuning: Tuning, events: Events, track: Track, covariance: bool
-) -> Estimates:
-    return Estimates(estimator=estimator, model=model, tuning=tuning, events=events, track=track, covariance=covariance)
-
-
 def all_pairs(model: StateSpaceModel) -> np.ndarray:
-    """Every pair of states i < j, (nx (nx - 1) / 2, 2)."""
+    """Return every pair of states i < j, (nx (nx - 1) / 2, 2)."""
     if len(model.shown) < model.nx:
         raise EstimatorError(
             f"covariance: {model.name} has {model.nx:,} states, of which a track keeps some; leave it out"
@@ -252,7 +234,7 @@ def all_pairs(model: StateSpaceModel) -> np.ndarray:
 
 
 def _seeded(tuning: Tuning, seed: int) -> Tuning:
-    # A seed is 64 bits of the draws' place; a float or a negative one would be another than was meant.
+    # Random numbers depend on the 64 bits of the seed, to which a float or a negative number would be converted.
     if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or not 0 <= seed < 2**63:
         raise ConfigError(f"seed is {seed!r}; it must be a whole number from 0 on")
     return replace(tuning, seed=int(seed))
@@ -270,10 +252,10 @@ def tuned_by_name(
     seed: int,
     options: Mapping[str, float | str],
 ) -> Tuning:
-    """A tuning with what is given by name.
+    """Return a tuning with entries given by name.
 
     Raises:
-        NisusError: If a name is unknown or a value breaks its rule.
+        NisusError: If a name is unknown or a value is out of range.
     """
     entry = find_estimator(estimator, model)
     tuned = Tuning.of(model) if tuning is None else tuning
@@ -296,7 +278,7 @@ def tuned_by_name(
 
 
 def _entries(group: str, name: str, value: Any, model: StateSpaceModel) -> list[tuple[str, float]]:
-    """Keys of a tuning and their values; of a sensor with several rows a value may be one for each."""
+    """Return keys of a tuning and their values; a sensor with several rows takes one value or one per row."""
     given = np.asarray(value)
     if given.dtype.kind not in "iufb":
         raise ConfigError(f"{group}[{name!r}] is {value!r}; it must be a number")
@@ -312,7 +294,7 @@ def _entries(group: str, name: str, value: Any, model: StateSpaceModel) -> list[
 
 @dataclass(frozen=True)
 class Estimates:
-    """One row an event of the log, in its order; `track` has all columns, `events` what was folded."""
+    """Estimates of a fold, one row per event of the log: `track` has all columns, `events` the folded events."""
 
     estimator: str
     model: StateSpaceModel
@@ -322,32 +304,28 @@ class Estimates:
     covariance: bool = False
 
     def __len__(self) -> int:
-        """Number of events."""
+        """Return the number of events."""
         return len(self.track)
 
     @cached_property
     def seconds(self) -> np.ndarray:
         """Times of the events, s, (N,)."""
-        seconds: np.ndarray = self.events.t * 1e-9
-        return seconds
+        return np.asarray(self.events.t * 1e-9)
 
     @property
     def mean(self) -> np.ndarray:
         """Estimates of the states after each event, (N, nx), in their units."""
-        mean: np.ndarray = self.track.mean
-        return mean
+        return np.asarray(self.track.mean)
 
     @property
     def std(self) -> np.ndarray:
-        """Their standard deviations, (N, nx)."""
-        std: np.ndarray = self.track.std
-        return std
+        """Standard deviations of the estimates, (N, nx)."""
+        return np.asarray(self.track.std)
 
     @property
     def nis(self) -> np.ndarray:
-        """Normalised innovation squared of each reading, (N,); NaN for other events."""
-        nis: np.ndarray = self.track.nis
-        return nis
+        """Normalised innovation squared of each measurement, (N,); NaN for other events."""
+        return np.asarray(self.track.nis)
 
     @property
     def cov(self) -> np.ndarray:
@@ -367,11 +345,11 @@ class Estimates:
 
     @property
     def log_likelihood(self) -> float:
-        """Sum over the readings that were used or refused; see diagnostics/refusals.py."""
+        """Log-likelihood of the measurements that were used or rejected; see `Score.log_likelihood`."""
         return self.score().log_likelihood
 
     def readings(self, sensor: str) -> np.ndarray:
-        """Indices of the rows that are readings of a sensor.
+        """Return the indices of the rows with measurements of a sensor.
 
         Raises:
             EstimatorError: If there is no such sensor.
@@ -384,21 +362,21 @@ class Estimates:
         return np.flatnonzero((self.events.kind == READING) & (self.events.channel == channel))
 
     def table(self) -> Any:
-        """A pyarrow.Table, one row an event; `.to_pandas()` makes a frame of it. See tabular.py for its columns."""
+        """Return a pyarrow.Table, one row per event, for `.to_pandas()`; `table_of` lists the columns."""
         return table_of(self.model, self.events, self.track, self.episodes())
 
     def episodes(self) -> list[Episode]:
-        """What was wrong from when to when, with whom, by how much, and what to do: see docs/alarms.md."""
+        """Return the episodes of alarms with cause, size and remedy: see docs/alarms.md."""
         marginal = find_estimator(self.estimator, self.model).family in ("particle", "ensemble")
         course = Course(self.model, self.tuning, marginal, self.events, self.track)
         return [found.episode for found in found_in(course)]
 
     def score(self) -> Score:
-        """NIS and its bounds, errors against the truth, predictions of sensors held out."""
+        """Return NIS and its bounds, errors against the truth, and predictions of held-out sensors."""
         return score(self.track, self.events, self.model, gate=self.tuning.gate, baseline=self.tuning.baseline)
 
     def nees(self) -> Nees:
-        """Normalised estimation error squared wherever the truth is known.
+        """Return the normalised estimation error squared at all events with a known truth.
 
         Raises:
             EstimatorError: If the fold did not keep the covariances, or no truth is known.

@@ -1,4 +1,4 @@
-"""A fold as a table: one row an event, one column a state."""
+"""Tables of folds: one row per event, one column per state."""
 
 from __future__ import annotations
 
@@ -28,16 +28,16 @@ def table_of(
     tuning: str = "",
     model_version: int = 1,
 ) -> Any:
-    """A pyarrow.Table of events and track.
+    """Return a pyarrow.Table of events and track.
 
-    Columns: `t_ns` and `arrival_ns`; `seconds`; `event`, `channel`, and `sensor` (null unless it is a reading);
-    `value_k` and, where a reading brought its own, `variance_k`; for each state `NAME_true` (NaN where it is not
-    known), `NAME` and `NAME_std`, and where the fold was smoothed `NAME_smooth` and `NAME_smooth_std`; `innovation_k`
-    and `innovation_std_k`; NIS with its windowed mean and bounds, log-likelihood; verdict and health in words;
-    `screened`: why the edge refused rows of the reading, null if it did not; `model_version`, which counts up with each
-    maintenance from that at the first event, and `tuning_version`, of the tuning that the track was folded with, which
-    `tuning` names (null if nobody did); `alarms`, the causes that are in alarm after a reading or a truth, and `flags`,
-    what else is wrong, both joined by commas, null where there is none. The schema's metadata have `episodes`, as JSON.
+    Columns: `t_ns`, `arrival_ns`, `seconds`; `event`, `channel`, and `sensor` (null unless a measurement); `value_k`
+    and, if measurements have variances of their own, `variance_k`; for each state `NAME_true` (NaN if unknown), `NAME`,
+    `NAME_std`, and of a smoothed fold `NAME_smooth` and `NAME_smooth_std`; `innovation_k` and `innovation_std_k`; NIS
+    with its windowed mean and bounds, log-likelihood; verdict and health as words; `screened`, the reasons why rows of
+    the measurement were rejected before the filter, or null; `model_version`, which increases with each maintenance;
+    `tuning_version` and `tuning`, number and name (or null) of the tuning of the track; `alarms`, the causes in alarm
+    after the event, and `flags`, other conditions, joined by commas or null. The schema's metadata have `episodes` as
+    JSON.
     """
     import pyarrow as pa
 
@@ -52,7 +52,7 @@ def table_of(
     }
     columns |= {f"value_{k}": events.value[:, k] for k in range(model.width)}
     columns |= {f"variance_{k}": events.value[:, model.width + k] for k in range(events.value.shape[1] - model.width)}
-    # The track of a large field keeps some of its states.
+    # The track of a large field has only some of its states.
     shown = [model.state_names[j] for j in model.shown]
     for j, name in zip(model.shown, shown, strict=True):
         rows, values = truth_of(events, int(j))
@@ -89,14 +89,14 @@ _FLAGS = {IMPOVERISHED: "impoverished", OUTSIDE: "outside the fitted range", TRU
 
 
 def _words(masks: np.ndarray, bits: dict[int, str]) -> np.ndarray:
-    """What the bits of each mask say; None where there are none."""
+    """Return the words of each mask's bits, joined by commas; None where there are none."""
     kinds, which = np.unique(masks, return_inverse=True)
     said = [", ".join(word for bit, word in bits.items() if int(mask) & bit) or None for mask in kinds]
     return np.array(said, object)[which.reshape(-1)]
 
 
 def _reasons(screened: np.ndarray) -> Any:
-    """Why readings were refused, as `range, rate`; null where they were not."""
+    """Return the reasons why rows were rejected before the filter, as `range, rate`; null where they were not."""
     import pyarrow as pa
 
     every = range(1 << len(REASONS))

@@ -13,7 +13,7 @@ from estimators.errors import LARGEST
 from estimators.estimator import Estimator
 from estimators.model.coloured import disturbance_time, error_time, errors_of
 from estimators.registry import find_entry
-from estimators.tuning import REOPEN, Tuning
+from estimators.tuning import REOPEN_S, Tuning
 
 from ...twin.bounds import bounds_of
 
@@ -118,7 +118,7 @@ def _within(value: float | list[float], bounds: tuple[float, float] | None) -> A
 def _gate(tuning: Tuning) -> Any:
     if tuning.gate is None:
         return None
-    if tuning.gate_kind == "hard" and tuning.reopen == REOPEN:
+    if tuning.gate_kind == "hard" and tuning.reopen == REOPEN_S:
         return tuning.gate
     reopen = "never" if tuning.reopen is None else tuning.reopen
     return {"probability": tuning.gate, "kind": tuning.gate_kind, "reopen": reopen}

@@ -8,7 +8,7 @@ import numpy as np
 
 from estimators.diagnostics.calibration import BANDS, Calibration
 from estimators.model.state_space import StateSpaceModel
-from estimators.tuning import TOGETHER
+from estimators.tuning import SHARED_ENTRY_ROWS
 
 
 def calibration_lines(found: Sequence[Calibration], model: StateSpaceModel) -> list[str]:
@@ -17,13 +17,13 @@ def calibration_lines(found: Sequence[Calibration], model: StateSpaceModel) -> l
         model.row_names[start + k]: sensor.name
         for sensor, start in zip(model.sensors, model.row_start, strict=True)
         for k in range(len(sensor.rows))
-        if len(sensor.rows) >= TOGETHER
+        if len(sensor.rows) >= SHARED_ENTRY_ROWS
     }
     lines: list[str] = []
     groups: dict[tuple[str, str], list[Calibration]] = {}
     states = sum(entry.role == "truth" for entry in found)
     for entry in found:
-        group = "states" if entry.role == "truth" and states >= TOGETHER else many.get(entry.subject)
+        group = "states" if entry.role == "truth" and states >= SHARED_ENTRY_ROWS else many.get(entry.subject)
         if group is not None:
             groups.setdefault((group, entry.role), []).append(entry)
         elif entry.words:

@@ -95,7 +95,7 @@ WRONG = {
         "have shape .1,. for 2 times; the shape must be .2,.",
     ),
     "columns": (lambda log: log.add("winding", [1.0], [[1.0, 2.0]]), "the shape must be .1,."),
-    "a word": (lambda log: log.add("winding", [1.0], ["warm"]), "what is no number, such as 'warm'"),
+    "a word": (lambda log: log.add("winding", [1.0], ["warm"]), "'warm'; all entries must be numbers"),
     "a time": (lambda log: log.add("winding", [1.0, np.nan], [1.0, 2.0]), r"seconds\[1\] is nan"),
     "nanoseconds": (lambda log: log.add("winding", 1_700_000_000 * 10**9, 1.0), "in seconds"),
     "times": (lambda log: log.add("winding", [[1.0]], [1.0]), "seconds has shape .1, 1."),
@@ -143,7 +143,7 @@ def test_errors_say_what_to_write(name):
 
 
 def test_a_log_of_no_model_knows_no_names():
-    with pytest.raises(EventError, match=r"add: this log is of no model.*Log.of\(model\)"):
+    with pytest.raises(EventError, match=r"add: this log has no model.*Log.of\(model\)"):
         Log(2).add("winding", 1.0, 2.0)
 
 
