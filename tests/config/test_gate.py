@@ -7,7 +7,7 @@ import pytest
 from app.twin.twin import restore_twin
 from config.loader import load_text
 from estimators.errors import ConfigError
-from estimators.tuning import REOPEN
+from estimators.tuning import REOPEN_S
 
 TWIN = "model: motor_winding\nsource: {type: simulator}\ngate: "
 
@@ -19,7 +19,7 @@ def loaded(gate):
 def test_a_number_is_a_hard_gate_that_reopens():
     assert loaded("null") is None
     assert loaded("0.99") == loaded("{probability: 0.99}")
-    assert (loaded("0.99").kind, loaded("0.99").seconds) == ("hard", REOPEN)
+    assert (loaded("0.99").kind, loaded("0.99").seconds) == ("hard", REOPEN_S)
 
 
 def test_all_that_a_gate_may_be():
