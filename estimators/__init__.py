@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from .interface.by_name import fold as fold
     from .interface.by_name import fold_many as fold_many
     from .log import Log as Log
+    from .model.rk4 import rk4 as rk4
     from .model.state_space import Field as Field
     from .model.state_space import Input as Input
     from .model.state_space import Jump as Jump
@@ -41,6 +42,7 @@ _HOMES = {
     "Tuning": "tuning",
     "fold_many": "interface.by_name",
     "mean_nees": "diagnostics.consistency",
+    "rk4": "model.rk4",
     **dict.fromkeys(("Field", "Input", "Jump", "Limits", "Noise", "Parameter", "Row", "Sensor", "State"), "model"),
     **dict.fromkeys(("StateSpaceModel", "Stuck"), "model"),
 }

@@ -1,4 +1,4 @@
-"""The models that ship, by name."""
+"""The bundled models, by name."""
 
 from __future__ import annotations
 
@@ -8,10 +8,8 @@ from .battery_cell import BATTERY_CELL
 from .battery_pack import BATTERY_PACK
 from .field_era5 import FIELD_ERA5
 from .gripper_contact import GRIPPER_CONTACT
-from .lorenz63 import LORENZ63
-from .lorenz96 import LORENZ96
-from .motor_drive import MOTOR_DRIVE
-from .motor_winding import MOTOR_WINDING
+from .lorenz import LORENZ63, LORENZ96
+from .motor_drive import MOTOR_DRIVE, MOTOR_WINDING
 from .road_car import ROAD_CAR
 from .thermal_field import THERMAL_FIELD, THERMAL_FIELD_LARGE
 from .uwb_rover import UWB_ROVER

@@ -1,14 +1,15 @@
-"""A vehicle in a corridor that looks the same after half a turn, but for a door: four range finders and odometry.
+"""A vehicle in a corridor with a two-fold symmetry, broken only by a door: four range finders and odometry.
 
     east' = speed cos ψ,   north' = speed sin ψ,   ψ' = yaw_rate
     scan_k = distance along ψ + k π/2 to the first wall,   k = 0 ahead, 1 left, 2 behind, 3 right
 
 The building is a rectilinear polygon about the origin, 48 m long and 3 m wide, with an alcove to the north and one to
-the south. (east, north, ψ) and (-east, -north, ψ + π) see the same, unless a beam meets the door, a niche in the north
-wall: until then the true posterior has two peaks. The prior is one Gaussian over the whole building and every heading.
+the south. (east, north, ψ) and (-east, -north, ψ + π) give the same ranges, unless a beam meets the door, a niche in
+the north wall: until then the true posterior has two peaks. The prior is one Gaussian over the whole building and all
+headings.
 
-Each wall is a segment of an axis, so a beam's distance to it is a quotient, d = (wall - east) / cos ψ, and its slopes
-are -1 / cos ψ and d tan ψ: the Jacobian is exact wherever a beam does not meet a corner.
+Each wall is parallel to an axis, so a beam's distance is a quotient, d = (wall - east) / cos ψ, with the slopes
+-1 / cos ψ and d tan ψ: the Jacobian is exact wherever a beam does not meet a corner.
 
 Source: Thrun, Burgard & Fox (2005), Probabilistic Robotics, sections 6.3 (beams) and 8.3 (particles).
 """
@@ -21,10 +22,14 @@ from ..model.state_space import Input, Noise, Row, Sensor, State, StateSpaceMode
 from ..numerics.jit import jit
 
 EAST, NORTH, HEADING = range(3)
+
+
 SPEED, YAW_RATE = range(2)
 
+
 FAR = 60.0
-"""What a beam that meets no wall tells, m; only from outside the building."""
+"""Range of a beam that meets no wall, m; only from outside the building."""
+
 
 OUTLINE = (
     (-24.0, -1.5), (-12.0, -1.5), (-12.0, -3.0), (-10.0, -3.0), (-10.0, -1.5), (24.0, -1.5),
@@ -33,13 +38,14 @@ OUTLINE = (
 )  # fmt: skip
 """Corners of the building, m; the short niche to the north is the door."""
 
+
 WALLS = np.array([(*a, *b) for a, b in zip(OUTLINE, OUTLINE[1:] + OUTLINE[:1], strict=True)])
 """East and north of both ends of each wall, (16, 4)."""
 
 
 @jit
 def first_wall(east, north, c, s):
-    """Distance along (c, s) to the first wall, and its slopes by east, north and the direction's angle."""
+    """Return the distance along (c, s) to the first wall, and its slopes by east, north and the direction's angle."""
     best, by_east, by_north, by_angle = FAR, 0.0, 0.0, 0.0
     for k in range(WALLS.shape[0]):
         a_east, a_north, b_east, b_north = WALLS[k, 0], WALLS[k, 1], WALLS[k, 2], WALLS[k, 3]
@@ -61,7 +67,7 @@ def first_wall(east, north, c, s):
 
 
 def f(x, u, p, dt, out):
-    """Drive with the heading of the middle of the step."""
+    """Drive with the heading at the middle of the step."""
     middle = x[HEADING] + 0.5 * dt * u[YAW_RATE]
     out[EAST] = x[EAST] + dt * u[SPEED] * np.cos(middle)
     out[NORTH] = x[NORTH] + dt * u[SPEED] * np.sin(middle)
@@ -69,14 +75,14 @@ def f(x, u, p, dt, out):
 
 
 def Q(x, u, p, q, dt, out):
-    """The same noise for east and north."""
+    """Fill Q: the same noise for east and north."""
     out[EAST, EAST] = q[0] * dt
     out[NORTH, NORTH] = q[0] * dt
     out[HEADING, HEADING] = q[1] * dt
 
 
 def scan(x, u, p, out):
-    """The four distances."""
+    """Measure the four distances."""
     c, s = np.cos(x[HEADING]), np.sin(x[HEADING])
     for k in range(4):
         out[k] = first_wall(x[EAST], x[NORTH], c, s)[0]
@@ -84,7 +90,7 @@ def scan(x, u, p, out):
 
 
 def scan_slopes(x, u, p, out):
-    """Their Jacobian."""
+    """Fill their Jacobian."""
     c, s = np.cos(x[HEADING]), np.sin(x[HEADING])
     for k in range(4):
         _, out[k, EAST], out[k, NORTH], out[k, HEADING] = first_wall(x[EAST], x[NORTH], c, s)

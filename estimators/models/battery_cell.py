@@ -5,17 +5,16 @@
     m dT/dt = i (R0 g(T) i + V1) - (T - T_air) / R_air
     v = U(z) + e - V1 - R0 g(T) i,  g(T) = exp(B (1 / T - 1 / 298.15 K))
 
-U is a monotone cubic through its values at 14 states of charge, which are parameters; outside 0 to 1 it goes on
-straight. R1 rises when the cell is nearly empty, where diffusion cannot follow. C1 = τ1 / R1. Entropic heat is left
-out. e is zero; estimated jointly, it stands for hysteresis and age, by which U is off for hours. z is exact for a
-current that is held, and so is V1 but for R1, which is held over a step; T takes Euler steps of at most 2 s, against
-minutes of its own.
+U is a monotone cubic through its values at 14 states of charge, which are parameters; outside 0 to 1 it is linear. R1
+rises when the cell is nearly empty, where diffusion cannot follow. C1 = τ1 / R1. Entropic heat is left out. e is zero;
+estimated jointly, it stands for hysteresis and ageing, which shift U for hours. z is exact for a constant current, and
+so is V1 but for R1, which is held over a step; T takes Euler steps of at most 2 s, against minutes of its own.
 
 The values are of a Panasonic NCR18650PF of 2.9 Ah at 25 °C, from the recordings of P. Kollmeyer, Panasonic 18650PF
 Li-ion Battery Data (2018), doi:10.17632/wykht8y7tg.1, CC BY 4.0: least squares of the simulated voltage and
 temperature, with z from the tester's charge counter, over the pulses (HPPC) and US06 at 25 °C; U is drawn to the
-discharge at C/20, and B, which recordings at one temperature cannot tell, is held at 2000 K. The simulation is then off
-by 22 mV and 0.7 K over the pulses (15 mV above 10 % of charge), and by 28 mV and 0.5 K over US06 (RMS).
+discharge at C/20, and B, which recordings at one temperature do not identify, is held at 2000 K. The error of the
+simulation is 22 mV and 0.7 K over the pulses (15 mV above 10 % of charge), and 28 mV and 0.5 K over US06 (RMS).
 
 Sources: Plett (2004), Extended Kalman filtering for battery management systems of LiPB-based HEV battery packs,
 doi:10.1016/j.jpowsour.2004.02.032, for state of charge and circuit as states; Bernardi, Pawlikowski & Newman (1985),
@@ -32,17 +31,22 @@ from ..numerics.jit import jit
 NODES = (0.0, 0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
 """States of charge at which the open-circuit voltage is given."""
 
+
 NEARLY_EMPTY = 0.05
 """State of charge over which the rise of R1 fades by e."""
 
+
 OPEN_CIRCUIT = (2.712, 3.092, 3.241, 3.346, 3.386, 3.454, 3.535, 3.598, 3.668, 3.767, 3.860, 3.949, 4.063, 4.165)
 
+
 TEMPERATURES = (20.0, 38.0)
-"""Where the values hold, °C: the recordings that they are fitted to reached from 25.3 to 33.0 °C, and within 5 °C of
-that an error of 1000 K in B, which these cannot tell, moves the resistances by 6 % at most."""
+"""Range of validity, °C: the recordings of the fit reached from 25.3 to 33.0 °C, and within 5 °C of that an error of
+1000 K in B, which they do not identify, moves the resistances by 6 % at most."""
+
 
 CURRENTS = (-7.6, 20.9)
 """Currents of those recordings, A: charged by US06's braking, discharged by its sprints."""
+
 
 COMMON = (
     *(
@@ -56,17 +60,26 @@ COMMON = (
     Parameter("heat_capacity", "J/K", 77.3, 5.0, 500.0),
     Parameter("to_air", "K/W", 8.2, 0.5, 100.0),
 )
-"""Parameters that a pack's cells have in common: U at 0 %, 2 %, ... of charge, R1, τ1, k, B, m, R_air."""
+"""Parameters that a pack's cells share: U at 0 %, 2 %, ... of charge, R1, τ1, k, B, m, R_air."""
+
 
 R1, TAU_1, R1_RISE, ACTIVATION, HEAT_CAPACITY, TO_AIR = range(len(NODES), len(COMMON))
+
+
 CAPACITY, R0, OCV_ERROR = range(len(COMMON), len(COMMON) + 3)
+
+
 CURRENT, AIR = range(2)
+
+
 SOC, V1, TEMPERATURE = range(3)
 
 
 @jit
 def mean_slope(before, after, width_before, width_after):
-    """Slope at a node between two intervals of those slopes and widths: zero at an extremum, else a harmonic mean.
+    """Return the slope at a node between two intervals of those slopes and widths.
+
+    It is zero at an extremum, otherwise a weighted harmonic mean.
 
     Source: Fritsch & Butland (1984), doi:10.1137/0905021, as in PCHIP.
     """
@@ -79,7 +92,7 @@ def mean_slope(before, after, width_before, width_after):
 
 @jit
 def open_circuit(z, p):
-    """U and dU/dz, V, at the state of charge z."""
+    """Return U and dU/dz, V, at the state of charge z."""
     last = len(NODES) - 1
     k = 0
     while k < last - 1 and z.real > NODES[k + 1]:
@@ -105,7 +118,7 @@ def open_circuit(z, p):
 
 @jit
 def warmth(celsius, p):
-    """g(T) and dg/dT: resistances relative to 25 °C."""
+    """Return g(T) and dg/dT: resistances relative to 25 °C."""
     kelvin = celsius + 273.15
     g = np.exp(p[ACTIVATION] * (1.0 / kelvin - 1.0 / 298.15))
     return g, -g * p[ACTIVATION] / kelvin**2
@@ -113,7 +126,7 @@ def warmth(celsius, p):
 
 @jit
 def rise(z, p):
-    """1 + k exp(-z / 0.05) and its derivative; below empty it rises no further."""
+    """Return 1 + k exp(-z / 0.05) and its derivative; below empty it is constant."""
     if z.real < 0.0:
         return 1.0 + p[R1_RISE] + 0.0 * z, 0.0 * z
     more = p[R1_RISE] * np.exp(-z / NEARLY_EMPTY)
@@ -122,7 +135,7 @@ def rise(z, p):
 
 @jit
 def advance(z, v1, celsius, i, inflow, keep, capacity, r0, p, dt):
-    """One cell `dt` on: z, V1 and T; `inflow` W come from outside, `keep` = exp(-dt / τ1)."""
+    """Return z, V1 and T of one cell after `dt`; `inflow` W come from outside, `keep` = exp(-dt / τ1)."""
     g, _ = warmth(celsius, p)
     more, _ = rise(z, p)
     return (
@@ -133,7 +146,7 @@ def advance(z, v1, celsius, i, inflow, keep, capacity, r0, p, dt):
 
 
 def f(x, u, p, dt, out):
-    """The cell after `dt`."""
+    """Advance the cell."""
     inflow = (u[AIR] - x[TEMPERATURE]) / p[TO_AIR]
     keep = np.exp(-dt / p[TAU_1])
     out[0], out[1], out[2] = advance(x[0], x[1], x[2], u[CURRENT], inflow, keep, p[CAPACITY], p[R0], p, dt)
@@ -141,7 +154,7 @@ def f(x, u, p, dt, out):
 
 @jit
 def advance_slope(z, celsius, i, outflow, keep, r0, p, dt, at, out):
-    """Derivative of `advance` with respect to its own cell, at `at` on the diagonal; `outflow` W/K."""
+    """Fill the derivative of `advance` by its own cell, at `at` on the diagonal; `outflow` in W/K."""
     g, of_g = warmth(celsius, p)
     more, of_more = rise(z, p)
     push = (1.0 - keep) * p[R1] * i
@@ -155,21 +168,21 @@ def advance_slope(z, celsius, i, outflow, keep, r0, p, dt, at, out):
 
 
 def F(x, u, p, dt, out):
-    """Derivative of the step."""
+    """Fill the derivative of the step."""
     out[:] = 0.0
     keep = np.exp(-dt / p[TAU_1])
     advance_slope(x[SOC], x[TEMPERATURE], u[CURRENT], 1.0 / p[TO_AIR], keep, p[R0], p, dt, 0, out)
 
 
 def voltage(x, u, p, out):
-    """Terminal voltage."""
+    """Measure the terminal voltage."""
     g, _ = warmth(x[TEMPERATURE], p)
     rest, _ = open_circuit(x[SOC], p)
     out[0] = rest + p[OCV_ERROR] - x[V1] - p[R0] * g * u[CURRENT]
 
 
 def voltage_slope(x, u, p, out):
-    """Its derivative."""
+    """Fill its derivative."""
     _, of_g = warmth(x[TEMPERATURE], p)
     _, out[0, SOC] = open_circuit(x[SOC], p)
     out[0, V1] = -1.0
@@ -177,12 +190,12 @@ def voltage_slope(x, u, p, out):
 
 
 def temperature(x, u, p, out):
-    """Thermometer on the can."""
+    """Measure the temperature of the can."""
     out[0] = x[TEMPERATURE]
 
 
 def temperature_slope(x, u, p, out):
-    """It sees that temperature alone."""
+    """Fill its derivative."""
     out[0, :] = 0.0
     out[0, TEMPERATURE] = 1.0
 

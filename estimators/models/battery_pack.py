@@ -34,17 +34,24 @@ from .battery_cell import (
 )
 
 CELLS = 8
+
+
 NEIGHBOUR = len(COMMON)
+
+
 CAPACITY = NEIGHBOUR + 1
+
+
 R0 = CAPACITY + CELLS
-"""Where the parameters of the first cell stand; those of the others follow."""
+"""Index of the parameters of the first cell; those of the others follow."""
+
 
 NUMBERS = range(1, CELLS + 1)
 
 
 @jit
 def inflow(k, x, u, p):
-    """Heat that flows into cell k from air and neighbours, W."""
+    """Return the heat that flows into cell k from air and neighbours, W."""
     own = x[3 * k + TEMPERATURE]
     heat = (u[AIR] - own) / p[TO_AIR]
     if k > 0:
@@ -55,7 +62,7 @@ def inflow(k, x, u, p):
 
 
 def f(x, u, p, dt, out):
-    """All cells after `dt`."""
+    """Advance all cells."""
     keep = np.exp(-dt / p[TAU_1])
     for k in range(CELLS):
         j = 3 * k
@@ -66,7 +73,7 @@ def f(x, u, p, dt, out):
 
 
 def F(x, u, p, dt, out):
-    """Derivative of the step: a block a cell, and the neighbours' temperatures."""
+    """Fill the derivative of the step: a block per cell, and the neighbours' temperatures."""
     out[:] = 0.0
     keep = np.exp(-dt / p[TAU_1])
     share = dt / (p[HEAT_CAPACITY] * p[NEIGHBOUR])
@@ -83,13 +90,13 @@ def F(x, u, p, dt, out):
 
 
 def Q(x, u, p, q, dt, out):
-    """The same noise in every cell."""
+    """Fill Q: the same noise in every cell."""
     for j in range(x.size):
         out[j, j] = q[j % 3] * dt
 
 
 def voltages(x, u, p, out):
-    """Terminal voltages."""
+    """Measure the terminal voltages."""
     for k in range(CELLS):
         g, _ = warmth(x[3 * k + TEMPERATURE], p)
         rest, _ = open_circuit(x[3 * k + SOC], p)
@@ -97,7 +104,7 @@ def voltages(x, u, p, out):
 
 
 def voltages_slope(x, u, p, out):
-    """Their derivatives."""
+    """Fill their derivatives."""
     out[:] = 0.0
     for k in range(CELLS):
         _, of_g = warmth(x[3 * k + TEMPERATURE], p)
@@ -107,19 +114,20 @@ def voltages_slope(x, u, p, out):
 
 
 def temperatures(x, u, p, out):
-    """A thermometer on each can."""
+    """Measure the temperature of each can."""
     for k in range(CELLS):
         out[k] = x[3 * k + TEMPERATURE]
 
 
 def temperatures_slope(x, u, p, out):
-    """Each sees its own cell."""
+    """Fill their derivatives."""
     out[:] = 0.0
     for k in range(CELLS):
         out[k, 3 * k + TEMPERATURE] = 1.0
 
 
 _capacity, _r0 = BATTERY_CELL.parameters[NEIGHBOUR : NEIGHBOUR + 2]
+
 
 BATTERY_PACK = StateSpaceModel(
     name="battery_pack",

@@ -1,10 +1,10 @@
-"""Air temperature at 2 m over the British Isles, on a grid of a quarter of a degree: persistence with honest noise.
+"""Air temperature at 2 m over the British Isles, on a grid of a quarter of a degree: fading persistence.
 
     T' = C + (T - C) exp(-dt / τ) + w
 
-The model knows no sun, no wind, no clouds and no coast: T stays what it is and forgets within τ towards the season's
-mean C. All else, the day's warming too, is noise w, alike at places that are near. What the estimate gains over C it
-has from the readings of a few places, and from what the noise says of the places between.
+The model has no sun, wind, clouds or coast: T persists, and relaxes within τ towards the season's mean C. Everything
+else, the daily cycle too, is noise w, correlated between nearby places. The estimate improves on C by the measurements
+at a few places, and by the correlation of the noise in between.
 
 A cell is 0.25° high and wide: 27.8 km from north to south, and from west to east 16.3 km in the middle, at 54° north.
 """
@@ -18,16 +18,20 @@ from ..model.states import Field
 from ..numerics.smoothed_noise import exponential
 
 SPACING = (27.8, 16.3)
-"""km to the south and to the east."""
+"""Side of a cell to the south and to the east, km."""
+
 
 LENGTH = 400.0
-"""km over which noise is alike."""
+"""Correlation length of the noise, km."""
+
 
 SHAPE = (33, 49)
 """Cells from 58° to 50° north, and from 10° west to 2° east."""
 
+
 STATIONS = tuple((i, j) for i in (3, 10, 16, 22, 29) for j in (3, 9, 15, 21, 27, 33, 39, 45))
-"""Cells whose temperature is read."""
+"""Cells with a thermometer."""
+
 
 _flat = np.array([i * SHAPE[1] + j for i, j in STATIONS])
 
@@ -40,7 +44,7 @@ def f(T, u, p, dt, out):
 
 
 def stations(T, u, p, out):
-    """The cells that are read."""
+    """Measure the cells with a thermometer."""
     for k in range(out.size):
         out[k] = T[_flat[k]]
 

@@ -1,8 +1,8 @@
-"""A gripper's finger and an object somewhere before it: touching or not is a mode that no sensor tells.
+"""A gripper's finger and an object in front of it: contact is a mode that no sensor measures.
 
-    depth'   = speed                                how far the finger is past the object's surface; negative before it
+    depth'   = speed                                distance of the finger past the object's surface; negative before it
     speed'   = (drive - b speed - c k depth) / m    c = 0 apart, 1 touching: a soft pad of stiffness k
-    surface' = 0, offset' = 0                       where the object begins; what the force sensor reads at rest
+    surface' = 0, offset' = 0                       place of the object; offset of the force sensor
     position = surface + depth,   force = c k depth + offset
 
 Apart, the finger comes to touch at the rate λ / (1 + exp(-depth/w)); touching, it lets go at λ / (1 + exp(depth/w)):
@@ -10,7 +10,7 @@ a rough surface of width w, which sticks a little when the finger leaves. An obj
 against each other.
 
 Given depth and contact, all is linear in speed, surface and offset: a particle needs two numbers, not five. The
-surface is known to some millimetres only, so that not having touched yet is news.
+surface is known to some millimetres only, so that the absence of contact is information.
 
 Source: the spring and damper of Hertz-like contact in one dimension, as in Siciliano et al. (2009), Robotics:
 Modelling, Planning and Control, section 9.1.3 (contact force from an elastic environment); contact as a jump of a
@@ -24,15 +24,20 @@ import numpy as np
 from ..model.state_space import Input, Jump, Noise, Parameter, Row, Sensor, State, StateSpaceModel
 
 CONTACT, DEPTH, SPEED, SURFACE, OFFSET = range(5)
+
+
 MASS, DAMPING, STIFFNESS, RATE, ROUGHNESS = range(5)
+
+
 PUSH, SLIP, DRIFT = range(3)
+
 
 MILLI = 1000.0
 """mm in a metre: forces are in N, masses in kg, lengths in mm."""
 
 
 def f(x, u, p, dt, out):
-    """Speed first, then the depth with the new speed: stable while the pad is soft for the step."""
+    """Advance the speed, then the depth with the new speed: stable while the pad is soft for the step."""
     pull = u[0] - p[DAMPING] * x[SPEED] - x[CONTACT] * p[STIFFNESS] * x[DEPTH]
     out[SPEED] = x[SPEED] + dt * MILLI / p[MASS] * pull
     out[DEPTH] = x[DEPTH] + dt * out[SPEED]
@@ -42,7 +47,7 @@ def f(x, u, p, dt, out):
 
 
 def F(x, u, p, dt, out):
-    """Its Jacobian."""
+    """Fill its Jacobian."""
     out[:] = 0.0
     a = dt * MILLI / p[MASS]
     out[SPEED, SPEED] = 1.0 - a * p[DAMPING]
@@ -57,7 +62,7 @@ def F(x, u, p, dt, out):
 
 
 def Q(x, u, p, q, dt, out):
-    """Pushes change the speed; what slips away from the finger is farther off and less deep."""
+    """Fill Q: pushes change the speed; an object that slips away is farther off and less deep."""
     out[SPEED, SPEED] = q[PUSH] * dt
     out[SURFACE, SURFACE] = q[SLIP] * dt
     out[DEPTH, DEPTH] = q[SLIP] * dt
@@ -67,7 +72,7 @@ def Q(x, u, p, q, dt, out):
 
 
 def chances(x, u, p, dt, out):
-    """Rates λ/(1 + exp(∓depth/w)) over dt, from the mode that is."""
+    """Fill the probabilities of the modes after dt at the rates λ/(1 + exp(∓depth/w))."""
     inside = 1.0 / (1.0 + np.exp(-x[DEPTH] / p[ROUGHNESS]))
     touch = 1.0 - np.exp(-p[RATE] * dt * inside)
     leave = 1.0 - np.exp(-p[RATE] * dt * (1.0 - inside))
@@ -76,24 +81,24 @@ def chances(x, u, p, dt, out):
 
 
 def position(x, u, p, out):
-    """The encoder."""
+    """Measure the position with the encoder."""
     out[0] = x[SURFACE] + x[DEPTH]
 
 
 def position_slopes(x, u, p, out):
-    """Its Jacobian."""
+    """Fill its Jacobian."""
     out[:] = 0.0
     out[0, SURFACE] = 1.0
     out[0, DEPTH] = 1.0
 
 
 def force(x, u, p, out):
-    """The pad's force and the sensor's offset."""
+    """Measure the pad's force, with the sensor's offset."""
     out[0] = x[CONTACT] * p[STIFFNESS] * x[DEPTH] + x[OFFSET]
 
 
 def force_slopes(x, u, p, out):
-    """Its Jacobian."""
+    """Fill its Jacobian."""
     out[:] = 0.0
     out[0, DEPTH] = x[CONTACT] * p[STIFFNESS]
     out[0, OFFSET] = 1.0

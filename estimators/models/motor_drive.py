@@ -1,4 +1,6 @@
-"""A permanent-magnet traction motor as a thermal network of four nodes; no sensor touches its rotor magnet.
+"""Two models of an electric motor: a thermal network of four nodes, and its winding alone.
+
+The network is that of a permanent-magnet traction motor whose rotor magnet has no sensor:
 
     C_i dT_i/dt = P_i + Σ_j (T_j - T_i) / R_ij          i = winding, tooth, yoke, magnet
 
@@ -7,8 +9,11 @@ Heat leaves through the water jacket (yoke to coolant) and through housing, end-
     winding  P = 3/2 (i_d² + i_q²) R_20 (θ + k_ac ω² / θ),  θ = 1 + 0.00393 (T_winding - 20 °C)
     iron     P = k_1 |ω| + k_2 ω², split between tooth, yoke and magnet
 
-Ohmic loss grows with the copper's resistivity θ, and that of eddy currents in the copper shrinks with it. Temperatures
-alone do not tell the scale of the network: capacities times s, resistances over s and losses times s give the same.
+Ohmic loss grows with the copper's resistivity θ, eddy current loss in the copper shrinks with it. Temperatures alone do
+not identify the scale of the network: capacities times s, resistances over s and losses times s give the same.
+
+The winding alone is a constant-velocity model, T' = T + dt·rate, rate' = rate, y = T + v, with a random walk on each
+state.
 
 Sources: Wallscheid & Böcker (2016), Global identification of a low-order lumped-parameter thermal network for
 permanent magnet synchronous motors, doi:10.1109/TEC.2015.2473673, for the network; Kirchgässner, Wallscheid & Böcker
@@ -18,14 +23,19 @@ order of a water-cooled motor of about 50 kW.
 
 from __future__ import annotations
 
+from ..model.rk4 import rk4
 from ..model.state_space import Input, Noise, Parameter, Row, Sensor, State, StateSpaceModel
 from ..numerics.jit import jit
 
 COPPER = 0.00393
 """Temperature coefficient of copper's resistivity at 20 °C, 1/K."""
 
+
 WINDING, TOOTH, YOKE, MAGNET = range(4)
+
+
 I_D, I_Q, SPEED, COOLANT, AMBIENT = range(5)
+
 
 PARAMETERS = (
     Parameter("capacity_winding", "J/K", 2700.0, 500.0, 20e3),
@@ -46,6 +56,8 @@ PARAMETERS = (
     Parameter("iron_tooth", "1", 0.5, 0.0, 0.6),
     Parameter("iron_magnet", "1", 0.3, 0.0, 0.4),
 )
+
+
 (
     C_WINDING,
     C_TOOTH,
@@ -69,7 +81,7 @@ PARAMETERS = (
 
 @jit
 def network(u, p):
-    """What of the network does not change within a step: conductances, losses, reciprocal capacities, surroundings.
+    """Return the terms that are constant within a step: losses, conductances, reciprocal capacities, surroundings.
 
     Divisions cost most of a step, so each is done once here and not in each of the four stages.
     """
@@ -99,11 +111,11 @@ def network(u, p):
 
 
 @jit
-def rates(winding, tooth, yoke, magnet, constants):
-    """dT/dt of the four nodes, K/s, at their temperatures in °C."""
-    current, eddy, iron_tooth, iron_yoke, iron_magnet, wt, ty, tm, wm, yc, wa, ma, cw, ct, cy, cm, coolant, ambient = (
-        constants
-    )
+def rates(
+    T, current, eddy, iron_tooth, iron_yoke, iron_magnet, wt, ty, tm, wm, yc, wa, ma, cw, ct, cy, cm, coolant, ambient
+):
+    """Return dT/dt of the four nodes, K/s, at the temperatures T, °C; the other arguments are those of `network`."""
+    winding, tooth, yoke, magnet = T[WINDING], T[TOOTH], T[YOKE], T[MAGNET]
     theta = 1.0 + COPPER * (winding - 20.0)
     copper = current * theta + eddy / theta
     winding_tooth = (winding - tooth) * wt
@@ -118,24 +130,9 @@ def rates(winding, tooth, yoke, magnet, constants):
     )
 
 
-def f(x, u, p, dt, out):
-    """One step of the classical Runge-Kutta method."""
-    k = network(u, p)
-    a0, a1, a2, a3 = rates(x[0], x[1], x[2], x[3], k)
-    h = 0.5 * dt
-    b0, b1, b2, b3 = rates(x[0] + h * a0, x[1] + h * a1, x[2] + h * a2, x[3] + h * a3, k)
-    c0, c1, c2, c3 = rates(x[0] + h * b0, x[1] + h * b1, x[2] + h * b2, x[3] + h * b3, k)
-    d0, d1, d2, d3 = rates(x[0] + dt * c0, x[1] + dt * c1, x[2] + dt * c2, x[3] + dt * c3, k)
-    sixth = dt / 6.0
-    out[0] = x[0] + sixth * (a0 + 2.0 * b0 + 2.0 * c0 + d0)
-    out[1] = x[1] + sixth * (a1 + 2.0 * b1 + 2.0 * c1 + d1)
-    out[2] = x[2] + sixth * (a2 + 2.0 * b2 + 2.0 * c2 + d2)
-    out[3] = x[3] + sixth * (a3 + 2.0 * b3 + 2.0 * c3 + d3)
-
-
 @jit
 def tangent(winding, tooth, yoke, magnet, theta, constants):
-    """Derivative of `rates` along a direction (winding, tooth, yoke, magnet) at the copper's resistivity theta."""
+    """Return the derivative of `rates` in a direction (winding, tooth, yoke, magnet); theta as there."""
     current, eddy, _, _, _, wt, ty, tm, wm, yc, wa, ma, cw, ct, cy, cm, _, _ = constants
     copper = COPPER * (current - eddy / theta**2) * winding
     winding_tooth = (winding - tooth) * wt
@@ -151,16 +148,16 @@ def tangent(winding, tooth, yoke, magnet, theta, constants):
 
 
 def F(x, u, p, dt, out):
-    """Derivative of the step: the same method along each state's direction, a fifth of complex step's cost."""
+    """Fill the derivative of the step: the same method in each state's direction, at a fifth of complex step's cost."""
     k = network(u, p)
     h = 0.5 * dt
-    a0, a1, a2, a3 = rates(x[0], x[1], x[2], x[3], k)
-    b0, b1, b2, b3 = rates(x[0] + h * a0, x[1] + h * a1, x[2] + h * a2, x[3] + h * a3, k)
-    c0, _, _, _ = rates(x[0] + h * b0, x[1] + h * b1, x[2] + h * b2, x[3] + h * b3, k)
+    a = rates(x, *k)
+    b = rates((x[0] + h * a[0], x[1] + h * a[1], x[2] + h * a[2], x[3] + h * a[3]), *k)
+    c = rates((x[0] + h * b[0], x[1] + h * b[1], x[2] + h * b[2], x[3] + h * b[3]), *k)
     theta_a = 1.0 + COPPER * (x[0] - 20.0)
-    theta_b = theta_a + COPPER * h * a0
-    theta_c = theta_a + COPPER * h * b0
-    theta_d = theta_a + COPPER * dt * c0
+    theta_b = theta_a + COPPER * h * a[0]
+    theta_c = theta_a + COPPER * h * b[0]
+    theta_d = theta_a + COPPER * dt * c[0]
     sixth = dt / 6.0
     for j in range(4):
         v0 = 1.0 if j == WINDING else 0.0
@@ -177,37 +174,17 @@ def F(x, u, p, dt, out):
         out[3, j] = v3 + sixth * (a3 + 2.0 * b3 + 2.0 * c3 + d3)
 
 
-def winding(x, u, p, out):
-    """The thermometer in the winding."""
-    out[0] = x[WINDING]
+def thermometer(name: str, node: int) -> Sensor:
+    """Return the thermometer at a node."""
 
+    def h(x, u, p, out):
+        out[0] = x[node]
 
-def winding_slope(x, u, p, out):
-    """It sees that temperature alone."""
-    out[0, :] = 0.0
-    out[0, WINDING] = 1.0
+    def H(x, u, p, out):
+        out[0, :] = 0.0
+        out[0, node] = 1.0
 
-
-def tooth(x, u, p, out):
-    """The thermometer in a stator tooth."""
-    out[0] = x[TOOTH]
-
-
-def tooth_slope(x, u, p, out):
-    """It sees that temperature alone."""
-    out[0, :] = 0.0
-    out[0, TOOTH] = 1.0
-
-
-def yoke(x, u, p, out):
-    """The thermometer in the stator yoke."""
-    out[0] = x[YOKE]
-
-
-def yoke_slope(x, u, p, out):
-    """It sees that temperature alone."""
-    out[0, :] = 0.0
-    out[0, YOKE] = 1.0
+    return Sensor(name, (Row(name, "°C", variance=0.25),), h=h, H=H)
 
 
 MOTOR_DRIVE = StateSpaceModel(
@@ -233,13 +210,38 @@ MOTOR_DRIVE = StateSpaceModel(
         Noise("yoke", "°C²/s", variance=0.003),
         Noise("magnet", "°C²/s", variance=0.003),
     ),
-    sensors=(
-        Sensor("winding", (Row("winding", "°C", variance=0.25),), h=winding, H=winding_slope),
-        Sensor("tooth", (Row("tooth", "°C", variance=0.25),), h=tooth, H=tooth_slope),
-        Sensor("yoke", (Row("yoke", "°C", variance=0.25),), h=yoke, H=yoke_slope),
-    ),
-    f=f,
+    sensors=(thermometer("winding", WINDING), thermometer("tooth", TOOTH), thermometer("yoke", YOKE)),
+    f=rk4(rates, network),
     F=F,
     max_step=1.0,
     source="Wallscheid & Böcker (2016), doi:10.1109/TEC.2015.2473673",
+)
+
+
+def f(x, u, p, dt, out):
+    """Advance the temperature by its rate; the rate is constant."""
+    out[0] = x[0] + dt * x[1]
+    out[1] = x[1]
+
+
+def winding(x, u, p, out):
+    """Measure the temperature of the winding."""
+    out[0] = x[0]
+
+
+MOTOR_WINDING = StateSpaceModel(
+    name="motor_winding",
+    title="Motor winding, temperature and heating rate",
+    states=(
+        State("temperature", "°C", mean=35.0, std=5.0),
+        State("rate", "°C/s", mean=0.0, std=1.0),
+    ),
+    noises=(
+        Noise("temperature", "°C²/s", variance=0.01),
+        Noise("rate", "°C²/s³", variance=0.001),
+    ),
+    sensors=(Sensor("winding", (Row("winding", "°C", variance=4.0),), h=winding),),
+    f=f,
+    linear=True,
+    source="digital-twin state estimation example: winding temperature and rate, Q = diag(0.01, 0.001), R = 4",
 )

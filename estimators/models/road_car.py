@@ -5,9 +5,9 @@
 
 Forward acceleration and yaw rate are inputs, as is usual in inertial navigation: their noise is process noise, and
 their slowly moving errors (road grade and mounting are in the first) are states. Heading ψ is counted from east to the
-left, as in ISO 8855; a compass heading χ is ψ = 90° - χ. A wheel sensor says wheel_scale·v. A GNSS receiver tells
-where the car was `gnss_delay` seconds ago. Its error wanders slowly: a twin says so with the sensor's `error`, or a
-thousand fixes with a common error would count as a thousand independent ones.
+left, as in ISO 8855; a compass heading χ is ψ = 90° - χ. A wheel sensor measures wheel_scale·v. A GNSS receiver
+measures the position `gnss_delay` seconds ago. Its error wanders slowly: a twin models that with the sensor's `error`,
+or a thousand fixes with a common error would count as a thousand independent ones.
 
 Source: Groves (2013), Principles of GNSS, Inertial, and Multisensor Integrated Navigation Systems, 2nd edition, for
 inertial errors as states.
@@ -20,12 +20,16 @@ import numpy as np
 from ..model.state_space import Input, Noise, Parameter, Row, Sensor, State, StateSpaceModel
 
 EAST, NORTH, HEADING, SPEED, ACCEL_BIAS, YAW_RATE_BIAS, WHEEL_SCALE = range(7)
+
+
 ACCEL, YAW_RATE = range(2)
+
+
 GNSS_DELAY = 0
 
 
 def f(x, u, p, dt, out):
-    """Drive with speed and heading of the middle of the step."""
+    """Drive with speed and heading at the middle of the step."""
     gained = dt * (u[ACCEL] - x[ACCEL_BIAS])
     turned = dt * (u[YAW_RATE] - x[YAW_RATE_BIAS])
     way = dt * (x[SPEED] + 0.5 * gained)
@@ -40,7 +44,7 @@ def f(x, u, p, dt, out):
 
 
 def Q(x, u, p, q, dt, out):
-    """The same noise for east and north; one entry for each of the other states."""
+    """Fill Q: the same noise for east and north; one entry for each of the other states."""
     out[EAST, EAST] = q[0] * dt
     out[NORTH, NORTH] = q[0] * dt
     out[HEADING, HEADING] = q[1] * dt
@@ -51,29 +55,29 @@ def Q(x, u, p, q, dt, out):
 
 
 def gnss_position(x, u, p, out):
-    """Where the receiver thinks that the car was when it measured."""
+    """Measure the position `gnss_delay` ago."""
     back = p[GNSS_DELAY] * x[SPEED]
     out[0] = x[EAST] - back * np.cos(x[HEADING])
     out[1] = x[NORTH] - back * np.sin(x[HEADING])
 
 
 def gnss_heading(x, u, p, out):
-    """The course over ground then; a receiver knows it only while the car moves."""
+    """Measure the course over ground then; a receiver has it only while the car moves."""
     out[0] = x[HEADING] - p[GNSS_DELAY] * (u[YAW_RATE] - x[YAW_RATE_BIAS])
 
 
 def gnss_speed(x, u, p, out):
-    """The speed over ground then."""
+    """Measure the speed over ground then."""
     out[0] = x[SPEED] - p[GNSS_DELAY] * (u[ACCEL] - x[ACCEL_BIAS])
 
 
 def wheel_speed(x, u, p, out):
-    """The speed that the wheels tell, by OBD or from a brake controller."""
+    """Measure the speed of the wheels, by OBD or from a brake controller."""
     out[0] = x[WHEEL_SCALE] * x[SPEED]
 
 
 def second_position(x, u, p, out):
-    """Another receiver, whose delay and error are its own: a check when it is held out."""
+    """Measure with another receiver, whose delay and error are its own: a check when it is held out."""
     out[0] = x[EAST]
     out[1] = x[NORTH]
 

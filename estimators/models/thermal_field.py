@@ -3,8 +3,8 @@
     dT/dt = α ∇²T - (T - T_ambient) / τ + q exp(-|r - r_source|² / (2 w²))
 
 by finite volumes with insulated edges and one explicit step, stable up to a step of spacing² / (4 α). Cell (i, j) is at
-(i, j)·spacing. The filter knows where the source is (it is an input) but not exactly how strong: the noise, correlated
-over 0.1 m, stands for that.
+(i, j)·spacing. The position of the source is an input, its strength is uncertain: the noise, correlated over 0.1 m,
+stands for that.
 
 Source: Patankar (1980), Numerical Heat Transfer and Fluid Flow, sections 4.2 to 4.4; α of carbon steel.
 """
@@ -21,13 +21,14 @@ from ..numerics.smoothed_noise import exponential
 SPACING = 0.01
 """Side of a cell, m."""
 
+
 CORRELATED = 0.1
-"""Length over which noise is correlated, m."""
+"""Correlation length of the noise, m."""
 
 
 @jit
 def conduct(T, rows, columns, u, p, dt, out):
-    """One explicit step of all cells."""
+    """Take one explicit step of all cells."""
     diffusivity, relaxation, heating, width = p[0], p[1], p[2], p[3]
     a = dt * diffusivity / (SPACING * SPACING)
     loss = dt / relaxation
@@ -47,7 +48,7 @@ def conduct(T, rows, columns, u, p, dt, out):
             right = T[here + min(j + 1, last)]
             around = T[above + j] + T[below + j] + left + right
             out[here + j] = t + a * (around - 4.0 * t) - loss * (t - ambient)
-    # The source is felt within four of its widths.
+    # The source acts within four of its widths.
     reach = int(4.0 * width / SPACING) + 1
     at_i, at_j = int(u[0] / SPACING), int(u[1] / SPACING)
     for i in range(max(0, at_i - reach), min(rows, at_i + reach + 1)):
@@ -57,7 +58,7 @@ def conduct(T, rows, columns, u, p, dt, out):
 
 
 def thermal_field(rows: int = 200, columns: int = 200, sensors: int = 10, name: str = "") -> StateSpaceModel:
-    """The model on a grid of rows × columns, with sensors × sensors thermocouples evenly spread.
+    """Return the model on a grid of rows × columns, with sensors × sensors thermocouples evenly spread.
 
     `rows` and `columns` from 2 on; `sensors` no more than either.
     """
@@ -104,4 +105,6 @@ def thermal_field(rows: int = 200, columns: int = 200, sensors: int = 10, name: 
 
 
 THERMAL_FIELD = thermal_field(name="thermal_field")
+
+
 THERMAL_FIELD_LARGE = thermal_field(1000, 1000, name="thermal_field_large")

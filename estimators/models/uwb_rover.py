@@ -1,16 +1,16 @@
-"""A rover on a plane that measures its distance to fixed radio anchors, one at a time, while it counts its way.
+"""A rover on a plane with odometry that measures its distance to fixed radio anchors, one at a time.
 
     east'  = v cos ψ,   north' = v sin ψ,   ψ' = ω - yaw_rate_bias
     v = odometry_scale (speed + (right + left) / 2),   ω = yaw_rate + (right - left) / track
     range_i = range_scale · |position - anchor_i| + bias_i
 
-The odometry is an input: either speed and yaw rate, or the speeds of the wheels of a differential drive; what a
-recording does not tell stays zero. Heading ψ is counted from east to the left. A radio that reflects off a wall instead
-of crossing it arrives late, so each anchor has a bias that lasts and is forgotten,
+The odometry is an input: either speed and yaw rate, or the speeds of the wheels of a differential drive; inputs that a
+recording does not have stay zero. Heading ψ is counted from east to the left. A radio that reflects off a wall instead
+of crossing it arrives late, so each anchor has a bias with a correlation time,
 
     bias_i' = (reflection - bias_i) / bias_time + w,    so bias_i settles at reflection ± √(Q.bias · bias_time / 2)
 
-Where the anchors stand are parameters, which the twin's YAML sets, and may move into the state (`estimate`).
+The positions of the anchors are parameters, set in the twin's YAML; they can be estimated as states (`estimate`).
 
 Sources: Thrun, Burgard & Fox (2005), Probabilistic Robotics, section 5.4, for the odometry; Djugash, Hamner & Roth
 (2009), doi:10.1002/rob.20311, for ranges whose errors grow with the distance.
@@ -25,12 +25,16 @@ import numpy as np
 from ..model.state_space import Input, Noise, Parameter, Row, Sensor, State, StateSpaceModel
 
 EAST, NORTH, HEADING, YAW_RATE_BIAS, RANGE_SCALE, BIAS = range(6)
+
+
 SPEED, YAW_RATE, RIGHT, LEFT = range(4)
+
+
 ODOMETRY_SCALE, TRACK, BIAS_TIME, REFLECTION, ANCHOR = range(5)
 
 
 def f(x, u, p, dt, out):
-    """Drive with the heading of the middle of the step; its sub-steps are short."""
+    """Drive with the heading at the middle of the step; its sub-steps are short."""
     way = dt * p[ODOMETRY_SCALE] * (u[SPEED] + 0.5 * (u[RIGHT] + u[LEFT]))
     turned = dt * (u[YAW_RATE] + (u[RIGHT] - u[LEFT]) / p[TRACK] - x[YAW_RATE_BIAS])
     middle = x[HEADING] + 0.5 * turned
@@ -45,7 +49,7 @@ def f(x, u, p, dt, out):
 
 
 def Q(x, u, p, q, dt, out):
-    """The same noise for east and north, and for all biases."""
+    """Fill Q: the same noise for east and north, and for all biases."""
     out[EAST, EAST] = q[0] * dt
     out[NORTH, NORTH] = q[0] * dt
     out[HEADING, HEADING] = q[1] * dt
@@ -57,7 +61,7 @@ def Q(x, u, p, q, dt, out):
 
 
 def range_to(anchor: int) -> Callable:
-    """The h of the range to one anchor, counted from 0."""
+    """Return h of the range to one anchor, counted from 0."""
 
     def h(x, u, p, out):
         east = x[EAST] - p[ANCHOR + 2 * anchor]
@@ -68,7 +72,7 @@ def range_to(anchor: int) -> Callable:
 
 
 def uwb_rover(anchors: int = 4) -> StateSpaceModel:
-    """The rover among so many anchors, which are numbered from 1."""
+    """Return the rover with so many anchors, which are numbered from 1."""
     numbers = range(1, anchors + 1)
     corners = [(10.0 * np.cos(2 * np.pi * k / anchors), 10.0 * np.sin(2 * np.pi * k / anchors)) for k in range(anchors)]
     return StateSpaceModel(

@@ -21,7 +21,7 @@ from estimators.fold import Fold
 from estimators.log import READING, Events, Log
 from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
 from estimators.models.gripper_contact import GRIPPER_CONTACT
-from estimators.models.lorenz96 import LORENZ96
+from estimators.models.lorenz import LORENZ96
 from estimators.models.thermal_field import thermal_field
 from estimators.snapshots import Base
 from estimators.track import USED

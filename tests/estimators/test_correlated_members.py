@@ -9,7 +9,7 @@ from estimators.errors import EstimatorError
 from estimators.fold import Fold, fold
 from estimators.log import READING, Log
 from estimators.model.sensor import covariance_of
-from estimators.models.lorenz96 import LORENZ96
+from estimators.models.lorenz import LORENZ96
 from estimators.registry import ESTIMATORS, checked
 from estimators.tuning import Tuning
 from tests.estimators.linear_models import random_linear

@@ -12,8 +12,8 @@ from estimators.errors import EstimatorError
 from estimators.fold import Fold
 from estimators.log import READING, TICK, Events, Log
 from estimators.model.state_space import Field, Noise, Row, Sensor, State, StateSpaceModel
-from estimators.models.lorenz96 import LORENZ96
-from estimators.models.motor_winding import MOTOR_WINDING
+from estimators.models.lorenz import LORENZ96
+from estimators.models.motor_drive import MOTOR_WINDING
 from estimators.numerics.random import key_of, normal
 from estimators.snapshots import Base
 from estimators.tuning import Tuning

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from estimators.models.lorenz63 import LORENZ63
-from estimators.models.lorenz96 import LORENZ96
+from estimators.models.lorenz import LORENZ63, LORENZ96
 
 
 def butterfly(t, s):
