@@ -67,7 +67,7 @@ class Compiler:
         return self._process.alive
 
     def end(self) -> None:
-        """Have the process end; what it writes into the cache is there whole or not at all."""
+        """Have the process end; a cache entry is written completely or not at all."""
         self._process.kill()
 
     def stop(self) -> None:

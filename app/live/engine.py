@@ -34,7 +34,7 @@ from .jobs import Jobs
 from .outputs import Status
 from .refolder import Refolded, Refolder
 from .running_fold import RunningFold
-from .status import Settings, busy_status, status_of
+from .status import StatusSettings, busy_status, status_of
 from .watchdog import Watchdog
 from .watchers import IdleTicks, Watchers
 from .workshop import Workshop
@@ -206,8 +206,8 @@ class Engine(RunningFold):
             notices=self.notices.counts(),
         )
 
-    def _settings(self, refolding: bool) -> Settings:
-        return Settings(
+    def _settings(self, refolding: bool) -> StatusSettings:
+        return StatusSettings(
             self.estimator,
             self.tuning,
             refolding,

@@ -13,7 +13,7 @@ from estimators.diagnostics.sensitivity import bounds_of, sensitivity, smallest_
 from estimators.model.state_space import StateSpaceModel
 from estimators.registry import find_entry
 
-from .jobs import Cancelled, Job, PacedExecutor
+from .jobs import Job, JobCancelled, PacedExecutor
 from .outputs import EventWindow, ProtectionLevels
 
 PERIOD_S = 15.0
@@ -68,7 +68,7 @@ class ProtectionMonitor:
                 false_alarm=self._false_alarm,
                 executor=PacedExecutor(job),
             )
-        except Cancelled:
+        except JobCancelled:
             raise
         except Exception as error:  # noqa: BLE001  a user's model may raise anything; the status shows the reason
             return ProtectionLevels(taken.revision, taken.end, f"{type(error).__name__}: {error}")

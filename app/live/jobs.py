@@ -32,7 +32,7 @@ STOP_TIMEOUT_S = 1.0
 RUNNING, CANCELLING, CANCELLED, FAILED, DONE = "running", "cancelling", "cancelled", "failed", "done"
 
 
-class Cancelled(Exception):  # noqa: N818  no error: the result is not wanted
+class JobCancelled(Exception):  # noqa: N818  no error: the result is not wanted
     """The job was cancelled, or its result is out of date."""
 
 
@@ -82,12 +82,12 @@ class Job:
         self._cancelled.set()
 
     def check(self) -> None:
-        """Raise `Cancelled` if the result is no longer wanted."""
+        """Raise `JobCancelled` if the result is no longer wanted."""
         if not self.wanted:
-            raise Cancelled
+            raise JobCancelled
 
     def rest(self, seconds: float) -> None:
-        """Wait so many seconds; raise `Cancelled` as soon as the job is cancelled."""
+        """Wait so many seconds; raise `JobCancelled` as soon as the job is cancelled."""
         self._cancelled.wait(seconds)
         self.check()
 
@@ -97,7 +97,7 @@ class Job:
         try:
             self.check()
             answer = self.work(self)
-        except Cancelled:
+        except JobCancelled:
             state = CANCELLED
         except NisusError as error:
             state, reason = FAILED, str(error)
@@ -119,7 +119,7 @@ class PacedExecutor(Executor):
         self._job = job
 
     def map(self, fn: Callable[..., Any], *iterables: Any, timeout: Any = None, chunksize: int = 1) -> Iterator[Any]:
-        """Apply a function as the built-in `map` does; raise `Cancelled` once the job is not wanted."""
+        """Apply a function as the built-in `map` does; raise `JobCancelled` once the job is not wanted."""
         took = 0.0
         for items in zip(*iterables, strict=False):
             self._job.rest(took)
@@ -154,7 +154,7 @@ class Jobs:
         """Queue a job.
 
         Args:
-            name: What it computes, for notices.
+            name: For notices.
             work: Called with the job, in a thread of the pool. What it returns is the job's `result`.
             stale: Whether the result is out of date; the job ends at its next `check` then.
             every: Seconds between two calls of a repeated job, which ends when it is cancelled; the work may return
@@ -172,7 +172,7 @@ class Jobs:
             self._hire()
 
     def stop(self) -> None:
-        """Cancel everything, and wait for what is under way, up to `STOP_TIMEOUT_S`."""
+        """Cancel all jobs, and wait up to `STOP_TIMEOUT_S` for those under way."""
         with self._wake:
             self._stopping = True
             for job in (*self._under_way, *(job for _, _, job in self._queue)):

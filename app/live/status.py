@@ -32,7 +32,7 @@ FOLDED = "the measurements so far are being folded"
 """Cause of a twin without a row yet."""
 
 
-class Settings(NamedTuple):
+class StatusSettings(NamedTuple):
     """The part of a status that is known without the fold.
 
     `estimator` and `tuning` are the requested ones, which differ from the fold's while a refold is waited for
@@ -54,7 +54,7 @@ class Settings(NamedTuple):
         return {**self._asdict(), "options": options, **playback_status(source)}
 
 
-def busy_status(last: Status, settings: Settings, model: StateSpaceModel, source: Source, busy: float) -> Status:
+def busy_status(last: Status, settings: StatusSettings, model: StateSpaceModel, source: Source, busy: float) -> Status:
     """Return the last status of a fold that has been at work for `busy` seconds, with the present settings."""
     fields = settings.fields(model, source)
     if last.t is None and busy >= 1.0 and settings.awaited is None:
@@ -67,7 +67,7 @@ def status_of(
     rows: RowCounts,
     watchers: Watchers,
     source: Source,
-    settings: Settings,
+    settings: StatusSettings,
     *,
     revision: int,
     inflated: int,
@@ -139,7 +139,7 @@ def _judged(fold: Fold) -> float:
     return nis_verdict(track, events, fold.model, baseline).judged
 
 
-def _cause_without_rows(fold: Fold, watchers: Watchers, settings: Settings) -> str:
+def _cause_without_rows(fold: Fold, watchers: Watchers, settings: StatusSettings) -> str:
     if fold.idle and settings.awaited is not None:
         begun = settings.compiling.get(settings.awaited)
         since = f" ({begun:.0f} s so far)" if begun else ""

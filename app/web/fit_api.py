@@ -13,7 +13,7 @@ from ..live.history_copy import END_OF_TIME
 from ..live.interface import Running
 from ..live.jobs import DONE
 from ..live.runs.fitting import FitAttempt, Fitting
-from ..live.runs.refits import FITTING, Refits, WindowFit
+from ..live.runs.refits import FITTING, LiveRefit, Refits
 from ..live.tunings.fitted import settings_of
 from ..live.tunings.versions import keep, version_text
 from ..studies.advice.advising import Advising
@@ -144,7 +144,7 @@ def _attempt_json(attempt: FitAttempt) -> dict[str, Any]:
     return found | {"result": fit_json(attempt.fitted), "values": values}
 
 
-def _refit_json(refit: WindowFit) -> dict[str, Any]:
+def _refit_json(refit: LiveRefit) -> dict[str, Any]:
     """Return a fit of a window as JSON; times as text, since JavaScript's numbers cannot hold them."""
     attempt = refit.attempt
     found: dict[str, Any] = {

@@ -1,7 +1,6 @@
 """A fit of the tuning to the events of the running twin: one at a time, with its progress.
 
-A job folds a copy of the events again and again (estimators/fit). The engine does not know of it; its result is applied
-like any other edit.
+A job folds a copy of the events again and again (estimators/fit). Its result is applied like any other edit.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ from estimators.tuning import Tuning
 from ...twin.bounds import bounds_of, natural_aim
 from ..history_copy import END_OF_TIME, copy_log
 from ..interface import Running
-from ..jobs import Cancelled, Job
+from ..jobs import Job, JobCancelled
 
 if TYPE_CHECKING:
     from estimators.fit.fit import Fitted
@@ -138,7 +137,7 @@ class Fitting:
                 go=go,
             )
         except objective.Cancelled:
-            raise Cancelled from None
+            raise JobCancelled from None
 
     def _log(self, attempt: FitAttempt, most: int | None, since: int | None, job: Job) -> tuple[Log, Base | None]:
         """The events to fit to, and where a fold of them starts."""

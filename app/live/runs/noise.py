@@ -63,20 +63,20 @@ def _doubtful(noise: SensorNoise) -> bool:
 
 
 def doubts(found: Mapping[str, SensorNoise], level: float | None) -> dict[str, str]:
-    """By key why what the innovations say is not to be taken: they are correlated, and their size then misleads.
+    """Return, by key, why an estimate should not be used: the innovations are correlated, so their size misleads.
 
-    Matching R to their size takes an error that lasts for one that the next readings average away: the bands become
-    too narrow, and the estimate follows the error. Matching Q is right only where it would mend the correlation, too.
+    Matching R to their size treats a coloured error as white noise: the bands become too narrow, and the estimate
+    follows the error. Matching Q is right only if it would remove the correlation too.
 
     Args:
-        found: What they say of each R, by key.
-        level: By how much all of Q would have to be scaled; None if not known.
+        found: Estimated R by key.
+        level: Factor of all of Q at which the NIS is consistent; None if not known.
     """
     correlated = {key: noise for key, noise in found.items() if _doubtful(noise)}
     said = {
         key: f"the innovations are correlated ({noise.correlation:+.2f} with the next, where chance allows "
         f"±{2.0 / np.sqrt(noise.n):.2f}): a state is missing, Q is wrong, or the sensor's error lasts; their size does "
-        f"not tell R"
+        f"not determine R"
         for key, noise in correlated.items()
     }
     signs = {np.sign(noise.correlation) for noise in correlated.values()}

@@ -1,7 +1,7 @@
 """Dual estimation of a running twin: fit the parameters again at intervals to its last measurements.
 
 A job watches the log's clock and starts the fits. A result that wins on the held-out blocks is a proposal, which a
-user accepts or dismisses, or which is adopted at once if the YAML says so. Every fit adds a notice; an adopted one
+user accepts or dismisses, or which is adopted at once with `adopt: if better`. Every fit adds a notice; an adopted one
 becomes a tuning version with its evidence. A proposal is valid for the tuning that it was fitted from; a dismissed one
 is proposed again only when the data differ.
 """
@@ -39,7 +39,7 @@ FITTING, OFFERED, ADOPTED, DISMISSED, OUTDATED, NOTHING, BROKEN = (
 
 
 @dataclass(frozen=True)
-class WindowFit:
+class LiveRefit:
     """One fit of a window, with its state and its result in a line (`text`).
 
     start and end are the window's first and last time, ns. `name` is the tuning version that was made of it.
@@ -70,7 +70,7 @@ class Refits:
         self._passage = 0
         self._due: int | None = None
         self._dismissed: Fitted | None = None
-        self.known: tuple[WindowFit, ...] = ()
+        self.known: tuple[LiveRefit, ...] = ()
 
     # From any thread
 
@@ -80,7 +80,7 @@ class Refits:
         return self._engine.twin.config.refit
 
     @property
-    def open(self) -> WindowFit | None:
+    def open(self) -> LiveRefit | None:
         """The present proposal."""
         return next((item for item in self.known if item.state == OFFERED), None)
 
@@ -184,9 +184,9 @@ class Refits:
         self._due = newest + round(section.every * 1e9)
         attempt = self._fitting.begin(section.entries, since=first)
         number = self.known[-1].number + 1 if self.known else 1
-        self.known = (*self.known, WindowFit(number, first, newest, attempt))[-MAX_FITS:]
+        self.known = (*self.known, LiveRefit(number, first, newest, attempt))[-MAX_FITS:]
 
-    def _take(self, refit: WindowFit) -> None:
+    def _take(self, refit: LiveRefit) -> None:
         """Report the result of a fit, and propose it if it won."""
         attempt, number = refit.attempt, refit.number
         fitted = attempt.fitted
@@ -202,7 +202,7 @@ class Refits:
         else:
             self._offer(refit, fitted)
 
-    def _offer(self, refit: WindowFit, fitted: Fitted) -> None:
+    def _offer(self, refit: LiveRefit, fitted: Fitted) -> None:
         section, before = self.section, self.open
         if before is not None:
             self._become(before.number, OUTDATED, f"{before.text}; fit {refit.number} took its place")
@@ -226,7 +226,7 @@ class Refits:
     def _current(self, attempt: FitAttempt) -> bool:
         return self._engine.tuning is attempt.tuning and self._engine.estimator == attempt.estimator
 
-    def _proposed(self, number: int) -> WindowFit:
+    def _proposed(self, number: int) -> LiveRefit:
         refit = self.open
         if refit is None or refit.number != number:
             state = next((item.state for item in self.known if item.number == number), "not known")

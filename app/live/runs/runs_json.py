@@ -6,8 +6,6 @@ import dataclasses
 import math
 from typing import Any
 
-import numpy as np
-
 from estimators.diagnostics.score import Fit
 from estimators.fit.dual import shift
 from estimators.fit.fit import Fitted, Line
@@ -151,8 +149,8 @@ def fit_json(fitted: Fitted) -> dict[str, Any]:
         "estimator": fitted.estimator,
         "proposed": fitted.proposed,
         "verdict": {
-            "gain": _finite(fitted.verdict.gain),
-            "error": _finite(fitted.verdict.error),
+            "gain": _plain(fitted.verdict.gain),
+            "error": _plain(fitted.verdict.error),
             "reasons": list(fitted.verdict.reasons),
         },
         "entries": [_line(line) for line in fitted.lines],
@@ -178,17 +176,16 @@ def correlated(fitted: Fitted) -> list[dict[str, Any]]:
 
 
 def _line(line: Line) -> dict[str, Any]:
-    fields = {**line._asdict(), "sigma": shift(line)}
-    return {name: _finite(value) if isinstance(value, float) else value for name, value in fields.items()}
+    return {name: _plain(value) for name, value in {**line._asdict(), "sigma": shift(line)}.items()}
 
 
 def part_json(part: Part) -> dict[str, Any]:
     """Return the scores of one part of the recordings."""
     return {
         "readings": part.n,
-        "log_density": _finite(part.log_density),
-        "nis": _finite(part.nis),
-        "coverage": _finite(part.coverage),
+        "log_density": _plain(part.log_density),
+        "nis": _plain(part.nis),
+        "coverage": _plain(part.coverage),
         "sensors": {name: _prediction(item) for name, item in part.sensors.items()},
         "withheld": {name: _prediction(item) for name, item in part.withheld.items()},
         "states": {name: _prediction(item) for name, item in part.states.items()},
@@ -199,11 +196,7 @@ def _prediction(item: Prediction) -> dict[str, Any]:
     return {
         "unit": item.unit,
         "n": item.n,
-        "rms": _finite(item.rms),
-        "coverage": _finite(item.coverage),
-        "crps": _finite(item.crps),
+        "rms": _plain(item.rms),
+        "coverage": _plain(item.coverage),
+        "crps": _plain(item.crps),
     }
-
-
-def _finite(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None

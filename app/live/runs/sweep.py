@@ -20,7 +20,7 @@ from estimators.tuning import Tuning
 
 from ..history_copy import END_OF_TIME
 from ..interface import Running
-from ..jobs import Cancelled, Job
+from ..jobs import Job, JobCancelled
 from ..outputs import EventWindow
 
 FACTORS = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0)
@@ -184,7 +184,7 @@ class Sweeps:
         """Fold every value of a key; `around` returns the points as they come.
 
         Raises:
-            Cancelled: If the job is, or another tuning runs by now.
+            JobCancelled: If the job is, or another tuning runs by now.
         """
         taken = self._engine.last_events(MIN_SWEEP_EVENTS, rows=True)
         if taken is None:
@@ -246,7 +246,7 @@ class Sweeps:
     def _check(self, taken: EventWindow, job: Job) -> None:
         job.check()
         if self._engine.tuning is not taken.tuning:
-            raise Cancelled
+            raise JobCancelled
 
     def _affordable(self, taken: EventWindow) -> tuple[int, str]:
         """Return how many events can be folded in reasonable time, or the reason why none."""

@@ -1,4 +1,4 @@
-"""What a fit found, as what a tuning version is made of."""
+"""Settings of a tuning version from the result of a fit."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from .versions import COVERAGE, DIGITS, LIKELIHOOD, NIS, RMSE, Settings
 
 
 def settings_of(found: Fitted, fitted_on: Sequence[str], note: str = "") -> Settings:
-    """Filter and tuning of a fit with what they were worth on the blocks that were held out.
+    """Return filter, tuning and held-out scores of a fit.
 
     Args:
-        found: What came of the fit.
+        found: Result of the fit.
         fitted_on: Names of the recordings.
-        note: What was tried.
+        note: Note of the version.
     """
     tuning, prior = found.setting
     beliefs = {}
@@ -73,5 +73,5 @@ def _moved(line: Line) -> MovedSection:
 
 
 def _rounded(value: float) -> float | None:
-    """With as many digits as a file should have; None for what is no number."""
+    """Round to four significant digits; None if it is not a number."""
     return float(f"{value:.4g}") if np.isfinite(value) and abs(value) <= LARGEST else None

@@ -1,4 +1,4 @@
-"""The settings of a run as lines that can stand in place of those in the twin's file."""
+"""Settings of a run as YAML that can replace the sections of the twin's file."""
 
 from __future__ import annotations
 
@@ -26,18 +26,17 @@ def tuning_yaml(
     *,
     whole: bool = True,
 ) -> str:
-    """The sections `estimator`, `filters`, `parameters`, `noise`, `sensors` and `gate`.
+    """Return the sections `estimator`, `filters`, `parameters`, `noise`, `sensors` and `gate`.
 
-    A twin whose file has these in place of its own starts with the same settings. What else a section of the file says
-    (limits of a sensor, options of other filters) is in them as it was; its comments are not. If not `whole`, they are
-    what is tuned and no more, every parameter among it: what stays as the file says is left out.
+    A twin whose file has these in place of its own starts with the same settings.
 
     Args:
-        config: What the twin's file says.
+        config: The twin's file.
         estimator: Of the run.
-        tuning: The same.
-        prior: Mean (nx,) and covariance (nx, nx), diagonal, where they are not the file's: a section `prior` too.
-        whole: See above.
+        tuning: Of the run.
+        prior: Mean (nx,) and covariance (nx, nx), diagonal, if they are not the file's; adds a section `prior`.
+        whole: Whether other content of these sections (limits of a sensor, options of other filters) is kept, without
+            its comments. If not, they have the tuned entries only, with every parameter.
     """
     entry, first = find_entry(estimator), config.estimator
     options = {name: _option(entry, name, value) for name, value in tuning.options.items()}
@@ -72,7 +71,7 @@ def tuning_yaml(
 
 
 def _errs(config: TwinSection, sensor: str) -> bool:
-    """Whether a sensor has an error that lasts."""
+    """Return whether a sensor has a coloured error."""
     return sensor in config.sensors and config.sensors[sensor].error is not None
 
 
@@ -83,7 +82,7 @@ def _sensors(
     values: Mapping[str, float],
     whole: bool,
 ) -> dict[str, Any]:
-    """The section `sensors`: with the variances of the errors that last, by sensor, and parameters by name."""
+    """Return the section `sensors`, given the variances of coloured errors by sensor, and parameters by name."""
     found = {}
     ranges = bounds_of(config, tuning.model)
     for sensor, start in zip(tuning.model.sensors, tuning.model.row_start, strict=True):
@@ -103,12 +102,12 @@ def _sensors(
 
 
 def _one_or_all(values: list[float]) -> float | list[float]:
-    """The value that all rows share, or one a row."""
+    """Return the value that all rows share, or one for each row."""
     return values[0] if all(value == values[0] for value in values) else values
 
 
 def _within(value: float | list[float], bounds: tuple[float, float] | None) -> Any:
-    """A variance with the range of its data sheet, unless it was turned beyond that."""
+    """Return a variance with the range of its data sheet, unless it lies outside."""
     values = value if isinstance(value, list) else [value]
     if bounds is None or not all(bounds[0] <= item <= bounds[1] for item in values):
         return value
@@ -125,6 +124,6 @@ def _gate(tuning: Tuning) -> Any:
 
 
 def _option(entry: Estimator, name: str, value: float) -> float | str:
-    """An option's value, a choice by its word."""
+    """Return an option's value, a choice by its name."""
     choices = next((option.choices for option in entry.options if option.name == name), ())
     return choices[round(value)] if choices else float(value)

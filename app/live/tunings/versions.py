@@ -1,4 +1,4 @@
-"""One section of a YAML file put in place of the one that is there; the rest of the text stays as it is."""
+"""Tuning versions in files beside a twin: write, accept, list and load them."""
 
 from __future__ import annotations
 
@@ -26,9 +26,31 @@ from ..changes import obstacle
 from ..interface import Running
 from .tuning_yaml import tuning_yaml
 
+NIS, LIKELIHOOD, RMSE, COVERAGE, REFUSED = "nis", "log_likelihood", "rmse", "coverage", "refused"
+
+DIGITS = 8
+"""Significant digits of a score, more than differ between processors."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Filter, tuning, scores and evidence of a version.
+
+    `prior` has mean and std by state if it was fitted; `scores` are those of `figures`; `evidence` is that of a fit.
+    """
+
+    estimator: str
+    tuning: Tuning
+    note: str = ""
+    fitted_on: Sequence[str] = ()
+    scores: Mapping[str, float] = field(default_factory=dict)
+    prior: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    model_version: int = 1
+    evidence: EvidenceSection | None = None
+
 
 def write_section(path: Path, key: str, section: str) -> None:
-    """Put the section `key`, whole lines, into a YAML file, in place of the one that is there, or at its end.
+    """Replace the section `key` of a YAML file by these lines, or append them; the other text stays.
 
     Raises:
         ConfigError: If the file cannot be written.
@@ -47,10 +69,10 @@ def write_section(path: Path, key: str, section: str) -> None:
 
 
 def listing(twin: Twin) -> list[dict[str, Any]]:
-    """What the twin's file says, then its versions as they were saved, the oldest first.
+    """Return the twin's own settings and its versions, the oldest first.
 
-    Each has `name`, `estimator`, `holds` (whether guards go by it) and what its file says of it; one that cannot be
-    read has `name` and `error`.
+    Each has `name`, `estimator`, `holds` (whether guards use it) and the head of its file; a file that cannot be read
+    has `name` and `error`.
     """
     versions: list[Version] = []
     broken: list[dict[str, Any]] = []
@@ -71,14 +93,11 @@ def listing(twin: Twin) -> list[dict[str, Any]]:
     return found + broken
 
 
-NIS, LIKELIHOOD, RMSE, COVERAGE, REFUSED = "nis", "log_likelihood", "rmse", "coverage", "refused"
-
-
 def figures(found: Score) -> dict[str, float]:
-    """Sum a score up; only what is a number: a fold without truth, and without a sensor held out, has no RMSE.
+    """Return the finite figures of a score; without truth or a held-out sensor there is no RMSE.
 
     Returns:
-        `nis`, `log_likelihood` of a reading, `refused` (a share), and for each state whose truth is known and each
+        `nis`, `log_likelihood` per measurement, `refused` (a share), and for each state whose truth is known and each
         sensor row held out `rmse.NAME` in its unit and `coverage.NAME` as a share; `rmse.field` for all cells of a
         large field.
     """
@@ -94,30 +113,8 @@ def figures(found: Score) -> dict[str, float]:
     return {name: float(value) for name, value in known.items() if np.isfinite(value)}
 
 
-DIGITS = 8
-"""Significant digits of a score: what other processors make of it differs far behind them."""
-
-
-@dataclass(frozen=True)
-class Settings:
-    """What a version is made of: the filter, the tuning, and what is known of them.
-
-    `prior` has mean and std by state where that was fitted; `scores` are those of `figures`; `evidence` is why a fit
-    proposed it.
-    """
-
-    estimator: str
-    tuning: Tuning
-    note: str = ""
-    fitted_on: Sequence[str] = ()
-    scores: Mapping[str, float] = field(default_factory=dict)
-    prior: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
-    model_version: int = 1
-    evidence: EvidenceSection | None = None
-
-
 def version_text(twin: Twin, given: Settings) -> str:
-    """The YAML of a version."""
+    """Return the YAML of a version."""
     head = VersionSection(
         twin=twin.name,
         model=twin.model.name,
@@ -141,7 +138,7 @@ def version_text(twin: Twin, given: Settings) -> str:
 
 
 def check_free(twin: Path, name: str) -> Path:
-    """The file that a version of this name would have, of a twin's YAML.
+    """Return the file for a version of this name, beside a twin's YAML.
 
     Raises:
         ConfigError: If the name is none or taken.
@@ -185,7 +182,7 @@ def accept(version: Version, note: str) -> None:
 
 
 def now() -> str:
-    """The present time, as versions have it."""
+    """Return the present time in the format of versions."""
     return time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
 
 
@@ -195,15 +192,15 @@ def _header(head: VersionSection) -> str:
 
 
 def load_into(engine: Running, name: str, why: str | None = None) -> None:
-    """Queue going on with a version of the twin; the history is folded again with it.
+    """Queue the change to a version of the twin; the history is folded again with it.
 
     Args:
-        engine: What runs.
+        engine: The running twin.
         name: Of the version, or `own`.
-        why: What is said of the run that begins; None for the version's name.
+        why: Reason of the new run; None for the version's name.
 
     Raises:
-        ConfigError: If there is no such version, it is wrong, or it does not fit what runs.
+        ConfigError: If there is no such version, it is wrong, or it does not fit the running twin.
     """
     twin = with_version(engine.twin, name)
     reason = obstacle(engine.twin, twin)

@@ -1,1 +1,1 @@
-"""What is computed of a running twin only while somebody looks: what if, and what is wrong."""
+"""Analyses of a running twin that are computed on request: forecast and diagnosis."""

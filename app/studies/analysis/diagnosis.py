@@ -1,4 +1,4 @@
-"""What is wrong with a running twin, in figures: innovations, particles, covariance, observability, faults, cost."""
+"""Diagnosis of a running twin: innovations, particles, covariance, observability, faults, cost."""
 
 from __future__ import annotations
 
@@ -23,19 +23,19 @@ from ...live.outputs import EventWindow, Status
 from .numbers import listed, number
 from .row_figures import rows_json
 
-ROWS = 20_000
-"""Rows that are looked at, the last."""
+DIAGNOSED_ROWS = 20_000
+"""Last rows that are analysed."""
 
-PIECE = 4096
+COPY_ROWS = 4096
 """Rows that are copied at once: the engine waits for no more."""
 
-FRESH = 1.0
-"""Seconds for which an answer holds, for all who look."""
+REUSE_S = 1.0
+"""Seconds for which an answer is reused, for all clients."""
 
-POINTS = 200
+LINE_POINTS = 200
 """Points of a line over time."""
 
-MOST_NAMES = 48
+MAX_CORRELATED_STATES = 48
 """States of a correlation map."""
 
 
@@ -50,9 +50,9 @@ COST_CHUNK = 64
 
 @dataclass(frozen=True)
 class FoldFigures:
-    """Of one revision: microseconds of an event, by a fold of the last ones again; observability, or why there is none.
+    """Cost of an event (µs) and observability of one revision, or the reason why there is none.
 
-    `note` is what to know of it.
+    `note` qualifies the observability.
     """
 
     revision: int
@@ -115,7 +115,7 @@ class Diagnosis:
         self._known: tuple[float, dict[str, Any]] | None = None
 
     def look(self) -> dict[str, Any]:
-        """The figures of the last rows, at most `FRESH` seconds old.
+        """Return the figures of the last rows, at most `REUSE_S` seconds old.
 
         `rows` are the first of the sensors' rows (row_figures.py), `rows_in_all` how many there are, `ranks` counts of
         an ensemble's histogram, `particles` what is left of a cloud over time, `correlation` a map of the present
@@ -124,7 +124,7 @@ class Diagnosis:
         event.
         """
         known = self._known
-        if known is None or time.monotonic() - known[0] > FRESH:
+        if known is None or time.monotonic() - known[0] > REUSE_S:
             answer = self._look()
             self._known = known = time.monotonic(), answer
         return known[1]
@@ -132,7 +132,7 @@ class Diagnosis:
     def _look(self) -> dict[str, Any]:
         engine = self._engine
         tuning, estimator = engine.folded_with()
-        revision, events, track = last_rows(engine, ROWS)
+        revision, events, track = last_rows(engine, DIAGNOSED_ROWS)
         status = engine.status()
         marginal = find_entry(estimator).family in ("particle", "ensemble")
         slow = self._figures.of(revision) if len(events) else None
@@ -157,14 +157,14 @@ class Diagnosis:
 
 
 def last_rows(engine: Running, most: int) -> tuple[int, Events, Track]:
-    """Copies of the last rows of one revision: its number, events and track.
+    """Copy the last rows of one revision; return its number, events and track.
 
-    In pieces, so that the engine never waits for long; a late reading between two of them may show in one only.
+    Copied in chunks, so that the engine never waits for long; a late measurement in between may show in one only.
     """
     end = engine.index_at(2**62)
     pieces = [engine.rows(end - most, end - most)]
-    for start in range(max(0, end - most), end, PIECE):
-        piece = engine.rows(start, min(start + PIECE, end))
+    for start in range(max(0, end - most), end, COPY_ROWS):
+        piece = engine.rows(start, min(start + COPY_ROWS, end))
         if piece.revision != pieces[0].revision:
             return last_rows(engine, most)
         pieces.append(piece)
@@ -174,7 +174,7 @@ def last_rows(engine: Running, most: int) -> tuple[int, Events, Track]:
 
 
 def _agreed(rows: list[dict[str, Any]], status: Status) -> list[dict[str, Any]]:
-    """The rows, of which none is called good while the twin's own tests say what is wrong with it."""
+    """Return the rows; none is called good while the detectors report an episode about it."""
     for row in rows:
         state, text = status.sensors.get(row["sensor"], ("", ""))
         if row["tone"] == "good" and state in ("suspect", "degraded", "diverged") and row["name"] in text:
@@ -183,7 +183,7 @@ def _agreed(rows: list[dict[str, Any]], status: Status) -> list[dict[str, Any]]:
 
 
 def _ranks(status: Status) -> dict[str, Any] | None:
-    """The rank histogram that an ensemble keeps since it started."""
+    """Return the rank histogram of an ensemble since its start."""
     counts = status.account.get("ranks")
     if not isinstance(counts, list) or not sum(counts):
         return None
@@ -192,11 +192,11 @@ def _ranks(status: Status) -> dict[str, Any] | None:
 
 
 def _particles(status: Status, events: Events, track: Track) -> dict[str, Any] | None:
-    """How many particles count, and from how many they descend: the least in each stretch of the rows."""
+    """Return the effective number of particles and of their ancestors over time: the minimum of each stretch."""
     rows = np.flatnonzero(np.isfinite(track.effective))
     if not rows.size:
         return None
-    cuts = np.unique(np.linspace(0, rows.size, min(POINTS, rows.size) + 1).astype(int))[:-1]
+    cuts = np.unique(np.linspace(0, rows.size, min(LINE_POINTS, rows.size) + 1).astype(int))[:-1]
     ago = (events.t[rows[cuts]] - events.t[-1]) * 1e-9
     lines = {
         name: listed(np.minimum.reduceat(np.nan_to_num(column[rows], nan=np.inf), cuts), 4)
@@ -207,12 +207,12 @@ def _particles(status: Status, events: Events, track: Track) -> dict[str, Any] |
 
 
 def _correlation(engine: Running) -> dict[str, Any]:
-    """The correlations of the present covariance by shown state, or why there are none."""
+    """Return the correlations of the present covariance by shown state, or the reason why there are none."""
     model = engine.model
     cov = engine.belief().cov
     if model.nx > LARGE or cov.shape[0] != model.nx:
         return {"names": [], "matrix": [], "reason": f"{model.nx:,} states have no covariance matrix, but variances"}
-    places = model.shown[:MOST_NAMES]
+    places = model.shown[:MAX_CORRELATED_STATES]
     some = cov[np.ix_(places, places)]
     std = np.sqrt(np.diag(some))
     with np.errstate(all="ignore"):
@@ -241,7 +241,7 @@ def _observability(engine: Running, found: FoldFigures | None) -> dict[str, Any]
 
 
 def _unseen(status: Status) -> dict[str, Any]:
-    """The smallest faults that are seen, and how wrong each state can be by one that is not."""
+    """Return the minimal detectable faults and the protection level of each state."""
     found = status.integrity
     if found is None:
         return {"faults": [], "integrity": {}, "unseen_reason": "being computed"}

@@ -1,4 +1,4 @@
-"""What if, of a running twin: the question as it comes, the forecast from where the filter stands, the answer."""
+"""Forecasts of a running twin: parse the question, fold on from the present state, return the answer as JSON."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ from .numbers import listed, number
 MAX_CHANGES = 200
 """Changes of one input."""
 
-PATIENCE = 8.0
-"""Seconds that one may take to compute."""
+MAX_COMPUTING_S = 8.0
+"""Seconds that a forecast may take to compute."""
 
-ALONE = 1.0
-"""Seconds of a step where there has been one reading only."""
+DEFAULT_STEP_S = 1.0
+"""Step after a single measurement."""
 
 SHARES = (0.1, 0.5, 0.9)
-"""Probabilities of a limit of which the times are told."""
+"""Probabilities of crossing a limit whose times are returned."""
 
 
 class Question(NamedTuple):
-    """What is asked: `horizon` in seconds; by input its changes; by state, a limit in its unit.
+    """Horizon (s), changes by input, and limits by state in its unit.
 
-    The inputs in `repeated` do again what they did in the last seconds, as long as the horizon.
+    The inputs in `repeated` repeat their values of the last seconds, as long as the horizon.
     """
 
     horizon: float
@@ -44,7 +44,7 @@ class Question(NamedTuple):
 
 
 def question_from_json(body: Any, model: StateSpaceModel) -> Question:
-    """The question `{"horizon": s, "inputs": {name: value | [[t, value], ...] | "repeat"}, "limits": {state: value}}`.
+    """Parse `{"horizon": s, "inputs": {name: value | [[t, value], ...] | "repeat"}, "limits": {state: value}}`.
 
     Raises:
         ConfigError: If it is not that.
@@ -65,13 +65,13 @@ def question_from_json(body: Any, model: StateSpaceModel) -> Question:
 
 
 class Forecasts:
-    """Answers questions about one running twin; from any thread, never from the engine's."""
+    """Forecasts of one running twin, from any thread but the engine's."""
 
     def __init__(self, engine: Running) -> None:
         self._engine = engine
 
     def may(self) -> dict[str, Any]:
-        """What may be asked: the longest horizon and the length of a step, s.
+        """Return the longest horizon and the length of a step, s.
 
         Raises:
             ConfigError: If nothing has come yet.
@@ -86,7 +86,7 @@ class Forecasts:
         return here
 
     def ask(self, question: Question) -> dict[str, Any]:
-        """What would be, see `forecast_json`.
+        """Return the forecast, see `forecast_json`.
 
         Raises:
             NisusError: If nothing has come yet, the question is too large, or `forecast` refuses it.
@@ -97,10 +97,10 @@ class Forecasts:
         inputs = question.inputs | recorded(self._engine, question.repeated, here.t, question.horizon)
 
         def between() -> None:
-            if time.monotonic() - begun > PATIENCE:
+            if time.monotonic() - begun > MAX_COMPUTING_S:
                 raise ConfigError(
-                    f"forecast: {question.horizon:g} s in steps of {step:.3g} s take longer than {PATIENCE:g} s to "
-                    f"compute with {here.estimator}; ask for a shorter horizon"
+                    f"forecast: {question.horizon:g} s in steps of {step:.3g} s take longer than {MAX_COMPUTING_S:g} s "
+                    f"to compute with {here.estimator}; ask for a shorter horizon"
                 )
 
         found = forecast(
@@ -123,12 +123,12 @@ class Forecasts:
                 "number; are the inputs possible? or ask for a shorter horizon"
             )
         told = forecast_json(self._engine.model, here, found)
-        chosen = {name: told_changes(changes) for name, changes in inputs.items()}
+        chosen = {name: drawn_changes(changes) for name, changes in inputs.items()}
         return {**told, "chosen": chosen, "step": step, "took": time.monotonic() - begun}
 
 
 def forecast_json(model: StateSpaceModel, here: Here, found: Forecast) -> dict[str, Any]:
-    """A forecast as JSON.
+    """Return a forecast as JSON.
 
     `now` is in seconds of the log, `t` in seconds from then; `states` have mean and the edges of their ± 1σ and ± 2σ
     bands, a probability its mean alone; `inputs` are those that hold now. Of each limit: whether it is looked at from
@@ -178,8 +178,8 @@ def _crossing(item: Crossing, t: np.ndarray) -> dict[str, Any]:
 
 
 def _step(here: Here, horizon: float, longest: float) -> float:
-    """As long as readings are apart, which the filter is used to; no longer than the model allows."""
-    step = min(here.step if math.isfinite(here.step) else ALONE, longest)
+    """Return the recent time between measurements, at most the step that the model allows."""
+    step = min(here.step if math.isfinite(here.step) else DEFAULT_STEP_S, longest)
     steps = math.ceil(horizon / step)
     if steps > MAX_STEPS:
         raise ConfigError(
@@ -217,23 +217,23 @@ def _number(where: str, value: Any) -> float:
 
 
 REPEAT = "repeat"
-"""In place of an input's values: what it was, once more."""
+"""In place of an input's values: those that it had before."""
 
 Changes = list[tuple[float, float]]
-"""Of one input: seconds from now, and the value from then on."""
+"""Changes of one input: seconds from now, and the value from then on."""
 
 MAX_STEPS = 20_000
-"""Steps of a forecast; each is as long as readings are apart."""
+"""Steps of a forecast; each is as long as the time between measurements."""
 
 MAX_TIMES = 160
-"""Times that are told of."""
+"""Times in the answer."""
 
 COPY_ROWS = 16_384
 """Rows copied at once, so that a long history does not hold the engine's lock for long."""
 
 
 def recorded(engine: Running, names: Sequence[str], now: int, horizon: float) -> dict[str, Changes]:
-    """What inputs did in the last `horizon` seconds before `now` (ns), from now on; of a shorter log again and again.
+    """Return the inputs of the last `horizon` seconds before `now` (ns) as changes from now on; repeat a shorter log.
 
     Raises:
         ConfigError: If they changed too often.
@@ -280,14 +280,14 @@ def recorded(engine: Running, names: Sequence[str], now: int, horizon: float) ->
     }
 
 
-def told_changes(changes: Changes) -> dict[str, list[Any]]:
-    """What an input does from now on, as some points to draw."""
+def drawn_changes(changes: Changes) -> dict[str, list[Any]]:
+    """Return the changes of an input as points to draw."""
     few = changes[:: max(1, math.ceil(len(changes) / (2 * MAX_TIMES)))]
     return {"t": listed(np.array([t for t, _ in few])), "value": listed(np.array([value for _, value in few]))}
 
 
 def input_events(inputs: Mapping[str, Changes], now: int, model: StateSpaceModel) -> Events | None:
-    """The changes of the inputs as events."""
+    """Return the changes of the inputs as events."""
     batch = []
     for name, changes in inputs.items():
         n = len(changes)

@@ -1,4 +1,4 @@
-"""Numbers as JSON has them: no NaN and no infinity, and no more digits than mean anything."""
+"""Rounded numbers for JSON, without NaN and infinity."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ import numpy as np
 
 
 def number(value: Any, digits: int = 6) -> float | None:
-    """A number of so many digits, or None where it is none."""
+    """Round to so many significant digits; None if it is not finite."""
     value = float(value)
     return float(f"{value:.{digits}g}") if math.isfinite(value) else None
 
 
 def listed(values: np.ndarray, digits: int = 6) -> list[Any]:
-    """An array as lists of such numbers."""
+    """Return an array as nested lists of rounded numbers."""
     return [listed(row, digits) if np.ndim(row) else number(row, digits) for row in values]

@@ -1,4 +1,4 @@
-"""The innovations of each sensor row as figures, and what they say in one sentence."""
+"""Figures of the innovations of each sensor row, with a verdict in one sentence."""
 
 from __future__ import annotations
 
@@ -27,23 +27,22 @@ from .numbers import listed, number
 
 LAGS = 50
 
-FEW = 50
-"""Readings below which nothing is called consistent."""
+MIN_READINGS = 50
+"""Measurements below which nothing is called consistent."""
 
 SLOW, SLOW_SHARE = 25, 0.02
-"""A slow error is the part of the innovations' variance that stays over so many lags; it matters from this share on."""
+"""A slow error is the part of the innovations' variance that remains over so many lags, if it exceeds this share."""
 
-MOST_ROWS = 24
-"""Rows that are looked at, as many as have charts."""
+MAX_ROWS = 24
+"""Rows that are analysed, as many as have charts."""
 
 
 def rows_json(
     model: StateSpaceModel, events: Events, track: Track, tuning: Tuning, *, marginal: bool
 ) -> list[dict[str, Any]]:
-    """Of each row its whitened innovations, how they are distributed and correlated, and a verdict in words.
+    """Return distribution, correlation and verdict of the whitened innovations of each row.
 
-    `autocorrelation` is of what the gate lets count: a refused reading stands at its edge, so that one spike does not
-    hide what the others tell.
+    For `autocorrelation` a rejected measurement is clipped to the gate, so that one spike does not hide the others.
 
     Args:
         model: Whose sensors.
@@ -56,7 +55,7 @@ def rows_json(
     known = {item.subject: item for item in found}
     rows = dict(zip(model.row_names, () if tuning.baseline is None else tuning.baseline, strict=False))
     said = []
-    for name, s, k in rows_of(model)[:MOST_ROWS]:
+    for name, s, k in rows_of(model)[:MAX_ROWS]:
         own = (events.kind == READING) & (events.channel == s)
         judged = own & np.isin(track.verdict, (USED, GATED, HELD_OUT))
         e = standardised(track, k, marginal)[judged]
@@ -101,10 +100,10 @@ def verdict(
     period: float,
     normal: np.ndarray | None = None,
 ) -> tuple[str, str]:
-    """One sentence, and whether it is good, bad or not known.
+    """Return a sentence, and whether it is good, bad or unknown.
 
-    What is said is what calibration.py finds to matter; of a correlation also for how long it lasts. A row of a twin
-    that was commissioned is measured by what was normal then, as its NIS is.
+    The findings are those of calibration.py; a correlation is given with its duration. A row of a commissioned twin is
+    compared with its baseline, as its NIS is.
 
     Args:
         name: Of the row.
@@ -120,7 +119,7 @@ def verdict(
     if normal is not None and calibration.role == "used":
         changed = _since(calibration, normal)
         if not changed:
-            if n < FEW:
+            if n < MIN_READINGS:
                 return f"{name}: {n} readings are too few to say", "unknown"
             then = "; ".join(word.removeprefix(f"{name}: ") for word in calibration.words)
             return f"{name}: as commissioned, as far as {n:,} readings tell{then and f' ({then})'}", "good"
@@ -135,9 +134,9 @@ def verdict(
     r = correlated.r[:SLOW]
     mean = float(np.mean(r)) if np.isfinite(r).all() else 0.0
     # Of a white series the mean of K correlations has a variance of 1 / (n K), nearly.
-    if n >= FEW and mean - 2.0 / np.sqrt(n * SLOW) > SLOW_SHARE:
+    if n >= MIN_READINGS and mean - 2.0 / np.sqrt(n * SLOW) > SLOW_SHARE:
         return f"{name}: innovations stay on one side for long, a slow error of about {np.sqrt(mean):.2f} σ", "bad"
-    if n < FEW:
+    if n < MIN_READINGS:
         return f"{name}: {n} readings are too few to say", "unknown"
     if calibration.role == "held out":
         return f"{name}: held out, and as the others predict it, within their bands ({n:,} readings)", "good"
@@ -145,7 +144,7 @@ def verdict(
 
 
 def _since(calibration: Calibration, normal: np.ndarray) -> tuple[str, ...]:
-    """What has changed since a row was commissioned: words on its figures against those of then."""
+    """Return findings on the changes of a row since it was commissioned."""
     bias, scale, correlation = normal[:3].tolist()
     return reading_words(
         calibration.subject,
@@ -158,12 +157,12 @@ def _since(calibration: Calibration, normal: np.ndarray) -> tuple[str, ...]:
 
 
 def _share(track: Track, own: np.ndarray, verdicts: tuple[int, ...]) -> float | None:
-    """Of a sensor's readings, those with one of these verdicts."""
+    """Return the share of a sensor's measurements with one of these verdicts."""
     return number(np.mean(np.isin(track.verdict[own], verdicts)), 3) if own.any() else None
 
 
 def _figures(calibration: Calibration | None) -> dict[str, Any]:
-    """Sizes of effects with their intervals: value, low, high."""
+    """Return the sizes of effects with their intervals: value, low, high."""
     figures: dict[str, Interval] = {} if calibration is None else {
         "scale": calibration.scale, "bias": calibration.bias, "correlation": calibration.correlation,
     }  # fmt: skip

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from app.live.integrity import ProtectionMonitor, reason_against
-from app.live.jobs import Cancelled, Job
+from app.live.jobs import Job, JobCancelled
 from app.live.outputs import EventWindow, event_window
 from app.twin.twin import load_twin
 from app.web.twin_json import status_json
@@ -126,6 +126,6 @@ def test_large_fields_and_failures_have_a_reason_instead():
 def test_a_cancelled_job_publishes_nothing():
     watch, job = monitor(folded(300)), Job("test")
     job.cancel()
-    with pytest.raises(Cancelled):
+    with pytest.raises(JobCancelled):
         watch.look(job)
     assert watch.of(0) is None

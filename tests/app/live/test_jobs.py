@@ -14,8 +14,8 @@ from app.live.jobs import (
     LOWEST_PRIORITY,
     MAX_JOBS,
     RUNNING,
-    Cancelled,
     Job,
+    JobCancelled,
     Jobs,
     PacedExecutor,
 )
@@ -113,7 +113,7 @@ def test_a_paced_executor_maps_in_order_and_ends_with_its_job():
     found = PacedExecutor(job).map(lambda a, b: a + b, [1, 2, 3], [10, 20, 30])
     assert next(found) == 11 and next(found) == 22
     job.cancel()
-    with pytest.raises(Cancelled):
+    with pytest.raises(JobCancelled):
         next(found)
 
 

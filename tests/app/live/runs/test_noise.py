@@ -55,7 +55,7 @@ def test_on_a_recording_whose_error_lasts_it_would_spoil_the_twin_and_is_doubted
     found = doubts(noise, 0.4)
     assert set(found) == {"R.voltage", "R.temperature", "Q"}
     assert found["R.voltage"].startswith("the innovations are correlated (+0.")
-    assert found["R.voltage"].endswith("their size does not tell R")
+    assert found["R.voltage"].endswith("their size does not determine R")
 
 
 def test_where_the_innovations_are_white_it_does_no_harm_and_is_offered():

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from app.live.jobs import Cancelled, Job
+from app.live.jobs import Job, JobCancelled
 from app.live.runs.noise import noise
 from app.live.runs.sweep import (
     FACTORS,
@@ -81,7 +81,7 @@ def test_another_tuning_ends_a_sweep():
     engine = started(1500)
     sweeps = Sweeps(engine)
     engine.tuning = FIRST.set("Q.rate", 0.5)
-    with pytest.raises(Cancelled):
+    with pytest.raises(JobCancelled):
         sweeps.sweep("Q.rate", Job("test"))
     assert sweeps.around("Q.rate").points == ()
 
