@@ -9,7 +9,9 @@ import pytest
 from app.live.outputs import Status
 from config.schema import TwinSection
 from estimators.diagnostics.detector_state import SENSOR_STATES
-from estimators.diagnostics.episodes import CAUSES, anchor
+from estimators.diagnostics.detectors import ALARM_NAMES, CAUSES, DETECTORS, anchor
+from estimators.diagnostics.effects import KINDS
+from estimators.diagnostics.episodes.sensors import LOSSES, OF_ALL_ROWS
 from estimators.track import HEALTH_NAMES, VERDICT_NAMES
 
 ROOT = Path(__file__).parents[1]
@@ -22,33 +24,16 @@ def sections():
     return {title.lower().replace(" ", "-"): body for title, body in zip(parts[1::2], parts[2::2], strict=True)}
 
 
-def causes_in(path):
-    """Literals that the code gives as a cause: `cause = ...`, `cause=...`, and the first argument of an `Effect`."""
-    found = set()
-    for node in ast.walk(ast.parse(path.read_text())):
-        values = []
-        if isinstance(node, ast.keyword) and node.arg == "cause":
-            values = [node.value]
-        elif isinstance(node, ast.Assign):
-            for target in node.targets:
-                if isinstance(target, ast.Name) and target.id == "cause":
-                    values = [node.value]
-                elif isinstance(target, ast.Tuple) and isinstance(node.value, ast.Tuple):
-                    pairs = zip(target.elts, node.value.elts, strict=True)
-                    values += [value for name, value in pairs if isinstance(name, ast.Name) and name.id == "cause"]
-        elif isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "Effect":
-            values = node.args[:1]
-        for value in values:
-            branches = [value.body, value.orelse] if isinstance(value, ast.IfExp) else [value]
-            found |= {branch.value for branch in branches if isinstance(branch, ast.Constant)}
-    return found
+def test_every_detector_with_an_effect_has_a_way_to_estimate_it():
+    estimated = {*KINDS, *OF_ALL_ROWS, *LOSSES} - {"screened"}
+    # The truth is compared in the kernel, row by row.
+    assert {row.name for row in DETECTORS if row.alarms and row.effect} == estimated | {"missed"}
+    assert {"stale", "diverged"} <= set(HEALTH_NAMES) & set(CAUSES)
 
 
-def test_the_causes_are_those_that_the_code_gives():
-    folder = ROOT / "estimators/diagnostics"
-    given = set().union(*(causes_in(path) for path in (folder / "effects.py", *folder.glob("episodes/*.py"))))
-    # Those of the twin as a whole are names of its health; what never came into the log, only its reader knows.
-    assert given | {"stale", "diverged", "dropped"} == set(CAUSES)
+def test_no_two_detectors_share_a_name_or_an_alarm():
+    assert len(set(CAUSES)) == len(CAUSES) and len(set(ALARM_NAMES)) == len(ALARM_NAMES) < 31
+    assert all(row.wording and row.remedy and row.statistic for row in DETECTORS)
 
 
 @pytest.mark.parametrize("cause", CAUSES)
@@ -85,8 +70,7 @@ def outcomes():
 
 
 OF_THE_PROGRAM = {
-    "chronicle",
-    "blame",
+    "episodes",
     "engine error",
     "view error",
     "sweep",

@@ -1,4 +1,4 @@
-"""Alerts from new rows: readings that could not be used, clouds and estimates that were lost. See also chronicle.py."""
+"""Report unusable measurements, lost estimates and silent sources of the running twin; see also episode_log.py."""
 
 from __future__ import annotations
 

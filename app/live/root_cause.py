@@ -1,18 +1,19 @@
-"""Who is most likely off, while the twin runs: for each open episode, in a thread that is never in the engine's way.
+"""Isolate the most likely faulty sensor, input or parameter behind each open episode of the running twin.
 
-A shift may be the fault of a sensor, an input or a parameter. Which of them explains best what was seen takes a refold
-for each (estimators/diagnostics/sensitivity/suspects.py); it is asked soon after an episode has begun, and again
-whenever twice as much has been seen of it.
+Sensor, input and parameter faults may look alike. Each is refolded with the last events, as a background job: soon
+after an episode has begun, and again whenever it lasts twice as long.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from math import inf
+from typing import NamedTuple
 
+from estimators.diagnostics.detectors import detector_of
 from estimators.diagnostics.episodes import Episode
 from estimators.diagnostics.sensitivity.responses import DRIFT, SENSOR
-from estimators.diagnostics.sensitivity.suspects import RIDDLES, in_words, likeliest, suspects
+from estimators.diagnostics.sensitivity.suspects import in_words, likeliest, suspects
 from estimators.errors import NisusError
 
 from .integrity import reason_against
@@ -20,88 +21,86 @@ from .jobs import Job, PacedExecutor
 from .notices import Notices
 from .outputs import EventWindow
 
-EVERY = 1.0
-"""Seconds between two looks at the open episodes."""
+CHECK_PERIOD_S = 1.0
+"""Seconds between two checks of the open episodes."""
 
-SOON = 3.0
-"""Seconds of an episode from which on it can be asked."""
+MIN_EPISODE_S = 3.0
+"""Duration of an episode from which its cause can be isolated."""
 
 
-class Blame:
-    """Whoever may be to blame for each open episode, by its subject."""
+class _Isolated(NamedTuple):
+    """Outcome for an episode that had lasted so long: the fault in words, and its sensor row, if it is one."""
+
+    lasted: float
+    words: str = ""
+    row: str = ""
+
+
+class RootCause:
+    """Most likely fault behind each open episode, by the episode's subject.
+
+    Args:
+        episodes: Returns the present episodes.
+        take: Returns a copy of the last events, or None where there is none.
+        notices: Receives a finding, once.
+    """
 
     def __init__(
-        self,
-        episodes: Callable[[], Sequence[Episode]],
-        take: Callable[[], EventWindow | None],
-        notices: Notices,
+        self, episodes: Callable[[], Sequence[Episode]], take: Callable[[], EventWindow | None], notices: Notices
     ) -> None:
-        """Prepare.
-
-        Args:
-            episodes: Gives those known now.
-            take: Gives a copy of the last events, or None if now is not the time.
-            notices: Where a finding is said, once.
-        """
         self._episodes, self._take, self._notices = episodes, take, notices
-        self._words: dict[str, str] = {}
-        self._rows: dict[str, str] = {}
-        self._seen: dict[str, float] = {}
+        self._found: dict[str, _Isolated] = {}
 
-    def of(self, episode: Episode) -> str:
-        """Who is most likely off, in words; nothing if it is not known."""
-        return self._words.get(episode.subject, "") if _riddle(episode) else ""
+    def fault_behind(self, episode: Episode) -> str:
+        """Return the most likely fault behind an episode; "" if it is not known."""
+        return self._found[episode.subject].words if _is_open(episode) and episode.subject in self._found else ""
 
-    def told(self, episode: Episode) -> Episode:
-        """The episode, with who is most likely off in its text."""
-        words = self.of(episode)
+    def with_fault(self, episode: Episode) -> Episode:
+        """Return the episode with the most likely fault in its text."""
+        words = self.fault_behind(episode)
         return episode._replace(text=f"{episode.text}; most likely off: {words}") if words else episode
 
-    def behind(self, episode: Episode) -> Episode:
-        """The open episode of the sensor that is most likely off in this one, if that is another's; else this one.
+    def primary(self, episode: Episode) -> Episode:
+        """Return the open episode of the sensor that is most likely faulty in this one; this one if it is its own.
 
-        A filter follows a sensor that is off, so that in time those that are in order contradict it.
+        A filter follows a biased sensor, so that in time consistent sensors contradict it.
         """
-        row = self._rows.get(episode.subject) if _riddle(episode) else None
-        return next((other for other in self._episodes() if _riddle(other) and other.subject == row), episode)
+        row = self._found[episode.subject].row if _is_open(episode) and episode.subject in self._found else None
+        return next((other for other in self._episodes() if _is_open(other) and other.subject == row), episode)
 
-    def look(self, job: Job) -> None:
-        """Ask for the open episode of which most is new."""
-        riddles = [episode for episode in self._episodes() if _riddle(episode)]
-        subjects = {episode.subject for episode in riddles}
-        self._words = {subject: words for subject, words in self._words.items() if subject in subjects}
-        self._rows = {subject: row for subject, row in self._rows.items() if subject in subjects}
-        self._seen = {subject: seen for subject, seen in self._seen.items() if subject in subjects}
-        taken = self._take() if riddles else None
+    def update(self, job: Job) -> None:
+        """Isolate the faults of the open episodes that have grown enough."""
+        opened = [episode for episode in self._episodes() if _is_open(episode)]
+        subjects = {episode.subject for episode in opened}
+        self._found = {subject: found for subject, found in self._found.items() if subject in subjects}
+        taken = self._take() if opened else None
         if taken is None or reason_against(taken.tuning.model, taken.estimator):
             return
         now, begun = taken.end * 1e-9, -inf if taken.base is None else taken.base.clock * 1e-9
-        for episode in riddles:
-            lasted = now - episode.start
-            if lasted < max(SOON, 2.0 * self._seen.get(episode.subject, 0.0)) or episode.start < begun:
+        for episode in opened:
+            lasted, known = now - episode.start, self._found.get(episode.subject, _Isolated(0.0))
+            if lasted < max(MIN_EPISODE_S, 2.0 * known.lasted) or episode.start < begun:
                 continue
-            self._seen[episode.subject] = lasted
-            self._ask(episode, taken, job)
+            self._found[episode.subject] = known._replace(lasted=lasted)
+            self._isolate(episode, taken, job)
 
-    def _ask(self, episode: Episode, taken: EventWindow, job: Job) -> None:
-        model = taken.tuning.model
-        log, executor = taken.log(), PacedExecutor(job)
+    def _isolate(self, episode: Episode, taken: EventWindow, job: Job) -> None:
         try:
             found = suspects(
-                taken.estimator, model, taken.tuning, log, episode.start, base=taken.base, executor=executor
-            )
+                taken.estimator, taken.tuning.model, taken.tuning, taken.log(), episode.start,
+                base=taken.base, executor=PacedExecutor(job),
+            )  # fmt: skip
         except NisusError:
             return
-        words, before = in_words(found), self.of(episode)
+        words, known = in_words(found), self._found[episode.subject]
         if words:
-            self._words[episode.subject] = words
             first = likeliest(found)[0].nudge
-            self._rows[episode.subject] = first.name if first.kind in (SENSOR, DRIFT) else ""
-            if not before:
-                self._notices.say(
-                    f"{episode.subject}: most likely off: {words}", level="warn", t=int(taken.events.t[-1])
-                )
+            row = first.name if first.kind in (SENSOR, DRIFT) else ""
+            self._found[episode.subject] = known._replace(words=words, row=row)
+            if not known.words:
+                text = f"{episode.subject}: most likely off: {words}"
+                self._notices.say(text, level="warn", t=int(taken.events.t[-1]))
 
 
-def _riddle(episode: Episode) -> bool:
-    return episode.end is None and episode.cause in RIDDLES
+def _is_open(episode: Episode) -> bool:
+    return episode.end is None and detector_of(episode.cause).isolate

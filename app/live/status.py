@@ -92,7 +92,7 @@ def status_of(
     t = int(log.t[last]) if last >= 0 else None
     states = sensor_states(model, fold.tuning.used, fold.evidence, (t or 0) * 1e-9, fold.policy)
     health = int(track.health[last]) if last >= 0 else watchers.silence.health
-    account = watchers.chronicle.account
+    account = watchers.episode_log.summary
     leading = account.leading(dict(zip(model.sensor_names, states, strict=True)))
     layer = source.faults if isinstance(source, Faulty) else None
     optional = {"inflated": inflated, "held": held, "recovered": fold.recoveries()}

@@ -15,11 +15,11 @@ from sources.source import Paced, Source
 
 from .alerts import Alerts, Silence
 from .counts import Latency
-from .episode_log import Chronicle
+from .episode_log import EpisodeLog
 from .integrity import PERIOD_S, ProtectionMonitor
 from .interface import Running
 from .notices import Notices
-from .root_cause import EVERY, Blame
+from .root_cause import CHECK_PERIOD_S, RootCause
 
 if TYPE_CHECKING:
     from estimators.diagnostics.episodes import Episode
@@ -33,21 +33,21 @@ class Watchers:
         self._jobs = engine.jobs
         self.latency = Latency()
         self.clock = HostClock(notices, section.horizon)
-        self.chronicle = Chronicle(engine)
-        self.alerts = Alerts(notices, lambda: self.chronicle.account.in_alarm)
+        self.episode_log = EpisodeLog(engine)
+        self.alerts = Alerts(notices, lambda: self.episode_log.summary.in_alarm)
         self.silence = Silence(notices, section.stale_after)
         self.integrity = ProtectionMonitor(engine.last_events, engine.policy.false_alarm_every)
-        self.blame = Blame(lambda: self.chronicle.account.episodes, engine.last_events, notices)
+        self.root_cause = RootCause(lambda: self.episode_log.summary.episodes, engine.last_events, notices)
 
     def start(self) -> None:
         """Begin to monitor."""
-        self.chronicle.start()
+        self.episode_log.start()
         self._jobs.run("protection levels", self.integrity.look, every=PERIOD_S)
-        self._jobs.run("root cause", self.blame.look, every=EVERY)
+        self._jobs.run("root cause", self.root_cause.update, every=CHECK_PERIOD_S)
 
     def stop(self) -> None:
         """Look at the last rows and end."""
-        self.chronicle.stop()
+        self.episode_log.stop()
 
     def arrived(self, batch: Events, passed: Events) -> None:
         """Note a batch of a live source that was folded, and those of its events that passed."""
@@ -56,18 +56,18 @@ class Watchers:
 
     def episodes(self) -> list[Episode]:
         """Return all episodes in the order of their start, with their root cause where it is known."""
-        return list(map(self.blame.told, self.chronicle.account.episodes))
+        return list(map(self.root_cause.with_fault, self.episode_log.summary.episodes))
 
     def episodes_of(self, revision: int) -> tuple[Episode, ...]:
         """Return the episodes if they are those of a revision; else none."""
-        account = self.chronicle.account
-        return tuple(map(self.blame.told, account.episodes)) if account.revision == revision else ()
+        account = self.episode_log.summary
+        return tuple(map(self.root_cause.with_fault, account.episodes)) if account.revision == revision else ()
 
     def cause(self, leading: Episode | None, health: int) -> str:
         """Return the cause of the present health: the leading episode, or that of the sensor behind it."""
         if leading is None or health in (WAITING, TRACKING):
             return ""
-        return self.blame.told(self.blame.behind(leading)).text
+        return self.root_cause.with_fault(self.root_cause.primary(leading)).text
 
 
 class IdleTicks:

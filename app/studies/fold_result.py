@@ -11,10 +11,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from estimators.diagnostics.calibration import BANDS, Calibration, calibrations, truth_calibration
+from estimators.diagnostics.detectors import detector_of
 from estimators.diagnostics.episodes import Episode, episode_json
 from estimators.diagnostics.failure_cause import failures
 from estimators.diagnostics.score import Fit, Score, score
-from estimators.diagnostics.sensitivity.suspects import RIDDLES, Suspect, in_words, likeliest, suspects
+from estimators.diagnostics.sensitivity.suspects import Suspect, in_words, likeliest, suspects
 from estimators.errors import NisusError
 from estimators.fold import Fold
 from estimators.fold_failures import cause_of
@@ -105,7 +106,7 @@ def explained(fold: Fold, episodes: Sequence[Episode]) -> list[ExplainedEpisode]
     searched = 0
     for episode in episodes:
         named: tuple[Suspect, ...] = ()
-        if episode.cause in RIDDLES and searched < MAX_EXPLAINED:
+        if detector_of(episode.cause).isolate and searched < MAX_EXPLAINED:
             searched += 1
             try:
                 named = likeliest(suspects(fold.estimator.name, fold.model, fold.tuning, fold.log, episode.start))

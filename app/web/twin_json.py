@@ -6,7 +6,8 @@ import math
 from typing import Any
 
 from estimators.diagnostics.consistency import NisVerdict
-from estimators.diagnostics.episodes import anchor, episode_json
+from estimators.diagnostics.detectors import detector_of
+from estimators.diagnostics.episodes import episode_json
 from estimators.estimator import Estimator, Option
 from estimators.registry import ESTIMATORS, unfit
 from estimators.track import HEALTH_NAMES
@@ -95,7 +96,9 @@ def _runs(revisions: Revisions) -> dict[str, Any]:
 def episodes_json(engine: Running) -> list[dict[str, Any]]:
     """What was and is wrong, in the order of its start: times in seconds of the log, `help` in docs/alarms.md."""
     return [
-        episode_json(episode) | {"help": f"docs/alarms.md#{anchor(episode.cause)}"} for episode in engine.episodes()
+        episode_json(episode) | {"help": f"docs/alarms.md#{row.anchor}", "severity": row.severity}
+        for episode in engine.episodes()
+        for row in [detector_of(episode.cause)]
     ]
 
 

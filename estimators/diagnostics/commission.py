@@ -18,7 +18,7 @@ from ..track import FAILED, GATED, USED
 from .detector_state import gate_log_ratios, no_baseline, threshold_of
 from .detector_tests import highest
 from .detectors import ALARM_NAMES, BITS
-from .episodes import Folded, course_of, standardised
+from .episodes import FoldLike, judged_rows, standardised
 from .health import JUDGED_MEAN, MAX_ROWS_PER_READING, MIN_WINDOW_EVENTS, HealthPolicy, normal_nis
 
 MARGIN = 1.5
@@ -44,14 +44,14 @@ class Normal(NamedTuple):
     nis: float = 0.0
 
 
-class Judged(Folded, Protocol):
+class JudgedFold(FoldLike, Protocol):
     """A fold, and what it was judged by."""
 
     @property
     def policy(self) -> HealthPolicy: ...  # noqa: D102
 
 
-def commission(fold: Judged, evidence: np.ndarray) -> dict[str, Normal]:
+def commission(fold: JudgedFold, evidence: np.ndarray) -> dict[str, Normal]:
     """What is normal in a fold whose tuning is accepted, by sensor row.
 
     Args:
@@ -68,7 +68,7 @@ def commission(fold: Judged, evidence: np.ndarray) -> dict[str, Normal]:
         verdict = track.verdict[rows]
         h = threshold_of(model, evidence, s)
         for k in range(len(sensor.rows)):
-            e = standardised(course_of(fold), rows, k)
+            e = standardised(judged_rows(fold), rows, k)
             known = np.isfinite(e)
             if known.sum() < FEWEST:
                 continue
@@ -97,7 +97,7 @@ def commission(fold: Judged, evidence: np.ndarray) -> dict[str, Normal]:
     return {name: normal._replace(nis=nis[name]) for name, normal in found.items()}
 
 
-def _most_nis(fold: Judged, normal: np.ndarray) -> np.ndarray:
+def _most_nis(fold: JudgedFold, normal: np.ndarray) -> np.ndarray:
     """The most that the NIS over the window was at readings of each sensor, (sensors,).
 
     A multiple of what was normal of the readings in it, `normal` (sensors,) times what the filter expected; the windows

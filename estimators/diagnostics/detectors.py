@@ -107,7 +107,8 @@ class Detector(NamedTuple):
 
     def text(self, facts: Any) -> str:
         """Return the sentence of an episode with these facts."""
-        return "; ".join(part.format(facts) for part in (self.wording, self.remedy) if part)
+        wording, remedy = self.wording.format(facts), self.remedy.format(facts)
+        return f"{wording}{';' if ':' in wording else ':'} {remedy}"
 
 
 def anchor(heading: str) -> str:

@@ -13,11 +13,9 @@ from typing import NamedTuple
 import numpy as np
 
 from ..numerics.quantiles import normal_quantile
+from .detectors import MAX_SIGMA
 
 SIDE = float(normal_quantile(0.975))
-
-FURTHEST = 6.0
-"""|e| beyond which it counts as this."""
 
 SPIKE = 4.0
 """|e| from which an innovation is a spike where the others are in order."""
@@ -26,7 +24,10 @@ FEWEST = 4
 """Innovations whose correlation says nothing yet."""
 
 KINDS = ("shifted", "narrow", "wide", "correlated", "alternating", "spiky")
-"""The ways in which innovations can differ."""
+"""Detectors whose effect is estimated here, by name."""
+
+EVIDENCE = "evidence"
+"""Kind of a series of log Λ of a test in place of e, for detectors of which nothing else is known."""
 
 
 class Effect(NamedTuple):
@@ -49,9 +50,9 @@ def effects(e: np.ndarray) -> list[Effect]:
 
     The mean is taken out before the scale, both before the correlation, and spikes are told from scale by what the
     innovations without them have. They stand alone: several in a row on one side are a shift. What is further off than
-    `FURTHEST` says no more than that.
+    `MAX_SIGMA` says no more than that.
     """
-    e = np.clip(e, -FURTHEST, FURTHEST)
+    e = np.clip(e, -MAX_SIGMA, MAX_SIGMA)
     n = e.size
     if n < 2:
         size = float(e[0]) if n else 0.0
@@ -96,7 +97,7 @@ def effects(e: np.ndarray) -> list[Effect]:
 
 def against(e: np.ndarray, effect: Effect) -> float:
     """log Λ, nats, of white noise over an effect of that size in a run e (n,), finite; 0 for spikes, which are rare."""
-    e = np.clip(e, -FURTHEST, FURTHEST)
+    e = np.clip(e, -MAX_SIGMA, MAX_SIGMA)
     size = effect.size
     if effect.cause == "shifted":
         return float(np.sum(0.5 * size**2 - size * e))
@@ -142,10 +143,10 @@ class Sums(NamedTuple):
     last: float = 0.0
 
 
-NOTHING = Sums()
+NO_SUMS = Sums()
 
 
-def gains(e: np.ndarray, cause: str, run: Sums = NOTHING) -> tuple[np.ndarray, Sums]:
+def gains(e: np.ndarray, cause: str, run: Sums = NO_SUMS) -> tuple[np.ndarray, Sums]:
     """How likely it is that `cause` is what is wrong in a run, up to each of its e.
 
     Args:
@@ -157,7 +158,7 @@ def gains(e: np.ndarray, cause: str, run: Sums = NOTHING) -> tuple[np.ndarray, S
         Generalised log-likelihood ratios against none, (n,); where spikes are the cause, they rise with each. And the
         sums of the whole run.
     """
-    e = np.clip(e, -FURTHEST, FURTHEST)
+    e = np.clip(e, -MAX_SIGMA, MAX_SIGMA)
     if not e.size:
         return e, run
     n = run.n + np.arange(1, e.size + 1)
@@ -181,6 +182,8 @@ def gains(e: np.ndarray, cause: str, run: Sums = NOTHING) -> tuple[np.ndarray, S
         gain = np.where(side & (n > FEWEST), -0.5 * n * np.log(1.0 - phi**2), 0.0)
     elif cause == "spiky":
         gain = np.where(np.abs(e) > SPIKE, n, 0.0)
+    elif cause == EVIDENCE:
+        gain = total
     return gain, sums
 
 

@@ -6,7 +6,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from ..diagnostics.words import since
+from ..diagnostics.episodes.wording import since
 from ..log import READING, Log
 from ..model.state_space import StateSpaceModel
 from ..snapshots import Story

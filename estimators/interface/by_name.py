@@ -26,7 +26,7 @@ import numpy as np
 
 from ..compiled.orphan import leave_with_parent
 from ..diagnostics.consistency import Nees, nees
-from ..diagnostics.episodes import Course, Episode, found_in
+from ..diagnostics.episodes import Episode, JudgedRows, episodes_of
 from ..diagnostics.health import HealthPolicy
 from ..diagnostics.score import Score, score
 from ..errors import ConfigError, EstimatorError
@@ -368,8 +368,7 @@ class Estimates:
     def episodes(self) -> list[Episode]:
         """Return the episodes of alarms with cause, size and remedy: see docs/alarms.md."""
         marginal = find_estimator(self.estimator, self.model).family in ("particle", "ensemble")
-        course = Course(self.model, self.tuning, marginal, self.events, self.track)
-        return [found.episode for found in found_in(course)]
+        return episodes_of(JudgedRows(self.model, self.tuning, marginal, self.events, self.track))
 
     def score(self) -> Score:
         """Return NIS and its bounds, errors against the truth, and predictions of held-out sensors."""

@@ -15,7 +15,7 @@ import time
 import numpy as np
 
 from app.live.engine import Engine
-from app.live.episode_log import SLOWEST
+from app.live.episode_log import MAX_PERIOD_S
 from app.studies.stress.scenario import asset_of
 from app.twin.twin import Twin, load_twin
 from estimators.log import MARK, Events
@@ -145,8 +145,8 @@ class Soak:
         took, used = time.monotonic() - begun, time.process_time() - used
         print(f"\n{source.seconds:.0f} s of the asset in {took:.0f} s ({used:.0f} s of the processor), ", end="")
         print(f"{source.sent / took:,.0f} events a second, {source.mixes} mixes of faults")
-        # The chronicle looks every three seconds at the rarest.
-        time.sleep(SLOWEST + 0.5)
+        # Episodes are updated every three seconds at least.
+        time.sleep(MAX_PERIOD_S + 0.5)
 
     def account(self) -> None:
         """Every event is a row, was too late, or was refused for its time."""
@@ -178,7 +178,7 @@ class Soak:
     def watch(self) -> None:
         """Who watches is still there, and the twin has come to itself."""
         status, alive = self.engine.status(), {thread.name for thread in threading.enumerate()}
-        for name in ("engine", "chronicle"):
+        for name in ("engine", "episodes"):
             self._expect(name in alive, f"the thread {name} has ended")
         errors = self.engine.notices.counts().get("engine error", 0)
         self._expect(errors == 0, f"{errors} errors of the engine")

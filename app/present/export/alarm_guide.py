@@ -8,7 +8,7 @@ from functools import cache
 from html import escape
 from pathlib import Path
 
-from estimators.diagnostics.episodes import anchor
+from estimators.diagnostics.detectors import anchor
 from estimators.errors import ConfigError
 
 BLOCK = re.compile(r"\n\s*\n")

@@ -69,7 +69,7 @@ def report(run: Reported) -> list[Topic]:
     return [
         _head(run),
         _scores(run, found),
-        _episodes(run),
+        episode_topic(run),
         *_before(run),
         Topic("Charts", said, html=(charts,)),
         *_checks(run),
@@ -145,7 +145,8 @@ def _cut(rows: Sequence[tuple[str, ...]]) -> tuple[tuple[str, ...], ...]:
     return (*rows[:MOST], (f"... and {len(rows) - MOST} more", *[""] * (len(rows[0]) - 1)))
 
 
-def _episodes(run: Reported) -> Topic:
+def episode_topic(run: Reported) -> Topic:
+    """Return the episodes of a run with causes, texts and responses."""
     shown = tuple(f"{offset.words[0].upper()}{offset.words[1:]}." for offset in _offsets(run))
     if not run.episodes:
         of = " of the sensors in use" if shown else ""

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from estimators.diagnostics.episodes import Course, Episode, found_in
+from estimators.diagnostics.episodes import Episode, JudgedRows, episodes_of
 from estimators.errors import ConfigError
 from estimators.events.maintenance import model_versions
 from estimators.interface.table import table_of
@@ -117,7 +117,7 @@ class RunRows(NamedTuple):
         events, track, tuning = self.pull.events, self.pull.track, self.run.tuning
         if not len(events):
             return []
-        return [item.episode for item in found_in(Course(tuning.model, tuning, self.marginal, events, track))]
+        return episodes_of(JudgedRows(tuning.model, tuning, self.marginal, events, track))
 
     def between(self, since: int | None, until: int | None) -> slice:
         """The rows from one time to another, ns; None is the end that there is."""

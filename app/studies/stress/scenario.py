@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from config.source_schema import AssetSection, CanSection
+from estimators.diagnostics.detectors import detector_of
 from estimators.diagnostics.episodes import Episode, episodes
 from estimators.diagnostics.sensitivity.responses import DRIFT, SENSOR
-from estimators.diagnostics.sensitivity.suspects import RIDDLES, likeliest, suspects
+from estimators.diagnostics.sensitivity.suspects import likeliest, suspects
 from estimators.errors import NisusError, SourceError
 from estimators.fold import Fold
 from estimators.log import MARK, READING, TICK, TRUTH, Events, Log
@@ -338,7 +339,7 @@ def accused(fold: Fold, episode: Episode, until: int) -> str:
         episode: What was said.
         until: When it is asked, ns of the log: what comes later is not known yet.
     """
-    if episode.cause not in RIDDLES:
+    if not detector_of(episode.cause).isolate:
         return episode.subject
     seen = fold.log.copy()
     seen.n = int(np.searchsorted(fold.log.t[: fold.n], until))

@@ -1,25 +1,10 @@
-"""Episodes: what was wrong from when to when, with whom, by how much, and what can be done about it."""
+"""Episodes: what was wrong from when to when, with which sensor or state, by how much, and the remedy."""
 
-from .course import JOINED, Course, Folded, course_of, standardised
-from .episode import CAUSES, Episode, Found, anchor, episode_json
-from .find import episodes, found_in
-from .going import ANY, Going
-from .sensors import LOSSES
+from .episode import JOINED, Episode, FoundEpisode, JudgedRows, episode_json, standardised
+from .sensors import ALARM_KEYS, LOSSES
+from .tracker import EpisodeTracker, FoldLike, TrackedEpisode, episodes, episodes_of, found_in, judged_rows
 
 __all__ = [
-    "ANY",
-    "CAUSES",
-    "JOINED",
-    "LOSSES",
-    "Course",
-    "Episode",
-    "Folded",
-    "Found",
-    "Going",
-    "anchor",
-    "course_of",
-    "episode_json",
-    "episodes",
-    "found_in",
-    "standardised",
-]
+    "ALARM_KEYS", "JOINED", "LOSSES", "Episode", "EpisodeTracker", "FoldLike", "FoundEpisode", "JudgedRows",
+    "TrackedEpisode", "episode_json", "episodes", "episodes_of", "found_in", "judged_rows", "standardised",
+]  # fmt: skip

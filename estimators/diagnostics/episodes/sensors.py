@@ -1,4 +1,4 @@
-"""Episodes of a sensor: the alarms of its readings that follow each other, and what its innovations show since then."""
+"""Episodes of a sensor: runs of alarms of its measurements, and the effect that its innovations show since then."""
 
 from __future__ import annotations
 
@@ -9,62 +9,50 @@ import numpy as np
 
 from ...log import READING, RESET
 from ...track import GATED, REASONS, SCREENED, USED
-from .. import words
-from ..detectors import (
-    AGREEING,
-    ALTERNATING,
-    BITS,
-    CORRELATED,
-    DISAGREEING,
-    NARROW,
-    REFUSED,
-    SHIFTED_DOWN,
-    SHIFTED_UP,
-    SPIKY,
-    STUCK,
-    WIDE,
-)
-from ..effects import KINDS, Effect, against, common_scale, effects, onset
-from .course import JOINED, Course, Run, runs, standardised, unusual
-from .episode import Episode, Found
+from ..detectors import AGREEING, BITS, DETECTORS, DISAGREEING, LOST, REFUSED, STUCK, Detector, detector_of, log_ratios
+from ..effects import EVIDENCE, KINDS, Effect, against, common_scale, effects, onset
+from .episode import JOINED, AlarmRun, Episode, FoundEpisode, JudgedRows, runs, standardised, without_baseline
+from .wording import SensorFacts, return_text
 
-LOOKED_AT = 4000
-"""Readings of an episode, and before it, of which the size is made."""
+MAX_MEASUREMENTS = 4000
+"""Measurements of an episode, and before it, from which onset and size are estimated."""
 
-WANDERING = 0.5
-"""Lag-1 correlation from which innovations that are too large are those of a mean that moves: noise does not wander."""
+WANDERING_CORRELATION = 0.5
+"""Lag-1 correlation from which innovations that are too large are explained by a moving mean, not by noise."""
 
-DECISIVE = float(np.log(1000.0))
-"""log Λ from which readings that follow an effect are back to normal: they are a thousand times likelier without it."""
+RECOVERED_NATS = float(np.log(1000.0))
+"""log Λ from which measurements after an effect are normal again: a thousand times more likely without it."""
 
-LEFT = 2.0
-"""Likelihood ratio, nats, below which nothing of an effect is left: that of a size on the edge of its 95 % interval."""
+REMAINING_NATS = 2.0
+"""log Λ below which no effect remains: that of a size at the end of its 95 % interval."""
 
-MOST = 0.5
-"""Share of the readings of an episode that are refused, or repeat themselves, from which it is one of that."""
+LOSS_SHARE = 0.5
+"""Share of rejected or repeated measurements of an episode from which it is a loss of the sensor."""
 
-TOLD_BY = {
-    "shifted": SHIFTED_UP | SHIFTED_DOWN, "narrow": NARROW, "wide": WIDE, "correlated": CORRELATED,
-    "alternating": ALTERNATING, "spiky": SPIKY,
-}  # fmt: skip
-"""Which tests say so of each kind of effect."""
+ALARMS_OF = {kind: detector_of(kind).bits for kind in KINDS}
+"""Alarms by the effect that they show."""
 
-LOSSES = ("stuck", "refused", "screened")
+LOSSES = tuple(detector.name for detector in DETECTORS if detector.sensor_lost)
 """Causes of which a sensor is lost."""
 
 OF_ALL_ROWS = ("disagreeing", "agreeing")
-"""Causes that are of a sensor as a whole, not of one of its rows."""
+"""Causes of a sensor as a whole, not of one of its rows."""
 
-UNITS = {"shifted": "σ", "narrow": "×", "wide": "×", "disagreeing": "×", "agreeing": "×"}
-"""Of the sizes; one that is stuck has its row's."""
+UNKNOWN_EFFECTS = tuple(detector for detector in DETECTORS if detector.alarms and not detector.effect)
+"""Detectors whose alarms have episodes of their own, sized by their own tests."""
+
+KNOWN_EFFECTS = sum(detector.bits for detector in DETECTORS if detector.effect)
+"""Alarms of all others."""
+
+ALARM_KEYS = {"sensor": KNOWN_EFFECTS, "lost": LOST, **{detector.name: detector.bits for detector in UNKNOWN_EFFECTS}}
+"""Alarms by the first part of the keys of a sensor's episodes."""
 
 
-class Shown(NamedTuple):
-    """What the readings of an episode show.
+class RunEffect(NamedTuple):
+    """Effect in measurements `begun` to `over` of row k of a sensor: `cause`, `size` and its 95 % interval.
 
-    Row `k` of the sensor, its readings `begun` to `over`, and the effect: `cause` and `size` with its 95 % interval.
-    `correlation`: lag 1, of its innovations, where it is needed to say whether Q or R is to blame for their scale.
-    `back`: whether what follows is back to normal, though the slowest of the tests has not fallen yet.
+    correlation: lag-1 correlation of the innovations, which decides whether Q or R explains their scale. back: whether
+    the measurements that follow are normal again, though the slowest test has not cleared yet.
     """
 
     k: int
@@ -78,60 +66,66 @@ class Shown(NamedTuple):
     back: bool = False
 
 
-def of_sensors(course: Course) -> Iterator[Found]:
-    """Sensors of which a row is in alarm, one after the other."""
-    events, track, model = course.events, course.track, course.model
+def sensor_alarms(judged: JudgedRows) -> Iterator[FoundEpisode]:
+    """Yield the episodes of sensors with a row in alarm."""
+    events, track, model = judged.events, judged.track, judged.model
     if not track.alarms.any():
         return
     for s, sensor in enumerate(model.sensors):
         rows = np.flatnonzero((events.kind == READING) & (events.channel == s))
-        masks = track.alarms[rows, : len(sensor.rows)]
+        alarms = track.alarms[rows, : len(sensor.rows)]
+        masks = alarms & KNOWN_EFFECTS
+        found = [
+            (detector.name, run, _own_evidence(judged, s, rows, alarms & detector.bits, run, detector))
+            for detector in UNKNOWN_EFFECTS
+            for run in runs((alarms & detector.bits != 0).any(axis=1), JOINED)
+        ]
         lost = [item for bit in (STUCK, REFUSED) for item in runs((masks & bit != 0).any(axis=1), JOINED)]
         for run in runs(masks.any(axis=1), JOINED):
-            before = course.alarmed[s] if course.alarmed is not None and run.begin <= JOINED else 0
+            before = judged.alarmed[s] if judged.alarmed is not None and run.begin <= JOINED else 0
             own = sorted(item for item in lost if run.begin <= item.begin < run.end)
             later = [item for item in own if before + item.begin - run.begin > JOINED]
-            shown, hidden = _shown_of_both(course, s, rows, masks, run, later)
-            for kind, part, what in (("sensor", run, shown), *(("lost", *item) for item in hidden)):
-                if what is None:
-                    continue
-                episode = _episode(course, s, rows, part, what)
-                yield Found((kind, sensor.name), part.begin, int(events.t[rows[part.begin]]), episode)
+            shown, hidden = _effect_and_losses(judged, s, rows, masks, run, later)
+            found += [] if shown is None else [("sensor", run, shown)]
+            found += [("lost", *item) for item in hidden]
+        for kind, run, shown in found:
+            episode = _episode(judged, s, rows, run, shown)
+            at, until = events.t[rows[[run.begin, run.end - 1]]].tolist()
+            yield FoundEpisode((kind, sensor.name), run.begin, at, until, episode)
 
 
-def _shown_of_both(
-    course: Course, s: int, rows: np.ndarray, masks: np.ndarray, run: Run, later: list[Run]
-) -> tuple[Shown | None, list[tuple[Run, Shown]]]:
-    """What explains a run of alarms, and what it would hide: the parts of it, `later`, in which the sensor is lost.
+def _effect_and_losses(
+    judged: JudgedRows, s: int, rows: np.ndarray, masks: np.ndarray, run: AlarmRun, later: list[AlarmRun]
+) -> tuple[RunEffect | None, list[tuple[AlarmRun, RunEffect]]]:
+    """Return the effect that explains a run of alarms, and the parts, of those in `later`, in which the sensor is lost.
 
-    What began so long before a sensor is lost is not explained by that. It goes on until it is seen to be over, and of
-    a sensor that is lost nothing else can be seen: None where it is from the first of these rows to the last.
+    An effect that began long before a loss is not explained by it, and lasts until it is known to be over. While a
+    sensor is lost nothing else is known of it: the effect is None where that is all rows.
     """
-    hidden: list[tuple[Run, Shown]] = []
+    hidden: list[tuple[AlarmRun, RunEffect]] = []
     shown = None
     for part in later:
-        what = _lost(course, s, rows, masks, part)
-        # In the course of anything a coarse sensor repeats itself for a while; for how long is not seen of one that
-        # does so from the first of these rows on.
+        what = _lost(judged, s, rows, masks, part)
+        # A coarse sensor may repeat itself for a while; for how long is unknown if it does so from the first row on.
         if what is None or what.cause == "stuck" and part.begin > run.begin and what.over - what.begun <= JOINED:
             continue
         if not hidden:
             begin, end = (run.begin, what.begun) if what.begun > run.begin else (part.end, run.end)
-            rest = Run(begin, end, run.lasts)
-            shown = _shown(course, s, rows, masks, rest) if begin < end else None
+            rest = AlarmRun(begin, end, run.lasts)
+            shown = _shown(judged, s, rows, masks, rest) if begin < end else None
         before = hidden[-1][1] if hidden else shown
         if before is None or before.cause not in LOSSES or what.begun >= before.over:
             hidden.append((part, what))
     if not hidden:
-        return _shown(course, s, rows, masks, run), []
+        return _shown(judged, s, rows, masks, run), []
     if shown is not None and shown.cause not in LOSSES and not shown.back:
         shown = shown._replace(over=run.end)
     return shown, hidden
 
 
-def _episode(course: Course, s: int, rows: np.ndarray, run: Run, shown: Shown) -> Episode:
-    """The episode of a run of readings of a sensor, whose events are `rows`."""
-    events, track, model = course.events, course.track, course.model
+def _episode(judged: JudgedRows, s: int, rows: np.ndarray, run: AlarmRun, shown: RunEffect) -> Episode:
+    """Return the episode of a run of measurements of a sensor, whose events are `rows`."""
+    events, track, model = judged.events, judged.track, judged.model
     k, begun, over, cause, size, low, high, correlation, back = shown
     nu = track.innovation[rows[begun:over], k]
     about = float(np.nanmean(nu)) if np.isfinite(nu).any() else np.nan
@@ -140,96 +134,100 @@ def _episode(course: Course, s: int, rows: np.ndarray, run: Run, shown: Shown) -
         bits = int(np.bitwise_or.reduce(track.screened[rows[begun:over], k]))
         reasons = " and ".join(reason for place, reason in enumerate(REASONS) if bits >> place & 1)
     start = events.t[rows[begun]] * 1e-9
-    text = words.of_sensor(model, course.tuning, s, k, cause, size, about, correlation, start, reasons)
+    detector = detector_of(cause)
+    facts = SensorFacts(model, s, None if cause in OF_ALL_ROWS else k, cause, start, size, about, correlation, reasons)
+    text = detector.text(facts)
+    unit = model.sensors[s].rows[k].unit if cause == "stuck" else detector.unit if detector.effect else "nats"
     if run.lasts and over < rows.size and (back or run.end < rows.size):
-        text = f"{text}; {words.of_return(cause, events.t[rows[over]] * 1e-9)}"
+        text = f"{text}; {return_text(cause, events.t[rows[over]] * 1e-9)}"
     return Episode(
         start=start,
         end=None if run.lasts else events.t[rows[max(over - 1, begun)]] * 1e-9,
-        subject=model.sensors[s].name if cause in OF_ALL_ROWS else model.row_names[model.row_start[s] + k],
+        subject=facts.name,
         cause=cause,
         size=size,
         low=low,
         high=high,
-        unit=model.sensors[s].rows[k].unit if cause == "stuck" else UNITS.get(cause, ""),
+        unit=unit,
         text=text,
     )
 
 
-def _shown(course: Course, s: int, rows: np.ndarray, masks: np.ndarray, run: Run) -> Shown:
-    """What explains a run best: that the sensor is lost, or else what the innovations show."""
-    lost = _lost(course, s, rows, masks, run)
+def _shown(judged: JudgedRows, s: int, rows: np.ndarray, masks: np.ndarray, run: AlarmRun) -> RunEffect:
+    """Return the effect that explains a run best: a loss of the sensor, else that of the innovations."""
+    lost = _lost(judged, s, rows, masks, run)
     if lost is not None:
         return lost
     said = np.bitwise_or.reduce(masks[run.begin : run.end])
     if said[0] & (DISAGREEING | AGREEING) and not np.any(said & ~(DISAGREEING | AGREEING)):
         cause = "disagreeing" if said[0] & DISAGREEING else "agreeing"
-        return _together(course, rows, masks, run, cause)
-    return _most_telling(course, s, rows, masks, np.flatnonzero(said), run)
+        return _joint_effect(judged, rows, masks, run, cause)
+    return _best_effect(judged, s, rows, masks, np.flatnonzero(said), run)
 
 
-def _lost(course: Course, s: int, rows: np.ndarray, masks: np.ndarray, run: Run) -> Shown | None:
-    """What the edge and the gate did in a run, or that a value repeats itself; None if the sensor is not lost."""
+def _lost(judged: JudgedRows, s: int, rows: np.ndarray, masks: np.ndarray, run: AlarmRun) -> RunEffect | None:
+    """Return the loss of a sensor in a run: screened, stuck or rejected; None if it is not lost."""
     begin, end, _ = run
     said = np.bitwise_or.reduce(masks[begin:end])
-    verdict = course.track.verdict[rows]
+    verdict = judged.track.verdict[rows]
     refused = np.flatnonzero(said & REFUSED)
-    if refused.size and np.mean(verdict[begin:end] == SCREENED) >= MOST:
-        k = int(np.argmax((course.track.screened[rows[begin:end]] != 0).sum(axis=0)))
+    if refused.size and np.mean(verdict[begin:end] == SCREENED) >= LOSS_SHARE:
+        k = int(np.argmax((judged.track.screened[rows[begin:end]] != 0).sum(axis=0)))
         return _share(k, verdict, SCREENED, _after_last(verdict[:begin] != SCREENED), run, cause="screened")
     for row in np.flatnonzero(said & STUCK):
-        stuck = _stuck(course.events.value[rows, row], masks[:, row], int(row), run)
+        stuck = _stuck(judged.events.value[rows, row], masks[:, row], int(row), run)
         if stuck is not None:
             return stuck
-    # Other tests fall more slowly than that of refusals: those readings are in order already. A gate that refuses some
-    # readings has a reason that shows in the others.
+    # Other tests clear more slowly than that of rejections. A gate that rejects only some measurements has a reason
+    # that shows in the others.
     until = begin + _after_last(np.any(masks[begin:end] & REFUSED, axis=1))
-    if refused.size and np.mean(verdict[begin:until] == GATED) >= MOST:
+    if refused.size and np.mean(verdict[begin:until] == GATED) >= LOSS_SHARE:
         return _share(int(refused[0]), verdict, GATED, _after_last(verdict[:begin] == USED), run, cause="refused")
     return None
 
 
-def _share(k: int, verdict: np.ndarray, refusal: int, begun: int, run: Run, *, cause: str) -> Shown:
-    """Most readings had this verdict: from where they began until the last of them, and how many they are."""
+def _share(k: int, verdict: np.ndarray, refusal: int, begun: int, run: AlarmRun, *, cause: str) -> RunEffect:
+    """Return the share of measurements with this verdict, from the first to the last of them."""
     over = run.end if run.lasts else begun + _after_last(verdict[begun : run.end] == refusal)
-    return Shown(k, begun, over, cause, float(np.mean(verdict[begun:over] == refusal)))
+    return RunEffect(k, begun, over, cause, float(np.mean(verdict[begun:over] == refusal)))
 
 
-def _stuck(values: np.ndarray, masks: np.ndarray, k: int, run: Run) -> Shown | None:
-    """A value that repeats itself: from its first reading until the first that is another.
+def _stuck(values: np.ndarray, masks: np.ndarray, k: int, run: AlarmRun) -> RunEffect | None:
+    """Return the run of a repeated value, from its first measurement to the first that differs.
 
-    None if most alarms until then are of something else, in the course of which a coarse sensor repeats itself, too.
+    None if most alarms until then have another cause, during which a coarse sensor repeats itself, too.
     """
     at = run.begin + int(np.argmax(masks[run.begin : run.end] & STUCK != 0))
     begun = _after_last(values[:at] != values[at])
     others = np.flatnonzero(values[begun : run.end] != values[begun])
     over = begun + int(others[0]) if others.size else run.end
-    if np.mean(run.begin + np.flatnonzero(masks[run.begin : over]) >= begun) < MOST:
+    if np.mean(run.begin + np.flatnonzero(masks[run.begin : over]) >= begun) < LOSS_SHARE:
         return None
-    return Shown(k, begun, over, cause="stuck", size=float(values[begun]), back=bool(others.size))
+    return RunEffect(k, begun, over, cause="stuck", size=float(values[begun]), back=bool(others.size))
 
 
-def _most_telling(course: Course, s: int, rows: np.ndarray, masks: np.ndarray, said: np.ndarray, run: Run) -> Shown:
-    """The row, of those that `said` something, that shows most of what is wrong.
+def _best_effect(
+    judged: JudgedRows, s: int, rows: np.ndarray, masks: np.ndarray, said: np.ndarray, run: AlarmRun
+) -> RunEffect:
+    """Return the effect with the highest likelihood ratio over the rows in alarm, `said`.
 
-    What moves one way and then back has no mean over the whole: where innovations wander, the part that is shifted
-    tells more.
+    Innovations that wander have no mean over the whole run: their shifted part is more informative.
     """
-    first = _earliest(course, rows, masks, run)
+    first = _earliest(judged, rows, masks, run)
     unknown = [Effect("narrow", np.nan, np.nan, np.nan, -np.inf)]
     best = int(said[0]) if said.size else 0, run.begin, run.end, unknown, np.zeros(0)
     shifted = best
     for k in said:
-        e = standardised(course, rows[first : run.end], int(k))
+        e = standardised(judged, rows[first : run.end], int(k))
         known = np.flatnonzero(np.isfinite(e))
         if known.size < 2:
             continue
-        e = unusual(course, s, int(k), e[known])
+        e = without_baseline(judged, s, int(k), e[known])
         alarm = min(int(np.searchsorted(known, run.begin - first)), e.size - 1)
-        kinds = _kinds(course, s, int(k), masks[run.begin : run.end, k])
+        kinds = _kinds(judged, s, int(k), masks[run.begin : run.end, k])
         for cause in kinds:
             begun, over = _likeliest(e, alarm, cause)
-            ranked = effects(e[begun : min(over, begun + LOOKED_AT)])
+            ranked = effects(e[begun : min(over, begun + MAX_MEASUREMENTS)])
             ranked.sort(key=lambda item: item.cause not in kinds)
             if ranked[0].cause != cause:
                 continue
@@ -239,7 +237,9 @@ def _most_telling(course: Course, s: int, rows: np.ndarray, masks: np.ndarray, s
             if cause == "shifted" and ranked[0].ratio > shifted[3][0].ratio:
                 shifted = found
     ranked = best[3]
-    if ranked[0].cause == "narrow" and any(item.cause == "correlated" and item.size >= WANDERING for item in ranked):
+    if ranked[0].cause == "narrow" and any(
+        item.cause == "correlated" and item.size >= WANDERING_CORRELATION for item in ranked
+    ):
         if np.isfinite(shifted[3][0].ratio):
             best = shifted
         else:
@@ -247,57 +247,82 @@ def _most_telling(course: Course, s: int, rows: np.ndarray, masks: np.ndarray, s
     effect = best[3][0]
     correlation = next((item.size for item in best[3] if item.cause in ("correlated", "alternating")), 0.0)
     back = _is_back(best[4], effect)
-    return Shown(*best[:3], effect.cause, effect.size, effect.low, effect.high, correlation, back)
+    return RunEffect(*best[:3], effect.cause, effect.size, effect.low, effect.high, correlation, back)
 
 
 def _is_back(e: np.ndarray, effect: Effect) -> bool:
-    """Whether what followed an effect, e (n,), does without it: it is gone for sure, and no lesser one is left of it.
+    """Return whether e (n,) after an effect is normal: the effect is over, and no smaller one of its kind remains.
 
-    A filter follows a sensor that is off, so that a shift shrinks while its cause lasts.
+    A filter follows a biased sensor, so that a shift shrinks while its cause lasts.
     """
-    if not e.size or against(e, effect) < DECISIVE:
+    if not e.size or against(e, effect) < RECOVERED_NATS:
         return False
     left = (item for item in effects(e) if item.cause == effect.cause and item.size * effect.size > 0.0)
-    return all(item.ratio < LEFT for item in left)
+    return all(item.ratio < REMAINING_NATS for item in left)
 
 
-def _kinds(course: Course, s: int, k: int, masks: np.ndarray) -> list[str]:
-    """The kinds of effects that can be the reason of alarms of row k: what was normal is none unless its test spoke."""
-    if course.tuning.baseline is None:
+def _kinds(judged: JudgedRows, s: int, k: int, masks: np.ndarray) -> list[str]:
+    """Return the effects that can explain alarms of row k: one of the baseline only if its own test is in alarm."""
+    if judged.tuning.baseline is None:
         return list(KINDS)
-    peaks = course.tuning.baseline[course.model.row_start[s] + k, 3:]
+    peaks = judged.tuning.baseline[judged.model.row_start[s] + k, 3:]
     said = int(np.bitwise_or.reduce(masks))
-    return [kind for kind in KINDS if said & TOLD_BY[kind] or not np.any(peaks[BITS & TOLD_BY[kind] != 0] > 0.0)]
+    return [kind for kind in KINDS if said & ALARMS_OF[kind] or not np.any(peaks[BITS & ALARMS_OF[kind] != 0] > 0.0)]
 
 
-def _together(course: Course, rows: np.ndarray, masks: np.ndarray, run: Run, cause: str) -> Shown:
-    """All rows of a sensor together are off more, or less, than their noise.
-
-    The mean of a NIS is its degrees of freedom: the root of their ratio takes the place of e.
-    """
-    first = _earliest(course, rows, masks, run)
-    nis, dof = course.track.nis[rows[first : run.end]], course.track.dof[rows[first : run.end]]
+def _joint_effect(judged: JudgedRows, rows: np.ndarray, masks: np.ndarray, run: AlarmRun, cause: str) -> RunEffect:
+    """Return the common scale of all rows of a sensor, from √(NIS / degrees of freedom) in place of e."""
+    first = _earliest(judged, rows, masks, run)
+    nis, dof = judged.track.nis[rows[first : run.end]], judged.track.dof[rows[first : run.end]]
     known = np.flatnonzero(np.isfinite(nis) & (dof > 0))
     e = np.sqrt(nis[known] / dof[known])
     alarm = min(int(np.searchsorted(known, run.begin - first)), e.size - 1)
     begun, over = _likeliest(e, alarm, "narrow" if cause == "disagreeing" else "wide")
-    looked_at = slice(begun, min(over, begun + LOOKED_AT))
+    looked_at = slice(begun, min(over, begun + MAX_MEASUREMENTS))
     _, size, low, high, _ = common_scale(e[looked_at], dof[known][looked_at])
-    return Shown(0, first + int(known[begun]), first + int(known[over - 1]) + 1, cause, size, low, high)
+    return RunEffect(0, first + int(known[begun]), first + int(known[over - 1]) + 1, cause, size, low, high)
 
 
-def _earliest(course: Course, rows: np.ndarray, masks: np.ndarray, run: Run) -> int:
-    """The first reading that can be the onset of a run of alarms: after the alarms before it, and the last reset."""
-    first = max(0, run.begin - LOOKED_AT)
+def _own_evidence(
+    judged: JudgedRows, s: int, rows: np.ndarray, masks: np.ndarray, run: AlarmRun, detector: Detector
+) -> RunEffect:
+    """Return the effect of a detector of which nothing but its tests is known: their mean log Λ, nats."""
+    first = _earliest(judged, rows, masks, run)
+    best = RunEffect(0, run.begin, run.end, detector.name, np.nan)
+    for k in np.flatnonzero(masks[run.begin : run.end].any(axis=0)):
+        known, ratios = evidence(judged, s, rows[first : run.end], int(k), detector)
+        if not known.size:
+            continue
+        alarm = min(int(np.searchsorted(known, run.begin - first)), known.size - 1)
+        begun, over = _likeliest(ratios, alarm, EVIDENCE)
+        own = ratios[begun : min(over, begun + MAX_MEASUREMENTS)]
+        if np.isnan(best.size) or own.mean() > best.size:
+            half = 1.96 * float(own.std()) / np.sqrt(own.size)
+            size, ends = float(own.mean()), (first + int(known[begun]), first + int(known[over - 1]) + 1)
+            best = RunEffect(int(k), *ends, detector.name, size, size - half, size + half)
+    return best
+
+
+def evidence(judged: JudgedRows, s: int, rows: np.ndarray, k: int, detector: Detector) -> tuple[np.ndarray, np.ndarray]:
+    """Return which of `rows` have an innovation of row k, (n,), and log Λ of the detector's best test there, (n,)."""
+    e = standardised(judged, rows, k)
+    known = np.flatnonzero(np.isfinite(e))
+    ratios = log_ratios(detector.bits, without_baseline(judged, s, k, e[known])) if known.size else np.zeros((0, 0))
+    return (known, ratios[np.argmax(ratios.sum(axis=1))]) if ratios.size else (known[:0], np.zeros(0))
+
+
+def _earliest(judged: JudgedRows, rows: np.ndarray, masks: np.ndarray, run: AlarmRun) -> int:
+    """Return the first measurement that can be the onset of a run: after earlier alarms and the last reset."""
+    first = max(0, run.begin - MAX_MEASUREMENTS)
     first += _after_last(np.any(masks[first : run.begin], axis=1))
-    resets = np.flatnonzero(course.events.kind[rows[first] : rows[run.begin]] == RESET)
+    resets = np.flatnonzero(judged.events.kind[rows[first] : rows[run.begin]] == RESET)
     return int(np.searchsorted(rows, rows[first] + resets[-1])) if resets.size else first
 
 
 def _likeliest(e: np.ndarray, alarm: int, cause: str) -> tuple[int, int]:
-    """From which to which of e (n,) it was so, most likely, if it was at `alarm`.
+    """Return the most likely begin and end, in e (n,), of an effect that is present at `alarm`.
 
-    A test falls more slowly than its cause goes, so the end is looked for as the onset is, backwards.
+    A test clears later than its cause ends, so the end is estimated like the onset, backwards.
     """
     begun = onset(e[: alarm + 1], cause)
     run = e[begun:]
@@ -305,6 +330,6 @@ def _likeliest(e: np.ndarray, alarm: int, cause: str) -> tuple[int, int]:
 
 
 def _after_last(there: np.ndarray) -> int:
-    """The index behind the last True in `there` (n,); 0 if there is none."""
+    """Return the index after the last True in `there` (n,); 0 if there is none."""
     places = np.flatnonzero(there)
     return int(places[-1]) + 1 if places.size else 0

@@ -42,9 +42,6 @@ from .responses import (
     stand_in,
 )
 
-RIDDLES = ("shifted", "refused")
-"""Causes of episodes that leave open who is to blame."""
-
 MOST = 4000
 """Events since the beginning of an episode that are folded again."""
 

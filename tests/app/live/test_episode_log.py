@@ -1,12 +1,12 @@
-"""The chronicle: whatever order and pieces, its episodes are those of one fold of the log, and each is said once."""
+"""The episode log: whatever order and pieces, its episodes are those of one fold of the log, and each is said once."""
 
 import numpy as np
 import pytest
 
 from app.live import commands
 from app.live.engine import Engine
-from app.live.episode_log import Account, Chronicle, Entry
-from estimators.diagnostics.episodes import Episode, episodes
+from app.live.episode_log import EpisodeLog, EpisodeSummary
+from estimators.diagnostics.episodes import Episode, TrackedEpisode, episodes
 from estimators.fold import Fold
 from estimators.log import Log
 from estimators.track import GATED
@@ -33,7 +33,7 @@ def asset():
 
 @pytest.fixture
 def engine():
-    """One whose thread does not run: the tests hand it batches, and let the chronicle look."""
+    """One whose thread does not run: the tests hand it batches, and let the episode log look."""
     return Engine(twin(horizon=1000.0), lambda report: Scripted())
 
 
@@ -62,8 +62,8 @@ def test_in_pieces_it_is_what_one_fold_says(engine, asset, piece):
     for start in range(0, N, piece):
         engine._accept([readings(t[start : start + piece], y[start : start + piece])])
         if piece > 1 or start % 5 == 0:
-            engine._watchers.chronicle.look()
-    engine._watchers.chronicle.look()
+            engine._watchers.episode_log.update()
+    engine._watchers.episode_log.update()
     expected = whole(engine)
     assert len(expected) >= 2 and expected[0].end is not None and expected[-1].cause == "stuck"
     same(engine.episodes(), expected)
@@ -75,11 +75,11 @@ def test_readings_that_come_late_take_rows_back(engine, asset):
     prompt = np.setdiff1d(np.arange(600), late)
     for part in np.array_split(prompt, 12):
         engine._accept([readings(t[part], y[part])])
-        engine._watchers.chronicle.look()
+        engine._watchers.episode_log.update()
     before = engine.episodes()
     for part in np.array_split(late[::-1], 5):
         engine._accept([readings(t[part], y[part])])
-        engine._watchers.chronicle.look()
+        engine._watchers.episode_log.update()
     same(engine.episodes(), whole(engine))
     assert before != engine.episodes()
     assert sum("too narrow" in text for text in said(engine)) == 1
@@ -90,7 +90,7 @@ def test_each_is_said_once_when_it_begins_and_when_it_is_over(engine, asset):
     lasted = False
     for start in range(0, 1580, 8):
         engine._accept([readings(t[start : start + 8], y[start : start + 8])])
-        engine._watchers.chronicle.look()
+        engine._watchers.episode_log.update()
         status = engine.status()
         engine._status = None
         if status.episodes_open:
@@ -113,18 +113,18 @@ def test_each_is_said_once_when_it_begins_and_when_it_is_over(engine, asset):
 def test_what_began_before_the_rows_that_are_kept_is_carried_on(engine, asset):
     """200 noisy readings, and at most 128 rows kept: the end falls where the beginning is forgotten."""
     t, y = asset
-    chronicle, starts = Chronicle(engine, rows=128), set()
+    episode_log, starts = EpisodeLog(engine, max_rows=128), set()
     for start in range(0, 1580, 10):
         engine._accept([readings(t[start : start + 10], y[start : start + 10])])
-        chronicle.look()
-        if chronicle._tail.first > 337:
-            starts.add(chronicle.account.episodes[0].start)
-    (expected,), (found,) = whole(engine), chronicle.account.episodes
+        episode_log.update()
+        if episode_log.tracker.first > 337:
+            starts.add(episode_log.summary.episodes[0].start)
+    (expected,), (found,) = whole(engine), episode_log.summary.episodes
     # Its onset was sought at the first alarm, less than 64 readings later (see above), when at least 64 were kept. Of
     # those that are forgotten since then the sums are left, on which the likelihood of each end depends.
     assert found.subject == expected.subject and starts == {found.start}
     assert (found.start, found.end) == (expected.start, expected.end)
-    assert chronicle._tail.n <= 128
+    assert episode_log.tracker.n <= 128
 
 
 @pytest.mark.parametrize("rows", [65_536, 512], ids=["all rows", "few rows"])
@@ -136,21 +136,21 @@ def test_what_lasts_hides_no_later_loss(engine, rows):
     t = 1.0 + np.arange(N)
     y = 40.0 + rng.normal(0.0, 0.1 * np.sqrt(MODEL.sensors[0].rows[0].variance), N)
     y[600:1100] = y[600]
-    chronicle = Chronicle(engine, rows=rows)
+    episode_log = EpisodeLog(engine, max_rows=rows)
     for start in range(0, N, 20):
         engine._accept([readings(t[start : start + 20], y[start : start + 20])])
-        chronicle.look()
+        episode_log.update()
         if 800 <= start < 1000:
-            lasting = {entry.key[0]: entry.episode for entry in chronicle.account.lasting}
+            lasting = {entry.key[0]: entry.episode for entry in episode_log.summary.lasting}
             assert {kind: each.cause for kind, each in lasting.items()} == {"sensor": "wide", "lost": "stuck"}
             assert lasting["lost"].start == pytest.approx(601.0)
-            worst = chronicle.account.leading(dict(winding="degraded"))
+            worst = episode_log.summary.leading(dict(winding="degraded"))
             assert worst is not None and worst.cause == "stuck"
-    wide, stuck = chronicle.account.episodes
+    wide, stuck = episode_log.summary.episodes
     expected = whole(engine)
     assert [(each.cause, each.start) for each in (wide, stuck)] == [(each.cause, each.start) for each in expected]
     assert wide.end is None and stuck.end == pytest.approx(1100.0) == expected[1].end
-    assert chronicle._tail.n <= rows
+    assert episode_log.tracker.n <= rows
     assert sum(text.startswith("winding: no longer stuck") for text in said(engine)) == 1
 
 
@@ -186,7 +186,7 @@ def same_as(engine, tuning):
     return engine.episodes() == episodes(fold)
 
 
-def test_a_source_that_begins_again_has_a_chronicle_of_its_own(asset):
+def test_a_source_that_begins_again_has_an_episode_log_of_its_own(asset):
     source = Replayed()
     engine = Engine(twin(), lambda report: source)
     engine.start()
@@ -212,7 +212,7 @@ def test_a_refused_sensor_is_said_once_and_not_reading_by_reading(asset):
     moved[300:] += 100.0
     told, refused = [], 0
     for start in range(0, 600, 10):
-        known = "winding" in engine._watchers.chronicle.account.in_alarm
+        known = "winding" in engine._watchers.episode_log.summary.in_alarm
         lines = len(engine.notices.since(0))
         # As if each batch came a second after the one before.
         engine.notices._last.clear()
@@ -221,30 +221,32 @@ def test_a_refused_sensor_is_said_once_and_not_reading_by_reading(asset):
         if np.any(engine._fold.track.verdict[-10:] == GATED):
             refused += known
             told.append((known, any(text.startswith("winding: measurement rejected") for text in new)))
-        engine._watchers.chronicle.look()
+        engine._watchers.episode_log.update()
     assert refused > 3 and all(line != known for known, line in told)
     assert sum("is refused by the gate" in text for text in said(engine)) == 1
 
 
 def test_the_cause_is_that_of_a_sensor_that_is_lost_before_that_of_one_that_is_noisy():
     def entry(kind, name, cause, start):
-        return Entry((kind, name), 0, Episode(start, None, name, cause, 1.0, 0.0, 2.0, "", f"{name} {cause}"))
+        return TrackedEpisode(
+            (kind, name), 0, 0, Episode(start, None, name, cause, 1.0, 0.0, 2.0, "", f"{name} {cause}")
+        )
 
     noisy, lost = entry("sensor", "a", "wide", 1.0), entry("sensor", "b", "narrow", 2.0)
-    account = Account((noisy.episode, lost.episode), (noisy, lost))
+    account = EpisodeSummary((noisy.episode, lost.episode), (noisy, lost))
     # Of two that are as bad the newest, whatever their order.
     assert account.leading({"a": "suspect", "b": "suspect"}).text == "b narrow"
-    assert Account((), (lost, noisy)).leading({"a": "suspect", "b": "suspect"}).text == "b narrow"
+    assert EpisodeSummary((), (lost, noisy)).leading({"a": "suspect", "b": "suspect"}).text == "b narrow"
     assert account.leading({"a": "degraded", "b": "suspect"}).text == "a wide"
     assert account.leading({"a": "suspect", "b": "degraded"}).text == "b narrow"
     silent, gone = entry("silence", "c", "silent", 3.0), entry("twin", "diverged", "diverged", 4.0)
-    assert Account((), (noisy, silent)).leading({"a": "suspect", "c": "degraded"}).text == "c silent"
-    assert Account((), (noisy, silent, gone)).leading({"c": "stale"}).text == "diverged diverged"
+    assert EpisodeSummary((), (noisy, silent)).leading({"a": "suspect", "c": "degraded"}).text == "c silent"
+    assert EpisodeSummary((), (noisy, silent, gone)).leading({"c": "stale"}).text == "diverged diverged"
     # What a shifted sensor leads to, a state off the truth, does not hide it.
     shifted, missed = entry("sensor", "a", "shifted", 1.0), entry("truth", "x", "missed", 2.0)
-    assert Account((), (shifted, missed)).leading({"a": "suspect"}).text == "a shifted"
-    assert Account((), (noisy, missed)).leading({"a": "suspect"}).text == "x missed"
+    assert EpisodeSummary((), (shifted, missed)).leading({"a": "suspect"}).text == "a shifted"
+    assert EpisodeSummary((), (noisy, missed)).leading({"a": "suspect"}).text == "x missed"
     # A sensor in order again has an episode that lasts until it is certain to be over: the one that is lost leads.
     assert account.leading({"a": "tracking", "b": "suspect"}).text == "b narrow"
-    assert Account((), (noisy,)).leading({"a": "tracking"}) is noisy.episode
-    assert Account().leading({}) is None
+    assert EpisodeSummary((), (noisy,)).leading({"a": "tracking"}) is noisy.episode
+    assert EpisodeSummary().leading({}) is None

@@ -6,7 +6,7 @@ import pytest
 from app.live.jobs import Job
 from app.live.notices import Notices
 from app.live.outputs import event_window
-from app.live.root_cause import Blame
+from app.live.root_cause import RootCause
 from estimators.diagnostics.episodes import Episode, episodes
 from estimators.fold import Fold
 from estimators.log import READING, Log
@@ -32,19 +32,19 @@ def folded():
     return fold
 
 
-def blame_of(fold, known, notices=None):
+def root_cause_of(fold, known, notices=None):
     said = notices or Notices(lambda: 0)
-    return Blame(lambda: known, lambda: event_window(fold, 0, 4000), said), said
+    return RootCause(lambda: known, lambda: event_window(fold, 0, 4000), said), said
 
 
 def test_the_sensor_that_is_off_is_named_once_and_in_the_text(folded):
     (yoke,) = [episode for episode in episodes(folded) if (episode.subject, episode.cause) == ("yoke", "shifted")]
-    blame, notices = blame_of(folded, [yoke])
-    blame.look(Job("test"))
-    blame.look(Job("test"))
-    words = blame.of(yoke)
+    cause, notices = root_cause_of(folded, [yoke])
+    cause.update(Job("test"))
+    cause.update(Job("test"))
+    words = cause.fault_behind(yoke)
     assert words.startswith("sensor yoke +")
-    assert blame.told(yoke).text == f"{yoke.text}; most likely off: {words}"
+    assert cause.with_fault(yoke).text == f"{yoke.text}; most likely off: {words}"
     lines = [line.text for line in notices.since(0)]
     assert lines == [f"yoke: most likely off: {words}"]
 
@@ -54,25 +54,25 @@ def test_a_consequence_leads_to_the_sensor_that_is_behind_it(folded):
     (yoke,) = [episode for episode in episodes(folded) if (episode.subject, episode.cause) == ("yoke", "shifted")]
     tooth = yoke._replace(subject="tooth", text="tooth reads low")
     known = [yoke, tooth]
-    blame, _ = blame_of(folded, known)
-    assert blame.behind(tooth) is tooth  # not yet asked
-    blame.look(Job("test"))
-    assert blame.behind(tooth) is yoke and blame.behind(yoke) is yoke
+    cause, _ = root_cause_of(folded, known)
+    assert cause.primary(tooth) is tooth  # not yet asked
+    cause.update(Job("test"))
+    assert cause.primary(tooth) is yoke and cause.primary(yoke) is yoke
     known[0] = yoke._replace(end=80.0)
-    assert blame.behind(tooth) is tooth
+    assert cause.primary(tooth) is tooth
 
 
 def test_what_is_over_or_no_riddle_is_left_alone(folded):
     over = Episode(60.0, 70.0, "yoke", "shifted", 1.0, 0.5, 1.5, "σ", "yoke reads high")
     stuck = Episode(60.0, None, "tooth", "stuck", 41.0, np.nan, np.nan, "°C", "tooth is stuck")
-    blame, notices = blame_of(folded, [over, stuck])
-    blame.look(Job("test"))
-    assert not notices.since(0) and blame.told(over) is over and blame.told(stuck) is stuck
+    cause, notices = root_cause_of(folded, [over, stuck])
+    cause.update(Job("test"))
+    assert not notices.since(0) and cause.with_fault(over) is over and cause.with_fault(stuck) is stuck
 
 
 def test_an_episode_older_than_the_window_is_not_guessed(folded):
     old = Episode(60.0, None, "yoke", "shifted", 1.0, 0.5, 1.5, "σ", "yoke reads high")
     late = event_window(folded, 0, 4000)._replace(base=folded.base_at(0)[1]._replace(clock=70 * 10**9))
-    blame = Blame(lambda: [old], lambda: late, Notices(lambda: 0))
-    blame.look(Job("test"))
-    assert blame.of(old) == ""
+    cause = RootCause(lambda: [old], lambda: late, Notices(lambda: 0))
+    cause.update(Job("test"))
+    assert cause.fault_behind(old) == ""

@@ -146,7 +146,7 @@ def test_what_a_browser_says_on_the_stream_is_a_word(page):  # noqa: F811
             stream.send(message)
             while True:
                 stream.recv(timeout=PATIENCE)
-    # What is left is the engine's own, of its chronicle.
+    # What is left is the engine's own, of its episode log.
     wait_for(lambda: len(page.engine._cursors) == 1)
 
 

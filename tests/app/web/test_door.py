@@ -491,7 +491,7 @@ def test_a_viewer_that_leaves_is_forgotten(page, tmp_path):
     with page.connect(STREAM) as connection:
         Viewer(connection, tmp_path).take()
         wait_for(lambda: len(page.engine._cursors) == 2)
-    # What is left is the engine's own, of its chronicle.
+    # What is left is the engine's own, of its episode log.
     wait_for(lambda: len(page.engine._cursors) == 1)
 
 

@@ -32,7 +32,7 @@ def test_a_stuck_sensor_in_the_api(engine):
     y = 40.0 + np.random.default_rng(5).normal(0, 2, 200)
     y[100:] = 41.5
     engine._accept([readings(1.0 + np.arange(200), y)])
-    engine._watchers.chronicle.look()
+    engine._watchers.episode_log.update()
     engine._status = None
     (episode,) = strict(episodes_json(engine))
     assert list(episode) == ["start", "end", "subject", "cause", "size", "low", "high", "unit", "text", "help"]

@@ -29,7 +29,9 @@ def session():
     wait_for(lambda: any(item.subject == "yoke" for item in engine.episodes()))
     for revision, (key, value) in enumerate((("use.yoke", False), ("Q.winding", 0.02)), start=1):
         engine.submit(SetTuning(key, value))
-        wait_for(lambda n=revision: engine.status().revision == n and engine._watchers.chronicle.account.revision == n)
+        wait_for(
+            lambda n=revision: engine.status().revision == n and engine._watchers.episode_log.summary.revision == n
+        )
     yield running
     running.stop()
 

@@ -4,7 +4,7 @@ import re
 from html.parser import HTMLParser
 
 from app.present.export.alarm_guide import alarms_text, as_html
-from estimators.diagnostics.episodes import CAUSES, anchor
+from estimators.diagnostics.detectors import CAUSES, anchor
 
 
 class Texts(HTMLParser):

@@ -13,7 +13,7 @@ from app.cli.main import main
 from app.present.export import report_charts
 from app.present.export.alarm_guide import advice
 from app.present.export.report_charts import charts_html
-from estimators.diagnostics.episodes import CAUSES
+from estimators.diagnostics.detectors import CAUSES
 from estimators.fold import fold
 from estimators.log import Log
 from estimators.tuning import Tuning

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from estimators.diagnostics.detector_state import no_baseline
-from estimators.diagnostics.detectors import BITS, IMPOVERISHED, NARROW, SHIFTED_DOWN, SHIFTED_UP, SPIKY, STUCK
-from estimators.diagnostics.episodes import CAUSES, JOINED, Episode, course_of, episode_json, episodes, found_in
+from estimators.diagnostics.detectors import BITS, CAUSES, IMPOVERISHED, NARROW, SHIFTED_DOWN, SHIFTED_UP, SPIKY, STUCK
+from estimators.diagnostics.episodes import JOINED, Episode, episode_json, episodes, found_in, judged_rows
 from estimators.diagnostics.health import HealthPolicy
 from estimators.fold import Fold
 from estimators.log import INPUT, READING, RESET, TICK, TRUTH, Events
@@ -177,7 +177,7 @@ def test_one_fault_of_a_sensor_is_one_episode(cause):
 
 
 def test_one_that_lasts_for_more_readings_than_its_size_is_made_of_ends_where_it_ended(monkeypatch):
-    monkeypatch.setattr("estimators.diagnostics.episodes.sensors.LOOKED_AT", 60)
+    monkeypatch.setattr("estimators.diagnostics.episodes.sensors.MAX_MEASUREMENTS", 60)
     (each,) = (item for item in episodes(folded(**SENSORS["narrow"][0])) if item.subject == "gauge")
     assert each.end is not None and abs(each.end - END) <= FAR
 
@@ -206,7 +206,7 @@ def test_silence():
     assert (each.subject, each.start, each.end, each.unit) == ("gauge", BEGIN, END + 1.0, "s")
     assert each.size == END + 1 - BEGIN
     said = f"gauge was silent for {END + 1 - BEGIN} s since {BEGIN}.0 s: other sensors see the same states; "
-    assert each.text == said + "look at its wiring and its bus if that is too long"
+    assert each.text == said + "check its wiring and its bus"
 
 
 def test_a_sensor_that_should_speak_and_never_does():
@@ -239,7 +239,7 @@ def test_a_truth_that_is_missed():
     assert each.start == BEGIN + 1.0 and END <= each.end <= END + 10.0 * np.log((2.0 / std) ** 2 / 3.0**2) + 5.0
     assert each.low <= each.size <= each.high <= 3.0 / std
     assert each.text.startswith("level is ") and each.text.endswith(
-        "the estimate is wrong and its band does not say so; look at what else is in alarm"
+        "the estimate is wrong and its band does not show it; look at what else is in alarm"
     )
 
 
@@ -266,13 +266,13 @@ def test_a_gate_that_refuses_all_is_divergence():
 
 
 def test_an_impoverished_cloud():
-    course = course_of(folded())
-    track = course.track.copy()
+    judged = judged_rows(folded())
+    track = judged.track.copy()
     track.flags[1000:2000] |= IMPOVERISHED
     track.effective[1000:2000], track.ancestors[1000:2000] = np.linspace(1.0, 3.0, 1000), 1.0
-    (found,) = found_in(course._replace(track=track))
+    (found,) = found_in(judged._replace(track=track))
     each = found.episode
-    t = course.events.t * 1e-9
+    t = judged.events.t * 1e-9
     assert (each.subject, each.cause, each.start, each.end) == ("twin", "impoverished", t[1000], t[2000])
     assert (each.low, each.size, each.high) == pytest.approx((1.05, 2.0, 2.95))
     assert "2 particles count, and all descend from one particle" in each.text
@@ -283,11 +283,11 @@ def test_an_impoverished_cloud():
 
 def alarmed(*readings):
     """Alarms of the gauge at those of its readings, in a fold that is in order."""
-    course = course_of(folded())
-    track = course.track.copy()
-    rows = np.flatnonzero((course.events.kind == READING) & (course.events.channel == 0))
+    judged = judged_rows(folded())
+    track = judged.track.copy()
+    rows = np.flatnonzero((judged.events.kind == READING) & (judged.events.channel == 0))
     track.alarms[rows[list(readings)], 0] = NARROW
-    return found_in(course._replace(track=track))
+    return found_in(judged._replace(track=track))
 
 
 def test_alarms_that_follow_each_other_are_one_episode():
@@ -311,11 +311,11 @@ def test_episodes_come_in_the_order_of_their_start():
 
 
 def test_episodes_of_several_bits_are_one():
-    course = course_of(folded())
-    track = course.track.copy()
-    rows = np.flatnonzero((course.events.kind == READING) & (course.events.channel == 1))
+    judged = judged_rows(folded())
+    track = judged.track.copy()
+    rows = np.flatnonzero((judged.events.kind == READING) & (judged.events.channel == 1))
     track.alarms[rows[100:120], 0], track.alarms[rows[110:130], 3] = NARROW, SHIFTED_DOWN
-    assert len(found_in(course._replace(track=track))) == 1
+    assert len(found_in(judged._replace(track=track))) == 1
 
 
 def test_a_noisy_sensor_that_rests_for_a_while_is_not_stuck():
@@ -334,9 +334,9 @@ def test_a_noisy_sensor_that_rests_for_a_while_is_not_stuck():
 
 def test_what_was_normal_is_no_cause_unless_its_test_spoke():
     """Spikes of 6 σ, one reading in 15, as always; from BEGIN on 1 σ more."""
-    course = course_of(folded())
-    track, rng = course.track.copy(), np.random.default_rng(1)
-    rows = np.flatnonzero((course.events.kind == READING) & (course.events.channel == 0))
+    judged = judged_rows(folded())
+    track, rng = judged.track.copy(), np.random.default_rng(1)
+    rows = np.flatnonzero((judged.events.kind == READING) & (judged.events.channel == 0))
     e = rng.standard_normal(N)
     e[::15] = 6.0 * rng.choice([-1.0, 1.0], e[::15].shape)
     e[BEGIN:END] += 1.0
@@ -345,7 +345,7 @@ def test_what_was_normal_is_no_cause_unless_its_test_spoke():
     baseline = no_baseline(MODEL)
     baseline[0, 3:][BITS & (SPIKY | NARROW) != 0] = 1e4
     for normal, cause in ((None, "spiky"), (baseline, "shifted")):
-        own = course._replace(track=track, tuning=replace(course.tuning, baseline=normal))
+        own = judged._replace(track=track, tuning=replace(judged.tuning, baseline=normal))
         assert [item.episode.cause for item in found_in(own)] == [cause]
 
 
@@ -366,10 +366,10 @@ def test_numbers_are_those_of_python():
 
 
 def cut(until, **faults):
-    """A course that is known only up to a second of the log."""
-    course = course_of(folded(**faults))
-    n = int(np.searchsorted(course.events.t, until * SECOND, side="right"))
-    return course._replace(events=course.events.select(slice(0, n)), track=course.track.select(slice(0, n)))
+    """A judged that is known only up to a second of the log."""
+    judged = judged_rows(folded(**faults))
+    n = int(np.searchsorted(judged.events.t, until * SECOND, side="right"))
+    return judged._replace(events=judged.events.select(slice(0, n)), track=judged.track.select(slice(0, n)))
 
 
 def test_what_is_back_to_normal_is_said_while_the_slowest_test_still_falls():
@@ -378,11 +378,11 @@ def test_what_is_back_to_normal_is_said_while_the_slowest_test_still_falls():
     for until in (*range(BEGIN + 20, END, 20), END):
         (each,) = [item.episode for item in found_in(cut(until, **fault)) if item.key == ("sensor", "gauge")]
         assert each.end is None and "back to normal" not in each.text, until
-    course = cut(END + 15, **fault)
-    gauge = np.flatnonzero((course.events.kind == READING) & (course.events.channel == 0))
-    assert course.track.alarms[gauge[-1], 0] != 0
-    (each,) = [item.episode for item in found_in(course) if item.key == ("sensor", "gauge")]
-    since = float(re.search(r"; back to normal since ([\d.]+) s: the alarm goes", each.text)[1])
+    judged = cut(END + 15, **fault)
+    gauge = np.flatnonzero((judged.events.kind == READING) & (judged.events.channel == 0))
+    assert judged.track.alarms[gauge[-1], 0] != 0
+    (each,) = [item.episode for item in found_in(judged) if item.key == ("sensor", "gauge")]
+    since = float(re.search(r"; back to normal since ([\d.]+) s: the alarm clears", each.text)[1])
     # The filter has followed by 4 of the 5 σ, so that the last readings of the fault look much like those after it.
     assert each.end is None and abs(since - END) <= 15
 
@@ -390,17 +390,17 @@ def test_what_is_back_to_normal_is_said_while_the_slowest_test_still_falls():
 def test_a_reset_is_advised_only_when_no_sensor_is_off():
     """The estimate is lost while two sensors are refused, then while one is, then with all in order."""
     fault = {"gauge": lambda x, z, rng: x + 9.0, "chain": lambda x, z, rng: x + 9.0 + 0.1 * z, "gate": 0.9999}
-    course = course_of(folded(**fault))
+    judged = judged_rows(folded(**fault))
 
     def text(verdicts):
-        track = course.track.copy()
-        n = int(np.searchsorted(course.events.t, (BEGIN + 60) * SECOND))
+        track = judged.track.copy()
+        n = int(np.searchsorted(judged.events.t, (BEGIN + 60) * SECOND))
         track.alarms[:], track.health[:n] = 0, TRACKING
         track.health[n - 40 : n] = DIVERGED
-        kind, channel = course.events.kind[:n], course.events.channel[:n]
+        kind, channel = judged.events.kind[:n], judged.events.channel[:n]
         for s, verdict in enumerate(verdicts):
             track.verdict[:n][(kind == READING) & (channel == s)] = verdict
-        part = course._replace(events=course.events.select(slice(0, n)), track=track.select(slice(0, n)))
+        part = judged._replace(events=judged.events.select(slice(0, n)), track=track.select(slice(0, n)))
         return only([item.episode for item in found_in(part)], "diverged").text
 
     remedy = "and Reset when the rest agrees"
@@ -417,11 +417,11 @@ def test_a_sensor_that_moves_again_is_not_said_to_be_stuck_only():
     def gauge(x, z, rng):
         return np.where(np.arange(END - BEGIN)[:, None] < 100, x[0], x + 2.0 * z)
 
-    course = cut(BEGIN + 50, gauge=gauge)
-    (each,) = [item.episode for item in found_in(course) if item.key == ("sensor", "gauge")]
+    judged = cut(BEGIN + 50, gauge=gauge)
+    (each,) = [item.episode for item in found_in(judged) if item.key == ("sensor", "gauge")]
     assert each.cause == "stuck" and "again" not in each.text
-    course = cut(BEGIN + 150, gauge=gauge)
-    (each,) = [item.episode for item in found_in(course) if item.key == ("sensor", "gauge")]
+    judged = cut(BEGIN + 150, gauge=gauge)
+    (each,) = [item.episode for item in found_in(judged) if item.key == ("sensor", "gauge")]
     assert each.cause == "stuck" and each.end is None
     assert each.text.endswith(f"it moves again since {BEGIN + 101}.0 s")
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from estimators.diagnostics.episodes import course_of, found_in
+from estimators.diagnostics.episodes import found_in, judged_rows
 from estimators.fold import Fold
 from estimators.log import READING, Events
 from estimators.model.sensor import Limits
@@ -35,7 +35,7 @@ def found(change, tuning, n=N):
         batch.append(Events.one(t, t, READING, 1, level[k] + rng.standard_normal(8), MODEL.width))
     fold = Fold("kf", LIMITED, tuning, as_log(Events.concat(batch, MODEL.width)), policy=POLICY)
     fold.advance()
-    items = found_in(course_of(fold))
+    items = found_in(judged_rows(fold))
     return {item.key[0]: item.episode for item in items if item.episode.subject == "gauge"}, len(items)
 
 

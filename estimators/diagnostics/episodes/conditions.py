@@ -1,0 +1,163 @@
+"""Episodes of dropouts, true states, ranges, particles and the twin's health: conditions of single rows."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from ...log import INPUT, READING, TRUTH, truth_of
+from ...model.state_space import Input, State
+from ...track import DIVERGED, GATED, HEALTH_NAMES, SCREENED, STALE
+from ..detectors import (
+    IMPOVERISHED,
+    MISSED,
+    OUTSIDE,
+    REFUSED,
+    SENSOR_FLAGS,
+    SHIFTED_DOWN,
+    SHIFTED_UP,
+    STUCK,
+    detector_of,
+)
+from .episode import JOINED, AlarmRun, Episode, FoundEpisode, JudgedRows, runs
+from .wording import SensorFacts, TwinFacts
+
+CONTRADICTING = REFUSED | STUCK | SHIFTED_UP | SHIFTED_DOWN
+"""Alarms of a sensor that contradicts the estimate."""
+
+
+def _found(
+    kind: str, facts: TwinFacts, end: float | None, low: float, high: float, run: AlarmRun, t: np.ndarray
+) -> FoundEpisode:
+    """Return the episode of these facts; `t`: times of the rows to which the run belongs, ns."""
+    row = detector_of(facts.cause)
+    unit = row.unit or facts.unit
+    episode = Episode(facts.start, end, facts.name, facts.cause, facts.size, low, high, unit, row.text(facts))
+    return FoundEpisode((kind, facts.name), run.begin, int(t[run.begin]), int(t[run.end - 1]), episode)
+
+
+def dropouts(judged: JudgedRows) -> Iterator[FoundEpisode]:
+    """Yield the dropouts of the sensors that have a bit of their own."""
+    events, model, flags = judged.events, judged.model, judged.track.flags
+    t = events.t
+    if not flags.any():
+        return
+    for s, sensor in enumerate(model.sensors[:SENSOR_FLAGS]):
+        heard = np.flatnonzero((events.kind == READING) & (events.channel == s))
+        earlier = 0 if judged.last_heard is None else int(judged.last_heard[s])
+        for run in runs(flags >> s & 1 != 0):
+            before = heard[heard < run.begin]
+            last = int(t[before[-1]]) if before.size else earlier
+            cause = "silent" if last else "never heard"
+            start, over = (last or int(t[0])) * 1e-9, run.over(t)
+            size = (t[run.end - 1] * 1e-9 if over is None else over) - start
+            facts = SensorFacts(model, s, None, cause, start, size, lasted=None if run.lasts else size)
+            text = detector_of(cause).text(facts)
+            episode = Episode(start, over, sensor.name, cause, size, np.nan, np.nan, "s", text)
+            at, until = int(t[run.begin]), int(t[run.end - 1])
+            yield FoundEpisode(("silence", sensor.name), run.begin, at, until, episode)
+
+
+def missed_truths(judged: JudgedRows) -> Iterator[FoundEpisode]:
+    """Yield the states whose known true value is far outside their bands."""
+    events, model, track = judged.events, judged.model, judged.track
+    known = np.flatnonzero(events.kind == TRUTH)
+    if not track.alarms[known].any():
+        return
+    for column, (j, state) in enumerate(zip(model.shown, model.shown_states, strict=True)):
+        rows, values = truth_of(events, int(j))
+        place = int(j) - events.channel[rows]
+        within = place < track.alarms.shape[1]
+        rows, values, place = rows[within], values[within], place[within]
+        if not rows.size:
+            continue
+        for run in runs(track.alarms[rows, place] & MISSED != 0, JOINED):
+            begin, end, lasts = run
+            own = rows[begin:end]
+            error = track.mean[own, column] - values[begin:end]
+            if state.circular:
+                error = (error + np.pi) % (2.0 * np.pi) - np.pi
+            sure = track.std[own, column] > 0.0
+            off = np.abs(error[sure]) / track.std[own[sure], column]
+            rms, size = (float(np.sqrt(np.mean(each**2))) for each in (error, off))
+            start = events.t[rows[begin]] * 1e-9
+            over = None if lasts else events.t[rows[end - 1]] * 1e-9
+            facts = TwinFacts(state.name, "missed", start, size, state.unit, rms)
+            yield _found("truth", facts, over, float(off.min()), float(off.max()), run, events.t[rows])
+
+
+def left_ranges(judged: JudgedRows) -> Iterator[FoundEpisode]:
+    """Yield shown states and inputs outside the range in which the model was fitted."""
+    events, model, track = judged.events, judged.model, judged.track
+    t = events.t
+    if not np.any(track.flags & OUTSIDE):
+        return
+    for column, state in enumerate(model.shown_states):
+        yield from _outside(state, track.mean[:, column], t)
+    rows = np.flatnonzero(events.kind == INPUT)
+    for j, item in enumerate(model.inputs):
+        value = events.value[rows, j]
+        known = np.isfinite(value)
+        yield from _outside(item, value[known], t[rows[known]])
+
+
+def _outside(item: State | Input, value: np.ndarray, t: np.ndarray) -> Iterator[FoundEpisode]:
+    if item.fitted is None:
+        return
+    low, high = item.fitted
+    for run in runs((value < low) | (value > high), JOINED):
+        own = value[run.begin : run.end]
+        smallest, largest = float(np.nanmin(own)), float(np.nanmax(own))
+        size = largest if largest > high else smallest
+        facts = TwinFacts(item.name, "outside", run.start(t), size, item.unit, limits=f"{low:g} to {high:g}")
+        yield _found("range", facts, run.over(t), smallest, largest, run, t)
+
+
+def impoverished_particles(judged: JudgedRows) -> Iterator[FoundEpisode]:
+    """Yield the times in which few particles carry the estimate."""
+    t, track = judged.events.t, judged.track
+    for run in runs(track.flags & IMPOVERISHED != 0):
+        rows = slice(run.begin, run.end)
+        effective = track.effective[rows]
+        effective = effective[np.isfinite(effective)]
+        if not effective.size:
+            continue
+        low, high = (float(np.quantile(effective, share)) for share in (0.025, 0.975))
+        size = float(np.median(effective))
+        ancestors = float(np.nanmin(track.ancestors[rows]))
+        words = "one particle" if ancestors < 2.0 else f"{ancestors:.0f} particles"
+        facts = TwinFacts("twin", "impoverished", run.start(t), size, ancestors=words)
+        yield _found("particles", facts, run.over(t), low, high, run, t)
+
+
+def contradicting_sensors(judged: JudgedRows, end: int) -> tuple[str, ...]:
+    """Return the used sensors whose last measurement before row `end` was rejected, shifted or repeated."""
+    channel, track = judged.events.channel, judged.track
+    off = []
+    for s, sensor in enumerate(judged.model.sensors):
+        rows = np.flatnonzero((judged.events.kind[:end] == READING) & (channel[:end] == s))
+        if not rows.size or not judged.tuning.used[s]:
+            continue
+        last = rows[-1]
+        alarms = int(np.bitwise_or.reduce(track.alarms[last, : len(sensor.rows)]))
+        if track.verdict[last] in (GATED, SCREENED) or alarms & CONTRADICTING:
+            off.append(sensor.name)
+    return tuple(off)
+
+
+def lost_estimates(judged: JudgedRows) -> Iterator[FoundEpisode]:
+    """Yield the times in which the twin is stale or has diverged."""
+    for code in (STALE, DIVERGED):
+        for run in runs(judged.track.health == code):
+            yield _lost(judged, code, run)
+
+
+def _lost(judged: JudgedRows, code: int, run: AlarmRun) -> FoundEpisode:
+    t, cause = judged.events.t, HEALTH_NAMES[code]
+    start = run.start(t) - (float(judged.track.age[run.begin]) if code == STALE else 0.0)
+    size = (t[run.end - 1] - t[run.begin]) * 1e-9
+    off = contradicting_sensors(judged, run.end) if code == DIVERGED else ()
+    facts = TwinFacts("twin", cause, start, size, off=off, sensors=len(judged.model.sensors))
+    found = _found("twin", facts, run.over(t), np.nan, np.nan, run, t)
+    return found._replace(key=("twin", cause))

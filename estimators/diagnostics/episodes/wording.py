@@ -1,0 +1,212 @@
+"""Facts of an episode, by which the wording and the remedy in the table of detectors are formatted."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from ...compiled.model import compile_model
+from ...model.indicator import indicator
+from ...model.state_space import StateSpaceModel
+
+CORRELATED_FROM = 0.15
+"""Lag-1 correlation of the innovations from which Q explains their scale, not R."""
+
+CALENDAR_FROM_S = 1e8
+"""Seconds from which a time is one of the calendar (after 1973), not one since the start of a recording."""
+
+MAX_STATES = 64
+"""States up to which the states that a sensor observes are listed."""
+
+
+def since(seconds: float) -> str:
+    """Return "since ..." with a time of day, or with seconds of the log."""
+    if seconds < CALENDAR_FROM_S:
+        return f"since {seconds:.1f} s"
+    of_day = int(seconds) % 86400
+    return f"since {of_day // 3600:02}:{of_day // 60 % 60:02}:{of_day % 60:02} UTC"
+
+
+def spaced(unit: str) -> str:
+    """Return a unit as it follows a number; nothing for dimensionless quantities."""
+    return f" {unit}" if unit and unit != "1" else ""
+
+
+def observed_states(model: StateSpaceModel) -> np.ndarray:
+    """Return which states each sensor's measurement depends on at the prior, (sensors, nx) of bool."""
+    compiled = compile_model(indicator(model))
+    x0, u = model.prior_mean.copy(), np.array([item.default for item in model.inputs], float)
+    p = np.array([item.value for item in model.parameters], float)
+    observed = np.zeros((len(model.sensors), model.nx), bool)
+    for s, sensor in enumerate(model.sensors):
+        y, moved = np.empty(len(sensor.rows)), np.empty(len(sensor.rows))
+        compiled.h[s](x0, u, p, y)
+        for j in range(model.nx):
+            x = x0.copy()
+            x[j] += 0.1 * model.prior_std[j] or 1e-3
+            compiled.h[s](x, u, p, moved)
+            observed[s, j] = bool(np.any(moved != y))
+    return observed
+
+
+class SensorFacts(NamedTuple):
+    """Facts of an episode of sensor s, or of its row k.
+
+    size: see `Detector.effect`. about: mean of the innovations, in the row's unit; correlation: their lag-1
+    correlation. reasons: limits that the measurements violate. lasted: duration of a dropout that is over, s.
+    """
+
+    model: StateSpaceModel
+    s: int
+    k: int | None
+    cause: str
+    start: float
+    size: float = np.nan
+    about: float = np.nan
+    correlation: float = 0.0
+    reasons: str = ""
+    lasted: float | None = None
+
+    @property
+    def sensor(self) -> str:
+        """Name of the sensor."""
+        return self.model.sensors[self.s].name
+
+    @property
+    def name(self) -> str:
+        """Name of the row, or of the sensor."""
+        return self.sensor if self.k is None else self.model.row_names[self.model.row_start[self.s] + self.k]
+
+    @property
+    def spaced_unit(self) -> str:
+        """Unit of the row."""
+        return spaced(self.model.sensors[self.s].rows[self.k or 0].unit)
+
+    @property
+    def since(self) -> str:
+        """Start of the episode."""
+        return since(self.start)
+
+    @property
+    def percent(self) -> float:
+        """Size as a percentage."""
+        return 100.0 * self.size
+
+    @property
+    def offset(self) -> str:
+        """Absolute mean innovation, with its unit."""
+        return f"{abs(self.about):.3g}{self.spaced_unit}"
+
+    @property
+    def sigmas(self) -> float:
+        """Absolute size."""
+        return abs(self.size)
+
+    @property
+    def side(self) -> str:
+        """Side of the prediction."""
+        return "above" if self.about > 0 else "below"
+
+    @property
+    def process_noise(self) -> str:
+        """Tuning keys of the process noises that act on the states which the sensor observes."""
+        model = self.model
+        if model.nx > MAX_STATES or model.black_box:
+            return "Q"
+        observed = set(np.flatnonzero(observed_states(model)[self.s]).tolist())
+        names = [noise.name for noise in model.noises if set(model.acts_on(noise.name)) & observed]
+        return " or ".join(f"Q.{name}" for name in names[:3]) or "Q"
+
+    @property
+    def variance(self) -> str:
+        """Tuning key that explains a wrong scale of the innovations: Q where they are correlated, else R."""
+        correlated = self.correlation if self.size > 1.0 else -self.correlation
+        return self.process_noise if correlated > CORRELATED_FROM else f"R.{self.name}"
+
+    @property
+    def observed_by(self) -> str:
+        """Whether other sensors observe the same states."""
+        model, only = self.model, []
+        if model.nx <= MAX_STATES and not model.black_box:
+            observed = observed_states(model)
+            others = np.delete(observed, self.s, axis=0).any(axis=0)
+            only = [model.state_names[int(j)] for j in np.flatnonzero(observed[self.s] & ~others)]
+        if not only:
+            return "other sensors see the same states"
+        return f"{' and '.join(only[:4])} {'is' if len(only) == 1 else 'are'} measured by nothing else"
+
+    @property
+    def cross_check(self) -> str:
+        """First step to find out whether the sensor or the twin is wrong."""
+        if len(self.model.sensors) == 1:
+            return "look at the sensor, and Reset where that is right"
+        return f"hold {self.sensor} out to see whether the others agree"
+
+    @property
+    def dropout(self) -> str:
+        """Description of a dropout."""
+        if self.lasted is not None:
+            if self.cause == "never heard":
+                return f"was heard for the first time after {self.lasted:.3g} s"
+            return f"was silent for {self.lasted:.3g} s {self.since}"
+        return "was never heard" if self.cause == "never heard" else f"is silent {self.since}"
+
+
+class TwinFacts(NamedTuple):
+    """Facts of an episode of a state, an input or the twin; see `SensorFacts`.
+
+    limits: range in which the model was fitted. ancestors: particles from which all descend. off: sensors that
+    contradict the estimate, of `sensors` in all.
+    """
+
+    name: str
+    cause: str
+    start: float
+    size: float
+    unit: str = ""
+    about: float = np.nan
+    limits: str = ""
+    ancestors: str = ""
+    off: tuple[str, ...] = ()
+    sensors: int = 0
+
+    @property
+    def since(self) -> str:
+        """Start of the episode."""
+        return since(self.start)
+
+    @property
+    def spaced_unit(self) -> str:
+        """Unit of the state or input."""
+        return spaced(self.unit)
+
+    @property
+    def offset(self) -> str:
+        """Error of the estimate, with its unit."""
+        return f"{self.about:.3g}{self.spaced_unit}"
+
+    @property
+    def contradiction(self) -> str:
+        """Sensors that contradict a lost estimate."""
+        if not self.off:
+            return ""
+        names = ", ".join(self.off[:4]) + (", ..." if len(self.off) > 4 else "")
+        return f", and {names} {'contradict' if len(self.off) > 1 else 'contradicts'} it still"
+
+    @property
+    def reset_advice(self) -> str:
+        """What to do before a reset: while a fault lasts, a reset starts from its measurements and believes them."""
+        if not self.off:
+            return "Reset starts again from the prior; then look at which sensor spoke first"
+        if self.sensors == 1:
+            return "look at the sensor, and Reset where that is right"
+        first = "hold them out first, one by one," if len(self.off) > 1 else "hold it out first,"
+        return f"{first} and Reset when the rest agrees"
+
+
+def return_text(cause: str, start: float) -> str:
+    """Return what is added while the alarm of a sensor that has recovered has not cleared."""
+    if cause == "stuck":
+        return f"it moves again {since(start)}"
+    return f"back to normal {since(start)}: the alarm clears after more such measurements"

@@ -1,0 +1,125 @@
+"""A detector is one row of one file: a copy of the package with a row more reports its cause everywhere."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[3]
+
+ROW = '''
+    Detector(
+        "skewed",
+        "innovations of {0.name} are skewed {0.since}",
+        "look for a clipped or rectified signal at {0.sensor}",
+        alarms={"skewed": (Density(lambda e: np.log1p(np.clip(0.25 * (e**3 - 3.0 * e), -0.9, 4.0))),)},
+        severity=3,
+    ),
+)
+"""Order:'''
+
+SCRIPT = """
+import json
+from types import SimpleNamespace
+import numpy as np
+from app.live.episode_log import EpisodeSummary
+from app.present.export.report import episode_topic
+from app.web.twin_json import episodes_json
+from estimators.diagnostics.detector_state import sensor_states
+from estimators.diagnostics.detectors import ALARM_NAMES, detector_of
+from estimators.diagnostics.episodes import EpisodeTracker, episodes, judged_rows
+from estimators.fold import Fold
+from estimators.log import READING, Events, Log
+from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
+from estimators.tuning import Tuning
+
+def f(x, u, p, dt, out):
+    out[0] = x[0]
+
+def h(x, u, p, out):
+    out[0] = x[0]
+
+model = StateSpaceModel(
+    name="level", title="a level", states=(State("level", "m", mean=0.0, std=1.0),), inputs=(),
+    noises=(Noise("level", "m2/s", 1e-8),), sensors=(Sensor("gauge", (Row("gauge", "m", 1.0),), h=h),), f=f,
+    linear=True,
+)
+rng = np.random.default_rng(0)
+z = rng.standard_normal(6000)
+# Skewness 1.5 at mean 0 and variance 1.
+g = rng.gamma(16.0 / 9.0, size=3000)
+z[3000:] = (g - 16.0 / 9.0) / (4.0 / 3.0)
+log = Log.of(model)
+t = (1 + np.arange(z.size)) * 10**9
+one = [Events.one(int(k), int(k), READING, 0, float(y), model.width) for k, y in zip(t, z)]
+log.extend(Events.concat(one, model.width))
+fold = Fold("kf", model, Tuning.of(model), log)
+fold.advance()
+found = episodes(fold)
+judged = judged_rows(fold)
+tracker = EpisodeTracker(model, fold.tuning, fold.marginal, max_rows=1000)
+for begin in range(0, z.size, 170):
+    rows = slice(begin, begin + 170)
+    tracker.feed(judged.events.select(rows), judged.track.select(rows))
+lasting = tuple(entry for entry in tracker.entries if entry.episode.end is None)
+(state,) = sensor_states(model, fold.tuning.used, fold.evidence, 6000.0, fold.policy)
+summary = EpisodeSummary(tuple(found), lasting)
+leading = summary.leading({"gauge": state})
+about = dict(episodes=found, events=judged.events, track=judged.track, tuning=fold.tuning)
+print(json.dumps({
+    "report": [list(row) for row in episode_topic(SimpleNamespace(**about)).rows],
+    "rows": int(np.sum(fold.track.alarms[:, 0] >> ALARM_NAMES.index("skewed") & 1)),
+    "episodes": [item._asdict() for item in found],
+    "live": [item._asdict() for item in tracker.episodes],
+    "state": state, "leading": leading.text, "sensor": summary.of_sensors(["gauge"], [state])["gauge"],
+    "help": detector_of("skewed").anchor, "json": episodes_json(SimpleNamespace(episodes=lambda: found)),
+}))
+"""
+
+
+@pytest.fixture(scope="module")
+def told(tmp_path_factory):
+    root = tmp_path_factory.mktemp("copy")
+    shutil.copytree(ROOT / "estimators", root / "estimators", ignore=shutil.ignore_patterns("__pycache__"))
+    for name in ("app", "config", "sources", "docs"):
+        (root / name).symlink_to(ROOT / name)
+    table = root / "estimators/diagnostics/detectors.py"
+    text = table.read_text()
+    assert text.count(')\n"""Order:') == 1
+    table.write_text(text.replace(')\n"""Order:', ROW.lstrip("\n")))
+    (root / "newcomer.py").write_text(SCRIPT)
+    run = subprocess.run(
+        [sys.executable, "newcomer.py"], cwd=root, capture_output=True, text=True, timeout=600,
+        env={**os.environ, "PYTHONPATH": str(root)},
+    )  # fmt: skip
+    assert run.returncode == 0, run.stderr
+    return json.loads(run.stdout)
+
+
+def test_its_alarm_is_an_episode_of_its_own_with_its_own_numbers(told):
+    (episode,) = [item for item in told["episodes"] if item["cause"] == "skewed"]
+    assert told["rows"] > 1000 and abs(episode["start"] - 3000.0) < 200.0 and episode["end"] is None
+    # Mean log Λ of the row's own test, with its interval.
+    assert episode["unit"] == "nats" and 0.0 < episode["low"] < episode["size"] < episode["high"]
+    assert "skewed since" in episode["text"] and "rectified signal at gauge" in episode["text"]
+
+
+def test_status_names_it_and_a_running_twin_finds_the_same(told):
+    (episode,) = [item for item in told["live"] if item["cause"] == "skewed"]
+    (once,) = [item for item in told["episodes"] if item["cause"] == "skewed"]
+    assert (episode["start"], episode["end"], episode["text"]) == (once["start"], None, once["text"])
+    assert told["state"] == "suspect" and told["leading"] == once["text"] == told["sensor"][1]
+
+
+def test_the_report_has_its_cause_and_remedy(told):
+    (row,) = [row for row in told["report"] if "skewed" in row]
+    assert any("rectified signal" in cell for cell in row)
+
+
+def test_the_page_links_to_its_heading(told):
+    (help_link,) = {item["help"] for item in told["json"] if item["cause"] == "skewed"}
+    assert told["help"] == "skewed" and help_link.endswith("#skewed")
