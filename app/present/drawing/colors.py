@@ -12,8 +12,10 @@ from typing import NamedTuple
 import numpy as np
 
 from estimators.diagnostics.field_pictures import Picture, plane_shape, reduction
+from estimators.log import READING, Events
 from estimators.model.state_space import StateSpaceModel
 from estimators.model.states import Field
+from estimators.track import Track
 
 RGB = tuple[int, int, int]
 
@@ -243,6 +245,27 @@ def positioned(model: StateSpaceModel) -> tuple[np.ndarray, np.ndarray]:
     axes = len(model.grid.shape) if model.grid is not None else 1
     places = np.array([place for place, _ in found], float).reshape(-1, axes)
     return places, np.array([which for _, which in found], int).reshape(-1, 2)
+
+
+def take_innovations(normalised: np.ndarray, which: np.ndarray, events: Events, track: Track) -> bool:
+    """Update the latest innovation of each sensor row, in units of its deviation, and return whether any came.
+
+    Args:
+        normalised: Shape (k,), changed in place.
+        which: (sensor, row) of each, shape (k, 2).
+        events: New events, n of them.
+        track: Their rows.
+    """
+    found = False
+    for k in np.unique(which[:, 0]):
+        mine = np.flatnonzero((events.kind == READING) & (events.channel == k))
+        if mine.size:
+            of = which[:, 0] == k
+            with np.errstate(invalid="ignore", divide="ignore"):
+                ratio = track.innovation[mine[-1]] / track.innovation_std[mine[-1]]
+            normalised[of] = ratio[which[of, 1]]
+            found = True
+    return found
 
 
 def sensor_colors(normalised: np.ndarray) -> np.ndarray:

@@ -16,7 +16,7 @@ from ...present.drawing.colors import EITHER, RGB, Frame, Palette, kinds
 from ...present.drawing.direct_readings import observed
 from .sink import EVENTS, GAP, TIMELINE, band_color, pair_name, row_title, with_unit
 
-LANES = 6
+MAX_SENSOR_LANES = 6
 """Sensors at most whose states are drawn, below the twin's health."""
 
 AT_ONCE = 3
@@ -74,7 +74,7 @@ def blueprint(
         # From a little below zero, whose label would stand on that of the time.
         axis_y=rrb.ScalarAxis(range=(-0.08 * nis_limit(model), nis_limit(model)), zoom_lock=True),
     )
-    told = len(model.sensors) if len(model.sensors) <= LANES else 0
+    told = len(model.sensors) if len(model.sensors) <= MAX_SENSOR_LANES else 0
     health = rrb.StateTimelineView(
         origin=f"{root}/",
         contents=[f"+ {root}/health", *([f"+ {root}/sensor/**"] if told else [])],

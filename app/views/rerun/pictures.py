@@ -22,6 +22,7 @@ from ...present.drawing.colors import (
     kinds,
     positioned,
     sensor_colors,
+    take_innovations,
 )
 from .sink import GAP, Sink, last_of_stretch
 
@@ -97,15 +98,8 @@ class FieldDrawing:
             sink.line(f"/innovation/{sensor.name}", events.t[mask], values, width, by_first=True)
 
     def note(self, events: Events, track: Track) -> None:
-        """Remember the newest innovation of each sensor row, for the dots on the pictures."""
-        for k in range(len(self._model.sensors)):
-            mine = np.flatnonzero((events.kind == READING) & (events.channel == k))
-            if mine.size:
-                last = mine[-1]
-                of = self._which[:, 0] == k
-                with np.errstate(invalid="ignore", divide="ignore"):
-                    ratio = track.innovation[last] / track.innovation_std[last]
-                self._normalised[of] = ratio[self._which[of, 1]]
+        """Keep the latest innovation of each sensor row, for the dots on the pictures."""
+        take_innovations(self._normalised, self._which, events, track)
 
     def pictures(self, sink: Sink, pictures: list[Picture], *, current: bool) -> None:
         """Log pictures; the sensors' colours with the last one, if it is the newest."""

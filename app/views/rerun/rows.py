@@ -1,4 +1,4 @@
-"""Rows of the track as Rerun's entities: for the page's live view and for recordings."""
+"""Rows of the track as Rerun entities, for the page's live view and for recordings."""
 
 from __future__ import annotations
 
@@ -7,31 +7,31 @@ import rerun as rr
 
 from estimators.diagnostics.detector_state import SENSOR_STATES, sensor_states_over_time
 from estimators.diagnostics.field_pictures import Picture
-from estimators.log import READING, Events, truth_of
-from estimators.track import FAILED, GATED, HEALTH_NAMES, Track, estimated_rows
+from estimators.log import READING, Events
+from estimators.track import FAILED, HEALTH_NAMES, Track
 
 from ...live.interface import Running
 from ...live.notices import Notice
 from ...live.outputs import Pull
 from ...present.drawing.colors import EITHER, Palette
 from ...present.drawing.direct_readings import observed
-from .layout import LANES, blueprint, styles
+from ...present.series.columns import Rows, columns_of, rows_of
+from .layout import MAX_SENSOR_LANES, blueprint, styles
 from .pictures import FieldDrawing, PairDrawing
 from .sink import EVENTS, Sink, last_of_each_time, pair_name, send_blueprint, state_colors
 
-PIXELS = 1200
+WINDOW_STRETCHES = 1200
 """Stretches into which the charts' window is cut; each is drawn by its extremes."""
 
-REMEMBERED = 30 * 10**9
-"""Nanoseconds back to which late readings are told from those drawn already."""
+LATE_MEMORY_NS = 30 * 10**9
+"""Age up to which a late measurement is recognised as already drawn."""
 
 
 class RerunRows:
     """Logs pulls of one engine into one stream.
 
-    Rows once logged cannot be taken back. So a revision that follows another in the same stream gets paths of its own
-    (and a blueprint that shows them); and of rows that a late reading rewrote, only what is new is drawn: its dots,
-    while the lines keep showing what was concluded without it.
+    Rerun cannot take back rows. So a revision that follows another in the same stream gets paths and a blueprint of its
+    own. Of rows that a late measurement rewrote, only new dots are drawn; the lines keep the earlier estimate.
     """
 
     def __init__(
@@ -47,11 +47,11 @@ class RerunRows:
 
         Args:
             stream: Where to.
-            engine: Whose rows these will be.
-            series: Stretches of time into which a long history is cut, each drawn by its extremes; those of the
-                charts' window are never cut finer than its `PIXELS`, which is what infinity gives. None draws all.
+            engine: Source of the rows.
+            series: Stretches of time into which a long history is cut, each drawn by its extremes. Those in the charts'
+                window are never cut finer than `WINDOW_STRETCHES`, which infinity gives. None draws every row.
             layout: Whether to log the blueprint.
-            palette: The colours; of a file, whose viewer is not known, those between light and dark.
+            palette: Colours; a file, whose viewer is unknown, has those between light and dark.
         """
         self._palette = palette
         self.model = engine.model
@@ -59,44 +59,35 @@ class RerunRows:
         self.sink = Sink(stream, window=float(engine.twin.config.view.window))
         self._series = series
         self._layout = layout
-        self._dots = observed(self.model)
-        self._tells_field = bool(self.model.grid is not None and engine.twin.tells_field)
+        self._columns = columns_of(self.model)
+        names = {(sensor, row): name for name, sensor, row in rows_of(self.model)}
+        self._dots = [names[item.sensor, item.row] for item in observed(self.model)]
+        self._has_field_truth = bool(self.model.grid is not None and engine.twin.tells_field)
         self._revisions = 0
-        self._lines: list[Notice] = []
+        self._waiting: list[Notice] = []
         self._begin("")
 
     def _begin(self, root: str) -> None:
+        """Start another revision below its own root."""
         self.sink.root = root
         self._next = 0
         self._newest: int | None = None
         self._oldest: int | None = None
-        self._health = -1
         self._drawn = np.zeros(0, np.int64)
         self._drawn_t = np.zeros(0, np.int64)
         styles(self.sink.stream, self.model, self.pairs, root, self._palette)
-        self.sink.static(
-            "/health",
-            rr.StateConfiguration(
-                values=list(HEALTH_NAMES), labels=list(HEALTH_NAMES), colors=state_colors(HEALTH_NAMES, self._palette)
-            ),
-        )
-        self._sensors = list(self.model.sensor_names) if len(self.model.sensors) <= LANES else []
-        self._states_of = dict.fromkeys(self._sensors, -1)
-        for name in self._sensors:
-            self.sink.static(
-                f"/sensor/{name}",
-                rr.StateConfiguration(
-                    values=list(SENSOR_STATES),
-                    labels=list(SENSOR_STATES),
-                    colors=state_colors(SENSOR_STATES, self._palette),
-                ),
-            )
+        sensors = self.model.sensor_names if len(self.model.sensors) <= MAX_SENSOR_LANES else ()
+        self._states = {"/health": -1} | {f"/sensor/{name}": -1 for name in sensors}
+        for path in self._states:
+            words = list(HEALTH_NAMES if path == "/health" else SENSOR_STATES)
+            colors = state_colors(words, self._palette)
+            self.sink.static(path, rr.StateConfiguration(values=words, labels=words, colors=colors))
         if self._layout:
-            layout = blueprint(self.model, self.pairs, window=self.sink.window, root=root, truth=self._tells_field)
+            layout = blueprint(self.model, self.pairs, window=self.sink.window, root=root, truth=self._has_field_truth)
             send_blueprint(self.sink.stream, layout)
         self._field: FieldDrawing | None = None
         if self.model.grid is not None:
-            self._field = FieldDrawing(self.model, truth=self._tells_field, theme=self._palette)
+            self._field = FieldDrawing(self.model, truth=self._has_field_truth, theme=self._palette)
             self._field.static(self.sink)
         self._ellipses = [
             PairDrawing(self.model, k, pair, f"/pair/{pair_name(self.model, pair)}/up", self._palette)
@@ -111,27 +102,26 @@ class RerunRows:
                 self._begin(f"/revision_{pull.revision}")
         t = pull.events.t
         if t.size:
-            newest = self._newest
-            rewritten = newest is not None and pull.first < self._next
-            after = t > newest if rewritten else np.ones(t.size, bool)
-            fresh = self._not_drawn(pull.events) if rewritten else after
+            after = new = np.ones(t.size, bool)
+            if self._newest is not None and pull.first < self._next:
+                after, new = t > self._newest, ~np.isin(_keys(pull.events), self._drawn)
             self._next = pull.first + t.size
-            self.rows(pull.events, pull.track, lines=after, dots=fresh)
+            self.rows(pull.events, pull.track, lines=after, dots=new)
         self.pictures(pull.pictures)
         self.notices(pull.notices)
 
     def begin(self, pull: Pull) -> None:
-        """Take note of a whole revision whose rows will be logged in pieces, by `rows`."""
+        """Prepare for a whole revision, whose rows are logged in pieces by `rows`."""
         self._revisions += 1
         self._next = pull.first + len(pull.events)
         self._oldest = int(pull.events.t[0])
         self.sink.started(self._oldest)
 
     def width(self, t: np.ndarray) -> int:
-        """Nanoseconds of the stretches into which rows at times `t` are cut for drawing."""
+        """Return the length (ns) of the stretches into which rows at times `t` are cut for drawing."""
         if self._series is None or not t.size:
             return 0
-        return int(max(self.sink.window * 1e9 / PIXELS, (int(t[-1]) - int(t[0])) / self._series))
+        return int(max(self.sink.window * 1e9 / WINDOW_STRETCHES, (int(t[-1]) - int(t[0])) / self._series))
 
     def rows(
         self,
@@ -147,30 +137,27 @@ class RerunRows:
         Args:
             events: The events.
             track: Their rows.
-            lines: Mask of the rows to draw as lines; None for all.
-            dots: Mask of the rows to draw as dots.
-            past: These rows came before rows that are drawn already.
+            lines: Mask of the rows that lines are drawn of; None for all.
+            dots: Mask of the rows that dots are drawn of; None for all.
+            past: Whether these rows precede rows that are already drawn.
         """
         t = events.t
         self.sink.started(int(t[0]))
         self._oldest = int(t[0]) if self._oldest is None else min(int(t[0]), self._oldest)
         self._newest = int(t[-1]) if self._newest is None else max(int(t[-1]), self._newest)
-        every = np.ones(t.size, bool)
-        lines = every if lines is None else lines
-        dots = every if dots is None else dots
         width = self.width(t)
-        if lines.any():
-            line_track, line_t = track.select(lines), t[lines]
-            self._states(line_t, line_track, width)
-            self._window_nis(line_t, line_track, width)
-            self._health_changes(line_t, line_track, past)
-            self._sensor_changes(events.select(lines), line_track, past)
+        if lines is None or lines.any():
+            drawn, part = (events, track) if lines is None else (events.select(lines), track.select(lines))
+            self._draw_lines(drawn.t, part, width, drawn)
+            self._draw_states(drawn, part, past)
             for ellipse in self._ellipses:
-                ellipse.draw(self.sink, line_t, line_track, events.select(lines), past)
-        if dots.any():
-            drawn = events.select(dots)
-            self._readings(drawn, track.select(dots), width)
-            self._remember(drawn)
+                ellipse.draw(self.sink, drawn.t, part, drawn, past)
+        if dots is None or dots.any():
+            drawn, part = (events, track) if dots is None else (events.select(dots), track.select(dots))
+            self._draw_dots(drawn, part, width)
+            times = np.concatenate((self._drawn_t, drawn.t))
+            recent = times >= self._newest - LATE_MEMORY_NS
+            self._drawn, self._drawn_t = np.concatenate((self._drawn, _keys(drawn)))[recent], times[recent]
 
     def pictures(self, pictures: list[Picture], *, past: bool = False) -> None:
         """Log the pictures of a large field; `past` as in `rows`."""
@@ -178,25 +165,23 @@ class RerunRows:
             self._field.pictures(self.sink, pictures, current=not past)
 
     def previous(self, t: np.ndarray, track: Track) -> None:
-        """Log another revision's rows as the thin grey lines behind this one's."""
-        rows = last_of_each_time(t)
-        width = self.width(t)
-        known = estimated_rows(track)[rows]
-        for j, name in enumerate(state.name for state in self.model.shown_states):
-            mean = np.where(known, track.mean[rows, j], np.nan)
-            self.sink.line(f"/previous/state/{name}", t[rows], mean[:, None], width, gaps=True)
-        self.sink.line("/previous/nis", t[rows], track.nis_mean[rows, None], width, gaps=True)
+        """Log the rows of another revision as thin grey lines."""
+        self._draw_lines(t, track, self.width(t), above="/previous", kinds=("mean",), nis="/previous/nis")
+
+    def smoothed(self, t: np.ndarray, track: Track) -> None:
+        """Log the states of a smoothed track, a line and a band beside the filter's."""
+        self._draw_lines(t, track, self.width(t), above="/smoothed", nis="")
 
     def notices(self, notices: list[Notice]) -> None:
-        """Log lines for people, once the rows have come to their time: a viewer that follows goes to the last of all.
+        """Log notices once the rows have reached their time: a viewer that follows shows the newest time of all.
 
-        They are under one path in all revisions, so that the table of a recording has them all.
+        They have one path in all revisions, so that the table of a recording lists all of them.
         """
-        self._lines += notices
+        self._waiting += notices
         if self._newest is None or self._oldest is None:
             return
-        due = [line for line in self._lines if line.t <= self._newest]
-        self._lines = [line for line in self._lines if line.t > self._newest]
+        due = [line for line in self._waiting if line.t <= self._newest]
+        self._waiting = [line for line in self._waiting if line.t > self._newest]
         if not due:
             return
         times = np.maximum([line.t for line in due], self._oldest)
@@ -206,83 +191,72 @@ class RerunRows:
             columns=rr.TextLog.columns(text=[line.text for line in due], level=[line.level.upper() for line in due]),
         )
 
-    def smoothed(self, t: np.ndarray, track: Track) -> None:
-        """Log a smoothed track's states, a line and a band of their own beside the filter's."""
-        self._states(t, track, self.width(t), "/smoothed")
+    def _values(self, rows: Rows, names: list[str]) -> np.ndarray:
+        """Return columns of the charts, (n, names)."""
+        return np.stack([self._columns[name].of(rows) for name in names], axis=1)
 
-    def _states(self, t: np.ndarray, track: Track, width: int, above: str = "") -> None:
-        rows = last_of_each_time(t)
-        known = estimated_rows(track)[rows]
-        for j, name in enumerate(state.name for state in self.model.shown_states):
-            # A probability has no band.
-            mean, twice = track.mean[rows, j], 2.0 * track.std[rows, j] * (j != self.model.mode)
-            band = np.where(known[:, None], np.stack((mean, mean + twice, mean - twice), axis=1), np.nan)
-            self.sink.line(f"{above}/state/{name}", t[rows], band, width, gaps=True)
+    def _draw_lines(
+        self,
+        t: np.ndarray,
+        track: Track,
+        width: int,
+        events: Events | None = None,
+        *,
+        above: str = "",
+        kinds: tuple[str, ...] = ("mean", "upper", "lower"),
+        nis: str = "/nis/window",
+    ) -> None:
+        """Log the states with their bands, and the windowed NIS with its bounds, of the last row of each time."""
+        last = last_of_each_time(t)
+        rows = Rows(Events.empty(self.model.width) if events is None else events.select(last), track.select(last))
+        for state in self.model.shown_states:
+            values = self._values(rows, [f"{kind}:{state.name}" for kind in kinds])
+            self.sink.line(f"{above}/state/{state.name}", t[last], values, width, gaps=True)
+        if nis:
+            columns = ["nis_mean", "nis_low", "nis_high"][: len(kinds)]
+            self.sink.line(nis, t[last], self._values(rows, columns), width, by_first=True, gaps=True)
 
-    def _window_nis(self, t: np.ndarray, track: Track, width: int) -> None:
-        rows = last_of_each_time(t)
-        columns = (track.nis_mean[rows], track.nis_low[rows], track.nis_high[rows])
-        self.sink.line("/nis/window", t[rows], np.stack(columns, axis=1), width, by_first=True, gaps=True)
-
-    def _health_changes(self, t: np.ndarray, track: Track, past: bool) -> None:
-        health = track.health
-        before = -1 if past else self._health
-        changes = np.flatnonzero(np.append(before, health[:-1]) != health)
-        if not past:
-            self._health = int(health[-1])
-        if changes.size:
-            names = [HEALTH_NAMES[health[k]] for k in changes]
-            self.sink.columns("/health", t[changes], rr.StateChange.columns(state=names))
-
-    def _sensor_changes(self, events: Events, track: Track, past: bool) -> None:
-        for s, name in enumerate(self._sensors):
-            rows, states = sensor_states_over_time(events, track, s)
+    def _draw_states(self, events: Events, track: Track, past: bool) -> None:
+        """Log the changes of the health, and of each sensor's state."""
+        for path, before in self._states.items():
+            if path == "/health":
+                rows, states, words = np.arange(len(events)), track.health, HEALTH_NAMES
+            else:
+                sensor = self.model.sensor_names.index(path.removeprefix("/sensor/"))
+                (rows, states), words = sensor_states_over_time(events, track, sensor), SENSOR_STATES
             if not rows.size:
                 continue
-            changes = np.flatnonzero(np.append(-1 if past else self._states_of[name], states[:-1]) != states)
+            changes = np.flatnonzero(np.append(-1 if past else before, states[:-1]) != states)
             if not past:
-                self._states_of[name] = int(states[-1])
+                self._states[path] = int(states[-1])
             if changes.size:
-                words = [SENSOR_STATES[states[k]] for k in changes]
-                self.sink.columns(f"/sensor/{name}", events.t[rows[changes]], rr.StateChange.columns(state=words))
+                named = [words[states[k]] for k in changes]
+                self.sink.columns(path, events.t[rows[changes]], rr.StateChange.columns(state=named))
 
-    def _readings(self, events: Events, track: Track, width: int) -> None:
-        channel, t = events.channel, events.t
-        is_reading = events.kind == READING
-        for j, state in zip(self.model.shown.tolist(), self.model.shown_states, strict=True):
-            rows, values = truth_of(events, j)
-            self.sink.line(f"/truth/{state.name}", t[rows], values[:, None], width)
-        for item in self._dots:
-            name = self.model.row_names[self.model.row_start[item.sensor] + item.row]
-            of_sensor = is_reading & (channel == item.sensor)
-            gated, screened = track.verdict == GATED, track.screened[:, item.row] != 0
-            for path, mask in (("reading", ~gated & ~screened), ("refused", gated & ~screened), ("screened", screened)):
-                rows = of_sensor & mask
-                self.sink.line(f"/{path}/{name}", t[rows], events.value[rows, item.row, None], width)
+    def _draw_dots(self, events: Events, track: Track, width: int) -> None:
+        """Log truth, measurements, innovations with their expected band, and the NIS of each measurement."""
+        t, rows = events.t, Rows(events, track)
+        for state in self.model.shown_states:
+            self.sink.line(f"/truth/{state.name}", t, self._values(rows, [f"truth:{state.name}"]), width)
+        for name in self._dots:
+            used, held = (self._columns[f"{kind}:{name}"].of(rows) for kind in ("reading", "held"))
+            self.sink.line(f"/reading/{name}", t, np.where(np.isfinite(used), used, held)[:, None], width)
+            for kind in ("refused", "screened"):
+                self.sink.line(f"/{kind}/{name}", t, self._values(rows, [f"{kind}:{name}"]), width)
         if self._field is not None:
             self._field.readings(self.sink, events, track, width)
             self._field.note(events, track)
-        for k, sensor in enumerate(() if self._field is not None else self.model.sensors):
-            mask = is_reading & (channel == k)
-            if not mask.any():
-                continue
-            for r in range(len(sensor.rows)):
-                nu, twice = track.innovation[mask, r], 2.0 * track.innovation_std[mask, r]
-                path = f"/innovation/{self.model.row_names[self.model.row_start[k] + r]}"
-                failed = track.verdict[mask] == FAILED
-                self.sink.line(path, t[mask], np.stack((nu, twice, -twice), axis=1), width, by_first=True, gaps=failed)
-        self.sink.line("/nis/reading", t[is_reading], track.nis[is_reading, None], width)
+        else:
+            for name, sensor, _ in rows_of(self.model):
+                mine = rows.of_sensor(sensor)
+                if mine.any():
+                    columns = [f"{kind}:{name}" for kind in ("innovation", "innovation_upper", "innovation_lower")]
+                    values, failed = self._values(rows, columns)[mine], track.verdict[mine] == FAILED
+                    self.sink.line(f"/innovation/{name}", t[mine], values, width, by_first=True, gaps=failed)
+        measured = events.kind == READING
+        self.sink.line("/nis/reading", t[measured], track.nis[measured, None], width)
 
-    def _keys(self, events: Events) -> np.ndarray:
-        # One number an event; that int64 wraps around does not matter.
-        return events.t * 4096 + events.channel * 8 + events.kind
 
-    def _remember(self, events: Events) -> None:
-        assert self._newest is not None
-        t = np.concatenate((self._drawn_t, events.t))
-        recent = t >= self._newest - REMEMBERED
-        self._drawn = np.concatenate((self._drawn, self._keys(events)))[recent]
-        self._drawn_t = t[recent]
-
-    def _not_drawn(self, events: Events) -> np.ndarray:
-        return ~np.isin(self._keys(events), self._drawn)
+def _keys(events: Events) -> np.ndarray:
+    """Return one number per event, which identifies it; int64 may wrap around."""
+    return events.t * 4096 + events.channel * 8 + events.kind

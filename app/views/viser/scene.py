@@ -173,20 +173,25 @@ SAME = 0.02
 
 
 class Outlook(NamedTuple):
-    """What a camera is to see.
+    """Points that a camera should see, and where it looks from.
 
-    points: What must be in the view, about the origin, shape (n, 3).
+    points: About the origin, shape (n, 3).
     direction: From the origin to the camera, shape (3,).
-    up: What is up on the screen, shape (3,), not along the direction.
+    up: Direction that is up on the screen, shape (3,), not parallel to `direction`.
     fov: Angle from top to bottom, radians.
-    turns: Whether the scene may be seen from its other side, a right angle about z to the right.
+    turns: Whether the scene may be turned by a right angle to the right about z, to fill a narrow pane better.
     """
 
     points: np.ndarray
     direction: np.ndarray
-    up: np.ndarray
-    fov: float
+    up: np.ndarray = np.array([0.0, 0.0, 1.0])
+    fov: float = float(np.radians(20))
     turns: bool = False
+
+    @staticmethod
+    def from_above(points: np.ndarray) -> Outlook:
+        """Return the view of a plane from far above, as on paper, with y up on the screen."""
+        return Outlook(points, np.array([0.0, -0.001, 1.0]), np.array([0.0, 1.0, 0.0]), float(np.radians(9.2)))
 
 
 def place(outlook: Outlook, aspect: float) -> tuple[np.ndarray, np.ndarray]:
