@@ -86,7 +86,11 @@ class VerifiedCacheFile(caching.IndexDataCacheFile):  # type: ignore[misc]
         content = self._read(self._data_path(name))
         if content is None:
             raise FileNotFoundError(name)
-        return caching.pickle.loads(content)
+        try:
+            return caching.pickle.loads(content)
+        except ModuleNotFoundError as error:
+            # The same file was compiled under another module name, as `runpy` and `exec` do: compile it again.
+            raise FileNotFoundError(name) from error
 
     def _save_data(self, name: str, data: Any) -> None:
         self._write(self._data_path(name), self._dump(data))

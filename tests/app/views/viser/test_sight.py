@@ -7,7 +7,7 @@ import pytest
 import viser
 
 from app.present.drawing.colors import LIGHT
-from app.views.viser.field_scenes import TALL, FieldSurfaceScene
+from app.views.viser.field_scenes import SURFACE_HEIGHT, FieldSurfaceScene
 from app.views.viser.machine_scenes import FINGER, PAD, PART, GripperScene
 from app.views.viser.scene import History
 from app.views.viser.vehicle_parts import FADING, RECENT, Beacons, Beams
@@ -193,10 +193,10 @@ def test_a_surface_is_as_high_as_the_field_and_as_doubtful(server):
     # Height is proportional to the value: 10 °C take the share of the scale that they are.
     slope, offset = np.polyfit(corners[:, 0], corners[:, 2], 1)
     np.testing.assert_allclose(corners[:, 2], slope * corners[:, 0] + offset, atol=1e-5)
-    assert 0.5 * TALL < np.ptp(corners[:, 2]) <= TALL
+    assert 0.5 * SURFACE_HEIGHT < np.ptp(corners[:, 2]) <= SURFACE_HEIGHT
     # Upright lines: 4 std long, in the same unit of height.
     per_degree = np.ptp(corners[:, 2]) / np.ptp(mean[0, scene._columns])
-    lines = np.asarray(scene._doubts.points)
+    lines = np.asarray(scene._bars.points)
     lengths = lines[:, 1, 2] - lines[:, 0, 2]
     north = lines[:, 0, 1] > 0.1
     np.testing.assert_allclose(lengths[north], 4 * 0.5 * per_degree, rtol=1e-3)
