@@ -15,9 +15,8 @@ from pydantic_core import PydanticCustomError
 from estimators.errors import ConfigError
 
 from .fields import NotNegative, Number, Positive, Positives, Section, Text, Texts, as_list
-from .files import read_text, shown_path
 from .problems import report, shown
-from .yaml_lines import Places, parse
+from .yaml_files import Places, parse, read_text, shown_path
 
 Table = Annotated[tuple[Annotated[tuple[Number, ...], Field(min_length=1)], ...], Field(min_length=2)]
 

@@ -13,11 +13,10 @@ from pydantic import ValidationError
 
 from estimators.errors import ConfigError, nearest
 
-from .files import read_text, shown_path
 from .problems import report, shown
 from .schema import TwinSection
 from .tunings import Version, find_version, keep_options, overlay
-from .yaml_lines import Key, Places, dotted, parse
+from .yaml_files import Key, Places, dotted, parse, read_text, shown_path
 
 TWINS = Path(str(resources.files("config"))) / "twins"
 """Folder of the twins that ship."""

@@ -11,7 +11,7 @@ from pydantic_core import ErrorDetails
 from estimators.errors import ConfigError, nearest
 
 from .source_schema import PartSection, SourceSection
-from .yaml_lines import Key, Places, dotted
+from .yaml_files import Key, Places, dotted
 
 MOST = 5
 """Problems shown at once."""

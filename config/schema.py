@@ -5,12 +5,12 @@ The docstring under each field is its documentation in the JSON Schema that `nis
 
 from __future__ import annotations
 
+import json
 from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, model_validator
 from pydantic_core import PydanticCustomError
 
-from .fault_schema import FaultSection
 from .fields import (
     LONGEST,
     Count,
@@ -32,7 +32,7 @@ from .fields import (
     Time,
 )
 from .limits_schema import DuplicatesSection, Ranges, StuckSection, Validity
-from .source_schema import SourceSection
+from .source_schema import FaultSection, SourceSection
 
 GateProbability = Annotated[float, Field(strict=True, ge=0.5, lt=1)]
 
@@ -326,3 +326,19 @@ class TwinSection(Section):
     act in their order, after those of a simulator. Default: none."""
     view: ViewSection = ViewSection()
     """What the page draws."""
+
+
+def json_schema() -> dict[str, Any]:
+    """The schema, with a description of every key."""
+    schema = TwinSection.model_json_schema(mode="validation")
+    return {
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        **schema,
+        "title": "Nisus twin",
+        "description": "A twin: a model of an asset, the source of its readings, and the estimator that joins them.",
+    }
+
+
+def json_schema_text() -> str:
+    """The schema as the text of a file."""
+    return json.dumps(json_schema(), indent=2, ensure_ascii=False) + "\n"

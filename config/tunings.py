@@ -14,10 +14,9 @@ from pydantic import ValidationError
 
 from estimators.errors import ConfigError, nearest
 
-from .files import read_text, shown_path
 from .problems import report, shown
 from .tuning_schema import TuningSection, VersionSection
-from .yaml_lines import Key, Places, parse
+from .yaml_files import Key, Places, parse, read_text, shown_path
 
 OWN = "own"
 """The name under which what the twin's file itself says is listed."""

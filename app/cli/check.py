@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from typing import TYPE_CHECKING
 
-from config.files import writing
+from config.yaml_files import writing
 
 from ..present.result import to_html, to_text
 from ..twin.log_reader import read_log

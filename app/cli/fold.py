@@ -7,7 +7,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from config.files import writing
+from config.yaml_files import writing
 from estimators.diagnostics.episodes import episodes
 from estimators.diagnostics.score import score
 from estimators.errors import ConfigError

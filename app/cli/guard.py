@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from typing import TYPE_CHECKING
 
-from config.files import writing
+from config.yaml_files import writing
 from estimators.errors import ConfigError, printable
 
 from ..present.result import to_text

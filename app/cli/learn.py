@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from config.files import shown_path, writing
+from config.yaml_files import shown_path, writing
 from estimators.errors import ConfigError
 from estimators.fit.entries import Setting
 from estimators.fit.judge import Part, worths

@@ -61,7 +61,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         _drop_output()  # its reader has ended (`| head`)
         return 0
     except OSError as error:
-        # Files that a command writes are named by `config.files.writing`.
+        # Files that a command writes are named by `config.yaml_files.writing`.
         name = error.filename or ("standard output" if error.errno in FULL else "")
         complain(f"{name}: {error.strerror or error}".removeprefix(": "))
         _drop_output()

@@ -6,8 +6,8 @@ import re
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from config.files import writing
 from config.loader import shipped
+from config.yaml_files import writing
 from estimators.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -128,7 +128,7 @@ def outflow(x, u, p, out):
 
 def write_schema(arguments: Schema) -> int:
     """Write the JSON Schema of a twin's YAML."""
-    from config.json_schema import json_schema_text
+    from config.schema import json_schema_text
 
     text = json_schema_text()
     if arguments.out is None:

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 from pydantic_core import PydanticCustomError
 
 from config.fields import as_seconds
-from config.files import shown_path, writing
 from config.loader import find
+from config.yaml_files import shown_path, writing
 from estimators.errors import ConfigError, printable
 from estimators.fit.aims import CRPS, ERROR, LIKELIHOOD
 from estimators.fit.dual import WindowFit, walk
@@ -25,7 +25,7 @@ from ..live.tunings.versions import check_free, keep, version_text
 from ..present.result import to_text
 from ..studies.tune import heading, sections, window_json, window_topics, windows_verdict
 from ..terminal import complain
-from ..twin.bounds import bounds_of, natural_aim
+from ..twin.defaults import bounds_of, natural_aim
 from ..twin.log_reader import read_log, read_logs
 from ..twin.twin import Twin, load_twin
 from .options import check_output, settings

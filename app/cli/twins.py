@@ -5,8 +5,8 @@ from __future__ import annotations
 from itertools import takewhile
 from typing import TYPE_CHECKING
 
-from config.files import writing
 from config.loader import Loaded, find, load, shipped, shown_path
+from config.yaml_files import writing
 
 from ..studies.scores import printed, read_scores
 

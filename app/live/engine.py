@@ -22,7 +22,7 @@ from estimators.log import TICK, Events
 from estimators.snapshots import SPARSE_EVERY, Base
 
 from ..concurrency import run_all
-from ..intake import Intake
+from ..ingest import Intake
 from ..terminal import complain
 from . import commands
 from .changes import merged

@@ -16,7 +16,7 @@ from estimators.model.state_space import StateSpaceModel
 from estimators.registry import checked, find_estimator
 from sources.source import Paced, Source, span_of
 
-from ..intake import maintenance_text
+from ..ingest import maintenance_text
 from . import commands
 from .faults import carry_out
 from .interface import Running

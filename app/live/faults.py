@@ -8,8 +8,7 @@ from typing import Any, Protocol, runtime_checkable
 
 from estimators.errors import LARGEST, ConfigError, SourceError, nearest, quoted
 from estimators.model.state_space import StateSpaceModel
-from sources.faults.fault import Fault
-from sources.faults.kinds import KINDS, OLDER, find_kind, numbers, problem
+from sources.faults.kinds import KINDS, OLDER, Fault, find_kind, numbers, problem
 from sources.faults.layer import Faults, FaultStatus
 from sources.source import Source
 

@@ -33,11 +33,9 @@ import numpy as np
 from pydantic import ValidationError
 from scipy.stats import t as student
 
-from config.files import read_text, shown_path, writing
-from config.guard_schema import FigureSection, ReferenceSection
 from config.problems import report, shown
-from config.yaml_lines import parse
-from config.yaml_text import as_flow
+from config.tuning_schema import FigureSection, ReferenceSection
+from config.yaml_files import as_flow, parse, read_text, shown_path, writing
 from estimators.diagnostics.field_pictures import Picture
 from estimators.diagnostics.health import PROBABILITY
 from estimators.diagnostics.score import score

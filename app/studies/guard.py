@@ -15,12 +15,11 @@ from typing import Any
 import numba
 import numpy as np
 
-from config.files import shown_path
-from config.guard_schema import FigureSection, ReferenceSection
 from config.loader import find, shipped
 from config.source_schema import SimulatorSection
-from config.tuning_schema import AcceptedSection
+from config.tuning_schema import AcceptedSection, FigureSection, ReferenceSection
 from config.tunings import OWN, Version, accepted_version, folders, named, ships
+from config.yaml_files import shown_path
 from estimators.errors import ConfigError, NisusError, SourceError, printable
 from estimators.fold import Fold
 from estimators.log import Log

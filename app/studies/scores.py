@@ -11,8 +11,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from config.files import writing
 from config.loader import TWINS
+from config.yaml_files import writing
 
 GAP = "  "
 """Between printed columns; no cell holds two spaces."""

@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from math import inf
 from typing import TYPE_CHECKING, Any
 
 from config.loader import Loaded
-from config.source_schema import ChannelSection, RangeSection, SignalSection
-from config.yaml_lines import Key
+from config.source_schema import ChannelSection, FaultSection, RangeSection, SignalSection
+from config.yaml_files import Key
 from estimators.log import INPUT, READING, TRUTH
 from estimators.model.state_space import Field, StateSpaceModel
 
-from .names import check_names
+from .checks import check_names
 
 if TYPE_CHECKING:
+    from sources.faults.kinds import Fault
     from sources.source import Channel, Condition
 
 
@@ -102,3 +103,23 @@ def _conditions(given: Mapping[str, RangeSection]) -> tuple[Condition, ...]:
 def _spread(values: tuple, count: int) -> tuple:
     """A value for each row, from one for all or one each (the schema has checked the number)."""
     return values * count if len(values) == 1 else values
+
+
+def read_faults(loaded: Loaded, sections: Sequence[FaultSection], key: Key, model: StateSpaceModel) -> list[Fault]:
+    """The faults of a list.
+
+    Raises:
+        ConfigError: With file and line, if one does not fit the model.
+    """
+    from sources.faults.kinds import Fault, problem
+
+    found = []
+    for k, section in enumerate(sections):
+        given = section.model_dump()
+        fault = Fault(**{**given, "end": inf if section.end is None else section.end})
+        wrong = problem(fault, model)
+        if wrong:
+            field, text = wrong
+            raise loaded.error((*key, k, field) if field else (*key, k), text)
+        found.append(fault)
+    return found

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from config.files import shown_path
 from config.learned_schema import CorrectionSection, load_correction
 from config.loader import Loaded
+from config.yaml_files import shown_path
 from estimators.errors import ConfigError
 from estimators.model.correction import Correction, GaussianProcess, Net, Ridge
 from estimators.model.hybrid import LearnedCorrection

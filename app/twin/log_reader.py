@@ -16,7 +16,7 @@ from estimators.log import Log
 from sources.source import NEVER, TRUNCATED, WRONG_TIME, Endless
 from sources.tables.order import REMARKS as ORDER
 
-from ..intake import CLOCK_MOVED, Intake
+from ..ingest import CLOCK_MOVED, Intake
 from ..terminal import complain
 from .twin import Twin, load_twin
 

@@ -8,21 +8,20 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from config.loader import Loaded
-from config.source_schema import AssetSection, CanSection
-from config.yaml_lines import Key
+from config.source_schema import AssetSection, CanLogSection, CanSection, RecordingSection
+from config.yaml_files import Key
 from estimators.errors import SourceError
 from estimators.log import READING
 from estimators.model.state_space import StateSpaceModel
 
-from .channels import channels
-from .faults import read_faults
+from .channels import channels, read_faults
 from .sources.can import make_player
-from .sources.kind import Opening
+from .sources.kind import Opening, find_databases, find_recording
 from .sources.registry import SOURCES
 
 if TYPE_CHECKING:
     from sources.can.player import Player
-    from sources.faults.fault import Fault
+    from sources.faults.kinds import Fault
     from sources.faults.layer import Faults
     from sources.source import Report, Source
 
@@ -157,3 +156,17 @@ def _scheduled(loaded: Loaded, model: StateSpaceModel) -> tuple[Fault, ...]:
 
 def _has_asset(section: object) -> bool:
     return isinstance(section, CanSection) and section.asset is not None
+
+
+def missing(loaded: Loaded) -> str | None:
+    """What is not here, in one line with the remedy; None if all is."""
+    section = loaded.config.source
+    try:
+        for key, part in SOURCES[section.type].sections(section, KEY).items():
+            if isinstance(part, RecordingSection):
+                find_recording(loaded, part, key, None)
+            if isinstance(part, CanSection | CanLogSection):
+                find_databases(loaded, part, key)
+    except SourceError as error:
+        return str(error)
+    return None

@@ -17,7 +17,7 @@ from config.schema import TwinSection
 from config.source_schema import AssetSection
 from config.tuning_schema import TuningSection
 from config.tunings import OWN, Version, find_version
-from config.yaml_lines import parse
+from config.yaml_files import parse
 from estimators.diagnostics.commission import baseline_of, lost_from
 from estimators.diagnostics.health import HealthPolicy
 from estimators.errors import ConfigError, EstimatorError
@@ -26,15 +26,11 @@ from estimators.model.state_space import StateSpaceModel
 from estimators.registry import checked, find_entry, find_estimator
 from estimators.tuning import CHANGED_MARK, Tuning
 
-from ..intake import Planned
-from .commissioned import commissioned
-from .dropout import DegradedAfter, degraded_after
-from .late import Late, late_policy
+from ..ingest import Planned
+from .checks import check_named, check_refit, check_scene, commissioned
+from .defaults import DegradedAfter, Late, degraded_after, late_policy
 from .learned import correction_files
 from .model import configure, find_model, model_files
-from .names import check_named
-from .refit import check_refit
-from .scene_names import check_scene
 from .source import Plan, plan_source
 
 if TYPE_CHECKING:

@@ -7,14 +7,9 @@ import numpy as np
 from estimators.log import MARK
 from estimators.model.state_space import StateSpaceModel
 
-from .effect import Effect, Moment
-from .fault import Fault
-from .item import Item
-from .kinds import find_kind, numbers
-from .routes import Elsewhere, Silence, Swap
-from .target import Target
-from .times import SHIFT, Reorder, TimeEffect
-from .values import SPOIL, ValueEffect
+from .effect import Effect, Item, Moment, Target
+from .effects import SHIFT, SPOIL, Elsewhere, Reorder, Silence, Swap, TimeEffect, ValueEffect
+from .kinds import Fault, find_kind, numbers
 
 
 def _effect(fault: Fault, target: Target, rng: np.random.Generator) -> Effect:

@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from math import inf, isfinite
+from typing import Protocol, runtime_checkable
 
 from estimators.errors import LARGEST, nearest, quoted
 from estimators.model.state_space import StateSpaceModel
-
-from .fault import Fault
 
 LONGEST = 1e6
 """Seconds by which an event may be late, eleven days."""
@@ -194,3 +193,68 @@ def numbers(fault: Fault) -> dict[str, float]:
     given = {item.name: getattr(fault, item.name) for item in find_kind(fault.kind).parameters}
     defaults = {item.name: item.default for item in find_kind(fault.kind).parameters}
     return {name: float(value if value is not None else defaults[name] or 0.0) for name, value in given.items()}
+
+
+NEVER = 2**62
+"""ns: later than any event."""
+
+
+@dataclass
+class Change:
+    """A true parameter that is multiplied by `factor` from `start` until `end`, ns of the asset's own time."""
+
+    parameter: str
+    factor: float
+    start: int
+    end: int
+
+
+@runtime_checkable
+class Changeable(Protocol):
+    """A simulated asset whose true parameters can be changed while it runs; from any thread.
+
+    `live` False says that its time is that of its events.
+    """
+
+    live: bool
+
+    def change(self, parameter: str, factor: float, start: int | None = None, length: int | None = None) -> Change:
+        """Multiply a parameter for `length` ns, or for ever, from `start` on (ns), or with the next step.
+
+        Raises:
+            SourceError: If there is no such parameter.
+        """
+
+    def end(self, change: Change) -> None:
+        """End a change with the next step."""
+
+
+@dataclass(frozen=True)
+class Fault:
+    """One fault, from `start` until `end`, in seconds after the source's first event (or after it was injected).
+
+    It concerns a `sensor` (a `row` of it, or all), an `input` or, of kind model, a true `parameter` of a simulated
+    asset; none of them means the whole source. What the numbers mean, in which unit, and which of them a kind takes, is
+    in `kinds.KINDS`; None is the kind's default. Draws are a function of `seed`, by default (seed of the layer, number
+    of the fault), and of the events alone.
+    """
+
+    kind: str
+    sensor: str | None = None
+    input: str | None = None
+    parameter: str | None = None
+    row: str | None = None
+    other: str | None = None
+    start: float = 0.0
+    end: float = inf
+    size: float | None = None
+    rate: float | None = None
+    every: float | None = None
+    count: int | None = None
+    seed: int | None = None
+
+    @property
+    def target(self) -> str:
+        """What it concerns, in words."""
+        name = self.sensor or self.input or self.parameter or "the whole twin"
+        return f"{name}.{self.row}" if self.row is not None else name

@@ -15,11 +15,9 @@ from estimators.log import INPUT, Events
 from estimators.model.state_space import StateSpaceModel
 
 from .active import Active
-from .change import NEVER, Change, Changeable
-from .fault import Fault
-from .item import Item, events_of, items_of
-from .kinds import find_kind, problem
-from .times import ns
+from .effect import Item, events_of, items_of
+from .effects import ns
+from .kinds import NEVER, Change, Changeable, Fault, find_kind, problem
 
 LINGERS = ns(60.0)
 """Of the source's time by which a fault must have ended to be gone. What was measured while it lasted and comes later

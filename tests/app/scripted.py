@@ -10,8 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 
 from app.live.engine import Engine
-from app.twin.dropout import DegradedAfter
-from app.twin.late import Late
+from app.twin.defaults import DegradedAfter, Late
 from estimators.diagnostics.health import HealthPolicy
 from estimators.log import READING, Events
 from estimators.models import MODELS

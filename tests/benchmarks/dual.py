@@ -21,7 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from app.twin.bounds import bounds_of
+from app.twin.defaults import bounds_of
 from app.twin.log_reader import read_log
 from app.twin.twin import Twin, load_twin
 from estimators.fit.dual import WindowFit, walk

@@ -20,7 +20,7 @@ from app.studies.stress.scenario import asset_of
 from app.twin.twin import Twin, load_twin
 from estimators.log import MARK, Events
 from estimators.track import HEALTH_NAMES, SUSPECT, TRACKING, VERDICT_NAMES
-from sources.faults.fault import Fault
+from sources.faults.kinds import Fault
 from sources.faults.layer import Faults
 from sources.source import WRONG_TIME
 

@@ -3,9 +3,9 @@ from typing import Any
 import jsonschema
 import pytest
 
-from config.json_schema import json_schema, json_schema_text
 from config.loader import load, shipped
-from config.yaml_lines import parse
+from config.schema import json_schema, json_schema_text
+from config.yaml_files import parse
 
 VALIDATOR = jsonschema.Draft202012Validator(json_schema())
 

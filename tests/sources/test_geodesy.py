@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sources.geodesy import ECCENTRICITY2, SEMI_MAJOR, east_north
+from sources.mapping import ECCENTRICITY2, SEMI_MAJOR, east_north
 
 
 @pytest.mark.parametrize("latitude", [-80.0, -33.0, 0.0, 37.7, 56.0, 85.0])

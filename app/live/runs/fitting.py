@@ -19,7 +19,7 @@ from estimators.log import Log
 from estimators.snapshots import Base
 from estimators.tuning import Tuning
 
-from ...twin.bounds import bounds_of, natural_aim
+from ...twin.defaults import bounds_of, natural_aim
 from ..history_copy import END_OF_TIME, copy_log
 from ..interface import Running
 from ..jobs import Job, JobCancelled

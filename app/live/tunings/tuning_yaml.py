@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 
 from config.schema import TwinSection
-from config.yaml_text import as_flow, as_section
+from config.yaml_files import as_flow, as_section
 from estimators.errors import LARGEST
 from estimators.estimator import Estimator
 from estimators.model.coloured import disturbance_time, error_time, errors_of
 from estimators.registry import find_entry
 from estimators.tuning import REOPEN_S, Tuning
 
-from ...twin.bounds import bounds_of
+from ...twin.defaults import bounds_of
 
 
 def tuning_yaml(

@@ -11,10 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from config.files import shown_path, writing
 from config.tuning_schema import AcceptedSection, EvidenceSection, VersionSection
 from config.tunings import OWN, Version, check_name, folders, load_version, version_files, version_of
-from config.yaml_text import as_section
+from config.yaml_files import as_section, shown_path, writing
 from estimators.diagnostics.score import Score
 from estimators.errors import ConfigError
 from estimators.fold import Fold

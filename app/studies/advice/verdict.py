@@ -20,10 +20,8 @@ from math import isfinite
 from pathlib import Path
 from typing import Any
 
-from config.files import writing
 from config.tunings import SPREADS
-from config.yaml_lines import parse
-from config.yaml_text import as_flow
+from config.yaml_files import as_flow, parse, writing
 from estimators.errors import ConfigError, NisusError
 from estimators.fit.objective import ALONE
 from estimators.log import Log

@@ -11,7 +11,7 @@ from estimators.errors import ConfigError
 from estimators.log import INPUT, READING, Events
 from estimators.model.state_space import Sensor, StateSpaceModel
 from estimators.tuning import Tuning
-from sources.faults.fault import Fault
+from sources.faults.kinds import Fault
 
 from .scenario import Mistake
 

@@ -23,13 +23,13 @@ from estimators.tuning import Tuning
 from sources.faults.layer import Faults
 from sources.faults.source import with_faults
 from sources.memory import MemorySource
-from sources.simulation.simulator import Simulator
+from sources.simulator import Simulator
 
 from ...twin.sources.asset import make_asset
 from ...twin.twin import Twin
 
 if TYPE_CHECKING:
-    from sources.faults.fault import Fault
+    from sources.faults.kinds import Fault
 
 ANYBODY: frozenset[str] = frozenset()
 """Subjects of a mistake that no sensor in particular is to be blamed for."""

@@ -6,16 +6,17 @@ from typing import TYPE_CHECKING
 
 from config.loader import Loaded
 from config.source_schema import AssetSection, ProfileSection
-from config.yaml_lines import Key, dotted
+from config.yaml_files import Key, dotted
 from estimators.model.state_space import StateSpaceModel
 
-from ..faults import read_faults
+from ..channels import read_faults
+from ..checks import check_names, one_each
 from ..model import find_model
-from ..names import check_names, one_each
+from .kind import Kind, Opening
 
 if TYPE_CHECKING:
-    from sources.simulation.profile import Profile
-    from sources.simulation.simulator import Simulator
+    from sources.simulator import Profile, Simulator
+    from sources.source import Source
 
 MOST_EVENTS = 1e8
 """The most events that a simulation may produce; it makes some ten thousand a second."""
@@ -30,7 +31,7 @@ def make_asset(loaded: Loaded, model: StateSpaceModel, section: AssetSection, ke
     Raises:
         ConfigError: With file and line, if its true model does not fit the twin's.
     """
-    from sources.simulation.simulator import SensorPlan, Simulator
+    from sources.simulator import SensorPlan, Simulator
 
     truth = section.truth
     truth_model = find_model(loaded, (*key, "truth", "model"), truth.model) if truth.model else None
@@ -120,7 +121,7 @@ def _check_same(loaded: Loaded, key: Key, truth: StateSpaceModel, model: StateSp
 
 def _profile(sections: tuple[ProfileSection, ...]) -> Profile:
     """The sum of an input's profiles."""
-    from sources.simulation.profile import Constant, Sine, Steps, Sum
+    from sources.simulator import Constant, Sine, Steps, Sum
 
     parts: list[Profile] = []
     for section in sections:
@@ -133,3 +134,15 @@ def _profile(sections: tuple[ProfileSection, ...]) -> Profile:
         else:
             parts.append(Constant(section.constant or 0.0))
     return parts[0] if len(parts) == 1 else Sum(tuple(parts))
+
+
+def _open(opening: Opening) -> Source:
+    return make_asset(opening.loaded, opening.model, opening.section, opening.key)
+
+
+SIMULATOR = Kind(
+    _open,
+    check=lambda loaded, model, section, key: check_asset(loaded, section, key, model),
+    sections=lambda section, key: {},
+    takes_log=False,
+)

@@ -6,22 +6,21 @@ from typing import TYPE_CHECKING
 
 from config.loader import Loaded
 from config.source_schema import CanSection
-from config.yaml_lines import Key
-from estimators.errors import NisusError
+from config.yaml_files import Key
+from estimators.errors import NisusError, SourceError
 from estimators.log import Events
 from estimators.model.state_space import StateSpaceModel
+from sources.pieces import FRAMES, VALUES
 
-from ..channels import channels
-from ..faults import read_faults
-from ..files import failure, find_databases
+from ..channels import channels, read_faults
 from .asset import check_asset, make_asset
-from .can_log import CAN_LOG, make_decoder, open_can_log
-from .kind import Kind, Opening
+from .kind import Kind, Opening, about, blamed, closed, failure, find_databases, find_recording
 
 if TYPE_CHECKING:
+    from sources.can.decoder import Decoder
     from sources.can.player import Player
-    from sources.faults.change import Change
-    from sources.simulation.simulator import Simulator
+    from sources.faults.kinds import Change
+    from sources.simulator import Simulator
     from sources.source import Report, Source
 
 
@@ -141,4 +140,33 @@ class PlayedBus:
         self._bus.close()
 
 
+def make_decoder(opening: Opening) -> Decoder:
+    """What takes the section's channels from its frames.
+
+    Raises:
+        SourceError: With file and line, if a database lacks a message or signal.
+    """
+    from sources.can.decoder import Decoder
+
+    databases = find_databases(opening.loaded, opening.section, opening.key)
+    width, report = opening.model.width, opening.report
+    return blamed(opening, lambda channels: Decoder(databases, channels, width=width, report=report))
+
+
+def open_can_log(opening: Opening) -> Source:
+    """Open the recorded frames."""
+    from sources.can.log import CanLog
+
+    files = find_recording(opening.loaded, opening.section, opening.key, opening.log_files)
+    decoder = make_decoder(opening)
+    try:
+        return CanLog(files, decoder, report=opening.report)
+    except SourceError as error:
+        if opening.log_files is not None:
+            raise
+        where = "recording" if isinstance(opening.section, CanSection) else "files"
+        raise about(opening.loaded, (*opening.key, where), str(error)) from None
+
+
+CAN_LOG = Kind(open_can_log, kernels=(FRAMES, VALUES), files=closed(open_can_log))
 CAN = Kind(_open, check=_check, kernels=CAN_LOG.kernels, files=_files)

@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+import glob
+import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from config.loader import Loaded
-from config.yaml_lines import Key, dotted
+from config.loader import Loaded, shown_path
+from config.source_schema import CanLogSection, CanSection, RecordingSection
+from config.yaml_files import Key, dotted
 from estimators.errors import SourceError
 from estimators.model.state_space import StateSpaceModel
 from sources.pieces import VALUES
 
 from ..channels import channels
-from ..files import find_recording
 
 if TYPE_CHECKING:
     from sources.source import Channel, Report, Source
@@ -105,3 +107,95 @@ def closed(open_: Callable[[Opening], Source]) -> Callable[[Opening], None]:
 def about(loaded: Loaded, key: Key, text: str) -> SourceError:
     """What a source says of itself, with the place in the YAML that it concerns."""
     return SourceError(f"{loaded.places.at(key)}: {dotted(key)}: {text}")
+
+
+DATA = "NISUS_DATA"
+"""Environment variable that replaces the `folder` of every recording."""
+
+
+def find_recording(
+    loaded: Loaded, section: CanSection | RecordingSection, key: Key, log_files: Sequence[Path] | None
+) -> list[Path]:
+    """The files of a recording, in order; `log_files`, from the command line, replace them.
+
+    Raises:
+        SourceError: If one is absent, with where it was sought and how to get it.
+    """
+    if log_files is not None:
+        files = [file.expanduser() for file in log_files]
+        for file in files:
+            if file.is_dir():
+                raise SourceError(f"--log {file}: it is a folder; name the files in it")
+            if not file.exists():
+                raise SourceError(f"--log {file}: there is no such file; check the path")
+            if not file.is_file():
+                raise SourceError(f"--log {file}: it is a device or a pipe; name a file, which can be read again")
+        return files
+    if isinstance(section, RecordingSection):
+        patterns, where = section.files, (*key, "files")
+    elif section.recording is not None:
+        patterns, where = section.recording, (*key, "recording")
+    else:
+        raise failure(loaded, key, "is a live bus, which does not end; give a recording of it with --log FILE")
+    root = _root(loaded, section)
+    found: list[Path] = []
+    for pattern in patterns:
+        wanted = str(Path(pattern).expanduser())
+        escaped = wanted if os.path.isabs(wanted) else os.path.join(glob.escape(str(root)), wanted)
+        matches = sorted(Path(match) for match in glob.glob(escaped, recursive=True) if Path(match).is_file())
+        exact = root / wanted  # A name with brackets in it is itself before it is a pattern.
+        if exact.is_file():
+            matches = [exact]
+        if not matches:
+            raise _absent(loaded, where, exact, section)
+        found += matches
+    return found
+
+
+def find_databases(
+    loaded: Loaded, section: CanSection | CanLogSection, key: Key
+) -> list[tuple[Path, int | str | None]]:
+    """The DBC files with the buses on which they hold; sought in the recording's folder, then beside the YAML.
+
+    Raises:
+        SourceError: If one is absent.
+    """
+    found: list[tuple[Path, int | str | None]] = []
+    for item in section.dbc:
+        name = Path(item.file).expanduser()
+        tried = [Path(os.path.normpath(_root(loaded, section) / name)), _beside(loaded, name)]
+        path = next((path for path in tried if path.is_file()), None)
+        if path is None:
+            raise _absent(loaded, (*key, "dbc"), tried[0], section)
+        found.append((path, item.channel))
+    return found
+
+
+def failure(loaded: Loaded, key: Key, text: str) -> SourceError:
+    """An error of the source about what stands at `key`."""
+    return SourceError(f"{loaded.places.at(key)}: {dotted(key)} {text}")
+
+
+def _beside(loaded: Loaded, path: Path) -> Path:
+    return Path(os.path.normpath(loaded.path.absolute().parent / path))
+
+
+def _root(loaded: Loaded, section: CanSection | RecordingSection) -> Path:
+    """The folder of a recording: NISUS_DATA in place of `folder`, where the YAML gives one."""
+    folder = section.folder if isinstance(section, RecordingSection) else None
+    if folder is None:
+        return _beside(loaded, Path())
+    return Path(os.environ.get(DATA) or _beside(loaded, Path(folder).expanduser()))
+
+
+def _absent(loaded: Loaded, key: Key, path: Path, section: CanSection | RecordingSection) -> SourceError:
+    recording = section if isinstance(section, RecordingSection) else None
+    remedies = []
+    if recording is not None and recording.folder is not None:
+        remedies.append(f"set {DATA} to the folder that holds the recordings")
+    if key[-1] != "dbc":
+        remedies.append("give other recordings with --log FILE")
+    text = f"is not there: {shown_path(path)}; {' or '.join(remedies) or 'check the path'}"
+    if recording is not None and recording.get:
+        text += "; to get it: " + " ".join(recording.get.split())
+    return failure(loaded, key, text)

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from .can import CAN
-from .can_log import CAN_LOG
+from .asset import SIMULATOR
+from .can import CAN, CAN_LOG
 from .kind import Kind
-from .merged import MERGED
-from .simulator import SIMULATOR
-from .table import TABLE
+from .recordings import MERGED, TABLE
 
 SOURCES: dict[str, Kind] = {
     "simulator": SIMULATOR,

@@ -11,7 +11,7 @@ from typing import Any
 from config.loader import TWINS, Loaded, find, load, shipped
 from estimators.errors import NisusError
 
-from ...twin.missing import missing
+from ...twin.source import missing
 from ...twin.twin import load_twin
 from ..running import Stamp, stamp_of
 

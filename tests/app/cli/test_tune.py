@@ -7,7 +7,7 @@ import pytest
 import yaml
 
 from app.cli.main import main
-from app.twin.bounds import natural_aim
+from app.twin.defaults import natural_aim
 from app.twin.twin import load_twin
 from config.loader import TWINS
 from tests.app.live.tunings.test_tuning_yaml import pasted

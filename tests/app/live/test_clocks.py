@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from app.intake import CLOCK_MOVED, Planned
+from app.ingest import CLOCK_MOVED, Planned
 from app.live import commands
 from app.live.alerts import Silence
 from app.live.engine import Engine

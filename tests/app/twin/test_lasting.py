@@ -7,7 +7,7 @@ import pytest
 
 from app.twin.log_reader import read_log
 from app.twin.twin import Twin, restore_twin
-from config.json_schema import json_schema
+from config.schema import json_schema
 from estimators.diagnostics.score import score
 from estimators.errors import ConfigError
 from estimators.fold import Fold, fold

@@ -10,7 +10,7 @@ from estimators.log import READING, Log
 from estimators.model.sensor import correlation_of, covariance_of
 from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
 from estimators.tuning import Tuning
-from sources.simulation.simulator import Simulator
+from sources.simulator import Simulator
 from tests.support import read_all
 
 

@@ -11,7 +11,7 @@ from estimators.log import READING, TRUTH, Events, Log
 from estimators.model.states import Field
 from estimators.models.thermal_field import thermal_field
 from estimators.tuning import Tuning
-from sources.simulation.simulator import Simulator
+from sources.simulator import Simulator
 from tests.support import read_all
 
 MODEL = thermal_field(12, 9, 2)

@@ -12,7 +12,7 @@ from estimators.model.state_space import LARGE, Field, Noise, Row, Sensor, State
 from estimators.models.thermal_field import thermal_field
 from estimators.numerics.smoothed_noise import smooth
 from estimators.tuning import Tuning
-from sources.simulation.simulator import Simulator
+from sources.simulator import Simulator
 from tests.support import as_log, read_all
 
 

@@ -13,7 +13,7 @@ from estimators.log import READING, TICK, TRUTH, Events, Log
 from estimators.models import MODELS
 from estimators.track import MISSING, USED
 from estimators.tuning import Tuning
-from sources.simulation.simulator import SensorPlan, Simulator
+from sources.simulator import SensorPlan, Simulator
 from tests.support import SECOND, read_all
 
 

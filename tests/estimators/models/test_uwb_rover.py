@@ -15,8 +15,7 @@ from estimators.log import truth_of
 from estimators.models.uwb_rover import UWB_ROVER, uwb_rover
 from estimators.track import Track
 from estimators.tuning import Tuning
-from sources.simulation.profile import Constant, Sine
-from sources.simulation.simulator import Simulator
+from sources.simulator import Constant, Simulator, Sine
 from tests.conftest import absent
 from tests.support import as_log, read_all
 

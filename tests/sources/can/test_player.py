@@ -12,8 +12,7 @@ from estimators.model.state_space import Input, Noise, Row, Sensor, State, State
 from sources.can.bus import CanBus
 from sources.can.decoder import Decoder
 from sources.can.player import Encoder, Player
-from sources.simulation.profile import Steps
-from sources.simulation.simulator import SensorPlan, Simulator
+from sources.simulator import SensorPlan, Simulator, Steps
 from sources.source import Channel
 from tests.sources.can.can_tools import Reports, dbc
 from tests.support import read_all

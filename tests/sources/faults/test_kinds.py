@@ -5,8 +5,7 @@ import pytest
 
 from estimators.log import INPUT, MARK, READING, Events
 from estimators.models import MODELS
-from sources.faults.fault import Fault
-from sources.faults.kinds import KINDS
+from sources.faults.kinds import KINDS, Fault
 from sources.faults.layer import Faults
 from sources.faults.source import FaultySource
 from sources.memory import MemorySource

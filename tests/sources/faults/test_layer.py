@@ -9,13 +9,12 @@ from estimators.errors import SourceError
 from estimators.log import MARK, READING, TRUTH, Events
 from estimators.models import MODELS
 from estimators.numerics.jit import plain
-from sources.faults.fault import Fault
-from sources.faults.kinds import KINDS
+from sources.faults.kinds import KINDS, Fault
 from sources.faults.layer import LINGERS, Faults
 from sources.faults.source import FaultySource, PacedFaultySource, with_faults
 from sources.memory import MemorySource
 from sources.pacer import Pacer
-from sources.simulation.simulator import Simulator
+from sources.simulator import Simulator
 from sources.source import Paced
 from tests.sources.faults.test_kinds import DRIVE, FIRST, MODEL, SECOND_ONE, START, N, said, stream, through
 from tests.sources.test_pacer import Clock

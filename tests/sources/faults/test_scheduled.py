@@ -9,10 +9,10 @@ from app.twin.twin import load_twin
 from estimators.errors import ConfigError, SourceError
 from estimators.log import MARK, READING
 from estimators.models import MODELS
-from sources.faults.fault import Fault
+from sources.faults.kinds import Fault
 from sources.faults.layer import Faults
 from sources.faults.source import FaultySource
-from sources.simulation.simulator import SensorPlan, Simulator
+from sources.simulator import SensorPlan, Simulator
 from tests.sources.can.can_tools import same
 from tests.support import read_all
 

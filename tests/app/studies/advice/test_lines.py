@@ -6,7 +6,7 @@ import pytest
 
 from app.cli.main import main
 from app.studies.advice.verdict import Advice, apply, changed, lines, with_entry
-from config.yaml_lines import parse
+from config.yaml_files import parse
 from estimators.errors import ConfigError
 
 BEFORE = """\

@@ -7,8 +7,7 @@ from estimators.diagnostics.sensitivity.suspects import in_words, suspects
 from estimators.log import INPUT, READING, Log
 from estimators.models import MODELS
 from estimators.tuning import Tuning
-from sources.simulation.profile import Constant, Steps
-from sources.simulation.simulator import Simulator
+from sources.simulator import Constant, Simulator, Steps
 from tests.support import read_all
 
 MODEL = MODELS["motor_drive"]

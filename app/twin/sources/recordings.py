@@ -8,19 +8,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from config.source_schema import CanLogSection, MergedSection, TableSection
-from config.yaml_lines import Key
+from config.yaml_files import Key
 from estimators.errors import SourceError
 from sources.formats import TABLES, suffix_of
 
-from .can_log import CAN_LOG
-from .kind import Kind, Opening, closed
-from .table import TABLE
+from .can import CAN_LOG
+from .kind import Kind, Opening, closed, recording
 
 if TYPE_CHECKING:
-    from sources.source import Source
-
-PARTS: dict[type, Kind] = {CanLogSection: CAN_LOG, TableSection: TABLE}
-"""What may be merged: recordings, whose clocks agree."""
+    from sources.source import Channel, Source
 
 
 def _open(opening: Opening) -> Source:
@@ -65,5 +61,26 @@ def _shares(opening: Opening) -> list[list[Path] | None]:
 def _sections(section: MergedSection, key: Key) -> dict[Key, Any]:
     return {(*key, "parts", k): part for k, part in enumerate(section.parts)}
 
+
+def _make(opening: Opening, files: list[Path], channels: list[Channel]) -> Source:
+    from sources.tables.table import Table
+
+    section: TableSection = opening.section
+    return Table(
+        files,
+        time_column=section.time.column,
+        time_unit=section.time.unit,
+        time_shift=section.time.shift,
+        channels=channels,
+        width=opening.model.width,
+        report=opening.report,
+        horizon=opening.loaded.config.time.horizon,
+    )
+
+
+TABLE = recording(_make)
+
+PARTS: dict[type, Kind] = {CanLogSection: CAN_LOG, TableSection: TABLE}
+"""Types that may be merged: recordings whose clocks agree."""
 
 MERGED = Kind(_open, sections=_sections, kernels=CAN_LOG.kernels, files=closed(_open))

@@ -7,8 +7,7 @@ from estimators.errors import SourceError
 from estimators.log import INPUT, READING, TICK, TRUTH, truth_of
 from estimators.model.state_space import Input, Jump, Noise, Parameter, Row, Sensor, State, StateSpaceModel
 from estimators.models import MODELS
-from sources.simulation.profile import Constant, Sine, Steps, Sum
-from sources.simulation.simulator import SensorPlan, Simulator
+from sources.simulator import Constant, SensorPlan, Simulator, Sine, Steps, Sum
 from tests.sources.can.can_tools import same
 from tests.support import read_all
 

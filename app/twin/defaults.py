@@ -7,9 +7,15 @@ from typing import NamedTuple
 import numpy as np
 
 from config.schema import TwinSection
+from config.source_schema import SimulatorSection
 from estimators.diagnostics.time_constants import MOST, jacobian, time_constants
-from estimators.errors import ModelError
+from estimators.errors import EstimatorError, ModelError
+from estimators.estimator import Estimator
+from estimators.fold_checks import check_variances
+from estimators.late import EVENT_S_PER_NUMBER, rewind_seconds
 from estimators.model.state_space import StateSpaceModel
+from estimators.snapshots import Snapshots
+from estimators.tuning import Tuning
 
 LEAST = 3.0
 """Seconds: below this a reading that is a little late would be a dropout."""
@@ -66,3 +72,52 @@ def _slowest_sensor(config: TwinSection) -> float | None:
     if step is None:
         return None
     return float(step * max([getattr(item, "every", 1) for item in sensors.values()], default=1))
+
+
+def bounds_of(config: TwinSection, model: StateSpaceModel) -> dict[str, tuple[float, float]]:
+    """Least and greatest variance by key: Q.NAME, and R of each row and of the sensor as a whole."""
+    found = {f"Q.{name}": section.bounds for name, section in config.noise.items()}
+    for sensor, start in zip(model.sensors, model.row_start, strict=True):
+        section = config.sensors.get(sensor.name)
+        if section is not None:
+            rows = model.row_names[start : start + len(sensor.rows)]
+            found |= {f"R.{name}": section.bounds for name in (sensor.name, *rows)}
+    return {key: bounds for key, bounds in found.items() if bounds is not None}
+
+
+def natural_aim(config: TwinSection) -> str:
+    """What a fit aims at if nobody says otherwise.
+
+    What a recording knows of the truth was measured, to be learnt from. A simulated asset stands for one of which
+    nobody knows the truth.
+    """
+    # With it come all folds, for which a twin that nobody fits need not wait.
+    from estimators.fit.aims import LIKELIHOOD, WITNESSES
+
+    return LIKELIHOOD if isinstance(config.source, SimulatorSection) else WITNESSES
+
+
+class Late(NamedTuple):
+    """Whether late readings are used when they come, with R inflated, and why; else the filter goes back."""
+
+    inflate: bool
+    reason: str
+
+
+def late_policy(config: TwinSection, model: StateSpaceModel, estimator: Estimator, tuning: Tuning) -> Late:
+    """The policy, with its arithmetic."""
+    section = config.time
+    if section.late != "auto":
+        return Late(section.late == "inflate", f"time.late is {section.late}")
+    options = estimator.complete_for(model, tuning.options)
+    numbers = estimator.state_size(options, model.nx) + estimator.memory(options, model)
+    events = Snapshots(8 * numbers).every
+    seconds = rewind_seconds(numbers, events)
+    sum_ = f"{events} events x {numbers:,} numbers x {EVENT_S_PER_NUMBER * 1e9:g} ns = {seconds:.2g} s to go back"
+    if seconds <= section.late_allowed:
+        return Late(False, f"{sum_}, allowed {section.late_allowed:g} s")
+    try:
+        check_variances(estimator, options)
+    except EstimatorError as error:
+        return Late(False, f"{sum_}, more than {section.late_allowed:g} s, but {error}")
+    return Late(True, f"{sum_}, more than {section.late_allowed:g} s")

@@ -1,0 +1,125 @@
+"""What was normal when a twin's tuning was accepted: `commissioned` of its YAML, checked against the model."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from config.loader import Loaded
+from config.yaml_files import Key
+from estimators.diagnostics.commission import Normal
+from estimators.diagnostics.detectors import ALARM_NAMES
+from estimators.errors import ConfigError, nearest
+from estimators.fit.entries import check_key
+from estimators.model.state_space import StateSpaceModel
+from estimators.tuning import Tuning
+
+
+def commissioned(loaded: Loaded, model: StateSpaceModel) -> dict[str, Normal]:
+    """What was normal by sensor row; nothing if nothing was commissioned.
+
+    Raises:
+        ConfigError: With file and line, if it names what the model or the bank lacks.
+    """
+    given = loaded.config.commissioned
+    for name, section in given.items():
+        if name not in model.row_names:
+            rows = ", ".join(model.row_names[:8])
+            raise loaded.error(("commissioned", name), f"is no sensor row of {model.name}; it has {rows}")
+        for cause in section.reached:
+            if cause not in ALARM_NAMES:
+                raise loaded.error(
+                    ("commissioned", name, "reached", cause), f"is no cause; choose from {', '.join(ALARM_NAMES)}"
+                )
+    return {
+        name: Normal(section.bias, section.scale, section.correlation, section.reached, section.nis)
+        for name, section in given.items()
+    }
+
+
+def check_scene(loaded: Loaded, model: StateSpaceModel) -> None:
+    """Refuse a scene that names what the model does not have.
+
+    Raises:
+        ConfigError: With file and line, and the near names.
+    """
+    scene = loaded.config.view.scene
+    for key in ("axes", "position", "heading", "parts", "charge", "temperature", "states"):
+        value = getattr(scene, key) or ()
+        names = (value,) if isinstance(value, str) else tuple(value.values()) if isinstance(value, dict) else value
+        check_named(loaded, ("view", "scene", key), names, model)
+    rows = {sensor.name: len(sensor.rows) for sensor in model.sensors}
+    for key in ("beams", "beacons"):
+        for name in getattr(scene, key):
+            if name not in rows:
+                text = f"names {name!r}, no sensor of {model.name}; {nearest(name, rows)}"
+                raise loaded.error(("view", "scene", key), text)
+    for name, angles in scene.beams.items():
+        if len(angles) != rows[name]:
+            text = f"has {len(angles)} angles; {name} has {rows[name]} rows, give one for each"
+            raise loaded.error(("view", "scene", "beams", name), text)
+    known = (*model.state_names, *(parameter.name for parameter in model.parameters))
+    for name, place in scene.beacons.items():
+        at = ("view", "scene", "beacons", name)
+        if rows[name] != 1:
+            raise loaded.error(at, f"is for one distance; {name} has {rows[name]} rows")
+        for item in place:
+            if item not in known:
+                text = f"names {item!r}, no state or parameter of {model.name}; {nearest(item, known)}"
+                raise loaded.error(at, text)
+
+
+def one_each(loaded: Loaded, key: Key, values: tuple, rows: list[str]) -> tuple:
+    """A value for each row, from one for all or one each."""
+    if len(values) == 1:
+        return values * len(rows)
+    if len(values) != len(rows):
+        raise loaded.error(key, f"has {len(values)} entries; give one, or {len(rows)}: {', '.join(rows)}")
+    return values
+
+
+def check_names(loaded: Loaded, key: Key, given: Any, known: Any, kind: str, model: StateSpaceModel) -> None:
+    """Refuse a name under `key` that the model does not have.
+
+    Raises:
+        ConfigError: With file and line, and the near names.
+    """
+    for name in given:
+        if name not in known:
+            raise loaded.error((*key, name), f"is no {kind} of {model.name}; {nearest(name, known)}")
+
+
+def check_named(loaded: Loaded, key: Key, names: Any, model: StateSpaceModel) -> None:
+    """Refuse a state that the value at `key` names and the model does not have.
+
+    Raises:
+        ConfigError: With file and line, and the near names.
+    """
+    for name in names:
+        if name not in model.state_names:
+            raise loaded.error(key, f"names {name!r}, no state of {model.name}; {nearest(name, model.state_names)}")
+
+
+def check_refit(loaded: Loaded, estimator: str, tuning: Tuning) -> None:
+    """Refuse entries that cannot be fitted beside the running twin.
+
+    Raises:
+        ConfigError: With file and line.
+    """
+    section = loaded.config.refit
+    if section is None:
+        return
+    if tuning.model.black_box:
+        raise loaded.error(("refit",), f"{tuning.model.name} is a black box, too slow for it; use nisus tune --windows")
+    for name in section.entries:
+        group, _, rest = name.partition(".")
+        if group == "prior":
+            raise loaded.error(("refit", "entries"), f"names {name}; a window begins where the filter is, not there")
+        if group == "p" and rest in loaded.config.estimate:
+            raise loaded.error(
+                ("refit", "entries"),
+                f"names {name}, which `estimate` moves into the state; keep it in one of them",
+            )
+        try:
+            check_key(estimator, tuning, name)
+        except ConfigError as error:
+            raise loaded.error(("refit", "entries"), f"names {name}: {error}") from None

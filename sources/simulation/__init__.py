@@ -1,1 +1,0 @@
-"""Simulated assets, and faults on demand."""
