@@ -91,7 +91,7 @@ def notices():
             if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr == "report":
                 found |= {arg.value for arg in node.args[:1] if isinstance(arg, ast.Constant)}
     values = {}
-    for path in (ROOT / "app/intake.py", ROOT / "sources/source.py"):
+    for path in (ROOT / "app/ingest.py", ROOT / "sources/source.py"):
         for names in constants_of(path):
             values |= names
     found |= {values[name] for name in ("WRONG_TIME", "CLOCK_MOVED", "MAINTENANCE")}
