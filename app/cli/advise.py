@@ -1,46 +1,44 @@
-"""`nisus advise`: which estimator for a twin, by what its log shows, with the figure behind each claim."""
+"""`nisus advise`: recommend an estimator for a twin from its log, or draft a twin from recordings."""
 
 from __future__ import annotations
 
-import json
 import math
-import textwrap
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-
-from rich.console import Console
-from rich.markup import escape
-from rich.table import Table
 
 from config.loader import shipped
 from estimators.errors import ConfigError
 from estimators.log import READING, Log
+from sources.inspect import RecordingContents
 
-from ..present.result import WIDTH
+from ..present.result import TableColumn, Topic, to_json, to_text
 from ..studies.advice.draft import python_text, yaml_text
 from ..studies.advice.measured import Measured, digits, percent, seconds_text
 from ..studies.advice.plan import Moves, Plan, plan
 from ..studies.advice.relations import Pair
 from ..studies.advice.signals import Signal, signals
 from ..studies.advice.verdict import Advice, advice_json, apply, lasting_lines, lines
-from ..studies.advice.verdict import advise as verdict
+from ..studies.advice.verdict import advise as recommend
 from ..twin.log_reader import read_log
 from ..twin.twin import Twin, load_twin
-from .log import WIDTH as LOG_WIDTH
 from .log import database_of, look
 from .new import check_new, model_of, write_pair
-from .options import settings
+from .options import names_of, settings
 from .prepare import attend, prepare
 
 if TYPE_CHECKING:
     from .arguments import Advise as Arguments
 
+MAX_LISTED_SIGNALS = 40
+
+KINDS = {"switch": "a switch", "counter": "time, counter or status", "constant": "constant", "short": "too few values"}
+
 
 def advise(arguments: Arguments) -> int:
-    """Carry the command out.
+    """Run the command.
 
     Raises:
-        ConfigError: If twins and recordings are mixed, or an option is for the other.
+        ConfigError: If twins and recordings are mixed, or an option does not apply.
     """
     for what in arguments.what:
         if what not in shipped() and Path(what).is_dir():
@@ -49,7 +47,7 @@ def advise(arguments: Arguments) -> int:
     if not twins and all(Path(what).suffix for what in arguments.what):
         if arguments.apply or arguments.log or arguments.set or arguments.estimator:
             raise ConfigError("--apply, --log, --set and --estimator are for a twin; a recording is drafted with --out")
-        return advise_log(arguments, tuple(Path(what) for what in arguments.what))
+        return _draft(arguments, tuple(Path(what) for what in arguments.what))
     if len(arguments.what) > 1:
         raise ConfigError(f"{arguments.what[1]}: one twin at a time; name its recordings with --log")
     if arguments.dbc or arguments.signals:
@@ -61,159 +59,112 @@ def _of_twin(arguments: Arguments, name: str) -> int:
     twin = load_twin(name, log_files=arguments.log or None, overrides=settings(arguments.set, arguments.estimator))
     prepare(twin)
     log, _ = read_log(twin, arguments.duration)
-    told: Advice = attend(twin.model, lambda: verdict(Measured(twin, log)), "measuring")
-    if arguments.json:
-        print(json.dumps(advice_json(twin, log, told), allow_nan=False))
-    else:
-        print("\n".join(as_text(twin, log, told)))
+    advice: Advice = attend(twin.model, lambda: recommend(Measured(twin, log)), "measuring")
+    print(to_json(advice_json(twin, log, advice)) if arguments.json else "\n".join(to_text(_topics(twin, log, advice))))
     if arguments.apply or arguments.out is not None:
-        kept = apply(twin.path, lines(told), arguments.out, told.sections)
+        kept = apply(twin.path, lines(advice), arguments.out, advice.sections)
         if not arguments.json:
-            was = f"; as it was: {kept}" if kept else ""
-            print(f"\n{arguments.out or twin.path}: its estimator is {told.estimator}{was}")
+            before = f"; the previous file is {kept}" if kept else ""
+            print(f"\n{arguments.out or twin.path}: its estimator is {advice.estimator}{before}")
     return 0
 
 
-def as_text(twin: Twin, log: Log, told: Advice) -> list[str]:
-    """The page: the recommendation, the claims in the order of the tree, the lines, and what else to do."""
+def _topics(twin: Twin, log: Log, advice: Advice) -> list[Topic]:
+    """Return the recommendation, the claims in the order of the tree, the lines for the YAML, and other remedies."""
     seconds = float(log.t[log.n - 1] - log.t[0]) * 1e-9
     readings = int((log.kind[: log.n] == READING).sum())
-    same = " (it has it)" if told.estimator == twin.estimator else f" (it has {twin.estimator})"
-    page = [
-        f"{twin.name}: {twin.title}",
-        f"  measured on {seconds:.4g} s of its log, {readings:,} readings",
-        "",
-        f"Use {told.estimator}, {_lower(told.title)}{same}",
-        *(line for reason in told.reasons for line in _wrapped(f"because {reason}", 2)),
-        "",
-        "Why",
+    same = "as now" if advice.estimator == twin.estimator else f"now {twin.estimator}"
+    title = advice.title if advice.title.startswith(("Kalman", "Rao")) else advice.title[0].lower() + advice.title[1:]
+    claims = []
+    for claim in advice.claims:
+        claims += [f"{claim.question} {claim.answer}{' *' * (claim.key in advice.because)}", f"    {claim.reason}"]
+    topics = [
+        Topic(f"{twin.name}: {twin.title}", (f"measured on {seconds:.4g} s of its log, {readings:,} readings",)),
+        Topic(f"Use {advice.estimator}, {title} ({same})", tuple(f"because {reason}" for reason in advice.reasons)),
+        Topic("Why (* decided)", tuple(claims)),
+        Topic(f"Lines for {twin.path.name}", tuple((lines(advice) + lasting_lines(advice)).splitlines())),
     ]
-    for claim in told.claims:
-        mark = " *" if claim.key in told.because else ""
-        page.append(f"  {claim.question} {claim.answer}{mark}")
-        page += _wrapped(claim.reason, 6)
-    page += [
-        "",
-        f"Lines for {twin.path.name}",
-        *(f"  {line}" for line in (lines(told) + lasting_lines(told)).splitlines()),
-    ]
-    if told.remedies:
-        page += ["", "What else to do", *(line for text in told.remedies for line in _wrapped(f"- {text}", 2))]
-    return page
+    return topics + ([Topic("Also", tuple(f"- {text}" for text in advice.remedies))] if advice.remedies else [])
 
 
-def _lower(title: str) -> str:
-    """A title within a sentence."""
-    return title if title.startswith(("Kalman", "Rao")) else title[0].lower() + title[1:]
-
-
-def _wrapped(text: str, indent: int) -> list[str]:
-    return textwrap.wrap(text, WIDTH, initial_indent=" " * indent, subsequent_indent=" " * (indent + 2))
-
-
-MAX_LISTED_SIGNALS = 40
-"""Signals that are listed; those that stand still are only counted."""
-
-MEANING = {"switch": "a switch", "counter": "time, counter or status", "constant": "stands still", "short": "too few"}
-
-
-def advise_log(arguments: Arguments, files: tuple[Path, ...]) -> int:
-    """Carry the command out on recordings."""
+def _draft(arguments: Arguments, files: tuple[Path, ...]) -> int:
+    """Draft a twin from recordings."""
     found = look(files, arguments.dbc, arguments.time, arguments.time_unit)
-    wanted = [text.strip() for text in arguments.signals.split(",") if text.strip()]
-    drafted = plan(found, wanted)
-    every = signals(found)
+    drafted, every = plan(found, names_of(arguments.signals)), signals(found)
     if arguments.json:
-        print(json.dumps(log_json(every, drafted), allow_nan=False))
+        print(to_json(_draft_json(every, drafted)))
     else:
-        console = Console()
-        if not console.is_terminal:
-            console = Console(width=LOG_WIDTH)
-        console.print(_table(every))
-        for line in _said(drafted):
-            console.print(escape(line), highlight=False, soft_wrap=True)
+        print("\n".join(to_text([_signals_topic(every), *_plan_topics(drafted)])))
     if arguments.out is not None:
-        _write(arguments, files, found, drafted)
+        _write(arguments, arguments.out, found, drafted)
     elif not arguments.json:
-        print("\nWrite the draft with --out NAME.yaml; take other signals with --signals A,B.")
+        print("\nWrite the draft with --out NAME.yaml; use other signals with --signals A,B.")
     return 0
 
 
-def _write(arguments: Arguments, files: tuple[Path, ...], found: Any, drafted: Plan) -> None:
-    """The two files of the draft, and what to do next."""
-    assert arguments.out is not None
-    out = arguments.out
+def _write(arguments: Arguments, out: Path, found: RecordingContents, drafted: Plan) -> None:
+    """Write the two files of the draft, and print the next steps."""
     if out.suffix not in (".yaml", ".yml", ""):
         raise ConfigError(f"--out {out}: must end in .yaml")
     name, folder = out.stem, out.parent
     check_new(name, folder)
     model, databases = model_of(name), [database_of(text) for text in arguments.dbc]
-    written = write_pair(
-        name,
-        folder,
-        yaml_text(name, model, drafted, found, databases, arguments.time_unit, folder),
-        python_text(name, model, drafted),
-    )
+    text = yaml_text(name, model, drafted, found, databases, arguments.time_unit, folder)
+    written = write_pair(name, folder, text, python_text(name, model, drafted))
     if not arguments.json:
         print("\nWritten: " + " and ".join(map(str, written)))
-        print(f"Next: nisus advise {written[0]}    whether its filter and noises bear out")
-        print(f"      nisus run {written[0]}       to look at it")
+        print(f"Next: nisus advise {written[0]}    to check its filter and noises")
+        print(f"      nisus run {written[0]}       to view it")
 
 
-def _table(every: list[Signal]) -> Table:
-    table = Table()
-    table.add_column("signal", no_wrap=True)
-    for title in ("unit", "a second", "holes", "longest gap", "levels", "step", "noise"):
-        table.add_column(title, justify="right", no_wrap=True)
-    table.add_column("is", no_wrap=True)
-    shown = [one for one in every if one.kind != "constant"]
-    for one in shown[:MAX_LISTED_SIGNALS]:
-        table.add_row(
-            escape(one.name),
-            escape(one.series.unit),
-            digits(one.rate) if math.isfinite(one.rate) else "",
-            str(one.holes or ""),
+def _signals_topic(every: list[Signal]) -> Topic:
+    shown = [one for one in every if one.kind != "constant"][:MAX_LISTED_SIGNALS]
+    rows = tuple(
+        (
+            one.name,
+            one.series.unit,
+            one.rate,
+            one.holes or None,
             seconds_text(one.longest) if one.longest else "",
-            str(one.levels),
-            digits(one.resolution),
-            digits(one.noise),
-            MEANING.get(one.kind, "an angle that wraps" if one.wraps else _bound(one)),
+            one.levels,
+            one.resolution,
+            one.noise,
+            KINDS.get(one.kind, "an angle that wraps" if one.wraps else _noise_remark(one)),
         )
-    more = len(every) - len(shown[:MAX_LISTED_SIGNALS])
-    if more:
-        table.caption = f"{more} more stand still or are left out; --json has all"
-    return table
+        for one in shown
+    )
+    gaps = TableColumn("gaps", absent="")
+    columns = ("signal", "unit", "rate [1/s]", gaps, "longest gap", "levels", "resolution", "noise", "")
+    more = len(every) - len(shown)
+    notes = (f"{more} more are constant or not listed; --json has all",) if more else ()
+    return Topic("Signals", notes, columns, rows)
 
 
-def _bound(one: Signal) -> str:
-    """What bounds the noise of a signal."""
+def _noise_remark(one: Signal) -> str:
     return "noise is its resolution" if one.noise <= 1.01 * one.resolution / math.sqrt(12.0) else ""
 
 
-def _said(drafted: Plan) -> list[str]:
-    """Pairs, candidates for states, inputs, in words."""
-    lines = ["", "What belongs together"]
-    lines += [f"  {_pair(drafted, pair)}" for pair in drafted.pairs] or ["  no two of the signals taken say the same"]
-    lines += ["", "Candidates for states"]
-    lines += [f"  {_state(item)}" for item in drafted.states]
-    if drafted.inputs:
-        lines += ["", "Inputs", *(f"  {name}: drives a state, and follows none" for name, _ in drafted.inputs)]
-    return lines
+def _plan_topics(drafted: Plan) -> list[Topic]:
+    """Return related signals, states and inputs in words."""
+    pairs = tuple(_pair_text(drafted, pair) for pair in drafted.pairs) or ("no two of these signals are related",)
+    topics = [Topic("Related signals", pairs), Topic("States", tuple(_state_text(item) for item in drafted.states))]
+    inputs = tuple(f"{name}: drives a state, and follows none" for name, _ in drafted.inputs)
+    return topics + ([Topic("Inputs", inputs)] if inputs else [])
 
 
-def _pair(drafted: Plan, pair: Pair) -> str:
+def _pair_text(drafted: Plan, pair: Pair) -> str:
     one, other = drafted.signals[pair.first].name, drafted.signals[pair.second].name
     share = f"explains {percent(pair.explained)}"
     line = f"{digits(pair.offset)} + {digits(pair.gain)}"
     if pair.rate:
         return f"{one}' = {line} {other} {share} of the changes: one state with a speed, two sensors"
     behind = f", {digits(pair.lag)} s later" if pair.lag else ""
-    left = f"what is left, {digits(pair.left)}, follows itself with {pair.related:+.2f}"
+    residual = f"residuals of {digits(pair.left)} are correlated by {pair.related:+.2f}"
     kind = "noise, so two sensors of one state" if pair.one else "more than noise, so two states"
-    return f"{other} = {line} {one}{behind} {share}; {left}: {kind}"
+    return f"{other} = {line} {one}{behind} {share}; {residual}: {kind}"
 
 
-def _state(item: Moves) -> str:
+def _state_text(item: Moves) -> str:
     sensors = ", ".join(reads.name for reads in item.sensors)
     r = f"σ of {sensors}: {', '.join(digits(math.sqrt(reads.r)) for reads in item.sensors)}"
     if item.lag is not None:
@@ -221,14 +172,14 @@ def _state(item: Moves) -> str:
             f"follows {', '.join(item.inputs)} with {seconds_text(item.lag.tau)}, which explains "
             f"{percent(item.lag.explained)} of the second half when fitted to the first"
         )
-        moves += "; what is left drifts" if item.smooth else "; what is left walks"
+        moves += "; the residual drifts" if item.smooth else "; the residual is a random walk"
     else:
-        moves = "moves with a speed of its own" if item.smooth else "walks at random"
-    return f"{item.name}: {moves}; Q {digits(item.q)} a second; {r}"
+        moves = "has a speed that is a random walk" if item.smooth else "is a random walk"
+    return f"{item.name}: {moves}; Q {digits(item.q)} per second; {r}"
 
 
-def log_json(every: list[Signal], drafted: Plan) -> dict[str, Any]:
-    """For scripts: `signals`, `pairs`, `states`, `inputs`."""
+def _draft_json(every: list[Signal], drafted: Plan) -> dict[str, Any]:
+    """Return `signals`, `pairs`, `states` and `inputs` for scripts."""
     names = [one.name for one in drafted.signals]
     return {
         "signals": [
@@ -237,7 +188,7 @@ def log_json(every: list[Signal], drafted: Plan) -> dict[str, Any]:
                 "message": one.message,
                 "unit": one.series.unit,
                 "number": int(one.series.values.size),
-                "rate": one.rate if math.isfinite(one.rate) else None,
+                "rate": one.rate,
                 "holes": one.holes,
                 "longest_gap": one.longest,
                 "levels": one.levels,

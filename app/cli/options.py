@@ -1,4 +1,4 @@
-"""Where a command writes: refused before its work, not after."""
+"""Values of options: `--set KEY=VALUE`, lists of names, numbers, and files to write."""
 
 from __future__ import annotations
 
@@ -11,28 +11,33 @@ from estimators.errors import ConfigError, quoted
 
 
 def check_output(option: str, path: Path) -> None:
-    """Refuse a file that could not be written, before the work of minutes that it is to keep.
+    """Refuse a file that cannot be written, before minutes of work.
 
     Raises:
-        ConfigError: If it is a folder, or its folder is not there or lets nobody write.
+        ConfigError: If it is a folder, or its folder is missing or not writable.
     """
     folder = path.absolute().parent
     if path.is_dir():
         raise ConfigError(f"{option} {path}: is a folder; name a file in it")
     if not folder.is_dir():
-        raise ConfigError(f"{option} {path}: there is no folder {path.parent}; make it first")
+        raise ConfigError(f"{option} {path}: there is no folder {path.parent}; create it first")
     if not os.access(path if path.exists() else folder, os.W_OK):
         raise ConfigError(f"{option} {path}: cannot be written; check the permissions")
 
 
-def settings(given: Sequence[str], estimator: str | None = None, tuning: str | None = None) -> dict[str, str]:
-    """The KEY=VALUE pairs of `--set`, with `--estimator` and `--tuning` as two more.
+def names_of(text: str) -> tuple[str, ...]:
+    """Return names that are separated by commas."""
+    return tuple(name.strip() for name in text.split(",") if name.strip())
+
+
+def settings(texts: Sequence[str], estimator: str | None = None, tuning: str | None = None) -> dict[str, str]:
+    """Return the KEY=VALUE pairs of `--set`, with `--estimator` and `--tuning` as two more.
 
     Raises:
         ConfigError: If one has no `=`, or no key before it.
     """
     pairs: dict[str, str] = {}
-    for text in given:
+    for text in texts:
         key, equals, value = text.partition("=")
         if not equals or not key.strip():
             lacks = "key" if equals else "value"
@@ -46,15 +51,15 @@ def settings(given: Sequence[str], estimator: str | None = None, tuning: str | N
 
 
 def check_numbers(command: type, words: Sequence[str]) -> None:
-    """Refuse what is no number where an option takes one; tyro would tell what Python said of it, in a frame.
+    """Refuse an option of a command whose value must be a number and is not, in one line.
 
     Raises:
         ConfigError: With the option and the value.
     """
     hints = get_type_hints(command)
     for word, after in zip(words, [*words[1:], ""], strict=False):
-        option, equals, given = word.partition("=")
-        value = given if equals else after
+        option, equals, own = word.partition("=")
+        value = own if equals else after
         hint = hints.get(option.removeprefix("--").replace("-", "_")) if option.startswith("--") else None
         number = next((kind for kind in (hint, *get_args(hint)) if kind in (int, float)), None)
         if number is None or value in ("", "None") or value.startswith("--"):
@@ -62,5 +67,5 @@ def check_numbers(command: type, words: Sequence[str]) -> None:
         try:
             number(value)
         except ValueError:
-            what = "a whole number" if number is int else "a number"
-            raise ConfigError(f"{option} {quoted(value)}: must be {what}") from None
+            kind = "a whole number" if number is int else "a number"
+            raise ConfigError(f"{option} {quoted(value)}: must be {kind}") from None

@@ -1,8 +1,7 @@
-"""`nisus tunings`: the tuning versions of a twin listed, two compared, one kept or accepted."""
+"""`nisus tunings`: list the tuning versions of a twin, compare two, save one or accept one."""
 
 from __future__ import annotations
 
-import json
 from typing import TYPE_CHECKING, Any
 
 from config.tunings import OWN
@@ -14,7 +13,8 @@ from estimators.fold import Fold
 from ..live.changes import difference
 from ..live.tunings.versions import COVERAGE, Settings, accept, figures, keep, listing, version_text
 from ..live.watchdog import interruptible
-from ..present.result import Topic, to_text
+from ..present.result import TableColumn, Topic, to_json, to_text
+from ..studies.baseline import badness
 from ..twin.log_reader import read_log
 from ..twin.twin import load_twin
 from .options import settings
@@ -25,13 +25,13 @@ if TYPE_CHECKING:
 
 
 def tunings_of(arguments: Arguments) -> int:
-    """Carry the command out."""
+    """Run the command."""
     if arguments.save is not None and arguments.accept is not None:
-        raise ConfigError("--save and --accept: one after the other; a version is judged before it is accepted")
+        raise ConfigError("--save and --accept: give one; a version is judged before it is accepted")
     if len(arguments.names) not in (0, 2):
         raise ConfigError(f"tunings: {len(arguments.names)} names; give two versions to compare, or none to list them")
     if arguments.save is not None:
-        print(_saved(arguments, arguments.save))
+        _save(arguments, arguments.save)
     elif arguments.accept is not None:
         _accept(arguments, arguments.accept)
     elif arguments.names:
@@ -41,8 +41,8 @@ def tunings_of(arguments: Arguments) -> int:
     return 0
 
 
-def _saved(arguments: Arguments, name: str) -> str:
-    """Fold the twin's log with these settings, and keep them with what they were worth."""
+def _save(arguments: Arguments, name: str) -> None:
+    """Fold the twin's log with the given settings, and save them with their scores."""
     overrides = settings(arguments.set, arguments.estimator, arguments.tuning)
     twin = load_twin(arguments.twin, log_files=arguments.log or None, overrides=overrides)
     prepare(twin)
@@ -55,17 +55,15 @@ def _saved(arguments: Arguments, name: str) -> str:
 
     interruptible(fold, work)
     pictures = fold.pictures.taken if fold.pictures is not None else []
-    found = score(fold.track, log.events, twin.model, pictures, gate=twin.tuning.gate)
-    given = Settings(twin.estimator, twin.tuning, printable(arguments.note), scores=figures(found))
-    return f"{shown_path(keep(twin, name, version_text(twin, given)))}: kept"
+    scores = figures(score(fold.track, log.events, twin.model, pictures, gate=twin.tuning.gate))
+    given = Settings(twin.estimator, twin.tuning, printable(arguments.note), scores=scores)
+    print(f"{shown_path(keep(twin, name, version_text(twin, given)))}: kept")
 
 
 def _accept(arguments: Arguments, name: str) -> None:
     twin = load_twin(arguments.twin, overrides={"tuning": name})
     if twin.version is None:
-        raise ConfigError(
-            f"--accept {OWN}: what the twin's file says needs no accepting; it holds while nothing else does"
-        )
+        raise ConfigError(f"--accept {OWN}: the twin's own file applies until a version is accepted")
     accept(twin.version, printable(arguments.note))
     print(f"{shown_path(twin.version.path)}: accepted")
 
@@ -74,62 +72,71 @@ def _list(arguments: Arguments) -> None:
     twin = load_twin(arguments.twin)
     listed = listing(twin)
     if arguments.json:
-        print(json.dumps(listed))
+        print(to_json(listed))
         return
-    broken = tuple(item["error"] for item in listed if "error" in item)
     rows = tuple(
         (
             item["name"] + (" *" if item.get("holds") else ""),
             item.get("saved", "-")[:16].replace("T", " "),
             item.get("estimator", "-"),
-            *_scored(item.get("scores", {})),
+            item.get("scores", {}).get("nis"),
+            item.get("scores", {}).get("log_likelihood"),
+            _mean_coverage(item.get("scores", {})),
             ", ".join(item.get("fitted_on", ())) or "-",
-            _noted(item),
+            _note(item),
         )
         for item in listed
         if "error" not in item
     )
-    head = ("version", "saved", "filter", "NIS", "log L", "in 95 %", "fitted on", "note")
-    said = ("*: holds; `nisus guard` folds with it.",)
-    parts = [Topic(f"Tuning versions of {twin.name}", said, head, rows)]
-    if broken:
-        parts.append(Topic("Cannot be read", broken))
-    print("\n".join(to_text(parts)))
+    inside = TableColumn("in 95 % band [%]", 1, 100.0)
+    columns = ("version", "saved", "filter", "NIS", TableColumn("log L"), inside, "fitted on", "note")
+    topics = [Topic(f"Tuning versions of {twin.name}", ("* accepted: `nisus guard` folds with it.",), columns, rows)]
+    if broken := tuple(item["error"] for item in listed if "error" in item):
+        topics.append(Topic("Cannot be read", broken))
+    print("\n".join(to_text(topics)))
 
 
-def _scored(scores: dict[str, float]) -> tuple[str, str, str]:
+def _mean_coverage(scores: dict[str, float]) -> float | None:
     covered = [value for name, value in scores.items() if name.startswith(f"{COVERAGE}.")]
-    inside = f"{100 * sum(covered) / len(covered):.1f}" if covered else "-"
-    nis, likelihood = (f"{scores[name]:.4g}" if name in scores else "-" for name in ("nis", "log_likelihood"))
-    return nis, likelihood, inside
+    return sum(covered) / len(covered) if covered else None
 
 
-def _noted(item: dict[str, Any]) -> str:
+def _note(item: dict[str, Any]) -> str:
     if item["name"] == OWN:
-        return "what the twin's file says"
+        return "the twin's file"
     accepted = item["accepted"]
-    said = [item["note"], f"accepted: {accepted['note']}" if accepted and accepted["note"] else ""]
-    return "; ".join(filter(None, said))
+    notes = [item["note"], f"accepted: {accepted['note']}" if accepted and accepted["note"] else ""]
+    return "; ".join(filter(None, notes))
 
 
 def _compare(arguments: Arguments) -> None:
+    """Print the entries in which two versions differ, and their scores with the change for the worse."""
     first, second = (load_twin(arguments.twin, overrides={"tuning": name}) for name in arguments.names)
     differ = difference(first.estimator, first.tuning, second.estimator, second.tuning)
     scores = [dict(twin.version.head.scores) if twin.version is not None else {} for twin in (first, second)]
-    both = [name for name in scores[0] if name in scores[1]]
     if arguments.json:
         entries = [{"key": key, "values": [before, after]} for key, before, after in differ]
-        print(json.dumps({"names": arguments.names, "entries": entries, "scores": scores}))
+        print(to_json({"names": arguments.names, "entries": entries, "scores": scores}))
         return
     names = tuple(arguments.names)
-    entries_of = tuple((key, _shown(before), _shown(after)) for key, before, after in differ)
-    parts = [
-        Topic("Entries that differ", () if entries_of else ("None.",), ("entry", *names), entries_of),
-        Topic("Scores", () if both else ("Not both were scored.",), ("score", *names),
-             tuple((name, *(f"{each[name]:.6g}" for each in scores)) for name in both)),
-    ]  # fmt: skip
-    print("\n".join(to_text(parts)))
+    dof = float(sum(len(sensor.rows) for sensor in first.model.sensors)) / len(first.model.sensors)
+    rows = tuple(
+        (name, f"{before:.6g}", f"{scores[1][name]:.6g}", _verdict(name, before, scores[1][name], dof))
+        for name, before in scores[0].items()
+        if name in scores[1]
+    )
+    entries_of = tuple((key, _value_text(before), _value_text(after)) for key, before, after in differ)
+    differing = Topic("Entries that differ", () if entries_of else ("None.",), ("entry", *names), entries_of)
+    scored = Topic("Scores", () if rows else ("Both versions need scores.",), ("score", *names, ""), rows)
+    print("\n".join(to_text([differing, scored])))
 
 
-def _shown(value: float | bool | str | None) -> str:
+def _verdict(name: str, before: float, after: float, dof: float) -> str:
+    """Return whether a score got better or worse, as `nisus guard` counts; a mean NIS is taken per `dof`."""
+    scale = dof if name == "nis" else 1.0
+    change = badness(name, after / scale) - badness(name, before / scale)
+    return "worse" if change > 0.0 else "better" if change < 0.0 else ""
+
+
+def _value_text(value: float | bool | str | None) -> str:
     return "off" if value is None else f"{value:.6g}" if isinstance(value, float) else str(value)

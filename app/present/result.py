@@ -22,7 +22,10 @@ WIDTH = 118
 """Columns of wrapped text."""
 
 MAX_TABLE_WIDTH = WIDTH + 40
-"""Columns beyond which each row of a table becomes a paragraph."""
+"""Columns of a table; each row of a wider one becomes a paragraph."""
+
+MIN_LAST_WIDTH = 40
+"""Columns to which a long last cell is wrapped at least."""
 
 SHORT_CELL = 12
 """Characters up to which a cell in a paragraph needs the heading of its column."""
@@ -163,17 +166,22 @@ def _table_lines(topic: Topic) -> list[str]:
     if len(table) == 1:
         return []
     widths = [max(map(len, column)) for column in zip(*table, strict=True)]
-    if sum(widths) + 2 * len(widths) > MAX_TABLE_WIDTH:
+    before_last = 2 * len(widths) + sum(widths[:-1])
+    if before_last + min(widths[-1], MIN_LAST_WIDTH) > MAX_TABLE_WIDTH:
         return _paragraphs(topic)
     right = [topic.is_numeric(k) for k in range(len(widths))]
-    return [
-        "  "
-        + "  ".join(
+    lines = []
+    for row in table:
+        cells = [
             cell.rjust(width) if numeric else cell.ljust(width)
             for cell, width, numeric in zip(row, widths, right, strict=True)
-        ).rstrip()
-        for row in table
-    ]
+        ]
+        # A long last cell continues below itself.
+        first, *more = textwrap.wrap(cells[-1].rstrip(), MAX_TABLE_WIDTH - before_last) or [""]
+        first = cells[-1] if not more else first
+        lines.append(f"  {'  '.join([*cells[:-1], first])}".rstrip())
+        lines += [" " * before_last + text for text in more]
+    return lines
 
 
 def _paragraphs(topic: Topic) -> list[str]:

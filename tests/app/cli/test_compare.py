@@ -322,7 +322,7 @@ def test_a_setting_that_is_none_is_told_what_it_might_be(given, why, capsys):
 def test_filters_lists_all_and_says_why_not(capsys):
     assert main(["filters"]) == 0
     listed = capsys.readouterr().out
-    assert all(re.search(rf"│ {re.escape(name)} ", listed) for name in ESTIMATORS)
+    assert all(re.search(rf"^{re.escape(name)} \(", listed, re.M) for name in ESTIMATORS)
     assert main(["filters", "--twin", "motor_can"]) == 0
     fitting = capsys.readouterr().out
     assert "no: motor_drive is not linear" in fitting

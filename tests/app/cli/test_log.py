@@ -66,7 +66,7 @@ def test_what_was_written_is_listed(drive, capsys):
     assert signals["Rpm"]["high"] == pytest.approx(2500, abs=1) and signals["Rpm"]["unit"] == "rpm"
     assert main(["log", str(drive / "drive.blf")]) == 0
     text = capsys.readouterr().out
-    assert "720 frames in 64.9 s, from 2023-11-14 22:13:20 UTC" in text and "1 holes: 5.1 s at 29.9 s" in text
+    assert "720 frames in 64.9 s, from 2023-11-14 22:13:20 UTC" in text and "1 gaps: 5.1 s at 29.9 s" in text
     assert "0x18fef100x" in text
 
 

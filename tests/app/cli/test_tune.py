@@ -78,7 +78,7 @@ def test_a_fit_stays_within_the_data_sheet(capsys):
         (["--predict", "winding"], "--predict: is for --aim crps and --aim error"),
         (["--duration", "-1"], "--duration -1: must be positive"),
         (["--save", "found.txt"], "--save found.txt: must end in .yaml"),
-        (["--save", "nowhere/found.yaml"], "--save nowhere/found.yaml: there is no folder nowhere; make it first"),
+        (["--save", "nowhere/found.yaml"], "--save nowhere/found.yaml: there is no folder nowhere; create it first"),
         (["--logs", "0"], "--logs 0: must be 1 or more"),
         (["--aim", "crps"], "the aim is crps; it needs a sensor to hold out, and another one that is used"),
         (

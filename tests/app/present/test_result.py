@@ -7,7 +7,17 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from app.present.result import WIDTH, Figure, TableColumn, Topic, number_text, to_html, to_json, to_text
+from app.present.result import (
+    MAX_TABLE_WIDTH,
+    WIDTH,
+    Figure,
+    TableColumn,
+    Topic,
+    number_text,
+    to_html,
+    to_json,
+    to_text,
+)
 
 
 def test_wide_rows_become_paragraphs_whose_short_cells_keep_their_heading():
@@ -15,10 +25,20 @@ def test_wide_rows_become_paragraphs_whose_short_cells_keep_their_heading():
     head = ("version", "saved", "filter", "NIS", "note")
     narrow = to_text([Topic("Versions", (), head, (("a", "today", "kf", "0.95", "short"),))])
     assert narrow[1].split() == list(head) and narrow[2].split() == ["a", "today", "kf", "0.95", "short"]
-    wide = to_text([Topic("Versions", (), head, (("a", "today", "kf", "0.95", note), ("b", "-", "ekf", "-", note)))])
+    two = (*head, "reason")
+    rows = (("a", "today", "kf", "0.95", note, note), ("b", "-", "ekf", "-", note, ""))
+    wide = to_text([Topic("Versions", (), two, rows)])
     assert wide[1:3] == ["  a today", "      filter kf, NIS 0.95"]
     assert "      filter ekf" in wide and max(map(len, wide)) <= WIDTH
-    assert " ".join(" ".join(wide).split()).count("why it was kept") == 24
+    assert " ".join(" ".join(wide).split()).count("why it was kept") == 36
+
+
+def test_a_long_last_cell_is_wrapped_below_itself():
+    rows = (("kf", "because it is not linear " * 12), ("ekf", "yes"))
+    lines = to_text([Topic("Filters", (), ("name", "applies"), rows)])
+    assert lines[1].split() == ["name", "applies"] and lines[2].startswith("  kf    because")
+    assert lines[3].startswith("        ") and lines[-1] == "  ekf   yes"
+    assert max(map(len, lines)) <= MAX_TABLE_WIDTH and " ".join(lines).count("because") == 12
 
 
 @pytest.mark.parametrize(
