@@ -29,7 +29,7 @@ from estimators.models import MODELS
 from estimators.track import DIVERGED
 from estimators.tuning import Tuning
 from tests.app.fake_engine import FakeEngine, events
-from tests.app.scripted import Scripted, fresh_status, readings, twin
+from tests.app.scripted import Scripted, Stepped, fresh_status, readings, twin
 from tests.support import SECOND
 
 RESET_AT, END = 20, 24
@@ -82,19 +82,18 @@ def reset(at=RESET_AT):
 
 
 def by_hand(estimator, *batches):
-    """An engine without threads, that has taken these readings."""
+    """An engine without threads that has these measurements."""
     made = twin()
     made.model, made.tuning, made.estimator = RAIL, Tuning.of(RAIL).with_options({}), estimator
     made.config.view = SimpleNamespace(window=60.0)
-    engine = Engine(made, lambda report: Scripted())
-    for batch in batches:
-        engine._accept([batch])
-    return engine
+    stepped = Stepped(of=made)
+    stepped.put(*batches)
+    return stepped.engine
 
 
 def swap(engine, estimator):
     engine.retune(estimator, engine.tuning.with_options({}))
-    engine._adopt(engine._refolder._fold(*engine._refolder._pending))
+    engine.settle()
 
 
 def lost_rows(track):

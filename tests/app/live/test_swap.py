@@ -16,7 +16,6 @@ import rerun as rr
 from rerun.chunk import RrdReader
 from viser import GuiEvent
 
-from app.live.engine import Engine
 from app.twin.twin import load_twin
 from app.views.rerun.feed import RerunFeed
 from app.views.viser.view import ViserView
@@ -24,7 +23,7 @@ from config.loader import shipped
 from estimators.fold import Fold
 from estimators.log import INPUT, READING, TICK, TRUTH, Events, Log, sorted_order
 from estimators.registry import ESTIMATORS, unfit
-from tests.app.scripted import Scripted, wait_for
+from tests.app.scripted import Stepped, pull_all
 
 EVERY_FILTER = "motor_winding"
 HUGE = ("thermal_field_large",)
@@ -114,16 +113,14 @@ def asset(model, count, seed=0):
     return events.select(sorted_order(events))
 
 
-class Running:
-    """An engine on a twin that ships, with what a page has around it, and the log that a test feeds it."""
+class Running(Stepped):
+    """An engine on a bundled twin, with the views of a page and a log that a test feeds it."""
 
     def __init__(self, twin, count):
+        super().__init__(of=twin)
         self.twin = twin
         self.events = asset(twin.model, count)
         self.given = 0
-        self.source = Scripted()
-        self.engine = Engine(twin, lambda report: self.source)
-        self.engine.start()
         self.view = ViserView(self.engine, secret="s3cret")
         self.feed = RerunFeed(self.engine)
         self.cold = {}
@@ -131,32 +128,21 @@ class Running:
     def stop(self):
         self.feed.close()
         self.view.stop()
-        self.engine.stop()
 
     def give(self, count):
-        self.source.put(self.events.select(slice(self.given, self.given + count)))
+        self.put(self.events.select(slice(self.given, self.given + count)))
         self.given += count
 
-    def rows(self):
-        cursor = self.engine.cursor()
-        pull = self.engine.pull(cursor)
-        self.engine.release(cursor)
-        return pull
-
-    def settled(self, revision):
-        status = self.engine.status()
-        return status.revision == revision and not status.refolding and len(self.rows().events) == self.given
-
     def swap(self, name):
-        """Swap as a browser does it, with readings on their way."""
-        revision = self.engine.status().revision
+        """Swap as a browser does it, with measurements before and after."""
+        revision = self.status().revision
         self.give(1)
         panel = self.view.panel
         choose(panel.controls.handles["estimator"], ESTIMATORS[name].title)
         self.give(1)
-        wait_for(lambda: self.settled(revision + 1))
+        status = self.status()
+        assert (status.revision, status.refolding) == (revision + 1, False)
         self.give(PACE - 2)
-        wait_for(lambda: self.settled(revision + 1))
 
     def fold(self, name):
         """The whole log, folded from its start with nothing before."""
@@ -171,7 +157,7 @@ class Running:
 
     def check(self, name):
         """Engine, status and the left side of the page show this filter over the whole history."""
-        pull, status = self.rows(), self.engine.status()
+        pull, status = pull_all(self.engine), self.status()
         assert pull.first == 0
         for column, given in zip(pull.events, self.events.select(slice(0, self.given)), strict=True):
             np.testing.assert_array_equal(column, given)
@@ -200,7 +186,7 @@ class Running:
                     pieces.append(message)
                 else:
                     pieces, revision = [], json.loads(message)["revision"]
-        pull, file = self.rows(), tmp_path / "piece.rrd"
+        pull, file = pull_all(self.engine), tmp_path / "piece.rrd"
         state = rr.escape_entity_path_part(self.twin.model.shown_states[0].name)
         times, means = [], []
         for piece in pieces:
@@ -234,7 +220,6 @@ def run():
     def start(twin, swaps):
         running.append(Running(twin, BEGUN + PACE * (swaps + 1)))
         running[-1].give(BEGUN)
-        wait_for(lambda: running[-1].settled(0))
         return running[-1]
 
     yield start
