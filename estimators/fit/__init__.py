@@ -1,1 +1,1 @@
-"""Fitting a tuning to recorded logs: which entries, by what they are judged, how sure the data are of them."""
+"""Fit a tuning to recorded logs: objective, uncertainty, held-out scores, proposal."""

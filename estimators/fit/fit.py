@@ -2,7 +2,7 @@
 
 The maximum is found on blocks of time; entries that the data do not identify go back to their start, and the others are
 fitted again without them; intervals follow from the curvature. Then held-out blocks and sensors choose the power of the
-likelihood (tempered.py), and decide whether the result is proposed.
+likelihood (judge.py), and decide whether the result is proposed.
 """
 
 from __future__ import annotations
@@ -20,10 +20,9 @@ from ..registry import find_estimator
 from ..tuning import Tuning
 from .aims import LIKELIHOOD, WITNESSES, aim_of
 from .entries import Entry, Setting, Skipped, entries_of, with_values
-from .judge import Verdict, Worth, worths
+from .judge import POWERS, Tempered, Verdict, Worth, tempered, worths
 from .objective import ALONE, Go, Objective, maximise, search
 from .recording import BLOCKS, Recording, held_out_rows, without_queries, without_stuck
-from .tempered import POWERS, Tempered, tempered
 from .uncertainty import Curvature, Z, curvature, intervals
 
 MAX_DEVIATION = 0.25
@@ -109,7 +108,7 @@ def fit(
         bounds: Range by key.
         blocks: Blocks of time per recording; every third is held out. 0 holds none out: then nothing is judged, and
             nothing proposed.
-        aim: What is maximised, see aims.py.
+        aim: Aim of the fit, see aims.py.
         predict: Sensors to hold out, for an aim that does; each in turn by default.
         go: Called from any thread with the number of folds done since; returns whether to continue.
 

@@ -1,14 +1,30 @@
-"""Scores of a tuning on fitted and on held-out measurements, and the verdict on a fit.
+"""Scores of a tuning on fitted and held-out measurements, the verdict on a fit, and the power of the likelihood.
 
 The fit sees none of the criteria: the density of the measurements of held-out blocks, the measurements of each sensor
 in turn predicted by the others, the coverage of the predictions, and the true state where a recording has it. A
 held-out prediction is scored by the continuous ranked probability score, which is proper, in its unit, and robust
 against single measurements.
+
+They also choose the power of the likelihood, p(θ | y) ∝ p(y | θ)^η p(θ), 0 < η ≤ 1. If the model is right, η = 1. The
+model of a real asset has slow errors, so that a thousand measurements carry the information of ten, and the likelihood
+is overconfident: it fits noises to one stretch of time under which the states that are not measured leave their bands.
+A smaller power discounts the measurements, and entries go back to their start, the least identified first.
+
+With the aim `likelihood` the power is 1 unless there is evidence against it: among the powers that worsen no held-out
+prediction, the largest whose prediction of the held-out blocks is within chance (two standard errors of the difference)
+of the best. With references, whose independent errors are few, it is the smallest of those with which the fit is
+proposed, preferably with all references in their bands.
+
+The maximum at a power is taken from the parabola at the maximum x̂ of power 1, with H minus its second derivatives, D
+those of the prior at x_0: x(η) = x_0 + (η (H - D) + D)⁻¹ η H (x̂ - x_0). Each is scored by folding.
+
+Sources: Grünwald & van Ommen (2017), doi:10.1214/17-BA1085, for a power learnt by prediction; Breiman, Friedman, Olshen
+& Stone, Classification and Regression Trees (1984), 3.4.3, for the simplest candidate that is no worse than by chance.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -33,30 +49,36 @@ from .aims import (
     track_of,
 )
 from .entries import Setting
-from .objective import ALONE, Cancelled, Go
+from .objective import ALONE, Cancelled, Go, Objective
 from .recording import Recording
-from .uncertainty import Z
+from .uncertainty import Curvature, Z
 
 GAIN_BATCHES = 20
 """Batches of time over which a difference is averaged, for its standard error."""
 
+
 MIN_SIGMAS = 2.0
 """Standard errors that a gain must exceed, and a loss before it counts."""
+
 
 MIN_TOTAL_GAIN = 1.0
 """Nats that a fit must gain on all held-out data: with less it is the same tuning in other digits."""
 
+
 MAX_LOSS = 0.05
 """Share by which the score of a held-out prediction may grow before it counts."""
+
 
 MIN_COVERAGE = 0.9
 """Coverage of a 95 % band from which on it is not too narrow."""
 
+
 MAX_COVERAGE_LOSS = 0.05
 """Coverage that may be lost before it counts, below `MIN_COVERAGE`."""
 
+
 UNITS = {LIKELIHOOD: "a reading", WITNESSES: "a reading or witness"}
-"""What a gain in nats is averaged over, by aim."""
+"""Unit of a gain in nats, by aim."""
 
 
 class Prediction(NamedTuple):
@@ -104,8 +126,8 @@ class Worth(NamedTuple):
 class Verdict(NamedTuple):
     """Whether the fit is proposed.
 
-    With the mean gain on the held-out blocks, in nats per `each`, its standard error, and the reasons against it.
-    `harmless` is whether no held-out prediction is worse, even without a gain.
+    `gain` is the mean on the held-out blocks, in nats per `each`, `error` its standard error, `reasons` those against
+    it. `harmless` is whether no held-out prediction is worse, even without a gain.
     """
 
     proposed: bool
@@ -272,3 +294,91 @@ def narrower(what: str, old: Prediction, new: Prediction) -> Iterator[str]:
     """Yield the reason against a prediction whose band is too narrow, and narrower than before."""
     if new.coverage < MIN_COVERAGE and new.coverage < old.coverage - MAX_COVERAGE_LOSS:
         yield f"{what} leaves its band: {100 * new.coverage:.0f} % inside after {100 * old.coverage:.0f} %"
+
+
+POWERS = tuple(0.25**k for k in range(9))
+"""Powers to try: at the last, 65,536 measurements count as one."""
+
+
+class Tempered(NamedTuple):
+    """The chosen power, its point x (k,) and covariance (k, k), and the scores before and after."""
+
+    power: float
+    x: np.ndarray
+    cov: np.ndarray
+    before: Worth
+    after: Worth
+    verdict: Verdict
+
+
+def tempered(
+    objective: Objective,
+    x: np.ndarray,
+    shape: Curvature,
+    setting: Callable[[np.ndarray], Setting],
+    judged: Callable[[Sequence[Setting]], list[Worth]],
+    *,
+    aim: Aim,
+    powers: Sequence[float] = POWERS,
+) -> Tempered:
+    """Choose the power.
+
+    Args:
+        objective: The objective.
+        x: Its maximum, (k,).
+        shape: Its curvature there.
+        setting: Setting to fold at a point.
+        judged: Scores of settings.
+        aim: Aim of the fit.
+        powers: Powers to try, from 1 on, falling.
+    """
+    found = [at_power(objective, x, shape, power) for power in powers]
+    own, *others = judged([setting(objective.start), *(setting(point) for point, _ in found)])
+    verdicts = [verdict(own, other, aim, changed=x.size > 0) for other in others]
+    k = _chosen(own, others, verdicts, aim)
+    return Tempered(powers[k], *found[k], own, others[k], verdicts[k])
+
+
+def at_power(objective: Objective, x: np.ndarray, shape: Curvature, power: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the maximum (k,) at a power, and its covariance (k, k)."""
+    if power == 1.0 or not x.size:
+        return x, shape.cov
+    H = np.linalg.inv(shape.cov)
+    start = objective.start
+    cov = np.linalg.inv(power * H + (1.0 - power) * np.diag(objective.precision))
+    low, high = np.array(objective.limits).T
+    return np.clip(start + cov @ (power * H @ (x - start)), low, high), cov
+
+
+def _chosen(own: Worth, others: Sequence[Worth], verdicts: Sequence[Verdict], aim: Aim) -> int:
+    """Return the index of the power; 0 (power 1, whose reasons are reported) if none qualifies.
+
+    For the likelihood all harmless fits qualify, since a proposed one may win by chance when several powers are tried.
+    """
+    if aim.kind == LIKELIHOOD:
+        qualified = [k for k, item in enumerate(verdicts) if item.harmless]
+    else:
+        qualified = [k for k, item in enumerate(verdicts) if item.proposed]
+        qualified = [k for k in qualified if _in_band(own, others[k])] or qualified
+    best = max(qualified, key=lambda k: verdicts[k].gain, default=0)
+    if aim.kind == LIKELIHOOD:
+        return next((k for k in qualified if _as_good(others[k], others[best])), 0)
+    return next((k for k in reversed(qualified) if _as_good(others[k], others[best])), 0) if aim.weights else best
+
+
+def _as_good(one: Worth, best: Worth) -> bool:
+    """Return whether a prediction of the held-out blocks is within chance of the best."""
+    less, error = gain(one.held_out.aimed, best.held_out.aimed)
+    return less <= MIN_SIGMAS * error
+
+
+def _in_band(own: Worth, other: Worth) -> bool:
+    """Return whether the bands of all references, fitted and held out, are wide enough or no narrower."""
+    pairs = [
+        (old, new[name])
+        for one, two in ((own.fitted, other.fitted), (own.held_out, other.held_out))
+        for olds, new in ((one.withheld, two.withheld), (one.states, two.states))
+        for name, old in olds.items()
+        if name in new
+    ]
+    return all(new.coverage >= min(MIN_COVERAGE, old.coverage) for old, new in pairs)

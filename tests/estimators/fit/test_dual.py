@@ -151,7 +151,7 @@ def test_a_value_that_lies_in_its_interval_has_nothing_against_it():
     won = fit("kf", believed(), [Recording(wearing(9, [0.6]))], wanted=["p.rate", "R.float"])
     assert won.proposed and against(won) == ()
     inside = tuple(line if line.alone else line._replace(before=line.after) for line in won.lines)
-    assert against(replace(won, lines=inside)) == ("every value of the day lies in its 95 % interval",)
+    assert against(replace(won, lines=inside)) == ("every current value lies in its 95 % interval",)
     # One that has left it is enough.
     assert against(replace(won, lines=(won.lines[0], inside[1]))) == ()
     lost = fit("kf", believed(), [Recording(wearing(10, [0.2]))], wanted=["p.rate"])

@@ -7,10 +7,9 @@ from scipy.optimize import minimize
 from estimators.fit.aims import Aim
 from estimators.fit.entries import entries_of
 from estimators.fit.fit import fit
-from estimators.fit.judge import Part, Worth, verdict
+from estimators.fit.judge import POWERS, Part, Worth, at_power, verdict
 from estimators.fit.objective import Objective, maximise
 from estimators.fit.recording import Recording
-from estimators.fit.tempered import POWERS, at_power
 from estimators.fit.uncertainty import curvature
 from estimators.tuning import Tuning
 from tests.estimators.fit.test_fit import DECADES, MODEL, dense, log_of, simulated
