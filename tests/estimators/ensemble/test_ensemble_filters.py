@@ -215,15 +215,8 @@ READ = (0, 3, 7, 8, 15, 21, 22, 30, 38)
 
 
 def some(x, u, p, out):
-    out[0] = x[0]
-    out[1] = x[3]
-    out[2] = x[7]
-    out[3] = x[8]
-    out[4] = x[15]
-    out[5] = x[21]
-    out[6] = x[22]
-    out[7] = x[30]
-    out[8] = x[38]
+    for k in range(out.size):
+        out[k] = x[READ[k]]
 
 
 def stay(x, u, p, dt, out):
