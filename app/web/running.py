@@ -14,7 +14,7 @@ from ..concurrency import run_all
 from ..live.engine import Engine
 from ..live.runs.refits import Refits
 from ..views.recording.rrd_file import NEVER, Split
-from ..views.recording.writer import FINE, Recorder
+from ..views.recording.writer import ALL_STRETCHES, Recorder
 from ..views.rerun.rows import RerunRows
 
 if TYPE_CHECKING:
@@ -95,7 +95,10 @@ class RunningTwin:
         for level, text in opening.remarks:
             self.engine.notices.say(text, level=level)
         self.recorder = Recorder(
-            self.engine, lambda stream: RerunRows(stream, self.engine, series=FINE), split, recordings or Path()
+            self.engine,
+            lambda stream: RerunRows(stream, self.engine, series=ALL_STRETCHES),
+            split,
+            recordings or Path(),
         )
         self.engine.recorder = self.recorder
         self.refits = Refits(self.engine)

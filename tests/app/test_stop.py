@@ -12,7 +12,7 @@ from app.cli.run import live_source
 from app.concurrency import run_all
 from app.twin.twin import load_twin
 from app.views.recording.reader import finished, read_recording
-from app.views.recording.writer import _Part
+from app.views.recording.writer import RecordingPart
 from app.web.running import Opening, RunningTwin
 from tests.app.scripted import row_count, wait_for
 from tests.conftest import ROOT
@@ -61,8 +61,8 @@ def test_the_recording_is_closed_after_the_last_row_and_has_it(tmp_path, monkeyp
         assert finished(path)
         order.append("closed")
 
-    ended = _Part.end
-    monkeypatch.setattr(_Part, "end", end)
+    ended = RecordingPart.end
+    monkeypatch.setattr(RecordingPart, "end", end)
     running.start()
     running.recorder.record(path)
     wait_for(lambda: path.exists() and row_count(running.engine) > 100, PATIENCE)

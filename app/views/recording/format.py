@@ -1,10 +1,9 @@
-"""The recording: an .rrd file that Rerun opens, and that holds all it takes to fold again, to the bit.
+"""Format of recordings: an .rrd file that Rerun opens, with everything needed to fold it again, bit for bit.
 
-Beside what charts show, the file keeps under /nisus, as plain columns: `twin` (YAML, tuning version, what the command
-line changed, base), `tuning` (each one, with the event from which it was in force), `events` (the log), `base` (where a
-fold of them starts, if that has moved), `notices` (lines for people) and `summary` (what the session was worth, for
-lists). The track is not among them: log and tuning give it again. Rows carry their absolute index; a late reading makes
-a recorder write the events again from where it belongs. `reader` reads them back.
+Besides the charts, the file keeps plain columns under /nisus: `twin` (YAML, tuning version, overrides, base), `tuning`
+(each with the event from which it applied), `events` (the log), `base` (start of a fold of them, if it has moved),
+`notices` and `summary` (scores of the session, for lists). The track is not stored: log and tuning give it again. Rows
+have absolute indices; after a late measurement the events are written again from its index on.
 """
 
 from __future__ import annotations
@@ -38,14 +37,14 @@ from .rrd_file import RrdFile
 
 FORMAT = 2
 READABLE = (1, 2)
-"""Formats that can be read; the first kept the track too."""
+"""Formats that can be read; the first also stored the track."""
 PREFIX = "nisus_"
-"""Of the name under which a recording is known to Rerun; the twin's follows."""
+"""Start of the application id that Rerun shows; the name of the twin follows."""
 TIMELINE = "event"
 
 
 def tuning_to_json(tuning: Tuning, estimator: str) -> str:
-    """A tuning and its estimator as text; float64s survive exactly."""
+    """Return a tuning and its estimator as text, which keeps float64 exactly."""
     return json.dumps(
         {
             "estimator": estimator,
@@ -64,7 +63,7 @@ def tuning_to_json(tuning: Tuning, estimator: str) -> str:
 
 
 def tuning_from_json(text: str, model: StateSpaceModel) -> tuple[Tuning, str]:
-    """The tuning and the estimator that `tuning_to_json` wrote."""
+    """Return the tuning and the estimator that `tuning_to_json` wrote."""
     values = json.loads(text)
     tuning = Tuning(
         model=model,
@@ -73,7 +72,7 @@ def tuning_from_json(text: str, model: StateSpaceModel) -> tuple[Tuning, str]:
         p=np.array(values["p"], float),
         used=np.array(values["used"], bool),
         gate=values["gate"],
-        # Of older recordings the gate was hard, and never opened again.
+        # In older recordings the gate was hard and never reopened.
         gate_kind=values.get("gate_kind", "hard"),
         reopen=values.get("reopen"),
         options=values["options"],
@@ -84,62 +83,62 @@ def tuning_from_json(text: str, model: StateSpaceModel) -> tuple[Tuning, str]:
 
 
 def version_to_json(version: Version) -> str:
-    """A tuning version as text: its file, whole."""
+    """Return a tuning version as text, with the content of its file."""
     return json.dumps({"name": version.name, "path": str(version.path), "text": version.text})
 
 
 def version_from_json(text: str) -> Version:
-    """The version that `version_to_json` wrote."""
+    """Return the version that `version_to_json` wrote."""
     values = json.loads(text)
     return version_of(values["name"], values["text"], Path(values["path"]))
 
 
 def base_to_json(base: Base | None) -> str:
-    """A base as text; float64s survive exactly."""
+    """Return a base as text, which keeps float64 exactly."""
     if base is None:
         return "null"
     moments = {"mean": base.mean.tolist(), "cov": base.cov.tolist(), "clock": base.clock, "u": base.u.tolist()}
     moments |= {"first": base.first, "version": base.version}
     arrays = {"state": base.state, "edge": base.edge, "evidence": base.evidence, "doubt": base.doubt}
-    held = {key: _packed(array) for key, array in arrays.items() if array is not None}
+    held = {key: _to_base64(array) for key, array in arrays.items() if array is not None}
     return json.dumps({**moments, "estimator": base.estimator, **held})
 
 
-def _packed(numbers: np.ndarray) -> str:
+def _to_base64(numbers: np.ndarray) -> str:
     return base64.b64encode(np.ascontiguousarray(numbers, "<f8").tobytes()).decode()
 
 
-def _unpacked(text: str | None) -> np.ndarray | None:
+def _from_base64(text: str | None) -> np.ndarray | None:
     return None if text is None else np.frombuffer(base64.b64decode(text), "<f8").astype(float)
 
 
 def base_from_json(text: str) -> Base | None:
-    """The base that `base_to_json` wrote; older recordings hold moments only, and no index or evidence."""
+    """Return the base that `base_to_json` wrote; in older recordings it has moments only."""
     values = json.loads(text)
     if values is None:
         return None
-    doubt = _unpacked(values.get("doubt"))
+    doubt = _from_base64(values.get("doubt"))
     return Base(
         np.array(values["mean"]),
         np.array(values["cov"]),
         int(values["clock"]),
         np.array(values["u"], float),
         values.get("estimator", ""),
-        _unpacked(values.get("state")),
+        _from_base64(values.get("state")),
         int(values.get("first", 0)),
-        evidence=_unpacked(values.get("evidence")),
-        edge=_unpacked(values.get("edge")),
+        evidence=_from_base64(values.get("evidence")),
+        edge=_from_base64(values.get("edge")),
         version=int(values.get("version", 1)),
         doubt=None if doubt is None else doubt.reshape(-1, REMEMBERED),
     )
 
 
 TAKEN = "is there already; choose another name, or remove it"
-"""What is said of a name that something stands under."""
+"""Message about a path that is taken."""
 
 
 class RecordingFile:
-    """An .rrd that is being written, in a stream of its own: no viewer can hold it up."""
+    """A recording that is being written, in a stream of its own, so that no viewer can delay it."""
 
     def __init__(
         self,
@@ -152,16 +151,16 @@ class RecordingFile:
         overrides: Mapping[str, str] | None = None,
         version: Version | None = None,
     ) -> None:
-        """Begin a file.
+        """Create the file.
 
         Args:
-            path: Where; nothing may stand there yet, not even a link that leads nowhere.
-            name: Of the twin.
+            path: Where; it must be free, also of a broken link.
+            name: Name of the twin.
             text: The twin's YAML.
-            twin_path: Where the YAML was, for the model's file beside it.
-            base: Where the fold of the first event starts, if older events were dropped before.
-            overrides: What the command line changed of the YAML, by key.
-            version: The tuning version whose values stand in place of the YAML's.
+            twin_path: Path of the YAML, for a model file beside it.
+            base: Start of the fold, if older events were dropped; None for the prior.
+            overrides: Keys of the YAML that the command line changed, with their values.
+            version: Tuning version that replaces values of the YAML.
 
         Raises:
             SourceError: If the file cannot be written.
@@ -174,25 +173,25 @@ class RecordingFile:
         except FileExistsError:
             raise SourceError(f"recording {path}: {TAKEN}") from None
         except OSError as error:
-            raise SourceError(f"recording {path}: {error.strerror}; choose a place that can be written") from None
+            raise SourceError(f"recording {path}: {error.strerror}; choose another folder") from None
         self.rows = 0
         self._header = {"name": name, "path": str(twin_path), "base": base_to_json(base)}
         self.twin(text, overrides or {}, version)
 
     @property
     def size(self) -> int:
-        """Bytes that the file has taken."""
+        """Size of the file in bytes."""
         return self._file.size
 
     def twin(self, text: str, overrides: Mapping[str, str], version: Version | None) -> None:
-        """Write the twin's YAML and its tuning version, again when one was saved anew: the last ones count."""
+        """Write the twin's YAML and its tuning version; the last ones count."""
         more = {"yaml": text, "overrides": json.dumps(dict(overrides))}
         if version is not None:
             more["version"] = version_to_json(version)
         self.stream.log("/nisus/twin", rr.AnyValues(format=FORMAT, **self._header, **more), static=True)
 
     def base(self, base: Base | None, index: int, revision: int) -> None:
-        """Write where a fold of a revision starts, from event `index` on; None is the prior."""
+        """Write the start of a revision's fold from event `index` on; None is the prior."""
         self.stream.send_columns(
             "/nisus/base",
             indexes=[rr.TimeColumn(TIMELINE, sequence=[index])],
@@ -200,7 +199,7 @@ class RecordingFile:
         )
 
     def tuning(self, tuning: Tuning, estimator: str, index: int, revision: int) -> None:
-        """Write the tuning that is in force from event `index` on."""
+        """Write the tuning that applies from event `index` on."""
         self.stream.send_columns(
             "/nisus/tuning",
             indexes=[rr.TimeColumn(TIMELINE, sequence=[index])],
@@ -208,11 +207,11 @@ class RecordingFile:
         )
 
     def summary(self, found: Mapping[str, Any]) -> None:
-        """Write what the session was worth when the file was closed, for lists."""
+        """Write the scores of the session, for lists."""
         self.stream.log("/nisus/summary", rr.AnyValues(json=json.dumps(dict(found))), static=True)
 
     def write(self, pull: Pull) -> None:
-        """Write rows of the log, and the lines for people."""
+        """Write events and notices."""
         if pull.notices:
             self.stream.send_columns(
                 "/nisus/notices",
@@ -227,7 +226,7 @@ class RecordingFile:
         if not count:
             return
         index = [rr.TimeColumn(TIMELINE, sequence=np.arange(pull.first, pull.first + count))]
-        # As Arrow's arrays: Rerun would turn NumPy's into Python lists, which takes fifty times as long.
+        # As Arrow arrays: Rerun would turn NumPy arrays into Python lists, which is fifty times slower.
         flat: dict[str, pa.Array] = {}
         for name, column in zip(pull.events._fields, pull.events, strict=True):
             if column.ndim == 1:
@@ -241,16 +240,16 @@ class RecordingFile:
         """Hand everything to the operating system.
 
         Raises:
-            OSError: If the file takes no more; what it took before stays, and can be read.
+            OSError: If the file cannot grow; what was written before can be read.
         """
         self._file.flush()
 
     def abandon(self) -> None:
-        """Leave a file that takes no more as it is."""
+        """Close the file as it is."""
         self._file.abandon()
 
     def close(self) -> None:
-        """Finish the file.
+        """Complete and close the file.
 
         Raises:
             OSError: As `flush`.
@@ -259,10 +258,7 @@ class RecordingFile:
 
 
 def summary_of(engine: Running) -> dict[str, Any]:
-    """Estimator, mean NIS and how it is judged, and the first error that could be taken, of what runs; or less.
-
-    `error` is {name, rmse, unit, coverage, against}: of the first state with a truth, else of a sensor held out.
-    """
+    """Return the scores of the running fold: see `summary`; fewer if they cannot be computed."""
     try:
         pull = copy_rows(engine)
         tuning, estimator = engine.folded_with()
@@ -276,13 +272,16 @@ def summary_of(engine: Running) -> dict[str, Any]:
 def summary(
     estimator: str, tuning: Tuning, events: Events, track: Track, pictures: Sequence[Picture] = ()
 ) -> dict[str, Any]:
-    """The same of a track, with what it was folded, and of what."""
+    """Return the scores of a track: estimator, mean NIS with bounds and verdict, and one error.
+
+    `error` is {name, rmse, unit, coverage, against} of the first state with a truth, or else of a held-out sensor.
+    """
     found = score(track, events, tuning.model, pictures, gate=tuning.gate, baseline=tuning.baseline)
     return {
         "estimator": estimator,
-        "nis": _plain(found.nis),
-        "nis_low": _plain(found.nis_low),
-        "nis_high": _plain(found.nis_high),
+        "nis": _finite(found.nis),
+        "nis_low": _finite(found.nis_low),
+        "nis_high": _finite(found.nis_high),
         "nis_words": found.nis_verdict.words,
         "error": _error(found, tuning.model),
     }
@@ -296,11 +295,11 @@ def _error(found: Score, model: StateSpaceModel) -> dict[str, Any] | None:
     for against, part in fits:
         for name, fit in part.items():
             if math.isfinite(fit.rmse):
-                coverage = _plain(fit.coverage)
+                coverage = _finite(fit.coverage)
                 unit = units.get(name, "")
                 return {"name": name, "rmse": fit.rmse, "unit": unit, "coverage": coverage, "against": against}
     return None
 
 
-def _plain(value: float) -> float | None:
+def _finite(value: float) -> float | None:
     return value if math.isfinite(value) else None

@@ -1,7 +1,7 @@
-"""A recording read back: twin, tuning and log as they were at the end, from which the track follows to the bit.
+"""Reading a recording back: twin, tuning and log as they were at its end, which give the track again, bit for bit.
 
-A recorder writes events again from the index where a late reading belongs. So rows are taken in the order of the file,
-and an index that is not new cuts off what came after it.
+A recorder writes events again from the index of a late measurement on. So rows are taken in the order of the file, and
+an index that is not new cuts off the rows after it.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ from estimators.log import Events
 from estimators.snapshots import Base
 
 from .format import FORMAT, PREFIX, READABLE, TIMELINE, base_from_json, version_from_json
-from .rrd_file import BEGIN, MESSAGE_HEADER, STREAM_HEADER, whole_until
+from .rrd_file import MAGIC, MESSAGE_HEADER, STREAM_HEADER, complete_until
 
 
 @dataclass(frozen=True)
 class Recorded:
-    """What a recording holds: twin, the last tuning, the log as it was at the end, lines (t, level, text).
+    """Content of a recording.
 
-    `text` is the twin's YAML, `version` the tuning version that it ran with, `overrides` what the command line changed,
-    which older recordings do not tell.
-    A fold of `events` starts at `base` (None: the prior). `first` is the index of their first event in the session,
-    `rows` how many there are, and `closed` whether the recording was finished when it ended.
+    `text` is the twin's YAML, `version` its tuning version, `overrides` the keys that the command line changed (older
+    recordings have none). `tuning` is the last of `tunings`. A fold of `events` starts at `base` (None: the prior);
+    `first` is the index of the first event in the session, `rows` their number. `notices` are (t, level, text), and
+    `closed` is whether the recording was finished when it ended.
     """
 
     path: Path
@@ -53,7 +53,7 @@ class Recorded:
 
 
 def read_recording(path: Path) -> Recorded:
-    """Read a recording back, also one whose writer was killed.
+    """Read a recording, also one whose writer was killed.
 
     Raises:
         SourceError: If it cannot be read, or is not a recording of Nisus.
@@ -64,27 +64,27 @@ def read_recording(path: Path) -> Recorded:
     try:
         content.read(path)
     except Exception:  # noqa: BLE001  Rerun's reader raises many kinds on a damaged file
-        # Cut in the middle of a message, by a full disk or a power cut: what stands before it is whole.
+        # Cut in the middle of a message, by a full disk or a power failure: the messages before it can be read.
         with tempfile.TemporaryDirectory() as folder:
-            whole = Path(folder) / path.name
+            copy = Path(folder) / path.name
             content = _Content()
             try:
-                copy_whole(path, whole)
-                content.read(whole)
+                copy_complete(path, copy)
+                content.read(copy)
             except Exception as error:  # noqa: BLE001  as above
                 if not (content.header and content.events):
-                    text = _cut_short(path) or f"cannot be read ({_line(error, whole, path)}); is it an .rrd file?"
-                    raise SourceError(f"{path}: {text}") from None
-    header, tunings, notices = content.header, content.tunings, content.notices
+                    text = (str(error).strip().splitlines() or [type(error).__name__])[0].replace(str(copy), path.name)
+                    raise SourceError(f"{path}: {_truncated(path) or f'cannot be read ({text})'}") from None
+    header, tunings = content.header, content.tunings
     if not header or not tunings:
-        text = _cut_short(path) or "holds no recording of Nisus; record one with `nisus run TWIN --record FILE.rrd`"
+        text = _truncated(path) or "holds no recording of Nisus; record one with `nisus run TWIN --record FILE.rrd`"
         raise SourceError(f"{path}: {text}")
     if int(header["format"]) not in READABLE:
         raise SourceError(f"{path}: has format {header['format']}, this version reads {FORMAT}; use the other")
     first, columns = _latest(content.events)
     base = base_from_json(content.bases[-1][1] if content.bases else str(header["base"]))
     start = content.bases[-1][0] if content.bases else first
-    # What stands before the base belongs to a fold that the session had left behind.
+    # Events before the base belong to an earlier fold of the session.
     events = Events(*(_column(name, columns) for name in Events._fields)).select(slice(max(0, start - first), None))
     return Recorded(
         path=path,
@@ -94,21 +94,53 @@ def read_recording(path: Path) -> Recorded:
         overrides=json.loads(str(header.get("overrides", "{}"))),
         version=version_from_json(str(header["version"])) if "version" in header else None,
         base=None if base is None else base._replace(first=start),
-        tuning=str(tunings[-1]),
+        tuning=tunings[-1],
         tunings=len(tunings),
         events=events,
-        notices=notices,
+        notices=content.notices,
         first=start,
         rows=len(events),
         closed=finished(path),
     )
 
 
+@dataclass(frozen=True)
+class Facts:
+    """Twin, filter, duration in seconds, and the summary of a recording, for lists of many."""
+
+    twin: str
+    estimator: str | None
+    seconds: float
+    summary: dict[str, Any]
+
+
+def facts_of(path: Path) -> Facts:
+    """Return the facts of a recording, also of one that is being written.
+
+    Raises:
+        SourceError: If it cannot be read, or is not a recording of Nisus.
+    """
+    content = _Content()
+    try:
+        content.read(path)
+    except Exception as error:  # noqa: BLE001  Rerun's reader raises many kinds
+        if not content.header:
+            raise SourceError(f"{path.name}: it cannot be read; is it an .rrd file?") from error
+    if not content.header:
+        raise SourceError(f"{path.name}: it is no recording of Nisus")
+    # Not in the order of time: a late measurement makes a recorder write events again.
+    times = [columns["t"] for _, columns in content.events]
+    seconds = (max(int(t.max()) for t in times) - min(int(t.min()) for t in times)) * 1e-9 if times else 0.0
+    estimator = json.loads(content.tunings[-1])["estimator"] if content.tunings else None
+    return Facts(str(content.header["name"]), estimator, seconds, content.summary)
+
+
 class _Content:
-    """What the entities under /nisus hold, in the order of the file."""
+    """Entities under /nisus, in the order of the file."""
 
     def __init__(self) -> None:
         self.header: dict[str, Any] = {}
+        self.summary: dict[str, Any] = {}
         self.tunings: list[str] = []
         self.notices: list[tuple[int, str, str]] = []
         self.events: list[tuple[np.ndarray, dict[str, np.ndarray]]] = []
@@ -116,97 +148,85 @@ class _Content:
 
     def read(self, path: Path) -> None:
         with warnings.catch_warnings():
-            # A killed writer leaves no footer; that such a file can still be read is the point.
-            warnings.simplefilter("ignore")
+            warnings.simplefilter("ignore")  # a killed writer leaves no footer, and these files have none
             reader = RrdReader(str(path))
         for chunk in reader.stream():
             if not chunk.entity_path.startswith("/nisus/"):
                 continue
-            batch = chunk.to_record_batch()
-            names = {name: k for k, name in enumerate(batch.schema.names)}
-            if chunk.entity_path == "/nisus/twin":
-                self.header = {name: _flat(batch.column(k))[0] for name, k in names.items() if not _control(name)}
-            elif chunk.entity_path == "/nisus/notices":
-                parts = (_flat(batch.column(names[name])).tolist() for name in ("t", "level", "text"))
-                self.notices += zip(*parts, strict=True)
-            elif chunk.entity_path == "/nisus/tuning":
-                self.tunings += _flat(batch.column(names["json"])).tolist()
-            elif chunk.entity_path == "/nisus/base":
-                index = batch.column(names[TIMELINE]).to_pylist()
-                self.bases += zip(index, _flat(batch.column(names["json"])).tolist(), strict=True)
-            elif chunk.entity_path == "/nisus/events":
-                index = batch.column(names[TIMELINE]).to_numpy()
-                columns = {name: _flat(batch.column(k)) for name, k in names.items() if not _control(name)}
-                self.events.append((index, columns))
+            batch, part = chunk.to_record_batch(), chunk.entity_path.removeprefix("/nisus/")
+            # Rows are lists; timelines and Rerun's own columns are not.
+            columns = {
+                name: column.flatten().to_numpy(zero_copy_only=False)
+                for name, column in zip(batch.schema.names, batch.columns, strict=True)
+                if hasattr(column, "flatten")
+            }
+            if part == "twin":
+                self.header = {name: values[0] for name, values in columns.items()}
+            elif part == "summary":
+                self.summary = json.loads(columns["json"][-1])
+            elif part == "notices":
+                self.notices += zip(*(columns[name].tolist() for name in ("t", "level", "text")), strict=True)
+            elif part == "tuning":
+                self.tunings += columns["json"].tolist()
+            elif part in ("base", "events"):
+                index = batch.column(batch.schema.names.index(TIMELINE)).to_numpy()
+                if part == "base":
+                    self.bases += zip(index.tolist(), columns["json"].tolist(), strict=True)
+                else:
+                    self.events.append((index, columns))
 
 
-def copy_whole(path: Path, to: Path) -> None:
-    """Copy an .rrd up to the last message that is there in full."""
+def copy_complete(path: Path, to: Path) -> None:
+    """Copy an .rrd up to its last complete message."""
     with path.open("rb") as file:
-        end, _ = whole_until(file, path.stat().st_size)
+        left, _ = complete_until(file, path.stat().st_size)
         file.seek(0)
         with to.open("wb") as copy:
-            while end > 0 and (piece := file.read(min(end, 1 << 20))):
+            while left > 0 and (piece := file.read(min(left, 1 << 20))):
                 copy.write(piece)
-                end -= len(piece)
+                left -= len(piece)
 
 
 def finished(path: Path) -> bool:
-    """Whether a recording was closed when it ended; one that was cut is read as far as it goes."""
+    """Return whether a recording was closed when it ended."""
     with path.open("rb") as file:
-        return whole_until(file, path.stat().st_size)[1]
+        return complete_until(file, path.stat().st_size)[1]
 
 
-def _cut_short(path: Path) -> str | None:
-    """What is missing of an .rrd that was not finished, and may be ours; None if it was, or is another program's."""
+def _truncated(path: Path) -> str | None:
+    """Return the message about a truncated .rrd that may be ours; None if it is complete or another program's."""
     size = path.stat().st_size
     with path.open("rb") as file:
-        rerun = file.read(len(BEGIN)) == BEGIN
+        is_rrd = file.read(len(MAGIC)) == MAGIC
         file.seek(STREAM_HEADER)
         message = file.read(MESSAGE_HEADER.size)
         length = MESSAGE_HEADER.unpack(message)[1] if len(message) == MESSAGE_HEADER.size else size
-        # The first message names the program; Rerun writes it in plain letters.
-        name = file.read(min(length, size))
-        _, whole = whole_until(file, size)
-    if whole or not rerun:
+        name = file.read(min(length, size))  # the first message holds the program's name in plain letters
+        _, closed = complete_until(file, size)
+    if closed or not is_rrd:
         return None
     if len(name) < length:
-        return f"is cut short: {size:,} bytes do not say what it records; look for another copy"
+        return f"is cut short: {size:,} bytes, too few to name its twin; look for another copy"
     if PREFIX.encode() not in name:
         return None
     return f"is a recording of Nisus, cut short before its first row: {size:,} bytes are there; look for another copy"
 
 
-def _control(name: str) -> bool:
-    return name == TIMELINE or name.startswith("rerun.") or name in ("log_time", "log_tick")
-
-
-def _flat(column: Any) -> np.ndarray:
-    return column.flatten().to_numpy(zero_copy_only=False)
-
-
-def _line(error: Exception, copy: Path, path: Path) -> str:
-    """What an error says, of the file itself where it says it of a copy."""
-    text = str(error).strip()
-    return text.splitlines()[0].replace(str(copy), path.name) if text else type(error).__name__
-
-
 def _latest(chunks: list[tuple[np.ndarray, dict[str, np.ndarray]]]) -> tuple[int, dict[str, np.ndarray]]:
-    """The rows that hold at the end: of each index the last one, and none that comes after an index written again."""
+    """Return the first index and the columns of the rows that are valid at the end of the file."""
     if not chunks:
         return 0, {}
     index = np.concatenate([chunk for chunk, _ in chunks])
-    # Columns of variances begin with the first reading that brought its own.
+    # Columns of variances begin with the first measurement that has its own.
     names = dict.fromkeys(name for _, values in chunks for name in values)
     columns = {
         name: np.concatenate([values.get(name, np.full(rows.size, np.nan)) for rows, values in chunks])
         for name in names
     }
-    # A row holds if no later row has an index that is not above its own.
+    # A row is valid if every later row has a larger index.
     later = np.minimum.accumulate(index[::-1])[::-1]
     keep = np.append(index[:-1] < later[1:], True)
-    kept = {name: column[keep] for name, column in columns.items()}
-    return int(index[keep][0]), kept
+    return int(index[keep][0]), {name: column[keep] for name, column in columns.items()}
 
 
 def _column(name: str, columns: dict[str, np.ndarray]) -> np.ndarray:
@@ -222,54 +242,3 @@ def _numbered(name: str, columns: dict[str, np.ndarray]) -> Iterator[np.ndarray]
     while f"{name}_{k}" in columns:
         yield columns[f"{name}_{k}"]
         k += 1
-
-
-@dataclass(frozen=True)
-class Facts:
-    """Twin, filter, seconds from the first event to the last, and what it was worth (see summary.py), if it says so."""
-
-    twin: str
-    estimator: str | None
-    seconds: float
-    summary: dict[str, Any]
-
-
-def facts_of(path: Path) -> Facts:
-    """Look through a recording.
-
-    Raises:
-        SourceError: If it cannot be read, or is none of Nisus.
-    """
-    twin, estimator, summary = "", None, {}
-    first, last = None, None
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # a killed writer leaves no footer
-            reader = RrdReader(str(path))
-        for chunk in reader.stream():
-            part = chunk.entity_path.removeprefix("/nisus/")
-            if part == chunk.entity_path or part not in ("twin", "tuning", "events", "summary"):
-                continue
-            batch = chunk.to_record_batch()
-            names = {name: k for k, name in enumerate(batch.schema.names)}
-            if part == "twin":
-                twin = str(_values(batch, names["name"])[0])
-            elif part == "tuning":
-                estimator = json.loads(_values(batch, names["json"])[-1])["estimator"]
-            elif part == "summary":
-                summary = json.loads(_values(batch, names["json"])[-1])
-            else:
-                t = _values(batch, names["t"])
-                # A late reading makes a recorder write events again, so they are not in the order of time.
-                first = int(t.min()) if first is None else min(first, int(t.min()))
-                last = int(t.max()) if last is None else max(last, int(t.max()))
-    except Exception as error:  # noqa: BLE001  whatever Rerun raises of a file that is none
-        if not twin:
-            raise SourceError(f"{path.name}: it cannot be read; is it an .rrd file?") from error
-    if not twin:
-        raise SourceError(f"{path.name}: it is no recording of Nisus")
-    return Facts(twin, estimator, 0.0 if first is None or last is None else (last - first) * 1e-9, summary)
-
-
-def _values(batch: Any, k: int) -> Any:
-    return batch.column(k).flatten().to_numpy(zero_copy_only=False)

@@ -1,8 +1,7 @@
-"""Writes what a running twin concludes into a file, from a thread and with cursors of its own.
+"""The recorder: writes a running twin into a file, from a thread and with cursors of its own.
 
-The log and the tunings are the truth, from which a review folds every track again. So an edit, after which the whole
-history has another track, adds its tuning. The charts go on as they were seen, and when the file ends, those of the
-last revision are drawn once over all of its time.
+A review folds the log with the tunings again, so an edit, which changes the whole track, only adds its tuning. The
+charts continue as they were seen; when the file ends, those of the last revision are drawn over all of its time.
 """
 
 from __future__ import annotations
@@ -37,25 +36,24 @@ if TYPE_CHECKING:
     from ...live.interface import Running
     from ...twin.twin import Twin
 
-PERIOD = 0.4
-"""Seconds between two writes; with what the operating system has after each, a killed process loses less than this."""
+LOG_PERIOD_S = 0.4
+"""Seconds between two writes of the log: a killed process loses less."""
 
-CHARTS = 5.0
-"""Seconds between two writes of what the charts show, which follows from the rows. Each of its many entities costs the
-same for a few rows as for thousands, and holds up the readings meanwhile."""
+CHARTS_PERIOD_S = 5.0
+"""Seconds between two writes of the charts. Each of their many entities costs the same for one row as for thousands."""
 
-REST = 5.0
-"""Seconds without an edit after which a knob has come to rest."""
+EDIT_REST_S = 5.0
+"""Seconds without an edit after which the file gets a new base."""
 
-ROWS = 20_000
+MAX_PULL_ROWS = 20_000
 """Rows pulled at once, so that a long history does not hold the engine's lock for long."""
 
-FINE = math.inf
-"""Of `RerunRows`: charts as fine as the page draws them, however long the recording is."""
+ALL_STRETCHES = math.inf
+"""`series` of `RerunRows`: charts as fine as on the page, however long the recording is."""
 
 
 class Recorder:
-    """Starts and stops recordings of one engine. `draw(stream)` gives what logs the charts' entities of a pull."""
+    """Starts and stops recordings of one engine. `draw(stream)` returns a function that logs the charts of a pull."""
 
     def __init__(self, engine: Running, draw: Any, split: Split = NEVER, folder: Path = Path()) -> None:
         self._engine = engine
@@ -67,21 +65,21 @@ class Recorder:
         self._asked: deque[Path | None] = deque()
         self._taken: Path | None = None
         self._stopping = False
-        self._open: _Part | None = None
+        self._open: RecordingPart | None = None
         self._closed = False
-        """Whether a stream was closed whose threads are still to be ended."""
+        """Whether a closed stream still has threads."""
         self.finished: list[Path] = []
         self.failure = ""
         self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
 
     @property
     def path(self) -> Path | None:
-        """The recording that is being written; its first part, if it is split."""
+        """Path of the current recording; of its first part if it is split."""
         return self._wanted
 
     @property
     def writing(self) -> Path | None:
-        """The file that is being written, or will be next: of a recording that is split, the part that began last."""
+        """Path of the file that is being written, or is next; of a split recording its last part."""
         part = self._open
         if part is not None:
             return part.file.path
@@ -89,22 +87,22 @@ class Recorder:
 
     @property
     def written(self) -> list[Path]:
-        """All files so far, that which is being written last."""
+        """Paths of all files so far, the current one last."""
         writing = self.writing
         return [*self.finished, *([] if writing is None or writing in self.finished else [writing])]
 
     def start(self) -> None:
-        """Wait for `record`."""
+        """Start the thread, which waits for `record`."""
         self._thread.start()
 
     def record(self, path: Path | None) -> None:
-        """Record into a new file from now on (the history included), or finish the one that is open."""
+        """Record into a new file, history included; None finishes the current one."""
         self._wanted = path
         self._asked.append(path)
         self._wake.set()
 
     def stop(self) -> None:
-        """Finish the file and end."""
+        """Finish the file and end the thread."""
         self._stopping = True
         self.record(None)
         if self._thread.is_alive():
@@ -112,7 +110,7 @@ class Recorder:
 
     def _run(self) -> None:
         while True:
-            # One after the other: a recording that is stopped at once is one too. In this order, as in `_finish`.
+            # In order: a recording that is stopped at once must still be written.
             if self._asked:
                 self._taken = self._asked[0]
                 self._asked.popleft()
@@ -121,7 +119,7 @@ class Recorder:
                 if self._open is not None and wanted != self._open.asked:
                     self._finish(self._open)
                 if self._open is None and wanted is not None:
-                    self._open = _Part(self._engine, wanted, self._draw)
+                    self._open = RecordingPart(self._engine, wanted, self._draw)
                     self._engine.notices.say(f"recording into {wanted}")
                 if self._open is not None:
                     self._go_on(self._open)
@@ -138,25 +136,25 @@ class Recorder:
                 continue
             if self._stopping and self._open is None:
                 return
-            self._wake.wait(PERIOD if self._open is not None else None)
+            self._wake.wait(LOG_PERIOD_S if self._open is not None else None)
             self._wake.clear()
 
-    def _go_on(self, part: _Part) -> None:
+    def _go_on(self, part: RecordingPart) -> None:
         part.write()
         warning = part.disk.warning(part.file.size)
         if warning is not None:
             self._engine.notices.say(f"recording {part.file.path}: {warning}", level="warn")
         if part.disk.free() < 0:
             self._finish(part, short=True)
-            raise SourceError(f"{part.file.path}: the disk is nearly full; what was written until then can be reviewed")
+            raise SourceError(f"{part.file.path}: the disk is nearly full; the recording up to here can be reviewed")
         if part.due(self._split):
             self._finish(part, goes_on=True)
-            self._open = _Part(self._engine, part.asked, self._draw, before=part)
+            self._open = RecordingPart(self._engine, part.asked, self._draw, before=part)
             self._engine.notices.say(f"recording on into {self._open.file.path}")
 
-    def _finish(self, part: _Part, *, short: bool = False, goes_on: bool = False) -> None:
+    def _finish(self, part: RecordingPart, *, short: bool = False, goes_on: bool = False) -> None:
         part.end(short=short)
-        # In this order, so that whoever lists the files meanwhile never misses it.
+        # In this order, so that `written` always lists it.
         self.finished.append(part.file.path)
         self._open, self._closed = None, True
         if not goes_on:
@@ -168,23 +166,23 @@ class Recorder:
             return f"{type(error).__name__}: {error}"
         said = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
         path = self._open.file.path
-        return f"{path}: it can no longer be written ({said}); what was written until then can be reviewed"
+        return f"{path}: it can no longer be written ({said}); the recording up to here can be reviewed"
 
     def _fail(self, text: str) -> None:
-        self.failure = f"recording failed: {text}"
-        self._engine.notices.report("recording failed", self.failure, level="error")
         if not self._asked:
             self._wanted = None
         if self._open is not None:
             self._open.abandon()
             self._open, self._closed = None, True
+        self.failure = f"recording failed: {text}"
+        self._engine.notices.report("recording failed", self.failure, level="error")
 
 
-class _Part:
-    """A file that is being written: how far its events and charts have come, and where a fold of them starts."""
+class RecordingPart:
+    """File of a recording: cursors of its events and charts, and the base of its fold."""
 
-    def __init__(self, engine: Running, asked: Path, draw: Any, *, before: _Part | None = None) -> None:
-        """Begin a recording at the path that was asked for; or the part after another, from which it goes on."""
+    def __init__(self, engine: Running, asked: Path, draw: Any, *, before: RecordingPart | None = None) -> None:
+        """Start a recording at a path, or the part that continues another."""
         twin = self._twin = engine.twin
         self._engine = engine
         self.asked = asked
@@ -195,9 +193,9 @@ class _Part:
             self._start, self._base = -1, engine.base()
             self.disk = Disk(path.absolute().parent)
         else:
-            # The same cursors, so that no late reading is missed in between.
+            # The same cursors, so that no late measurement is missed in between.
             self._events, self._charts, self.disk = before._events, before._charts, before.disk
-            # Health looks back at the rows before: they are there from where this part takes over.
+            # Health uses earlier rows, so they are repeated.
             self._start, self._base = engine.origin(self._events.next - MAX_ROWS_PER_READING * engine.policy.window)
             self._events.next = self._start
         self._drawn_from = self._charts.next
@@ -223,13 +221,13 @@ class _Part:
         self._opening = 0
 
     def write(self, *, last: bool = False) -> None:
-        """Write everything that is there, in pieces; the charts too if their time has come or it is the last time."""
+        """Write all new events; the charts too if they are due or this is the last time."""
         self._write_events()
-        if self._turned is not None and (last or time.monotonic() - self._turned >= REST):
+        if self._turned is not None and (last or time.monotonic() - self._turned >= EDIT_REST_S):
             self._turned = None
             self._move(self._start)
             self._write_events()
-        if last or time.monotonic() - self._drawn >= CHARTS:
+        if last or time.monotonic() - self._drawn >= CHARTS_PERIOD_S:
             self._drawn = time.monotonic()
             for pull in self._pulls(self._charts):
                 if pull.fresh:
@@ -240,7 +238,7 @@ class _Part:
         self._opening = self._opening or self.file.size
 
     def due(self, split: Split) -> bool:
-        """Whether the next part should begin; not while most of this one is what each part has to begin with."""
+        """Return whether the next part should begin; not while this one holds little but its header."""
         grown = self.file.size - self._opening
         large = self.file.size >= split.size and grown >= split.size / 2
         return large or time.monotonic() - self._begun >= split.seconds
@@ -251,11 +249,11 @@ class _Part:
             if pull.fresh:
                 self._start, base = self._engine.origin(pull.first)
                 if begun or base is not self._base:
-                    # The source began again, and the log with it; or the log forgot its oldest events just now.
+                    # The source restarted, and the log with it, or the log dropped its oldest events.
                     self.file.base(base, self._start, pull.revision)
                 self._base = base
             elif pull.first < self._start:
-                # A late reading belongs before the start.
+                # A late measurement belongs before the start.
                 self._move(pull.first)
             if pull.revision != self._revision:
                 tuning, estimator = self._engine.folded_with()
@@ -263,14 +261,14 @@ class _Part:
                     self._twin = self._engine.twin
                     self.file.twin(self._twin.text, self._twin.overrides, self._twin.version)
                 self.file.tuning(tuning, estimator, pull.first, pull.revision)
-                # An edit while this part was begun, too: its base may be of the revision before.
+                # Also after an edit while this part was created: its base may be of the revision before.
                 if (begun or self._before not in (-1, pull.revision)) and not pull.fresh:
                     self._edited, self._turned = True, time.monotonic()
                 self._revision = pull.revision
             self.file.write(pull)
 
     def _move(self, index: int) -> None:
-        """Write where a fold starts that gives the rows from `index` on; if that is earlier, the events from there."""
+        """Write the base of a fold that gives the rows from `index` on, and the events from there if it is earlier."""
         start, base = self._engine.origin(index)
         if start == self._start and base is self._base:
             return
@@ -281,13 +279,13 @@ class _Part:
 
     def _pulls(self, cursor: Cursor) -> Iterator[Pull]:
         while True:
-            pull = self._engine.pull(cursor, ROWS)
+            pull = self._engine.pull(cursor, MAX_PULL_ROWS)
             yield pull
-            if len(pull.events) < ROWS and cursor.next == pull.first + len(pull.events):
+            if len(pull.events) < MAX_PULL_ROWS and cursor.next == pull.first + len(pull.events):
                 return
 
     def end(self, *, short: bool = False) -> None:
-        """Write what is left and close; after an edit with the charts of the last revision, unless room is `short`."""
+        """Write the rest and close; after an edit with the charts of the last revision, if the disk has room."""
         self.write(last=True)
         if self._edited and not short:
             again = replace(self._charts, next=self._drawn_from, picture=-1)
@@ -301,12 +299,12 @@ class _Part:
         self.file.close()
 
     def abandon(self) -> None:
-        """Leave a file that takes no more as it is."""
+        """Close the file as it is."""
         self.release()
         self.file.abandon()
 
     def release(self) -> None:
-        """Give the cursors back."""
+        """Release the cursors."""
         self._engine.release(self._events)
         self._engine.release(self._charts)
 
@@ -320,16 +318,16 @@ def write_recording(
     episodes: Sequence[Episode] = (),
     smoothed: Smoothed | None = None,
 ) -> None:
-    """Write a finished fold as a recording, in the same form as a running twin's, with the pictures of a large field.
+    """Write a finished fold as a recording.
 
     Args:
-        path: Where; what stands there is replaced, and a link is not followed.
-        twin: What was folded.
+        path: Where; an existing file is replaced, a link is not followed.
+        twin: The twin that was folded.
         log: The events.
         track: Their rows.
         pictures: Of a large field.
-        episodes: What was wrong; a line each among the recording's events.
-        smoothed: What all readings say of the states, drawn beside the filter's; a review has the filter's alone.
+        episodes: Faults; one notice each.
+        smoothed: Smoothed states, drawn beside the filter's; a review shows the filter's only.
 
     Raises:
         SourceError: If the file cannot be written.
@@ -346,8 +344,8 @@ def write_recording(
         )  # fmt: skip
         drawing = RerunRows(file.stream, SimpleNamespace(model=twin.model, pairs=twin.pairs, twin=twin), series=None)
         file.tuning(twin.tuning, twin.estimator, 0, 0)
-        for start in range(0, log.n, ROWS):
-            rows = slice(start, min(log.n, start + ROWS))
+        for start in range(0, log.n, MAX_PULL_ROWS):
+            rows = slice(start, min(log.n, start + MAX_PULL_ROWS))
             here = [picture for picture in pictures if start < picture.before <= rows.stop]
             said = lines if start == 0 else []
             pull = Pull(0, start == 0, start, log.events.select(rows), track.select(rows), said, here)
@@ -361,4 +359,4 @@ def write_recording(
         del file, drawing
         free_closed_streams()
     except OSError as error:
-        raise SourceError(f"recording {path}: {error.strerror}; choose a place that can be written") from None
+        raise SourceError(f"recording {path}: {error.strerror}; choose another folder") from None

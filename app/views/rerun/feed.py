@@ -1,8 +1,7 @@
-"""The right side of the page: what one browser's Rerun viewer is fed.
+"""Feed of one browser's Rerun viewer.
 
-There is no Rerun server. Each browser has a feed of its own, with a cursor and a stream of its own, and asks for the
-next bytes when it has drawn the last. So a viewer that stops reading costs nothing but its own pictures: nothing is
-queued for it, and nobody waits.
+There is no Rerun server. Each browser has a feed with a cursor and a stream of its own, and asks for the next bytes
+when it has drawn the last ones. So a viewer that stops reading delays nobody, and nothing is queued for it.
 
 Each revision is another Rerun recording under the same paths. The viewer shows the newest, with the layout, zoom and
 play state that the user chose, and the page closes the one before.
@@ -33,31 +32,31 @@ if TYPE_CHECKING:
     from ...live.notices import Notice
     from ...live.outputs import Pull
 
-ROWS = 20_000
+MAX_PULL_ROWS = 20_000
 """Rows pulled at once, so that a long history does not hold the engine's lock for long."""
 
-SERIES = 3000
+HISTORY_STRETCHES = 3000
 """Stretches into which a whole history is cut for drawing."""
 
-AHEAD = 1.5
-"""Windows of the charts that a new revision sends first, so that they are drawn before the rest of a long history."""
+FIRST_WINDOWS = 1.5
+"""Length that a new revision sends first, in windows of the charts; the rest of a long history follows."""
 
-FRAMES = "frame"
-"""A timeline that only counts the messages, so that the page sees how far the viewer has got with them."""
+FRAME_TIMELINE = "frame"
+"""Timeline that counts the messages, from which the page reads how many the viewer has drawn."""
 
 Message = str | bytes
 
 
 class RerunFeed:
-    """Gives what the viewer of one browser needs next. Not to be called by two threads at once."""
+    """Messages for the viewer of one browser. Not thread-safe."""
 
     def __init__(self, engine: Running, *, layout: bool = True, palette: Palette = EITHER) -> None:
-        """Prepare; nothing is pulled yet.
+        """Create a feed; nothing is pulled yet.
 
         Args:
-            engine: Whose rows to give.
-            layout: Whether the first recording brings the blueprint; False if the viewer has it from an earlier feed.
-            palette: The colours of the viewer's theme.
+            engine: Source of the rows.
+            layout: Whether the first recording has the blueprint; False if the viewer has it from an earlier feed.
+            palette: Colours of the viewer's theme.
         """
         self._engine = engine
         self._cursor = engine.cursor()
@@ -72,19 +71,19 @@ class RerunFeed:
         self._later: Callable[[], None] | None = None
 
     def next(self) -> list[Message]:
-        """The next messages, none if nothing has happened: bytes for Rerun, or a line of JSON for the page.
+        """Return the next messages, if any: bytes for Rerun, or a line of JSON for the page.
 
-        `{"recording": id}` announces that the bytes which follow belong to another recording. The k-th bytes of a
-        recording end with row k of the timeline `FRAMES`.
+        `{"recording": id}` announces that the following bytes belong to another recording. The k-th bytes of a
+        recording end with row k of the timeline `FRAME_TIMELINE`.
         """
         if self._later is not None:
             later, self._later = self._later, None
             later()
             return self._read()
-        pull = self._engine.pull(self._cursor, ROWS)
+        pull = self._engine.pull(self._cursor, MAX_PULL_ROWS)
         self._notices.extend(pull.notices)
         if pull.fresh and self._rows is not None and not len(pull.events):
-            # The source has just begun again: the charts stay as they are until there is something to show.
+            # The source has just restarted: the charts stay as they are until there are rows.
             self._cursor.revision = -1
             return []
         if pull.fresh:
@@ -95,7 +94,7 @@ class RerunFeed:
         return self._read()
 
     def close(self) -> None:
-        """Give everything back."""
+        """Release the cursor and the stream."""
         self._engine.release(self._cursor)
         self._end()
 
@@ -107,12 +106,12 @@ class RerunFeed:
             free_closed_streams()
 
     def _whole(self, pull: Pull) -> Pull:
-        """All there is of a revision that just began, pulled in pieces."""
+        """Return all rows of a revision that just began, pulled in pieces."""
         parts = [pull]
-        while len(parts[-1].events) == ROWS:
-            more = self._engine.pull(self._cursor, ROWS)
+        while len(parts[-1].events) == MAX_PULL_ROWS:
+            more = self._engine.pull(self._cursor, MAX_PULL_ROWS)
             self._notices.extend(more.notices)
-            # Another revision may begin meanwhile, or a late reading rewrite rows: those are the ones that hold.
+            # Another revision may begin meanwhile, or a late measurement rewrite rows; the later ones apply.
             parts = [more] if more.fresh else [*parts, more]
         if len(parts) == 1:
             return parts[0]
@@ -136,21 +135,22 @@ class RerunFeed:
         )
 
     def _begin(self, pull: Pull) -> list[Message]:
-        """Another recording: first the window that the charts show, then the rest."""
+        """Start another recording: first the window of the charts, then the rest."""
         self._end()
         name = f"{self._name}-{pull.revision}"
         self._stream = rr.RecordingStream(self.application, recording_id=name, send_properties=False)
         self._bytes = self._stream.binary_stream()
         rows = self._rows = RerunRows(
-            self._stream, self._engine, series=SERIES, layout=self._layout, palette=self._palette
+            self._stream, self._engine, series=HISTORY_STRETCHES, layout=self._layout, palette=self._palette
         )
         self._layout = False
         self._frame = 0
         announcement = json.dumps({"recording": f"Recording:{self.application}:{name}", "revision": pull.revision})
         t = pull.events.t
-        cut = int(np.searchsorted(t, t[-1] - int(AHEAD * rows.sink.window * 1e9))) if t.size and pull.revision else 0
+        first = int(FIRST_WINDOWS * rows.sink.window * 1e9)
+        cut = int(np.searchsorted(t, t[-1] - first)) if t.size and pull.revision else 0
         before = self._engine.previous() if pull.revision and t.size else None
-        # A recording's timeline must not begin before its rows; they may have been forgotten meanwhile.
+        # A recording's timeline must not begin before its rows, of which the oldest may have been dropped.
         grey = before.events.t if before is not None else t[:0]
         known = int(np.searchsorted(grey, t[0])) if t.size else 0
         grey_cut = max(known, int(np.searchsorted(grey, t[cut]))) if t.size else 0
@@ -165,8 +165,8 @@ class RerunFeed:
         if t.size:
             rows.begin(pull)
             draw(slice(cut, None), slice(grey_cut, None), past=False)
-        # The engine gives a line once; the viewer forgets it with the recording that it closes. Times of what was said
-        # before the source began again are yet to come.
+        # The engine gives a notice once, and the viewer loses it with the recording that it closes. Notices from before
+        # the source restarted have later times than its rows, so they are left out.
         here = self._engine.notices.passage
         rows.notices([_labelled(line, pull.revision) for line in self._notices if line.passage == here])
         if cut:
@@ -178,7 +178,7 @@ class RerunFeed:
         self._frame += 1
         self._stream.send_columns(
             "/frame",
-            indexes=[rr.TimeColumn(FRAMES, sequence=[self._frame])],
+            indexes=[rr.TimeColumn(FRAME_TIMELINE, sequence=[self._frame])],
             columns=rr.AnyValues.columns(count=[self._frame]),
         )
         data = self._bytes.read()
@@ -186,12 +186,12 @@ class RerunFeed:
 
 
 def _labelled(line: Notice, revision: int) -> Notice:
-    """A line for the table of a revision: one of another revision says so, as its rows are no longer to be seen."""
+    """Return a notice for the table of a revision; one of another revision is labelled."""
     return line if line.revision == revision else replace(line, text=f"revision {line.revision}: {line.text}")
 
 
 def _cut(events: list[Events], tracks: list[Track], rows: int) -> tuple[list[Events], list[Track]]:
-    """The first `rows` rows of some pieces."""
+    """Return the first `rows` rows of some pieces."""
     kept_readings, kept_tracks = [], []
     for reading, track in zip(events, tracks, strict=True):
         count = min(rows, len(reading))

@@ -14,7 +14,7 @@ from estimators.numerics.quantiles import chi_square_quantile
 
 from ...present.drawing.colors import EITHER, RGB, Frame, Palette, kinds
 from ...present.drawing.direct_readings import observed
-from .sink import EVENTS, GAP, TIMELINE, band_color, pair_name, row_title, with_unit
+from .sink import NOTICES_PATH, SCALE_GAP, TIMELINE, band_color, pair_name, row_title, with_unit
 
 MAX_SENSOR_LANES = 6
 """Sensors at most whose states are drawn, below the twin's health."""
@@ -82,7 +82,7 @@ def blueprint(
         time_view=axis,
     )
     columns = rrb.TextLogColumns(timeline_columns=[TIMELINE], text_log_columns=["LogLevel", "Body"])
-    events = rrb.TextLogView(origin=EVENTS, name="events", columns=columns)
+    events = rrb.TextLogView(origin=NOTICES_PATH, name="events", columns=columns)
     ellipses = [
         rrb.Spatial2DView(
             origin=f"{root}/pair/{pair_name(model, pair)}",
@@ -183,7 +183,7 @@ def field_pictures(model: StateSpaceModel, root: str, *, truth: bool) -> rrb.Hor
     assert grid is not None
     frame = Frame.of(grid)
     bounds = rrb.VisualBounds2D(
-        x_range=(-0.04 * frame.width, (1.2 + 2 * GAP) * frame.width),
+        x_range=(-0.04 * frame.width, (1.2 + 2 * SCALE_GAP) * frame.width),
         y_range=(-0.06 * frame.height, 1.06 * frame.height),
     )
     views = {

@@ -24,7 +24,7 @@ from ...present.drawing.colors import (
     sensor_colors,
     take_innovations,
 )
-from .sink import GAP, Sink, last_of_stretch
+from .sink import SCALE_GAP, Sink, last_of_stretch
 
 
 class FieldDrawing:
@@ -35,7 +35,7 @@ class FieldDrawing:
         assert model.grid is not None
         self._model = model
         self._frame = Frame.of(model.grid)
-        self._bar = max(3, round(GAP * self._frame.width))
+        self._bar = max(3, round(SCALE_GAP * self._frame.width))
         self._kinds = kinds(truth)
         self._palettes = {kind.name: gradient(kind.colors) for kind in self._kinds}
         self._scales = {kind.name: Scale(kind) for kind in self._kinds}

@@ -18,7 +18,7 @@ from ...present.drawing.direct_readings import observed
 from ...present.series.columns import Rows, columns_of, rows_of
 from .layout import MAX_SENSOR_LANES, blueprint, styles
 from .pictures import FieldDrawing, PairDrawing
-from .sink import EVENTS, Sink, last_of_each_time, pair_name, send_blueprint, state_colors
+from .sink import NOTICES_PATH, Sink, last_of_each_time, pair_name, send_blueprint, state_colors
 
 WINDOW_STRETCHES = 1200
 """Stretches into which the charts' window is cut; each is drawn by its extremes."""
@@ -186,7 +186,7 @@ class RerunRows:
             return
         times = np.maximum([line.t for line in due], self._oldest)
         self.sink.stream.send_columns(
-            EVENTS,
+            NOTICES_PATH,
             indexes=[self.sink.times(times.astype(np.int64))],
             columns=rr.TextLog.columns(text=[line.text for line in due], level=[line.level.upper() for line in due]),
         )

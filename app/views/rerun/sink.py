@@ -14,8 +14,8 @@ from estimators.model.state_space import StateSpaceModel
 
 from ...present.drawing.colors import RGB, Palette, mixed
 
-CALENDAR = 10**18
-"""Nanoseconds from which on times are dates (this one is in 2001), and before which they are durations."""
+FIRST_DATE_NS = 10**18
+"""Times (ns) from here on are dates, the first of them in 2001; smaller ones are durations."""
 
 
 def send_blueprint(stream: rr.RecordingStream, layout: rrb.Blueprint) -> None:
@@ -47,7 +47,7 @@ def free_closed_streams() -> None:
 
 
 class Sink:
-    """Logs columns over time. `root` is the path before all others, `window` the seconds that the charts show."""
+    """Logs columns over time, below the path `root`; `window` is the length of the charts in seconds."""
 
     def __init__(self, stream: rr.RecordingStream, *, window: float) -> None:
         self.stream = stream
@@ -56,22 +56,22 @@ class Sink:
         self._calendar: bool | None = None
 
     def started(self, t: int) -> None:
-        """The first time (ns) decides whether all are dates or durations."""
+        """Decide by the first time (ns) whether all are dates or durations."""
         if self._calendar is None:
-            self._calendar = t >= CALENDAR
+            self._calendar = t >= FIRST_DATE_NS
 
     def times(self, t: np.ndarray) -> rr.TimeColumn:
-        """Times (ns) as a column of the timeline."""
+        """Return times (ns) as a column of the timeline."""
         if self._calendar:
             return rr.TimeColumn(TIMELINE, timestamp=t.astype("datetime64[ns]"))
         return rr.TimeColumn(TIMELINE, duration=t.astype("timedelta64[ns]"))
 
     def static(self, path: str, what: Any) -> None:
-        """Log what holds at every time."""
+        """Log values that apply at every time."""
         self.stream.log(f"{self.root}{path}", what, static=True)
 
     def gap(self, path: str, t: np.ndarray) -> None:
-        """Log that under a path there is nothing from each of some times on, until something is logged."""
+        """Clear a path at some times, until its next values."""
         if t.size:
             clear = rr.Clear.columns(is_recursive=np.zeros(t.size, bool))
             self.stream.send_columns(f"{self.root}{path}", indexes=[self.times(t)], columns=clear)
@@ -88,7 +88,7 @@ class Sink:
     ) -> None:
         """Log values (n, k) that are finite, thinned by their lowest and highest, or by those of the first column.
 
-        Where they are not finite, the line leads on to the next; but where `gaps` says so, it ends and starts again.
+        Rows that are not finite are left out; where `gaps` is true the line has a gap there.
         """
         good = np.isfinite(values).all(axis=1)
         ends = ~good & gaps
@@ -101,43 +101,43 @@ class Sink:
         self.columns(path, t[rows], rr.Scalars.columns(scalars=np.ascontiguousarray(values[rows])))
 
     def columns(self, path: str, t: np.ndarray, what: Any) -> None:
-        """Log columns of one component, a row for each time."""
+        """Log columns of one component, one row per time."""
         self.stream.send_columns(f"{self.root}{path}", indexes=[self.times(t)], columns=what)
 
 
-EVENTS = "/events"
-"""Where the lines for people are, whichever revision the charts show."""
+NOTICES_PATH = "/events"
+"""Path of the notices of all revisions."""
 
 TIMELINE = "time"
 
-GAP = 0.05
-"""Between the picture of a field and its scale, and the width of the scale, of the picture's width."""
+SCALE_GAP = 0.05
+"""Gap between the picture of a field and its scale, and width of the scale, as shares of the picture's width."""
 
 
 def state_colors(names: Sequence[str], palette: Palette) -> np.ndarray:
-    """Colours of states of health, as Rerun packs them (n,) uint32; what is no health is grey."""
+    """Return the colours of health states as Rerun packs them, (n,) uint32; other states are grey."""
     colors = [palette.health.get(name, palette.faint) for name in names]
     return np.array([(r << 24) | (g << 16) | (b << 8) | 255 for r, g, b in colors], np.uint32)
 
 
 def band_color(palette: Palette) -> RGB:
-    """Of the lines at ± 2 σ, and of what else belongs to the estimate but is not the line itself."""
+    """Return the colour of the lines at ± 2 σ and of secondary parts of the estimate."""
     return mixed(palette.estimate, palette.panel, 0.45)
 
 
 def with_unit(name: str, unit: str) -> str:
-    """`gnss_speed`, `m/s` as a chart's title."""
+    """Return the title of a chart, for example `gnss speed [m/s]`."""
     words = name.replace("_", " ").replace(".", " ")
     return words if unit in ("", "1") else f"{words} [{unit}]"
 
 
 def row_title(model: StateSpaceModel, sensor: int, row: int) -> str:
-    """Title of one sensor row."""
+    """Return the title of one sensor row."""
     return with_unit(model.row_names[model.row_start[sensor] + row], model.sensors[sensor].rows[row].unit)
 
 
 def pair_name(model: StateSpaceModel, pair: Any) -> str:
-    """Name of the entity of one pair of states."""
+    """Return the entity name of a pair of states."""
     return f"{model.state_names[pair[0]]}_{model.state_names[pair[1]]}"
 
 

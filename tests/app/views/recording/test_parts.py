@@ -37,9 +37,9 @@ VALUES = 40 + np.random.default_rng(3).normal(size=COUNT)
 @pytest.fixture
 def start(monkeypatch):
     """start(estimator, ...): an engine with its source and recorder, and the pulls that its charts were given."""
-    monkeypatch.setattr(app.views.recording.writer, "PERIOD", 0.01)
-    monkeypatch.setattr(app.views.recording.writer, "CHARTS", 0.02)
-    monkeypatch.setattr(app.views.recording.writer, "REST", 0.02)
+    monkeypatch.setattr(app.views.recording.writer, "LOG_PERIOD_S", 0.01)
+    monkeypatch.setattr(app.views.recording.writer, "CHARTS_PERIOD_S", 0.02)
+    monkeypatch.setattr(app.views.recording.writer, "EDIT_REST_S", 0.02)
     running = []
 
     def start(estimator="kf", split=NEVER, **options):
@@ -240,7 +240,7 @@ def test_a_link_that_leads_nowhere_is_not_followed(start, tmp_path, monkeypatch,
     wait_for(lambda: any("is there already" in line.text for line in engine.notices.since(0)))
     assert engine.recorder.path is None
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(ConfigError, match="is there already"):
+    with pytest.raises(ConfigError, match="already"):
         command_from_json({"command": "Record", "path": "run.rrd"}, engine)
     assert main(["run", "motor_winding", "--headless", "--record", str(link)]) == 2
     assert "is there already" in capsys.readouterr().err
@@ -267,11 +267,11 @@ def test_a_disk_that_fills_is_warned_of_and_the_recording_closed_in_time(start, 
     engine.submit(commands.Record(path))
     feed(source, engine, 0, 1000)
     assert not any(line.level != "info" for line in engine.notices.since(0))
-    free = app.views.recording.rrd_file.RESERVE + 500_000_000
+    free = app.views.recording.rrd_file.RESERVED_BYTES + 500_000_000
     wait_for(lambda: any("has room for 500 MB more" in line.text for line in engine.notices.since(0)))
     assert engine.recorder.path == path
     feed(source, engine, 1000, 1400)
-    free = app.views.recording.rrd_file.RESERVE - 1
+    free = app.views.recording.rrd_file.RESERVED_BYTES - 1
     wait_for(lambda: engine.recorder.failure)
     assert engine.recorder.failure.startswith(f"recording failed: {path}: the disk is nearly full; ")
     texts = [line.text for line in engine.notices.since(0) if line.level != "info"]
@@ -283,15 +283,15 @@ def test_a_disk_that_fills_is_warned_of_and_the_recording_closed_in_time(start, 
 
 
 def test_a_fast_growing_file_is_warned_of_by_its_rate(tmp_path, monkeypatch):
-    now, free = 0.0, app.views.recording.rrd_file.RESERVE + 9 * 10**9
+    now, free = 0.0, app.views.recording.rrd_file.RESERVED_BYTES + 9 * 10**9
     monkeypatch.setattr(shutil, "disk_usage", lambda path: Usage(0, 0, free))
     disk = app.views.recording.rrd_file.Disk(tmp_path, clock=lambda: now)
     assert disk.warning(10**9) is None
-    now = app.views.recording.rrd_file.SETTLED + 40.0
+    now = app.views.recording.rrd_file.GROWTH_SETTLING_S + 40.0
     assert disk.warning(10**9 + 10**9 // 2) is None  # 5 MB/s fill 9 GB in 1800 s
-    now = app.views.recording.rrd_file.SETTLED + 60.0
+    now = app.views.recording.rrd_file.GROWTH_SETTLING_S + 60.0
     line = disk.warning(10**9 + 12 * 10**8)  # 10 MB/s in 900 s
-    assert line is not None and "9000 MB more, which lasts for about 15 min" in line
+    assert line is not None and "9000 MB more, enough for about 15 min" in line
     assert disk.warning(10**9 + 13 * 10**8) is None
 
 

@@ -146,13 +146,13 @@ def test_a_recording_that_is_being_finished_is_among_the_files(running, tmp_path
     source, engine, recorder = running
     path = tmp_path / "run.rrd"
     source.put(readings([1.0, 2.0], [40, 41]))
-    seen, release = [], writer._Part.release
+    seen, release = [], writer.RecordingPart.release
 
     def releasing(part):
         seen.append(list(recorder.written))
         release(part)
 
-    monkeypatch.setattr(writer._Part, "release", releasing)
+    monkeypatch.setattr(writer.RecordingPart, "release", releasing)
     engine.submit(commands.Record(path))
     wait_for(path.is_file)
     engine.submit(commands.Record(None))
@@ -278,7 +278,7 @@ def test_a_recording_cut_before_its_first_row_is_told_from_another_programs(tmp_
         expected = f"is a recording of Nisus, cut short before its first row: {length:,} bytes are there; "
         assert message(ours[:length]).startswith(expected)
     for length in (4, 11, 12, 27, 28, 60):
-        assert message(ours[:length]).startswith(f"is cut short: {length} bytes do not say what it records; ")
+        assert message(ours[:length]).startswith(f"is cut short: {length} bytes")
     for content in (other, other[:-40], other[:1000], ours):  # the last is whole, and never began
         assert message(content).startswith("holds no recording of Nisus; record one with")
 
