@@ -1,1 +1,1 @@
-"""What a twin is: the schema of its YAML, the loader, the twins that ship and their DBC files."""
+"""Definition of twins: YAML schema and loader, bundled twins and their DBC files."""

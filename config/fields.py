@@ -98,14 +98,14 @@ def one_of(section: Section, *keys: str, required: bool) -> None:
 
 
 class BoundedSection(Section):
-    """A value, and the range that a data sheet leaves it: a fit (nisus tune) stays inside."""
+    """A value and its range by the data sheet, within which a fit (`nisus tune`) stays."""
 
     value: NotNegatives
     """The value; a list gives one a row."""
     low: NotNegative = Field(0.0, alias="from")
-    """The least that it can be. Default: 0."""
+    """Smallest admissible value. Default: 0."""
     to: Positive = LARGEST
-    """The most. Default: no bound."""
+    """Largest admissible value. Default: no bound."""
 
     @model_validator(mode="after")
     def _inside(self) -> BoundedSection:
@@ -132,7 +132,7 @@ Spread = Annotated[
 
 
 class LevelSection(Section):
-    """How strongly one disturbance drives the state: what it adds in one second. Give one of the two."""
+    """Strength of a process noise: the variance or standard deviation that one second adds. Give one of the two."""
 
     variance: Level | None = None
     """Variance added in one second, in the square of the state's unit for the usual additive noise. {value, from, to}
@@ -163,16 +163,16 @@ class LevelSection(Section):
 
 
 class NoiseSection(LevelSection):
-    """How strongly one disturbance drives the state, and for how long it lasts."""
+    """Strength and correlation time of a process noise."""
 
     over: Duration | None = None
-    """Correlation time of the disturbance, in seconds or with a unit: 120, 2 min. A state is appended that carries it,
-    NAME_disturbance, and the parameter NAME_disturbance_time; what it adds in the long run stays the `variance` a
-    second. Default: none, white noise."""
+    """Correlation time of the disturbance, in seconds or with a unit: 120, 2 min. A state
+    NAME_disturbance and a parameter NAME_disturbance_time are appended; in the long run the disturbance adds the same
+    `variance` a second as white noise. Default: none, white noise."""
 
 
 class ErrorSection(Section):
-    """An error of a sensor that lasts, beside its white noise."""
+    """A coloured error of a sensor, beside its white noise."""
 
     variance: Positives | None = None
     """Variance of the error, in the square of the sensor's unit; a list gives one a row."""

@@ -1,7 +1,7 @@
 """The schema of a learned correction: a YAML of its own, which a twin's YAML names under `learned`.
 
-It holds what was learned from, so that what it says elsewhere can be computed again. The docstring under each field is
-its documentation.
+It holds the training windows, so that the correction can be computed from them anywhere. The docstring under each field
+is its documentation.
 """
 
 from __future__ import annotations
@@ -22,20 +22,20 @@ Table = Annotated[tuple[Annotated[tuple[Number, ...], Field(min_length=1)], ...]
 
 
 class LearnedHeadSection(Section):
-    """What a correction is of, and what it was worth."""
+    """Origin and scores of a correction."""
 
     twin: Text
     """Name of the twin whose physics it corrects."""
     model: Text
     """Name of its model: states and inputs of another mean something else."""
     saved: Text
-    """When, as 2026-11-22T10:30:00Z."""
+    """Time of saving, as 2026-11-22T10:30:00Z."""
     learned_on: Annotated[tuple[Text, ...], BeforeValidator(as_list, json_schema_input_type=str | list[str])] = ()
     """The recordings from which it was learned."""
     how: str = ""
     """How it was chosen."""
     scores: dict[str, Number] = {}
-    """What it was worth on the blocks that were held out: rmse.NAME, coverage.NAME, crps.NAME, nis, log_density, and
+    """Scores on the held-out blocks: rmse.NAME, coverage.NAME, crps.NAME, nis, log_density, and
     the same of the physics alone under physics.*."""
 
 
@@ -43,27 +43,27 @@ class CorrectionSection(Section):
     """A correction of the rates of some states by features, learned from windows of recordings (nisus learn)."""
 
     learned: LearnedHeadSection
-    """What it is of."""
+    """Origin and scores."""
     kind: Literal["gp", "ridge", "net"]
     """gp: a Gaussian process. ridge: ridge regression. net: a network of an ONNX file, which makes the model a black
     box."""
     corrects: Texts
     """The states whose rates are corrected."""
     features: Texts
-    """States and inputs by which."""
+    """States and inputs on which the correction depends."""
     noise: dict[str, NotNegative]
-    """Of each corrected state the variance that a second adds where the correction knows nothing, in the state's unit
-    squared: the noise NAME_learned, which may be tuned like any other."""
+    """Variance that a second adds to each corrected state where there is no training data, in the square of its unit:
+    the noise NAME_learned, which can be tuned like any other."""
     points: Table
     """The features of each window, in their units, in the order of `features`."""
     rates: Table | None = None
-    """By how much the physics was wrong there, in units of the corrected states a second. Not of a net."""
+    """Error of the model's rate in each window, in units of the corrected states a second. Not for a net."""
     lengths: Positives | None = None
     """gp: the length scale of each feature, in its unit."""
     ratio: Positive | None = None
-    """gp: the variance that a window has beside the correction, over that of the correction."""
+    """gp: variance of a window's noise over the variance of the correction."""
     penalty: Positive | None = None
-    """ridge: what is added to the diagonal of its normal equations, of standardised features."""
+    """ridge: penalty added to the diagonal of the normal equations, for standardised features."""
     degree: Literal[1, 2] = 1
     """ridge: 2 has products and squares of the features too. Default: 1."""
     net: Text | None = None

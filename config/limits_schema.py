@@ -1,4 +1,4 @@
-"""The schema of what a sensor can say at all, and of where a model holds."""
+"""The schema of sensor limits and of a model's range of validity."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Pair = tuple[Number | None, Number | None]
 
 
 def _as_pairs(value: Any) -> Any:
-    """A lone pair stands for a list of one."""
+    """Return a single pair as a list of one."""
     if not isinstance(value, (list, tuple)) or any(isinstance(item, (list, tuple)) for item in value):
         return value
     if len(value) != 2:
@@ -48,26 +48,25 @@ Validity = Annotated[RangeSection, AfterValidator(_holds_something)]
 
 
 def bounds(pair: Pair) -> tuple[float, float]:
-    """The two ends; infinite where there is none."""
+    """Return the two ends; infinite where one is not given."""
     low, high = pair
     return -np.inf if low is None else low, np.inf if high is None else high
 
 
 class StuckSection(Section):
-    """When a sensor that repeats itself is stuck. Equal readings are refused from there on, until one differs."""
+    """When a sensor that repeats its value is stuck. Equal measurements are rejected until one differs."""
 
     readings: Annotated[int, Field(strict=True, ge=2)] | None = None
-    """The reading that is equal to as many as these, itself among them, is stuck. Default: told by `seconds`, or by
-    `quantum`."""
+    """Number of equal measurements in a row from which on the sensor is stuck. Default: by `seconds` or `quantum`."""
     seconds: Seconds | None = None
-    """Readings that have been equal for so long are stuck. Default: told by `readings`, or by `quantum`."""
+    """Seconds of equal measurements after which the sensor is stuck. Default: by `readings` or `quantum`."""
     quantum: Positives | None = None
-    """Step of the sensor's converter, in its unit; a list gives one a row. Values less than half of it apart are equal.
-    Alone, it says how many equal readings noise may give: a longer run would come by chance less than once a day at the
-    sensor's rate. Default: only the same number is equal."""
+    """Step of the sensor's converter, in its unit; a list gives one a row. Values less than half a step apart are
+    equal. Alone, it sets the length of a stuck run: noise gives a longer one less than once a day at the sensor's rate.
+    Default: only identical numbers are equal."""
     std: Positives | None = None
-    """Standard deviation of the noise before it is rounded, for that arithmetic, where the sensor's `std` stands for
-    more than that; a list gives one a row. Default: the sensor's `std`."""
+    """Standard deviation of the noise before rounding, for the run length by `quantum`, if the sensor's `std` includes
+    other errors; a list gives one a row. Default: the sensor's `std`."""
 
     @model_validator(mode="after")
     def _one(self) -> StuckSection:
@@ -78,8 +77,8 @@ class StuckSection(Section):
 
 
 class DuplicatesSection(Section):
-    """Readings that come again."""
+    """Copies of measurements."""
 
     within: SomeSeconds
-    """Seconds after a reading within which one of the same values is that reading again, as of a gateway that repeats
-    what it hears. Below the sensor's own period, and below `time.stale_after`."""
+    """Seconds after a measurement within which one of equal values is a copy, for gateways that repeat messages. Below
+    the sensor's own period and `time.stale_after`."""

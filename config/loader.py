@@ -26,8 +26,8 @@ TWINS = Path(str(resources.files("config"))) / "twins"
 class Loaded:
     """A twin's checked configuration, the text it came from, and the place of each of its values.
 
-    `version` is the tuning version whose values stand in place of the text's, and `without` the same file without them:
-    an asset that is simulated by what the twin believes is no other one for what its estimator assumes. None for none.
+    `version` is the tuning version whose values replace those of the text, and `without` the same file without them:
+    a tuning must not change the simulated asset. None if there is none.
     """
 
     config: TwinSection

@@ -46,9 +46,9 @@ Range = Annotated[RangeSection, BeforeValidator(_range, json_schema_input_type=f
 
 
 class AccuracySection(Section):
-    """What the source itself says of the noise of each reading, as a GNSS receiver does. Give one of the two.
+    """Noise that the source reports with each measurement, as a GNSS receiver does. Give one of the two.
 
-    It takes the place of the tuned R for that one reading. Where it is missing, or not positive, R holds.
+    It replaces the tuned R for that measurement. If it is missing or not positive, R is used.
     """
 
     std: Texts | None = None
@@ -62,7 +62,7 @@ class AccuracySection(Section):
     scale: Annotated[
         tuple[Positive, ...], Field(min_length=1), BeforeValidator(as_list, json_schema_input_type=float | list[float])
     ] = (1.0,)
-    """Factor applied after the unit is converted: 0.5 where two standard deviations are told. Default: 1."""
+    """Factor applied after the conversion of units: 0.5 if two standard deviations are reported. Default: 1."""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -85,18 +85,18 @@ class ChannelSection(Section):
     offset: Numbers = (0.0,)
     """Added after `scale`, in the model's unit. A list gives one a value. Default: 0."""
     where: dict[str, Range] = {}
-    """Conditions {name: value} or {name: {min, max}} on values that came along; where one fails, the reading is
-    missing. Default: none."""
+    """Conditions {name: value} or {name: {min, max}} on other values of the same row or message; where one fails, the
+    measurement is missing. Default: none."""
     only: dict[str, Range] = {}
-    """Conditions as in `where`, on values that tell of what a row or frame speaks: {anchor: 3}. Where one fails, it
-    says nothing of this channel, not even that a reading is missing. Default: none."""
+    """Conditions as in `where` that select the rows or frames of this channel: {anchor: 3}. Others are ignored, without
+    a missing measurement. Default: none."""
     convert: Literal["east_north"] | None = None
     """east_north: the two values are latitude and longitude in degrees, and become metres east and north of `origin`.
     Default: null, no conversion."""
     origin: tuple[Number, Number] | None = None
     """Latitude and longitude of the local origin, degrees. Default: the first valid fix."""
     accuracy: AccuracySection | None = None
-    """Of a sensor: the noise that comes with each reading, {std: SIGNAL}. Default: null, the tuned R."""
+    """Noise that is reported with each measurement of a sensor, {std: SIGNAL}. Default: null, the tuned R."""
 
     @abstractmethod
     def names(self) -> tuple[str, ...]:
@@ -188,7 +188,7 @@ class SineSection(Section):
 
 
 class ProfileSection(Section):
-    """How one input runs over time: exactly one of these."""
+    """Course of one input over time: exactly one of constant, steps and sine."""
 
     constant: Number | None = None
     """A constant, in the input's unit."""
@@ -230,16 +230,16 @@ Profiles = Annotated[
 
 
 class PlanSection(SpreadSection):
-    """When one simulated sensor speaks, and how noisy it truly is."""
+    """Rate, true noise and losses of one simulated sensor."""
 
     every: Count = 1
-    """Steps between its readings. Default: 1."""
+    """Steps between its measurements. Default: 1."""
     drop_every: Count | None = None
-    """One in so many of its readings is lost. Default: null, none."""
+    """One in so many of its measurements is lost. Default: null, none."""
 
 
 class TruthSection(Section):
-    """Where the simulated asset differs from the estimator's model."""
+    """Differences of the simulated asset from the estimator's model."""
 
     model: Text | None = None
     """Another model with the same states, inputs and sensors: a name, or file.py:Name. Default: the twin's."""
@@ -248,8 +248,8 @@ class TruthSection(Section):
     noise: dict[str, LevelSection] = {}
     """The asset's true process noise. Default: that of the twin, or of `model` if it is given."""
     every: Count | None = None
-    """Steps between two tellings of every cell of a large field, by which the estimate is scored and its error drawn;
-    the cells that are charted are given at each step. Default: null, never."""
+    """Steps between two outputs of the true value of every cell of a large field, for scores and pictures of the error;
+    charted cells are output at each step. Default: null, never."""
 
 
 class AssetSection(Section):
@@ -270,12 +270,12 @@ class AssetSection(Section):
     sensors: dict[str, PlanSection] = {}
     """Rates, noise and losses by sensor. Default: every sensor at every step."""
     faults: tuple[FaultSection, ...] = ()
-    """Faults of what it says, or of itself, as in `faults` of the twin. On a bus they act before its frames are made,
-    and leave no stamp in the log. Default: none."""
+    """Faults of its sensors, inputs or parameters, as in `faults` of the twin. On a bus they act before frames are
+    encoded, and leave no mark in the log. Default: none."""
 
 
 class SimulatorSection(AssetSection):
-    """A simulated asset that gives its readings directly."""
+    """A simulated asset as the source."""
 
     type: Literal["simulator"]
     """simulator"""
@@ -300,9 +300,9 @@ class CanSection(SignalMaps):
     type: Literal["can"]
     """can"""
     interface: Text
-    """python-can's name of the interface: virtual, udp_multicast, socketcan, pcan, ..."""
+    """Interface of python-can: virtual, udp_multicast, socketcan, pcan, ..."""
     channel: Annotated[int, Field(strict=True)] | str
-    """The bus: vcan0, can0, 239.74.163.2, ... as the interface names it."""
+    """Channel of the interface: vcan0, can0, 239.74.163.2, ... Of udp_multicast each group is a bus of its own."""
     options: dict[str, Any] = {}
     """Further arguments of python-can's interface, for example {bitrate: 500000}. Default: none."""
     asset: AssetSection | None = None
@@ -312,7 +312,7 @@ class CanSection(SignalMaps):
 
 
 class RecordingSection(Section):
-    """Where a recording lies."""
+    """Files of a recording."""
 
     folder: Text | None = None
     """Folder of the recordings, relative to this YAML. The environment variable NISUS_DATA replaces it. Default: null,
@@ -338,12 +338,12 @@ class TimeColumnSection(Section):
     unit: Literal["s", "ms", "us", "ns", "min", "h"] = "s"
     """Its unit. Default: s."""
     shift: Time = 0.0
-    """Seconds added to it: -0.2 where a row tells of the 0.2 s that end with it, so that an input holds for these and
-    not for the next. Default: 0."""
+    """Seconds added to it: -0.2 if a row describes the 0.2 s before it, so that an input holds for these and not for
+    the next. Default: 0."""
 
 
 class TableSection(RecordingSection):
-    """A table: CSV, Parquet, MATLAB (.mat up to version 7) or NumPy (.npz).
+    """A table: CSV, Parquet, MATLAB (.mat up to version 7) or NumPy (.npz); compressed if it ends in .gz, .bz2 or .zst.
 
     Columns of a MATLAB file are its vectors by their names there: meas.Voltage. Those of a NumPy archive are its arrays
     whose first axis is time: speed, or t2m_K[3,5] for a cell of a field.
@@ -363,7 +363,7 @@ class TableSection(RecordingSection):
 
 
 PartSection = Annotated[CanLogSection | TableSection, Field(discriminator="type")]
-"""What may be merged."""
+"""Recordings that can be merged."""
 
 
 class MergedSection(Section):
@@ -381,10 +381,10 @@ SourceSection = Annotated[
 
 
 class FaultSection(Section):
-    """A fault that is put into what the source says, or into a simulated asset; the estimator is not told.
+    """A fault that is injected into a source or a simulated asset, unknown to the estimator.
 
-    It is of a `sensor`, an `input` or, of kind model, a `parameter`; without any of them it is of the whole source. Its
-    begin and end are stamped into the log.
+    It affects a `sensor`, an `input` or, of kind model, a `parameter`; without any of them the whole source. Its start
+    and end are marked in the log.
     """
 
     kind: Literal[
@@ -394,12 +394,12 @@ class FaultSection(Section):
     """bias: `size` is added. drift: `size` is added for every second since `start`. scale: times `size`. stuck: the
     value before `start` is repeated. spike (outliers is its older name): with probability `rate` a draw of that
     standard deviation, `size`, is added. noise: a draw of that standard deviation is added to each. quantisation:
-    rounded to multiples of `size`. dropout: with probability `rate` a reading arrives empty. silence: nothing arrives.
-    delay: arrives `size` seconds later. jitter: later by random seconds of that mean, `size`. bursts: arrives together,
-    every `every` seconds. reorder: with probability `rate` it arrives after the next one. duplicate: with probability
-    `rate` it is said `count` times more, `every` seconds apart. clock_jump: stamped `size` seconds ahead. clock_drift:
-    the clock gains `size` seconds a second. swap: readings of `sensor` come as those of `other`. model: the true
-    parameter of a simulated asset is multiplied by `size`."""
+    rounded to multiples of `size`. dropout: with probability `rate` a measurement arrives empty. silence: nothing
+    arrives. delay: arrives `size` seconds later. jitter: later by random seconds of that mean, `size`. bursts: arrives
+    together, every `every` seconds. reorder: with probability `rate` it arrives after the next one. duplicate: with
+    probability `rate` it is said `count` times more, `every` seconds apart. clock_jump: stamped `size` seconds ahead.
+    clock_drift: the clock gains `size` seconds a second. swap: readings of `sensor` come as those of `other`. model:
+    the true parameter of a simulated asset is multiplied by `size`."""
     sensor: Text | None = None
     """The sensor's name."""
     input: Text | None = None
@@ -407,17 +407,17 @@ class FaultSection(Section):
     parameter: Text | None = None
     """The true parameter's name."""
     row: Text | None = None
-    """The row of the sensor that fails. Default: null, all."""
+    """The affected row of the sensor. Default: null, all."""
     other: Text | None = None
     """The sensor with which `sensor` is swapped."""
     start: SomeSeconds = 0.0
-    """Seconds after the first event at which it begins. Default: 0."""
+    """Start, seconds after the first event. Default: 0."""
     end: Seconds | None = None
-    """Seconds after the first event at which it ends. Default: null, never."""
+    """End, seconds after the first event. Default: null, never."""
     size: Number | None = None
-    """How much: in the unit of the row or input (drift: a second), a factor, or seconds, as the kind says."""
+    """Size: in the unit of the row or input (drift: per second), a factor, or seconds, by kind."""
     rate: Number | None = None
-    """Probability, a reading. Needed by spike; otherwise the default is 1."""
+    """Probability for each measurement. Required by spike; otherwise the default is 1."""
     every: Number | None = None
     """Seconds: of bursts between two arrivals, of duplicate between two repetitions. Default: of duplicate 0."""
     count: Count | None = None

@@ -30,50 +30,50 @@ class TunedSensorSection(SpreadSection):
     """The noise of one sensor, and whether the estimate uses it. Its limits stay the twin's."""
 
     error: ErrorSection | None = None
-    """Its error that lasts, where the twin's sensor has one."""
+    """Its coloured error, if the twin's sensor has one."""
     use: Annotated[bool, Field(strict=True)] = True
     """false holds the sensor out. Default: true."""
 
 
 class AcceptedSection(Section):
-    """That this version is the one that guards and lists go by."""
+    """Acceptance of this version as the reference of `nisus guard` and lists."""
 
     at: Text
-    """When, as 2026-11-22T10:30:00Z."""
+    """Time, as 2026-11-22T10:30:00Z."""
     note: str = ""
-    """Why."""
+    """Reason."""
 
 
 class MovedSection(Section):
-    """What a fit found of one entry, in the entry's unit."""
+    """Result of a fit for one entry, in the entry's unit."""
 
     before: Number
     """Its value before."""
     after: Number
     """Its value in this version."""
     low: Number | None = None
-    """Where the 95 % interval begins. Default: without bound."""
+    """Lower end of the 95 % interval. Default: unbounded."""
     high: Number | None = None
-    """Where it ends. Default: without bound."""
+    """Upper end of the 95 % interval. Default: unbounded."""
     sigma: Number = 0.0
-    """By how many standard deviations of its estimate it moved, on the logarithm of what is positive."""
+    """Change in standard deviations of its estimate, on a logarithmic scale for positive entries."""
 
 
 class EvidenceSection(Section):
-    """Why a fit proposed this version: what it predicts better of the blocks of time that were held out."""
+    """Evidence for a proposed version: better prediction of held-out blocks of time."""
 
     gain: Number
-    """Log-likelihood of a reading there, more than before, nats; of another aim, its score."""
+    """Gain in log-likelihood per held-out measurement, nats; for another aim, gain in its score."""
     error: NotNegative
-    """Standard error of that."""
+    """Standard error of the gain."""
     before: dict[str, Number] = {}
-    """What the settings before were worth there; `scores` are those after."""
+    """Scores of the previous settings on the held-out blocks; `scores` are those of this version."""
     entries: dict[str, MovedSection] = {}
-    """What moved, by key."""
+    """Changed entries, by key."""
 
 
 class VersionSection(Section):
-    """What a tuning version is of, and what it was worth."""
+    """Origin and scores of a tuning version."""
 
     twin: Text
     """Name of the twin that it was made for."""
@@ -82,24 +82,24 @@ class VersionSection(Section):
     model_version: Annotated[int, Field(strict=True, ge=0)] = 1
     """Which version of the model it was made for: each maintenance begins another."""
     saved: Text
-    """When, as 2026-11-22T10:30:00Z."""
+    """Time, as 2026-11-22T10:30:00Z."""
     note: str = ""
-    """What was tried, and what came of it."""
+    """Description of the attempt and its result."""
     fitted_on: Annotated[tuple[Text, ...], BeforeValidator(as_list, json_schema_input_type=str | list[str])] = ()
     """The recordings that it was fitted on, or where else it is from."""
     scores: dict[str, Number] = {}
-    """What it was worth there: nis, log_likelihood (of a reading), rmse.NAME, coverage.NAME, ..."""
+    """Scores on these recordings: nis, log_likelihood (per measurement), rmse.NAME, coverage.NAME, ..."""
     evidence: EvidenceSection | None = None
-    """Why it was proposed. Default: nothing proposed it."""
+    """Evidence of the fit that proposed it. Default: not proposed by a fit."""
     accepted: AcceptedSection | None = None
     """Default: not accepted. Of several that are, the last counts."""
 
 
 class TuningSection(Section):
-    """A tuning version: what of a twin was tuned. What it does not say is as the twin's file says."""
+    """A tuning version: tuned values of a twin. All others are those of the twin's file."""
 
     version: VersionSection
-    """What it is of."""
+    """Origin and scores."""
     estimator: Annotated[
         EstimatorSection | None, BeforeValidator(as_estimator, json_schema_input_type=str | EstimatorSection)
     ] = None
@@ -109,7 +109,7 @@ class TuningSection(Section):
     parameters: dict[str, Number] = {}
     """Parameters of the model."""
     prior: dict[str, PriorSection] = {}
-    """The belief before the first reading."""
+    """Prior before the first measurement."""
     noise: dict[str, NoiseSection] = {}
     """Process noise Q by name."""
     sensors: dict[str, TunedSensorSection] = {}
@@ -119,16 +119,16 @@ class TuningSection(Section):
     ] = None
     """The gate; null for none."""
     commissioned: dict[str, NormalSection] = {}
-    """What was normal when it was accepted, by sensor row."""
+    """Baseline by sensor row, recorded when it was accepted."""
 
 
 class FigureSection(Section):
     """One figure of each fold: log by log, and of each log seed by seed."""
 
     values: Annotated[tuple[Number, ...], Field(min_length=1)]
-    """What it was."""
+    """Recorded values."""
     allowed: Annotated[tuple[NotNegative, ...], Field(min_length=1)]
-    """By how much it may be worse."""
+    """Allowed deterioration."""
 
     @model_validator(mode="after")
     def _alike(self) -> FigureSection:
@@ -159,7 +159,7 @@ class ReferenceSection(Section):
     sums: Annotated[tuple[NotNegative, ...], Field(min_length=1)]
     """The sum of the sizes of each log's values, which tells one from another."""
     figures: dict[str, FigureSection]
-    """What was measured, by name."""
+    """Figures by name."""
 
     @model_validator(mode="after")
     def _complete(self) -> ReferenceSection:

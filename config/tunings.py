@@ -1,4 +1,4 @@
-"""Tuning versions: YAML files beside a twin's, each with the values under a name, and what they were worth."""
+"""Tuning versions: YAML files beside a twin's, each with the values under a name, and their scores."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class Version:
 
     @property
     def head(self) -> VersionSection:
-        """What it is of, and what it was worth."""
+        """Origin and scores."""
         return self.section.version
 
 
@@ -61,7 +61,7 @@ def named(twin: Path) -> str:
 def folders(twin: Path) -> tuple[Path, ...]:
     """Where the versions of a twin's YAML are kept; the first is where new ones go.
 
-    Of a twin that ships in the user's data folder, and those that ship with the program; of any other beside its file.
+    For a bundled twin, the user's data folder and the bundled versions; for any other, a folder beside its file.
     """
     if not ships(twin):
         return (twin.with_name(f"{twin.stem}.tunings"),)
@@ -79,7 +79,7 @@ def version_files(twin: Path) -> dict[str, Path]:
 
 
 def find_version(twin: Path, reference: str) -> Version | None:
-    """The version that a name, or the path of its file, means; None for what the twin's own file says.
+    """Return the version of a name or path; None for the twin's own file.
 
     Raises:
         ConfigError: If there is none, or its file is wrong.
@@ -145,7 +145,7 @@ def overlay(data: dict[str, Any], places: Places, version: Version) -> None:
     """Put a version's values in place of a twin's; errors about them name the version's file and line.
 
     Entries are replaced one by one, so that what a version does not say (limits of a sensor, another filter's options)
-    stays; estimator, gate and what was normal are replaced whole.
+    stays; estimator, gate and baseline are replaced as a whole.
     """
     given = {key: value for key, value in version.data.items() if key != "version"}
     if "estimator" in given and given["estimator"] is not None:

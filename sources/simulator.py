@@ -14,7 +14,7 @@ from estimators.log import INPUT, READING, TICK, TRUTH, Events
 from estimators.model.state_space import StateSpaceModel
 from estimators.numerics.jit import plain
 
-from .faults.kinds import NEVER, Change
+from .faults.kinds import NEVER_NS, Change
 
 BATCH = 32
 """Events after which `read` returns: a change of the asset holds for what has not been read."""
@@ -207,7 +207,7 @@ class Simulator:
                 f"simulator: {self._truth.model.name} has no parameter {parameter!r}; {nearest(parameter, names)}"
             )
         begin = self._time(self._k + 1) if start is None else start
-        change = Change(parameter, factor, begin, NEVER if length is None else begin + length)
+        change = Change(parameter, factor, begin, NEVER_NS if length is None else begin + length)
         self._changes.append(change)
         return change
 

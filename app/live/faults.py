@@ -8,7 +8,7 @@ from typing import Any, Protocol, runtime_checkable
 
 from estimators.errors import LARGEST, ConfigError, SourceError, nearest, quoted
 from estimators.model.state_space import StateSpaceModel
-from sources.faults.kinds import KINDS, OLDER, Fault, find_kind, numbers, problem
+from sources.faults.kinds import KINDS, OLD_NAMES, Fault, find_kind, numbers, problem
 from sources.faults.layer import Faults, FaultStatus
 from sources.source import Source
 
@@ -44,7 +44,7 @@ def fault_of(command: commands.InjectFault, model: StateSpaceModel) -> Fault:
     Raises:
         ConfigError: If the kind or the target is not known, or a number is missing or cannot be.
     """
-    if OLDER.get(command.kind, command.kind) not in KINDS:
+    if OLD_NAMES.get(command.kind, command.kind) not in KINDS:
         raise ConfigError(f"InjectFault: kind is {quoted(command.kind)}; {nearest(command.kind, list(KINDS))}")
     lasts = inf if command.duration is None else command.duration
     if not (0.0 < lasts <= LARGEST or lasts == inf):

@@ -1,1 +1,1 @@
-"""Faults on demand: one layer over any source, which spoils what it says and stamps since when into the log."""
+"""Fault injection: a layer over any source that changes its events and marks the faults in the log."""

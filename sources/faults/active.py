@@ -1,4 +1,4 @@
-"""A fault at work in a stream of events: when it holds, its draws, and its stamps."""
+"""An active fault in a stream of events: its time window, its draws, and its marks."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from estimators.log import MARK
 from estimators.model.state_space import StateSpaceModel
 
 from .effect import Effect, Item, Moment, Target
-from .effects import SHIFT, SPOIL, Elsewhere, Reorder, Silence, Swap, TimeEffect, ValueEffect
+from .effects import TIME_EFFECTS, VALUE_EFFECTS, Reorder, Silence, Swap, TimeEffect, ValueEffect
 from .kinds import Fault, find_kind, numbers
 
 
@@ -17,21 +17,21 @@ def _effect(fault: Fault, target: Target, rng: np.random.Generator) -> Effect:
     if kind == "swap":
         return Swap(*target.sensors)
     if kind == "model":
-        return Elsewhere()
+        return Effect()  # The asset itself changes; its events pass unchanged.
     given = numbers(fault)
-    if kind in SPOIL:
+    if kind in VALUE_EFFECTS:
         return ValueEffect(kind, target, given, rng)
-    if kind in SHIFT:
+    if kind in TIME_EFFECTS:
         return TimeEffect(kind, target, given, rng)
     return (Reorder if kind == "reorder" else Silence)(kind, target, given, rng)
 
 
-class Active:
-    """One fault from `start` until `end`, ns; which of an event's times counts is when it was truly measured.
+class ActiveFault:
+    """One fault from `start` until `end`, ns, of the true time of measurement.
 
-    A `scheduled` one draws from the first event on, so that its draws do not depend on its start; one that was injected
-    only from its start on, as it has not seen what was before. So both draw the same numbers when the source begins
-    again. `inputs` is what was told of the inputs when it was injected.
+    A `scheduled` fault draws from the first event on, so that its draws do not depend on its start; an injected one
+    from its start on, as it has not seen earlier events. So both draw the same numbers when the source begins again.
+    `inputs` are the last inputs before it was injected.
     """
 
     def __init__(
@@ -56,27 +56,27 @@ class Active:
         self._effect = _effect(fault, self._target, rng)
         index = self._target.input
         if index is not None and isinstance(self._effect, ValueEffect | Silence) and not np.isnan(inputs[index]):
-            self._effect.told(float(inputs[index]))
+            self._effect.set_input(float(inputs[index]))
 
     @property
     def lost(self) -> int:
-        """Events that it swallowed."""
+        """Events that it removed."""
         return self._effect.lost
 
     def process(self, items: list[Item]) -> list[Item]:
-        """What comes in place of these events, in their order, with the stamps where it begins and ends."""
+        """Return the events in place of these, in order, with marks at its start and end."""
         out: list[Item] = []
         for item in items:
-            # A stamp is not of the asset, and says nothing of its time that an event beside it does not say.
+            # A mark is not an event of the asset, and has the time of the event beside it.
             if item.kind == MARK:
                 out.append(item)
                 continue
             if not self.begun and item.at >= self.start:
                 self.begun, self.since = True, item.at
-                out += [self._stamp(item, self._code), *self._effect.turn(item, self._moment(item, True))]
+                out += [self._mark(item, self._code), *self._effect.turn(item, self._moment(item, True))]
             if self.begun and not self.ended and item.at >= self.end:
                 self.ended = True
-                out += [self._stamp(item, -self._code), *self._effect.turn(item, self._moment(item, False))]
+                out += [self._mark(item, -self._code), *self._effect.turn(item, self._moment(item, False))]
             if not self._target.has(item):
                 out.append(item)
                 continue
@@ -86,13 +86,13 @@ class Active:
         return out
 
     def flush(self) -> list[Item]:
-        """What it keeps back, when there is no more."""
+        """Return the events that it still holds back at the end."""
         return self._effect.flush()
 
     def _moment(self, item: Item, during: bool) -> Moment:
         return Moment(during, self._scheduled or item.at >= self.start, item.at - self.start)
 
-    def _stamp(self, item: Item, code: int) -> Item:
+    def _mark(self, item: Item, code: int) -> Item:
         value = np.full_like(item.value, np.nan)
         value[0] = code
         return Item(item.at, item.arrival, MARK, self._target.channel, value, item.at)

@@ -1,10 +1,9 @@
-"""What every effect of a fault offers, and the moment at which it acts."""
+"""Events one by one, the target of a fault, and the interface of its effect."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 
@@ -14,104 +13,8 @@ from estimators.model.state_space import StateSpaceModel
 from .kinds import Fault
 
 
-@dataclass(frozen=True)
-class Moment:
-    """Of one event: whether the fault lasts when it is measured, whether it draws, and ns since the fault began."""
-
-    during: bool
-    draws: bool
-    since: int
-
-    @property
-    def seconds(self) -> float:
-        """Since the fault began."""
-        return self.since / 1e9
-
-
-class Effect(Protocol):
-    """What a fault makes of the events of its target, in the order in which they come."""
-
-    lost: int
-    """Events that it swallowed."""
-
-    def apply(self, item: Item, moment: Moment) -> list[Item]:
-        """What comes in place of one event."""
-
-    def turn(self, item: Item, moment: Moment) -> list[Item]:
-        """What comes when the fault begins or ends, before the event with which it does."""
-
-    def flush(self) -> list[Item]:
-        """What it still keeps back when there is no more."""
-
-
-READINGS_ONLY = ("stuck",)
-"""Kinds that, of the whole twin, are of its sensors; the others are also of its inputs."""
-
-
-class Target:
-    """Finds what a fault is of. `channel` is its number in the log's stamps: sensors, then inputs, then the whole."""
-
-    def __init__(self, fault: Fault, model: StateSpaceModel) -> None:
-        self._rows = [len(sensor.rows) for sensor in model.sensors]
-        self._nu = len(model.inputs)
-        self._kinds: tuple[int, ...] = ()
-        self._sensors: tuple[int, ...] = ()
-        self._input = self._row = -1
-        self.channel = len(self._rows) + self._nu
-        if fault.sensor is not None:
-            self.channel = model.sensor_names.index(fault.sensor)
-            self._sensors = (self.channel,)
-            if fault.other is not None:
-                self._sensors += (model.sensor_names.index(fault.other),)
-            if fault.row is not None:
-                self._row = [row.name for row in model.sensors[self.channel].rows].index(fault.row)
-        elif fault.input is not None:
-            self._input = model.input_names.index(fault.input)
-            self.channel = len(self._rows) + self._input
-        elif fault.parameter is None:
-            self._kinds = (READING,) if fault.kind in READINGS_ONLY else (READING, INPUT)
-
-    @property
-    def sensors(self) -> tuple[int, ...]:
-        """Indices of the sensors that it names."""
-        return self._sensors
-
-    @property
-    def input(self) -> int | None:
-        """Index of the input, if it is one."""
-        return self._input if self._input >= 0 else None
-
-    def has(self, item: Item) -> bool:
-        """Whether an event is of it; an input that an event leaves as it was is not told."""
-        if self._kinds:
-            return item.kind in self._kinds
-        if self._input >= 0:
-            return item.kind == INPUT and not np.isnan(item.value[self._input])
-        return item.kind == READING and item.channel in self._sensors
-
-    def cells(self, item: Item) -> slice:
-        """The columns of an event's values that are its own, all rows of a sensor."""
-        if self._input >= 0:
-            return slice(self._input, self._input + 1)
-        return slice(0, self._rows[item.channel] if item.kind == READING else self._nu)
-
-    def touched(self, size: int) -> np.ndarray:
-        """Which of `size` rows the fault is of, shape (size,)."""
-        return np.ones(size, bool) if self._row < 0 else np.arange(size) == self._row
-
-    def apart(self, item: Item) -> tuple[list[Item], Item]:
-        """Of an event that it has: what else the event tells (of other inputs), and what it tells of the target."""
-        if self._input < 0:
-            return [], item
-        mine = np.full_like(item.value, np.nan)
-        mine[self._input] = item.value[self._input]
-        rest = item.value.copy()
-        rest[self._input] = np.nan
-        return ([item.but(value=rest)] if not np.isnan(rest).all() else []), item.but(value=mine)
-
-
 class Item:
-    """An event. `at` is when it was truly measured, ns, whatever the clocks say in `t`; `value` is never written to."""
+    """An event. `at` is its true time of measurement, ns, whatever the stamp `t`; `value` is never written to."""
 
     __slots__ = ("t", "arrival", "kind", "channel", "value", "at")
 
@@ -126,7 +29,7 @@ class Item:
         channel: int | None = None,
         value: np.ndarray | None = None,
     ) -> Item:
-        """The same event, with these in place of its own."""
+        """Return a copy with these fields replaced."""
         return Item(
             self.t if t is None else t,
             self.arrival if arrival is None else arrival,
@@ -137,14 +40,14 @@ class Item:
         )
 
     def with_cells(self, cells: slice, values: np.ndarray) -> Item:
-        """The same event with other values in some columns."""
+        """Return a copy with other values in some columns."""
         value = self.value.copy()
         value[cells] = values
         return self.but(value=value)
 
 
 def items_of(events: Events) -> list[Item]:
-    """The events of a batch, one by one."""
+    """Return the events of a batch, one by one."""
     columns = (events.t.tolist(), events.arrival.tolist(), events.kind.tolist(), events.channel.tolist())
     return [
         Item(t, arrival, kind, channel, value, t)
@@ -153,7 +56,7 @@ def items_of(events: Events) -> list[Item]:
 
 
 def events_of(items: Sequence[Item], width: int) -> Events:
-    """Events as a batch of at least `width` value columns."""
+    """Return events as a batch of at least `width` value columns."""
     if not items:
         return Events.empty(width)
     widest = max(width, *(item.value.size for item in items))
@@ -167,3 +70,90 @@ def events_of(items: Sequence[Item], width: int) -> Events:
         np.array([item.channel for item in items], np.int32),
         value,
     )
+
+
+class Target:
+    """Events and values that a fault affects. `channel` is its number in the log's marks: sensors, inputs, all."""
+
+    def __init__(self, fault: Fault, model: StateSpaceModel) -> None:
+        self._rows = [len(sensor.rows) for sensor in model.sensors]
+        self._nu = len(model.inputs)
+        self._kinds: tuple[int, ...] = ()
+        self.sensors: tuple[int, ...] = ()
+        self.input: int | None = None
+        self._row: int | None = None
+        self.channel = len(self._rows) + self._nu
+        if fault.sensor is not None:
+            self.channel = model.sensor_names.index(fault.sensor)
+            self.sensors = (self.channel,)
+            if fault.other is not None:
+                self.sensors += (model.sensor_names.index(fault.other),)
+            if fault.row is not None:
+                self._row = [row.name for row in model.sensors[self.channel].rows].index(fault.row)
+        elif fault.input is not None:
+            self.input = model.input_names.index(fault.input)
+            self.channel = len(self._rows) + self.input
+        elif fault.parameter is None:
+            # Of the whole twin, a stuck fault affects the sensors only.
+            self._kinds = (READING,) if fault.kind == "stuck" else (READING, INPUT)
+
+    def has(self, item: Item) -> bool:
+        """Return whether an event is affected; one that leaves an input unchanged is not."""
+        if self._kinds:
+            return item.kind in self._kinds
+        if self.input is not None:
+            return item.kind == INPUT and not np.isnan(item.value[self.input])
+        return item.kind == READING and item.channel in self.sensors
+
+    def cells(self, item: Item) -> slice:
+        """Return the affected columns of an event's values, all rows of a sensor."""
+        if self.input is not None:
+            return slice(self.input, self.input + 1)
+        return slice(0, self._rows[item.channel] if item.kind == READING else self._nu)
+
+    def touched(self, size: int) -> np.ndarray:
+        """Return which of `size` rows are affected, shape (size,)."""
+        return np.ones(size, bool) if self._row is None else np.arange(size) == self._row
+
+    def split(self, item: Item) -> tuple[list[Item], Item]:
+        """Return the unaffected part of an event (other inputs), if there is one, and the affected part."""
+        if self.input is None:
+            return [], item
+        mine = np.full_like(item.value, np.nan)
+        mine[self.input] = item.value[self.input]
+        rest = item.value.copy()
+        rest[self.input] = np.nan
+        return ([item.but(value=rest)] if not np.isnan(rest).all() else []), item.but(value=mine)
+
+
+@dataclass(frozen=True)
+class Moment:
+    """State of the fault at an event: whether it is active, whether it draws, and ns since it began."""
+
+    during: bool
+    draws: bool
+    since: int
+
+    @property
+    def seconds(self) -> float:
+        """Seconds since the fault began."""
+        return self.since / 1e9
+
+
+class Effect:
+    """Effect of a fault on the events of its target, in their order of arrival; by default none."""
+
+    lost = 0
+    """Events that it removed."""
+
+    def apply(self, item: Item, moment: Moment) -> list[Item]:
+        """Return the events in place of one event."""
+        return [item]
+
+    def turn(self, item: Item, moment: Moment) -> list[Item]:
+        """Return the events to insert before the event with which the fault begins or ends."""
+        return []
+
+    def flush(self) -> list[Item]:
+        """Return the events that are still held back at the end."""
+        return []

@@ -1,4 +1,4 @@
-"""The catalogue of faults: what each kind does, what it takes, of what it may be; and what a fault must keep."""
+"""The catalogue of faults: effect, parameters and targets of each kind; and the checks of a fault."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from typing import Protocol, runtime_checkable
 from estimators.errors import LARGEST, nearest, quoted
 from estimators.model.state_space import StateSpaceModel
 
-LONGEST = 1e6
-"""Seconds by which an event may be late, eleven days."""
+MAX_DELAY_S = 1e6
+"""Seconds by which a fault may delay an event, eleven days."""
 
 
 @dataclass(frozen=True)
 class Parameter:
-    """A number that a kind takes; one without a default must be given. `holds` is what it must keep, `rule` in words.
+    """A number of a kind of fault; required without a default. `holds` checks it, `rule` describes the check.
 
     In `unit`, "row" stands for the unit of the sensor's row or of the input.
     """
@@ -33,7 +33,7 @@ class Parameter:
 class Kind:
     """One kind of fault; `code` stands for it in the log's stamps, so it never changes.
 
-    `of` says what it may be of: sensor, input, parameter, or twin, the whole. `rows` says that it may be of one row.
+    `of` are its possible targets: sensor, input, parameter, or twin (the whole). `rows`: it may affect a single row.
     """
 
     name: str
@@ -57,10 +57,10 @@ def _positive(unit: str, text: str) -> Parameter:
 
 def _seconds(name: str, text: str, default: float | None = None) -> Parameter:
     def holds(x: float) -> bool:
-        return (0.0 < x if default is None else 0.0 <= x) and x <= LONGEST
+        return (0.0 < x if default is None else 0.0 <= x) and x <= MAX_DELAY_S
 
     low = "positive" if default is None else "zero or positive"
-    return Parameter(name, "s", text, default, holds, f"must be {low}, and {LONGEST:g} s at most")
+    return Parameter(name, "s", text, default, holds, f"must be {low}, and {MAX_DELAY_S:g} s at most")
 
 
 def _rate(text: str, default: float | None = 1.0) -> Parameter:
@@ -71,40 +71,42 @@ VALUE = ("sensor", "input")
 ANY = ("sensor", "input", "twin")
 
 _LIST = (
-    Kind("bias", 1, "size is added to what is said", VALUE, (_size("row", "what is added"),), rows=True),
+    Kind("bias", 1, "size is added to the value", VALUE, (_size("row", "offset"),), rows=True),
     Kind("drift", 2, "size is added for every second since the start", VALUE,
-         (_size("row/s", "what a second adds"),), rows=True),
-    Kind("scale", 3, "what is said is multiplied by size", VALUE, (_size("1", "the factor"),), rows=True),
-    Kind("stuck", 4, "what was said last before the start is repeated", ("sensor", "input", "twin"), rows=True),
+         (_size("row/s", "change a second"),), rows=True),
+    Kind("scale", 3, "the value is multiplied by size", VALUE, (_size("1", "the factor"),), rows=True),
+    Kind("stuck", 4, "the last value before the start is repeated", ("sensor", "input", "twin"), rows=True),
     Kind("spike", 5, "with probability rate a draw of that standard deviation is added", VALUE,
-         (_positive("row", "standard deviation of a spike"), _rate("probability, a reading", None)), rows=True),
-    Kind("noise", 6, "a draw of that standard deviation is added to each reading", VALUE,
+         (_positive("row", "standard deviation of a spike"), _rate("probability for each measurement", None)),
+         rows=True),
+    Kind("noise", 6, "a draw of that standard deviation is added to each measurement", VALUE,
          (_positive("row", "standard deviation of the added noise"),), rows=True),
-    Kind("quantisation", 7, "what is said is rounded to multiples of size", VALUE,
+    Kind("quantisation", 7, "values are rounded to multiples of size", VALUE,
          (Parameter("size", "row", "the step", None, lambda x: 1e-9 <= x <= LARGEST,
                     f"must be 1e-9 or more, and {LARGEST:g} at most"),),
          rows=True),
-    Kind("dropout", 8, "with probability rate a reading arrives empty", ANY, (_rate("probability, a reading"),)),
-    Kind("silence", 9, "nothing arrives; an input stays as it was told last", ANY),
-    Kind("delay", 10, "what is said arrives later by size", ANY, (_seconds("size", "the delay"),)),
-    Kind("jitter", 11, "what is said arrives later by a draw of an exponential distribution", ANY,
+    Kind("dropout", 8, "with probability rate a measurement arrives empty", ANY,
+         (_rate("probability for each measurement"),)),
+    Kind("silence", 9, "nothing arrives; an input keeps its last value", ANY),
+    Kind("delay", 10, "events arrive later by size", ANY, (_seconds("size", "the delay"),)),
+    Kind("jitter", 11, "events arrive later by a draw of an exponential distribution", ANY,
          (_seconds("size", "mean of the delays"),)),
-    Kind("bursts", 12, "what is said is kept back, and arrives together every so many seconds", ANY,
+    Kind("bursts", 12, "events are held back, and arrive together every so many seconds", ANY,
          (_seconds("every", "seconds between two arrivals"),)),
-    Kind("reorder", 13, "with probability rate a reading arrives after the next one of its kind", ANY,
-         (_rate("probability, a reading"),)),
-    Kind("duplicate", 14, "with probability rate a reading is said again", ANY,
-         (_rate("probability, a reading"),
+    Kind("reorder", 13, "with probability rate a measurement arrives after the next one of its kind", ANY,
+         (_rate("probability for each measurement"),)),
+    Kind("duplicate", 14, "with probability rate a measurement is repeated", ANY,
+         (_rate("probability for each measurement"),
           _seconds("every", "seconds between repetitions, by stamp and arrival; 0 repeats the stamp", 0.0),
-          Parameter("count", "1", "repetitions of a reading", 1.0,
+          Parameter("count", "1", "repetitions of a measurement", 1.0,
                     lambda x: 1.0 <= x <= 1000.0 and x == round(x), "must be a whole number from 1 to 1000"))),
-    Kind("clock_jump", 15, "the clock that stamps what is said is ahead by size", ANY,
+    Kind("clock_jump", 15, "the clock of the stamps is ahead by size", ANY,
          (Parameter("size", "s", "how far ahead; negative is behind", None, lambda x: abs(x) <= 1e9,
                     "must lie within 1e9 s"),)),
-    Kind("clock_drift", 16, "the clock that stamps what is said gains size seconds a second", ANY,
-         (Parameter("size", "s/s", "what it gains; negative loses", None, lambda x: abs(x) < 1.0,
+    Kind("clock_drift", 16, "the clock of the stamps gains size seconds a second", ANY,
+         (Parameter("size", "s/s", "gain; negative loses", None, lambda x: abs(x) < 1.0,
                     "must lie between -1 and 1"),)),
-    Kind("swap", 17, "the readings of sensor come as those of other, and the other way round", ("sensor",),
+    Kind("swap", 17, "the measurements of sensor and other are exchanged", ("sensor",),
          other=True),
     Kind("model", 18, "a true parameter of the simulated asset is multiplied by size", ("parameter",),
          (_size("1", "the factor"),)),
@@ -113,18 +115,18 @@ _LIST = (
 KINDS = {kind.name: kind for kind in _LIST}
 """By name."""
 
-OLDER = {"outliers": "spike"}
-"""Names by which a kind was known."""
+OLD_NAMES = {"outliers": "spike"}
+"""Former names of kinds."""
 
 
 def find_kind(name: str) -> Kind:
-    """The kind of that name, today's or an older one."""
-    return KINDS[OLDER.get(name, name)]
+    """Return the kind of a current or former name."""
+    return KINDS[OLD_NAMES.get(name, name)]
 
 
 def problem(fault: Fault, model: StateSpaceModel) -> tuple[str, str] | None:
-    """What is wrong with a fault: its field (or an empty text, for the fault itself) and a text; None if nothing is."""
-    if OLDER.get(fault.kind, fault.kind) not in KINDS:
+    """Return what is wrong with a fault: its field (empty for the fault itself) and a text; None if nothing is."""
+    if OLD_NAMES.get(fault.kind, fault.kind) not in KINDS:
         return "kind", f"is {quoted(fault.kind)}; {nearest(fault.kind, list(KINDS))}"
     kind = find_kind(fault.kind)
     return _of_target(fault, kind, model) or _of_numbers(fault, kind)
@@ -142,7 +144,7 @@ def _of_target(fault: Fault, kind: Kind, model: StateSpaceModel) -> tuple[str, s
     what = given[0] if given else "twin"
     if what not in kind.of:
         if given:
-            return what, f"means nothing to a fault of kind {fault.kind}; leave it out"
+            return what, f"is not used by a fault of kind {fault.kind}; leave it out"
         return "", f"has no {' or '.join(kind.of)}; a fault of kind {fault.kind} needs one"
     for field, names, word in ((what, known.get(what, []), what), ("other", known["sensor"], "sensor")):
         name = getattr(fault, field, None)
@@ -151,7 +153,7 @@ def _of_target(fault: Fault, kind: Kind, model: StateSpaceModel) -> tuple[str, s
     if (fault.other is not None) != kind.other:
         if kind.other:
             return "other", f"is missing; a fault of kind {fault.kind} needs it"
-        return "other", f"means nothing to a fault of kind {fault.kind}; leave it out"
+        return "other", f"is not used by a fault of kind {fault.kind}; leave it out"
     rows = {sensor.name: [row.name for row in sensor.rows] for sensor in model.sensors}
     if kind.other:
         ours, theirs = len(rows[str(fault.sensor)]), len(rows[str(fault.other)])
@@ -162,7 +164,7 @@ def _of_target(fault: Fault, kind: Kind, model: StateSpaceModel) -> tuple[str, s
             )
     if fault.row is not None:
         if not kind.rows or fault.sensor is None:
-            return "row", f"means nothing to a fault of kind {fault.kind}; leave it out"
+            return "row", f"is not used by a fault of kind {fault.kind}; leave it out"
         if fault.row not in rows[fault.sensor]:
             near = nearest(fault.row, rows[fault.sensor])
             return "row", f"is {quoted(fault.row)}, no row of {fault.sensor}; {near}"
@@ -179,7 +181,7 @@ def _of_numbers(fault: Fault, kind: Kind) -> tuple[str, str] | None:
         value = getattr(fault, name)
         if name not in takes:
             if value is not None:
-                return name, f"means nothing to a fault of kind {fault.kind}; leave it out"
+                return name, f"is not used by a fault of kind {fault.kind}; leave it out"
         elif value is None:
             if takes[name].default is None:
                 return name, f"is missing; a fault of kind {fault.kind} needs it"
@@ -189,14 +191,14 @@ def _of_numbers(fault: Fault, kind: Kind) -> tuple[str, str] | None:
 
 
 def numbers(fault: Fault) -> dict[str, float]:
-    """The numbers of a fault by name, defaults filled in."""
+    """Return the numbers of a fault by name, with defaults."""
     given = {item.name: getattr(fault, item.name) for item in find_kind(fault.kind).parameters}
     defaults = {item.name: item.default for item in find_kind(fault.kind).parameters}
     return {name: float(value if value is not None else defaults[name] or 0.0) for name, value in given.items()}
 
 
-NEVER = 2**62
-"""ns: later than any event."""
+NEVER_NS = 2**62
+"""Time after any event, ns."""
 
 
 @dataclass
@@ -213,7 +215,7 @@ class Change:
 class Changeable(Protocol):
     """A simulated asset whose true parameters can be changed while it runs; from any thread.
 
-    `live` False says that its time is that of its events.
+    `live` is False if its time is that of its events.
     """
 
     live: bool
@@ -233,10 +235,9 @@ class Changeable(Protocol):
 class Fault:
     """One fault, from `start` until `end`, in seconds after the source's first event (or after it was injected).
 
-    It concerns a `sensor` (a `row` of it, or all), an `input` or, of kind model, a true `parameter` of a simulated
-    asset; none of them means the whole source. What the numbers mean, in which unit, and which of them a kind takes, is
-    in `kinds.KINDS`; None is the kind's default. Draws are a function of `seed`, by default (seed of the layer, number
-    of the fault), and of the events alone.
+    It affects a `sensor` (a `row` of it, or all), an `input` or, of kind model, a true `parameter` of a simulated
+    asset; none of them means the whole source. `KINDS` defines the numbers and their units; None is the kind's default.
+    Draws are a function of `seed`, by default (seed of the layer, number of the fault), and of the events alone.
     """
 
     kind: str
@@ -255,6 +256,6 @@ class Fault:
 
     @property
     def target(self) -> str:
-        """What it concerns, in words."""
+        """The affected target, in words."""
         name = self.sensor or self.input or self.parameter or "the whole twin"
         return f"{name}.{self.row}" if self.row is not None else name

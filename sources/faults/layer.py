@@ -1,4 +1,4 @@
-"""The faults of one source: scheduled and injected, changed from any thread while another reads."""
+"""The faults of one source, scheduled and injected; changed from any thread while another reads."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from estimators.errors import SourceError
 from estimators.log import INPUT, Events
 from estimators.model.state_space import StateSpaceModel
 
-from .active import Active
+from .active import ActiveFault
 from .effect import Item, events_of, items_of
 from .effects import ns
-from .kinds import NEVER, Change, Changeable, Fault, find_kind, problem
+from .kinds import NEVER_NS, Change, Changeable, Fault, find_kind, problem
 
-LINGERS = ns(60.0)
-"""Of the source's time by which a fault must have ended to be gone. What was measured while it lasted and comes later
-still, it does not touch."""
+LINGER_NS = ns(60.0)
+"""Time of the source after the end of a fault when it is removed; measurements from its window that arrive even later
+are not affected."""
 
 
 @dataclass
@@ -32,17 +32,17 @@ class _Entry:
     fault: Fault
     scheduled: bool
     base: int | None
-    end: int = NEVER
+    end: int = NEVER_NS
     change: Change | None = None
 
     def window(self, base: int) -> tuple[int, int]:
-        last = NEVER if self.fault.end == inf else base + ns(self.fault.end)
+        last = NEVER_NS if self.fault.end == inf else base + ns(self.fault.end)
         return base + ns(self.fault.start), min(self.end, last)
 
 
 @dataclass(frozen=True)
 class FaultStatus:
-    """A fault that holds or will: its number, since when (ns; None: not yet), events that it touched and swallowed."""
+    """A current or future fault: its number, its start (ns; None: not yet), affected and removed events."""
 
     number: int
     fault: Fault
@@ -52,11 +52,10 @@ class FaultStatus:
 
 
 class Faults:
-    """Makes of a source's events what they become under faults, which act one after the other in order of number.
+    """Applies faults to a source's events, one after the other in order of their number.
 
-    The same events, seed and faults give the same bits, in whatever batches the events come. What arrives later is kept
-    back until an event that arrived after it has come, or `release` is told that its time has come; nothing is lost
-    but what a silence swallows, which is counted.
+    The same events, seed and faults give the same bits, for any batches. A delayed event is held back until a later
+    arrival or `release`. Only a silence removes events, and counts them.
 
     Raises:
         SourceError: If a scheduled fault does not fit the model, with its number and remedy.
@@ -79,27 +78,27 @@ class Faults:
             raise SourceError(f"{name}: {' '.join(part for part in wrong if part)}")
 
     def _begin(self) -> None:
-        """Nothing has come yet."""
-        self._active: list[tuple[_Entry, Active]] = []
+        """Reset to the state before the first event."""
+        self._active: list[tuple[_Entry, ActiveFault]] = []
         self._waiting: list[tuple[int, int, Item]] = []
         self._lost = 0
         self._sent = 0
         self._origin: int | None = None
         self._newest: int | None = None
         self._clock: int | None = None
-        self._told = np.full(len(self._model.inputs), np.nan)
+        self._inputs = np.full(len(self._model.inputs), np.nan)
 
     # From any thread
 
     def inject(self, fault: Fault) -> int:
-        """Begin a fault with the next event; its start and end count from there. Gives its number.
+        """Begin a fault with the next event, from which its start and end count; return its number.
 
         Raises:
-            SourceError: If it does not fit the model, or the source is no asset whose parameters could change.
+            SourceError: If it does not fit the model, or it needs a simulated asset and the source is none.
         """
         self._check(fault, "fault")
         if find_kind(fault.kind).name == "model":
-            # With the asset's next step, which is not known before.
+            # With the asset's next step, whose time is not known yet.
             fault = replace(fault, start=0.0, end=fault.end - fault.start)
         with self._lock:
             entry = _Entry(self._next, fault, False, None if self._newest is None else self._newest + 1)
@@ -112,7 +111,7 @@ class Faults:
             return entry.number
 
     def clear(self, number: int | None = None) -> int:
-        """End the fault of that number, or all, with the next event; how many there were.
+        """End the fault of that number, or all, with the next event; return how many there were.
 
         Raises:
             SourceError: If there is none of that number.
@@ -123,8 +122,8 @@ class Faults:
                 for item in self._entries
                 if number in (None, item.number)
                 and not self._over(item)
-                # A model that is to change back with its asset's next step.
-                and (item.change is None or item.end == NEVER)
+                # A model changes back with its asset's next step.
+                and (item.change is None or item.end == NEVER_NS)
             ]
             if number is not None and not found:
                 raise SourceError(f"there is no fault {number} that could end")
@@ -133,7 +132,7 @@ class Faults:
             return len(found)
 
     def status(self) -> tuple[FaultStatus, ...]:
-        """The faults that hold or will."""
+        """Return current and future faults."""
         with self._lock:
             running = {entry.number: active for entry, active in self._active}
             found = []
@@ -147,7 +146,7 @@ class Faults:
 
     @property
     def lost(self) -> int:
-        """Events that faults swallowed, since the source began."""
+        """Events that faults have removed since the source began."""
         with self._lock:
             return self._lost + sum(active.lost for _, active in self._active)
 
@@ -157,10 +156,10 @@ class Faults:
         return self._asset is not None
 
     def attach(self, source: object) -> None:
-        """The source was opened: changes of the model that are to come are told to it.
+        """Attach a source that was opened, and schedule its changes of the model.
 
         Raises:
-            SourceError: If there are some, and it is no simulated asset.
+            SourceError: If there are some, and it is not a simulated asset.
         """
         with self._lock:
             self._asset = source if isinstance(source, Changeable) else None
@@ -171,12 +170,12 @@ class Faults:
     # On the thread that reads
 
     def restart(self) -> None:
-        """The source began again: so does everything, with the faults where they were."""
+        """Begin again with the source; faults keep their times."""
         with self._lock:
             self._begin()
 
     def pass_on(self, batch: Events) -> Events:
-        """What comes in place of a batch."""
+        """Return the events in place of a batch."""
         with self._lock:
             if not len(batch):
                 return batch
@@ -194,24 +193,24 @@ class Faults:
                     out += self._send(self._leave(item.at))
                 passed = events_of(out, width)
             else:
-                self._clock = max(int(batch.arrival.max()), self._clock if self._clock is not None else -NEVER)
+                self._clock = max(int(batch.arrival.max()), self._clock if self._clock is not None else -NEVER_NS)
                 passed = batch
-            self._newest = max(int(batch.t.max()), self._newest if self._newest is not None else -NEVER)
+            self._newest = max(int(batch.t.max()), self._newest if self._newest is not None else -NEVER_NS)
             self._note_inputs(passed)
             return passed
 
     def release(self, now: int) -> Events:
-        """What has arrived by `now`, ns; only when no event that arrived before is still to come."""
+        """Return the delayed events that have arrived by `now`, ns; call it when no earlier arrival is pending."""
         with self._lock:
             return events_of(self._due(now), self._model.width)
 
     def finish(self) -> Events:
-        """What is still kept back, when the source has ended."""
+        """Return the events that are still held back when the source has ended."""
         with self._lock:
             kept: list[Item] = []
             for k, (_, active) in enumerate(self._active):
                 kept += self._through(active.flush(), k + 1)
-            return events_of(self._send(kept) + self._due(NEVER), self._model.width)
+            return events_of(self._send(kept) + self._due(NEVER_NS), self._model.width)
 
     # With the lock held
 
@@ -221,8 +220,8 @@ class Faults:
         return items
 
     def _leave(self, at: int) -> list[Item]:
-        """Let faults go that have ended long before: what they still keep back. Each would cost every later event."""
-        gone = [k for k, (_, active) in enumerate(self._active) if active.ended and at > active.end + LINGERS]
+        """Remove faults that ended long ago, which would slow every event; return the events that they hold back."""
+        gone = [k for k, (_, active) in enumerate(self._active) if active.ended and at > active.end + LINGER_NS]
         kept: list[Item] = []
         for k in gone:
             kept += self._through(self._active[k][1].flush(), k + 1)
@@ -232,7 +231,7 @@ class Faults:
         return kept
 
     def _send(self, items: list[Item]) -> list[Item]:
-        """Those that have arrived; the others wait."""
+        """Return events that have arrived; the others wait."""
         out = []
         for item in items:
             if self._clock is not None and item.arrival > self._clock:
@@ -249,36 +248,36 @@ class Faults:
         return out
 
     def _note_inputs(self, events: Events) -> None:
-        rows = events.value[events.kind == INPUT][:, : self._told.size]
-        for k in range(self._told.size if len(rows) else 0):
+        rows = events.value[events.kind == INPUT][:, : self._inputs.size]
+        for k in range(self._inputs.size if len(rows) else 0):
             known = rows[~np.isnan(rows[:, k]), k]
             if known.size:
-                self._told[k] = known[-1]
+                self._inputs[k] = known[-1]
 
     def _activate(self, entry: _Entry) -> None:
         assert self._origin is not None
         if entry.base is None:
             entry.base = self._origin
         start, end = entry.window(entry.base)
-        active = Active(
+        active = ActiveFault(
             entry.fault,
             self._model,
             (self._seed, entry.number),
             start,
             end,
             scheduled=entry.scheduled,
-            inputs=self._told,
+            inputs=self._inputs,
         )
         self._active.append((entry, active))
 
     def _over(self, entry: _Entry) -> bool:
-        """Whether it has ended, or ends with the next event."""
+        """Return whether a fault has ended, or ends with the next event."""
         if entry.base is None or self._newest is None:
             return False
         return entry.window(entry.base)[1] <= self._newest + 1
 
     def _end(self, entry: _Entry) -> None:
-        entry.end = self._newest + 1 if self._newest is not None else -NEVER
+        entry.end = self._newest + 1 if self._newest is not None else -NEVER_NS
         begun = any(item is entry and active.begun for item, active in self._active)
         if entry.change is not None and self._asset is not None:
             self._asset.end(entry.change)
@@ -292,7 +291,7 @@ class Faults:
                 active.end = entry.end
 
     def _change(self, entry: _Entry) -> None:
-        """Tell the asset of a change of its model, and learn from when on it holds."""
+        """Schedule a change of the asset's model."""
         fault = entry.fault
         if self._asset is None:
             raise SourceError("a fault of kind model needs a simulated asset; this source has none")
@@ -303,7 +302,7 @@ class Faults:
             start = entry.change.start
         length = None if fault.end == inf else ns(fault.end - fault.start)
         change = self._asset.change(str(fault.parameter), float(fault.size or 0.0), start, length)
-        if entry.end != NEVER and entry.change is not None:
+        if entry.end != NEVER_NS and entry.change is not None:
             change.end = entry.change.end
         entry.change = change
         if not (self._asset.live or entry.scheduled):

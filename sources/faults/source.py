@@ -1,4 +1,4 @@
-"""A source whose events pass through faults; it is held, hurried and sought as the one inside."""
+"""A source behind a layer of faults, with the controls of the source inside."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from .layer import Faults
 
 
 class FaultySource:
-    """Gives what `inner` gives, as `faults` make it.
+    """Source of the events of `inner` under `faults`.
 
-    Around a replay it stands outside the pacer, so that a fault that is injected holds for what is played next, not
-    only for what has not been read ahead.
+    It stands outside the pacer of a replay, so that an injected fault affects the next events to be played, including
+    those that were read ahead.
     """
 
     def __init__(self, inner: Source, faults: Faults) -> None:
@@ -24,7 +24,7 @@ class FaultySource:
 
     @property
     def span(self) -> tuple[int, int] | None:
-        """First and last time of the source inside, ns; None if it does not tell."""
+        """First and last time of the source inside, ns; None if it is not known."""
         return span_of(self._inner)
 
     @property
@@ -33,7 +33,7 @@ class FaultySource:
         return isinstance(self._inner, Endless) and self._inner.endless
 
     def read(self, timeout: float) -> Events | None:
-        """The next events, and those that were kept back until now; None at the end."""
+        """Return the next events and the delayed ones that are due; None at the end."""
         now = self._inner.now()
         batch = self._inner.read(timeout)
         if self._paced is not None and self._paced.restarts != self._restarts:
@@ -44,11 +44,11 @@ class FaultySource:
             return rest if len(rest) else None
         if len(batch) or now is None:
             return self.faults.pass_on(batch)
-        # All that arrived until `now` has been given.
+        # All events that arrived until `now` have been returned.
         return self.faults.release(now)
 
     def now(self) -> int | None:
-        """The present time of the source inside, ns."""
+        """Return the present time of the source inside, ns."""
         return self._inner.now()
 
     def close(self) -> None:
@@ -56,58 +56,36 @@ class FaultySource:
         self._inner.close()
 
 
-class PacedFaultySource:
-    """The same around a source whose time can be held and sought. Begun again by seeking back, so are its faults."""
+class PacedFaultySource(FaultySource):
+    """The same with the controls of a paced source. When it begins again by seeking back, so do its faults."""
 
-    live = False
-
-    def __init__(self, inner: Paced, faults: Faults) -> None:
-        self._inner = inner
-        self._faulty = FaultySource(inner, faults)
-        self.faults = faults
-
-    @property
-    def span(self) -> tuple[int, int] | None:
-        """First and last time, ns; None if it does not tell."""
-        return self._inner.span
+    _inner: Paced
 
     @property
     def speed(self) -> float:
-        """Times real time."""
+        """Speed, times real time."""
         return self._inner.speed
 
     @property
     def paused(self) -> bool:
-        """Whether it is held."""
+        """Whether it is paused."""
         return self._inner.paused
 
     @property
     def restarts(self) -> int:
-        """How often it was begun again."""
+        """How often it began again by seeking back."""
         return self._inner.restarts
 
-    def read(self, timeout: float) -> Events | None:
-        """The events that are due, and those that were kept back until now; None at the end."""
-        return self._faulty.read(timeout)
-
-    def now(self) -> int | None:
-        """Where it stands, ns."""
-        return self._inner.now()
-
-    def close(self) -> None:
-        """Close the source inside."""
-        self._inner.close()
-
     def pause(self) -> None:
-        """Hold its time."""
+        """Pause."""
         self._inner.pause()
 
     def resume(self) -> None:
-        """Let it go on."""
+        """Resume."""
         self._inner.resume()
 
     def set_speed(self, speed: float) -> None:
-        """Go on at `speed` times real time."""
+        """Continue at `speed` times real time."""
         self._inner.set_speed(speed)
 
     def step(self) -> None:
@@ -120,5 +98,5 @@ class PacedFaultySource:
 
 
 def with_faults(source: Source, faults: Faults) -> FaultySource | PacedFaultySource:
-    """The source behind these faults."""
+    """Return the source behind these faults."""
     return PacedFaultySource(source, faults) if isinstance(source, Paced) else FaultySource(source, faults)

@@ -132,7 +132,7 @@ def test_an_option_that_is_no_number_is_refused_by_the_api(value, start):
 def test_a_number_beyond_all_numbers_is_refused(start):
     _, engine = start(load_twin("motor_winding"))
     key = engine.tuning.keys()[0]
-    with pytest.raises(ConfigError, match="value is too large; it must be a finite number"):
+    with pytest.raises(ConfigError, match="value is too large"):
         command_from_json({"command": "SetTuning", "key": key, "value": 10**400}, engine)
     with pytest.raises(ConfigError, match=rf"{key} is 1e\+300; it must be 1e\+50 at most"):
         command_from_json({"command": "SetTuning", "key": key, "value": 1e300}, engine)

@@ -91,7 +91,7 @@ def test_the_catalogue_says_what_a_kind_takes(page):
         ({"kind": "bias", "target": "windin", "size": 1}, "InjectFault: target is 'windin', no sensor or input of"),
         ({"kind": "bias", "target": "winding"}, "InjectFault: size is missing; a fault of kind bias needs it"),
         ({"kind": "bias", "size": 1}, "InjectFault: target is missing; a fault of kind bias needs the name"),
-        ({"kind": "stuck", "target": "winding", "size": 1}, "size means nothing to a fault of kind stuck"),
+        ({"kind": "stuck", "target": "winding", "size": 1}, "size is not used by a fault of kind stuck"),
         ({"kind": "spike", "target": "winding", "size": 1, "rate": 2}, "rate is 2; it is a probability"),
         ({"kind": "delay", "size": 1e30}, "size is 1e+30; it must be positive, and 1e+06 s at most"),
         ({"kind": "duplicate", "count": 0}, "count is 0; it must be a whole number from 1 to 1000"),

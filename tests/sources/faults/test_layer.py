@@ -10,7 +10,7 @@ from estimators.log import MARK, READING, TRUTH, Events
 from estimators.models import MODELS
 from estimators.numerics.jit import plain
 from sources.faults.kinds import KINDS, Fault
-from sources.faults.layer import LINGERS, Faults
+from sources.faults.layer import LINGER_NS, Faults
 from sources.faults.source import FaultySource, PacedFaultySource, with_faults
 from sources.memory import MemorySource
 from sources.pacer import Pacer
@@ -166,7 +166,7 @@ def test_faults_that_ended_long_ago_cost_nothing_and_what_they_lost_stays_counte
     )
     source = FaultySource(MemorySource(events, batch=4), layer)
     out = read_all(source)
-    assert events.t[-1] - events.t[0] > 20 * SECOND + LINGERS
+    assert events.t[-1] - events.t[0] > 20 * SECOND + LINGER_NS
     assert not layer._active and layer.lost == 10
     assert len(out) == len(events) - layer.lost + 4
 

@@ -142,7 +142,7 @@ source:
         ("{sensor: winding, kind: stuk}", "faults[0].kind is 'stuk'; did you mean stuck?"),
         ("{sensor: winding, kind: bias}", "size is missing; a fault of kind bias needs it"),
         ("{sensor: winding, kind: outliers, size: 3}", "rate is missing; a fault of kind outliers needs it"),
-        ("{sensor: winding, kind: stuck, size: 3}", "size means nothing to a fault of kind stuck; leave it out"),
+        ("{sensor: winding, kind: stuck, size: 3}", "size is not used by a fault of kind stuck; leave it out"),
         ("{sensor: winding, kind: stuck, start: 4, end: 3}", "end is 3 s; it must be above start"),
     ],
 )
