@@ -1,4 +1,4 @@
-"""What stands between a source and the log, for the running twin and for a fold of a file alike."""
+"""Check the times of events between a source and the log, and add planned maintenance."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from estimators.model.state_space import StateSpaceModel
 from sources.source import WRONG_TIME, Report
 
 CLOCK_MOVED = "clock moved"
-"""Key of a source's clock that was set."""
+"""Key of jumps of a source's clock."""
 
 MAINTENANCE = "maintenance"
-"""Key of a maintenance that the YAML tells of."""
+"""Key of maintenance."""
 
 
 class Planned(NamedTuple):
-    """A maintenance that the YAML tells of: its time (ns), what was changed, and the indices of the states."""
+    """Maintenance by the YAML: its time (ns), description, and the indices of the states."""
 
     at: int
     what: str
@@ -29,25 +29,25 @@ class Planned(NamedTuple):
 
 
 def maintenance_text(what: str, states: Sequence[int], model: StateSpaceModel) -> str:
-    """What is said of a maintenance."""
+    """Return the notice of a maintenance."""
     names = [model.state_names[k] for k in states]
     shown = ", ".join(names[:6]) + (", ..." if len(names) > 6 else "")
     return f"maintenance: {what}; {shown} as uncertain as at the start, and a new version of the model begins"
 
 
-class Intake:
-    """Judges the time of what a source says, and tells what was refused or set right."""
+class Ingest:
+    """Accepts, corrects or rejects the times of a source's events, and reports each change."""
 
     def __init__(
         self, model: StateSpaceModel, horizon: int | None, report: Report, planned: Sequence[Planned] = ()
     ) -> None:
-        """What comes from a source of this model.
+        """Prepare for a source of this model.
 
         Args:
             model: The model.
             horizon: The log's, ns; None is a recording's log, which was judged when it was recorded.
-            report: Told of what is refused or set right, and of maintenance.
-            planned: Maintenance that the YAML tells of; a recording's log has it already.
+            report: Receives rejections, corrections and maintenance.
+            planned: Maintenance by the YAML; a recording's log contains it already.
         """
         self._model, self._report = model, report
         self._guard = None if horizon is None else ClockGuard(len(model.sensors), horizon)
@@ -55,22 +55,22 @@ class Intake:
 
     @property
     def held(self) -> int:
-        """Events that wait for the next to tell whether their time is true."""
+        """Number of events held until the next one confirms their time."""
         return 0 if self._guard is None else self._guard.held
 
     def take(self, batch: Events) -> Passed:
-        """What of the next events, in the order of arrival, may go to the log."""
+        """Return those of the next events, in order of arrival, that enter the log."""
         if self._guard is None:
             return Passed(batch, np.zeros(len(batch), np.bool_), [], [])
-        return self._told(self._guard.take(batch))
+        return self._reported(self._guard.take(batch))
 
     def finish(self) -> Passed:
-        """What is left at the end of the source."""
+        """Return the events that are held at the end of the source."""
         if self._guard is None:
             return Passed(Events.empty(self._model.width), np.zeros(0, np.bool_), [], [])
-        return self._told(self._guard.finish())
+        return self._reported(self._guard.finish())
 
-    def _told(self, passed: Passed) -> Passed:
+    def _reported(self, passed: Passed) -> Passed:
         for refused in passed.refused:
             self._report(WRONG_TIME, self._refusal(refused))
         for by in dict.fromkeys(moved.by for moved in passed.moved):
@@ -80,7 +80,7 @@ class Intake:
         return passed
 
     def _maintain(self, passed: Passed, item: Planned) -> Passed:
-        """With a maintenance whose time has come."""
+        """Return the events with a maintenance that is due."""
         model = self._model
         events = maintained(item.at, item.at, item.states, model.width)
         self._report(MAINTENANCE, maintenance_text(item.what, item.states, model))
@@ -96,7 +96,7 @@ class Intake:
         ahead = (refused.t - refused.expected) * 1e-9
         return (
             f"{self._named(refused.kind, refused.channel)}: its time, {refused.t * 1e-9:.9g} s, is {ahead:.6g} s after "
-            "the newest, and what came next does not agree; refused"
+            "the newest, and the next events do not confirm it; rejected"
         )
 
     def _move(self, moved: Sequence[Moved]) -> str:

@@ -23,7 +23,7 @@ def suffix_of(path: Path) -> str:
 
 
 def is_compressed(path: Path) -> bool:
-    """Return whether the ending says that the file is compressed as a whole."""
+    """Return whether the file as a whole is compressed, by its ending."""
     return path.suffix.lower() in COMPRESSIONS
 
 

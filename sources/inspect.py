@@ -1,4 +1,4 @@
-"""What recordings hold, before any twin is there: messages and signals of CAN logs, columns of tables."""
+"""Summarise recordings: messages and signals of CAN logs, columns of tables."""
 
 from __future__ import annotations
 
@@ -23,21 +23,20 @@ from .source import Channel
 from .tables.rows import Rows, names_of, rows_of
 from .tables.text import UNREADABLE, csv_header
 
-LONGEST = 64
+MAX_FRAME_BYTES = 64
 """Bytes of the longest frame, of CAN FD."""
 
-HOLE = 1.0
-"""Seconds without anything that are a hole, or so many usual intervals:"""
+MIN_GAP_S = 1.0
+MIN_GAP_INTERVALS = 20.0
+"""Seconds, or median intervals if they are longer, from which on a pause is a gap."""
 
-INTERVALS = 20.0
-
-TIMES = ("t", "time", "timestamp", "seconds", "time_s", "t_s", "date", "datetime", "unix_time", "elapsed")
-"""Names of a column that holds the time."""
+TIME_NAMES = ("t", "time", "timestamp", "seconds", "time_s", "t_s", "date", "datetime", "unix_time", "elapsed")
+"""Usual names of a time column."""
 
 
 @dataclass(frozen=True)
 class Series:
-    """Values of one signal or column: times (ns) and finite values, (n,); `missing` were none."""
+    """Values of one signal or column: times (ns) and finite values, (n,); `missing` counts the others."""
 
     name: str
     unit: str
@@ -48,7 +47,7 @@ class Series:
 
 @dataclass(frozen=True)
 class Message:
-    """The frames of one id on one bus: their times (ns), and what a DBC says of them, if one does."""
+    """Frames of one id on one bus: times (ns), and name and signals by a DBC, if one is given."""
 
     bus: BusName
     key: int
@@ -59,7 +58,7 @@ class Message:
 
 @dataclass
 class RecordingContents:
-    """What recordings of one kind hold; `t` (ns) is when anything was recorded, in order."""
+    """Contents of recordings of one kind; `t` (ns) are the times of all records, in order."""
 
     files: list[Path]
     kind: str
@@ -71,21 +70,21 @@ class RecordingContents:
 
     @property
     def holes(self) -> list[tuple[int, int]]:
-        """When something should have come and nothing did: start and end, ns."""
+        """Gaps in the recording: start and end, ns."""
         return holes(self.t)
 
 
 def holes(t: np.ndarray) -> list[tuple[int, int]]:
-    """Gaps between times in order, far longer than is usual there."""
+    """Return gaps between ordered times that are far longer than the median interval."""
     gaps = np.diff(t)
     if not gaps.size:
         return []
-    long = np.flatnonzero(gaps > max(HOLE * 1e9, INTERVALS * float(np.median(gaps))))
+    long = np.flatnonzero(gaps > max(MIN_GAP_S * 1e9, MIN_GAP_INTERVALS * float(np.median(gaps))))
     return [(int(t[k]), int(t[k + 1])) for k in long]
 
 
 def is_table(path: Path) -> bool:
-    """Whether a file is read as a table; a CSV is a CAN log if it looks like one of python-can's."""
+    """Return whether a file is read as a table; a CSV with the header of python-can is a CAN log."""
     if suffix_of(path) not in CAN_LOGS:
         return True
     if suffix_of(path) != ".csv":
@@ -96,12 +95,12 @@ def is_table(path: Path) -> bool:
 def inspect_recordings(
     files: Sequence[Path], databases: Sequence[tuple[Path, BusName]] = (), time: str | None = None, unit: str = "s"
 ) -> RecordingContents:
-    """What recordings hold, all of one kind: CAN logs or tables.
+    """Return the contents of recordings of one kind, CAN logs or tables.
 
     Args:
         files: In their order.
-        databases: DBC files with the bus on which each holds, None for every one.
-        time: The column of a table that tells the time; None looks for one.
+        databases: DBC files with the bus that each describes, None for every one.
+        time: Time column of a table; None searches for one.
         unit: Its unit.
 
     Raises:
@@ -128,7 +127,7 @@ def _logs(files: list[Path], databases: list[tuple[Path, BusName]]) -> Recording
     errors = 0
     for path in files:
         check_log(path)
-        reader = IsolatedReader(read_frames, path, None, LONGEST)
+        reader = IsolatedReader(read_frames, path, None, MAX_FRAME_BYTES)
         try:
             while not reader.ended:
                 item = reader.take(1.0)
@@ -163,12 +162,12 @@ def _logs(files: list[Path], databases: list[tuple[Path, BusName]]) -> Recording
 def _named(
     files: list[Path], databases: list[tuple[Path, BusName]], messages: list[Message], faults: list[str]
 ) -> list[Message]:
-    """The messages with the names and signals that the databases give them."""
-    told: set[str] = set()
+    """Return the messages with their names and signals by the databases."""
+    reported: set[str] = set()
 
     def report(key: str, text: str) -> None:
-        if key not in told:
-            told.add(key)
+        if key not in reported:
+            reported.add(key)
             faults.append(text)
 
     named: dict[int, tuple[str, Path]] = {}
@@ -249,7 +248,7 @@ def _tables(files: list[Path], time: str | None, unit: str) -> RecordingContents
 
 
 def _rows(path: Path, time: str, unit: str, columns: list[str], faults: list[str]) -> Iterator[Rows]:
-    """The rows of one table as far as it can be read."""
+    """Yield the rows of one table as far as it can be read."""
     try:
         for rows in rows_of(path, time, unit, columns, lambda: 1.0):
             if rows is not None:
@@ -260,6 +259,6 @@ def _rows(path: Path, time: str, unit: str, columns: list[str], faults: list[str
 
 
 def _time_of(names: Sequence[str]) -> str | None:
-    """The column that holds the time, by its name."""
+    """Return the time column, by its name."""
     last = {name.lower().rpartition(".")[2].partition("[")[0].strip(): name for name in reversed(names)}
-    return next((last[name] for name in TIMES if name in last), None)
+    return next((last[name] for name in TIME_NAMES if name in last), None)

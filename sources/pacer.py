@@ -12,17 +12,17 @@ from estimators.log import Events
 
 from .source import Source, span_of
 
-BATCH = 4096
-"""Events given at once at most, so that whoever reads can breathe at full speed."""
+MAX_BATCH_EVENTS = 4096
+"""Events returned at once at most, which bounds the work of the reader at full speed."""
 
-LAST = 2**62
-"""Nanoseconds: where the playhead stops, since times are int64."""
+MAX_TIME_NS = 2**62
+"""Last position of the playhead, since times are int64."""
 
 
 class Pacer:
     """A source whose events come when the playhead reaches their time.
 
-    `restarts` counts how often the source was begun again, by seeking back: what was read before no longer holds.
+    `restarts` counts how often the source began again by seeking back, which invalidates earlier events.
     Speed, pause, step and seek may be called from any thread; `read` from one.
     """
 
@@ -38,9 +38,9 @@ class Pacer:
         """Open the source; the playhead starts at its first event.
 
         Args:
-            open_source: Called again to start again.
+            open_source: Opens the source, at first and after each seek back.
             speed: Times real time; inf is as fast as possible.
-            clock: Nanoseconds that only rise.
+            clock: Monotonic time, ns.
 
         Raises:
             SourceError: If the source cannot be opened.
@@ -71,9 +71,9 @@ class Pacer:
         return None if self._first is None or self._last is None else (self._first, self._last)
 
     def now(self) -> int | None:
-        """The playhead, ns, or None before the first event and after the last.
+        """Return the playhead, ns; None before the first event and after the last.
 
-        At a high speed it runs ahead of a source that is slower; what was not read yet may have happened before.
+        At high speed it runs ahead of a slower source, whose unread events may lie before it.
         """
         with self._changed:
             position = self._position()
@@ -88,22 +88,22 @@ class Pacer:
         if self.paused:
             return self._playhead
         gone = (self._clock() - self._anchor) * self.speed
-        return min(LAST, self._playhead + round(gone)) if gone < LAST else LAST
+        return min(MAX_TIME_NS, self._playhead + round(gone)) if gone < MAX_TIME_NS else MAX_TIME_NS
 
     def _settle(self) -> None:
-        """Make the present position the anchor, before speed or pause change it."""
+        """Make the present position the anchor, before speed or pause change."""
         self._playhead = self._position()
         self._anchor = self._clock()
 
     def pause(self) -> None:
-        """Hold the playhead."""
+        """Pause the playhead."""
         with self._changed:
             self._settle()
             self.paused = True
             self._changed.notify_all()
 
     def resume(self) -> None:
-        """Let it go on."""
+        """Resume the playhead."""
         with self._changed:
             self._settle()
             self.paused = False
@@ -129,7 +129,7 @@ class Pacer:
             self._changed.notify_all()
 
     def read(self, timeout: float) -> Events | None:
-        """The events that are due; an empty batch if none becomes due within `timeout` seconds; None at the end."""
+        """Return the events that are due; none if none becomes due within `timeout` seconds; None at the end."""
         with self._changed:
             self._obey_seek()
             nothing = self._fill(timeout)
@@ -165,7 +165,7 @@ class Pacer:
         self._playhead, self._anchor = t, self._clock()
 
     def _fill(self, timeout: float) -> Events | None:
-        """Have at least one event waiting; else an empty batch if the source has none yet, and None at its end."""
+        """Read until one event waits; return an empty batch if the source has none yet, and None at its end."""
         batch: Events | None = None
         if self._pending is None and not self._ended:
             batch = self._source.read(timeout)
@@ -182,22 +182,22 @@ class Pacer:
         return batch
 
     def _due(self) -> int:
-        """How many of the waiting events the playhead has reached."""
+        """Return how many of the waiting events the playhead has reached."""
         if self._steps:
             self._steps -= 1
             t = int(self._reach[0])
             self._playhead, self._anchor = t, self._clock()
             return int(np.searchsorted(self._reach, t, side="right"))
         if np.isinf(self.speed) and not self.paused:
-            count = min(BATCH, self._reach.size)
+            count = min(MAX_BATCH_EVENTS, self._reach.size)
             self._playhead, self._anchor = int(self._reach[count - 1]), self._clock()
             return count
         position = self._position()
         assert position is not None
-        return min(BATCH, int(np.searchsorted(self._reach, position, side="right")))
+        return min(MAX_BATCH_EVENTS, int(np.searchsorted(self._reach, position, side="right")))
 
     def _wait(self, timeout: float) -> None:
-        """Until the next event is due, something changes, or the time is up."""
+        """Wait until the next event is due, a control changes, or the timeout ends."""
         if not self.paused and np.isfinite(self.speed):
             position = self._position()
             assert position is not None

@@ -1,4 +1,4 @@
-"""What a source compiles, in the pieces of `estimators/pieces.py`: a page's source is opened when they are there."""
+"""Compiled functions of sources, as pieces of `estimators/pieces.py`; a live source opens once they are compiled."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ KERNELS: dict[str, tuple[Any, Any]] = {FRAMES: (extract, extract_signature), VAL
 
 
 def pieces_of(name: str) -> list[Piece]:
-    """The pieces of what a source or a fold compiles."""
+    """Return the pieces that a source or a fold compiles."""
     return [Piece(name, 0)] if name in KERNELS else folds.pieces_of(name)
 
 

@@ -16,13 +16,13 @@ from estimators.numerics.jit import plain
 
 from .faults.kinds import NEVER_NS, Change
 
-BATCH = 32
-"""Events after which `read` returns: a change of the asset holds for what has not been read."""
+BATCH_EVENTS = 32
+"""Events after which `read` returns; a change of the asset affects unread events only."""
 
 
 @dataclass(frozen=True)
 class SensorPlan:
-    """A sensor speaks at every `every`th step; one in `drop_every` of its readings is lost (it arrives empty).
+    """A sensor reports at every `every`th step; one in `drop_every` of its measurements is lost (it arrives empty).
 
     `variances` of its true noise, one for each row, in place of the model's.
     """
@@ -33,7 +33,7 @@ class SensorPlan:
 
 
 class Simulator:
-    """Gives the events of a simulated asset as fast as it is asked.
+    """Source of a simulated asset, as fast as it is read.
 
     In each step, in this order: the mode jumps, where the model has one; x ← f(x, u, p, dt) + w with w ~ N(0, Q); then
     y = h(x, u, p) + v with v ~ N(0, R) for each sensor that is due, drawn even if the reading is lost, so that a loss
@@ -62,7 +62,7 @@ class Simulator:
         """Set the asset up.
 
         Args:
-            model: The estimator's model: channels, sensors and, unless told otherwise, the truth.
+            model: The estimator's model: inputs, sensors and, by default, the truth.
             seed: Of all noise.
             step: Seconds.
             duration: Seconds; None never ends.
@@ -71,8 +71,8 @@ class Simulator:
             truth_model: Another model with the same states, inputs and sensors: unmodelled behaviour.
             truth_noise: Variances that the asset's noise adds in a second, where they differ.
             inputs: Profiles by name; the others keep their default.
-            sensors: Plans by name; a sensor without one speaks at every step.
-            truth_every: Steps between two tellings of all states of a large field; None for never.
+            sensors: Plans by name; a sensor without one reports at every step.
+            truth_every: Steps between two outputs of all states of a large field; None for never.
 
         Raises:
             SourceError: If a duration or step is not positive.
@@ -114,7 +114,7 @@ class Simulator:
         self._circular = np.flatnonzero(truth.circular)
         self._rng = np.random.default_rng(seed)
         self._factor: tuple[bytes, np.ndarray] | None = None
-        self._told = _runs(model.shown, model.width)
+        self._shown_runs = _runs(model.shown, model.width)
         self._all_every = truth_every
         self._all = _runs(np.arange(model.nx), model.width) if truth_every is not None else []
         self._k = 0
@@ -128,14 +128,14 @@ class Simulator:
         return np.array([profile.at(t) for profile in self._profiles], float)
 
     def read(self, timeout: float) -> Events | None:
-        """The events of the next steps; None at the end."""
+        """Return the events of the next steps; None at the end."""
         rows: list[tuple[int, int, int, np.ndarray]] = []
         if not self._begun:
             self._begun = True
             rows.append((0, TICK, 0, np.zeros(0)))
             if self._u.size:
                 rows.append((0, INPUT, 0, self._u))
-        while len(rows) < BATCH and (self._steps is None or self._k < self._steps):
+        while len(rows) < BATCH_EVENTS and (self._steps is None or self._k < self._steps):
             try:
                 self._advance(rows)
             except NisusError:
@@ -143,7 +143,7 @@ class Simulator:
             except Exception as error:
                 raise SourceError(
                     f"the simulator's model {self._model.name} fails at {self._k * self._step:g} s: "
-                    f"{type(error).__name__}: {error}; it may not fail where the asset goes"
+                    f"{type(error).__name__}: {error}; it may not fail at states that the asset reaches"
                 ) from error
         if not rows:
             return None
@@ -160,7 +160,7 @@ class Simulator:
         )
 
     def _advance(self, rows: list[tuple[int, int, int, np.ndarray]]) -> None:
-        """One step, and what is said of it."""
+        """Simulate one step and append its events."""
         truth = self._truth
         self._k += 1
         t = self._time(self._k)
@@ -192,8 +192,8 @@ class Simulator:
             lost = plan.drop_every is not None and self._spoken[i] % plan.drop_every == plan.drop_every - 1
             self._spoken[i] += 1
             rows.append((t, READING, i, np.full(y.size, np.nan) if lost else y))
-        told = self._all if self._all_every is not None and self._k % self._all_every == 0 else self._told
-        rows += [(t, TRUTH, first, self._x[first:end].copy()) for first, end in told]
+        runs = self._all if self._all_every is not None and self._k % self._all_every == 0 else self._shown_runs
+        rows += [(t, TRUTH, first, self._x[first:end].copy()) for first, end in runs]
 
     def change(self, parameter: str, factor: float, start: int | None = None, length: int | None = None) -> Change:
         """Multiply a true parameter for `length` ns, or for ever, from `start` on (ns), or with the next step.
@@ -247,11 +247,11 @@ class Simulator:
         return self._factor[1] @ self._rng.standard_normal(self._x.size)
 
     def now(self) -> int | None:
-        """It has no clock of its own."""
+        """Return None: a simulation has no clock."""
         return None
 
     def close(self) -> None:
-        """Nothing to give back."""
+        """Release nothing."""
 
 
 def _runs(states: np.ndarray, width: int) -> list[tuple[int, int]]:

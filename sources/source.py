@@ -1,4 +1,4 @@
-"""What a source is, and how a twin says what of it feeds the model."""
+"""Interface of sources, and the channels that map their values to a model."""
 
 from __future__ import annotations
 
@@ -13,68 +13,68 @@ Report = Callable[[str, str], None]
 """report(key, text): counted under `key`, `text` shown among the events; called from the source's thread."""
 
 NEVER = "never seen"
-"""Key of what a channel is mapped to and the source does not give."""
+"""Key of messages, signals and columns that channels need and the source never provides."""
 
 WRONG_TIME = "wrong time"
-"""Key of events that are refused for their time."""
+"""Key of events that are rejected for their time."""
 
 TRUNCATED = "truncated file"
-"""Key of a file of which something is lost."""
+"""Key of incomplete files."""
 
 
 class Source(Protocol):
-    """Gives events in the order in which they arrived.
+    """A source of events in their order of arrival.
 
-    `live` True is a bus, which sets its own pace and holds nothing back; False gives its events when it is asked.
+    A `live` source, such as a bus, sets its own pace; any other returns its events when it is read.
     """
 
     live: bool
 
     def read(self, timeout: float) -> Events | None:
-        """The next events; none after `timeout` seconds without one; None at the end."""
+        """Return the next events; none after `timeout` seconds without one; None at the end."""
 
     def now(self) -> int | None:
-        """The source's present time, ns; None if it has none."""
+        """Return the present time of the source, ns; None if it has no clock."""
 
     def close(self) -> None:
-        """Let go of files and buses."""
+        """Close files and buses."""
 
 
 @runtime_checkable
 class Spanned(Protocol):
-    """A source that may know from when to when it lasts before it is read."""
+    """A source that may know its time span before it is read."""
 
     @property
     def span(self) -> tuple[int, int] | None:
-        """First and last time, ns; None if it does not tell."""
+        """First and last time, ns; None if not known."""
 
 
 @runtime_checkable
 class Endless(Protocol):
-    """A source that may have no end of its own."""
+    """A source that may be endless."""
 
     @property
     def endless(self) -> bool:
-        """Whether it has none."""
+        """Whether it has no end."""
 
 
 @runtime_checkable
 class Paced(Source, Spanned, Protocol):
-    """A source whose time can be held, hurried and sought; from any thread, while another reads."""
+    """A source with controls of its time, from any thread while another reads."""
 
     speed: float
     paused: bool
     restarts: int
-    """How often it was begun again, by seeking back: what was read before no longer holds."""
+    """How often it began again by seeking back, which invalidates earlier events."""
 
     def pause(self) -> None:
-        """Hold its time."""
+        """Pause."""
 
     def resume(self) -> None:
-        """Let it go on."""
+        """Resume."""
 
     def set_speed(self, speed: float) -> None:
-        """Go on at `speed` times real time."""
+        """Continue at `speed` times real time."""
 
     def step(self) -> None:
         """Release the events of the next time at which there are any."""
@@ -84,13 +84,13 @@ class Paced(Source, Spanned, Protocol):
 
 
 def span_of(source: Source) -> tuple[int, int] | None:
-    """First and last time of a source, ns; None if it does not tell."""
+    """Return first and last time of a source, ns; None if not known."""
     return source.span if isinstance(source, Spanned) else None
 
 
 @dataclass(frozen=True)
 class Condition:
-    """A value that came along must lie in [low, high], or the reading is missing."""
+    """Another value of the same row or frame must lie in [low, high], or the measurement is missing."""
 
     signal: str
     low: float
@@ -99,7 +99,7 @@ class Condition:
 
 @dataclass(frozen=True)
 class Accuracy:
-    """Where the variances of a sensor's readings come from, if these tell them: a signal for each row.
+    """Signals that report the noise of a sensor's measurements, one for each row.
 
     A signal holds a standard deviation, or a variance if `squared`, in its unit; it is converted to the row's unit (or
     the square of that) and multiplied by `scale`. One entry stands for all rows.
@@ -118,14 +118,14 @@ class Accuracy:
 
 @dataclass(frozen=True)
 class Channel:
-    """Where the values of one sensor, input or true state come from.
+    """Mapping of signals or columns to one sensor, input or true state.
 
     `kind` is READING, INPUT or TRUTH and `index` that of the sensor, input or state. `signals` are signals of the CAN
     `message`, or columns of a table, one for each row. A value is converted from its unit to the model's and becomes
     scale * value + offset. `units` None means the DBC's own unit, or the model's where that is empty too.
-    Where a condition of `where` fails the value is missing; where one of `only` fails, nothing was said of the channel.
+    Where a condition of `where` fails, the value is missing; where one of `only` fails, the row or frame is ignored.
     With convert "east_north" the two signals are latitude and longitude in degrees and become metres east and north of
-    `origin`, which is the first valid fix unless given. `accuracy` is that of a sensor's readings, where they tell it.
+    `origin`, which is the first valid fix unless given. `accuracy` is reported with a sensor's measurements.
     """
 
     kind: int
@@ -162,4 +162,4 @@ class Channel:
 
 
 def ignore(key: str, text: str) -> None:
-    """A report that nobody wants."""
+    """Ignore a report."""

@@ -41,7 +41,7 @@ _SAME = {
 """Spellings that stand for one thing only (1/min on a bus is a rotation)."""
 
 _OTHERWISE = {"g": "standard_gravity", "C": "degC", "F": "degF"}
-"""What a spelling means where its first meaning (gram, coulomb, farad) has the wrong dimension."""
+"""Second meaning of a spelling, if the first one (gram, coulomb, farad) has the wrong dimension."""
 
 
 def _normal(unit: str) -> str:
@@ -64,7 +64,7 @@ def _unit(text: str) -> Any:
     """A unit of pint's; a temperature within a product is a difference of temperatures.
 
     Raises:
-        LookupError: If nobody knows it.
+        LookupError: If it is unknown.
     """
     import pint
 
@@ -77,7 +77,7 @@ def _unit(text: str) -> Any:
 
 
 def _turns(unit: str) -> bool | None:
-    """Whether a frequency is of an angle, as rpm or rad/s, or of events, as Hz; None of what is no frequency."""
+    """Return whether a frequency is a rotation (rpm, rad/s) or not (Hz); None for other units."""
     try:
         found = _unit(unit)
     except LookupError:
@@ -99,7 +99,7 @@ def _refuse_turns(a: str, b: str, given: str, wanted: str, where: str) -> None:
         return
     raise SourceError(
         f"{where}: {given!r} is {'a rotation' if source else 'a frequency'} and the model's {wanted!r} is not, so they "
-        f"may be 2π apart; say what is meant: under `units` {'Hz' if source else 'rad/s'}, and what is left as `scale`"
+        f"may differ by 2π; give {'Hz' if source else 'rad/s'} under `units`, and the factor as `scale`"
     )
 
 

@@ -22,7 +22,7 @@ from estimators.log import TICK, Events
 from estimators.snapshots import SPARSE_EVERY, Base
 
 from ..concurrency import run_all
-from ..ingest import Intake
+from ..ingest import Ingest
 from ..terminal import complain
 from . import commands
 from .changes import merged
@@ -114,7 +114,7 @@ class Engine(RunningFold):
     def _begin_intake(self) -> None:
         """Begin a log, of which no event has been judged."""
         self._late = 0
-        self._intake = Intake(self.model, self._horizon, self.notices.report, self.twin.maintenance)
+        self._intake = Ingest(self.model, self._horizon, self.notices.report, self.twin.maintenance)
 
     # From any thread
 

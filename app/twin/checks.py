@@ -1,4 +1,4 @@
-"""What was normal when a twin's tuning was accepted: `commissioned` of its YAML, checked against the model."""
+"""Checks of a twin's YAML against its model: names, scene, baseline and dual estimation."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from estimators.tuning import Tuning
 
 
 def commissioned(loaded: Loaded, model: StateSpaceModel) -> dict[str, Normal]:
-    """What was normal by sensor row; nothing if nothing was commissioned.
+    """Return the baseline by sensor row; empty if none was recorded.
 
     Raises:
         ConfigError: With file and line, if it names what the model or the bank lacks.

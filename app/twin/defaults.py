@@ -32,7 +32,7 @@ class DegradedAfter(NamedTuple):
 
 
 def degraded_after(config: TwinSection, model: StateSpaceModel) -> DegradedAfter:
-    """What the YAML gives; else the slowest time constant of the model at its prior, within what makes sense."""
+    """Return the YAML's value; by default the slowest time constant of the model at its prior, within limits."""
     section = config.time
     if section.degraded_after is not None:
         return DegradedAfter(section.degraded_after, "time.degraded_after")
@@ -86,10 +86,10 @@ def bounds_of(config: TwinSection, model: StateSpaceModel) -> dict[str, tuple[fl
 
 
 def natural_aim(config: TwinSection) -> str:
-    """What a fit aims at if nobody says otherwise.
+    """Return the default objective of a fit.
 
-    What a recording knows of the truth was measured, to be learnt from. A simulated asset stands for one of which
-    nobody knows the truth.
+    A measured true state of a recording is used. The true state of a simulated asset is not, since a real asset has
+    none.
     """
     # With it come all folds, for which a twin that nobody fits need not wait.
     from estimators.fit.aims import LIKELIHOOD, WITNESSES

@@ -1,4 +1,4 @@
-"""A twin's learned correction: read from its file, and put beside the model."""
+"""The learned correction of a twin, read from its file."""
 
 from __future__ import annotations
 
@@ -42,14 +42,14 @@ def load_learned(model: StateSpaceModel, loaded: Loaded) -> tuple[LearnedCorrect
 
 
 def correction_files(loaded: Loaded) -> list[Path]:
-    """The file of the correction that the YAML names; none of a twin without."""
+    """Return the file of the correction that the YAML names, if it names one."""
     if loaded.config.learned is None:
         return []
     return [loaded.path.absolute().parent / Path(loaded.config.learned).expanduser()]
 
 
 def learned_of(section: CorrectionSection, path: Path) -> LearnedCorrection:
-    """What a correction's file at `path` says; of the same content the same object, so that it is compiled once.
+    """Return the correction of a file at `path`; the same object for the same content, so that it is compiled once.
 
     Raises:
         ConfigError: If its net cannot be read.
@@ -77,9 +77,9 @@ def _learned_of(text: str, net: Path | None, stamp: int) -> LearnedCorrection:
 
 
 def run_net(path: Path, features: int, corrects: int) -> Callable[[np.ndarray], np.ndarray]:
-    """An ONNX network as a function of features (N, d) that gives rates (N, k), run state by state.
+    """Return an ONNX network as a function of features (N, d) to rates (N, k), run state by state.
 
-    State by state, since of a block of another size it would round otherwise.
+    Blocks of other sizes would be rounded differently.
 
     Raises:
         ConfigError: If onnxruntime is not installed, or the file holds no network of these sizes.

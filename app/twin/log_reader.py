@@ -16,7 +16,7 @@ from estimators.log import Log
 from sources.source import NEVER, TRUNCATED, WRONG_TIME, Endless
 from sources.tables.order import REMARKS as ORDER
 
-from ..ingest import CLOCK_MOVED, Intake
+from ..ingest import CLOCK_MOVED, Ingest
 from ..terminal import complain
 from .twin import Twin, load_twin
 
@@ -79,7 +79,7 @@ def read_log(twin: Twin, duration: float | None) -> tuple[Log, Counter[str]]:
     horizon = round(twin.config.time.horizon * 1e9)
     # What a late reading is inflated by is asked of the estimate when it comes.
     beside = Fold(twin.estimator, twin.model, twin.tuning, log) if twin.late.inflate else None
-    intake = Intake(twin.model, horizon, remark, twin.maintenance)
+    intake = Ingest(twin.model, horizon, remark, twin.maintenance)
     try:
         while (batch := source.read(1.0)) is not None:
             put(intake.take(batch))

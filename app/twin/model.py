@@ -111,7 +111,7 @@ def _blame(error: BaseException, path: Path) -> ModelError:
 
 
 def configure(model: StateSpaceModel, loaded: Loaded) -> StateSpaceModel:
-    """Return the model with what the YAML appends, and with its parameters, prior and noise.
+    """Return the model with the YAML's additions, parameters, prior, noise and limits.
 
     Raises:
         ConfigError: With file and line, if the YAML names something that the model lacks, or a value breaks its rule.
@@ -223,7 +223,7 @@ def _states(model: StateSpaceModel, loaded: Loaded) -> Sequence[State]:
 
 
 def _in_range(item: Any, loaded: Loaded) -> Any:
-    """A state or an input with the range over which the YAML says that the model holds."""
+    """Return a state or an input with the YAML's range of validity."""
     given = loaded.config.valid.get(item.name)
     return item if given is None else replace(item, fitted=bounds((given.min, given.max)))
 
@@ -250,15 +250,15 @@ def _correlation(sensor: Any, given: Correlation, loaded: Loaded) -> Correlation
     return None if np.array_equal(given, np.eye(len(given))) else given
 
 
-MOST_READINGS = 1e6
-"""Equal readings after which a sensor that is stuck must be found at the latest."""
+MAX_STUCK_RUN = 1e6
+"""Equal measurements after which a stuck sensor must be detected at the latest."""
 
 
 def limits_of(sensor: Sensor, section: SensorSection, loaded: Loaded) -> Limits | None:
-    """The sensor's own limits with those of its YAML in their place.
+    """Return the sensor's limits, replaced by those of the YAML.
 
     Raises:
-        ConfigError: With file and line, if a list does not fit the sensor's rows, or a rule could never speak.
+        ConfigError: With file and line, if a list does not fit the sensor's rows, or a rule can never apply.
     """
     own = sensor.limits or Limits()
     given = section.stuck
@@ -280,7 +280,7 @@ def limits_of(sensor: Sensor, section: SensorSection, loaded: Loaded) -> Limits 
 
 
 def _contradiction(limits: Limits, sensor: Sensor) -> str | None:
-    """What limits leave no reading, or could never speak, as `key is ...; rule`; None if they can be kept."""
+    """Return limits that reject every measurement or never apply, as `key is ...; rule`; None if there are none."""
     for k, row in enumerate(sensor.rows):
         low, high = _of_row(limits.range, k, (-inf, inf))
         clip_low, clip_high = _of_row(limits.saturation, k, (-inf, inf))
@@ -295,7 +295,7 @@ def _contradiction(limits: Limits, sensor: Sensor) -> str | None:
             key = "range" if limits.range else "saturation"
             return (
                 f"{key} leaves {width:g} {row.unit}, less than the noise of the sensor ({std:g} {row.unit}), so that "
-                "most good readings would be refused; widen it"
+                "most valid measurements would be rejected; widen it"
             )
         stuck = limits.stuck
         if stuck is None:
@@ -309,10 +309,8 @@ def _contradiction(limits: Limits, sensor: Sensor) -> str | None:
         if stuck.readings is None and stuck.seconds is None:
             std = _of_row(stuck.std, k, std)
             if not std > 0.0:
-                return (
-                    "stuck gives a quantum alone, which says nothing of a sensor without noise; add readings or seconds"
-                )
-            if MOST_READINGS * surprise(quantum, std) < log(DAY):
+                return "stuck gives a quantum alone, which needs a sensor with noise; add readings or seconds"
+            if MAX_STUCK_RUN * surprise(quantum, std) < log(DAY):
                 return (
                     f"stuck.quantum is {quantum:g} {row.unit}, so coarse that noise of {std:g} {row.unit} never moves "
                     "the reading; add readings or seconds"
@@ -321,12 +319,12 @@ def _contradiction(limits: Limits, sensor: Sensor) -> str | None:
 
 
 def _of_row(values: tuple[Any, ...], k: int, default: Any) -> Any:
-    """The entry of row k among one for all rows, or one a row."""
+    """Return the entry of row k, from one for all rows or one a row."""
     return values[k % len(values)] if values else default
 
 
 def _too_long(limits: Limits, sensor: Sensor, config: TwinSection) -> str | None:
-    """A window of duplicates that takes every reading for the one before."""
+    """Return a window of duplicates that would make every measurement a copy; None if it does not."""
     within, stale = limits.duplicates, config.time.stale_after
     what = f"duplicates.within is {within:g} s"
     period = _period(sensor, config)
@@ -338,7 +336,7 @@ def _too_long(limits: Limits, sensor: Sensor, config: TwinSection) -> str | None
 
 
 def _period(sensor: Sensor, config: TwinSection) -> float | None:
-    """Seconds between two readings of a sensor, where a simulated asset says so."""
+    """Return the seconds between two measurements of a simulated sensor, None for other sources."""
     source = config.source
     asset = source if isinstance(source, AssetSection) else getattr(source, "asset", None)
     if asset is None:

@@ -30,21 +30,21 @@ KEY: Key = ("source",)
 
 @dataclass(frozen=True)
 class Plan:
-    """What it takes to open the source; the YAML is checked, no file has been touched."""
+    """A checked source section, ready to open; no file has been read."""
 
     loaded: Loaded
     model: StateSpaceModel
     log_files: tuple[Path, ...] | None
     brings_variances: bool = False
-    """Whether some sensor's readings tell their own noise."""
+    """Whether some measurements come with their own noise."""
     scheduled: tuple[Fault, ...] = ()
-    """The faults that the YAML puts into the source."""
+    """Faults that the YAML injects into the source."""
     fed: tuple[int, ...] = ()
     """The sensors that the source feeds."""
 
     @property
     def kernels(self) -> tuple[str, ...]:
-        """What the source compiles; see `sources/pieces.py`."""
+        """Compiled functions of the source; see `sources/pieces.py`."""
         return SOURCES[self.loaded.config.source.type].kernels
 
     def check_files(self) -> None:
@@ -71,9 +71,9 @@ class Plan:
         """Open the source, behind its faults.
 
         Args:
-            report: Told of what is worth counting.
+            report: Receives counted events: errors, losses and rejections.
             live: False takes a recording in place of a bus.
-            speed: Times real time, for what is not live; None gives it as fast as it is asked.
+            speed: Times real time, for a source that is not live; None is as fast as it is read.
             faults: A layer that was made before, for a source that is opened again.
 
         Raises:
@@ -159,7 +159,7 @@ def _has_asset(section: object) -> bool:
 
 
 def missing(loaded: Loaded) -> str | None:
-    """What is not here, in one line with the remedy; None if all is."""
+    """Return a missing recording or DBC file, in one line with the remedy; None if all are present."""
     section = loaded.config.source
     try:
         for key, part in SOURCES[section.type].sections(section, KEY).items():

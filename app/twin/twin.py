@@ -44,7 +44,7 @@ VERSION = "tuning"
 
 @dataclass(frozen=True)
 class Twin:
-    """A model set up as its YAML says, the first tuning, and what it takes to open the source.
+    """A configured model, the first tuning, and the plan of its source.
 
     `pairs` (k, 2) holds the indices of the states whose ellipses are drawn. `overrides` are the command line's
     changes to the YAML, which `text` holds as it was read. `recorded` says that tuning and estimator are a recording's.
@@ -81,7 +81,7 @@ class Twin:
 
     @property
     def files(self) -> tuple[Path, ...]:
-        """What it was read from: its YAML, its tuning version, the user's files of its model and correction."""
+        """Files of the twin: its YAML, its tuning version, the user's files of its model and correction."""
         version = () if self.version is None else (self.version.path,)
         return (self.path, *version, *model_files(self.loaded), *correction_files(self.loaded))
 
@@ -103,7 +103,7 @@ class Twin:
 
     @property
     def maintenance(self) -> tuple[Planned, ...]:
-        """What of the asset was changed, as the YAML says."""
+        """Maintenance of the asset by the YAML."""
         names = self.model.state_names
         return tuple(
             Planned(round(item.at * 1e9), item.what, tuple(sorted(names.index(name) for name in item.states)))
@@ -121,7 +121,7 @@ class Twin:
 
     @cached_property
     def late(self) -> Late:
-        """What becomes of late readings, and why."""
+        """Treatment of late measurements, with the reason."""
         return late_policy(self.config, self.model, find_estimator(self.estimator, self.model), self.tuning)
 
     @cached_property
@@ -131,12 +131,12 @@ class Twin:
 
     @property
     def expected(self) -> np.ndarray:
-        """Whether each sensor must speak, (sensors,): those that the source feeds."""
+        """Whether each sensor is expected to report, (sensors,): those that the source feeds."""
         return np.isin(np.arange(len(self.model.sensors)), self.plan.fed)
 
     @property
     def tells_field(self) -> bool:
-        """Whether the source tells the truth of a whole large field."""
+        """Whether the source provides the true state of a whole large field."""
         grid, source = self.model.grid, self.config.source
         if grid is None:
             return False
@@ -172,9 +172,9 @@ class Twin:
         """Open the source, behind its faults.
 
         Args:
-            report: Called as report(key, text) with what is worth counting; from the source's thread.
+            report: Called as report(key, text) for counted events, from the source's thread.
             live: False asks for events that end: a recording in place of a bus.
-            speed: Times real time, for what is not live; None gives it as fast as it is asked.
+            speed: Times real time, for a source that is not live; None is as fast as it is read.
             faults: A layer of `faults`, for a source that is opened again; None makes one.
 
         Raises:
@@ -222,7 +222,7 @@ def restore_twin(
 ) -> Twin:
     """Put a twin together from the YAML text that a recording holds; `base_path` is where its file was.
 
-    `version` is the tuning version that it holds; what `overrides` say of one is not looked for again.
+    `version` is its tuning version; a version named in `overrides` is not loaded again.
 
     Raises:
         ConfigError: If the YAML breaks a rule.
@@ -235,7 +235,7 @@ def restore_twin(
 def with_version(twin: Twin, reference: str) -> Twin:
     """The same twin under another tuning version, or under what its file says (`own`).
 
-    What the command line changed of the tuning is left behind, as what was turned on the page is; the rest stays.
+    Changes of the tuning by the command line or the page are dropped; other overrides stay.
 
     Raises:
         ConfigError: If there is no such version, or it breaks a rule.
@@ -334,7 +334,7 @@ def _check_options(
 
 @contextmanager
 def _placed(loaded: Loaded, key: tuple[str, ...]) -> Iterator[None]:
-    """What is wrong with an estimator is said of its place in the YAML."""
+    """Name the place in the YAML in errors of an estimator."""
     try:
         yield
     except EstimatorError as error:

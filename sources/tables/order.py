@@ -1,4 +1,4 @@
-"""The order of a table's times: what a wrong sort, a wrong unit or a wrong column does to them, said once."""
+"""Check the order of a table's times, and report wrong sorting, a wrong unit or a wrong column once."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ from estimators.log import BEFORE
 
 from ..source import WRONG_TIME, Report
 
-MANY = 100_000
-"""Rows one after the other at one time from which on the time is doubted."""
+MAX_EQUAL_TIMES = 100_000
+"""Consecutive rows of equal time from which on the time column is reported."""
 
 BACKWARDS, STANDING = REMARKS = ("times run backwards", "time stands still")
 """Keys under which it is reported."""
 
-ENOUGH = 3
-"""Times that must follow each other before the one before them is called wrong, or the rows reversed."""
+MIN_ORDERED_TIMES = 3
+"""Ordered times that must follow before a first time is reported as wrong, or rows as reversed."""
 
 
 class Order:
-    """Looks at the times of the rows as they are read.
+    """Checks the times of the rows as they are read.
 
     A row that is older than one before it by more than the horizon is dropped as stale by the log, unless the guard of
     times finds a lone wrong time or a clock that was set (estimators/events/clocks.py); the first of them is reported
@@ -32,10 +32,10 @@ class Order:
         self._column, self._unit, self._horizon, self._report = column, unit, horizon, report
         self._newest, self._newest_at = BEFORE, ""
         self._run, self._run_at, self._run_length = BEFORE, "", 0
-        self._told: set[str] = set()
+        self._reported: set[str] = set()
 
     def first(self, file: str, line: np.ndarray, t: np.ndarray) -> int:
-        """How many of a file's first rows are to be left out: those of one time, ahead of all that follow.
+        """Return how many of a file's first rows to leave out: those of one time, ahead of all that follow.
 
         Args:
             file: Its name.
@@ -48,7 +48,7 @@ class Order:
         if self._horizon is None or not t.size:
             return 0
         change = np.flatnonzero(np.diff(t)) + 1
-        if change.size < ENOUGH:
+        if change.size < MIN_ORDERED_TIMES:
             return 0
         if np.all(np.diff(t) <= 0) and t[0] - t[-1] > self._horizon:
             back = (t[0] - t[change[0]]) * 1e-9
@@ -58,7 +58,7 @@ class Order:
             )
         begin = int(change[0])
         rest = t[begin:]
-        alone = t[0] - self._horizon > rest.max() and np.all(np.diff(t[change[:ENOUGH]]) > 0)
+        alone = t[0] - self._horizon > rest.max() and np.all(np.diff(t[change[:MIN_ORDERED_TIMES]]) > 0)
         if alone:
             after = (t[0] - t[begin]) * 1e-9
             self._report(
@@ -69,14 +69,14 @@ class Order:
         return begin if alone else 0
 
     def look(self, file: str, line: np.ndarray, t: np.ndarray) -> None:
-        """The next rows: their lines and times (ns), each (n,)."""
+        """Check the next rows: their lines and times (ns), each (n,)."""
         if t.size:
             self._backwards(file, line, t)
             self._standing(file, line, t)
 
-    def _tell(self, key: str, text: str) -> None:
-        if key not in self._told:
-            self._told.add(key)
+    def _report_once(self, key: str, text: str) -> None:
+        if key not in self._reported:
+            self._reported.add(key)
             self._report(key, text)
 
     def _backwards(self, file: str, line: np.ndarray, t: np.ndarray) -> None:
@@ -87,7 +87,7 @@ class Order:
         if late.size:
             k = int(late[0])
             at = f"{file}:{line[int(np.argmax(t[:k]))]}" if k and np.max(t[:k]) > self._newest else self._newest_at
-            self._tell(
+            self._report_once(
                 BACKWARDS,
                 f"{file}:{line[k]}: {self._column} is {(newest[k] - t[k]) * 1e-9:.6g} s before that of {at}, more than "
                 f"time.horizon ({self._horizon * 1e-9:g} s), and such rows are dropped as stale, unless that was a "
@@ -103,12 +103,12 @@ class Order:
         lengths[0] += carried
         if not carried:
             self._run_at = f"{file}:{line[0]}"
-        for k in np.flatnonzero(lengths >= MANY):
+        for k in np.flatnonzero(lengths >= MAX_EQUAL_TIMES):
             at = self._run_at if k == 0 else f"{file}:{line[edges[k]]}"
-            self._tell(
+            self._report_once(
                 STANDING,
-                f"{at}: {self._column} stays {t[edges[k]] * 1e-9:g} s for {MANY} rows and more; check that it is the "
-                f"column of the time (time.column), and its unit (time.unit, {self._unit})",
+                f"{at}: {self._column} stays {t[edges[k]] * 1e-9:g} s for {MAX_EQUAL_TIMES} rows and more; check that "
+                f"it is the column of the time (time.column), and its unit (time.unit, {self._unit})",
             )
         if lengths.size > 1:
             self._run_at = f"{file}:{line[edges[-2]]}"

@@ -1,4 +1,4 @@
-"""Tables (CSV, Parquet, MATLAB, NumPy) as recordings: each row is what was known at one time."""
+"""Source of tables (CSV, Parquet, MATLAB, NumPy); each row holds the values of one time."""
 
 from __future__ import annotations
 
@@ -124,7 +124,7 @@ class Table:
     def _never(self, name: str) -> str:
         fed = ", ".join(channel.name for channel in self._channels if name in channel.needed)
         files = self._files[0].name + (f" and {len(self._files) - 1} more" if len(self._files) > 1 else "")
-        return f"{files}: column {name!r} has no value in {self._count} rows; {fed} gets nothing from it"
+        return f"{files}: column {name!r} has no value in {self._count} rows, so {fed} has no values"
 
     def read(self, timeout: float) -> Events | None:
         """The events of the next rows; none if there are none within `timeout` seconds; None at the end."""

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from app.ingest import Intake
+from app.ingest import Ingest
 from estimators.diagnostics.health import HealthPolicy
 from estimators.fold import Fold
 from estimators.log import MAINTENANCE, MARK, READING, RESET, TICK, TRUTH, Events, Log, sorted_order
@@ -82,13 +82,13 @@ def stream(items: list[Told]) -> Events:
 
 
 class Twin:
-    """Intake, log and fold, as the engine has them."""
+    """Ingest, log and fold, as the engine has them."""
 
     def __init__(self, estimator: str = "kf", gate: str = "hard") -> None:
         self.counts: Counter[str] = Counter()
         self.stale = 0
         self.log = Log.of(MODEL, capacity=8)
-        self.intake = Intake(MODEL, HORIZON * BEAT, lambda key, text: self.counts.update([key]))
+        self.intake = Ingest(MODEL, HORIZON * BEAT, lambda key, text: self.counts.update([key]))
         self.fold = folded(estimator, gate, self.log)
 
     def take(self, events: Events, cuts: list[int]) -> None:

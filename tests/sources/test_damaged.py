@@ -244,4 +244,4 @@ def test_a_column_without_a_value_is_named(tmp_path, ending):
     channels = [Channel(READING, 0, "x", ("x",)), Channel(READING, 1, "why", ("y",))]
     read_all(Table([path], time_column="t", time_unit="s", channels=channels, width=1, report=reports))
     assert reports.counts == {"never seen": 1}
-    assert reports.texts["never seen"] == f"a{ending}: column 'y' has no value in 5 rows; why gets nothing from it"
+    assert reports.texts["never seen"] == f"a{ending}: column 'y' has no value in 5 rows, so why has no values"

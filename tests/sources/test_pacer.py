@@ -7,7 +7,7 @@ import pytest
 
 from estimators.log import Events
 from sources.memory import MemorySource
-from sources.pacer import BATCH, Pacer
+from sources.pacer import MAX_BATCH_EVENTS, Pacer
 from tests.support import SECOND, read_all
 
 
@@ -94,7 +94,7 @@ def test_as_fast_as_possible_is_everything_in_breaths():
     sizes = []
     while (batch := pacer.read(0.0)) is not None:
         sizes.append(len(batch))
-    assert max(sizes) <= BATCH and sum(sizes) == 10_000
+    assert max(sizes) <= MAX_BATCH_EVENTS and sum(sizes) == 10_000
 
 
 @pytest.mark.parametrize(("speed", "seconds"), [(1e300, 1e-6), (1e300, 1e9), (1e9, 1e6)])

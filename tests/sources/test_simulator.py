@@ -285,5 +285,7 @@ def test_a_model_that_raises_on_the_way_is_one_line():
         f=raises_above_one, sensors=(Sensor("s", (Row("a", "m", 1.0),), reads_it),),
     )  # fmt: skip
     source = Simulator(model, seed=1, step=0.5, duration=10.0)
-    with pytest.raises(SourceError, match=r"model rising fails at 2 s: ValueError: too high; it may not fail where"):
+    with pytest.raises(
+        SourceError, match=r"model rising fails at 2 s: ValueError: too high; it may not fail at states"
+    ):
         read_all(source)

@@ -64,6 +64,6 @@ def test_what_does_not_convert_names_both(given, wanted, expected):
 )
 def test_a_rotation_is_no_frequency(given, wanted, what):
     """An angle has no unit, so a table of units takes one for the other, off by 2π."""
-    with pytest.raises(SourceError, match=f"x: '{given}' is {what}.* they may be 2π apart; say what is meant: under"):
+    with pytest.raises(SourceError, match=f"x: '{given}' is {what}.* they may differ by 2π; give .* under"):
         conversion(given, wanted, "x")
     assert conversion("rpm", "deg/s", "x")[0] == pytest.approx(6.0) and conversion("kHz", "1/s", "x")[0] == 1000.0

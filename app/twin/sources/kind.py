@@ -1,4 +1,4 @@
-"""What the program knows of one type of source: how its section is checked, and how it is opened."""
+"""Interface of source types: how a section is checked and opened, and where its files are."""
 
 from __future__ import annotations
 
@@ -49,8 +49,8 @@ class Kind:
         check: Checks its section against the model beyond its channels, before any file is touched.
         sections: The sections whose channels feed the model, each with its key: itself, unless it has parts or none.
         takes_log: Whether `--log` can replace what it reads.
-        kernels: What it compiles; see `sources/pieces.py`.
-        files: Opens its files alone, as `open` does: what is wrong with them is told before anything is compiled.
+        kernels: Its compiled functions; see `sources/pieces.py`.
+        files: Opens its files only, so that errors in them are reported before anything is compiled.
     """
 
     open: Callable[[Opening], Source]
@@ -105,7 +105,7 @@ def closed(open_: Callable[[Opening], Source]) -> Callable[[Opening], None]:
 
 
 def about(loaded: Loaded, key: Key, text: str) -> SourceError:
-    """What a source says of itself, with the place in the YAML that it concerns."""
+    """Return an error of a source with its place in the YAML."""
     return SourceError(f"{loaded.places.at(key)}: {dotted(key)}: {text}")
 
 

@@ -145,7 +145,7 @@ def test_what_means_nothing_is_refused_with_its_place(tmp_path, limits, more, sa
 def test_a_quantum_says_nothing_of_a_sensor_without_noise(tmp_path) -> None:
     path = write(tmp_path, "stuck: {quantum: 0.1}")
     Path(path).write_text(Path(path).read_text().replace("std: 0.5", "std: 0"))
-    with pytest.raises(ConfigError, match="gives a quantum alone, which says nothing of a sensor without noise"):
+    with pytest.raises(ConfigError, match="gives a quantum alone, which needs a sensor with noise"):
         load_twin(path)
 
 

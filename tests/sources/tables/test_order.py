@@ -6,7 +6,7 @@ import pytest
 from estimators.errors import SourceError
 from estimators.log import READING, Log
 from sources.source import WRONG_TIME, Channel
-from sources.tables.order import BACKWARDS, MANY, STANDING, Order
+from sources.tables.order import BACKWARDS, MAX_EQUAL_TIMES, STANDING, Order
 from sources.tables.table import Table
 from tests.sources.can.can_tools import Reports
 from tests.support import SECOND, read_all
@@ -65,10 +65,10 @@ def test_what_is_told_is_what_the_log_drops(tmp_path):
 @pytest.mark.parametrize("pieces", [1, 2, 25, 26])
 def test_a_time_that_stands_still_is_told_once(pieces):
     moving = np.arange(10.0)
-    still = np.full(MANY, 10.0)
+    still = np.full(MAX_EQUAL_TIMES, 10.0)
     told = looked(np.concatenate((moving, still, [11.0], still + 2.0)), pieces)
     assert [key for key, _ in told] == [STANDING]
-    assert told[0][1].startswith(f"drive.csv:12: t stays 10 s for {MANY} rows and more; check that it is the column of")
+    assert told[0][1].startswith(f"drive.csv:12: t stays 10 s for {MAX_EQUAL_TIMES} rows and more; check that it is")
     assert "time.column" in told[0][1] and told[0][1].endswith("and its unit (time.unit, s)")
     assert looked(np.concatenate((moving, still[1:], [11.0], still[1:] + 2.0)), pieces) == []
 
