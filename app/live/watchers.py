@@ -152,11 +152,3 @@ class HostClock:
                 "machine's; synchronise them",
                 level="warn",
             )
-
-
-def clock_text(fit: ClockFit) -> str:
-    """Return offset and drift in a few words; a value that rounds to zero has no minus."""
-    offset = f"{fit.offset:+z.3f} s"
-    if math.isnan(fit.drift_ppm):
-        return offset
-    return f"{offset}, {fit.drift_ppm:+z.1f} ± {fit.drift_error_ppm:.1g} ppm"

@@ -16,9 +16,9 @@ from estimators.learned.train import OnWindows, Trained
 from estimators.model.correction import Correction, GaussianProcess, Net, Ridge
 from estimators.model.state_space import StateSpaceModel
 
-from ..live.runs.runs_json import part_json
 from ..live.tunings.versions import now
 from ..present.result import Topic
+from ..present.runs_json import part_json
 from ..twin.twin import Twin
 
 TUNINGS = ("physics", "physics, its noise from the windows", "with the correction")

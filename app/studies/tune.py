@@ -12,8 +12,8 @@ from estimators.fit.dual import WindowFit, against, shift
 from estimators.fit.fit import Fitted, Line
 from estimators.fit.judge import Part, Prediction, Worth
 
-from ..live.runs.runs_json import correlated, fit_json
 from ..present.result import Topic
+from ..present.runs_json import correlated, fit_json
 from ..twin.twin import Twin
 
 UNSEEN = 0.05

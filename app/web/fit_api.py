@@ -138,7 +138,7 @@ def _attempt_json(attempt: FitAttempt) -> dict[str, Any]:
     }
     if attempt.fitted is None:
         return found
-    from ..live.runs.runs_json import fit_json
+    from ..present.runs_json import fit_json
 
     values = {line.key: line.after for line in attempt.fitted.lines if not line.alone}
     return found | {"result": fit_json(attempt.fitted), "values": values}
@@ -162,6 +162,6 @@ def _refit_json(refit: LiveRefit) -> dict[str, Any]:
     }
     if refit.fitted is None or refit.state == FITTING:
         return found
-    from ..live.runs.runs_json import fit_json
+    from ..present.runs_json import fit_json
 
     return found | {"result": fit_json(refit.fitted)}

@@ -19,7 +19,6 @@ from ..live.changes import difference
 from ..live.interface import Running
 from ..live.revisions import MAX_NOTE_LENGTH, Revision
 from ..live.runs.noise import noise
-from ..live.runs.runs_json import difference_json, noise_json, runs_json, swept_json, what_changed
 from ..live.runs.scores import RunScore, RunScores
 from ..live.runs.sweep import Sweeps
 from ..live.tunings.tuning_yaml import tuning_yaml
@@ -27,6 +26,7 @@ from ..live.tunings.versions import Settings, figures, keep, listing, load_into,
 from ..present.export.report import Reported, report
 from ..present.export.track_file import KINDS, RunRows, encoded, rows_of_run, tables
 from ..present.result import to_html
+from ..present.runs_json import difference_json, noise_json, runs_json, swept_json, what_changed
 from ..present.series.series import Series
 from ..studies.guard import last
 from ..twin.twin import with_version

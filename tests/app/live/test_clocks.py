@@ -10,12 +10,11 @@ from app.live import commands
 from app.live.alerts import Silence
 from app.live.engine import Engine
 from app.live.notices import Notices
-from app.live.watchers import HostClock, clock_text
+from app.live.watchers import HostClock
 from app.views.recording.reader import read_recording
 from app.views.recording.writer import Recorder
 from app.web.commands_json import command_from_json
 from app.web.twin_json import status_json
-from estimators.diagnostics.clock_fit import ClockFit
 from estimators.errors import ConfigError
 from estimators.events.maintenance import model_versions
 from estimators.log import MAINTENANCE
@@ -84,11 +83,6 @@ def test_what_waits_for_the_next_is_counted(start):
     source.put(None)
     wait_for(lambda: fresh_status(engine).counts.get(WRONG_TIME) == 1)
     assert "held" not in fresh_status(engine).counts
-
-
-def test_what_rounds_to_zero_is_not_negative():
-    assert clock_text(ClockFit(-0.0002, -0.02, 0.03)) == "+0.000 s, +0.0 ± 0.03 ppm"
-    assert clock_text(ClockFit(-20.06, np.nan, np.nan)) == "-20.060 s"
 
 
 def test_offset_and_drift_are_in_status_page_and_events(start):

@@ -7,9 +7,9 @@ import pytest
 from scipy.stats import chi2
 
 from app.live.engine import Engine
-from app.live.runs.runs_json import runs_json
 from app.live.runs.scores import RunScores
 from app.present.export.report import Reported, _scores
+from app.present.runs_json import runs_json
 from app.studies.analysis.diagnosis import Diagnosis
 from app.web.twin_json import status_json
 from estimators.diagnostics.detector_state import no_baseline

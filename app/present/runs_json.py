@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
-import dataclasses
-import math
-from typing import Any
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
 
-from estimators.diagnostics.score import Fit
-from estimators.fit.dual import shift
-from estimators.fit.fit import Fitted, Line
-from estimators.fit.judge import Part, Prediction
 from estimators.registry import ESTIMATORS
 
-from ..changes import difference, in_words
-from ..interface import Running
-from ..revisions import Revision
-from .noise import NoiseEstimates
-from .scores import RunScore, RunScores
-from .sweep import Swept
+from ..live.changes import difference, in_words
+from ..live.interface import Running
+from ..live.revisions import Revision
+from ..live.runs.noise import NoiseEstimates
+from ..live.runs.scores import RunScore, RunScores
+from ..live.runs.sweep import Swept
+from .result import plain
+
+if TYPE_CHECKING:
+    from estimators.fit.fit import Fitted
+    from estimators.fit.judge import Part, Prediction
 
 
 def runs_json(scores: RunScores, engine: Running) -> list[dict[str, Any]]:
@@ -59,75 +59,57 @@ def what_changed(run: Revision) -> str:
 def difference_json(run: Revision, other: Revision) -> list[dict[str, Any]]:
     """Return the entries in which two runs differ, with both values."""
     changes = difference(run.estimator, run.tuning, other.estimator, other.tuning)
-    return [{"key": key, "values": [_plain(before), _plain(after)]} for key, before, after in changes]
+    return [{"key": key, "values": plain([before, after])} for key, before, after in changes]
 
 
 def swept_json(swept: Swept) -> dict[str, Any]:
     """Return a sweep as far as it is done, its most likely value, and the value at which the NIS is consistent."""
     best = swept.best
-    return {
-        **{key: _plain(value) for key, value in dataclasses.asdict(swept).items() if key != "points"},
-        "points": [dataclasses.asdict(point) for point in swept.points],
-        "best": None if best is None else best.value,
-        "level": _plain(swept.level),
-    }
+    return plain(swept) | plain({"best": None if best is None else best.value, "level": swept.level})
 
 
 def noise_json(noise: NoiseEstimates) -> dict[str, Any]:
     """Return the estimated R by key and the sweep of all of Q; `doubt` is the reason not to use an estimate."""
     estimates = {
         key: {
-            "value": _plain(found.variance) if found.variance > 0.0 else None,
-            "std": _plain(found.std),
+            "value": found.variance if found.variance > 0.0 else None,
+            "std": found.std,
             "n": found.n,
             "doubt": noise.doubts.get(key, ""),
         }
         for key, found in noise.sensors.items()
     }
     q = swept_json(noise.q) | {"doubt": noise.doubts.get("Q", "")}
-    return {"revision": noise.revision, "R": estimates, "reason": noise.reason, "Q": q}
+    return {"revision": noise.revision, "R": plain(estimates), "reason": noise.reason, "Q": q}
 
 
 def _score(known: RunScore, units: dict[str, str]) -> dict[str, Any]:
     found = known.score
-    fits = [_fit(name, "truth", fit, units.get(name, "")) for name, fit in found.states.items()]
-    fits += [_fit(name, "held out", fit, units.get(name, "")) for name, fit in found.held_out.items()]
+    fits = [(name, "truth", fit) for name, fit in found.states.items()]
+    fits += [(name, "held out", fit) for name, fit in found.held_out.items()]
     if found.field is not None:
-        fits.append(_fit("all cells", "truth", found.field, ""))
-    return {
-        "rows": known.rows,
-        "seconds": known.seconds,
-        "nis": _plain(found.nis),
-        "nis_low": _plain(found.nis_low),
-        "nis_high": _plain(found.nis_high),
-        "nis_judged": _plain(found.nis_verdict.measure),
-        "nis_place": found.nis_verdict.place,
-        "nis_words": found.nis_verdict.words,
-        "log_likelihood": _plain(found.log_likelihood),
-        "log_likelihood_reading": _plain(known.log_likelihood_reading),
-        "readings": found.readings,
-        "refused": _plain(found.refused),
-        "step_us": _plain(known.step_us),
-        "fits": fits,
-    }
-
-
-def _fit(name: str, against: str, fit: Fit, unit: str) -> dict[str, Any]:
-    return {
-        "name": name,
-        "against": against,
-        "unit": unit,
-        "rmse": _plain(fit.rmse),
-        "coverage": _plain(fit.coverage),
-        "bias": _plain(fit.bias),
-    }
-
-
-def _plain(value: Any) -> Any:
-    """Replace infinity and NaN, which JSON does not have, by None."""
-    if isinstance(value, (str, bool, int)) or value is None:
-        return value
-    return float(value) if math.isfinite(value) else None
+        fits.append(("all cells", "truth", found.field))
+    return plain(
+        {
+            "rows": known.rows,
+            "seconds": known.seconds,
+            "nis": found.nis,
+            "nis_low": found.nis_low,
+            "nis_high": found.nis_high,
+            "nis_judged": found.nis_verdict.measure,
+            "nis_place": found.nis_verdict.place,
+            "nis_words": found.nis_verdict.words,
+            "log_likelihood": found.log_likelihood,
+            "log_likelihood_reading": known.log_likelihood_reading,
+            "readings": found.readings,
+            "refused": found.refused,
+            "step_us": known.step_us,
+            "fits": [
+                {"name": name, "against": against, "unit": units.get(name, ""), **fit._asdict()}
+                for name, against, fit in fits
+            ],
+        }
+    )
 
 
 HIGH_CORRELATION = 0.9
@@ -145,23 +127,28 @@ def fit_json(fitted: Fitted) -> dict[str, Any]:
     never uses, and true `states`. `verdict` says whether the fit is proposed, its gain in nats on the held-out blocks,
     and the reasons against it.
     """
-    return {
-        "estimator": fitted.estimator,
-        "proposed": fitted.proposed,
-        "verdict": {
-            "gain": _plain(fitted.verdict.gain),
-            "error": _plain(fitted.verdict.error),
-            "reasons": list(fitted.verdict.reasons),
-        },
-        "entries": [_line(line) for line in fitted.lines],
-        "power": fitted.power,
-        "skipped": [item._asdict() for item in fitted.skipped],
-        "left_out": dict(fitted.left_out),
-        "correlated": correlated(fitted),
-        "before": {"fitted": part_json(fitted.before.fitted), "held_out": part_json(fitted.before.held_out)},
-        "after": {"fitted": part_json(fitted.after.fitted), "held_out": part_json(fitted.after.held_out)},
-        "folds": fitted.folds,
-    }
+    # Half a second of imports, which a twin without a fit need not wait for.
+    from estimators.fit.dual import shift
+
+    return plain(
+        {
+            "estimator": fitted.estimator,
+            "proposed": fitted.proposed,
+            "verdict": {
+                "gain": fitted.verdict.gain,
+                "error": fitted.verdict.error,
+                "reasons": fitted.verdict.reasons,
+            },
+            "entries": [{**line._asdict(), "sigma": shift(line)} for line in fitted.lines],
+            "power": fitted.power,
+            "skipped": fitted.skipped,
+            "left_out": fitted.left_out,
+            "correlated": correlated(fitted),
+            "before": {"fitted": part_json(fitted.before.fitted), "held_out": part_json(fitted.before.held_out)},
+            "after": {"fitted": part_json(fitted.after.fitted), "held_out": part_json(fitted.after.held_out)},
+            "folds": fitted.folds,
+        }
+    )
 
 
 def correlated(fitted: Fitted) -> list[dict[str, Any]]:
@@ -175,28 +162,21 @@ def correlated(fitted: Fitted) -> list[dict[str, Any]]:
     return sorted(found, key=lambda pair: -abs(pair["correlation"]))
 
 
-def _line(line: Line) -> dict[str, Any]:
-    return {name: _plain(value) for name, value in {**line._asdict(), "sigma": shift(line)}.items()}
-
-
 def part_json(part: Part) -> dict[str, Any]:
     """Return the scores of one part of the recordings."""
-    return {
-        "readings": part.n,
-        "log_density": _plain(part.log_density),
-        "nis": _plain(part.nis),
-        "coverage": _plain(part.coverage),
-        "sensors": {name: _prediction(item) for name, item in part.sensors.items()},
-        "withheld": {name: _prediction(item) for name, item in part.withheld.items()},
-        "states": {name: _prediction(item) for name, item in part.states.items()},
-    }
 
+    def predictions(items: Mapping[str, Prediction]) -> dict[str, Any]:
+        names = ("unit", "n", "rms", "coverage", "crps")
+        return {key: {name: getattr(item, name) for name in names} for key, item in items.items()}
 
-def _prediction(item: Prediction) -> dict[str, Any]:
-    return {
-        "unit": item.unit,
-        "n": item.n,
-        "rms": _plain(item.rms),
-        "coverage": _plain(item.coverage),
-        "crps": _plain(item.crps),
-    }
+    return plain(
+        {
+            "readings": part.n,
+            "log_density": part.log_density,
+            "nis": part.nis,
+            "coverage": part.coverage,
+            "sensors": predictions(part.sensors),
+            "withheld": predictions(part.withheld),
+            "states": predictions(part.states),
+        }
+    )
