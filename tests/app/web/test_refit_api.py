@@ -30,7 +30,6 @@ def page(tmp_path, monkeypatch):
     page.source.put(readings(np.arange(1.0, 651.0) * 0.1, 40.0 + 5.0 * rng.normal(size=650)))
     wait_for(lambda: page.rows() == 650)
     yield page
-    page.server.refits.stop()
     page.stop()
 
 
@@ -48,7 +47,6 @@ def brief(page):
 
 
 def proposed(page):
-    page.server.refits._look = 0.01
     page.server.refits.start()
     wait_for(lambda: brief(page)["proposed"] is not None)
     return look(page)["fits"][0]
