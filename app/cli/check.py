@@ -1,4 +1,4 @@
-"""`nisus check`: what could be wrong with a twin unnoticed, and what its estimate is worth, on one page."""
+"""`nisus check`: undetectable faults, observability and consistency of a twin, on one page."""
 
 from __future__ import annotations
 
@@ -51,14 +51,14 @@ def check_twin(arguments: Arguments) -> int:
 
 
 def figures(checked: Checked) -> dict[str, Any]:
-    """All figures of a check; times in seconds of the log, null where there is no number.
+    """Return all figures of a check; times in seconds of the log, null where there is no number.
 
     `checklist`: question, answer (yes, partly, no, not told), figures, remedy. `observability`: the Gramian of the log
-    and of each window, and whose estimates take the blame for each other. `smallest_visible`: of every sensor row,
-    input and parameter the size from which a fault is seen, null if it cannot be within its range, `low` to `high` what
-    passes unseen. `integrity`: by state the bound of its error under one unseen fault beside 2 σ, and the fault.
-    `held_out`: by sensor row what the others predict of it. `open_loop`: RMS without any reading, by sensor row and by
-    state whose truth is known, `worse` where the filter is.
+    and of each window, and pairs of faults that the log hardly distinguishes. `smallest_visible`: minimal detectable
+    fault of every sensor row, input and parameter, null if there is none in its range, and the undetectable range `low`
+    to `high`. `integrity`: protection level of each state beside 2 σ, and its fault. `held_out`: prediction of each
+    sensor row by the others. `open_loop`: RMS without measurements, by sensor row and by state with known truth;
+    `worse` where that of the filter is larger.
     """
     return {
         "twin": checked.twin.name,
@@ -108,7 +108,7 @@ def _view(checked: Checked, view: View) -> dict[str, Any]:
 
 
 def smallest_visible(found: Sensitivity) -> list[dict[str, Any]]:
-    """One entry a nudge: `size` in `unit`, and from `low` to `high` what passes unseen."""
+    """Return one entry per nudge: detectable `size` in `unit`, and the undetectable range `low` to `high`."""
     return [
         {
             "kind": nudge.kind,
@@ -209,11 +209,11 @@ def _health_figures(checked: Checked) -> dict[str, Any]:
 MOST = 12
 """Rows of a table on the page; JSON has all."""
 
-UNKNOWN = "How late readings come is not known: the log has one time for each, that at which it was measured."
+UNKNOWN = "Lateness is not known: the log has only the time of measurement."
 
 
 def sections(checked: Checked) -> list[Topic]:
-    """The page, from top to bottom."""
+    """Return the sections of the page."""
     return [
         _title(checked),
         _checklist(checked),
@@ -262,7 +262,7 @@ def _mark(line: Line) -> str:
 
 def _integrity(checked: Checked) -> Topic:
     found = checked.sensitivity
-    title = "How wrong a state can be by one fault that nobody notices"
+    title = "Protection levels: error of a state under one undetectable fault"
     if found.reason:
         return Topic(title, (f"Not computed: {found.reason}.",))
     bounds = bounds_of(checked.twin.model, found)
@@ -278,7 +278,7 @@ def _integrity(checked: Checked) -> Topic:
 
 def _visible(checked: Checked) -> Topic:
     found = checked.sensitivity
-    title = "How large a fault must be to be noticed"
+    title = "Minimal detectable faults"
     if found.reason:
         return Topic(title, (f"Not computed: {found.reason}.",))
     seconds = float(found.t[-1] - found.t[0]) * 1e-9
@@ -293,7 +293,7 @@ def _visible(checked: Checked) -> Topic:
 
 def _observability(checked: Checked) -> Topic:
     found = checked.gramian
-    title = "What the readings can tell"
+    title = "Observability"
     if found.whole is None:
         return Topic(title, (f"Not computed: {found.reason}.",))
     begin = float(found.whole.begin)
@@ -312,24 +312,26 @@ def _observability(checked: Checked) -> Topic:
 
 def _blame(checked: Checked) -> Topic:
     told = checked.sensitivity
-    title = "Who takes the blame for whom"
+    title = "Faults that are hard to distinguish"
     if told.reason:
         return Topic(title, (f"Not computed: {told.reason}.",))
     said = [f"{told.note}."] if told.note else []
     rows = [(one, other, f"{value:+.2f}") for one, other, value in blamed(told)]
     said.append(
-        "What the readings cannot tell apart: a fault of one looks like a fault of the other."
+        "The log does not distinguish these faults."
         if rows
         else f"No two faults look alike: no correlation is beyond {BLAME:g}."
     )
     untold = [item for item in directions(told.fisher, told.nudges) if not item.deviation < 1.0] if told.nudges else []
     if untold:
-        said.append(f"With all unknown together {len(untold)} combination(s) cannot be told, first {untold[0].text}.")
+        said.append(
+            f"With all unknown together {len(untold)} combination(s) cannot be determined, first {untold[0].text}."
+        )
     return Topic(title, tuple(said), ("one", "other", "correlation") if rows else (), _cut(rows) if rows else ())
 
 
 def _held_out(checked: Checked) -> Topic:
-    title = "Each sensor held out, and predicted by the others"
+    title = "Each sensor held out and predicted by the others"
     found = checked.held_out.rows
     rows, bars = [], []
     for row in found:
@@ -349,10 +351,10 @@ def _held_out(checked: Checked) -> Topic:
 
 
 def _open_loop(checked: Checked) -> Topic:
-    title = "The estimate against no filter at all, where the truth is known"
+    title = "Filter against the model alone, where the truth is known"
     found = checked.held_out.states
     if not found:
-        return Topic(title, ("The log tells no truth: see the sensors held out.",))
+        return Topic(title, ("The log has no true states: see the held-out sensors.",))
     said = tuple(
         f"The filter makes {item.state} {WORSE}: RMS {_number(item.filter)} {item.unit} with its readings, "
         f"{_number(item.open_loop)} without any."
@@ -381,7 +383,7 @@ def _timing(checked: Checked) -> Topic:
     ]
     head = ("sensor", "readings", "a second", "longest gap, s", "missing, %", "lateness, s: half, 99 %, worst")
     said = () if known else (UNKNOWN,)
-    return Topic("When readings come", said, head, _cut(rows))
+    return Topic("Arrival of measurements", said, head, _cut(rows))
 
 
 def _health(checked: Checked) -> Topic:

@@ -122,7 +122,7 @@ def _posterior(checked: Checked) -> Line:
     # Of many rows a few look so by chance.
     heavy = heavy if len(heavy) > OFTEN * len(checked.tails) else []
     if found.reason:
-        said = [f"no cloud tells of peaks: {found.reason}"]
+        said = [f"peaks are not computed: {found.reason}"]
     else:
         several = f"{100 * found.several:.2g} % of {found.looks} looks at the cloud of {found.estimator} over "
         several += f"{found.over:.4g} s show more than one peak (at most {found.most})"
@@ -160,13 +160,13 @@ def scaled(value: float, unit: str) -> str:
 
 
 def health_shares(track: Track) -> str:
-    """How much of the track was in which state of health, the longest first."""
+    """Return the share of the track in each state of health, the largest first."""
     share = np.bincount(track.health, minlength=len(HEALTH_NAMES)) / max(1, len(track))
     return ", ".join(f"{HEALTH_NAMES[k]} {_percent(share[k])}" for k in np.argsort(-share, kind="stable") if share[k])
 
 
 def _percent(share: float) -> str:
-    """A share of which neither 0 % nor 100 % is said unless it is."""
+    """Format a share, as 0 % or 100 % only where it is exact."""
     if 0.0 < share < 0.0005:
         return "less than 0.1 %"
     return "more than 99.9 %" if 0.9995 <= share < 1.0 else f"{100 * share:.3g} %"
@@ -177,9 +177,9 @@ def _every(seconds: float) -> str:
 
 
 def blamed(found: Sensitivity) -> list[tuple[str, str, float]]:
-    """Who takes the blame for whom: pairs that look alike in the readings.
+    """Return pairs of nudges that the log hardly distinguishes.
 
-    Their estimates from this log would be correlated beyond 0.9, if these two were unknown and all others known.
+    Their estimates would be correlated beyond 0.9 if these two were unknown and all others known.
     """
     names = [subject_text(nudge) for nudge in found.nudges]
     root = np.sqrt(np.diag(found.fisher))
@@ -220,14 +220,14 @@ def _observability(checked: Checked) -> Line:
     full = whole.rank >= int(free.sum()) and whole.conditioning < ILL
     remedy = ""
     if unseen or not full:
-        remedy = "what is not observed keeps its prior and drifts: add a sensor, or trust it no further than its band"
+        remedy = "a state that is not observed keeps its prior and drifts: add a sensor, or rely on its band only"
     elif pairs:
         remedy = "do not estimate both of a pair from this log; measure one, or excite the asset otherwise"
     return Line("observability", question, NO if unseen else YES if full and not pairs else PARTLY, figures, remedy)
 
 
 def stamps(checked: Checked) -> str:
-    """Where the times of the readings come from, in words."""
+    """Return the origin of the times of the measurements."""
     source = checked.twin.config.source
     kinds = {type(part) for part in source.parts} if isinstance(source, MergedSection) else {type(source)}
     if kinds & {CanSection, CanLogSection}:
@@ -258,7 +258,7 @@ def _timing(checked: Checked) -> Line:
     if stale:
         remedy = f"{stale} reading(s) came later than the horizon: raise time.horizon"
     elif silent:
-        remedy = "check the channel map of what is never heard"
+        remedy = "check the channel map of the sensors that never reported"
     elif worst is not None and worst.gap > policy.degraded_after:
         remedy = f"{worst.sensor} is silent for longer than {policy.degraded_after:g} s: degraded meanwhile"
     whole = bool(late) and "measured" in said[0] and not silent
@@ -288,7 +288,7 @@ def _tuning(checked: Checked) -> Line:
         for entry in checked.calibration
         if entry.role == "used" and entry.scale.beyond(1.0 / (1.0 + LIMITS.width), 1.0 + LIMITS.width)
     ]
-    normal = "what was normal is kept with them" if twin.tuning.baseline is not None else "what was normal is not kept"
+    normal = "their baseline is kept with them" if twin.tuning.baseline is not None else "their baseline is not kept"
     figures = (
         f"Q and R stand in {twin.path.name}, which says no more of a fit than its comments; {normal}; scores of every "
         f"filter {'are kept in ' + kept.name if scores else 'are not kept'}; bands off by more than a quarter: "
@@ -307,7 +307,7 @@ def _change(checked: Checked) -> Line:
     log = checked.log
     done = int(np.sum(log.kind[: log.n] == MAINTENANCE))
     figures = f"each maintenance counts the version of {checked.twin.model.name} up; {done} in this log"
-    remedy = "tell the twin of maintenance, so that the covariance of what was changed is opened again"
+    remedy = "report maintenance to the twin, so that the covariance of the changed part is reset"
     return Line("change", question, YES if done else PARTLY, figures, "" if done else remedy)
 
 
@@ -337,7 +337,7 @@ class Checked:
 
 
 def check(twin: Twin, log: Log, counts: Counter[str]) -> Checked:
-    """Measure all there is to say of a twin over a log.
+    """Compute all measures of a twin over a log.
 
     Raises:
         NisusError: If the twin's own filter does not run.
@@ -380,7 +380,7 @@ def _rate(log: Log) -> float:
 
 
 def _peaks(twin: Twin, log: Log) -> Peaks:
-    """By the twin's own cloud, if it has one."""
+    """Return the peaks of the twin's own particles, if it has any, else of a particle filter."""
     own = find_entry(twin.estimator)
     name = twin.estimator if own.peaks is not None else "pf"
     return peaks(name, twin.model, twin.tuning.with_options(twin.options_of(name)), log)

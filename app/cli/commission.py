@@ -1,4 +1,4 @@
-"""`nisus commission`: what is normal of a twin whose tuning is accepted, as lines of its YAML."""
+"""`nisus commission`: store the baseline of an accepted tuning in the YAML of the twin."""
 
 from __future__ import annotations
 

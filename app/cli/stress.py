@@ -1,4 +1,4 @@
-"""`nisus stress`: mistakes made with a twin on purpose, and how soon, and how rightly, it says so."""
+"""`nisus stress`: deliberate faults of a twin, and how soon and how correctly they are detected."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def stress_twin(arguments: Arguments) -> int:
 
 
 def _chosen(mistakes: Sequence[Mistake], only: Sequence[str]) -> list[Mistake]:
-    """Those whose name holds one of `only`; all without."""
+    """Return the faults whose name contains one of `only`; all without it."""
     found = [item for item in mistakes if not only or any(text.lower() in item.name.lower() for text in only)]
     if not found:
         raise ConfigError(f"--only {' '.join(only)}: no mistake has that in its name; see --list")
@@ -111,7 +111,7 @@ def _print(trials: Sequence[Trial], mistakes: Sequence[Mistake], names: Sequence
 
 
 def _summary(trials: Sequence[Trial], mistakes: Sequence[Mistake]) -> list[str]:
-    """What was foretold against what was found, and how rightly that was named."""
+    """Return expected against actual detections, and how correctly they were named."""
     made = {mistake.name: mistake for mistake in mistakes}
     real = [trial for trial in trials if made[trial.mistake].causes]
     found = [trial for trial in real if trial.outcome in (NAMED, MISNAMED)]
@@ -135,14 +135,14 @@ def _share(right: Sequence[bool]) -> str:
 
 
 def _median(values: Sequence[float | None]) -> str:
-    """The median; never counts as later than any time."""
+    """Return the median; never counts as later than any time."""
     ordered = sorted(np.inf if value is None else value for value in values)
     middle = ordered[(len(ordered) - 1) // 2]
     return f"{middle:.1f}" if np.isfinite(middle) else "never"
 
 
 def _visible_from(own: Sequence[Trial], mistake: Mistake) -> str:
-    """What was foretold: the size that would be visible beside the mistake's own, or a word."""
+    """Return the expected detection: the minimal detectable size beside the fault's own, or a word."""
     words = [trial.foretold for trial in own]
     word = max(sorted(set(words)), key=words.count)
     multiple = float(np.median([trial.visible_from for trial in own]))
@@ -156,13 +156,13 @@ def _visible_from(own: Sequence[Trial], mistake: Mistake) -> str:
 
 
 def _often(words: Sequence[str]) -> str:
-    """Different words, each with how often it came, the most frequent first."""
+    """Return the different words with their counts, the most frequent first."""
     counts = sorted({(-words.count(word), word) for word in words})
     return counts[0][1] if len(counts) == 1 else ", ".join(f"{-n} {word}" for n, word in counts)
 
 
 def _cells(own: Sequence[Trial], mistake: Mistake) -> list[str]:
-    """The figures of one mistake and filter: medians over the seeds."""
+    """Return the figures of one fault and filter, medians over the seeds."""
     said = [trial.named for trial in own if trial.named]
     most = max(set(said), key=said.count) if said else "-"
     right = sum(trial.cause_right and trial.subject_right for trial in own)

@@ -84,8 +84,8 @@ def calibrations(
 
     Args:
         model: Whose sensors.
-        events: What was folded, or a window of it.
-        track: What was concluded of these events.
+        events: The folded events, or a window of them.
+        track: Its rows of the track.
         gate: That of the tuning; None where nothing is refused.
         marginal: Whether the filter's predictions are not Gaussian, and `Track.whitened` holds each row by itself.
         limits: What matters.

@@ -1,8 +1,7 @@
-"""What was normal when a tuning was accepted: the null against which a change is a change.
+"""Baseline of an accepted tuning: the null hypothesis of the detectors from then on.
 
-Recordings of real assets never leave white innovations. What a tuned filter leaves of data on which it was accepted
-is its normal: bias, scale and correlation of each row, and how high each test, and the NIS over a window, rise because
-of what they leave over.
+Innovations of real assets are never exactly white. The baseline of a tuned filter on the data on which it was accepted
+is the bias, scale and correlation of each row, and the highest value of each test and of the NIS over a window.
 """
 
 from __future__ import annotations
@@ -21,20 +20,19 @@ from .detectors import ALARM_NAMES, BITS
 from .episodes import FoldLike, judged_rows, standardised
 from .health import JUDGED_MEAN, MAX_ROWS_PER_READING, MIN_WINDOW_EVENTS, HealthPolicy, normal_nis
 
-MARGIN = 1.5
-"""By which a test may rise above the highest that it reached, besides its own threshold, and the NIS over a window
-above its own: other days are other."""
+BASELINE_MARGIN = 1.5
+"""Factor on the highest value of a test, which is added to its threshold, and on the highest NIS over a window."""
 
-FEWEST = 50
-"""Readings of a row from which on there is a normal."""
+MIN_MEASUREMENTS = 50
+"""Measurements of a row from which it has a baseline."""
 
 
 class Normal(NamedTuple):
-    """What was normal of one sensor row.
+    """Baseline of one sensor row.
 
-    `bias` and `scale` of its standardised innovations e, the lag-1 `correlation` of (e - bias) / scale, the highest W
-    that the tests of each cause `reached`, by its name, and the most that the `nis` over the twin's window was at a
-    reading of this sensor, as a multiple of its normal mean; 0 where that is far from saying that the estimate is lost.
+    bias, scale: of its standardised innovations e; correlation: lag 1, of (e - bias) / scale; reached: highest W of the
+    tests of each alarm, by name; nis: highest NIS over the twin's window at a measurement of this sensor, as a multiple
+    of its mean, 0 where that is far below divergence.
     """
 
     bias: float
@@ -45,21 +43,21 @@ class Normal(NamedTuple):
 
 
 class JudgedFold(FoldLike, Protocol):
-    """A fold, and what it was judged by."""
+    """A fold and its health policy."""
 
     @property
     def policy(self) -> HealthPolicy: ...  # noqa: D102
 
 
 def commission(fold: JudgedFold, evidence: np.ndarray) -> dict[str, Normal]:
-    """What is normal in a fold whose tuning is accepted, by sensor row.
+    """Return the baseline of a fold whose tuning is accepted, by sensor row.
 
     Args:
-        fold: Over data on which everything was in order.
-        evidence: Its bank's state at the end.
+        fold: Over data without faults.
+        evidence: State of its detectors at the end.
 
     Returns:
-        The normal of each row that has `FEWEST` readings.
+        The baseline of each row that has `MIN_MEASUREMENTS` measurements.
     """
     model, log, track = fold.model, fold.log, fold.track
     found: dict[str, Normal] = {}
@@ -70,7 +68,7 @@ def commission(fold: JudgedFold, evidence: np.ndarray) -> dict[str, Normal]:
         for k in range(len(sensor.rows)):
             e = standardised(judged_rows(fold), rows, k)
             known = np.isfinite(e)
-            if known.sum() < FEWEST:
+            if known.sum() < MIN_MEASUREMENTS:
                 continue
             clipped = np.clip(e[known], -6.0, 6.0)
             bias, scale = float(clipped.mean()), float(max(clipped.std(), 1e-3))
@@ -91,17 +89,16 @@ def commission(fold: JudgedFold, evidence: np.ndarray) -> dict[str, Normal]:
                     reached[name] = round(float(own.max()), 1)
             found[model.row_names[index]] = Normal(round(bias, 3), round(scale, 3), round(phi, 3), reached)
     most = _most_nis(fold, normal_nis(model, baseline_of(model, found))[:, JUDGED_MEAN])
-    most[MARGIN * most <= HealthPolicy().diverged_nis] = 0.0
+    most[BASELINE_MARGIN * most <= HealthPolicy().diverged_nis] = 0.0
     of_row = np.repeat(most, [len(sensor.rows) for sensor in model.sensors]).tolist()
     nis = {name: round(value, 3) for name, value in zip(model.row_names, of_row, strict=True)}
     return {name: normal._replace(nis=nis[name]) for name, normal in found.items()}
 
 
 def _most_nis(fold: JudgedFold, normal: np.ndarray) -> np.ndarray:
-    """The most that the NIS over the window was at readings of each sensor, (sensors,).
+    """Return the highest NIS over the window at measurements of each sensor, (sensors,).
 
-    A multiple of what was normal of the readings in it, `normal` (sensors,) times what the filter expected; the windows
-    are those of `health.assess`.
+    In multiples of `normal` (sensors,) times the expected NIS; the windows are those of `health.assess`.
     """
     log, track, window = fold.log, fold.track, fold.policy.window
     rows = np.flatnonzero(np.isin(track.verdict[: fold.n], (USED, GATED, FAILED)))
@@ -121,19 +118,19 @@ def _most_nis(fold: JudgedFold, normal: np.ndarray) -> np.ndarray:
 
 
 def baseline_of(model: StateSpaceModel, normals: Mapping[str, Normal]) -> np.ndarray:
-    """The bank's baseline, (rows, 3 + TESTS), of what was normal of each row; white innovations for the others."""
+    """Return the detectors' baseline, (rows, 3 + TESTS); that of white innovations for rows without one."""
     baseline = no_baseline(model)
     for name, normal in normals.items():
         own = baseline[model.row_names.index(name)]
         own[:3] = normal.bias, normal.scale, normal.correlation
         for cause, peak in normal.reached.items():
-            own[3:][BITS == 1 << ALARM_NAMES.index(cause)] = MARGIN * peak
+            own[3:][BITS == 1 << ALARM_NAMES.index(cause)] = BASELINE_MARGIN * peak
     return baseline
 
 
 def lost_from(normals: Mapping[str, Normal]) -> float:
-    """From which multiple of its normal mean on a NIS over the window says that the estimate is lost.
+    """Return the multiple of its expected mean from which the NIS over a window means divergence.
 
-    Where it came close on data on which it was not, from `MARGIN` times that on.
+    At least `BASELINE_MARGIN` times the highest multiple on the accepted data.
     """
-    return max([HealthPolicy().diverged_nis, *(MARGIN * normal.nis for normal in normals.values())])
+    return max([HealthPolicy().diverged_nis, *(BASELINE_MARGIN * normal.nis for normal in normals.values())])

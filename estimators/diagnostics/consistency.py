@@ -30,7 +30,7 @@ class NisVerdict(NamedTuple):
 
     @property
     def measure(self) -> float:
-        """What is compared with the bounds."""
+        """The mean NIS that is compared with the bounds."""
         return self.judged if np.isfinite(self.judged) else self.nis
 
     @property
@@ -42,7 +42,7 @@ class NisVerdict(NamedTuple):
 
     @property
     def said(self) -> str:
-        """Where it lies, and by what."""
+        """Its position relative to the bounds."""
         if not self.place:
             return "no reading to judge"
         bounds = f"{self.place} its 95 % bounds {self.low:.3g} to {self.high:.3g}"
@@ -90,7 +90,7 @@ def nees(model: StateSpaceModel, events: Events, mean: np.ndarray, cov: np.ndarr
 
     Args:
         model: Whose states; errors of circular ones wrap.
-        events: What was folded, N of them.
+        events: The folded events, N of them.
         mean: Estimates, (N, nx).
         cov: Covariances, (N, nx, nx).
 

@@ -1,7 +1,7 @@
-"""How a run of standardised innovations differs from white noise N(0, 1): by how much, since when, and how surely.
+"""Effects of faults on standardised innovations: size, onset and likelihood ratio against white noise N(0, 1).
 
-Each way of being wrong has a size with a 95 % interval, and the generalised likelihood ratio of that size against
-none, in nats; the way with the largest ratio explains the run best.
+Each kind of effect has a size with a 95 % interval, and a generalised likelihood ratio against none, in nats. The kind
+with the largest ratio explains a run best.
 
 Source: Basseville & Nikiforov (1993), Detection of Abrupt Changes, 2.4 and 4.2.
 """
@@ -18,10 +18,10 @@ from .detectors import MAX_SIGMA
 SIDE = float(normal_quantile(0.975))
 
 SPIKE = 4.0
-"""|e| from which an innovation is a spike where the others are in order."""
+"""|e| from which an innovation is an outlier."""
 
-FEWEST = 4
-"""Innovations whose correlation says nothing yet."""
+MIN_PAIRS = 4
+"""Innovations up to which a correlation is not estimated."""
 
 KINDS = ("shifted", "narrow", "wide", "correlated", "alternating", "spiky")
 """Detectors whose effect is estimated here, by name."""
@@ -31,11 +31,10 @@ EVIDENCE = "evidence"
 
 
 class Effect(NamedTuple):
-    """One way in which innovations differ from white noise.
+    """Deviation of innovations from white noise.
 
-    `cause`: shifted, narrow, wide, correlated, alternating or spiky. `size` with its 95 % interval `low` to `high`: the
-    mean in σ, the ratio of the innovations' deviation to what the filter believes, the lag-1 correlation, or the share
-    of spikes. `ratio`: log Λ, nats.
+    cause: one of `KINDS`. size, with its 95 % interval low to high: the mean in σ, the ratio of the standard deviation
+    to the predicted one, the lag-1 correlation, or the share of outliers. ratio: log Λ, nats.
     """
 
     cause: str
@@ -63,7 +62,7 @@ def effects(e: np.ndarray) -> list[Effect]:
     floor = max(variance, 1e-12)
     phi = float(np.sum(rest[1:] * rest[:-1]) / max(float(np.sum(rest**2)), 1e-300))
     bounded = float(np.clip(phi, -0.995, 0.995))
-    # With correlated noise a mean is known less well than with white.
+    # Correlated noise determines a mean less well than white noise.
     wide = np.sqrt(floor * (1.0 + max(bounded, 0.0)) / (1.0 - max(bounded, 0.0)) / n)
     found = [Effect("shifted", mean, mean - SIDE * wide, mean + SIDE * wide, 0.5 * n * mean**2)]
     spikes = _alone(rest)
@@ -71,7 +70,7 @@ def effects(e: np.ndarray) -> list[Effect]:
     share = float(np.mean(spikes))
     if spikes.any() and calm.size > 1:
         own = max(float(np.mean(calm**2)), 1e-12)
-        # A few spikes among innovations that are otherwise in order; else it is the scale.
+        # A few outliers among normal innovations; otherwise it is the scale.
         gain = 0.5 * float(np.sum(rest[spikes] ** 2)) - int(spikes.sum()) * np.log(max(1.0 / max(share, 1e-9), 1.0))
         if own < 1.5 and share < 0.2:
             half = SIDE * np.sqrt(share * (1.0 - share) / n)
@@ -96,7 +95,7 @@ def effects(e: np.ndarray) -> list[Effect]:
 
 
 def against(e: np.ndarray, effect: Effect) -> float:
-    """log Λ, nats, of white noise over an effect of that size in a run e (n,), finite; 0 for spikes, which are rare."""
+    """Return log Λ, nats, of white noise against an effect of this size in e (n,), finite; 0 for rare outliers."""
     e = np.clip(e, -MAX_SIGMA, MAX_SIGMA)
     size = effect.size
     if effect.cause == "shifted":
@@ -111,7 +110,7 @@ def against(e: np.ndarray, effect: Effect) -> float:
 
 
 def common_scale(e: np.ndarray, dof: np.ndarray) -> Effect:
-    """The scale of all rows of a sensor together, from e = √(NIS / dof) (n,) and the degrees of freedom (n,)."""
+    """Return the common scale of all rows of a sensor, from e = √(NIS / dof) (n,) and degrees of freedom (n,)."""
     whole = float(np.sum(dof))
     variance = max(float(np.sum(dof * e**2)) / whole, 1e-12)
     deviation = float(np.sqrt(variance))
@@ -122,7 +121,7 @@ def common_scale(e: np.ndarray, dof: np.ndarray) -> Effect:
 
 
 def _alone(e: np.ndarray) -> np.ndarray:
-    """Which of e (n,) are spikes without a neighbour that is one on the same side."""
+    """Return which of e (n,) are outliers without a neighbouring one on the same side."""
     side = np.where(np.abs(e) > SPIKE, np.sign(e), 0.0)
     beside = np.concatenate(([0.0], side, [0.0]))
     alone: np.ndarray = (side != 0.0) & (beside[:-2] != side) & (beside[2:] != side)
@@ -130,7 +129,7 @@ def _alone(e: np.ndarray) -> np.ndarray:
 
 
 class Sums(NamedTuple):
-    """What the likelihood of an effect needs of a run e (n,) that is forgotten.
+    """Sufficient statistics of a run e (n,) for the likelihood of its effects.
 
     n, Σ e, Σ e², Σ e e₋ and Σ e² of those that have one before, e₋; and the last e.
     """
@@ -147,16 +146,16 @@ NO_SUMS = Sums()
 
 
 def gains(e: np.ndarray, cause: str, run: Sums = NO_SUMS) -> tuple[np.ndarray, Sums]:
-    """How likely it is that `cause` is what is wrong in a run, up to each of its e.
+    """Return the likelihood ratio of an effect in a run, up to each of its e.
 
     Args:
         e: Innovations (n,), finite.
-        cause: One of `KINDS`.
-        run: What came before them.
+        cause: One of `KINDS`, or `EVIDENCE` for a series of log Λ.
+        run: Sums of the values before them.
 
     Returns:
-        Generalised log-likelihood ratios against none, (n,); where spikes are the cause, they rise with each. And the
-        sums of the whole run.
+        Generalised log-likelihood ratios against none, (n,), which for outliers rise with each; and the sums of the
+        whole run.
     """
     e = np.clip(e, -MAX_SIGMA, MAX_SIGMA)
     if not e.size:
@@ -179,7 +178,7 @@ def gains(e: np.ndarray, cause: str, run: Sums = NO_SUMS) -> tuple[np.ndarray, S
     elif cause in ("correlated", "alternating"):
         phi = np.clip(products / np.maximum(after, 1e-12), -0.995, 0.995)
         side = phi > 0 if cause == "correlated" else phi < 0
-        gain = np.where(side & (n > FEWEST), -0.5 * n * np.log(1.0 - phi**2), 0.0)
+        gain = np.where(side & (n > MIN_PAIRS), -0.5 * n * np.log(1.0 - phi**2), 0.0)
     elif cause == "spiky":
         gain = np.where(np.abs(e) > SPIKE, n, 0.0)
     elif cause == EVIDENCE:
@@ -188,7 +187,7 @@ def gains(e: np.ndarray, cause: str, run: Sums = NO_SUMS) -> tuple[np.ndarray, S
 
 
 def onset(e: np.ndarray, cause: str) -> int:
-    """The index of e (n,), up to which nothing was wrong, most likely, if `cause` is what is wrong at the end.
+    """Return the most likely onset in e (n,) of an effect that is present at the end.
 
     The start that maximises the generalised likelihood ratio of what follows it; the estimate of the time of change of
     Basseville & Nikiforov (1993), 2.6.

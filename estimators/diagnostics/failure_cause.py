@@ -1,6 +1,6 @@
 """Why a reading failed: the model's functions tried again, one by one, from the last estimate that was a number.
 
-A filter that finds no covariance, or no number, cannot say which function of the model gave it. This is found out
+A filter that gets no covariance, or no number, does not know which function of the model failed. This is found out
 afterwards, outside the fold: the path of the estimate to the failure is walked as the filter predicts, from the
 estimate and from places around it, where sigma points and particles are.
 """
@@ -24,7 +24,7 @@ AWAY = (1.0, -1.0, 3.0, -3.0)
 """Standard deviations from the estimate, a state at a time; the sigma points of nx states lie at about √nx."""
 
 STEPS = 100
-"""Of a prediction that are walked; in more, as many longer ones."""
+"""Steps of a prediction that are repeated at most; a longer prediction has longer steps."""
 
 
 class Estimate(NamedTuple):
@@ -87,7 +87,7 @@ def cause(
 def questions(
     compiled: CompiledModel, states: Sequence[np.ndarray], u: np.ndarray, p: np.ndarray, q: np.ndarray, dt: float
 ) -> Iterator[tuple[str, Callable[[], object]]]:
-    """What a filter may have asked of a compiled model: each function at each of some states.
+    """Yield the calls of a filter to a compiled model: each function at each of some states.
 
     Args:
         compiled: The model.
@@ -127,7 +127,7 @@ def around(compiled: CompiledModel, estimate: Estimate) -> Iterator[np.ndarray]:
 def _walk(
     compiled: CompiledModel, x: np.ndarray, u: np.ndarray, p: np.ndarray, q: np.ndarray, dt: float
 ) -> str | np.ndarray:
-    """Where the prediction from a state ends, or the first function that is not in order on the way."""
+    """Return the end of a prediction from a state, or the first function that fails on the way."""
     model = compiled.model
     steps = min(STEPS, steps_of(dt, model.max_step)) if dt > 0.0 else 0
     for _ in range(steps):
@@ -148,7 +148,7 @@ def _walk(
 
 
 def _ask(compiled: CompiledModel, sensor: int, x: np.ndarray, u: np.ndarray, p: np.ndarray) -> str | None:
-    """What is wrong with h of a sensor at a state."""
+    """Return the error of h of a sensor at a state, or None."""
     given = compiled.model.sensors[sensor]
     y = np.full(len(given.rows), np.nan)
     compiled.h[sensor](x, u, p, y)

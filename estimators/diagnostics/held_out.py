@@ -1,4 +1,4 @@
-"""What a sensor that is held out shows: whether it reads as the others say it should.
+"""Offset of a held-out sensor against the prediction by the others.
 
 The mean of its last innovations ν, and what they allow it. Of the variance S of an innovation, R is noise, which a mean
 of n of them leaves R/n of; the rest, H P Hᵀ, is an error of the estimate that all of them share:
@@ -63,7 +63,7 @@ def offsets(events: Events, track: Track, tuning: Tuning) -> list[Offset]:
 
     Args:
         events: A stretch.
-        track: What was concluded of it.
+        track: Its track.
         tuning: Under which.
     """
     model, found = tuning.model, []

@@ -1,4 +1,4 @@
-"""Innovations as pictures show them: how they are distributed beside N(0, 1), and what each says of the later ones.
+"""Statistics of innovations: distribution against N(0, 1), autocorrelation, tests of whiteness, and their size.
 
 All take one row's standardised innovations e (T,), see `calibration.standardised`; NaN is a missing one, which keeps
 its place in time.
@@ -72,7 +72,7 @@ def histogram(e: np.ndarray, low: float = -4.0, high: float = 4.0, bins: int = 3
 
 
 def quantile_pairs(e: np.ndarray, most: int = 60) -> np.ndarray:
-    """Points (k, 2) of a Q-Q plot: what a normal variable has at a probability, and what e has; k ≤ `most`.
+    """Return points (k, 2) of a Q-Q plot: quantiles of a normal variable and of e; k ≤ `most`.
 
     The i-th smallest of n stands at (i - ½) / n; of many the outermost are shown, and some at even steps of the normal
     quantile between.
@@ -90,7 +90,7 @@ def quantile_pairs(e: np.ndarray, most: int = 60) -> np.ndarray:
 def rank_histogram(e: np.ndarray, bins: int = 10) -> Ranks:
     """In which of the bins each reading lay among what was predicted: Φ(e), flat where the prediction is right.
 
-    A U shape says that the spread is too small, a hump that it is too large, a slope that there is a bias.
+    A U shape means that the spread is too small, a hump that it is too large, a slope a bias.
 
     Source: Hamill (2001), doi:10.1175/1520-0493(2001)129<0550:IORHFV>2.0.CO;2, with the predictive distribution in
     place of its members.
@@ -136,7 +136,7 @@ def mean_nis(track: Track, gate: float | None) -> float:
     """Mean NIS a degree of freedom of the readings used and refused, 1 if the filter is consistent; NaN without any.
 
     Args:
-        track: What was concluded.
+        track: Its track.
         gate: That of the tuning; None where nothing is refused.
     """
     judged = (track.verdict == USED) | (track.verdict == GATED)
@@ -157,7 +157,7 @@ def sensor_noise(track: Track, events: Events, tuning: Tuning) -> dict[str, Sens
     follows from R; taken again and again the estimate comes to rest.
 
     Args:
-        track: What was concluded, under `tuning`.
+        track: Its track, under `tuning`.
         events: Of what.
         tuning: Its R held as it is: nothing brought variances, and the filter adapted none.
 

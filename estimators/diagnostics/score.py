@@ -66,7 +66,7 @@ class Score(NamedTuple):
 
     @property
     def nis_verdict(self) -> NisVerdict:
-        """Whether the mean NIS is what it should be."""
+        """Whether the mean NIS is within its bounds."""
         return NisVerdict(self.nis, self.nis_low, self.nis_high, self.commissioned, self.nis_judged)
 
 
@@ -82,13 +82,13 @@ def score(
     """Sum a track up. Errors are taken at the truth events, whose rows hold the estimate at that time.
 
     Args:
-        track: What was concluded.
+        track: Its track.
         events: Of what.
         model: Whose sensors and states.
         pictures: Of a large field, which are summed up too; the track knows a few cells only.
         gate: That of the tuning, the probability that a good reading passes: it sets the price of a refusal. Where
             readings were refused and it is not given, the log-likelihood is NaN.
-        baseline: That of the tuning: what was normal when it was accepted, by which the NIS is judged.
+        baseline: Baseline of the tuning, by which the NIS is judged.
     """
     used = track.verdict == USED
     nis, low, high, commissioned, judged = nis_verdict(track, events, model, baseline)

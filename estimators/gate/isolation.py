@@ -1,4 +1,22 @@
-"""What is decided of sensors that stay refused, while a fold goes on: a pure function of the log and the tuning."""
+"""Decide about sensors that stay rejected: the sensor is wrong, or the twin is. A function of log and tuning.
+
+A second fold runs beside the first from the first rejection on, the last moment at which both were one: the covariance
+is widened there, and the gate of the sensor is off. Its evidence is
+
+    Δ = Σ over the other sensors of (ℓ₂ - ℓ₁)  -  ½ Σ over the sensor's own, in the second fold, of the excess
+
+where ℓ is the predictive log-likelihood of a measurement, held-out sensors included, and a measurement beyond the gate
+g costs as much as with its noise inflated until it lies on it,
+
+    ℓ = -½ (c + log det S),   c = NIS up to g,   g + m log(NIS / g) beyond
+
+so that no single measurement decides. A faulty sensor can report any value, so its own measurements count only against
+it, where they contradict one another although the second fold accepts them.
+
+Sources: Willsky & Jones (1976), doi:10.1109/TAC.1976.1101146, for the likelihood ratio of a jump in the state since the
+time of its onset; Gustafsson (2000), Adaptive Filtering and Change Detection, chapter 9; Bar-Shalom, Li & Kirubarajan
+(2001), Estimation with Applications to Tracking and Navigation, chapter 11.
+"""
 
 from __future__ import annotations
 
@@ -13,23 +31,23 @@ from ..snapshots import Story
 from ..track import GATED, HELD_OUT, USED, Track
 from .rejection_runs import ASKED, DUE, EVER, FROM, PASSED, RUN, SINCE, WAIT
 
-STRETCH = 1024
-"""Events, at most, over which two stories are compared: the work of a decision is bounded."""
+MAX_COMPARED_EVENTS = 1024
+"""Events over which two folds are compared at most."""
 
-ASKS = 64
-"""Of the seconds until the asset is believed, the least part between two questions."""
+MAX_DECISIONS = 64
+"""Decisions at most until the sensor is accepted without evidence."""
 
-LONGEST_WAIT = 3600.0
-"""Seconds, at most, before a sensor that was isolated is asked again; `reopen` where that is longer."""
+MAX_WAIT_S = 3600.0
+"""Seconds at most until an isolated sensor is checked again; `reopen` where that is longer."""
 
 
 class Decision(NamedTuple):
-    """What was decided of a sensor that stayed refused.
+    """Decision about a sensor that stayed rejected.
 
-    `row`: absolute index of the reading at which, `first` of the first refused with which the stories begin; `time` and
-    `since` (of the first refused) in seconds of the log. `outcome`: a word of stories.py. `refused`: readings in a row;
-    `evidence`: log-likelihood of the story that the twin is wrong over that of the sensor, NaN where none was weighed;
-    `witnesses`: readings of other sensors in it. `text`: one sentence.
+    row: absolute index of the measurement at which it was taken; first: of the first rejected one, the start of the
+    second fold; time and since (of the first rejected one), s. outcome: "doubted", "isolated", "reopened", "believed"
+    or "agrees". refused: rejections in a row; evidence: log-likelihood ratio for a wrong twin, NaN where none was
+    computed; witnesses: measurements of other sensors in it. text: one sentence.
     """
 
     row: int
@@ -44,8 +62,8 @@ class Decision(NamedTuple):
     text: str
 
 
-class Told(Protocol):
-    """What a decision needs of a fold."""
+class ReopeningFold(Protocol):
+    """A fold, as far as decisions need it."""
 
     model: StateSpaceModel
     log: Log
@@ -53,35 +71,35 @@ class Told(Protocol):
 
     @property
     def track(self) -> Track:
-        """The rows folded so far."""
+        """Rows folded so far."""
 
     def second_story(self, start: int, stop: int, sensor: int) -> Story:
-        """The events from `start` to `stop` folded apart, as if the twin had been wrong before."""
+        """Fold the events from `start` to `stop` apart, as if the twin had been wrong before."""
 
     def go_on_with(self, story: Story) -> None:
-        """Take its state for one's own."""
+        """Continue from the state of a second fold."""
 
 
-def decide(fold: Told, row: int, doubt: np.ndarray, reopen: float) -> tuple[Decision | None, bool]:
-    """Decide what to do about the sensor whose reading in a row of the track asks for it.
+def decide(fold: ReopeningFold, row: int, doubt: np.ndarray, reopen: float) -> tuple[Decision | None, bool]:
+    """Decide about the sensor whose measurement in a row of the track is due for it.
 
     Args:
-        fold: The fold, which has come to this row; if the twin was wrong, it goes on in the second story.
+        fold: The fold up to this row; if the twin was wrong, it continues from the second fold.
         row: The row.
-        doubt: What is remembered of the sensors (sensors, REMEMBERED); changed.
-        reopen: Seconds after the first refused reading from which on the asset is believed if nothing tells.
+        doubt: State of the runs of rejections (sensors, REMEMBERED); changed.
+        reopen: Seconds after the first rejection from which the sensor is accepted without evidence.
 
     Returns:
-        The decision, None if it is the one before; and whether the state is another now.
+        The decision, None if it repeats the one before; and whether the state has changed.
     """
     log, model = fold.log, fold.model
     sensor = int(log.channel[row])
     own, now = doubt[sensor], float(log.t[row])
     name, time, index = model.sensor_names[sensor], now * 1e-9, log.first + row
-    nothing = Evidence(0.0, 0, 0.0)
+    nothing = ReopeningEvidence(0.0, 0, 0.0)
     if own[RUN] == 0.0:
         own[ASKED], own[WAIT], own[DUE] = 0.0, 0.0, -np.inf
-        text = told(model, name, AGREES, 0, "", nothing, 0.0, reopen, False, np.zeros(0))
+        text = decision_text(model, name, AGREES, 0, "", nothing, 0.0, reopen, False, np.zeros(0))
         return Decision(index, index, time, name, AGREES, 0, time, np.nan, 0, text), False
     run, begun = int(own[RUN]), own[FROM]
     start = _first_refused(fold, row, sensor, int(own[SINCE]) - log.first)
@@ -94,46 +112,48 @@ def decide(fold: Told, row: int, doubt: np.ndarray, reopen: float) -> tuple[Deci
     changed = outcome in (REOPENED, BELIEVED)
     if changed:
         fold.go_on_with(story)
-        # What was refused was refused by another state.
+        # The rejections belong to another state.
         doubt[:, RUN] = 0.0
         own[PASSED], own[WAIT], own[ASKED], own[EVER], own[DUE] = 0.0, 0.0, 0.0, 1.0, -np.inf
     elif outcome == ISOLATED:
-        own[WAIT] = max(reopen, min(2.0 * own[WAIT], LONGEST_WAIT))
+        own[WAIT] = max(reopen, min(2.0 * own[WAIT], MAX_WAIT_S))
         own[RUN], own[DUE] = 0.0, now + own[WAIT] * 1e9
     else:
-        own[DUE] = min(now + 1e9 * max(0.5e-9 * (now - begun), reopen / ASKS), begun + reopen * 1e9)
+        own[DUE] = min(now + 1e9 * max(0.5e-9 * (now - begun), reopen / MAX_DECISIONS), begun + reopen * 1e9)
         if asked:
             return None, False
-    text = told(model, name, outcome, run, since(begun * 1e-9), evidence, own[WAIT], reopen, never, story.widened)
+    text = decision_text(
+        model, name, outcome, run, since(begun * 1e-9), evidence, own[WAIT], reopen, never, story.widened
+    )
     return Decision(
         index, log.first + start, time, name, outcome, run, begun * 1e-9, evidence.total, evidence.witnesses, text
     ), changed
 
 
-def _first_refused(fold: Told, row: int, sensor: int, since: int) -> int:
-    """The first refused reading of a sensor from row `since` on, of those within reach before `row`."""
-    log, begin = fold.log, max(since, row - STRETCH, 0)
+def _first_refused(fold: ReopeningFold, row: int, sensor: int, since: int) -> int:
+    """Return the first rejected measurement of a sensor from row `since` on, within reach before `row`."""
+    log, begin = fold.log, max(since, row - MAX_COMPARED_EVENTS, 0)
     verdict, channel = fold.track.verdict[begin : row + 1], log.channel[begin : row + 1]
     mine = (log.kind[begin : row + 1] == READING) & (channel == sensor) & np.isin(verdict, (GATED, USED))
     return begin + int(np.flatnonzero(mine)[0])
 
 
-DECISIVE = float(np.log(1000.0))
-"""|Δ| from which a story is believed: the one is a thousand times likelier than the other."""
+DECISION_NATS = float(np.log(1000.0))
+"""|Δ| from which one fold is accepted: it is a thousand times more likely than the other."""
 
-SHARE = 0.01
-"""Of the variance that the prior gives a row: a state with less of it is not widened."""
+MIN_VARIANCE_SHARE = 0.01
+"""Share of the prior variance of a row below which a state is not widened."""
 
-NAMED = 4
-"""States, at most, that a sentence names."""
+MAX_NAMED_STATES = 4
+"""States named in a text at most."""
 
 DOUBTED, ISOLATED, REOPENED, BELIEVED, AGREES = "doubted", "isolated", "reopened", "believed", "agrees"
-"""What can be decided: nothing tells yet; the sensor is wrong; the twin was wrong; nothing told for as long as the
-tuning says, so the asset is believed; the sensor passes the gate again."""
+"""Outcomes: no decision yet; the sensor is wrong; the twin was wrong; no evidence for as long as the tuning allows, so
+the sensor is accepted; the sensor passes the gate again."""
 
 
-class Evidence(NamedTuple):
-    """What speaks for the second story: the others' log-likelihood, how many of their readings, and its own (≤ 0)."""
+class ReopeningEvidence(NamedTuple):
+    """Evidence for the second fold: log-likelihood of the other sensors, number of measurements, own part (≤ 0)."""
 
     others: float
     witnesses: int
@@ -146,29 +166,29 @@ class Evidence(NamedTuple):
 
 
 def cost(nis: np.ndarray, dof: np.ndarray, limit: np.ndarray) -> np.ndarray:
-    """c (N,) of readings: their NIS, and beyond the gate the least that inflated noise makes of it."""
+    """Return c (N,) of measurements: their NIS, and beyond the gate its least value with inflated noise."""
     with np.errstate(divide="ignore", invalid="ignore"):
         beyond = limit + dof * np.log(nis / limit)
     return np.where(nis > limit, beyond, nis)
 
 
 def degrees(track: Track) -> np.ndarray:
-    """Rows that were there in each reading of a track (N,)."""
+    """Return the number of finite rows of each measurement of a track, (N,)."""
     rows: np.ndarray = np.isfinite(track.innovation_std).sum(axis=1)
     return rows
 
 
 def softened(track: Track, limits: np.ndarray) -> np.ndarray:
-    """Which rows of a track are readings beyond the gate that were used all the same (N,)."""
+    """Return which rows of a track are measurements beyond the gate that were used, (N,)."""
     beyond: np.ndarray = (track.verdict == USED) & (track.nis > limits[degrees(track)])
     return beyond
 
 
 def log_likelihoods(track: Track, limits: np.ndarray) -> np.ndarray:
-    """ℓ (N,) of the readings of a track but for a constant; limits (width + 1,): the gate by degrees of freedom.
+    """Return ℓ (N,) of the measurements of a track, up to a constant; limits (width + 1,): gate by degrees of freedom.
 
-    By NIS and the deviations that the track shows, as those of every family of filters mean the same; the correlation
-    of a sensor's rows is left out of det S, in both stories.
+    NIS and standard deviations mean the same for every family of filters. Correlation of a sensor's rows is left out of
+    det S, in both folds.
     """
     dof = degrees(track)
     log_det = 2.0 * np.nansum(np.log(track.innovation_std), axis=1)
@@ -178,10 +198,10 @@ def log_likelihoods(track: Track, limits: np.ndarray) -> np.ndarray:
 
 def weigh(
     first: Track, second: Track, kind: np.ndarray, channel: np.ndarray, sensor: int, limits: np.ndarray
-) -> Evidence:
-    """What rows of the two stories say of a sensor; the first row is its first refused reading.
+) -> ReopeningEvidence:
+    """Return the evidence in the rows of the two folds; the first row is the sensor's first rejected measurement.
 
-    That one itself says nothing: the second story was widened by it.
+    That one does not count: the second fold was widened by it.
     """
     judged = [np.isin(track.verdict, (USED, GATED, HELD_OUT)) for track in (first, second)]
     others = (kind == READING) & (channel != sensor) & judged[0] & judged[1]
@@ -191,11 +211,11 @@ def weigh(
     mine = second.select(own)
     dof = degrees(mine)
     wild = mine.nis - cost(mine.nis, dof, limits[dof])
-    return Evidence(float(np.nansum(gained)), int(np.sum(np.isfinite(gained))), -0.5 * float(np.nansum(wild)))
+    return ReopeningEvidence(float(np.nansum(gained)), int(np.sum(np.isfinite(gained))), -0.5 * float(np.nansum(wild)))
 
 
 def widening(cov: np.ndarray, prior: np.ndarray, H: np.ndarray, innovation: np.ndarray) -> np.ndarray:
-    """What to add to P's diagonal: α Σ, of the states that a sensor sees, α so that ν² ≤ α H Σ Hᵀ in every row.
+    """Return the addition to P's diagonal: α Σ of the states that a sensor observes, ν² ≤ α H Σ Hᵀ in every row.
 
     A state is seen that has a share in H Σ Hᵀ. One that hardly moves a reading, as the speed moves a late fix, would be
     widened in vain: all that knew it better would speak against the second story. Σ holds the prior's variances: they
@@ -215,7 +235,7 @@ def widening(cov: np.ndarray, prior: np.ndarray, H: np.ndarray, innovation: np.n
     for variances in (prior, cov):
         added = np.where(np.isfinite(variances), variances, 0.0)
         parts = np.square(H) * added
-        added[~np.any(parts > SHARE * parts.sum(axis=1)[:, None], axis=0)] = 0.0
+        added[~np.any(parts > MIN_VARIANCE_SHARE * parts.sum(axis=1)[:, None], axis=0)] = 0.0
         spread = np.square(H) @ added
         reached = (spread > 0.0) & (nu != 0.0)
         if np.any(reached):
@@ -224,20 +244,20 @@ def widening(cov: np.ndarray, prior: np.ndarray, H: np.ndarray, innovation: np.n
     return np.zeros(len(cov))
 
 
-def decided(evidence: Evidence, never_agreed: bool, waited: bool) -> str:
-    """What follows from the evidence, of a sensor that never agreed with the twin, or for which was waited enough."""
-    if evidence.total >= DECISIVE:
+def decided(evidence: ReopeningEvidence, never_agreed: bool, waited: bool) -> str:
+    """Return the outcome; never_agreed: no measurement has passed yet; waited: the time without evidence is over."""
+    if evidence.total >= DECISION_NATS:
         return REOPENED
-    if evidence.total <= -DECISIVE:
+    if evidence.total <= -DECISION_NATS:
         return ISOLATED
     return BELIEVED if never_agreed or waited else DOUBTED
 
 
-def told(
-    model: StateSpaceModel, sensor: str, outcome: str, run: int, since: str, evidence: Evidence,
+def decision_text(
+    model: StateSpaceModel, sensor: str, outcome: str, run: int, since: str, evidence: ReopeningEvidence,
     wait: float, reopen: float, never_agreed: bool, added: np.ndarray,
 ) -> str:  # fmt: skip
-    """One sentence for a user: what was refused since when, what it was taken for and why, what follows."""
+    """Return one sentence with the rejections, the decision, its reason and its consequence."""
     begun = f"{sensor}: {run} readings in a row refused {since}"
     others = f"the other sensors, by exp({evidence.others:+.0f})"
     if outcome == AGREES:
@@ -247,8 +267,8 @@ def told(
         why = "its readings contradict one another" if alone else f"{others}, contradict it"
         return f"{begun}; the sensor is wrong, {why}: it stays refused, asked again in {wait:g} s"
     if outcome == DOUBTED:
-        return f"{begun}; it or the twin is wrong, nothing tells which: it is believed {reopen:g} s after the first"
-    most = np.argsort(-added, kind="stable")[:NAMED]
+        return f"{begun}; it or the twin is wrong, without evidence which: it is believed {reopen:g} s after the first"
+    most = np.argsort(-added, kind="stable")[:MAX_NAMED_STATES]
     units = {state.name: state.unit for state in model.shown_states}
     names = [model.state_names[j] for j in most if added[j] > 0.0]
     states = [f"{name} ± {added[j]:.3g} {units.get(name, '')}".rstrip() for name, j in zip(names, most, strict=False)]
@@ -257,4 +277,4 @@ def told(
         return f"{begun}; the twin was wrong, {others}, agree with it: {wide}"
     if never_agreed:
         return f"{begun}, from its first; nothing confirms where the twin began: {wide}"
-    return f"{begun}; nothing told for {reopen:g} s whether it or the twin is wrong: believed, {wide}"
+    return f"{begun}; no evidence for {reopen:g} s whether it or the twin is wrong: believed, {wide}"

@@ -1,1 +1,1 @@
-"""A twin put to the test: mistakes that are made on purpose, and how soon and how rightly it says so."""
+"""Stress tests of a twin: deliberate faults, and how soon and how correctly they are detected."""

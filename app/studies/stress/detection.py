@@ -1,4 +1,4 @@
-"""What the bank should see of a mistake, told before it is made: visible, invisible, or left to chance.
+"""Expected and actual detection of a deliberate fault: visible, invisible, or by chance.
 
 A mistake that moves the means of the innovations moves them by as much in every log: the same noise is folded with and
 without it, by a filter without chance, and the difference is put to the criterion of the smallest visible fault
@@ -30,12 +30,12 @@ from .scenario import Bench, Folded, Mistake, accused, asset_of, first_word, gre
 VISIBLE, INVISIBLE, CHANCE = FORETOLD = ("visible", "invisible", "by chance")
 
 DETECTION = 0.95
-"""Probability with which what is visible is found, and what is invisible is not."""
+"""Probability of detection of a visible fault, and of no alarm for an invisible one."""
 
 REHEARSALS = 5
 """Logs in which a mistake is rehearsed."""
 
-SOON = 0.5
+DETECTION_SHARE = 0.5
 """Share of the time that a mistake lasts within which each rehearsal must find what is visible."""
 
 OTHERS = 1000
@@ -93,7 +93,7 @@ class Oracle:
             after = [bench.found_after(mistake, estimator) for bench in self._benches]
         if not after:
             return Foretold(CHANCE)
-        if max(after) <= SOON:
+        if max(after) <= DETECTION_SHARE:
             return Foretold(VISIBLE)
         return Foretold(CHANCE if min(after) < 1.0 else INVISIBLE)
 
@@ -165,7 +165,7 @@ def _readings(fold: Fold) -> np.ndarray:
 
 
 GATE = 0.9973
-"""Of the fold with the defence, where the twin ships without a gate."""
+"""Gate of the defended fold, where the twin has none."""
 
 
 OUTCOMES = NAMED, MISNAMED, MISSED, UNSEEN, RIGHTLY_SILENT, FALSE = (
@@ -182,7 +182,7 @@ foretold, or by chance. Of what is none: not heard of, heard of."""
 
 @dataclass(frozen=True)
 class Trial:
-    """What came of one mistake.
+    """Outcome of one fault.
 
     `foretold`: visible, invisible or by chance, before it was made; `visible_from`: the multiple of its size from which
     on it would be visible, NaN where that is not known. `outcome`: one of `OUTCOMES`. `delay`: seconds from its start

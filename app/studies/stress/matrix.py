@@ -16,7 +16,7 @@ from sources.faults.kinds import Fault
 from .scenario import Mistake
 
 SMALL_BANDS = frozenset({"narrow", "correlated", "shifted"})
-"""What shows where the filter believes itself too much."""
+"""Causes that show an overconfident filter."""
 
 LARGE_BANDS = frozenset({"wide", "alternating"})
 SHIFT = frozenset({"shifted", "refused"})
@@ -138,7 +138,7 @@ def _of_inputs(model: StateSpaceModel, events: Events) -> Iterator[Mistake]:
 
 
 def _of_time(sensors: Sequence[Sensor]) -> Iterator[Mistake]:
-    """What the log undoes by itself, and what it cannot."""
+    """Yield time faults, which the log corrects or cannot correct."""
     yield Mistake("all 0.5 s late", NOTHING, fault=_fault("delay", size=0.5))
     yield Mistake("all late by chance, 0.2 s", NOTHING, fault=_fault("jitter", size=0.2))
     yield Mistake("neighbours in the wrong order", NOTHING, fault=_fault("reorder", rate=0.5))

@@ -1,4 +1,4 @@
-"""A mistake that is made on purpose, and what the twin should say of it."""
+"""Deliberate faults of a twin, the folds of its log with and without them, and when they are reported."""
 
 from __future__ import annotations
 
@@ -100,10 +100,10 @@ def asset_of(twin: Twin, seed: int) -> Simulator | None:
 
 
 def plain_log(twin: Twin, seed: int, duration: float) -> Events:
-    """What the twin's source says in `duration` seconds, without stamps; of an asset with another seed.
+    """Read `duration` seconds of the twin's source, without stamps; of a simulated asset with another seed.
 
     Raises:
-        SourceError: If the source cannot be opened, or says nothing.
+        SourceError: If the source cannot be opened, or has no events.
     """
     asset = asset_of(twin, seed)
     source = with_faults(asset, twin.faults()) if asset is not None else twin.open_source(_ignore, live=False)
@@ -111,7 +111,7 @@ def plain_log(twin: Twin, seed: int, duration: float) -> Events:
 
 
 def _ignore(key: str, text: str) -> None:
-    """Nobody listens."""
+    """Discard a notice."""
 
 
 def _read(source: object, width: int, duration: float) -> Events:
@@ -128,7 +128,7 @@ def _read(source: object, width: int, duration: float) -> Events:
     finally:
         source.close()  # type: ignore[attr-defined]
     if begin is None:
-        raise SourceError("stress: the source said nothing")
+        raise SourceError("stress: the source has no events")
     events = Events.concat(parts, width)
     return events.select((events.kind != MARK) & (events.t <= begin + round(duration * 1e9)))
 
@@ -167,7 +167,7 @@ class Bench:
         return self.origin + round(start * 1e9), self.origin + round(end * 1e9)
 
     def found_after(self, mistake: Mistake, estimator: str) -> float:
-        """Share of the time that a mistake lasts after which the twin says so, as it ships; or infinity.
+        """Return the delay of detection as a share of the fault's duration, with the twin as it ships; or infinity.
 
         Raises:
             NisusError: As `fold`.
@@ -267,7 +267,7 @@ SAME = 1_000_000_000
 
 
 def green(fold: Fold) -> np.ndarray:
-    """Rows in which the twin says that all is well, shape (N,)."""
+    """Return the rows in which the twin is tracking, (N,) of bool."""
     health: np.ndarray = fold.track.health[: fold.n] == TRACKING
     return health
 
@@ -336,8 +336,8 @@ def accused(fold: Fold, episode: Episode, until: int) -> str:
 
     Args:
         fold: In which the episode is.
-        episode: What was said.
-        until: When it is asked, ns of the log: what comes later is not known yet.
+        episode: The episode.
+        until: Time of the question, ns of the log; later events are not known yet.
     """
     if not detector_of(episode.cause).isolate:
         return episode.subject

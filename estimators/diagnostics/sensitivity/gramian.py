@@ -1,4 +1,4 @@
-"""Observability along the track: what readings tell of the state in which they began.
+"""Observability along the track: information of measurements about the state at their beginning.
 
 The prior mean of each state is nudged, in units of its deviation, and the same log folded again. With P₀ = I in these
 units, and J = Oᵀ N⁻¹ O the information of the readings on the state at their beginning (process noise is in N),
@@ -27,20 +27,32 @@ from ...model.state_space import StateSpaceModel
 from ...snapshots import Base
 from ...track import USED
 from ...tuning import Tuning
-from .responses import STEP, Given, Nudge, Start, astray, each, most_events, moved, reason_against, refold, stand_in
+from .responses import (
+    STEP,
+    FoldInputs,
+    Nudge,
+    Start,
+    astray,
+    each,
+    most_events,
+    moved,
+    reason_against,
+    refold,
+    stand_in,
+)
 
 TOLD = 1.0
-"""Information, in units of the prior's, from which on the readings tell more of a direction than the prior did."""
+"""Information, in units of the prior's, from which the measurements determine a direction better than the prior."""
 
 SURE = 1e-9
 """Least share of the prior's variance that differences tell from zero; no eigenvalue is larger than its reciprocal."""
 
 BEYOND = 1.05
-"""Eigenvalue of G from which on the filter does not follow nudges in proportion: of a linear model none is above 1."""
+"""Eigenvalue of G from which the filter responds nonlinearly to nudges: for a linear model none is above 1."""
 
 
 class View(NamedTuple):
-    """What the readings of a part of the log tell of the state at its beginning.
+    """Information of the measurements of a part of the log about the state at its beginning.
 
     begin, end: ns. gramian (nx, nx) is J, in the prior's deviations, and eigenvalues (nx,) its own, rising. `rank`
     counts those of which the readings tell more than the prior did; `conditioning` is the ratio of the largest to the
@@ -82,7 +94,7 @@ def gramian(
     most: int | None = None,
     executor: Executor | str | None = "threads",
 ) -> Gramian:
-    """Nudge the prior mean of each state, and see what the readings of a log tell of it.
+    """Nudge the prior mean of each state, and compute the information of a log about it.
 
     Args:
         estimator: Of the twin; particles and ensembles are replaced by a filter without chance, see `note`.
@@ -121,7 +133,7 @@ def gramian(
     parts = [(begin, log.n, bases[0]), *(span for span in spans if windows and span[1] > span[0])]
     views = each(lambda part: _view(name, model, tuning, log, *part), parts, executor)
     if any(view.beyond for view in views):
-        note = "; ".join(filter(None, [note, f"{name} does not follow nudges in proportion: the Gramian says little"]))
+        note = "; ".join(filter(None, [note, f"{name} responds nonlinearly to nudges: the Gramian is unreliable"]))
     return Gramian(name, "", note, views[0], tuple(views[1:]))
 
 
@@ -130,7 +142,7 @@ def _view(estimator: str, model: StateSpaceModel, tuning: Tuning, log: Log, begi
     part.n = end
     if begin:
         part.drop_front(begin)
-    given = Given(tuning, part, base)
+    given = FoldInputs(tuning, part, base)
     begun = Start(estimator, given, refold(estimator, given), begin, "")
     used = begun.track.verdict == USED
     told = [_response(begun, j, std)[used] for j, std in enumerate(model.prior_std.tolist())]
@@ -182,18 +194,18 @@ def _in_words(weights: np.ndarray, model: StateSpaceModel, left: float) -> str:
 
 
 LEAST = 1e-10
-"""Eigenvalue of the information scaled to a unit diagonal, below which differences cannot tell it from zero."""
+"""Eigenvalue of the information, scaled to a unit diagonal, that differences cannot distinguish from zero."""
 
 PRESENT = 1e-3
-"""Share of a nudge in a direction, below which it has no part in it."""
+"""Share of a nudge in a direction below which it is not part of it."""
 
 
 PART = 0.05
-"""Of the largest part of a direction, below which another is not named."""
+"""Share of the largest part of a direction below which another is not named."""
 
 
 class Direction(NamedTuple):
-    """A combination of nudges, and how well the log tells it.
+    """A combination of nudges, and how well the log determines it.
 
     `weights` (k,) are in the nudges' scales, with unit norm; `deviation`, of the combination, in the same: beyond 1,
     the log does not tell it to the size of the values themselves. `text` says it in words.
@@ -245,7 +257,7 @@ def uncertainty(fisher: np.ndarray, nudges: Sequence[Nudge]) -> Uncertainty:
 
 
 def directions(fisher: np.ndarray, nudges: Sequence[Nudge]) -> tuple[Direction, ...]:
-    """Combinations of nudges that the log tells independently of one another, the worst told first."""
+    """Return independent combinations of nudges, the least determined first."""
     scale = np.array([nudge.scale for nudge in nudges])
     values, vectors = np.linalg.eigh(fisher * np.outer(scale, scale))
     least = LEAST * max(float(values.max(initial=0.0)), np.finfo(float).tiny)
@@ -258,7 +270,7 @@ def directions(fisher: np.ndarray, nudges: Sequence[Nudge]) -> tuple[Direction, 
 
 
 def in_words(weights: np.ndarray, nudges: Sequence[Nudge], most: int = 4) -> str:
-    """A combination of nudges: its largest parts, parameters in percent of their values, the others in units."""
+    """Describe a combination of nudges: its largest parts, parameters in percent of their values, others in units."""
     order = np.argsort(-np.abs(weights), kind="stable")
     order = order[np.abs(weights[order]) >= PART * np.abs(weights[order[0]])]
     largest = np.abs(weights[order[0]])

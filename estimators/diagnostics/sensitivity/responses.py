@@ -1,4 +1,4 @@
-"""Responses: how innovations and states move with each nudge, by folding the same log again."""
+"""Responses of innovations and states to small changes of sensors, inputs and parameters, by refolding a log."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from ...track import DIVERGED, MISSING, NONE, USED, Track
 from ...tuning import Tuning
 
 SMOOTH = ("ekf", "ukf", "kf")
-"""Filters that stand in for one that draws at random, the first that applies."""
+"""Deterministic filters that replace a Monte Carlo one, the first that applies."""
 
-ASTRAY = 0.1
-"""Share of the rows in which a filter has diverged, from which on it cannot stand in for another."""
+MAX_DIVERGED_SHARE = 0.1
+"""Share of diverged rows up to which a filter can replace another."""
 
 THREADS = int(numba.config.NUMBA_NUM_THREADS)
 
@@ -32,7 +32,7 @@ R = TypeVar("R")
 
 
 class Response(NamedTuple):
-    """What one unit of a nudge does: N events, `innovation` and `whitened` NaN where there is none.
+    """Effect of one unit of a nudge on N events, `innovation` and `whitened` NaN where there is none.
 
     innovation (N, ny) is dν, whitened (N, ny) S^-1/2 dν, states (N, shown) dx, of the states that a track keeps.
     """
@@ -44,19 +44,19 @@ class Response(NamedTuple):
 
 
 class Start(NamedTuple):
-    """The fold that is nudged: its estimator, what it is given, its track, and the log's index of its first event."""
+    """The fold that is nudged: estimator, inputs, track, index of its first event in the log, and a note."""
 
     estimator: str
-    given: Given
+    given: FoldInputs
     track: Track
     first: int
     note: str
 
 
 def stand_in(estimator: str, model: StateSpaceModel) -> tuple[str, str]:
-    """The filter to nudge in place of one that draws at random, and a note that says so, or nothing.
+    """Return the filter to nudge in place of a Monte Carlo one, and a note about it, or "".
 
-    With one seed the draws are the same, but a nudge changes which particles survive, so that differences are noise.
+    A nudge changes which particles survive, even with the same seed, so differences would be noise.
 
     Raises:
         EstimatorError: If the estimator does not exist or does not apply to the model.
@@ -65,25 +65,27 @@ def stand_in(estimator: str, model: StateSpaceModel) -> tuple[str, str]:
         return estimator, ""
     for name in SMOOTH:
         if unfit(find_entry(name), model) is None:
-            return name, f"{estimator} draws at random; nudged in its place: {name}"
-    return estimator, f"{estimator} draws at random, and no filter without chance applies: differences hold its noise"
+            return name, f"{estimator} is a Monte Carlo filter; nudged in its place: {name}"
+    return (
+        estimator,
+        f"{estimator} is a Monte Carlo filter without a deterministic substitute: differences contain its noise",
+    )
 
 
 def astray(estimator: str, instead: str, track: Track) -> str:
-    """Why the fold of the filter `instead` tells nothing of what an estimator sees; nothing if it does.
+    """Return why the filter `instead` cannot replace an estimator on this track, or "".
 
-    One peak in place of two, or a linearisation where there is none: what moves a filter that is lost moves no other.
+    A diverged filter, with one peak in place of two or an invalid linearisation, responds differently.
     """
-    if instead == estimator or np.mean(track.health == DIVERGED) <= ASTRAY:
+    if instead == estimator or np.mean(track.health == DIVERGED) <= MAX_DIVERGED_SHARE:
         return ""
-    return f"{estimator} draws at random, and {instead}, which would be nudged in its place, loses this track"
+    return f"{estimator} is a Monte Carlo filter, and {instead}, which would be nudged in its place, diverges"
 
 
 def start(estimator: str, model: StateSpaceModel, tuning: Tuning, log: Log, base: Base | None, most: int) -> Start:
-    """Fold once, and prepare to fold the last `most` events again and again from what stood before them.
+    """Fold once, and prepare to refold the last `most` events from the state before them.
 
-    What was refused stays refused under every nudge, however near to the gate it was: it is taken out of the log, and
-    the gate is opened.
+    Rejected measurements stay rejected under every nudge: they are removed from the log, and the gate is opened.
     """
     name, note = stand_in(estimator, model)
     if name != estimator:
@@ -93,24 +95,24 @@ def start(estimator: str, model: StateSpaceModel, tuning: Tuning, log: Log, base
     at, base = fold.base_at(max(0, log.n - most))
     still = log.copy()
     refused = (still.kind == READING) & ~np.isin(fold.track.verdict, (USED, NONE, MISSING))
-    # Of a sensor that is held out nothing is used anyhow, and its prediction is of interest.
+    # Measurements of a held-out sensor are not used, but their predictions are needed.
     refused &= tuning.used[np.where(still.kind == READING, still.channel, 0)]
     still.value[refused, : still.width] = np.nan
     if at:
         still.drop_front(at)
-    given = Given(replace(tuning, gate=None), still, base)
+    given = FoldInputs(replace(tuning, gate=None), still, base)
     return Start(name, given, refold(name, given), at, note)
 
 
-def refold(estimator: str, given: Given) -> Track:
-    """The track of what is given."""
+def refold(estimator: str, given: FoldInputs) -> Track:
+    """Return the track of a fold of these inputs."""
     fold = Fold(estimator, given.tuning.model, given.tuning, given.log, base=given.base)
     fold.advance()
     return fold.track
 
 
 def respond(begun: Start, nudge: Nudge) -> Response:
-    """The derivative, as a difference over a step; central where the range allows."""
+    """Return the derivative by a nudge, as a difference over a step; central where the range allows."""
     low, high = max(-nudge.step, nudge.low), min(nudge.step, nudge.high)
     below, above = (
         begun.track if size == 0.0 else refold(begun.estimator, nudged(begun.given, nudge, size))
@@ -120,7 +122,7 @@ def respond(begun: Start, nudge: Nudge) -> Response:
 
 
 class Moved(NamedTuple):
-    """What is other in one track than in another; see `Response`."""
+    """Difference of two tracks; see `Response`."""
 
     innovation: np.ndarray
     whitened: np.ndarray
@@ -128,7 +130,7 @@ class Moved(NamedTuple):
 
 
 def moved(begun: Start, new: Track, old: Track | None = None) -> Moved:
-    """A track less another, or less that of the fold without nudge; angles go by the shorter way."""
+    """Subtract a track from another, by default that of the fold without nudge; angles by the shorter way."""
     model = begun.given.tuning.model
     log = begun.given.log
     old = old or begun.track
@@ -155,7 +157,7 @@ def _shorter(angle: np.ndarray) -> np.ndarray:
 
 
 def each(work: Callable[[T], R], items: Iterable[T], executor: Executor | str | None) -> list[R]:
-    """Do the same with each item: "threads" side by side (a fold gives up the interpreter), None one by one."""
+    """Map a function over items: in threads (a fold releases the interpreter), or one by one with None."""
     own: Any = ThreadPoolExecutor(THREADS) if executor == "threads" else nullcontext(executor)
     with own as pool:
         return list(map(work, items) if pool is None else pool.map(work, items))
@@ -164,17 +166,17 @@ def each(work: Callable[[T], R], items: Iterable[T], executor: Executor | str | 
 SENSOR, INPUT_, PARAMETER = KINDS = ("sensor", "input", "parameter")
 
 DRIFT = "drift"
-"""Of a sensor row, too: its readings move away from the log's first event on, by so much a second."""
+"""Kind of a nudge that grows in proportion to the time since the first event, of a sensor row."""
 
 STEP = 1e-3
-"""Of the scale of what is nudged: the error of a central difference is of the order of its square, and rounding of the
-order of 1e-16 over it."""
+"""Step of a difference, as a share of the nudge's scale: the error of a central difference is of the order of its
+square, that of rounding 1e-16 over it."""
 
 
 class Nudge(NamedTuple):
-    """A constant, or a drift, added to the readings of a sensor row; a constant added to an input or a parameter.
+    """A constant or a drift added to the measurements of a sensor row, or a constant added to an input or parameter.
 
-    `step` is what is added and taken off for the differences, `low` and `high` the range in which a fault of this kind
+    `step` is added and subtracted for the differences, `low` and `high` the range in which a fault of this kind
     (a change from the present value) makes sense, `scale` the size by which nudges are compared: the deviation of the
     sensor's noise, the spread of the input in the log, the parameter's value, or its range where that is 0. `value` is
     a parameter's own. All in `unit`.
@@ -190,7 +192,7 @@ class Nudge(NamedTuple):
     value: float = np.nan
 
     def in_words(self, size: float) -> str:
-        """A fault of a size: of a parameter in percent of its value, if it has one; else in units."""
+        """Describe a fault of a size: of a parameter in percent of its value, if it has one; else in units."""
         if self.kind == PARAMETER and self.value:
             return f"{self.name} {100.0 * size / abs(self.value):+.3g} %"
         if self.kind == DRIFT:
@@ -200,12 +202,12 @@ class Nudge(NamedTuple):
 
     @property
     def largest(self) -> float:
-        """Size of the largest fault within the range."""
+        """Size of the largest fault in the range."""
         return max(abs(self.low), abs(self.high))
 
 
-class Given(NamedTuple):
-    """What a fold is given: any of it may be nudged."""
+class FoldInputs(NamedTuple):
+    """Inputs of a fold, each of which may be nudged."""
 
     tuning: Tuning
     log: Log
@@ -213,7 +215,7 @@ class Given(NamedTuple):
 
 
 def nudges_of(model: StateSpaceModel, tuning: Tuning, log: Log, kinds: Sequence[str] = KINDS) -> list[Nudge]:
-    """Every nudge of a model: rows of sensors that speak and are used, inputs, parameters with room in their range."""
+    """Return all nudges of a model: rows of used sensors with measurements, inputs, parameters that may vary."""
     found = []
     seconds = float(log.t[log.n - 1] - log.t[0]) * 1e-9 if log.n else 0.0
     units = [row.unit for sensor in model.sensors for row in sensor.rows]
@@ -241,14 +243,14 @@ def nudges_of(model: StateSpaceModel, tuning: Tuning, log: Log, kinds: Sequence[
     return [nudge for nudge in found if nudge.kind in kinds]
 
 
-def nudged(given: Given, nudge: Nudge, size: float) -> Given:
-    """What a fold is given, with `size` added to what the nudge names; nothing that was given changes."""
+def nudged(given: FoldInputs, nudge: Nudge, size: float) -> FoldInputs:
+    """Return a copy of the inputs of a fold with a nudge of this size."""
     tuning, log, base = given
     model = tuning.model
     if nudge.kind == PARAMETER:
         p = tuning.p.copy()
         p[[item.name for item in model.parameters].index(nudge.name)] += size
-        return Given(replace(tuning, p=p), log, base)
+        return FoldInputs(replace(tuning, p=p), log, base)
     other = log.copy()
     kind, value = other.kind[: other.n], other.value[: other.n]
     if nudge.kind in (SENSOR, DRIFT):
@@ -257,16 +259,16 @@ def nudged(given: Given, nudge: Nudge, size: float) -> Given:
         own = np.flatnonzero((kind == READING) & (other.channel[: other.n] == sensor))
         off = size if nudge.kind == SENSOR else size * 1e-9 * (other.t[own] - other.t[0])
         value[own, row - model.row_start[sensor]] += off
-        return Given(tuning, other, base)
+        return FoldInputs(tuning, other, base)
     k = model.input_names.index(nudge.name)
     value[kind == INPUT, k] += size
     u = base.u.copy()
     u[k] += size
-    return Given(tuning, other, base._replace(u=u))
+    return FoldInputs(tuning, other, base._replace(u=u))
 
 
 def digits(value: float, sign: str = "") -> str:
-    """A number to three digits, with an exponent only where it would be longer without: `2,280`, `0.0375`, `1.8e+10`.
+    """Format a number with three digits, with an exponent only where that is shorter: `2,280`, `0.0375`, `1.8e+10`.
 
     `sign`: "+" shows that of a positive number too. Zero has none.
     """
@@ -277,12 +279,12 @@ def digits(value: float, sign: str = "") -> str:
 
 
 def subject_text(nudge: Nudge) -> str:
-    """What is nudged."""
+    """Return the kind and name of a nudge."""
     return f"{nudge.kind} {nudge.name}"
 
 
 def size_text(nudge: Nudge, size: float) -> str:
-    """The size of a fault without its sign: of a parameter in percent of its value, if it has one; else in its unit."""
+    """Return the size of a fault without its sign: of a parameter in percent of its value, else in its unit."""
     if nudge.kind == PARAMETER and nudge.value:
         return f"{digits(100.0 * size / abs(nudge.value))} %"
     return f"{digits(size)} {nudge.unit}".rstrip()
@@ -305,28 +307,28 @@ def fault_text(nudge: Nudge, low: float, high: float) -> str:
 
 
 MOST_STATES = 64
-"""States beyond which a model is too large to be folded again for each of its nudges."""
+"""States up to which a model is refolded for each of its nudges."""
 
 MOST_EVENTS = 20_000
-"""Events that are folded again; of a longer log the last."""
+"""Events that are refolded at most, the last of the log."""
 
 MOST_NUMBERS = 32_000_000
-"""Numbers that the responses may take together."""
+"""Numbers in all responses at most."""
 
 MOST_WORK = 2_000_000_000
 """Events times nudges times nx³, as a covariance costs: some ten seconds."""
 
 
 def reason_against(model: StateSpaceModel, log: Log) -> str:
-    """Why sensitivities are not computed, in words, or nothing."""
+    """Return why sensitivities are not computed, or ""."""
     if model.grid is not None or model.nx > MOST_STATES:
         return f"{model.name} has {model.nx:,} states; sensitivities are computed up to {MOST_STATES}"
     if not (log.kind[: log.n] == READING).any():
-        return "the log has no reading, so nothing can be seen"
+        return "the log has no measurement"
     return ""
 
 
 def most_events(model: StateSpaceModel, nudges: int) -> int:
-    """How many events are folded again for so many nudges, by what that takes."""
+    """Return the number of events to refold for this number of nudges, by their cost."""
     numbers = nudges * (2 * model.ny + 2 * len(model.shown))
     return max(1, min(MOST_EVENTS, MOST_NUMBERS // numbers, MOST_WORK // (nudges * model.nx**3)))

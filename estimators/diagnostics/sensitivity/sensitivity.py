@@ -1,7 +1,7 @@
-"""What could be wrong without anyone noticing: every sensor, input and parameter off by a little, and what moves.
+"""Minimal detectable faults, protection levels and Fisher information of a twin, by refolding its log with nudges.
 
-From folds of the same log alone, no new mathematics: the smallest visible fault of each, the bound of the error of each
-state under a fault that is not seen, and what the log can tell of several unknowns at once.
+A nudge is a small change of a sensor, an input or a parameter. The protection level (integrity bound) of a state is the
+bound of its error under an undetectable fault.
 """
 
 from __future__ import annotations
@@ -40,19 +40,19 @@ from .responses import (
 )
 from .visibility import fault_tests, undetectable_fault
 
-CURVED = 0.5
-"""Nonlinearity from which on a derivative says little; where half the nudges are beyond it, the result says so."""
+MAX_NONLINEARITY = 0.5
+"""Median nonlinearity of the nudges from which the result has a note that derivatives are unreliable."""
 
 BANK, BEST = WITNESSES = ("bank", "best")
-"""By whom a fault is seen: the bank of tests that watches the twin, or the best test that there could be."""
+"""Tests for a fault: the detectors of the twin, or the optimal test of a known fault."""
 
 
 class Sensitivity(NamedTuple):
-    """What nudges of a fold do, and what follows; k nudges, N events, the last of the log.
+    """Sensitivity of a fold to k nudges over its last N events.
 
-    estimator is the filter that was nudged. `reason` is empty, or says why nothing was done: then all arrays are
-    empty; `note` says what to know of the result. t (N,) are the events' times, ns; `first` the index in the log of the
-    first. std (N, shown): σ of the states without nudge.
+    estimator: the filter that was nudged. reason: why nothing was computed and all arrays are empty, or ""; note: a
+    remark on the result, or "". t (N,): times of the events, ns; first: index of the first in the log. std (N, shown):
+    σ of the states without nudge.
 
     fisher (k, k), deviation (k,) and correlation (k, k): see `Uncertainty`, for all nudges unknown together; `among`
     gives them for some.
@@ -85,7 +85,7 @@ class Sensitivity(NamedTuple):
     integrity_bias: np.ndarray
     integrity: np.ndarray
     integrity_cause: np.ndarray
-    over_time: Integrity
+    over_time: ProtectionLevels
 
     @property
     def nudges(self) -> tuple[Nudge, ...]:
@@ -93,7 +93,7 @@ class Sensitivity(NamedTuple):
         return tuple(response.nudge for response in self.responses)
 
     def place(self, kind: str, name: str) -> int:
-        """Where a nudge stands in the arrays.
+        """Return the index of a nudge in the arrays.
 
         Raises:
             KeyError: If there is no such nudge.
@@ -104,7 +104,7 @@ class Sensitivity(NamedTuple):
         raise KeyError(f"no nudge of {kind} {name!r}; there are {', '.join(n.name for n in self.nudges)}")
 
     def among(self, indices: Sequence[int]) -> Uncertainty:
-        """What the log tells of some nudges, if these are unknown and all others are known."""
+        """Return the uncertainty of some nudges if these are unknown and all others are known."""
         some = list(indices)
         return uncertainty(self.fisher[np.ix_(some, some)], [self.nudges[k] for k in some])
 
@@ -136,14 +136,14 @@ def sensitivity(
         base: Where the log starts, if older events were dropped; see `Fold.base_at`.
         kinds: Which nudges, of "sensor", "input", "parameter".
         most: Events to look at, from the end; None for what takes seconds and 256 MB at most.
-        seen_by: "bank" for the tests that watch the twin, "best" for a test that would know what each fault looks like:
-            what it does not see, nobody can.
+        seen_by: "bank" for the detectors of the twin, "best" for the optimal test of a known fault, a bound for all
+            tests.
         false_alarm: Mean time between false alarms of all tests together, s.
         detection: Probability with which the smallest visible fault is seen.
         executor: "threads", an Executor, or None to fold one after the other. The results are the same bits.
 
     Raises:
-        EstimatorError: As `Fold`; if nobody is called `seen_by`.
+        EstimatorError: As `Fold`; if `seen_by` is unknown.
         ModelError: As `Fold`.
     """
     find_estimator(estimator, model)
@@ -178,8 +178,8 @@ def sensitivity(
     faults = each(lambda response: undetectable_fault(begun, response, tests), responses, executor)
     bounds = integrity([item.error for item in faults], track.std)
     notes = [begun.note]
-    if np.median([item.nonlinearity for item in faults]) > CURVED:
-        notes.append(f"{begun.estimator} does not follow nudges in proportion: Fisher information says little here")
+    if np.median([item.nonlinearity for item in faults]) > MAX_NONLINEARITY:
+        notes.append(f"{begun.estimator} responds nonlinearly to nudges: Fisher information is unreliable here")
     return Sensitivity(
         estimator=begun.estimator,
         reason="",
@@ -226,19 +226,19 @@ def _nothing(estimator: str, reason: str, shown: int) -> Sensitivity:
         integrity_bias=unknown,
         integrity=unknown,
         integrity_cause=cause,
-        over_time=Integrity(rows, rows, np.zeros((0, shown), int)),
+        over_time=ProtectionLevels(rows, rows, np.zeros((0, shown), int)),
     )
 
 
 PROBABILITY = 0.95
-"""That an error stays below the bound, under the fault that is worst for it."""
+"""Probability that an error stays below the protection level, under the worst undetectable fault."""
 
 
-class Integrity(NamedTuple):
-    """Bounds of the error of each state, row by row, under one fault that was there from the first row on and unseen.
+class ProtectionLevels(NamedTuple):
+    """Bounds of the error of each state, row by row, under one undetectable fault from the first row on.
 
-    bias (N, shown): the largest |dx| by any fault as large as can pass unseen. bound (N, shown): bias + 1.96 σ, what
-    the error stays below with 95 % at least. cause (N, shown): the index of the nudge that causes it, -1 for none.
+    bias (N, shown): the largest |dx| of any undetectable fault. bound (N, shown): bias + 1.96 σ, exceeded by the error
+    with at most 5 %. cause (N, shown): the index of the nudge that causes it, -1 for none.
     """
 
     bias: np.ndarray
@@ -246,25 +246,25 @@ class Integrity(NamedTuple):
     cause: np.ndarray
 
 
-def integrity(errors: Sequence[np.ndarray], std: np.ndarray) -> Integrity:
-    """Bounds from the error (N, shown) by the largest unseen fault of each nudge, and σ (N, shown)."""
+def integrity(errors: Sequence[np.ndarray], std: np.ndarray) -> ProtectionLevels:
+    """Return the bounds from the error (N, shown) of the largest undetectable fault of each nudge, and σ (N, shown)."""
     bias = np.zeros(std.shape)
     cause = np.full(std.shape, -1)
     for k, error in enumerate(errors):
         worse = error > bias
         bias[worse], cause[worse] = error[worse], k
-    return Integrity(bias, bias + normal_quantile(0.5 + PROBABILITY / 2.0) * std, cause)
+    return ProtectionLevels(bias, bias + normal_quantile(0.5 + PROBABILITY / 2.0) * std, cause)
 
 
 TWO_SIGMA = normal_quantile(0.5 + PROBABILITY / 2.0)
-"""Standard deviations to either side in a band of 95 %, "± 2 σ", as the integrity bound has it."""
+"""Half width of a 95 % band in standard deviations, "± 2 σ", as in the protection level."""
 
 
 class Bound(NamedTuple):
-    """Of one state, in `unit`: below which its error stays with 95 %.
+    """Protection level of one state, in `unit`: bounds of its error with a probability of 95 %.
 
-    `two_sigma` by the covariance, if nothing is wrong; `bound` under the one unseen fault that is worst for it, which
-    moves it by `bias`. `fault` says which that is and from where to where it passes unseen; empty if none moves it.
+    two_sigma: by the covariance, without a fault; bound: under the worst undetectable fault, which moves it by bias.
+    fault: that fault with its undetectable range; "" if none moves the state.
     """
 
     unit: str
@@ -275,7 +275,7 @@ class Bound(NamedTuple):
 
 
 def bounds_of(model: StateSpaceModel, found: Sensitivity) -> dict[str, Bound]:
-    """By state, at the end of what was folded; none where there is a reason against it."""
+    """Return the protection levels by state at the last event; none where there is a reason against it."""
     if found.reason:
         return {}
     bounds = {}

@@ -1,13 +1,12 @@
-"""Who is to blame: which single fault explains best what the innovations have shown since an episode began.
+"""Isolate the single fault that best explains the innovations since an episode began.
 
-A fault of size θ (what is off by a constant, or a sensor that drifts by so much a second) moves the whitened
-innovations by θ Δν, as a refold with that nudge shows. Against what was seen,
+A fault of size θ (a constant offset, or a drift of a sensor per second) moves the whitened innovations by θ Δν, as a
+refold with that nudge shows. Against the observed innovations ν,
 
     θ̂ = Σ Δνᵀν / Σ ΔνᵀΔν,   log Λ = ½ (Σ Δνᵀν)² / Σ ΔνᵀΔν
 
-is its most likely size and how much likelier than no fault it makes what was seen. A size says by how much a sensor, or
-what the filter is told or believes, is off. Faults that nothing in the data tells apart have the same log Λ, and are
-named together.
+are its most likely size and its log-likelihood ratio against no fault. Indistinguishable faults have the same log Λ and
+are named together.
 
 Source: Willsky & Jones (1976), doi:10.1109/TAC.1976.1101146, the generalised likelihood ratio of additive faults.
 """
@@ -30,7 +29,7 @@ from .responses import (
     DRIFT,
     KINDS,
     SENSOR,
-    Given,
+    FoldInputs,
     Nudge,
     Start,
     astray,
@@ -42,14 +41,14 @@ from .responses import (
     stand_in,
 )
 
-MOST = 4000
-"""Events since the beginning of an episode that are folded again."""
+MAX_EVENTS = 4000
+"""Events since the beginning of an episode that are refolded at most."""
 
-ALIKE = 3.0
-"""Nats within which one fault explains as much as another: twenty times as likely is another matter."""
+EQUAL_NATS = 3.0
+"""Nats within which two faults explain equally much."""
 
-TELLING = 5.0
-"""Nats below which nothing is explained."""
+MIN_NATS = 5.0
+"""Nats below which a fault explains nothing."""
 
 
 class Suspect(NamedTuple):
@@ -71,13 +70,13 @@ def suspects(
     base: Base | None = None,
     executor: Executor | str | None = "threads",
 ) -> list[Suspect]:
-    """The faults that may explain what has happened since a time, the likeliest first.
+    """Return the faults that may explain the innovations since a time, the most likely first.
 
     Args:
         estimator: That ran.
         model: The model.
         tuning: That ran.
-        log: What was folded; nothing is changed.
+        log: The folded log; not changed.
         since: Beginning of the episode, s.
         base: Where the log's fold starts, if not at the prior.
         executor: See `sensitivity`.
@@ -88,7 +87,7 @@ def suspects(
     """
     first = int(np.searchsorted(log.t[: log.n], round(since * 1e9)))
     cut = log.copy()
-    cut.n = min(log.n, first + MOST)
+    cut.n = min(log.n, first + MAX_EVENTS)
     if first >= cut.n or reason_against(model, cut):
         return []
     begun = _start(estimator, model, tuning, cut, base, first)
@@ -112,7 +111,7 @@ def suspects(
 def _start(
     estimator: str, model: StateSpaceModel, tuning: Tuning, log: Log, base: Base | None, first: int
 ) -> Start | None:
-    """The fold from exactly the event `first` on, with the gate open: what it refuses tells most of all."""
+    """Fold from event `first` on with the gate open: rejected measurements are the most informative."""
     name, note = stand_in(estimator, model)
     own = tuning.with_options({}) if name != estimator else tuning
     fold = Fold(name, model, own, log, base=base)
@@ -122,25 +121,25 @@ def _start(
     here = fold.base_here()
     still = log.copy()
     still.drop_front(first)
-    given = Given(replace(own, gate=None), still, here)
+    given = FoldInputs(replace(own, gate=None), still, here)
     return Start(name, given, refold(name, given), first, note)
 
 
 def likeliest(found: Sequence[Suspect]) -> tuple[Suspect, ...]:
-    """The likeliest, and those that explain as much; none if no single fault explains anything.
+    """Return the most likely fault and those that explain as much; none if no single fault explains anything.
 
-    Of a sensor that may be off or drift, only what is likelier of the two.
+    Offset and drift of one sensor count as one fault, the more likely of the two.
     """
-    if not found or found[0].gain < TELLING:
+    if not found or found[0].gain < MIN_NATS:
         return ()
     alike: dict[tuple[str, str], Suspect] = {}
     for suspect in found:
-        if found[0].gain - suspect.gain < ALIKE:
+        if found[0].gain - suspect.gain < EQUAL_NATS:
             kind = SENSOR if suspect.nudge.kind == DRIFT else suspect.nudge.kind
             alike.setdefault((kind, suspect.nudge.name), suspect)
     return tuple(alike.values())
 
 
 def in_words(found: Sequence[Suspect], most: int = 3) -> str:
-    """Those of `likeliest`, at most so many."""
+    """Describe the most likely faults, at most `most` of them."""
     return " or ".join(suspect.nudge.in_words(suspect.size) for suspect in likeliest(found)[:most])

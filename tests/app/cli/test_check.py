@@ -169,4 +169,4 @@ def test_what_does_not_apply_is_said_and_nothing_fails(name, seconds, capsys):
         assert "temperature, all cells" in found["open_loop"]["states"]
     if name == "agv_corridor":
         # Its building looks the same after half a turn, so that a filter of one peak is lost in it.
-        assert "pf draws at random, and ekf, which would be nudged" in found["integrity"]["reason"]
+        assert "pf is a Monte Carlo filter, and ekf, which would be nudged" in found["integrity"]["reason"]

@@ -5,7 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from estimators.diagnostics.commission import FEWEST, MARGIN, Normal, baseline_of, commission, lost_from
+from estimators.diagnostics.commission import (
+    BASELINE_MARGIN,
+    MIN_MEASUREMENTS,
+    Normal,
+    baseline_of,
+    commission,
+    lost_from,
+)
 from estimators.diagnostics.detector_state import no_baseline
 from estimators.diagnostics.detectors import ALARM_NAMES, BITS, NARROW
 from estimators.diagnostics.health import JUDGED_MEAN, MAX_ROWS_PER_READING, MIN_WINDOW_EVENTS, HealthPolicy, normal_nis
@@ -121,7 +128,7 @@ def test_the_baseline_is_what_was_normal(normals):
     baseline = baseline_of(MODEL, part)
     np.testing.assert_array_equal(baseline[1:], no_baseline(MODEL)[1:])
     assert tuple(baseline[0, :3]) == part["gauge"][:3]
-    assert np.all(baseline[0, 3:][BITS == NARROW] == MARGIN * part["gauge"].reached.get("narrow", 0.0))
+    assert np.all(baseline[0, 3:][BITS == NARROW] == BASELINE_MARGIN * part["gauge"].reached.get("narrow", 0.0))
 
 
 def lurching(n=600, at=200, until=212):
@@ -170,11 +177,11 @@ def test_what_is_far_from_lost_changes_nothing(normals):
     assert {normal.nis for normal in normals.values()} == {0.0}
     usual = HealthPolicy().diverged_nis
     assert lost_from({}) == lost_from(normals) == usual
-    assert lost_from({"gauge": Normal(0.0, 1.0, 0.0, {}, usual)}) == MARGIN * usual
+    assert lost_from({"gauge": Normal(0.0, 1.0, 0.0, {}, usual)}) == BASELINE_MARGIN * usual
 
 
 def test_too_few_readings_have_no_normal():
-    fold = folded(asset(0, n=FEWEST))
+    fold = folded(asset(0, n=MIN_MEASUREMENTS))
     assert len(commission(fold, fold.evidence)) == 3
-    fold = folded(asset(0, n=FEWEST - 1))
+    fold = folded(asset(0, n=MIN_MEASUREMENTS - 1))
     assert commission(fold, fold.evidence) == {}

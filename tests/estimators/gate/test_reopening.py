@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from estimators.fold import Fold
-from estimators.gate.isolation import SHARE, Evidence, cost, decided, widening
+from estimators.gate.isolation import MIN_VARIANCE_SHARE, ReopeningEvidence, cost, decided, widening
 from estimators.gate.rejection_runs import MIN_RUN, RUN_PROBABILITY, rule_of
 from estimators.log import READING, RESET, Events, Log
 from estimators.track import GATED, USED
@@ -171,7 +171,7 @@ def test_widened_states_reach_what_was_refused():
     """S = α H Σ Hᵀ alone explains ν to one deviation in every row; what hardly moves a reading stays as it was."""
     prior = np.array([4.0, 1.0, 100.0])
     H = np.array([[1.0, 0.01, 0.0], [0.0, 0.0, 2.0]])
-    assert H[0, 1] ** 2 * prior[1] < SHARE * 4.0
+    assert H[0, 1] ** 2 * prior[1] < MIN_VARIANCE_SHARE * 4.0
     nu = np.array([10.0, np.nan])
     added = widening(np.full(3, 1e-3), prior, H, nu)
     assert added == pytest.approx([100.0, 0.0, 2500.0])
@@ -181,11 +181,11 @@ def test_widened_states_reach_what_was_refused():
 
 
 def test_what_follows_from_the_evidence():
-    assert decided(Evidence(8.0, 3, 0.0), False, False) == "reopened"
-    assert decided(Evidence(8.0, 3, -16.0), True, True) == "isolated"
-    assert decided(Evidence(6.0, 3, 0.0), False, False) == "doubted"
-    assert decided(Evidence(-6.0, 3, 0.0), False, True) == "believed"
-    assert decided(Evidence(-6.0, 3, 0.0), True, False) == "believed"
+    assert decided(ReopeningEvidence(8.0, 3, 0.0), False, False) == "reopened"
+    assert decided(ReopeningEvidence(8.0, 3, -16.0), True, True) == "isolated"
+    assert decided(ReopeningEvidence(6.0, 3, 0.0), False, False) == "doubted"
+    assert decided(ReopeningEvidence(-6.0, 3, 0.0), False, True) == "believed"
+    assert decided(ReopeningEvidence(-6.0, 3, 0.0), True, False) == "believed"
 
 
 def test_a_story_that_begins_after_another_starts_from_what_that_one_left():
