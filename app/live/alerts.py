@@ -21,10 +21,10 @@ TRIES = 3
 
 
 class Alerts:
-    """Reports the rows of a fold as they come."""
+    """Report unusable measurements and lost estimates of a fold as its rows arrive."""
 
     def __init__(self, notices: Notices, in_alarm: Callable[[], frozenset[str]] = frozenset) -> None:
-        """`in_alarm`: sensors of which it is said already that something is wrong."""
+        """`in_alarm`: returns the sensors with an open episode."""
         self._notices, self._in_alarm = notices, in_alarm
         self._recoveries = 0
         self._lost: tuple[int, int] | None = None
@@ -35,16 +35,16 @@ class Alerts:
 
     @property
     def lost(self) -> int | None:
-        """Time (ns) from which on the estimate has not been a number; None if it is one."""
+        """Time (ns) from which the estimate has not been finite; None while it is."""
         return None if self._lost is None else self._lost[1]
 
     def again(self) -> None:
-        """Another fold begins, whose recoveries and failures are counted from none."""
+        """Reset the counts for another fold."""
         self._recoveries = self._failures = 0
         self._decided = -np.inf
         self._lost = None
         self._said.clear()
-        # Nobody has looked at its rows yet.
+        # None of its rows has been examined.
         self._tries, self._fresh = 0, True
 
     def look(self, fold: Fold, before: int) -> None:
@@ -72,7 +72,7 @@ class Alerts:
             self._notices.say(text, level="error", t=self._lost[1])
 
     def _look_for_numbers(self, fold: Fold, before: int) -> tuple[int, int] | None:
-        """The first of the last rows without a number: its absolute index, and its time; None if the last has one."""
+        """Return index and time of the first of the last rows without a finite estimate; None if there is none."""
         track, log = fold.track, fold.log
         end = len(track)
         if not end or estimated_rows(track.select(slice(end - 1, end)))[0]:
@@ -94,7 +94,7 @@ class Alerts:
         return log.first + end, int(log.t[end])
 
     def _look_at_decisions(self, fold: Fold) -> None:
-        """Tell what was decided of sensors that stayed refused; nothing twice, though a late reading decides again."""
+        """Report decisions about rejected sensors, each once, even if a late measurement repeats one."""
         new = [decision for decision in fold.decisions if decision.time > self._decided]
         for decision in new:
             level = "info" if decision.outcome == AGREES else "warn"
@@ -102,7 +102,7 @@ class Alerts:
             self._decided = decision.time
 
     def _look_at_failures(self, fold: Fold) -> None:
-        """Say what a black box failed with; the same words once, as readings that failed are counted anyway."""
+        """Report errors of a black-box model, each text once."""
         count, known = fold.failures, self._failures
         self._failures = count
         text = str(fold.failure)
@@ -112,7 +112,7 @@ class Alerts:
             self._notices.report("model failed", f"{text}; {more}", level="error", counted=False)
 
     def _look_for_cause(self, fold: Fold, before: int) -> None:
-        """Say once for each fold what of the model made a reading or the estimate fail, if it is to blame."""
+        """Report, once per fold, the model function that made a measurement or the estimate fail."""
         first = 0 if self._fresh else before
         self._fresh = False
         if self._tries >= TRIES or fold.failure is not None:
@@ -127,35 +127,35 @@ class Alerts:
 
 
 class Silence:
-    """From the opening of the source to the first of its events."""
+    """Health of a twin whose source is open but has no events yet."""
 
     def __init__(self, notices: Notices, stale_after: float, clock: Callable[[], float] = time.monotonic) -> None:
-        """`stale_after`: seconds after which a live source that says nothing is stale; `clock` gives seconds."""
+        """`stale_after`: seconds without an event after which a live source is stale; `clock` returns seconds."""
         self._notices, self._after, self._clock = notices, stale_after, clock
         self._since = clock()
         self._told = False
 
     @property
     def health(self) -> int:
-        """Of a twin that has heard nothing."""
+        """Waiting, or stale."""
         return STALE if self._told else WAITING
 
     @property
     def cause(self) -> str:
-        """Why the twin is stale that has heard nothing; nothing while it waits."""
+        """Reason why the twin is stale, or "" while it waits."""
         if not self._told:
             return ""
         return f"nothing has come since the twin started, {self._clock() - self._since:.0f} s ago; check the source"
 
     def look(self, *, live: bool) -> None:
-        """Nothing has come yet. A recording may be held; of a bus that is silent so long people are told, once."""
+        """Report a live source without events, once it is stale; a recording may be paused."""
         if live and not self._told and self._clock() - self._since > self._after:
             self._told = True
             text = f"stale: nothing has come since the twin started, {self._after:g} s ago; check the source"
             self._notices.say(text, level="warn")
 
     def broken(self) -> None:
-        """Something has come."""
+        """Note that the first event has arrived."""
         if self._told:
             self._told = False
             silent = self._clock() - self._since

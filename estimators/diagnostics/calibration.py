@@ -1,10 +1,8 @@
-"""How far the bands can be believed: by how much they are too narrow or too wide, not whether a test would say so.
+"""Calibration of the confidence bands: by how much they are too narrow or too wide, as an effect size.
 
-On a real asset no filter is exactly consistent, and with enough readings every test says that. So each figure is the
-size of an effect with its 95 % interval, which allows for correlation in time and for heavy tails (intervals.py), and
-words are said of it only where the whole interval lies beyond the size that matters.
-
-A window is a slice of the events and of the track.
+On a real asset no filter is exactly consistent, and with enough measurements every test is significant. So each figure
+is an effect size with a 95 % interval that allows for correlation, and it is reported in words only where the whole
+interval lies beyond a size that matters.
 """
 
 from __future__ import annotations
@@ -151,7 +149,7 @@ def truth_calibration(
 def standardised(track: Track, row: int, marginal: bool) -> np.ndarray:
     """e of one row of each event's sensor, (N,), as it would be drawn from N(0, 1); NaN where there is none.
 
-    The innovation over its standard deviation, or, with `marginal`, what the predictive distribution makes of it.
+    Return innovations over their standard deviations, or with `marginal` by the predictive distribution.
     """
     with np.errstate(all="ignore"):
         e: np.ndarray = track.innovation[:, row] / track.innovation_std[:, row]

@@ -1,4 +1,4 @@
-"""Whether a mean NIS is what it should be (normal_nis.py), in the same words wherever one is shown."""
+"""Verdict on a mean NIS against its expected value and bounds (`health.normal_nis`), in words."""
 
 from __future__ import annotations
 

@@ -6,9 +6,9 @@ coefficients (a, b, c, d, f) of
 
     log Λ = a e² + b e e₋ + c e₋² + d e + f
 
-or a `Density`, whose log Λ is any function of e. Compiled code, episodes, status, report and guide take everything they
-know of a detector from its row. To add a detector, add a row with its tests and a section to the guide: a row without
-`effect` gets episodes of its own, whose size is the mean log Λ of its most significant test.
+or a `Density`, whose log Λ is any function of e. Kernels, episodes, status, report and guide use nothing but the row
+of a detector. To add a detector, add a row with its tests and a section to the guide: a row without `effect` gets
+episodes of its own, whose size is the mean log Λ of its most significant test.
 
 Source: Basseville & Nikiforov (1993), Detection of Abrupt Changes, chapters 2 and 4.
 """
@@ -74,13 +74,13 @@ class Detector(NamedTuple):
         name: The cause, as episodes, JSON and the guide name it.
         wording: Text of an episode, formatted with the facts of one (`episodes/wording.py`) as field 0.
         remedy: What to do, formatted alike; follows the wording.
-        statistic: What is tested, for the guide.
-        effect: What the size of an episode is; empty where nothing but the tests themselves is known.
+        statistic: The tested statistic, for the guide.
+        effect: Quantity of an episode's size; "" where only the tests themselves are known.
         unit: Unit of the size.
         alarms: Tests by the name of their alarm, a bit of `Track.alarms`. Alarms without tests have a kernel of their
             own.
         severity: The smallest is the most urgent.
-        sensor_lost: Whether the sensor says nothing of the asset meanwhile.
+        sensor_lost: Whether the sensor carries no information on the asset meanwhile.
         isolate: Whether sensor, input and parameter are compared to find the most likely fault.
     """
 
@@ -312,7 +312,7 @@ CORRELATED, ALTERNATING, SPIKY = map(bit_of, ("correlated", "alternating", "spik
 REFUSED, STUCK, DISAGREEING, AGREEING, MISSED = map(bit_of, ("refused", "stuck", "disagreeing", "agreeing", "missed"))
 
 LOST = sum(detector.bits for detector in DETECTORS if detector.sensor_lost)
-"""Alarms during which a sensor says nothing of the asset."""
+"""Alarms during which a sensor carries no information on the asset."""
 
 IMPOVERISHED, OUTSIDE, TRUTH_MISSED = 1 << 59, 1 << 60, 1 << 61
 """Bits of `Track.flags` above those of the sensors that dropped out: few particles carry the estimate; outside the

@@ -49,7 +49,7 @@ class Pictures:
         """Begin without any.
 
         Args:
-            field: What they show.
+            field: Field of the pictures.
             period: Seconds between two; None for those at which most of the truth is told only.
         """
         self.field = field
@@ -152,7 +152,7 @@ class Pictures:
 
 
 def layer(shape: tuple[int, ...]) -> tuple[int, int]:
-    """Rows and columns of what is drawn of a field: of one axis a strip, of more than two the middle of the first."""
+    """Return rows and columns of the drawn part of a field: a strip of one axis, the middle slice of more than two."""
     return (1, shape[0]) if len(shape) == 1 else (shape[-2], shape[-1])
 
 

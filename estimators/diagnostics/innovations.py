@@ -221,8 +221,8 @@ def ljung_box(innovations: np.ndarray, lags: int | None = None) -> WhitenessTest
 
     Q = n (n + 2) Σ_k r_k² / n_k,  r_k = Σ z_t z_{t+k} / Σ z_t²,  chi-square with `lags` degrees of freedom,
 
-    z being the series less its mean (0 where missing), n its values that are there and n_k the pairs, k apart, of which
-    both are: under the null the variance of r_k is n_k / (n (n + 2)). Where nothing is missing n_k is n - k.
+    z being the series less its mean (0 where missing), n the number of its finite values and n_k that of the finite
+    pairs at lag k: under the null the variance of r_k is n_k / (n (n + 2)). Without missing values n_k is n - k.
 
     Args:
         innovations: Standardised innovations, (T,); NaN is a missing one.
@@ -249,7 +249,7 @@ def ljung_box(innovations: np.ndarray, lags: int | None = None) -> WhitenessTest
 
 
 def jarque_bera(innovations: np.ndarray) -> WhitenessTest:
-    """Whether the values are normal, by skewness S and kurtosis K of those that are there.
+    """Test of normality by the skewness S and kurtosis K of the finite values.
 
     JB = n (S² / 6 + (K - 3)² / 24),  chi-square with 2 degrees of freedom
 
@@ -273,7 +273,7 @@ def heteroscedasticity(innovations: np.ndarray) -> WhitenessTest:
 
     H = Σ e_t² of the last h / Σ e_t² of the first h,  h = T / 3;  (n_first / n_last) H is F(n_last, n_first),
 
-    n_first and n_last being the values that are there; about zero, not about their mean.
+    n_first and n_last being the numbers of finite values; about zero, not about their mean.
 
     Args:
         innovations: Standardised innovations, (T,); NaN is a missing one.

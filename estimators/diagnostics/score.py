@@ -1,4 +1,4 @@
-"""What a fold was worth: NIS in its bounds, errors where the truth is known, predictions of sensors held out.
+"""Scores of a fold: NIS with its bounds, errors where the truth is known, predictions of held-out sensors.
 
 The log-likelihood counts the readings that the gate refused (see refusals.py); else it would prefer the filter that
 refuses what it does not expect.
@@ -21,7 +21,7 @@ from .field_pictures import Picture
 from .health import MAX_ROWS_PER_READING, PROBABILITY, nis_bounds, normal_nis
 
 FARTHEST = 6.0
-"""σ from which on a row counts no more for what is normal (commission.py)."""
+"""σ at which the innovations of a row are clipped in a baseline (commission.py)."""
 
 
 class Fit(NamedTuple):

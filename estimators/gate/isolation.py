@@ -219,7 +219,7 @@ def widening(cov: np.ndarray, prior: np.ndarray, H: np.ndarray, innovation: np.n
 
     A state is seen that has a share in H Σ Hᵀ. One that hardly moves a reading, as the speed moves a late fix, would be
     widened in vain: all that knew it better would speak against the second story. Σ holds the prior's variances: they
-    say what is believed of the states when nothing is known, one in relation to the other. The NIS is then the number
+    give the relative uncertainty of the states without measurements. The NIS is then the number
     of rows at most.
 
     Args:

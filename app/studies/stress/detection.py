@@ -107,9 +107,9 @@ class Oracle:
 
 
 def shift_of(bench: Bench, mistake: Mistake, estimator: str) -> Foretold | None:
-    """By the shift of the means; None where it cannot be told so: no filter without chance holds it, or other times.
+    """Return the expected detection by the shift of the means; None where no deterministic filter tracks the asset.
 
-    Where the twin has a gate, what this refuses goes on to be told of, so that it is looked at with and without.
+    Rejected measurements still count for the detectors, so a twin with a gate is folded with and without it.
     """
     name, _ = stand_in(estimator, bench.twin.model)
     if name != estimator and name not in SMOOTH:
@@ -176,8 +176,8 @@ OUTCOMES = NAMED, MISNAMED, MISSED, UNSEEN, RIGHTLY_SILENT, FALSE = (
     "rightly silent",
     "false alarm",
 )
-"""Of a mistake: found, by its name or by another; not found though it was visible: wrong and green; not found as
-foretold, or by chance. Of what is none: not heard of, heard of."""
+"""Outcomes of a fault: detected, by its name or another; missed though visible (wrong and green); not detected, as
+expected or by chance. Outcomes of a harmless change: no alarm, false alarm."""
 
 
 @dataclass(frozen=True)

@@ -32,21 +32,20 @@ if TYPE_CHECKING:
     from sources.faults.kinds import Fault
 
 ANYBODY: frozenset[str] = frozenset()
-"""Subjects of a mistake that no sensor in particular is to be blamed for."""
+"""Subjects of a fault that concerns no particular sensor."""
 
 
 @dataclass(frozen=True)
 class Mistake:
-    """One row of the matrix.
+    """One deliberate fault, a row of the matrix.
 
-    `belief` are factors on entries of the tuning, from the start of the log; `fault` makes the faults of the source for
-    a window (start, end) in seconds of the log. An episode has the right cause if its key is among `causes`, and the
-    right subject if whom it tells a user to look at (`told.accused`), or the sensor whose row that is, is among
-    `subjects`. A mistake without causes is none that should be heard of.
+    belief: factors on entries of the tuning, from the start of the log. fault: returns the faults of the source for a
+    window (start, end) in seconds of the log. An episode has the right cause if it is among `causes`, and the right
+    subject if its most likely fault (`accused`), or the sensor of that row, is among `subjects`. A fault without causes
+    is harmless and must not raise an alarm.
 
-    `size` in `unit`: of a mistake that adds a constant to a sensor or an input, for those who compare. `shifts`:
-    whether it moves the means of the innovations alone, by as much in every log; else it changes their noise, or what
-    comes when.
+    size, in unit: of a constant added to a sensor or an input. shifts: whether it moves only the means of the
+    innovations, equally in every log; otherwise it changes their noise or the times of events.
     """
 
     name: str
@@ -60,11 +59,11 @@ class Mistake:
     shifts: bool = False
 
     def right_cause(self, episode: Episode) -> bool:
-        """Whether the cause that an episode names is one of this mistake's."""
+        """Return whether the cause of an episode belongs to this fault."""
         return episode.cause in self.causes
 
     def right_subject(self, name: str) -> bool:
-        """Whether who is to blame by that name, a sensor or one of its rows, is one of this mistake's."""
+        """Return whether a sensor, or one of its rows, belongs to this fault."""
         return not self.subjects or not self.subjects.isdisjoint((name, name.partition(".")[0]))
 
 
@@ -298,7 +297,7 @@ def said_at(fold: Fold, episode: Episode) -> int:
 def first_word(fold: Fold, start: int, calm: Fold | None = None) -> float | None:
     """Seconds from `start` (ns) to the first row that is not green, once a reading has come; None if all stay green.
 
-    Where `calm`, the fold without the mistake, was not green either at that time, nothing is said of the mistake.
+    Where `calm`, the fold without the mistake, was not green either at that time, the fault is not detected.
     """
     t, ok = fold.log.t[: fold.n], green(fold)
     waiting = fold.track.health[: fold.n] == WAITING

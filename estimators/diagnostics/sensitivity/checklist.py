@@ -27,7 +27,7 @@ BUSY = 0.5
 
 
 class Dimension(NamedTuple):
-    """What a step costs, and what it would cost otherwise.
+    """Cost of a filter step, and of the alternatives.
 
     `flops` are those of a covariance step of n states and m rows, 4 n³ for F P Fᵀ and 6 m n² for the update; `memory`
     is the covariance's, bytes. `share` of one processor is taken at `rate` readings a second by the filter in use, at
@@ -54,7 +54,7 @@ def dimension(model: StateSpaceModel, rate: float, seconds: float, *, covariance
     Args:
         model: Whose states.
         rate: Readings a second.
-        seconds: That the filter in use takes for each reading, with what comes between two, measured.
+        seconds: Measured time of the filter per measurement, with the events between.
         covariance: Whether that filter carries one.
     """
     n = model.nx
@@ -131,10 +131,10 @@ def arrivals(model: StateSpaceModel, log: Log) -> tuple[Arrivals, ...]:
 
 
 LEAST = 0.001
-"""Of a σ; what is smaller is said to be."""
+"""Smallest share of σ that is reported."""
 
 QUANTILE = 0.95
-"""Of the differences along the track; a few at the start, where the spread is the prior's, need not matter."""
+"""Quantile of the differences along the track; a few at the start, with the spread of the prior, do not matter."""
 
 LINEARISED, UNSCENTED = "ekf", "ukf"
 

@@ -5,7 +5,7 @@ units, and J = Oᵀ N⁻¹ O the information of the readings on the state at the
 
     G_ij = Σ dν_iᵀ S⁻¹ dν_j = (I + J⁻¹)⁻¹,        I - G = (I + J)⁻¹
 
-so I - G is the covariance of that state after the readings, as a share of what it was before them, and the eigenvalues
+so I - G is the covariance of that state after the measurements, as a share of that before, and the eigenvalues
 g of G give those of J, the stochastic observability Gramian: g / (1 - g). Exact for linear models, the derivative along
 the track for others.
 
@@ -54,11 +54,11 @@ BEYOND = 1.05
 class View(NamedTuple):
     """Information of the measurements of a part of the log about the state at its beginning.
 
-    begin, end: ns. gramian (nx, nx) is J, in the prior's deviations, and eigenvalues (nx,) its own, rising. `rank`
-    counts those of which the readings tell more than the prior did; `conditioning` is the ratio of the largest to the
-    smallest. deviation (nx,): share of each state's prior deviation that is left. weakest (nx,): the direction of the
-    smallest eigenvalue, in the prior's deviations; `text` has it in words. `beyond`: nudges were not followed in
-    proportion, so this says little.
+    begin, end: ns. gramian (nx, nx): J, in the prior's standard deviations; eigenvalues (nx,), ascending. rank: number
+    of those that the measurements determine better than the prior; conditioning: largest over smallest. deviation
+    (nx,): remaining share of each state's prior standard deviation. weakest (nx,): direction of the smallest
+    eigenvalue, in the prior's standard deviations; text describes it. beyond: the response to nudges was nonlinear, so
+    the result is unreliable.
     """
 
     begin: int
@@ -208,7 +208,7 @@ class Direction(NamedTuple):
     """A combination of nudges, and how well the log determines it.
 
     `weights` (k,) are in the nudges' scales, with unit norm; `deviation`, of the combination, in the same: beyond 1,
-    the log does not tell it to the size of the values themselves. `text` says it in words.
+    the log does not determine it to the size of the values. `text` describes it.
     """
 
     weights: np.ndarray

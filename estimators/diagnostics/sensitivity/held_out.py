@@ -127,7 +127,7 @@ def _score(fold: Fold) -> Score:
 
 
 def _predictions(fold: Fold, s: int, floor: dict[str, Fit]) -> list[Prediction]:
-    """Of the rows of sensor s, which this fold holds out."""
+    """Return the predictions of the rows of sensor s, which this fold holds out."""
     model, log = fold.model, fold.log
     own = np.flatnonzero(
         (log.kind[: log.n] == READING) & (log.channel[: log.n] == s) & (fold.track.verdict == HELD_OUT)

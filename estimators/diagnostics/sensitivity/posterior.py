@@ -26,7 +26,7 @@ LOOKS = 150
 """Times at which the cloud is looked at; finding its peaks takes milliseconds."""
 
 MOST_STATES = 12
-"""Of a cloud: beyond, particles that explain a reading become too rare for its shape to say anything."""
+"""States up to which the shape of a particle cloud is informative: beyond, too few particles explain a measurement."""
 
 MOST_EVENTS = 4000
 
@@ -34,7 +34,7 @@ DISTINCT = 0.2
 """Share of a cloud's members that must differ after a reading; of fewer, clusters are of chance."""
 
 COLLAPSED = 0.5
-"""Share of the looks at a collapsed cloud, from which on its shape says nothing."""
+"""Share of looks at a collapsed cloud from which its shape is not informative."""
 
 WEIGHT = 0.001
 """Share of the other cloud that a peak must have there, too."""
@@ -59,7 +59,7 @@ LEAST = 50
 
 
 class Peaks(NamedTuple):
-    """Of a cloud, at `looks` times: share of them with more than one peak, and the most there were.
+    """Peaks of a particle cloud at `looks` times: share with more than one peak, and their largest number.
 
     `collapsed` is the share of the times at which so few members differed that peaks would be of chance; they do not
     count. `reason` says why nothing can be told. `recoveries` counts how often the cloud lost the asset: then its shape

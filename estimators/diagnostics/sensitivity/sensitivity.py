@@ -123,13 +123,13 @@ def sensitivity(
     detection: float = 0.95,
     executor: Executor | str | None = "threads",
 ) -> Sensitivity:
-    """Nudge every sensor row, input and parameter, fold the log again, and look at what moved.
+    """Nudge every sensor row, input and parameter, and refold the log.
 
-    A fault is a constant that is there from the first of the events looked at to the last. What it does is folded at
-    its own size, so the model need not be linear; `fisher` is of derivatives.
+    A fault is constant over all events, and folded at its own size, so the model need not be linear; `fisher` is
+    computed from derivatives.
 
     Args:
-        estimator: Of the twin; particles and ensembles are replaced by a filter without chance, see `note`.
+        estimator: Of the twin; particle and ensemble filters are replaced by a deterministic one, see `note`.
         model: Of at most 64 states.
         tuning: As the twin's.
         log: The events; it must not grow meanwhile (give a copy). Refused readings stay refused.
