@@ -56,7 +56,7 @@ def test_where_nothing_tells_the_asset_is_believed_after_a_time(name):
     assert outcomes(growing) == ["doubted", "believed"]
     believed = growing.decisions[1]
     assert JUMP + 30.0 <= believed.time <= JUMP + 30.0 + 0.15 and believed.witnesses == 0
-    assert "nothing told for 30 s" in believed.text
+    assert "no evidence for 30 s" in believed.text
     at = believed.row - growing.log.first
     assert growing.track.verdict[at] == GATED and np.all(growing.track.verdict[at + 1 :] != GATED)
     sooner = folded(name, series(1, a=5.0, with_b=False), TUNING.set("gate.reopen", 5.0))
