@@ -1,6 +1,6 @@
-"""What a model is: its declaration, the checks when it loads, and the models made from it.
+"""State-space models: their declaration and checks, and models assembled from others.
 
-What a model's file needs is here: `from estimators.model import Row, Sensor, State, StateSpaceModel`.
+A model's file imports from here: `from estimators.model import Row, Sensor, State, StateSpaceModel`.
 """
 
 from .state_space import Field, Input, Jump, Limits, Noise, Parameter, Row, Sensor, State, StateSpaceModel, Stuck

@@ -1,4 +1,4 @@
-"""A model put together from its physics and what a twin appends to it.
+"""Assemble a model from its physics and the additions of a twin.
 
 The order is fixed, and each step wraps the model of the step before:
 

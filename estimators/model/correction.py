@@ -1,22 +1,22 @@
-"""Learned corrections: what one adds to the rates of some states, and what share of its ignorance is left there.
+"""Learned corrections of the rates of some states, with the remaining share of their variance.
 
-A correction has learned from windows of recordings: their features z (d of the model's states and inputs), and the
-rates r, units of the state a second, by which the physics was wrong in them. It gives m(z), and s(z) from 0 to 1: the
-variance that is left beside that of knowing nothing. Far from its windows m → 0 and s → 1, which leaves the physics.
+A correction is trained on windows of recordings: their features z (d of the model's states and inputs), and the errors
+r of the model's rates in them, in units of the state a second. It gives the correction m(z), and s(z) from 0 to 1: the
+remaining variance relative to that without data. Far from its windows m → 0 and s → 1, which leaves the physics.
 
 Gaussian process, the prior variance being 1 for all corrected states:
 
     κᵢ = exp(-½ Σⱼ ((zⱼ - Zᵢⱼ) / ℓⱼ)²),   m = κᵀ (K + ρ I)⁻¹ r,   s = 1 - κᵀ (K + ρ I)⁻¹ κ
 
 Ridge, over φ = (1, z, and for degree 2 all zᵢ zⱼ) of standardised features, where D is the Mahalanobis distance from
-the windows and g = exp(-½ max(0, D - reach)²) how far it is believed:
+the windows and g = exp(-½ max(0, D - reach)²) its weight there:
 
     m = g φᵀ A⁻¹ Φᵀ r,   A = ΦᵀΦ + λ I,   s = 1 - g (1 - min(1, λ φᵀ A⁻¹ φ / mean |Φ|²))
 
-A net that somebody else has trained says m itself, and is believed as far as ridge is: m = g·net(z), s = 1 - g.
+A pretrained net gives m itself, with the weight of ridge: m = g·net(z), s = 1 - g.
 
 Sources: Rasmussen & Williams (2006), Gaussian Processes for Machine Learning, (2.25), (2.26), and 2.1.1 for ridge as
-what is believed of weights; Ko & Fox (2009), GP-BayesFilters, doi:10.1007/s10514-009-9119-x, for Q of x from s.
+a Bayesian regression; Ko & Fox (2009), GP-BayesFilters, doi:10.1007/s10514-009-9119-x, for Q of x from s.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ from functools import cached_property
 import numpy as np
 from scipy.linalg import cho_solve, solve_triangular
 
-APART = 0.01
-"""Added to the diagonal of a correlation of features: two that say the same may differ by a tenth of a deviation."""
+FEATURE_JITTER = 0.01
+"""Added to the diagonal of a correlation of features, so that equal features do not make it singular."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +46,7 @@ class GaussianProcess:
 
     @cached_property
     def data(self) -> tuple[np.ndarray, ...]:
-        """What the compiled functions take: Z / ℓ, 1 / ℓ, weights (M, k), and L⁻¹ (M, M) with L Lᵀ = K + ρ I."""
+        """Data of the compiled functions: Z / ℓ, 1 / ℓ, weights (M, k), and L⁻¹ (M, M) with L Lᵀ = K + ρ I."""
         scaled = np.ascontiguousarray(self.points / self.lengths)
         K = self._near(self.points) + self.ratio * np.eye(len(scaled))
         L = np.linalg.cholesky(K)
@@ -55,24 +55,24 @@ class GaussianProcess:
         return scaled, 1.0 / self.lengths, np.ascontiguousarray(weights), np.ascontiguousarray(root)
 
     def _near(self, z: np.ndarray) -> np.ndarray:
-        """κ (N, M) of features z (N, d)."""
+        """Return κ (N, M) of features z (N, d)."""
         off = z[:, None, :] / self.lengths - self.points / self.lengths
         near: np.ndarray = np.exp(-0.5 * np.sum(off**2, axis=-1))
         return near
 
     def mean(self, z: np.ndarray) -> np.ndarray:
-        """m (N, k) at features z (N, d)."""
+        """Return m (N, k) at features z (N, d)."""
         found: np.ndarray = self._near(z) @ self.data[2]
         return found
 
     def share(self, z: np.ndarray) -> np.ndarray:
-        """s (N,) at features z (N, d)."""
+        """Return s (N,) at features z (N, d)."""
         explained = np.sum((self._near(z) @ self.data[3].T) ** 2, axis=1)
         return np.clip(1.0 - explained, 0.0, 1.0)
 
     @property
     def functions(self) -> tuple[Callable, Callable, Callable]:
-        """Plain functions that are compiled: they add m, its slope, and say s."""
+        """Plain functions to compile: they add m, add its slope, and return s."""
         return process_add, process_slope, process_share
 
 
@@ -96,7 +96,7 @@ class Ridge:
 
     @cached_property
     def data(self) -> tuple[np.ndarray, ...]:
-        """What the compiled functions take: `support`, terms, weights (n, k), and C (n, n): s = 1 - g (1 - φᵀCφ)."""
+        """Data of the compiled functions: `support`, terms, weights (n, k), and C (n, n): s = 1 - g (1 - φᵀCφ)."""
         centre, scale, precision, reach = support(self.points)
         phi = self._phi((self.points - centre) / scale)
         A = phi.T @ phi + self.penalty * np.eye(phi.shape[1])
@@ -111,27 +111,27 @@ class Ridge:
         return phi
 
     def mean(self, z: np.ndarray) -> np.ndarray:
-        """m (N, k) at features z (N, d)."""
+        """Return m (N, k) at features z (N, d)."""
         centre, scale, _, _, _, weights, _ = self.data
-        found: np.ndarray = believed(z, self.data)[:, None] * (self._phi((z - centre) / scale) @ weights)
+        found: np.ndarray = weight(z, self.data)[:, None] * (self._phi((z - centre) / scale) @ weights)
         return found
 
     def share(self, z: np.ndarray) -> np.ndarray:
-        """s (N,) at features z (N, d)."""
+        """Return s (N,) at features z (N, d)."""
         centre, scale, *_, C = self.data
         phi = self._phi((z - centre) / scale)
         left = np.minimum(1.0, np.einsum("ni,ij,nj->n", phi, C, phi))
-        return 1.0 - believed(z, self.data) * (1.0 - left)
+        return 1.0 - weight(z, self.data) * (1.0 - left)
 
     @property
     def functions(self) -> tuple[Callable, Callable, Callable]:
-        """Plain functions that are compiled: they add m, its slope, and say s."""
+        """Plain functions to compile: they add m, add its slope, and return s."""
         return ridge_add, ridge_slope, ridge_share
 
 
 @dataclass(frozen=True, eq=False)
 class Net:
-    """A function of features (N, d) that gives rates (N, k), believed as far as the points (M, d) reach.
+    """A function of features (N, d) that gives rates (N, k), weighted by the distance from the points (M, d).
 
     It is not compiled, so the model that it corrects becomes a black box.
     """
@@ -141,17 +141,17 @@ class Net:
 
     @cached_property
     def data(self) -> tuple[np.ndarray, ...]:
-        """What the compiled function takes: see `support`."""
+        """Data of the compiled function, see `support`."""
         return support(self.points)
 
     def mean(self, z: np.ndarray) -> np.ndarray:
-        """m (N, k) at features z (N, d)."""
-        found: np.ndarray = believed(z, self.data)[:, None] * self.run(z)
+        """Return m (N, k) at features z (N, d)."""
+        found: np.ndarray = weight(z, self.data)[:, None] * self.run(z)
         return found
 
     def share(self, z: np.ndarray) -> np.ndarray:
-        """s (N,) at features z (N, d)."""
-        return 1.0 - believed(z, self.data)
+        """Return s (N,) at features z (N, d)."""
+        return 1.0 - weight(z, self.data)
 
     @property
     def functions(self) -> tuple[None, None, Callable]:
@@ -163,17 +163,17 @@ Correction = GaussianProcess | Ridge | Net
 
 
 def support(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Where points (M, d) lie: centre and scale (d,), inverse correlation (d, d), and their greatest distance (1,)."""
+    """Return centre and scale (d,), inverse correlation (d, d) and greatest distance (1,) of points (M, d)."""
     centre, scale = points.mean(axis=0), points.std(axis=0)
     z = (points - centre) / scale
     d = points.shape[1]
-    precision = np.linalg.inv(z.T @ z / len(z) + APART * np.eye(d))
+    precision = np.linalg.inv(z.T @ z / len(z) + FEATURE_JITTER * np.eye(d))
     reach = np.sqrt(np.max(np.einsum("ni,ij,nj->n", z, precision, z)))
     return centre, scale, precision, np.array([reach])
 
 
-def believed(z: np.ndarray, data: tuple[np.ndarray, ...]) -> np.ndarray:
-    """g (N,) at features z (N, d), of a support."""
+def weight(z: np.ndarray, data: tuple[np.ndarray, ...]) -> np.ndarray:
+    """Return g (N,) at features z (N, d), for a support."""
     centre, scale, precision, reach = data[:4]
     off = (z - centre) / scale
     beyond = np.maximum(0.0, np.sqrt(np.einsum("ni,ij,nj->n", off, precision, off)) - reach[0])
@@ -244,7 +244,7 @@ def _standard(x, u, place, data, z):
     return np.sqrt(square)
 
 
-def _belief(distance, reach):
+def _weight(distance, reach):
     """g of a distance D."""
     beyond = distance - reach
     if beyond.real <= 0.0:
@@ -252,9 +252,9 @@ def _belief(distance, reach):
     return np.exp(-0.5 * beyond * beyond)
 
 
-def _term(z, pair, whole):
-    """One entry of φ, of features whose product with nothing is `whole`."""
-    value = whole
+def _term(z, pair, factor):
+    """Return one entry of φ times `factor`."""
+    value = factor
     if pair[0] >= 0:
         value = value * z[pair[0]]
     if pair[1] >= 0:
@@ -266,7 +266,7 @@ def ridge_add(x, u, dt, place, target, data, out):
     """out[target] += dt m."""
     _, _, _, reach, terms, weights, _ = data
     z = np.empty(place.size, x.dtype)
-    g = _belief(_standard(x, u, place, data, z), reach[0])
+    g = _weight(_standard(x, u, place, data, z), reach[0])
     for i in range(terms.shape[0]):
         term = _term(z, terms[i], g)
         for c in range(target.size):
@@ -278,7 +278,7 @@ def ridge_slope(x, u, dt, place, target, data, out):
     _, scale, precision, reach, terms, weights, _ = data
     z = np.empty(place.size)
     distance = _standard(x, u, place, data, z)
-    g = _belief(distance, reach[0])
+    g = _weight(distance, reach[0])
     for j in range(place.size):
         if place[j] < 0:
             continue
@@ -301,7 +301,7 @@ def ridge_share(x, u, place, data):
     """s."""
     _, _, _, reach, terms, _, C = data
     z = np.empty(place.size)
-    g = _belief(_standard(x, u, place, data, z), reach[0])
+    g = _weight(_standard(x, u, place, data, z), reach[0])
     left = 0.0
     for i in range(terms.shape[0]):
         row = _term(z, terms[i], 1.0)
@@ -313,4 +313,4 @@ def ridge_share(x, u, place, data):
 def net_share(x, u, place, data):
     """s."""
     z = np.empty(place.size)
-    return 1.0 - _belief(_standard(x, u, place, data, z), data[3][0])
+    return 1.0 - _weight(_standard(x, u, place, data, z), data[3][0])

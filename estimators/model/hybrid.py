@@ -120,7 +120,7 @@ def gathered(X: np.ndarray, u: np.ndarray, place: np.ndarray) -> np.ndarray:
 def _added(
     function: Callable, addition: Any, learned: LearnedCorrection, place: tuple[int, ...], target: tuple[int, ...]
 ) -> Callable:
-    """Return f or F followed by what the correction adds to its result."""
+    """Return f or F with the correction added to its result."""
     inner, add = as_inner(function), as_inner(addition)
     features, states, data = np.array(place), np.array(target), learned.correction.data
 

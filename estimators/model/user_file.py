@@ -1,7 +1,7 @@
-"""Functions of a model's own file, which lies where Python does not look: run under a name, here or in other processes.
+"""Run a model's own file, which is not on the import path, as a module; here or in other processes.
 
-What goes to another process goes by the name of its module, which that process then imports. A model beside its twin's
-YAML has no such name; so its functions go with the path of their file, which is run there under the same name, once.
+Functions are pickled by the name of their module, which the other process imports. The file of a model beside its
+twin's YAML has no importable name; so its functions are pickled with its path, and the file is run there once.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from types import CodeType, ModuleType
 from typing import Any
 
 MARK = "~"
-"""In the name of a function, before what tells the versions of the files that its own file imports."""
+"""Separates the name of a function from the digest of the files that its own file imports."""
 
 
 _guarded: set[str] = set()
@@ -51,7 +51,7 @@ def _guard(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def imported_beside(path: Path) -> tuple[Path, ...]:
-    """The files in a Python file's folder, and below it, that it imports, and those that they import, by name."""
+    """Return the files in or below a Python file's folder that it imports, directly or indirectly, by name."""
     path, found = path.resolve(), set[Path]()
     waiting = [path]
     while waiting:
@@ -71,7 +71,7 @@ def imported_beside(path: Path) -> tuple[Path, ...]:
 
 
 def _imports(tree: ast.Module, file: Path, top: Path) -> Iterator[tuple[Path, str]]:
-    """What a file imports: the folder where it is sought, and its dotted name."""
+    """Yield the imports of a file: the folder to search, and the dotted name."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             yield from ((top, alias.name) for alias in node.names)
@@ -85,7 +85,7 @@ def _imports(tree: ast.Module, file: Path, top: Path) -> Iterator[tuple[Path, st
 
 
 def _forget(files: tuple[Path, ...]) -> None:
-    """Let these be imported anew, as they may have been edited."""
+    """Import these files again the next time, since they may have been edited."""
     importlib.invalidate_caches()
     for name, module in list(sys.modules.items()):
         file = getattr(module, "__file__", None)
@@ -94,16 +94,16 @@ def _forget(files: tuple[Path, ...]) -> None:
 
 
 def _marked(code: CodeType, mark: str) -> CodeType:
-    """The code, with functions of other names in it, so that no machine code of before is taken for theirs."""
+    """Return the code with other names of its functions, so that machine code of another version is not used."""
     inner = tuple(_marked(item, mark) if isinstance(item, CodeType) else item for item in code.co_consts)
     return code.replace(co_consts=inner, co_qualname=code.co_qualname + mark)
 
 
 def run_file(name: str, path: Path) -> ModuleType:
-    """Run a Python file as the module `name`, with its folder importable meanwhile, and what it imports there anew.
+    """Run a Python file as the module `name`, with its folder importable; files imported from there are run again.
 
-    Numba keeps machine code under a function's own file and name. What that took from another file, a constant say, is
-    part of neither; so the bytes of the files that this one imports become part of its functions' names.
+    Numba caches machine code by a function's file and name, which do not change if an imported constant does. So a
+    digest of the imported files becomes part of the functions' names.
 
     Raises:
         ImportError: If its name does not end in .py.
@@ -118,7 +118,7 @@ def run_file(name: str, path: Path) -> ModuleType:
     _forget(beside)
     _refuse_exit((path, *beside))
     sys.path.insert(0, str(path.parent))
-    # Nothing is left beside the user's files, by those that this one imports either.
+    # No bytecode is written beside the user's files.
     before, sys.dont_write_bytecode = sys.dont_write_bytecode, True
     try:
         # Not through the loader, which would trust a stale __pycache__.
@@ -137,7 +137,7 @@ def run_file(name: str, path: Path) -> ModuleType:
 
 
 def portable(function: Callable) -> Callable:
-    """The function, or, if Python does not find its module by name, one that is pickled with the path of its file."""
+    """Return the function, or one that is pickled with its file's path if its module cannot be imported by name."""
     if isinstance(function, partial):
         return partial(portable(function.func), *function.args, **function.keywords)
     name = getattr(function, "__module__", None) or ""
@@ -151,7 +151,7 @@ def portable(function: Callable) -> Callable:
 
 
 class _FromFile:
-    """A function that is pickled as the place of its source, and found there when it is called."""
+    """A function that is pickled as the path of its source, and loaded from there when it is called."""
 
     def __init__(self, module: str, name: str, file: str, stamp: int, function: Callable | None = None) -> None:
         self._place = module, name, file, stamp
