@@ -1,1 +1,1 @@
-"""The one loopback port: the page, the API, and what is passed through."""
+"""The page: its server, API and streams, and the gallery of twins."""

@@ -16,7 +16,7 @@ from ..live.interface import Running
 from .http import parse, shown
 
 MAX_NAME_BYTES = 255
-"""Of a file's name, on nearly all file systems."""
+"""Longest file name on nearly all file systems."""
 
 COMMANDS = {kind.__name__: kind for kind in typing.get_args(commands.Command)}
 

@@ -1,7 +1,7 @@
-"""The one port of the page: open as long as the process, while what is behind it changes.
+"""The one port of the page: open as long as the process, while the application behind it changes.
 
-A twin, another twin, or none: whoever was connected to what went is disconnected, comes again and finds what is there
-now. The token, the port and the rules of who may enter stay.
+That is a twin, another twin, or none. Clients of an application that is replaced are disconnected; they reconnect and
+find the new one. Port, token and access rules stay.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ GONE = 1012
 NOTHING = "no twin runs; choose one in the gallery"
 
 CONNECTIONS = 96
-"""Open at a time. A page holds up to eight; each of its Viser panes costs one more descriptor within the process, and
+"""Open connections. A page holds up to eight; each of its Viser panes costs one more descriptor within the process, and
 some systems allow 256 in all."""
 
 BACKLOG = 64
-"""Connections that are accepted at once, before the first of them can be refused."""
+"""Connections that may wait to be accepted."""
 
 REQUEST_TIMEOUT_S = 10.0
 """From the first byte of a request, or the connection, to the last byte of its body."""
@@ -55,18 +55,18 @@ def _policy(port: int, scripts: str) -> str:
 
 
 class Shown:
-    """An application behind the door; `boot` tells it from what was there before."""
+    """An application behind the door; `boot` distinguishes it from those before."""
 
     def __init__(self, application: App, boot: str) -> None:
         self.application, self.boot = application, boot
         self.left = asyncio.Event()
-        """Set when something else has taken its place, by the thread of the server."""
+        """Set by the server's thread when another application has taken its place."""
         self.over = threading.Event()
-        """Set once nobody is connected to it any more either."""
+        """Set once it has no connection left either."""
         self._open = 0
 
     async def stream(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Serve a WebSocket for as long as this is shown."""
+        """Serve a WebSocket while this application is shown."""
         self._open += 1
         try:
             await self.application(scope, _until(receive, self.left), send)
@@ -75,7 +75,7 @@ class Shown:
             self._look()
 
     def leave(self) -> None:
-        """Something else is shown; in the thread of the server."""
+        """Give way to another application; in the server's thread."""
         self.left.set()
         self._look()
 
@@ -85,7 +85,7 @@ class Shown:
 
 
 class Door:
-    """Serves what is shown, and its own routes before it, from a thread of its own."""
+    """Serves its own routes, then the application that is shown, from a thread of its own."""
 
     def __init__(self, port: int) -> None:
         """Take the port; 0 takes a free one.
@@ -105,7 +105,7 @@ class Door:
         gate = Gate(_WithHeaders(self._enter, self.port), self._token, self.port)
         self.entered = gate.entered
         self.stage_pass = gate.stage_pass if self._listening.localhost else None
-        """What lets a frame under the other loopback name see the stage; None where that name may not be ours."""
+        """Pass for a frame under the other loopback name to see the stage; None where that name may not be ours."""
         config = uvicorn.Config(
             gate, log_config=None, log_level="critical", access_log=False,
             server_header=False, lifespan="off", ws_per_message_deflate=False, timeout_graceful_shutdown=1, 
@@ -118,29 +118,29 @@ class Door:
 
     @property
     def url(self) -> str:
-        """Address of the page, with the token that it asks for."""
+        """Address of the page, with its token."""
         return f"http://127.0.0.1:{self.port}/?token={self._token}"
 
     @property
     def boot(self) -> str:
-        """What tells that which is shown from all that was: a page that knows another one loads again."""
+        """Identity of the application that is shown: a page of another one reloads."""
         return self._shown.boot
 
     @property
     def furnished(self) -> bool:
-        """Whether there is more than what is shown: a gallery."""
+        """Whether it has routes of its own: a gallery."""
         return bool(self._own.routes)
 
     def furnish(self, routes: Sequence[BaseRoute], page: App) -> None:
-        """What is served whatever is shown, and which page while nothing is; before the start."""
+        """Add routes that are always served, and the page for when nothing is shown; before the start."""
         self._own.router.routes.extend(routes)
         self._page = page
 
     def show(self, application: App | None, boot: str | None = None) -> threading.Event:
-        """Put an application behind the door in place of what is there, or nothing; from any thread.
+        """Put another application behind the door, or none; from any thread.
 
         Returns:
-            Set once nobody is connected any more to what was there.
+            An event that is set once the previous application has no connection left.
         """
         before = self._shown
         boot = uuid.uuid4().hex if boot is None else boot
@@ -175,7 +175,7 @@ class Door:
         await serve(scope, receive, send)
 
     async def _nothing(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """No twin runs. A page that still shows one is told to load again, others the reason."""
+        """Answer while no twin runs: a page that still shows one reloads, others get the reason."""
         if scope["type"] == "websocket":
             browser = WebSocket(scope, receive, send)
             await browser.accept()
@@ -190,7 +190,7 @@ class Door:
 
 
 def _until(receive: Receive, left: asyncio.Event) -> Receive:
-    """What a browser says, until what it speaks to has gone."""
+    """Return a `receive` that disconnects once the application has gone."""
 
     async def take() -> Any:
         said, gone = asyncio.ensure_future(receive()), asyncio.ensure_future(left.wait())
@@ -239,7 +239,7 @@ class BoundedProtocol(H11Protocol):
     """uvicorn's HTTP, with a time for each request and a number of connections, neither of which uvicorn bounds."""
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """Take the connection; if there are too many, the one that has been silent longest makes room."""
+        """Take the connection; if there are too many, the one idle for longest is closed."""
         super().connection_made(transport)
         self._since = self.loop.time()
         self._deadline: asyncio.TimerHandle | None = None
@@ -255,17 +255,17 @@ class BoundedProtocol(H11Protocol):
         self._watch()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """The connection is gone."""
+        """Forget the connection's deadline."""
         self._done()
         super().connection_lost(exc)
 
     def on_response_complete(self) -> None:
-        """The next request may begin; what it began with may be here already."""
+        """Expect the next request, the start of which may have arrived already."""
         self._since = self.loop.time()
         super().on_response_complete()
 
     def _idle(self, newcomer: BoundedProtocol) -> bool:
-        """Whether no request of this connection is being answered; it may be closed then."""
+        """Return whether no request of this connection is being answered, so that it may be closed."""
         return self is not newcomer and (self.cycle is None or self.cycle.response_complete)
 
     def _watch(self) -> None:

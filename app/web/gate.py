@@ -1,4 +1,4 @@
-"""Who may speak to the page server: a browser on this machine, on the page itself, that has shown the token.
+"""Access to the page server: for a browser on this machine, on the page itself, that has shown the token.
 
 A web page anywhere can make the user's browser send requests to 127.0.0.1, and a name anywhere can be made to point
 there. So every request, WebSocket upgrades included, is refused before any work unless its Host is a loopback name, its
@@ -34,7 +34,7 @@ REFUSED_TOKEN = "Nisus: open the page at the address, with its token, that `nisu
 
 
 def session_token() -> str:
-    """A token for one session: one that was seen somewhere is worth nothing from the next start on."""
+    """Return a token for one session; the next one has another."""
     return secrets.token_urlsafe(32)
 
 
@@ -45,15 +45,15 @@ class Gate:
         self._app = app
         self._token = token.encode()
         self.entered = threading.Event()
-        """Set once a browser has come with the token."""
+        """Set once a browser has shown the token."""
         self._cookie_name = f"nisus_{port}"
-        # The cookie is not the token: whoever reads one cannot make the other's address of it.
+        # The cookie is not the token, so that it does not reveal the address.
         self._cookie = self._derived(f"cookie {port}")
         self._pass = self._derived(f"stage {port}")
 
     @property
     def stage_pass(self) -> str:
-        """What the page puts into the address of the stage that it frames."""
+        """Pass in the address of the stage, which the page frames."""
         return self._pass.decode()
 
     def _derived(self, purpose: str) -> bytes:
@@ -104,7 +104,7 @@ class Gate:
         return kind.lower() == "bearer" and hmac.compare_digest(value.strip().encode(), self._token)
 
     async def _exchange(self, headers: _Headers, send: Send) -> None:
-        """Put the token into a cookie and out of the address."""
+        """Move the token from the address into a cookie."""
         self.entered.set()
         cookie = f"{self._cookie_name}={self._cookie.decode()}; Path=/; HttpOnly; SameSite=Strict"
         common = [

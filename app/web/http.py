@@ -30,10 +30,10 @@ PAGE = Path(__file__).parent / "page"
 """Folder of the page's HTML, CSS and JavaScript."""
 
 MAX_BODY_BYTES = 64 * 1024
-"""Of a request's body, or of a browser's message on a stream; a command takes a hundred bytes."""
+"""Longest request body, and longest message of a browser on a stream; a command takes a hundred bytes."""
 
 MAX_REASON_CHARACTERS = 500
-"""Of an error line, which may quote the request."""
+"""Longest error line; it may quote the request."""
 
 QUEUE_TIMEOUT_S = 15.0
 """How long a question waits for the one before it."""

@@ -1,4 +1,4 @@
-"""A twin that runs, with all around it: engine, recorder, and behind a page's door its scene and what serves it."""
+"""A running twin with its engine and recorder, and with a page also its scene and page server."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ if TYPE_CHECKING:
 
 
 Stamp = tuple[tuple[int, int] | None, ...]
-"""Of some files: when each was written, ns, and how large it is; None where there is none."""
+"""Time of writing, ns, and size of each of some files; None where one is missing."""
 
 
 def stamp_of(files: tuple[Path, ...]) -> Stamp:
-    """When each file was written and how large it is; None while an editor has taken it away."""
+    """Return time of writing and size of each file; None while an editor has removed it."""
     found: list[tuple[int, int] | None] = []
     for file in files:
         try:
@@ -44,12 +44,11 @@ def stamp_of(files: tuple[Path, ...]) -> Stamp:
 
 @dataclass(frozen=True)
 class Opening:
-    """What is to run: a twin on its source, or a recording of one.
+    """A twin and its source, ready to run, or a recording of one.
 
-    `open_source`, `base` and `horizon` are those of `Engine`; `review` is the recording that is reviewed, `said` what
-    its session had said, `remarks` what there is to say of it now, (level, text). `files` are those from which the twin
-    was read, `stamp` what they were then, and `again` reads them once more; none of a recording, which holds its own.
-    `workshop` compiles its filters, and stops with the engine.
+    `open_source`, `base` and `horizon` are those of `Engine`; `review` is the reviewed recording, `said` the notices of
+    its session, `remarks` new notices, (level, text). `files` are the twin's files, `stamp` their state when read, and
+    `again` reads them once more; a recording has none. `workshop` compiles its filters, and stops with the engine.
     """
 
     twin: Twin
@@ -66,7 +65,7 @@ class Opening:
 
 
 class RunningTwin:
-    """Starts what a twin needs, in order, and stops it in reverse."""
+    """Starts the parts of a running twin in order, and stops them in reverse."""
 
     def __init__(
         self, opening: Opening, *, door: Door | None, split: Split = NEVER, recordings: Path | None = None
@@ -77,7 +76,7 @@ class RunningTwin:
             opening: What to run.
             door: Behind which the page shows it, once it is started; None for no page.
             split: Into what parts to split a recording.
-            recordings: The folder of what the page records; None is the working directory.
+            recordings: Folder of recordings made on the page; None is the working directory.
 
         Raises:
             NisusError: If the source cannot be opened.
@@ -105,7 +104,7 @@ class RunningTwin:
         self.view: Any = None
         self.server: Any = None
         self.gone: threading.Event | None = None
-        """Set, once this was started, when nobody is connected any more to what the page showed before."""
+        """After the start: set once the application shown before has no connection left."""
         if door is not None:
             from ..views.viser.view import ViserView
             from .server import PageServer
@@ -127,7 +126,7 @@ class RunningTwin:
                 raise
 
     def discard(self) -> None:
-        """Give up what was put together and never started."""
+        """Discard a twin that was never started."""
         self.engine.stop()
         if self.view is not None:
             self.view.stop()

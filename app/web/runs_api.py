@@ -33,7 +33,7 @@ from ..twin.twin import with_version
 from .http import OneAtATime, get, post
 
 MAX_SECONDS = 1e9
-"""Of a time that can be asked for, to either side."""
+"""Largest time of a query, to either side."""
 
 MAX_ERRORS = 6
 """States whose error the report gives for each run."""

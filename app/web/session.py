@@ -1,4 +1,4 @@
-"""The process that runs twins: one port, one twin at a time, from the start to Ctrl-C."""
+"""The process that runs twins: one port, one twin at a time, until Ctrl-C."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from ..views.recording.writer import Recorder
 
 DISCONNECT_TIMEOUT_S = 3.0
-"""Seconds for the browsers to let go of a twin that was stopped."""
+"""How long browsers may keep connections to a stopped twin."""
 
 SWITCH = 0.0005
 """Seconds after which Python lets another thread run; its default of 5 ms is as long as a reading may take in all."""
@@ -45,17 +45,17 @@ SWITCH = 0.0005
 
 @dataclass(frozen=True)
 class Page:
-    """Where the page is served, and whether to open it."""
+    """Port of the page, and whether to open it in a browser."""
 
     port: int
     open_browser: bool
 
 
 def _settle(gone: threading.Event | None = None, before: Callable[[], Engine | None] | None = None) -> None:
-    """What a start has built stays: looking through it again and again would hold readings up for milliseconds.
+    """Keep the objects of a start out of garbage collections, which would delay measurements by milliseconds.
 
-    Not so what ran before, which is garbage once nobody is connected to it any more (`gone`) and the last request to it
-    was answered: `before` gives its engine until then.
+    The twin before is garbage once it has no connection left (`gone`) and its last request is answered: `before`
+    gives its engine until then.
     """
     end = time.monotonic() + DISCONNECT_TIMEOUT_S
     if gone is not None:
@@ -104,7 +104,7 @@ class Session:
             open_source: See `Engine`; of a twin.
             page: Where to serve the page; None for no page.
             split: Into what parts to split a recording.
-            recordings: The folder of what the page records; None is the working directory.
+            recordings: Folder of recordings made on the page; None is the working directory.
 
         Raises:
             NisusError: If the source cannot be opened, or the port is in use.
@@ -116,7 +116,7 @@ class Session:
         self._changing = threading.RLock()
         self._recorded: list[Path] = []
         self.beside: list[Beside] = []
-        """What starts and stops with the session."""
+        """Threads that start and stop with the session."""
         if page is not None:
             self.door = Door(page.port)
         try:
@@ -131,12 +131,12 @@ class Session:
 
     @property
     def engine(self) -> Engine:
-        """That of the twin that runs."""
+        """That of the running twin."""
         return self._ran.engine
 
     @property
     def recorder(self) -> Recorder:
-        """That of the twin that runs."""
+        """That of the running twin."""
         return self._ran.recorder
 
     @property
@@ -146,7 +146,7 @@ class Session:
 
     @property
     def server(self) -> Any:
-        """What serves it; None without a page."""
+        """Its page server; None without a page."""
         return self._ran.server
 
     @property
@@ -161,12 +161,12 @@ class Session:
 
     @property
     def recorded(self) -> list[Path]:
-        """Files that this session has recorded, wherever they are."""
+        """Files that this session has recorded, in any folder."""
         running = self.running
         return [*self._recorded, *([] if running is None else running.recorder.written)]
 
     def prepared(self, opening: Opening) -> RunningTwin:
-        """A twin put together, for `change`.
+        """Return a twin for `change`, put together but not started.
 
         Raises:
             NisusError: If its source cannot be opened.

@@ -246,7 +246,7 @@ def belief_json(engine: Running, i: int, j: int) -> dict[str, Any] | None:
 
 
 async def feed_rerun(browser: WebSocket, feed: RerunFeed, status: Callable[[], dict[str, Any]]) -> None:
-    """Feed one Rerun viewer, and tell its window the status."""
+    """Feed one Rerun viewer, and send its window the status."""
     drawn = asyncio.Event()
     drawn.set()
 

@@ -22,7 +22,7 @@ from ..present.series.columns import columns_of
 
 
 def status_json(engine: Running) -> dict[str, Any]:
-    """What the page's header shows, and more for whoever asks."""
+    """Return the state of a running twin, as the page's header shows it and more."""
     status = engine.status()
     commissioned = status.tuning.baseline is not None
     judged = NisVerdict(status.nis, status.nis_low, status.nis_high, commissioned, status.nis_judged)
@@ -94,7 +94,7 @@ def _runs(revisions: Revisions) -> dict[str, Any]:
 
 
 def episodes_json(engine: Running) -> list[dict[str, Any]]:
-    """What was and is wrong, in the order of its start: times in seconds of the log, `help` in docs/alarms.md."""
+    """Return all episodes by their start: times in seconds of the log, `help` in docs/alarms.md."""
     return [
         episode_json(episode) | {"help": f"docs/alarms.md#{row.anchor}", "severity": row.severity}
         for episode in engine.episodes()

@@ -41,7 +41,7 @@ def _row(tag: str, cells: list[str]) -> str:
 
 
 def _words(text: str) -> str:
-    """Code, bold and emphasis within a line; what stands in code is as it is."""
+    """Render code, bold and emphasis within a line; code stays as it is."""
     parts = re.split(r"`([^`]+)`", escape(" ".join(text.split()), quote=False))
     for k, part in enumerate(parts):
         if k % 2:
@@ -58,7 +58,7 @@ PLACES = (
     Path(__file__).resolve().parents[3] / NAME,
     Path(sysconfig.get_path("data")) / "share" / "nisus" / Path(NAME).name,
 )
-"""Beside the packages, or where an installation puts it."""
+"""In the checkout, or where an installation puts it."""
 
 
 @cache
@@ -75,7 +75,7 @@ def alarms_text() -> str:
 
 
 def advice(cause: str, label: str) -> str:
-    """What is said of a cause under a label such as "Response"; "" if nothing is."""
+    """Return the text of a cause under a label such as "Response"; "" without one."""
     try:
         sections = re.split(r"^#+ ", alarms_text(), flags=re.MULTILINE)
     except ConfigError:

@@ -1,4 +1,4 @@
-"""How far the bands can be believed, in lines."""
+"""Calibration of confidence bands, in lines of text."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from estimators.tuning import SHARED_ENTRY_ROWS
 
 
 def calibration_lines(found: Sequence[Calibration], model: StateSpaceModel) -> list[str]:
-    """A line for what each row or state has to say; the many rows of one sensor, or many states, are one."""
+    """Return a line for each row or state; many rows of one sensor, or many states, share one."""
     many = {
         model.row_names[start + k]: sensor.name
         for sensor, start in zip(model.sensors, model.row_start, strict=True)
@@ -40,7 +40,7 @@ def calibration_lines(found: Sequence[Calibration], model: StateSpaceModel) -> l
 
 
 def _figures(entry: Calibration) -> str:
-    """The figures of a row or state of which nothing need be said."""
+    """Return the figures of a calibrated row or state."""
     shares = ", ".join(f"{100 * share.value:.3g}" for share in entry.coverage)
     bands = ", ".join(f"{100 * band:.0f}" for band in BANDS)
     said = [f"{shares} % in the {bands} % bands"]

@@ -1,4 +1,4 @@
-"""The report of a run: what it was, what it was worth, its charts, checks, episodes and tuning, as sections."""
+"""Report of a run: settings, scores, episodes, charts, checks and tuning."""
 
 from __future__ import annotations
 
@@ -28,17 +28,16 @@ from .alarm_guide import advice
 from .calibration_lines import calibration_lines
 from .report_charts import charts_html
 
-MOST = 60
-"""Rows of a table; of more the rest is counted."""
+MAX_ROWS = 60
+"""Of a table; the rest is counted."""
 
 
 class Reported(NamedTuple):
-    """A run to be reported: with what it was folded, its rows, and what was wrong in it.
+    """A run to report: settings, rows and episodes.
 
-    `about` are more lines of its head, by name; `bounds` the integrity bounds of its states, where they are known;
-    `others` the runs before and after it: number, what was changed, scores in words; `before` the episodes of each
-    earlier run that had any, by its number and what it was; `smoothed` what all readings say of the states, if that was
-    asked for.
+    `about` are further lines of its head, by name; `bounds` the protection levels of its states, where known; `others`
+    all runs of the session: number, change, scores; `before` the episodes of earlier runs, by number and change;
+    `smoothed` the smoothed states, if asked for.
     """
 
     twin: Twin
@@ -57,7 +56,7 @@ class Reported(NamedTuple):
 
 
 def report(run: Reported) -> list[Topic]:
-    """The report, from top to bottom."""
+    """Return the topics of the report, from top to bottom."""
     model = run.twin.model
     found = score(run.track, run.events, model, run.pictures, gate=run.tuning.gate, baseline=run.tuning.baseline)
     charts = charts_html(run.tuning, run.events, run.track, run.episodes, run.bounds, run.smoothed)
@@ -123,26 +122,26 @@ def _scores(run: Reported, found: Score) -> Topic:
         rows.append(("RMSE of all cells", digits(found.field.rmse), f"{100 * found.field.coverage:.3g} % in the band"))
     judged = found.nis_readings + found.gated
     each = found.log_likelihood / judged if judged else np.nan
-    rows.append(("log-likelihood", f"{found.log_likelihood:.6g}", f"{digits(each)} a reading"))
+    rows.append(("log-likelihood", f"{found.log_likelihood:.6g}", f"{digits(each)} per measurement"))
     counts = np.bincount(track.verdict[run.events.kind == READING], minlength=len(VERDICT_NAMES))
     told = [f"{name} {count:,}" for name, count in zip(VERDICT_NAMES[1:], counts[1:].tolist(), strict=True) if count]
-    rows.append(("readings", f"{int(counts.sum()):,}", ", ".join(told)))
+    rows.append(("measurements", f"{int(counts.sum()):,}", ", ".join(told)))
     shares = np.bincount(track.health, minlength=len(HEALTH_NAMES)) / max(1, len(track))
     worst = [f"{HEALTH_NAMES[k]} {100 * shares[k]:.3g} %" for k in np.argsort(-shares, kind="stable") if shares[k]]
     rows.append(("health at the end", HEALTH_NAMES[int(track.health[-1])], ", ".join(worst)))
     marks += [""] * (len(rows) - len(marks))
-    return Topic("What the estimate was worth", (), ("", "", ""), _cut(rows), marks=_marks(marks, rows))
+    return Topic("Scores", (), ("", "", ""), _cut(rows), marks=_marks(marks, rows))
 
 
 def _marks(marks: Sequence[str], rows: Sequence[tuple[str, ...]]) -> tuple[str, ...]:
-    return tuple(marks) if len(rows) <= MOST + 1 else (*marks[:MOST], "")
+    return tuple(marks) if len(rows) <= MAX_ROWS + 1 else (*marks[:MAX_ROWS], "")
 
 
 def _cut(rows: Sequence[tuple[str, ...]]) -> tuple[tuple[str, ...], ...]:
-    """At most `MOST` rows, and one that says how many more there are."""
-    if len(rows) <= MOST + 1:
+    """Return at most `MAX_ROWS` rows, and one with the number of the rest."""
+    if len(rows) <= MAX_ROWS + 1:
         return tuple(rows)
-    return (*rows[:MOST], (f"... and {len(rows) - MOST} more", *[""] * (len(rows[0]) - 1)))
+    return (*rows[:MAX_ROWS], (f"... and {len(rows) - MAX_ROWS} more", *[""] * (len(rows[0]) - 1)))
 
 
 def episode_topic(run: Reported) -> Topic:
@@ -150,14 +149,14 @@ def episode_topic(run: Reported) -> Topic:
     shown = tuple(f"{offset.words[0].upper()}{offset.words[1:]}." for offset in _offsets(run))
     if not run.episodes:
         of = " of the sensors in use" if shown else ""
-        return Topic("Episodes", (f"Nothing that the tests could see was wrong{of}.", *shown))
+        return Topic("Episodes", (f"No faults detected{of}.", *shown))
     rows = [_told(item, run) for item in run.episodes]
     causes = [cause for cause in dict.fromkeys(item.cause for item in run.episodes) if advice(cause, "Response")]
     small = tuple(
         f"{cause.capitalize()}. Usual cause: {advice(cause, 'Usual cause')} Response: {advice(cause, 'Response')}"
         for cause in causes
     )
-    return Topic("Episodes", shown, ("when", "who", "what", "what was said, and what to do"), _cut(rows), notes=small)
+    return Topic("Episodes", shown, ("time", "subject", "cause", "text and remedy"), _cut(rows), notes=small)
 
 
 def _told(item: Episode, run: Reported) -> tuple[str, str, str, str]:
@@ -168,17 +167,17 @@ def _told(item: Episode, run: Reported) -> tuple[str, str, str, str]:
 
 
 def _offsets(run: Reported) -> list[Offset]:
-    """What the sensors show that are held out."""
+    """Return the offsets of held-out sensors."""
     return offsets(run.events, run.track, run.tuning)
 
 
 def _before(run: Reported) -> list[Topic]:
-    """What was wrong under the settings of earlier runs: what made somebody change them, and may hide now."""
+    """Return episodes under the settings of earlier runs, which a later setting may hide."""
     rows = [(name, *_told(item, run)) for name, episodes in run.before for item in episodes]
     if not rows:
         return []
-    said = "Over the same log, with the settings of then; what a setting hides was there all the same."
-    return [Topic("Episodes of the runs before", (said,), ("run", "when", "who", "what", "what was said"), _cut(rows))]
+    said = "Over the same log with earlier settings; a later setting may hide them."
+    return [Topic("Episodes of earlier runs", (said,), ("run", "time", "subject", "cause", "text"), _cut(rows))]
 
 
 def _checks(run: Reported) -> list[Topic]:
@@ -186,17 +185,17 @@ def _checks(run: Reported) -> list[Topic]:
     given = model, run.events, run.track
     found = [*calibrations(*given, gate=tuning.gate, marginal=run.marginal), *truth_calibration(*given)]
     lines = [(line,) for line in calibration_lines(found, model)]
-    parts = [Topic("Can the bands be believed? 95 % intervals", (), ("",), _cut(lines))] if lines else []
+    parts = [Topic("Calibration (95 % intervals)", (), ("",), _cut(lines))] if lines else []
     if run.bounds:
-        title = "How wrong a state can be by one fault that nobody notices"
+        title = "Protection levels: largest error that one undetected fault can cause"
         rows = [
             (name, item.unit, digits(item.two_sigma), digits(item.bound) if np.isfinite(item.bound) else "no bound",
              item.fault or "none")
             for name, item in run.bounds.items()
         ]  # fmt: skip
-        bars = tuple(Bar(name, item.unit, item.two_sigma, item.bound) for name, item in run.bounds.items())[:MOST]
-        head = ("state", "unit", "± 2 σ", "integrity bound", "by")
-        parts.append(Topic(title, (), head, _cut(rows), bars, ("± 2 σ", "integrity bound")))
+        bars = tuple(Bar(name, item.unit, item.two_sigma, item.bound) for name, item in run.bounds.items())[:MAX_ROWS]
+        head = ("state", "unit", "± 2 σ", "protection level", "fault")
+        parts.append(Topic(title, (), head, _cut(rows), bars, ("± 2 σ", "protection level")))
     return parts
 
 
@@ -224,7 +223,7 @@ def _value(value: float | bool | str | None) -> str:
 
 
 def _runs(run: Reported) -> Topic:
-    head = ("run", "what was changed", "mean NIS", "log L a reading", "RMSE, or held out")
+    head = ("run", "change", "mean NIS", "log L per measurement", "RMSE")
     return Topic("Runs of the session", (), head, _cut(run.others))
 
 

@@ -92,7 +92,7 @@ class _Sink:
         pass
 
     def take(self) -> bytes:
-        """What was written since."""
+        """Return the bytes written since the last call."""
         pieces, self._pieces = self._pieces, []
         return b"".join(pieces)
 
@@ -113,7 +113,7 @@ class RunRows(NamedTuple):
         return find_entry(self.run.estimator).family in ("particle", "ensemble")
 
     def episodes(self) -> list[Episode]:
-        """What was wrong in it, in the order of its start, as `nisus fold` finds it."""
+        """Return its episodes by their start, as `nisus fold` finds them."""
         events, track, tuning = self.pull.events, self.pull.track, self.run.tuning
         if not len(events):
             return []

@@ -66,28 +66,28 @@ def check_query(query: ChartQuery, columns: dict[str, Column]) -> ChartQuery:
 
 
 class ChartStream:
-    """Gives frames of one view; see `ChartQuery`."""
+    """Makes frames for one query of one browser."""
 
     def __init__(self, name: str, wanted: ChartQuery, columns: dict[str, Column]) -> None:
         self.name, self.wanted = name, wanted
         self._kinds = np.array([columns[column].kind for column in wanted.columns])
         self._size = 0
         self._rows = (0, 0)
-        """The rows in sight: the first, and the one after the last."""
+        """Rows that the query covers: the first, and the one after the last."""
         self._sent, self._end = (0, 0), 0
-        """Numbers of the groups that the browser has, from the first to before the second; the row after their last."""
+        """Groups that the browser has, from the first to before the second; the row after their last."""
         self._told: object = None
-        """Which run, and which generation of it, they are of."""
+        """Run, generation and group size of those."""
         self._dirty = LAST_ROW
         """First row that has changed since the last frame."""
         self._offsets = np.full(len(wanted.columns), np.nan)
 
     def changed(self, row: int) -> None:
-        """Rows from that one on are new or others."""
+        """Note that rows from this one on are new or have changed."""
         self._dirty = min(self._dirty, row)
 
     def look(self, run: Run, origin: int, newest: int) -> None:
-        """Find the rows in sight, and how many of them a group has.
+        """Find the rows that the query covers, and the size of their groups.
 
         Args:
             run: Whose rows; its levels need not be up to date.
@@ -106,11 +106,11 @@ class ChartStream:
 
     @property
     def levelled(self) -> tuple[str, ...]:
-        """The columns of which it needs levels: none while it is near enough to take the rows themselves."""
+        """Columns of which it needs levels of detail: none while groups are small enough to be made of rows."""
         return self.wanted.columns if self._size >= FIRST else ()
 
     def frame(self, run: Run, origin: int) -> bytes | None:
-        """What has changed in what it looks at since the last frame, or None; the levels of the run are up to date."""
+        """Return the changes since the last frame, or None; the levels of the run must be up to date."""
         (start, stop), size = self._rows, self._size
         told = (run, run.generation, size)
         end = min(stop, run.end)
@@ -131,7 +131,7 @@ class ChartStream:
         return self._packed(groups, origin, fresh, first, run.revision)
 
     def _sized(self, rows: int) -> int:
-        """How many rows a group has: as few as the points allow, and as before if that nearly does."""
+        """Return the size of groups: the smallest that the points allow, or the last one if that nearly does."""
         points = self.wanted.points
         kept = self._size
         if kept and rows <= SLACK * points * kept and (kept == 1 or rows * SLACK > points * kept / FACTOR):
@@ -172,7 +172,7 @@ class ChartStream:
 
 
 def drawn(groups: Groups, kinds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The points of groups: times (k,) and values (k, columns), one a group of one row, else two.
+    """Return points of groups: times (k,) and values (k, columns), one for a group of one row, else two.
 
     The two are a line's extremes in the order in which they lead on to the next; the edge of a band is twice its outer
     extreme; a dot that is alone in its group is drawn once.

@@ -125,7 +125,7 @@ class Levels:
 
 
 class LiveRun:
-    """What is running now. Not for several threads at once."""
+    """Rows of the running fold. Not thread-safe."""
 
     def __init__(self, engine: Running, columns: dict[str, Column]) -> None:
         self._engine, self._levels = engine, Levels(columns)

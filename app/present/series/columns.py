@@ -1,4 +1,4 @@
-"""What can be charted of a twin, by name: `mean:winding`, `reading:yoke`, `nis_mean`."""
+"""Columns for charts, by name: `mean:winding`, `reading:yoke`, `nis_mean`."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ LINE, UPPER, LOWER, DOTS = "line", "upper", "lower", "dots"
 
 
 class Rows:
-    """Events and what was concluded of them, with what several columns need of them."""
+    """Events and their track rows, with intermediate results that columns share."""
 
     def __init__(self, events: Events, track: Track) -> None:
         self.events, self.track = events, track

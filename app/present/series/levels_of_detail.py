@@ -166,7 +166,7 @@ class _Level:
 
     @property
     def groups(self) -> Groups:
-        """Views of what is there."""
+        """Return views of the groups."""
         first, last, low, high, rising = (column[: self._n] for column in self._room)
         return Groups(self._size, self._start, first, last, low, high, rising)
 
@@ -183,7 +183,7 @@ class _Level:
         self._n = needed
 
     def drop(self, number: int) -> None:
-        """Drop the groups before a number, once they are half of what is there."""
+        """Drop the groups before a number, once they are half of all."""
         gone = min(number - self._start, self._n)
         if gone * 2 > self._n > 0:
             for column in self._room:

@@ -1,4 +1,4 @@
-"""The series of a running twin, for every browser that looks: one set of levels for all, and none while nobody does."""
+"""Series of a running twin: one set of levels of detail for all browsers, none without a browser."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ LESS = "difference:"
 
 
 class Series:
-    """Frames for the lanes of all browsers. Any thread may ask."""
+    """Frames for the chart streams of all browsers. Thread-safe."""
 
     def __init__(self, engine: Running) -> None:
         self._engine = engine
@@ -48,12 +48,12 @@ class Series:
         return self._origin
 
     def open(self, lane: ChartStream) -> None:
-        """A browser looks at this lane from now on."""
+        """Open a chart stream."""
         with self._lock:
             self._lanes.add(lane)
 
     def close(self, lane: ChartStream) -> None:
-        """Nobody looks at it any more."""
+        """Close a chart stream."""
         with self._lock:
             self._lanes.discard(lane)
             if not self._lanes:
@@ -64,7 +64,7 @@ class Series:
                     self._live = None
 
     def frames(self, lanes: Iterable[ChartStream]) -> list[bytes]:
-        """What has changed in these lanes since they were asked last."""
+        """Return frames with the changes of these streams since the last call."""
         with self._lock:
             origin, newest = self.origin(), self._engine.span()[1]
             if origin is None or not newest:
@@ -84,13 +84,13 @@ class Series:
             return [frame for lane, run in shown if (frame := lane.frame(run, origin)) is not None]
 
     def _sync(self, run: Run, lanes: list[ChartStream]) -> None:
-        """Bring a run up to date for the lanes that show it."""
+        """Bring a run up to date for the streams that show it."""
         run.sync({column for lane in lanes for column in lane.levelled})
         for lane in lanes:
             lane.changed(run.changed)
 
     def _find(self, name: str) -> Run | None:
-        """What runs, the previous revision, what is smoothed, a pinned one, or one less what runs; None if none is."""
+        """Return a run by name: running, previous, smoothed, pinned, or a difference; None if there is none."""
         if name == LIVE:
             if self._live is None:
                 self._live = LiveRun(self._engine, self.columns)
@@ -128,7 +128,7 @@ class Series:
         return found
 
     def _leave(self, looked_at: set[str]) -> None:
-        """End the folds of pinned runs at which nobody looks, and the smoother."""
+        """End the folds of pinned runs that no client shows, and the smoother."""
         if self._smoothing is not None and SMOOTHED not in looked_at:
             self._smoothing.stop()
             self._smoothing = None

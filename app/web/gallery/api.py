@@ -25,7 +25,7 @@ COMPILING_SHOWN_AFTER_S = 1.0
 """Loading a model from the cache takes less."""
 
 PIECE_BYTES = 4 * 2**20
-"""Of a dropped file, sent at once: each piece has its own time to arrive."""
+"""Size of the pieces in which a page sends a dropped file; each has its own timeout."""
 
 
 class GalleryApi:
@@ -58,7 +58,7 @@ class GalleryApi:
         return page_file("gallery.html", {"boot": self._door.boot})
 
     def state(self) -> dict[str, Any]:
-        """Return what runs, what is being started, and the last start that failed."""
+        """Return the running twin, the start under way, and the last start that failed."""
         gallery, running = self._gallery, self._gallery.session.running
         starting, failed, request = gallery.starting, gallery.failed, gallery.running
         begun = gallery.compiling

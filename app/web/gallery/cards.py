@@ -16,25 +16,25 @@ from ...twin.twin import load_twin
 from ..running import Stamp, stamp_of
 
 CARDS = TWINS.parent / "cards"
-"""Folder of the pictures of the twins that ship."""
+"""Folder of pictures of the bundled twins."""
 
 
 def picture_file(twin: Path) -> Path:
-    """Where the picture of a twin's YAML is; it may be absent."""
+    """Return the path of a twin's picture; it may be absent."""
     ships = twin.resolve().parent == TWINS.resolve()
     return CARDS / f"{twin.stem}.svg" if ships else twin.with_suffix(".svg")
 
 
 KINDS = {"simulator": "simulated", "can": "CAN bus", "can_log": "recorded", "table": "recorded", "merged": "recorded"}
-"""What a type of source is called on a card."""
+"""Names of source types on a card."""
 
 
 @dataclass(frozen=True)
 class Card:
-    """One twin on the shelf.
+    """One twin of the gallery.
 
-    `name` is by what it is started: that of a twin that ships, or the path of a YAML file. `missing` says why it cannot
-    run here, `error` what is wrong with its files. `log` is whether a log can be dropped on it.
+    `name` is that of a bundled twin, or the path of a YAML file. `missing` is why it cannot run here, `error` a fault
+    in its files, `log` whether a log can be dropped on it.
     """
 
     name: str
@@ -51,18 +51,18 @@ class Card:
     error: str | None = None
 
     def json(self) -> dict[str, Any]:
-        """As the page gets it."""
+        """Return the card for the page."""
         return asdict(self)
 
 
 def shelf(own: Iterable[str] = ()) -> list[Card]:
-    """The user's own twins, then those that ship, from the smallest state to the largest."""
+    """Return cards of the user's own twins, then of bundled ones, by number of states."""
     ships = [card(name) for name in shipped()]
     return [*map(card, own), *sorted(ships, key=lambda item: (item.states, item.source, item.name))]
 
 
 def card(name: str) -> Card:
-    """The card of a twin, whatever is wrong with it."""
+    """Return the card of a twin, also if its files have errors."""
     try:
         path = find(name)
         # A user's twin has a model of its own, which may change by itself.
@@ -75,7 +75,7 @@ def card(name: str) -> Card:
 
 @lru_cache(maxsize=128)
 def _read(name: str, stamp: Stamp) -> tuple[Card, Loaded]:
-    """What a twin's files say, once for each time that they were saved."""
+    """Read a twin's files, once for each time that they were saved."""
     twin = load_twin(name)
     config = twin.config
     found = Card(

@@ -1,4 +1,4 @@
-"""Who changes what runs: one start at a time, in a thread of its own, while what ran before goes on."""
+"""Start, switch and stop the twin of a session: one start at a time, while the running twin goes on."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from ..session import Session
 
 @dataclass(frozen=True)
 class StartRequest:
-    """What is to run: a twin, perhaps on other recordings than its own, or a recording to review."""
+    """A twin to run, perhaps on other logs than its own, or a recording to review."""
 
     twin: str | None = None
     logs: tuple[Path, ...] = ()
@@ -30,7 +30,7 @@ class StartRequest:
 
     @property
     def name(self) -> str:
-        """What people call it."""
+        """Name for messages."""
         if self.recording is not None:
             return self.recording.name
         name = Path(self.twin or "").stem
@@ -39,14 +39,14 @@ class StartRequest:
 
 @dataclass(frozen=True)
 class FailedStart:
-    """What could not be started, and why, in one line."""
+    """A start that failed, and the reason in one line."""
 
     name: str
     text: str
 
 
 class Opener(Protocol):
-    """How what is wanted is read from its files, and made ready."""
+    """Reads a requested twin from its files, and compiles it."""
 
     def open(self, wanted: StartRequest) -> Opening:
         """Read it.
@@ -71,15 +71,15 @@ class Opener(Protocol):
 
 
 class Gallery:
-    """Starts, switches and stops what runs in a session."""
+    """Starts, switches and stops the twin of a session."""
 
     def __init__(self, session: Session, opener: Opener, *, first: StartRequest | None = None, own: Sequence[str] = ()):
         """Take over a session.
 
         Args:
-            session: Whose page shows what runs.
-            opener: Reads what is wanted.
-            first: What runs at first.
+            session: Its page shows the running twin.
+            opener: Reads requested twins.
+            first: Runs at first.
             own: Paths of twins beside those that ship; nothing else may be started, as a twin's model is a program.
         """
         self.session = session
@@ -87,17 +87,17 @@ class Gallery:
         self.running: StartRequest | None = first
         self.starting: tuple[StartRequest, float] | None = None
         self.compiling: float | None = None
-        """Since when what is being started is made ready; None while it is not."""
+        """Start of the compilation under way, s; None without one."""
         self.failed: FailedStart | None = None
         self._opener = opener
         self._lock = threading.Lock()
 
     def names(self) -> list[str]:
-        """Of all twins that may be started."""
+        """Return the names of all twins that may be started."""
         return [*self.own, *shipped()]
 
     def start(self, wanted: StartRequest) -> None:
-        """Begin to start something; `starting` and `failed` say how it goes.
+        """Begin to start a twin; `starting` and `failed` show its progress.
 
         Raises:
             ConfigError: If there is no such twin, or something is being started already.
@@ -107,7 +107,7 @@ class Gallery:
         self._begin(wanted, lambda: self._start(wanted))
 
     def again(self, remark: str) -> None:
-        """Begin to start anew what runs, which says why.
+        """Begin to start the running twin anew, with a notice of the reason.
 
         Raises:
             ConfigError: If something is being started already, or nothing runs.
@@ -118,11 +118,11 @@ class Gallery:
         self._begin(wanted, lambda: self._start(wanted, remark))
 
     def prepare(self, twin: Twin) -> None:
-        """Compile what a twin runs with; raises as `Opener.prepare`."""
+        """Compile a twin's model and filter; raises as `Opener.prepare`."""
         self._opener.prepare(twin)
 
     def stop(self) -> None:
-        """Stop what runs; the gallery stays."""
+        """Stop the running twin; the gallery stays."""
         with self._lock:
             self.running = None
         self.session.change(None)
@@ -159,7 +159,7 @@ class Gallery:
         self._put(wanted, opening)
 
     def _put(self, wanted: StartRequest, opening: Opening) -> None:
-        """Run it in place of what runs."""
+        """Run it in place of the running twin."""
         # Two on one bus would hear each other's asset.
         both = _on_a_bus(opening) and self._runs_on_a_bus()
         try:
@@ -180,11 +180,11 @@ def _on_a_bus(opening: Opening) -> bool:
 
 
 EVERY = 0.4
-"""Seconds between two looks at the files. An editor may write one in pieces: it is read once it stays as it is."""
+"""Seconds between two looks at the files. An editor may write in pieces: a file is read once it is unchanged."""
 
 
 class SavedFiles:
-    """Looks at the files of what runs in a gallery's session, in a thread of its own."""
+    """Watches the files of the running twin, in a thread of its own."""
 
     def __init__(self, gallery: Gallery, *, every: float = EVERY) -> None:
         self._gallery, self._every = gallery, every
@@ -207,7 +207,7 @@ class SavedFiles:
             self._thread.join(timeout=2.0)
 
     def look(self) -> None:
-        """Look once; act when a file has changed since it was read, and not since the last look."""
+        """Look once; reload when a file has changed since it was read, but not since the last look."""
         running = self._gallery.session.running
         if running is None or running.opening.again is None:
             self._of = None
@@ -223,7 +223,7 @@ class SavedFiles:
             self._read(running, ", ".join(shown_path(file) for file in changed), running.opening.again)
 
     def _watch(self, files: tuple[Path, ...]) -> None:
-        """The twin was read from these, some of which it may not have imported before."""
+        """Watch these files, from which the twin was just read."""
         known = dict(zip(self._files, self._known, strict=True))
         self._files = files
         self._known = self._seen = tuple(known.get(file, *stamp_of((file,))) for file in files)

@@ -22,7 +22,7 @@ RECORDING = ".rrd"
 LOGS = tuple(dict.fromkeys((*CAN_LOGS, *TABLES)))
 """Endings of files that can replace a twin's own recording."""
 PART = ".part"
-"""Ending of what is still on its way here, behind a point, so that lists do not show it."""
+"""Ending of a file that is still arriving; its name begins with a point, so that lists do not show it."""
 
 LARGEST = 256 * 2**20
 """Bytes up to which a recording is looked through for the list."""
@@ -76,7 +76,7 @@ class Recordings:
         self._looking = False
 
     def entries(self, busy: Callable[[Path], bool] = lambda path: False) -> list[Entry]:
-        """What is there, the newest first. What a recording is, is read beside, and is there when one asks again.
+        """Return the files, newest first. Facts of a recording are read in a thread, for the next call.
 
         Args:
             busy: Whether a file is being written.
@@ -134,7 +134,7 @@ class Recordings:
         threading.Thread(target=look, name="recordings", daemon=True).start()
 
     def _elsewhere(self) -> dict[str, Path]:
-        """Recordings of this session that are not in the folder, by name; what is in the folder goes before."""
+        """Return by name the recordings of this session outside the folder; files in the folder take precedence."""
         home = self.folder.absolute()
         found = {path.name: path.absolute() for path in self._recorded() if path.absolute().parent != home}
         return {name: path for name, path in found.items() if not (self.folder / name).exists()}

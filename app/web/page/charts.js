@@ -125,7 +125,7 @@ function followed(start, end, span) {
   return [start, start + length];
 }
 
-// Which charts are shown, in which order and how high: chosen in a menu, kept in the browser, for each twin.
+// Selection, order and height of the charts: chosen in a menu, kept in the browser, for each twin.
 
 const LOWEST = 40; // px
 const HIGHEST = 1200;
@@ -144,7 +144,7 @@ class Layout {
   }
 
   prepare(chart) {
-    const grip = element("div", { class: "grip", role: "separator", "aria-orientation": "horizontal", "aria-label": `Height of ${chart.what.title}`, tabindex: 0, title: "Drag: height. Double click: as before" });
+    const grip = element("div", { class: "grip", role: "separator", "aria-orientation": "horizontal", "aria-label": `Height of ${chart.what.title}`, tabindex: 0, title: "Drag to change the height, double-click to reset it" });
     let from = null;
     grip.addEventListener("pointerdown", (event) => {
       grip.setPointerCapture(event.pointerId);
@@ -181,7 +181,7 @@ class Layout {
     return this.order.filter((chart) => !chart.node.hidden).map(({ what: { key } }) => [key, this.kept.heights?.[key] ?? null]);
   }
 
-  // Show these and no others, as a link says; what the user has chosen is kept for the next time.
+  // Show these and no others, for a link; the user's own choice is kept for the next visit.
   use(shown) {
     const wanted = new Map(shown);
     const others = this.charts.map((chart) => chart.what.key).filter((key) => !wanted.has(key));
@@ -202,7 +202,7 @@ class Layout {
     this.told();
   }
 
-  // Of a sensor with many rows, such as a grid of thermocouples, the first few are enough until more are asked for.
+  // Of a sensor with many rows, only the first few are shown by default.
   get hidden() {
     return this.kept.hidden ?? this.charts.filter((chart) => chart.what.further).map((chart) => chart.what.key);
   }
@@ -233,8 +233,8 @@ class Layout {
       const button = (text, label, step) => element("button", { type: "button", "aria-label": `${chart.what.title} ${label}`, onclick: () => move(chart, step) }, text);
       return element("li", {}, element("label", {}, box, chart.what.title, element("span", { class: "faint" }, chart.what.note ?? "")), button("↑", "up", -1), button("↓", "down", 1));
     };
-    const again = element("button", { type: "button", class: "go", onclick: () => ((this.kept = {}), this.changed()) }, "As at first");
-    this.menu.replaceChildren(element("summary", { title: "Which charts, in which order" }, "Shown"), element("div", { class: "menu" }, element("ol", {}, ...this.order.map(row)), again));
+    const again = element("button", { type: "button", class: "go", onclick: () => ((this.kept = {}), this.changed()) }, "Reset");
+    this.menu.replaceChildren(element("summary", { title: "Choose and order the charts" }, "Shown"), element("div", { class: "menu" }, element("ol", {}, ...this.order.map(row)), again));
   }
 
   changed() {

@@ -81,11 +81,11 @@ export class Panel {
 
 const TYPING = "input:not([type=range]):not([type=checkbox]), textarea, select, [contenteditable]";
 
-// commands: [key, what it does, run]
+// commands: [key, text, run]
 export function keys(commands) {
   const named = new Map(commands.map(([key, , run]) => [key === "space" ? " " : key, run]));
   const palette = $("palette");
-  const field = element("input", { type: "text", placeholder: "What to do?", "aria-label": "Find a command" });
+  const field = element("input", { type: "text", placeholder: "Command", "aria-label": "Find a command" });
   const list = element("ul", {});
   palette.replaceChildren(field, list);
   const offer = () => {

@@ -42,7 +42,7 @@ export class Diagnose {
         this.draw(JSON.parse(text));
       }
     } catch (error) {
-      if (!this.drawn) setText(this.node, `The twin does not answer: ${error.message}`);
+      if (!this.drawn) setText(this.node, `No answer from the twin: ${error.message}`);
     }
     if (this.shown) this.timer = setTimeout(() => this.ask(), AGAIN);
   }
@@ -54,9 +54,9 @@ export class Diagnose {
     const rows = [...found.rows].sort((a, b) => ORDER.indexOf(a.tone) - ORDER.indexOf(b.tone));
     const open = (row) => this.turned.get(row.name) ?? (found.rows.length <= FEW || row.tone === "bad");
     const focused = this.node.contains(document.activeElement) ? document.activeElement.getAttribute("aria-label") : null;
-    const cost = found.cost === null ? "" : ` An event costs ${compact(found.cost, 3)} µs.`;
+    const cost = found.cost === null ? "" : ` ${compact(found.cost, 3)} µs per event.`;
     this.node.replaceChildren(
-      element("p", { class: "summary" }, element("b", {}, `${good} of ${found.rows.length} sensor rows${left} are as they should be${but}. `), `Last ${found.events.toLocaleString("en")} events, ${span(found.span)}, ${found.estimator}: ${found.nis}.${cost}`),
+      element("p", { class: "summary" }, element("b", {}, `${good} of ${found.rows.length} sensor rows${left} are consistent${but}. `), `Last ${found.events.toLocaleString("en")} events, ${span(found.span)}, ${found.estimator}: ${found.nis}.${cost}`),
       ...rows.map((row) => rowCard(row, found.marginal, open(row), (now) => this.turned.set(row.name, now))),
       element("div", { class: "cards" }, ...[ranksCard(found), particlesCard(found), correlationCard(found), ...unseenCards(found)].filter(Boolean)),
     );
@@ -75,7 +75,7 @@ export class Diagnose {
   }
 }
 
-// A plot under its name and what a good one looks like.
+// A plot below its name and the description of a good one.
 const figure = (name, good, plot) => element("figure", {}, element("figcaption", {}, element("b", {}, name), " ", element("span", { class: "faint" }, good)), plot);
 
 function rowCard(row, marginal, open, turned) {
@@ -103,11 +103,11 @@ function rowCard(row, marginal, open, turned) {
 // Sizes with their 95 % intervals.
 function figures(row) {
   const interval = ([value, low, high]) => (low === null ? compact(value, 2) : `${compact(value, 2)} (${compact(low, 2)} to ${compact(high, 2)})`);
-  const parts = [`${row.n.toLocaleString("en")} readings`];
-  if (row.scale?.[0] != null) parts.push(`bands should be ${interval(row.scale)} times as wide`);
+  const parts = [`${row.n.toLocaleString("en")} measurements`];
+  if (row.scale?.[0] != null) parts.push(`band scale ${interval(row.scale)}`);
   if (row.bias?.[0] != null) parts.push(`bias ${interval(row.bias)} σ`);
-  if (row.correlation?.[0] != null) parts.push(`each with the next ${interval(row.correlation)}`);
-  if (row.refused !== null) parts.push(`${compact(100 * row.refused, 2)} % refused`);
+  if (row.correlation?.[0] != null) parts.push(`lag-1 correlation ${interval(row.correlation)}`);
+  if (row.refused !== null) parts.push(`${compact(100 * row.refused, 2)} % rejected`);
   if (!row.used) parts.push("held out");
   return parts.join(" · ");
 }
@@ -119,18 +119,18 @@ function ranksCard({ ranks }) {
   if (!ranks) return null;
   const { counts, low, high } = ranks;
   const n = counts.reduce((sum, count) => sum + count, 0);
-  return card("Readings among the members", "good: flat, within the band", `Of ${n.toLocaleString("en")} values since the start: ${shape(counts, n)}.`, flat(ranks, "Rank histogram of the ensemble"));
+  return card("Rank histogram", "good: flat, within the band", `Of ${n.toLocaleString("en")} values since the start: ${shape(counts, n)}.`, flat(ranks, "Rank histogram of the ensemble"));
 }
 
-// What matters, not what a test would find among so many.
+// Deviations that matter in practice, not those that a test finds among many values.
 function shape(counts, n) {
   const expected = n / counts.length;
   const ends = (counts[0] + counts.at(-1)) / (2 * expected);
   const low = counts.slice(0, counts.length / 2).reduce((sum, count) => sum + count, 0) / n;
-  if (Math.abs(low - 0.5) > LEANS) return `most lie ${low > 0.5 ? "low" : "high"}, so the prediction reads too ${low > 0.5 ? "high" : "low"}`;
-  if (ends > UNEVEN) return `the ends hold ${compact(ends, 2)} times what they should, so the spread is too small`;
-  if (ends < 1 / UNEVEN) return `the ends hold ${compact(ends, 2)} of what they should, so the spread is too large`;
-  return "about flat, so the spread is right";
+  if (Math.abs(low - 0.5) > LEANS) return `most ranks are ${low > 0.5 ? "low" : "high"}: the prediction is biased ${low > 0.5 ? "high" : "low"}`;
+  if (ends > UNEVEN) return `extreme ranks occur ${compact(ends, 2)} times as often as expected: the spread is too small`;
+  if (ends < 1 / UNEVEN) return `extreme ranks occur ${compact(ends, 2)} times as often as expected: the spread is too large`;
+  return "about flat: the spread is right";
 }
 
 function particlesCard({ particles }) {
@@ -138,11 +138,11 @@ function particlesCard({ particles }) {
   const { t, effective, ancestors, count, lag } = particles;
   const least = Math.min(...effective);
   const roots = ancestors.filter((value) => value !== null);
-  const descent = roots.length ? ` They descend from ${compact(roots.at(-1), 3)}${lag ? ` of ${compact(lag, 3)} readings ago` : ""}.` : "";
-  const verdict = least < 0.02 * count ? "few carry the estimate at times" : "enough carry the estimate";
+  const descent = roots.length ? ` ${compact(roots.at(-1), 3)} ancestors${lag ? ` ${compact(lag, 3)} measurements ago` : ""}.` : "";
+  const verdict = least < 0.02 * count ? "too few at times" : "sufficient";
   return card(
-    "Particles that count", "good: far above 1, most of the time",
-    `Of ${compact(count, 6)} at least ${compact(least, 3)} count: ${verdict}.${descent}`,
+    "Effective particles", "good: far above 1",
+    `At least ${compact(least, 3)} of ${compact(count, 6)}: ${verdict}.${descent}`,
     decades(t, [[effective, "line"], [ancestors, "line second"]], count, "Effective sample size and ancestors over time", [`−${span(-t[0])}`, "now"]),
     element("p", { class: "faint key" }, element("i", { class: "swatch" }), "effective sample size ", element("i", { class: "swatch second" }), "ancestors"),
   );
@@ -154,50 +154,50 @@ function correlationCard({ correlation }) {
   let most = [0, 0, 0];
   matrix.forEach((row, i) => row.forEach((value, j) => i < j && value !== null && Math.abs(value) > Math.abs(most[0]) && (most = [value, i, j])));
   const [value, i, j] = most;
-  const verdict = Math.abs(value) > 0.9 ? `${words(names[i])} and ${words(names[j])} can hardly be told apart (${value.toFixed(2)}).` : n(names.length, value, words(names[i]), words(names[j]));
-  return card("Correlation of the estimates", "good: pale beside the diagonal", reason ? `${verdict} ${reason}.` : verdict, correlations(names.map(words), matrix, "Correlations of the present covariance"), element("p", { class: "faint key" }, element("i", { class: "swatch" }), "together ", element("i", { class: "swatch against" }), "opposed"));
+  const verdict = Math.abs(value) > 0.9 ? `${words(names[i])} and ${words(names[j])} are hardly distinguishable (${value.toFixed(2)}).` : n(names.length, value, words(names[i]), words(names[j]));
+  return card("Correlation of the estimates", "good: pale off the diagonal", reason ? `${verdict} ${reason}.` : verdict, correlations(names.map(words), matrix, "Correlations of the present covariance"), element("p", { class: "faint key" }, element("i", { class: "swatch" }), "together ", element("i", { class: "swatch against" }), "opposed"));
 }
 
-const n = (count, value, a, b) => (count < 2 ? "There is one state." : `All can be told apart; closest are ${a} and ${b} (${value.toFixed(2)}).`);
+const n = (count, value, a, b) => (count < 2 ? "There is one state." : `All are distinguishable; most correlated: ${a} and ${b} (${value.toFixed(2)}).`);
 
-// One word for all where one reason speaks against all.
+// One card where all three have the same reason.
 function unseenCards(found) {
   const reason = found.observability.reason;
-  if (reason && reason === found.unseen_reason) return [card("Observability, visible faults, integrity", "", `${reason}.`)];
+  if (reason && reason === found.unseen_reason) return [card("Observability, visible faults, protection levels", "", `${reason}.`)];
   return [observabilityCard(found), faultsCard(found), integrityCard(found)];
 }
 
 function observabilityCard({ observability }) {
   const { reason, rank, of, conditioning, states, weakest, span: seconds, note } = observability;
   if (reason) return card("Observability", "", `${reason}.`);
-  const told = rank === of ? `The readings of ${span(seconds)} tell more of all ${of} directions than the prior did` : `The readings of ${span(seconds)} tell more than the prior of ${rank} of ${of} directions`;
+  const told = rank === of ? `${span(seconds)} of measurements inform all ${of} directions` : `${span(seconds)} of measurements inform ${rank} of ${of} directions`;
   const between = conditioning === null ? "" : `; best to worst 1 : ${compact(conditioning, 2)}`;
   return card(
-    "Observability", "good: little left of every state",
+    "Observability", "good: small share for every state",
     `${told}${between}. Weakest: ${weakest}.${note ? ` ${note}.` : ""}`,
-    shares(Object.entries(states).map(([name, share]) => [words(name), share]), "Share of the prior's deviation that the readings leave of each state"),
+    shares(Object.entries(states).map(([name, share]) => [words(name), share]), "Share of the prior deviation that remains in each state"),
   );
 }
 
 function faultsCard({ faults, unseen_reason: reason }) {
   if (reason || !faults.length) return card("Smallest visible faults", "", `${reason || "Nothing to nudge"}.`);
   const blind = faults.filter((item) => item.share === null).length;
-  const verdict = blind ? `${blind} of ${faults.length} pass unseen, as large as they can be.` : "Every one is seen, if it is large enough.";
+  const verdict = blind ? `${blind} of ${faults.length} are undetectable at any size.` : "All are detectable if large enough.";
   return card(
-    "Smallest visible faults", "good: small beside what matters to you", verdict,
-    table(["fault of", "seen from", "unseen"], faults.map((item) => [words(item.subject), plain(item.size), plain(item.unseen)])),
+    "Smallest visible faults", "good: small compared with your tolerance", verdict,
+    table(["fault of", "detected from", "undetected"], faults.map((item) => [words(item.subject), plain(item.size), plain(item.unseen)])),
   );
 }
 
 function integrityCard({ integrity, unseen_reason: reason }) {
   const entries = Object.entries(integrity);
-  if (reason || !entries.length) return card("Integrity", "", `${reason || "Nothing is bounded"}.`);
+  if (reason || !entries.length) return card("Protection levels", "", `${reason || "No state has one"}.`);
   const [worst, item] = entries.reduce((a, b) => ((b[1].bound ?? Infinity) / b[1].two_sigma > (a[1].bound ?? Infinity) / a[1].two_sigma ? b : a));
   const far = item.bound === null ? "without limit" : `by ${compact(item.bound, 2)}${spaced(item.unit)}`;
   return card(
-    "Integrity", "good: the bound is near 2σ",
-    `One fault that nobody sees could put ${words(worst)} off ${far}, not ${compact(item.two_sigma, 2)}${spaced(item.unit)}.`,
-    table(["state", "2σ", "bound", "by"], entries.map(([name, entry]) => [words(name), `${compact(entry.two_sigma, 2)}${spaced(entry.unit)}`, entry.bound === null ? "none" : `${compact(entry.bound, 2)}${spaced(entry.unit)}`, words(entry.fault)])),
+    "Protection levels", "good: near 2σ",
+    `One undetected fault can shift ${words(worst)} ${far} (2σ: ${compact(item.two_sigma, 2)}${spaced(item.unit)}).`,
+    table(["state", "2σ", "level", "fault"], entries.map(([name, entry]) => [words(name), `${compact(entry.two_sigma, 2)}${spaced(entry.unit)}`, entry.bound === null ? "none" : `${compact(entry.bound, 2)}${spaced(entry.unit)}`, words(entry.fault)])),
   );
 }
 

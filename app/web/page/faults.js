@@ -24,7 +24,7 @@ export class Faults {
     const hint = "Put something wrong into what the source says, and see how soon the twin tells";
     if (!available) return section("Faults on demand", hint, false, element("p", { class: "about" }, "A recording that is reviewed holds what came, faults included."));
     this.kind = element("select", { "aria-label": "Fault", onchange: () => this.offer() }, ...kinds.map((kind) => element("option", { value: kind.name, title: kind.help }, words(kind.name))));
-    this.target = element("select", { "aria-label": "Of what", onchange: () => this.offerRows() });
+    this.target = element("select", { "aria-label": "Target", onchange: () => this.offerRows() });
     this.row = element("select", { "aria-label": "Row", onchange: () => this.showUnits() });
     this.other = element("select", { "aria-label": "Swapped with" });
     this.help = element("p", { class: "about" });
@@ -113,8 +113,8 @@ export class Faults {
   }
 
   maintenanceSection() {
-    const what = element("input", { type: "text", placeholder: "what was changed", "aria-label": "What was changed", maxlength: 200 });
-    const which = element("select", { "aria-label": "States that it concerns" }, element("option", { value: "" }, "all states"), ...this.model.states.map((state) => element("option", { value: state.name }, words(state.name))));
+    const what = element("input", { type: "text", placeholder: "changed part", "aria-label": "Changed part", maxlength: 200 });
+    const which = element("select", { "aria-label": "States concerned" }, element("option", { value: "" }, "all states"), ...this.model.states.map((state) => element("option", { value: state.name }, words(state.name))));
     const note = element("p", { class: "error", role: "alert", hidden: true });
     const done = async () => {
       const states = which.value ? [which.value] : this.model.states.map((state) => state.name);
@@ -123,7 +123,7 @@ export class Faults {
       note.hidden = !reason;
       if (!reason) what.value = "";
     };
-    const reset = element("button", { type: "button", id: "reset", title: "Back to the prior at the present time", onclick: () => this.link.ask("Reset") }, "Reset the estimate");
+    const reset = element("button", { type: "button", id: "reset", title: "Restart the estimate from the prior", onclick: () => this.link.ask("Reset") }, "Reset the estimate");
     return section("Maintenance", "Something of the asset was changed: states start again, a new version of the model begins", false,
       element("div", { class: "pair" }, what, which), element("div", { class: "pair" }, element("button", { type: "button", class: "go", onclick: done }, "Done"), reset), note);
   }

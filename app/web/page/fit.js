@@ -1,21 +1,21 @@
-// Fit: a small panel beside the Tune column. What is fitted and over what, how far it is, and what came of it, which is
-// offered only if it won on what it had not seen.
+// Fit: a panel beside the Tune column with the fitted entries, progress and result. A result is offered only if it won
+// on held-out data.
 
 import { Panel } from "./controls.js";
 import { element, setText } from "./dom.js";
 import { clock, compact, spaced, span, words } from "./format.js";
 
-const FIT_PERIOD = 300; // ms between two looks at how far it is
+const FIT_PERIOD = 300; // ms between two progress queries
 const GROUPS = { Q: "Q", R: "R", p: "parameters", options: "options" };
-const FIRST = ["Q", "R"]; // what is ticked at first
+const FIRST = ["Q", "R"]; // ticked at first
 const LAST = [100_000, 20_000, 5_000]; // of so many events, where there are more
 const BUSY = ["running", "cancelling"];
 
 export class Fit {
-  // tune: whose head has the button, and which puts in what was found
+  // tune: its head has the button, and it applies results
   constructor(model, link, tune) {
     Object.assign(this, { model, link, tune });
-    this.button = element("button", { type: "button", id: "fit", title: "Fit noises and parameters to what was read" }, "Fit…");
+    this.button = element("button", { type: "button", id: "fit", title: "Fit noises and parameters to the log" }, "Fit…");
     tune.restoreButton.before(this.button);
     this.form = element("div", { class: "form" });
     this.progress = element("div", { class: "progress", role: "status", hidden: true });
@@ -25,7 +25,7 @@ export class Fit {
       if (this.estimator !== link.status.estimator) this.offer();
       return this.ask("GET");
     };
-    this.box = new Panel(this.button, "fit-panel", "Fit to what was read", opened, this.form, this.progress, this.error, this.result);
+    this.box = new Panel(this.button, "fit-panel", "Fit to the log", opened, this.form, this.progress, this.error, this.result);
     this.panel = this.box.node;
     this.count = element("output", {});
     this.progress.append(element("progress", { "aria-label": "Folding" }), this.count, this.cancelButton = element("button", { type: "button", id: "fit-cancel", class: "go", onclick: () => this.ask("DELETE") }, "Cancel"));
@@ -36,19 +36,19 @@ export class Fit {
     });
   }
 
-  // What may be fitted: a box a group, and under it one an entry.
+  // Entries that may be fitted: a box for each group, and below it one for each entry.
   offer() {
     this.estimator = this.link.status.estimator;
     const options = this.model.estimators.find((entry) => entry.name === this.estimator)?.options ?? [];
     const keys = [...this.model.tuning.map((item) => item.key), ...options.filter((item) => !item.choices.length && !item.whole).map((item) => `options.${item.name}`)];
     this.groups = Object.entries(GROUPS).map(([prefix, title]) => group(prefix, title, keys.filter((key) => key.startsWith(`${prefix}.`)))).filter(Boolean);
-    this.over = element("select", { id: "fit-over", "aria-label": "Over what" });
+    this.over = element("select", { id: "fit-over", "aria-label": "Events" });
     this.beginButton = element("button", { type: "button", id: "fit-begin", class: "go", onclick: () => this.begin() }, "Fit");
     this.form.replaceChildren(
-      element("div", { class: "groups", role: "group", "aria-label": "What is fitted" }, ...this.groups.map((item) => item.head)),
+      element("div", { class: "groups", role: "group", "aria-label": "Fitted entries" }, ...this.groups.map((item) => item.head)),
       element("details", { class: "entries" }, element("summary", {}, "single entries"), ...this.groups.map((item) => item.list)),
       element("div", { class: "pair" }, this.over, this.beginButton),
-      element("p", { class: "about" }, "Every third block of time takes no part in the fit: it decides whether the result is better."));
+      element("p", { class: "about" }, "Every third block of time is held out to judge the result."));
   }
 
   begin() {
@@ -59,7 +59,7 @@ export class Fit {
   async ask(method, body) {
     clearTimeout(this.timer);
     const answer = await fetch("/api/fit", { method, ...(body ? { headers: { "Content-Type": "application/json" }, body: JSON.stringify(body) } : {}) }).catch(() => null);
-    const told = answer?.headers.get("content-type")?.includes("json") ? await answer.json() : { error: "the twin does not answer" };
+    const told = answer?.headers.get("content-type")?.includes("json") ? await answer.json() : { error: "no answer from the twin" };
     this.say(told.error ?? "");
     if (!told.error) this.take(told);
     else if (BUSY.includes(this.told?.state)) this.timer = setTimeout(() => this.ask("GET"), 10 * FIT_PERIOD);
@@ -110,7 +110,7 @@ export class Fit {
     const { proposed } = told.result;
     if (!Object.keys(told.values).length) return [];
     const late = told.current ? null : `It was fitted from run ${told.revision}; another runs now`;
-    const use = element("button", { type: "button", id: "fit-use", class: proposed ? "go first" : "go quiet", disabled: Boolean(late), title: late ?? "One edit, which U takes back", onclick: () => this.use(told) }, proposed ? "Use it" : "use it all the same: it did not win");
+    const use = element("button", { type: "button", id: "fit-use", class: proposed ? "go first" : "go quiet", disabled: Boolean(late), title: late ?? "Apply as one edit (U to undo)", onclick: () => this.use(told) }, proposed ? "Use it" : "use it all the same: it did not win");
     return [use, ...(proposed ? this.keeping(told) : []), late ? element("span", { class: "faint" }, late) : null].filter(Boolean);
   }
 
@@ -120,11 +120,11 @@ export class Fit {
     const keep = async () => {
       const note = `fitted: ${told.wanted.join(", ")}`;
       const answer = await fetch("/api/fit/keep", { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify({ name: name.value.trim(), note }) }).catch(() => null);
-      this.say(answer?.ok ? "" : ((await answer?.json().catch(() => null))?.error ?? "the twin does not answer"));
+      this.say(answer?.ok ? "" : ((await answer?.json().catch(() => null))?.error ?? "no answer from the twin"));
       setText(kept, answer?.ok ? `kept as ${name.value.trim()}, see Runs` : "");
     };
     const kept = element("span", { class: "faint", role: "status" });
-    return [element("span", { class: "space" }), name, element("button", { type: "button", id: "fit-keep", class: "go", title: "Beside the twin, with what it was worth on the blocks held out", onclick: keep }, "Keep as a version"), kept];
+    return [element("span", { class: "space" }), name, element("button", { type: "button", id: "fit-keep", class: "go", title: "Save as a tuning version, with its scores on the held-out blocks", onclick: keep }, "Keep as a version"), kept];
   }
 
   async use(told) {
@@ -153,7 +153,7 @@ function group(prefix, title, keys) {
 
 const ALONE = "left alone: the data cannot tell";
 const EDGE = "at the edge of its range: the best may lie beyond";
-const BOUND = "only a bound: the data cannot tell it from none";
+const BOUND = "only a bound: not distinguishable from zero";
 
 // told: the answer of /api/fit; offers: buttons
 function fitted(told, offers) {
@@ -217,14 +217,14 @@ export class Refit {
   constructor(model, link, tune) {
     Object.assign(this, { model, link, opened: new Set() });
     this.said = element("span", { class: "faint", role: "status" });
-    this.button = element("button", { type: "button", id: "refit-open", title: "Every fit, with its evidence" }, "Fits…");
+    this.button = element("button", { type: "button", id: "refit-open", title: "All fits with their evidence" }, "Fits…");
     this.offer = element("div", {});
     this.error = element("p", { class: "error", role: "alert", hidden: true });
-    const head = element("div", { class: "refit-head" }, element("h3", { title: "A fit of parameters on the last readings, at set times, beside the filter of the state" }, "Dual estimation"), this.said, element("span", { class: "space" }), this.button);
+    const head = element("div", { class: "refit-head" }, element("h3", { title: "Parameters are fitted to the latest measurements at set times" }, "Dual estimation"), this.said, element("span", { class: "space" }), this.button);
     this.card = element("section", { id: "refit", "aria-label": "Dual estimation", hidden: true }, head, this.offer, this.error);
     tune.sections.before(this.card);
     this.about = element("p", { class: "about" });
-    this.begin = element("button", { type: "button", id: "refit-begin", class: "go", title: "Fit the last window at once", onclick: () => this.post("/api/refit", {}) }, "Fit now");
+    this.begin = element("button", { type: "button", id: "refit-begin", class: "go", title: "Fit the latest window now", onclick: () => this.post("/api/refit", {}) }, "Fit now");
     this.list = element("div", { class: "fits" });
     this.panel = new Panel(this.button, "refit-panel", "Dual estimation", () => this.look(), this.about, element("div", { class: "progress" }, this.begin), this.list);
     link.addEventListener("status", ({ detail }) => {
@@ -245,7 +245,7 @@ export class Refit {
   // Says why where it is refused.
   async post(path, fields) {
     const answer = await fetch(path, { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(fields) }).catch(() => null);
-    const reason = answer?.ok ? "" : ((await answer?.json().catch(() => null))?.error ?? "the twin does not answer");
+    const reason = answer?.ok ? "" : ((await answer?.json().catch(() => null))?.error ?? "no answer from the twin");
     setText(this.error, reason);
     this.error.hidden = !reason;
     await this.look();
@@ -272,14 +272,14 @@ export class Refit {
     const rows = entries.filter((line) => !line.alone).map((line) => element("tr", {},
       element("th", { scope: "row" }, words(line.key)),
       element("td", { title: `95 % interval ${compact(line.low, 3)} … ${compact(line.high, 3)}${spaced(line.unit)}` }, `${compact(line.before)} → `, element("b", {}, compact(line.after)), spaced(line.unit)),
-      element("td", { title: "Standard deviations of its estimate by which it moved" }, `${line.sigma < 0 ? "−" : "+"}${Math.abs(line.sigma).toFixed(1)} σ`)));
+      element("td", { title: "Change in standard deviations of the estimate" }, `${line.sigma < 0 ? "−" : "+"}${Math.abs(line.sigma).toFixed(1)} σ`)));
     const decide = (what) => () => this.post(`/api/refit/${what}`, { number: fit.number });
     return [
       element("table", {}, element("tbody", {}, ...rows)),
       element("p", { class: "about" }, `Better on the blocks held out: +${compact(verdict.gain, 3)} ± ${compact(verdict.error, 2)} nats a reading.`),
       element("div", { class: "offers" },
-        element("button", { type: "button", id: "refit-accept", class: "go first", title: "Keep it as a tuning version with its evidence, and fold again with it", onclick: decide("accept") }, "Accept"),
-        element("button", { type: "button", id: "refit-dismiss", class: "go", title: "Leave things as they are, until the data say something else", onclick: decide("dismiss") }, "Dismiss")),
+        element("button", { type: "button", id: "refit-accept", class: "go first", title: "Save as a tuning version and fold again with it", onclick: decide("accept") }, "Accept"),
+        element("button", { type: "button", id: "refit-dismiss", class: "go", title: "Keep the current tuning", onclick: decide("dismiss") }, "Dismiss")),
     ];
   }
 
@@ -301,7 +301,7 @@ const ADVICE_PERIOD = 500; // ms between two looks at whether it is there
 export class Advice {
   constructor(model, link, tune) {
     Object.assign(this, { model, link, tune });
-    this.button = element("button", { type: "button", id: "advise", title: "Which estimator what was read speaks for, and why" }, "Advice…");
+    this.button = element("button", { type: "button", id: "advise", title: "Recommended estimator for this log, with reasons" }, "Advice…");
     tune.restoreButton.before(this.button);
     this.measure = element("button", { type: "button", id: "advice-begin", class: "go", onclick: () => this.ask("POST") }, "Measure");
     this.said = element("span", { class: "faint", role: "status" });
@@ -318,7 +318,7 @@ export class Advice {
   async ask(method) {
     clearTimeout(this.timer);
     const answer = await fetch("/api/advice", { method, ...(method === "POST" ? { headers: { "Content-Type": "application/json" }, body: "{}" } : {}) }).catch(() => null);
-    const told = answer?.headers.get("content-type")?.includes("json") ? await answer.json() : { error: "the twin does not answer" };
+    const told = answer?.headers.get("content-type")?.includes("json") ? await answer.json() : { error: "no answer from the twin" };
     this.say(told.error ?? told.reason);
     if (told.error) return;
     const busy = told.state === "running";
@@ -343,7 +343,7 @@ export class Advice {
     const has = advice.has === advice.estimator && !options;
     return element("article", { class: "first" },
       element("header", {}, element("h3", {}, has ? `${title}: as it is` : title), element("span", { class: "space" }),
-        has ? null : element("button", { type: "button", id: "advice-apply", class: "go first", title: "One edit, which U takes back", onclick: () => this.apply(advice) }, "Apply")),
+        has ? null : element("button", { type: "button", id: "advice-apply", class: "go first", title: "Apply as one edit (U to undo)", onclick: () => this.apply(advice) }, "Apply")),
       options ? element("p", {}, options) : null, ...advice.reasons.map((reason) => element("p", {}, `because ${reason}`)));
   }
 

@@ -92,7 +92,7 @@ export class Strong {
   }
 }
 
-// A colour of its own for each place, and a dash for who cannot distinguish the colours.
+// Each place has its own colour, and its own dash beside the colour.
 const DASHES = [[], [9, 3], [3, 2], [10, 3, 2, 3]];
 const REACH = 1; // spans of a chart's own by which pinned runs may widen its axis to either side
 

@@ -1,4 +1,4 @@
-// The page's connection to the twin: what it says arrives here, what the user asks leaves here.
+// Connection of the page to the twin: status, episodes, notices and chart points arrive here; commands leave here.
 
 import { unpack } from "./stream.js";
 
@@ -59,7 +59,7 @@ export class Link extends EventTarget {
     this.tell("connection", why);
   }
 
-  // Whether a drag is over: what a run is worth, and what lies around a knob, is not worked out for each value on the way.
+  // Whether a drag is over: scores and likelihood curves are not computed for every value on the way.
   get settled() {
     return performance.now() - this.turned > SETTLED;
   }
@@ -128,7 +128,7 @@ export class Link extends EventTarget {
       const text = await answer.text();
       return answer.headers.get("content-type")?.includes("json") ? JSON.parse(text).error : text.trim();
     } catch {
-      return "the twin does not answer";
+      return "no answer from the twin";
     }
   }
 }

@@ -142,17 +142,17 @@ link.addEventListener("status", (event) => {
   if ($("recordings").dataset.names === key) return;
   $("recordings").dataset.names = key;
   $("recordings").replaceChildren(
-    ...names.slice(-3).map((name) => element("a", { href: `/rec/${encodeURIComponent(name)}`, download: name, title: "Download this recording" }, name)),
+    ...names.slice(-3).map((name) => element("a", { href: `/rec/${encodeURIComponent(name)}`, download: name, title: "Download recording" }, name)),
   );
 });
 
 const leave = settings.gallery ? new Leave(model, settings.boot) : null;
 
-// Files of the twin that were saved: what is wrong with them, and other configured values.
+// Saved files of the twin: errors in them, and new configured values.
 let reloads = null;
 link.addEventListener("status", async ({ detail: { unread, reloads: now } }) => {
   $("unread").hidden = !unread;
-  setText($("unread"), unread ? `${unread}. What runs goes on as it was.` : "");
+  setText($("unread"), unread ? `${unread}. The running twin goes on unchanged.` : "");
   if (reloads !== null && now !== reloads) tune.configure((await (await fetch("/api/model")).json()).tuning);
   reloads = now;
 });
@@ -164,25 +164,25 @@ const drawer = () => {
 $("drawer").addEventListener("click", drawer);
 
 keys([
-  ["space", "pause or go on", () => transport.pause()],
-  [".", "one event further, while paused", () => link.ask("Step")],
-  ["ArrowLeft", "a tenth of the charts back", () => view.pan(-0.1 * (charts.range[1] - charts.range[0]), charts.range)],
-  ["ArrowRight", "a tenth of the charts on", () => view.pan(0.1 * (charts.range[1] - charts.range[0]), charts.range)],
-  ["f", "follow the newest row", () => view.follow()],
-  ["0", "charts as wide as the twin says", () => view.follow(view.configured)],
-  ["r", "record, or end the recording", record],
+  ["space", "pause or continue", () => transport.pause()],
+  [".", "step one event, while paused", () => link.ask("Step")],
+  ["ArrowLeft", "move charts back", () => view.pan(-0.1 * (charts.range[1] - charts.range[0]), charts.range)],
+  ["ArrowRight", "move charts forward", () => view.pan(0.1 * (charts.range[1] - charts.range[0]), charts.range)],
+  ["f", "follow the newest data", () => view.follow()],
+  ["0", "default width of the charts", () => view.follow(view.configured)],
+  ["r", "start or stop recording", record],
   ["u", "undo the last edit", () => tune.undo()],
   ["U", "redo", () => tune.redo()],
-  ["b", "between what runs and the run before it", () => runs.swap()],
+  ["b", "switch to the previous run and back", () => runs.swap()],
   ["e", "episodes", () => side.show("episodes")],
-  ["y", "two states against each other", () => side.show("xy")],
-  ["s", "scene; once more: large, and back", () => (side.chosen === "scene" ? stage.enlarge() : side.show("scene"))],
-  ["x", "explore in Rerun, and back", () => turn("explore")],
-  ["w", "what if, and back", () => turn("whatif")],
-  ["d", "diagnose, and back", () => turn("diagnose")],
+  ["y", "state over state (XY)", () => side.show("xy")],
+  ["s", "scene; again: enlarge or shrink", () => (side.chosen === "scene" ? stage.enlarge() : side.show("scene"))],
+  ["x", "explore in Rerun", () => turn("explore")],
+  ["w", "what if", () => turn("whatif")],
+  ["d", "diagnose", () => turn("diagnose")],
   ["l", "copy a link to this moment", () => saving.copyLink()],
-  ["o", "save the track, a report", () => saving.run($("save"))],
-  ["t", "tune, where the page is narrow", drawer],
+  ["o", "save track or report", () => saving.run($("save"))],
+  ["t", "show the tuning panel", drawer],
   ...(leave?.commands ?? []),
 ]);
 

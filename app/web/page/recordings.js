@@ -16,7 +16,7 @@ export class Recordings {
     this.choose = element("input", { type: "file", multiple: true, hidden: true, onchange: () => this.ask.drop([...this.choose.files]) });
     this.node.replaceChildren(
       element("header", { class: "panel-head" }, element("h2", {}, "Recordings"), element("span", { class: "space" }),
-        element("button", { type: "button", class: "go", onclick: () => this.choose.click(), title: "A recording (.rrd) or a log; dropping it on the page does the same" }, "Add a file"), this.choose),
+        element("button", { type: "button", class: "go", onclick: () => this.choose.click(), title: "Add a recording (.rrd) or a log; or drop it on the page" }, "Add a file"), this.choose),
       this.list, this.where,
     );
     document.addEventListener("visibilitychange", () => this.refresh());
@@ -171,14 +171,14 @@ async function send(file, tell) {
 // Which twin is to read a log; null if none after all.
 function choose(name, twins) {
   return new Promise((done) => {
-    const dialog = element("dialog", { class: "choose", "aria-label": "Which twin reads it?" });
+    const dialog = element("dialog", { class: "choose", "aria-label": "Twin for this log" });
     const close = (value) => {
       dialog.close();
       dialog.remove();
       done(value);
     };
     dialog.append(
-      element("h2", {}, "Which twin reads it?"), element("p", { class: "faint" }, `${name} takes the place of the twin's own recording.`),
+      element("h2", {}, "Twin for this log"), element("p", { class: "faint" }, `${name} takes the place of the twin's own recording.`),
       element("ul", {}, ...twins.map((twin) => element("li", {}, element("button", { type: "button", onclick: () => close(twin.name) }, element("b", {}, twin.short), " ", element("span", { class: "faint" }, twin.title))))),
       element("button", { type: "button", class: "go", onclick: () => close(null) }, "Cancel"),
     );

@@ -1,4 +1,4 @@
-// Every revision: what was changed for it, and what it was worth. Pinned ones stay on the charts; any can be named,
+// Every revision with its change and its scores. Pinned ones stay on the charts; any can be named,
 // noted, loaded, saved as YAML, and compared with another.
 
 import { element, setText } from "./dom.js";
@@ -28,7 +28,7 @@ export class Runs {
     setInterval(() => link.socket && link.status.runs && this.heard(link.status), LOOK);
   }
 
-  // While somebody looks, and is not just writing.
+  // While the tab is shown, and nothing is being typed.
   async heard(status) {
     if (!this.node.checkVisibility() || this.asking || (this.key && !this.link.settled)) return;
     const key = `${status.runs.version}/${status.revision}/${status.refolding}`;
@@ -69,16 +69,16 @@ export class Runs {
 
   head(subjects) {
     const select = subjects.length
-      ? element("select", { "aria-label": "RMSE of what", dataset: { focus: "subject" }, onchange: () => ((this.subject = select.value), this.show()) },
+      ? element("select", { "aria-label": "State of the RMSE", dataset: { focus: "subject" }, onchange: () => ((this.subject = select.value), this.show()) },
           ...subjects.map((fit) => element("option", { value: fit.name, selected: fit.name === this.subject }, `${fit.name}${fit.against === "truth" ? "" : " (held out)"}`)))
       : null;
     const cell = (title, ...text) => element("th", { scope: "col", title }, ...text);
     return element("thead", {}, element("tr", {},
-      cell("Mean NIS of the readings that were used; ▲ above, ▼ below its 95 % bounds; bold: nearest to what it should be", "NIS"),
-      cell("Root mean square error against the truth, or of predictions of a sensor held out", "RMSE ", select ?? "–"),
+      cell("Mean NIS of used measurements (▲ above, ▼ below its 95 % bounds; bold: nearest to the bounds' middle)", "NIS"),
+      cell("Root mean square error against the truth, or of predictions of a held-out sensor", "RMSE ", select ?? "–"),
       cell("Share of errors inside their 95 % band", "in 95 %"),
-      cell("Log-likelihood of a reading, refused ones priced", "log L"),
-      cell("Elapsed time of folding one event, µs", "µs/step")));
+      cell("Log-likelihood per measurement, with a penalty for rejected ones", "log L"),
+      cell("Time per event, µs", "µs/step")));
   }
 
   run(run, best) {
@@ -87,8 +87,8 @@ export class Runs {
     const cell = (key, text, title) => element("td", { class: best[key] === number ? "best" : null, title: best[key] === number ? `Best. ${title ?? ""}` : title }, text);
     const scores = score
       ? element("tr", { class: "scores" },
-          cell("nis", `${compact(score.nis, 3)}${BEYOND[score.nis_place] ?? ""}`, `Of the whole run: ${score.nis_words}; ${score.readings} readings in ${span(score.seconds)}, ${compact(100 * (score.refused ?? 0), 2)} % refused`),
-          cell("rmse", fit ? compact(fit.rmse, 3) : "–", fit ? `${fit.name}, ${fit.against}: mean error ${compact(fit.bias, 2)}${spaced(fit.unit)}` : "No truth, and no sensor is held out"),
+          cell("nis", `${compact(score.nis, 3)}${BEYOND[score.nis_place] ?? ""}`, `Of the whole run: ${score.nis_words}; ${score.readings} measurements in ${span(score.seconds)}, ${compact(100 * (score.refused ?? 0), 2)} % rejected`),
+          cell("rmse", fit ? compact(fit.rmse, 3) : "–", fit ? `${fit.name}, ${fit.against}: mean error ${compact(fit.bias, 2)}${spaced(fit.unit)}` : "Needs a known truth or a held-out sensor"),
           cell("coverage", fit ? `${compact(100 * fit.coverage, 3)} %` : "–"),
           cell("likelihood", compact(score.log_likelihood_reading, 4), `In all ${compact(score.log_likelihood, 6)}`),
           cell("step", compact(score.step_us, 3)))
@@ -102,7 +102,7 @@ export class Runs {
 
   pin(run) {
     const pinned = run.place !== null;
-    const title = pinned ? "Unpin" : run.kept ? "Pin: keep it on the charts" : "Its track is gone: load it to pin it";
+    const title = pinned ? "Unpin" : run.kept ? "Pin to the charts" : "Load it first: its track is gone";
     return element("button", {
       type: "button", class: "pin", "aria-pressed": String(pinned), "aria-label": `Pin run ${run.number}`, title, disabled: !run.kept && !pinned,
       dataset: { focus: `pin${run.number}` }, onclick: () => this.ask(pinned ? "Unpin" : "Pin", { number: run.number }),
@@ -115,7 +115,7 @@ export class Runs {
       type: "text", class: "name", value: run.name, placeholder: run.estimator, maxlength: 60, "aria-label": `Name of run ${run.number}`,
       onchange: keep, onkeydown: (event) => event.key === "Enter" && name.blur(),
     });
-    return [element("b", { title: run.running ? "Runs now" : null }, run.running ? `${run.number} ▸` : String(run.number)), name];
+    return [element("b", { title: run.running ? "Running" : null }, run.running ? `${run.number} ▸` : String(run.number)), name];
   }
 
   buttons(run) {
@@ -126,13 +126,13 @@ export class Runs {
       this.show();
     };
     return [
-      run.running ? null : button("load", "Load: back to this filter and tuning", () => this.ask("Load", { number })),
+      run.running ? null : button("load", "Load this filter and tuning", () => this.ask("Load", { number })),
       button("note", "Write a note", () => ((this.noted = this.noted === number ? null : number), this.show(), this.table.querySelector(`tbody[data-number="${number}"] textarea`)?.focus())),
-      button("⇄", "Compare with another", choose, { "aria-pressed": String(this.chosen.includes(number)) }),
+      button("⇄", "Compare with another run", choose, { "aria-pressed": String(this.chosen.includes(number)) }),
       this.download(run, "report", `/api/report.html?run=${number}`, "Save a report: scores, charts, checks, episodes and tuning in one file", `Save a report of run ${number}`),
       this.download(run, "csv", `/api/track.csv?run=${number}`, "Save the track as CSV", `Save the track of run ${number}`),
       button("keep", run.name ? `Keep as version ${run.name}, beside the twin` : "Keep as a version beside the twin, under the run's name: give it one", () => this.versions.keep(run), { disabled: !run.name }),
-      element("a", { href: `/api/runs/${number}.yaml`, download: "", title: "Save the tuning as lines of the twin's YAML", "aria-label": `Save run ${number} as YAML` }, "yaml"),
+      element("a", { href: `/api/runs/${number}.yaml`, download: "", title: "Save the tuning as YAML", "aria-label": `Save run ${number} as YAML` }, "yaml"),
     ];
   }
 
@@ -144,7 +144,7 @@ export class Runs {
 
   note(run) {
     const text = element("textarea", {
-      rows: 2, maxlength: 2000, "aria-label": `Note on run ${run.number}`, placeholder: "What was tried, and what came of it",
+      rows: 2, maxlength: 2000, "aria-label": `Note on run ${run.number}`, placeholder: "Note",
       onchange: () => ((this.noted = null), this.ask("Note", { number: run.number, name: run.name, note: text.value })),
     });
     text.value = run.note;
@@ -162,9 +162,9 @@ export class Runs {
     if (!answer?.ok) return;
     const differ = await answer.json();
     const shown = (value) => (typeof value === "number" ? compact(value, 6) : value === null ? "off" : String(value));
-    const head = element("tr", {}, element("th", { scope: "col" }, "differs in"), ...[a, b].map((number) => element("th", { scope: "col" }, `run ${number}`)));
+    const head = element("tr", {}, element("th", { scope: "col" }, "entry"), ...[a, b].map((number) => element("th", { scope: "col" }, `run ${number}`)));
     const rows = differ.map((entry) => element("tr", {}, element("th", { scope: "row" }, entry.key), ...entry.values.map((value) => element("td", {}, shown(value)))));
-    this.compared.replaceChildren(element("table", {}, element("thead", {}, head), element("tbody", {}, ...rows)), ...(rows.length ? [] : [element("p", { class: "faint" }, "Filter and tuning are the same.")]));
+    this.compared.replaceChildren(element("table", {}, element("thead", {}, head), element("tbody", {}, ...rows)), ...(rows.length ? [] : [element("p", { class: "faint" }, "No differences.")]));
   }
 }
 
@@ -188,8 +188,8 @@ function bests(runs, subject) {
   };
 }
 
-// The tuning versions that are kept beside the twin: listed with what they were worth, loaded, compared with what runs;
-// and what runs, or any run, kept as another one.
+// Tuning versions beside the twin: list them with their scores, load one, compare one with the running tuning, or save
+// a run as a new one.
 
 class Versions {
   constructor(link) {
@@ -199,13 +199,13 @@ class Versions {
     this.error = element("p", { class: "error", role: "alert", hidden: true });
     this.name = element("input", { type: "text", "aria-label": "Name of the version", placeholder: "name", maxlength: 60 });
     this.note = element("input", { type: "text", "aria-label": "Note on the version", placeholder: "note", maxlength: 2000 });
-    const keep = element("button", { type: "submit", class: "go", title: "Keep what runs as a version, beside the twin" }, "keep");
+    const keep = element("button", { type: "submit", class: "go", title: "Save the running tuning as a version" }, "keep");
     this.form = element("form", { onsubmit: (event) => (event.preventDefault(), this.keepRunning()) }, this.name, this.note, keep);
     this.guard = element("p", { class: "guard faint", hidden: true });
-    this.node = element("details", { class: "versions", open: true }, element("summary", { title: "Filter and tuning under a name, in files beside the twin" }, "Tuning versions"), this.table, this.guard, this.form, this.error);
+    this.node = element("details", { class: "versions", open: true }, element("summary", { title: "Named filters and tunings, saved beside the twin" }, "Tuning versions"), this.table, this.guard, this.form, this.error);
   }
 
-  // Asked for while somebody looks; what has the focus keeps it.
+  // While the tab is shown; the focus stays where it is.
   async list() {
     const answer = await fetch("/api/tunings").catch(() => null);
     if (!answer?.ok) return;
@@ -214,7 +214,7 @@ class Versions {
     this.guard.replaceChildren(...guard.map((each) => guarded(each, versions)));
     const differ = this.compared && (await this.difference(this.compared));
     const focused = this.table.contains(document.activeElement) ? document.activeElement.dataset.focus : null;
-    const head = element("tr", {}, element("th", { scope: "col" }, "version"), element("th", { scope: "col", title: "Mean NIS where it was scored" }, "NIS"), element("th", { scope: "col", title: "Log-likelihood of a reading where it was scored" }, "log L"), element("th", {}));
+    const head = element("tr", {}, element("th", { scope: "col" }, "version"), element("th", { scope: "col", title: "Mean NIS when it was saved" }, "NIS"), element("th", { scope: "col", title: "Log-likelihood per measurement when it was saved" }, "log L"), element("th", {}));
     this.table.replaceChildren(element("thead", {}, head), ...versions.map((item) => this.version(item, running, differ)));
     if (focused) this.table.querySelector(`[data-focus="${focused}"]`)?.focus();
   }
@@ -224,12 +224,12 @@ class Versions {
     const runs = running === name;
     const button = (text, title, click, attributes = {}) => element("button", { type: "button", title, "aria-label": `${title}: version ${name}`, dataset: { focus: `${text}${name}` }, disabled: Boolean(error), onclick: click, ...attributes }, text);
     const compare = () => ((this.compared = this.compared === name ? null : name), this.list());
-    const about = error ?? [item.note, item.fitted_on?.length ? `fitted on ${item.fitted_on.join(", ")}` : "", item.accepted?.note ? `accepted: ${item.accepted.note}` : "", item.saved?.slice(0, 16).replace("T", " ") ?? "what the twin's file says"].filter(Boolean).join(" · ");
+    const about = error ?? [item.note, item.fitted_on?.length ? `fitted on ${item.fitted_on.join(", ")}` : "", item.accepted?.note ? `accepted: ${item.accepted.note}` : "", item.saved?.slice(0, 16).replace("T", " ") ?? "from the twin's file"].filter(Boolean).join(" · ");
     return element("tbody", { dataset: { version: name, running: runs } },
       element("tr", {},
-        element("th", { scope: "row" }, name, holds ? element("i", { title: "Accepted: nisus guard goes by it" }, " ✓") : null, runs ? element("i", { title: "Runs now" }, " ▸") : running === `${name}*` ? element("i", { title: "What runs began with it; since then something was turned" }, " ▸*") : null),
+        element("th", { scope: "row" }, name, holds ? element("i", { title: "Accepted: reference of nisus guard" }, " ✓") : null, runs ? element("i", { title: "Running" }, " ▸") : running === `${name}*` ? element("i", { title: "Running, with edits since it was loaded" }, " ▸*") : null),
         element("td", {}, compact(scores.nis, 3)), element("td", {}, compact(scores.log_likelihood, 4)),
-        element("td", {}, button("load", "Load: the history is folded again with it", () => this.ask("/api/tunings/load", { name })), button("⇄", "Compare with what runs", compare, { "aria-pressed": String(this.compared === name) }))),
+        element("td", {}, button("load", "Load and fold the history again", () => this.ask("/api/tunings/load", { name })), button("⇄", "Compare with the running tuning", compare, { "aria-pressed": String(this.compared === name) }))),
       element("tr", { class: error ? "error" : "faint" }, element("td", { colspan: 4 }, about)),
       this.compared === name && differ ? element("tr", {}, element("td", { colspan: 4 }, differences(name, differ))) : null);
   }
@@ -246,7 +246,7 @@ class Versions {
     this.error.hidden = !reason;
   }
 
-  // Says why where it is refused; whether it was done.
+  // Show the reason of a refusal; resolves to whether it was done.
   async ask(path, fields) {
     const answer = await fetch(path, { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(fields) }).catch(() => null);
     const reason = answer?.ok ? null : ((await answer?.json().catch(() => null))?.error ?? "no answer");
@@ -265,19 +265,19 @@ class Versions {
   }
 }
 
-// What `nisus guard` said last of one recording: what got worse is shown, the rest is told.
+// Last result of `nisus guard` for one recording.
 function guarded(each, versions) {
   const { recording, at, version, figures, worse, better, failure } = each;
   const verdict = failure || (worse.length ? `${worse.length} of ${figures} figures worse: ${worse[0]}` : `none of ${figures} figures worse${better.length ? `, ${better.length} better` : ""}`);
   const holds = versions.find((item) => item.holds)?.name;
   const since = holds && version && holds !== version ? `; since then ${holds} was accepted` : "";
-  const title = [...worse, ...better.map((text) => `better: ${text}`)].join("\n") || "What nisus guard compared with the recorded scores";
+  const title = [...worse, ...better.map((text) => `better: ${text}`)].join("\n") || "Last result of nisus guard";
   return element("span", { class: failure || worse.length ? "error" : "", title, dataset: { guarded: recording } }, `${failure || worse.length ? "✗" : "✓"} guard, ${at.slice(0, 16).replace("T", " ")} UTC, ${recording} with ${version || "?"}: ${verdict}${since}`);
 }
 
 function differences(name, differ) {
-  if (!differ.length) return "Filter and tuning are what runs.";
+  if (!differ.length) return "No differences from the running tuning.";
   const shown = (value) => (typeof value === "number" ? compact(value, 6) : value === null ? "off" : String(value));
-  const head = element("tr", {}, ...["differs in", name, "what runs"].map((text) => element("th", { scope: "col" }, text)));
+  const head = element("tr", {}, ...["entry", name, "running"].map((text) => element("th", { scope: "col" }, text)));
   return element("table", {}, element("thead", {}, head), element("tbody", {}, ...differ.map((entry) => element("tr", {}, element("th", { scope: "row" }, entry.key), ...entry.values.map((value) => element("td", {}, shown(value)))))));
 }

@@ -1,5 +1,4 @@
-// What can be saved: a chart as a picture, the track as a table, a report, a link to what is shown. One menu for all,
-// which opens beside the button that was pressed.
+// Saving a chart as a picture, the track as a table, a report, or a link: one menu, beside the button that was pressed.
 
 import { heading } from "./chart.js";
 import { element } from "./dom.js";
@@ -20,7 +19,7 @@ export class Save {
     document.body.append(this.menu);
   }
 
-  // items: [text, title, run, reason]; with a reason why not it is greyed, and says so
+  // items: [text, title, run, reason]; with a reason it is disabled and shows it
   open(button, items) {
     this.menu.replaceChildren(
       ...items.map(([text, title, run, reason]) =>
@@ -65,7 +64,7 @@ export class Save {
   // A chart as a picture or a drawing; draw() gives the text of the SVG.
   offer(button, draw, name) {
     const save = (kind, title) => [kind.toUpperCase(), title, () => this.picture(draw(), name, kind)];
-    this.open(button, [save("png", "A picture of this chart as it is"), save("svg", "A drawing of this chart as it is")]);
+    this.open(button, [save("png", "Picture of this chart"), save("svg", "Drawing of this chart")]);
   }
 
   run(button) {
@@ -74,14 +73,14 @@ export class Save {
     const [since, until] = this.charts.range.map((time) => Number(time.toFixed(6)));
     const whole = (kind) => `/api/track.${kind}?run=${number}`;
     const part = (kind) => `${whole(kind)}&since=${since}&until=${until}`;
-    const reason = this.link.status.t === null ? "no reading has come yet" : null;
+    const reason = this.link.status.t === null ? "no measurement has arrived yet" : null;
     this.open(button, [
-      ["Track, what is shown: CSV", "One line an event, the columns of nisus fold", () => fetched(part("csv")), reason],
-      ["Track, what is shown: Parquet", "The same, with its types", () => fetched(part("parquet")), reason],
-      ["Track, all of it: CSV", "One line an event, the columns of nisus fold", () => fetched(whole("csv")), reason],
-      ["Track, all of it: Parquet", "The same, with its types", () => fetched(whole("parquet")), reason],
-      ["Report: HTML", "Scores, charts, checks, episodes and tuning in one file", () => fetched(`/api/report.html?run=${number}`), reason],
-      ["Copy a link to this moment (L)", "Time, span and charts, for who has this session open", () => this.copyLink()],
+      ["Track, shown part: CSV", "One line per event", () => fetched(part("csv")), reason],
+      ["Track, shown part: Parquet", "One row per event, with types", () => fetched(part("parquet")), reason],
+      ["Track, all: CSV", "One line per event", () => fetched(whole("csv")), reason],
+      ["Track, all: Parquet", "One row per event, with types", () => fetched(whole("parquet")), reason],
+      ["Report: HTML", "Scores, charts, episodes and tuning in one file", () => fetched(`/api/report.html?run=${number}`), reason],
+      ["Copy a link to this moment (L)", "For browsers of this session: time, span and charts", () => this.copyLink()],
     ]);
   }
 
@@ -120,7 +119,7 @@ export class Save {
     // In the address too, for where a page may not write to the clipboard.
     history.replaceState(null, "", url);
     await navigator.clipboard?.writeText(url).catch(() => {});
-    this.said?.("link copied; it is in the address too");
+    this.said?.("Link copied");
   }
 }
 

@@ -1,4 +1,4 @@
-// What runs at this address, what is being started, and what could not be; asked again and again while it is looked at.
+// State of the session: the running twin, a start under way, a start that failed. Polled while the page is visible.
 
 import { $, element, setAttribute, setText } from "./dom.js";
 import { drops } from "./recordings.js";
@@ -42,7 +42,7 @@ export class Session extends EventTarget {
   async tell(asked) {
     const answer = await asked;
     if (!answer.error) this.take(answer);
-    else this.dispatchEvent(new CustomEvent("state", { detail: { ...this.state, failed: { title: "It", text: answer.error } } }));
+    else this.dispatchEvent(new CustomEvent("state", { detail: { ...this.state, failed: { title: "Start", text: answer.error } } }));
     this.ask();
   }
 }
@@ -67,7 +67,7 @@ export async function post(path, body, method = "POST") {
   }
 }
 
-// One twin of the gallery: picture, question, what it teaches, and a button to start it, or why it cannot.
+// One twin of the gallery: picture, question, lesson, and a button to start it, or the reason why it cannot.
 
 const many = (count, word) => `${count.toLocaleString("en")} ${word}${count === 1 ? "" : "s"}`;
 

@@ -57,7 +57,7 @@ export class Transport {
     this.status = status;
     const held = status.seekable ? status.paused : !this.view.following;
     setText($("pause"), held ? "▶" : "❚❚");
-    setAttribute($("pause"), "title", status.seekable ? (held ? "Go on (space)" : "Pause the replay (space)") : "Hold the charts; the twin runs on (space)");
+    setAttribute($("pause"), "title", status.seekable ? (held ? "Continue (space)" : "Pause the replay (space)") : "Hold the charts (space)");
     $("pause").disabled = status.finished && status.seekable;
     $("step").hidden = $("speed").hidden = !status.seekable;
     $("step").disabled = !status.paused;

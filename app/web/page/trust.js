@@ -3,7 +3,7 @@
 import { $, element, setAttribute, setText } from "./dom.js";
 import { clock, compact, span, words } from "./format.js";
 
-// Beside the colours, for whoever cannot tell them.
+// Signs beside the colours, for users who cannot distinguish them.
 export const SIGNS = {
   waiting: "○", tracking: "●", suspect: "◐", degraded: "▲", diverged: "✖", stale: "◌", "held out": "–", screened: "⊘",
 };
@@ -38,12 +38,12 @@ export class Trust {
     const name = lost ? "not a number" : status.health;
     setText($("health"), `${SIGNS[status.health] ?? "●"} ${name}${lasting ? ` ${span((status.t - since) / 1e9)}` : ""}`);
     $("health").dataset.health = lost ? "diverged" : status.health;
-    const cause = lost ? "The estimate is not a number: reset it, or choose another filter" : status.cause;
+    const cause = lost ? "The estimate is not a number. Reset it, or choose another filter." : status.cause;
     const first = status.episodes_open > 1 && cause ? `1 of ${status.episodes_open}: ` : ""; // ahead, as the end may be cut
     setText($("cause"), first + cause);
     setAttribute($("cause"), "title", first + cause);
     this.gauge(status);
-    // What is wrong needs the room: sensors that are in order keep their light alone.
+    // A cause needs the room: healthy sensors show their light without a name.
     $("lights").dataset.brief = String(Boolean(cause));
     for (const [sensor, light] of this.lights) {
       const { state, text } = status.sensors[sensor] ?? { state: "waiting", text: "" };
@@ -54,7 +54,7 @@ export class Trust {
     const rest = Object.entries(status.sensors).filter(([sensor]) => !this.lights.has(sensor));
     const bad = rest.filter(([, item]) => !["tracking", "held out", "waiting"].includes(item.state));
     if ($("more-lights")) {
-      setText($("more-lights"), `+${rest.length}${bad.length ? `, ${bad.length} not well` : ""}`);
+      setText($("more-lights"), `+${rest.length}${bad.length ? `, ${bad.length} with faults` : ""}`);
       setAttribute($("more-lights"), "title", bad.map(([sensor, item]) => `${words(sensor)}: ${item.state}`).join("\n"));
     }
     setText($("folding"), refolding(status));
@@ -81,13 +81,13 @@ export class Trust {
     $("gauge").style.setProperty("--high", place(high));
     $("gauge").style.setProperty("--nis", place(judged));
     $("gauge").dataset.inside = String(where === "inside");
-    setAttribute($("gauge"), "title", `Of the last readings: ${said}`);
+    setAttribute($("gauge"), "title", `Latest measurements: ${said}`);
   }
 
   connection(state) {
     const text = {
-      live: "", waiting: "connection lost, trying again", hidden: "",
-      ended: "this session has ended; open the address that Nisus printed last",
+      live: "", waiting: "Connection lost, trying again", hidden: "",
+      ended: "This session has ended; open the address that Nisus printed last",
     }[state];
     setText($("connection"), text ?? "");
     $("connection").hidden = !text;
@@ -95,20 +95,20 @@ export class Trust {
   }
 }
 
-// What a refold waits for, or the revision.
+// The filter being compiled, the refold under way, or the revision.
 function refolding({ awaited, compiling, refolding: waits, revision }) {
   if (awaited !== null) return `compiling ${awaited}, ${Math.round(compiling[awaited] ?? 0)} s …`;
   return waits ? `folding r${revision + 1} …` : `r${revision}`;
 }
 
-// What was and is wrong, newest first, each with its remedy; and what else happened.
+// Episodes, newest first, each with its remedy; and notices.
 
 const MOST = 200;
 
-// What can become of a reading, by the key of its count; those of which there are none are not shown.
+// Names of measurement counts; a count of zero is not shown.
 const KINDS = [
-  ["used", "used"], ["gated", "refused by the gate"], ["held out", "held out"], ["screened", "screened at the edge"], ["missing", "empty"],
-  ["failed", "failed"], ["stale", "dropped: too late"], ["wrong time", "dropped: wrong time"], ["inflated", "late, with R inflated"], ["held", "waiting for their time to be believed"], ["silenced", "lost by a fault on demand"],
+  ["used", "used"], ["gated", "rejected by the gate"], ["held out", "held out"], ["screened", "implausible"], ["missing", "empty"],
+  ["failed", "failed"], ["stale", "dropped: too late"], ["wrong time", "dropped: wrong time"], ["inflated", "late, with R inflated"], ["held", "waiting for a clock check"], ["silenced", "dropped by an injected fault"],
 ];
 
 const grouped = (n) => n.toLocaleString("en");
@@ -117,11 +117,11 @@ export class Episodes {
   constructor(node, link, view, charts) {
     Object.assign(this, { node, link, view, charts });
     this.notices = [];
-    this.held = []; // what sensors show that are held out, in words
-    this.counts = element("dl", { class: "counts", "aria-label": "What became of the readings" });
+    this.held = []; // offsets of held-out sensors, in words
+    this.counts = element("dl", { class: "counts", "aria-label": "Measurement counts" });
     link.addEventListener("episodes", (event) => this.show(event.detail));
     link.addEventListener("notices", (event) => {
-      // After a break all are told again.
+      // After a reconnection all arrive again.
       const known = this.notices[0]?.number ?? -1;
       const fresh = event.detail.filter((notice) => notice.number > known).reverse();
       this.notices = [...fresh, ...this.notices].slice(0, MOST);
@@ -134,7 +134,7 @@ export class Episodes {
     this.show([]);
   }
 
-  // What became of the readings; the sensors' own counts when pointed at.
+  // Measurement counts; those of each sensor in the tooltip.
   count({ counts }) {
     const found = KINDS.filter(([key]) => counts[key]).map(([key, name]) => [key, name, counts[key]]);
     const text = JSON.stringify([found, counts.readings]);
@@ -142,12 +142,12 @@ export class Episodes {
     this.counted = text;
     const whose = (key) => Object.entries(counts).filter(([name]) => name.startsWith(`${key} `)).map(([name, n]) => `${words(name.slice(key.length + 1))} ${n}`).join("\n");
     this.counts.replaceChildren(
-      element("dt", {}, "readings"), element("dd", {}, grouped(counts.readings ?? 0)),
+      element("dt", {}, "measurements"), element("dd", {}, grouped(counts.readings ?? 0)),
       ...found.flatMap(([key, name, n]) => [element("dt", { title: whose(key) }, name), element("dd", { title: whose(key) }, `${grouped(n)}${key === "used" || !counts.readings ? "" : ` (${compact((100 * n) / counts.readings, 2)} %)`}`)]),
     );
   }
 
-  // Nothing of a sensor that is held out is tested; what it reads is shown all the same.
+  // Held-out sensors have no episodes, but their offsets are shown.
   holds(sensors) {
     const held = Object.values(sensors).filter(({ state, text }) => state === "held out" && text).map(({ text }) => text);
     if (held.join() === this.held.join()) return;
@@ -161,7 +161,7 @@ export class Episodes {
     const list = (items, entry) => element("ol", {}, ...items.map(entry));
     this.node.replaceChildren(
       this.counts,
-      element("h3", {}, open.length ? `Now (${open.length})` : `Now: nothing is wrong${this.held.length ? " with the sensors in use" : ""}`),
+      element("h3", {}, open.length ? `Now (${open.length})` : `Now: no faults${this.held.length ? " in the sensors in use" : ""}`),
       list(open, (item) => this.entry(item)),
       this.held.length ? element("h3", {}, "Held out") : "",
       list(this.held, (text) => element("li", { class: "event held-out" }, element("span", {}, text))),
@@ -181,13 +181,13 @@ export class Episodes {
     };
     return element(
       "li", { class: "episode", dataset: { open: String(episode.end === null), severity: episode.severity ?? "" } },
-      element("button", { type: "button", title: "Show it in the charts", onclick: show }, element("time", {}, times), element("b", {}, `${words(episode.subject)}: ${episode.cause}`)),
+      element("button", { type: "button", title: "Show in the charts", onclick: show }, element("time", {}, times), element("b", {}, `${words(episode.subject)}: ${episode.cause}`)),
       element("p", {}, episode.text),
       element("a", { href: `/alarms#${episode.help.split("#")[1]}`, target: "_blank" }, `more on ${episode.cause}`),
     );
   }
 
-  // The last told first. Another run folds the same time again, which a line between them says.
+  // Newest first, with a line between runs, which fold the same time again.
   event(notice, after) {
     const when = notice.from === null ? "" : clock(notice.from);
     const line = element("li", { class: "event", dataset: { level: notice.level } }, element("time", {}, when), element("span", {}, notice.text));

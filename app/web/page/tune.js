@@ -105,9 +105,9 @@ export class Tune {
 
   gateSection() {
     const choose = () => this.turn("gate", this.gate.value === "off" ? null : Number(this.gate.value));
-    this.gate = element("select", { "aria-label": "Gate", title: "Probability with which a good reading passes", onchange: choose });
+    this.gate = element("select", { "aria-label": "Gate", title: "Probability that a good measurement passes", onchange: choose });
     this.kind = element(
-      "select", { "aria-label": "Kind of gate", title: "What becomes of a reading beyond it", onchange: () => this.turn("gate.kind", this.kind.value) },
+      "select", { "aria-label": "Kind of gate", title: "Treatment of a measurement beyond the gate", onchange: () => this.turn("gate.kind", this.kind.value) },
       element("option", { value: "hard" }, "refuse"), element("option", { value: "soft" }, "soften"),
     );
     return section("Gate", "Readings that a good sensor would hardly give", true, element("div", { class: "pair" }, this.gate, this.kind));
@@ -117,11 +117,11 @@ export class Tune {
     this.sensors = new Map();
     const rows = this.model.sensors.map((name) => {
       const box = element("input", { type: "checkbox", onchange: () => this.use(name, box.checked) });
-      const row = element("label", { class: "sensor", title: "Off: held out. Predicted and scored, never used" }, box, element("span", {}, words(name)), element("em", {}));
+      const row = element("label", { class: "sensor", title: "Off: held out (predicted and scored, but not used)" }, box, element("span", {}, words(name)), element("em", {}));
       this.sensors.set(name, [box, row.lastChild]);
       return row;
     });
-    return section("Sensors in use", "Off: held out. Predicted and scored, never used", this.model.sensors.length <= MANY, ...rows);
+    return section("Sensors in use", "Off: held out (predicted and scored, but not used)", this.model.sensors.length <= MANY, ...rows);
   }
 
   sync(status) {

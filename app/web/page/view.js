@@ -1,4 +1,4 @@
-// Which stretch of time all charts show: the last seconds, followed; or a fixed one.
+// The stretch of time that all charts show: the last seconds, followed, or a fixed one.
 
 const NARROWEST = 1e-3; // s
 
@@ -16,7 +16,7 @@ export class View extends EventTarget {
     return this.since === null;
   }
 
-  // What a lane is asked for.
+  // The stretch as a chart query.
   wanted() {
     if (this.following) return this.span === null ? {} : { span: this.span };
     return { since: this.since, until: this.until };
@@ -28,7 +28,7 @@ export class View extends EventTarget {
     this.changed();
   }
 
-  // The moment stays, if it is still in sight; else it is the last of what is shown.
+  // The moment stays if it is still shown; else it is the end of the stretch.
   show(since, until, at = this.at) {
     const middle = (since + until) / 2;
     const half = Math.max(NARROWEST, until - since) / 2;
@@ -38,13 +38,13 @@ export class View extends EventTarget {
     this.changed();
   }
 
-  // Hold what is shown now, or follow again.
+  // Hold the present stretch, or follow again.
   hold(range) {
     if (this.following) this.show(...range);
     else this.follow();
   }
 
-  // To a moment: what is shown stays where it holds it; else the same width around it, but not beyond the newest row.
+  // Go to a moment: within the stretch if it is shown, else with the same width around it, up to the newest row.
   goTo(time, range, newest = Infinity) {
     if (range[0] <= time && time <= range[1]) return this.show(...range, time);
     const width = range[1] - range[0];
@@ -71,7 +71,7 @@ export class View extends EventTarget {
 
 const DIGITS = 9; // of a second
 
-// The address of what is shown now.
+// The address of the present view.
 export function link({ model, link, view, charts }) {
   const [since, until] = charts.range;
   const parts = {

@@ -55,13 +55,13 @@ export class WhatIf {
     this.state = element("span", { class: "state", role: "status" });
     this.rows = new Map(this.model.inputs.map((input) => [input.name, inputRow(this, input)]));
     const asked = element(
-      "section", { class: "asked", "aria-label": "The future that is asked for" },
+      "section", { class: "asked", "aria-label": "Forecast settings" },
       element("label", { class: "choice" }, element("b", {}, "Horizon"), this.slider, this.length),
       ...[...this.rows.values()].map((row) => row.node),
     );
     this.charts = element("div", { class: "fans" });
     const axis = element("div", { class: "axis", "aria-hidden": "true" });
-    this.node.replaceChildren(asked, this.problem, this.charts, axis, element("p", { class: "faint foot" }, "From now on without readings, by the filter that runs. Bands ± 1σ, ± 2σ. ", this.method, this.state));
+    this.node.replaceChildren(asked, this.problem, this.charts, axis, element("p", { class: "faint foot" }, "Prediction of the running filter without measurements. Bands ± 1σ, ± 2σ. ", this.method, this.state));
     const { states } = this;
     const actions = (this.actions = { select: () => {}, home: () => {}, wheel: () => {}, save: (chart, button) => this.saving.chart(chart, button) });
     this.parts = states.map((state) => new Chart(fan(this, state), actions));
@@ -81,7 +81,7 @@ export class WhatIf {
       ...this.states.flatMap((state) => state.rows.map((row) => `reading:${row}`)),
       ...this.model.inputs.map((input) => `input:${input.name}`),
     ];
-    // More than is shown: what is forecast may be seconds old.
+    // More than is shown, as a forecast may be seconds old.
     const past = 1.5 * PAST * (this.horizon ?? this.model.window) + LONGEST_REST / 1000;
     this.stream.ask({ span: past, points: 400, columns });
   }
@@ -233,7 +233,7 @@ function sentence(whatif, name, found) {
   return members ? `stays ${side} for ${within} (over 99 %)` : `${side} at any time for ${within} (over 99 %)`;
 }
 
-// A chart of one state: what was, and to the right of now the fan of what may be.
+// A chart of one state: the past, and to the right of now a fan of the forecast.
 function fan(whatif, state) {
   const range = new Range();
   const { stream } = whatif;

@@ -6,7 +6,7 @@ import { colour } from "./drawing.js";
 import { bracketed, compact, span, words } from "./format.js";
 import { Range, extent, shownExtent, within } from "./ranges.js";
 
-const KINDS = { hold: "as it is now", constant: "constant", step: "step", ramp: "ramp", repeat: "as recorded, again" };
+const KINDS = { hold: "unchanged", constant: "constant", step: "step", ramp: "ramp", repeat: "repeat recording" };
 const POINTS = 100; // of a ramp
 const PART = 0.25; // of the horizon, after which a step comes and a ramp ends at first
 
@@ -26,7 +26,7 @@ export function inputRow(whatif, input) {
   const label = `${name}${input.unit ? ` [${input.unit}]` : ""}`;
   const slider = element("input", { type: "range", step: "any", "aria-label": `${label} from now on`, oninput: () => choose({ value: Number(slider.value) }) });
   const field = element("input", { type: "text", inputmode: "decimal", "aria-label": `${label} from now on, as a number`, onchange: () => choose({ value: number(field) }) });
-  const back = element("button", { type: "button", class: "back", title: "As it is now", "aria-label": `${name} as it is now`, onclick: () => choose({ kind: "hold" }) }, "↺");
+  const back = element("button", { type: "button", class: "back", title: "Unchanged", "aria-label": `${name} as it is now`, onclick: () => choose({ kind: "hold" }) }, "↺");
   const kinds = element("select", { "aria-label": `How ${name} goes on`, onchange: () => choose({ kind: kinds.value }) }, ...Object.entries(KINDS).map(([kind, text]) => element("option", { value: kind }, text)));
   const after = element("input", { type: "text", inputmode: "decimal", "aria-label": `Seconds until ${name} is there`, onchange: () => choose({ after: number(after) }) });
   const later = element("label", { class: "later", hidden: true }, element("span", {}), after, " s");
@@ -40,7 +40,7 @@ export function inputRow(whatif, input) {
   function choose(change) {
     const before = whatif.inputs[input.name];
     const chosen = { kind: "constant", value: row.now, ...before, ...change };
-    // Another value is a choice; of what is repeated there is none.
+    // Choosing a value ends a repetition.
     if ("value" in change && chosen.kind === "repeat") chosen.kind = "constant";
     if (!(chosen.after > 0)) delete chosen.after;
     if (chosen.kind === "hold" || !Number.isFinite(chosen.value)) delete whatif.inputs[input.name];
@@ -82,7 +82,7 @@ export function inputRow(whatif, input) {
 
 const number = (field) => (field.value.trim() === "" ? NaN : Number(field.value.replace(",", ".")));
 
-// A chart of one input that was chosen: what it was, and what it will be.
+// A chart of one chosen input: the past and the chosen future.
 export function inputChart(whatif, input) {
   const range = new Range();
   const { stream } = whatif;
@@ -127,7 +127,7 @@ function stairs({ t, value }, now, end) {
   return found;
 }
 
-// An input says nothing between its changes, in which it holds.
+// An input holds between its changes.
 function held(values) {
   let last = null;
   return values.map((value) => (last = value ?? last));

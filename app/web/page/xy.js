@@ -29,7 +29,7 @@ export class XY {
     const save = element("button", { type: "button", class: "save", title: "Save this chart", "aria-label": "Save the chart of two states", "aria-haspopup": "menu", onclick: () => this.saving.xy(this, save) }, "⤓");
     this.canvas = element("canvas", { role: "img", "aria-label": "Two states against each other" });
     this.text = element("p", { class: "faint" });
-    if (names.length < 2) return node.replaceChildren(element("p", { class: "faint" }, "This twin has one state."));
+    if (names.length < 2) return node.replaceChildren(element("p", { class: "faint" }, "This twin has one state only."));
     node.replaceChildren(element("header", {}, choice(1, "Upwards"), element("span", {}, " over "), choice(0, "To the right"), save), this.canvas, this.text);
     link.addEventListener("frames", () => this.draw());
     link.addEventListener("belief", (event) => {
@@ -76,7 +76,7 @@ export class XY {
     const ctx = canvas.getContext("2d");
     ctx.scale(devicePixelRatio, devicePixelRatio);
     const belief = this.paint(ctx, width, height);
-    this.text.textContent = belief ? `correlation ${compact(belief.cov[1] / Math.sqrt(belief.cov[0] * belief.cov[2]), 2)}` : "ellipses are those of the newest row; follow to see them";
+    this.text.textContent = belief ? `correlation ${compact(belief.cov[1] / Math.sqrt(belief.cov[0] * belief.cov[2]), 2)}` : "Ellipses show the newest estimate; press follow to see them.";
   }
 
   // As a file.

@@ -53,7 +53,7 @@ def test_the_report_has_the_episode_of_the_run_before_though_two_edits_came_sinc
     first = session.engine.revisions.find(0)
     assert first.track is None and any(item.subject == "yoke" for item in first.episodes)
     text = " ".join(parsed(Client(session.server).get("/api/report.html").text).text)
-    assert "Episodes of the runs before" in text and "0: as it began" in text
+    assert "Episodes of earlier runs" in text and "0: as it began" in text
     for item in first.episodes:
         assert item.text in text
     assert "Yoke, held out, reads" in text
@@ -62,4 +62,4 @@ def test_the_report_has_the_episode_of_the_run_before_though_two_edits_came_sinc
 def test_the_report_of_the_first_run_has_nothing_from_before(session):
     taken = rows_of_run(session.engine)
     said = Reported(session.engine.twin, "ekf", taken.run.tuning, taken.pull.events, taken.pull.track, (), (), False)
-    assert not [part for part in report(said) if "runs before" in part.title]
+    assert not [part for part in report(said) if "earlier runs" in part.title]

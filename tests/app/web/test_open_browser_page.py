@@ -30,7 +30,7 @@ def test_the_file_opens_the_page_and_the_next_session_asks_for_its_own_address(b
         wait_for(lambda: "trying again" in page.locator("#connection").inner_text(), PATIENCE)
         server = PageServer(engine, port=server.port, viser_port=None, secret=SECRET)
         server.start()
-        page.get_by_text("this session has ended").wait_for(timeout=PATIENCE * 1000)
+        page.get_by_text("This session has ended").wait_for(timeout=PATIENCE * 1000)
         page.screenshot(path=str(tmp_path / "ended.png"))
     finally:
         page.context.close()

@@ -10,7 +10,7 @@ export const order = 2;
 
 const MAX_CHARTS = 24;
 const FEW_STATES = 6; // up to so many, those that nobody measures have more room
-const UNBOUNDED = 100; // times the band, or the value itself, from which on a protection level says nothing
+const UNBOUNDED = 100; // times the band, or the value itself, beyond which a protection level is shown as unbounded
 
 const MEASURED = {
   reading: () => dots("reading", 4),

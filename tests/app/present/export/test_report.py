@@ -79,7 +79,7 @@ def test_figures_are_those_of_the_track(made):
     shown = re.search(r"RMSE of temperature\s+([\d.]+) °C", text)
     assert float(shown[1]) == pytest.approx(np.sqrt(np.mean(error**2)), rel=5e-3)
     verdicts = np.array(track["verdict"].to_pylist())
-    assert re.search(rf"readings\s+{np.sum(verdicts != 'none'):,}\s", text)
+    assert re.search(rf"measurements\s+{np.sum(verdicts != 'none'):,}\s", text)
     nis = track["nis"].to_numpy()[verdicts == "used"]
     assert float(re.search(r"mean NIS\s+([\d,.]+)", text)[1].replace(",", "")) == pytest.approx(nis.mean(), rel=5e-3)
 

@@ -172,7 +172,7 @@ def test_rows_in_order_do_not_hide_a_mean_nis_that_is_not(page, place):
     until(page, "window.nisus.diagnosed > 0")
     said = page.locator("#diagnose .summary b").inner_text().strip()
     but = ", but the mean NIS is above its bounds" if place == "above" else ""
-    assert said == f"3 of 3 sensor rows are as they should be{but}."
+    assert said == f"3 of 3 sensor rows are consistent{but}."
 
 
 def test_nothing_is_asked_while_both_are_hidden(page):

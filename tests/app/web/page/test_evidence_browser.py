@@ -45,7 +45,7 @@ def test_a_sensor_that_is_held_out_is_not_passed_over_in_silence(shown):
     page.get_by_role("tab", name="Episodes").click()
     page.get_by_text("Now (").wait_for()
     session.engine.submit(SetTuning("use.yoke", False))
-    page.get_by_text("Now: nothing is wrong with the sensors in use").wait_for()
+    page.get_by_text("Now: no faults in the sensors in use").wait_for()
     text = session.engine.status().sensors["yoke"][1]
     assert re.fullmatch(r"yoke, held out, reads [\d.]+ °C above what the others say, beyond the .* leave open", text)
     page.locator("#episodes .held-out").get_by_text(text, exact=True).wait_for()

@@ -135,7 +135,7 @@ def test_what_runs_is_kept_compared_and_loaded_again(page, session):
     assert page.evaluate("window.nisus.link.ask('SetTuning', {key: 'R.winding', value: 9})") is None
     settled(engine, 1)
 
-    row.get_by_role("button", name="Compare with what runs").click()
+    row.get_by_role("button", name="Compare with the running tuning").click()
     wait_for(lambda: "R.winding" in row.inner_text(), PATIENCE)
     assert row.locator("table tbody tr").all_inner_texts() == ["R.winding\t100\t9"]
 

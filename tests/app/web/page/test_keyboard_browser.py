@@ -97,7 +97,7 @@ def test_every_control_is_reached_by_tab_and_has_a_name(browser, session, show):
     page = opened(browser, session)
     # Paused, nothing comes or goes on the way; and the scene is Viser's, with focus of its own.
     page.get_by_role("tab", name="XY").click()
-    page.get_by_label("Pause or go on").click()
+    page.get_by_label("Pause or continue").click()
     wait_for(lambda: session.engine.status().paused, PATIENCE)
     try:
         for tab in show:
@@ -120,7 +120,7 @@ def test_every_control_is_reached_by_tab_and_has_a_name(browser, session, show):
         until(page, f"document.activeElement.textContent !== {chosen!r}")
         assert page.evaluate("document.activeElement.getAttribute('aria-selected')") == "true"
     finally:
-        page.get_by_label("Pause or go on").click()
+        page.get_by_label("Pause or continue").click()
         wait_for(lambda: not session.engine.status().paused, PATIENCE)
         page.context.close()
 

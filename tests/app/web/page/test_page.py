@@ -122,7 +122,7 @@ def test_a_session_on_the_page(browser, served, tmp_path, monkeypatch):
     settled(engine)
 
     # Time: pause, go on, look at a part, follow again.
-    page.get_by_label("Pause or go on").click()
+    page.get_by_label("Pause or continue").click()
     wait_for(lambda: engine.status().paused, PATIENCE)
     page.keyboard.press("Escape")
     chart = page.locator(".u-over").first.bounding_box()
@@ -136,7 +136,7 @@ def test_a_session_on_the_page(browser, served, tmp_path, monkeypatch):
     page.locator("#follow").click()
     until(page, "window.nisus.view.following")
     page.get_by_label("Speed").select_option("inf")
-    page.get_by_label("Pause or go on").click()
+    page.get_by_label("Pause or continue").click()
     wait_for(lambda: engine.status().finished, PATIENCE)
 
     # Stop the recording once the source has ended, so that it holds everything.
@@ -178,7 +178,7 @@ def test_two_browsers_see_the_same_fault(browser, served):
     wait_for(lambda: session.engine.status().counts.get("readings", 0) > 150, PATIENCE)
     first.get_by_text("Faults on demand").click()
     first.get_by_label("Fault", exact=True).select_option("bias")
-    first.get_by_label("Of what").select_option("yoke")
+    first.get_by_label("Target").select_option("yoke")
     first.get_by_label("size").fill("2.5")
     first.locator("#inject").click()
     for page in (first, second):

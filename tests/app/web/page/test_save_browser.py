@@ -160,7 +160,7 @@ def numbers_of(root, anchor):
 
 def test_the_track_that_is_shown(page, session, tmp_path):
     page.evaluate("window.nisus.view.show(10, 25)")
-    path = saved(page, "Save", "Track, what is shown: CSV", tmp_path)
+    path = saved(page, "Save", "Track, shown part: CSV", tmp_path)
     assert path.name == f"{session.engine.twin.name}-run0-10-to-25s.csv"
     with path.open(newline="") as file:
         rows = list(csv.DictReader(file))
@@ -168,7 +168,7 @@ def test_the_track_that_is_shown(page, session, tmp_path):
     inside = t[(t >= t[0] + 10_000_000_000) & (t <= t[0] + 25_000_000_000)]
     assert [int(row["t_ns"]) for row in rows] == inside.tolist()
     report = saved(page, "Save", "Report: HTML", tmp_path)
-    assert report.suffix == ".html" and "What the estimate was worth" in report.read_text(encoding="utf-8")
+    assert report.suffix == ".html" and "Scores" in report.read_text(encoding="utf-8")
 
 
 def test_a_link_goes_to_the_moment_and_holds_it(context, page, session):
