@@ -11,10 +11,14 @@ from urllib.parse import parse_qs, urlsplit
 
 from websockets.datastructures import Headers
 from websockets.http11 import Response
+from websockets.sync.client import connect
 from websockets.sync.server import serve
 
+from app.live.engine import Engine
 from app.views.viser.guarded_server import HEADER
-from tests.app.scripted import twin
+from app.views.viser.stage import Choice, Choices
+from app.web.server import PageServer
+from tests.app.scripted import Scripted, twin, wait_for
 
 SECRET = "the secret between the servers"
 PATIENCE = 60.0
@@ -124,3 +128,51 @@ class Client:
         kind = ("Content-Type", "application/json")
         headers = [("Host", self.host), ("Cookie", self.cookie), ("Origin", self.origin), kind]
         return self.raw("POST", target, headers, json.dumps(body).encode() if not isinstance(body, bytes) else body)
+
+
+class ServedEngine:
+    """A scripted engine behind the page's port, with a stand-in for Viser; fields of answers are JSON."""
+
+    def __init__(self, twin=None, review=None, behind=lambda source: source):
+        self.source = Scripted()
+        self.engine = Engine(shown_twin() if twin is None else twin, lambda report: behind(self.source))
+        self.viser = FakeViser()
+        self.choices = Choices([Choice("x", "x", ("temperature", "rate"), "temperature")])
+        self.server = PageServer(
+            self.engine, port=0, viser_port=self.viser.port, secret=SECRET, review=review, choices=self.choices
+        )
+        self.server.start()
+        self.engine.start()
+        self.client = Client(self.server)
+
+    def stop(self):
+        self.engine.stop()
+        self.server.stop()
+        self.viser.stop()
+
+    def connect(self, path, **options):
+        headers = {"Cookie": self.client.cookie}
+        return connect(
+            f"ws://{self.client.host}{path}", origin=self.client.origin, additional_headers=headers,
+            compression=None, max_size=None, proxy=None, open_timeout=PATIENCE, close_timeout=0.5,
+            ping_interval=None, **options,
+        )  # fmt: skip
+
+    def rows(self):
+        return self.engine.status().counts["readings"]
+
+    def get(self, path):
+        return json.loads(self.client.get(path).text)
+
+    def post(self, path, **fields):
+        answer = self.client.post(path, fields)
+        return answer.status, json.loads(answer.text)
+
+    def command(self, command, **fields):
+        """The reason if a command was refused, else None once it is carried out."""
+        before = self.engine.revisions.version
+        status, answer = self.post("/api/command", command=command, **fields)
+        if status != 202:
+            return answer["error"]
+        wait_for(lambda: self.engine.revisions.version > before)
+        return None

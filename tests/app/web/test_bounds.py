@@ -17,7 +17,7 @@ from app.web.door import CONNECTIONS
 from app.web.http import MAX_BODY_BYTES as BODY
 from tests.app.scripted import readings, wait_for
 from tests.app.served import PATIENCE
-from tests.app.web.test_door import STREAM, page  # noqa: F401  the fixture
+from tests.app.web.test_door import STREAM
 
 HALF = b"GET /api/status HTTP/1.1\r\nHost: 127.0.0.1"
 
@@ -41,7 +41,7 @@ def is_open(sock):
 # Connections, and the time for a request
 
 
-def test_many_half_open_connections_leave_room_for_an_honest_one(page):  # noqa: F811
+def test_many_half_open_connections_leave_room_for_an_honest_one(page):
     with page.connect(STREAM) as stream:
         crowd = [half_open(page.client.port) for _ in range(3 * CONNECTIONS)]
         try:
@@ -64,13 +64,13 @@ def test_many_half_open_connections_leave_room_for_an_honest_one(page):  # noqa:
         b"GET /viser/ HTTP/1.1\r\nUpgrade: websocket\r\n",
     ],
 )
-def test_a_header_that_does_not_end_is_not_waited_for(page, monkeypatch, sent):  # noqa: F811
+def test_a_header_that_does_not_end_is_not_waited_for(page, monkeypatch, sent):
     monkeypatch.setattr(door, "REQUEST_TIMEOUT_S", 0.3)
     with half_open(page.client.port, sent) as sock:
         assert b"200 OK" not in sock.recv(65536)
 
 
-def test_a_header_that_trickles_is_not_waited_for_either(page, monkeypatch):  # noqa: F811
+def test_a_header_that_trickles_is_not_waited_for_either(page, monkeypatch):
     monkeypatch.setattr(door, "REQUEST_TIMEOUT_S", 0.3)
     client = page.client
     first = f"GET /api/status HTTP/1.1\r\nHost: {client.host}\r\nCookie: {client.cookie}\r\n\r\n".encode()
@@ -94,7 +94,7 @@ def test_a_header_that_trickles_is_not_waited_for_either(page, monkeypatch):  # 
         wait_for(ended)
 
 
-def test_a_body_that_does_not_end_is_not_waited_for(page, monkeypatch):  # noqa: F811
+def test_a_body_that_does_not_end_is_not_waited_for(page, monkeypatch):
     client = page.client
     head = f"Host: {client.host}\r\nCookie: {client.cookie}\r\nOrigin: {client.origin}\r\n"
     kind = "Content-Type: application/json\r\nContent-Length: 40\r\n\r\n{"
@@ -122,7 +122,7 @@ def test_the_private_viser_server_is_not_crowded_out_either(monkeypatch, capfd):
 # Sizes
 
 
-def test_a_body_of_more_than_64_kb_is_refused(page):  # noqa: F811
+def test_a_body_of_more_than_64_kb_is_refused(page):
     padded = b'{"command": "Restore"' + b" " * BODY + b"}"
     answer = page.client.post("/api/command", padded)
     assert answer.status == 413 and "64 kB" in answer.text and answer.text.count("\n") == 1
@@ -130,7 +130,7 @@ def test_a_body_of_more_than_64_kb_is_refused(page):  # noqa: F811
     assert len(fits) == BODY and page.client.post("/api/command", fits).status == 202
 
 
-def test_a_body_of_unsaid_length_is_counted(page):  # noqa: F811
+def test_a_body_of_unsaid_length_is_counted(page):
     client = page.client
     head = [("Host", client.host), ("Cookie", client.cookie), ("Origin", client.origin)]
     lines = ["POST /api/command HTTP/1.1", *(f"{name}: {value}" for name, value in head), "Connection: close"]
@@ -140,7 +140,7 @@ def test_a_body_of_unsaid_length_is_counted(page):  # noqa: F811
         assert sock.recv(65536).startswith(b"HTTP/1.1 413")
 
 
-def test_what_a_browser_says_on_the_stream_is_a_word(page):  # noqa: F811
+def test_what_a_browser_says_on_the_stream_is_a_word(page):
     for message in ("x" * (BODY + 1), b"bytes"):
         with page.connect(STREAM) as stream, pytest.raises(ConnectionClosed):
             stream.send(message)
@@ -150,7 +150,7 @@ def test_what_a_browser_says_on_the_stream_is_a_word(page):  # noqa: F811
     wait_for(lambda: len(page.engine._cursors) == 1)
 
 
-def test_large_things_still_pass(page):  # noqa: F811
+def test_large_things_still_pass(page):
     recording = bytes(range(256)) * 2**15
     page.server._review.write_bytes(recording)
     assert page.client.get("/rec/reviewed.rrd").body == recording
@@ -190,7 +190,7 @@ def one_line(answer, asked):
 
 
 @pytest.fixture
-def seekable(page, tmp_path, monkeypatch):  # noqa: F811
+def seekable(page, tmp_path, monkeypatch):
     """The page over a source that can be sought, in a folder of its own, with a recorder."""
     monkeypatch.chdir(tmp_path)
     for name in ("seek", "set_speed"):
@@ -256,7 +256,7 @@ def test_a_value_outside_its_range_is_refused_by_name(seekable, value):
     assert (answer.status == 202) == (value == 0.5), answer.text
 
 
-def test_no_address_is_answered_by_a_failure_of_ours(page):  # noqa: F811
+def test_no_address_is_answered_by_a_failure_of_ours(page):
     parts = [str(value) for value in NASTY if isinstance(value, str)] + [
         "..",
         "%",
@@ -287,7 +287,7 @@ def test_no_address_is_answered_by_a_failure_of_ours(page):  # noqa: F811
         ("Accept-Encoding", "\xff"),
     ],
 )
-def test_no_header_is_answered_by_a_failure_of_ours(page, name, value):  # noqa: F811
+def test_no_header_is_answered_by_a_failure_of_ours(page, name, value):
     client = page.client
     value = value.format(name=client.cookie.partition("=")[0])
     for path in ("/", "/?token=%ff%fe", "/?token=\\ud800", "/api/status", "/viser/"):
@@ -299,7 +299,7 @@ def test_no_header_is_answered_by_a_failure_of_ours(page, name, value):  # noqa:
             assert not isinstance(error, InvalidStatus) or error.response.status_code < 500
 
 
-def test_viser_gets_the_path_as_it_was_asked(page):  # noqa: F811
+def test_viser_gets_the_path_as_it_was_asked(page):
     for path in ("/caf%C3%A9%20b.js", "/a%3Fb"):
         answer = page.client.get("/viser" + path)
         assert answer.status == 200 and json.loads(answer.text)["path"] == path

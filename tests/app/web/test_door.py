@@ -12,60 +12,13 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 from app.live import commands
-from app.live.engine import Engine
-from app.views.viser.stage import Choice, Choices
 from app.web.door import Door
 from app.web.server import PageServer
 from estimators.errors import ConfigError
-from tests.app.scripted import Scripted, pull_all, readings, wait_for
-from tests.app.served import PATIENCE, SECRET, Client, FakeViser, shown_twin
+from tests.app.scripted import pull_all, readings, wait_for
+from tests.app.served import PATIENCE, SECRET
 
 STREAM = "/rerun/stream"
-
-
-class Page:
-    """All that runs behind one port."""
-
-    def __init__(self, tmp_path, review=None, behind=lambda source: source):
-        self.source = Scripted()
-        self.engine = Engine(shown_twin(), lambda report: behind(self.source))
-        self.viser = FakeViser()
-        self.choices = Choices([Choice("x", "x", ("temperature", "rate"), "temperature")])
-        self.server = PageServer(
-            self.engine, port=0, viser_port=self.viser.port, secret=SECRET, review=review, choices=self.choices
-        )
-        self.server.start()
-        self.engine.start()
-        self.client = Client(self.server)
-
-    def stop(self):
-        self.engine.stop()
-        self.server.stop()
-        self.viser.stop()
-
-    def connect(self, path, **options):
-        headers = {"Cookie": self.client.cookie}
-        return connect(
-            f"ws://{self.client.host}{path}", origin=self.client.origin, additional_headers=headers,
-            compression=None, max_size=None, proxy=None, open_timeout=PATIENCE, close_timeout=0.5,
-            ping_interval=None, **options,
-        )  # fmt: skip
-
-    def rows(self):
-        return self.engine.status().counts["readings"]
-
-
-@pytest.fixture
-def page(tmp_path, monkeypatch):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    # What the viewer's files are is tested elsewhere; to make them takes a while.
-    monkeypatch.setattr("app.web.server.viewer_assets", lambda progress: tmp_path)
-    recording = tmp_path / "reviewed.rrd"
-    recording.write_bytes(b"RRF2 and so on")
-    (tmp_path / "private.rrd").write_bytes(b"nobody's business")
-    page = Page(tmp_path, review=recording)
-    yield page
-    page.stop()
 
 
 # Who is refused

@@ -12,16 +12,11 @@ from sources.faults.layer import Faults
 from sources.faults.source import with_faults
 from tests.app.scripted import MODEL, pull_all, readings, wait_for
 from tests.app.web.test_bounds import NASTY
-from tests.app.web.test_door import Page
 
 
 @pytest.fixture
-def page(tmp_path, monkeypatch):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setattr("app.web.server.viewer_assets", lambda progress: tmp_path)
-    page = Page(tmp_path, behind=lambda source: with_faults(source, Faults(MODEL)))
-    yield page
-    page.stop()
+def page(serve):
+    return serve(behind=lambda source: with_faults(source, Faults(MODEL)))
 
 
 def ask(page, **body):
@@ -142,13 +137,8 @@ def test_nothing_that_is_asked_for_stops_the_source(page):
     assert not counts.get("engine error") and not counts.get("source failed")
 
 
-def test_a_recording_takes_no_faults(tmp_path, monkeypatch):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setattr("app.web.server.viewer_assets", lambda progress: tmp_path)
-    page = Page(tmp_path)
-    try:
-        answer = ask(page, command="InjectFault", kind="stuck", target="winding")
-        assert answer.status == 400 and "holds what came, faults included" in answer.text
-        assert not json.loads(page.client.get("/api/faults").text)["available"]
-    finally:
-        page.stop()
+def test_a_recording_takes_no_faults(serve):
+    page = serve()
+    answer = ask(page, command="InjectFault", kind="stuck", target="winding")
+    assert answer.status == 400 and "review of a recording" in answer.text
+    assert not page.get("/api/faults")["available"]

@@ -1,33 +1,29 @@
-"""A fit over HTTP: begun, told, put in, given up, and what is refused."""
+"""Fits over HTTP, of the log and of the last window: begun, shown, applied, cancelled, adopted, refused."""
 
+import io
 import json
+import shutil
 
-import numpy as np
+import pyarrow.parquet as pq
 import pytest
 
 from app.live.execute import retuned
+from app.twin.twin import load_twin
 from app.web.commands_json import command_from_json
+from config.loader import TWINS
 from estimators.errors import NisusError
-from tests.app.scripted import readings, wait_for
-from tests.app.web.test_door import Page
+from tests.app.scripted import wait_for
 
 DONE = ("done", "failed", "cancelled")
 
 
 @pytest.fixture
-def page(tmp_path, monkeypatch):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setattr("app.web.server.viewer_assets", lambda progress: tmp_path)
-    page = Page(tmp_path)
-    rng = np.random.default_rng(4)
-    page.source.put(readings(np.arange(1.0, 601.0) * 0.1, 40.0 + rng.normal(size=600)))
-    wait_for(lambda: page.rows() == 600)
-    yield page
-    page.stop()
+def page(serve):
+    return serve(600)
 
 
 def look(page):
-    return json.loads(page.client.get("/api/fit").text)
+    return page.get("/api/fit")
 
 
 def test_a_fit_is_begun_told_and_put_in_at_once(page):
@@ -56,18 +52,23 @@ def test_given_up_and_nothing_to_give_up(page):
 
 
 @pytest.mark.parametrize(
-    ("body", "reason"),
+    ("path", "body", "reason"),
     [
-        ([], "it must be an object of wanted, events"),
-        ({"wanted": "Q"}, "wanted is 'Q'; it must be a list of texts"),
-        ({"wanted": ["Q"], "more": 1}, "more is not known; choose from wanted, events"),
-        ({"wanted": []}, "wanted is empty"),
-        ({"wanted": ["Q"], "events": 0}, "events is 0; it must be a positive whole number"),
-        ({"wanted": ["Q"], "events": True}, "events is true; it must be a whole number"),
+        ("/api/fit", [], "it must be an object of wanted, events"),
+        ("/api/fit", {"wanted": "Q"}, "wanted is 'Q'; it must be a list of texts"),
+        ("/api/fit", {"wanted": ["Q"], "more": 1}, "more is not known; choose from wanted, events"),
+        ("/api/fit", {"wanted": []}, "wanted is empty"),
+        ("/api/fit", {"wanted": ["Q"], "events": 0}, "events is 0; it must be a positive whole number"),
+        ("/api/fit", {"wanted": ["Q"], "events": True}, "events is true; it must be a whole number"),
+        ("/api/refit/accept", {"number": 7}, "refit 7: it is not known"),
+        ("/api/refit/dismiss", {"number": 7}, "refit 7: it is not known"),
+        ("/api/refit/accept", {"number": "1"}, "number is '1'; it must be a whole number"),
+        ("/api/refit/accept", {}, "number is missing"),
+        ("/api/refit", {"entries": []}, "entries is not known; it takes no field"),
     ],
 )
-def test_what_is_refused(page, body, reason):
-    answer = page.client.post("/api/fit", body)
+def test_what_is_refused(page, path, body, reason):
+    answer = page.client.post(path, body)
     assert answer.status == 400 and reason in json.loads(answer.text)["error"]
 
 
@@ -81,3 +82,66 @@ def test_options_go_with_the_rest(page):
     assert (name, tuning.get("Q.rate"), tuning.options["alpha"]) == ("ukf", 0.5, 0.3)
     with pytest.raises(NisusError, match="is an option of the estimator; set it with SetOption"):
         command_from_json({"command": "SetTuning", "key": "options.alpha", "value": 0.3}, page.engine)
+
+
+# Dual estimation
+
+SECTION = "{entries: [R.winding], every: 30 s, window: 1 min}"
+
+
+@pytest.fixture
+def twin_page(serve, tmp_path):
+    path = tmp_path / "winding.yaml"
+    shutil.copy(TWINS / "motor_winding.yaml", path)
+    still = {"refit": SECTION, "Q.rate": "1e-6", "Q.temperature": "1e-6"}
+    return serve(650, std=5.0, twin=load_twin(path, overrides=still))
+
+
+def refits(twin_page):
+    return twin_page.get("/api/refit")
+
+
+def brief(twin_page):
+    return twin_page.get("/api/status")["refit"]
+
+
+def proposed(twin_page):
+    twin_page.server.refits.start()
+    wait_for(lambda: brief(twin_page)["proposed"] is not None)
+    return refits(twin_page)["fits"][0]
+
+
+def test_a_window_s_fit_is_adopted_and_named_in_every_row(twin_page):
+    assert refits(twin_page) == {
+        "section": {"entries": ["R.winding"], "every": 30.0, "window": 60.0, "adopt": "by hand"},
+        "due": None,
+        "fits": [],
+    }
+    assert brief(twin_page) == {"last": None, "state": None, "proposed": None}
+    fit = proposed(twin_page)
+    assert brief(twin_page) == {"last": 1, "state": "proposed", "proposed": 1}
+    (entry,) = fit["result"]["entries"]
+    assert entry["low"] < 25.0 < entry["high"] and entry["sigma"] > 10.0 and fit["result"]["proposed"]
+    assert fit["text"].startswith("R.winding 4 → ") and int(fit["end"]) - int(fit["start"]) == 60 * 10**9
+    assert refits(twin_page)["due"] == str(65 * 10**9 + 30 * 10**9)
+
+    assert twin_page.post("/api/refit/accept", number=1) == (200, {"name": "refit-1"})
+    wait_for(lambda: twin_page.engine.folded_with()[0].name == "refit-1")
+    assert refits(twin_page)["fits"][0]["state"] == "adopted" and refits(twin_page)["fits"][0]["name"] == "refit-1"
+    table = pq.read_table(io.BytesIO(twin_page.client.get("/api/track.parquet").body))
+    assert set(table["tuning"].to_pylist()) == {"refit-1"}
+    versions = twin_page.get("/api/tunings")
+    assert versions["running"] == "refit-1"
+    assert versions["versions"][1]["evidence"]["entries"]["R.winding"]["after"] == entry["after"]
+
+
+def test_a_window_s_fit_is_dismissed(twin_page):
+    proposed(twin_page)
+    status, told = twin_page.post("/api/refit/dismiss", number=1)
+    assert status == 200 and told["fits"][0]["state"] == "dismissed"
+    assert brief(twin_page)["proposed"] is None and twin_page.engine.folded_with()[0].name == "own*"
+
+
+def test_a_window_is_fitted_at_once(twin_page):
+    status, told = twin_page.post("/api/refit")
+    assert status == 202 and told["fits"][0]["number"] == 1

@@ -1,49 +1,32 @@
-"""Runs over HTTP: what is listed, pinned, named, loaded, compared and saved, and what is refused."""
+"""Runs and tuning versions over HTTP: listed, pinned, named, loaded, compared, kept and saved, and what is refused."""
 
-import json
+import shutil
 
 import numpy as np
 import pytest
 import yaml
 
 from app.live.commands import SetTuning
+from app.studies.baseline import ComparedFigure
+from app.studies.guard import GuardVerdict, keep_last
+from app.twin.twin import load_twin
+from config.loader import TWINS
+from estimators.fold import Fold
 from estimators.tuning import Tuning
-from tests.app.scripted import MODEL, readings, wait_for
-from tests.app.web.test_door import Page
+from tests.app.scripted import MODEL, wait_for
 
 FIRST = Tuning.of(MODEL)
 
 
 @pytest.fixture
-def page(tmp_path, monkeypatch):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setattr("app.web.server.viewer_assets", lambda progress: tmp_path)
-    page = Page(tmp_path)
-    rng = np.random.default_rng(4)
-    page.source.put(readings(np.arange(1.0, 301.0) * 0.1, 40.0 + rng.normal(size=300)))
-    wait_for(lambda: page.rows() == 300)
-    yield page
-    page.stop()
-
-
-def ask(page, command, **fields):
-    """A command, carried out; the reason if it was refused."""
-    before = page.engine.revisions.version
-    answer = page.client.post("/api/command", {"command": command, **fields})
-    if answer.status != 202:
-        return json.loads(answer.text)["error"]
-    wait_for(lambda: page.engine.revisions.version > before)
-    return None
-
-
-def runs(page):
-    return json.loads(page.client.get("/api/runs").text)
+def page(serve):
+    return serve(300)
 
 
 def test_runs_are_listed_with_what_changed_and_scores(page):
-    ask(page, "SetTuning", key="Q.rate", value=0.5)
-    ask(page, "SetEstimator", name="ukf")
-    listed = runs(page)
+    page.command("SetTuning", key="Q.rate", value=0.5)
+    page.command("SetEstimator", name="ukf")
+    listed = page.get("/api/runs")
     assert [run["number"] for run in listed] == [0, 1, 2]
     assert [run["what"] for run in listed] == ["as it began", f"Q.rate {FIRST.get('Q.rate'):.6g} → 0.5", "kf → ukf"]
     assert [run["running"] for run in listed] == [False, False, True]
@@ -56,51 +39,51 @@ def test_runs_are_listed_with_what_changed_and_scores(page):
 
 
 def test_pinned_named_and_loaded(page):
-    assert ask(page, "Pin", number=0) is None
-    assert ask(page, "Note", number=0, name="calm", note="as delivered") is None
-    ask(page, "SetTuning", key="Q.rate", value=0.5)
-    told = json.loads(page.client.get("/api/status").text)["runs"]
+    assert page.command("Pin", number=0) is None
+    assert page.command("Note", number=0, name="calm", note="as delivered") is None
+    page.command("SetTuning", key="Q.rate", value=0.5)
+    told = page.get("/api/status")["runs"]
     assert told["last"] == 0
     assert told["pinned"] == [{"number": 0, "place": 0, "name": "calm", "running": False}]
-    assert ask(page, "Load", number=0) is None
+    assert page.command("Load", number=0) is None
     wait_for(lambda: page.engine.status().tuning.get("Q.rate") == FIRST.get("Q.rate"))
-    *_, last = runs(page)
+    *_, last = page.get("/api/runs")
     assert last["what"].startswith("back to run 0: Q.rate 0.5 →")
     assert (last["number"], last["loaded"], last["name"], last["note"]) == (2, 0, "calm", "as delivered")
 
 
 def test_what_cannot_be_is_one_line(page):
     for value in (0.1, 0.2, 0.3, 0.4):
-        assert ask(page, "Pin", number=page.engine.revisions.runs[-1].number) is None
-        ask(page, "SetTuning", key="Q.rate", value=value)
-    assert ask(page, "Pin", number=4) == "run 4 cannot be pinned: 4 are (0, 1, 2, 3); unpin one first"
+        assert page.command("Pin", number=page.engine.revisions.runs[-1].number) is None
+        page.command("SetTuning", key="Q.rate", value=value)
+    assert page.command("Pin", number=4) == "run 4 cannot be pinned: 4 are (0, 1, 2, 3); unpin one first"
     for command in ("Pin", "Unpin", "Load"):
-        assert ask(page, command, number=99) == "run 99 is not known; /api/runs lists those that are"
-    assert "it may have 60" in ask(page, "Note", number=0, name="x" * 61)
-    assert "must be a whole number" in ask(page, "Pin", number="0")
+        assert page.command(command, number=99) == "run 99 is not known; /api/runs lists those that are"
+    assert "it may have 60" in page.command("Note", number=0, name="x" * 61)
+    assert "must be a whole number" in page.command("Pin", number="0")
 
 
 def test_two_runs_are_compared(page):
-    ask(page, "SetTuning", key="Q.rate", value=0.5)
-    ask(page, "SetTuning", key="gate", value=0.99)
-    answer = json.loads(page.client.get("/api/runs/0/against/2").text)
+    page.command("SetTuning", key="Q.rate", value=0.5)
+    page.command("SetTuning", key="gate", value=0.99)
+    answer = page.get("/api/runs/0/against/2")
     assert answer == [
         {"key": "Q.rate", "values": [FIRST.get("Q.rate"), 0.5]},
         {"key": "gate", "values": [None, 0.99]},
     ]
-    assert json.loads(page.client.get("/api/runs/1/against/1").text) == []
+    assert page.get("/api/runs/1/against/1") == []
     assert page.client.get("/api/runs/0/against/9").status == 404
 
 
 def test_what_the_data_say_is_folded_when_asked(page):
-    first = json.loads(page.client.get("/api/around?key=Q.rate").text)
+    first = page.get("/api/around?key=Q.rate")
     assert first["key"] == "Q.rate"
     done = []
-    wait_for(lambda: done.append(json.loads(page.client.get("/api/around?key=Q.rate").text)) or done[-1]["done"])
+    wait_for(lambda: done.append(page.get("/api/around?key=Q.rate")) or done[-1]["done"])
     found = done[-1]
     assert len(found["points"]) == 7 and found["events"] == 300
     assert found["best"] == max(found["points"], key=lambda point: point["log_likelihood"])["value"]
-    noise = json.loads(page.client.get("/api/noise").text)
+    noise = page.get("/api/noise")
     assert noise["R"]["R.winding"]["n"] == 300 and noise["Q"]["key"] == "Q"
     refused = page.client.get("/api/around?key=gate")
     assert refused.status == 400 and "cannot be swept" in refused.text
@@ -111,7 +94,7 @@ def test_an_edit_of_a_drag_keeps_the_first_to_compare_with(page):
     for value in np.geomspace(0.1, 1.0, 10):
         page.engine.submit(SetTuning("Q.rate", float(value)))
     wait_for(lambda: page.engine.revisions.version > before and not page.engine.status().refolding)
-    listed = runs(page)
+    listed = page.get("/api/runs")
     assert [run["what"] for run in listed] == ["as it began", f"Q.rate {FIRST.get('Q.rate'):.6g} → 1"]
     assert listed[0]["kept"] and listed[0]["score"] is not None
 
@@ -120,10 +103,93 @@ def test_yaml_of_a_run_is_text_to_save(page, monkeypatch):
     from app.twin.twin import load_twin
 
     monkeypatch.setattr(page.engine, "twin", load_twin("motor_winding"))
-    ask(page, "SetTuning", key="Q.rate", value=0.5)
-    ask(page, "Note", number=1, name="fast", note="two\nlines")
+    page.command("SetTuning", key="Q.rate", value=0.5)
+    page.command("Note", number=1, name="fast", note="two\nlines")
     answer = page.client.get("/api/runs/1.yaml")
     assert answer.headers["content-disposition"] == 'attachment; filename="motor_winding-run1.yaml"'
     assert answer.text.startswith("# motor_winding, run 1: fast\n# two\n# lines\n")
     assert yaml.safe_load(answer.text)["noise"]["rate"] == {"variance": 0.5}
     assert page.client.get("/api/runs/7.yaml").status == 404
+
+
+# Tuning versions
+
+
+@pytest.fixture
+def twin_page(serve, tmp_path):
+    path = tmp_path / "winding.yaml"
+    shutil.copy(TWINS / "motor_winding.yaml", path)
+    return serve(300, twin=load_twin(path))
+
+
+def tunings(twin_page):
+    return twin_page.get("/api/tunings")
+
+
+def test_what_guard_said_last_is_listed_beside_the_versions(twin_page):
+    assert tunings(twin_page)["guard"] == []
+    worse = ComparedFigure("rmse.temperature", 0.5, 0.6, 0.1, 0.01)
+    keep_last(twin_page.engine.twin.path, [GuardVerdict("winding", "own", [worse])])
+    (said,) = tunings(twin_page)["guard"]
+    assert said["recording"] == "winding" and said["figures"] == 1
+    assert said["worse"] == ["rmse.temperature was 0.5 and is 0.6: worse by 0.1, allowed 0.01"]
+
+
+def turn(twin_page, key, value):
+    before = twin_page.engine.status().revision
+    twin_page.engine.submit(SetTuning(key, value))
+    wait_for(lambda: twin_page.engine.status().revision > before and not twin_page.engine.status().refolding)
+
+
+def test_a_run_is_kept_and_loaded_again(twin_page, tmp_path):
+    assert tunings(twin_page)["running"] == "own" and [item["name"] for item in tunings(twin_page)["versions"]] == [
+        "own"
+    ]
+    turn(twin_page, "R.winding", 0.5)
+    assert tunings(twin_page)["running"] == "own*"
+    assert twin_page.post("/api/tunings", run=1, name="quiet", note="tried") == (200, {"name": "quiet"})
+    (_, version) = tunings(twin_page)["versions"]
+    assert version["name"] == "quiet" and version["note"] == "tried" and not version["holds"]
+    score = twin_page.get("/api/runs")[1]["score"]
+    assert version["scores"]["nis"] == pytest.approx(score["nis"], rel=1e-7)
+
+    turn(twin_page, "Q.rate", 5.0)
+    before = twin_page.engine.status().revision
+    assert twin_page.post("/api/tunings/load", name="quiet") == (200, {"name": "quiet"})
+    wait_for(lambda: twin_page.engine.status().revision > before and not twin_page.engine.status().refolding)
+    status = twin_page.engine.status()
+    # What was turned since is left behind.
+    twin = load_twin(tmp_path / "winding.yaml", overrides={"tuning": "quiet"})
+    assert status.tuning.name == "quiet" and tunings(twin_page)["running"] == "quiet"
+    np.testing.assert_array_equal(status.tuning.q, twin.tuning.q)
+    np.testing.assert_array_equal(status.tuning.r, [0.5])
+    # The same fold as that of the command line.
+    fold = Fold("kf", twin.model, twin.tuning, twin_page.engine._log.copy(), policy=twin.policy)
+    fold.advance()
+    np.testing.assert_array_equal(twin_page.engine._fold.track.mean, fold.track.mean)
+    assert twin_page.get("/api/runs")[-1]["what"].startswith("version quiet: ")
+    # And back to what the file says.
+    before = status.revision
+    assert twin_page.post("/api/tunings/load", name="own") == (200, {"name": "own"})
+    wait_for(lambda: twin_page.engine.status().revision > before and not twin_page.engine.status().refolding)
+    assert twin_page.engine.status().tuning.name == "own" and twin_page.engine.status().tuning.get("R.winding") == 4.0
+
+
+@pytest.mark.parametrize(
+    ("path", "fields", "said"),
+    [
+        ("/api/tunings", {"run": 0, "name": "own", "note": ""}, "the version's name is 'own'; use letters"),
+        ("/api/tunings", {"run": 0, "name": "../a", "note": ""}, "the version's name is '../a'; use letters"),
+        ("/api/tunings", {"run": 7, "name": "a", "note": ""}, "run 7 is not known"),
+        ("/api/tunings", {"run": True, "name": "a", "note": ""}, "run is true; it must be a whole number"),
+        ("/api/tunings", {"run": 0, "name": "a"}, "note is missing; it takes run, name, note"),
+        ("/api/tunings", {"run": 0, "name": "a", "note": "x" * 2001}, "note: it has 2001 characters; it may have 2000"),
+        ("/api/tunings/load", {"name": "nobody"}, "--tuning nobody: winding has no such version"),
+        ("/api/tunings/load", {"name": "/etc/passwd"}, "/etc/passwd: no version is read from there"),
+        ("/api/tunings/load", {"name": 3}, "name is 3; it must be a text"),
+    ],
+)
+def test_what_is_refused_of_versions(twin_page, path, fields, said):
+    status, answer = twin_page.post(path, **fields)
+    assert status == 400 and said in answer["error"]
+    assert len(tunings(twin_page)["versions"]) == 1 and twin_page.engine.status().tuning.name == "own"

@@ -1,0 +1,37 @@
+"""Served engines that the tests of the API share."""
+
+import numpy as np
+import pytest
+
+from tests.app.scripted import readings, wait_for
+from tests.app.served import ServedEngine
+
+
+@pytest.fixture
+def serve(tmp_path, monkeypatch):
+    """serve(n, std): an engine behind its page, with so many measurements of a constant temperature of 40 °C."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    # The viewer's files are tested elsewhere; to make them takes a while.
+    monkeypatch.setattr("app.web.server.viewer_assets", lambda progress: tmp_path)
+    opened = []
+
+    def serve(n=0, std=1.0, **options):
+        opened.append(ServedEngine(**options))
+        if n:
+            values = 40.0 + std * np.random.default_rng(4).normal(size=n)
+            opened[-1].source.put(readings(np.arange(1.0, n + 1.0) * 0.1, values))
+            wait_for(lambda: opened[-1].rows() == n)
+        return opened[-1]
+
+    yield serve
+    for page in opened:
+        page.stop()
+
+
+@pytest.fixture
+def page(serve, tmp_path):
+    """An engine behind its page that reviews a recording."""
+    recording = tmp_path / "reviewed.rrd"
+    recording.write_bytes(b"RRF2 and so on")
+    (tmp_path / "private.rrd").write_bytes(b"nobody's business")
+    return serve(review=recording)
