@@ -110,6 +110,7 @@ class SvgContext {
   }
 
   fillText(text, x, y) {
+    if (text === null || text === "") return;
     const size = parseFloat(this.font.match(/[\d.]+(?=px)/)?.[0] ?? 11);
     const [left, top] = [x + this.x, y + this.y + size * (BASELINES[this.textBaseline] ?? 0)];
     const place = this.angle ? `transform="translate(${round(left)} ${round(top)}) rotate(${round((180 * this.angle) / Math.PI)})"` : `x="${round(left)}" y="${round(top)}"`;
@@ -154,8 +155,7 @@ export function svgFile([width, height], [title, about], legend, draw, scale = d
       `<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 ${width} ${height}" width="${width}" height="${height}" font-family="${FAMILY}">`,
       `<title>${escaped(title)}</title><rect width="${width}" height="${height}" fill="${colour("panel")}"/>`,
       `<text x="10" y="19" fill="${colour("ink")}" font-size="14" font-weight="650">${escaped(title)}</text><text x="10" y="38" fill="${colour("faint")}" font-size="11.5">${escaped(about)}</text>`,
-      legendText(legend, width, colour),
-      `<g transform="translate(0 ${HEAD})${scale === 1 ? "" : ` scale(${1 / scale})`}">`, ...context.clips, ...context.parts, "</g></svg>",
+      `<g transform="translate(0 ${HEAD})${scale === 1 ? "" : ` scale(${1 / scale})`}">`, ...context.clips, ...context.parts, "</g>", legendText(legend, width, colour), "</svg>",
     ].join("\n");
   });
 }

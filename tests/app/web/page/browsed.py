@@ -6,7 +6,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from app.web.session import Session
+from app.cli.run import live_source
+from app.twin.twin import load_twin
+from app.web.session import Page, Session
 from tests.app.scripted import wait_for
 
 PATIENCE = 120.0
@@ -26,11 +28,27 @@ def until(page: Any, expression: str) -> None:
 
 
 @contextmanager
-def browsed(browser: Any, session: Session) -> Iterator[Any]:
-    """A light page of 1440 × 900, once it has drawn; nothing in it may have raised when it is closed."""
-    page = browser.new_context(viewport={"width": 1440, "height": 900}, color_scheme="light").new_page()
+def running(name: str, speed: float = float("inf"), **overrides: str) -> Iterator[Session]:
+    """A session of a twin with its page; played as fast as possible, it has ended."""
+    twin = load_twin(name, overrides=overrides)
+    session = Session(twin, live_source(twin, speed), page=Page(0, open_browser=False))
+    session.start()
+    try:
+        if speed == float("inf"):
+            wait_for(lambda: session.engine.status().finished, PATIENCE)
+        yield session
+    finally:
+        session.stop()
+
+
+@contextmanager
+def browsed(browser: Any, session: Session, width: int = 1440, scheme: str = "light") -> Iterator[Any]:
+    """A page of a height of 900 px, once it has drawn; nothing in it may have raised when it is closed."""
+    page = browser.new_context(viewport={"width": width, "height": 900}, color_scheme=scheme).new_page()
     page.set_default_timeout(PATIENCE * 1000)
     errors: list[str] = []
+    page.asked = []
+    page.on("request", lambda request: page.asked.append(request.url))
     page.on("pageerror", lambda error: errors.append(str(error)))
     page.goto(session.url)
     until(page, "window.nisus?.drawn > 0")

@@ -2,12 +2,8 @@
 
 import pytest
 
-from app.cli.run import live_source
-from app.twin.twin import load_twin
-from app.web.session import Page, Session
 from tests.app.scripted import wait_for
-from tests.app.web.page.browsed import PATIENCE
-from tests.app.web.page.test_fit_browser import page  # noqa: F401  a fixture
+from tests.app.web.page.browsed import PATIENCE, running
 from tests.app.web.page.test_runs_browser import settled
 
 pytestmark = pytest.mark.browser
@@ -15,15 +11,11 @@ pytestmark = pytest.mark.browser
 
 @pytest.fixture
 def session():
-    twin = load_twin("motor_winding", overrides={"estimator": "ukf"})
-    running = Session(twin, live_source(twin, float("inf")), page=Page(0, open_browser=False))
-    running.start()
-    wait_for(lambda: running.engine.status().finished, PATIENCE)
-    yield running
-    running.stop()
+    with running("motor_winding", **{"estimator": "ukf"}) as session:
+        yield session
 
 
-def test_a_linear_model_is_told_its_filter_which_applies_itself(page, session):  # noqa: F811
+def test_a_linear_model_is_told_its_filter_which_applies_itself(page, session):
     engine = session.engine
     assert engine.estimator == "ukf"
     page.locator("#advise").click()

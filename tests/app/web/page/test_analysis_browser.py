@@ -3,37 +3,18 @@
 import numpy as np
 import pytest
 
-from app.cli.run import live_source
-from app.twin.twin import load_twin
-from app.web.session import Page, Session
 from estimators.log import INPUT
 from tests.app.scripted import pull_all, row_count, wait_for
-from tests.app.web.page.browsed import PATIENCE, until
+from tests.app.web.page.browsed import PATIENCE, running, until
 
 pytestmark = pytest.mark.browser
 
 
 @pytest.fixture(scope="module")
 def session():
-    twin = load_twin("motor_can")
-    made = Session(twin, live_source(twin, 1.0), page=Page(0, open_browser=False))
-    made.start()
-    wait_for(lambda: row_count(made.engine) > 600, PATIENCE)
-    yield made
-    made.stop()
-
-
-@pytest.fixture
-def page(browser, session):
-    opened = browser.new_page(viewport={"width": 1440, "height": 900})
-    opened.set_default_timeout(PATIENCE * 1000)
-    opened.asked, opened.wrong = [], []
-    opened.on("request", lambda request: opened.asked.append(request.url))
-    opened.on("pageerror", lambda error: opened.wrong.append(str(error)))
-    opened.goto(session.url)
-    until(opened, "window.nisus?.drawn > 0")
-    yield opened
-    opened.close()
+    with running("motor_can", 1.0) as made:
+        wait_for(lambda: row_count(made.engine) > 600, PATIENCE)
+        yield made
 
 
 def questions(page, path):
@@ -183,4 +164,3 @@ def test_nothing_is_asked_while_both_are_hidden(page):
     # Long enough for several of either, by what the charts have drawn meanwhile at ten a second at most.
     until(page, f"window.nisus.drawn > {drawn} + 60")
     assert [questions(page, path) for path in ("/api/forecast", "/api/diagnose")] == asked
-    assert page.wrong == []

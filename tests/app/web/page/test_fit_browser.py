@@ -4,14 +4,12 @@ import json
 
 import pytest
 
-from app.cli.run import live_source
 from app.live.tunings.versions import listing
 from app.studies.baseline import ComparedFigure
 from app.studies.guard import GuardVerdict, keep_last
-from app.twin.twin import load_twin, with_version
-from app.web.session import Page, Session
+from app.twin.twin import with_version
 from tests.app.scripted import wait_for
-from tests.app.web.page.browsed import PATIENCE, browsed
+from tests.app.web.page.browsed import PATIENCE, running
 from tests.app.web.page.test_runs_browser import settled
 
 pytestmark = pytest.mark.browser
@@ -26,18 +24,8 @@ WRONG = 100.0
 def session(tmp_path, monkeypatch):
     # Where versions of twins that ship are kept.
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
-    twin = load_twin("motor_winding", overrides={"R.winding": str(WRONG), "source.duration": "1200"})
-    running = Session(twin, live_source(twin, float("inf")), page=Page(0, open_browser=False))
-    running.start()
-    wait_for(lambda: running.engine.status().finished, PATIENCE)
-    yield running
-    running.stop()
-
-
-@pytest.fixture
-def page(browser, session):
-    with browsed(browser, session) as page:
-        yield page
+    with running("motor_winding", **{"R.winding": str(WRONG), "source.duration": "1200"}) as session:
+        yield session
 
 
 def fitted(page):

@@ -4,11 +4,8 @@ import re
 
 import pytest
 
-from app.cli.run import live_source
-from app.twin.twin import load_twin
-from app.web.session import Page, Session
 from tests.app.scripted import wait_for
-from tests.app.web.page.browsed import PATIENCE, until
+from tests.app.web.page.browsed import PATIENCE, running, until
 from tests.app.web.page.test_colours import TEXT, contrast, over
 
 pytestmark = pytest.mark.browser
@@ -48,11 +45,8 @@ TEXTS = """(() => {
 
 @pytest.fixture(scope="module")
 def session():
-    twin = load_twin("motor_winding")
-    session = Session(twin, live_source(twin, 4.0), page=Page(0, open_browser=False))
-    session.start()
-    yield session
-    session.stop()
+    with running("motor_winding", 4.0) as session:
+        yield session
 
 
 def opened(browser, session, scheme="light", size=SIZE):

@@ -3,12 +3,9 @@
 import numpy as np
 import pytest
 
-from app.cli.run import live_source
 from app.live.commands import Pin, SetTuning, UseSensor
-from app.twin.twin import load_twin
-from app.web.session import Page, Session
 from tests.app.scripted import pull_all, wait_for
-from tests.app.web.page.browsed import PATIENCE, until
+from tests.app.web.page.browsed import PATIENCE, running, until
 from tests.support import SECOND
 
 pytestmark = pytest.mark.browser
@@ -16,21 +13,8 @@ pytestmark = pytest.mark.browser
 
 @pytest.fixture
 def session():
-    twin = load_twin("motor_joint", overrides={"source.duration": "300"})
-    running = Session(twin, live_source(twin, float("inf")), page=Page(0, open_browser=False))
-    running.start()
-    wait_for(lambda: running.engine.status().finished, PATIENCE)
-    yield running
-    running.stop()
-
-
-@pytest.fixture
-def page(browser, session):
-    page = browser.new_context(viewport={"width": 1400, "height": 900}).new_page()
-    page.goto(session.url, timeout=PATIENCE * 1000)
-    until(page, "window.nisus?.drawn > 0")
-    yield page
-    page.context.close()
+    with running("motor_joint", **{"source.duration": "300"}) as session:
+        yield session
 
 
 def lanes(session):
@@ -148,7 +132,7 @@ def test_what_became_of_the_readings_is_told(page, session):
     wait_for(lambda: "held out" in told.inner_text(), PATIENCE)
     counts = session.engine.status().counts
     words = told.inner_text().split("\n")
-    assert words[:4] == ["readings", f"{counts['readings']:,}", "used", f"{counts['used']:,}"]
+    assert words[:4] == ["measurements", f"{counts['readings']:,}", "used", f"{counts['used']:,}"]
     assert words[words.index("held out") + 1] == f"{counts['held out']} (33 %)"
 
 

@@ -2,12 +2,9 @@
 
 import pytest
 
-from app.cli.run import live_source
 from app.live.tunings.versions import listing
-from app.twin.twin import load_twin
-from app.web.session import Page, Session
 from tests.app.scripted import wait_for
-from tests.app.web.page.browsed import PATIENCE, browsed
+from tests.app.web.page.browsed import PATIENCE, browsed, running
 from tests.app.web.page.test_fit_browser import TRUE, WRONG
 from tests.app.web.page.test_runs_browser import settled
 
@@ -20,12 +17,9 @@ def session(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
     section = "{entries: [R.winding], every: 10 min, window: 15 min}"
     overrides = {"R.winding": str(WRONG), "source.duration": "1200", "refit": section}
-    twin = load_twin("motor_winding", overrides=overrides)
-    running = Session(twin, live_source(twin, float("inf")), page=Page(0, open_browser=False))
-    running.start()
-    wait_for(lambda: running.running.refits.open is not None, PATIENCE)
-    yield running
-    running.stop()
+    with running("motor_winding", **overrides) as session:
+        wait_for(lambda: session.running.refits.open is not None, PATIENCE)
+        yield session
 
 
 @pytest.fixture

@@ -6,14 +6,11 @@ import re
 import numpy as np
 import pytest
 
-from app.cli.run import live_source
-from app.twin.twin import load_twin
-from app.web.session import Page, Session
 from estimators.fold import fold
 from estimators.log import Log
 from estimators.track import GATED, USED
 from tests.app.scripted import pull_all, wait_for
-from tests.app.web.page.browsed import PATIENCE, browsed, until
+from tests.app.web.page.browsed import PATIENCE, running, until
 
 pytestmark = pytest.mark.browser
 
@@ -23,27 +20,17 @@ PINNED = (176, 51, 143)
 
 @pytest.fixture
 def session():
-    twin = load_twin("motor_winding")
-    running = Session(twin, live_source(twin, float("inf")), page=Page(0, open_browser=False))
-    running.start()
-    wait_for(lambda: running.engine.status().finished, PATIENCE)
-    yield running
-    running.stop()
+    with running("motor_winding") as session:
+        yield session
 
 
-@pytest.fixture
-def page(browser, session):
-    with browsed(browser, session) as page:
-        yield page
-
-
-def coloured(page, selector):
-    """Pixels of the first pin's colour in an element."""
+def coloured(page, selector, colour=PINNED):
+    """Pixels of a colour in an element."""
     from PIL import Image
 
     picture = page.screenshot(clip=page.locator(selector).first.bounding_box())
     pixels = np.asarray(Image.open(io.BytesIO(picture)).convert("RGB")).astype(int)
-    return int(np.sum(np.abs(pixels - PINNED).sum(axis=2) < 60))
+    return int(np.sum(np.abs(pixels - colour).sum(axis=2) < 60))
 
 
 def settled(engine, revision):
@@ -127,3 +114,14 @@ def test_the_curve_around_a_knob_shows_the_likeliest_value(page, session):
     wanted = float(take.inner_text().split()[-1])
     take.click()
     wait_for(lambda: engine.status().tuning.get(key) == pytest.approx(wanted, rel=0.01), PATIENCE)
+
+
+def test_the_smoothed_estimate_is_drawn_while_it_is_on(page):
+    chart, colour = "#charts .chart canvas", (38, 76, 70)  # app/web/page/chart.css, --smoothed
+    before = coloured(page, chart, colour)
+    button = page.locator("#smoothed")
+    button.click()
+    assert button.get_attribute("aria-pressed") == "true"
+    wait_for(lambda: coloured(page, chart, colour) > before + 100, PATIENCE)
+    button.click()
+    wait_for(lambda: coloured(page, chart, colour) <= before + 20, PATIENCE)

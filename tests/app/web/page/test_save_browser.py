@@ -7,12 +7,9 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from app.cli.run import live_source
 from app.live.commands import SetTuning
-from app.twin.twin import load_twin
-from app.web.session import Page, Session
 from tests.app.scripted import pull_all, wait_for
-from tests.app.web.page.browsed import PATIENCE, until
+from tests.app.web.page.browsed import PATIENCE, running, until
 
 pytestmark = pytest.mark.browser
 
@@ -24,12 +21,8 @@ ESTIMATE = "#0b62c4"
 
 @pytest.fixture(scope="module", params=["motor_winding", "motor_joint"])
 def session(request):
-    twin = load_twin(request.param)
-    running = Session(twin, live_source(twin, float("inf")), page=Page(0, open_browser=False))
-    running.start()
-    wait_for(lambda: running.engine.status().finished, PATIENCE)
-    yield running
-    running.stop()
+    with running(request.param) as session:
+        yield session
 
 
 @pytest.fixture

@@ -2,23 +2,17 @@
 
 import pytest
 
-from app.cli.run import live_source
-from app.twin.twin import load_twin
 from app.web.http import PAGE
-from app.web.session import Page, Session
 from tests.app.scripted import wait_for
-from tests.app.web.page.browsed import PATIENCE, until
+from tests.app.web.page.browsed import PATIENCE, running, until
 
 pytestmark = pytest.mark.browser
 
 
 @pytest.fixture
 def session():
-    twin = load_twin("motor_winding")
-    session = Session(twin, live_source(twin, 4.0), page=Page(0, open_browser=False))
-    session.start()
-    yield session
-    session.stop()
+    with running("motor_winding", 4.0) as session:
+        yield session
 
 
 @pytest.fixture
@@ -67,7 +61,7 @@ def test_the_scene_is_chosen_enlarged_and_opened_alone(context, session):
     with context.expect_page() as opened:
         page.get_by_label("Scene in a window of its own").click()
     alone = opened.value
-    alone.get_by_text("Process noise Q").wait_for()
+    alone.get_by_text("Reset estimate").wait_for()
     wait_for(lambda: asked(session) == ["theme=light", "theme=light&part=scene"], PATIENCE)
     wait_for(lambda: "revision 0" in session.view.panel.status.content, PATIENCE)
 

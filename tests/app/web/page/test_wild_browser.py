@@ -3,13 +3,9 @@
 import numpy as np
 import pytest
 
-from app.cli.run import live_source
-from app.twin.twin import load_twin
-from app.web.session import Page, Session
 from estimators.log import READING
 from tests.app.scripted import pull_all, wait_for
-from tests.app.web.page.browsed import PATIENCE
-from tests.app.web.page.test_runs_browser import page  # noqa: F401  fixture
+from tests.app.web.page.browsed import PATIENCE, running
 
 pytestmark = pytest.mark.browser
 
@@ -18,15 +14,11 @@ SPIKES = "[{kind: spike, sensor: winding, size: 6000.0, rate: 0.01}]"
 
 @pytest.fixture(scope="module")
 def session():
-    twin = load_twin("motor_winding", overrides={"faults": SPIKES, "gate": "0.9999", "source.duration": "600"})
-    running = Session(twin, live_source(twin, float("inf")), page=Page(0, open_browser=False))
-    running.start()
-    wait_for(lambda: running.engine.status().finished, PATIENCE)
-    yield running
-    running.stop()
+    with running("motor_winding", **{"faults": SPIKES, "gate": "0.9999", "source.duration": "600"}) as session:
+        yield session
 
 
-def chart(page, key):  # noqa: F811
+def chart(page, key):
     """The value axis of a chart, and what is marked at its edges."""
     return page.evaluate(
         """(key) => {
@@ -38,7 +30,7 @@ def chart(page, key):  # noqa: F811
     )
 
 
-def test_a_wild_reading_is_marked_at_the_edge_and_the_others_rule_the_axis(page, session):  # noqa: F811
+def test_a_wild_reading_is_marked_at_the_edge_and_the_others_rule_the_axis(page, session):
     pull = pull_all(session.engine)
     innovation = pull.track.innovation[pull.events.kind == READING, 0]
     innovation = innovation[np.isfinite(innovation)]  # without those beyond what the sensor can say at all
@@ -67,7 +59,7 @@ def test_a_wild_reading_is_marked_at_the_edge_and_the_others_rule_the_axis(page,
     assert {mark["tone"] for mark in state["marks"]} == {"refused"}
 
 
-def test_what_an_axis_spans(page):  # noqa: F811
+def test_what_an_axis_spans(page):
     """Of columns whose answer is plain."""
     found = page.evaluate(
         """async () => {
