@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
-
 import numpy as np
 
 from ..compiled.context import expect, options, row_count, transition
 from ..compiled.jacobians import scratch_size, sensor_jacobian, state_jacobian
 from ..estimator import Estimator, Options
 from ..model.state_space import StateSpaceModel
-from ..numerics.jit import inlined, jit
+from ..numerics.jit import by_address, embedded
 from ..numerics.linalg import congruence
-from ..numerics.workspace import layout, size_of, start_of, take_matrix, take_vector
+from ..numerics.workspace import declare_layout, size_of, start_of
 from ..track import USED
 from ..tuning import Tuning
 from .robust import (
@@ -27,7 +25,6 @@ from .robust import (
     shared_options,
 )
 from .shared import (
-    Reading,
     admit_weighted,
     compare,
     describe,
@@ -45,58 +42,28 @@ from .shared import (
     wrap_mean,
 )
 
+Predicting, predicting = declare_layout(
+    "Predicting",
+    "n",
+    scratch_size,
+    forward="n",  # f(x, u)
+    F="n, n",  # df/dx
+    products="2 * n, n",  # scratch of F P Fᵀ
+    Q="n, n = products",  # scratch of the noise, once the products are not needed any more
+    jacobian="scratch_size(n, n)",  # scratch of a Jacobian
+)
 
-class Predicting(NamedTuple):
-    """What `predict` works in."""
-
-    forward: Any
-    """(n,): f(x, u)."""
-    F: Any
-    """(n, n): df/dx."""
-    products: Any
-    """(2n, n): scratch of F P Fᵀ."""
-    Q: Any
-    """(n, n): scratch of the noise, once the products are needed no more."""
-    jacobian: Any
-    """Scratch of a Jacobian."""
-    end: int
-
-
-@layout
-def predicting(at, n):
-    """The layout of `predict`."""
-    forward, at = take_vector(at, n)
-    F, at = take_matrix(at, n, n)
-    Q, _ = take_matrix(at, n, n)
-    products, at = take_matrix(at, 2 * n, n)
-    jacobian, at = take_vector(at, scratch_size(n, n))
-    return Predicting(forward, F, products, Q, jacobian, at)
-
-
-class Updating(NamedTuple):
-    """What `update` works in."""
-
-    reading: Reading
-    K: Any
-    """(n, m): the gain."""
-    H: Any
-    """(m, n): dh/dx."""
-    N: Any
-    """(n, n): scratch of the Joseph form."""
-    jacobian: Any
-    """Scratch of a Jacobian."""
-    end: int
-
-
-@layout
-def updating(at, n, m):
-    """The layout of `update`."""
-    reading = reading_of(at, n, m)
-    K, at = take_matrix(reading.end, n, m)
-    H, at = take_matrix(at, m, n)
-    N, at = take_matrix(at, n, n)
-    jacobian, at = take_vector(at, scratch_size(n, m))
-    return Updating(reading, K, H, N, jacobian, at)
+Updating, updating = declare_layout(
+    "Updating",
+    "n, m",
+    reading_of,
+    scratch_size,
+    reading="Reading(at, n, m)",
+    K="n, m",  # gain
+    H="m, n",  # dh/dx
+    N="n, n",  # scratch of the Joseph form
+    jacobian="scratch_size(n, m)",  # scratch of a Jacobian
+)
 
 
 def work_size(options: Options, nx: int, ny: int) -> int:
@@ -109,7 +76,7 @@ def tune(values: Options, model: StateSpaceModel, tuning: Tuning) -> np.ndarray:
     return np.array(shared_options(values))
 
 
-@jit
+@by_address
 def predict(context, u, dt, index, state, work):
     """x ← f(x, u);  P ← F P Fᵀ + Q, with F = df/dx at the estimate before the step.
 
@@ -125,7 +92,7 @@ def predict(context, u, dt, index, state, work):
     move_to(context, own.forward, x)
 
 
-@inlined
+@embedded
 def linearise(context, sensor, x, u, P, reading, H, scratch):
     """Fill ŷ = h(x), H = dh/dx (ny, nx), and for the reading C = P Hᵀ and S = H P Hᵀ."""
     C, S = reading.C, reading.S
@@ -146,7 +113,7 @@ def linearise(context, sensor, x, u, P, reading, H, scratch):
             S[k, i] = s
 
 
-@inlined
+@embedded
 def correct(context, m, own, x, P):
     """x ← x + K ν;  P by the Joseph form, or as P - K S Kᵀ."""
     reading = own.reading
@@ -161,7 +128,7 @@ def correct(context, m, own, x, P):
     wrap_mean(context, x)
 
 
-@jit
+@by_address
 def update(context, u, sensor, y, index, state, work, innovation, innovation_std, score):
     """x ← x + K ν;  P by the Joseph form, with H = dh/dx at the prediction.
 

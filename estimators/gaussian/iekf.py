@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
-
 import numpy as np
 
 from ..compiled.context import options, row_count
 from ..estimator import Estimator, Option, Options
 from ..model.state_space import StateSpaceModel
-from ..numerics.jit import inlined, jit
+from ..numerics.jit import by_address, inlined
 from ..numerics.linalg import solve_transposed
-from ..numerics.workspace import layout, size_of, start_of, take_vector
+from ..numerics.workspace import declare_layout, size_of, start_of
 from ..track import FAILED, USED
 from ..tuning import Tuning
 from . import ekf
-from .ekf import Updating, correct, linearise, predict, predicting
+from .ekf import correct, linearise, predict, predicting
 from .robust import (
     JOSEPH_OPTION,
     OPTIONS,
@@ -43,28 +41,15 @@ ITERATIONS = OWN
 """Position in the context's options."""
 
 
-class Iterating(NamedTuple):
-    """What `update` works in."""
-
-    own: Updating
-    """What the EKF's works in."""
-    predicted: Any
-    """(n,): x̂, the prediction."""
-    innovation: Any
-    """(m,): y - h(xᵢ), of which the track keeps the first."""
-    innovation_std: Any
-    """(m,): its deviations."""
-    end: int
-
-
-@layout
-def iterating(at, n, m):
-    """The layout of `update`."""
-    own = ekf.updating(at, n, m)
-    predicted, at = take_vector(own.end, n)
-    innovation, at = take_vector(at, m)
-    innovation_std, at = take_vector(at, m)
-    return Iterating(own, predicted, innovation, innovation_std, at)
+Iterating, iterating = declare_layout(
+    "Iterating",
+    "n, m",
+    ekf.updating,
+    own="Updating(at, n, m)",
+    predicted="n",  # x̂, the prediction
+    innovation="m",  # y - h(xᵢ), of which the track keeps the first
+    innovation_std="m",  # standard deviations of the innovation
+)
 
 
 def work_size(options: Options, nx: int, ny: int) -> int:
@@ -77,7 +62,7 @@ def tune(values: Options, model: StateSpaceModel, tuning: Tuning) -> np.ndarray:
     return np.array([*shared_options(values), values["iterations"]])
 
 
-@jit
+@by_address
 def update(context, u, sensor, y, index, state, work, innovation, innovation_std, score):
     """The Gauss-Newton minimum of ½ |x - x̂|²_P⁻¹ + ½ |y - h(x)|²_R⁻¹, then P by the Joseph form with its last H.
 

@@ -2,37 +2,25 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
-
 from ..compiled.context import transition
 from ..compiled.jacobians import state_jacobian
 from ..estimator import Estimator, Options
 from ..model.state_space import StateSpaceModel
-from ..numerics.jit import floats, inlined, jit
+from ..numerics.jit import by_address, embedded, floats, inlined
 from ..numerics.linalg import congruence
-from ..numerics.workspace import layout, size_of, start_of, take_matrix, take_vector
+from ..numerics.workspace import declare_layout, size_of, start_of
 from . import ekf
 from .ekf import predicting
 from .robust import JOSEPH_OPTION, OPTIONS, add_noise, memory
 from .shared import describe, moments, moments_of, move_to, no_points, start, state_size
 
-
-class Kept(NamedTuple):
-    """What stays from step to step."""
-
-    F: Any
-    """(n, n): the transition matrix."""
-    dt: Any
-    """(1,): the step for which F holds; NaN at first."""
-    end: int
-
-
-@layout
-def kept(at, n):
-    """The layout of what stays."""
-    F, at = take_matrix(at, n, n)
-    dt, at = take_vector(at, 1)
-    return Kept(F, dt, at)
+Kept, kept = declare_layout(
+    "Kept",
+    "n",
+    F="n, n",  # transition matrix
+    dt="1",  # step for which F holds; NaN at first
+)
+"""Workspace that keeps its numbers from step to step."""
 
 
 @inlined
@@ -46,7 +34,7 @@ def work_size(options: Options, nx: int, ny: int) -> int:
     return ekf.work_size(options, nx, ny) + size_of(kept, nx)
 
 
-@inlined
+@embedded
 def constant_jacobian(context, u, dt, kept, scratch):
     """Fill F for this dt, unless it holds for it.
 
@@ -58,7 +46,7 @@ def constant_jacobian(context, u, dt, kept, scratch):
         kept.dt[0] = dt
 
 
-@jit
+@by_address
 def predict(context, u, dt, index, state, work):
     """x ← F x + B u;  P ← F P Fᵀ + Q.
 

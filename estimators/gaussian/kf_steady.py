@@ -16,7 +16,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import lru_cache
-from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -25,9 +24,9 @@ from ..errors import EstimatorError
 from ..estimator import Estimator, Option, Options
 from ..model.sensor import covariance_of
 from ..model.state_space import StateSpaceModel
-from ..numerics.jit import inlined, jit
+from ..numerics.jit import by_address, inlined, jit
 from ..numerics.linalg import congruence, unit_factor
-from ..numerics.workspace import layout, start_of, take_matrix
+from ..numerics.workspace import declare_layout, start_of
 from ..track import USED
 from ..tuning import Tuning
 from . import kf, shared
@@ -51,25 +50,13 @@ def state_size(values: Options, nx: int) -> int:
     return nx + nx * nx + 1
 
 
-class Steady(NamedTuple):
-    """What the filter settles to."""
-
-    K: Any
-    """(n, m): the gain."""
-    after: Any
-    """(n, n): P after a reading."""
-    before: Any
-    """(n, n): P before a reading."""
-    end: int
-
-
-@layout
-def steady(at, n, m):
-    """The layout of what the filter settles to."""
-    K, at = take_matrix(at, n, m)
-    after, at = take_matrix(at, n, n)
-    before, at = take_matrix(at, n, n)
-    return Steady(K, after, before, at)
+Steady, steady = declare_layout(
+    "Steady",
+    "n, m",
+    K="n, m",  # gain
+    after="n, n",  # P after a measurement
+    before="n, n",  # P before a measurement
+)
 
 
 @inlined
@@ -84,7 +71,7 @@ def phase_of(state):
     return state[state.size - 1 :]
 
 
-@jit
+@by_address
 def start(context, mean, cov, state):
     """The state that stands for N(mean, cov)."""
     shared.start(context, mean, cov, state)
@@ -112,7 +99,7 @@ def settled(A, P):
     return True
 
 
-@jit
+@by_address
 def predict(context, u, dt, index, state, work):
     """x ← f(x, u); P steps from the steady one to the steady one, or else as the Kalman filter's.
 
@@ -138,7 +125,7 @@ def predict(context, u, dt, index, state, work):
     move_to(context, own.forward, x)
 
 
-@jit
+@by_address
 def update(context, u, sensor, y, index, state, work, innovation, innovation_std, score):
     """x ← x + K ν with the steady gain, or where rows of the reading are missing with the gain of the others.
 

@@ -8,19 +8,17 @@ After P stands what an adaptation remembers (robust.py), if it is on.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
-
 import numpy as np
 
 from ..compiled.context import circular_rows, circular_states, shown_states
 from ..compiled.noise import has_correlated_rows, independent_rows
 from ..compiled.verdict import verdict_of
 from ..estimator import Options
-from ..numerics.jit import inlined, ints, jit, part
+from ..numerics.jit import by_address, embedded, inlined, ints, part
 from ..numerics.linalg import EPSILON, cholesky, mirror, solve_transposed, solve_unit, solve_upper, wrap
 from ..numerics.padded_rows import subtract_squares
 from ..numerics.simd_ir import padded
-from ..numerics.workspace import layout, start_of, take_matrix, take_vector
+from ..numerics.workspace import declare_layout, start_of, take_matrix, take_vector
 from ..track import FAILED, MISSING, USED, WHITENED
 from .robust import forget, is_robust, reweigh
 
@@ -48,7 +46,7 @@ def no_points(options: Options, state: np.ndarray, nx: int) -> np.ndarray:
     return np.zeros((0, nx))
 
 
-@jit
+@by_address
 def start(context, mean, cov, state):
     """The state that stands for N(mean, cov)."""
     n = mean.size
@@ -60,7 +58,7 @@ def start(context, mean, cov, state):
     forget(context, state)
 
 
-@jit
+@by_address
 def describe(context, state, mean, std, cross):
     """Mean, standard deviation and the configured covariances."""
     x, P = moments_of(state, context.nx)
@@ -91,53 +89,28 @@ def move_to(context, forward, x):
     wrap_mean(context, x)
 
 
-class Reading(NamedTuple):
-    """What an update works in: a reading of m rows, of n states.
+Reading, reading_of = declare_layout(
+    "Reading",
+    "n, m",
+    padded,
+    W="m, padded(n)",  # scratch of `downdate`
+    nu="m",  # predicted measurement, then innovation ν, then whitened, S^-½ ν
+    r="m",  # variances of all rows, as they are in use
+    S="m, m",  # covariance of the predicted measurement, then of the innovation
+    chol_S="m, m",  # upper, chol_Sᵀ chol_S = S
+    C="n, m",  # covariance of state and predicted measurement
+    raw="m",  # innovation, not whitened
+    d="m",  # variances of the finite rows, made independent
+    z="2 * m",  # scratch of a weight
+    V="m, m",  # scratch of a weight
+)
+"""Workspace of an update with m rows and n states.
 
-    `compare` moves the rows that are there to the front and makes their noise independent; all but `r` are then about
-    these.
-    """
-
-    W: Any
-    """(m, padded n): for `downdate`."""
-    nu: Any
-    """(m,): predicted reading, then innovation ν, then whitened, S^-½ ν."""
-    r: Any
-    """(m,): variances of all rows, as they are in use."""
-    S: Any
-    """(m, m): covariance of the predicted reading, then of the innovation."""
-    chol_S: Any
-    """(m, m): upper, chol_Sᵀ chol_S = S."""
-    C: Any
-    """(n, m): covariance of state and predicted reading."""
-    raw: Any
-    """(m,): the innovation, not whitened."""
-    d: Any
-    """(m,): variances of the rows that are there, independent."""
-    z: Any
-    """(2 m,): scratch of a weight."""
-    V: Any
-    """(m, m): scratch of a weight."""
-    end: int
+`compare` moves the finite rows to the front and makes their noise independent; all arrays but `r` then describe these.
+"""
 
 
-@layout
-def reading_of(at, n, m):
-    """The layout of a reading's workspace."""
-    W, at = take_matrix(at, m, padded(n))
-    nu, at = take_vector(at, m)
-    r, at = take_vector(at, m)
-    S, at = take_matrix(at, m, m)
-    chol_S, at = take_matrix(at, m, m)
-    C, at = take_matrix(at, n, m)
-    raw, at = take_vector(at, m)
-    d, at = take_vector(at, m)
-    z, at = take_vector(at, 2 * m)
-    V, at = take_matrix(at, m, m)
-    return Reading(W, nu, r, S, chol_S, C, raw, d, z, V, at)
-
-
-@inlined
+@embedded
 def compare(context, sensor, y, reading, H, P, innovation, innovation_std):
     """The innovation ν = y - ŷ and its covariance S = S_ŷ + R, over the rows of the reading that are there.
 
@@ -261,7 +234,7 @@ def admit(context, sensor, m, nu, S, U, score):
     return judge(context, sensor, m, nu, U, score)
 
 
-@inlined
+@embedded
 def admit_weighted(context, sensor, m, reading, score):
     """Judge the innovation of a reading, and weight the noise of one that is used: the verdict."""
     verdict = admit(context, sensor, m, reading.nu, reading.S, reading.chol_S, score)

@@ -7,16 +7,14 @@ remembers, as in shared.py.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
-
 import numpy as np
 
 from ..compiled.context import add_process_noise, circular_rows, options, shown_states
 from ..compiled.noise import has_correlated_rows, independent_rows
 from ..estimator import Options
-from ..numerics.jit import inlined, ints, jit
+from ..numerics.jit import by_address, embedded, inlined, ints, jit
 from ..numerics.linalg import EPSILON, remove, root, solve_transposed, solve_unit, triangularise, wrap
-from ..numerics.workspace import layout, start_of, take_matrix, take_vector
+from ..numerics.workspace import declare_layout, start_of, take_matrix
 from ..track import FAILED, MISSING, USED
 from . import robust
 from .robust import ROBUST, ROBUST_AT, adapt, forget, is_adaptive, is_robust, reading_variances, weight
@@ -29,49 +27,24 @@ def moments(options: Options, state: np.ndarray, nx: int) -> tuple[np.ndarray, n
     return state[:nx].copy(), U.T @ U
 
 
-class Conditioning(NamedTuple):
-    """What `condition` works in: a reading of m rows, of n states whose spread has k rows."""
-
-    A: Any
-    """(k + m, m + n): the joint factor of reading and state."""
-    w: Any
-    """(m + n,): scratch of a triangularisation."""
-    v: Any
-    """(m + n,): a row that is taken off the joint factor."""
-    r: Any
-    """(m,): variances of all rows, as they are in use."""
-    d: Any
-    """(m,): variances of the rows that are there, independent."""
-    raw: Any
-    """(m,): the innovation, not whitened."""
-    L: Any
-    """(m, m): unit lower, R = L diag(d) Lᵀ, where rows are correlated."""
-    S: Any
-    """(m, m): for a weight, the covariance of the innovation; in the place of L."""
-    z: Any
-    """(2 m,): scratch of a weight."""
-    V: Any
-    """(m, m): scratch of a weight."""
-    end: int
+Conditioning, conditioning = declare_layout(
+    "Conditioning",
+    "n, m, k",
+    A="k + m, m + n",  # joint factor of measurement and state
+    w="m + n",  # scratch of a triangularisation
+    v="m + n",  # row that is taken off the joint factor
+    r="m",  # variances of all rows, as they are in use
+    d="m",  # variances of the finite rows, made independent
+    raw="m",  # innovation, not whitened
+    S="m, m",  # covariance of the innovation, for a weight
+    L="m, m = S",  # unit lower, R = L diag(d) Lᵀ, where rows are correlated
+    z="2 * m",  # scratch of a weight
+    V="m, m",  # scratch of a weight
+)
+"""Workspace of `condition` with m rows and n states whose spread has k rows."""
 
 
-@layout
-def conditioning(at, n, m, k):
-    """The layout of `condition`."""
-    A, at = take_matrix(at, k + m, m + n)
-    w, at = take_vector(at, m + n)
-    v, at = take_vector(at, m + n)
-    r, at = take_vector(at, m)
-    d, at = take_vector(at, m)
-    raw, at = take_vector(at, m)
-    L, _ = take_matrix(at, m, m)
-    S, at = take_matrix(at, m, m)
-    z, at = take_vector(at, 2 * m)
-    V, at = take_matrix(at, m, m)
-    return Conditioning(A, w, v, r, d, raw, L, S, z, V, at)
-
-
-@jit
+@by_address
 def start(context, mean, cov, state):
     """The state that stands for N(mean, cov); NaN if cov is indefinite."""
     n = mean.size
@@ -84,7 +57,7 @@ def start(context, mean, cov, state):
     forget(context, state)
 
 
-@jit
+@by_address
 def describe(context, state, mean, std, cross):
     """Mean, standard deviation and the configured covariances."""
     x, U = moments_of(state, context.nx)
@@ -105,7 +78,7 @@ def describe(context, state, mean, std, cross):
             cross[c] += U[k, i] * U[k, j]
 
 
-@inlined
+@embedded
 def noise_root(context, x, u, dt, state, V, scratch):
     """Fill V (nx, nx) with a factor of Q, as scaled by an adaptation; False if Q is indefinite."""
     n = context.nx
@@ -218,7 +191,7 @@ def dependent_variance(A, L, k):
     return variance
 
 
-@inlined
+@embedded
 def condition(context, sensor, y, state, expected, Y, lost, own, innovation, innovation_std, score):
     """Condition on a reading whose prediction is `expected` (ny,), and return the verdict.
 

@@ -2,76 +2,42 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
-
 import numpy as np
 
 from ..compiled.context import expect, row_count, transition
 from ..compiled.jacobians import scratch_size, sensor_jacobian, state_jacobian
 from ..estimator import Estimator, Options
-from ..numerics.jit import inlined, jit
+from ..numerics.jit import by_address, inlined
 from ..numerics.linalg import triangularise
-from ..numerics.workspace import layout, size_of, start_of, take_matrix, take_vector
+from ..numerics.workspace import declare_layout, size_of, start_of
 from .ekf import tune
 from .robust import OPTIONS, growth, memory
 from .shared import moments_of, no_points, state_size
-from .square_root import Conditioning, condition, conditioning, describe, moments, noise_root, settle, start
+from .square_root import condition, conditioning, describe, moments, noise_root, settle, start
 
+Predicting, predicting = declare_layout(
+    "Predicting",
+    "n",
+    scratch_size,
+    forward="n",  # f(x, u)
+    F="n, n",  # df/dx
+    A="2 * n, n",  # U Fᵀ over Q^½
+    scratch="n, n",  # Q, then scratch of a triangularisation
+    jacobian="scratch_size(n, n)",  # scratch of a Jacobian
+)
 
-class Predicting(NamedTuple):
-    """What `predict` works in."""
-
-    forward: Any
-    """(n,): f(x, u)."""
-    F: Any
-    """(n, n): df/dx."""
-    A: Any
-    """(2n, n): U Fᵀ over Q^½."""
-    scratch: Any
-    """(n, n): Q, then scratch of a triangularisation."""
-    jacobian: Any
-    """Scratch of a Jacobian."""
-    end: int
-
-
-@layout
-def predicting(at, n):
-    """The layout of `predict`."""
-    forward, at = take_vector(at, n)
-    F, at = take_matrix(at, n, n)
-    A, at = take_matrix(at, 2 * n, n)
-    scratch, at = take_matrix(at, n, n)
-    jacobian, at = take_vector(at, scratch_size(n, n))
-    return Predicting(forward, F, A, scratch, jacobian, at)
-
-
-class Updating(NamedTuple):
-    """What `update` works in."""
-
-    expected: Any
-    """(m,): h(x)."""
-    H: Any
-    """(m, n): dh/dx."""
-    Y: Any
-    """(n, m): U Hᵀ."""
-    nothing: Any
-    """(0,): no weight is negative."""
-    jacobian: Any
-    """Scratch of a Jacobian."""
-    conditioning: Conditioning
-    end: int
-
-
-@layout
-def updating(at, n, m):
-    """The layout of `update`."""
-    expected, at = take_vector(at, m)
-    H, at = take_matrix(at, m, n)
-    Y, at = take_matrix(at, n, m)
-    nothing, at = take_vector(at, 0)
-    jacobian, at = take_vector(at, scratch_size(n, m))
-    own = conditioning(at, n, m, n)
-    return Updating(expected, H, Y, nothing, jacobian, own, own.end)
+Updating, updating = declare_layout(
+    "Updating",
+    "n, m",
+    scratch_size,
+    conditioning,
+    expected="m",  # h(x)
+    H="m, n",  # dh/dx
+    Y="n, m",  # U Hᵀ
+    nothing="0",  # no weight is negative
+    jacobian="scratch_size(n, m)",  # scratch of a Jacobian
+    conditioning="Conditioning(at, n, m, n)",
+)
 
 
 def work_size(options: Options, nx: int, ny: int) -> int:
@@ -102,7 +68,7 @@ def advance(context, u, dt, state, own, F):
     settle(context, own.forward, own.A, good, state)
 
 
-@jit
+@by_address
 def predict(context, u, dt, index, state, work):
     """x ← f(x, u);  Uᵀ U ← F Uᵀ U Fᵀ + Q, with F = df/dx at the estimate before the step.
 
@@ -115,7 +81,7 @@ def predict(context, u, dt, index, state, work):
     advance(context, u, dt, state, own, own.F)
 
 
-@jit
+@by_address
 def update(context, u, sensor, y, index, state, work, innovation, innovation_std, score):
     """One triangularisation of [U Hᵀ, U; R^½, 0], with H = dh/dx at the prediction.
 

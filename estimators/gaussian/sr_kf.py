@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from ..compiled.context import transition
 from ..estimator import Estimator, Options
-from ..numerics.jit import jit
+from ..numerics.jit import by_address
 from ..numerics.workspace import size_of, start_of
 from . import sr_ekf
 from .kf import applies, constant_jacobian, kept, kept_in
@@ -19,7 +19,7 @@ def work_size(options: Options, nx: int, ny: int) -> int:
     return sr_ekf.work_size(options, nx, ny) + size_of(kept, nx)
 
 
-@jit
+@by_address
 def predict(context, u, dt, index, state, work):
     """x ← F x + B u;  Uᵀ U ← F Uᵀ U Fᵀ + Q.
 

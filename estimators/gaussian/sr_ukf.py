@@ -9,20 +9,18 @@ break where P⁺ is nearly singular, are replaced by one triangularisation of re
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
-
 import numpy as np
 
 from ..compiled.context import circular_rows, circular_states, expect_points, row_count, transition_points
 from ..estimator import Estimator, Options
-from ..numerics.jit import inlined, jit
+from ..numerics.jit import by_address, inlined
 from ..numerics.linalg import remove, triangularise
 from ..numerics.padded_rows import spread_points
 from ..numerics.simd_ir import padded
-from ..numerics.workspace import layout, size_of, start_of, take_matrix, take_vector
+from ..numerics.workspace import declare_layout, size_of, start_of
 from .robust import growth, memory
 from .shared import moments_of, state_size
-from .square_root import Conditioning, condition, conditioning, describe, moments, noise_root, settle, start
+from .square_root import condition, conditioning, describe, moments, noise_root, settle, start
 from .ukf import UKF, deviations, tune, weights, weights_of
 
 
@@ -33,66 +31,31 @@ def points(values: Options, state: np.ndarray, nx: int) -> np.ndarray:
     return np.vstack((state[:nx], state[:nx] + spread * U, state[:nx] - spread * U))
 
 
-class Predicting(NamedTuple):
-    """What `predict` works in."""
+Predicting, predicting = declare_layout(
+    "Predicting",
+    "n",
+    padded,
+    sigma="2 * n + 1, padded(n)",  # sigma points
+    moved="2 * n + 1, padded(n)",  # sigma points through f, then their deviations from the mean
+    mean="padded(n)",  # mean of the sigma points through f
+    lost="n",  # weighted deviation of the central point
+    D="3 * n + 1, n",  # all weighted deviations over Q^½
+    scratch="n, n",  # Q, then scratch of a triangularisation
+)
 
-    sigma: Any
-    """(2n + 1, padded n): the sigma points."""
-    moved: Any
-    """(2n + 1, padded n): the same through f, then their deviations from the mean."""
-    mean: Any
-    """(padded n,)."""
-    lost: Any
-    """(n,): the weighted deviation of the central point."""
-    D: Any
-    """(3n + 1, n): all weighted deviations over Q^½."""
-    scratch: Any
-    """(n, n): Q, then scratch of a triangularisation."""
-    end: int
-
-
-@layout
-def predicting(at, n):
-    """The layout of `predict`."""
-    sigma, at = take_matrix(at, 2 * n + 1, padded(n))
-    moved, at = take_matrix(at, 2 * n + 1, padded(n))
-    mean, at = take_vector(at, padded(n))
-    lost, at = take_vector(at, n)
-    D, at = take_matrix(at, 3 * n + 1, n)
-    scratch, at = take_matrix(at, n, n)
-    return Predicting(sigma, moved, mean, lost, D, scratch, at)
-
-
-class Updating(NamedTuple):
-    """What `update` works in."""
-
-    sigma: Any
-    """(2n + 1, padded n): the sigma points."""
-    D: Any
-    """(2n + 1, padded m): the same through h, then their deviations from the mean."""
-    mean: Any
-    """(padded m,)."""
-    expected: Any
-    """(m,): the same, without what pads it."""
-    lost: Any
-    """(m,): the weighted deviation of the central point."""
-    Y: Any
-    """(2n + 1, m): the deviations, those of opposite points turned by 45°."""
-    conditioning: Conditioning
-    end: int
-
-
-@layout
-def updating(at, n, m):
-    """The layout of `update`."""
-    sigma, at = take_matrix(at, 2 * n + 1, padded(n))
-    D, at = take_matrix(at, 2 * n + 1, padded(m))
-    expected, _ = take_vector(at, m)
-    mean, at = take_vector(at, padded(m))
-    lost, at = take_vector(at, m)
-    Y, at = take_matrix(at, 2 * n + 1, m)
-    own = conditioning(at, n, m, 2 * n + 1)
-    return Updating(sigma, D, mean, expected, lost, Y, own, own.end)
+Updating, updating = declare_layout(
+    "Updating",
+    "n, m",
+    padded,
+    conditioning,
+    sigma="2 * n + 1, padded(n)",  # sigma points
+    D="2 * n + 1, padded(m)",  # sigma points through h, then their deviations from the mean
+    mean="padded(m)",  # mean of the sigma points through h
+    expected="m = mean",  # mean without padding
+    lost="m",  # weighted deviation of the central point
+    Y="2 * n + 1, m",  # deviations, those of opposite points turned by 45°
+    conditioning="Conditioning(at, n, m, 2 * n + 1)",
+)
 
 
 def work_size(options: Options, nx: int, ny: int) -> int:
@@ -109,7 +72,7 @@ def weigh_central(central, a, deviation, lost, row):
         row[j] = lost[j] if central > 0.0 else 0.0
 
 
-@jit
+@by_address
 def predict(context, u, dt, index, state, work):
     """x ← mean of the propagated sigma points;  U ← triangle of their weighted deviations over Q^½.
 
@@ -148,7 +111,7 @@ def turn_pairs(D, n, w, Y):
             Y[n + k, j] = a * (D[1 + k, j] + D[1 + n + k, j])
 
 
-@jit
+@by_address
 def update(context, u, sensor, y, index, state, work, innovation, innovation_std, score):
     """One triangularisation of sigma deviations and R^½, with fresh sigma points through h.
 

@@ -9,23 +9,22 @@ doi:10.1109/ASSPCC.2000.882463.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from ..compiled.context import circular_rows, circular_states, expect_points, options, row_count, transition_points
 from ..estimator import Estimator, Option, Options
 from ..model.state_space import StateSpaceModel
-from ..numerics.jit import inlined, jit
+from ..numerics.jit import by_address, inlined, jit
 from ..numerics.linalg import EPSILON, wrap
 from ..numerics.padded_rows import centre, covariance, cross_covariance, factor, spread_points
 from ..numerics.simd_ir import padded
-from ..numerics.workspace import layout, size_of, start_of, take_matrix, take_vector
+from ..numerics.workspace import declare_layout, size_of, start_of
 from ..track import FAILED, USED
 from ..tuning import Tuning
 from .robust import OPTIONS, OWN, adapt, add_noise, is_adaptive, memory, reading_variances, shared_options
 from .shared import (
-    Reading,
     admit_weighted,
     compare,
     describe,
@@ -63,64 +62,30 @@ def points(values: Options, state: np.ndarray, nx: int) -> np.ndarray:
     return sigma_points(*moments(values, state, nx), spread)
 
 
-class Predicting(NamedTuple):
-    """What `predict` works in."""
+Predicting, predicting = declare_layout(
+    "Predicting",
+    "n",
+    padded,
+    D="2 * n + 1, padded(n)",  # sigma points through f, then their deviations from the mean
+    sigma="2 * n + 1, padded(n)",  # sigma points
+    mean="padded(n)",  # mean of the sigma points through f
+    chol_P="n, padded(n)",  # upper, chol_Pᵀ chol_P = P
+    Q="n, n = chol_P",  # scratch of the noise, once the factor is not needed any more
+)
 
-    D: Any
-    """(2n + 1, padded n): sigma points through f, then their deviations from the mean."""
-    sigma: Any
-    """(2n + 1, padded n): the sigma points."""
-    mean: Any
-    """(padded n,)."""
-    chol_P: Any
-    """(n, padded n): upper, chol_Pᵀ chol_P = P."""
-    Q: Any
-    """(n, n): scratch of the noise, once the factor is needed no more."""
-    end: int
-
-
-@layout
-def predicting(at, n):
-    """The layout of `predict`."""
-    D, at = take_matrix(at, 2 * n + 1, padded(n))
-    sigma, at = take_matrix(at, 2 * n + 1, padded(n))
-    mean, at = take_vector(at, padded(n))
-    Q, _ = take_matrix(at, n, n)
-    chol_P, at = take_matrix(at, n, padded(n))
-    return Predicting(D, sigma, mean, chol_P, Q, at)
-
-
-class Updating(NamedTuple):
-    """What `update` works in."""
-
-    D: Any
-    """(2n + 1, padded m): sigma points through h, then their deviations from the mean."""
-    across: Any
-    """(n, padded m): the differences between opposite ones, in the place of the first of each pair."""
-    mean: Any
-    """(padded m,)."""
-    sigma: Any
-    """(2n + 1, padded n): the sigma points."""
-    chol_P: Any
-    """(n, padded n): upper, chol_Pᵀ chol_P = P."""
-    no_H: Any
-    """(m, 0): there is no Jacobian."""
-    reading: Reading
-    end: int
-
-
-@layout
-def updating(at, n, m):
-    """The layout of `update`."""
-    _, second = take_vector(at, padded(m))
-    across, _ = take_matrix(second, n, padded(m))
-    D, at = take_matrix(at, 2 * n + 1, padded(m))
-    mean, at = take_vector(at, padded(m))
-    sigma, at = take_matrix(at, 2 * n + 1, padded(n))
-    chol_P, at = take_matrix(at, n, padded(n))
-    no_H, at = take_matrix(at, m, 0)
-    reading = reading_of(at, n, m)
-    return Updating(D, across, mean, sigma, chol_P, no_H, reading, reading.end)
+Updating, updating = declare_layout(
+    "Updating",
+    "n, m",
+    padded,
+    reading_of,
+    D="2 * n + 1, padded(m)",  # sigma points through h, then their deviations from the mean
+    across="n, padded(m) = D + padded(m)",  # differences between opposite points, in the place of the first ones
+    mean="padded(m)",  # mean of the sigma points through h
+    sigma="2 * n + 1, padded(n)",  # sigma points
+    chol_P="n, padded(n)",  # upper, chol_Pᵀ chol_P = P
+    no_H="m, 0",  # there is no Jacobian
+    reading="Reading(at, n, m)",
+)
 
 
 def work_size(options: Options, nx: int, ny: int) -> int:
@@ -128,7 +93,7 @@ def work_size(options: Options, nx: int, ny: int) -> int:
     return max(size_of(predicting, nx), size_of(updating, nx, ny))
 
 
-@jit
+@by_address
 def predict(context, u, dt, index, state, work):
     """x, P ← mean and covariance of the propagated sigma points, plus Q.
 
@@ -178,7 +143,7 @@ def subtract_opposite(D, m, across):
             across[k, j] -= D[1 + n + k, j]
 
 
-@jit
+@by_address
 def update(context, u, sensor, y, index, state, work, innovation, innovation_std, score):
     """x ← x + C S⁻¹ ν;  P ← P - C S⁻¹ Cᵀ, with C and S from fresh sigma points through h.
 

@@ -64,6 +64,13 @@ part: Callable[[Callable[..., Any]], Any] = register_jitable(cache=True, nogil=T
 """The same for what only compiled functions call. A wrapper for Python would take a third of the time of compiling;
 from Python it is the function as it is written, in Python."""
 
+embedded: Callable[[Callable[..., Any]], Any] = register_jitable(
+    cache=True, nogil=True, error_model="numpy", forceinline=True
+)
+"""`part` for a long helper in the steps of several filters: compiled once, and copied into each caller by LLVM.
+
+`inlined` would compile it again in each caller; for a short helper that is cheaper than a unit of its own."""
+
 inlined = partial(jit, inline="always")
 """`jit` for helpers that stand inside a filter's step: a call that hands over context and arrays costs 50 to 100 ns."""
 

@@ -5,8 +5,8 @@ A filter declares its workspace as the arrays that stand one after the other, wi
     Work, workspace = declare_layout("Work", "n, m", D="2 * n + 1, m", mean="m")
 
 and a kernel calls it with the address of its scratch, `workspace(start_of(work), n, m)`. The size follows from the same
-function, called in Python from address zero without touching memory: `size_of(workspace, n, m)`. Where arrays share
-memory, the layout is written out as the function that `declare_layout` would make:
+function, called in Python from address zero without touching memory: `size_of(workspace, n, m)`. A layout can also be
+written out as the function that `declare_layout` would make:
 
     @layout
     def workspace(at, n, m):
@@ -72,19 +72,24 @@ def declare_layout(
         sizes: Parameters of the layout, such as "n, m".
         functions: Functions that the shapes call.
         fields: Shape of each array: "n, m" for a matrix, "n" for a vector, "int n" for a vector of int64s, or a call
-            "other(at, n)" for a nested layout.
+            "Other(at, n)" for a nested layout, by the name of its tuple. An array in the place of an earlier one names
+            that after an equals sign, with a count of numbers to skip if any: "n, n = D" or "n, m = D + m".
     """
     lines = [f"def {kind}(at, {sizes}):"]
-    for name, shape in fields.items():
+    for name, declared in fields.items():
+        shape, _, place = declared.removeprefix("int ").partition(" = ")
         if "(at, " in shape:
-            lines += [f"    {name} = {shape}", f"    at = {name}.end"]
+            lines += [f"    _{name} = {shape}", f"    at = _{name}.end"]
         else:
-            shape = shape.removeprefix("int ")
             # A comma within parentheses separates arguments, not dimensions.
             matrix = isinstance(ast.parse(shape, mode="eval").body, ast.Tuple)
-            take = "take_integers" if shape != fields[name] else "take_matrix" if matrix else "take_vector"
-            lines.append(f"    {name}, at = {take}(at, {shape})")
-    lines.append(f"    return _kind({', '.join(fields)}, at)")
+            integers = declared.startswith("int ")
+            take = "take_integers" if integers else "take_matrix" if matrix else "take_vector"
+            start, _, skipped = place.partition(" + ")
+            begin = f"at_{start} + {WORD} * ({skipped or 0})" if place else "at"
+            lines += [f"    at_{name} = {begin}", f"    _{name}, end = {take}(at_{name}, {shape})"]
+            lines += [] if place else ["    at = end"]
+    lines.append(f"    return _kind({', '.join(f'_{name}' for name in fields)}, at)")
     # As of namedtuple itself, the caller's module is where pickle finds the class again.
     module = sys._getframe(1).f_globals["__name__"]
     made: Any = namedtuple(kind, [*fields, "end"], module=module)  # type: ignore[misc]
