@@ -24,7 +24,7 @@ from ..errors import EstimatorError
 from ..estimator import Estimator, Option, Options
 from ..model.sensor import covariance_of
 from ..model.state_space import StateSpaceModel
-from ..numerics.jit import by_address, inlined, jit
+from ..numerics.jit import by_address, inlined, part
 from ..numerics.linalg import congruence, unit_factor
 from ..numerics.workspace import declare_layout, start_of
 from ..track import USED
@@ -78,7 +78,7 @@ def start(context, mean, cov, state):
     phase_of(state)[0] = MOVING
 
 
-@jit
+@part
 def copy(A, P):
     """P ← A."""
     n = P.shape[0]
@@ -87,7 +87,7 @@ def copy(A, P):
             P[i, j] = A[i, j]
 
 
-@jit
+@part
 def settled(A, P):
     """Whether P is A within 1e-12, relative to the deviations."""
     n = P.shape[0]
@@ -263,7 +263,7 @@ def unseen(F: np.ndarray, H: np.ndarray) -> np.ndarray | None:
     n = F.shape[0]
     scale = max(1.0, np.abs(F).max(), np.abs(H).max())
     # An eigenvalue that is there twice is good to the root of rounding only, 1e-8.
-    for value, mode in zip(*(part.T for part in np.linalg.eig(F)), strict=True):
+    for value, mode in zip(*(item.T for item in np.linalg.eig(F)), strict=True):
         if abs(value) >= 1.0 - 1e-7:
             seen = np.linalg.svd(np.vstack((F - value * np.eye(n), H)), compute_uv=False)[-1]
             if seen < 1e-7 * scale:

@@ -115,13 +115,14 @@ def noise_scale(context, state):
 @embedded
 def add_noise(context, x, u, dt, state, P, scratch):
     """P ← growth·P + scale·Q; scratch is (nx, nx)."""
-    if options(context)[INFLATION] != 0.0 or options(context)[ADAPT] == ADAPT_Q:
-        scale = noise_scale(context, state)
+    scaled = options(context)[INFLATION] != 0.0 or options(context)[ADAPT] == ADAPT_Q
+    scale = noise_scale(context, state) if scaled else 1.0
+    if scaled:
         multiply(growth(context, dt) / scale, P)
-        add_process_noise(context, x, u, dt, P, scratch)
+    # Called in one place: it is inlined there.
+    add_process_noise(context, x, u, dt, P, scratch)
+    if scaled:
         multiply(scale, P)
-    else:
-        add_process_noise(context, x, u, dt, P, scratch)
 
 
 @part

@@ -12,7 +12,7 @@ import numpy as np
 from ..compiled.context import add_process_noise, circular_rows, options, shown_states
 from ..compiled.noise import has_correlated_rows, independent_rows
 from ..estimator import Options
-from ..numerics.jit import by_address, embedded, inlined, ints, jit
+from ..numerics.jit import by_address, embedded, inlined, ints, part
 from ..numerics.linalg import EPSILON, remove, root, solve_transposed, solve_unit, triangularise, wrap
 from ..numerics.workspace import declare_layout, start_of, take_matrix
 from ..track import FAILED, MISSING, USED
@@ -110,7 +110,7 @@ def settle(context, forward, A, good, state):
     move_to(context, forward, x)
 
 
-@jit
+@part
 def triangularise_joint(d, m, Y, U, lost, A, w, v):
     """Fill A (k + m, m + n) with the factor of the joint covariance of reading and state; False if S has none.
 
@@ -169,7 +169,7 @@ def gather(context, sensor, y, own, expected, Y, lost, innovation):
     return m
 
 
-@jit
+@part
 def make_independent(m, L, nu, Y, lost):
     """ν ← L⁻¹ ν, Y ← Y L⁻ᵀ, lost ← L⁻¹ lost: see compiled/noise.py."""
     solve_unit(L, m, nu)
@@ -179,7 +179,7 @@ def make_independent(m, L, nu, Y, lost):
         solve_unit(L, m, lost)
 
 
-@jit
+@part
 def dependent_variance(A, L, k):
     """S_kk of a reading's own rows, from the factor A of that of its independent ones: S = L Aᵀ A Lᵀ."""
     variance = 0.0
@@ -254,7 +254,7 @@ def take_over(m, nu, A, x, U):
             U[i, j] = A[m + i, m + j]
 
 
-@jit
+@part
 def reweigh_joint(context, m, nu, own, Y, U, lost, A):
     """Weight the reading's noise and triangularise again; A and the whitened nu then belong to the weighted noise.
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from .jit import inlined, jit
+from .jit import inlined, jit, part
 
 EPSILON = float(np.finfo(float).eps)
 
@@ -43,7 +43,7 @@ def cholesky(A, U, n):
     return True
 
 
-@jit
+@part
 def root(A, U, n):
     """Upper U with Uᵀ U = A for a positive semidefinite A, which may be singular; False if A is indefinite.
 
@@ -80,7 +80,7 @@ def root(A, U, n):
     return True
 
 
-@jit
+@part
 def triangularise(A, w):
     """Overwrite A (rows ≥ columns) with the upper R of A = Q R, its diagonal ≥ 0; w is scratch of a row's length.
 
@@ -121,7 +121,7 @@ def triangularise(A, w):
                 A[k, j] = -A[k, j]
 
 
-@jit
+@part
 def remove(R, n, v):
     """Overwrite upper R (leading n rows and columns) with the factor of RᵀR - v vᵀ; False if that is not positive.
 
@@ -190,7 +190,7 @@ def solve_unit(L, m, b):
             b[i] -= L[i, j] * b[j]
 
 
-@jit
+@part
 def congruence(F, P, T):
     """Overwrite symmetric P with F P Fᵀ; T is scratch of twice the shape (2n, n)."""
     n = P.shape[0]
