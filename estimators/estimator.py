@@ -1,19 +1,19 @@
-"""What a filter is: four compiled functions over a flat state, and an entry that describes it.
+"""The definition of a filter: four compiled functions over a flat state, and an entry that describes it.
 
-The state of a filter is one float64 array, so it can be copied, kept and restored without knowing the filter. The
-four functions read the context and change nothing else:
+The state of a filter is one float64 array, so it can be copied, kept and restored without knowledge of the filter.
+The four functions only read the context:
 
-    start(context, mean, cov, state)                                 the state that stands for N(mean, cov)
+    start(context, mean, cov, state)                                 set the state to N(mean, cov)
     predict(context, u, dt, index, state, work)                      dt seconds forward, in place
     update(context, u, sensor, y, index, state, work, innovation, innovation_std, score) -> verdict
-    describe(context, state, mean, std, cross)                       what the track shows of it
+    describe(context, state, mean, std, cross)                       fill the track's columns
 
-`index` numbers the event in the log. Randomness goes not by it but by a filter's own count of its predictions and
-updates, which is part of the state (`next_draw`): the sub-steps of one event (`max_step`) then differ, queries change
-no draw, and a refold draws what the fold drew.
+`index` numbers the event in the log. Random numbers do not depend on it but on a filter's own count of predictions and
+updates, which is part of the state (`next_draw`): the sub-steps of one event (`max_step`) then differ, queries do not
+change later draws, and folding again draws the same numbers.
 
-`work` is scratch that starts as NaN. `score` takes NIS, degrees of freedom, log-likelihood, how many particles count,
-from how many they descend, and the normal scores of the rows (`track.WHITENED`).
+`work` is scratch that starts as NaN. `score` takes NIS, degrees of freedom, log-likelihood, effective sample size,
+number of ancestors, and the normal scores of the rows (`track.WHITENED`).
 
 The functions of an `interpreted` filter are plain Python, and its context is a `View` (interpreted/view.py).
 """
@@ -51,10 +51,10 @@ Options = dict[str, float]
 
 
 class Option(NamedTuple):
-    """One option of an estimator: where its value starts, and the range and unit that a panel offers.
+    """Option of an estimator: default, range and unit.
 
-    An option whose default is an int is a count: its value must be a whole number. One with `choices` has the position
-    of one of them as its value.
+    An option with an int as default is a count, whose value must be a whole number. The value of one with `choices` is
+    the position of a choice.
     """
 
     name: str
@@ -72,7 +72,7 @@ class Option(NamedTuple):
 
     @staticmethod
     def choice(name: str, choices: tuple[str, ...], meaning: str, default: int = 0) -> Option:
-        """An option that is one of several words."""
+        """Return an option that is one of several words."""
         return Option(name, float(default), 0.0, len(choices) - 1.0, "", meaning, choices)
 
 
@@ -90,21 +90,25 @@ code_type = types.NamedUniTuple(i64, len(Code._fields), Code)
 
 @dataclass(frozen=True)
 class Estimator:
-    """One entry of the catalogue.
+    """Entry of the catalogue.
 
-    `applies(model)` gives the reason why the estimator does not fit a model, or None; `refuses(model, options)` why it
-    does not with these options. `options` are complete here (see `complete`). `state_size(options, nx)` and
-    `work_size(options, nx, ny)` count float64s; `moments(options, state, nx)` gives mean and covariance,
-    `points(options, state, nx)` what to draw beside the mean (sigma points, particles) as (k, nx), `peaks(options,
-    state, nx)` the peaks where there can be several, `recoveries(state)` how often the filter had to recover since its
-    start, `account(options, state, nx)` what only this filter can say of itself. `tune(options, model, tuning)` turns
-    the options into the numbers that the compiled functions read; it may raise EstimatorError. `memory(options, model)`
-    counts numbers that the state holds beyond `state_size`. `runs(options, nx)` is `model_runs` as a number: how often
-    a step runs f. `prepare(model, options)` computes what depends on the model too, once for a fold, as int64s.
-    `blocks(options, state, nx)` is a view of the members (N, nx) in a state, of a compiled filter that runs f and h at
-    these alone and so can run on a black box (interpreted/). `fixed_r` says that its gain is for one R, so that no
-    reading can bring its own; `needs_factor` that it cannot start from a covariance without a Cholesky factor;
-    `singular` that P and R may be singular: states that are certain at first, rows of a sensor without noise.
+    `options` are complete in all these calls (see `complete`):
+
+    - `applies(model)` returns why the estimator does not apply to a model, or None; `refuses(model, options)` why it
+      does not with these options.
+    - `state_size(options, nx)`, `work_size(options, nx, ny)` and `memory(options, model)` count float64s of the state,
+      of scratch, and of the state beyond `state_size`.
+    - `moments(options, state, nx)` returns mean and covariance, `points(options, state, nx)` sigma points or particles
+      (k, nx) to draw, `peaks(options, state, nx)` the peaks of a distribution that can have several,
+      `recoveries(state)` the number of recoveries since the start, `account(options, state, nx)` further figures.
+    - `tune(options, model, tuning)` returns the numbers that the compiled functions read, and may raise
+      EstimatorError; `prepare(model, options)` returns int64s that depend on the model, once per fold.
+    - `runs(options, nx)` is `model_runs` as a number: evaluations of f per step.
+    - `blocks(options, state, nx)` is a view of the members (N, nx) of a compiled filter that evaluates f and h only at
+      these, and so can run on a black box (interpreted/).
+
+    `fixed_r`: the gain is for one R, so that measurements cannot have their own. `needs_factor`: the filter needs the
+    Cholesky factor of its initial covariance. `singular`: P and R may be singular.
     """
 
     name: str
@@ -136,7 +140,7 @@ class Estimator:
     singular: bool = False
 
     def complete(self, options: Mapping[str, float | str]) -> dict[str, float]:
-        """The given options and the defaults of the others; one of several words may be given as the word.
+        """Return the given options and the defaults of the others; a choice may be given as its word.
 
         Raises:
             EstimatorError: If an option is unknown, out of its range, or a fraction where it is a count.
@@ -163,7 +167,7 @@ class Estimator:
         return {option.name: float(values.get(option.name, option.default)) for option in self.options}
 
     def _number(self, option: Option, given: float | str) -> float:
-        """The value of an option, of a word its place among the choices."""
+        """Return the value of an option; for a word its position among the choices."""
         if isinstance(given, str):
             if given in option.choices:
                 return float(option.choices.index(given))
@@ -176,10 +180,10 @@ class Estimator:
             raise EstimatorError(f"estimator {self.name}: {option.name} is {given!r}; it must be {wanted}") from None
 
     def complete_for(self, model: StateSpaceModel, options: Mapping[str, float | str]) -> dict[str, float]:
-        """The given options and the defaults of the others, for a model.
+        """Return the given options and the defaults of the others, for a model.
 
         Raises:
-            EstimatorError: As `complete` does, or if the model refuses them.
+            EstimatorError: As `complete`, or if they do not apply to the model.
         """
         values = self.complete(options)
         reason = self.refuses(model, values)
@@ -188,7 +192,7 @@ class Estimator:
         return values
 
     def code(self) -> Code:
-        """Compile the four functions, or load them from the cache; or, if interpreted, the functions themselves."""
+        """Return the four functions, compiled or loaded from the cache; those of an interpreted filter unchanged."""
         return Code(*self.functions) if self.interpreted else _code(self.functions)
 
 

@@ -1,4 +1,4 @@
-"""The fold's loop over the events, compiled once for every filter and model."""
+"""The fold's loop over events, compiled once for all filters and models."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ from .track import ANCESTORS, EFFECTIVE, GATED, MISSING, NONE, SCREENED, USED, W
 
 @part
 def advance_to(code, context, u, clock, t, index, state, work):
-    """Predict from the clock to time t, in steps no longer than the model allows.
+    """Predict from the clock to time t, in steps of at most `max_step`.
 
-    After `LONGEST` of them the model alone says no more than the prior does, so the state is the prior again.
+    After a time of more than `LONGEST` steps the state is reset to the prior.
     """
     if clock == UNSET or t <= clock:
         return
@@ -42,13 +42,13 @@ def advance_to(code, context, u, clock, t, index, state, work):
 
 @inlined
 def asks(kind):
-    """Whether an event only asks for the estimate: true states, ticks and marks."""
+    """Return whether an event is a query: a true state, tick or mark."""
     return kind == TRUTH or kind == TICK or kind == MARK
 
 
 @part
 def exchange(r, own, kept):
-    """r (ny,) ← what a reading brought of its own, where it brought any; `kept` (ny,) gets what stood there."""
+    """r (ny,) ← the measurement's own variances where they are finite; `kept` (ny,) gets the previous ones."""
     for k in range(r.size):
         kept[k] = r[k]
         if k < own.size and np.isfinite(own[k]):
@@ -60,15 +60,14 @@ def run(
     code, context, rule, first, start, end, t, kind, channel, value, width,
     clock, u, state, doubt, edge, spare, work, score, track,
 ):  # fmt: skip
-    """Fold events `start` to `end`: clock (1,), u (nu,) and state move on in place, one track row is filled an event.
+    """Fold events `start` to `end`: update clock (1,), u (nu,) and state in place, and fill one track row per event.
 
-    Stops behind the first reading that asks for a decision on its sensor (gate/doubt.py), and returns its row; -1 if
+    Stops after the first measurement that asks for a decision on its sensor (gate/doubt.py), and returns its row; -1 if
     none does.
 
     A tick, a truth or a mark is a query: it is answered from a copy of the state, so it never changes the estimate.
-    Variances that a reading brings (columns of `value` from `width` on) take the place of the tuned R while it is
-    folded, so every filter honours them. The filter does not see rows of a reading that are screened; of a reading of
-    which nothing is left it only predicts.
+    Variances of a measurement (columns of `value` from `width` on) replace the tuned R while it is folded, in every
+    filter. Rows that are rejected before the filter are NaN for it; without any row left it only predicts.
     """
     nu = u.size
     variances = value.shape[1] > width
@@ -161,7 +160,7 @@ def run(
         else:
             if clock[0] == UNSET:
                 clock[0] = t[i]
-            # Several true states at one time are one query: `spare` still holds its answer.
+            # Several true states at one time are one query: `spare` still holds the answer.
             if i == start or not asks(kind[i - 1]) or t[i] != t[i - 1]:
                 for j in range(state.size):
                     spare[j] = state[j]
@@ -182,13 +181,13 @@ def run(
 
 @jit
 def begin(code, context, mean, cov, state):
-    """The state that stands for N(mean, cov)."""
+    """Set the state to N(mean, cov)."""
     call_start(code.start, context, mean, cov, state)
 
 
 @jit
 def judge(start, end, t, kind, channel, value, context, policy, bounds, evidence, track):
-    """What the rows `start` to `end`, which are folded, say of the estimate: windowed NIS, alarms, health."""
+    """Fill windowed NIS, alarms and health of the folded rows `start` to `end`."""
     normal = floats(context.normal, NORMALS * context.n_sensors)
     assess(start, end, t, kind, channel, track, normal, policy, bounds)
     watch_rows(start, end, t, kind, channel, value, context, policy, evidence, track)
@@ -220,7 +219,7 @@ run_signature = i64(
 
 @lru_cache(maxsize=1)
 def compiled() -> tuple[Any, ...]:
-    """The entry points, compiled for their one signature (or loaded from the cache)."""
+    """Return the entry points, compiled for their only signatures or loaded from the cache."""
     functions = (run_and_judge, judge, begin, screen_reading)
     signatures = (run_signature, judge_signature, begin_signature, screen_signature)
     for function, signature in zip(functions, signatures, strict=True):

@@ -1,4 +1,4 @@
-"""What a fold compiles, in pieces that several processes can compile at once: the cache on disk hands the code over."""
+"""The code of a fold as pieces that several processes can compile at once into the cache on disk."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ from .registry import ESTIMATORS
 from .smoothing.moments_back import PIECES
 
 LOOP = "loop"
-"""In place of a filter's name: the loop over the events, which serves all of them."""
+"""In place of a filter's name: the loop over events, common to all filters."""
 
 SMOOTHER = "smoother"
-"""The same: what goes back over a fold, of all filters."""
+"""In place of a filter's name: the smoother, common to all filters."""
 
 
 class Piece(NamedTuple):
-    """A function that is compiled by itself: of the loop, the smoother or a filter, by name, and its place in that.
+    """A separately compiled function of the loop, the smoother or a filter: name, and place in that.
 
-    `after` are the places of those that it contains; with them in the cache it takes a tenth of the time.
+    `after` lists the places of functions that it contains; if they are in the cache it takes a tenth of the time.
     """
 
     of: str
@@ -39,7 +39,7 @@ class Piece(NamedTuple):
 
 
 def pieces_of(name: str) -> list[Piece]:
-    """The pieces of a filter, of the `LOOP` or the `SMOOTHER`, what takes longest first."""
+    """Return the pieces of a filter, of the `LOOP` or the `SMOOTHER`, the slowest first."""
     if name == SMOOTHER:
         return [Piece(SMOOTHER, place) for place in range(len(PIECES))]
     if name == LOOP:
@@ -48,7 +48,7 @@ def pieces_of(name: str) -> list[Piece]:
 
 
 def function_of(piece: Piece) -> tuple[Any, tuple[Any, ...]]:
-    """The function of a piece, and the types of its arguments."""
+    """Return the function of a piece, and the types of its arguments."""
     if piece.of == SMOOTHER:
         return PIECES[piece.place]
     if piece.of == LOOP:
@@ -71,23 +71,23 @@ def function_of(piece: Piece) -> tuple[Any, tuple[Any, ...]]:
 
 def compile_into_cache(function: Any, types: tuple[Any, ...]) -> None:
     """Compile a function for these arguments, if it is not in the cache."""
-    # Code from the cache may call for threads.
+    # Code from the cache may start threads.
     threaded()
     function.compile(types)
 
 
 def is_cached(function: Any, types: tuple[Any, ...]) -> bool:
-    """Whether a function is in the cache; asked of its index, which takes a tenth of a millisecond."""
+    """Return whether a function is in the cache, from the cache's index, which takes a tenth of a millisecond."""
     cache = function._cache
     key = cache._index_key(types, function.targetctx.codegen())
     return types in function.overloads or key in cache._cache_file._load_index()
 
 
 def make(piece: Piece) -> None:
-    """Compile a piece into the cache, if it is not there."""
+    """Compile a piece into the cache, if it is missing."""
     compile_into_cache(*function_of(piece))
 
 
 def is_made(piece: Piece) -> bool:
-    """Whether a piece is in the cache."""
+    """Return whether a piece is in the cache."""
     return is_cached(*function_of(piece))

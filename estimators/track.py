@@ -1,4 +1,4 @@
-"""The track: everything the estimator concluded, one row an event of the log."""
+"""The track: the results of a fold, one row per event of the log."""
 
 from __future__ import annotations
 
@@ -10,27 +10,27 @@ from numba import types
 from .numerics.jit import B1, F1, F2, I1, borrowed, borrowed_rows, counts, flag_rows, flags, ints, masks, part
 
 NONE, USED, GATED, HELD_OUT, MISSING, FAILED, SCREENED = range(7)
-"""Verdict on an event: not a reading; used; refused by the gate; held out and scored; no finite row; not usable,
-as S was not positive definite beyond rounding or the NIS no finite number; refused at the edge, before the filter."""
+"""Verdict on an event: not a measurement; used; rejected by the gate; held out and scored; no finite row; failed, as S
+was not positive definite beyond rounding or the NIS not finite; rejected before the filter."""
 
 VERDICT_NAMES = ("none", "used", "gated", "held out", "missing", "failed", "screened")
 
 REASONS = ("range", "rate", "stuck", "saturated", "duplicate")
-"""Why a row of a reading is refused at the edge: beyond what can be; changing faster; repeating itself; where its
-converter clips; a reading that came before. Bits of `Track.screened`, in this order."""
+"""Reasons for which a row of a measurement is rejected before the filter: out of range; changes too fast; repeats
+itself; saturated converter; a measurement that arrived before. Bits of `Track.screened`, in this order."""
 
 RANGE, RATE, REPEATED, SATURATED, DUPLICATE = (1 << k for k in range(len(REASONS)))
 
 WAITING, TRACKING, SUSPECT, DEGRADED, DIVERGED, STALE = range(6)
-"""Health: no reading has come; consistent; consistent no more; a sensor is lost or readings are late; the estimate is
-lost; nothing arrives."""
+"""Health: no measurement has arrived; consistent; inconsistent; a sensor is lost or measurements are late; the estimate
+is lost; no data."""
 
 LOG_LIKELIHOOD = 2
-"""Where in what a filter scores its log-likelihood is."""
+"""Index of the log-likelihood in a filter's scores."""
 
 EFFECTIVE, ANCESTORS, WHITENED = range(3, 6)
-"""Where in what a filter scores, after NIS, degrees of freedom and log-likelihood, the particles that count stand and
-those from which they descend, and where the whitened rows of the reading begin."""
+"""Indices in a filter's scores, after NIS, degrees of freedom and log-likelihood, of the effective sample size and the
+number of ancestors, and of the first whitened row of the measurement."""
 
 HEALTH_NAMES = ("waiting", "tracking", "suspect", "degraded", "diverged", "stale")
 
@@ -39,16 +39,16 @@ class Track(NamedTuple):
     """Columns of one length N.
 
     mean, std (N, nx): the estimate after the event, in the units of the states. cross (N, pairs): the covariance of
-    each configured pair of states. innovation, innovation_std (N, ny): reading minus prediction and the square
-    root of S's diagonal; NaN where there is none. nis: νᵀ S⁻¹ ν, `dof` its degrees of freedom. nis_mean with
-    nis_low and nis_high: mean NIS over the last readings, and its 95 % bounds. age: seconds since the last reading that
-    was used, gated or failed, or since a reset. consistency: DIVERGED where the window alone says so, else TRACKING.
-    whitened (N, ny): the innovation as it would be drawn from N(0, I), by row of the reading; of a prediction that is
-    not Gaussian each row by itself, Φ⁻¹(F(y)). alarms (N, width): bits of the causes that are in alarm after this
-    event, by row of the reading or state of the truth; flags: bits of what else is wrong (diagnostics/detectors.py).
-    screened (N, ny): bits of `REASONS` for which a row of the reading was refused at the edge.
-    effective: of particles, their effective sample size after a reading that was used, before resampling; ancestors:
-    how many of some readings ago these descend from (particle/lineage.py); NaN elsewhere.
+    each configured pair of states. innovation, innovation_std (N, ny): measurement minus prediction and the square
+    root of S's diagonal; NaN for other events. nis: νᵀ S⁻¹ ν, `dof` its degrees of freedom. nis_mean with nis_low and
+    nis_high: mean NIS over the last measurements, and its 95 % bounds. age: seconds since the last measurement that was
+    used, gated or failed, or since a reset. consistency: DIVERGED if the window of NIS shows that, else TRACKING.
+    whitened (N, ny): the innovation transformed to N(0, I), by row of the measurement; for a prediction that is not
+    Gaussian each row by itself, Φ⁻¹(F(y)). alarms (N, width): bits of the causes in alarm after this event, by row of
+    the measurement or state of the truth; flags: bits of other conditions (diagnostics/detectors.py).
+    screened (N, ny): bits of `REASONS` for which a row of the measurement was rejected before the filter. effective:
+    effective sample size of particles after a used measurement, before resampling; ancestors: number of particles some
+    measurements ago from which these descend (particle/); NaN elsewhere.
     """
 
     mean: Any
@@ -75,7 +75,7 @@ class Track(NamedTuple):
 
     @staticmethod
     def allocate(rows: int, nx: int, pairs: int, ny: int, width: int | None = None) -> Track:
-        """Columns for `rows` events, filled with NaN (so that their memory is paid for at once)."""
+        """Allocate columns for `rows` events, filled so that their memory is committed at once."""
         matrix = [np.full((rows, k), np.nan) for k in (nx, nx, pairs, ny, ny)]
         vectors = [np.full(rows, np.nan) for _ in range(2)]
         codes = [np.zeros(rows, np.int32), np.zeros(rows, np.int8)]
@@ -88,21 +88,21 @@ class Track(NamedTuple):
         return Track(*columns)
 
     def select(self, index: object) -> Track:
-        """The rows that a slice, mask or index array picks."""
+        """Return the rows that a slice, mask or index array selects."""
         return Track(*(column[index] for column in self))
 
     def copy(self) -> Track:
-        """Columns of its own."""
+        """Return an independent copy."""
         return Track(*(column.copy() for column in self))
 
     def __len__(self) -> int:
-        """Number of rows (not of columns)."""
+        """Return the number of rows (not of columns)."""
         return int(self.nis.size)
 
 
 def estimated_rows(track: Track) -> np.ndarray:
-    """Which rows hold an estimate, (n,): one state that is not a number leaves none, whatever the others say."""
-    # A sum is finite only where all of it is; and it takes a third of the time that `all` does along so few columns.
+    """Return the mask (n,) of rows whose estimate is finite in all states."""
+    # A sum is finite only if all terms are, and takes a third of the time of `all` along so few columns.
     return np.asarray(np.isfinite(np.einsum("ij->i", track.mean) + np.einsum("ij->i", track.std)))
 
 
@@ -117,7 +117,7 @@ track_type = types.NamedTuple(
 
 @part
 def borrowed_columns(track):
-    """The same columns, not reference-counted."""
+    """Return the same columns, not reference-counted."""
     n, width = track.alarms.shape
     return Track(
         borrowed_rows(track.mean),

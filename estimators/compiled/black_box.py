@@ -1,7 +1,7 @@
-"""A model whose functions run on blocks of states in Python, split over threads, processes or any executor.
+"""Black-box models: their functions run on blocks of states in Python, on threads, processes or any executor.
 
-A compiled filter that runs f and h at its own members alone is driven on it: the block is run first, and what the
-filter calls as f or h looks the answer up by the address of the member (see interpreted/view.py).
+Compiled filters that evaluate f and h only at their members can use them: the block is evaluated first, and the f or h
+that the filter calls looks up the answer by the address of the member (see interpreted/view.py).
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from ..numerics.jit import floats
 from .orphan import leave_with_parent
 
 ANSWER = 2
-"""Numbers behind the parameters: where the members stand, and where the answers for them."""
+"""Numbers appended to the parameters: the addresses of the members and of their answers."""
 
 
 def answered_f(x, u, p, dt, out):
@@ -54,7 +54,7 @@ class BlackBox:
         self._sent = {id(function): portable(function) for function in functions}
 
     def f(self, X: np.ndarray, u: np.ndarray, p: np.ndarray, dt: float) -> np.ndarray:
-        """The states (N, nx) that follow those of a block X (N, nx).
+        """Return the next states (N, nx) of a block X (N, nx).
 
         Raises:
             ModelError: If the function fails or returns another shape.
@@ -62,7 +62,7 @@ class BlackBox:
         return self._run("f", self.model.f, X, self.model.nx, u, p, dt)
 
     def h(self, sensor: int, X: np.ndarray, u: np.ndarray, p: np.ndarray) -> np.ndarray:
-        """What a sensor is expected to say (N, ny) of every state of a block X (N, nx).
+        """Return the predicted measurements (N, ny) of a sensor for a block of states X (N, nx).
 
         Raises:
             ModelError: If the function fails or returns another shape.
@@ -107,8 +107,8 @@ class BlackBox:
         """Run f and every h at the prior and near it, as a block and state by state, which must agree.
 
         Raises:
-            ModelError: If they fail, return another shape, something that is not finite at the prior, or another value
-                for a state when it comes with others (or again).
+            ModelError: If they fail, return another shape, a value at the prior that is not finite, or a value for a
+                state that depends on the rest of the block or changes between calls.
         """
         model = self.model
         X = model.prior_mean + np.array([[0.0], [0.1], [-0.1]]) * model.prior_std
@@ -136,7 +136,7 @@ class BlackBox:
 
 
 def _call(function: Callable, X: np.ndarray, u: np.ndarray, p: np.ndarray, *rest: float) -> np.ndarray:
-    """Run a block; what the filter holds cannot be written to."""
+    """Evaluate a block, with read-only views of the filter's arrays."""
     given = [X.view(), u.view(), p.view()]
     for array in given:
         array.flags.writeable = False
@@ -145,7 +145,7 @@ def _call(function: Callable, X: np.ndarray, u: np.ndarray, p: np.ndarray, *rest
 
 @lru_cache(maxsize=2)
 def _pool(kind: str) -> Executor:
-    """The threads or processes that all models share."""
+    """Return the pool of threads or processes that all models share."""
     count = int(numba.config.NUMBA_NUM_THREADS)
     # Spawned, not forked: a fork would copy the locks of threads that it does not copy.
     if kind == "threads":
@@ -158,19 +158,18 @@ def _workers(pool: Executor) -> int:
 
 
 def _remedy(error: BaseException, sent: Callable | None) -> str:
-    """What to do about a failure; `sent` is the function if it had to go to another process."""
+    """Return the remedy for a failure; `sent` is the function if it was sent to another process."""
     if isinstance(error, BrokenExecutor):
         _pool.cache_clear()
     elif sent is None or _pickles(sent):
         return "mend it, or let it return NaN in the rows of states that it has no answer for"
-    return "processes need functions that stand by their names in a module or file, use threads for others"
+    return "processes need functions defined in a module or file, use threads for others"
 
 
 def _pickles(function: Callable) -> bool:
-    """Whether a function can go to another process.
+    """Return whether a function can be sent to another process.
 
-    Asked of pickle itself, which raises other errors in each version of Python, and whatever the function's own
-    `__reduce__` raises.
+    Tries pickle, whose errors differ between versions of Python and with the function's own `__reduce__`.
     """
     try:
         pickle.dumps(function)

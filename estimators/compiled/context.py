@@ -53,15 +53,16 @@ _FIELDS = """
 _layout = np.dtype([(name, np.float64 if name == "max_step" else np.int64) for name in _FIELDS])
 
 context_type = from_dtype(_layout)
-"""All that a compiled filter may know: the model's code and layout, the tuning, the options. Never written to.
+"""Read-only input of a compiled filter: the model's code and layout, the tuning, the options.
 
 Plain numbers: sizes, modes, and addresses of code and of arrays, which the functions below turn into views. A record is
-handed over as one address; a tuple would be forty numbers in every call, and counted arrays cost more than a step.
+passed as one address; a tuple would be forty numbers in every call, and counting references of arrays costs more than a
+step.
 """
 
 
 def context_of(**values: float) -> np.void:
-    """A context with these values, which are all that it has.
+    """Make a context of these values.
 
     Raises:
         KeyError: If one is missing.
@@ -71,7 +72,7 @@ def context_of(**values: float) -> np.void:
 
 @intrinsic
 def place_of(typing_context: Any, context: Any) -> Any:
-    """The address of a context: a parallel loop takes no records."""
+    """Return the address of a context, as a parallel loop takes no records."""
 
     def codegen(_: Any, builder: Any, signature: Any, given: Any) -> Any:
         return builder.ptrtoint(given[0], ir.IntType(64))
@@ -81,7 +82,7 @@ def place_of(typing_context: Any, context: Any) -> Any:
 
 @intrinsic
 def context_at(typing_context: Any, place: Any) -> Any:
-    """The context at an address."""
+    """Return the context at an address."""
 
     def codegen(lowering: Any, builder: Any, signature: Any, given: Any) -> Any:
         return builder.inttoptr(given[0], lowering.get_value_type(context_type))
@@ -90,7 +91,7 @@ def context_at(typing_context: Any, place: Any) -> Any:
 
 
 def with_parameters(context: np.void, p: np.ndarray) -> np.void:
-    """The same context with other parameters p, an array that must outlive it."""
+    """Return a context with other parameters p, an array that must outlive it."""
     changed = np.array([context], _layout)
     changed["p"], changed["n_parameters"] = p.ctypes.data, p.size
     return changed[0]
@@ -98,51 +99,51 @@ def with_parameters(context: np.void, p: np.ndarray) -> np.void:
 
 @part
 def parameters(context):
-    """The model's parameters p."""
+    """Return the model's parameters p."""
     return floats(context.p, context.n_parameters)
 
 
 @part
 def process_variances(context):
-    """q (nw,): the variance that each process noise adds in a second."""
+    """Return q (nw,), the variance that each process noise adds per second."""
     return floats(context.q, context.n_noises)
 
 
 @part
 def sensor_rows(context, sensor):
-    """A sensor's first row among all rows, and how many it has."""
+    """Return a sensor's first row among all rows, and the number of its rows."""
     return ints(context.row_start, context.n_sensors)[sensor], ints(context.row_count, context.n_sensors)[sensor]
 
 
 @part
 def row_count(context, sensor):
-    """How many rows a sensor has."""
+    """Return the number of rows of a sensor."""
     return ints(context.row_count, context.n_sensors)[sensor]
 
 
 @part
 def sensor_variances(context, sensor):
-    """r (ny,): the variances of one sensor's rows."""
+    """Return r (ny,), the variances of one sensor's rows."""
     first, count = sensor_rows(context, sensor)
     return floats(context.r, context.n_rows)[first : first + count]
 
 
 @part
 def circular_states(context):
-    """For each state, whether it is an angle (int8)."""
+    """Return for each state whether it is an angle (int8)."""
     return flags(context.circular_x, context.nx)
 
 
 @part
 def circular_rows(context, sensor):
-    """For each row of a sensor, whether it is an angle (int8)."""
+    """Return for each row of a sensor whether it is an angle (int8)."""
     first, count = sensor_rows(context, sensor)
     return flags(context.circular_y, context.n_rows)[first : first + count]
 
 
 @part
 def options(context):
-    """The numbers that the estimator's `tune` made of its options."""
+    """Return the numbers that the estimator's `tune` made of its options."""
     return floats(context.options, context.n_options)
 
 
@@ -203,7 +204,7 @@ def add_given_noise(context, x, u, dt, P, scratch):
 
 @part
 def prior(context):
-    """Mean (nx,) and covariance of the prior, (nx, nx), or (1, nx) where it is diagonal."""
+    """Return mean (nx,) and covariance of the prior, (nx, nx), or (1, nx) if it is diagonal."""
     n = context.nx
     rows = context.prior_rows
     return floats(context.prior_mean, n), matrix(floats(context.prior_cov, rows * n), 0, rows, n)
@@ -211,13 +212,13 @@ def prior(context):
 
 @jit
 def linear_states(context):
-    """The indices of the states in which the model is linear, given the others."""
+    """Return the indices of the conditionally linear states."""
     return ints(context.linear_states, context.n_linear)
 
 
 @jit
 def sampled_states(context):
-    """The indices of all the other states but the mode, if there is one (`context.mode`, or -1)."""
+    """Return the indices of the other states except the mode, if there is one (`context.mode`, or -1)."""
     return ints(context.sampled_states, context.n_sampled)
 
 
@@ -229,7 +230,7 @@ def jump_chances(context, x, u, dt, out):
 
 @part
 def shown_states(context):
-    """The index of the state in each of the track's columns."""
+    """Return the index of the state in each of the track's columns."""
     return ints(context.shown, context.n_shown)
 
 
@@ -241,13 +242,13 @@ def shaped(context, z, out):
 
 @jit
 def has_own_likelihood(context, sensor):
-    """Whether the sensor's noise is given by a function of its own instead of r."""
+    """Return whether the sensor has a likelihood function instead of r."""
     return ints(context.log_likelihood, context.n_sensors)[sensor] != 0
 
 
 @jit
 def own_likelihood(context, sensor, y, x, u):
-    """log p(y | x) of a sensor that gives it."""
+    """Return log p(y | x) of a sensor with a likelihood function."""
     target = ints(context.log_likelihood, context.n_sensors)[sensor]
     return call_log_likelihood(target, y, x, u, parameters(context), sensor_variances(context, sensor))
 
@@ -255,7 +256,7 @@ def own_likelihood(context, sensor, y, x, u):
 f_rows_signature = types.void(i64, i64, i64, i64, i64, f64, i64, i64)
 h_rows_signature = types.void(i64, i64, i64, i64, i64, i64, i64)
 
-# What the templates below name, and `_looped` gives them for each model.
+# Globals of the templates below, which `_looped` sets for each model.
 function: Any = None
 NX = NU = PARAMETERS = NY = 0
 
@@ -285,20 +286,20 @@ def _h_rows(x, stride, n, u, p, out, out_stride):
 
 
 def looped_f(f: Any, nx: int, nu: int, parameters: int) -> Any:
-    """A dispatcher of f_rows(x, stride, n, u, p, dt, out, out_stride): f of n rows, `stride` numbers apart."""
+    """Return a dispatcher of f_rows(x, stride, n, u, p, dt, out, out_stride): f of n rows, `stride` numbers apart."""
     return _looped(_f_rows, f, {"NX": nx, "NU": nu, "PARAMETERS": parameters})
 
 
 def looped_h(h: Any, nx: int, nu: int, parameters: int, ny: int) -> Any:
-    """A dispatcher of h_rows(x, stride, n, u, p, out, out_stride): h of n rows, `stride` numbers apart."""
+    """Return a dispatcher of h_rows(x, stride, n, u, p, out, out_stride): h of n rows, `stride` numbers apart."""
     return _looped(_h_rows, h, {"NX": nx, "NU": nu, "PARAMETERS": parameters, "NY": ny})
 
 
 def _looped(template: Callable, dispatcher: Any, sizes: dict[str, int]) -> Any:
-    """The template around a model's function, cached under the function's own file, line and name.
+    """Return the template around a model's function, cached under the function's own file, line and name.
 
-    Numba keys its cache by these, the bytecode and the closure, but not by globals; so the sizes, and what the
-    function has in its closure, go into the name.
+    Numba keys its cache by these, the bytecode and the closure, but not by globals; so the sizes, and the closure of
+    the function, are part of the name.
     """
     model = dispatcher.py_func
     closure = dumps(tuple(cell.cell_contents for cell in model.__closure__ or ()))
@@ -316,13 +317,12 @@ def _looped(template: Callable, dispatcher: Any, sizes: dict[str, int]) -> Any:
 SLACK = 1e-3
 """Share of a step by which a step may be longer than `max_step`.
 
-0.3 s in steps of 0.1 s are three, though 0.3 / 0.1 is a little more than 3 in floating point; and so are three periods
-of 1/30 s, though timestamps are whole nanoseconds. `max_step` bounds how far a crude integration goes, which a
-thousandth does not change.
+0.3 s in steps of 0.1 s are three, though 0.3 / 0.1 exceeds 3 in floating point; and so are three periods of 1/30 s,
+though timestamps are whole nanoseconds. `max_step` bounds the error of integration, which a thousandth does not change.
 """
 
 
 @jit
 def steps_of(dt: float, max_step: float) -> int:
-    """The fewest equal steps that cross `dt` seconds with none longer than `max_step`, within `SLACK` of a step."""
+    """Return the smallest number of equal steps over `dt` seconds of at most `max_step`, within `SLACK` of a step."""
     return max(1, int(math.ceil(dt / max_step - SLACK)))

@@ -1,4 +1,4 @@
-"""Derivatives of a model's f and h: its own, by complex step, or by central differences.
+"""Derivatives of a model's f and h: analytic, by complex step, or by central differences.
 
 Complex step: df/dx_j = Im f(x + i·e·e_j) / e, exact to rounding for an analytic f, since nothing is subtracted.
 Source: Squire & Trapp (1998), doi:10.1137/S003614459631241X.
@@ -22,12 +22,12 @@ from .context import (
 )
 
 ANALYTIC, COMPLEX_STEP, CENTRAL = range(3)
-"""How a Jacobian is found: the model's own function, complex step, central differences."""
+"""Method of a Jacobian: the model's own function, complex step, central differences."""
 
 
 @layout
 def scratch_size(nx: int, ny: int) -> int:
-    """Numbers that a Jacobian takes to work in: two complex vectors, or three real ones."""
+    """Return the scratch of a Jacobian: two complex vectors, or three real ones."""
     return 2 * nx + 2 * max(nx, ny)
 
 

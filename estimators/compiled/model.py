@@ -1,7 +1,7 @@
-"""A model as machine code, and the context in which a filter sees it.
+"""Compilation of a model to machine code.
 
-`compile_model` turns the plain functions of a `StateSpaceModel` into addresses, and checks on the way that they agree
-with the declaration: shapes, finiteness at the prior, and derivatives.
+`compile_model` turns the plain functions of a `StateSpaceModel` into addresses, and checks them against the
+declaration: shapes, finite values at the prior, and derivatives.
 """
 
 from __future__ import annotations
@@ -41,10 +41,10 @@ from .jacobians import ANALYTIC, CENTRAL, COMPLEX_STEP, complex_step_f, complex_
 
 @dataclass(frozen=True)
 class CompiledModel:
-    """A model whose functions are machine code; `f`, `h[k]` and `Q` can be called from Python too.
+    """Compiled functions of a model; `f`, `h[k]` and `Q` can be called from Python too.
 
-    A field too large for a matrix Q, or with a shape, has draw(z, p, q, dt) instead, which turns white z (nx,) into
-    noise of the process.
+    A field too large for a matrix Q, or with a shape, has draw(z, p, q, dt) instead, which turns white noise z (nx,)
+    into process noise.
     """
 
     model: StateSpaceModel
@@ -57,7 +57,7 @@ class CompiledModel:
     box: BlackBox | None = None
 
     def f_block(self, X: np.ndarray, u: np.ndarray, p: np.ndarray, dt: float) -> np.ndarray:
-        """f of every state of a block X (N, nx)."""
+        """Return f of every state of a block X (N, nx)."""
         if self.box is not None:
             return self.box.f(X, u, p, dt)
         out = np.empty(X.shape)
@@ -66,7 +66,7 @@ class CompiledModel:
         return out
 
     def h_block(self, sensor: int, X: np.ndarray, u: np.ndarray, p: np.ndarray) -> np.ndarray:
-        """h (N, ny) of one sensor at every state of a block X (N, nx)."""
+        """Return h (N, ny) of one sensor at every state of a block X (N, nx)."""
         if self.box is not None:
             return self.box.h(sensor, X, u, p)
         out = np.empty((len(X), len(self.model.sensors[sensor].rows)))
@@ -104,7 +104,7 @@ def _compile(model: StateSpaceModel) -> CompiledModel:
         return address(dispatcher, signature)
 
     def complex_code(function: Callable, signature: Any) -> int:
-        """The same function over complex numbers, or 0 where it is not analytic (comparisons, abs, atan2)."""
+        """Return the function over complex numbers, or 0 if it is not analytic (comparisons, abs, atan2)."""
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
@@ -219,27 +219,27 @@ def _compile(model: StateSpaceModel) -> CompiledModel:
 
 
 def _sampled(model: StateSpaceModel) -> np.ndarray:
-    """Indices of the states that are neither conditionally linear nor the mode; of a field nobody asks."""
+    """Return the states that are neither conditionally linear nor the mode; none for a field, which needs none."""
     if isinstance(model.states, Field):
         return np.zeros(0, np.int64)
     return np.array([j for j in range(model.nx) if j != model.mode and j not in model.linear_states], np.int64)
 
 
 def _within(states: range, w: np.ndarray) -> np.ndarray:
-    """The entries of w (nx,) that a range of states has, and zero elsewhere."""
+    """Return w (nx,) with zeros outside a range of states."""
     out = np.zeros_like(w)
     out[states.start : states.stop] = w[states.start : states.stop]
     return out
 
 
 def _each_cell(x, u, p, q, dt, out):
-    """Q of a field whose noise has its name: the same for every cell."""
+    """Fill Q of a field with the same noise in every cell."""
     for j in range(x.size):
         out[j, j] = q[0] * dt
 
 
 def _varies(model: StateSpaceModel) -> bool:
-    """Whether Q depends on the state, judged by its values at the prior and at 32 states spread around it."""
+    """Return whether Q depends on the state, from its values at the prior and at 32 states around it."""
     if model.Q is None:
         return False
     rng = np.random.default_rng(0)
@@ -259,7 +259,7 @@ def _varies(model: StateSpaceModel) -> bool:
 
 
 def _check_derivatives(compiled: CompiledModel) -> None:
-    """Compare every analytic or complex-step Jacobian with central differences; demote or refuse what disagrees."""
+    """Compare Jacobians with central differences; reject analytic ones that differ, and replace complex steps."""
     model, static = compiled.model, compiled.static
     rng = np.random.default_rng(0)
     u = np.array([item.default for item in model.inputs], float)
@@ -284,7 +284,7 @@ def _check_derivatives(compiled: CompiledModel) -> None:
     points = [static["prior_mean"] + 0.3 * std * rng.standard_normal(model.nx) for _ in range(3)]
 
     def disagree(jacobian: Callable, function: Callable, rows: int) -> float:
-        """Largest difference relative to the size of the Jacobian, over the points where all is finite."""
+        """Return the largest difference relative to the size of the Jacobian, over points with finite values."""
         worst = 0.0
         for x in points:
             J = np.zeros((rows, model.nx))

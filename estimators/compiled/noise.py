@@ -23,7 +23,7 @@ _SMALL = 1e-13
 
 @jit
 def _not_semidefinite(L):
-    """Make the failure visible in whatever uses L."""
+    """Fill L with NaN, so that the failure shows in every result."""
     for i in range(L.shape[0]):
         for k in range(L.shape[1]):
             L[i, k] = np.nan
@@ -32,7 +32,7 @@ def _not_semidefinite(L):
 
 @jit
 def semidefinite_root(A, L):
-    """Lower L with L Lᵀ = A for a positive semidefinite A (n, n); False (and L of NaN) if A is not.
+    """Factor a positive semidefinite A (n, n) = L Lᵀ with lower L; return False (and L of NaN) if A is not.
 
     Cholesky by columns; a pivot of zero leaves its column zero. Reads the lower triangle of A.
 
@@ -71,7 +71,7 @@ def semidefinite_root(A, L):
 
 @jit
 def belief_root(P, L):
-    """Lower L with L Lᵀ = P for the covariance of a belief, or for its diagonal where rounding left it indefinite."""
+    """Factor a covariance P = L Lᵀ with lower L, or its diagonal if rounding left P indefinite."""
     if not semidefinite_root(P, L):
         for i in range(L.shape[0]):
             for j in range(L.shape[1]):
@@ -113,32 +113,32 @@ def add_noise(L, z, x):
 
 @jit
 def has_correlated_rows(context, sensor):
-    """Whether the noise of a sensor's rows is correlated; if not, R is the diagonal of their variances."""
+    """Return whether the noise of a sensor's rows is correlated; otherwise R is diagonal."""
     return ints(context.correlation, context.n_sensors)[sensor] != 0
 
 
 @part
 def sensor_correlation(context, sensor):
-    """c (ny * ny,), by rows, of a sensor with correlated rows: R_ij = c_ij √(r_i r_j)."""
+    """Return c (ny * ny,), row by row, of a sensor with correlated rows: R_ij = c_ij √(r_i r_j)."""
     _, ny = sensor_rows(context, sensor)
     return floats(ints(context.correlation, context.n_sensors)[sensor], ny * ny)
 
 
 @jit
 def independent_rows(context, sensor, y, r, L, d):
-    """Factor R over the rows of a reading y (ny,) that are there: R = L diag(d) Lᵀ, with unit lower L.
+    """Factor R over the finite rows of a measurement y (ny,): R = L diag(d) Lᵀ, with unit lower L.
 
     Args:
         context: The context.
         sensor: Index of the sensor.
-        y: The reading (ny,); missing rows are NaN, and the sub-block of R without them is factored.
-        r: Variances of the sensor's rows (ny,), as they are in use.
-        L: Gets the factor in its leading (m, m), of which the strictly lower triangle is written and meant (see
-            `solve_unit`); left alone where the rows are independent anyway.
+        y: The measurement (ny,); missing rows are NaN, and the sub-block of R without them is factored.
+        r: Variances of the sensor's rows in use (ny,).
+        L: Gets the factor in the strictly lower triangle of its leading (m, m) (see `solve_unit`); unchanged if the
+            rows are independent.
         d: Gets the variances of the independent rows (m,).
 
     Returns:
-        The number m of rows that are there.
+        The number m of finite rows.
     """
     ny = r.size
     m = 0
@@ -165,7 +165,7 @@ def independent_rows(context, sensor, y, r, L, d):
 
 @jit
 def add_covariances(context, sensor, y, factor, S):
-    """Add `factor` times what is off the diagonal of R, over the rows of y that are there, to S (m, m)."""
+    """Add `factor` times the off-diagonal entries of R over the finite rows of y to S (m, m)."""
     if not has_correlated_rows(context, sensor):
         return
     r, c = sensor_variances(context, sensor), sensor_correlation(context, sensor)

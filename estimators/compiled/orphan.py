@@ -1,4 +1,4 @@
-"""Worker processes end with the process that they work for, however that ends."""
+"""End worker processes when their parent process ends."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from threading import Thread
 
 
 def leave_with_parent() -> None:
-    """Have this worker end when its parent does: killed, it can send no word, and workers would wait for ever."""
+    """End this worker when its parent ends. A parent that is killed cannot notify workers, which would wait forever."""
     parent = parent_process()
 
     def watch() -> None:

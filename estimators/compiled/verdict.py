@@ -1,4 +1,4 @@
-"""What becomes of a reading, by its NIS: the same rule in every filter."""
+"""The verdict on a measurement by its NIS: one rule for every filter."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ LOG_2PI = float(np.log(2.0 * np.pi))
 
 @inlined
 def limit_of(context, sensor, m):
-    """The NIS up to which a reading of m finite rows passes the gate."""
+    """Return the NIS up to which a measurement with m finite rows passes the gate."""
     width = context.width + 1
     return floats(context.gate, context.n_sensors * width)[sensor * width + m]
 
 
 @inlined
 def verdict_of(context, sensor, m, nis, log_det, score):
-    """NIS, log-likelihood and verdict of a reading with m finite rows, from its NIS and log det S.
+    """Return the verdict on a measurement with m finite rows, and score NIS and log-likelihood.
 
     log-likelihood = -½ (NIS + log det S + m log 2π)
 
@@ -32,7 +32,7 @@ def verdict_of(context, sensor, m, nis, log_det, score):
         return HELD_OUT
     limit = limit_of(context, sensor, m)
     if nis <= limit:
-        # A reading that far off would leave an estimate that is no number.
+        # An infinite innovation would leave an estimate of NaN.
         return USED if nis < np.inf else FAILED
-    # Of a NIS that is no number the model is the reason.
+    # A NIS of NaN is due to the model.
     return GATED if limit < nis else FAILED

@@ -1,4 +1,4 @@
-"""Events: what the asset said, one row each, as columns of one length."""
+"""Events of an asset, one row each, as columns of one length."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ import numpy as np
 from ..errors import EventError
 
 READING, INPUT, TRUTH, TICK, RESET, MARK, MAINTENANCE = range(7)
-"""Kinds of event: a sensor's reading; inputs; a true state (scored, never used); a query; back to the prior; a fault
-that begins or ends in what the source is made to say; the covariance of a state back to the prior's."""
+"""Kinds of event: a measurement of a sensor; inputs; a true state (scored, never used); a query; a reset to the prior;
+start or end of an injected fault; maintenance, which resets the covariance of a state to the prior's."""
 
 BEFORE = -(2**62)
-"""Earlier than any event, and far enough from the end of int64 that a horizon can be taken off."""
+"""Earlier than any event, and far enough from the end of int64 to subtract a horizon."""
 
 KIND_NAMES = ("reading", "input", "truth", "tick", "reset", "mark", "maintenance")
 
@@ -22,14 +22,14 @@ KIND_NAMES = ("reading", "input", "truth", "tick", "reset", "mark", "maintenance
 class Events(NamedTuple):
     """A batch of events in the order of arrival; columns of one length N.
 
-    `channel` is the sensor's index for a reading, the first state's for a truth, the state's for a maintenance, that of
-    a sensor, input (after the sensors) or the whole twin (after both) for a mark, else 0. `value` (N, width) holds a
-    reading's rows, all inputs, or the true values of the states channel, channel + 1, ...; NaN is a row that is
-    missing, an input that stays, or a state whose truth is not known. A mark's first value is the code of its fault,
-    negative where it ends.
+    `channel` is the index of the sensor for a measurement, of the first state for a truth, of the state for
+    maintenance, of a sensor, input (after the sensors) or the twin (after both) for a mark, else 0. `value` (N, width)
+    holds the rows of a measurement, all inputs, or the true values of the states channel, channel + 1, ...; NaN is a
+    missing row, an unchanged input, or an unknown true value. A mark's first value is the code of its fault, negative
+    at the end of the fault.
 
-    Columns of `value` beyond the width of the log hold variances: column width + k is that of the noise of row k of
-    this one reading, in the row's unit squared; NaN leaves the tuned one.
+    Columns of `value` beyond the width of the log hold variances: column width + k is the variance of the noise of row
+    k of this measurement, in the row's unit squared; NaN leaves the tuned R.
     """
 
     t: np.ndarray
@@ -40,13 +40,13 @@ class Events(NamedTuple):
 
     @staticmethod
     def empty(width: int) -> Events:
-        """A batch without events."""
+        """Return a batch without events."""
         none = np.zeros(0, np.int64)
         return Events(none, none, np.zeros(0, np.int8), np.zeros(0, np.int32), np.zeros((0, width)))
 
     @staticmethod
     def one(t: int, arrival: int, kind: int, channel: int, values: object, width: int) -> Events:
-        """A batch of one event; `values` fill the first columns, the rest is NaN.
+        """Return a batch of one event; `values` fill the first columns, the rest is NaN.
 
         Raises:
             EventError: If a time or an index is not an integer, or the values are more than `width`.
@@ -66,7 +66,7 @@ class Events(NamedTuple):
 
     @staticmethod
     def concat(batches: list[Events], width: int) -> Events:
-        """Batches one after the other, with at least `width` value columns."""
+        """Concatenate batches, with at least `width` value columns."""
         if not batches:
             return Events.empty(width)
         widest = max(width, *(batch.value.shape[1] for batch in batches))
@@ -74,18 +74,18 @@ class Events(NamedTuple):
         return Events(*(np.concatenate(columns) for columns in zip(*wide, strict=True)))
 
     def widened(self, width: int) -> Events:
-        """The same events with at least `width` value columns; those that are added know nothing."""
+        """Return the events with at least `width` value columns; added columns are NaN."""
         missing = width - self.value.shape[1]
         if missing <= 0:
             return self
         return Events(*self[:4], np.pad(self.value, ((0, 0), (0, missing)), constant_values=np.nan))
 
     def select(self, index: Any) -> Events:
-        """The events that a mask, slice or index array picks."""
+        """Return the events that a mask, slice or index array selects."""
         return Events(*(column[index] for column in self))
 
     def __len__(self) -> int:
-        """Number of events (not of columns)."""
+        """Return the number of events (not of columns)."""
         return self.t.size
 
 
@@ -94,7 +94,7 @@ Events._make = classmethod(lambda cls, columns: cls(*columns))  # type: ignore[m
 
 
 def _whole(name: str, value: Any) -> int:
-    """An integer as it is; a float would lose what stands after its point without a word."""
+    """Return an integer; reject a float, whose decimals would be lost."""
     try:
         return index(value)
     except TypeError:
@@ -104,14 +104,14 @@ def _whole(name: str, value: Any) -> int:
 
 
 def truth_of(events: Events, state: int) -> tuple[np.ndarray, np.ndarray]:
-    """What the truth events know of one state.
+    """Return the true values of one state.
 
     Args:
         events: Any events.
         state: Index of the state.
 
     Returns:
-        Indices of the events that know it, ascending, shape (k,), and its finite true values, shape (k,).
+        Indices of the events with a finite true value of it, ascending, (k,), and the values, (k,).
     """
     channel = events.channel
     blocks = (events.kind == TRUTH) & (channel <= state) & (channel > state - events.value.shape[1])

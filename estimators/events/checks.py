@@ -1,7 +1,7 @@
-"""The log's door: what every event must keep, checked once, when it enters.
+"""Checks of events when they enter a log.
 
-Compiled code trusts each index that it finds in a log. So a log that knows its model refuses what the model has no
-place for; one that does not is checked where it meets a model, by the fold.
+Compiled code trusts every index in a log. A log with a model checks events against the model; the events of a log
+without one are checked by the fold.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from ..numerics.jit import i64, jit_brief
 from .batch import BEFORE, INPUT, KIND_NAMES, MAINTENANCE, MARK, READING, TRUTH, Events
 
 FINE, TIME, KIND, CHANNEL, VALUES, STRAY, VARIANCE = range(7)
-"""The rules, as `_look` names the one that is broken."""
+"""Rules, by which `_look` names a violation."""
 
 _ANY = np.zeros(0, np.int64)
-"""Rows of the sensors of a model that nobody knows."""
+"""Rows of the sensors of an unknown model."""
 
 
 def _read_only(element: types.Type, dimensions: int) -> types.Array:
@@ -42,7 +42,7 @@ _signature = types.UniTuple(i64, 3)(
 
 @jit_brief
 def _look(t, kind, channel, value, width, rows, nu, nx):
-    """The first event that breaks a rule, the rule (`FINE` if none does), and how many values are infinite."""
+    """Return the first event that violates a rule, the rule (`FINE` if none), and the number of infinite values."""
     infinite = 0
     for i in range(t.size):
         if t[i] <= BEFORE or t[i] >= -BEFORE:
@@ -51,7 +51,7 @@ def _look(t, kind, channel, value, width, rows, nu, nx):
             return i, KIND, infinite
         if channel[i] < 0:
             return i, CHANNEL, infinite
-        # Nobody reads what a tick or a reset holds.
+        # Values of a tick or a reset are ignored.
         places = width
         if rows.size > 0:
             if kind[i] == READING:
@@ -90,7 +90,7 @@ def _look(t, kind, channel, value, width, rows, nu, nx):
 
 @lru_cache(maxsize=1)
 def _looking() -> Any:
-    """`_look`, compiled for its one signature, which also takes arrays that can be written to."""
+    """Return `_look`, compiled for its only signature, which also accepts writable arrays."""
     _look.compile(_signature.args)
     _look.disable_compile()
     return _look
@@ -100,15 +100,15 @@ _TYPES = {"t": np.int64, "arrival": np.int64, "kind": np.int8, "channel": np.int
 
 
 def admitted(batch: Events, width: int, layout: EventLayout | None) -> Events:
-    """The batch, with infinite values as missing ones, if a log may take it.
+    """Return the batch, with infinite values replaced by NaN, if a log accepts it.
 
     Args:
         batch: Any events.
         width: Value columns of the log; further ones hold variances.
-        layout: The model's, if the log is of one.
+        layout: Layout of the model, if the log has one.
 
     Raises:
-        EventError: If an event breaks a rule; then nothing of the batch may be taken.
+        EventError: If an event violates a rule; then no event of the batch may be inserted.
     """
     batch = _plain(batch)
     t, _, kind, channel, value = batch

@@ -1,4 +1,4 @@
-"""What each channel's clock is expected to say next, and whether a time fits that: compiled, once for each event."""
+"""Expected next time of each channel's clock, and whether a time fits it; compiled, as it runs for every event."""
 
 from __future__ import annotations
 
@@ -13,42 +13,42 @@ from .batch import INPUT, READING, TRUTH
 SECOND = 10**9
 
 ENOUGH = 3
-"""Readings that must agree on another time, and steps after which the period of a channel is known."""
+"""Number of events that must agree on another time, and of steps after which the period of a channel is known."""
 
 PERIODS, PERIODS_LIVE = 10, 3
-"""A reading may be so many periods ahead of the newest, without and with known arrivals."""
+"""Number of periods by which an event may be ahead of the newest, without and with known arrivals."""
 
 AHEAD_OF_ARRIVAL = SECOND
-"""By which t - arrival may exceed its largest lately at least, ns; else by half the horizon."""
+"""Smallest tolerance, ns, by which t - arrival may exceed its recent maximum; otherwise half the horizon."""
 
 RELAX = 1000
-"""t - arrival at its largest comes down by one part in so many of the time that passes, where the clock falls back:
-no clock is worse, and after minutes of long delays it is still known what the clock says of itself."""
+"""The maximum of t - arrival decays by one part in so many of the elapsed time. No clock drifts faster, and after
+minutes of long delays the offset of the clock is still known."""
 
 FITS, AHEAD, BACK = range(3)
 
-# Columns of the state, one row a channel and the last for all of them together: whether it has spoken; its newest and
-# its first time; how many steps forward it made and their sum; largest t - arrival lately, the last arrival; whether
-# arrivals are known; whether events are held; its last gap.
+# Columns of the state, one row per channel and the last row for all of them together: whether it has reported; newest
+# and first time; number of steps forward and their sum; recent maximum of t - arrival, last arrival; whether arrivals
+# are known; whether events are held; the last gap.
 SEEN, LAST, FIRST, STEPS, TOTAL, OFFSET, ARRIVED, LIVE, HOLDING, GAP_FROM, GAP_TO = range(11)
 
 
 @inlined
 def _reach(state, row, horizon, live):
-    """How far ahead of the newest the next time of a channel may be, ns; -1 while its period is not known."""
+    """Return how far ahead of the newest the next time of a channel may be, ns; -1 while its period is unknown."""
     last = state.shape[0] - 1
     if state[row, STEPS] < ENOUGH:
         row = last
     if state[row, STEPS] < ENOUGH:
         return -1
     period = state[row, TOTAL] // state[row, STEPS]
-    # With half a horizon to spare, else what others stamp would be stale if it were on its way for a moment.
+    # Half a horizon remains, so that slightly delayed events of other channels are not stale.
     return max(horizon // 2, PERIODS_LIVE * period) if live else max(horizon, PERIODS * period)
 
 
 @inlined
 def _judge(state, row, t, arrival, live, horizon):
-    """Whether a time fits its channel's clock, or is far ahead or back."""
+    """Return whether a time fits its channel's clock, or is far ahead or back."""
     everything = state.shape[0] - 1
     if state[row, SEEN] and t < state[row, LAST] - horizon:
         return BACK
@@ -62,7 +62,7 @@ def _judge(state, row, t, arrival, live, horizon):
         offset = state[row if state[row, SEEN] else everything, OFFSET]
         if t - arrival <= offset + max(horizon // 2, AHEAD_OF_ARRIVAL):
             return FITS
-        # By a clock that is right: the others were on their way for longer, and within the horizon that is no fault.
+        # Stamped by a correct clock: the other events were delayed longer, within the horizon.
         if -horizon <= offset and t <= arrival:
             return FITS
     return AHEAD
@@ -70,7 +70,7 @@ def _judge(state, row, t, arrival, live, horizon):
 
 @inlined
 def _note(state, row, t, arrival, live, horizon):
-    """A time is let in: what its channel, and all together, are expected to say next."""
+    """Update the expectation of a channel, and of all together, with an accepted time."""
     everything = state.shape[0] - 1
     for k in (row, everything):
         if not state[k, SEEN]:
@@ -94,7 +94,7 @@ def _note(state, row, t, arrival, live, horizon):
 
 @inlined
 def row_of(kind, channel, sensors):
-    """The row of the state for an event; -1 for those that always pass, and that the log refuses."""
+    """Return the row of the state for an event; -1 for events that always pass, or that the log rejects."""
     if kind == READING and 0 <= channel < sensors:
         return channel
     return sensors if kind == INPUT else sensors + 1 if kind == TRUTH else -1
@@ -102,7 +102,7 @@ def row_of(kind, channel, sensors):
 
 @jit_brief
 def _scan(state, t, raw, arrival, kind, channel, start, horizon):
-    """Let in what fits, from `start` to the first event that does not, or whose channel holds some: its index."""
+    """Accept events from `start` on; return the first that does not fit or whose channel has held events."""
     sensors = state.shape[0] - 3
     for i in range(start, t.size):
         row = row_of(kind[i], channel[i], sensors)
@@ -116,7 +116,7 @@ def _scan(state, t, raw, arrival, kind, channel, start, horizon):
 
 @lru_cache(maxsize=1)
 def compiled() -> tuple[Any, Any, Any, Any]:
-    """The functions, compiled for their one signature."""
+    """Return the functions, compiled for their only signatures."""
     one = (I2, i64, i64, i64, types.boolean, i64)
     _reach.compile((I2, i64, i64, types.boolean))
     _judge.compile(one)

@@ -67,12 +67,12 @@ Updating, updating = declare_layout(
 
 
 def work_size(options: Options, nx: int, ny: int) -> int:
-    """Scratch of a prediction or an update."""
+    """Return the scratch of a prediction or an update."""
     return max(size_of(predicting, nx), size_of(updating, nx, ny))
 
 
 def tune(values: Options, model: StateSpaceModel, tuning: Tuning) -> np.ndarray:
-    """The shared options alone."""
+    """Return the shared options."""
     return np.array(shared_options(values))
 
 
@@ -94,7 +94,7 @@ def predict(context, u, dt, index, state, work):
 
 @embedded
 def linearise(context, sensor, x, u, P, reading, H, scratch):
-    """Fill ŷ = h(x), H = dh/dx (ny, nx), and for the reading C = P Hᵀ and S = H P Hᵀ."""
+    """Fill ŷ = h(x), H = dh/dx (ny, nx), C = P Hᵀ and S = H P Hᵀ."""
     C, S = reading.C, reading.S
     n, m = C.shape
     sensor_jacobian(context, sensor, x, u, H, scratch)
@@ -155,7 +155,7 @@ EKF = Estimator(
     family="Gaussian",
     assumes="differentiable f and h, nearly straight within the spread of the estimate",
     model_runs="1 and its derivatives (nx by complex step)",
-    fails_when="curvature makes it overconfident: it stops listening to the sensors",
+    fails_when="curvature makes it overconfident, so that it neglects the sensors",
     source="Jazwinski (1970), Stochastic Processes and Filtering Theory, chapter 8",
     functions=(start, predict, update, describe),
     runs=lambda options, nx: nx + 1,

@@ -1,4 +1,4 @@
-"""The iterated extended Kalman filter: the update linearised again where it leads, until it stays there."""
+"""The iterated extended Kalman filter: the update is linearised again at its own result until that converges."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ Iterating, iterating = declare_layout(
 
 
 def work_size(options: Options, nx: int, ny: int) -> int:
-    """Scratch of a prediction or an update."""
+    """Return the scratch of a prediction or an update."""
     return max(size_of(predicting, nx), size_of(iterating, nx, ny))
 
 
@@ -66,8 +66,8 @@ def tune(values: Options, model: StateSpaceModel, tuning: Tuning) -> np.ndarray:
 def update(context, u, sensor, y, index, state, work, innovation, innovation_std, score):
     """The Gauss-Newton minimum of ½ |x - x̂|²_P⁻¹ + ½ |y - h(x)|²_R⁻¹, then P by the Joseph form with its last H.
 
-    xᵢ₊₁ = x̂ + Kᵢ (y - h(xᵢ) - Hᵢ (x̂ - xᵢ)),  x₀ = x̂. Each step starts from the prediction x̂ and its P again, so that
-    the reading counts once; NIS, gate and weight are those of the prediction. One iteration is the EKF.
+    xᵢ₊₁ = x̂ + Kᵢ (y - h(xᵢ) - Hᵢ (x̂ - xᵢ)),  x₀ = x̂. Each step starts from the prediction x̂ and its P, so that the
+    measurement counts once; NIS, gate and weight are those of the prediction. One iteration is the EKF.
 
     Source: Bell & Cathey (1993), doi:10.1109/9.250476.
     """
@@ -80,7 +80,7 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
         predicted[i] = x[i]
     iterations = int(options(context)[ITERATIONS])
     verdict = USED
-    m = np.int64(0)  # a literal would compile all that takes it twice
+    m = np.int64(0)  # a literal would be a second type, and compile every callee twice
     for iteration in range(iterations):
         linearise(context, sensor, x, u, P, reading, H, own.jacobian)
         m = compare(context, sensor, y, reading, H, P, places.innovation, places.innovation_std)
@@ -115,7 +115,7 @@ def back_to(predicted, m, H, x, nu):
 
 @inlined
 def tell(y, nu, nu_std, innovation, innovation_std):
-    """Fill the track's innovation and its deviations, in the rows of the reading that are there."""
+    """Fill the track's innovation and its standard deviations in the finite rows of the measurement."""
     for i in range(nu.size):
         if np.isfinite(y[i]):
             innovation[i] = nu[i]
@@ -137,7 +137,7 @@ IEKF = Estimator(
     moments=moments,
     points=no_points,
     options=(
-        Option("iterations", 3, 1, 100, "", "linearisations of a reading; 1 is the EKF"),
+        Option("iterations", 3, 1, 100, "", "linearisations per measurement; 1 is the EKF"),
         JOSEPH_OPTION,
         *OPTIONS,
     ),

@@ -25,23 +25,23 @@ Kept, kept = declare_layout(
 
 @inlined
 def kept_in(work, n):
-    """What stays, at the end of the scratch: no step works there."""
+    """Return the kept numbers, at the end of the scratch, where no step works."""
     return kept(start_of(work[work.size - (n * n + 1) :]), n)
 
 
 def work_size(options: Options, nx: int, ny: int) -> int:
-    """Scratch: the EKF's, and what stays."""
+    """Return the scratch: the EKF's, and the kept numbers."""
     return ekf.work_size(options, nx, ny) + size_of(kept, nx)
 
 
 @embedded
 def constant_jacobian(context, u, dt, kept, scratch):
-    """Fill F for this dt, unless it holds for it.
+    """Fill F for this dt, unless it has been computed for it.
 
-    F is the same at every x of a linear model, so it is found once for each dt, unless inputs may change it.
+    F of a linear model is the same at every x, so it is computed once per dt, unless inputs may change it.
     """
     if kept.dt[0] != dt or u.size > 0:
-        # At the prior, not at x: differences round differently at each x, and F must not depend on when it was found.
+        # At the prior, not at x: differences round differently at each x, and F must not depend on when it is computed.
         state_jacobian(context, floats(context.prior_mean, context.nx), u, dt, kept.F, scratch)
         kept.dt[0] = dt
 
@@ -64,7 +64,7 @@ def predict(context, u, dt, index, state, work):
 
 
 def applies(model: StateSpaceModel) -> str | None:
-    """Only a linear model has one F and one H."""
+    """Return why the filter does not apply: only a linear model has one F and one H."""
     return None if model.linear else f"{model.name} is not linear; use an extended or unscented Kalman filter"
 
 

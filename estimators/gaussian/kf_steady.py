@@ -1,13 +1,13 @@
-"""The steady-state Kalman filter: the gain that the Kalman filter settles to, found once.
+"""The steady-state Kalman filter: the limit of the Kalman filter's gain, computed once.
 
-With readings of one sensor, `period` seconds apart, P before a reading tends to the solution of the discrete algebraic
-Riccati equation, whatever it was at first:
+With measurements of one sensor, `period` seconds apart, P before a measurement tends to the solution of the discrete
+algebraic Riccati equation, whatever it was at first:
 
     P = F (P - P Hᵀ (H P Hᵀ + R)⁻¹ H P) Fᵀ + Q,      K = P Hᵀ (H P Hᵀ + R)⁻¹
 
-The gain is fixed from the first reading on, so the start is slower than the Kalman filter's. P is the covariance that
-this gain really has: it is carried by the Joseph form until it is within rounding of the steady one, and from then on
-copied, so that a step costs n m multiplications for the gain; a late or lost reading makes it grow as it should.
+The gain is fixed from the first measurement on, so the start is slower than the Kalman filter's. P is the actual
+covariance for this gain: it is computed by the Joseph form until it equals the steady one within rounding, and is then
+copied, so that a step costs n m multiplications for the gain. After a late or lost measurement it grows accordingly.
 
 Source: Anderson & Moore (1979), Optimal Filtering, chapter 4.
 """
@@ -36,17 +36,17 @@ from .robust import INFLATION_OPTION, OWN, add_noise, reading_variances, shared_
 from .shared import admit, compare, describe, gain, joseph, moments_of, move_to, no_points, wrap_mean
 
 STEP, WHOLE, STEADY = range(OWN, OWN + 3)
-"""Positions in the context's options: a step of the period, whether that is all of it, and what `Steady` lists."""
+"""Positions in the context's options: a step of the period, whether it is the whole period, and the `Steady` arrays."""
 
 NEAR = 0.01
-"""Share of a step by which it may be shorter or longer and count, for P, as the one that the gain was found for."""
+"""Relative difference up to which a step counts, for P, as the step for which the gain was computed."""
 
 MOVING, AFTER, BEFORE = range(3)
-"""What P is: on its way, the steady one after a reading, the steady one before a reading."""
+"""Phase of P: not steady, the steady one after a measurement, the steady one before a measurement."""
 
 
 def state_size(values: Options, nx: int) -> int:
-    """Numbers in the state: mean, covariance, and what the covariance is."""
+    """Return the size of the state: mean, covariance, and phase of the covariance."""
     return nx + nx * nx + 1
 
 
@@ -61,19 +61,19 @@ Steady, steady = declare_layout(
 
 @inlined
 def steady_of(context):
-    """What `tune` found; the model has one sensor."""
+    """Return the steady gain and covariances from `tune`; the model has one sensor."""
     return steady(start_of(options(context)[STEADY:]), context.nx, row_count(context, 0))
 
 
 @inlined
 def phase_of(state):
-    """(1,): what P is."""
+    """Return the phase of P, (1,)."""
     return state[state.size - 1 :]
 
 
 @by_address
 def start(context, mean, cov, state):
-    """The state that stands for N(mean, cov)."""
+    """Set the state to N(mean, cov)."""
     shared.start(context, mean, cov, state)
     phase_of(state)[0] = MOVING
 
@@ -89,7 +89,7 @@ def copy(A, P):
 
 @part
 def settled(A, P):
-    """Whether P is A within 1e-12, relative to the deviations."""
+    """Return whether P equals A within 1e-12, relative to the standard deviations."""
     n = P.shape[0]
     for i in range(n):
         for j in range(i + 1):
@@ -101,7 +101,7 @@ def settled(A, P):
 
 @by_address
 def predict(context, u, dt, index, state, work):
-    """x ← f(x, u); P steps from the steady one to the steady one, or else as the Kalman filter's.
+    """x ← f(x, u); P goes from the steady one to the steady one, or else as the Kalman filter's.
 
     Source: Anderson & Moore (1979), Optimal Filtering, chapter 4.
     """
@@ -127,7 +127,7 @@ def predict(context, u, dt, index, state, work):
 
 @by_address
 def update(context, u, sensor, y, index, state, work, innovation, innovation_std, score):
-    """x ← x + K ν with the steady gain, or where rows of the reading are missing with the gain of the others.
+    """x ← x + K ν with the steady gain, or with the gain of the finite rows if some are missing.
 
     Source: Anderson & Moore (1979), Optimal Filtering, chapter 4; P by the Joseph form, which holds for any gain.
     """
@@ -166,7 +166,7 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
 
 
 def tune(values: Options, model: StateSpaceModel, tuning: Tuning) -> np.ndarray:
-    """The period, the steady gain, and the steady covariance after and before a reading.
+    """Return the period, the steady gain, and the steady covariance after and before a measurement.
 
     Raises:
         EstimatorError: If the Riccati equation has no stabilising solution, with the reason.
@@ -185,7 +185,7 @@ def tune(values: Options, model: StateSpaceModel, tuning: Tuning) -> np.ndarray:
     if (mode := unseen(F.T, Q)) is not None:
         raise EstimatorError(
             f"estimator kf-steady: {model.name} has no steady gain, as {largest(model, mode)} neither decays nor gets "
-            "process noise, so it is known ever better; raise its Q, or use kf"
+            "process noise, so its variance tends to zero; raise its Q, or use kf"
         )
     try:
         before = solve_discrete_are(F.T, H.T, Q, R)
@@ -205,7 +205,7 @@ def tune(values: Options, model: StateSpaceModel, tuning: Tuning) -> np.ndarray:
 
 
 def independent(H: np.ndarray, R: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """H and R of the rows L⁻¹ y, which are independent: those that `update` conditions on, as `compare` leaves them."""
+    """Return H and R of the independent rows L⁻¹ y, on which `update` conditions."""
     L, d = R.copy(), np.diag(R).copy()
     unit_factor(L, d, d.size)
     return np.linalg.solve(np.tril(L, -1) + np.eye(d.size), H), np.diag(d)
@@ -214,7 +214,7 @@ def independent(H: np.ndarray, R: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def matrices(
     model: StateSpaceModel, u: np.ndarray, p: np.ndarray, q: np.ndarray, period: float, rate: float = 0.0
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """F and Q over a period, in steps that the model allows, and H of the only sensor; F includes the inflation."""
+    """Return F and Q over a period, in steps of at most `max_step`, and H of the only sensor; F includes inflation."""
     n, m = model.nx, len(model.sensors[0].rows)
     steps = steps_of(period, float(model.max_step))
     dt = period / steps
@@ -236,7 +236,7 @@ def matrices(
 
 
 def columns(function: Callable, n: int, m: int) -> np.ndarray:
-    """The matrix (m, n) of a linear function (of an affine one, without its constant)."""
+    """Return the matrix (m, n) of a linear function (of an affine one, without its constant)."""
     origin, out, J = np.empty(m), np.empty(m), np.empty((m, n))
     function(np.zeros(n), origin)
     for j in range(n):
@@ -248,21 +248,21 @@ def columns(function: Callable, n: int, m: int) -> np.ndarray:
 
 
 def undetectable(model: StateSpaceModel, F: np.ndarray, H: np.ndarray) -> str | None:
-    """The reason why no gain tames the model: something that does not decay and that the sensor does not see."""
+    """Return why the model is not detectable, if it is not: a mode that neither decays nor is observed."""
     if (mode := unseen(F, H)) is None:
         return None
     sensor, state = model.sensor_names[0], largest(model, mode)
-    return f"{model.name} is not detectable: {sensor} does not see {state}, which does not decay"
+    return f"{model.name} is not detectable: {sensor} does not observe {state}, which does not decay"
 
 
 def unseen(F: np.ndarray, H: np.ndarray) -> np.ndarray | None:
-    """A mode of F that does not decay and that H does not see, if there is one.
+    """Return a mode of F that does not decay and that H does not observe, if there is one.
 
     Source: the Popov-Belevitch-Hautus test; Kailath, Sayed & Hassibi, Linear Estimation (2000), appendix C.
     """
     n = F.shape[0]
     scale = max(1.0, np.abs(F).max(), np.abs(H).max())
-    # An eigenvalue that is there twice is good to the root of rounding only, 1e-8.
+    # A double eigenvalue is accurate to the root of rounding only, 1e-8.
     for value, mode in zip(*(item.T for item in np.linalg.eig(F)), strict=True):
         if abs(value) >= 1.0 - 1e-7:
             seen = np.linalg.svd(np.vstack((F - value * np.eye(n), H)), compute_uv=False)[-1]
@@ -272,13 +272,13 @@ def unseen(F: np.ndarray, H: np.ndarray) -> np.ndarray | None:
 
 
 def largest(model: StateSpaceModel, mode: np.ndarray) -> str:
-    """The state that a mode moves most."""
+    """Return the state with the largest entry in a mode."""
     return model.state_names[int(np.argmax(np.abs(mode)))]
 
 
 @lru_cache(maxsize=64)
 def applies(model: StateSpaceModel) -> str | None:
-    """Only a linear model with one F, one Q and one sensor has a steady state."""
+    """Return why the filter does not apply: only a linear model with one F, Q and sensor has a steady state."""
     if not model.linear:
         return f"{model.name} is not linear; its gain never settles; use an extended or unscented Kalman filter"
     if len(model.sensors) > 1:
@@ -305,9 +305,9 @@ KF_STEADY = Estimator(
     name="kf-steady",
     title="Steady-state Kalman filter",
     family="Gaussian",
-    assumes="linear, constant f and h; one sensor that reads every `period` seconds",
+    assumes="linear, constant f and h; one sensor that measures every `period` seconds",
     model_runs="1",
-    fails_when="readings are lost, late, or start far off: the gain stays what it is",
+    fails_when="measurements are lost or late, or the prior is far off: the gain does not adapt",
     source="Anderson & Moore (1979), Optimal Filtering, chapter 4",
     functions=(start, predict, update, describe),
     state_size=state_size,
@@ -315,7 +315,7 @@ KF_STEADY = Estimator(
     moments=shared.moments,
     points=no_points,
     options=(
-        Option("period", 1.0, 1e-6, 1e6, "s", "time between readings, for which the gain is found"),
+        Option("period", 1.0, 1e-6, 1e6, "s", "time between measurements, for which the gain is computed"),
         INFLATION_OPTION,
     ),
     tune=tune,

@@ -1,7 +1,7 @@
-"""What every Gaussian filter offers against a wrong model or wrong readings: inflation, weights, adaptation.
+"""Protection of Gaussian filters against a wrong model or wrong measurements: inflation, robust weights, adaptation.
 
-All of it is off by default and then costs a comparison. What an adaptation remembers stands behind the filter's own
-state, so it is rewound and reproduced with it.
+All are off by default, and then cost a comparison. The memory of an adaptation is part of the filter's state, so it is
+rewound and reproduced with it.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ JOSEPH, INFLATION, ROBUST, ROBUST_AT, ADAPT, ADAPT_RATE, ADAPT_BOUND, OWN = rang
 """Positions in the context's options; those of the filter itself begin at OWN."""
 
 NONE, HUBER, STUDENT_T = range(3)
-"""How a reading is weighted."""
+"""Weighting of a measurement."""
 
 OFF, ADAPT_R, ADAPT_Q = range(3)
-"""What is adapted."""
+"""Adapted noise."""
 
 JOSEPH_OPTION = Option.choice("joseph", ("off", "on"), "update P by the Joseph form; off subtracts K S Kᵀ, faster", 1)
 
@@ -29,21 +29,21 @@ INFLATION_OPTION = Option("inflation", 1.0, 1.0, 1e9, "1/s", "factor by which P 
 
 OPTIONS = (
     INFLATION_OPTION,
-    Option.choice("robust", ("none", "huber", "student-t"), "how the weight of a reading falls with its distance"),
+    Option.choice("robust", ("none", "huber", "student-t"), "how the weight of a measurement falls with its distance"),
     Option("huber", 1.345, 0.1, 10.0, "std", "distance from which Huber's weight falls"),
     Option("dof", 4.0, 1.0, 1e4, "", "degrees of freedom of Student's t; fewer have heavier tails"),
-    Option.choice("adapt", ("off", "R", "Q"), "what follows the innovations: each sensor row's variance, or all of Q"),
-    Option("memory", 200.0, 10.0, 1e5, "readings", "over how many readings an adaptation averages"),
+    Option.choice("adapt", ("off", "R", "Q"), "noise that is adapted: each sensor row's variance, or all of Q"),
+    Option("memory", 200.0, 10.0, 1e5, "readings", "number of measurements over which an adaptation averages"),
     Option("bound", 10.0, 1.0, 1e4, "", "an adapted variance stays within this factor of the tuned one"),
 )
 """Options of every Gaussian filter that has a gain of its own."""
 
-MOST = 1000
-"""Iterations of a weight, at most: Huber's takes a few, Student's t some tens, or hundreds where two nearly fit."""
+MAX_WEIGHT_ITERATIONS = 1000
+"""Huber's weight takes a few iterations, Student's t some tens, or hundreds if two weights nearly fit."""
 
 
 def shared_options(values: Options) -> list[float]:
-    """The numbers of the shared options, in the order of the positions above."""
+    """Return the numbers of the shared options, in the order of the positions above."""
     kind = values.get("robust", NONE)
     return [
         values.get("joseph", 0.0),
@@ -57,33 +57,33 @@ def shared_options(values: Options) -> list[float]:
 
 
 def memory(values: Options, model: StateSpaceModel) -> int:
-    """Numbers that an adaptation keeps: for each sensor row its mean and the variance in use; or one scale of Q."""
+    """Return the size of an adaptation's memory: two numbers per sensor row for R, one scale for Q."""
     rows = sum(len(sensor.rows) for sensor in model.sensors)
     return {OFF: 0, ADAPT_R: 2 * rows, ADAPT_Q: 1}[int(values["adapt"])]
 
 
 @inlined
 def is_robust(context):
-    """Whether readings are weighted."""
+    """Return whether measurements are weighted."""
     return options(context)[ROBUST] != NONE
 
 
 @inlined
 def is_adaptive(context):
-    """Whether R or Q follows the innovations."""
+    """Return whether R or Q is adapted."""
     return options(context)[ADAPT] != OFF
 
 
 @inlined
 def adapted_variances(context, state):
-    """What the adaptation of R keeps: the mean of each sensor row's samples, and its variance in use, (rows,) each."""
+    """Return the memory of an adapted R: the mean of each sensor row's samples, and its variance, (rows,) each."""
     rows = context.n_rows
     return state[state.size - 2 * rows : state.size - rows], state[state.size - rows :]
 
 
 @part
 def forget(context, state):
-    """Set what an adaptation remembers to the tuned values."""
+    """Reset the memory of an adaptation to the tuned values."""
     kind = options(context)[ADAPT]
     if kind == ADAPT_R:
         mean, used = adapted_variances(context, state)
@@ -97,10 +97,10 @@ def forget(context, state):
 
 @part
 def growth(context, dt):
-    """The factor by which P grows in dt seconds beside Q.
+    """Return the factor by which P grows in dt seconds, beside Q.
 
-    Old readings are forgotten exponentially, which keeps the gain from dying; a rate, so that it does not matter in how
-    many steps the time is crossed. Source: Simon (2006), Optimal State Estimation, 7.4 (the fading-memory filter).
+    Old measurements are forgotten exponentially, which keeps the gain from vanishing. As it is a rate, the result does
+    not depend on the number of steps. Source: Simon (2006), Optimal State Estimation, 7.4 (the fading-memory filter).
     """
     rate = options(context)[INFLATION]
     return np.exp(rate * dt) if rate != 0.0 else 1.0
@@ -108,7 +108,7 @@ def growth(context, dt):
 
 @part
 def noise_scale(context, state):
-    """The adapted factor of Q, or 1."""
+    """Return the adapted factor of Q, or 1."""
     return state[state.size - 1] if options(context)[ADAPT] == ADAPT_Q else 1.0
 
 
@@ -135,7 +135,7 @@ def multiply(a, P):
 
 @inlined
 def reading_variances(context, sensor, state, r):
-    """Fill r (ny,) with the variances of one sensor's rows, as adapted."""
+    """Fill r (ny,) with the variances, adapted or tuned, of one sensor's rows."""
     first, count = sensor_rows(context, sensor)
     if options(context)[ADAPT] == ADAPT_R:
         _, used = adapted_variances(context, state)
@@ -149,9 +149,9 @@ def reading_variances(context, sensor, state, r):
 
 @part
 def weight(kind, at, m, nu, r, S, V, z):
-    """The weight w by which a reading counts: as if its noise were N(0, R / w). NaN if S + R (1/w - 1) has no factor.
+    """Return the weight w of a measurement, whose noise becomes N(0, R / w); NaN if S + R (1/w - 1) has no factor.
 
-    nu, r (m,): raw innovation and variances of independent rows (a full R is factored before and scaled as a whole, see
+    nu, r (m,): innovation and variances of independent rows (a full R is factored before and scaled as a whole, see
     compiled/noise.py); S (m, m) includes R; V (m, m) and z (2 m,) are scratch.
     """
     return huber(at, m, nu, r, S, V, z) if kind == HUBER else student_t(at, m, nu, r, S, V, z)
@@ -167,7 +167,7 @@ def huber(k, m, nu, r, S, V, z):
     Sources: Huber (1964), doi:10.1214/aoms/1177703732; Moré & Sorensen (1983), doi:10.1137/0904038, for the equation.
     """
     s = 1.0
-    for _ in range(MOST):
+    for _ in range(MAX_WEIGHT_ITERATIONS):
         if not precision_times(s, m, nu, r, S, V, z):
             return np.nan
         square = 0.0
@@ -196,7 +196,7 @@ def student_t(dof, m, nu, r, S, V, z):
     """
     w = 1.0
     unit = z[m : 2 * m]
-    for _ in range(MOST):
+    for _ in range(MAX_WEIGHT_ITERATIONS):
         if not precision_times(1.0 / w, m, nu, r, S, V, z):
             return np.nan
         total = 0.0
@@ -232,11 +232,11 @@ def precision_times(s, m, nu, r, S, V, z):
 
 @part
 def reweigh(context, m, nu, raw, d, S, U, V, z):
-    """Weight the noise of a reading: d is divided by w; S, its factor U and the whitened nu then belong to that noise.
+    """Weight the noise of a measurement: d is divided by w; S, its factor U and the whitened nu follow.
 
     Args:
         context: The context.
-        m: Rows of the reading that are there.
+        m: Number of finite rows.
         nu: Gets the whitened innovation (m,).
         raw: The innovation (m,), its rows' noise independent.
         d: Variances of that noise (m,).
@@ -261,16 +261,16 @@ def reweigh(context, m, nu, raw, d, S, U, V, z):
 
 @part
 def adapt(context, sensor, y, state, innovation, innovation_std, score):
-    """Let R or Q follow the innovations of a reading that was used, over a fading memory of N readings.
+    """Adapt R or Q to the innovations of used measurements, with a fading memory of N measurements.
 
-    R: r ← mean of ν² - (S - r), of each row. Q: one factor s of all of Q, s ← s (1 + (NIS / m - 1) / N), so that
-    the mean NIS becomes what it should be. One of the two: both show in the size of ν alone, where any split between
-    them fits as well. What is in use stays within the bound. The spread of an adapted r is about
-    S √(2 / (2N - 1)), that of ln s about 1 / √(N m γ) with γ the share of S that scales with s.
+    R: r ← mean of ν² - (S - r), of each row. Q: one factor s of all of Q, s ← s (1 + (NIS / m - 1) / N), so that the
+    mean NIS becomes what it should be. Only one of the two can be adapted, as both act on the size of ν alone. The
+    values in use stay within the bound. The spread of an adapted r is about S √(2 / (2N - 1)), that of ln s about
+    1 / √(N m γ) with γ the share of S that scales with s.
 
-    Of rows that are correlated the correlation stays, and their variances follow. An outlier is taken at its face
-    value: use the gate. Sources: Mohamed & Schwarz (1999), doi:10.1007/s001900050236, for R (there over a window);
-    Bar-Shalom, Li & Kirubarajan (2001), 11.2, for the level of Q.
+    Correlated rows keep their correlation. An outlier counts fully: use the gate. Sources: Mohamed & Schwarz (1999),
+    doi:10.1007/s001900050236, for R (there over a window); Bar-Shalom, Li & Kirubarajan (2001), 11.2, for the level of
+    Q.
     """
     kind = options(context)[ADAPT]
     rate = options(context)[ADAPT_RATE]

@@ -1,9 +1,7 @@
-"""What the Gaussian filters share: a mean and a covariance as state, and conditioning on a reading.
+"""Shared parts of the Gaussian filters: mean and covariance as state, and conditioning on a measurement.
 
-The state is x (nx,) followed by P (nx, nx). The filters differ only in how mean and covariance pass through f and h;
-gate, verdict, NIS and likelihood are here.
-
-After P stands what an adaptation remembers (robust.py), if it is on.
+The state is x (nx,) followed by P (nx, nx), and the memory of an adaptation (robust.py) if one is on. The filters
+differ only in how mean and covariance pass through f and h; gate, verdict, NIS and likelihood are here.
 """
 
 from __future__ import annotations
@@ -24,31 +22,31 @@ from .robust import forget, is_robust, reweigh
 
 
 def state_size(options: Options, nx: int) -> int:
-    """Numbers in the state."""
+    """Return the size of the state."""
     return nx + nx * nx
 
 
 @inlined
 def moments_of(state, n):
-    """Views of the mean x (n,) and the covariance P (n, n), or the factor of it that takes its place, in a state."""
+    """Return views of the mean x (n,) and the covariance P (n, n), or its factor, in a state."""
     x, at = take_vector(start_of(state), n)
     P, at = take_matrix(at, n, n)
     return x, P
 
 
 def moments(options: Options, state: np.ndarray, nx: int) -> tuple[np.ndarray, np.ndarray]:
-    """Mean (nx,) and covariance (nx, nx) of a state."""
+    """Return mean (nx,) and covariance (nx, nx) of a state."""
     return state[:nx].copy(), state[nx : nx + nx * nx].reshape(nx, nx).copy()
 
 
 def no_points(options: Options, state: np.ndarray, nx: int) -> np.ndarray:
-    """No points to draw."""
+    """Return no points to draw."""
     return np.zeros((0, nx))
 
 
 @by_address
 def start(context, mean, cov, state):
-    """The state that stands for N(mean, cov)."""
+    """Set the state to N(mean, cov)."""
     n = mean.size
     x, P = moments_of(state, n)
     for i in range(n):
@@ -60,7 +58,7 @@ def start(context, mean, cov, state):
 
 @by_address
 def describe(context, state, mean, std, cross):
-    """Mean, standard deviation and the configured covariances."""
+    """Fill mean, standard deviation and the configured covariances."""
     x, P = moments_of(state, context.nx)
     shown = shown_states(context)
     for k in range(mean.size):
@@ -112,19 +110,19 @@ Reading, reading_of = declare_layout(
 
 @embedded
 def compare(context, sensor, y, reading, H, P, innovation, innovation_std):
-    """The innovation ν = y - ŷ and its covariance S = S_ŷ + R, over the rows of the reading that are there.
+    """Compute the innovation ν = y - ŷ and its covariance S = S_ŷ + R over the finite rows of a measurement.
 
-    On entry reading.nu holds ŷ, S (ny, ny) its covariance, C (nx, ny) that with the state, r the variances of the
-    rows, and H (ny, nx) is the Jacobian (or has no columns). On return the leading rows and columns of all but r belong
-    to the rows that are there, made independent. `innovation` and `innovation_std` keep the reading's own rows. An S
-    that is nothing but the rounding of H P Hᵀ becomes NaN, so that the reading fails.
+    On entry reading.nu holds ŷ, S (ny, ny) its covariance, C (nx, ny) the covariance with the state, r the variances of
+    the rows, and H (ny, nx) is the Jacobian (or has no columns). On return the leading rows and columns of all but r
+    belong to the finite rows, made independent. `innovation` and `innovation_std` keep the order of the sensor's rows.
+    An S that consists of rounding errors of H P Hᵀ becomes NaN, so that the update fails.
 
     Returns:
-        The number of rows that are there.
+        The number of finite rows.
     """
     m = gather(context, sensor, y, reading, H, P, innovation, innovation_std)
     if has_correlated_rows(context, sensor):
-        # The factor of R is needed no more when that of S is found, and stands in its place.
+        # The factor of R shares memory with that of S, which is computed later.
         L = reading.chol_S
         independent_rows(context, sensor, y, reading.r, L, reading.d)
         make_independent(m, L, reading.nu, reading.S, reading.C, H)
@@ -136,10 +134,10 @@ def compare(context, sensor, y, reading, H, P, innovation, innovation_std):
 
 @inlined
 def gather(context, sensor, y, reading, H, P, innovation, innovation_std):
-    """Fill ν and d, and move what belongs to rows that are there to the front; how many there are."""
+    """Fill ν and d, move the entries of finite rows to the front, and return the number of finite rows."""
     nu, S, C = reading.nu, reading.S, reading.C
     circular = circular_rows(context, sensor)
-    m = np.int64(0)  # a literal would compile all that takes it twice
+    m = np.int64(0)  # a literal would be a second type, and compile every callee twice
     for i in range(reading.r.size):
         if not np.isfinite(y[i]):
             continue
@@ -159,7 +157,7 @@ def gather(context, sensor, y, reading, H, P, innovation, innovation_std):
         nu[m] = residual
         reading.d[m] = reading.r[i]
         if m < i:
-            # Row i moves up: what it overwrites has been read.
+            # Row i moves up over a row that has been read.
             column = 0
             for j in range(i):
                 if np.isfinite(y[j]):
@@ -177,7 +175,7 @@ def gather(context, sensor, y, reading, H, P, innovation, innovation_std):
 
 @part
 def make_independent(m, L, nu, S, C, H):
-    """ν ← L⁻¹ ν, S ← L⁻¹ S L⁻ᵀ, C ← C L⁻ᵀ, H ← L⁻¹ H, in their leading m rows of a reading: see compiled/noise.py."""
+    """ν ← L⁻¹ ν, S ← L⁻¹ S L⁻ᵀ, C ← C L⁻ᵀ, H ← L⁻¹ H in the leading m rows: see compiled/noise.py."""
     solve_unit(L, m, nu)
     for i in range(m):
         solve_unit(L, m, S[i])
@@ -193,10 +191,10 @@ def make_independent(m, L, nu, S, C, H):
 
 @inlined
 def factor(S, U, m, n):
-    """The Cholesky factor U of S (m, m); False if S is not positive definite, or only rounding makes it so.
+    """Factor S (m, m) = Uᵀ U; return False if S is not positive definite beyond rounding.
 
-    Forming S from n states leaves errors of a few n ε S_kk in each pivot: a pivot that small says nothing, and a gain
-    from it would be wrong without a sign. The square-root filters do not form S.
+    Forming S from n states leaves errors of a few n ε S_kk in each pivot. A gain from a pivot that small would be wrong
+    without notice. The square-root filters do not form S.
     """
     if not cholesky(S, U, m):
         return False
@@ -208,7 +206,7 @@ def factor(S, U, m, n):
 
 @inlined
 def judge(context, sensor, m, nu, U, score):
-    """NIS, log-likelihood and verdict of an innovation with covariance Uᵀ U; nu (m,) becomes U⁻ᵀ nu.
+    """Return the verdict on an innovation with covariance Uᵀ U, and score it; nu (m,) becomes U⁻ᵀ nu.
 
     NIS = νᵀ S⁻¹ ν. Source: Bar-Shalom, Li & Kirubarajan, Estimation with Applications to Tracking and Navigation
     (2001), 5.4.2.
@@ -225,7 +223,7 @@ def judge(context, sensor, m, nu, U, score):
 
 @inlined
 def admit(context, sensor, m, nu, S, U, score):
-    """Judge an innovation nu (m,) of covariance S: the verdict. U gets the factor of S, nu becomes U⁻ᵀ ν."""
+    """Return the verdict on an innovation nu (m,) of covariance S; U gets the factor of S, nu becomes U⁻ᵀ ν."""
     if m == 0:
         return MISSING
     score[1] = m
@@ -236,7 +234,7 @@ def admit(context, sensor, m, nu, S, U, score):
 
 @embedded
 def admit_weighted(context, sensor, m, reading, score):
-    """Judge the innovation of a reading, and weight the noise of one that is used: the verdict."""
+    """Return the verdict on the innovation of a measurement; weight the noise of one that is used."""
     verdict = admit(context, sensor, m, reading.nu, reading.S, reading.chol_S, score)
     if verdict == USED and is_robust(context):
         w = reweigh(context, m, reading.nu, reading.raw, reading.d, reading.S, reading.chol_S, reading.V, reading.z)

@@ -1,8 +1,8 @@
-"""What the square-root filters share: a mean and a factor of P as state, and conditioning by one triangularisation.
+"""Shared parts of the square-root filters: mean and a factor of P as state, conditioning by one triangularisation.
 
-The state is x (nx,) followed by upper U (nx, nx) with P = Uᵀ U. P and S are never formed, so a spread of 1e-9 beside
-one of 1 keeps half its digits, where P itself would hold none of 1e-18 beside 1. After U stands what an adaptation
-remembers, as in shared.py.
+The state is x (nx,) followed by upper U (nx, nx) with P = Uᵀ U, and the memory of an adaptation as in shared.py. P and
+S are never formed, so a standard deviation of 1e-9 beside one of 1 keeps half its digits, where P would lose 1e-18
+beside 1.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from .shared import judge, moments_of, move_to, wrap_mean
 
 
 def moments(options: Options, state: np.ndarray, nx: int) -> tuple[np.ndarray, np.ndarray]:
-    """Mean (nx,) and covariance (nx, nx) of a state."""
+    """Return mean (nx,) and covariance (nx, nx) of a state."""
     U = state[nx : nx + nx * nx].reshape(nx, nx)
     return state[:nx].copy(), U.T @ U
 
@@ -46,7 +46,7 @@ Conditioning, conditioning = declare_layout(
 
 @by_address
 def start(context, mean, cov, state):
-    """The state that stands for N(mean, cov); NaN if cov is indefinite."""
+    """Set the state to N(mean, cov); to NaN if cov is indefinite."""
     n = mean.size
     x, U = moments_of(state, n)
     good = root(cov, U, n)
@@ -59,7 +59,7 @@ def start(context, mean, cov, state):
 
 @by_address
 def describe(context, state, mean, std, cross):
-    """Mean, standard deviation and the configured covariances."""
+    """Fill mean, standard deviation and the configured covariances."""
     x, U = moments_of(state, context.nx)
     shown = shown_states(context)
     for k in range(mean.size):
@@ -144,7 +144,7 @@ def triangularise_joint(d, m, Y, U, lost, A, w, v):
         whole = 0.0
         for i in range(j + 1):
             whole += A[i, j] * A[i, j]
-        # Triangularising leaves errors of a few n ε of the column's length: a diagonal entry that small says nothing.
+        # Triangularising leaves errors of a few n ε of the column's length: a diagonal entry that small is no result.
         if not (A[j, j] > 4.0 * (n + m) * EPSILON * np.sqrt(whole) and whole < np.inf):
             return False
     return True
@@ -152,9 +152,9 @@ def triangularise_joint(d, m, Y, U, lost, A, w, v):
 
 @inlined
 def gather(context, sensor, y, own, expected, Y, lost, innovation):
-    """Fill the innovation ν, in place of ŷ, and d; move what belongs to rows that are there to the front; how many."""
+    """Fill ν, in place of ŷ, and d; move the entries of finite rows to the front, and return their number."""
     circular = circular_rows(context, sensor)
-    m = np.int64(0)  # a literal would compile all that takes it twice
+    m = np.int64(0)  # a literal would be a second type, and compile every callee twice
     for i in range(expected.size):
         if np.isfinite(y[i]):
             residual = y[i] - expected[i]
@@ -193,9 +193,9 @@ def dependent_variance(A, L, k):
 
 @embedded
 def condition(context, sensor, y, state, expected, Y, lost, own, innovation, innovation_std, score):
-    """Condition on a reading whose prediction is `expected` (ny,), and return the verdict.
+    """Condition on a measurement whose prediction is `expected` (ny,), and return the verdict.
 
-    Y (k, ny) and lost are those of `triangularise_joint`, for all rows of the reading; they and `expected` are lost.
+    Y (k, ny) and lost are those of `triangularise_joint`, for all rows; they and `expected` are overwritten.
 
     Source: the array algorithm of Kailath, Sayed & Hassibi, Linear Estimation (2000), chapter 12; for sigma points,
     whose (D₊ - D₋) take the place of U Hᵀ, Arasaratnam, Haykin & Hurd (2010), doi:10.1109/TSP.2010.2056923.
@@ -256,9 +256,9 @@ def take_over(m, nu, A, x, U):
 
 @part
 def reweigh_joint(context, m, nu, own, Y, U, lost, A):
-    """Weight the reading's noise and triangularise again; A and the whitened nu then belong to the weighted noise.
+    """Weight the measurement's noise and triangularise again, for A and the whitened nu of the weighted noise.
 
-    The weight alone is found from S itself.
+    Only the weight is computed from S itself.
     """
     S = own.S
     for i in range(m):

@@ -41,7 +41,7 @@ Updating, updating = declare_layout(
 
 
 def work_size(options: Options, nx: int, ny: int) -> int:
-    """Scratch of a prediction or an update."""
+    """Return the scratch of a prediction or an update."""
     return max(size_of(predicting, nx), size_of(updating, nx, ny))
 
 
@@ -103,7 +103,7 @@ SR_EKF = Estimator(
     family="Gaussian",
     assumes="differentiable f and h, nearly straight within the spread of the estimate; any conditioning",
     model_runs="1 and its derivatives (nx by complex step)",
-    fails_when="curvature makes it overconfident: it stops listening to the sensors",
+    fails_when="curvature makes it overconfident, so that it neglects the sensors",
     source="Kailath, Sayed & Hassibi (2000), Linear Estimation, chapter 12",
     functions=(start, predict, update, describe),
     runs=lambda options, nx: nx + 1,

@@ -15,7 +15,7 @@ from .sr_ekf import advance, predicting
 
 
 def work_size(options: Options, nx: int, ny: int) -> int:
-    """Scratch: the square-root EKF's, and what stays from step to step."""
+    """Return the scratch: the square-root EKF's, and the numbers kept from step to step."""
     return sr_ekf.work_size(options, nx, ny) + size_of(kept, nx)
 
 

@@ -1,7 +1,7 @@
-"""The square-root unscented Kalman filter: sigma points from a factor of P that is never multiplied out.
+"""The square-root unscented Kalman filter: sigma points from a factor of P, which is never formed.
 
-Sigma points and weights as in ukf.py. A negative central weight takes a square off the others: that is a
-rank-one downdate, which fails visibly where nothing positive definite is left.
+Sigma points and weights are those of ukf.py. A negative central weight is a rank-one downdate, which fails with NaN
+if the result is not positive definite.
 
 Source: van der Merwe & Wan (2001), doi:10.1109/ICASSP.2001.940586. Their m downdates by the columns of K S^½, which
 break where P⁺ is nearly singular, are replaced by one triangularisation of reading and state together.
@@ -25,7 +25,7 @@ from .ukf import UKF, deviations, tune, weights, weights_of
 
 
 def points(values: Options, state: np.ndarray, nx: int) -> np.ndarray:
-    """The sigma points (2 nx + 1, nx) of a state."""
+    """Return the sigma points (2 nx + 1, nx) of a state."""
     U = state[nx : nx + nx * nx].reshape(nx, nx)
     spread = weights(values["alpha"], values["beta"], values["kappa"], nx).spread
     return np.vstack((state[:nx], state[:nx] + spread * U, state[:nx] - spread * U))
@@ -59,13 +59,13 @@ Updating, updating = declare_layout(
 
 
 def work_size(options: Options, nx: int, ny: int) -> int:
-    """Scratch of a prediction or an update."""
+    """Return the scratch of a prediction or an update."""
     return max(size_of(predicting, nx), size_of(updating, nx, ny))
 
 
 @inlined
 def weigh_central(central, a, deviation, lost, row):
-    """The row of the central point, a √|w| D₀: in `row` if its weight w is positive, otherwise to be taken off."""
+    """Fill `lost` with the central point's row a √|w| D₀, and `row` too if its weight w is positive."""
     w = a * np.sqrt(abs(central))
     for j in range(lost.size):
         lost[j] = w * deviation[j]
@@ -76,8 +76,8 @@ def weigh_central(central, a, deviation, lost, row):
 def predict(context, u, dt, index, state, work):
     """x ← mean of the propagated sigma points;  U ← triangle of their weighted deviations over Q^½.
 
-    Where a negative central weight leaves nothing positive definite, the state becomes NaN and the twin reports
-    divergence. Source: van der Merwe & Wan (2001), the time update.
+    If a negative central weight leaves a matrix that is not positive definite, the state becomes NaN and the twin
+    reports divergence. Source: van der Merwe & Wan (2001), the time update.
     """
     n = context.nx
     x, U = moments_of(state, n)

@@ -41,12 +41,12 @@ from .shared import (
 
 
 def tune(values: Options, model: StateSpaceModel, tuning: Tuning) -> np.ndarray:
-    """The shared options, and the weights."""
+    """Return the shared options, and the weights."""
     return np.array([*shared_options(values), *weights(values["alpha"], values["beta"], values["kappa"], model.nx)])
 
 
 def refuses(model: StateSpaceModel, values: Options) -> str | None:
-    """nx + kappa is what the spread is the root of; kappa = 3 - nx, of Julier & Uhlmann, leaves 3 of it."""
+    """Return why kappa is invalid: the spread is the root of a multiple of nx + kappa, which must be positive."""
     kappa = values["kappa"]
     if model.nx + kappa > 0.0:
         return None
@@ -57,7 +57,7 @@ def refuses(model: StateSpaceModel, values: Options) -> str | None:
 
 
 def points(values: Options, state: np.ndarray, nx: int) -> np.ndarray:
-    """The sigma points (2 nx + 1, nx) of a state."""
+    """Return the sigma points (2 nx + 1, nx) of a state."""
     spread = weights(values["alpha"], values["beta"], values["kappa"], nx).spread
     return sigma_points(*moments(values, state, nx), spread)
 
@@ -89,7 +89,7 @@ Updating, updating = declare_layout(
 
 
 def work_size(options: Options, nx: int, ny: int) -> int:
-    """Scratch of a prediction or an update."""
+    """Return the scratch of a prediction or an update."""
     return max(size_of(predicting, nx), size_of(updating, nx, ny))
 
 
@@ -97,7 +97,7 @@ def work_size(options: Options, nx: int, ny: int) -> int:
 def predict(context, u, dt, index, state, work):
     """x, P ← mean and covariance of the propagated sigma points, plus Q.
 
-    Fails when P loses positive definiteness; the state then becomes NaN and the twin reports divergence.
+    Fails if P loses positive definiteness: the state becomes NaN, and the twin reports divergence.
     Source: Julier & Uhlmann (2004), doi:10.1109/JPROC.2003.823141.
     """
     n = context.nx
@@ -118,11 +118,11 @@ def predict(context, u, dt, index, state, work):
 
 @jit
 def only_rounding(U, P, across, S, r, w, y):
-    """Whether a reading rests on directions of P that its factor U shows by rounding alone.
+    """Return whether an update depends on directions of P that are rounding errors of its factor U.
 
-    A pivot of a few n ε of P_kk is what subtracting left; its sigma points are then anywhere. That does no harm unless
-    they make more than a hundredth of what the reading is weighed against, S (ny, ny) and r: then no gain is known.
-    across (nx, ny): the differences between opposite points' readings.
+    A pivot of a few n ε of P_kk is a rounding error, and its sigma points are arbitrary. The update fails if they make
+    up more than a hundredth of the innovation's variance, from S (ny, ny) and r. across (nx, ny): the differences
+    between predicted measurements of opposite points.
     """
     n = P.shape[0]
     for k in range(n):
@@ -147,7 +147,7 @@ def subtract_opposite(D, m, across):
 def update(context, u, sensor, y, index, state, work, innovation, innovation_std, score):
     """x ← x + C S⁻¹ ν;  P ← P - C S⁻¹ Cᵀ, with C and S from fresh sigma points through h.
 
-    Source: Julier & Uhlmann (2004), as above; sigma points are drawn again from the prediction, so that they carry Q.
+    Source: Julier & Uhlmann (2004), as above; sigma points are drawn again from the prediction, so that they include Q.
     """
     x, P = moments_of(state, context.nx)
     own = updating(start_of(work), context.nx, row_count(context, sensor))
@@ -193,7 +193,7 @@ UKF = Estimator(
     points=points,
     options=(
         Option("alpha", 1.0, 1e-4, 2.0, "", "spread of the sigma points"),
-        Option("beta", 2.0, 0.0, 10.0, "", "knowledge of the distribution; 2 is best for a Gaussian"),
+        Option("beta", 2.0, 0.0, 10.0, "", "prior knowledge of the distribution; 2 is optimal for a Gaussian"),
         Option("kappa", 0.0, -1024.0, 1e4, "", "second spread; nx + kappa must be positive; 3 - nx fits a Gaussian"),
         *OPTIONS,
     ),

@@ -1,4 +1,4 @@
-"""Where machine code is kept. Without Numba, whose import takes long: to know that nothing is there needs none."""
+"""The folder of the compile cache. Does not import Numba, which takes long, so that an empty cache is found quickly."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ from importlib.metadata import version
 from pathlib import Path
 
 CONSTANTS = ("errors.py", "batch.py", "state_space.py", "detectors.py")
-"""Files from which compiled code takes constants, and nothing else."""
+"""Files from which compiled code takes only constants."""
 
 PROSE_CHARACTERS = 24
 """Strings of these files from which on are prose, an edit of which compiles nothing anew."""
 
 
 def cache_folder() -> Path:
-    """Where machine code is kept: per user, and apart for each version of the sources.
+    """Return the folder of machine code: per user, and separate for each version of the sources.
 
-    Numba looks only at the file of the function it compiles, not at those that the function calls, or takes a constant
-    from; so the sources of the package that have to do with compiling are part of the path, and an edit to any of them
-    compiles all anew. The models that ship are left out: each is compiled by itself.
+    Numba checks only the file of the function that it compiles, not the files of its callees and constants. A digest of
+    all sources of compiled code is therefore part of the path, so that an edit to any of them compiles everything anew.
+    Bundled models are excluded, as each is compiled by itself.
     """
     base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     digest = hashlib.sha256(version("numba").encode())

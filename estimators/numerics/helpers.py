@@ -1,7 +1,7 @@
-"""A model's function with the plain Python functions that it calls compiled too.
+"""Compilation of the plain Python functions that a model's function calls.
 
-Numba compiles what it is given, and what that calls only if it has been compiled before. A function is therefore built
-again from the same code, with compiled functions in place of the plain ones that its globals and its closure hold.
+Numba compiles a function, but calls only functions that are compiled already. A function is therefore built again from
+the same code, with compiled functions in place of the plain ones in its globals and closure.
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ from typing import Any
 from .jit import jit
 
 LIBRARIES = ("numpy", "scipy", "numba", "math", "cmath")
-"""Packages whose functions Numba knows by itself, or not at all."""
+"""Packages whose functions Numba supports itself, or not at all."""
 
 
 def with_helpers(function: Callable) -> Callable:
-    """The function itself if it calls no plain ones, else one that calls them compiled.
+    """Return the function if it calls no plain ones, else a copy that calls them compiled.
 
-    Numba keeps machine code under a function's file, line and name, and does not look into other files: so the sources
-    of what it calls are part of the new name.
+    Numba caches machine code by a function's file, line and name, and ignores other files. A digest of the callees'
+    sources is therefore part of the new name.
     """
     return _with_helpers(function, {})
 
@@ -51,7 +51,7 @@ def _with_helpers(function: Any, known: dict[Any, Any]) -> Any:
 
 def _compiled(helper: Any, known: dict[Any, Any]) -> Any:
     if helper not in known:
-        # First itself as it is: one that is reached again through its own helpers must not be followed for ever.
+        # Registered first, so that a function that calls itself through its helpers does not recurse forever.
         known[helper] = helper
         known[helper] = jit(_with_helpers(helper, known))
     return known[helper]
@@ -62,7 +62,7 @@ def _plain(item: Any) -> bool:
 
 
 def _names(code: CodeType) -> Iterator[str]:
-    """Names that the code, and what is defined in it, looks up."""
+    """Yield the names that the code and its nested functions look up."""
     yield from code.co_names
     for item in code.co_consts:
         if isinstance(item, CodeType):
@@ -70,7 +70,7 @@ def _names(code: CodeType) -> Iterator[str]:
 
 
 def _digest(helpers: list[Any]) -> str:
-    """Of the sources of helpers and of all that they call."""
+    """Return a digest of the sources of helpers and all their callees."""
     digest = hashlib.sha256()
     seen: list[Any] = []
     while helpers:

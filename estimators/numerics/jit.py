@@ -47,22 +47,22 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 jit = partial(njit, cache=True, nogil=True, error_model="numpy", no_cfunc_wrapper=True)
 """Numba's njit as used here: cached, without the GIL, and with IEEE division (zero divisors give inf, no error).
 
-Numba would compile two wrappers around each function: that for C, which nobody here calls, is left out.
+Of the two wrappers that Numba compiles around each function, the one for C is left out, as nothing calls it.
 """
 
 jit_brief = partial(njit, cache=True, error_model="numpy", no_cfunc_wrapper=True)
-"""The same with the GIL, for calls of microseconds that run none of a model's functions: giving the GIL up would mean
-to wait for it again, after other threads."""
+"""`jit` with the GIL, for calls of microseconds that run no model function: after releasing the GIL, a thread waits for
+it behind others."""
 
 by_address = partial(jit, no_cpython_wrapper=True)
-"""The same for what is called through its address alone: to call it from Python would end the program.
+"""`jit` for functions that are called only through their address: a call from Python would end the program.
 
-Not for a function that is also compiled by `jit`: the cache does not tell the two apart.
+Not for a function that is also compiled by `jit`, as the cache does not distinguish the two.
 """
 
 part: Callable[[Callable[..., Any]], Any] = register_jitable(cache=True, nogil=True, error_model="numpy")
-"""The same for what only compiled functions call. A wrapper for Python would take a third of the time of compiling;
-from Python it is the function as it is written, in Python."""
+"""`jit` for functions that only compiled functions call, without the wrapper for Python, which takes a third of the
+compile time. Called from Python, the function runs as plain Python."""
 
 embedded: Callable[[Callable[..., Any]], Any] = register_jitable(
     cache=True, nogil=True, error_model="numpy", forceinline=True
@@ -76,7 +76,7 @@ inlined = partial(jit, inline="always")
 
 
 def plain(function: Any) -> Callable[..., Any]:
-    """The Python function inside a compiled one; any other function as it is."""
+    """Return the Python function of a compiled one; any other function unchanged."""
     return getattr(function, "py_func", function)  # type: ignore[no-any-return]
 
 
@@ -92,7 +92,7 @@ def address(dispatcher: Any, signature: Any) -> int:
 
 
 def caller(signature: Any) -> Any:
-    """A function for compiled code, `call(address, *args)`, which calls the function of `signature` at `address`."""
+    """Return a function for compiled code, `call(address, *args)`, which calls the function at `address`."""
     args, result = signature.args, signature.return_type
 
     @intrinsic
@@ -112,7 +112,7 @@ def caller(signature: Any) -> Any:
 
 
 def _pointer_to(element: Any) -> Any:
-    """A function for compiled code that reads an integer as a pointer to `element`s."""
+    """Return a function for compiled code that reads an integer as a pointer to `element`s."""
 
     @intrinsic
     def pointer(typing_context: Any, target: Any) -> Any:
@@ -133,61 +133,61 @@ _to_complex = _pointer_to(types.complex128)
 
 @part
 def floats(target, n):
-    """The n float64s at an address, as an array that is not reference-counted (counting costs more than the filter)."""
+    """Return the n float64s at an address as an array without reference counts, which cost more than the filter."""
     return carray(_to_float(target), (n,))
 
 
 @part
 def ints(target, n):
-    """The n int64s at an address."""
+    """Return the n int64s at an address."""
     return carray(_to_int(target), (n,))
 
 
 @part
 def flags(target, n):
-    """The n int8s at an address."""
+    """Return the n int8s at an address."""
     return carray(_to_byte(target), (n,))
 
 
 @part
 def flag_rows(target, rows, columns):
-    """The (rows, columns) int8s at an address."""
+    """Return the (rows, columns) int8s at an address."""
     return carray(_to_byte(target), (rows, columns))
 
 
 @part
 def counts(target, n):
-    """The n int32s at an address."""
+    """Return the n int32s at an address."""
     return carray(_to_mask(target), (n,))
 
 
 @part
 def masks(target, rows, columns):
-    """The (rows, columns) int32s at an address."""
+    """Return the (rows, columns) int32s at an address."""
     return carray(_to_mask(target), (rows, columns))
 
 
 @part
 def matrix(vector, start, rows, columns):
-    """A matrix that lives in `vector` from `start` on (NumPy's reshape costs 50 ns here, this nothing)."""
+    """Return a view of `vector` from `start` on as a matrix (NumPy's reshape costs 50 ns here)."""
     return carray(_to_float(vector.ctypes.data + 8 * start), (rows, columns))
 
 
 @part
 def complexes(scratch, start, n):
-    """n complex numbers that live in the float64s of `scratch` from `start` on."""
+    """Return a view of the float64s of `scratch` from `start` on as n complex numbers."""
     return carray(_to_complex(scratch.ctypes.data + 8 * start), (n,))
 
 
 @part
 def borrowed(vector):
-    """The same float64s, not reference-counted."""
+    """Return a view of the float64s without reference counts."""
     return floats(vector.ctypes.data, vector.size)
 
 
 @part
 def borrowed_rows(matrix):
-    """The same matrix of float64s, not reference-counted."""
+    """Return a view of the matrix without reference counts."""
     return carray(_to_float(matrix.ctypes.data), matrix.shape)
 
 

@@ -184,7 +184,7 @@ def linear(f, h=itself, *, inputs=()):
         (PENDULUM, "pendulum is not linear"),
         (random_linear(np.random.default_rng(0), 2, 0).model, "linear has 3 sensors.*no one steady state"),
         (linear(geared, inputs=(Input("gear", "1"),)), "geared varies with its inputs"),
-        (linear(drift, second), "drift is not detectable: y does not see place, which does not decay"),
+        (linear(drift, second), "drift is not detectable: y does not observe place, which does not decay"),
     ],
 )
 def test_it_refuses_with_the_reason(model, reason):
