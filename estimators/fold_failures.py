@@ -9,7 +9,7 @@ import numpy as np
 from .diagnostics.failure_cause import Estimate, around, cause, failures, questions
 from .fold import Fold
 from .fold_machine import variances_of
-from .interpreted.fold_loop import LONGEST, UNSET
+from .interpreted.fold_loop import MAX_PREDICT_STEPS, UNSET
 from .log import INPUT, READING
 
 
@@ -32,7 +32,7 @@ def cause_of(fold: Fold, row: int) -> str | None:
         given = log.value[k, : u.size]
         np.copyto(u, given, where=np.isfinite(given))
     dt = (int(log.t[row]) - then) * 1e-9 if then != UNSET else 0.0
-    if dt > LONGEST * model.max_step:
+    if dt > MAX_PREDICT_STEPS * model.max_step:
         mean, cov = fold.prior
         x, std, dt = mean.copy(), np.sqrt(variances_of(cov)), 0.0
     sensor = int(log.channel[row]) if log.kind[row] == READING else None

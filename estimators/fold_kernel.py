@@ -15,7 +15,7 @@ from .diagnostics.health import NORMALS, assess, bounds_type, policy_type
 from .estimator import call_describe, call_predict, call_start, call_update, code_type
 from .gate.rejection_runs import forget, note, rule_type
 from .gate.soften import soften
-from .interpreted.fold_loop import LONGEST, UNSET
+from .interpreted.fold_loop import MAX_PREDICT_STEPS, UNSET
 from .log import INPUT, MARK, READING, RESET, TICK, TRUTH
 from .numerics.jit import B1, F1, F2, I1, borrowed, borrowed_rows, floats, i64, inlined, jit, part
 from .plausibility import pass_on, screen_reading, screen_signature
@@ -26,12 +26,12 @@ from .track import ANCESTORS, EFFECTIVE, GATED, MISSING, NONE, SCREENED, USED, W
 def advance_to(code, context, u, clock, t, index, state, work):
     """Predict from the clock to time t, in steps of at most `max_step`.
 
-    After a time of more than `LONGEST` steps the state is reset to the prior.
+    After a time of more than `MAX_PREDICT_STEPS` steps the state is reset to the prior.
     """
     if clock == UNSET or t <= clock:
         return
     dt = (t - clock) * 1e-9
-    if dt > LONGEST * context.max_step:
+    if dt > MAX_PREDICT_STEPS * context.max_step:
         prior_mean, prior_cov = prior(context)
         call_start(code.start, context, prior_mean, prior_cov, state)
         return

@@ -14,8 +14,8 @@ from ..compiled.verdict import verdict_of
 from ..estimator import Options
 from ..numerics.jit import by_address, embedded, inlined, ints, part
 from ..numerics.linalg import EPSILON, cholesky, mirror, solve_transposed, solve_unit, solve_upper, wrap
-from ..numerics.padded_rows import subtract_squares
 from ..numerics.simd_ir import padded
+from ..numerics.simd_rows import subtract_squares
 from ..numerics.workspace import declare_layout, start_of, take_matrix, take_vector
 from ..track import FAILED, MISSING, USED, WHITENED
 from .robust import forget, is_robust, reweigh

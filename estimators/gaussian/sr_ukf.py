@@ -15,8 +15,8 @@ from ..compiled.context import circular_rows, circular_states, expect_points, ro
 from ..estimator import Estimator, Options
 from ..numerics.jit import by_address, inlined
 from ..numerics.linalg import remove, triangularise
-from ..numerics.padded_rows import spread_points
 from ..numerics.simd_ir import padded
+from ..numerics.simd_rows import spread_points
 from ..numerics.workspace import declare_layout, size_of, start_of
 from .robust import growth, memory
 from .shared import moments_of, state_size

@@ -18,8 +18,8 @@ from ..estimator import Estimator, Option, Options
 from ..model.state_space import StateSpaceModel
 from ..numerics.jit import by_address, inlined, jit
 from ..numerics.linalg import EPSILON, wrap
-from ..numerics.padded_rows import centre, covariance, cross_covariance, factor, spread_points
 from ..numerics.simd_ir import padded
+from ..numerics.simd_rows import centre, covariance, cross_covariance, factor, spread_points
 from ..numerics.workspace import declare_layout, size_of, start_of
 from ..track import FAILED, USED
 from ..tuning import Tuning

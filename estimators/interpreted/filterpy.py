@@ -1,9 +1,9 @@
 """FilterPy's filters behind one adapter: KF, EKF, UKF and EnKF as a second opinion, selectable like our own.
 
-FilterPy's objects do the algebra of a step. The flat state stays the truth: an object is given it before a step, and
-what the object made of it is taken over only where the reading is used; so snapshots, gate and held-out sensors work
-as with every filter. A reading's rows that are missing, sensors of several sizes and rates, offsets of a linear model
-and angles are the adapter's.
+FilterPy's objects do the algebra of a step. The flat state is authoritative: an object is set from it before a step,
+and its result is copied back only if the measurement is used, so that snapshots, gate and held-out sensors work as with
+every filter. The adapter handles missing rows, sensors of several sizes and rates, offsets of a linear model, and
+angles.
 
 Where FilterPy 2.0 must be handled with care:
 - `ExtendedKalmanFilter.predict_update` evaluates H before it predicts, so predict() and update() are called; its
@@ -11,7 +11,7 @@ Where FilterPy 2.0 must be handled with care:
 - `UnscentedKalmanFilter.update` takes the sigma points of the last predict(), which are stale for a second reading at
   one time: they are drawn anew from x and P.
 - `UnscentedKalmanFilter` takes sigma points from a P that is singular but for rounding and returns a wrong estimate
-  without a word: such a reading fails, as in our own (`only_rounding`).
+  without notice: such an update fails, as in our UKF (`only_rounding`).
 - `EnsembleKalmanFilter.update` leaves a P = P - K S Kᵀ that is not its members' covariance: the members' is reported.
   Its perturbations do not have mean zero over the members. It has one Q for all members, here that of their mean.
 - `EnsembleKalmanFilter` draws from NumPy's global generator: its methods run here with a generator of
@@ -42,20 +42,20 @@ PROCESS, START, PERTURB = range(3)
 
 @lru_cache(maxsize=1)
 def objects() -> Any:
-    """FilterPy's classes, imported when one is needed: with what they import of SciPy that takes as long as Numba."""
+    """Return FilterPy's classes, imported at first use: with their SciPy imports that takes as long as Numba."""
     from . import filterpy_objects
 
     return filterpy_objects
 
 
 def in_turn(block: np.ndarray) -> Callable[..., np.ndarray]:
-    """A function that hands out the rows of a block: FilterPy asks point by point, in order; the block ran at once."""
+    """Return a function that yields the rows of a block in order, as FilterPy evaluates point by point."""
     rows = iter(block)
     return lambda *_: next(rows)
 
 
 def moments_of(view: View, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Views of mean (nx,) and covariance (nx, nx) in a state."""
+    """Return views of mean (nx,) and covariance (nx, nx) in a state."""
     n = view.nx
     return state[:n], state[n:].reshape(n, n)
 
@@ -67,12 +67,12 @@ def keep(view: View, state: np.ndarray, x: np.ndarray, P: np.ndarray) -> None:
 
 
 def start(view: View, mean: np.ndarray, cov: np.ndarray, state: np.ndarray) -> None:
-    """The state that stands for N(mean, cov)."""
+    """Set the state to N(mean, cov)."""
     keep(view, state, mean, cov)
 
 
 def describe(view: View, state: np.ndarray, mean: np.ndarray, std: np.ndarray, cross: np.ndarray) -> None:
-    """Mean, standard deviation and the configured covariances."""
+    """Fill mean, standard deviation and the configured covariances."""
     x, P = moments_of(view, state)
     mean[:] = x[view.shown]
     std[:] = np.sqrt(np.diag(P)[view.shown])
@@ -91,7 +91,7 @@ def predict_kf(view: View, u: np.ndarray, dt: float, index: int, state: np.ndarr
 
 
 def update_kf(view: View, u: np.ndarray, sensor: int, y: np.ndarray, *rest: Any) -> int:
-    """Condition on a reading z = y - h(x) + H x, which takes inputs and offsets out of it, and turns of angles."""
+    """Condition on z = y - h(x) + H x, which removes inputs, offsets and turns of angles."""
 
     def step(x: np.ndarray, P: np.ndarray, rows: np.ndarray, R: np.ndarray) -> Any:
         filter_ = objects().KalmanFilter(dim_x=view.nx, dim_z=rows.size)
@@ -116,7 +116,7 @@ def predict_ekf(view: View, u: np.ndarray, dt: float, index: int, state: np.ndar
 
 
 def update_ekf(view: View, u: np.ndarray, sensor: int, y: np.ndarray, *rest: Any) -> int:
-    """Condition on a reading, linearised at the prediction."""
+    """Condition on a measurement, linearised at the prediction."""
 
     def step(x: np.ndarray, P: np.ndarray, rows: np.ndarray, R: np.ndarray) -> Any:
         filter_ = objects().Extended(dim_x=view.nx, dim_z=rows.size)
@@ -135,7 +135,7 @@ def update_ekf(view: View, u: np.ndarray, sensor: int, y: np.ndarray, *rest: Any
 
 
 def _mean_of(angles: np.ndarray) -> Callable[..., np.ndarray] | None:
-    """The weighted mean of points some of whose columns are angles, added up from the central point."""
+    """Return a weighted mean of points with angles, summed relative to the central point."""
     if not np.any(angles):
         return None
     return lambda points, weights: points[0] + weights @ wrapped(points - points[0], angles)
@@ -177,7 +177,7 @@ def predict_ukf(view: View, u: np.ndarray, dt: float, index: int, state: np.ndar
 
 
 def update_ukf(view: View, u: np.ndarray, sensor: int, y: np.ndarray, *rest: Any) -> int:
-    """Condition on a reading, with sigma points drawn anew from the prediction."""
+    """Condition on a measurement, with sigma points drawn again from the prediction."""
 
     def step(x: np.ndarray, P: np.ndarray, rows: np.ndarray, R: np.ndarray) -> Any:
         filter_ = _unscented(view, view.circular_rows(sensor)[rows])
@@ -207,7 +207,7 @@ def _update(
     innovation_std: np.ndarray,
     score: np.ndarray,
 ) -> int:
-    """Let FilterPy update a copy by the rows that came; judge its innovation; take the copy over if it is used."""
+    """Update a copy with FilterPy by the finite rows, judge its innovation, and keep the copy if it is used."""
     R = view.covariance(sensor)
     rows = np.flatnonzero(np.isfinite(y[: len(R)]))
     if not rows.size:
@@ -291,7 +291,7 @@ def update_enkf(
     X, filter_ = _members(view, state), _enkf(view)
     angles = view.circular_rows(sensor)[rows]
     expected = view.h(sensor, X, u)[:, rows]
-    # FilterPy subtracts plainly: angles are told within half a turn of one another, and so is the reading.
+    # FilterPy does not wrap differences, so angles are given within half a turn of one another.
     expected = expected[0] + wrapped(expected - expected[0], angles)
     centre = expected.mean(axis=0)
     nu = wrapped(y[rows] - centre, angles)

@@ -1,7 +1,7 @@
-"""The fold's loop in Python, for filters that are not compiled: the same events, rows and order as the kernel's.
+"""The fold's loop in Python, for filters that are not compiled: the same events, rows and order as fold_kernel.py.
 
-What the kernel gets as addresses this loop gets as Python functions, and its context is a `View`; see estimator.py for
-the four functions. Everything else, snapshots and rewinds too, is the Fold's and knows no difference.
+The filter is four Python functions instead of addresses (see estimator.py), and the context is a `View`. Snapshots and
+rewinds are those of `Fold`.
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ from ..track import (
 )
 
 UNSET = int(np.iinfo(np.int64).min)
-"""The clock before the first event, which sets it: the prior holds at that time."""
+"""Clock before the first event. The first event sets it, as the prior holds at that time."""
 
-LONGEST = 10_000
-"""Steps of the model's `max_step` that are predicted in one go; a clock that jumps must not keep the fold busy."""
+MAX_PREDICT_STEPS = 10_000
+"""Largest number of prediction steps between two events, so that a jump of the clock does not stall the fold."""
 
 
 def begin(code: Any, context: Any, mean: np.ndarray, cov: np.ndarray, state: np.ndarray) -> None:
-    """The state that stands for N(mean, cov)."""
+    """Set the state to N(mean, cov)."""
     with np.errstate(all="ignore"):
         code.start(context, mean, cov, state)
 
@@ -48,11 +48,11 @@ def begin(code: Any, context: Any, mean: np.ndarray, cov: np.ndarray, state: np.
 def _advance_to(
     code: Any, context: Any, u: np.ndarray, clock: np.ndarray, t: int, index: int, state: np.ndarray, work: np.ndarray
 ) -> None:
-    """Predict to time t; where the model fails, state and clock stay at the last step that it answered."""
+    """Predict to time t; if the model fails, state and clock stay at the last step that succeeded."""
     begun = int(clock[0])
     if begun != UNSET and t > begun:
         dt = (t - begun) * 1e-9
-        if dt > LONGEST * context.max_step:
+        if dt > MAX_PREDICT_STEPS * context.max_step:
             code.start(context, *context.prior(), state)
         else:
             steps = steps_of(dt, context.max_step)
@@ -84,11 +84,11 @@ def run(
     score: np.ndarray,
     track: Track,
 ) -> int:
-    """Fold events `start` to `end` as the kernel does; see `fold.run`.
+    """Fold events `start` to `end`; see `fold_kernel.run`.
 
-    Where a model's own Python fails, the view counts it and the fold goes on: a reading has failed, an estimate that
-    would need the answer is no number, and the state stays what and when it was, for the next event to go on from.
-    A filter asks the model before it changes its state, so that it never stands in between.
+    If the model's Python raises, the view counts it and the fold continues: the measurement has the verdict failed, an
+    estimate that needs the result is NaN, and state and clock are unchanged for the next event. Filters evaluate the
+    model before they change their state, so that the state is never half updated.
     """
     tuned = nullcontext()
     passed = np.empty(value.shape[1])
@@ -152,7 +152,7 @@ def run(
             else:
                 if clock[0] == UNSET:
                     clock[0] = now
-                # Several queries at one time are one: `spare` still holds its answer.
+                # Several queries at one time are one: `spare` still holds the answer.
                 if i == start or kind[i - 1] not in (TRUTH, TICK, MARK) or now != t[i - 1]:
                     spare[:] = state
                     try:
@@ -189,7 +189,7 @@ def _soften(
     innovation_std: np.ndarray,
     score: np.ndarray,
 ) -> int:
-    """As gate/soften.py does."""
+    """Update with inflated noise; see gate/soften.py."""
     w = inflation(context.context, sensor, y, innovation, score[0], int(score[1]))
     if not w < np.inf:
         return GATED
@@ -204,12 +204,12 @@ def _soften(
 
 
 def run_and_judge(judge: Any, seen: np.void, *given: Any) -> int:
-    """Fold events, and judge their rows as those of a compiled filter are.
+    """Fold events, and fill NIS windows, alarms and health of their rows; see `fold_kernel.run_and_judge`.
 
     Args:
-        judge: The compiled judgement.
-        seen: The context that `View` stands for.
-        given: As the kernel's.
+        judge: The compiled function of fold_kernel.py.
+        seen: The context that `View` wraps.
+        given: Further arguments of the kernel.
     """
     *folded, policy, bounds, evidence = given
     _, _, _, _, start, end, t, kind, channel, value, *_, track = folded

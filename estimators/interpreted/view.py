@@ -1,7 +1,6 @@
-"""What a filter in Python sees of a model and a tuning: functions of blocks of states, and numbers.
+"""The context of a filter in Python: functions of blocks of states, and numbers of model and tuning.
 
-The context (see compiled/context.py) says the same to a compiled filter; a view wraps it, so that both judge a reading
-by the same code.
+It wraps the context of compiled filters (compiled/context.py), so that both judge measurements by the same code.
 """
 
 from __future__ import annotations
@@ -25,13 +24,13 @@ from ..track import FAILED
 from ..tuning import Tuning
 
 _STEP = 6e-6
-"""Of a central difference, relative: about the cube root of the rounding error (see compiled/jacobians.py)."""
+"""Relative step of a central difference, about the cube root of the rounding error (see compiled/jacobians.py)."""
 
 
 class View:
-    """A model, a tuning and the options of a filter, for its Python functions.
+    """Model, tuning and options of a filter, for its Python functions.
 
-    Nothing in it changes but what filters keep in `kept`, and the count of the model's failures, with the last of them.
+    Only `kept`, the memory of filters, and the count and last of the model's failures change.
     """
 
     def __init__(
@@ -43,7 +42,7 @@ class View:
         pairs: np.ndarray,
         held: dict[str, Any],
     ) -> None:
-        """See a model; `held` are the arrays that the context points to."""
+        """Wrap a context; `held` are the arrays that it points to."""
         model = compiled.model
         self.model: StateSpaceModel = model
         self.compiled, self.context, self.options, self.pairs = compiled, context, options, pairs
@@ -64,26 +63,26 @@ class View:
         self.failure: ModelError | None = None
 
     def failed(self, error: ModelError) -> None:
-        """Note that the model's own Python failed."""
+        """Count a failure of the model's Python."""
         self.failures += 1
-        # Its frames hold the filter's arrays.
+        # The frames of its traceback hold the filter's arrays.
         self.failure = error.with_traceback(None)
 
     def prior(self) -> tuple[np.ndarray, np.ndarray]:
-        """Mean (nx,) and covariance (nx, nx) of the prior."""
+        """Return mean (nx,) and covariance (nx, nx) of the prior."""
         return self._prior
 
     def covariance(self, sensor: int) -> np.ndarray:
-        """R (ny, ny): the covariance of a sensor's rows."""
+        """Return R (ny, ny), the covariance of a sensor's rows."""
         return self._R[sensor]
 
     def variances(self, sensor: int) -> np.ndarray:
-        """r (ny,): the variances of a sensor's rows."""
+        """Return r (ny,), the variances of a sensor's rows."""
         return self._r[sensor]
 
     @contextmanager
     def brought(self, sensor: int, own: np.ndarray) -> Iterator[None]:
-        """While it lasts, R has the variances that a reading brought, own (ny or more,); NaN leaves the tuned one."""
+        """Context manager: replace R by a measurement's own variances (ny or more,); NaN leaves the tuned one."""
         r, tuned = self._r[sensor], (self._r[sensor].copy(), self._R[sensor])
         own = own[: len(tuned[1])]
         np.copyto(r[: own.size], own, where=np.isfinite(own))
@@ -94,19 +93,19 @@ class View:
             r[:], self._R[sensor] = tuned
 
     def circular_rows(self, sensor: int) -> np.ndarray:
-        """For each row of a sensor, whether it is an angle."""
+        """Return for each row of a sensor whether it is an angle."""
         return self._angles[sensor]
 
     def f(self, X: np.ndarray, u: np.ndarray, dt: float) -> np.ndarray:
-        """f of every state of a block X (N, nx), dt seconds on."""
+        """Return f of every state of a block X (N, nx) over dt seconds."""
         return self.compiled.f_block(X, u, self.p, dt)
 
     def h(self, sensor: int, X: np.ndarray, u: np.ndarray) -> np.ndarray:
-        """What a sensor is expected to say (N, ny) of every state of a block X (N, nx)."""
+        """Return the predicted measurements (N, ny) of a sensor for a block of states X (N, nx)."""
         return self.compiled.h_block(sensor, X, u, self.p)
 
     def F(self, x: np.ndarray, u: np.ndarray, dt: float) -> np.ndarray:
-        """df/dx (nx, nx) at a state; of a black box by central differences, all of them in one block."""
+        """Return df/dx (nx, nx) at a state; for a black box by central differences, evaluated in one block."""
         if self.model.black_box:
             return self._differences(lambda X: self.f(X, u, dt), x, self.circular)
         F = np.empty((self.nx, self.nx))
@@ -114,7 +113,7 @@ class View:
         return F
 
     def H(self, sensor: int, x: np.ndarray, u: np.ndarray) -> np.ndarray:
-        """dh/dx (ny, nx) of a sensor at a state."""
+        """Return dh/dx (ny, nx) of a sensor at a state."""
         if self.model.black_box:
             return self._differences(lambda X: self.h(sensor, X, u), x, self._angles[sensor])
         H = np.empty((self._r[sensor].size, self.nx))
@@ -129,7 +128,7 @@ class View:
         return (D / np.diag(above - below)[:, None]).T
 
     def Q(self, x: np.ndarray, u: np.ndarray, dt: float) -> np.ndarray:
-        """Covariance (nx, nx) of the noise that is added in dt seconds at a state."""
+        """Return the covariance (nx, nx) of the process noise over dt seconds at a state."""
         Q = np.zeros((self.nx, self.nx))
         self.compiled.Q(np.ascontiguousarray(x), u, self.p, self.q, dt, Q)
         return Q
@@ -144,11 +143,7 @@ class View:
         innovation_std: np.ndarray,
         score: np.ndarray,
     ) -> int:
-        """Judge the innovation nu (m,) of a reading's finite rows, of covariance S (m, m), as every filter does.
-
-        Returns:
-            The verdict.
-        """
+        """Return the verdict on the innovation nu (m,) of finite rows, of covariance S (m, m), as compiled filters do."""
         rows = np.isfinite(y[: self._r[sensor].size])
         innovation[: rows.size][rows] = nu
         innovation_std[: rows.size][rows] = np.sqrt(np.diag(S))
@@ -160,7 +155,7 @@ class View:
 
 
 def wrapped(difference: np.ndarray, circular: np.ndarray) -> np.ndarray:
-    """Differences (…, k) with those of angles brought to ±π."""
+    """Return differences (…, k) with those of angles wrapped to ±π."""
     if not np.any(circular):
         return difference
     turned: np.ndarray = np.where(circular, (difference + np.pi) % (2.0 * np.pi) - np.pi, difference)

@@ -1,4 +1,4 @@
-"""Building blocks for vector code: LLVM instructions on vectors of `LANES` numbers.
+"""Building blocks of vector code: LLVM instructions on vectors of `LANES` numbers, for simd.py and its like.
 
 The compiler splits them where the processor's vectors are shorter.
 """

@@ -1,6 +1,10 @@
-"""Small matrices whose rows are as wide as whole vectors: sigma points and what becomes of them, in simd_ir.
+"""Small matrices with rows padded to full vectors, for the unscented filters: factor, sigma points, covariances.
 
-All take addresses, as in simd.py. What stands behind a row's own numbers is never part of a result.
+Padding is never part of a result. The functions at the end take arrays; those in LLVM take addresses, as in simd.py.
+
+Measured on a shared x86-64 machine against plain Numba loops, for 2, 4, 7, 16 and 48 states: a covariance of sigma
+points takes 6 ns for 17, 16 for 99, 37 for 463, 310 for 2,640 and 8,000 for 65,000; a factor 11 ns for 16, 33 for 48,
+61 for 125, 300 for 700 and 3,900 for 10,900.
 """
 
 from __future__ import annotations
@@ -14,13 +18,14 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 
 from . import simd_ir
+from .jit import inlined
 from .simd_ir import LANES
 
 _i64, _f64 = types.int64, types.float64
 
 
 @intrinsic
-def centre(typing_context: Any, rows: Any, k: Any, width: Any, x: Any, w: Any, mean: Any) -> Any:
+def centre_at(typing_context: Any, rows: Any, k: Any, width: Any, x: Any, w: Any, mean: Any) -> Any:
     """Rows of k numbers, `width` apart (whole vectors), become deviations from mean = x₀ + w Σ_r (x_r - x₀).
 
     What stands behind the k numbers becomes zero: left alone, it would shrink from call to call to subnormal numbers,
@@ -127,7 +132,7 @@ def product(
 
 
 @intrinsic
-def subtract_squares(typing_context: Any, n: Any, rows: Any, w: Any, width: Any, p: Any) -> Any:
+def subtract_squares_at(typing_context: Any, n: Any, rows: Any, w: Any, width: Any, p: Any) -> Any:
     """P (n, n) -= Σ_k w_kᵀ w_k over rows w_k, `width` apart (whole vectors); what is symmetric stays so, bit by bit."""
 
     def codegen(context: Any, builder: Any, signature: Any, given: Any) -> Any:
@@ -228,3 +233,42 @@ def around(typing_context: Any, n: Any, x: Any, u: Any, apart: Any, spread: Any,
         return context.get_dummy_value()
 
     return types.void(_i64, _i64, _i64, _i64, _f64, _i64, _i64), codegen
+
+
+@inlined
+def factor(P, U):
+    """Upper U (n, padded n) with Uᵀ U = P (n, n); False if P is not positive definite."""
+    return factor_rows(P.shape[0], P.ctypes.data, U.ctypes.data, U.shape[1]) != 0
+
+
+@inlined
+def spread_points(x, U, spread, points):
+    """Fill `points` (2n+1, padded n) with x and x ± spread·U[k]."""
+    around(x.size, x.ctypes.data, U.ctypes.data, U.shape[1], spread, points.ctypes.data, points.shape[1])
+
+
+@inlined
+def centre(D, k, w, mean):
+    """Turn points D (2n+1, padded k) into deviations from mean = D₀ + w Σ (Dᵢ - D₀), (padded k,)."""
+    centre_at(D.shape[0], k, D.shape[1], D.ctypes.data, w, mean.ctypes.data)
+
+
+@inlined
+def covariance(D, first, w, P):
+    """P (k, k) = first D₀ᵀ D₀ + w Σ Dᵢᵀ Dᵢ, from deviations D (2n+1, padded k)."""
+    rows, width = D.shape
+    k = P.shape[0]
+    product(k, rows, D.ctypes.data, width, D.ctypes.data, width, first, w, P.ctypes.data, k)
+
+
+@inlined
+def cross_covariance(U, across, w, C):
+    """C (n, m) = w Σ U[k]ᵀ across[k], with differences `across` (n, padded m) between opposite points."""
+    n, m = C.shape
+    product(n, n, U.ctypes.data, U.shape[1], across.ctypes.data, across.shape[1], w, w, C.ctypes.data, m)
+
+
+@inlined
+def subtract_squares(W, m, P):
+    """P (n, n) -= Wᵀ W, of the leading m rows of W (m or more, padded n)."""
+    subtract_squares_at(P.shape[0], m, W.ctypes.data, W.shape[1], P.ctypes.data)

@@ -35,8 +35,8 @@ from ..gaussian.shared import moments_of
 from ..gaussian.ukf import deviations, weights_of
 from ..numerics.jit import address, floats, inlined, ints, jit
 from ..numerics.linalg import root
-from ..numerics.padded_rows import cross_covariance, factor, spread_points
 from ..numerics.simd_ir import padded
+from ..numerics.simd_rows import cross_covariance, factor, spread_points
 from ..numerics.workspace import declare_layout, layout, size_of, take_matrix, take_vector
 from .notes import CUT, STAYED, copy, cut, finite, join, solve_semidefinite, step_at, step_layout
 

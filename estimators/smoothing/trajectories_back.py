@@ -19,7 +19,7 @@ from ..compiled.context import add_process_noise, steps_of, transition_points
 from ..errors import EstimatorError
 from ..estimator import call_predict
 from ..fold import Fold
-from ..interpreted.fold_loop import LONGEST, UNSET
+from ..interpreted.fold_loop import MAX_PREDICT_STEPS, UNSET
 from ..log import INPUT, RESET
 from ..numerics.jit import jit
 from ..particle.cloud import weights_of
@@ -136,7 +136,7 @@ class TrajectoriesBack:
         dt, longest = (t - clock) * 1e-9, self._fold.model.max_step
         if dt <= 0.0:
             return at
-        if dt > LONGEST * longest:
+        if dt > MAX_PREDICT_STEPS * longest:
             return self._drawn(i, state)
         steps = steps_of(dt, longest)
         states = [state]

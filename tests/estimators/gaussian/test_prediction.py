@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from estimators.fold import Fold, fold
-from estimators.interpreted.fold_loop import LONGEST
+from estimators.interpreted.fold_loop import MAX_PREDICT_STEPS
 from estimators.log import INPUT, READING, RESET, TICK, TRUTH, Events, Log
 from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
 from estimators.models import MODELS
@@ -184,7 +184,7 @@ def test_after_a_clock_jump_the_estimate_is_the_prior():
     model = MODELS["motor_drive"]
     log = Log(model.width)
     log.extend(Events.one(0, 0, READING, 0, 90.0, model.width))
-    just, beyond = int(model.max_step * LONGEST * 1e9), int(model.max_step * LONGEST * 1e9) + 10**9
+    just, beyond = int(model.max_step * MAX_PREDICT_STEPS * 1e9), int(model.max_step * MAX_PREDICT_STEPS * 1e9) + 10**9
     log.extend(Events.one(just, 0, TICK, 0, [], model.width))
     log.extend(Events.one(beyond, 0, TICK, 0, [], model.width))
     log.extend(Events.one(1_700_000_000 * 10**9, 0, INPUT, 0, [0, 0, 0, 40, 25], model.width))

@@ -7,7 +7,7 @@ import pytest
 
 from estimators import registry
 from estimators.fold import Fold, fold
-from estimators.interpreted.fold_loop import LONGEST
+from estimators.interpreted.fold_loop import MAX_PREDICT_STEPS
 from estimators.log import TICK, Events, Log
 from estimators.tuning import Tuning
 from tests.estimators.linear_models import random_linear
@@ -30,7 +30,7 @@ def test_the_python_loop_gives_the_bits_of_the_kernel(name, monkeypatch):
 def test_long_gaps_are_split_and_end_at_the_prior_as_in_the_kernel(name, monkeypatch):
     monkeypatch.setitem(registry.ESTIMATORS, f"{name}-python", in_python(name))
     model = replace(MODEL, max_step=0.125)
-    times = np.cumsum([1, 0.3, 0.1251, 7.77, 0.125 * LONGEST + 1, 0.5]) * SECOND
+    times = np.cumsum([1, 0.3, 0.1251, 7.77, 0.125 * MAX_PREDICT_STEPS + 1, 0.5]) * SECOND
     readings = [Events.one(int(t), int(t), 0, 1, [0.3, -0.2], 3) for t in times]
     tick = Events.one(int(times[3]) + 1, 0, TICK, 0, (), 3)
     log = as_log(Events.concat([*readings, tick], 3))

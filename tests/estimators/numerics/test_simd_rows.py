@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 from numba import njit
 
-from estimators.numerics.padded_rows import covariance, cross_covariance, factor, spread_points
 from estimators.numerics.simd_ir import padded
-from estimators.numerics.simd_rows import subtract_squares
+from estimators.numerics.simd_rows import covariance, cross_covariance, factor, spread_points, subtract_squares
 
 ORDERS = (1, 2, 3, 4, 5, 7, 8, 9, 13, 16, 24)
 
@@ -40,7 +39,7 @@ def cross_covariance_of(U, across, w, C):
 
 @njit
 def without_squares(n, m, W, P):
-    subtract_squares(n, m, W.ctypes.data, W.shape[1], P.ctypes.data)
+    subtract_squares(W, m, P)
 
 
 @pytest.mark.parametrize("n", ORDERS)
