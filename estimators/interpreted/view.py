@@ -143,7 +143,7 @@ class View:
         innovation_std: np.ndarray,
         score: np.ndarray,
     ) -> int:
-        """Return the verdict on the innovation nu (m,) of finite rows, of covariance S (m, m), as compiled filters do."""
+        """Return the verdict on the innovation nu (m,) of the finite rows, of covariance S (m, m)."""
         rows = np.isfinite(y[: self._r[sensor].size])
         innovation[: rows.size][rows] = nu
         innovation_std[: rows.size][rows] = np.sqrt(np.diag(S))
