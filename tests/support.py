@@ -5,7 +5,10 @@ from typing import Any
 
 import numpy as np
 
+from estimators.fold import Fold
 from estimators.log import Events, Log
+from estimators.model.state_space import StateSpaceModel
+from estimators.tuning import Tuning
 
 SECOND = 1_000_000_000
 """Nanoseconds."""
@@ -25,6 +28,23 @@ def log_of(width: int, *rows: tuple[float, int, Any] | tuple[float, int, Any, in
         t = round(seconds * SECOND)
         batch.append(Events.one(t, t, kind, channel, value, width))
     return as_log(Events.concat(batch, width))
+
+
+def folded(
+    estimator: str,
+    model: StateSpaceModel,
+    log: Log,
+    tuning: Tuning | None = None,
+    *,
+    options: dict[str, Any] | None = None,
+    stop: int | None = None,
+    **given: Any,
+) -> Fold:
+    """A fold of a log, advanced over `stop` events, all by default; `given` are further arguments of `Fold`."""
+    tuning = Tuning.of(model) if tuning is None else tuning
+    fold = Fold(estimator, model, tuning if options is None else tuning.with_options(options), log, **given)
+    fold.advance(stop)
+    return fold
 
 
 def read_all(source: Any) -> Events:

@@ -5,13 +5,11 @@ import pytest
 from scipy.stats import norm
 
 from estimators.errors import EstimatorError
-from estimators.fold import Fold
 from estimators.forecast import SIGMAS, first_time, forecast
 from estimators.log import INPUT, READING, Events, Log
 from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
-from estimators.tuning import Tuning
 from tests.estimators.linear_models import random_linear, random_log
-from tests.support import SECOND, assert_same, log_of
+from tests.support import SECOND, assert_same, folded, log_of
 
 SURE = 4.5
 """Standard errors that a test by chance may be off: once in 150,000 looks."""
@@ -34,12 +32,6 @@ WALK = StateSpaceModel(
     linear=True,
     sensors=(Sensor("y", (Row("y", "m", 0.04),), h=itself),),
 )
-
-
-def folded(estimator, model, log, **options):
-    made = Fold(estimator, model, Tuning.of(model).with_options(options), log)
-    made.advance()
-    return made
 
 
 def ahead(made, horizon, step, **more):
@@ -128,11 +120,11 @@ def test_the_fold_that_runs_is_not_disturbed():
     log = random_log(rng, matrices, 60)
     half = Log(log.width)
     half.extend(log.events.select(slice(0, 30)))
-    made = folded("pf", matrices.model, half, particles=200)
+    made = folded("pf", matrices.model, half, options={"particles": 200})
     ahead(made, 3.0, 0.1, limits={"x0": 100.0})
     half.extend(log.events.select(slice(30, None)))
     made.advance()
-    assert_same(made.track, folded("pf", matrices.model, log, particles=200).track)
+    assert_same(made.track, folded("pf", matrices.model, log, options={"particles": 200}).track)
 
 
 def test_a_silent_start_is_predicted_up_to_now():

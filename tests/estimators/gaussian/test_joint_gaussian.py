@@ -11,12 +11,12 @@ from functools import cache
 import numpy as np
 import pytest
 
-from estimators.fold import Fold
 from estimators.log import READING, Events
 from estimators.registry import ESTIMATORS
 from estimators.track import HELD_OUT, MISSING, USED
 from estimators.tuning import Tuning
 from tests.estimators.linear_models import JointGaussian, random_linear, random_log
+from tests.support import folded
 
 GAUSSIAN = [name for name, entry in ESTIMATORS.items() if entry.family == "Gaussian" and name != "kf-steady"]
 CASES = [(nx, nu, seed) for nx, nu in ((1, 0), (1, 1), (2, 0), (3, 2), (4, 0), (5, 1)) for seed in range(2)]
@@ -39,19 +39,13 @@ def case(nx, nu, seed):
     return matrices, log, JointGaussian(matrices, log)
 
 
-def folded(estimator, matrices, log, tuning=None, stop=None):
-    fold = Fold(estimator, matrices.model, tuning or Tuning.of(matrices.model), log)
-    fold.advance(stop)
-    return fold
-
-
 @pytest.mark.parametrize("estimator", GAUSSIAN)
 @pytest.mark.parametrize(("nx", "nu", "seed"), CASES)
 def test_filtered_moments(estimator, nx, nu, seed):
     matrices, log, joint = case(nx, nu, seed)
     used = np.ones(3, bool)
     for k in (0, 1, 7, 23, log.n - 1):
-        mean, cov = folded(estimator, matrices, log, stop=k + 1).moments()
+        mean, cov = folded(estimator, matrices.model, log, stop=k + 1).moments()
         expected_mean, expected_cov = joint.filtered(k, used)
         close(mean, expected_mean, f"mean at {k}")
         close(cov, expected_cov, f"covariance at {k}")
@@ -62,7 +56,7 @@ def test_filtered_moments(estimator, nx, nu, seed):
 def test_innovations_nis_and_likelihood(estimator, nx, nu, seed):
     matrices, log, joint = case(nx, nu, seed)
     used = np.ones(3, bool)
-    track = folded(estimator, matrices, log).track
+    track = folded(estimator, matrices.model, log).track
     events = log.events
     readings = np.flatnonzero(events.kind == READING)
     assert np.all((track.verdict == MISSING)[events.kind == READING] == ~np.isin(readings, joint.owner))
@@ -83,7 +77,7 @@ def test_innovations_nis_and_likelihood(estimator, nx, nu, seed):
 def test_held_out_sensor_is_predicted_and_scored_but_not_used(estimator, held_out):
     matrices, log, joint = case(4, 1, 5)
     tuning = Tuning.of(matrices.model).set(f"use.{held_out}", False)
-    fold = folded(estimator, matrices, log, tuning)
+    fold = folded(estimator, matrices.model, log, tuning)
     events, track = log.events, fold.track
     expected_mean, expected_cov = joint.filtered(log.n - 1, tuning.used)
     close(fold.moments()[0], expected_mean, "mean")
@@ -112,7 +106,7 @@ def test_order_of_equal_times_does_not_matter(estimator):
     for order in (np.arange(8), np.arange(8)[::-1], np.array([3, 1, 4, 0, 5, 2, 7, 6])):
         again = type(log)(log.width)
         again.extend(together.select(order))
-        moments.append(folded(estimator, matrices, again).moments())
+        moments.append(folded(estimator, matrices.model, again).moments())
     for mean, cov in moments[1:]:
         close(mean, moments[0][0], "mean")
         close(cov, moments[0][1], "covariance")
@@ -123,7 +117,7 @@ def test_ukf_is_exact_whatever_its_spread(alpha, tolerance):
     """Sigma points of a linear function give its moments exactly; rounding alone grows as 1/(α² n) ε cond."""
     matrices, log, joint = case(3, 1, 1)
     tuning = Tuning.of(matrices.model).with_options({"alpha": alpha})
-    mean, cov = folded("ukf", matrices, log, tuning).moments()
+    mean, cov = folded("ukf", matrices.model, log, tuning).moments()
     expected_mean, expected_cov = joint.filtered(log.n - 1, np.ones(3, bool))
     np.testing.assert_allclose(mean, expected_mean, rtol=0, atol=tolerance * np.max(np.abs(expected_mean)))
     np.testing.assert_allclose(cov, expected_cov, rtol=0, atol=tolerance * np.max(np.abs(expected_cov)))
