@@ -8,7 +8,7 @@ from ..compiled.context import expect, options, row_count, transition
 from ..compiled.jacobians import scratch_size, sensor_jacobian, state_jacobian
 from ..estimator import Estimator, Options
 from ..model.state_space import StateSpaceModel
-from ..numerics.jit import by_address, embedded
+from ..numerics.jit import by_address, embedded, inlined
 from ..numerics.linalg import congruence
 from ..numerics.workspace import declare_layout, size_of, start_of
 from ..track import USED
@@ -113,7 +113,7 @@ def linearise(context, sensor, x, u, P, reading, H, scratch):
             S[k, i] = s
 
 
-@embedded
+@inlined
 def correct(context, m, own, x, P):
     """x ← x + K ν;  P by the Joseph form, or as P - K S Kᵀ."""
     reading = own.reading

@@ -232,7 +232,7 @@ def admit(context, sensor, m, nu, S, U, score):
     return judge(context, sensor, m, nu, U, score)
 
 
-@embedded
+@inlined
 def admit_weighted(context, sensor, m, reading, score):
     """Return the verdict on the innovation of a measurement; weight the noise of one that is used."""
     verdict = admit(context, sensor, m, reading.nu, reading.S, reading.chol_S, score)

@@ -78,7 +78,7 @@ def describe(context, state, mean, std, cross):
             cross[c] += U[k, i] * U[k, j]
 
 
-@embedded
+@inlined
 def noise_root(context, x, u, dt, state, V, scratch):
     """Fill V (nx, nx) with a factor of Q, as scaled by an adaptation; False if Q is indefinite."""
     n = context.nx
