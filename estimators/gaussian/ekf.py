@@ -9,14 +9,15 @@ from ..compiled.jacobians import scratch_size, sensor_jacobian, state_jacobian
 from ..estimator import Estimator, Options
 from ..model.state_space import StateSpaceModel
 from ..numerics.jit import by_address, embedded, inlined
-from ..numerics.linalg import congruence
+from ..numerics.linalg import congruence, solve_transposed
 from ..numerics.workspace import declare_layout, size_of, start_of
-from ..track import USED
+from ..track import FAILED, USED
 from ..tuning import Tuning
 from .robust import (
     JOSEPH,
     JOSEPH_OPTION,
     OPTIONS,
+    OWN,
     adapt,
     add_noise,
     is_adaptive,
@@ -29,6 +30,7 @@ from .shared import (
     compare,
     describe,
     downdate,
+    factor,
     gain,
     joseph,
     moments,
@@ -41,6 +43,9 @@ from .shared import (
     state_size,
     wrap_mean,
 )
+
+ITERATIONS = OWN
+"""Position in the context's options: iterations of the update."""
 
 Predicting, predicting = declare_layout(
     "Predicting",
@@ -72,8 +77,8 @@ def work_size(options: Options, nx: int, ny: int) -> int:
 
 
 def tune(values: Options, model: StateSpaceModel, tuning: Tuning) -> np.ndarray:
-    """Return the shared options."""
-    return np.array(shared_options(values))
+    """Return the shared options, and the number of iterations of the update: one but for iekf.py."""
+    return np.array([*shared_options(values), values.get("iterations", 1.0)])
 
 
 @by_address
@@ -130,23 +135,57 @@ def correct(context, m, own, x, P):
 
 @by_address
 def update(context, u, sensor, y, index, state, work, innovation, innovation_std, score):
-    """x ← x + K ν;  P by the Joseph form, with H = dh/dx at the prediction.
+    """x ← x + K ν;  P by the Joseph form, with H = dh/dx at the prediction. Iterated, the update of iekf.py.
 
     Diverges when h curves strongly within the spread of the prediction: P then shrinks faster than the error.
-    Source: Jazwinski (1970), chapter 8.
+
+    With more iterations, xᵢ₊₁ = x̂ + Kᵢ (y - h(xᵢ) - Hᵢ (x̂ - xᵢ)), x₀ = x̂. Each starts from the prediction x̂ and its P,
+    so that the measurement counts once; NIS, gate and weight are those of the prediction, P that of the last H.
+
+    Sources: Jazwinski (1970), chapter 8; Bell & Cathey (1993), doi:10.1109/9.250476, for iterations.
     """
     x, P = moments_of(state, context.nx)
     own = updating(start_of(work), context.nx, row_count(context, sensor))
-    reading = own.reading
-    linearise(context, sensor, x, u, P, reading, own.H, own.jacobian)
+    reading, H = own.reading, own.H
     reading_variances(context, sensor, state, reading.r)
-    m = compare(context, sensor, y, reading, own.H, P, innovation, innovation_std)
-    verdict = admit_weighted(context, sensor, m, reading, score)
+    iterations = int(options(context)[ITERATIONS])
+    # N is needed for the Joseph form only, z for the weight at the prediction only.
+    predicted, nu, nu_std = own.N[0], innovation, innovation_std
+    for i in range(x.size):
+        predicted[i] = x[i]
+    verdict = USED
+    m = np.int64(0)  # a literal would be a second type, and compile every callee twice
+    for iteration in range(iterations):
+        linearise(context, sensor, x, u, P, reading, H, own.jacobian)
+        m = compare(context, sensor, y, reading, H, P, nu, nu_std)
+        if iteration == 0:
+            verdict = admit_weighted(context, sensor, m, reading, score)
+        else:
+            back_to(predicted, m, H, x, reading.nu)
+            if factor(reading.S, reading.chol_S, m, x.size):
+                solve_transposed(reading.chol_S, m, reading.nu)
+            else:
+                verdict = FAILED
+        if verdict != USED:
+            break
+        if iteration < iterations - 1:
+            move_mean(m, reading.C, reading.chol_S, reading.nu, x)
+            nu, nu_std = reading.z[: reading.r.size], reading.z[reading.r.size :]
     if verdict == USED:
         correct(context, m, own, x, P)
         if is_adaptive(context):
             adapt(context, sensor, y, state, innovation, innovation_std, score)
     return verdict
+
+
+@inlined
+def back_to(predicted, m, H, x, nu):
+    """ν ← ν - Hᵢ (x̂ - xᵢ);  xᵢ ← x̂."""
+    for k in range(m):
+        for j in range(x.size):
+            nu[k] -= H[k, j] * (predicted[j] - x[j])
+    for j in range(x.size):
+        x[j] = predicted[j]
 
 
 EKF = Estimator(
