@@ -9,7 +9,17 @@ from rerun.chunk import RrdReader
 from app.cli.run import open_review
 from app.live import commands
 from app.live.engine import Engine
-from app.present.drawing.colors import ERROR, FAR, NOTHING, ODD, QUIET, SILENT, Frame, Scale, sensor_colors
+from app.present.drawing.colors import (
+    ERROR,
+    EXTREME_DOT,
+    LARGE_DOT,
+    NORMAL_DOT,
+    UNKNOWN_DOT,
+    UNKNOWN_INDEX,
+    Frame,
+    Scale,
+    sensor_colors,
+)
 from app.present.drawing.direct_readings import observed
 from app.twin.twin import load_twin
 from app.views.recording.writer import Recorder
@@ -289,7 +299,7 @@ def test_the_scene_shows_the_picture_that_is_chosen_and_the_sensor_that_is_off(r
         far = np.abs(pull.track.innovation[last] / pull.track.innovation_std[last]) >= 3
         biased = [row.name for row in live.engine.model.sensors[0].rows].index("t2_3")
         assert far[biased] and not far.all()
-        np.testing.assert_array_equal((scene._points.colors == FAR).all(axis=1), far)
+        np.testing.assert_array_equal((scene._points.colors == EXTREME_DOT).all(axis=1), far)
 
         # Another picture, but not sooner than may be.
         scene._dirty = True
@@ -360,7 +370,7 @@ def test_a_scale_has_round_numbers_and_moves_seldom():
     assert scale.high >= 1.99
     scale.fit(np.array([0.0, 0.1]))
     assert scale.high < 0.3
-    assert scale.indices(np.array([[0.0, np.nan, 9.0, -9.0]])).tolist() == [[127, NOTHING, NOTHING - 1, 0]]
+    assert scale.indices(np.array([[0.0, np.nan, 9.0, -9.0]])).tolist() == [[127, UNKNOWN_INDEX, UNKNOWN_INDEX - 1, 0]]
     assert [place for place, _ in scale.ticks()][0] >= 0
 
 
@@ -378,4 +388,4 @@ def test_a_frame_keeps_distances_in_shape():
 
 def test_sensors_are_coloured_by_their_innovation():
     colors = sensor_colors(np.array([-1.9, 2.1, -3.2, np.nan]))
-    assert [tuple(color) for color in colors] == [QUIET, ODD, FAR, SILENT]
+    assert [tuple(color) for color in colors] == [NORMAL_DOT, LARGE_DOT, EXTREME_DOT, UNKNOWN_DOT]

@@ -26,7 +26,7 @@ def rgb(color: str) -> RGB:
 
 
 def mixed(a: RGB, b: RGB, share: float) -> RGB:
-    """A colour between two: `share` of the second."""
+    """Return a mixture of two colours with `share` of the second."""
     x, y, z = (round(p + share * (q - p)) for p, q in zip(a, b, strict=True))
     return x, y, z
 
@@ -75,7 +75,7 @@ THEMES = {"light": LIGHT, "dark": DARK}
 
 
 def between(a: Palette, b: Palette) -> Palette:
-    """The palette halfway between two."""
+    """Return the palette halfway between two."""
     both = {
         item.name: mixed(getattr(a, item.name), getattr(b, item.name), 0.5)
         for item in fields(Palette)
@@ -85,7 +85,7 @@ def between(a: Palette, b: Palette) -> Palette:
 
 
 EITHER = between(LIGHT, DARK)
-"""For files: nobody knows on what ground their viewer draws."""
+"""For files, whose viewer may be light or dark."""
 
 
 WARM = ("#0b1354", "#3b2e8c", "#7b2f8d", "#b73779", "#e8604c", "#f9a03f", "#fcf3a6")
@@ -97,12 +97,17 @@ SPREAD = ("#f7fbff", "#c6dbef", "#6baed6", "#2171b5", "#08306b")
 SIGNED = ("#1d4ed8", "#7aa2f0", "#f5f5f5", "#f2a07a", "#b91c1c")
 """Negative, none, positive."""
 
-NOTHING = 255
-"""Index of the colour of what is unknown: grey."""
+UNKNOWN_INDEX = 255
+"""Index of the colour of unknown values, grey."""
 
-QUIET, ODD, FAR, SILENT, RIM = (255, 255, 255), EITHER.reading, EITHER.refused, EITHER.faint, (51, 65, 85)
-"""Colours of a sensor whose innovation is below two of its deviations, below three, above; that said nothing; and of
-the line around it."""
+NORMAL_DOT, LARGE_DOT, EXTREME_DOT, UNKNOWN_DOT, RIM = (
+    (255, 255, 255),
+    EITHER.reading,
+    EITHER.refused,
+    EITHER.faint,
+    (51, 65, 85),
+)
+"""Colours of a sensor: innovation below 2 σ, below 3 σ, above, none yet; and of its rim."""
 
 
 class Kind(NamedTuple):
@@ -121,34 +126,34 @@ TRUE = Kind("truth", "truth", "truth", WARM)
 
 
 def kinds(truth: bool) -> tuple[Kind, ...]:
-    """The pictures that there are."""
+    """Return the kinds of pictures of a field."""
     return (ESTIMATE, DEVIATION, ERROR, TRUE) if truth else (ESTIMATE, DEVIATION)
 
 
 def image_of(picture: Picture, kind: Kind) -> np.ndarray | None:
-    """The values (rows, columns) that a kind of picture shows, or None."""
+    """Return the values (rows, columns) of a kind of picture, or None."""
     if kind is ERROR:
         return None if picture.mean is None or picture.truth is None else picture.mean - picture.truth
     return {ESTIMATE.name: picture.mean, DEVIATION.name: picture.std, TRUE.name: picture.truth}[kind.name]
 
 
 def gradient(colors: tuple[str, ...]) -> np.ndarray:
-    """256 colours (256, 3) uint8 between some, evenly spaced; the last stands for `NOTHING`."""
+    """Return 255 interpolated colours and that of unknown values, (256, 3) uint8."""
     anchors = np.array([[int(c[k : k + 2], 16) for k in (1, 3, 5)] for c in colors], float)
-    at = np.linspace(0, len(colors) - 1, NOTHING)
+    at = np.linspace(0, len(colors) - 1, UNKNOWN_INDEX)
     columns = [np.interp(at, np.arange(len(colors)), anchors[:, k]) for k in range(3)]
     return np.vstack((np.stack(columns, axis=1).round(), [[205, 205, 210]])).astype(np.uint8)
 
 
 class Scale:
-    """The values from the lowest to the highest colour: round numbers that change seldom."""
+    """Range of a colour scale: round numbers that change rarely."""
 
     def __init__(self, kind: Kind) -> None:
         self.kind = kind
         self.low, self.high, self.step = np.nan, np.nan, 1.0
 
     def fit(self, values: np.ndarray) -> None:
-        """Widen it at once if values lie outside; narrow it if they fill less than half."""
+        """Widen the range if values lie outside; narrow it if they fill less than half."""
         finite = values[np.isfinite(values)]
         if not finite.size:
             return
@@ -171,10 +176,12 @@ class Scale:
             self.high = self.low + self.step
 
     def indices(self, values: np.ndarray) -> np.ndarray:
-        """Colour of each value, uint8; what is unknown gets `NOTHING`."""
-        place = (values - self.low) / (self.high - self.low) * (NOTHING - 1)
+        """Return the colour index of each value, uint8; unknown values get `UNKNOWN_INDEX`."""
+        place = (values - self.low) / (self.high - self.low) * (UNKNOWN_INDEX - 1)
         known = np.isfinite(place)
-        return np.where(known, np.clip(np.where(known, place, 0.0), 0, NOTHING - 1), NOTHING).astype(np.uint8)
+        return np.where(known, np.clip(np.where(known, place, 0.0), 0, UNKNOWN_INDEX - 1), UNKNOWN_INDEX).astype(
+            np.uint8
+        )
 
     def ticks(self) -> list[tuple[float, str]]:
         """Places from 0 (low) to 1 (high) of the numbers beside it, with their text; none before the first number."""
@@ -191,7 +198,7 @@ class Scale:
 
 @dataclass(frozen=True)
 class Frame:
-    """Where a field's cells lie in its picture: each is `tall` × `wide` pixels, so that distances keep their shape."""
+    """Pixels of a field's picture: a cell takes `tall` × `wide`, so that distances keep their proportions."""
 
     field: Field
     rows: int
@@ -202,7 +209,7 @@ class Frame:
 
     @staticmethod
     def of(field: Field) -> Frame:
-        """The frame of a field, at least some 150 pixels large."""
+        """Return the frame of a field, about 150 pixels or larger."""
         rows, columns = plane_shape(field.shape)
         steps = field.steps[-2:] if len(field.shape) > 1 else (max(1.0, columns / 12) * field.steps[0], field.steps[0])
         ratio = steps[0] / steps[1]
@@ -223,11 +230,11 @@ class Frame:
         return self.columns * self.wide
 
     def enlarge(self, image: np.ndarray) -> np.ndarray:
-        """A picture (rows, columns) in pixels."""
+        """Return a picture (rows, columns) in pixels."""
         return np.repeat(np.repeat(image, self.tall, axis=0), self.wide, axis=1)
 
     def pixels(self, positions: np.ndarray) -> np.ndarray:
-        """Where places (k, axes) of the field lie, as (across, down) in pixels (k, 2)."""
+        """Return positions (k, axes) in the field as (across, down) in pixels (k, 2)."""
         cells = np.atleast_2d(positions) / np.array(self.field.steps)
         down = cells[:, -2] if cells.shape[1] > 1 else np.zeros(len(cells))
         scale = np.array([self.wide, self.tall]) / self.reduced
@@ -235,7 +242,7 @@ class Frame:
 
 
 def positioned(model: StateSpaceModel) -> tuple[np.ndarray, np.ndarray]:
-    """Places (k, axes) of the sensor rows that have one, and (sensor, row) of each (k, 2)."""
+    """Return the positions (k, axes) of sensor rows that have one, and (sensor, row) of each, (k, 2)."""
     found = [
         (row.position, (k, r))
         for k, sensor in enumerate(model.sensors)
@@ -269,17 +276,17 @@ def take_innovations(normalised: np.ndarray, which: np.ndarray, events: Events, 
 
 
 def sensor_colors(normalised: np.ndarray) -> np.ndarray:
-    """Colours (k, 3) uint8 of innovations in units of their deviation (k,); NaN is a sensor that said nothing."""
+    """Return colours (k, 3) uint8 of innovations in units of their deviation (k,); NaN is a sensor without one."""
     size = np.abs(normalised)
-    colors = np.full((size.size, 3), SILENT, np.uint8)
-    colors[size < 2.0] = QUIET
-    colors[(size >= 2.0) & (size < 3.0)] = ODD
-    colors[size >= 3.0] = FAR
+    colors = np.full((size.size, 3), UNKNOWN_DOT, np.uint8)
+    colors[size < 2.0] = NORMAL_DOT
+    colors[(size >= 2.0) & (size < 3.0)] = LARGE_DOT
+    colors[size >= 3.0] = EXTREME_DOT
     return colors
 
 
 def round_step(span: float) -> float:
-    """The smallest of 1, 2, 5 · 10ᵏ that is at least `span`."""
+    """Return the smallest of 1, 2, 5 · 10ᵏ that is at least `span`."""
     exponent = np.floor(np.log10(span))
     for factor in (1.0, 2.0, 5.0, 10.0):
         step = factor * 10.0**exponent
@@ -289,7 +296,7 @@ def round_step(span: float) -> float:
 
 
 def tick_text(value: float, step: float) -> str:
-    """A tick's number with the decimals that its step needs."""
+    """Return the number of a tick with the decimals that its step needs."""
     if step < 1e-4 or abs(value) >= 1e6:
         return f"{value:.4g}"
     decimals = max(0, int(-np.floor(np.log10(step) + 1e-9)))
@@ -297,7 +304,7 @@ def tick_text(value: float, step: float) -> str:
 
 
 def with_deviation(value: float, deviation: float) -> str:
-    """A value with its deviation, to one decimal or two digits of the deviation, as the page writes them."""
+    """Return a value ± its deviation, with two digits of the deviation or one decimal."""
     if not deviation > 0 or not np.isfinite(deviation):
         return f"{value:.4g}"
     decimals = min(8, max(1, int(1 - np.floor(np.log10(deviation)))))

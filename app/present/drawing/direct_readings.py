@@ -1,4 +1,4 @@
-"""Which sensor rows read a state as it is, so that their readings are drawn over it: charts and scene ask the same."""
+"""Sensor rows that measure a state directly, so that charts and scenes draw their measurements over it."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ from estimators.model.state_space import Sensor, StateSpaceModel
 
 from ...terminal import complain
 
-NEAR, AWAY = 0.05, 0.2
-"""How far a row may be from its state, as a share: where the prior has its mean (a wheel's scale), and elsewhere, where
-a small error that the model estimates too comes on top (a GNSS receiver's)."""
+SCALE_TOLERANCE, OFFSET_TOLERANCE = 0.05, 0.2
+"""Largest relative difference of a row from its state at the mean of the prior (the scale of a wheel), and elsewhere,
+where an estimated error is added (of a GNSS receiver)."""
 
-ARITHMETIC = (ArithmeticError, ValueError)
-"""What Python raises where machine code gives a value that is none."""
+ARITHMETIC_ERRORS = (ArithmeticError, ValueError)
+"""Errors of Python where machine code returns NaN."""
 
 STEP = 1e-3
-"""Of a state's standard deviation, for slopes."""
+"""Step of the slopes, as a share of a state's standard deviation."""
 
 
 @dataclass(frozen=True)
 class Observed:
-    """One row of a sensor, and the state that it reads."""
+    """One row of a sensor, and the state that it measures."""
 
     sensor: int
     row: int
@@ -32,12 +32,12 @@ class Observed:
 
 
 def observed(model: StateSpaceModel) -> list[Observed]:
-    """The sensor rows that read one charted state, give or take a scale near one: h ≈ x_j, ∂h/∂x_j ≈ 1.
+    """Return the sensor rows that measure one charted state, up to a scale near one: h ≈ x_j, ∂h/∂x_j ≈ 1.
 
-    Looked at where the prior has its mean, and at two places within its standard deviation.
+    Evaluated at the mean of the prior, and at two points within its standard deviation.
     """
     rng = np.random.default_rng(0)
-    share = np.array([NEAR, AWAY, AWAY])
+    share = np.array([SCALE_TOLERANCE, OFFSET_TOLERANCE, OFFSET_TOLERANCE])
     moves = np.concatenate((np.zeros((1, model.nx)), rng.uniform(0.3, 0.9, (2, model.nx))))
     points = model.prior_mean + moves * model.prior_std
     charted = list(zip(model.shown.tolist(), model.shown_states, strict=True))
@@ -62,7 +62,7 @@ def observed(model: StateSpaceModel) -> list[Observed]:
                 j
                 for column, (j, state) in enumerate(charted)
                 if state.unit == row.unit
-                and abs(slopes[r, column] - 1.0) < NEAR
+                and abs(slopes[r, column] - 1.0) < SCALE_TOLERANCE
                 and np.all(
                     np.abs(values[:, r] - points[:, j]) < share * np.maximum(np.abs(points[:, j]), state.std or 1.0)
                 )
@@ -74,7 +74,7 @@ def observed(model: StateSpaceModel) -> list[Observed]:
 
 
 def expected(model: StateSpaceModel, sensor: Sensor, x: np.ndarray, p: np.ndarray) -> np.ndarray:
-    """What a sensor should read, h(x, u, p) with the inputs' defaults, shape (ny,); NaN where that cannot be said."""
+    """Return h(x, u, p) of a sensor with the inputs' defaults, shape (ny,); NaN where it fails."""
     out = np.full(len(sensor.rows), np.nan)
     _expect(model, sensor, x, np.array([item.default for item in model.inputs]), p, out)
     return out
@@ -83,9 +83,9 @@ def expected(model: StateSpaceModel, sensor: Sensor, x: np.ndarray, p: np.ndarra
 def _expect(
     model: StateSpaceModel, sensor: Sensor, x: np.ndarray, u: np.ndarray, p: np.ndarray, out: np.ndarray
 ) -> None:
-    """Fill `out` with h(x, u, p); NaN, which is near nothing, where it fails.
+    """Fill `out` with h(x, u, p), or NaN where it fails.
 
-    Of a domain or a division Python says so where machine code gives NaN and the twin runs; all else is told.
+    Python raises where machine code returns NaN and the twin runs; other errors are reported.
     """
     try:
         if model.black_box:
@@ -94,11 +94,13 @@ def _expect(
             sensor.h(x, u, p, out)
     except Exception as error:  # noqa: BLE001  a user's model may raise anything; the views go on without its dots
         out[:] = np.nan
-        if model.black_box or not isinstance(error, ARITHMETIC):
-            _tell(f"model {model.name}: h of {sensor.name} fails near the prior: {type(error).__name__}: {error}")
+        if model.black_box or not isinstance(error, ARITHMETIC_ERRORS):
+            _report_once(
+                f"model {model.name}: h of {sensor.name} fails near the prior: {type(error).__name__}: {error}"
+            )
 
 
 @cache
-def _tell(text: str) -> None:
-    """Say it once: every view asks."""
-    complain(f"{text}; what it reads is drawn over no state")
+def _report_once(text: str) -> None:
+    """Report once: every view asks."""
+    complain(f"{text}; its measurements are drawn over no state")

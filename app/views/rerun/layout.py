@@ -19,12 +19,12 @@ from .sink import NOTICES_PATH, SCALE_GAP, TIMELINE, band_color, pair_name, row_
 MAX_SENSOR_LANES = 6
 """Sensors at most whose states are drawn, below the twin's health."""
 
-AT_ONCE = 3
+MAX_VISIBLE_CHARTS = 3
 """Charts of states that are shown at the same time; more come in tabs, which cost nothing while they are hidden."""
 
 
 def nis_limit(model: StateSpaceModel) -> float:
-    """Where the NIS chart ends: what one good reading in a hundred exceeds. A spike must not flatten the rest."""
+    """Return the top of the NIS chart, which 1 % of consistent measurements exceed; spikes are cut off."""
     return float(chi_square_quantile(0.99, max(len(sensor.rows) for sensor in model.sensors)))
 
 
@@ -102,8 +102,8 @@ def blueprint(
         charts = _stacked(states)
         above = [*charts, rrb.Horizontal(*_tabs(innovations), nis)]
         # As high as the lanes, of which those of up to three sensors are read at once.
-        lanes = 0.75 + 0.4 * min(told, AT_ONCE)
-        shares = [1.25 * min(len(states), AT_ONCE) / len(charts)] * len(charts) + [1.1, lanes, 1.5]
+        lanes = 0.75 + 0.4 * min(told, MAX_VISIBLE_CHARTS)
+        shares = [1.25 * min(len(states), MAX_VISIBLE_CHARTS) / len(charts)] * len(charts) + [1.1, lanes, 1.5]
     return rrb.Blueprint(
         rrb.Vertical(*above, health, bottom, row_shares=shares),
         rrb.TopPanel(state="hidden"),
@@ -121,9 +121,9 @@ def _tabs(views: list[Any]) -> list[Any]:
 
 def _stacked(views: list[Any]) -> list[Any]:
     """Views one above the other; if they are many, in tabs that hold as many as one can read at once."""
-    if len(views) <= AT_ONCE:
+    if len(views) <= MAX_VISIBLE_CHARTS:
         return views
-    groups = [views[k : k + AT_ONCE] for k in range(0, len(views), AT_ONCE)]
+    groups = [views[k : k + MAX_VISIBLE_CHARTS] for k in range(0, len(views), MAX_VISIBLE_CHARTS)]
     return [rrb.Tabs(*(rrb.Vertical(*group, name=_group_name(group)) for group in groups))]
 
 

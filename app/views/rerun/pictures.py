@@ -1,4 +1,4 @@
-"""A large field in Rerun: pictures with a scale, the sensors on them, and what the errors of all cells come to."""
+"""Pictures in Rerun: a large field with its sensors and scale; two states with 2σ ellipse, trail and truth."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class FieldDrawing:
         self._normalised = np.full(len(places), np.nan)
 
     def static(self, sink: Sink) -> None:
-        """Log what stays: the scale's place, the sensors' rims, the charted cells with their names."""
+        """Log static parts: scale, rims of the sensors, charted cells with their names."""
         bar = np.linspace(254, 0, self._frame.height).round().astype(np.uint8)[:, None].repeat(self._bar, axis=1)
         names = [state.name.removeprefix(f"{self._model.grid.name}") for state in self._model.shown_states]  # type: ignore[union-attr]
         for kind in self._kinds:
@@ -81,7 +81,7 @@ class FieldDrawing:
             )
 
     def readings(self, sink: Sink, events: Events, track: Track, width: int) -> None:
-        """Log of each sensor with many rows the size of its innovations, in units of their deviations."""
+        """Log the size of each sensor's innovations (rms and largest), in units of their deviations."""
         is_reading = events.kind == READING
         for k, sensor in enumerate(self._model.sensors):
             mask = is_reading & (events.channel == k)
@@ -102,7 +102,7 @@ class FieldDrawing:
         take_innovations(self._normalised, self._which, events, track)
 
     def pictures(self, sink: Sink, pictures: list[Picture], *, current: bool) -> None:
-        """Log pictures; the sensors' colours with the last one, if it is the newest."""
+        """Log pictures, and with the newest one the colours of the sensors."""
         if not pictures:
             return
         t = np.array([picture.t for picture in pictures], np.int64)
@@ -146,24 +146,24 @@ class FieldDrawing:
             sink.columns(f"/field/{kind.name}/sensors", np.array([t]), dots.partition([count]))
 
 
-CORNERS = 65
-"""Points of an ellipse's line, its first one again at the end."""
+ELLIPSE_POINTS = 65
+"""Points of an ellipse, the first one again at the end."""
 
-TRAIL = 100
-"""Points of the way behind the mean."""
+TRAIL_POINTS = 100
+"""Points of the trail behind the mean."""
 
-PICTURES = 400
+WINDOW_ELLIPSES = 400
 """Ellipses in one window of the charts, or in a longer history that is drawn at once."""
 
-PANE = 2.5
-"""Width of the picture over its height, about."""
+PICTURE_RATIO = 2.5
+"""Approximate width of the picture over its height."""
 
-ASIDE, BELOW = 0.2, 0.4
-"""Shares of the picture's width and height that the numbers take, on either side of their point and below it."""
+LABEL_HALF_WIDTH, LABEL_HEIGHT = 0.2, 0.4
+"""Shares of the picture's width and height that the labels take, beside and below their point."""
 
 _STRIP = rr.components.LineStrip2DBatch._ARROW_DATATYPE
 _POINT = _STRIP.value_type
-_angle = np.linspace(0.0, 2.0 * np.pi, CORNERS)
+_angle = np.linspace(0.0, 2.0 * np.pi, ELLIPSE_POINTS)
 _circle = np.stack((np.cos(_angle), np.sin(_angle)), axis=1)
 
 
@@ -178,7 +178,7 @@ def ellipse_points(mean: np.ndarray, var: np.ndarray, cross: np.ndarray) -> np.n
         cross: Off-diagonal entries, shape (n,).
 
     Returns:
-        Shape (n, CORNERS, 2).
+        Shape (n, ELLIPSE_POINTS, 2).
     """
     l11 = np.sqrt(var[:, 0])
     l21 = np.divide(cross, l11, out=np.zeros_like(cross), where=l11 > 0)
@@ -189,13 +189,11 @@ def ellipse_points(mean: np.ndarray, var: np.ndarray, cross: np.ndarray) -> np.n
 
 
 def anchors(mean: np.ndarray, ellipses: np.ndarray, ways: list[np.ndarray]) -> np.ndarray:
-    """Where the numbers stand: at the mean, but no nearer to the picture's edge than they are wide and high.
-
-    The view shows what is drawn and cuts the numbers off where it ends.
+    """Return the positions of the labels: the mean, but far enough from the edge that the view does not cut them off.
 
     Args:
         mean: Shape (n, 2).
-        ellipses: Shape (n, CORNERS, 2).
+        ellipses: Shape (n, ELLIPSE_POINTS, 2).
         ways: n lines of shape (k, 2).
 
     Returns:
@@ -205,14 +203,14 @@ def anchors(mean: np.ndarray, ellipses: np.ndarray, ways: list[np.ndarray]) -> n
     high = np.stack([np.maximum(e.max(0), way.max(0)) for e, way in zip(ellipses, ways, strict=True)])
     middle, size = 0.5 * (low + high), high - low
     # The view has one scale for both axes: the longer one fills it.
-    height = np.maximum(size[:, 1], size[:, 0] / PANE)
-    edge = np.stack(((0.5 - ASIDE) * PANE * height, (0.5 - BELOW) * height), axis=1)
+    height = np.maximum(size[:, 1], size[:, 0] / PICTURE_RATIO)
+    edge = np.stack(((0.5 - LABEL_HALF_WIDTH) * PICTURE_RATIO * height, (0.5 - LABEL_HEIGHT) * height), axis=1)
     x = np.clip(mean[:, 0], middle[:, 0] - edge[:, 0], middle[:, 0] + edge[:, 0])
     return np.stack((x, np.maximum(mean[:, 1], middle[:, 1] - edge[:, 1])), axis=1)
 
 
 def strips(lines: list[np.ndarray]) -> pa.Array:
-    """Lines of shape (k, 2) each as Rerun holds them; its own conversion takes 50 µs a line."""
+    """Return lines of shape (k, 2) each in Rerun's Arrow type; its own conversion takes 50 µs a line."""
     ends = np.cumsum([0] + [line.shape[0] for line in lines]).astype(np.int32)
     points = pa.FixedSizeListArray.from_arrays(pa.array(np.concatenate(lines).reshape(-1)), type=_POINT)
     return pa.ListArray.from_arrays(pa.array(ends), points, type=_STRIP)
@@ -225,9 +223,9 @@ def _lines(lines: list[np.ndarray], color: tuple[int, int, int], width: float) -
 
 
 def axis_scales(model: StateSpaceModel, pair: np.ndarray) -> np.ndarray:
-    """Units that one length of the picture stands for: the states' own if they agree, else the priors' widths.
+    """Return the scale of each axis: 1 if the units agree, or the order of magnitude of the priors' deviations.
 
-    Rerun's view has one scale for both axes, in which a temperature and its rate would not both be seen.
+    Rerun's view has one scale for both axes, in which a temperature would hide its rate.
     """
     a, b = (model.states[j] for j in pair)
     if a.unit == b.unit:
@@ -257,12 +255,12 @@ class PairDrawing:
 
     def draw(self, sink: Sink, t: np.ndarray, track: Track, events: Events, past: bool) -> None:
         """Log the pictures of some rows of the track."""
-        step = int(max(sink.window * 1e9, int(t[-1]) - int(t[0])) / PICTURES)
+        step = int(max(sink.window * 1e9, int(t[-1]) - int(t[0])) / WINDOW_ELLIPSES)
         pick = last_of_stretch(t, step)
         if past or self._last is None:
             self._last = None
         else:
-            # After a reset nothing else may come.
+            # After a reset there may be no other row.
             pick = pick[(t[pick] >= self._last + step // 2) | (events.kind[pick] == RESET)]
         if not pick.size:
             return
@@ -282,7 +280,7 @@ class PairDrawing:
         self._truth(sink, events, t[pick])
 
     def _blank(self, sink: Sink, t: np.ndarray, past: bool) -> None:
-        """Show nothing from a time (1,) on, at which the estimate is not a number."""
+        """Clear the picture from a time (1,) on, at which the estimate is not a number."""
         for name in ("ellipse", "mean", "numbers", "way"):
             sink.gap(f"{self._path}/{name}", t)
         if not past:
@@ -318,9 +316,9 @@ class PairDrawing:
         ]
 
     def _trail(self, sink: Sink, t: np.ndarray, mean: np.ndarray, past: bool) -> list[np.ndarray]:
-        """For each row the way that led there, within the charts' window."""
+        """Return for each row the trail that leads to it, within the window of the charts."""
         before, before_t = (self._way[:0], self._way_t[:0]) if past else (self._way, self._way_t)
-        keep = last_of_stretch(t, int(sink.window * 1e9 / TRAIL))
+        keep = last_of_stretch(t, int(sink.window * 1e9 / TRAIL_POINTS))
         way = np.concatenate((before, mean[keep]))
         way_t = np.concatenate((before_t, t[keep]))
         start = np.searchsorted(way_t, t - int(sink.window * 1e9))
@@ -328,9 +326,9 @@ class PairDrawing:
         if not past:
             recent = way_t >= t[-1] - int(sink.window * 1e9)
             self._way, self._way_t = way[recent], way_t[recent]
-        # A strip needs two points; the first row has nothing behind it.
+        # A strip needs two points, also at the first row.
         return [
-            np.concatenate((way[max(i, j - 2 * TRAIL) : j], here[None], here[None]))
+            np.concatenate((way[max(i, j - 2 * TRAIL_POINTS) : j], here[None], here[None]))
             for i, j, here in zip(start, end, mean, strict=True)
         ]
 

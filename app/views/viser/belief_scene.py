@@ -1,4 +1,4 @@
-"""The belief plot: the estimate over two or three states, in its ellipses of 1σ and 2σ, on axes with numbers."""
+"""Plot of the estimate over two or three states: ellipses or ellipsoids of 1σ and 2σ, particles, trail and truth."""
 
 from __future__ import annotations
 
@@ -16,24 +16,24 @@ from ...present.drawing.colors import Palette, mixed, round_step, tick_text
 from .scene import History, Outlook, circle, disc, ellipsoid, segments
 
 TRAIL = 80
-"""Rows of the track that are drawn behind the point."""
+"""Rows of the track in the trail."""
 
 TICKS = (-2, -1, 0, 1, 2)
 PEAKS = 6
-"""Peaks of the estimate that are marked at most."""
+"""Largest number of marked peaks."""
 
-HALF = 2.5
+HALF_AXIS_TICKS = 2.5
 """Half an axis, in ticks."""
 
 SIZES = ((1, 0.022), (3, 0.036), (10, 0.06), (100, 0.1))
-"""A point that stands for so many of its kind, or more, is drawn so large: particles of more weight are larger."""
+"""Number of equal particles, and size of their common point: heavier particles are larger."""
 
-OUTSIDE = 1.3
-"""Place on an axis, which ends at 1, up to which points are drawn."""
+MAX_POSITION = 1.3
+"""Position on an axis, which ends at 1, up to which points are drawn."""
 
 
 class _Axis:
-    """One axis: its state, and the round numbers between which it runs."""
+    """Axis of a state, with round numbers as ticks."""
 
     def __init__(self, state: int) -> None:
         self.state = state
@@ -41,21 +41,21 @@ class _Axis:
         self.middle = 0.0
 
     def fit(self, mean: float, reach: float) -> bool:
-        """Move or rescale the axis if the belief no longer sits well in it; True if it changed.
+        """Move or rescale the axis if the estimate no longer fits; return whether it changed.
 
-        Only then: an axis that followed every step would make the point stand still and the numbers run.
+        An axis that followed every step would keep the point still and move the numbers.
         """
         reach = max(reach, 1e-12 + 1e-9 * abs(mean))
-        half = HALF * self.step
+        half = HALF_AXIS_TICKS * self.step
         if self.step and 0.12 * half < reach < 0.85 * half and abs(mean - self.middle) + 0.5 * reach < half:
             return False
-        self.step = round_step(reach * 2.2 / HALF)
+        self.step = round_step(reach * 2.2 / HALF_AXIS_TICKS)
         self.middle = round(mean / self.step) * self.step
         return True
 
     def place(self, values: np.ndarray) -> np.ndarray:
-        """States as places between -1 and 1."""
-        return (values - self.middle) / (HALF * self.step)
+        """Return states as positions between -1 and 1."""
+        return (values - self.middle) / (HALF_AXIS_TICKS * self.step)
 
 
 class BeliefScene:
@@ -68,7 +68,7 @@ class BeliefScene:
         self._known = False
         self.root = api.add_frame("/scene", show_axes=False)
         line = {"thickness_units": "screen"}
-        ticks = np.array(TICKS) / HALF
+        ticks = np.array(TICKS) / HALF_AXIS_TICKS
         api.add_line_segments("/scene/grid", _grid(ticks, flat), palette.rule, thickness=1, **line)
         api.add_line_segments("/scene/box", _frame(flat), palette.bound, thickness=1.5, **line)
         shown = range(2 if flat else 3)
@@ -110,8 +110,7 @@ class BeliefScene:
         self._bodies = [self._body(api, sigmas, palette, line) for sigmas in (1, 2)]
         margin = np.array([[-1.3, -1.32, 0.0], [1.12, -1.32, 0.0], [-1.3, 1.22, 0.0], [1.12, 1.22, 0.0]])
         if flat:
-            # From far away, so that it looks as on paper.
-            self.outlook = Outlook(margin, np.array([0.0, -0.001, 1.0]), np.array([0.0, 1.0, 0.0]), np.radians(9.2))
+            self.outlook = Outlook.from_above(margin)
         else:
             box = np.stack(np.meshgrid([-1.15, 1.15], [-1.15, 1.15], [-1.1, 1.15]), axis=-1).reshape(-1, 3)
             titles = np.array([_title_place(k, False) for k in range(3)])
@@ -120,7 +119,7 @@ class BeliefScene:
             )
 
     def _body(self, api: viser.SceneApi, sigmas: int, palette: Palette, line: dict[str, Any]) -> tuple[int, list[Any]]:
-        """The ellipse or ellipsoid at some σ: how many, and its handles."""
+        """Return the handles of the ellipse or ellipsoid of a number of σ, with that number."""
         name, flat = f"/scene/belief/{sigmas}", {"cast_shadow": False, "receive_shadow": False}
         opacity = {1: 0.28, 2: 0.16}[sigmas]
         if not self.flat:
@@ -134,12 +133,12 @@ class BeliefScene:
         return sigmas, [plate, rim]
 
     def draw(self, history: History, belief: Belief, heavy: bool = True) -> None:
-        """Send where everything is now; trail and points only if `heavy`."""
+        """Send the present estimate; trail and particles only if `heavy`."""
         axes, index = self.axes, [axis.state for axis in self.axes]
         lift = np.array([0.0, 0.0, 0.02 if self.flat else 0.0])
         mean, cov = belief.mean[index], belief.cov[np.ix_(index, index)]
         known = bool(np.isfinite(mean).all() and np.isfinite(cov).all())
-        # What was drawn before would else stand for an estimate that is not a number.
+        # Otherwise the earlier drawing would stay for an estimate that is not a number.
         heavy |= known != self._known
         self._known = known
         self._belief.visible = known
@@ -154,11 +153,11 @@ class BeliefScene:
             self._trail.points = segments(trail)
 
     def _columns(self, index: list[int]) -> list[int]:
-        """Where these states are among those that the track has."""
+        """Return the columns of these states in the track."""
         return [int(np.searchsorted(self.model.shown, j)) for j in index]
 
     def _draw_belief(self, mean: np.ndarray, cov: np.ndarray) -> bool:
-        """Move the ellipses; whether an axis changed, so that all else has to move too."""
+        """Move the ellipses; return whether an axis changed, which moves everything else."""
         changed = False
         for k, axis in enumerate(self.axes):
             # A mode's axis always shows all of its values.
@@ -167,7 +166,7 @@ class BeliefScene:
             if axis.fit(float(middle), float(reach)):
                 self._number(k, axis)
                 changed = True
-        scale = np.array([HALF * axis.step for axis in self.axes])
+        scale = np.array([HALF_AXIS_TICKS * axis.step for axis in self.axes])
         full, n = np.zeros((3, 3)), len(self.axes)
         full[:n, :n] = cov / np.outer(scale, scale)
         if n < 3:
@@ -183,17 +182,17 @@ class BeliefScene:
         return changed
 
     def _draw_points(self, states: np.ndarray) -> None:
-        """Draw what stands for the belief; of points that are the same one, the larger the more there are."""
+        """Draw the particles; equal ones as one point, larger for a larger number."""
         points, counts = np.unique(states, axis=0, return_counts=True)
         bounds = [size for size, _ in SIZES] + [np.inf]
         for k, handle in enumerate(self._clouds):
             handle.visible = self._put(handle, points[(counts >= bounds[k]) & (counts < bounds[k + 1])], 0.02)
 
     def _mark(self, index: list[int], peaks: tuple[Peak, ...], lift: np.ndarray) -> None:
-        """Put a dot with its weight at each peak, where there are several."""
+        """Draw a dot with its weight at each of several peaks."""
         for k, (dot, label) in enumerate(self._peaks):
             place = self._place(peaks[k].mean[None, index])[0] if k < len(peaks) else np.full(3, np.nan)
-            shown = bool(np.isfinite(place).all() and (np.abs(place) <= OUTSIDE).all())
+            shown = bool(np.isfinite(place).all() and (np.abs(place) <= MAX_POSITION).all())
             if shown:
                 dot.points = (place + 2 * lift)[None].astype(np.float32)
                 label.position = tuple(place + 2 * lift + [0.04, 0.04, 0.0])
@@ -201,10 +200,10 @@ class BeliefScene:
             dot.visible = label.visible = shown
 
     def _put(self, handle: Any, states: np.ndarray, lift: np.ndarray | float) -> bool:
-        """Draw states as points; whether there are any to be seen."""
+        """Draw states as points; return whether any is in view."""
         places = self._place(states)
         places[:, 2] += np.max(lift) if self.flat else 0.0
-        places = places[np.isfinite(places).all(axis=1) & (np.abs(places) <= OUTSIDE).all(axis=1)]
+        places = places[np.isfinite(places).all(axis=1) & (np.abs(places) <= MAX_POSITION).all(axis=1)]
         if len(places):
             handle.points = places
         return bool(len(places))
@@ -233,7 +232,7 @@ class BeliefScene:
 
 
 def _beside(k: int, along: float, away: float, flat: bool) -> tuple[float, float, float]:
-    """Where the numbers of axis k stand: beside the edge that the first view shows in front."""
+    """Return the position of the numbers of axis k, beside the front edge of the initial view."""
     if flat:
         return ((along, -away, 0.0), (-away - 0.04, along, 0.0))[k]
     return ((along, -away, -1.06), (away, along, -1.06), (-away, -away, along))[k]

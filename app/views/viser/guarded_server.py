@@ -31,15 +31,15 @@ BACKLOG = 64
 
 HEADER = "X-Nisus-Secret"
 
-CONNECTIONS = 96
-"""Open at a time, as many as those of the page: only its server has business here, but anybody can connect."""
+MAX_CONNECTIONS = 96
+"""Open connections, as many as the page has: only its server should connect, but any process can."""
 
 _patching = threading.Lock()
 
 
 def guarded_server(secret: str, label: str) -> viser.ViserServer:
-    """A Viser server on a free loopback port that answers 403 to whatever lacks the secret."""
-    logging.getLogger("websockets.server").addFilter(_worth_a_line)
+    """Return a Viser server on a free loopback port that answers 403 to requests without the secret."""
+    logging.getLogger("websockets.server").addFilter(_is_failure)
     with _patching, unprinted():
         serve = websockets.asyncio.server.serve
 
@@ -59,15 +59,15 @@ def guarded_server(secret: str, label: str) -> viser.ViserServer:
 
 
 def addresses(server: viser.ViserServer) -> list[str]:
-    """Of each browser that is connected, the query of the address at which it asked for its WebSocket."""
-    # Viser tells who is there, but not what they asked for.
+    """Return the query of each connected browser's WebSocket address."""
+    # Viser lists its clients, but not their addresses.
     connections = list(server._websock_server._live_connections.values())
     return [urlsplit(there.request.path).query for there in connections if there.request is not None]
 
 
 @contextmanager
 def unprinted() -> Iterator[None]:
-    """Viser prints an address that answers nobody, and that it stopped; neither helps a user."""
+    """Suppress Viser's output: an address that answers 403, and that it stopped."""
     console = rich.get_console()
     before, console.quiet = console.quiet, True
     try:
@@ -76,18 +76,18 @@ def unprinted() -> Iterator[None]:
         console.quiet = before
 
 
-def _worth_a_line(record: logging.LogRecord) -> bool:
-    """Whether the log should have a record; that somebody connected and said nothing is no failure of ours."""
+def _is_failure(record: logging.LogRecord) -> bool:
+    """Return whether to log a record; a connection without a request is no failure."""
     return record.getMessage() != "opening handshake failed"
 
 
 class _Bounded(ServerConnection):
-    """A connection for which, if there are too many, the oldest that has not said what it wants makes room."""
+    """Connection that, if there are too many, closes the oldest one without a request."""
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         super().connection_made(transport)
         there = [other for other in self.server.handlers if not other.transport.is_closing()]
-        if len(there) > CONNECTIONS:
+        if len(there) > MAX_CONNECTIONS:
             next(
                 other for other in there if other is self or other.protocol.state is State.CONNECTING
             ).transport.abort()

@@ -1,4 +1,9 @@
-"""Cells of a battery: filled as high as they are charged, in the colour of their temperature, the doubt as a slab."""
+"""Scenes of machines: a motor cut open, cells of a battery, and a gripper before a part.
+
+Motor: each part has the colours of its temperature, of the mean and of ± 2σ in alternating slices, so an uncertain part
+is striped. Battery: cells are filled to their charge, in the colour of their temperature, with a slab for ± 2σ.
+Gripper: the finger and its mirror image, with a pad in the colour of the contact's probability, and the part with ± 2σ.
+"""
 
 from __future__ import annotations
 
@@ -11,17 +16,18 @@ from estimators.log import truth_of
 from estimators.model.state_space import StateSpaceModel
 
 from ...live.outputs import Belief
-from ...present.drawing.colors import ESTIMATE, NOTHING, RGB, Palette, Scale, gradient, mixed, with_deviation
+from ...present.drawing.colors import ESTIMATE, RGB, UNKNOWN_INDEX, Palette, Scale, gradient, mixed, with_deviation
+from .field_scenes import draw_ticks
 from .scene import History, Outlook, about_z, segments
 
 HEIGHT, RADIUS, PITCH = 1.4, 0.3, 0.78
-IN_A_ROW = 4
-THINNEST = 0.004
-"""Height of what would else be flat."""
+CELLS_PER_ROW = 4
+MIN_SLAB_HEIGHT = 0.004
+"""Smallest height of a slab."""
 
 
 class BatteryScene:
-    """The cells side by side, and below them the scale of their temperatures."""
+    """Cells side by side, and below them the scale of their temperatures."""
 
     def __init__(
         self, api: viser.SceneApi, model: StateSpaceModel, charge: tuple[str, ...], temperature: tuple[str, ...],
@@ -32,7 +38,7 @@ class BatteryScene:
         self._temperature = [names.index(name) for name in temperature]
         self.root = api.add_frame("/scene", show_axes=False)
         flat = {"cast_shadow": False, "receive_shadow": False}
-        columns = min(IN_A_ROW, len(charge))
+        columns = min(CELLS_PER_ROW, len(charge))
         self._feet = np.array([
             [(k % columns - 0.5 * (columns - 1)) * PITCH, 0.0, -(k // columns) * (HEIGHT + 0.5)]
             for k in range(len(charge))
@@ -62,12 +68,10 @@ class BatteryScene:
         middle = np.array([0.0, 0.0, 0.5 * (low + top)])
         corners = np.array([[x, 0.0, z] for x in (-wide, wide) for z in (low, top)])
         self.root.position = -middle
-        self.outlook = Outlook(
-            corners - middle, np.array([0.0, -1.0, 0.16]), np.array([0.0, 0.0, 1.0]), float(np.radians(20))
-        )
+        self.outlook = Outlook(corners - middle, np.array([0.0, -1.0, 0.16]))
 
     def draw(self, history: History, belief: Belief, heavy: bool = True) -> None:
-        """Send how full and how warm the cells are now."""
+        """Send charge and temperature of the cells."""
         if not heavy:
             return
         mean, std = belief.mean, np.sqrt(np.maximum(np.diag(belief.cov), 0.0))
@@ -90,26 +94,26 @@ class BatteryScene:
 
     def _stand(self, handle: viser.CylinderHandle, k: int, low: float, high: float) -> None:
         """Let a cylinder reach from one share of a cell's height to another."""
-        tall = max(HEIGHT * (high - low), THINNEST)
+        tall = max(HEIGHT * (high - low), MIN_SLAB_HEIGHT)
         handle.scale = (1.0, 1.0, tall)
         handle.position = self._feet[k] + [0.0, 0.0, HEIGHT * low + 0.5 * tall]
 
 
-PART, DEEP, TALL = 30.0, 10.0, 12.0
+PART_WIDTH, HALF_DEPTH, HALF_HEIGHT = 30.0, 10.0, 12.0
 """Width of the part, and half of its depth and of its height, mm."""
 
 FINGER, PAD = 7.0, 4.0
 """Thickness of a finger and of its pad, mm."""
 
-ABOVE, RISE = 34.0, 8.0
-"""Where the fingers end, and the height of what carries them, mm above the part's middle."""
+FINGER_TOP, PALM_HEIGHT = 34.0, 8.0
+"""Upper end of the fingers above the middle of the part, and height of the palm, mm."""
 
-SHARE = 0.25
-"""Part of the way to the estimate that the middle of the view moves in one frame."""
+FOLLOW_SHARE = 0.25
+"""Share of the way to the estimate that the middle of the view moves in one frame."""
 
 
 class GripperScene:
-    """Across is the finger's way, in mm, from where it begins on the left to the part on the right."""
+    """Finger on the left and part on the right; x is the way of the finger in mm."""
 
     def __init__(
         self, api: viser.SceneApi, model: StateSpaceModel, states: Mapping[str, str], palette: Palette
@@ -125,20 +129,19 @@ class GripperScene:
         line, world = {"thickness_units": "screen"}, "/scene/world"
         nothing = np.zeros((1, 2, 3), np.float32)
         steel, body = mixed(palette.faint, palette.panel, 0.25), mixed(palette.bound, palette.panel, 0.45)
-        self._part = api.add_box(f"{world}/part", body, (PART, 2 * DEEP, 2 * TALL), **flat)
-        tall = TALL + 2.0 + ABOVE
+        self._part = api.add_box(f"{world}/part", body, (PART_WIDTH, 2 * HALF_DEPTH, 2 * HALF_HEIGHT), **flat)
+        tall = HALF_HEIGHT + 2.0 + FINGER_TOP
         self._fingers = [
             (
-                api.add_box(f"{world}/fingers/{k}/steel", steel, (FINGER, 1.4 * DEEP, tall), **flat),
-                api.add_box(f"{world}/fingers/{k}/pad", self._apart, (1.0, 1.4 * DEEP, 2 * TALL), **flat),
+                api.add_box(f"{world}/fingers/{k}/steel", steel, (FINGER, 1.4 * HALF_DEPTH, tall), **flat),
+                api.add_box(f"{world}/fingers/{k}/pad", self._apart, (1.0, 1.4 * HALF_DEPTH, 2 * HALF_HEIGHT), **flat),
             )
             for k in range(2)
         ]
-        self._palm = api.add_box(f"{world}/palm", steel, (1.0, 1.4 * DEEP, RISE), **flat)
+        self._palm = api.add_box(f"{world}/palm", steel, (1.0, 1.4 * HALF_DEPTH, PALM_HEIGHT), **flat)
+        size = (1.0, 2.3 * HALF_DEPTH, 2 * HALF_HEIGHT + 2.0)
         self._doubts = [
-            api.add_box(
-                f"{world}/doubt/{name}", palette.estimate, (1.0, 2.3 * DEEP, 2 * TALL + 2.0), opacity=0.3, **flat
-            )
+            api.add_box(f"{world}/doubt/{name}", palette.estimate, size, opacity=0.3, **flat)
             for name in ("surface", "finger")
         ]
         self._gap = api.add_line_segments(f"{world}/gap", nothing, palette.ink, thickness=2, **line)
@@ -153,19 +156,19 @@ class GripperScene:
         self._where = api.add_label(f"{world}/where", " ", anchor="top-center", **text)
         # The gripper closes about the part's middle, which is where the view has its own.
         prior = model.prior_mean
-        self._middle = float(prior[self._surface]) + 0.5 * PART
-        across = 0.5 * PART + abs(float(prior[self._depth])) + PAD + FINGER + 8.0
-        low, high = -2.0 * TALL, ABOVE + RISE + 8.0
+        self._middle = float(prior[self._surface]) + 0.5 * PART_WIDTH
+        across = 0.5 * PART_WIDTH + abs(float(prior[self._depth])) + PAD + FINGER + 8.0
+        low, high = -2.0 * HALF_HEIGHT, FINGER_TOP + PALM_HEIGHT + 8.0
         self._height = 0.5 * (low + high)
         self._look_at(self._middle)
-        corners = np.array([[x, y, z] for x in (-across, across) for y in (-DEEP, DEEP) for z in (low, high)])
+        corners = np.array(
+            [[x, y, z] for x in (-across, across) for y in (-HALF_DEPTH, HALF_DEPTH) for z in (low, high)]
+        )
         self.outlook = Outlook(
-            corners - [0.0, 0.0, self._height], np.array([-0.2, -1.0, 0.22]), np.array([0.0, 0.0, 1.0]),
-            float(np.radians(20)),
-        )  # fmt: skip
+            corners - [0.0, 0.0, self._height], np.array([-0.2, -1.0, 0.22]))  # fmt: skip
 
     def draw(self, history: History, belief: Belief, heavy: bool = True) -> None:
-        """Send where finger and part are and whether they touch; particles and truth only if `heavy`."""
+        """Send finger, part and contact; particles and truth only if `heavy`."""
         pick = [self._surface, self._depth]
         surface, depth = belief.mean[pick]
         contact = float(belief.mean[self._contact])
@@ -180,8 +183,8 @@ class GripperScene:
         contact = float(np.clip(contact, 0.0, 1.0))
         cov = belief.cov[np.ix_(pick, pick)]
         spread = 2 * np.sqrt(np.maximum([cov[0, 0], cov.sum(), cov[1, 1]], 0.0))
-        self._look_at(self._middle + SHARE * (float(surface) + 0.5 * PART - self._middle))
-        self._part.position = (surface + 0.5 * PART, 0.0, 0.0)
+        self._look_at(self._middle + FOLLOW_SHARE * (float(surface) + 0.5 * PART_WIDTH - self._middle))
+        self._part.position = (surface + 0.5 * PART_WIDTH, 0.0, 0.0)
         self._move_fingers(surface, depth, contact)
         for handle, at, around in zip(self._doubts, (surface, surface + depth), spread, strict=False):
             handle.position = (at, 0.0, 0.0)
@@ -192,96 +195,100 @@ class GripperScene:
             self._draw_truth(history)
 
     def _move_fingers(self, surface: float, depth: float, contact: float) -> None:
-        """The finger and its mirror image on the part's far side; a pad gives way by as much as the finger is deep."""
+        """Move the finger and its mirror image; a pad is compressed by the depth of the finger."""
         face = surface + depth - contact * max(depth, 0.0)
         back = surface + depth - PAD
         color = mixed(self._apart, self._touching, contact)
-        tall = TALL + 2.0 + ABOVE
+        tall = HALF_HEIGHT + 2.0 + FINGER_TOP
         for (steel, pad), mirrored in zip(self._fingers, (False, True), strict=True):
-            ends = [2 * surface + PART - x if mirrored else x for x in (back - FINGER, back, face)]
-            steel.position = (0.5 * (ends[0] + ends[1]), 0.0, ABOVE - 0.5 * tall)
+            ends = [2 * surface + PART_WIDTH - x if mirrored else x for x in (back - FINGER, back, face)]
+            steel.position = (0.5 * (ends[0] + ends[1]), 0.0, FINGER_TOP - 0.5 * tall)
             pad.position = (0.5 * (ends[1] + ends[2]), 0.0, 0.0)
             pad.scale = (max(abs(ends[2] - ends[1]), 0.1), 1.0, 1.0)
             if tuple(pad.color) != color:
                 pad.color = color
-        self._palm.position = (surface + 0.5 * PART, 0.0, ABOVE + 0.5 * RISE)
-        self._palm.scale = (PART + 2 * (surface - back + FINGER), 1.0, 1.0)
+        self._palm.position = (surface + 0.5 * PART_WIDTH, 0.0, FINGER_TOP + 0.5 * PALM_HEIGHT)
+        self._palm.scale = (PART_WIDTH + 2 * (surface - back + FINGER), 1.0, 1.0)
 
     def _measure(self, surface: float, depth: float, contact: float, spread: np.ndarray) -> None:
-        """What is between finger and part, as a measure line, and in words."""
-        height = TALL + 4.0
+        """Draw the distance between finger and part as a line and as text."""
+        height = HALF_HEIGHT + 4.0
         ends = np.array([surface + depth, surface])
         self._gap.visible = True
         self._gap.points = np.array(
-            [[[ends[0], -DEEP, height], [ends[1], -DEEP, height]]]
-            + [[[x, -DEEP, height - 2.0], [x, -DEEP, height + 2.0]] for x in ends],
+            [[[ends[0], -HALF_DEPTH, height], [ends[1], -HALF_DEPTH, height]]]
+            + [[[x, -HALF_DEPTH, height - 2.0], [x, -HALF_DEPTH, height + 2.0]] for x in ends],
             np.float32,
         )
-        middle, unit = surface + 0.5 * PART, self._unit
+        middle, unit = surface + 0.5 * PART_WIDTH, self._unit
         texts = (
             (self._between, f"depth {with_deviation(depth, spread[2])} {unit}", (min(ends), height + 2.5)),
-            (self._says, f"contact {100 * contact:.0f} %", (middle, ABOVE + RISE + 2.0)),
-            (self._where, f"part at {with_deviation(surface, spread[0])} {unit}", (middle, -TALL - 5.0)),
+            (self._says, f"contact {100 * contact:.0f} %", (middle, FINGER_TOP + PALM_HEIGHT + 2.0)),
+            (self._where, f"part at {with_deviation(surface, spread[0])} {unit}", (middle, -HALF_HEIGHT - 5.0)),
         )
         for label, text, (x, z) in texts:
             if label.text != text:
                 label.text = text
-            label.position = (x, -DEEP, z)
+            label.position = (x, -HALF_DEPTH, z)
 
     def _draw_cloud(self, points: np.ndarray) -> None:
-        """Where the particles have the part begin."""
+        """Draw the surface of the part by each particle."""
         at = points[:, self._surface] if len(points) else np.zeros(0)
         at = at[np.isfinite(at)]
         self._cloud.visible = bool(at.size)
         if at.size:
-            rows = np.linspace(-DEEP, DEEP, at.size)
-            self._cloud.points = np.column_stack((at, rows, np.full(at.size, -TALL - 2.0))).astype(np.float32)
+            rows = np.linspace(-HALF_DEPTH, HALF_DEPTH, at.size)
+            self._cloud.points = np.column_stack((at, rows, np.full(at.size, -HALF_HEIGHT - 2.0))).astype(np.float32)
 
     def _draw_truth(self, history: History) -> None:
-        """Where the part begins and the finger is, in truth."""
+        """Draw the true surface and finger."""
         events = history.events()
         told = [truth_of(events, j)[1] for j in (self._surface, self._depth)]
         surface, depth = (values[-1] if values.size else np.nan for values in told)
-        lines = [[x, -1.15 * DEEP, z] for x in (surface, surface + depth) for z in (-TALL - 1.0, TALL + 1.0)]
+        lines = [
+            [x, -1.15 * HALF_DEPTH, z]
+            for x in (surface, surface + depth)
+            for z in (-HALF_HEIGHT - 1.0, HALF_HEIGHT + 1.0)
+        ]
         self._truth.visible = bool(np.isfinite(surface))
         self._truth.points = segments(np.insert(np.array(lines), 2, np.nan, axis=0))
 
     def _look_at(self, middle: float) -> None:
-        """Move the world so that a place on the finger's way is in the middle of the view."""
+        """Move the world so that a position of the finger is in the middle of the view."""
         self._middle = middle
         self.world.position = (-middle, 0.0, -self._height)
 
 
 SLOTS, MAGNETS = 12, 8
-CUT = 90.0
-"""Degrees that are cut out of what stands still, up and to the right."""
+CUT_DEGREES = 90.0
+"""Angle that is cut out of the stator, degrees."""
 
-TURNED = 0.3
-"""Radians by which its axis is turned away from who looks."""
+AXIS_ANGLE = 0.3
+"""Angle between the axis and the view, radians."""
 
 SIGMAS = (-2.0, 0.0, 2.0)
 
 Sector = tuple[float, float, float, float, float]
-"""Inner and outer radius, from which angle to which in degrees, half the length."""
+"""Inner and outer radius, first and last angle in degrees, half the length."""
 
 
 def sectors(part: str) -> list[Sector]:
-    """The slices of a part of the motor, whose outer radius is 1 and whose axis is y."""
+    """Return the slices of a part of the motor, whose outer radius is 1 and whose axis is y."""
     pitch, pole = 360.0 / SLOTS, 360.0 / MAGNETS
     if part == "yoke":
-        return [(0.78, 1.0, angle, angle + 10.0, 0.6) for angle in np.arange(CUT, 360.0, 10.0)]
+        return [(0.78, 1.0, angle, angle + 10.0, 0.6) for angle in np.arange(CUT_DEGREES, 360.0, 10.0)]
     if part == "tooth":
         middles = pitch * np.arange(SLOTS) + 0.5 * pitch
-        return [(0.52, 0.78, a - 6.0, a + 6.0, 0.6) for a in middles if a > CUT]
+        return [(0.52, 0.78, a - 6.0, a + 6.0, 0.6) for a in middles if a > CUT_DEGREES]
     if part == "winding":
         # Coils are longer than the iron: their ends stand out.
         middles = pitch * np.arange(SLOTS + 1)
-        return [(0.55, 0.76, max(CUT, a - 8.0), min(360.0, a + 8.0), 0.78) for a in middles if a >= CUT]
+        return [(0.55, 0.76, max(CUT_DEGREES, a - 8.0), min(360.0, a + 8.0), 0.78) for a in middles if a >= CUT_DEGREES]
     return [(0.36, 0.47, pole * k + 4.0, pole * (k + 1) - 4.0, 0.6) for k in range(MAGNETS)]
 
 
 def mesh(parts: list[Sector]) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (n, 3) and triangles (m, 3) of some sectors of a ring about the y axis."""
+    """Return vertices (n, 3) and triangles (m, 3) of sectors of a ring about the y axis."""
     vertices, faces, count = [], [], 0
     for inner, outer, start, end, half in parts:
         angles = np.radians(np.linspace(start, end, max(2, int((end - start) / 4) + 1)))
@@ -301,12 +308,12 @@ def mesh(parts: list[Sector]) -> tuple[np.ndarray, np.ndarray]:
 
 
 class MotorScene:
-    """The motor, and below it the scale of its colours with each part's temperature."""
+    """Motor, and below it the scale of its colours with each part's temperature."""
 
     def __init__(self, api: viser.SceneApi, model: StateSpaceModel, parts: Mapping[str, str], palette: Palette) -> None:
         self._states = [model.state_names.index(name) for name in parts.values()]
         self.root = api.add_frame("/scene", show_axes=False)
-        api.add_frame("/scene/motor", show_axes=False, wxyz=about_z(TURNED))
+        api.add_frame("/scene/motor", show_axes=False, wxyz=about_z(AXIS_ANGLE))
         flat = {"cast_shadow": False, "receive_shadow": False, "side": "double", "flat_shading": True}
         iron = mixed(palette.faint, palette.panel, 0.35)
         for name, solid in {
@@ -330,12 +337,10 @@ class MotorScene:
         corners = np.array([[x, y, z] for x in (-1.05, 1.05) for y in (-0.8, 0.8) for z in (self._bar.bottom, 1.02)])
         middle = np.array([0.0, 0.0, 0.5 * (self._bar.bottom + 1.02)])
         self.root.position = -middle
-        self.outlook = Outlook(
-            corners - middle, np.array([0.0, -1.0, 0.28]), np.array([0.0, 0.0, 1.0]), float(np.radians(20))
-        )
+        self.outlook = Outlook(corners - middle, np.array([0.0, -1.0, 0.28]))
 
     def draw(self, history: History, belief: Belief, heavy: bool = True) -> None:
-        """Send the colours of now."""
+        """Send the present colours."""
         if not heavy:
             return
         mean = belief.mean[self._states]
@@ -348,20 +353,20 @@ class MotorScene:
                     handle.color = color
 
 
-TICKS = 9
-ROW = 0.26
-"""Height of a quantity's line and its text."""
+MAX_SCALE_TICKS = 9
+ROW_HEIGHT = 0.26
+"""Height of the line of a quantity, with its text."""
 
 
 class ScaleBar:
-    """Stands upright, x from -1 to 1, its top at z = `top`, facing who looks north."""
+    """Upright scale of colours, x from -1 to 1, with mean and ± 2σ of each quantity below it."""
 
     def __init__(
         self, api: viser.SceneApi, name: str, labels: Sequence[str], unit: str, theme: Palette, *, y: float, top: float
     ) -> None:
         self._labels, self._unit, self._y, self._top = labels, unit, y, top
         self._scale, self._colors = Scale(ESTIMATE), gradient(ESTIMATE.colors)
-        strip = np.repeat(self._colors[:NOTHING][None], 8, axis=0)
+        strip = np.repeat(self._colors[:UNKNOWN_INDEX][None], 8, axis=0)
         # An image lies in the plane of x and y, its top at -y: up it goes by a right angle about x.
         half = float(np.sqrt(0.5))
         api.add_image(
@@ -370,7 +375,7 @@ class ScaleBar:
         )  # fmt: skip
         self._ticks = [
             api.add_label(f"{name}/ticks/{k}", " ", anchor="top-center", font_screen_scale=0.75, visible=False)
-            for k in range(TICKS)
+            for k in range(MAX_SCALE_TICKS)
         ]
         line = {"thickness_units": "screen"}
         nothing = np.zeros((1, 2, 3), np.float32)
@@ -384,7 +389,7 @@ class ScaleBar:
         self.bottom = self._row(len(labels) - 1) - 0.05
 
     def fit(self, mean: np.ndarray, std: np.ndarray) -> None:
-        """Show these quantities; both (k,), NaN where one is not known."""
+        """Show quantities; both (k,), NaN where one is unknown."""
         self._scale.fit(np.concatenate((mean - 2 * std, mean + 2 * std)))
         for k, (label, place) in enumerate(zip(self._labels, zip(mean, std, strict=True), strict=True)):
             at, spread = place
@@ -392,28 +397,21 @@ class ScaleBar:
             text = known if np.isfinite(at + spread) else f"{label}  –"
             if self._texts[k].text != text:
                 self._texts[k].text = text
-        ticks = self._scale.ticks()
-        for label, tick in zip(self._ticks, [*ticks, *[None] * TICKS], strict=False):
-            if label.visible != (tick is not None):
-                label.visible = tick is not None
-            if tick is not None and label.text != tick[1]:
-                label.text = tick[1]
-            if tick is not None:
-                label.position = (2 * tick[0] - 1, self._y, self._top - 0.1)
+        draw_ticks(self._ticks, self._scale, lambda share: (2 * share - 1, self._y, self._top - 0.1))
         rows = np.array([self._row(k) for k in range(len(mean))])
         self._bands.points = self._lines(mean - 2 * std, mean + 2 * std, rows, rows)
         self._means.points = self._lines(mean, mean, rows - 0.04, rows + 0.04)
 
     def color(self, value: float) -> RGB:
-        """The colour of a value; grey if it is not known."""
+        """Return the colour of a value; grey if it is unknown."""
         red, green, blue = self._colors[self._scale.indices(np.array([value]))[0]]
         return int(red), int(green), int(blue)
 
     def _row(self, k: int) -> float:
-        return self._top - 0.34 - ROW * (k + 1) + 0.06
+        return self._top - 0.34 - ROW_HEIGHT * (k + 1) + 0.06
 
     def _lines(self, start: np.ndarray, end: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-        """Lines in the plane of the bar between values, at heights."""
+        """Return lines between values at heights."""
         width = self._scale.high - self._scale.low
         gap = np.full(3, np.nan)
         points = []

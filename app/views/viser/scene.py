@@ -1,4 +1,4 @@
-"""Shapes and numbers for the scene: ellipsoids of a covariance, polylines, round ticks."""
+"""Parts that all scenes share: the recent rows of the track, cameras, and shapes such as ellipsoids and polylines."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ...live.outputs import Pull
 
 
 def ellipsoid(cov: np.ndarray, sigmas: float = 2.0) -> tuple[np.ndarray, tuple[float, float, float, float]]:
-    """The ellipsoid x' cov⁻¹ x = sigmas² as a unit sphere, scaled and turned.
+    """Return the ellipsoid x' cov⁻¹ x = sigmas² as a scaled and turned unit sphere.
 
     Args:
         cov: Symmetric positive semidefinite, shape (3, 3).
@@ -29,7 +29,7 @@ def ellipsoid(cov: np.ndarray, sigmas: float = 2.0) -> tuple[np.ndarray, tuple[f
 
 
 def quaternion(rotation: np.ndarray) -> tuple[float, float, float, float]:
-    """The unit quaternion (w, x, y, z) of a rotation matrix, from its largest component, which is never near zero.
+    """Return the unit quaternion (w, x, y, z) of a rotation matrix, from its largest component.
 
     Source: Shepperd (1978), doi:10.2514/3.55767b.
     """
@@ -50,12 +50,12 @@ def quaternion(rotation: np.ndarray) -> tuple[float, float, float, float]:
 
 
 def about_z(angle: float) -> tuple[float, float, float, float]:
-    """The quaternion of a turn to the left about the vertical, in radians."""
+    """Return the quaternion of a turn to the left about the vertical, in radians."""
     return float(np.cos(angle / 2)), 0.0, 0.0, float(np.sin(angle / 2))
 
 
 def segments(points: np.ndarray) -> np.ndarray:
-    """A polyline (n, 3) as segments (n - 1, 2, 3); the gaps at rows that are not finite stay open."""
+    """Return a polyline (n, 3) as segments (n - 1, 2, 3), without those at rows that are not finite."""
     pairs = np.stack((points[:-1], points[1:]), axis=1) if len(points) > 1 else np.zeros((0, 2, 3))
     pairs = pairs[np.isfinite(pairs).all(axis=(1, 2))]
     # Viser draws nothing sensible of an empty array; a segment without length is invisible.
@@ -63,7 +63,7 @@ def segments(points: np.ndarray) -> np.ndarray:
 
 
 def disc(sides: int = 64) -> tuple[np.ndarray, np.ndarray]:
-    """A flat disc of radius 1 in the plane z = 0: vertices and triangles."""
+    """Return vertices and triangles of a flat disc of radius 1 in the plane z = 0."""
     angle = np.linspace(0, 2 * np.pi, sides, endpoint=False)
     rim = np.stack((np.cos(angle), np.sin(angle), np.zeros(sides)), axis=1)
     k = np.arange(sides)
@@ -72,7 +72,7 @@ def disc(sides: int = 64) -> tuple[np.ndarray, np.ndarray]:
 
 
 def circle(sides: int = 64) -> np.ndarray:
-    """The rim of that disc as segments (sides, 2, 3)."""
+    """Return the rim of that disc as segments (sides, 2, 3)."""
     angle = np.linspace(0, 2 * np.pi, sides + 1)
     return segments(np.stack((np.cos(angle), np.sin(angle), np.zeros(sides + 1)), axis=1))
 
@@ -84,8 +84,8 @@ _COLUMNS = (*_EVENTS, "mean", "std", "verdict")
 class History:
     """A sliding copy of the track: the last `span` nanoseconds, and never more than `2 * limit` rows.
 
-    Row i of the arrays is event `base + i` of the log. Rows that a late reading or another revision rewrites are
-    simply pulled again, and overwrite what is here from there on.
+    Row i of the arrays is event `base + i` of the log. Rows that a late measurement or another revision rewrites are
+    pulled again and overwrite the rows from there on.
     """
 
     def __init__(self, nx: int, width: int, limit: int = 32_768) -> None:
@@ -95,28 +95,28 @@ class History:
         self.n = 0
         shapes = {"value": (width,), "mean": (nx,), "std": (nx,)}
         kinds = {"t": np.int64, "kind": np.int8, "channel": np.int32, "verdict": np.int8}
-        # Filled, not empty: the pages are paid for now, and memory stays flat.
+        # Filled, not empty: memory is allocated now and stays flat.
         self._columns = {
             name: np.full((2 * limit, *shapes.get(name, ())), 0, kinds.get(name, np.float64)) for name in _COLUMNS
         }
 
     def column(self, name: str) -> np.ndarray:
-        """The valid rows of one column, as a view."""
+        """Return the valid rows of one column, as a view."""
         return self._columns[name][: self.n]
 
     def events(self, rows: slice = slice(None)) -> Events:
-        """Some of the valid rows as events, as views; each as if it had arrived when it was measured."""
+        """Return valid rows as events, as views, with the time of measurement as the time of arrival."""
         t, kind, channel, value = (self.column(name)[rows] for name in ("t", "kind", "channel", "value"))
         return Events(t, t, kind, channel, value)
 
     def settled(self, name: str, rows: int) -> np.ndarray:
-        """The newest rows of a column, only the last one of each time: what all sensors together made of it."""
+        """Return the newest rows of a column, of each time only the last, after all its sensors."""
         t = self.column("t")[-4 * rows :]
         last = np.append(t[1:] != t[:-1], [True] * bool(t.size))
         return self.column(name)[-4 * rows :][last.astype(bool)][-rows:]
 
     def clear(self) -> None:
-        """Forget all rows."""
+        """Drop all rows."""
         self.base, self.n = 0, 0
 
     def take(self, pull: Pull) -> int:
@@ -135,16 +135,16 @@ class History:
             start -= self._drop(start - self.limit)
         for name, column in self._columns.items():
             batch = getattr(pull.events if name in _EVENTS else pull.track, name)
-            # Pictures have no use for the variances that readings bring, in columns after the values.
+            # The variances of measurements, in columns after the values, are not drawn.
             column[start : start + count] = batch[:, : column.shape[1]] if column.ndim > 1 else batch
         self.n = start + count
         return start
 
     def trim(self) -> int:
-        """Drop what is older than the span, once that is a third of what is here.
+        """Drop rows older than the span, once they are a third of all rows.
 
         Returns:
-            How many rows went, by which all row numbers fall.
+            Number of dropped rows, by which all row numbers fall.
         """
         if self.span is None or not self.n:
             return 0
@@ -160,7 +160,7 @@ class History:
 
 
 MARGIN = 0.94
-"""Part of the view that is filled by what is to be seen."""
+"""Share of the view that the points fill."""
 
 WORTH = 0.75
 """A scene is turned by a right angle if it then can be seen from that share of the distance."""
@@ -195,11 +195,11 @@ class Outlook(NamedTuple):
 
 
 def place(outlook: Outlook, aspect: float) -> tuple[np.ndarray, np.ndarray]:
-    """Where a camera stands that looks at the origin, and its up: both (3,).
+    """Return position and up direction of a camera that looks at the origin, both (3,).
 
     Args:
-        outlook: What it is to see.
-        aspect: Width of the pane over its height.
+        outlook: Points to see.
+        aspect: Width of the view over its height.
     """
     straight = _distance(outlook, aspect)
     if outlook.turns:
@@ -211,7 +211,7 @@ def place(outlook: Outlook, aspect: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _distance(outlook: Outlook, aspect: float) -> float:
-    """How far away a camera must stand to see the points, with a margin.
+    """Return the distance at which a camera sees the points, with a margin.
 
     A point c is seen if |c · r| <= tan(h/2) (d + c · f), with f forward, r to the right and h the angle across; so for
     what is up, with the angle from top to bottom.
@@ -229,14 +229,14 @@ def _unit(vector: np.ndarray) -> np.ndarray:
 
 
 def _turned(vector: np.ndarray) -> np.ndarray:
-    """A right angle to the right about z: what was north on the screen is to the left, east is up."""
+    """Turn by a right angle to the right about z: north is left on the screen, east is up."""
     return np.array([vector[1], -vector[0], vector[2]])
 
 
 class Cameras:
-    """Gives each browser's camera its place: when it comes, when its pane changes its shape, and for another scene.
+    """Places each browser's camera: when it connects, when its view changes its shape, and for another scene.
 
-    Otherwise a camera is its user's, who turns it freely.
+    Otherwise the user moves the camera.
     """
 
     def __init__(self, server: viser.ViserServer) -> None:

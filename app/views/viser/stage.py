@@ -1,4 +1,4 @@
-"""What stands on the stage: one scene at a time, the one that is chosen; nothing of the others is kept or sent."""
+"""The stage: builds and draws the chosen scene, one at a time, and holds the choices about it."""
 
 from __future__ import annotations
 
@@ -30,34 +30,34 @@ BELIEF, FIELD, SURFACE = "belief", "field", "surface"
 VEHICLE, MOTOR, BATTERY, GRIPPER = "vehicle", "motor", "battery", "gripper"
 FOLLOW, STAY = "vehicle", "place"
 
-PICTURED = (FieldScene, FieldSurfaceScene)
-"""Scenes of a large field, which are drawn from its pictures."""
+FIELD_SCENES = (FieldScene, FieldSurfaceScene)
+"""Scenes of a large field, drawn from its pictures."""
 
 AMBIENT, ABOVE = 2.5, 0.9
-"""Strength of the lights: π of the first alone would show each colour as it is."""
+"""Strength of the lights; π of the first alone would show each colour unchanged."""
 
-HEAVY = 0.4
-"""Seconds between two redraws of what is many points."""
+HEAVY_PERIOD_S = 0.4
+"""Seconds between two redraws of lines and point clouds."""
 
 
 class Scene(Protocol):
-    """A scene below one frame, which takes it away."""
+    """A scene below one frame; removing the frame removes the scene."""
 
     root: viser.FrameHandle
     outlook: Outlook
 
     def draw(self, history: History, belief: Belief, heavy: bool = True) -> None:
-        """Send where everything is now; what is many points only if `heavy`."""
+        """Send the present positions; lines and point clouds only if `heavy`."""
 
 
 class Stage:
-    """Builds the scene that is chosen, again where that changes, and draws it."""
+    """Builds the chosen scene, again after another choice, and draws it."""
 
     def __init__(self, server: viser.ViserServer, engine: Running) -> None:
         self._server, self._engine = server, engine
         api = server.scene
         api.set_up_direction("+z")
-        # Nearly the same light from everywhere: colours mean something, so shading must not change them much.
+        # Nearly uniform light: colours have a meaning, so shading must not change them much.
         api.configure_default_lights(False)
         api.configure_environment_map(None)
         api.add_light_ambient("/light/all", intensity=AMBIENT)
@@ -69,14 +69,14 @@ class Stage:
         self.palette = LIGHT
         self.scene: Scene | None = None
         self._built: object = None
-        self._heavy = -HEAVY
+        self._heavy = -HEAVY_PERIOD_S
         self._values: dict[str, str] = {}
         self._late = False
-        """Whether something that is many points is yet to be drawn."""
+        """Whether lines and point clouds are still to be drawn."""
         self.prepare()
 
     def prepare(self) -> bool:
-        """Build the scene that is chosen; whether it is another one than before."""
+        """Build the chosen scene; return whether it is another one than before."""
         values = self.choices.values()
         show = values.get(SHOW, "")
         wanted = (show, *(values.get(axis) for axis in AXES if show == BELIEF), self.palette)
@@ -86,12 +86,12 @@ class Stage:
                 self.scene.root.remove()
             self.scene = self._build(show, values)
             self.cameras.show(self.scene.outlook)
-            self._built, self._heavy = wanted, -HEAVY
+            self._built, self._heavy = wanted, -HEAVY_PERIOD_S
             # Viser has a dark of its own.
             self._server.scene.set_background_image(np.full((2, 2, 3), self.palette.panel, np.uint8), format="png")
         self._late |= values != self._values
         self._values = values
-        if isinstance(self.scene, PICTURED):
+        if isinstance(self.scene, FIELD_SCENES):
             self.scene.show(values["picture"])
         elif isinstance(self.scene, VehicleScene):
             self.scene.follow = values["follow"] == FOLLOW
@@ -99,18 +99,18 @@ class Stage:
 
     @property
     def due(self) -> bool:
-        """Whether there is something to draw though nothing new came; a field knows that itself."""
-        return self._late or isinstance(self.scene, PICTURED)
+        """Return whether to draw without new rows; a field decides itself."""
+        return self._late or isinstance(self.scene, FIELD_SCENES)
 
     def draw(self, history: History) -> None:
-        """Send what has changed."""
+        """Send changes."""
         assert self.scene is not None
         now = time.monotonic()
-        heavy = now - self._heavy >= HEAVY
+        heavy = now - self._heavy >= HEAVY_PERIOD_S
         self._late = not heavy
         if heavy:
             self._heavy = now
-        # The moments of a large field are dear, and its pictures come with the rows.
+        # The moments of a large field are expensive, and its pictures come with the rows.
         belief = self._engine.belief() if self.model.grid is None else None
         if isinstance(self.scene, VehicleScene):
             self.scene.tuning = self._engine.tuning
@@ -139,12 +139,12 @@ class Stage:
 
 
 def choices_of(model: StateSpaceModel, view: ViewSection, *, truth: bool) -> list[Choice]:
-    """What there is to choose from: the pictures of a twin, and what may be chosen about each.
+    """Return the choices about the scenes of a twin.
 
     Args:
-        model: Of the twin.
-        view: As its YAML says.
-        truth: Whether a field's true values are told.
+        model: Model of the twin.
+        view: Section `view` of its YAML.
+        truth: Whether the true values of a field are known.
     """
     if model.grid is not None:
         titles = tuple(kind.title for kind in kinds(truth))
@@ -170,9 +170,9 @@ AXES = ("x", "y", "z")
 
 @dataclass(frozen=True)
 class Choice:
-    """One choice: its key, its label, what there is to choose from and what is chosen at first.
+    """One choice: key, label, options and the initial option.
 
-    `of` is the picture that it is about; None for a choice that is always there.
+    `of` is the scene that it belongs to; None for a choice that all scenes have.
     """
 
     key: str
@@ -183,7 +183,7 @@ class Choice:
 
 
 class Choices:
-    """The choices, and what is chosen. Any thread may ask and set."""
+    """The choices and their values. Thread-safe."""
 
     def __init__(self, choices: Iterable[Choice]) -> None:
         self._choices = {choice.key: choice for choice in choices}
@@ -191,20 +191,20 @@ class Choices:
         self._lock = threading.Lock()
 
     def values(self) -> dict[str, str]:
-        """What is chosen, by key."""
+        """Return the values by key."""
         with self._lock:
             return dict(self._values)
 
     def offered(self) -> list[Choice]:
-        """The choices that there are for the picture that is shown, with more than one option each."""
+        """Return the choices of the present scene that have more than one option."""
         show = self.values().get(SHOW)
         return [item for item in self._choices.values() if len(item.options) > 1 and item.of in (None, show)]
 
     def choose(self, key: str, value: str) -> None:
-        """Choose; an axis that another one has is exchanged with it.
+        """Set a choice; a state that another axis shows is exchanged with it.
 
         Raises:
-            ConfigError: If there is no such choice, or nothing of that name to choose.
+            ConfigError: If there is no such choice or option.
         """
         choice = self._choices.get(key)
         if choice is None:
@@ -221,7 +221,7 @@ class Choices:
             self._values[key] = value
 
     def json(self) -> list[dict[str, Any]]:
-        """The choices for the page, with what is chosen."""
+        """Return the choices with their values, for the page."""
         values = self.values()
         return [
             {"key": item.key, "label": item.label, "options": list(item.options), "value": values[item.key]}

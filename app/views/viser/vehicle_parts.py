@@ -1,7 +1,7 @@
-"""Where an estimate went whose cloud has several peaks at times: at the mean between them it never was.
+"""Parts of the vehicle scene: trail of an estimate with several peaks, beacons with ranges, beams of range finders.
 
-The track knows the mean alone. So where the scene saw several peaks, the way is that of the heaviest; between two looks
-at which there were several, rows of the mean are left out.
+The track has the mean only, which lies between the peaks where the vehicle never was. Where the scene saw several peaks
+the trail follows the heaviest one; rows of the mean between two such frames are left out.
 """
 
 from __future__ import annotations
@@ -19,43 +19,43 @@ from ...present.drawing.colors import Palette, mixed
 from ...present.drawing.direct_readings import expected
 from .scene import History, circle
 
-MOST = 4096
-"""Looks that are remembered."""
+MAX_FRAMES = 4096
+"""Frames that are kept."""
 
 
 class PeakTrail:
-    """The looks of one scene, each with its time, the mean in its row, and the heaviest of several peaks, or NaN."""
+    """Frames of one scene: time, mean of its row, and the heaviest of several peaks, or NaN."""
 
     def __init__(self) -> None:
         self._looks: list[tuple[int, np.ndarray, np.ndarray]] = []
 
     def look(self, t: np.ndarray, mean: np.ndarray, peak: np.ndarray | None) -> None:
-        """Remember what is seen with the newest row.
+        """Keep the frame of the newest row.
 
         Args:
             t: Times of the rows, ns, (n,).
-            mean: The place that the mean of each gives, (n, 2).
-            peak: Place of the heaviest peak where there are several, (2,); None where there is one.
+            mean: Position by the mean of each, (n, 2).
+            peak: Position of the heaviest of several peaks, (2,); None if there is one.
         """
         if self._looks:
             then, place, _ = self._looks[-1]
             row = min(int(np.searchsorted(t, then, side="right")) - 1, len(t) - 1)
-            # Rows that are others by now, of another filter or after a late reading, had other peaks.
+            # Rows that were rewritten, by another filter or a late measurement, had other peaks.
             if then > t[-1] or row >= 0 and t[row] == then and not np.array_equal(mean[row], place, equal_nan=True):
                 self._looks.clear()
         seen = np.full(2, np.nan) if peak is None else np.array(peak, float)
         if self._looks and self._looks[-1][0] == t[-1]:
             self._looks.pop()
-        self._looks = [*self._looks[-MOST + 1 :], (int(t[-1]), mean[-1].copy(), seen)]
+        self._looks = [*self._looks[-MAX_FRAMES + 1 :], (int(t[-1]), mean[-1].copy(), seen)]
 
     def of(self, t: np.ndarray, mean: np.ndarray) -> np.ndarray:
-        """The way, (m, 2): the mean's, and where there were several peaks that of the heaviest."""
+        """Return the trail, (m, 2): the mean, or the heaviest peak where there were several."""
         if not self._looks or not any(np.isfinite(peak[0]) for *_, peak in self._looks):
             return mean
         looks = np.array([then for then, *_ in self._looks])
         peaks = np.array([peak for *_, peak in self._looks])
         several = np.isfinite(peaks[:, 0])
-        # The look that a row led up to; those after the last, of which nothing was seen yet, are as that was.
+        # The frame after each row; rows after the last frame are treated like it.
         led = np.minimum(np.searchsorted(looks, t), len(looks) - 1)
         kept = ~several[led]
         peaked = several & (looks >= t[0])
@@ -63,7 +63,7 @@ class PeakTrail:
         return np.concatenate((mean[kept], peaks[peaked]))[np.argsort(times, kind="stable")]
 
 
-FADING = 10.0
+FADING_S = 10.0
 """Seconds over which a ring pales; then it is gone."""
 
 SIDES = 180
@@ -114,7 +114,7 @@ class Beacons:
         self._size = size
 
     def draw(self, history: History, mean: np.ndarray, p: np.ndarray) -> None:
-        """Send where they stand, and what they told lately."""
+        """Send the positions of the beacons, and their recent ranges."""
         places = self._places.at(mean, p)
         points = np.column_stack((places, np.full(len(places), 0.2 * self._size))).astype(np.float32)
         if not np.array_equal(points, self._marks.points):
@@ -126,24 +126,24 @@ class Beacons:
             mine = np.flatnonzero((kind == READING) & (channel == sensor))
             age = (t[-1] - t[mine[-1]]) / 1e9 if mine.size else np.inf
             far = float(history.column("value")[mine[-1], 0]) if mine.size else np.nan
-            ring.visible = bool(age < FADING and far > 0)
+            ring.visible = bool(age < FADING_S and far > 0)
             if ring.visible:
                 refused = history.column("verdict")[mine[-1]] in (GATED, FAILED)
                 color = self._palette.refused if refused else self._palette.reading
-                color = mixed(color, self._palette.panel, 0.2 * round(4 * age / FADING))
+                color = mixed(color, self._palette.panel, 0.2 * round(4 * age / FADING_S))
                 if tuple(ring.colors) != color:
                     ring.colors = np.array(color, np.uint8)
                 ring.position, ring.scale = (*place, 0.03), (far, far, 1.0)
 
 
-RECENT = 3.0
-"""Seconds after which a reading is no longer drawn: it says nothing of where the vehicle is now."""
+MAX_AGE_S = 3.0
+"""Age in seconds from which a measurement is no longer drawn."""
 
 HEIGHT = 0.12
 
 
 class Beams:
-    """Lines from the vehicle to where each beam should end, and dots where its reading says that it ended."""
+    """Lines from the vehicle to the expected end of each beam, and dots at its measured end."""
 
     def __init__(
         self, api: viser.SceneApi, name: str, model: StateSpaceModel, angles: Mapping[str, Sequence[float]],
@@ -165,7 +165,7 @@ class Beams:
         ]  # fmt: skip
 
     def draw(self, history: History, mean: np.ndarray, place: np.ndarray, heading: float, p: np.ndarray) -> None:
-        """Send the beams of a vehicle of state `mean` (nx,), at `place` (2,) on the plane; p are the parameters."""
+        """Send the beams of a vehicle with state `mean` (nx,) at `place` (2,); p are the parameters."""
         expectations: list[tuple] = []
         readings: list[tuple] = []
         refusals: list[tuple] = []
@@ -186,16 +186,16 @@ class Beams:
                 handle.points = np.column_stack((ends, np.full(len(ends), HEIGHT + 0.05))).astype(np.float32)
 
     def hide(self) -> None:
-        """Draw nothing: the vehicle is nowhere."""
+        """Hide the beams while the position is unknown."""
         for handle in (self._expected, self._read, *self._dots):
             handle.visible = False
 
     @staticmethod
     def _last(history: History, sensor: int, rows: int) -> tuple[np.ndarray, bool]:
-        """The newest reading of a sensor (rows,), NaN if it is too old, and whether it was refused."""
+        """Return the newest measurement of a sensor (rows,), NaN if it is too old, and whether it was rejected."""
         mine = np.flatnonzero((history.column("kind") == READING) & (history.column("channel") == sensor))
         t = history.column("t")
-        if not mine.size or t[-1] - t[mine[-1]] > RECENT * 1e9:
+        if not mine.size or t[-1] - t[mine[-1]] > MAX_AGE_S * 1e9:
             return np.full(rows, np.nan), False
         return history.column("value")[mine[-1], :rows], bool(history.column("verdict")[mine[-1]] in (GATED, FAILED))
 

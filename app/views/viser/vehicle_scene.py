@@ -24,41 +24,41 @@ from .scene import History, Outlook, about_z, circle, disc, ellipsoid, segments
 from .vehicle_parts import Beacons, Beams, PeakTrail, Places
 
 UNSURE = 20.0
-"""Times the usual deviation of a place, beyond which the trail says nothing of it."""
+"""Multiple of the median deviation from which a position is left out of the trail."""
 
 LEAP = 20.0
-"""Times a usual step of the trail, beyond which it is none that a vehicle made."""
+"""Multiple of the median step from which a step of the trail is drawn as a gap."""
 
 TRAIL = 300
-"""Points of a line where something was, at most."""
+"""Largest number of points of a trail."""
 
 PEAKS = 4
 POINTS = 600
-"""Position readings of one sensor that are drawn at most."""
+"""Largest number of position measurements of a sensor."""
 
 SOFTNESS = 0.3
-"""Part of the way to the vehicle that the view moves in one frame."""
+"""Share of the way to the vehicle that the view moves in one frame."""
 
 FOV = float(np.radians(40))
 UP = np.array([0.0, 0.0, 1.0])
 
 SLANTED = np.array([0.0, -0.68, 0.73])
-"""From the vehicle to the first view of it."""
+"""Direction from the vehicle to the initial camera."""
 
 ABOVE = np.array([0.0, -0.12, 0.99])
-"""From walls to the first view of them, nearly as on a plan: a corridor would else be a line."""
+"""Direction from walls to the initial camera, nearly from above: a corridor would otherwise be a line."""
 
 AROUND = 4.0
-"""Lengths of the vehicle around it that the first view shows where there are no walls and no beacons."""
+"""Radius of the initial view without walls and beacons, in lengths of the vehicle."""
 
 NEAREST = 0.7
-"""Lengths of the vehicle around the middle of walls and beacons that the first view shows at least."""
+"""Smallest radius of the initial view with walls or beacons, in lengths of the vehicle."""
 
 BESIDE = 1.2
-"""Times as far as beacons are that the first view reaches, for their names."""
+"""Factor by which the initial view reaches beyond the beacons, for their names."""
 
 LARGE = 2.5
-"""Times what the first view shows from which on an ellipse has no area, which would be all that one sees."""
+"""Multiple of the view's radius from which an ellipse is drawn as an outline only."""
 
 
 class VehicleScene:
@@ -84,13 +84,13 @@ class VehicleScene:
         walled = np.array([corner for line in scene.walls for corner in line]).reshape(-1, 2)
         standing = Places(model, scene.beacons.values()).at(model.prior_mean, self.tuning.p)
         corners = np.concatenate((walled, standing))
-        # Among walls and beacons the place is what matters, all of it: two peaks may be at its two ends.
+        # With walls or beacons the view shows all of them: two peaks may be at opposite ends.
         self._home = 0.5 * (corners.min(axis=0) + corners.max(axis=0)) if corners.size else None
         self._length = scene.size[0]
         self._reach = AROUND * self._length
         if self._home is not None:
             self._reach = max(NEAREST * self._length, float(np.abs(corners - self._home).max()))
-        # Of dots, as large at any distance.
+        # Size of dots.
         dot_size = self._reach / 36.0
         self.follow = self._home is None
         self._anchor: np.ndarray | None = None if self._home is None else self._home.copy()
@@ -152,12 +152,12 @@ class VehicleScene:
         self._move_world()
 
     def draw(self, history: History, belief: Belief, heavy: bool = True) -> None:
-        """Send where everything is now; lines, readings and particles only if `heavy`."""
+        """Send the present positions; lines, measurements and particles only if `heavy`."""
         if not history.n:
             return
         mean = history.column("mean")
         known = bool(np.isfinite(belief.mean[[self.east, self.north]]).all())
-        # What was drawn before would else stand for an estimate that is not a number.
+        # Otherwise the earlier drawing would stay for an estimate that is not a number.
         heavy |= known != self._known
         self._known = known
         self._vehicle.visible = known
@@ -199,12 +199,12 @@ class VehicleScene:
         self._draw_ellipse(here, peak.cov[np.ix_([self.east, self.north], [self.east, self.north])])
 
     def _move_world(self) -> None:
-        """Bring what is to be in the middle there."""
+        """Move the world so that the anchor is in the middle of the view."""
         if self._anchor is None:
             return
         shift = np.array([*-self._anchor, 0.0])
         self.world.position = shift
-        # The grid is endless: only where its lines fall matters.
+        # The grid is endless, so only the phase of its lines matters.
         self._grid.position = (*np.mod(shift[:2], self._section), 0.0)
 
     def _draw_ellipse(self, here: np.ndarray, cov: np.ndarray) -> None:
@@ -243,12 +243,12 @@ class VehicleScene:
             _put(handle, np.concatenate(parts))
 
     def _draw_cloud(self, points: Any) -> None:
-        """The points that stand for the belief."""
+        """Draw the particles."""
         plane = points[:, [self.east, self.north]] if len(points) else np.zeros((0, 2))
         _put(self._cloud, np.column_stack((plane, np.full(len(plane), 0.2))))
 
     def _mark(self, peaks: Any) -> None:
-        """A dot with its weight at each peak, where there are several."""
+        """Draw a dot with its weight at each of several peaks."""
         several = peaks if len(peaks) > 1 else ()
         for k, (dot, label) in enumerate(self._peaks):
             place = several[k].mean[[self.east, self.north]] if k < len(several) else np.full(2, np.nan)

@@ -1,4 +1,4 @@
-"""Viser: the stage of the page, and the same scene with a small panel in a window of its own, for any browsers."""
+"""Viser: the scene of the page, and the same scene with a small panel in a window of its own."""
 
 from __future__ import annotations
 
@@ -14,34 +14,34 @@ from ...present.series.series import Series
 from .guarded_server import addresses, guarded_server, unprinted
 from .panel import Panel
 from .scene import History
-from .stage import PICTURED, Stage
+from .stage import FIELD_SCENES, Stage
 
-FRAME = 0.1
-"""Seconds between two frames, when they are cheap."""
+FRAME_PERIOD_S = 0.1
+"""Seconds between two cheap frames."""
 
-SHARE = 0.08
-"""Part of a core that drawing may take: dearer frames come less often."""
+MAX_CPU_SHARE = 0.08
+"""Share of a core that drawing may take: expensive frames are drawn less often."""
 
-SLOWEST = 2.0
-"""Seconds between two frames at most."""
+MAX_FRAME_PERIOD_S = 2.0
+"""Largest time between two frames, seconds."""
 
-RESTED = 0.4
-"""Seconds for which a knob must rest before the page's scene follows it: it is drawn on one thread with the charts."""
+EDIT_REST_S = 0.4
+"""Seconds without an edit before the page's scene follows: the browser draws it on one thread with the charts."""
 
-LATEST = 1.0
-"""Seconds between two frames of that scene while a knob is dragged."""
+MAX_EDIT_WAIT_S = 1.0
+"""Seconds between two frames of that scene while a slider is dragged."""
 
-ROWS = 16_384
+MAX_PULL_ROWS = 16_384
 """Rows pulled at once, so that a long history does not hold the engine's lock for long."""
 
 
 class ViserView:
-    """Pulls rows from the engine at its own rate, with a cursor of its own, and never keeps the engine waiting.
+    """Pulls rows from the engine at its own rate, with a cursor of its own, so that the engine never waits.
 
-    While no browser is there it pulls, computes and sends nothing. A browser says by the address of its WebSocket what
-    it shows: `?part=scene` for the scene alone, so that the panel is not kept up for it, and `theme=dark`.
+    Without a browser it pulls, computes and sends nothing. The address of a browser's WebSocket has its options:
+    `?part=scene` for the scene without the panel, and `theme=dark`.
 
-    `port` is known once the view is built; browsers reach it through the page's server only, which knows `secret`.
+    Browsers reach `port` through the page's server only, which knows `secret`.
     """
 
     def __init__(self, engine: Running, *, secret: str) -> None:
@@ -55,18 +55,18 @@ class ViserView:
         self.history = History(len(model.shown), model.width, limit)
         self.history.span = int(engine.twin.config.view.window * 1e9)
         self._series = Series(engine)
-        self._rows = min(ROWS, limit)
+        self._rows = min(MAX_PULL_ROWS, limit)
         self._cursor: Any = None
-        self._tuning, self._turned, self._drawn = engine.tuning, -RESTED, -LATEST
+        self._tuning, self._turned, self._drawn = engine.tuning, -EDIT_REST_S, -MAX_EDIT_WAIT_S
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="viser view", daemon=True)
 
     def start(self) -> None:
-        """Begin to draw."""
+        """Start drawing."""
         self._thread.start()
 
     def stop(self) -> None:
-        """End drawing, and the server with it."""
+        """Stop drawing and the server."""
         self._stop.set()
         if self._thread.is_alive():
             self._thread.join()
@@ -75,7 +75,7 @@ class ViserView:
             self.server.stop()
 
     def frame(self, *, panel: bool = True) -> None:
-        """Bring the scene, and if it is seen the panel, up to what the engine has now."""
+        """Update the scene, and the panel if a browser shows it, to the engine's present state."""
         with self.server.atomic():
             if self.stage.prepare() or self._cursor is None:
                 self._begin()
@@ -86,7 +86,7 @@ class ViserView:
                 self.panel.sync(self._series.origin())
 
     def _begin(self) -> None:
-        """Pull what the window shows, from its start."""
+        """Start pulling, from the start of the window."""
         self._rest()
         self._cursor = self.engine.cursor(span=self.history.span)
 
@@ -98,12 +98,12 @@ class ViserView:
             self.panel.nis.close()
 
     def _pull(self) -> bool:
-        """Take what is new; whether there was anything."""
+        """Take new rows; return whether there were any."""
         changed = False
         while True:
             pull = self.engine.pull(self._cursor, self._rows)
             changed |= bool(len(pull.events)) or pull.fresh
-            if isinstance(self.stage.scene, PICTURED):
+            if isinstance(self.stage.scene, FIELD_SCENES):
                 self.stage.scene.take(pull)
             self.history.take(pull)
             self.history.trim()
@@ -111,21 +111,21 @@ class ViserView:
                 return changed
 
     def _waits(self, now: float, there: Sequence[str]) -> bool:
-        """Whether charts come first: beside them the scene waits until the knob that is turned rests."""
+        """Return whether the scene waits for the charts beside it, until the edited slider rests."""
         tuning = self.engine.tuning
         if tuning is not self._tuning:
             self._tuning, self._turned = tuning, now
-        return _scene_alone(there) and now - self._turned < RESTED and now - self._drawn < LATEST
+        return _scene_alone(there) and now - self._turned < EDIT_REST_S and now - self._drawn < MAX_EDIT_WAIT_S
 
     def _look(self, there: Sequence[str]) -> None:
-        """Draw for the browsers that are there, whose addresses have these queries."""
-        # Two browsers may differ; one scene has the colours that the last of them can see best.
+        """Draw for the connected browsers, whose addresses have these queries."""
+        # Two browsers may differ; the scene has the colours of the last one's theme.
         self.stage.palette = THEMES.get(parse_qs(there[-1]).get("theme", ["light"])[0], THEMES["light"])
         self.frame(panel=not _scene_alone(there))
 
     def _run(self) -> None:
         due = time.monotonic()
-        while not self._stop.wait(FRAME / 2):
+        while not self._stop.wait(FRAME_PERIOD_S / 2):
             there = addresses(self.server)
             if not there:
                 self._rest()
@@ -135,12 +135,12 @@ class ViserView:
                 self._drawn, begun = now, time.thread_time()
                 try:
                     self._look(there)
-                except Exception as error:  # noqa: BLE001  a picture that cannot be drawn must not end the others
+                except Exception as error:  # noqa: BLE001  a frame that fails must not end the others
                     self.engine.notices.report("view error", f"view error: {type(error).__name__}: {error}", "error")
-                # This thread's own work counts, not the time it waited for its turn.
-                due = now + min(SLOWEST, max(FRAME, (time.thread_time() - begun) / SHARE))
+                # CPU time of this thread, not the time it waited.
+                due = now + min(MAX_FRAME_PERIOD_S, max(FRAME_PERIOD_S, (time.thread_time() - begun) / MAX_CPU_SHARE))
 
 
 def _scene_alone(there: Sequence[str]) -> bool:
-    """Whether no browser, by the query of its address, shows the panel as well."""
+    """Return whether no browser shows the panel."""
     return all(parse_qs(query).get("part") == ["scene"] for query in there)

@@ -15,7 +15,7 @@ from rerun.chunk import RrdReader
 
 from app.live.commands import SetEstimator
 from app.live.engine import Engine
-from app.present.drawing.colors import ESTIMATE, NOTHING, Scale
+from app.present.drawing.colors import ESTIMATE, UNKNOWN_INDEX, Scale
 from app.views.rerun.feed import RerunFeed
 from app.views.rerun.pictures import FieldDrawing
 from app.views.rerun.sink import Sink, pair_name
@@ -243,7 +243,7 @@ def test_a_field_that_is_not_a_number_is_grey_and_has_no_scale():
     lost = np.full(model.grid.shape, np.nan)
     scale = Scale(ESTIMATE)
     scale.fit(lost)
-    assert scale.ticks() == [] and np.all(scale.indices(lost) == NOTHING)
+    assert scale.ticks() == [] and np.all(scale.indices(lost) == UNKNOWN_INDEX)
     stream = rr.RecordingStream("field")
     data = stream.binary_stream()
     FieldDrawing(model, truth=False)._draw(Sink(stream, window=60.0), SECOND, ESTIMATE.name, lost)

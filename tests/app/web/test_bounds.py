@@ -104,7 +104,7 @@ def test_a_body_that_does_not_end_is_not_waited_for(page, monkeypatch):
 
 
 def test_the_private_viser_server_is_not_crowded_out_either(monkeypatch, capfd):
-    monkeypatch.setattr(private_viser, "CONNECTIONS", 8)
+    monkeypatch.setattr(private_viser, "MAX_CONNECTIONS", 8)
     server = private_viser.guarded_server("s3cret", "crowded")
     crowd = []
     try:

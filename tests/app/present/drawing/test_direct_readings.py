@@ -106,5 +106,5 @@ def test_a_sensor_that_fails_otherwise_is_named_once(black_box, capsys):
         black_box=black_box,
     )  # fmt: skip
     assert observed(model) == observed(model) == []
-    said = f"nisus: model m: h of gauge fails near the prior: LookupError: no table of {black_box}; "
-    assert capsys.readouterr().err == said + "what it reads is drawn over no state\n"
+    (line,) = capsys.readouterr().err.splitlines()
+    assert all(part in line for part in ("model m", "h of gauge", f"LookupError: no table of {black_box}"))

@@ -16,7 +16,7 @@ from app.views.recording.writer import Recorder
 from app.views.rerun import feed
 from app.views.rerun.feed import FIRST_WINDOWS, RerunFeed
 from app.views.rerun.layout import blueprint
-from app.views.rerun.pictures import ASIDE, BELOW, PANE, anchors, axis_scales, ellipse_points
+from app.views.rerun.pictures import LABEL_HALF_WIDTH, LABEL_HEIGHT, PICTURE_RATIO, anchors, axis_scales, ellipse_points
 from app.views.rerun.rows import RerunRows
 from app.views.rerun.sink import FIRST_DATE_NS, last_of_each_time, pair_name, thin
 from estimators.log import READING, TRUTH, Events
@@ -158,18 +158,21 @@ def test_bytes_hold_the_rows_of_the_track(fed):
 def test_the_numbers_stand_inside_the_picture_and_at_the_mean_where_they_fit(wide):
     # A way `wide` by 4, seen by a pane whose one scale is that of its fuller side.
     way = np.array([[0.0, 0.0], [wide, 4.0], [wide, 0.0]])
-    height = max(4.0, wide / PANE)
-    view = np.array([PANE * height, height])
+    height = max(4.0, wide / PICTURE_RATIO)
+    view = np.array([PICTURE_RATIO * height, height])
     middle = np.array([0.5 * wide, 2.0])
     means = np.array([[0.0, 4.0], [wide, 0.0], [0.0, 0.0], middle + [0.0, 0.05 * height]])
     ellipses = ellipse_points(means, np.full((4, 2), 1e-12), np.zeros(4))
     stand = anchors(means, ellipses, [way] * 4)
     share = (stand - middle) / view + 0.5  # from the lower left corner
-    assert np.all((share[:, 0] >= ASIDE - 1e-6) & (share[:, 0] <= 1.0 - ASIDE + 1e-6))
-    assert np.all(share[:, 1] >= BELOW - 1e-6)
+    assert np.all((share[:, 0] >= LABEL_HALF_WIDTH - 1e-6) & (share[:, 0] <= 1.0 - LABEL_HALF_WIDTH + 1e-6))
+    assert np.all(share[:, 1] >= LABEL_HEIGHT - 1e-6)
     np.testing.assert_allclose(stand[3], means[3], rtol=1e-12)
     # No farther from the mean than it must be: along each axis at the mean, or at the limit.
-    limits = middle + (np.array([[ASIDE, BELOW], [1.0 - ASIDE, BELOW]])[:, None] - 0.5) * view
+    limits = (
+        middle
+        + (np.array([[LABEL_HALF_WIDTH, LABEL_HEIGHT], [1.0 - LABEL_HALF_WIDTH, LABEL_HEIGHT]])[:, None] - 0.5) * view
+    )
     at_limit = np.isclose(stand, limits[0], atol=1e-5) | np.isclose(stand, limits[1], atol=1e-5)
     assert np.all(np.isclose(stand, means) | at_limit)
 

@@ -8,9 +8,9 @@ import viser
 
 from app.present.drawing.colors import LIGHT
 from app.views.viser.field_scenes import SURFACE_HEIGHT, FieldSurfaceScene
-from app.views.viser.machine_scenes import FINGER, PAD, PART, GripperScene
+from app.views.viser.machine_scenes import FINGER, PAD, PART_WIDTH, GripperScene
 from app.views.viser.scene import History
-from app.views.viser.vehicle_parts import FADING, RECENT, Beacons, Beams
+from app.views.viser.vehicle_parts import FADING_S, MAX_AGE_S, Beacons, Beams
 from app.views.viser.vehicle_scene import VehicleScene
 from config.schema import SceneSection
 from estimators.diagnostics.field_pictures import Picture
@@ -65,9 +65,9 @@ def test_a_finger_stands_before_the_part_and_its_pad_gives_way(server):
     assert ends(pad) == pytest.approx((24.0 - PAD, 24.0)) and tuple(pad.color) == LIGHT.previous
     assert steel.position[0] == pytest.approx(24.0 - PAD - FINGER / 2)
     # The other finger is as far beyond the part.
-    assert ends(far_pad) == pytest.approx((44.0 + PART + 20.0, 44.0 + PART + 20.0 + PAD))
+    assert ends(far_pad) == pytest.approx((44.0 + PART_WIDTH + 20.0, 44.0 + PART_WIDTH + 20.0 + PAD))
     assert far_steel.position[0] > ends(far_pad)[1]
-    assert scene._part.position[0] == pytest.approx(44.0 + PART / 2)
+    assert scene._part.position[0] == pytest.approx(44.0 + PART_WIDTH / 2)
     assert scene._says.text == "contact 0 %"
 
     # Touching, 1 mm deep: its face is at the part's, and the pad is 1 mm thinner.
@@ -128,7 +128,7 @@ def test_beams_end_at_walls_and_at_what_was_read(server):
     beams.draw(told, mean, mean[:2], mean[2], p)
     assert refused.visible and not used.visible
     # A reading says where the vehicle was, not where it is.
-    late = rows(AGV, [(1.0, READING, 0, [1.2, 26.0, 1.5, 22.0], 0), (1.1 + RECENT, TRUTH, 0, [0.0], 0)])
+    late = rows(AGV, [(1.0, READING, 0, [1.2, 26.0, 1.5, 22.0], 0), (1.1 + MAX_AGE_S, TRUTH, 0, [0.0], 0)])
     beams.draw(late, mean, mean[:2], mean[2], p)
     assert not used.visible and not refused.visible and beams._expected.visible
 
@@ -138,7 +138,8 @@ def test_a_ring_is_as_wide_as_its_beacon_reads(server):
     beacons = Beacons(server.scene, "/beacons", ROVER, names, LIGHT, size=1.0)
     tuning = Tuning.of(ROVER).set("p.anchor_2_east", 7.0).set("p.anchor_2_north", -3.0)
     told = rows(
-        ROVER, [(0.0, READING, 0, [4.0], 0), (FADING - 1.0, READING, 1, [5.0], GATED), (FADING + 0.5, TRUTH, 0, [0], 0)]
+        ROVER,
+        [(0.0, READING, 0, [4.0], 0), (FADING_S - 1.0, READING, 1, [5.0], GATED), (FADING_S + 0.5, TRUTH, 0, [0], 0)],
     )
     beacons.draw(told, ROVER.prior_mean, tuning.p)
     first, second, third = beacons._rings

@@ -24,7 +24,7 @@ from app.views.viser.guarded_server import HEADER, addresses, guarded_server
 from app.views.viser.panel import SIGNS, error_html, status_html
 from app.views.viser.scene import History
 from app.views.viser.vehicle_scene import VehicleScene
-from app.views.viser.view import RESTED, ViserView
+from app.views.viser.view import EDIT_REST_S, ViserView
 from config.schema import SceneSection, ViewSection
 from estimators.log import READING, TRUTH, Events
 from estimators.models import MODELS
@@ -256,8 +256,8 @@ def test_the_scene_waits_until_a_knob_rests_but_not_for_ever(view, engine):
     assert not view._waits(100.0, scene)
     engine.tuning = engine.tuning.set("R.winding", 2.0)
     assert not view._waits(100.1, both)
-    assert view._waits(100.1, scene) and view._waits(100.0 + 0.9 * RESTED, scene)
-    assert not view._waits(100.1 + RESTED, scene)
+    assert view._waits(100.1, scene) and view._waits(100.0 + 0.9 * EDIT_REST_S, scene)
+    assert not view._waits(100.1 + EDIT_REST_S, scene)
     # A drag: something new ten times a second.
     turned = []
     for k in range(1, 30):
