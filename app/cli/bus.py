@@ -1,4 +1,4 @@
-"""`nisus bus`: a twin's simulated asset, played on a CAN bus in a process of its own."""
+"""`nisus bus`: simulate the asset of a twin on a CAN bus."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ FORMATS = (".asc", ".blf", ".csv", ".log", ".mf4", ".trc")
 
 
 def play_bus(arguments: Bus) -> int:
-    """Carry the command out."""
+    """Run the command."""
     if arguments.duration is not None and not arguments.duration > 0:
         raise ConfigError(f"--duration {arguments.duration:g}: must be positive")
     twin = load_twin(arguments.twin, overrides=settings(arguments.set))
@@ -72,7 +72,7 @@ def _channel(arguments: Bus, twin: Twin) -> str | int:
         return GROUP
     if arguments.interface == "virtual":
         return "nisus"
-    raise ConfigError(f"--interface {arguments.interface}: which bus is not known; give --channel, for example can0")
+    raise ConfigError(f"--interface {arguments.interface}: needs a channel; give --channel, for example can0")
 
 
 def _logger(path: Path) -> Any:
@@ -87,7 +87,7 @@ def _logger(path: Path) -> Any:
 
 
 def _play(player: Any, duration: float | None) -> None:
-    """Until the asset has said all, the time is up, or a signal comes."""
+    """Send frames until the asset ends, the time is up, or a signal arrives."""
     done = threading.Event()
     previous = when_asked_to_end(done.set)
     end = time.monotonic() + duration if duration is not None else float("inf")

@@ -1,4 +1,4 @@
-"""`nisus learn`: what a twin's model leaves out, learned from recordings, and whether the twin is better with it."""
+"""`nisus learn`: learn the model error of a twin from recordings, and judge the corrected twin."""
 
 from __future__ import annotations
 
@@ -36,15 +36,15 @@ from .prepare import attend, prepare
 if TYPE_CHECKING:
     from .arguments import Learn as Arguments
 
-FEWEST = 3
-"""Blocks, with which one is held out."""
+MIN_BLOCKS = 3
+"""Least number of blocks, of which one is held out."""
 
 STRETCHES = 9
-"""Of each recording, by which candidates are chosen: long, as it is what adds up over them that counts."""
+"""Long parts of each recording over which errors add up to choose between candidates."""
 
 
 def learn_correction(arguments: Arguments) -> int:
-    """Carry the command out."""
+    """Run the command."""
     corrects, features = _names("--corrects", arguments.corrects), _names("--features", arguments.features)
     _check(arguments)
     net = None if arguments.net is None else run_net(arguments.net, len(features), len(corrects))
@@ -80,7 +80,7 @@ def learn_correction(arguments: Arguments) -> int:
             )
         return Windows.joined(parts)
 
-    given: Windows = attend(twin.model, cut, "comparing the physics with what is known")
+    given: Windows = attend(twin.model, cut, "comparing the physics with the states")
     own, apart = given.of(~given.held_out), given.of(given.held_out)
 
     def learn() -> Trained:
@@ -127,9 +127,9 @@ def learn_correction(arguments: Arguments) -> int:
 
 
 def _check(arguments: Arguments) -> None:
-    """Refuse numbers and files that cannot be, before the work."""
-    if arguments.blocks < FEWEST:
-        raise ConfigError(f"--blocks {arguments.blocks}: must be {FEWEST} or more, or nothing is held out")
+    """Refuse wrong numbers and files before the work."""
+    if arguments.blocks < MIN_BLOCKS:
+        raise ConfigError(f"--blocks {arguments.blocks}: must be {MIN_BLOCKS} or more, or nothing is held out")
     if not arguments.window > 0.0:
         raise ConfigError(f"--window {arguments.window:g}: must be positive")
     if (arguments.kind == NET) != (arguments.net is not None):
@@ -141,7 +141,7 @@ def _check(arguments: Arguments) -> None:
 
 
 def _tuned_physics(twin: Twin) -> StateSpaceModel:
-    """The twin's model before anything is appended to it, with the parameters as they are tuned."""
+    """Return the twin's own model with tuned parameters, without appended states."""
     physics = physics_of(twin.loaded)
     values = dict(zip((item.name for item in twin.model.parameters), twin.tuning.p.tolist(), strict=True))
     parameters = tuple(replace(item, value=values.get(item.name, item.value)) for item in physics.parameters)

@@ -21,7 +21,7 @@ _YAML = """\
 #
 # Source: simulated; the true pump delivers less than the model expects, as a worn one does.
 # Expect: the level within a few millimetres from the start, better than its sensor's 10 mm. The pump's delivery, which
-# no sensor measures, is found within ten seconds, 15 % below where the belief begins.
+# no sensor measures, is found within ten seconds, 15 % below its prior.
 # Run it: nisus run {name}.yaml      Score it: nisus fold {name}.yaml      Every key: nisus schema
 title: Level of a tank and delivery of its pump
 model: ./{name}.py:{model}       # file beside this one, and the name of the model in it
@@ -30,20 +30,20 @@ parameters:                      # constants of the model
   area: 0.5                         # m², base of the tank
   outlet: 0.02                      # m²·√m/s, outflow through the open valve at one metre of level
 
-prior:                           # belief before the first reading
+prior:                           # estimate before the first measurement
   level: {mean: 1.0, std: 0.3}      # m
   delivery: {mean: 0.0010, std: 0.0003}  # m³ a turn
 
-noise:                           # how much the model is distrusted: what it adds in one second
+noise:                           # model uncertainty, per second
   level: {std: 0.001}               # m
   delivery: {std: 0.000002}         # m³
 
-sensors:                         # how much each sensor is distrusted
+sensors:                         # sensor noise
   level: {std: 0.01}                # m
-  outflow: {std: 0.0005, use: true} # m³/s; use: false holds it out, and scores what is predicted of it
+  outflow: {std: 0.0005, use: true} # m³/s; use: false holds it out, and scores its predictions
 
 estimator: ekf                   # kf, ekf, ukf
-gate: 0.9999                     # probability with which a good reading passes; null uses every reading
+gate: 0.9999                     # probability that a good measurement passes; null uses all
 
 source:
   type: simulator
@@ -88,12 +88,12 @@ def tank(x, u, p, dt, out):
 
 
 def level(x, u, p, out):
-    """What the level sensor reads, m."""
+    """Measurement of the level sensor, m."""
     out[0] = x[0]
 
 
 def outflow(x, u, p, out):
-    """What the flow meter behind the valve reads, m³/s."""
+    """Measurement of the flow meter behind the valve, m³/s."""
     out[0] = p[1] * u[1] * math.sqrt(max(x[0], 0.0))
 
 
@@ -157,7 +157,7 @@ def new_files(arguments: Arguments) -> tuple[Path, Path]:
     wanted = [text.strip() for text in arguments.signals.split(",") if text.strip()]
     if not arguments.log:
         if wanted or arguments.dbc:
-            raise ConfigError("--signals and --dbc say what to take from a recording; name it with --log FILE")
+            raise ConfigError("--signals and --dbc are for recordings; name one with --log FILE")
         return write_twin(name, folder)
     from ..studies.advice.draft import python_text, yaml_text
     from ..studies.advice.plan import plan
@@ -203,14 +203,14 @@ def check_new(name: str, folder: Path) -> None:
         ConfigError: If the name or the folder will not do, or one of the files is there already.
     """
     if not _NAME.fullmatch(name):
-        raise ConfigError(f"the name {name!r} will not do; use letters, digits, _ and -, and begin with a letter")
+        raise ConfigError(f"the name {name!r} is not valid; use letters, digits, _ and -, and begin with a letter")
     if name in shipped():
-        raise ConfigError(f"the name {name!r} is that of a twin that ships; choose another")
+        raise ConfigError(f"the name {name!r} is that of a bundled twin; choose another")
     if not folder.is_dir():
-        raise ConfigError(f"{folder}: there is no such folder; make it first")
+        raise ConfigError(f"{folder}: there is no such folder; create it first")
     for path in (folder / f"{name}.yaml", folder / f"{name}.py"):
         if path.exists():
-            raise ConfigError(f"{path}: it is there already and is not overwritten; choose another name")
+            raise ConfigError(f"{path}: already exists and is not overwritten; choose another name")
 
 
 def model_of(name: str) -> str:

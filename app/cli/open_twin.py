@@ -1,4 +1,4 @@
-"""How a twin or a recording is opened to be run; the same for a command and for the gallery."""
+"""Open a twin or a recording to run it, for a command and for the gallery."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def opened_twin(
 def recorded_twin(recorded: Recorded) -> Twin:
     """The twin as it was when the recording ended: its YAML, with the last tuning and estimator.
 
-    What was normal of the innovations is no knob, and stands in the YAML.
+    The baseline of the innovations is not part of the tuning and comes from the YAML.
     """
     twin = restore_twin(recorded.text, recorded.twin_path, recorded.overrides, recorded.version)
     tuning, estimator = tuning_from_json(recorded.tuning, twin.model)
@@ -69,7 +69,7 @@ def recorded_twin(recorded: Recorded) -> Twin:
 
 
 def opened_review(path: Path) -> Opening:
-    """What a recording holds, to be folded again: the same engine, the same fold. Its model is not compiled yet.
+    """Open a recording to fold it again. Its model is not compiled yet.
 
     Raises:
         NisusError: If the recording cannot be read, or its model is not there.
@@ -83,7 +83,7 @@ def opened_review(path: Path) -> Opening:
 
     remarks = [("info", f"{path.name}: {recorded.rows} rows, {recorded.tunings} tuning(s), folded again")]
     if not recorded.closed:
-        cut = f"{path.name}: was not closed, as by a kill or a full disk; it is reviewed as far as it goes"
+        cut = f"{path.name}: was not closed (killed, or full disk); it is reviewed up to its last complete row"
         remarks.append(("warn", cut))
     return Opening(
         recorded_twin(recorded),
@@ -99,7 +99,7 @@ def opened_review(path: Path) -> Opening:
 class FileOpener:
     """Opens what the gallery asks for.
 
-    `given` has twins that the command line says more of than their name; `workers` compile for the first.
+    `given` has twins with options from the command line; `workers` compile for the first.
     """
 
     def __init__(

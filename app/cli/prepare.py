@@ -1,4 +1,4 @@
-"""Compiling, with a line that says so: it happens once, and takes longer than anything else a user waits for."""
+"""Compile filters and models, and run long work with a status line."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from ..live.watchdog import CallWatch
 from ..live.workshop import Workshop
 from ..twin.twin import Twin
 
-PATIENCE = 1.0
+STATUS_DELAY_S = 1.0
 """Seconds before the line appears; loading from the cache takes less."""
 
 
@@ -52,7 +52,7 @@ def compile_for(twin: Twin) -> None:
 
 
 def begin_to_compile(twin: Twin, workers: Sequence[Compiler] = ()) -> Workshop:
-    """Let other processes compile what is not in the cache: what the twin's source needs, its filter, then all others.
+    """Let other processes compile missing cache entries: those of the source, the twin's filter, then all others.
 
     Those that do not apply to the twin are left out. `workers` are processes that were started before.
     """
@@ -84,15 +84,15 @@ def attend(model: StateSpaceModel, work: Callable[[], Any], doing: str, done: st
 
     Args:
         model: Whose function is named on standard error if it does not return.
-        work: What to do.
-        doing: What is shown meanwhile, if it takes long.
+        work: Function to call.
+        doing: Status shown while it runs long.
         done: Message printed when it has finished.
 
     Returns:
-        What the work returns.
+        The result of the work.
 
     Raises:
-        BaseException: What the work raises.
+        BaseException: As the work.
     """
     result: list[Any] = []
     failure: list[BaseException] = []
@@ -106,7 +106,7 @@ def attend(model: StateSpaceModel, work: Callable[[], Any], doing: str, done: st
     begun = time.monotonic()
     thread = threading.Thread(target=run, name="compile", daemon=True)
     thread.start()
-    thread.join(PATIENCE)
+    thread.join(STATUS_DELAY_S)
     if thread.is_alive():
         console = Console(file=sys.stderr)
         watch = CallWatch(model)

@@ -1,4 +1,4 @@
-"""How far a long piece of work has got, on standard error: a bar in a terminal, elsewhere a line now and then."""
+"""Progress of long work on standard error: a bar in a terminal, elsewhere a line every few seconds."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from typing import TextIO
 from rich.console import Console
 from rich.progress import Progress
 
-EVERY = 10.0
+LINE_PERIOD_S = 10.0
 """Seconds between two lines."""
 
 
 @contextmanager
 def progress(title: str, total: int, unit: str) -> Iterator[Callable[[], None]]:
-    """Show how many of `total` units of work are done; gives what is to be called when one more is."""
+    """Show how many of `total` units are done; yields the function to call after each."""
     console = Console(stderr=True)
     if not console.is_terminal:
         with lines(title, total, unit) as advance:
@@ -35,11 +35,11 @@ def lines(
     total: int,
     unit: str,
     *,
-    every: float = EVERY,
+    every: float = LINE_PERIOD_S,
     clock: Callable[[], float] = time.monotonic,
     file: TextIO | None = None,
 ) -> Iterator[Callable[[], None]]:
-    """The same in plain lines, one every `every` seconds, also when nothing has been done meanwhile."""
+    """Print plain lines, one every `every` seconds."""
     ended = threading.Event()
     done = [0]
     begun = clock()

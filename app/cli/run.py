@@ -30,12 +30,12 @@ if TYPE_CHECKING:
 
 __all__ = ["live_source", "run_twin"]
 
-SAID = 5
-"""Failures that a run without a page prints at its end, since it has no list of events."""
+MAX_FAILURES = 5
+"""Failures that a run without a page prints at its end."""
 
 
 def run_twin(arguments: Run, workers: Sequence[Compiler] = ()) -> int:
-    """Carry the command out; `workers` are processes that wait for something to compile."""
+    """Run the command; `workers` are idle compiler processes."""
     speed = arguments.speed
     if speed is not None and not (0.0 < speed <= MAX_SPEED or speed == math.inf):
         raise ConfigError(
@@ -72,14 +72,14 @@ def run_twin(arguments: Run, workers: Sequence[Compiler] = ()) -> int:
         status = session.engine.status()
         print(", ".join(f"{name} {count}" for name, count in status.counts.items() if count or name == "readings"))
         lines = session.engine.notices.since(0)
-        # What a page shows of a source that ended in the midst, nobody would see here.
+        # A page would show that the source failed.
         failed = [line.text for line in lines if line.text.startswith("source failed")]
         failures = dict.fromkeys([*failed, *(line.text for line in lines if line.level == "error")])
-        for text in list(failures)[:SAID]:
+        for text in list(failures)[:MAX_FAILURES]:
             complain(text)
         refits = [line.text for line in lines if line.text.startswith("refit ")]
         for k, text in enumerate(refits):
-            if "adopted" in text or k >= len(refits) - SAID:
+            if "adopted" in text or k >= len(refits) - MAX_FAILURES:
                 complain(text)
         return 2 if failed else 0
     return 0
@@ -91,7 +91,7 @@ if TYPE_CHECKING:
 
 
 def open_review(path: Path, page: Page | None, recordings: Path = Path()) -> tuple[Session, Opening]:
-    """A session over the recorded readings, and what it runs.
+    """Return a session over a recording, and its opened twin.
 
     Raises:
         NisusError: As `opened_review`, or if the page's port is in use.
@@ -107,7 +107,7 @@ def open_review(path: Path, page: Page | None, recordings: Path = Path()) -> tup
 
 
 def review_recording(arguments: Review) -> int:
-    """Carry the command out."""
+    """Run the command."""
     page = Page(arguments.port, not arguments.no_browser)
     session, _ = open_review(arguments.file, page, arguments.recordings)
     session.run(record=None, duration=arguments.duration, until_finished=False)

@@ -1,4 +1,4 @@
-"""`nisus tune`: fit a twin's tuning to recordings, and say whether what was found is better."""
+"""`nisus tune`: fit a tuning to recordings, and propose it if it predicts held-out data better."""
 
 from __future__ import annotations
 
@@ -34,17 +34,17 @@ from .prepare import attend, prepare
 if TYPE_CHECKING:
     from .arguments import Tune as Arguments
 
-FEWEST = 3
-"""Blocks, with which one is held out."""
+MIN_BLOCKS = 3
+"""Least number of blocks, of which one is held out."""
 
 
 def tune_twin(arguments: Arguments) -> int:
-    """Carry the command out."""
+    """Run the command."""
     wanted = [key.strip() for key in arguments.fit.split(",") if key.strip()]
     if not wanted:
         raise ConfigError("--fit names nothing; write for example --fit Q,R")
-    if arguments.blocks < FEWEST:
-        raise ConfigError(f"--blocks {arguments.blocks}: must be {FEWEST} or more, or nothing is held out")
+    if arguments.blocks < MIN_BLOCKS:
+        raise ConfigError(f"--blocks {arguments.blocks}: must be {MIN_BLOCKS} or more, or nothing is held out")
     if arguments.predict and arguments.aim not in (CRPS, ERROR):
         raise ConfigError("--predict: is for --aim crps and --aim error; the likelihood is that of every sensor")
     if arguments.save is not None:
@@ -89,7 +89,7 @@ def tune_twin(arguments: Arguments) -> int:
 
 
 def _recordings(arguments: Arguments) -> tuple[Twin, list[Recording]]:
-    """The twin, and what it is fitted to: recordings, logs of its simulator, or its own log."""
+    """Return the twin, and its recordings, simulated logs, or own log."""
     overrides = settings(arguments.set, arguments.estimator)
     if not arguments.log:
         twin = load_twin(arguments.twin, overrides=overrides)
@@ -129,7 +129,7 @@ Recordings = Callable[["Arguments"], tuple[Twin, list[Recording]]]
 
 
 def tune_windows(arguments: Arguments, wanted: Sequence[str], recordings: Recordings) -> int:
-    """Carry the command out; `recordings` reads what is named.
+    """Fit window after window; `recordings` reads the twin and its logs.
 
     Returns:
         0 if something was adopted, else 1.
@@ -156,7 +156,7 @@ def tune_windows(arguments: Arguments, wanted: Sequence[str], recordings: Record
                 bounds=bounds_of(twin.config, twin.model),
                 blocks=arguments.blocks,
             ):
-                # Its rows are many, and nobody asks for them here.
+                # Its rows are many and not needed here.
                 found.append((k, refit._replace(lived=refit.lived.select(slice(0, 0)).copy())))
                 if refit.fitted is not None and refit.proposed:
                     tuning = refit.fitted.setting.tuning

@@ -1,4 +1,4 @@
-"""`nisus twins`: the twins that ship, or what one of them is, what to expect of it, and how each filter scored."""
+"""`nisus twins`: list the bundled twins, or describe one with the scores of each filter."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ if TYPE_CHECKING:
 
 
 def show_twins(arguments: Arguments) -> int:
-    """Carry the command out."""
+    """Run the command."""
     if arguments.picture:
         for name in shipped() if arguments.name is None else [arguments.name]:
-            print(_drawn(name))
+            print(_draw(name))
         return 0
     if arguments.name is None:
         for name in shipped():
@@ -29,8 +29,8 @@ def show_twins(arguments: Arguments) -> int:
     return 0
 
 
-def _drawn(name: str) -> str:
-    """Fold a twin's log, draw its picture for the gallery and keep it; the file."""
+def _draw(name: str) -> str:
+    """Draw the gallery picture of a twin from its log, and return its path."""
     from ..present.drawing.card import picture_of
     from ..twin.log_reader import read_log
     from ..twin.twin import load_twin
@@ -39,7 +39,7 @@ def _drawn(name: str) -> str:
 
     twin = load_twin(name)
     prepare(twin)
-    # Of what never ends, or would take minutes, a part says as much.
+    # A part of an endless or long simulation is enough.
     duration = 10.0 * twin.config.view.window if twin.config.source.type == "simulator" else None
     log, _ = read_log(twin, duration)
     path = picture_file(find(name))
@@ -51,7 +51,7 @@ def _drawn(name: str) -> str:
 
 
 def described(loaded: Loaded) -> list[str]:
-    """A twin in lines of text: title, the comment at the head of its YAML, and its scores."""
+    """Return title, leading comment of the YAML, and scores as lines of text."""
     name = loaded.path.stem
     head = takewhile(lambda line: line.startswith("#"), loaded.text.splitlines())
     prose = [line.removeprefix("#").removeprefix(" ") for line in head]

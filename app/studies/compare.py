@@ -1,4 +1,4 @@
-"""One row of a comparison: a filter folded over a log, over several seeds where it draws its members."""
+"""Comparison of filters over one log, with several seeds for filters that draw random members."""
 
 from __future__ import annotations
 
@@ -24,17 +24,17 @@ from .processes import beside, jobs_of
 from .scores import Row, Spread
 
 SEEDS = 8
-"""Folds of a filter that draws its members; one makes do for the others."""
+"""Folds of a filter that draws random members; others are folded once."""
 
 BUDGET = 20.0
-"""Seconds of one processor for the folds of one filter, if nobody says otherwise."""
+"""Default processor seconds for the folds of one filter."""
 
-ENOUGH = 0.2
-"""Seconds that a fold is timed for."""
+MIN_TIMED_S = 0.2
+"""Processor seconds for which a fold is timed."""
 
 
 class Outcome(NamedTuple):
-    """What one fold was worth; see `Row`."""
+    """Scores of one fold; see `Row`."""
 
     rmse: dict[str, float]
     nis: float
@@ -47,7 +47,7 @@ class Outcome(NamedTuple):
 
 
 def draws(entry: Estimator) -> bool:
-    """Whether the filter draws members, so that its estimate depends on the seed."""
+    """Return whether the filter draws random members, so that its estimate depends on the seed."""
     return any(option.name in ("particles", "members") for option in entry.options)
 
 
@@ -66,7 +66,9 @@ def fold_row(twin: Twin, estimator: str, logs: Sequence[Events], budget: float =
     try:
         for k in range(folds):
             events = within(logs[k % len(logs)], span)
-            fold, seconds = timed(twin, estimator, events, k, share if k == 0 else np.inf, ENOUGH if k == 0 else 0.0)
+            fold, seconds = timed(
+                twin, estimator, events, k, share if k == 0 else np.inf, MIN_TIMED_S if k == 0 else 0.0
+            )
             if fold.n < len(events):
                 span = tidy((events.t[fold.n - 1] - events.t[0]) * 1e-9)
                 events = within(events, span)
@@ -97,7 +99,7 @@ def tidy(seconds: float) -> float:
 
 
 def timed(
-    twin: Twin, estimator: str, events: Events, seed: int, budget: float, enough: float = ENOUGH
+    twin: Twin, estimator: str, events: Events, seed: int, budget: float, enough: float = MIN_TIMED_S
 ) -> tuple[Fold, float]:
     """Fold the events, or what the budget (s) allows; a short fold again and again, as other work disturbs it.
 
@@ -128,7 +130,7 @@ def timed(
 
 
 def outcome_of(fold: Fold, events: Events, seconds: float) -> Outcome:
-    """What a fold was worth over its first events, which are these."""
+    """Return the scores of a fold over its first events."""
     model, track = fold.model, fold.track.select(slice(0, len(events)))
     fold.finish()
     pictures = () if fold.pictures is None else [one for one in fold.pictures.taken if one.before <= len(events)]

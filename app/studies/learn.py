@@ -1,4 +1,4 @@
-"""What `nisus learn` found, as sections of tables and as JSON."""
+"""Result of learning a correction: windows, held-out folds, verdict, JSON, and the text of its file."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ TUNINGS = ("physics", "physics, its noise from the windows", "with the correctio
 
 
 class Lesson(NamedTuple):
-    """What was learned: of which states and how, what is left over in windows, and what the folds are worth.
+    """A learned correction: its states and method, residuals in windows, and scores of the folds.
 
     `learned_from` is of corrections that were trained on the other blocks. `parts` are of the blocks held out, under
-    `TUNINGS`; `noise` is what is left of the model's own noise, `reasons` what speaks against the correction.
+    `TUNINGS`; `noise` is the remaining noise of the model, `reasons` are against the correction.
     """
 
     corrects: tuple[str, ...]
@@ -52,7 +52,7 @@ def sections(name: str, window: float, lesson: Lesson, keep: Path | None) -> lis
 
 
 def as_dict(lesson: Lesson) -> dict[str, Any]:
-    """For a script; null stands for what is not a number."""
+    """Return the result for scripts."""
     held_out = lesson.held_out
     return {
         "better": lesson.better,
@@ -68,7 +68,7 @@ def as_dict(lesson: Lesson) -> dict[str, Any]:
 
 
 def scores_of(lesson: Lesson) -> dict[str, float]:
-    """What the correction's file says of its worth on the blocks held out, and of the physics alone there."""
+    """Return scores on the held-out blocks for the correction's file, with those of the physics alone."""
     found: dict[str, float] = {}
     for prefix, part in (("", lesson.parts[2]), ("physics.", lesson.parts[0])):
         found |= {f"{prefix}nis": part.nis, f"{prefix}log_density": part.log_density}
@@ -90,7 +90,7 @@ def _of_windows(lesson: Lesson, part: OnWindows) -> dict[str, Any]:
 
 def _windows(name: str, window: float, lesson: Lesson) -> Topic:
     rows: list[tuple[str, ...]] = []
-    parts = (("learned from, each block without itself", lesson.learned_from), ("held out", lesson.held_out))
+    parts = (("training, cross-validated", lesson.learned_from), ("held out", lesson.held_out))
     for what, part in parts:
         if part is None:
             continue
@@ -105,7 +105,7 @@ def _windows(name: str, window: float, lesson: Lesson) -> Topic:
                     f"{100.0 * part.known:.0f} %",
                 )
             )
-    head = ("windows", "", "", "rate by which the model is wrong, RMS", "drift of a minute, RMS", "known")
+    head = ("windows", "", "", "rate error of the model, RMS", "drift per minute, RMS", "known")
     return Topic(f"{name}: windows of {window:g} s, {lesson.words}", (), head, tuple(rows))
 
 
@@ -139,23 +139,22 @@ def _verdict(lesson: Lesson, keep: Path | None) -> Topic:
 
 
 DIGITS = 8
-"""Significant digits of what was measured."""
+"""Significant digits of measured values."""
 
-LEAST = 1e-3
-"""Share of the physics' own drift that a correction which knows nothing is uncertain by, at least."""
+MIN_NOISE_SHARE = 1e-3
+"""Least uncertainty of a correction far from its data, as a share of the drift of the physics."""
 
 
 def noises_of(
     physics: StateSpaceModel, trained: Trained, corrects: Sequence[str]
 ) -> tuple[dict[str, float], dict[str, float]]:
-    """Variances a second: what is left of the model's own noises where the correction knows, and what it adds else.
+    """Return variances per second: the remaining model noise near the data, and the added noise far from it.
 
-    Where it knows nothing the twin is as uncertain as its physics was in these windows. A model with a Q of its own
-    keeps that.
+    Far from the data the twin is as uncertain as the physics was in these windows. A model with its own Q keeps it.
     """
     own, learned = {}, {}
     for name, before, rest in zip(corrects, trained.before.tolist(), trained.drift.tolist(), strict=True):
-        learned[name] = _rounded(max(before - rest, LEAST * before))
+        learned[name] = _rounded(max(before - rest, MIN_NOISE_SHARE * before))
         if physics.Q is None and name in (noise.name for noise in physics.noises):
             own[name] = _rounded(rest)
     return own, learned
@@ -189,7 +188,7 @@ def correction_text(
 
 
 def _numbers(correction: Correction, net: Path | None) -> list[str]:
-    """What the kind is made of, as lines."""
+    """Return the parameters of a correction as lines."""
     if isinstance(correction, GaussianProcess):
         lengths = [_rounded(value) for value in correction.lengths.tolist()]
         lines = ["kind: gp", f"lengths: {as_flow(lengths)}", f"ratio: {_rounded(correction.ratio)}"]

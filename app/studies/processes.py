@@ -1,4 +1,4 @@
-"""Work in processes beside each other, which end with the command: Ctrl-C leaves none, and none speaks of it."""
+"""Parallel worker processes that end with the command, also on Ctrl-C."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from estimators.errors import ConfigError
 
 
 def jobs_of(given: int | None, most: int) -> int:
-    """How many processes, of --jobs: as many as processors without, and no more than there is work.
+    """Return the number of processes for --jobs: at most the number of calls, by default one per processor.
 
     Raises:
         ConfigError: If it is none.
@@ -35,8 +35,8 @@ def beside(
         work: A function of a module, as another process finds it.
         calls: Its arguments, in the order in which they are taken up.
         jobs: Processes.
-        begin: What each of them does first.
-        given: The arguments of that.
+        begin: First call in each process.
+        given: Its arguments.
 
     Yields:
         A future for each call.
@@ -55,7 +55,7 @@ def beside(
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
         yield futures
     except BaseException:
-        # Nobody asks for the rest any more, and a fold may take minutes.
+        # The other results are not needed, and a fold may take minutes.
         pool.shutdown(wait=False, cancel_futures=True)
         for child in multiprocessing.active_children():
             child.terminate()

@@ -1,4 +1,4 @@
-"""The table of a comparison: its cells, which are written as CSV (see scores.py), and how they print."""
+"""Scores of filters: the rows of a comparison, their cells in CSV files, and the printed table."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Spread(NamedTuple):
 
 @dataclass(frozen=True)
 class Row:
-    """What one filter made of the log.
+    """Scores of one filter on a log.
 
     `rmse` by unit: the root mean square over the states of that unit whose truth is known, or, where no truth is,
     over the sensors held out. `coverage` is the share of those errors inside their 95 % band. `span` is the part of
@@ -74,7 +74,7 @@ def spread(title: str) -> str:
 def cells(rows: Sequence[Row], events: int, seconds: float) -> list[dict[str, str]]:
     """The rows as text by column, empty where there is nothing to say; every row has the same columns.
 
-    What the gate refuses has a column where it refuses anything.
+    Rejected measurements have a column if there are any.
 
     Args:
         rows: Of the filters.
@@ -136,7 +136,7 @@ def _text(figure: Spread, digits: int = 4, decimals: int | None = None) -> str:
 
 
 def printed(name: str, lines: Sequence[Mapping[str, str]], logs: int = 1) -> list[str]:
-    """A caption (what was folded, and what a consistent filter's mean NIS would be) and the table, as lines of text.
+    """Return caption (log, and bounds of the mean NIS) and table as lines of text.
 
     Args:
         name: Of the twin.
@@ -160,19 +160,19 @@ def printed(name: str, lines: Sequence[Mapping[str, str]], logs: int = 1) -> lis
 
 
 def _notes(line: Mapping[str, str]) -> str:
-    """What else there is to say of a row: when it diverged, what it refused, the part of the log, options, failure."""
-    said = []
+    """Return the notes of a row: divergence, rejected measurements, part of the log, options, failure."""
+    notes = []
     if int(line["diverged"]):
         seeds = f"in {line['diverged']} of {line['seeds']} " if int(line["seeds"]) > 1 else ""
-        said.append(f"diverged {seeds}at {line['diverged at [s]']} s, {line[LOST]} % of events")
+        notes.append(f"diverged {seeds}at {line['diverged at [s]']} s, {line[LOST]} % of events")
     if line.get(REFUSED, "") not in ("", "0"):
-        said.append(f"refused {line[REFUSED]} % of the readings")
+        notes.append(f"rejected {line[REFUSED]} % of the readings")
     if line[SPAN]:
-        said.append(f"first {line[SPAN]} s")
-    said += [option.replace("=", " ") for option in line["options"].split()]
+        notes.append(f"first {line[SPAN]} s")
+    notes += [option.replace("=", " ") for option in line["options"].split()]
     if line["failure"]:
-        said.append(line["failure"])
-    return ", ".join(said)
+        notes.append(line["failure"])
+    return ", ".join(notes)
 
 
 def read_cell(line: Mapping[str, str], title: str) -> ScoreCell:
@@ -184,7 +184,7 @@ def read_cell(line: Mapping[str, str], title: str) -> ScoreCell:
 
 
 def read_span(line: Mapping[str, str]) -> float | None:
-    """Seconds of the log that a row speaks of; None for all."""
+    """Return the seconds of the log that a row covers; None means all."""
     return float(line[SPAN]) if line[SPAN] else None
 
 
@@ -193,7 +193,7 @@ SCORES = TWINS.parent / "scores"
 
 
 def scores_file(twin: Path) -> Path:
-    """Where the scores of a twin's YAML are: those of one that ships in a folder of their own, others beside it."""
+    """Return the scores file of a twin: a common folder for bundled twins, else beside the YAML."""
     ships = twin.resolve().parent == TWINS.resolve()
     return SCORES / f"{twin.stem}.csv" if ships else twin.with_name(f"{twin.stem}.scores.csv")
 

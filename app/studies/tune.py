@@ -1,4 +1,4 @@
-"""`nisus tune --windows`: dual estimation over recordings, window after window, as a running twin does it."""
+"""Results of a fit as topics: entries, scores, held-out sensors, verdict; and of dual estimation by windows."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from ..present.result import Topic
 from ..present.runs_json import correlated, fit_json
 from ..twin.twin import Twin
 
-UNSEEN = 0.05
-"""Share of a window up to which nobody need be told that the end of a log is in none."""
+MIN_UNFITTED_SHARE = 0.05
+"""Share of a window above which an unfitted end of a log is reported."""
 
 
 def window_json(recording: int, refit: WindowFit, origin: int) -> dict[str, Any]:
@@ -34,7 +34,7 @@ def window_json(recording: int, refit: WindowFit, origin: int) -> dict[str, Any]
 
 
 def window_topics(found: Sequence[tuple[int, WindowFit]], origins: Sequence[int]) -> list[Topic]:
-    """For every entry a table: its value and interval of each window, and what the twin went on with."""
+    """Return a table per entry: value and interval in each window, and the value in use after it."""
     keys = dict.fromkeys(line.key for _, refit in found if refit.fitted is not None for line in refit.fitted.lines)
     head = (
         *_place(None, None, origins), "fitted", "95 % interval", "σ moved", "gain, nats a reading", "went on with",
@@ -94,18 +94,16 @@ def windows_verdict(
     for k, last in enumerate(ends):
         own = [refit for other, refit in found if other == k]
         left = (last - max((refit.end for refit in own), default=origins[k])) * 1e-9
-        if left > UNSEEN * max((refit.end - refit.start for refit in own), default=0) * 1e-9:
+        if left > MIN_UNFITTED_SHARE * max((refit.end - refit.start for refit in own), default=0) * 1e-9:
             which = f"Of recording {k + 1} the" if len(ends) > 1 else "The"
             said.append(f"{which} last {left:,.0f} s are less than half a window, or half a step, and were not fitted.")
     return Topic("Verdict", tuple(said))
 
 
-ALONE = "left alone: the data cannot tell"
-BOUND = "only a bound: the data cannot tell it from none"
-EDGE = "at the edge of its range: the best may lie beyond"
-TEMPERED = (
-    "Of what the fitted blocks say {:.2g} is believed: with more of it the blocks held out are predicted no better."
-)
+ALONE = "not identifiable: unchanged"
+BOUND = "only an upper bound: indistinguishable from zero"
+EDGE = "at the edge of its range: the optimum may lie beyond"
+TEMPERED = "The likelihood of the fitted blocks has weight {:.2g}; more does not improve held-out predictions."
 
 
 def sections(twin: Twin, fitted: Fitted) -> list[Topic]:
@@ -115,7 +113,7 @@ def sections(twin: Twin, fitted: Fitted) -> list[Topic]:
 
 
 def heading(twin: Twin, fitted: Fitted) -> str:
-    """Comment above the lines of a tuning that is proposed: what it is, and why it is proposed."""
+    """Return the comment above a proposed tuning, with its gain."""
     gained = f"{_gained(fitted)} on blocks held out"
     return f"# Fitted by `nisus tune {twin.name}`: {gained}.\n# These sections stand in place of the twin's own.\n"
 
@@ -125,7 +123,7 @@ def _number(value: float) -> str:
 
 
 def _pair(before: float, after: float, form: str, unit: str = "") -> str:
-    """A figure before and after; a dash where nothing told it."""
+    """Return a figure before and after; a dash where it is unknown."""
     old, new = (f"{value:{form}}" if np.isfinite(value) else "-" for value in (before, after))
     return f"{old} -> {new}{unit if np.isfinite(after) else ''}"
 
@@ -146,7 +144,7 @@ def _entries(twin: Twin, fitted: Fitted) -> Topic:
     pairs = [
         f"{pair['entries'][0]} with {pair['entries'][1]} ({pair['correlation']:+.2f})" for pair in correlated(fitted)
     ]
-    said = [f"Hardly told apart: {', '.join(pairs)}."] if pairs else []
+    said = [f"Hardly distinguishable: {', '.join(pairs)}."] if pairs else []
     said += [f"{name} was stuck: {n:,} of its readings were left out." for name, n in fitted.left_out.items()]
     head = ("entry", "before", "after", "95 % interval", "unit", "")
     return Topic(f"{twin.name}: {fitted.estimator}, {fitted.folds} folds", tuple(said), head, tuple(rows))
@@ -173,7 +171,7 @@ def _scores(fitted: Fitted) -> Topic:
     rows = [row("fitted", fitted.before.fitted, fitted.after.fitted)]
     if fitted.before.held_out.n:
         rows.append(row("held out", fitted.before.held_out, fitted.after.held_out))
-    head = ("blocks", "readings", "log density of a reading, nats", "NIS / dof", "in the 95 % band")
+    head = ("blocks", "readings", "log density per reading [nats]", "NIS / dof", "in the 95 % band")
     return Topic("Predictions of the next reading, before and after", (), head, tuple(rows))
 
 
@@ -182,7 +180,7 @@ def _held_out(fitted: Fitted) -> Topic:
     for kind, group in (("sensor", "sensors"), ("never used", "withheld"), ("truth", "states")):
         rows += _rows(kind, group, fitted.before, fitted.after)
     head = ("", "", "unit", "RMS", "in the 95 % band", "RMS, blocks held out", "in the 95 % band")
-    return Topic("Sensors held out in turn, and what is known to be true, before and after", (), head, tuple(rows))
+    return Topic("Sensors held out in turn, and true states, before and after", (), head, tuple(rows))
 
 
 def _rows(kind: str, group: str, before: Worth, after: Worth) -> list[tuple[str, ...]]:

@@ -1,4 +1,4 @@
-"""Remarks about a recording as a whole go to standard error too, besides being counted and shown."""
+"""Read the log of a twin; warnings about a whole recording also go to standard error."""
 
 from __future__ import annotations
 
@@ -25,19 +25,19 @@ if TYPE_CHECKING:
 
 REMARKS = (*ORDER, NEVER, TRUNCATED, CLOCK_MOVED)
 
-FIRST = (WRONG_TIME,)
-"""Of these only the first is said: there may be as many as there are rows."""
+PRINTED_ONCE = (WRONG_TIME,)
+"""Warnings printed once, since there may be one per row."""
 
 
 def remarking(report: Callable[[str, str], None]) -> Callable[[str, str], None]:
-    """A report that also says each remark, once."""
+    """Return a report that also prints each warning once."""
     said: set[str] = set()
 
     def both(key: str, text: str) -> None:
         if key in REMARKS and text not in said:
             said.add(text)
             complain(text)
-        elif key in FIRST and key not in said:
+        elif key in PRINTED_ONCE and key not in said:
             said.add(key)
             complain(text)
         report(key, text)
@@ -46,11 +46,11 @@ def remarking(report: Callable[[str, str], None]) -> Callable[[str, str], None]:
 
 
 def read_log(twin: Twin, duration: float | None) -> tuple[Log, Counter[str]]:
-    """Everything that the twin's source says, in the order of time, and what was counted on the way.
+    """Return all events of the twin's source in order of time, and counts of dropped and corrected ones.
 
     Raises:
         ConfigError: If `duration` is not positive.
-        SourceError: If the source cannot be opened, has no end, or says nothing.
+        SourceError: If the source cannot be opened, has no end, or is empty.
     """
     if duration is not None and not duration > 0.0:
         raise ConfigError(f"--duration {duration:g}: must be positive")
@@ -93,7 +93,7 @@ def read_log(twin: Twin, duration: float | None) -> tuple[Log, Counter[str]]:
     if not log.n:
         files = ", ".join(map(str, twin.plan.log_files or ()))
         place = f"--log {files}" if files else twin.loaded.places.at(("source",))
-        raise SourceError(f"{place}: the source said nothing that a sensor needs; check the channel maps")
+        raise SourceError(f"{place}: the source has no values for any sensor; check the channel maps")
     return log, +counts
 
 

@@ -1,8 +1,8 @@
-"""Would noise that lasts explain innovations that follow one another? Tried, and fitted, before it is recommended.
+"""Test whether coloured noise explains correlated innovations, by fitting it before it is recommended.
 
-White noise makes white innovations. Where they follow one another, something that lasts is missing: a disturbance of
-the process, or an error of the sensor (estimators/model/coloured.py). Each that has to do with the row is appended in
-turn, its size and its time are fitted by likelihood, and the one that explains most stays, until no row is left.
+White noise makes white innovations. Correlated innovations point to a disturbance of the process, or an error of the
+sensor, with a correlation time (estimators/model/coloured.py). Each candidate that affects the row is appended in turn,
+its size and time are fitted by likelihood, and the best one is kept, until no row is correlated.
 """
 
 from __future__ import annotations
@@ -27,22 +27,22 @@ from estimators.tuning import Tuning
 
 from .measured import NO, UNTOLD, YES, Claim, Measured, digits
 
-QUESTION = "Would noise that lasts explain innovations that follow one another?"
+QUESTION = "Does coloured noise explain the correlated innovations?"
 OF = "correlation of one innovation with the next"
 
-MOST = 3
-"""Errors that are appended; beyond that the model itself is to be mended."""
+MAX_APPENDED = 3
+"""Noises that are appended; beyond that the model itself needs work."""
 
-WORTH = 10.0
-"""Nats that one must gain, at least: it brings two numbers, and the best of several is taken."""
+MIN_GAIN_NATS = 10.0
+"""Least gain in likelihood: each adds two parameters, and the best of several is taken."""
 
 BUDGET = 30.0
-"""Seconds of one processor for all that is tried; what was found by then is said."""
+"""Processor seconds for all trials; the best result so far is reported."""
 
-REACHES = 0.05
+MIN_EFFECT = 0.05
 """Change of a row's innovations, in parts of their size, by four times the Q of a noise that has to do with it."""
 
-LONGER = 30.0
+MAX_TIME_FACTOR = 30.0
 """How many times as long as that of the innovations themselves the time of an error is tried at most."""
 
 
@@ -57,7 +57,7 @@ class Appended(NamedTuple):
 
 @dataclass(frozen=True)
 class Explained:
-    """What is appended, by key of the YAML, the likelihood that it gains, nats, and the rows that are related still."""
+    """Appended entries by key of the YAML, gain in likelihood, nats, and rows that are still correlated."""
 
     sections: Mapping[str, dict[str, object]] = field(default_factory=dict)
     gain: float = 0.0
@@ -75,7 +75,7 @@ class _Trial:
 
 
 def lasting(measured: Measured, estimator: str, options: Mapping[str, float] | None) -> tuple[Claim, Explained] | None:
-    """Ask it of the filter that is chosen; None where no row of its innovations follows itself."""
+    """Test the chosen filter; None if no row has correlated innovations."""
     before = _begun(measured, estimator, options)
     related = _related(before)
     if not related:
@@ -86,8 +86,8 @@ def lasting(measured: Measured, estimator: str, options: Mapping[str, float] | N
     except NisusError as error:
         return Claim("lasting", QUESTION, UNTOLD, worst, LIMITS.correlation, OF, str(error)), Explained()
     if after is before:
-        reason = f"{related[0].subject} follows itself with {worst:+.2f}, and no noise that lasts makes that likelier"
-        text = "a state is missing, or the asset is at times another one: look at Innovations over time"
+        reason = f"{related[0].subject} has correlation {worst:+.2f}, and no coloured noise raises the likelihood"
+        text = "a state is missing, or the asset changes: see the innovations over time"
         return Claim("lasting", QUESTION, NO, worst, LIMITS.correlation, OF, reason, text), Explained()
     left = _related(after)
     found = Explained(_sections(after), after.likelihood - before.likelihood, tuple(left))
@@ -96,11 +96,11 @@ def lasting(measured: Measured, estimator: str, options: Mapping[str, float] | N
         f"{each.noise or each.sensor} for {digits(_time(after.tuning, each))} s" for each in after.appended
     )
     reason = (
-        f"with what lasts of {times} the log is {digits(found.gain)} nats likelier; of {len(related)} "
-        f"row{'s' if len(related) > 1 else ''} that followed themselves by up to {worst:+.2f}, "
-        + (f"{len(left)} still do{'es' * (len(left) == 1)}, {left[0].subject} most" if left else "none does any more")
+        f"with coloured noise ({times}) the log-likelihood is higher by {digits(found.gain)} nats; of {len(related)} "
+        f"row{'s' if len(related) > 1 else ''} correlated by up to {worst:+.2f}, "
+        + (f"{len(left)} still {'is' if len(left) == 1 else 'are'}, {left[0].subject} most" if left else "none remains")
     )
-    remedy = "with the lines with `over` in the YAML, nisus tune fits their size and time"
+    remedy = "put the lines with `over` into the YAML; nisus tune fits their size and time"
     return Claim("lasting", QUESTION, NO if left else YES, figure, LIMITS.correlation, OF, reason, remedy), found
 
 
@@ -122,23 +122,23 @@ def _rows(trial: _Trial) -> list[Calibration]:
 
 
 def _related(trial: _Trial) -> list[Calibration]:
-    """The rows that follow themselves, those first that do so most."""
+    """Return the rows with positive correlation, the largest first."""
     rows = [entry for entry in _rows(trial) if entry.correlation.beyond(-LIMITS.correlation, LIMITS.correlation)]
     return sorted((entry for entry in rows if entry.correlation.value > 0.0), key=lambda each: -each.correlation.value)
 
 
 def _explained(model: StateSpaceModel, estimator: str, begun: _Trial) -> _Trial:
-    """Append what explains the row that follows itself most, and again, until the budget is spent."""
+    """Append the best noise for the most correlated row, repeatedly until the budget is spent."""
     log, best, given_up = without_queries(begun.fold.log), begun, set[str]()
     end = time.thread_time() + BUDGET
-    while len(best.appended) < MOST and time.thread_time() < end:
+    while len(best.appended) < MAX_APPENDED and time.thread_time() < end:
         rows = [entry for entry in _related(best) if entry.subject not in given_up]
         if not rows:
             break
         candidates = list(_candidates(model, estimator, best, rows[0]))
         tried = [_tried(model, estimator, begun, best, one, log, end) for one in candidates]
         better = max((one for one in tried if one is not None), key=lambda one: one.likelihood, default=None)
-        if better is None or better.likelihood < best.likelihood + WORTH:
+        if better is None or better.likelihood < best.likelihood + MIN_GAIN_NATS:
             given_up.add(rows[0].subject)
         else:
             best = better
@@ -146,7 +146,7 @@ def _explained(model: StateSpaceModel, estimator: str, begun: _Trial) -> _Trial:
 
 
 def _candidates(model: StateSpaceModel, estimator: str, trial: _Trial, row: Calibration) -> Iterator[Appended]:
-    """The noises that change the innovations of a row, and the error of its sensor, where they do not last yet."""
+    """Yield noises that change the innovations of a row, and the error of its sensor, unless already appended."""
     fold = trial.fold
     index = fold.model.row_names.index(row.subject)
     k = int(np.searchsorted(fold.model.row_start, index, side="right")) - 1
@@ -155,14 +155,16 @@ def _candidates(model: StateSpaceModel, estimator: str, trial: _Trial, row: Cali
     innovation = fold.track.innovation[said, column]
     period = float(np.median(np.diff(fold.log.t[said]))) * 1e-9
     # Of a lag of first order the correlation over a period is exp(-period / time).
-    over = float(np.clip(-period / np.log(np.clip(row.correlation.value, 0.05, 0.95)), period, LONGER * period))
+    over = float(
+        np.clip(-period / np.log(np.clip(row.correlation.value, 0.05, 0.95)), period, MAX_TIME_FACTOR * period)
+    )
     done = {each.noise or each.sensor for each in trial.appended}
     for noise in model.noises:
         if noise.name in done or not _can(model, Appended(noise.name, None, over)):
             continue
         key = f"Q.{noise.name}"
         other = _folded(estimator, fold, trial.tuning.set(key, 4.0 * float(trial.tuning.get(key) or 0.0)))
-        if np.nanstd(other.track.innovation[said, column] - innovation) > REACHES * np.nanstd(innovation):
+        if np.nanstd(other.track.innovation[said, column] - innovation) > MIN_EFFECT * np.nanstd(innovation):
             yield Appended(noise.name, None, over)
     sensor = model.sensors[k]
     one = Appended(None, sensor.name, over, float(trial.tuning.r[index]))
@@ -187,12 +189,12 @@ def _model(model: StateSpaceModel, appended: tuple[Appended, ...]) -> StateSpace
 def _tried(
     model: StateSpaceModel, estimator: str, begun: _Trial, best: _Trial, one: Appended, log: Log, end: float
 ) -> _Trial | None:
-    """One more error, its size and time fitted; None if it cannot be folded, or there is no time left for it."""
+    """Return a trial with one more noise, fitted; None if it cannot be folded or the budget is spent."""
     appended = (*best.appended, one)
     larger = _model(model, appended)
     tuning = _onto(larger, begun.tuning)
     if one.noise is not None:
-        # What lasts explains what white noise of that strength did not.
+        # Coloured noise of the same effect is stronger than white noise.
         key = f"Q.{one.noise}"
         tuning = tuning.set(key, 2.0 * float(tuning.get(key) or 0.0))
     for key in _keys(larger, best.appended):
@@ -216,14 +218,14 @@ def _tried(
 
 
 def _onto(model: StateSpaceModel, tuning: Tuning) -> Tuning:
-    """A tuning of the model that something was appended to: what is new stands behind what was there."""
+    """Return a tuning for the extended model; new entries follow the old ones."""
     new = Tuning.of(model)
     new.q[: tuning.q.size], new.p[: tuning.p.size] = tuning.q, tuning.p
     return replace(tuning, model=model, q=new.q, p=new.p, baseline=None)
 
 
 def _keys(model: StateSpaceModel, appended: tuple[Appended, ...]) -> list[str]:
-    """What is fitted: how strong each is, and how long it lasts; of a sensor also what is white of its noise."""
+    """Return the fitted entries: strength and time of each, and for a sensor also its white noise."""
     keys = []
     for each in appended:
         if each.noise is not None:
@@ -240,7 +242,7 @@ def _time(tuning: Tuning, one: Appended) -> float:
 
 
 def _sections(trial: _Trial) -> dict[str, dict[str, object]]:
-    """The entries of the YAML that say so, by `noise.NAME` or `sensors.NAME`; what else they say stays."""
+    """Return the entries of the YAML, by `noise.NAME` or `sensors.NAME`."""
     found: dict[str, dict[str, object]] = {}
     for each in trial.appended:
         over = f"{_time(trial.tuning, each):.3g} s"

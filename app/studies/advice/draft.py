@@ -73,7 +73,7 @@ def python_text(name: str, model: str, plan: Plan) -> str:
         + ["Parameter"] * bool(parameters)
     )
     uses_math = "import math\n\n" if parameters else ""
-    return f'''"""Signals of a recording, each as it moves by itself: a start for equations that tie them together."""
+    return f'''"""Signals of a recording, each with its own motion: a start for equations that couple them."""
 
 {uses_math}from estimators.model import {", ".join(names)}
 
@@ -154,10 +154,10 @@ def _parameters(item: Moves) -> list[str]:
 
 
 def _function(reads: Reads, k: int) -> str:
-    """What a sensor reads of state k."""
+    """Return the measurement function of a sensor of state k."""
     text = f"x[{k}]" if reads.gain == 1.0 else f"{reads.gain:.6g} * x[{k}]"
     text += f" + {reads.offset:.6g}" if reads.offset else ""
-    return f'def read_{reads.name}(x, u, p, out):\n    """What the sensor {reads.name} reads."""\n    out[0] = {text}\n'
+    return f'def read_{reads.name}(x, u, p, out):\n    """Measurement of {reads.name}."""\n    out[0] = {text}\n'
 
 
 def yaml_text(
@@ -192,25 +192,25 @@ def yaml_text(
     degraded, stale = max(3.0, 5.0 * slowest), max(15.0, 20.0 * slowest)
     text = "\n".join
     return f"""\
-# {name}: signals of a recording, each as it moves by itself. Change it, and {name}.py beside it, into your own twin.
+# {name}: signals of a recording, each with its own motion. Change it, and {name}.py beside it, into your own twin.
 #
 # Source: {", ".join(path.name for path in found.files[:3])}{", ..." if len(found.files) > 3 else ""}
-# Expect: a start. The noise below was taken from the differences of the data, and is that of no moment in particular
-# where a signal now rests and now moves; nisus tune fits it, nisus advise says whether it bears out.
+# Expect: a start. The noise below was taken from the differences of the data, and is an average
+# where a signal rests and moves; nisus tune fits it, nisus advise checks it.
 # Run it: nisus run {name}.yaml      Score it: nisus fold {name}.yaml      Every key: nisus schema
 title: {_text(_title(plan))}
 model: ./{name}.py:{model}       # file beside this one, and the name of the model in it
 
-noise:                           # how much the model is distrusted: what it adds in one second
+noise:                           # model uncertainty, per second
 {text(noise)}
 
-sensors:                         # how much each sensor is distrusted
+sensors:                         # sensor noise
 {text(sensors)}
 
 estimator: kf                    # nisus filters --twin {name}.yaml lists those that fit
-gate: null                       # uses every reading; 0.9999 refuses those that fewer than one in 10,000 good ones are
+gate: null                       # null uses every measurement; 0.9999 rejects one good measurement in 10,000
 
-time:                            # by the slowest sensor, which speaks every {slowest:.3g} s
+time:                            # the slowest sensor reports every {slowest:.3g} s
   degraded_after: {degraded:.3g}
   stale_after: {stale:.3g}
   tick: {max(0.5, slowest):.3g}

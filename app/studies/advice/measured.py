@@ -1,4 +1,4 @@
-"""What is measured of a twin and its log: each thing when it is first asked for, and once."""
+"""Measurements on a twin and its log, each made once when first needed; claims; and numbers in words."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class Folded:
 
 @dataclass
 class Measured:
-    """A twin, the log of its asset, and what has been measured of the two."""
+    """A twin with a log, and its cached measurements."""
 
     twin: Twin
     log: Log
@@ -47,19 +47,19 @@ class Measured:
 
     @cached_property
     def rate(self) -> float:
-        """Readings a second, over the whole log."""
+        """Readings per second over the log."""
         times = self.log.t[: self.log.n][self.log.kind[: self.log.n] == READING]
         span = float(times[-1] - times[0]) * 1e-9 if times.size else 0.0
         return (times.size - 1) / span if span > 0.0 else 0.0
 
     @cached_property
     def linearity(self) -> Linearity:
-        """Of the linearised filter against the unscented one."""
+        """Comparison of the linearised with the unscented filter."""
         return linearity(self.twin.model, self.twin.tuning, self.log)
 
     @cached_property
     def gramian(self) -> Gramian:
-        """What the readings tell of each state."""
+        """Observability Gramian of the log."""
         name = self.twin.estimator
         if unfit(find_entry(name), self.twin.model):
             name = stand_in("pf", self.twin.model)[0]
@@ -68,7 +68,7 @@ class Measured:
 
     @cached_property
     def peaks(self) -> Peaks:
-        """By the twin's own cloud, if it has one."""
+        """Peaks of the posterior, by the twin's own particle cloud if it has one."""
         own = find_entry(self.twin.estimator)
         name = self.twin.estimator if own.peaks is not None else "pf"
         return peaks(name, self.twin.model, self.twin.tuning.with_options(self.twin.options_of(name)), self.log)
@@ -105,7 +105,7 @@ class Measured:
             limit = int(min(log.n, max(1.0, fold.n * min(left, 4.0))))
         if fold.failure is not None:
             raise fold.failure
-        # What the budget left over is not part of this fold.
+        # The fold ends where the budget ended.
         fold.log.n = fold.n
         readings = int(np.sum(log.kind[: fold.n] == READING))
         return Folded(fold, (time.process_time() - begun) / max(1, readings))
@@ -147,24 +147,24 @@ _SECONDS = ((1.0, "s"), (1e-3, "ms"), (1e-6, "µs"), (1e-9, "ns"))
 
 
 def apart_text(sigma: float) -> str:
-    """A distance in σ; what is very small is said to be."""
+    """Return a distance in σ; a very small one as "less than"."""
     return f"less than {LEAST:g} σ" if sigma < LEAST else f"{digits(sigma)} σ"
 
 
 def bytes_text(count: float) -> str:
-    """A number of bytes with a prefix."""
+    """Return a number of bytes with a prefix."""
     size, unit = next((step for step in _BYTES if count >= step[0]), _BYTES[-1])
     return f"{count / size:.3g} {unit}"
 
 
 def seconds_text(seconds: float) -> str:
-    """A time below minutes with a prefix."""
+    """Return a time below minutes with a prefix."""
     size, unit = next((step for step in _SECONDS if seconds >= step[0]), _SECONDS[-1])
     return f"{seconds / size:.3g} {unit}"
 
 
 def percent(share: float) -> str:
-    """A share in percent: whole from ten on, two digits below; what is nearly all is not said to be all."""
+    """Return a share in percent: an integer from ten on, two digits below; nearly all is not rounded to all."""
     if not math.isfinite(share):
         return "unknown"
     if 0.995 <= share < 1.0:

@@ -1,4 +1,4 @@
-"""Do the innovations of the filter that is chosen bear out its bands? If not, its tuning or the model is wrong."""
+"""Questions of the decision tree: each is answered by a figure measured on the log."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ from .measured import (
     seconds_text,
 )
 
-CONSISTENT_QUESTION = "Are the innovations as large and as white as the filter says?"
-CONSISTENT_OF = "mean NIS a degree of freedom"
+CONSISTENT_QUESTION = "Are the innovations white and as large as predicted?"
+CONSISTENT_OF = "mean NIS per degree of freedom"
 
 
 def consistent(measured: Measured, estimator: str, options: dict[str, float] | None = None) -> Claim:
-    """By mean NIS, and by the scale and correlation of each row with their intervals."""
+    """Check the chosen filter by mean NIS, and by scale and correlation of each row with their intervals."""
     twin = measured.twin
     fold = measured.folded(estimator, options).fold
     nis = mean_nis(fold.track, fold.tuning.gate)
@@ -60,7 +60,7 @@ def consistent(measured: Measured, estimator: str, options: dict[str, float] | N
     wide = 1.0 + LIMITS.width
     size = [entry for entry in rows if entry.scale.beyond(1.0 / wide, wide)]
     related = [entry for entry in rows if entry.correlation.beyond(-LIMITS.correlation, LIMITS.correlation)]
-    reason = f"{estimator}: mean NIS {digits(nis)} a degree of freedom"
+    reason = f"{estimator}: mean NIS {digits(nis)} per degree of freedom"
     if not size and not related:
         reason += (
             f"; every band is right within a quarter, and no correlation is beyond {LIMITS.correlation:g} "
@@ -70,11 +70,11 @@ def consistent(measured: Measured, estimator: str, options: dict[str, float] | N
     remedies = []
     if size:
         one = max(size, key=lambda entry: abs(np.log(entry.scale.value)))
-        reason += f"; bands of {one.subject} would have to be {digits(one.scale.value)} times as wide"
+        reason += f"; bands of {one.subject} should be {digits(one.scale.value)} times as wide"
         remedies.append(f"noises are off: nisus tune {named(twin.path)} fits Q and R to the log")
     if related:
         one = max(related, key=lambda entry: abs(entry.correlation.value))
-        reason += f"; innovations of {one.subject} follow one another with {one.correlation.value:+.2f}"
+        reason += f"; successive innovations of {one.subject} are correlated by {one.correlation.value:+.2f}"
         remedies.append(
             "too little Q, or a state is missing" if one.correlation.value > 0.0 else "too much Q against R"
         )
@@ -82,13 +82,13 @@ def consistent(measured: Measured, estimator: str, options: dict[str, float] | N
 
 
 def curvature(measured: Measured) -> Claim:
-    """By how far the two filters are apart in σ along the log; also how much likelier one finds the readings."""
+    """Compare EKF and UKF along the log, in σ, and their likelihoods."""
     question = "Is the curvature of f and h significant over the spread of the estimate?"
     found = measured.linearity
     if found.reason:
         return Claim("curvature", question, UNTOLD, None, LIMITS.bias, APART, found.reason)
     name, apart = worst(found)
-    reason = f"95 % of the time ekf and ukf are {apart_text(apart)} apart, most in {name}"
+    reason = f"ekf and ukf agree to within {apart_text(apart)} (95th percentile; largest for {name})"
     if not np.isfinite(apart):
         reason = f"ekf loses {name} where ukf does not"
     return Claim(
@@ -97,11 +97,11 @@ def curvature(measured: Measured) -> Claim:
 
 
 def _gain(measured: Measured) -> str:
-    """How much likelier the unscented filter finds the readings, in words."""
+    """Return the gain in likelihood of the unscented filter, in words."""
     one, other = (measured.likelihood(name) for name in ("ekf", "ukf"))
     if not (np.isfinite(one) and np.isfinite(other)):
         return ""
-    return f"; ukf finds the readings {digits(other - one)} nats a reading likelier" if other > one else ""
+    return f"; the likelihood of ukf is higher by {digits(other - one)} nats per measurement" if other > one else ""
 
 
 LEFT = 0.9
@@ -109,9 +109,9 @@ LEFT = 0.9
 
 
 def observed(measured: Measured) -> Claim:
-    """By the Gramian along the log: the state that keeps most of its prior deviation after all readings."""
-    question = "Do the readings tell of every state?"
-    of = "of its prior deviation left to the state that is seen least"
+    """Find the state that keeps most of its prior deviation after all measurements, by the Gramian of the log."""
+    question = "Is every state observable?"
+    of = "of its prior deviation left to the least observable state"
     found, model = measured.gramian, measured.twin.model
     if found.whole is None:
         return Claim("observed", question, UNTOLD, None, LEFT, of, found.reason)
@@ -147,19 +147,19 @@ RADIUS_SHARES = (0.05, 0.1, 0.2, 0.4)
 INFLATIONS = (1.0, 1.02, 1.05, 1.1)
 
 LIKELIHOOD_MARGIN = 0.01
-"""Nats a value; what is less likely by no more than this is as good, and the cheaper one is taken."""
+"""Nats per value; of options closer than this the cheapest is taken."""
 
 SWEEP_BUDGET_S = 2.0
 """Seconds of one processor for each fold of the sweep."""
 
 
 def sweep(measured: Measured, estimator: str) -> tuple[list[Claim], dict[str, float]]:
-    """Radius first, with the members in the middle, then inflation, then members: claims and options."""
+    """Choose radius, inflation and number of members, one after another; return claims and options."""
     options: dict[str, float] = {"members": MEMBERS[1]}
     has = {option.name for option in find_entry(estimator).options}
     claims = []
     if radii := _radii(measured, estimator):
-        claims.append(_best(measured, estimator, options, "radius", radii, "How far does a reading reach?"))
+        claims.append(_best(measured, estimator, options, "radius", radii, "What is the localisation radius?"))
     if "inflation" in has:
         values = list(INFLATIONS)
         claims.append(_best(measured, estimator, options, "inflation", values, "How much inflation does it need?"))
@@ -170,7 +170,7 @@ def sweep(measured: Measured, estimator: str) -> tuple[list[Claim], dict[str, fl
 def _best(
     measured: Measured, estimator: str, options: dict[str, float], name: str, values: list[float], question: str
 ) -> Claim:
-    """Try the values of one option, the others as they are; the first within the margin of the best is taken."""
+    """Try values of one option, and take the first within the margin of the best."""
     found = _likelihoods(measured, estimator, [{**options, name: value} for value in values])
     of = f"{name} of {estimator}, the likeliest within {LIKELIHOOD_MARGIN:g} nats a value"
     if not np.any(np.isfinite(found)):
@@ -183,14 +183,14 @@ def _best(
     if name == "members":
         n = measured.twin.model.nx
         reason += (
-            f"; two states that know nothing of each other look correlated by 1 / √{chosen:.0f} = "
+            f"; two independent states appear correlated by 1 / √{chosen:.0f} = "
             f"{1.0 / np.sqrt(chosen):.2f} by chance, and {chosen:.0f} × {n:,} × 8 B = {bytes_text(8.0 * chosen * n)}"
         )
     return Claim(name, question, YES, chosen, best, of, reason)
 
 
 def _likelihoods(measured: Measured, estimator: str, tried: list[dict[str, float]]) -> list[float]:
-    """Mean log-likelihood of a value, over the events that all of them folded within the budget."""
+    """Return the mean log-likelihood of a value over the events that all folds reached within the budget."""
     folds: list[Fold | None] = []
     for options in tried:
         try:
@@ -203,7 +203,7 @@ def _likelihoods(measured: Measured, estimator: str, tried: list[dict[str, float
 
 
 def _radii(measured: Measured, estimator: str) -> list[float]:
-    """Radii to try, shares of the largest extent; none where the filter has no radius, or places are not known."""
+    """Return radii to try as shares of the largest extent; none if the filter has none or positions are unknown."""
     model, entry = measured.twin.model, find_entry(estimator)
     places = model.positions()
     if places is None or all(option.name != "radius" for option in entry.options):
@@ -218,16 +218,16 @@ def _radii(measured: Measured, estimator: str) -> list[float]:
 
 STEADY = "kf-steady"
 
-APART = "σ between ekf and ukf 95 % of the time"
+APART = "σ between ekf and ukf (95th percentile)"
 
 EXACT = 1e-9
-"""Of a σ; what two filters of a linear model differ by is rounding."""
+"""Difference in σ of two filters on a linear model, by rounding."""
 
 UNEVEN = 0.01
 """Share of the period by which the time between two readings may differ from it."""
 
 LOST = 0.001
-"""Share of the intervals that may differ: a fixed gain knows nothing of a reading that is lost or late."""
+"""Share of the intervals that may differ: a fixed gain cannot follow lost or late measurements."""
 
 
 def worst(found: Linearity) -> tuple[str, float]:
@@ -237,27 +237,27 @@ def worst(found: Linearity) -> tuple[str, float]:
 
 
 def linear(measured: Measured) -> Claim:
-    """By the model's own word, or because linearising changes nothing anywhere in the log."""
+    """Check by the model's declaration, or by the effect of linearisation along the log."""
     question = "Are f and h linear?"
     of = APART
     found, model = measured.linearity, measured.twin.model
     if found.reason:
         if model.linear:
-            return Claim("linear", question, YES, None, EXACT, of, "the model says so: linear=True")
+            return Claim("linear", question, YES, None, EXACT, of, "declared by the model: linear=True")
         return Claim("linear", question, UNTOLD, None, EXACT, of, found.reason)
     name, apart = worst(found)
-    told = f"95 % of the time ekf and ukf are {apart_text(apart)} apart (most in {name})"
+    told = f"ekf and ukf agree to within {apart_text(apart)} (95th percentile; largest for {name})"
     if model.linear:
-        return Claim("linear", question, YES, apart, EXACT, of, f"the model says so (linear=True), and {told}")
+        return Claim("linear", question, YES, apart, EXACT, of, f"declared by the model (linear=True), and {told}")
     if apart <= EXACT:
-        remedy = "say linear=True in the model, and kf applies: it finds F once where ekf finds it at every step"
+        remedy = "set linear=True in the model; kf then computes F once, ekf at every step"
         return Claim("linear", question, YES, apart, EXACT, of, f"{told}, which is rounding", remedy)
     return Claim("linear", question, NO, apart, EXACT, of, told)
 
 
 def steady(measured: Measured) -> tuple[Claim, float]:
-    """Whether a gain that is fixed would do, and the period for which: time-invariant, one sensor, regular readings."""
-    question = "Is it time-invariant, and do readings come regularly and never fail?"
+    """Check whether a fixed gain suffices, and return its period: time-invariant, one sensor, regular measurements."""
+    question = "Is it time-invariant, with regular measurements and no dropouts?"
     of = "of the intervals between readings off the period by more than 1 %"
     twin, log = measured.twin, measured.log
     against = unfit(find_entry(STEADY), twin.model)
@@ -282,33 +282,33 @@ def steady(measured: Measured) -> tuple[Claim, float]:
     with np.errstate(all="ignore"):
         share = np.abs(one.mean - other.mean) / other.std
     far = float(np.nanquantile(np.nanmax(share, axis=1), QUANTILE))
-    said = f"{reason}; 95 % of the time {STEADY} is {apart_text(far)} from kf, where {LIMITS.bias:g} would matter"
-    of = f"σ between {STEADY} and kf 95 % of the time"
+    said = f"{reason}; {STEADY} and kf agree to within {apart_text(far)} (95th percentile), limit {LIMITS.bias:g}"
+    of = f"σ between {STEADY} and kf (95th percentile)"
     return Claim("steady", question, YES if far <= LIMITS.bias else NO, far, LIMITS.bias, of, said), period
 
 
 SHAPE_QUESTION = "Does the posterior have several peaks?"
-SHAPE_OF = "of the looks at the cloud of particles with several peaks"
+SHAPE_OF = "of the samples of the particle cloud with several peaks"
 
 
 def several(measured: Measured) -> Claim:
-    """By the share of the looks at two clouds of particles that show more than one peak in both."""
+    """Check the share of samples in which two particle clouds both have more than one peak."""
     model = measured.twin.model
     if model.linear and model.jump is None and not any(sensor.log_likelihood for sensor in model.sensors):
         reason = "f and h are linear and the noise is Gaussian, so the posterior is Gaussian"
         return Claim("peaks", SHAPE_QUESTION, NO, 0.0, OFTEN, SHAPE_OF, reason)
     if model.nx > MOST_STATES:
         reason = (
-            f"{model.nx:,} states: the particles that are needed grow exponentially with them, so a cloud cannot tell "
+            f"{model.nx:,} states: the number of particles needed grows exponentially, so a cloud cannot answer this "
             f"beyond {MOST_STATES}"
         )
         return Claim("peaks", SHAPE_QUESTION, UNTOLD, None, OFTEN, SHAPE_OF, reason)
     found = measured.peaks
     if found.reason:
         return Claim("peaks", SHAPE_QUESTION, UNTOLD, None, OFTEN, SHAPE_OF, found.reason)
-    reason = f"{percent(found.several)} of {found.looks} looks at clouds of {found.estimator} over {found.over:.4g} s"
+    reason = f"{percent(found.several)} of {found.looks} samples of clouds of {found.estimator} over {found.over:.4g} s"
     if found.recoveries:
-        reason += f"; the cloud lost the asset {found.recoveries} time(s), so its shape says little"
+        reason += f"; the cloud lost the asset {found.recoveries} time(s), so its shape is not reliable"
         return Claim("peaks", SHAPE_QUESTION, UNTOLD, found.several, OFTEN, SHAPE_OF, reason)
     reason += f", at most {found.most} peak{'s' if found.most > 1 else ''} at once"
     return Claim("peaks", SHAPE_QUESTION, YES if found.several > OFTEN else NO, found.several, OFTEN, SHAPE_OF, reason)
@@ -325,7 +325,7 @@ LEAST_DOF = 3.0
 
 
 def heavy(measured: Measured, estimator: str, options: dict[str, float] | None = None) -> tuple[Claim, float]:
-    """By the excess kurtosis of the innovations of the filter that is chosen; and Student's t that has as much.
+    """Check the excess kurtosis of the innovations, and return the degrees of freedom of a Student's t with as much.
 
     Source: the excess kurtosis of Student's t is 6 / (ν - 4), so ν = 4 + 6 / κ.
     """
@@ -340,7 +340,7 @@ def heavy(measured: Measured, estimator: str, options: dict[str, float] | None =
         f"{worst.row} has excess kurtosis {digits(worst.kurtosis)} and {percent(worst.far)} of its {worst.n:,} "
         f"innovations beyond {FAR:g} σ, the most of {len(found)} rows of {estimator}"
     )
-    # Of many rows a few look so by chance.
+    # A few of many rows have heavy tails by chance.
     if len(rows) <= OFTEN * len(found):
         return Claim("tails", TAILS_QUESTION, NO, worst.kurtosis, HEAVY, TAILS_OF, reason), np.inf
     related = [
@@ -349,11 +349,9 @@ def heavy(measured: Measured, estimator: str, options: dict[str, float] | None =
         if entry.role == "used" and entry.correlation.beyond(-LIMITS.correlation, LIMITS.correlation)
     ]
     if any(entry.subject == worst.row for entry in related):
-        reason += (
-            "; they are correlated too, so these are errors of the model, and weights would keep good readings out"
-        )
+        reason += "; they are also correlated, which points to model errors; weights would reject good measurements"
         return Claim("tails", TAILS_QUESTION, NO, worst.kurtosis, HEAVY, TAILS_OF, reason), np.inf
-    # A kurtosis tells no more figures; more would differ each time that the lines are put in and asked for again.
+    # Two digits: more would differ each time the advice is applied and repeated.
     dof = float(f"{max(LEAST_DOF, 4.0 + 6.0 / worst.kurtosis):.2g}")
     reason += f"; Student's t with 4 + 6 / κ = {digits(dof)} degrees of freedom has as heavy ones"
     weighing, weighted = with_weights(estimator, dof)
@@ -368,7 +366,7 @@ def heavy(measured: Measured, estimator: str, options: dict[str, float] | None =
     change = after / before - 1.0
     reason += f"; weighed so, the innovations are {100 * abs(change):.2g} % {'larger' if change > 0 else 'smaller'}"
     if change > WORSE:
-        reason += ": it is the asset that jumps, not the sensor, and weights would keep good readings out"
+        reason += ": the asset jumps, not the sensor; weights would reject good measurements"
         return Claim("tails", TAILS_QUESTION, NO, worst.kurtosis, HEAVY, TAILS_OF, reason), np.inf
     return Claim("tails", TAILS_QUESTION, YES, worst.kurtosis, HEAVY, TAILS_OF, reason), dof
 
@@ -391,7 +389,7 @@ SHARE = 0.5
 
 
 def small(measured: Measured) -> Claim:
-    """Whether 4 n³ + 6 m n² operations a reading, and 8 n² bytes, are affordable.
+    """Check whether 4 n³ + 6 m n² operations per measurement, and 8 n² bytes, are affordable.
 
     4 n³ are those of F P Fᵀ, 6 m n² those of the update with m rows.
     """
@@ -412,7 +410,7 @@ def small(measured: Measured) -> Claim:
         reason += f"; beyond {LARGE:,} states no filter here forms one"
     else:
         figure, threshold, of = share, SHARE, "of a processor for a covariance"
-    question = "Is the state small enough for a covariance at this rate?"
+    question = "Does the state dimension suit a full covariance at this rate?"
     return Claim("size", question, YES if fits else NO, figure, threshold, of, reason)
 
 
@@ -425,7 +423,7 @@ COST_OF = "of one processor"
 
 
 def affordable(measured: Measured, estimator: str, options: dict[str, float] | None = None) -> Claim:
-    """By its measured time a reading."""
+    """Check the measured time per measurement."""
     folded = measured.folded(estimator, options)
     share = folded.seconds * measured.rate
     runs = find_entry(estimator).runs(folded.fold.options, measured.twin.model.nx)

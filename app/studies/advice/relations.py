@@ -1,4 +1,4 @@
-"""What drives a signal: a first-order lag behind others, fitted to the first half and judged by the second."""
+"""Relations between signals: drivers by a first-order lag, and pairs that measure the same quantity or its rate."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def driven(found: Sequence[Signal], target: int, candidates: Sequence[int]) -> D
 
 
 def simulated(found: Sequence[Signal], lag: Driven) -> Series:
-    """What the drivers leave of a signal: its values less the driven lag, which is simulated without any reading."""
+    """Return a signal minus its lag behind the drivers, which is simulated without measurements."""
     t, values = common([found[lag.signal].series, *(found[k].series for k in lag.drivers)])
     weights = np.array([lag.offset, lag.start, *lag.gains])
     course = _columns(t, _held(values[:, 1:]), lag.tau) @ weights
@@ -100,7 +100,7 @@ def simulated(found: Sequence[Signal], lag: Driven) -> Series:
 
 
 def _held(values: np.ndarray) -> np.ndarray:
-    """The last value that was there, in place of NaN; at first the first."""
+    """Return values with NaN replaced by the last known value, or the first at the start."""
     out = values.copy()
     for column in out.T:
         known = np.flatnonzero(np.isfinite(column))
@@ -133,7 +133,7 @@ def _lag(t: np.ndarray, y: np.ndarray, u: np.ndarray, half: int, tau: float) -> 
 
 
 def _columns(t: np.ndarray, u: np.ndarray, tau: float) -> np.ndarray:
-    """What a lag is made of: offset, start, and each input lagged, which holds from its time to the next."""
+    """Return the regressors of a lag: offset, start, and each input, held between its times and lagged."""
     a = np.exp(-float(t[1] - t[0]) / tau)
     lagged = lfilter([0.0, 1.0 - a], [1.0, -a], u, axis=0, zi=u[:1])[0]
     return np.column_stack([np.ones(t.size), np.exp(-t / tau), lagged])
@@ -149,7 +149,7 @@ RATE = 0.9
 """The same of the changes of one signal by the integral of the other."""
 
 WHITE = 0.5
-"""Correlation of what is left with the next, beyond which it is no noise."""
+"""Lag-one correlation of the residual above which it is not noise."""
 
 LAGS = 20
 """Intervals by which one may follow the other."""
@@ -161,8 +161,8 @@ MIN_PAIR_TIMES = 30
 class Pair(NamedTuple):
     """`second` = offset + gain · first, `lag` s later, explains the share `explained` of its variance.
 
-    `left` is the standard deviation of what is left of the second, `related` its correlation with the next: where that
-    is high they are two quantities that are much alike, and not two sensors of one.
+    `left` is the standard deviation of the residual, `related` its lag-one correlation; if that is high, they
+    are two similar quantities, not two sensors of one.
     With `rate`, offset + gain · second is the speed of `first`, and the variance is that of the first's changes.
     """
 
@@ -178,12 +178,12 @@ class Pair(NamedTuple):
 
     @property
     def one(self) -> bool:
-        """Whether they may be two sensors of one quantity: what differs is noise."""
+        """Whether they may be two sensors of one quantity, differing by noise."""
         return self.rate or self.related < WHITE
 
 
 def pairs(found: Sequence[Signal]) -> list[Pair]:
-    """All pairs among some signals, by their indices; of equal ones the first is the one with less noise."""
+    """Return all related pairs among signals, by index."""
     told = []
     for i in range(len(found)):
         for j in range(i + 1, len(found)):

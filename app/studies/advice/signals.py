@@ -1,4 +1,4 @@
-"""What a signal of a recording is like: rate, holes, resolution, noise."""
+"""Signals of a recording: sample rate, gaps, resolution, noise, common times."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ FEWEST = 20
 SKIPPED = re.compile(
     r"time|epoch|date|count|check|crc|valid|status|mode|error|alive|_id$|^id$|parity|accuracy", re.IGNORECASE
 )
-"""Names of what is no measurement."""
+"""Names that are not measurements."""
 
 DEGREES = ("deg", "°", "degree", "degrees")
 
@@ -26,11 +26,11 @@ STEPS = 8
 
 
 class Signal(NamedTuple):
-    """A signal, and what its values say.
+    """A signal and properties of its values.
 
     `rate` is readings a second by the usual interval, NaN with none; `holes` how many gaps far longer than usual, and
     `longest` the longest, s. `resolution` is the smallest step between two values, `levels` how many values there are.
-    `noise` is the standard deviation of what is not smooth in it, in its unit, never below that of its resolution.
+    `noise` is the standard deviation of its roughness, in its unit, at least that of its resolution.
     `kind` is "signal", "switch", "counter", "constant", or "short". `wraps`: an angle in degrees that jumps by a turn;
     its series is in radians, and goes on where the angle jumps.
     """
@@ -56,7 +56,7 @@ def signals(found: RecordingContents) -> list[Signal]:
 
 
 def signal(message: str | None, series: Series) -> Signal:
-    """What one series is like."""
+    """Describe one series."""
     wraps = series.unit in DEGREES and bool(np.any(np.abs(np.diff(series.values)) > 300.0))
     if wraps:
         series = replace(series, unit="rad", values=np.unwrap(np.radians(series.values)))
@@ -103,7 +103,7 @@ def step_of(levels: np.ndarray) -> float:
 def rough(t: np.ndarray, y: np.ndarray) -> float:
     """Standard deviation of the noise of a smooth curve that is sampled at t (ns), (n,), with any intervals.
 
-    e_k = a y_(k-1) + b y_(k+1) - y_k is what the straight line between the neighbours leaves of a value, with
+    e_k = a y_(k-1) + b y_(k+1) - y_k is a value minus the straight line between its neighbours, with
     a = (t_(k+1) - t_k) / (t_(k+1) - t_(k-1)) and b = 1 - a; σ² = mean of e_k² / (a² + b² + 1). What is not smooth over
     two intervals counts as noise, so this is an upper bound.
 
@@ -125,7 +125,7 @@ def rough(t: np.ndarray, y: np.ndarray) -> float:
 
 
 MIN_STANDARD_ERRORS = 3.0
-"""Standard errors of a variance of differences, √(8 / n) of it for white noise, below which it tells nothing."""
+"""Standard errors of a variance of differences, √(8 / n) of it for white noise, below which it is not significant."""
 
 WALK_INTERVALS = 20
 """Intervals over which a slow walk is looked for."""
@@ -172,7 +172,7 @@ def noise_of(series: Series) -> tuple[bool, float, float]:
 def walk_of(series: Series) -> float:
     """Variance that a random walk with noisy readings adds in one second, whether it moves smoothly or not.
 
-    E d² = q dt + 2 r of its differences, r by what is rough in it (`signals.rough`).
+    E d² = q dt + 2 r of its differences, r by its roughness (`rough`).
     """
     d, dt = np.diff(series.values), np.diff(series.t) * 1e-9
     later = dt > 0.0

@@ -48,22 +48,22 @@ from .questions import (
 
 STATEMENTS = {
     ("size", NO): "the state is too large for a covariance",
-    ("observed", NO): "no filter can recover what the readings do not tell of",
+    ("observed", NO): "no filter recovers an unobservable state",
     ("linear", YES): "f and h are linear",
     ("linear", NO): "f or h is not linear",
     ("linear", UNTOLD): "whether f and h are linear could not be measured",
-    ("steady", YES): "nothing varies in time, and readings come regularly",
-    ("steady", NO): "one fixed gain will not do",
-    ("steady", UNTOLD): "whether one gain would do could not be measured",
+    ("steady", YES): "time-invariant, with regular measurements",
+    ("steady", NO): "one fixed gain does not suffice",
+    ("steady", UNTOLD): "whether one gain suffices could not be measured",
     ("peaks", YES): "the posterior has several peaks",
     ("peaks", NO): "the posterior has one peak",
-    ("peaks", UNTOLD): "nothing tells of several peaks",
+    ("peaks", UNTOLD): "no evidence of several peaks",
     ("curvature", YES): "they curve over the spread of the estimate",
     ("curvature", NO): "they are nearly straight over the spread of the estimate",
     ("curvature", UNTOLD): "their curvature could not be measured",
     ("tails", YES): "the innovations are heavy-tailed",
 }
-"""What the answers that decide say."""
+"""Statement of each deciding answer."""
 
 
 @dataclass
@@ -71,7 +71,7 @@ class Advice:
     """A recommendation: filter and options, the claims in the order in which they were asked, and which decided.
 
     `because` are the keys of the claims that led to this filter and not to the one before it in the tree. `remedies`
-    are what to do beside choosing it; `sections` entries of the YAML, by key, that say which errors last.
+    are other actions; `sections` are entries of the YAML, by key, that declare coloured noise.
     """
 
     estimator: str = ""
@@ -86,12 +86,12 @@ class Advice:
 
     @property
     def title(self) -> str:
-        """The filter's own."""
+        """Title of the filter."""
         return find_entry(self.estimator).title
 
     @property
     def reasons(self) -> list[str]:
-        """What decided, each with its figure and what that was compared with."""
+        """Deciding answers, each with its figure and limit."""
         found = []
         for claim in (claim for claim in self.claims if claim.key in self.because):
             text = STATEMENTS[claim.key, claim.answer]
@@ -102,7 +102,7 @@ class Advice:
 
     @property
     def remedies(self) -> list[str]:
-        """What to do beside."""
+        """Other actions."""
         return [claim.remedy for claim in self.claims if claim.remedy]
 
 
@@ -124,7 +124,7 @@ def advise(measured: Measured) -> Advice:
 
 
 def _consistency(told: Advice, measured: Measured, *, ensemble: bool) -> None:
-    """Whether the result bears out; where its innovations follow one another, whether noise that lasts explains it."""
+    """Check the chosen filter for consistency; if its innovations are correlated, try coloured noise."""
     claim = consistent(measured, told.estimator, told.options)
     _ask(told, claim)
     # A filter that draws is too slow to be fitted here, and has no likelihood that is smooth.
@@ -255,7 +255,7 @@ def _word(advice: Advice, name: str, value: float) -> str:
 
 
 def lasting_lines(advice: Advice) -> str:
-    """The entries of `noise` and `sensors` that say which errors last; empty if none does."""
+    """Return the entries of `noise` and `sensors` that declare coloured noise; empty if there is none."""
     found: dict[str, list[str]] = {}
     for key, entry in advice.sections.items():
         group, _, name = key.partition(".")
@@ -290,7 +290,7 @@ def with_entry(text: str, key: str, entry: Mapping[str, Any]) -> str:
 
 
 def changed(text: str, section: str, entries: Mapping[str, Mapping[str, Any]] | None = None) -> str:
-    """A YAML's text with the section `estimator` in place of the one that is there, or at its end; and entries."""
+    """Return a YAML text with the section `estimator` replaced or added, and with other entries."""
     end = "\r\n" if "\r\n" in text else "\n"
     plain = text.replace("\r\n", "\n")
     if plain and not plain.endswith("\n"):

@@ -101,7 +101,7 @@ def test_the_channel(interface: str, channel: str | None, expected: str | int) -
     [
         (["motor_can", "--duration", "0"], "--duration 0: must be positive"),
         (["motor_can", "--interface", "virtual"], "stay in this process; use udp_multicast, or give --record"),
-        (["motor_can", "--interface", "socketcan"], "which bus is not known; give --channel, for example can0"),
+        (["motor_can", "--interface", "socketcan"], "needs a channel; give --channel, for example can0"),
         (["motor_winding"], "source is of type simulator"),
         (
             ["motor_can", "--interface", "virtual", "--record", "drive.txt"],

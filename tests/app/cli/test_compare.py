@@ -137,7 +137,7 @@ def test_what_the_gate_refuses_is_told_where_it_refuses_anything():
     lines = cells(rows, events=241, seconds=120.0)
     assert [line["refused [%]"] for line in lines] == ["24", "0", ""]
     _, _, kf, pf, ukf = printed("pump", lines)
-    assert kf.endswith("refused 24 % of the readings") and "refused" not in pf + ukf
+    assert kf.endswith("rejected 24 % of the readings") and "rejected" not in pf + ukf
     assert "refused [%]" not in LINES[0]
 
 

@@ -29,12 +29,12 @@ def test_the_pair_that_new_writes_loads_as_it_stands(tmp_path: Path) -> None:
 def test_a_bad_name_is_refused(name: str, tmp_path: Path) -> None:
     with pytest.raises(ConfigError) as caught:
         write_twin(name, tmp_path)
-    assert str(caught.value) == f"the name {name!r} will not do; use letters, digits, _ and -, and begin with a letter"
+    assert repr(name) in str(caught.value) and "begin with a letter" in str(caught.value)
     assert list(tmp_path.iterdir()) == []
 
 
 def test_a_shipped_name_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"^the name 'motor_winding' is that of a twin that ships; choose another$"):
+    with pytest.raises(ConfigError, match=r"^the name 'motor_winding' .* choose another$"):
         write_twin("motor_winding", tmp_path)
 
 
@@ -43,12 +43,12 @@ def test_nothing_is_overwritten(there: str, tmp_path: Path) -> None:
     (tmp_path / there).write_text("mine")
     with pytest.raises(ConfigError) as caught:
         write_twin("pump", tmp_path)
-    assert str(caught.value) == f"{tmp_path / there}: it is there already and is not overwritten; choose another name"
+    assert str(caught.value).startswith(f"{tmp_path / there}: already exists and is not overwritten")
     assert [path.name for path in tmp_path.iterdir()] == [there] and (tmp_path / there).read_text() == "mine"
 
 
 def test_a_folder_that_is_absent_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="there is no such folder; make it first$"):
+    with pytest.raises(ConfigError, match="there is no such folder; create it first$"):
         write_twin("pump", tmp_path / "absent")
 
 

@@ -96,7 +96,7 @@ class Pipe(io.StringIO):
 def test_where_output_is_redirected_it_says_what_it_does_before_it_is_done(monkeypatch):
     pipe = Pipe()
     monkeypatch.setattr(sys, "stderr", pipe)
-    monkeypatch.setattr(app.cli.prepare, "PATIENCE", 0.0)
+    monkeypatch.setattr(app.cli.prepare, "STATUS_DELAY_S", 0.0)
 
     def work():
         end = time.monotonic() + 10.0

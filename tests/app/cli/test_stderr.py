@@ -62,7 +62,7 @@ def test_a_recording_without_rows_is_named_and_so_is_one_that_feeds_nothing(
     *never, line = said(capsys, "fold", str(drive / "drive.yaml"), "--log", str(drive / "mute.csv"))
     assert never and all("has no value in 2 rows" in item for item in never), never
     assert line == (
-        f"nisus: --log {drive / 'mute.csv'}: the source said nothing that a sensor needs; check the channel maps"
+        f"nisus: --log {drive / 'mute.csv'}: the source has no values for any sensor; check the channel maps"
     )
 
 

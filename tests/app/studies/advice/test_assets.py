@@ -95,7 +95,7 @@ def test_time_varying_takes_a_gain_that_follows(told):
 def test_an_error_that_lasts_is_found_with_its_size_and_time(told, tmp_path):
     found = told("erring", "STILL", recordings.erring, "float")
     before, after = found.claim("consistent"), found.claim("lasting")
-    assert before.answer == "no" and "follow one another" in before.reason
+    assert before.answer == "no" and "correlated" in before.reason
     assert after.answer == "yes" and after.figure < after.threshold
     assert list(found.sections) == ["sensors.float"]
     entry = found.sections["sensors.float"]
