@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from config.yaml_files import shown_path, writing
 from estimators.errors import ConfigError
 from estimators.fit.entries import Setting
-from estimators.fit.judge import Part, worths
+from estimators.fit.judge import PartScore, worths
 from estimators.fit.recording import Recording, held_out_rows
 from estimators.fold import Fold
 from estimators.learned.train import NET, Trained, against, known, on_held_out, on_windows, train
@@ -101,10 +101,10 @@ def learn_correction(arguments: Arguments) -> int:
     tunings = twin.tuning, _tuned(twin.tuning, wider), _tuned(corrected.tuning, own_noise)
     recordings = [Recording(log, 1.0, held_out_rows(log, arguments.blocks)) for log in logs]
 
-    def judge() -> list[Part]:
+    def judge() -> list[PartScore]:
         return [worths(twin.estimator, [Setting(each, None)], recordings, _go)[0].held_out for each in tunings]
 
-    parts: list[Part] = attend(twin.model, judge, "judging")
+    parts: list[PartScore] = attend(twin.model, judge, "judging")
     lesson = Lesson(
         corrects=corrects,
         units=tuple(physics.states[physics.state_names.index(name)].unit for name in corrects),

@@ -17,7 +17,7 @@ from .result import plain
 
 if TYPE_CHECKING:
     from estimators.fit.fit import Fitted
-    from estimators.fit.judge import Part, Prediction
+    from estimators.fit.judge import PartScore, PredictionScore
 
 
 def runs_json(scores: RunScores, engine: Running) -> list[dict[str, Any]]:
@@ -162,10 +162,10 @@ def correlated(fitted: Fitted) -> list[dict[str, Any]]:
     return sorted(found, key=lambda pair: -abs(pair["correlation"]))
 
 
-def part_json(part: Part) -> dict[str, Any]:
+def part_json(part: PartScore) -> dict[str, Any]:
     """Return the scores of one part of the recordings."""
 
-    def predictions(items: Mapping[str, Prediction]) -> dict[str, Any]:
+    def predictions(items: Mapping[str, PredictionScore]) -> dict[str, Any]:
         names = ("unit", "n", "rms", "coverage", "crps")
         return {key: {name: getattr(item, name) for name in names} for key, item in items.items()}
 

@@ -11,7 +11,7 @@ import numpy as np
 from config.learned_schema import LearnedHeadSection
 from config.yaml_files import as_flow, as_section
 from estimators.diagnostics.sensitivity.responses import digits
-from estimators.fit.judge import Part
+from estimators.fit.judge import PartScore
 from estimators.learned.train import OnWindows, Trained
 from estimators.model.correction import Correction, GaussianProcess, Net, Ridge
 from estimators.model.state_space import StateSpaceModel
@@ -36,7 +36,7 @@ class Lesson(NamedTuple):
     words: str
     learned_from: OnWindows
     held_out: OnWindows | None
-    parts: tuple[Part, ...]
+    parts: tuple[PartScore, ...]
     noise: Mapping[str, float]
     reasons: tuple[str, ...]
 

@@ -9,8 +9,8 @@ import numpy as np
 
 from estimators.diagnostics.sensitivity.responses import digits
 from estimators.fit.dual import WindowFit, against, shift
-from estimators.fit.fit import Fitted, Line
-from estimators.fit.judge import Part, Prediction, Worth
+from estimators.fit.fit import EntryFit, Fitted
+from estimators.fit.judge import PartScore, PredictionScore, Worth
 
 from ..present.result import Topic
 from ..present.runs_json import correlated, fit_json
@@ -60,12 +60,12 @@ def _place(k: int | None, refit: WindowFit | None, origins: Sequence[int]) -> tu
     return (*((str(k + 1),) if len(origins) > 1 else ()), *at)
 
 
-def _line_of(refit: WindowFit, key: str) -> Line | None:
+def _line_of(refit: WindowFit, key: str) -> EntryFit | None:
     lines = () if refit.fitted is None else refit.fitted.lines
     return next((line for line in lines if line.key == key), None)
 
 
-def _window_row(refit: WindowFit, line: Line | None) -> tuple[str, ...]:
+def _window_row(refit: WindowFit, line: EntryFit | None) -> tuple[str, ...]:
     if refit.fitted is None or line is None:
         return ("-", "", "", "", "-")
     verdict = refit.fitted.verdict
@@ -150,7 +150,7 @@ def _entries(twin: Twin, fitted: Fitted) -> Topic:
     return Topic(f"{twin.name}: {fitted.estimator}, {fitted.folds} folds", tuple(said), head, tuple(rows))
 
 
-def _remark(line: Line) -> str:
+def _remark(line: EntryFit) -> str:
     if line.alone:
         return ALONE
     if line.edge and line.told:
@@ -159,7 +159,7 @@ def _remark(line: Line) -> str:
 
 
 def _scores(fitted: Fitted) -> Topic:
-    def row(what: str, before: Part, after: Part) -> tuple[str, ...]:
+    def row(what: str, before: PartScore, after: PartScore) -> tuple[str, ...]:
         return (
             what,
             f"{before.n:,}",
@@ -184,9 +184,9 @@ def _held_out(fitted: Fitted) -> Topic:
 
 
 def _rows(kind: str, group: str, before: Worth, after: Worth) -> list[tuple[str, ...]]:
-    def pair(name: str, worths: tuple[Part, Part]) -> tuple[str, str]:
+    def pair(name: str, worths: tuple[PartScore, PartScore]) -> tuple[str, str]:
         old, new = (getattr(part, group).get(name) for part in worths)
-        if not isinstance(old, Prediction) or not isinstance(new, Prediction):
+        if not isinstance(old, PredictionScore) or not isinstance(new, PredictionScore):
             return "", ""
         return f"{_number(old.rms)} -> {_number(new.rms)}", _pair(100 * old.coverage, 100 * new.coverage, ".0f", " %")
 

@@ -231,8 +231,8 @@ def covariance(X, j, mean_j, k, mean_k):
     return total / (N - 1)
 
 
-Forecast, forecast_at = declare_layout(
-    "Forecast", "n, side", forward="n", z="n", w="n", L="side, side", spare="side, side"
+ForecastScratch, forecast_at = declare_layout(
+    "ForecastScratch", "n, side", forward="n", z="n", w="n", L="side, side", spare="side, side"
 )
 """Scratch of a crew: next state, normal numbers, shaped noise; where the noise has a covariance (`side` is n, otherwise
 0) a root of Q and room for it."""

@@ -24,7 +24,7 @@ from ..snapshots import Base
 from ..track import Track
 from ..tuning import Tuning
 from .entries import check_key
-from .fit import Fitted, Line, fit
+from .fit import EntryFit, Fitted, fit
 from .objective import Go
 from .recording import BLOCKS, Recording
 from .uncertainty import Z
@@ -158,7 +158,7 @@ def against(fitted: Fitted) -> tuple[str, ...]:
     return ()
 
 
-def shift(line: Line, value: float | None = None) -> float:
+def shift(line: EntryFit, value: float | None = None) -> float:
     """Return the distance of an estimate from a value (None: the one before), in deviations; NaN if it was reset."""
     if line.alone:
         return np.nan

@@ -56,7 +56,7 @@ MAX_FACTOR = 1e4
 
 
 @dataclass(frozen=True)
-class Entry:
+class TuningEntry:
     """One entry: its key, its value in the twin, its range, and the deviation of its weak prior.
 
     `start`, `low` and `high` are in `unit`; `deviation` is on the scale of the fit, the logarithm where `log` is true.
@@ -112,7 +112,7 @@ def entries_of(
     bounds: Mapping[str, tuple[float, float]] | None = None,
     *,
     references: bool = False,
-) -> tuple[list[Entry], list[Skipped]]:
+) -> tuple[list[TuningEntry], list[Skipped]]:
     """Return the entries for some keys and groups, and those that cannot be fitted.
 
     Args:
@@ -128,7 +128,7 @@ def entries_of(
     """
     entry = find_estimator(estimator, tuning.model)
     known = _all(entry, tuning)
-    found: dict[str, Entry] = {}
+    found: dict[str, TuningEntry] = {}
     skipped: dict[str, Skipped] = {}
     for name in wanted:
         keys = [name]
@@ -169,7 +169,7 @@ def check_key(estimator: str, tuning: Tuning, key: str) -> None:
         _find(key, _all(find_estimator(estimator, tuning.model), tuning), tuning)
 
 
-def with_values(tuning: Tuning, entries: Sequence[Entry], values: Sequence[float]) -> Setting:
+def with_values(tuning: Tuning, entries: Sequence[TuningEntry], values: Sequence[float]) -> Setting:
     """Return the tuning, and the prior where it is fitted, with values of the entries in their units."""
     mean: np.ndarray | None = None
     options, factor = dict(tuning.options), 1.0
@@ -199,7 +199,7 @@ def with_values(tuning: Tuning, entries: Sequence[Entry], values: Sequence[float
     return Setting(tuning, None if mean is None else (mean, np.diag(std**2)))
 
 
-def _all(entry: Estimator, tuning: Tuning) -> dict[str, Entry]:
+def _all(entry: Estimator, tuning: Tuning) -> dict[str, TuningEntry]:
     model = tuning.model
     found = []
     for item in tuning.items():
@@ -215,20 +215,22 @@ def _all(entry: Estimator, tuning: Tuning) -> dict[str, Entry]:
         for state in model.states:
             value, deviation = float(state.mean), float(state.std)
             if deviation > 0.0:
-                found.append(Entry(f"prior.{state.name}.mean", state.unit, value, -np.inf, np.inf, False, deviation))
+                found.append(
+                    TuningEntry(f"prior.{state.name}.mean", state.unit, value, -np.inf, np.inf, False, deviation)
+                )
                 found.append(_entry(f"prior.{state.name}.std", state.unit, deviation, 0.0, np.inf, SPREAD["prior"]))
     found.append(_entry(SCALE, "", 1.0, 0.0, np.inf, SPREAD[SCALE]))
     return {item.key: item for item in found}
 
 
-def _entry(key: str, unit: str, value: float, low: float, high: float, spread: float) -> Entry:
+def _entry(key: str, unit: str, value: float, low: float, high: float, spread: float) -> TuningEntry:
     if low >= 0.0 and value > 0.0:
-        return Entry(key, unit, value, max(low, value / MAX_FACTOR), min(high, value * MAX_FACTOR), True, spread)
+        return TuningEntry(key, unit, value, max(low, value / MAX_FACTOR), min(high, value * MAX_FACTOR), True, spread)
     width = abs(value) or (high - low if np.isfinite(high - low) else 1.0)
-    return Entry(key, unit, value, low, high, False, width)
+    return TuningEntry(key, unit, value, low, high, False, width)
 
 
-def _find(key: str, known: Mapping[str, Entry], tuning: Tuning) -> Entry:
+def _find(key: str, known: Mapping[str, TuningEntry], tuning: Tuning) -> TuningEntry:
     """Return an entry by its key; R of a sensor scales all its rows and keeps their proportions."""
     if key in known:
         return known[key]
@@ -240,7 +242,7 @@ def _find(key: str, known: Mapping[str, Entry], tuning: Tuning) -> Entry:
     return _entry(key, f"({unit})²" if unit else "", float(tuning.get(key) or 0.0), 0.0, np.inf, SPREAD["R"])
 
 
-def _against(item: Entry, tuning: Tuning, logs: Sequence[Log], references: bool) -> str:
+def _against(item: TuningEntry, tuning: Tuning, logs: Sequence[Log], references: bool) -> str:
     """Return why an entry cannot be fitted; empty if it can."""
     if item.low >= item.high:
         return "has no room in its range"

@@ -19,11 +19,11 @@ from ..log import READING
 from ..registry import find_estimator
 from ..tuning import Tuning
 from .aims import LIKELIHOOD, WITNESSES, aim_of
-from .entries import Entry, Setting, Skipped, entries_of, with_values
-from .judge import POWERS, Tempered, Verdict, Worth, tempered, worths
+from .entries import Setting, Skipped, TuningEntry, entries_of, with_values
+from .judge import POWERS, FitVerdict, Tempered, Worth, tempered, worths
 from .objective import ALONE, Go, Objective, maximise, search
 from .recording import BLOCKS, Recording, held_out_rows, without_queries, without_stuck
-from .uncertainty import Curvature, Z, curvature, intervals
+from .uncertainty import LikelihoodCurvature, Z, curvature, intervals
 
 MAX_DEVIATION = 0.25
 """Deviation of an identified entry, in deviations of its weak prior: for a variance a factor of 3 in its standard
@@ -36,7 +36,7 @@ MAX_RESETS = 3
 """Times that entries are reset and the others fitted again."""
 
 
-class Line(NamedTuple):
+class EntryFit(NamedTuple):
     """One entry of the result, in its unit: before and after, and the 95 % interval.
 
     `told` is whether the data identify it; an entry that they do not identify is reset where that costs nothing
@@ -70,13 +70,13 @@ class Fitted:
 
     estimator: str
     setting: Setting
-    lines: tuple[Line, ...]
+    lines: tuple[EntryFit, ...]
     skipped: tuple[Skipped, ...]
     left_out: Mapping[str, int]
     correlation: np.ndarray
     before: Worth
     after: Worth
-    verdict: Verdict
+    verdict: FitVerdict
     power: float
     folds: int
 
@@ -182,14 +182,14 @@ def fit(
     )
 
 
-def _identified(objective: Objective, shape: Curvature) -> np.ndarray:
+def _identified(objective: Objective, shape: LikelihoodCurvature) -> np.ndarray:
     """Return the mask of the entries that the data identify, (k,)."""
     found: np.ndarray = shape.deviation <= MAX_DEVIATION * np.array([item.deviation for item in objective.entries])
     return found
 
 
 def _resettable(
-    objective: Objective, x: np.ndarray, value: float, shape: Curvature, identified: np.ndarray
+    objective: Objective, x: np.ndarray, value: float, shape: LikelihoodCurvature, identified: np.ndarray
 ) -> list[int]:
     """Return the entries that are not identified and can go back to their start at no cost."""
     loose = np.flatnonzero(~identified)
@@ -203,16 +203,16 @@ def _resettable(
     return [int(i) for i, cost in zip(loose, costs, strict=True) if cost <= MAX_COST * shape.widened[i] ** 2]
 
 
-def _at_edge(item: Entry, x: float) -> bool:
+def _at_edge(item: TuningEntry, x: float) -> bool:
     value = item.outward(x)
     near = 1e-6 * (item.high - item.low) if np.isfinite(item.high - item.low) and not item.log else 1e-6 * abs(value)
     return bool(value - item.low <= near or item.high - value <= near)
 
 
 def _lines(
-    entries: Sequence[Entry], kept: Objective, x: np.ndarray, value: float, shape: Curvature, chosen: Tempered,
-    identified: np.ndarray,
-) -> tuple[tuple[Line, ...], np.ndarray]:  # fmt: skip
+    entries: Sequence[TuningEntry], kept: Objective, x: np.ndarray, value: float, shape: LikelihoodCurvature,
+    chosen: Tempered, identified: np.ndarray,
+) -> tuple[tuple[EntryFit, ...], np.ndarray]:  # fmt: skip
     """Return the lines of all entries, reset ones too, in their order, and the correlations."""
     ends, profiled, deviation = np.zeros((0, 2)), np.zeros(x.size, bool), shape.deviation
     if chosen.power < 1.0:
@@ -227,12 +227,14 @@ def _lines(
     for item in entries:
         if item.key not in place:
             nan = np.nan
-            lines.append(Line(item.key, item.unit, item.start, item.start, nan, nan, nan, item.log, False, True, False))
+            lines.append(
+                EntryFit(item.key, item.unit, item.start, item.start, nan, nan, nan, item.log, False, True, False)
+            )
             continue
         i = place[item.key]
         at = float(chosen.x[i])
         lines.append(
-            Line(
+            EntryFit(
                 key=item.key,
                 unit=item.unit,
                 before=item.start,

@@ -51,7 +51,7 @@ from .aims import (
 from .entries import Setting
 from .objective import ALONE, Cancelled, Go, Objective
 from .recording import Recording
-from .uncertainty import Curvature, Z
+from .uncertainty import LikelihoodCurvature, Z
 
 GAIN_BATCHES = 20
 """Batches of time over which a difference is averaged, for its standard error."""
@@ -81,7 +81,7 @@ UNITS = {LIKELIHOOD: "a reading", WITNESSES: "a reading or witness"}
 """Unit of a gain in nats, by aim."""
 
 
-class Prediction(NamedTuple):
+class PredictionScore(NamedTuple):
     """Quality of n held-out predictions.
 
     Root mean square error and mean CRPS are in `unit`, coverage is the share of errors inside the 95 % band; `scores`
@@ -96,7 +96,7 @@ class Prediction(NamedTuple):
     scores: np.ndarray
 
 
-class Part(NamedTuple):
+class PartScore(NamedTuple):
     """Scores of one part of the recordings, with n measurements.
 
     Mean log density of a measurement, mean NIS per degree of freedom, share of innovations inside their 95 % band.
@@ -111,19 +111,19 @@ class Part(NamedTuple):
     coverage: float
     terms: np.ndarray
     aimed: np.ndarray
-    sensors: dict[str, Prediction]
-    withheld: dict[str, Prediction]
-    states: dict[str, Prediction]
+    sensors: dict[str, PredictionScore]
+    withheld: dict[str, PredictionScore]
+    states: dict[str, PredictionScore]
 
 
 class Worth(NamedTuple):
     """Scores of the fitted part, and of the held-out part."""
 
-    fitted: Part
-    held_out: Part
+    fitted: PartScore
+    held_out: PartScore
 
 
-class Verdict(NamedTuple):
+class FitVerdict(NamedTuple):
     """Whether the fit is proposed.
 
     `gain` is the mean on the held-out blocks, in nats per `each`, `error` its standard error, `reasons` those against
@@ -184,7 +184,7 @@ def gain(before: np.ndarray, after: np.ndarray) -> tuple[float, float]:
 
 def _part(
     setting: Setting, sensors: list[int], folded: list[tuple[Recording, list[Track]]], aim: Aim, held_out: bool
-) -> Part:
+) -> PartScore:
     """Return the scores of the fitted or the held-out part of folded recordings."""
     model, gate = setting.tuning.model, setting.tuning.gate
     terms, aimed, normal, tracks = [], [], [], []
@@ -212,7 +212,7 @@ def _part(
     finite = np.isfinite(nis)
     weights = np.array([len(track) for track in tracks])[finite]
     predictions = ({name: _prediction(items) for name, items in group.items()} for group in groups)
-    return Part(
+    return PartScore(
         every.size,
         float(every.mean()) if every.size else np.nan,
         float(np.average(nis[finite], weights=weights)) if finite.any() else np.nan,
@@ -223,21 +223,21 @@ def _part(
     )
 
 
-def _prediction(items: list[Reference]) -> Prediction:
+def _prediction(items: list[Reference]) -> PredictionScore:
     error, std = np.concatenate([item.error for item in items]), np.concatenate([item.std for item in items])
     scores = crps(error, std)
     rms, coverage = float(np.sqrt(np.mean(error**2))), float(np.mean(np.abs(error) <= Z * std))
-    return Prediction(items[0].unit, error.size, rms, coverage, float(scores.mean()), scores)
+    return PredictionScore(items[0].unit, error.size, rms, coverage, float(scores.mean()), scores)
 
 
-def verdict(before: Worth, after: Worth, aim: Aim, *, changed: bool = True) -> Verdict:
+def verdict(before: Worth, after: Worth, aim: Aim, *, changed: bool = True) -> FitVerdict:
     """Judge by the held-out part: the aim of the fit must be better there, and nothing else worse."""
     one, other = before.held_out, after.held_out
     if not changed:
         few = f": the references have {aim.independent:.0f} independent errors" if aim.weights else ""
-        return Verdict(False, 0.0, 0.0, (f"the data identify none of the entries{few}",))
+        return FitVerdict(False, 0.0, 0.0, (f"the data identify none of the entries{few}",))
     if not one.n:
-        return Verdict(False, np.nan, np.nan, ("no data were held out to judge the fit",))
+        return FitVerdict(False, np.nan, np.nan, ("no data were held out to judge the fit",))
     mean, error = _gain(one, other, aim)
     each = UNITS.get(aim.kind, "a reading")
     reasons = []
@@ -247,7 +247,7 @@ def verdict(before: Worth, after: Worth, aim: Aim, *, changed: bool = True) -> V
     elif aim.kind in UNITS and mean * other.aimed.size < MIN_TOTAL_GAIN:
         reasons.append(f"negligible gain: {mean * other.aimed.size:.2g} nats in total")
     # The references must not be predicted worse; without any, each sensor in turn stands in for them.
-    groups: list[tuple[str, dict[str, Prediction], dict[str, Prediction]]]
+    groups: list[tuple[str, dict[str, PredictionScore], dict[str, PredictionScore]]]
     if one.withheld or one.states:
         groups = [("sensor", one.withheld, other.withheld), ("true state", one.states, other.states)]
     else:
@@ -260,10 +260,10 @@ def verdict(before: Worth, after: Worth, aim: Aim, *, changed: bool = True) -> V
         for reason in _against(f"held-out {kind} {name}", old, news[name])
     ]
     reasons += against
-    return Verdict(not reasons, mean, error, tuple(reasons), each, not against)
+    return FitVerdict(not reasons, mean, error, tuple(reasons), each, not against)
 
 
-def _gain(one: Part, other: Part, aim: Aim) -> tuple[float, float]:
+def _gain(one: PartScore, other: PartScore, aim: Aim) -> tuple[float, float]:
     """Return the gain in the aim of the fit, and its standard error."""
     if aim.kind not in (CRPS, ERROR):
         return gain(one.aimed, other.aimed)
@@ -275,14 +275,14 @@ def _gain(one: Part, other: Part, aim: Aim) -> tuple[float, float]:
     return float(means.mean()), float(np.sqrt(np.sum(errors**2)) / len(found))
 
 
-def _against(what: str, old: Prediction, new: Prediction) -> list[str]:
+def _against(what: str, old: PredictionScore, new: PredictionScore) -> list[str]:
     """Return the reasons against a new prediction."""
     if old.n != new.n:
         return [f"{what}: {abs(old.n - new.n)} readings could not be predicted"]
     return [*worse(what, old, new), *narrower(what, old, new)]
 
 
-def worse(what: str, old: Prediction, new: Prediction) -> Iterator[str]:
+def worse(what: str, old: PredictionScore, new: PredictionScore) -> Iterator[str]:
     """Yield the reason against a prediction whose score is worse beyond chance."""
     mean, error = gain(old.scores, new.scores)
     if mean > MAX_LOSS * old.crps and mean > MIN_SIGMAS * error:
@@ -290,7 +290,7 @@ def worse(what: str, old: Prediction, new: Prediction) -> Iterator[str]:
         yield f"{what} is predicted worse: CRPS {new.crps:.3g}{unit} after {old.crps:.3g}"
 
 
-def narrower(what: str, old: Prediction, new: Prediction) -> Iterator[str]:
+def narrower(what: str, old: PredictionScore, new: PredictionScore) -> Iterator[str]:
     """Yield the reason against a prediction whose band is too narrow, and narrower than before."""
     if new.coverage < MIN_COVERAGE and new.coverage < old.coverage - MAX_COVERAGE_LOSS:
         yield f"{what} leaves its band: {100 * new.coverage:.0f} % inside after {100 * old.coverage:.0f} %"
@@ -308,13 +308,13 @@ class Tempered(NamedTuple):
     cov: np.ndarray
     before: Worth
     after: Worth
-    verdict: Verdict
+    verdict: FitVerdict
 
 
 def tempered(
     objective: Objective,
     x: np.ndarray,
-    shape: Curvature,
+    shape: LikelihoodCurvature,
     setting: Callable[[np.ndarray], Setting],
     judged: Callable[[Sequence[Setting]], list[Worth]],
     *,
@@ -339,7 +339,9 @@ def tempered(
     return Tempered(powers[k], *found[k], own, others[k], verdicts[k])
 
 
-def at_power(objective: Objective, x: np.ndarray, shape: Curvature, power: float) -> tuple[np.ndarray, np.ndarray]:
+def at_power(
+    objective: Objective, x: np.ndarray, shape: LikelihoodCurvature, power: float
+) -> tuple[np.ndarray, np.ndarray]:
     """Return the maximum (k,) at a power, and its covariance (k, k)."""
     if power == 1.0 or not x.size:
         return x, shape.cov
@@ -350,7 +352,7 @@ def at_power(objective: Objective, x: np.ndarray, shape: Curvature, power: float
     return np.clip(start + cov @ (power * H @ (x - start)), low, high), cov
 
 
-def _chosen(own: Worth, others: Sequence[Worth], verdicts: Sequence[Verdict], aim: Aim) -> int:
+def _chosen(own: Worth, others: Sequence[Worth], verdicts: Sequence[FitVerdict], aim: Aim) -> int:
     """Return the index of the power; 0 (power 1, whose reasons are reported) if none qualifies.
 
     For the likelihood all harmless fits qualify, since a proposed one may win by chance when several powers are tried.

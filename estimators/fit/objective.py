@@ -32,7 +32,7 @@ from ..errors import NisusError
 from ..registry import find_estimator
 from ..tuning import Tuning
 from .aims import Aim
-from .entries import Entry, Setting, with_values
+from .entries import Setting, TuningEntry, with_values
 from .recording import Recording
 
 FAILED_FOLD = -1e12
@@ -74,9 +74,9 @@ class Objective:
 
     estimator: str
     tuning: Tuning
-    entries: tuple[Entry, ...]
+    entries: tuple[TuningEntry, ...]
     recordings: tuple[Recording, ...]
-    fixed: tuple[Entry, ...] = ()
+    fixed: tuple[TuningEntry, ...] = ()
     at: tuple[float, ...] = ()
     aim: Aim = Aim()
     go: Go = lambda folds: True

@@ -52,7 +52,7 @@ PROFILE_GRADIENT = 0.2
 """Gradient at their maximum, in deviations: half its square is the remaining gain, in nats."""
 
 
-class Curvature(NamedTuple):
+class LikelihoodCurvature(NamedTuple):
     """Shape of a maximum.
 
     cov (k, k) is H⁻¹ on the scales of the fit; `widened` (k,) the factor, at least 1, by which correlated scores widen
@@ -82,7 +82,7 @@ class Curvature(NamedTuple):
         return found
 
 
-def curvature(objective: Objective, x: np.ndarray) -> Curvature:
+def curvature(objective: Objective, x: np.ndarray) -> LikelihoodCurvature:
     """Return the curvature at a maximum x (k,)."""
     k = x.size
     _, scores = objective.slopes(x)
@@ -107,7 +107,7 @@ def curvature(objective: Objective, x: np.ndarray) -> Curvature:
     if cov is None:
         # Without curvature at this width, the outer product is positive definite in any case.
         cov = np.linalg.inv(outer)
-    return Curvature(cov, _widened(cov, scores, precision))
+    return LikelihoodCurvature(cov, _widened(cov, scores, precision))
 
 
 def _inverse(H: np.ndarray) -> np.ndarray | None:
@@ -136,7 +136,9 @@ def _widened(cov: np.ndarray, scores: np.ndarray, precision: np.ndarray) -> np.n
     return found
 
 
-def intervals(objective: Objective, x: np.ndarray, value: float, shape: Curvature) -> tuple[np.ndarray, np.ndarray]:
+def intervals(
+    objective: Objective, x: np.ndarray, value: float, shape: LikelihoodCurvature
+) -> tuple[np.ndarray, np.ndarray]:
     """Return 95 % intervals (k, 2) on the scales of the fit, and the mask of those by profile (k,).
 
     Args:
@@ -165,7 +167,7 @@ def intervals(objective: Objective, x: np.ndarray, value: float, shape: Curvatur
 
 
 def _profile_end(
-    objective: Objective, x: np.ndarray, value: float, shape: Curvature, H: np.ndarray, i: int, t: float
+    objective: Objective, x: np.ndarray, value: float, shape: LikelihoodCurvature, H: np.ndarray, i: int, t: float
 ) -> float:
     """Return where the profile of entry i has dropped, on the side of t."""
     low, high = objective.limits[i]

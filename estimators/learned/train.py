@@ -22,7 +22,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..errors import EstimatorError
-from ..fit.judge import MIN_SIGMAS, Part, gain, narrower, worse
+from ..fit.judge import MIN_SIGMAS, PartScore, gain, narrower, worse
 from ..model.correction import Correction, GaussianProcess, Net, Ridge
 from .windows import Windows
 
@@ -207,7 +207,7 @@ def on_held_out(trained: Trained, given: Windows) -> OnWindows:
     return on_windows(given, given.rates - trained.correction.mean(given.features), known(trained, given))
 
 
-def against(physics: Sequence[Part], corrected: Part, states: Sequence[str]) -> tuple[str, ...]:
+def against(physics: Sequence[PartScore], corrected: PartScore, states: Sequence[str]) -> tuple[str, ...]:
     """Return the reasons against a correction on held-out blocks; empty if it is better.
 
     Args:

@@ -86,8 +86,8 @@ PROPAGATE, WEIGH, SMOOTH = range(OWN, OWN + 3)
 """Phases: x_i ~ p(x | x_i'); p(y | x_i); the kernel of the regularised filter."""
 
 
-Room, room_at = declare_layout(
-    "Room",
+BootstrapRoom, room_at = declare_layout(
+    "BootstrapRoom",
     "nx, ny",
     forward=f"{CHUNK}, nx",
     z=f"{CHUNK} * nx",

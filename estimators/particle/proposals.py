@@ -61,8 +61,8 @@ MOVE, EXPECT, PROPOSE = range(OWN, OWN + 3)
 """Phases: N(x, P) one step on; its prediction of the measurement; the filter's own draw."""
 
 
-Room, room_at = declare_layout(
-    "Room",
+ProposalRoom, room_at = declare_layout(
+    "ProposalRoom",
     "nx, ny",
     scratch_size,
     F="nx, nx",

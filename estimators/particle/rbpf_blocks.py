@@ -58,8 +58,8 @@ THREADED_FROM = 4 * BLOCK
 """Particles from which threads gain more than they cost: fewer than for `pf`, since each takes ten times as long."""
 
 
-Room, room_at = declare_layout(
-    "Room",
+KalmanRoom, room_at = declare_layout(
+    "KalmanRoom",
     "nx, ny",
     scratch_size,
     F="nx, nx",

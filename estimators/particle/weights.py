@@ -68,7 +68,7 @@ block_signature = types.void(context_type, F1, f64, i64, F1, types.uint64, f64, 
 call_block = caller(block_signature)
 
 
-class Work(NamedTuple):
+class CloudScratch(NamedTuple):
     """Scratch that all blocks share.
 
     Weights w (N,), joint log weights (N,), the sums, a root L (nx, nx) and room for it, the covariance S of the
@@ -117,7 +117,7 @@ def work_at(at, nx, ny, n):
     reference, at = take_vector(at, nx)
     strata, at = take_vector(at, blocks_of(n))
     end = at + blocks_of(n) * block_at(0, nx, ny).end
-    return Work(w, ancestors, joint, sums, L, spare, S, U, nu, reference, strata, at, end)
+    return CloudScratch(w, ancestors, joint, sums, L, spare, S, U, nu, reference, strata, at, end)
 
 
 @jit

@@ -23,9 +23,20 @@ from ..log import INPUT, RESET
 from ..numerics.jit import B1, F1, F2, I1, i64, inlined, ints, jit
 from ..numerics.workspace import size_of
 from ..snapshots import Snapshot
-from .notes import STAYED, Step, changed, copy, cut, join_moments, step_at, step_back, step_layout, widened
-from .recorder import MEMBERS, ROW, Kind, Recorder, covariance_of, describe, head_of, predict, start, update
-from .walk import QUERIES, Jump, Smoothed, Stretch
+from .notes import STAYED, StepNote, changed, copy, cut, join_moments, step_at, step_back, step_layout, widened
+from .recorder import (
+    MEMBERS,
+    ROW,
+    SmoothingRule,
+    StepRecorder,
+    covariance_of,
+    describe,
+    head_of,
+    predict,
+    start,
+    update,
+)
+from .walk import QUERIES, Smoothed, StateJump, Stretch
 
 HERE = 3
 """Kind of a query's note: asked at the time of the state before it. STAYED: at that of the next event."""
@@ -165,7 +176,7 @@ def backward(context, first, kind, tape, own, earlier, later, work, mean, std, c
 class MomentsBack:
     """Fills `out` on its way; see `Notes`."""
 
-    def __init__(self, fold: Fold, kind: Kind, out: Smoothed, lag: np.ndarray | None = None) -> None:
+    def __init__(self, fold: Fold, kind: SmoothingRule, out: Smoothed, lag: np.ndarray | None = None) -> None:
         """`lag` (N, nx, nx) takes the covariances of neighbours, see `backward`."""
         n = fold.model.nx
         self._log, self._machine, self._kind, self._out = fold.log, fold.machine, kind, out
@@ -180,7 +191,7 @@ class MomentsBack:
 
     def room(self, events: int) -> None:
         """See `Notes`."""
-        self._recorder = Recorder(self._machine.code, self._kind, self._own, self._nx, self._members, events)
+        self._recorder = StepRecorder(self._machine.code, self._kind, self._own, self._nx, self._members, events)
 
     def take(self, part: Stretch, now: Snapshot, row: int) -> np.ndarray:
         """See `Notes`."""
@@ -190,7 +201,7 @@ class MomentsBack:
         now.state[:] = noting.state[:-1]
         return spare[:-1]
 
-    def back(self, part: Stretch, row: int, before: Snapshot, jump: Jump | None) -> None:
+    def back(self, part: Stretch, row: int, before: Snapshot, jump: StateJump | None) -> None:
         """See `Notes`."""
         log, machine, recorder = self._log, self._machine, self._recorder
         context = machine.context
@@ -224,7 +235,7 @@ _F3 = types.Array(types.float64, 3, "C")
 _moments = types.NamedTuple((F1, F2), Moments)
 
 
-_step = types.NamedTuple((F1, F1, F1, F2, F2, F1, i64), Step)
+_step = types.NamedTuple((F1, F1, F1, F2, F2, F1, i64), StepNote)
 
 
 PIECES: tuple[tuple[Any, tuple[Any, ...]], ...] = (

@@ -31,7 +31,9 @@ STAYED, MOVED, CUT = range(3)
 """Effect of an event on the state before any update: none; predicted; restarted or lost."""
 
 
-Step, step_layout = declare_layout("Step", "n, own", kind="1", before="n", after="n", G="n, n", M="n, n", state="own")
+StepNote, step_layout = declare_layout(
+    "StepNote", "n, own", kind="1", before="n", after="n", G="n, n", M="n, n", state="own"
+)
 """Note of one event: STAYED, MOVED or CUT; mean m of the state before the event; its prediction m⁻; G; M, after a cut
 all of P; the filter's state after the event (`own` numbers), or the answer to a query."""
 
@@ -167,9 +169,9 @@ def _note(mean: np.ndarray, cov: np.ndarray, after: np.ndarray, C: np.ndarray) -
     U, W = np.zeros((n, n)), np.zeros((n, n))
     nothing = np.zeros(0)
     if not root(after, U, n):
-        return Step(np.array([float(CUT)]), mean, mean, np.zeros((n, n)), cov, nothing, 0)
+        return StepNote(np.array([float(CUT)]), mean, mean, np.zeros((n, n)), cov, nothing, 0)
     solve_semidefinite(U, C, W)
-    return Step(np.array([float(MOVED)]), mean, mean, C, cov - W.T @ W, nothing, 0)
+    return StepNote(np.array([float(MOVED)]), mean, mean, C, cov - W.T @ W, nothing, 0)
 
 
 @jit

@@ -53,7 +53,7 @@ COVARIANCE, FACTOR, MEMBERS = range(3)
 """Form of the covariance in a filter's state: P, a factor of it, or the members of an ensemble."""
 
 
-class Crossing(NamedTuple):
+class CrossScratch(NamedTuple):
     """Scratch of the cross-covariance.
 
     F (n, n) is df/dx with the scratch of a Jacobian; chol_P (n, padded n) is upper, chol_Pᵀ chol_P = P; sigma
@@ -82,7 +82,7 @@ def crossing(at, n):
     across, _ = take_matrix(second, n, padded(n))
     D, at = take_matrix(at, 2 * n + 1, padded(n))
     mean, at = take_vector(at, padded(n))
-    return Crossing(F, jacobian, chol_P, sigma, D, across, mean, at)
+    return CrossScratch(F, jacobian, chol_P, sigma, D, across, mean, at)
 
 
 Noting, noting_layout = declare_layout(
@@ -273,17 +273,17 @@ def describe(context, state, mean, std, cross):
     call_describe(head[DESCRIBE], context, own, mean, std, cross)
 
 
-class Kind(NamedTuple):
+class SmoothingRule(NamedTuple):
     """Prediction rule (CONSTANT, TANGENT, POINTS; unused for ensembles) and form of the covariance of a filter."""
 
     rule: int
     holds: int
 
 
-class Recorder:
+class StepRecorder:
     """The noting functions, and room for the notes of a number of events."""
 
-    def __init__(self, code: Code, kind: Kind, own: int, nx: int, members: int, rows: int) -> None:
+    def __init__(self, code: Code, kind: SmoothingRule, own: int, nx: int, members: int, rows: int) -> None:
         """`code` is the filter's, `own` how many numbers its state has; `members` is 0 unless it is an ensemble."""
         self._each = size_of(step_layout, nx, own)
         self._tape = np.zeros((rows + 1) * self._each)

@@ -15,21 +15,21 @@ from ..fold import Fold
 from ..model.state_space import StateSpaceModel
 from ..track import Track
 from .moments_back import MomentsBack
-from .recorder import CONSTANT, COVARIANCE, FACTOR, MEMBERS, POINTS, TANGENT, Kind
+from .recorder import CONSTANT, COVARIANCE, FACTOR, MEMBERS, POINTS, TANGENT, SmoothingRule
 from .trajectories_back import TrajectoriesBack
 from .walk import Notes, Smoothed, Walk
 
 KINDS = {
-    "kf": Kind(CONSTANT, COVARIANCE),
-    "kf-steady": Kind(CONSTANT, COVARIANCE),
-    "ekf": Kind(TANGENT, COVARIANCE),
-    "iekf": Kind(TANGENT, COVARIANCE),
-    "ukf": Kind(POINTS, COVARIANCE),
-    "ckf": Kind(POINTS, COVARIANCE),
-    "sr-kf": Kind(CONSTANT, FACTOR),
-    "sr-ekf": Kind(TANGENT, FACTOR),
-    "sr-ukf": Kind(POINTS, FACTOR),
-    **dict.fromkeys(("enkf", "etkf", "ensrf", "letkf"), Kind(TANGENT, MEMBERS)),
+    "kf": SmoothingRule(CONSTANT, COVARIANCE),
+    "kf-steady": SmoothingRule(CONSTANT, COVARIANCE),
+    "ekf": SmoothingRule(TANGENT, COVARIANCE),
+    "iekf": SmoothingRule(TANGENT, COVARIANCE),
+    "ukf": SmoothingRule(POINTS, COVARIANCE),
+    "ckf": SmoothingRule(POINTS, COVARIANCE),
+    "sr-kf": SmoothingRule(CONSTANT, FACTOR),
+    "sr-ekf": SmoothingRule(TANGENT, FACTOR),
+    "sr-ukf": SmoothingRule(POINTS, FACTOR),
+    **dict.fromkeys(("enkf", "etkf", "ensrf", "letkf"), SmoothingRule(TANGENT, MEMBERS)),
 }
 """Filters that are smoothed by means and covariances."""
 

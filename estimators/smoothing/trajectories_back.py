@@ -24,7 +24,7 @@ from ..log import INPUT, RESET
 from ..numerics.jit import jit
 from ..particle.cloud import weights_of
 from ..snapshots import Snapshot
-from .walk import QUERIES, Jump, Smoothed, Stretch
+from .walk import QUERIES, Smoothed, StateJump, Stretch
 
 TRAJECTORIES = 200
 
@@ -95,7 +95,7 @@ class TrajectoriesBack:
             self._states[row + i - part.start] = spare if query else now.state
         return spare
 
-    def back(self, part: Stretch, row: int, before: Snapshot, jump: Jump | None) -> None:
+    def back(self, part: Stretch, row: int, before: Snapshot, jump: StateJump | None) -> None:
         """See `Notes`."""
         log = self._log
         outside = jump is not None

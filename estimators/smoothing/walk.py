@@ -40,7 +40,7 @@ class Stretch(NamedTuple):
     state: int = -1
 
 
-class Jump(NamedTuple):
+class StateJump(NamedTuple):
     """Change of N(mean, cov) from outside: `added` variances (nx,), or the restart of a `state`."""
 
     mean: np.ndarray
@@ -61,7 +61,7 @@ class Notes(Protocol):
     def take(self, part: Stretch, now: Snapshot, row: int) -> np.ndarray:
         """Fold a stretch with notes from a row on, advancing `now`; return the state that answered the last query."""
 
-    def back(self, part: Stretch, row: int, before: Snapshot, jump: Jump | None) -> None:
+    def back(self, part: Stretch, row: int, before: Snapshot, jump: StateJump | None) -> None:
         """Go back over a stretch whose notes begin at a row; `before` is the state before it."""
 
 
@@ -142,7 +142,7 @@ class Walk:
         for part, before, jump in reversed(noted):
             self._notes.back(part, part.start - first, before, jump)
 
-    def _fold_on(self, part: Stretch, now: Snapshot, row: int | None = None) -> Jump | None:
+    def _fold_on(self, part: Stretch, now: Snapshot, row: int | None = None) -> StateJump | None:
         """Fold a stretch, noted from a row on if one is given; return the change from outside."""
         machine = self._machine
         if part.sensor >= 0:
@@ -150,13 +150,13 @@ class Walk:
             added = machine.widen(now, part.sensor, self._fold.track.innovation[part.start])
             with machine.open(part.sensor):
                 self._run(part, now, row)
-            return Jump(*begun, added=added)
+            return StateJump(*begun, added=added)
         spare = self._run(part, now, row)
         if part.state < 0:
             return None
         mean, cov = machine.moments(spare)
         machine.maintain(mean, cov, part.state, int(self._log.t[part.start]), now)
-        return Jump(mean, cov, state=part.state)
+        return StateJump(mean, cov, state=part.state)
 
     def _run(self, part: Stretch, now: Snapshot, row: int | None) -> np.ndarray:
         """Fold events; return the state that answered the last query."""

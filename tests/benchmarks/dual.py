@@ -25,7 +25,7 @@ from app.twin.defaults import bounds_of
 from app.twin.log_reader import read_log
 from app.twin.twin import Twin, load_twin
 from estimators.fit.dual import WindowFit, walk
-from estimators.fit.fit import Fitted, Line
+from estimators.fit.fit import EntryFit, Fitted
 from estimators.fold import Fold
 from estimators.log import INPUT, READING, TICK, TRUTH, Events, Log, truth_of
 from estimators.track import USED, Track
@@ -131,7 +131,7 @@ def told(found: Sequence[WindowFit], tuning: Tuning, parameters: Sequence[str]) 
     return values
 
 
-def line_of(fitted: Fitted | None, name: str) -> Line | None:
+def line_of(fitted: Fitted | None, name: str) -> EntryFit | None:
     """Of a parameter."""
     return None if fitted is None else next((line for line in fitted.lines if line.key == f"p.{name}"), None)
 
@@ -392,7 +392,7 @@ def cycles(simulated: bool) -> None:
         )
 
 
-def _value(line: Line | None) -> Value:
+def _value(line: EntryFit | None) -> Value:
     """What a window says, adopted or not."""
     return Value(np.nan, np.nan, np.nan) if line is None or line.alone else Value(line.after, line.low, line.high)
 

@@ -23,7 +23,7 @@ from estimators.errors import NisusError
 from estimators.fit.aims import AIMS, WITNESSES, correlation_time, references, track_of
 from estimators.fit.entries import Setting
 from estimators.fit.fit import fit
-from estimators.fit.judge import Part, Z, worths
+from estimators.fit.judge import PartScore, Z, worths
 from estimators.fit.recording import Recording
 from estimators.log import Log
 from estimators.registry import find_entry, unfit
@@ -59,7 +59,7 @@ def halves(log: Log) -> tuple[Log, np.ndarray]:
     return first, log.t[: log.n] >= middle
 
 
-def scored(twin: Twin, estimator: str, setting: Setting, log: Log, second: np.ndarray) -> Part:
+def scored(twin: Twin, estimator: str, setting: Setting, log: Log, second: np.ndarray) -> PartScore:
     """What it is worth on the second half."""
     (worth,) = worths(estimator, [setting], [Recording(log, 1.0, second)], lambda folds: True)
     return worth.held_out
@@ -84,7 +84,7 @@ def outside(twin: Twin, setting: Setting, log: Log, second: np.ndarray) -> list[
     return found
 
 
-def line(name: str, part: Part) -> str:
+def line(name: str, part: PartScore) -> str:
     """As a row of the table."""
 
     def predictions(group: str) -> str:

@@ -30,7 +30,7 @@ from scipy.optimize import minimize
 from app.twin.log_reader import read_log
 from app.twin.twin import Twin, load_twin
 from estimators.diagnostics.score import score
-from estimators.fit.entries import Entry, entries_of, with_values
+from estimators.fit.entries import TuningEntry, entries_of, with_values
 from estimators.fit.fit import Fitted, fit
 from estimators.fit.recording import Recording
 from estimators.fold import Fold
@@ -199,7 +199,7 @@ def of_the_fit(twin: Twin, fitted: Fitted, log: Log) -> float:
     tuning = fitted.setting.tuning
     entries, _ = entries_of(twin.estimator, tuning, [log], [fitted.lines[i].key for i in told])
 
-    def nis(item: Entry, by: float) -> float:
+    def nis(item: TuningEntry, by: float) -> float:
         given = with_values(tuning, [item], [item.outward(item.inward(item.start) + by)])
         fold = Fold(twin.estimator, twin.model, given.tuning, log, prior=given.prior)
         fold.advance()

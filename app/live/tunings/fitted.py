@@ -9,8 +9,8 @@ import numpy as np
 from config.tuning_schema import EvidenceSection, MovedSection
 from estimators.errors import LARGEST
 from estimators.fit.dual import shift
-from estimators.fit.fit import Fitted, Line
-from estimators.fit.judge import Part
+from estimators.fit.fit import EntryFit, Fitted
+from estimators.fit.judge import PartScore
 
 from .versions import COVERAGE, DIGITS, LIKELIHOOD, NIS, RMSE, Settings
 
@@ -42,7 +42,7 @@ def settings_of(found: Fitted, fitted_on: Sequence[str], note: str = "") -> Sett
     )
 
 
-def _scores(part: Part) -> dict[str, float]:
+def _scores(part: PartScore) -> dict[str, float]:
     predicted = {**part.sensors, **part.withheld, **part.states}
     scores = {
         NIS: part.nis,
@@ -62,7 +62,7 @@ def _evidence(found: Fitted) -> EvidenceSection:
     )
 
 
-def _moved(line: Line) -> MovedSection:
+def _moved(line: EntryFit) -> MovedSection:
     return MovedSection(
         before=line.before,
         after=line.after,

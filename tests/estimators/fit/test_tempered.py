@@ -7,7 +7,7 @@ from scipy.optimize import minimize
 from estimators.fit.aims import Aim
 from estimators.fit.entries import entries_of
 from estimators.fit.fit import fit
-from estimators.fit.judge import POWERS, Part, Worth, at_power, verdict
+from estimators.fit.judge import POWERS, PartScore, Worth, at_power, verdict
 from estimators.fit.objective import Objective, maximise
 from estimators.fit.recording import Recording
 from estimators.fit.uncertainty import curvature
@@ -64,7 +64,7 @@ def test_a_little_of_a_gain_is_none(gained, said):
 
     def worth(each):
         terms = np.full(200, each)
-        part = Part(200, each, 1.0, 0.95, terms, terms, {}, {}, {})
+        part = PartScore(200, each, 1.0, 0.95, terms, terms, {}, {}, {})
         return Worth(part, part)
 
     found = verdict(worth(0.0), worth(gained), Aim())

@@ -256,7 +256,7 @@ def test_the_memory_is_bounded_and_the_bits_are_the_same(estimator, notes, monke
         rooms.append(given[-1])
         return made(*given)
 
-    monkeypatch.setattr(moments_back, "Recorder", noting)
+    monkeypatch.setattr(moments_back, "StepRecorder", noting)
     monkeypatch.setattr(walk, "BATCH_BYTES", notes)
     for one, other in zip(whole, smooth_with_pairs(estimator, log), strict=True):
         np.testing.assert_array_equal(one, other)
