@@ -11,7 +11,7 @@ import numpy as np
 from config.yaml_files import writing
 from estimators.diagnostics.calibration import BANDS
 from estimators.diagnostics.episodes import episode_json
-from estimators.diagnostics.sensitivity import Sensitivity, View, bounds_of
+from estimators.diagnostics.sensitivity import GramianView, Sensitivity, bounds_of
 from estimators.diagnostics.sensitivity.gramian import directions
 from estimators.diagnostics.sensitivity.responses import digits, range_text, size_text, subject_text
 from estimators.track import HEALTH_NAMES
@@ -21,7 +21,7 @@ from ..present.result import WORSE, Bar, Topic, plain, to_html, to_text
 from ..studies.fold_result import calibration_json
 from ..twin.log_reader import read_log
 from ..twin.twin import load_twin
-from .check_list import BLAME, Checked, Line, blamed, check, checklist, health_shares, stamps
+from .check_list import MAX_CORRELATION, Checked, ChecklistLine, blamed, check, checklist, health_shares, stamps
 from .options import settings
 from .prepare import attend, prepare
 
@@ -94,7 +94,7 @@ def _observability_figures(checked: Checked) -> dict[str, Any]:
     }
 
 
-def _view(checked: Checked, view: View) -> dict[str, Any]:
+def _view(checked: Checked, view: GramianView) -> dict[str, Any]:
     names = checked.twin.model.state_names
     return {
         "begin": view.begin * 1e-9,
@@ -206,10 +206,10 @@ def _health_figures(checked: Checked) -> dict[str, Any]:
     }
 
 
-MOST = 12
+MAX_ROWS = 12
 """Rows of a table on the page; JSON has all."""
 
-UNKNOWN = "Lateness is not known: the log has only the time of measurement."
+LATENESS_UNKNOWN = "Lateness is not known: the log has only the time of measurement."
 
 
 def sections(checked: Checked) -> list[Topic]:
@@ -233,10 +233,10 @@ def _number(value: float) -> str:
 
 
 def _cut(rows: Sequence[tuple[str, ...]]) -> tuple[tuple[str, ...], ...]:
-    """At most `MOST` rows, and one that says how many more there are."""
-    if len(rows) <= MOST + 1:
+    """At most `MAX_ROWS` rows, and one that says how many more there are."""
+    if len(rows) <= MAX_ROWS + 1:
         return tuple(rows)
-    return (*rows[:MOST], (f"... and {len(rows) - MOST} more, see --json", *[""] * (len(rows[0]) - 1)))
+    return (*rows[:MAX_ROWS], (f"... and {len(rows) - MAX_ROWS} more, see --json", *[""] * (len(rows[0]) - 1)))
 
 
 def _title(checked: Checked) -> Topic:
@@ -254,7 +254,7 @@ def _checklist(checked: Checked) -> Topic:
     return Topic("Checklist", (), head, rows, marks=tuple(map(_mark, lines)))
 
 
-def _mark(line: Line) -> str:
+def _mark(line: ChecklistLine) -> str:
     """Whether the answer is good news: to the question for peaks and tails that is a no."""
     good, bad = ("no", "") if line.key == "posterior" else ("yes", "no")
     return {good: "good", bad: "bad", "not told": ""}.get(line.answer, "partly")
@@ -273,7 +273,7 @@ def _integrity(checked: Checked) -> Topic:
     bars = [Bar(name, item.unit, item.two_sigma, item.bound) for name, item in bounds.items()]
     said = (f"{found.note}.",) if found.note else ()
     head = ("state", "unit", "± 2 σ", "integrity bound", "by")
-    return Topic(title, said, head, _cut(rows), tuple(bars[:MOST]), ("± 2 σ", "integrity bound"))
+    return Topic(title, said, head, _cut(rows), tuple(bars[:MAX_ROWS]), ("± 2 σ", "integrity bound"))
 
 
 def _visible(checked: Checked) -> Topic:
@@ -320,7 +320,7 @@ def _blame(checked: Checked) -> Topic:
     said.append(
         "The log does not distinguish these faults."
         if rows
-        else f"No two faults look alike: no correlation is beyond {BLAME:g}."
+        else f"No two faults look alike: no correlation is beyond {MAX_CORRELATION:g}."
     )
     untold = [item for item in directions(told.fisher, told.nudges) if not item.deviation < 1.0] if told.nudges else []
     if untold:
@@ -347,7 +347,7 @@ def _held_out(checked: Checked) -> Topic:
     bands = tuple(f"in {100 * band:.0f} %" for band in BANDS)
     head = ("sensor row", "unit", "RMS", "bias", *bands, "open loop", "")
     legend = ("RMS by the other sensors", "RMS without any reading")
-    return Topic(title, tuple(said[:MOST]), head, _cut(rows), tuple(bars[:MOST]), legend)
+    return Topic(title, tuple(said[:MAX_ROWS]), head, _cut(rows), tuple(bars[:MAX_ROWS]), legend)
 
 
 def _open_loop(checked: Checked) -> Topic:
@@ -363,7 +363,7 @@ def _open_loop(checked: Checked) -> Topic:
     )
     rows = [(item.state, item.unit, _number(item.filter), _number(item.open_loop), WORSE if item.worse else "")
             for item in found]  # fmt: skip
-    bars = tuple(Bar(item.state, item.unit, item.filter, item.open_loop) for item in found[:MOST])
+    bars = tuple(Bar(item.state, item.unit, item.filter, item.open_loop) for item in found[:MAX_ROWS])
     head = ("state", "unit", "RMS of the filter", "RMS of the open loop", "")
     return Topic(title, said, head, _cut(rows), bars, ("filter", "open loop"))
 
@@ -382,14 +382,14 @@ def _timing(checked: Checked) -> Topic:
         for item in checked.arrivals
     ]
     head = ("sensor", "readings", "a second", "longest gap, s", "missing, %", "lateness, s: half, 99 %, worst")
-    said = () if known else (UNKNOWN,)
+    said = () if known else (LATENESS_UNKNOWN,)
     return Topic("Arrival of measurements", said, head, _cut(rows))
 
 
 def _health(checked: Checked) -> Topic:
     said = [f"{health_shares(checked.fold.track)}."]
-    said += [episode.text for episode in checked.episodes[:MOST]]
-    if len(checked.episodes) > MOST:
-        said.append(f"... and {len(checked.episodes) - MOST} more episodes.")
-    said += calibration_lines(checked.calibration, checked.twin.model)[: 2 * MOST]
+    said += [episode.text for episode in checked.episodes[:MAX_ROWS]]
+    if len(checked.episodes) > MAX_ROWS:
+        said.append(f"... and {len(checked.episodes) - MAX_ROWS} more episodes.")
+    said += calibration_lines(checked.calibration, checked.twin.model)[: 2 * MAX_ROWS]
     return Topic("Health and calibration", tuple(said))

@@ -13,7 +13,7 @@ from estimators.diagnostics.calibration import LIMITS, Calibration
 from estimators.diagnostics.episodes import Episode, episodes
 from estimators.diagnostics.sensitivity import Gramian, Sensitivity, gramian, sensitivity
 from estimators.diagnostics.sensitivity.checklist import (
-    BUSY,
+    MAX_PROCESSOR_SHARE,
     Arrivals,
     Dimension,
     Linearity,
@@ -23,7 +23,7 @@ from estimators.diagnostics.sensitivity.checklist import (
     spread_error,
 )
 from estimators.diagnostics.sensitivity.held_out import HeldOut, held_out
-from estimators.diagnostics.sensitivity.posterior import OFTEN, Peaks, Tail, peaks, tails
+from estimators.diagnostics.sensitivity.posterior import FREQUENT_SHARE, Peaks, Tail, peaks, tails
 from estimators.diagnostics.sensitivity.responses import digits, subject_text
 from estimators.fold import Fold
 from estimators.log import MAINTENANCE, READING, Log
@@ -37,19 +37,19 @@ from ..twin.twin import Twin
 
 YES, PARTLY, NO, NONE = "yes", "partly", "no", "not told"
 
-BLAME = 0.9
+MAX_CORRELATION = 0.9
 """Correlation of two estimates from which on one takes the blame for the other."""
 
-ILL = 1e8
+MAX_CONDITIONING = 1e8
 """Conditioning from which on the information of the worst direction is rounding."""
 
-LEFT = 0.9
+UNOBSERVED_SHARE = 0.9
 """Share of the prior deviation; a direction that keeps more is not observed."""
 
 LINEARISES = ("ekf", "iekf", "sr_ekf", "filterpy_ekf", "pf_ekf")
 
 
-class Line(NamedTuple):
+class ChecklistLine(NamedTuple):
     """One question of the checklist: `answer` is yes, partly, no, or "not told"."""
 
     key: str
@@ -59,7 +59,7 @@ class Line(NamedTuple):
     remedy: str
 
 
-def checklist(checked: Checked) -> list[Line]:
+def checklist(checked: Checked) -> list[ChecklistLine]:
     """The lines, in the order of the article."""
     return [
         _linearity(checked),
@@ -73,11 +73,11 @@ def checklist(checked: Checked) -> list[Line]:
     ]
 
 
-def _linearity(checked: Checked) -> Line:
+def _linearity(checked: Checked) -> ChecklistLine:
     found, name = checked.linearity, checked.twin.estimator
     question = "Does a linearised model pass innovation whiteness over what the log covers?"
     if found.passes is None:
-        return Line("linearity", question, NONE, found.reason, "")
+        return ChecklistLine("linearity", question, NONE, found.reason, "")
     remedy = ""
     if not found.passes:
         better = (
@@ -87,10 +87,10 @@ def _linearity(checked: Checked) -> Line:
     elif not found.white:
         remedy = "correlation above zero: more Q, or a state is missing; below: less Q"
     answer = NO if not found.passes else YES if found.white else PARTLY
-    return Line("linearity", question, answer, found.text, remedy)
+    return ChecklistLine("linearity", question, answer, found.text, remedy)
 
 
-def _dimension(checked: Checked) -> Line:
+def _dimension(checked: Checked) -> ChecklistLine:
     found, fold = checked.dimension, checked.fold
     entry = fold.estimator
     question = "Is n small enough for O(n³) at this rate, or is an ensemble required?"
@@ -107,20 +107,21 @@ def _dimension(checked: Checked) -> Line:
     else:
         figures += f"; an ensemble would need {found.members} members for σ within 10 %"
     remedy = ""
-    if found.share > BUSY:
-        remedy = f"more than {100 * BUSY:.0f} % of a processor: fewer readings, fewer members, or another filter"
+    if found.share > MAX_PROCESSOR_SHARE:
+        limit = f"{100 * MAX_PROCESSOR_SHARE:.0f} % of a processor"
+        remedy = f"more than {limit}: fewer readings, fewer members, or another filter"
     elif entry.family == "ensemble":
         remedy = "an ensemble is what runs"
     answer = YES if found.passes and entry.family != "ensemble" else PARTLY if found.passes else NO
-    return Line("dimension", question, answer, figures, remedy)
+    return ChecklistLine("dimension", question, answer, figures, remedy)
 
 
-def _posterior(checked: Checked) -> Line:
+def _posterior(checked: Checked) -> ChecklistLine:
     found = checked.peaks
     question = "Is the posterior multimodal, or is the noise heavy-tailed?"
     heavy = [tail for tail in checked.tails if tail.heavy]
     # Of many rows a few look so by chance.
-    heavy = heavy if len(heavy) > OFTEN * len(checked.tails) else []
+    heavy = heavy if len(heavy) > FREQUENT_SHARE * len(checked.tails) else []
     if found.reason:
         said = [f"peaks are not computed: {found.reason}"]
     else:
@@ -135,7 +136,7 @@ def _posterior(checked: Checked) -> Line:
             f"innovations: {sum(tail.heavy for tail in checked.tails)} of {len(checked.tails)} rows are heavy-tailed, "
             f"the worst {worst.row} with excess kurtosis {worst.kurtosis:.2g} and {100 * worst.far:.2g} % beyond 4 σ"
         )
-    peaked = not found.reason and not found.recoveries and found.several > OFTEN
+    peaked = not found.reason and not found.recoveries and found.several > FREQUENT_SHARE
     remedy = ""
     if peaked:
         one = checked.fold.estimator.peaks is None
@@ -149,7 +150,7 @@ def _posterior(checked: Checked) -> Line:
     elif heavy:
         remedy = "heavy tails: the gate takes the worst of them"
     answer = YES if peaked else PARTLY if heavy else NONE if found.reason and worst is None else NO
-    return Line("posterior", question, answer, "; ".join(said), remedy)
+    return ChecklistLine("posterior", question, answer, "; ".join(said), remedy)
 
 
 def scaled(value: float, unit: str) -> str:
@@ -189,17 +190,17 @@ def blamed(found: Sensitivity) -> list[tuple[str, str, float]]:
         (names[i], names[j], float(c[i, j]))
         for i in range(len(names))
         for j in range(i + 1, len(names))
-        if abs(c[i, j]) > BLAME
+        if abs(c[i, j]) > MAX_CORRELATION
     ]
     return sorted(pairs, key=lambda pair: -abs(pair[2]))
 
 
-def _observability(checked: Checked) -> Line:
+def _observability(checked: Checked) -> ChecklistLine:
     found, told = checked.gramian, checked.sensitivity
     question = "Is the Gramian well conditioned for every state and parameter that is estimated?"
     whole = found.whole
     if whole is None:
-        return Line("observability", question, NONE, found.reason, "")
+        return ChecklistLine("observability", question, NONE, found.reason, "")
     figures = (
         f"rank {whole.rank} of {checked.twin.model.nx}, conditioning {digits(whole.conditioning)}; "
         f"the weakest direction is {whole.text}"
@@ -213,17 +214,19 @@ def _observability(checked: Checked) -> Line:
         first, second, value = pairs[0]
         figures += f"; {len(pairs)} pair(s) look alike in the readings, most of all {first} and {second} ({value:+.2f})"
     if whole.beyond:
-        return Line("observability", question, NONE, f"{figures}; {found.note}", "")
+        return ChecklistLine("observability", question, NONE, f"{figures}; {found.note}", "")
     free = checked.twin.model.prior_std > 0.0
     left = whole.deviation[free]
-    unseen = bool(left.size and left.max() > LEFT)
-    full = whole.rank >= int(free.sum()) and whole.conditioning < ILL
+    unseen = bool(left.size and left.max() > UNOBSERVED_SHARE)
+    full = whole.rank >= int(free.sum()) and whole.conditioning < MAX_CONDITIONING
     remedy = ""
     if unseen or not full:
         remedy = "a state that is not observed keeps its prior and drifts: add a sensor, or rely on its band only"
     elif pairs:
         remedy = "do not estimate both of a pair from this log; measure one, or excite the asset otherwise"
-    return Line("observability", question, NO if unseen else YES if full and not pairs else PARTLY, figures, remedy)
+    return ChecklistLine(
+        "observability", question, NO if unseen else YES if full and not pairs else PARTLY, figures, remedy
+    )
 
 
 def stamps(checked: Checked) -> str:
@@ -235,7 +238,7 @@ def stamps(checked: Checked) -> str:
     return "every reading has the time at which it was measured"
 
 
-def _timing(checked: Checked) -> Line:
+def _timing(checked: Checked) -> ChecklistLine:
     question = "Are there source timestamps, a buffer for the worst latency, and a policy for stale data?"
     section, policy = checked.twin.config.time, checked.twin.policy
     spoke = [item for item in checked.arrivals if item.n]
@@ -262,10 +265,10 @@ def _timing(checked: Checked) -> Line:
     elif worst is not None and worst.gap > policy.degraded_after:
         remedy = f"{worst.sensor} is silent for longer than {policy.degraded_after:g} s: degraded meanwhile"
     whole = bool(late) and "measured" in said[0] and not silent
-    return Line("timing", question, NO if stale else YES if whole else PARTLY, "; ".join(said), remedy)
+    return ChecklistLine("timing", question, NO if stale else YES if whole else PARTLY, "; ".join(said), remedy)
 
 
-def _health(checked: Checked) -> Line:
+def _health(checked: Checked) -> ChecklistLine:
     question = "Are NIS, whiteness and refusals monitored, with alerts and a documented response?"
     found = checked.episodes
     wrong = [entry for entry in checked.calibration if entry.words]
@@ -275,10 +278,10 @@ def _health(checked: Checked) -> Line:
         f"calibration off in {len(wrong)} of {len(checked.calibration)} rows and states"
     )
     remedy = found[0].text if found else wrong[0].words[0] if wrong else ""
-    return Line("health", question, YES, figures, remedy)
+    return ChecklistLine("health", question, YES, figures, remedy)
 
 
-def _tuning(checked: Checked) -> Line:
+def _tuning(checked: Checked) -> ChecklistLine:
     question = "Are Q and R fitted on recorded data, versioned, and covered by regression tests?"
     twin = checked.twin
     kept = scores_file(twin.path)
@@ -299,19 +302,19 @@ def _tuning(checked: Checked) -> Line:
         remedy.append(f"nisus commission {twin.path.stem} keeps what is normal, so that a change is told")
     if not scores:
         remedy.append(f"nisus compare {twin.path.stem} --write keeps the scores")
-    return Line("tuning", question, PARTLY if scores or not remedy else NO, figures, "; ".join(remedy))
+    return ChecklistLine("tuning", question, PARTLY if scores or not remedy else NO, figures, "; ".join(remedy))
 
 
-def _change(checked: Checked) -> Line:
+def _change(checked: Checked) -> ChecklistLine:
     question = "Is the model version tied to maintenance events?"
     log = checked.log
     done = int(np.sum(log.kind[: log.n] == MAINTENANCE))
     figures = f"each maintenance counts the version of {checked.twin.model.name} up; {done} in this log"
     remedy = "report maintenance to the twin, so that the covariance of the changed part is reset"
-    return Line("change", question, YES if done else PARTLY, figures, "" if done else remedy)
+    return ChecklistLine("change", question, YES if done else PARTLY, figures, "" if done else remedy)
 
 
-BUDGET = 20.0
+HELD_OUT_BUDGET_S = 20.0
 """Seconds of one processor for the folds with a sensor held out; of a log that takes longer the first part is taken."""
 
 
@@ -344,7 +347,7 @@ def check(twin: Twin, log: Log, counts: Counter[str]) -> Checked:
     """
     model, tuning = twin.model, twin.tuning
     speak = np.unique(log.channel[: log.n][log.kind[: log.n] == READING]).size
-    fold, seconds = timed(twin, twin.estimator, log.events, tuning.seed, BUDGET / (speak + 2))
+    fold, seconds = timed(twin, twin.estimator, log.events, tuning.seed, HELD_OUT_BUDGET_S / (speak + 2))
     span = None
     if fold.n < log.n:
         span = float(log.t[fold.n - 1] - log.t[0]) * 1e-9

@@ -23,10 +23,10 @@ from .prepare import prepare
 if TYPE_CHECKING:
     from .arguments import Commission as Arguments
 
-MOST = 0.1
+MAX_FAULTY_SHARE = 0.1
 """Share of readings refused, of rows lost, or of one value in a row, beyond which data are not in order."""
 
-LONGEST = 50
+MAX_EQUAL_RUN = 50
 """Equal readings in a row that are never too many."""
 
 
@@ -58,20 +58,20 @@ def against(fold: Fold) -> str:
     """Why a fold cannot be what is normal, in one line; nothing if it can."""
     model, log, track = fold.model, fold.log, fold.track
     lost = float(np.mean((track.health == DIVERGED) | (track.health == STALE)))
-    if lost > MOST:
+    if lost > MAX_FAULTY_SHARE:
         return f"the twin is diverged or stale for {100 * lost:.0f} % of its rows"
     for s, sensor in enumerate(model.sensors):
         rows = np.flatnonzero((log.kind[: fold.n] == READING) & (log.channel[: fold.n] == s))
         if not rows.size:
             continue
         refused = float(np.mean(np.isin(track.verdict[rows], (GATED, FAILED, SCREENED))))
-        if refused > MOST:
+        if refused > MAX_FAULTY_SHARE:
             return f"{100 * refused:.0f} % of the readings of {sensor.name} are refused"
         for k, row in enumerate(sensor.rows):
             value = log.value[rows, k]
             changes = np.flatnonzero(np.diff(value, prepend=np.nan, append=np.nan) != 0.0)
             longest = int(np.max(np.diff(changes))) if changes.size > 1 else 0
-            if longest > max(LONGEST, MOST * rows.size):
+            if longest > max(MAX_EQUAL_RUN, MAX_FAULTY_SHARE * rows.size):
                 return f"{row.name} of {sensor.name} says the same {longest} times in a row"
     return ""
 

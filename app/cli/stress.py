@@ -26,7 +26,7 @@ from .progress import progress
 if TYPE_CHECKING:
     from .arguments import Stress as Arguments
 
-WIDTH = 220
+PIPE_WIDTH = 220
 """Columns of the output where it is not a terminal."""
 
 
@@ -85,7 +85,7 @@ def _chosen(mistakes: Sequence[Mistake], only: Sequence[str]) -> list[Mistake]:
 def _print(trials: Sequence[Trial], mistakes: Sequence[Mistake], names: Sequence[str]) -> None:
     console = Console()
     if not console.is_terminal:
-        console = Console(width=WIDTH)
+        console = Console(width=PIPE_WIDTH)
     table = Table()
     for title in ("mistake", "filter", "visible from"):
         table.add_column(title, no_wrap=True)

@@ -16,7 +16,7 @@ from estimators.track import STALE, WAITING, estimated_rows
 from .counts import UNSETTLED, complaints, refusals
 from .notices import Notices
 
-TRIES = 3
+MAX_CAUSE_SEARCHES = 3
 """Failures of one fold whose cause is sought; a reading of 1e300 has none in the model, so more than one."""
 
 
@@ -115,18 +115,18 @@ class Alerts:
         """Report, once per fold, the model function that made a measurement or the estimate fail."""
         first = 0 if self._fresh else before
         self._fresh = False
-        if self._tries >= TRIES or fold.failure is not None:
+        if self._tries >= MAX_CAUSE_SEARCHES or fold.failure is not None:
             return
         rows = failures(fold.track, first)
         if rows.size:
             self._tries += 1
             text = cause_of(fold, int(rows[0]))
             if text is not None:
-                self._tries = TRIES
+                self._tries = MAX_CAUSE_SEARCHES
                 self._notices.say(text, level="error", t=int(fold.log.t[rows[0]]))
 
 
-class Silence:
+class SilentSource:
     """Health of a twin whose source is open but has no events yet."""
 
     def __init__(self, notices: Notices, stale_after: float, clock: Callable[[], float] = time.monotonic) -> None:

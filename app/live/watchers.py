@@ -13,7 +13,7 @@ from estimators.log import INPUT, READING, Events
 from estimators.track import TRACKING, WAITING
 from sources.source import Paced, Source
 
-from .alerts import Alerts, Silence
+from .alerts import Alerts, SilentSource
 from .counts import Latency
 from .episode_log import EpisodeLog
 from .integrity import PERIOD_S, ProtectionMonitor
@@ -35,7 +35,7 @@ class Watchers:
         self.clock = HostClock(notices, section.horizon)
         self.episode_log = EpisodeLog(engine)
         self.alerts = Alerts(notices, lambda: self.episode_log.summary.in_alarm)
-        self.silence = Silence(notices, section.stale_after)
+        self.silence = SilentSource(notices, section.stale_after)
         self.integrity = ProtectionMonitor(engine.last_events, engine.policy.false_alarm_every)
         self.root_cause = RootCause(lambda: self.episode_log.summary.episodes, engine.last_events, notices)
 

@@ -23,7 +23,7 @@ BANDS = (0.50, 0.90, 0.95)
 """Shares of the readings, or of the truth, that these bands should hold."""
 
 
-class Limits(NamedTuple):
+class CalibrationLimits(NamedTuple):
     """Sizes from which on something is said: the whole interval of a figure must lie beyond.
 
     Bands that would have to be wider by more than the share `width` to be right, or are wider by more than that than
@@ -37,7 +37,7 @@ class Limits(NamedTuple):
     refused: float = 0.05
 
 
-LIMITS = Limits()
+LIMITS = CalibrationLimits()
 
 
 class Calibration(NamedTuple):
@@ -73,7 +73,7 @@ def calibrations(
     *,
     gate: float | None = None,
     marginal: bool = False,
-    limits: Limits = LIMITS,
+    limits: CalibrationLimits = LIMITS,
 ) -> list[Calibration]:
     """Calibration of every sensor row with readings, those that were used or refused and those held out apart.
 
@@ -108,7 +108,7 @@ def calibrations(
 
 
 def truth_calibration(
-    model: StateSpaceModel, events: Events, track: Track, *, limits: Limits = LIMITS
+    model: StateSpaceModel, events: Events, track: Track, *, limits: CalibrationLimits = LIMITS
 ) -> list[Calibration]:
     """Calibration of every state whose truth is told, at those times; a mode that jumps has no band and is left out.
 
@@ -158,7 +158,7 @@ def standardised(track: Track, row: int, marginal: bool) -> np.ndarray:
 
 
 def _of_row(
-    name: str, t: np.ndarray, e: np.ndarray, edge: np.ndarray, refused: np.ndarray, limits: Limits
+    name: str, t: np.ndarray, e: np.ndarray, edge: np.ndarray, refused: np.ndarray, limits: CalibrationLimits
 ) -> Calibration:
     coverage, _ = _coverage(e, limits)
     clipped = np.clip(e, -edge, edge)
@@ -173,14 +173,14 @@ def _of_row(
     return Calibration(name, "used", *_window(t), ratio, scale, bias, correlation, share, coverage, words)
 
 
-def _held_out(name: str, t: np.ndarray, e: np.ndarray, limits: Limits) -> Calibration:
+def _held_out(name: str, t: np.ndarray, e: np.ndarray, limits: CalibrationLimits) -> Calibration:
     coverage, verdicts = _coverage(e, limits)
     words = held_out_words(name, verdicts)
     unknown = UNKNOWN, UNKNOWN, UNKNOWN, UNKNOWN, UNKNOWN
     return Calibration(name, "held out", *_window(t), *unknown, coverage, words)
 
 
-def _coverage(e: np.ndarray, limits: Limits) -> tuple[tuple[Interval, ...], Sequence[Verdict]]:
+def _coverage(e: np.ndarray, limits: CalibrationLimits) -> tuple[tuple[Interval, ...], Sequence[BandVerdict]]:
     """Shares inside the bands, and those that are beyond what bands as wrong as the limits allow would hold."""
     shares, verdicts = [], []
     for band in BANDS:
@@ -191,7 +191,7 @@ def _coverage(e: np.ndarray, limits: Limits) -> tuple[tuple[Interval, ...], Sequ
         )
         shares.append(share)
         if share.beyond(low, high):
-            verdicts.append(Verdict(band, share))
+            verdicts.append(BandVerdict(band, share))
     return tuple(shares), verdicts[::-1]
 
 
@@ -203,7 +203,7 @@ def _window(t: np.ndarray) -> tuple[float, float, int]:
     return float(t[0]) * 1e-9, float(t[-1]) * 1e-9, int(t.size)
 
 
-class Verdict(NamedTuple):
+class BandVerdict(NamedTuple):
     """A band, by the share that it should hold, and the share that it does, which is beyond the limits."""
 
     band: float
@@ -222,7 +222,7 @@ FRACTIONS = (
 
 
 def reading_words(
-    name: str, scale: Interval, bias: Interval, correlation: Interval, refused: Interval, limits: Limits
+    name: str, scale: Interval, bias: Interval, correlation: Interval, refused: Interval, limits: CalibrationLimits
 ) -> tuple[str, ...]:
     """What matters of a sensor row whose readings are used."""
     said = []
@@ -239,7 +239,7 @@ def reading_words(
     return tuple(said)
 
 
-def held_out_words(name: str, verdicts: Sequence[Verdict]) -> tuple[str, ...]:
+def held_out_words(name: str, verdicts: Sequence[BandVerdict]) -> tuple[str, ...]:
     """What matters of a sensor row that is held out: the widest band that holds too many or too few."""
     return tuple(
         f"{name}: {_share(share)} of its readings in the {100 * band:.0f} % band of the prediction{_wide(band, share)}"
@@ -247,7 +247,9 @@ def held_out_words(name: str, verdicts: Sequence[Verdict]) -> tuple[str, ...]:
     )
 
 
-def truth_words(name: str, verdicts: Sequence[Verdict], bias: Interval, limits: Limits) -> tuple[str, ...]:
+def truth_words(
+    name: str, verdicts: Sequence[BandVerdict], bias: Interval, limits: CalibrationLimits
+) -> tuple[str, ...]:
     """What matters of a state whose truth is told."""
     said = [
         f"{name}: truth in its {100 * band:.0f} % band {_share(share)} of the time{_wide(band, share)}"

@@ -15,15 +15,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-STRETCH = 10**9
-"""Nanoseconds of arrival of which the least delay is kept, at first; twice as long each time that `MOST` are full."""
+SEGMENT_NS = 10**9
+"""Initial length of a segment, of which the smallest delay is kept; doubled whenever `MAX_SEGMENTS` are full."""
 
-MOST = 512
+MAX_SEGMENTS = 512
 
-FEW = 8
+MIN_SEGMENTS = 8
 """Stretches below which no drift is told."""
 
-OUTLYING = 10.0
+OUTLIER_DEVIATIONS = 10.0
 """Robust deviations above the line beyond which a stretch was held up."""
 
 
@@ -43,7 +43,7 @@ class LeastDelays:
     """The least arrival - t of each stretch, in bounded memory; the same however the events were cut into batches."""
 
     def __init__(self) -> None:
-        self._stretch = STRETCH
+        self._stretch = SEGMENT_NS
         self._at: list[int] = []
         self._arrival: list[int] = []
         self._delay: list[int] = []
@@ -51,7 +51,7 @@ class LeastDelays:
     def note(self, t: np.ndarray, arrival: np.ndarray) -> None:
         """Readings with their own and their arrival's times, ns, each (n,)."""
         delay = arrival - t
-        stretch = arrival // STRETCH
+        stretch = arrival // SEGMENT_NS
         # Of each stretch in the batch the least, and of these the first.
         order = np.lexsort((arrival, delay, stretch))
         first = np.ones(order.size, np.bool_)
@@ -71,7 +71,7 @@ class LeastDelays:
         self._at.append(at)
         self._arrival.append(arrival)
         self._delay.append(delay)
-        if len(self._at) > MOST:
+        if len(self._at) > MAX_SEGMENTS:
             self._stretch *= 2
             kept = list(zip(self._arrival, self._delay, strict=True))
             self._at, self._arrival, self._delay = [], [], []
@@ -86,12 +86,12 @@ class LeastDelays:
         x = np.array([arrival - self._arrival[-1] for arrival in self._arrival], float) * 1e-9
         y = np.array([delay - self._delay[-1] for delay in self._delay], float) * 1e-9
         last = self._delay[-1] * 1e-9
-        if x.size < FEW:
+        if x.size < MIN_SEGMENTS:
             return ClockFit(-(last + float(y.min())), np.nan, np.nan)
         above = y - _robust_slope(x, y) * x
         middle = np.median(above)
         spread = 1.4826 * np.median(np.abs(above - middle))
-        used = above <= middle + OUTLYING * spread + 1e-9
+        used = above <= middle + OUTLIER_DEVIATIONS * spread + 1e-9
         slope, level = np.polyfit(x[used], y[used], 1)
         rest = y[used] - (level + slope * x[used])
         lever = np.sum((x[used] - x[used].mean()) ** 2)

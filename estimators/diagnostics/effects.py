@@ -15,9 +15,9 @@ import numpy as np
 from ..numerics.quantiles import normal_quantile
 from .detectors import MAX_SIGMA
 
-SIDE = float(normal_quantile(0.975))
+INTERVAL_SIGMAS = float(normal_quantile(0.975))
 
-SPIKE = 4.0
+OUTLIER_FROM_SIGMA = 4.0
 """|e| from which an innovation is an outlier."""
 
 MIN_PAIRS = 4
@@ -30,7 +30,7 @@ EVIDENCE = "evidence"
 """Kind of a series of log Λ of a test in place of e, for detectors of which nothing else is known."""
 
 
-class Effect(NamedTuple):
+class InnovationEffect(NamedTuple):
     """Deviation of innovations from white noise.
 
     cause: one of `KINDS`. size, with its 95 % interval low to high: the mean in σ, the ratio of the standard deviation
@@ -44,7 +44,7 @@ class Effect(NamedTuple):
     ratio: float
 
 
-def effects(e: np.ndarray) -> list[Effect]:
+def effects(e: np.ndarray) -> list[InnovationEffect]:
     """All ways in which a run e (n,), finite, differs from white noise, the likeliest first.
 
     The mean is taken out before the scale, both before the correlation, and spikes are told from scale by what the
@@ -55,7 +55,7 @@ def effects(e: np.ndarray) -> list[Effect]:
     n = e.size
     if n < 2:
         size = float(e[0]) if n else 0.0
-        return [Effect("shifted", size, size - SIDE, size + SIDE, 0.5 * size * size)]
+        return [InnovationEffect("shifted", size, size - INTERVAL_SIGMAS, size + INTERVAL_SIGMAS, 0.5 * size * size)]
     mean = float(e.mean())
     rest = e - mean
     variance = float(np.mean(rest**2))
@@ -64,7 +64,11 @@ def effects(e: np.ndarray) -> list[Effect]:
     bounded = float(np.clip(phi, -0.995, 0.995))
     # Correlated noise determines a mean less well than white noise.
     wide = np.sqrt(floor * (1.0 + max(bounded, 0.0)) / (1.0 - max(bounded, 0.0)) / n)
-    found = [Effect("shifted", mean, mean - SIDE * wide, mean + SIDE * wide, 0.5 * n * mean**2)]
+    found = [
+        InnovationEffect(
+            "shifted", mean, mean - INTERVAL_SIGMAS * wide, mean + INTERVAL_SIGMAS * wide, 0.5 * n * mean**2
+        )
+    ]
     spikes = _alone(rest)
     calm = rest[~spikes]
     share = float(np.mean(spikes))
@@ -73,17 +77,17 @@ def effects(e: np.ndarray) -> list[Effect]:
         # A few outliers among normal innovations; otherwise it is the scale.
         gain = 0.5 * float(np.sum(rest[spikes] ** 2)) - int(spikes.sum()) * np.log(max(1.0 / max(share, 1e-9), 1.0))
         if own < 1.5 and share < 0.2:
-            half = SIDE * np.sqrt(share * (1.0 - share) / n)
-            found.append(Effect("spiky", share, max(0.0, share - half), min(1.0, share + half), gain))
+            half = INTERVAL_SIGMAS * np.sqrt(share * (1.0 - share) / n)
+            found.append(InnovationEffect("spiky", share, max(0.0, share - half), min(1.0, share + half), gain))
             variance, floor = own, own
     deviation = float(np.sqrt(floor))
-    half = SIDE / np.sqrt(2.0 * n) * deviation
+    half = INTERVAL_SIGMAS / np.sqrt(2.0 * n) * deviation
     cause = "narrow" if variance > 1.0 else "wide"
     gain = 0.5 * n * (variance - 1.0 - np.log(floor))
-    found.append(Effect(cause, deviation, max(0.0, deviation - half), deviation + half, gain))
-    spread = SIDE * np.sqrt((1.0 - bounded**2) / n)
+    found.append(InnovationEffect(cause, deviation, max(0.0, deviation - half), deviation + half, gain))
+    spread = INTERVAL_SIGMAS * np.sqrt((1.0 - bounded**2) / n)
     found.append(
-        Effect(
+        InnovationEffect(
             "correlated" if phi > 0 else "alternating",
             phi,
             max(-1.0, phi - spread),
@@ -94,7 +98,7 @@ def effects(e: np.ndarray) -> list[Effect]:
     return sorted(found, key=lambda effect: -effect.ratio)
 
 
-def against(e: np.ndarray, effect: Effect) -> float:
+def against(e: np.ndarray, effect: InnovationEffect) -> float:
     """Return log Λ, nats, of white noise against an effect of this size in e (n,), finite; 0 for rare outliers."""
     e = np.clip(e, -MAX_SIGMA, MAX_SIGMA)
     size = effect.size
@@ -109,20 +113,20 @@ def against(e: np.ndarray, effect: Effect) -> float:
     return 0.0
 
 
-def common_scale(e: np.ndarray, dof: np.ndarray) -> Effect:
+def common_scale(e: np.ndarray, dof: np.ndarray) -> InnovationEffect:
     """Return the common scale of all rows of a sensor, from e = √(NIS / dof) (n,) and degrees of freedom (n,)."""
     whole = float(np.sum(dof))
     variance = max(float(np.sum(dof * e**2)) / whole, 1e-12)
     deviation = float(np.sqrt(variance))
-    half = SIDE / np.sqrt(2.0 * whole) * deviation
+    half = INTERVAL_SIGMAS / np.sqrt(2.0 * whole) * deviation
     gain = 0.5 * whole * (variance - 1.0 - float(np.log(variance)))
     cause = "narrow" if variance > 1.0 else "wide"
-    return Effect(cause, deviation, max(0.0, deviation - half), deviation + half, gain)
+    return InnovationEffect(cause, deviation, max(0.0, deviation - half), deviation + half, gain)
 
 
 def _alone(e: np.ndarray) -> np.ndarray:
     """Return which of e (n,) are outliers without a neighbouring one on the same side."""
-    side = np.where(np.abs(e) > SPIKE, np.sign(e), 0.0)
+    side = np.where(np.abs(e) > OUTLIER_FROM_SIGMA, np.sign(e), 0.0)
     beside = np.concatenate(([0.0], side, [0.0]))
     alone: np.ndarray = (side != 0.0) & (beside[:-2] != side) & (beside[2:] != side)
     return alone
@@ -180,7 +184,7 @@ def gains(e: np.ndarray, cause: str, run: Sums = NO_SUMS) -> tuple[np.ndarray, S
         side = phi > 0 if cause == "correlated" else phi < 0
         gain = np.where(side & (n > MIN_PAIRS), -0.5 * n * np.log(1.0 - phi**2), 0.0)
     elif cause == "spiky":
-        gain = np.where(np.abs(e) > SPIKE, n, 0.0)
+        gain = np.where(np.abs(e) > OUTLIER_FROM_SIGMA, n, 0.0)
     elif cause == EVIDENCE:
         gain = total
     return gain, sums

@@ -20,10 +20,10 @@ from ..model.check import indefinite, numbers, place
 from ..model.state_space import SHOWN
 from ..track import FAILED, GATED, Track, estimated_rows
 
-AWAY = (1.0, -1.0, 3.0, -3.0)
+SIGMA_OFFSETS = (1.0, -1.0, 3.0, -3.0)
 """Standard deviations from the estimate, a state at a time; the sigma points of nx states lie at about √nx."""
 
-STEPS = 100
+MAX_STEPS = 100
 """Steps of a prediction that are repeated at most; a longer prediction has longer steps."""
 
 
@@ -117,7 +117,7 @@ def questions(
 def around(compiled: CompiledModel, estimate: Estimate) -> Iterator[np.ndarray]:
     """States around an estimate, where asking there is cheap."""
     if estimate.mean.size <= SHOWN and compiled.box is None:
-        for away in AWAY:
+        for away in SIGMA_OFFSETS:
             for j in np.flatnonzero(estimate.std > 0.0):
                 x = estimate.mean.copy()
                 x[j] += away * estimate.std[j]
@@ -129,7 +129,7 @@ def _walk(
 ) -> str | np.ndarray:
     """Return the end of a prediction from a state, or the first function that fails on the way."""
     model = compiled.model
-    steps = min(STEPS, steps_of(dt, model.max_step)) if dt > 0.0 else 0
+    steps = min(MAX_STEPS, steps_of(dt, model.max_step)) if dt > 0.0 else 0
     for _ in range(steps):
         step = dt / steps
         at = f"x = {numbers(x)}, u = {numbers(u)}, dt = {step:.4g} s"

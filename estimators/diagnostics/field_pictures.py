@@ -15,10 +15,10 @@ from ..log import MARK, TRUTH, Log
 from ..model.states import Field
 from ..numerics.quantiles import normal_quantile
 
-SIDE = 200
+MAX_SIDE = 200
 """Cells of a picture along an axis at most; a larger field is averaged over squares."""
 
-MEMORY = 64 * 2**20
+MAX_PICTURE_BYTES = 64 * 2**20
 """Bytes that the pictures of a fold may take; then every second of the older ones keeps its numbers only."""
 
 
@@ -56,7 +56,7 @@ class Pictures:
         self.period = None if period is None else max(1, round(period * 1e9))
         self.taken: list[Picture] = []
         rows, columns = plane_shape(field.shape)
-        self._most = max(2, MEMORY // (12 * rows * columns))
+        self._most = max(2, MAX_PICTURE_BYTES // (12 * rows * columns))
         self._half = normal_quantile(0.975)
 
     def due(self, log: Log, n: int) -> bool:
@@ -158,7 +158,7 @@ def layer(shape: tuple[int, ...]) -> tuple[int, int]:
 
 def reduction(shape: tuple[int, ...]) -> int:
     """Cells along each side of the squares over which a picture averages."""
-    return max(1, -(-max(layer(shape)) // SIDE))
+    return max(1, -(-max(layer(shape)) // MAX_SIDE))
 
 
 def plane_shape(shape: tuple[int, ...]) -> tuple[int, int]:

@@ -21,10 +21,10 @@ from ..track import HELD_OUT, Track
 from ..tuning import Tuning
 from .health import PROBABILITY
 
-LAST = 200
+LAST_MEASUREMENTS = 200
 """Readings of a row that are looked at, the last."""
 
-FEWEST = 10
+MIN_MEASUREMENTS = 10
 """Below which nothing is said."""
 
 
@@ -71,12 +71,12 @@ def offsets(events: Events, track: Track, tuning: Tuning) -> list[Offset]:
         return []
     held = (events.kind == READING) & (track.verdict == HELD_OUT)
     for s in np.flatnonzero(~tuning.used.astype(bool)):
-        rows = np.flatnonzero(held & (events.channel == s))[-LAST:]
+        rows = np.flatnonzero(held & (events.channel == s))[-LAST_MEASUREMENTS:]
         for k, row in enumerate(model.sensors[s].rows):
             nu, std = track.innovation[rows, k], track.innovation_std[rows, k]
             known = np.isfinite(nu) & np.isfinite(std)
             n = int(known.sum())
-            if n < FEWEST:
+            if n < MIN_MEASUREMENTS:
                 continue
             S = float(np.mean(std[known] ** 2))
             R = min(float(tuning.r[model.row_start[s] + k]), S)

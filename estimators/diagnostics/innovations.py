@@ -112,7 +112,7 @@ def memory(r: np.ndarray) -> int:
     return int(fallen[0]) + 1 if fallen.size else r.size
 
 
-FEWEST = 50
+MIN_INNOVATIONS = 50
 """Readings of a row from which on its noise is estimated."""
 
 
@@ -175,7 +175,7 @@ def sensor_noise(track: Track, events: Events, tuning: Tuning) -> dict[str, Sens
             nu, S = track.innovation[rows, k], track.innovation_std[rows, k] ** 2
             known = np.isfinite(nu) & np.isfinite(S) & (S > 0.0)
             n = int(known.sum())
-            if n < FEWEST:
+            if n < MIN_INNOVATIONS:
                 continue
             nu, S, m = nu[known], S[known], dof[known]
             R = float(tuning.r[model.row_start[s] + k])

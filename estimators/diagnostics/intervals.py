@@ -19,10 +19,10 @@ from scipy.special import stdtrit
 PROBABILITY = 0.95
 """Of every interval here."""
 
-COSINES = 12
+N_COSINES = 12
 """Projections; fewer for a series that has not twice as many values."""
 
-LEAST = 8
+MIN_VALUES = 8
 """Values that an interval takes at least."""
 
 
@@ -46,7 +46,7 @@ def long_run_variance(x: np.ndarray) -> tuple[float, int]:
 
     Ω = 1/B Σ_j Λ_j²,  Λ_j = √(2/T) Σ_t x_t cos(π j (t + ½) / T),  j = 1 to B
     """
-    count = min(COSINES, x.size // 2)
+    count = min(N_COSINES, x.size // 2)
     # The transform is twice the sum, and the cosines are orthogonal to a constant.
     projections = dct(x - np.mean(x), type=2)[1 : count + 1] / np.sqrt(2.0 * x.size)
     return float(np.mean(projections**2)), count
@@ -59,7 +59,7 @@ def _half(degrees: int) -> float:
 
 def mean_interval(x: np.ndarray) -> Interval:
     """The mean of a series (T,) of finite values in order of time."""
-    if x.size < LEAST:
+    if x.size < MIN_VALUES:
         return Interval(float(np.mean(x)), np.nan, np.nan) if x.size else UNKNOWN
     variance, degrees = long_run_variance(x)
     mean, half = float(np.mean(x)), _half(degrees) * np.sqrt(variance / x.size)
@@ -90,7 +90,7 @@ def share_interval(inside: np.ndarray, like: np.ndarray) -> Interval:
     if not n:
         return UNKNOWN
     share = float(np.mean(inside))
-    if n < LEAST:
+    if n < MIN_VALUES:
         return Interval(share, np.nan, np.nan)
     # Squares keep their correlation where the sign of the values alternates.
     independent, degrees = _independent(inside.astype(float) if 0.0 < share < 1.0 else like**2)
@@ -110,7 +110,7 @@ def correlation_interval(x: np.ndarray) -> Interval:
     """
     z = x - np.mean(x) if x.size else x
     square = float(np.mean(z**2)) if x.size else 0.0
-    if x.size <= LEAST or not square > 0.0:
+    if x.size <= MIN_VALUES or not square > 0.0:
         return UNKNOWN
     products, squares = z[1:] * z[:-1], 0.5 * (z[1:] ** 2 + z[:-1] ** 2)
     r = float(np.sum(products) / (x.size * square))

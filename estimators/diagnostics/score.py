@@ -20,7 +20,7 @@ from .consistency import NisVerdict
 from .field_pictures import Picture
 from .health import MAX_ROWS_PER_READING, PROBABILITY, nis_bounds, normal_nis
 
-FARTHEST = 6.0
+BASELINE_CLIP_SIGMA = 6.0
 """σ at which the innovations of a row are clipped in a baseline (commission.py)."""
 
 
@@ -128,7 +128,7 @@ def nis_verdict(track: Track, events: Events, model: StateSpaceModel, baseline: 
     with np.errstate(all="ignore"):
         e = track.innovation[rows] / track.innovation_std[rows]
     e = np.where(np.isfinite(track.whitened[rows]), track.whitened[rows], e)
-    judged = float(np.nansum(np.clip(e, -FARTHEST, FARTHEST) ** 2)) / count
+    judged = float(np.nansum(np.clip(e, -BASELINE_CLIP_SIGMA, BASELINE_CLIP_SIGMA) ** 2)) / count
     return NisVerdict(nis, low, high, True, judged)
 
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from estimators.diagnostics.score import score
 from estimators.diagnostics.sensitivity import Gramian, gramian
-from estimators.diagnostics.sensitivity.checklist import LEAST, Linearity, linearity
+from estimators.diagnostics.sensitivity.checklist import MIN_DIFFERENCE, Linearity, linearity
 from estimators.diagnostics.sensitivity.posterior import Peaks, peaks
 from estimators.diagnostics.sensitivity.responses import digits, stand_in
 from estimators.errors import NisusError
@@ -148,7 +148,7 @@ _SECONDS = ((1.0, "s"), (1e-3, "ms"), (1e-6, "µs"), (1e-9, "ns"))
 
 def apart_text(sigma: float) -> str:
     """Return a distance in σ; a very small one as "less than"."""
-    return f"less than {LEAST:g} σ" if sigma < LEAST else f"{digits(sigma)} σ"
+    return f"less than {MIN_DIFFERENCE:g} σ" if sigma < MIN_DIFFERENCE else f"{digits(sigma)} σ"
 
 
 def bytes_text(count: float) -> str:

@@ -9,8 +9,8 @@ import numpy as np
 from config.tunings import named
 from estimators.diagnostics.calibration import LIMITS, calibrations
 from estimators.diagnostics.innovations import mean_nis
-from estimators.diagnostics.sensitivity.checklist import QUANTILE, Linearity
-from estimators.diagnostics.sensitivity.posterior import FAR, HEAVY, MOST_STATES, OFTEN, Tail
+from estimators.diagnostics.sensitivity.checklist import DIFFERENCE_QUANTILE, Linearity
+from estimators.diagnostics.sensitivity.posterior import FAR_SIGMA, FREQUENT_SHARE, HEAVY_KURTOSIS, MOST_STATES, Tail
 from estimators.diagnostics.sensitivity.posterior import tails as measure
 from estimators.errors import EstimatorError, NisusError
 from estimators.fold import Fold
@@ -281,7 +281,7 @@ def steady(measured: Measured) -> tuple[Claim, float]:
         return Claim("steady", question, NO, uneven, LOST, of, str(error)), period
     with np.errstate(all="ignore"):
         share = np.abs(one.mean - other.mean) / other.std
-    far = float(np.nanquantile(np.nanmax(share, axis=1), QUANTILE))
+    far = float(np.nanquantile(np.nanmax(share, axis=1), DIFFERENCE_QUANTILE))
     said = f"{reason}; {STEADY} and kf agree to within {apart_text(far)} (95th percentile), limit {LIMITS.bias:g}"
     of = f"σ between {STEADY} and kf (95th percentile)"
     return Claim("steady", question, YES if far <= LIMITS.bias else NO, far, LIMITS.bias, of, said), period
@@ -296,22 +296,30 @@ def several(measured: Measured) -> Claim:
     model = measured.twin.model
     if model.linear and model.jump is None and not any(sensor.log_likelihood for sensor in model.sensors):
         reason = "f and h are linear and the noise is Gaussian, so the posterior is Gaussian"
-        return Claim("peaks", SHAPE_QUESTION, NO, 0.0, OFTEN, SHAPE_OF, reason)
+        return Claim("peaks", SHAPE_QUESTION, NO, 0.0, FREQUENT_SHARE, SHAPE_OF, reason)
     if model.nx > MOST_STATES:
         reason = (
             f"{model.nx:,} states: the number of particles needed grows exponentially, so a cloud cannot answer this "
             f"beyond {MOST_STATES}"
         )
-        return Claim("peaks", SHAPE_QUESTION, UNTOLD, None, OFTEN, SHAPE_OF, reason)
+        return Claim("peaks", SHAPE_QUESTION, UNTOLD, None, FREQUENT_SHARE, SHAPE_OF, reason)
     found = measured.peaks
     if found.reason:
-        return Claim("peaks", SHAPE_QUESTION, UNTOLD, None, OFTEN, SHAPE_OF, found.reason)
+        return Claim("peaks", SHAPE_QUESTION, UNTOLD, None, FREQUENT_SHARE, SHAPE_OF, found.reason)
     reason = f"{percent(found.several)} of {found.looks} samples of clouds of {found.estimator} over {found.over:.4g} s"
     if found.recoveries:
         reason += f"; the cloud lost the asset {found.recoveries} time(s), so its shape is not reliable"
-        return Claim("peaks", SHAPE_QUESTION, UNTOLD, found.several, OFTEN, SHAPE_OF, reason)
+        return Claim("peaks", SHAPE_QUESTION, UNTOLD, found.several, FREQUENT_SHARE, SHAPE_OF, reason)
     reason += f", at most {found.most} peak{'s' if found.most > 1 else ''} at once"
-    return Claim("peaks", SHAPE_QUESTION, YES if found.several > OFTEN else NO, found.several, OFTEN, SHAPE_OF, reason)
+    return Claim(
+        "peaks",
+        SHAPE_QUESTION,
+        YES if found.several > FREQUENT_SHARE else NO,
+        found.several,
+        FREQUENT_SHARE,
+        SHAPE_OF,
+        reason,
+    )
 
 
 TAILS_QUESTION = "Are the innovations heavy-tailed?"
@@ -333,16 +341,18 @@ def heavy(measured: Measured, estimator: str, options: dict[str, float] | None =
     track, model = fold.track, measured.twin.model
     found = measure(model, fold.log, track, marginal=fold.marginal)
     if not found:
-        return Claim("tails", TAILS_QUESTION, UNTOLD, None, HEAVY, TAILS_OF, "no row has enough readings"), np.inf
+        return Claim(
+            "tails", TAILS_QUESTION, UNTOLD, None, HEAVY_KURTOSIS, TAILS_OF, "no row has enough readings"
+        ), np.inf
     worst: Tail = max(found, key=lambda tail: tail.kurtosis)
     rows = [tail for tail in found if tail.heavy]
     reason = (
         f"{worst.row} has excess kurtosis {digits(worst.kurtosis)} and {percent(worst.far)} of its {worst.n:,} "
-        f"innovations beyond {FAR:g} σ, the most of {len(found)} rows of {estimator}"
+        f"innovations beyond {FAR_SIGMA:g} σ, the most of {len(found)} rows of {estimator}"
     )
     # A few of many rows have heavy tails by chance.
-    if len(rows) <= OFTEN * len(found):
-        return Claim("tails", TAILS_QUESTION, NO, worst.kurtosis, HEAVY, TAILS_OF, reason), np.inf
+    if len(rows) <= FREQUENT_SHARE * len(found):
+        return Claim("tails", TAILS_QUESTION, NO, worst.kurtosis, HEAVY_KURTOSIS, TAILS_OF, reason), np.inf
     related = [
         entry
         for entry in calibrations(model, fold.log.events, track, gate=measured.twin.tuning.gate, marginal=fold.marginal)
@@ -350,14 +360,20 @@ def heavy(measured: Measured, estimator: str, options: dict[str, float] | None =
     ]
     if any(entry.subject == worst.row for entry in related):
         reason += "; they are also correlated, which points to model errors; weights would reject good measurements"
-        return Claim("tails", TAILS_QUESTION, NO, worst.kurtosis, HEAVY, TAILS_OF, reason), np.inf
+        return Claim("tails", TAILS_QUESTION, NO, worst.kurtosis, HEAVY_KURTOSIS, TAILS_OF, reason), np.inf
     # Two digits: more would differ each time the advice is applied and repeated.
     dof = float(f"{max(LEAST_DOF, 4.0 + 6.0 / worst.kurtosis):.2g}")
     reason += f"; Student's t with 4 + 6 / κ = {digits(dof)} degrees of freedom has as heavy ones"
     weighing, weighted = with_weights(estimator, dof)
     if not weighted:
         return Claim(
-            "tails", TAILS_QUESTION, YES, worst.kurtosis, HEAVY, TAILS_OF, f"{reason}; {estimator} cannot weigh"
+            "tails",
+            TAILS_QUESTION,
+            YES,
+            worst.kurtosis,
+            HEAVY_KURTOSIS,
+            TAILS_OF,
+            f"{reason}; {estimator} cannot weigh",
         ), dof
     other = measured.folded(weighing, weighted).fold.track
     both = np.isfinite(track.innovation) & np.isfinite(other.innovation)
@@ -367,8 +383,8 @@ def heavy(measured: Measured, estimator: str, options: dict[str, float] | None =
     reason += f"; weighed so, the innovations are {100 * abs(change):.2g} % {'larger' if change > 0 else 'smaller'}"
     if change > WORSE:
         reason += ": the asset jumps, not the sensor; weights would reject good measurements"
-        return Claim("tails", TAILS_QUESTION, NO, worst.kurtosis, HEAVY, TAILS_OF, reason), np.inf
-    return Claim("tails", TAILS_QUESTION, YES, worst.kurtosis, HEAVY, TAILS_OF, reason), dof
+        return Claim("tails", TAILS_QUESTION, NO, worst.kurtosis, HEAVY_KURTOSIS, TAILS_OF, reason), np.inf
+    return Claim("tails", TAILS_QUESTION, YES, worst.kurtosis, HEAVY_KURTOSIS, TAILS_OF, reason), dof
 
 
 def with_weights(estimator: str, dof: float) -> tuple[str, dict[str, float]]:

@@ -10,7 +10,7 @@ import numpy as np
 
 from estimators.diagnostics.innovations import flat_range
 from estimators.diagnostics.score import nis_verdict
-from estimators.diagnostics.sensitivity import View, gramian
+from estimators.diagnostics.sensitivity import GramianView, gramian
 from estimators.log import Events
 from estimators.model.state_space import LARGE
 from estimators.registry import find_entry
@@ -57,7 +57,7 @@ class FoldFigures:
 
     revision: int
     cost: float
-    observability: View | None
+    observability: GramianView | None
     reason: str
     note: str = ""
 

@@ -19,13 +19,24 @@ import numpy as np
 from estimators.diagnostics.detectors import OUTSIDE
 from estimators.diagnostics.episodes import episodes
 from estimators.diagnostics.score import Score, score
-from estimators.diagnostics.sensitivity.responses import SMOOTH, astray, stand_in
+from estimators.diagnostics.sensitivity.responses import DETERMINISTIC_FILTERS, astray, stand_in
 from estimators.diagnostics.sensitivity.visibility import fault_tests
 from estimators.fold import Fold
 from estimators.log import READING
 
 from ...twin.twin import Twin
-from .scenario import Bench, Folded, Mistake, accused, asset_of, first_word, green_share, heard_in, recovery, said_at
+from .scenario import (
+    Bench,
+    Mistake,
+    StressFold,
+    accused,
+    asset_of,
+    first_word,
+    green_share,
+    heard_in,
+    recovery,
+    said_at,
+)
 
 VISIBLE, INVISIBLE, CHANCE = FORETOLD = ("visible", "invisible", "by chance")
 
@@ -38,7 +49,7 @@ REHEARSALS = 5
 DETECTION_SHARE = 0.5
 """Share of the time that a mistake lasts within which each rehearsal must find what is visible."""
 
-OTHERS = 1000
+REHEARSAL_SEED = 1000
 """Seeds from here on are of rehearsals."""
 
 
@@ -89,7 +100,7 @@ class Oracle:
             while len(self._benches) < REHEARSALS:
                 k = len(self._benches)
                 begin = (k + 0.5) / REHEARSALS * 2.0 / 3.0 if recorded else 1.0 / 3.0
-                self._benches.append(Bench(self.twin, OTHERS + k, self.duration, begin))
+                self._benches.append(Bench(self.twin, REHEARSAL_SEED + k, self.duration, begin))
             after = [bench.found_after(mistake, estimator) for bench in self._benches]
         if not after:
             return Foretold(CHANCE)
@@ -100,7 +111,7 @@ class Oracle:
     def _later(self, mistake: Mistake, estimator: str) -> list[float]:
         """When a wrong belief is found that begins later in a recording: a share for each length of the logs."""
         if self._whole is None:
-            self._whole = Bench(self.twin, OTHERS, (REHEARSALS + 1) * self.duration)
+            self._whole = Bench(self.twin, REHEARSAL_SEED, (REHEARSALS + 1) * self.duration)
         whole, step = self._whole, round(self.duration * 1e9)
         begins = [whole.origin + k * step for k in range(1, round(whole.length / self.duration))]
         return [whole.found_within(mistake, estimator, begin, begin + step) for begin in begins]
@@ -112,7 +123,7 @@ def shift_of(bench: Bench, mistake: Mistake, estimator: str) -> Foretold | None:
     Rejected measurements still count for the detectors, so a twin with a gate is folded with and without it.
     """
     name, _ = stand_in(estimator, bench.twin.model)
-    if name != estimator and name not in SMOOTH:
+    if name != estimator and name not in DETERMINISTIC_FILTERS:
         return None
     calm = bench.fold(None, name, None).fold
     if astray(estimator, name, calm.track.select(slice(0, calm.n))):
@@ -278,7 +289,7 @@ def _outcome(mistake: Mistake, foretold: str, heard: bool, named: bool) -> str:
     return NAMED if named else MISNAMED
 
 
-def _score(folded: Folded, start: int, end: int) -> Score:
+def _score(folded: StressFold, start: int, end: int) -> Score:
     t = folded.truth.t
     rows = (t >= start) & (t <= end)
     track = folded.fold.track.select(slice(0, t.size)).select(rows)

@@ -31,7 +31,7 @@ from ...twin.twin import Twin
 if TYPE_CHECKING:
     from sources.faults.kinds import Fault
 
-ANYBODY: frozenset[str] = frozenset()
+ANY_SUBJECT: frozenset[str] = frozenset()
 """Subjects of a fault that concerns no particular sensor."""
 
 
@@ -50,7 +50,7 @@ class Mistake:
 
     name: str
     causes: frozenset[str]
-    subjects: frozenset[str] = ANYBODY
+    subjects: frozenset[str] = ANY_SUBJECT
     belief: Mapping[str, float] = field(default_factory=dict)
     fault: Callable[[float, float], list[Fault]] | None = None
     of_asset: bool = False
@@ -67,7 +67,7 @@ class Mistake:
         return not self.subjects or not self.subjects.isdisjoint((name, name.partition(".")[0]))
 
 
-class Folded(NamedTuple):
+class StressFold(NamedTuple):
     """A fold of a log without its true states, the same events with them, and how many came too late for it."""
 
     fold: Fold
@@ -151,8 +151,8 @@ class Bench:
         self.origin = int(self.events.t[0])
         self.length = float(self.events.t.max() - self.events.t[0]) * 1e-9
         # Folds of the log as it is, and of the mistake that is looked at, by filter and gate.
-        self._calm: dict[tuple[str, float | None], Folded] = {}
-        self._wrong: dict[tuple[str, float | None], Folded] = {}
+        self._calm: dict[tuple[str, float | None], StressFold] = {}
+        self._wrong: dict[tuple[str, float | None], StressFold] = {}
         self._present = ""
 
     def window(self, mistake: Mistake) -> tuple[float, float]:
@@ -191,7 +191,7 @@ class Bench:
         fold = self._folded(estimator, self._tuning(estimator, mistake).set("gate", gate), log, base)
         return _share(first_word(fold, begin, calm), end - begin)
 
-    def fold(self, mistake: Mistake | None, estimator: str, gate: float | None) -> Folded:
+    def fold(self, mistake: Mistake | None, estimator: str, gate: float | None) -> StressFold:
         """The log with a mistake, or without, folded with a filter and a gate.
 
         Raises:
@@ -227,14 +227,14 @@ class Bench:
             tuning = tuning.set(key, factor * float(tuning.get(key) or 0.0))
         return tuning
 
-    def _fold(self, estimator: str, tuning: Tuning, events: Events) -> Folded:
+    def _fold(self, estimator: str, tuning: Tuning, events: Events) -> StressFold:
         twin = self.twin
         log = Log.of(twin.model, capacity=max(1, len(events)))
         _, stale = log.extend(events, round(twin.config.time.horizon * 1e9))
         truth = log.events.select(slice(None))
         untold = Log.of(twin.model, capacity=max(1, len(truth)))
         untold.extend(without_truth(truth))
-        return Folded(self._folded(estimator, tuning, untold), truth, stale)
+        return StressFold(self._folded(estimator, tuning, untold), truth, stale)
 
     def _folded(self, estimator: str, tuning: Tuning, log: Log, base: Base | None = None) -> Fold:
         twin = self.twin
@@ -261,7 +261,7 @@ def _everything(source: object, width: int) -> Events:
 if TYPE_CHECKING:
     from estimators.fold import Fold
 
-SAME = 1_000_000_000
+SAME_EPISODE_NS = 1_000_000_000
 """ns between two episodes of one subject and cause that are the same, with a mistake and without."""
 
 
@@ -320,7 +320,7 @@ def heard_in(fold: Fold, calm: Fold) -> list[tuple[int, Episode]]:
             (at, item)
             for at, item in ((said_at(fold, item), item) for item in episodes(fold))
             if not any(
-                (item.subject, item.cause) == (other.subject, other.cause) and abs(at - when) < SAME
+                (item.subject, item.cause) == (other.subject, other.cause) and abs(at - when) < SAME_EPISODE_NS
                 for when, other in known
             )
         ),

@@ -10,7 +10,7 @@ import numpy as np
 from ...log import READING, RESET
 from ...track import GATED, REASONS, SCREENED, USED
 from ..detectors import AGREEING, BITS, DETECTORS, DISAGREEING, LOST, REFUSED, STUCK, Detector, detector_of, log_ratios
-from ..effects import EVIDENCE, KINDS, Effect, against, common_scale, effects, onset
+from ..effects import EVIDENCE, KINDS, InnovationEffect, against, common_scale, effects, onset
 from .episode import JOINED, AlarmRun, Episode, FoundEpisode, JudgedRows, runs, standardised, without_baseline
 from .wording import SensorFacts, return_text
 
@@ -49,7 +49,7 @@ ALARM_KEYS = {"sensor": KNOWN_EFFECTS, "lost": LOST, **{detector.name: detector.
 
 
 class RunEffect(NamedTuple):
-    """Effect in measurements `begun` to `over` of row k of a sensor: `cause`, `size` and its 95 % interval.
+    """InnovationEffect in measurements `begun` to `over` of row k of a sensor: `cause`, `size` and its 95 % interval.
 
     correlation: lag-1 correlation of the innovations, which decides whether Q or R explains their scale. back: whether
     the measurements that follow are normal again, though the slowest test has not cleared yet.
@@ -214,7 +214,7 @@ def _best_effect(
     Innovations that wander have no mean over the whole run: their shifted part is more informative.
     """
     first = _earliest(judged, rows, masks, run)
-    unknown = [Effect("narrow", np.nan, np.nan, np.nan, -np.inf)]
+    unknown = [InnovationEffect("narrow", np.nan, np.nan, np.nan, -np.inf)]
     best = int(said[0]) if said.size else 0, run.begin, run.end, unknown, np.zeros(0)
     shifted = best
     for k in said:
@@ -250,7 +250,7 @@ def _best_effect(
     return RunEffect(*best[:3], effect.cause, effect.size, effect.low, effect.high, correlation, back)
 
 
-def _is_back(e: np.ndarray, effect: Effect) -> bool:
+def _is_back(e: np.ndarray, effect: InnovationEffect) -> bool:
     """Return whether e (n,) after an effect is normal: the effect is over, and no smaller one of its kind remains.
 
     A filter follows a biased sensor, so that a shift shrinks while its cause lasts.

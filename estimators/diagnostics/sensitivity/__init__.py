@@ -1,10 +1,10 @@
 """What could be wrong without anyone noticing: sensitivities, smallest visible faults, integrity, observability."""
 
-from .gramian import Gramian, View, gramian
+from .gramian import Gramian, GramianView, gramian
 from .responses import Nudge, Response
 from .sensitivity import Bound, Sensitivity, Smallest, bounds_of, sensitivity, smallest_of
 
 __all__ = [
-    "Bound", "Gramian", "Nudge", "Response", "Sensitivity", "Smallest", "View", "bounds_of", "gramian", "sensitivity",
-    "smallest_of",
+    "Bound", "Gramian", "GramianView", "Nudge", "Response", "Sensitivity", "Smallest", "bounds_of", "gramian",
+    "sensitivity", "smallest_of",
 ]  # fmt: skip

@@ -19,10 +19,10 @@ from ..innovations import ljung_box
 from ..intervals import Interval, correlation_interval
 from .responses import MOST_STATES, digits, each
 
-CLOSE = 0.1
+SPREAD_TOLERANCE = 0.1
 """Share by which the standard deviations of an ensemble may be off by chance."""
 
-BUSY = 0.5
+MAX_PROCESSOR_SHARE = 0.5
 """Share of one processor that an estimate may take: the rest is for late readings and for refolds."""
 
 
@@ -60,7 +60,7 @@ def dimension(model: StateSpaceModel, rate: float, seconds: float, *, covariance
     n = model.nx
     rows = max(len(sensor.rows) for sensor in model.sensors)
     share = rate * seconds
-    members = int(np.ceil(1.0 + 0.5 / CLOSE**2))
+    members = int(np.ceil(1.0 + 0.5 / SPREAD_TOLERANCE**2))
     return Dimension(
         nx=n,
         rows=rows,
@@ -71,7 +71,7 @@ def dimension(model: StateSpaceModel, rate: float, seconds: float, *, covariance
         share=share,
         largest=n * share ** (-1.0 / 3.0) if covariance and share > 0.0 else np.nan,
         members=members,
-        passes=share <= BUSY and (n <= LARGE or not covariance),
+        passes=share <= MAX_PROCESSOR_SHARE and (n <= LARGE or not covariance),
     )
 
 
@@ -130,10 +130,10 @@ def arrivals(model: StateSpaceModel, log: Log) -> tuple[Arrivals, ...]:
     return tuple(found)
 
 
-LEAST = 0.001
+MIN_DIFFERENCE = 0.001
 """Smallest share of σ that is reported."""
 
-QUANTILE = 0.95
+DIFFERENCE_QUANTILE = 0.95
 """Quantile of the differences along the track; a few at the start, with the spread of the prior, do not matter."""
 
 LINEARISED, UNSCENTED = "ekf", "ukf"
@@ -229,7 +229,7 @@ def _curvature(name: str, apart: np.ndarray) -> Curvature:
     there = apart[~np.isnan(apart)]
     if not there.size:
         return Curvature(name, 0.0, 0.0)
-    return Curvature(name, float(np.sqrt(np.mean(there**2))), float(np.quantile(there, QUANTILE)))
+    return Curvature(name, float(np.sqrt(np.mean(there**2))), float(np.quantile(there, DIFFERENCE_QUANTILE)))
 
 
 def _apart(one: np.ndarray, other: np.ndarray, std: np.ndarray, circular: bool) -> np.ndarray:
@@ -278,13 +278,13 @@ def _judged(track: Track, k: int) -> np.ndarray:
 
 
 def _at_most(most: float) -> str:
-    return f"less than {LEAST:g} σ" if most < LEAST else f"at most {digits(most)} σ"
+    return f"less than {MIN_DIFFERENCE:g} σ" if most < MIN_DIFFERENCE else f"at most {digits(most)} σ"
 
 
 def _in_words(exact: bool, apart: tuple[Curvature, ...], bad: list[White]) -> str:
     worst = max(apart, key=lambda item: item.most)
     figure = (
-        f"{100 * QUANTILE:.0f} % of the time {LINEARISED} and {UNSCENTED} are {_at_most(worst.most)} apart "
+        f"{100 * DIFFERENCE_QUANTILE:.0f} % of the time {LINEARISED} and {UNSCENTED} are {_at_most(worst.most)} apart "
         f"({worst.name})"
     )
     if exact:

@@ -41,17 +41,17 @@ from .responses import (
     stand_in,
 )
 
-TOLD = 1.0
+RANK_INFORMATION = 1.0
 """Information, in units of the prior's, from which the measurements determine a direction better than the prior."""
 
-SURE = 1e-9
+MIN_VARIANCE_SHARE = 1e-9
 """Least share of the prior's variance that differences tell from zero; no eigenvalue is larger than its reciprocal."""
 
-BEYOND = 1.05
+MAX_LINEAR_EIGENVALUE = 1.05
 """Eigenvalue of G from which the filter responds nonlinearly to nudges: for a linear model none is above 1."""
 
 
-class View(NamedTuple):
+class GramianView(NamedTuple):
     """Information of the measurements of a part of the log about the state at its beginning.
 
     begin, end: ns. gramian (nx, nx): J, in the prior's standard deviations; eigenvalues (nx,), ascending. rank: number
@@ -79,8 +79,8 @@ class Gramian(NamedTuple):
     estimator: str
     reason: str
     note: str
-    whole: View | None
-    windows: tuple[View, ...]
+    whole: GramianView | None
+    windows: tuple[GramianView, ...]
 
 
 def gramian(
@@ -137,7 +137,9 @@ def gramian(
     return Gramian(name, "", note, views[0], tuple(views[1:]))
 
 
-def _view(estimator: str, model: StateSpaceModel, tuning: Tuning, log: Log, begin: int, end: int, base: Base) -> View:
+def _view(
+    estimator: str, model: StateSpaceModel, tuning: Tuning, log: Log, begin: int, end: int, base: Base
+) -> GramianView:
     part = log.copy()
     part.n = end
     if begin:
@@ -148,25 +150,25 @@ def _view(estimator: str, model: StateSpaceModel, tuning: Tuning, log: Log, begi
     told = [_response(begun, j, std)[used] for j, std in enumerate(model.prior_std.tolist())]
     g = information(told)
     values, vectors = np.linalg.eigh(g)
-    left = np.clip(1.0 - values, SURE, 1.0)
+    left = np.clip(1.0 - values, MIN_VARIANCE_SHARE, 1.0)
     # A state that is certain at first cannot be nudged, and nothing need be told of it.
     free = model.prior_std > 0.0
     eigenvalues = np.clip(values, 0.0, None) / left
-    order = [k for k in range(model.nx) if np.any(np.abs(vectors[free, k]) > SURE)]
+    order = [k for k in range(model.nx) if np.any(np.abs(vectors[free, k]) > MIN_VARIANCE_SHARE)]
     weak = vectors[:, order[0]] if order else np.zeros(model.nx)
     weak = weak * (np.sign(weak[np.argmax(np.abs(weak))]) or 1.0)
     kept = eigenvalues[order]
-    return View(
+    return GramianView(
         begin=int(part.t[0]),
         end=int(part.t[part.n - 1]),
         gramian=(vectors * eigenvalues) @ vectors.T,
         eigenvalues=eigenvalues,
-        rank=int(np.sum(eigenvalues > TOLD)),
+        rank=int(np.sum(eigenvalues > RANK_INFORMATION)),
         conditioning=float(kept[-1] / kept[0]) if kept.size and kept[0] > 0.0 else np.inf,
         deviation=np.sqrt((vectors**2) @ left),
         weakest=weak,
         text=_in_words(weak, model, float(left[order[0]]) if order else 0.0),
-        beyond=bool(np.any(values > BEYOND)),
+        beyond=bool(np.any(values > MAX_LINEAR_EIGENVALUE)),
     )
 
 
@@ -193,14 +195,14 @@ def _in_words(weights: np.ndarray, model: StateSpaceModel, left: float) -> str:
     return f"{together}: {100 * np.sqrt(left):.3g} % of its prior deviation is left"
 
 
-LEAST = 1e-10
+MIN_EIGENVALUE = 1e-10
 """Eigenvalue of the information, scaled to a unit diagonal, that differences cannot distinguish from zero."""
 
-PRESENT = 1e-3
+MIN_NULL_SHARE = 1e-3
 """Share of a nudge in a direction below which it is not part of it."""
 
 
-PART = 0.05
+MIN_NAMED_SHARE = 0.05
 """Share of the largest part of a direction below which another is not named."""
 
 
@@ -244,13 +246,13 @@ def uncertainty(fisher: np.ndarray, nudges: Sequence[Nudge]) -> Uncertainty:
     seen = np.isfinite(alone)
     unit = np.where(seen, alone, 0.0)
     values, vectors = np.linalg.eigh(fisher * np.outer(unit, unit))
-    told = values > LEAST
+    told = values > MIN_EIGENVALUE
     shares = vectors**2
     spread = shares[:, told] @ (1.0 / values[told])
-    lost = ~seen | (shares[:, ~told].sum(axis=1) > PRESENT**2)
+    lost = ~seen | (shares[:, ~told].sum(axis=1) > MIN_NULL_SHARE**2)
     deviation = np.where(lost, np.inf, np.sqrt(spread) * unit)
     # Of what the log cannot tell, the null space says which goes with which; the rest is nothing beside it.
-    weight = np.where(told, 1.0 / np.maximum(values, LEAST), 1.0 / LEAST)
+    weight = np.where(told, 1.0 / np.maximum(values, MIN_EIGENVALUE), 1.0 / MIN_EIGENVALUE)
     cov = (vectors * weight) @ vectors.T
     root = np.sqrt(np.diag(cov)) if k else np.zeros(0)
     return Uncertainty(tuple(nudges), deviation, alone, cov / np.outer(root, root), directions(fisher, nudges))
@@ -260,7 +262,7 @@ def directions(fisher: np.ndarray, nudges: Sequence[Nudge]) -> tuple[Direction, 
     """Return independent combinations of nudges, the least determined first."""
     scale = np.array([nudge.scale for nudge in nudges])
     values, vectors = np.linalg.eigh(fisher * np.outer(scale, scale))
-    least = LEAST * max(float(values.max(initial=0.0)), np.finfo(float).tiny)
+    least = MIN_EIGENVALUE * max(float(values.max(initial=0.0)), np.finfo(float).tiny)
     found = []
     for value, weights in zip(values, vectors.T, strict=True):
         weights = weights * (np.sign(weights[np.argmax(np.abs(weights))]) or 1.0)
@@ -272,7 +274,7 @@ def directions(fisher: np.ndarray, nudges: Sequence[Nudge]) -> tuple[Direction, 
 def in_words(weights: np.ndarray, nudges: Sequence[Nudge], most: int = 4) -> str:
     """Describe a combination of nudges: its largest parts, parameters in percent of their values, others in units."""
     order = np.argsort(-np.abs(weights), kind="stable")
-    order = order[np.abs(weights[order]) >= PART * np.abs(weights[order[0]])]
+    order = order[np.abs(weights[order]) >= MIN_NAMED_SHARE * np.abs(weights[order[0]])]
     largest = np.abs(weights[order[0]])
     parts = [nudges[j].in_words(float(weights[j] / largest) * nudges[j].scale) for j in order[:most]]
     more = f" and {len(order) - most} more" if len(order) > most else ""

@@ -19,14 +19,14 @@ from ..calibration import BANDS, calibrations
 from ..score import Fit, Score, score
 from .responses import each
 
-MARGIN = 0.05
+WORSE_MARGIN = 0.05
 """Share by which an error must exceed that of the open loop before the filter is said to make it worse."""
 
-ALONE = ("particle", "ensemble")
+MONTE_CARLO_FAMILIES = ("particle", "ensemble")
 """Families whose folds run one after the other: each of them runs on all processors."""
 
 
-class Prediction(NamedTuple):
+class HeldOutPrediction(NamedTuple):
     """A sensor row that is predicted without its sensor, at `n` readings.
 
     rms and bias (prediction less reading) in `unit`; coverage (3,) the shares of the readings inside the bands `BANDS`
@@ -66,13 +66,13 @@ class Against(NamedTuple):
 class HeldOut(NamedTuple):
     """All rows of sensors that speak, and all states whose truth is known."""
 
-    rows: tuple[Prediction, ...]
+    rows: tuple[HeldOutPrediction, ...]
     states: tuple[Against, ...]
 
 
 def worse(rms: float, floor: float) -> bool:
     """Whether an error is larger than that of the open loop by more than the margin; an error of no size is not."""
-    return bool(rms > (1.0 + MARGIN) * floor)
+    return bool(rms > (1.0 + WORSE_MARGIN) * floor)
 
 
 def held_out(
@@ -111,11 +111,11 @@ def held_out(
         fold.finish()
         return fold
 
-    if find_estimator(estimator, model).family in ALONE:
+    if find_estimator(estimator, model).family in MONTE_CARLO_FAMILIES:
         executor = None
     filtered, floor, *folds = each(run, [tuning, nobody, *without], executor)
     open_rows = _score(floor).held_out
-    rows: list[Prediction] = []
+    rows: list[HeldOutPrediction] = []
     for s, fold in zip(speak, folds, strict=True):
         rows += _predictions(fold, s, open_rows)
     return HeldOut(tuple(rows), tuple(_states(filtered, floor)))
@@ -126,7 +126,7 @@ def _score(fold: Fold) -> Score:
     return score(fold.track, fold.log.events, fold.model, pictures, gate=fold.tuning.gate)
 
 
-def _predictions(fold: Fold, s: int, floor: dict[str, Fit]) -> list[Prediction]:
+def _predictions(fold: Fold, s: int, floor: dict[str, Fit]) -> list[HeldOutPrediction]:
     """Return the predictions of the rows of sensor s, which this fold holds out."""
     model, log = fold.model, fold.log
     own = np.flatnonzero(
@@ -139,7 +139,7 @@ def _predictions(fold: Fold, s: int, floor: dict[str, Fit]) -> list[Prediction]:
     first = model.row_start[s]
     by_name = dict(zip(model.row_names[first : first + len(units)], units, strict=True))
     return [
-        Prediction(
+        HeldOutPrediction(
             row=entry.subject,
             sensor=model.sensor_names[s],
             unit=by_name[entry.subject],

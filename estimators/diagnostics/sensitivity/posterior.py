@@ -22,7 +22,7 @@ from ...tuning import Tuning
 from ..calibration import standardised
 from ..innovations import jarque_bera
 
-LOOKS = 150
+MAX_LOOKS = 150
 """Times at which the cloud is looked at; finding its peaks takes milliseconds."""
 
 MOST_STATES = 12
@@ -30,31 +30,31 @@ MOST_STATES = 12
 
 MOST_EVENTS = 4000
 
-DISTINCT = 0.2
+DISTINCT_SHARE = 0.2
 """Share of a cloud's members that must differ after a reading; of fewer, clusters are of chance."""
 
-COLLAPSED = 0.5
+COLLAPSED_SHARE = 0.5
 """Share of looks at a collapsed cloud from which its shape is not informative."""
 
-WEIGHT = 0.001
+MIN_PEAK_WEIGHT = 0.001
 """Share of the other cloud that a peak must have there, too."""
 
-NEAR = 3.0
+NEAR_SIGMA = 3.0
 """Standard deviations in each state, within which a point belongs to a peak."""
 
-DIP = 0.5
+PEAK_DIP = 0.5
 """Share of the points at either end, of which there must be fewer in the middle between two peaks."""
 
-OFTEN = 0.05
+FREQUENT_SHARE = 0.05
 """Share of the looks with more than one peak, from which on the posterior has several."""
 
-HEAVY = 1.0
+HEAVY_KURTOSIS = 1.0
 """Excess kurtosis that matters: that of Student's t with ten degrees of freedom."""
 
-FAR = 4.0
+FAR_SIGMA = 4.0
 """Standard deviations beyond which a normal innovation lies once in 16,000 readings."""
 
-LEAST = 50
+MIN_TAIL_MEASUREMENTS = 50
 """Readings of which a kurtosis is taken at least."""
 
 
@@ -88,7 +88,7 @@ class Tail(NamedTuple):
     @property
     def heavy(self) -> bool:
         """Whether the tails are heavier than a normal distribution's by more than matters."""
-        return self.n >= LEAST and self.kurtosis > HEAVY
+        return self.n >= MIN_TAIL_MEASUREMENTS and self.kurtosis > HEAVY_KURTOSIS
 
 
 def peaks(estimator: str, model: StateSpaceModel, tuning: Tuning, log: Log, *, base: Base | None = None) -> Peaks:
@@ -113,22 +113,22 @@ def peaks(estimator: str, model: StateSpaceModel, tuning: Tuning, log: Log, *, b
     end = min(log.n, MOST_EVENTS)
     # After a reading, where a cloud that has lost its variety shows it: later, noise moves copies apart.
     stops = np.flatnonzero(log.kind[:end] == READING) + 1
-    stops = stops[np.unique(np.linspace(0, stops.size - 1, min(stops.size, LOOKS)).round().astype(int))]
+    stops = stops[np.unique(np.linspace(0, stops.size - 1, min(stops.size, MAX_LOOKS)).round().astype(int))]
     folds = [Fold(estimator, model, replace(tuning, seed=tuning.seed + k), log, base=base) for k in range(2)]
     counts = []
     for stop in stops:
         for fold in folds:
             fold.advance(int(stop) - fold.n)
         points, other = (fold.points() for fold in folds)
-        varied = len(np.unique(points, axis=0)) >= DISTINCT * len(points)
+        varied = len(np.unique(points, axis=0)) >= DISTINCT_SHARE * len(points)
         counts.append(_confirmed(folds[0].peaks(), other, model.circular) if varied else 0)
     over = float(log.t[end - 1] - log.t[0]) * 1e-9
     found = np.array(counts, int)
     collapsed = float(np.mean(found == 0)) if found.size else 0.0
-    if collapsed > COLLAPSED:
+    if collapsed > COLLAPSED_SHARE:
         reason = (
-            f"{100 * collapsed:.3g} % of the time fewer than {100 * DISTINCT:.0f} % of the particles of {estimator} "
-            "differ, as the readings are too sharp for so few"
+            f"{100 * collapsed:.3g} % of the time fewer than {100 * DISTINCT_SHARE:.0f} % of the particles of "
+            f"{estimator} differ, as the readings are too sharp for so few"
         )
     found = found[found > 0]
     several = float(np.mean(found > 1)) if found.size else np.nan
@@ -153,10 +153,10 @@ def _apart(one: Peak, other: Peak, points: np.ndarray, circular: np.ndarray) -> 
     middle = one.mean + 0.5 * _less(other.mean, one.mean, circular)
 
     def share(centre: np.ndarray) -> float:
-        return float(np.mean(np.all(np.abs(_less(points, centre, circular)) <= NEAR * spread, axis=1)))
+        return float(np.mean(np.all(np.abs(_less(points, centre, circular)) <= NEAR_SIGMA * spread, axis=1)))
 
     ends = min(share(one.mean), share(other.mean))
-    return ends >= WEIGHT and share(middle) < DIP * ends
+    return ends >= MIN_PEAK_WEIGHT and share(middle) < PEAK_DIP * ends
 
 
 def _less(one: np.ndarray, other: np.ndarray, circular: np.ndarray) -> np.ndarray:
@@ -177,7 +177,7 @@ def tails(model: StateSpaceModel, log: Log, track: Track, *, marginal: bool) -> 
             variance = float(np.mean(z**2)) if z.size else 0.0
             if variance > 0.0:
                 kurtosis = float(np.mean(z**4)) / variance**2 - 3.0
-                far = float(np.mean(np.abs(z) > FAR * np.sqrt(variance)))
+                far = float(np.mean(np.abs(z) > FAR_SIGMA * np.sqrt(variance)))
                 name = model.row_names[model.row_start[s] + k]
                 found.append(Tail(name, int(e.size), kurtosis, far, jarque_bera(e).p_value))
     return tuple(found)

@@ -19,7 +19,7 @@ from ...snapshots import Base
 from ...track import DIVERGED, MISSING, NONE, USED, Track
 from ...tuning import Tuning
 
-SMOOTH = ("ekf", "ukf", "kf")
+DETERMINISTIC_FILTERS = ("ekf", "ukf", "kf")
 """Deterministic filters that replace a Monte Carlo one, the first that applies."""
 
 MAX_DIVERGED_SHARE = 0.1
@@ -63,7 +63,7 @@ def stand_in(estimator: str, model: StateSpaceModel) -> tuple[str, str]:
     """
     if find_estimator(estimator, model).family not in ("particle", "ensemble"):
         return estimator, ""
-    for name in SMOOTH:
+    for name in DETERMINISTIC_FILTERS:
         if unfit(find_entry(name), model) is None:
             return name, f"{estimator} is a Monte Carlo filter; nudged in its place: {name}"
     return (
@@ -121,7 +121,7 @@ def respond(begun: Start, nudge: Nudge) -> Response:
     return Response(nudge, *(change / (high - low) for change in moved(begun, above, below)))
 
 
-class Moved(NamedTuple):
+class TrackDifference(NamedTuple):
     """Difference of two tracks; see `Response`."""
 
     innovation: np.ndarray
@@ -129,7 +129,7 @@ class Moved(NamedTuple):
     states: np.ndarray
 
 
-def moved(begun: Start, new: Track, old: Track | None = None) -> Moved:
+def moved(begun: Start, new: Track, old: Track | None = None) -> TrackDifference:
     """Subtract a track from another, by default that of the fold without nudge; angles by the shorter way."""
     model = begun.given.tuning.model
     log = begun.given.log
@@ -149,7 +149,7 @@ def moved(begun: Start, new: Track, old: Track | None = None) -> Moved:
     for j, state in enumerate(model.shown_states):
         if state.circular:
             states[:, j] = _shorter(states[:, j])
-    return Moved(innovation, whitened, states)
+    return TrackDifference(innovation, whitened, states)
 
 
 def _shorter(angle: np.ndarray) -> np.ndarray:

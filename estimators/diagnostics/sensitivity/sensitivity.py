@@ -85,7 +85,7 @@ class Sensitivity(NamedTuple):
     integrity_bias: np.ndarray
     integrity: np.ndarray
     integrity_cause: np.ndarray
-    over_time: ProtectionLevels
+    over_time: ErrorBounds
 
     @property
     def nudges(self) -> tuple[Nudge, ...]:
@@ -226,7 +226,7 @@ def _nothing(estimator: str, reason: str, shown: int) -> Sensitivity:
         integrity_bias=unknown,
         integrity=unknown,
         integrity_cause=cause,
-        over_time=ProtectionLevels(rows, rows, np.zeros((0, shown), int)),
+        over_time=ErrorBounds(rows, rows, np.zeros((0, shown), int)),
     )
 
 
@@ -234,7 +234,7 @@ PROBABILITY = 0.95
 """Probability that an error stays below the protection level, under the worst undetectable fault."""
 
 
-class ProtectionLevels(NamedTuple):
+class ErrorBounds(NamedTuple):
     """Bounds of the error of each state, row by row, under one undetectable fault from the first row on.
 
     bias (N, shown): the largest |dx| of any undetectable fault. bound (N, shown): bias + 1.96 σ, exceeded by the error
@@ -246,14 +246,14 @@ class ProtectionLevels(NamedTuple):
     cause: np.ndarray
 
 
-def integrity(errors: Sequence[np.ndarray], std: np.ndarray) -> ProtectionLevels:
+def integrity(errors: Sequence[np.ndarray], std: np.ndarray) -> ErrorBounds:
     """Return the bounds from the error (N, shown) of the largest undetectable fault of each nudge, and σ (N, shown)."""
     bias = np.zeros(std.shape)
     cause = np.full(std.shape, -1)
     for k, error in enumerate(errors):
         worse = error > bias
         bias[worse], cause[worse] = error[worse], k
-    return ProtectionLevels(bias, bias + normal_quantile(0.5 + PROBABILITY / 2.0) * std, cause)
+    return ErrorBounds(bias, bias + normal_quantile(0.5 + PROBABILITY / 2.0) * std, cause)
 
 
 TWO_SIGMA = normal_quantile(0.5 + PROBABILITY / 2.0)

@@ -7,7 +7,7 @@ import pytest
 
 from app.ingest import CLOCK_MOVED, Planned
 from app.live import commands
-from app.live.alerts import Silence
+from app.live.alerts import SilentSource
 from app.live.engine import Engine
 from app.live.notices import Notices
 from app.live.watchers import HostClock
@@ -134,7 +134,7 @@ def test_a_bus_that_is_open_and_silent_waits_and_goes_stale_and_goes_on(start):
 def test_it_waits_until_then():
     now = [100.0]
     notices = Notices(lambda: 0)
-    silence = Silence(notices, 15.0, lambda: now[0])
+    silence = SilentSource(notices, 15.0, lambda: now[0])
     assert silence.health == WAITING
     now[0] = 115.0
     silence.look(live=True)

@@ -5,7 +5,7 @@ import pytest
 from scipy.signal import lfilter
 from scipy.stats import chi2, norm
 
-from estimators.diagnostics.calibration import Limits, calibrations, truth_calibration
+from estimators.diagnostics.calibration import CalibrationLimits, calibrations, truth_calibration
 from estimators.events.batch import READING, TRUTH, Events
 from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
 from estimators.track import GATED, HELD_OUT, MISSING, USED, Track
@@ -83,7 +83,7 @@ def test_each_fault_is_said_and_no_other():
 def test_only_what_surely_matters_is_said():
     """A band a tenth too narrow, however many readings tell; a larger size of which the interval is too wide."""
     assert of(1.1 * normal(2, 50_000)).words == ()
-    assert of(1.1 * normal(2, 50_000), limits=Limits(width=0.05)).words != ()
+    assert of(1.1 * normal(2, 50_000), limits=CalibrationLimits(width=0.05)).words != ()
     short = of(1.4 * normal(3, 24))
     assert short.words == () and short.scale.low < 1.25
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from estimators.diagnostics.clock_fit import MOST, LeastDelays
+from estimators.diagnostics.clock_fit import MAX_SEGMENTS, LeastDelays
 from tests.support import SECOND
 
 
@@ -64,7 +64,7 @@ def test_memory_is_bounded_and_a_day_is_a_line_too():
     t, arrival = stamped(4, ppm=12.5, seconds=86400, rate=1)
     delays = LeastDelays()
     delays.note(t, arrival)
-    assert len(delays._at) <= MOST
+    assert len(delays._at) <= MAX_SEGMENTS
     assert abs(delays.fit().drift_ppm - 12.5) < 0.05
 
 

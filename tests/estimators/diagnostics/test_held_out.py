@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from estimators.diagnostics.held_out import FEWEST, LAST, Offset, offsets
+from estimators.diagnostics.held_out import LAST_MEASUREMENTS, MIN_MEASUREMENTS, Offset, offsets
 from estimators.log import READING, Events
 from estimators.models import MODELS
 from estimators.track import HELD_OUT, USED, Track
@@ -38,18 +38,18 @@ def test_of_sensors_that_read_right_five_in_a_hundred_are_called_off():
 def test_a_shift_is_said_with_its_size_and_what_is_left_open():
     (found,) = shown(2.4 + 0.5 * np.random.default_rng(2).normal(size=500))
     assert found.sensor == "yoke" and found.beyond
-    assert found.offset == pytest.approx(2.4, abs=4 * 0.5 / np.sqrt(LAST))
-    allowed = 1.96 * np.sqrt(P + 0.25 / LAST)
+    assert found.offset == pytest.approx(2.4, abs=4 * 0.5 / np.sqrt(LAST_MEASUREMENTS))
+    allowed = 1.96 * np.sqrt(P + 0.25 / LAST_MEASUREMENTS)
     text = f"yoke, held out, reads 2.4 °C above what the others say, beyond the ±{allowed:.2g} °C that they leave open"
     assert found.words == text
 
 
 def test_only_the_last_readings_count_and_few_say_nothing():
-    innovations = np.concatenate([np.full(1000, 50.0), np.full(LAST, -0.1)])
+    innovations = np.concatenate([np.full(1000, 50.0), np.full(LAST_MEASUREMENTS, -0.1)])
     (found,) = shown(innovations)
     assert found.offset == pytest.approx(-0.1) and not found.beyond
     assert found.words.startswith("yoke, held out, reads as the others say: 0.1 °C below")
-    assert shown(np.ones(FEWEST - 1)) == []
+    assert shown(np.ones(MIN_MEASUREMENTS - 1)) == []
 
 
 def test_a_sensor_in_use_is_not_looked_at_and_one_without_others_says_so():

@@ -7,7 +7,7 @@ from scipy.stats import norm, t
 from statsmodels.stats.proportion import proportion_confint
 
 from estimators.diagnostics.intervals import (
-    COSINES,
+    N_COSINES,
     Interval,
     correlation_interval,
     long_run_variance,
@@ -59,14 +59,14 @@ def test_the_interval_is_as_wide_as_the_correlation_asks():
         widths[kind] = np.mean([(one.high - one.low) ** 2 for one in found])
     # A mean of 400 chi-squares of 12 has a deviation of 2 %.
     assert widths["correlated"] / widths["white"] == pytest.approx(1.7 / 0.3, rel=0.12)
-    assert widths["white"] == pytest.approx((2 * t.ppf(0.975, COSINES)) ** 2 / STEPS, rel=0.08)
+    assert widths["white"] == pytest.approx((2 * t.ppf(0.975, N_COSINES)) ** 2 / STEPS, rel=0.08)
 
 
 @pytest.mark.parametrize("kind", ["white", "correlated", "alternating"])
 def test_a_correlation_is_as_uncertain_as_bartlett_says(kind):
     """Its variance is (1 - ρ²) / n for a first-order autoregression."""
     found = [correlation_interval(series(kind, seed)[0]) for seed in range(RUNS)]
-    half = t.ppf(0.975, COSINES)
+    half = t.ppf(0.975, N_COSINES)
     variance = np.mean([((one.high - one.low) / (2 * half)) ** 2 for one in found])
     assert variance == pytest.approx((1 - series(kind, 0)[1] ** 2) / STEPS, rel=0.1)
 
@@ -74,16 +74,16 @@ def test_a_correlation_is_as_uncertain_as_bartlett_says(kind):
 def test_the_projections_are_on_cosines():
     x = np.random.default_rng(3).standard_normal(50) + 7.0
     steps = np.arange(50) + 0.5
-    own = [np.sqrt(2 / 50) * np.sum(x * np.cos(np.pi * j * steps / 50)) for j in range(1, COSINES + 1)]
+    own = [np.sqrt(2 / 50) * np.sum(x * np.cos(np.pi * j * steps / 50)) for j in range(1, N_COSINES + 1)]
     variance, degrees = long_run_variance(x)
-    assert degrees == COSINES and variance == pytest.approx(np.mean(np.square(own)), rel=1e-12)
+    assert degrees == N_COSINES and variance == pytest.approx(np.mean(np.square(own)), rel=1e-12)
     assert long_run_variance(x[:9])[1] == 4
 
 
 def test_a_share_has_wilsons_interval():
     """Of values whose squares alternate, so that they count as independent, with Student's t in the normal's place."""
     like = np.tile([1.0, 2.0], 50)
-    alpha = 2 * norm.sf(t.ppf(0.975, COSINES))
+    alpha = 2 * norm.sf(t.ppf(0.975, N_COSINES))
     for share in (1.0, 0.0, 0.5):
         inside = np.full(100, bool(share)) if share != 0.5 else np.tile([True, False], 50)
         low, high = proportion_confint(100 * share, 100, alpha, "wilson")

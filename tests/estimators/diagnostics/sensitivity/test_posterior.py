@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from estimators.diagnostics.sensitivity.posterior import FAR, peaks, tails
+from estimators.diagnostics.sensitivity.posterior import FAR_SIGMA, peaks, tails
 from estimators.fold import fold
 from estimators.log import Log
 from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
@@ -88,4 +88,4 @@ def test_tails_of_a_normal_and_of_a_student(heavy):
     else:
         # Four standard errors, √(24 / n); one beyond 4 σ is expected in 16,000.
         assert abs(tail.kurtosis) < 4.0 * np.sqrt(24.0 / n)
-        assert tail.far * n <= 3 and FAR == 4.0
+        assert tail.far * n <= 3 and FAR_SIGMA == 4.0
