@@ -5,6 +5,8 @@ The events here are numbered by their values, so that at equal times they keep t
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from estimators.fold import Fold, fold
 from estimators.log import INPUT, READING, RESET, TICK, TRUTH, Events, Log, truth_of
@@ -13,6 +15,11 @@ from estimators.track import Track
 from estimators.tuning import Tuning
 from tests.estimators.linear_models import ROWS, random_linear
 from tests.support import SECOND, assert_same
+
+
+def any_seed(test):
+    """The test for thirty seeds of its random events, drawn by hypothesis."""
+    return settings(max_examples=30, deadline=None, derandomize=True)(given(seed=st.integers(0, 2**32 - 1))(test))
 
 
 def batch(times, first=0, kind=READING, width=2):
@@ -44,7 +51,7 @@ def lately(rng, n):
     return t - late * rng.integers(0, 30, n) * SECOND
 
 
-@pytest.mark.parametrize("seed", range(20))
+@any_seed
 def test_order_is_a_stable_sort_whatever_the_pieces(seed):
     rng = np.random.default_rng(seed)
     events = batch(lately(rng, 200))
@@ -60,7 +67,7 @@ def test_order_is_a_stable_sort_whatever_the_pieces(seed):
     same(log.events, expected)
 
 
-@pytest.mark.parametrize("seed", range(20))
+@any_seed
 def test_stale_is_judged_event_by_event(seed):
     """An event is stale against the newest that arrived before it, not against its batch."""
     rng = np.random.default_rng(seed)
@@ -171,7 +178,7 @@ def test_fewer_columns_are_filled_up_not_repeated():
     assert old.widened(1) is old and log.events.widened(2).value.shape == (3, 3)
 
 
-@pytest.mark.parametrize("seed", range(5))
+@any_seed
 def test_truth_of_is_its_definition(seed):
     """Event by event: values from the state `channel` on, some NaN, among readings and ticks that must not count."""
     rng = np.random.default_rng(seed)
@@ -249,7 +256,7 @@ def shuffled(rng, events):
     return [events.select(part) for part in np.array_split(order, int(rng.integers(1, len(events))))]
 
 
-@pytest.mark.parametrize("seed", range(30))
+@any_seed
 def test_any_order_of_arrival_gives_the_order_as_it_is_stated(seed):
     rng = np.random.default_rng(seed)
     events = crowded(rng)
