@@ -26,7 +26,7 @@ TIME_UNITS = {"ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0}
 
 
 def as_seconds(value: Any) -> Any:
-    """A duration as its seconds: `5 min` is 300; a number is seconds already."""
+    """Return a duration as its seconds: `5 min` is 300; a number is seconds already."""
     if not isinstance(value, str):
         return value
     number, unit = re.fullmatch(r"\s*([-+.\deE]*)\s*(.*?)\s*", value).groups()  # type: ignore[union-attr]
@@ -47,7 +47,7 @@ Item = TypeVar("Item")
 
 
 def as_list(value: Any) -> Any:
-    """A lone value stands for a list of one."""
+    """Return a lone value as a list of one."""
     return value if isinstance(value, (list, tuple)) or value is None else [value]
 
 

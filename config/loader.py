@@ -38,17 +38,17 @@ class Loaded:
     without: Loaded | None = None
 
     def error(self, key: Key, text: str) -> ConfigError:
-        """An error about the value at `key`, which `text` goes on to describe."""
+        """Return an error about the value at `key`, which `text` goes on to describe."""
         return ConfigError(f"{self.places.at(key)}: {dotted(key)} {text}")
 
 
 def shipped() -> list[str]:
-    """Names of the twins that ship."""
+    """Return the names of the bundled twins."""
     return sorted(path.stem for path in TWINS.glob("*.yaml"))
 
 
 def find(name: str | os.PathLike[str]) -> Path:
-    """The YAML file that a name (of a twin that ships) or a path means.
+    """Return the YAML file that a name (of a bundled twin) or a path means.
 
     Raises:
         ConfigError: If there is none.

@@ -21,7 +21,7 @@ FEW = 8
 
 
 def shown(value: Any) -> str:
-    """A value as an error shows it."""
+    """Return a value as an error shows it."""
     if value is None:
         return "empty"
     if isinstance(value, bool):
@@ -38,7 +38,7 @@ def shown(value: Any) -> str:
 
 
 def report(error: ValidationError, data: Any, places: Places) -> ConfigError:
-    """One ConfigError with a line for each of the first problems."""
+    """Return one ConfigError with a line for each of the first problems."""
     found: dict[tuple, str] = {}  # One line a key: pydantic repeats itself for each kind that a value might have been.
     problems = error.errors(include_url=False)
     for problem in problems:
@@ -82,7 +82,7 @@ def _line(problem: ErrorDetails, key: Key, value: Any, places: Places) -> str:
 
 
 def _locate(loc: tuple[str | int, ...], data: Any) -> tuple[Key, Any]:
-    """The part of a pydantic location that exists in the YAML; it also names union members and lone list items."""
+    """Return the part of a pydantic location that exists in the YAML, without union members and lone list items."""
     key: list[str | int] = []
     for part in loc:
         if isinstance(data, dict) and part in data:

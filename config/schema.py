@@ -329,7 +329,7 @@ class TwinSection(Section):
 
 
 def json_schema() -> dict[str, Any]:
-    """The schema, with a description of every key."""
+    """Return the schema, with a description of every key."""
     schema = TwinSection.model_json_schema(mode="validation")
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
@@ -340,5 +340,5 @@ def json_schema() -> dict[str, Any]:
 
 
 def json_schema_text() -> str:
-    """The schema as the text of a file."""
+    """Return the schema as the text of a file."""
     return json.dumps(json_schema(), indent=2, ensure_ascii=False) + "\n"

@@ -100,7 +100,7 @@ class ChannelSection(Section):
 
     @abstractmethod
     def names(self) -> tuple[str, ...]:
-        """The signals or columns, one a row."""
+        """Return the signals or columns, one a row."""
 
     @model_validator(mode="after")
     def _lengths(self) -> ChannelSection:
@@ -139,7 +139,7 @@ class SignalSection(ChannelSection):
     """Its signal's name, or a list: one for each row of the sensor."""
 
     def names(self) -> tuple[str, ...]:
-        """The signals, one a row."""
+        """Return the signals, one a row."""
         return self.signals
 
 
@@ -150,7 +150,7 @@ class ColumnSection(ChannelSection):
     """The column's name, or a list: one for each row of the sensor."""
 
     def names(self) -> tuple[str, ...]:
-        """The columns, one a row."""
+        """Return the columns, one a row."""
         return self.columns
 
 

@@ -49,17 +49,17 @@ class Version:
 
 
 def ships(twin: Path) -> bool:
-    """Whether a twin's YAML is one of those that ship."""
+    """Return whether a twin's YAML is one of those that ship."""
     return twin.resolve().parent == (_CONFIG / "twins").resolve()
 
 
 def named(twin: Path) -> str:
-    """A twin's YAML as the command line takes it."""
+    """Return a twin's YAML as the command line takes it."""
     return twin.stem if ships(twin) else shown_path(twin)
 
 
 def folders(twin: Path) -> tuple[Path, ...]:
-    """Where the versions of a twin's YAML are kept; the first is where new ones go.
+    """Return the folders of a twin's tuning versions; new ones are saved in the first.
 
     For a bundled twin, the user's data folder and the bundled versions; for any other, a folder beside its file.
     """
@@ -70,7 +70,7 @@ def folders(twin: Path) -> tuple[Path, ...]:
 
 
 def version_files(twin: Path) -> dict[str, Path]:
-    """The file of each version of a twin's YAML by name; the user's own hides one of its name that ships."""
+    """Return the file of each version of a twin's YAML by name; the user's own hides one of its name that ships."""
     found: dict[str, Path] = {}
     for folder in folders(twin):
         for path in sorted(folder.glob("*.yaml")):
@@ -98,7 +98,7 @@ def find_version(twin: Path, reference: str) -> Version | None:
 
 
 def accepted_version(twin: Path) -> Version | None:
-    """The version that was accepted last; None if none was, and the twin's own file holds."""
+    """Return the version that was accepted last; None if the twin's own file is in use."""
     found = [load_version(path) for path in version_files(twin).values()]
     accepted = [version for version in found if version.head.accepted is not None]
     return max(accepted, key=lambda version: version.head.accepted.at, default=None)  # type: ignore[union-attr]
@@ -128,7 +128,7 @@ def version_of(name: str, text: str, path: Path) -> Version:
 
 
 def check_name(name: str) -> str:
-    """A name under which a version can be kept.
+    """Return a name under which a version can be kept.
 
     Raises:
         ConfigError: If it is none.

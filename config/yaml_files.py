@@ -48,7 +48,7 @@ class Places:
     options: dict[Key, str] = field(default_factory=dict)
 
     def at(self, key: Key) -> str:
-        """The place of `key`, or of the nearest section around it that the file has."""
+        """Return the place of `key`, or of the nearest section around it that the file has."""
         for end in range(len(key), -1, -1):
             if key[:end] in self.options:
                 return self.options[key[:end]]
@@ -149,7 +149,7 @@ class _Builder:
 
 
 def dotted(key: Key) -> str:
-    """A key path as text: source.parts[1].files."""
+    """Return a key path as text: source.parts[1].files."""
     text = ""
     for part in key:
         text += f"[{part}]" if isinstance(part, int) else f".{part}" if text else part
@@ -161,7 +161,7 @@ RESERVED = {"null", "true", "false"}
 
 
 def as_section(name: str, items: Mapping[str, Any]) -> list[str]:
-    """A section as lines, an entry each; none if it is empty."""
+    """Return a section as lines, an entry each; none if it is empty."""
     return [f"{name}:", *(f"  {_key(key)}: {as_flow(value)}" for key, value in items.items())] if items else []
 
 
@@ -170,7 +170,7 @@ def _key(name: str) -> str:
 
 
 def as_flow(value: Any) -> str:
-    """A value in one line of YAML."""
+    """Return a value in one line of YAML."""
     if isinstance(value, Mapping):
         return "{" + ", ".join(f"{_key(key)}: {as_flow(item)}" for key, item in value.items()) + "}"
     if isinstance(value, (list, tuple)):
@@ -183,7 +183,7 @@ def as_flow(value: Any) -> str:
 
 
 def shown_path(path: Path) -> str:
-    """A path as messages show it: relative to the working directory where it lies inside."""
+    """Return a path as messages show it: relative to the working directory where it lies inside."""
     try:
         return str(path.absolute().relative_to(Path.cwd()))
     except (ValueError, OSError):
@@ -191,11 +191,11 @@ def shown_path(path: Path) -> str:
 
 
 def read_text(path: Path, listing: str) -> str:
-    """The text of a YAML file.
+    """Return the text of a YAML file.
 
     Args:
         path: Where it is.
-        listing: The command that says which there are.
+        listing: The command that lists them.
 
     Raises:
         ConfigError: If it is not there, no file, or no text.

@@ -1,4 +1,4 @@
-"""Events that are in memory already, as a source."""
+"""Source of events in memory."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ BATCH = 4096
 
 
 class MemorySource:
-    """Gives `readings` in their order, some thousands at a time."""
+    """Returns `readings` in their order, some thousands at a time."""
 
     live = False
 
@@ -24,7 +24,7 @@ class MemorySource:
         return (int(t.min()), int(t.max())) if t.size else None
 
     def read(self, timeout: float) -> Events | None:
-        """The next events; None at the end."""
+        """Return the next events; None at the end."""
         if self._next >= len(self._readings):
             return None
         part = self._readings.select(slice(self._next, self._next + self._batch))
@@ -32,8 +32,8 @@ class MemorySource:
         return part
 
     def now(self) -> int | None:
-        """It has no clock."""
+        """Return None: it has no clock."""
         return None
 
     def close(self) -> None:
-        """Nothing to let go of."""
+        """Release nothing."""

@@ -48,7 +48,7 @@ class Merged:
         return any(isinstance(source, Endless) and source.endless for source in self._sources)
 
     def read(self, timeout: float) -> Events | None:
-        """The next events of all sources, up to the earliest time to which every one of them is known."""
+        """Return the next events of all sources, up to the earliest time to which every one of them is known."""
         for k, source in enumerate(self._sources):
             while not self._ended[k] and not self._order[k].size:
                 batch = source.read(timeout)

@@ -22,12 +22,12 @@ def pieces_of(name: str) -> list[Piece]:
 
 
 def needs(name: str) -> tuple[str, ...]:
-    """What must be compiled before something can run: a filter and the loop over the events, or a kernel alone."""
+    """Return the names to compile before something can run: a filter and the loop over the events, or a kernel alone."""
     return (name,) if name in KERNELS else (folds.LOOP, name)
 
 
 def function_of(piece: Piece) -> tuple[Any, tuple[Any, ...]]:
-    """The function of a piece, and the types of its arguments."""
+    """Return the function of a piece, and the types of its arguments."""
     if piece.of in KERNELS:
         kernel, signature = KERNELS[piece.of]
         return kernel, signature.args
@@ -40,5 +40,5 @@ def make(piece: Piece) -> None:
 
 
 def is_made(piece: Piece) -> bool:
-    """Whether a piece is in the cache."""
+    """Return whether a piece is in the cache."""
     return folds.is_cached(*function_of(piece))

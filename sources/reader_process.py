@@ -124,7 +124,7 @@ class IsolatedReader:
         return self._worker is None
 
     def take(self, timeout: float) -> Any:
-        """The next item, or None: at the end (`ended`), or if none came within `timeout` seconds.
+        """Return the next item, or None: at the end (`ended`), or if none came within `timeout` seconds.
 
         Raises:
             ReaderError: If the process ended, hung, or the generator raised.

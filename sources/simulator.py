@@ -216,7 +216,7 @@ class Simulator:
         change.end = max(change.start, self._time(self._k + 1))
 
     def _changed(self, t: int) -> np.ndarray:
-        """The true parameters of the step that ends at t ns."""
+        """Return the true parameters of the step that ends at t ns."""
         p = self._own_p.copy()
         names = [item.name for item in self._truth.model.parameters]
         for change in tuple(self._changes):
@@ -234,7 +234,7 @@ class Simulator:
         self._x[self._truth.model.mode] = self._rng.choice(chances.size, p=chances)
 
     def _noise(self) -> np.ndarray:
-        """A draw of N(0, Q), as numpy's multivariate_normal makes it, with the factor kept while Q stays."""
+        """Return a draw of N(0, Q), as numpy's multivariate_normal makes it, with the factor kept while Q stays."""
         truth = self._truth
         if truth.draw is not None:
             return truth.draw(self._rng.standard_normal(self._x.size), self._p, self._q, self._step)

@@ -111,7 +111,7 @@ class Accuracy:
     scale: tuple[float, ...] = (1.0,)
 
     def spread(self, rows: int) -> Accuracy:
-        """With one entry for each of the rows."""
+        """Return a copy with one entry for each row."""
         each = {name: getattr(self, name) for name in ("signals", "units", "scale")}
         return replace(self, **{name: item * rows for name, item in each.items() if len(item) == 1})
 

@@ -45,7 +45,7 @@ _OTHERWISE = {"g": "standard_gravity", "C": "degC", "F": "degF"}
 
 
 def _normal(unit: str) -> str:
-    """One spelling of a unit: ASCII, with ** for powers."""
+    """Return one spelling of a unit: ASCII, with ** for powers."""
     text = unit.strip()
     text = _SAME.get(text, text)
     for old, new in (("°C", "degC"), ("°F", "degF"), ("°", "deg"), ("·", "*"), ("²", "**2"), ("³", "**3"), ("^", "**")):
@@ -61,7 +61,7 @@ def _registry() -> pint.UnitRegistry:
 
 
 def _unit(text: str) -> Any:
-    """A unit of pint's; a temperature within a product is a difference of temperatures.
+    """Return a unit of pint's; a temperature within a product is a difference of temperatures.
 
     Raises:
         LookupError: If it is unknown.
@@ -145,7 +145,7 @@ def conversion(given: str | None, wanted: str, where: str) -> tuple[float, float
 
 
 def spread_factor(given: str | None, wanted: str, where: str, *, squared: bool) -> float:
-    """What turns a standard deviation, or a variance if `squared`, in `given` into one of a value in `wanted`.
+    """Return the factor from a standard deviation, or a variance if `squared`, in `given` to one in `wanted`.
 
     A spread knows no zero point: one of 2 °C is 2 K.
 

@@ -64,7 +64,7 @@ class WorkerProcess:
         self._write((list(sys.path), os.getcwd()), (function, args))
 
     def answer(self, timeout: float) -> tuple[int, Any] | None:
-        """The next answer (kind, item); None if none comes in time.
+        """Return the next answer (kind, item); None if none comes in time.
 
         Raises:
             EOFError: If the process has ended.

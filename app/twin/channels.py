@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 def channels(loaded: Loaded, section: Any, key: Key, model: StateSpaceModel) -> list[tuple[Key, Channel]]:
-    """The channels of a section, each with its key in the YAML.
+    """Return the channels of a section, each with its key in the YAML.
 
     Raises:
         ConfigError: With file and line, if a name or a number of rows does not fit the model.
@@ -47,7 +47,7 @@ def channels(loaded: Loaded, section: Any, key: Key, model: StateSpaceModel) -> 
 
 
 def _cells(loaded: Loaded, key: Key, item: ChannelSection, field: Field, read: set[str]) -> list[tuple[Key, Channel]]:
-    """The true values of a whole field from one array; the cells among `read` are no truth."""
+    """Return the true values of a whole field from one array; the cells among `read` are left out."""
     if isinstance(item, SignalSection) or len(item.names()) != 1:
         raise loaded.error(key, f"is a field of {len(field)} cells; name one array of a table")
     found = []
@@ -101,12 +101,12 @@ def _conditions(given: Mapping[str, RangeSection]) -> tuple[Condition, ...]:
 
 
 def _spread(values: tuple, count: int) -> tuple:
-    """A value for each row, from one for all or one each (the schema has checked the number)."""
+    """Return a value for each row, from one for all or one each (the schema has checked the number)."""
     return values * count if len(values) == 1 else values
 
 
 def read_faults(loaded: Loaded, sections: Sequence[FaultSection], key: Key, model: StateSpaceModel) -> list[Fault]:
-    """The faults of a list.
+    """Return the faults of a list of sections.
 
     Raises:
         ConfigError: With file and line, if one does not fit the model.

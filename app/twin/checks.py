@@ -69,7 +69,7 @@ def check_scene(loaded: Loaded, model: StateSpaceModel) -> None:
 
 
 def one_each(loaded: Loaded, key: Key, values: tuple, rows: list[str]) -> tuple:
-    """A value for each row, from one for all or one each."""
+    """Return a value for each row, from one for all or one each."""
     if len(values) == 1:
         return values * len(rows)
     if len(values) != len(rows):

@@ -105,7 +105,7 @@ class Late(NamedTuple):
 
 
 def late_policy(config: TwinSection, model: StateSpaceModel, estimator: Estimator, tuning: Tuning) -> Late:
-    """The policy, with its arithmetic."""
+    """Return the policy, with its arithmetic."""
     section = config.time
     if section.late != "auto":
         return Late(section.late == "inflate", f"time.late is {section.late}")

@@ -34,7 +34,7 @@ from .learned import load_learned
 
 
 def find_model(loaded: Loaded, key: Key, reference: str) -> StateSpaceModel:
-    """The model that `reference`, the value at `key`, means: a name, or ./file.py:Name beside the YAML.
+    """Return the model that `reference`, the value at `key`, means: a name, or ./file.py:Name beside the YAML.
 
     Raises:
         ConfigError: If there is no such model or file.
@@ -59,7 +59,7 @@ def find_model(loaded: Loaded, key: Key, reference: str) -> StateSpaceModel:
 
 
 def model_files(loaded: Loaded) -> tuple[Path, ...]:
-    """The user's file that holds the model, and those beside it that it imports; none of a model of the catalogue."""
+    """Return the user's file of the model and those beside it that it imports; none for a bundled model."""
     file = loaded.config.model.rpartition(":")[0]
     if not file:
         return ()
@@ -98,7 +98,7 @@ def _as_model(found: Any, name: str, path: Path, loaded: Loaded, key: Key) -> St
 
 
 def _blame(error: BaseException, path: Path) -> ModelError:
-    """One line with the place in the user's code from which an exception came."""
+    """Return one line with the place in the user's code from which an exception came."""
     if isinstance(error, SyntaxError) and error.filename:
         return ModelError(f"{shown_path(Path(error.filename))}:{error.lineno}: {error.msg}; correct the Python")
     frames = traceback.extract_tb(error.__traceback__)
@@ -171,12 +171,12 @@ def _with_noise(model: StateSpaceModel, loaded: Loaded) -> StateSpaceModel:
 
 
 def physics_of(loaded: Loaded) -> StateSpaceModel:
-    """The model as the YAML has it, before anything is learned, estimated or appended; raises as both of these."""
+    """Return the model with the YAML's parameters, before anything is appended."""
     return with_parameters(find_model(loaded, ("model",), loaded.config.model), loaded)
 
 
 def with_parameters(model: StateSpaceModel, loaded: Loaded) -> StateSpaceModel:
-    """The model with the YAML's parameters in place of its own; raises as `configure`."""
+    """Return the model with the YAML's parameters in place of its own; raises as `configure`."""
     config = loaded.config
     names = [item.name for item in model.parameters]
     check_names(loaded, ("parameters",), config.parameters, names, "parameter", model)
@@ -192,7 +192,7 @@ def with_parameters(model: StateSpaceModel, loaded: Loaded) -> StateSpaceModel:
 
 
 def _states(model: StateSpaceModel, loaded: Loaded) -> Sequence[State]:
-    """The states with the YAML's prior; that of a field is given for all its cells, under the field's name."""
+    """Return the states with the YAML's prior; that of a field is given for all its cells, under the field's name."""
     given, cells = loaded.config.prior, loaded.config.view.cells
     states = model.states
     if cells is not None and model.grid is None:
@@ -243,7 +243,7 @@ def _sensor(sensor: Any, loaded: Loaded) -> Any:
 
 
 def _correlation(sensor: Any, given: Correlation, loaded: Loaded) -> Correlation | None:
-    """The correlation of a sensor's rows; None of rows that are independent, which every filter takes."""
+    """Return the correlation of a sensor's rows; None if they are independent."""
     wrong = correlation_error(given, len(sensor.rows))
     if wrong:
         raise loaded.error(("sensors", sensor.name, "correlation"), wrong)

@@ -58,7 +58,7 @@ class Plan:
         SOURCES[section.type].files(opening)
 
     def faults(self) -> Faults:
-        """A new layer of faults, with those of the YAML."""
+        """Return a new layer of faults, with those of the YAML."""
         from sources.faults.layer import Faults
 
         section = self.loaded.config.source
@@ -103,7 +103,7 @@ class Plan:
         return with_faults(source, layer)
 
     def player(self, report: Report, *, interface: str | None = None, channel: str | int | None = None) -> Player:
-        """The twin's asset, ready to play on its bus, or on another one.
+        """Return the twin's asset, ready to play on its bus, or on another one.
 
         Raises:
             SourceError: If the source is not a bus, it has no `asset`, or the bus cannot be opened.
@@ -140,7 +140,7 @@ def plan_source(loaded: Loaded, model: StateSpaceModel, log_files: Sequence[Path
 
 
 def _scheduled(loaded: Loaded, model: StateSpaceModel) -> tuple[Fault, ...]:
-    """The faults of the YAML that act on what the source says: those of a simulator, then those of the twin."""
+    """Return the faults of the YAML that act on the source's events: those of a simulator, then those of the twin."""
     section = loaded.config.source
     found = read_faults(loaded, loaded.config.faults, ("faults",), model)
     for k, fault in enumerate(found):

@@ -159,11 +159,11 @@ class Twin:
             self.plan.check_files()
 
     def options_of(self, estimator: str) -> Mapping[str, float]:
-        """The options that the YAML gives for an estimator; of a choice its number."""
+        """Return the YAML's options of an estimator; choices as their numbers."""
         return _options(self.config, estimator)
 
     def faults(self) -> Faults:
-        """A new layer of faults for `open_source`, with those of the YAML; more can be injected while it runs."""
+        """Return a new layer of faults for `open_source`, with those of the YAML."""
         return self.plan.faults()
 
     def open_source(
@@ -183,7 +183,7 @@ class Twin:
         return self.plan.open(report, live=live, speed=speed, faults=faults)
 
     def player(self, report: Report, *, interface: str | None = None, channel: str | int | None = None) -> Player:
-        """The asset of a twin on a CAN bus, ready to play there, or on another `interface` and `channel`.
+        """Return the asset of a twin on a CAN bus, ready to play there, or on another `interface` and `channel`.
 
         Raises:
             SourceError: If the source is not a bus, it has no `asset`, or the bus cannot be opened.
@@ -233,7 +233,7 @@ def restore_twin(
 
 
 def with_version(twin: Twin, reference: str) -> Twin:
-    """The same twin under another tuning version, or under what its file says (`own`).
+    """Return the same twin under another tuning version, or under its own file (`own`).
 
     Changes of the tuning by the command line or the page are dropped; other overrides stay.
 
@@ -248,7 +248,7 @@ def with_version(twin: Twin, reference: str) -> Twin:
 
 
 def _of_yaml(overrides: Mapping[str, str]) -> dict[str, str]:
-    """The overrides that change the YAML; the others are keys of the tuning."""
+    """Return the overrides that change the YAML; the others are keys of the tuning."""
     return {key: value for key, value in overrides.items() if key.split(".")[0] in TwinSection.model_fields}
 
 
@@ -314,7 +314,7 @@ def _check_version(loaded: Loaded, model: StateSpaceModel) -> None:
 
 
 def _options(config: TwinSection, estimator: str) -> dict[str, float]:
-    """The options given for an estimator, with words of choices as their numbers."""
+    """Return the options given for an estimator, with words of choices as their numbers."""
     first = config.estimator
     given = {**config.filters.get(estimator, {}), **(first.options if estimator == first.name else {})}
     values = find_entry(estimator).complete(given)

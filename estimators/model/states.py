@@ -86,7 +86,7 @@ class Field(Sequence[State]):
         return np.array(self.means) if self.means else np.full(len(self), float(self.mean))
 
     def positions(self) -> np.ndarray:
-        """Where every cell is, (nx, axes)."""
+        """Return the positions of the cells, (nx, axes)."""
         axes = [np.arange(n) * step for n, step in zip(self.shape, self.steps, strict=True)]
         return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(len(self), len(self.shape))
 
@@ -95,7 +95,7 @@ class Field(Sequence[State]):
         return self.index_of(value.name)
 
     def index_of(self, name: str) -> int:
-        """The flat index of the cell of that name, `temperature[3,4]`.
+        """Return the flat index of the cell of that name, `temperature[3,4]`.
 
         Raises:
             ValueError: If the field has no such cell.
@@ -109,7 +109,7 @@ class Field(Sequence[State]):
         return int(np.ravel_multi_index(cell, self.shape))
 
     def cell_name(self, k: int) -> str:
-        """The name of a cell."""
+        """Return the name of a cell."""
         return f"{self.name}[{','.join(str(int(i)) for i in np.unravel_index(k, self.shape))}]"
 
     def __len__(self) -> int:

@@ -99,7 +99,7 @@ class Table:
             self._report(TRUNCATED, f"{path.name}: damaged after {self._count - before} rows: {gist}")
 
     def _events(self, path: Path, rows: Rows, first: bool) -> Events:
-        """The events of the next rows of a file, or of its first ones."""
+        """Return the events of the next rows of a file, or of its first ones."""
         for key, line, text in rows.problems:
             self._report(key, f"{path.name}:{line}: {text}")
         known = rows.known
@@ -127,12 +127,12 @@ class Table:
         return f"{files}: column {name!r} has no value in {self._count} rows, so {fed} has no values"
 
     def read(self, timeout: float) -> Events | None:
-        """The events of the next rows; none if there are none within `timeout` seconds; None at the end."""
+        """Return the events of the next rows; none if there are none within `timeout` seconds; None at the end."""
         self._timeout = timeout
         return next(self._batches, None)
 
     def now(self) -> int | None:
-        """A recording has no clock."""
+        """Return None: a recording has no clock."""
         return None
 
     def close(self) -> None:

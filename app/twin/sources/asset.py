@@ -26,7 +26,7 @@ WITHOUT_END = 100.0
 
 
 def make_asset(loaded: Loaded, model: StateSpaceModel, section: AssetSection, key: Key) -> Simulator:
-    """The simulated asset.
+    """Return the simulated asset.
 
     Raises:
         ConfigError: With file and line, if its true model does not fit the twin's.
@@ -120,7 +120,7 @@ def _check_same(loaded: Loaded, key: Key, truth: StateSpaceModel, model: StateSp
 
 
 def _profile(sections: tuple[ProfileSection, ...]) -> Profile:
-    """The sum of an input's profiles."""
+    """Return the sum of an input's profiles."""
     from sources.simulator import Constant, Sine, Steps, Sum
 
     parts: list[Profile] = []

@@ -45,7 +45,7 @@ def _open(opening: Opening) -> Source:
 
 
 def _files(opening: Opening) -> object:
-    """The recording that stands in for the bus, or the databases: nobody may be on the bus twice."""
+    """Check the recording in place of the bus, or the databases; the bus itself is opened once only."""
     return CAN_LOG.files(opening) if opening.log_files is not None else make_decoder(opening)
 
 
@@ -62,7 +62,7 @@ def make_player(
     interface: str | None = None,
     channel: str | int | None = None,
 ) -> Player:
-    """The twin's asset, ready to play on its bus, or on another one.
+    """Return the twin's asset, ready to play on its bus, or on another one.
 
     Raises:
         SourceError: If the source is not a bus, it has no `asset`, or the bus cannot be opened.
@@ -78,7 +78,7 @@ def _make_player(
     interface: str | None = None,
     channel: str | int | None = None,
 ) -> tuple[Simulator, Player]:
-    """The asset, and what plays it."""
+    """Return the asset and its player."""
     from sources.can.player import Player
     from sources.faults.layer import Faults
     from sources.faults.source import with_faults
@@ -119,11 +119,11 @@ class PlayedBus:
         player.start()
 
     def read(self, timeout: float) -> Events | None:
-        """The next events of the bus."""
+        """Return the next events of the bus."""
         return self._bus.read(timeout)
 
     def now(self) -> int | None:
-        """The bus's time, ns."""
+        """Return the bus's time, ns."""
         return self._bus.now()
 
     def change(self, parameter: str, factor: float, start: int | None = None, length: int | None = None) -> Change:
@@ -141,7 +141,7 @@ class PlayedBus:
 
 
 def make_decoder(opening: Opening) -> Decoder:
-    """What takes the section's channels from its frames.
+    """Return the decoder of the section's channels.
 
     Raises:
         SourceError: With file and line, if a database lacks a message or signal.

@@ -87,7 +87,7 @@ def blamed(opening: Opening, build: Callable[[list[Channel]], T]) -> T:
 
 
 def recording(make: Callable[[Opening, list[Path], list[Channel]], Source]) -> Kind:
-    """A type whose sections are recordings: `make(opening, files, channels)` gives the source.
+    """Return a type whose sections are recordings: `make(opening, files, channels)` gives the source.
 
     Its section has `folder`, `files` and `get` (config/source_schema.py, RecordingSection) beside maps of channels.
     """
@@ -116,7 +116,7 @@ DATA = "NISUS_DATA"
 def find_recording(
     loaded: Loaded, section: CanSection | RecordingSection, key: Key, log_files: Sequence[Path] | None
 ) -> list[Path]:
-    """The files of a recording, in order; `log_files`, from the command line, replace them.
+    """Return the files of a recording, in order; `log_files`, from the command line, replace them.
 
     Raises:
         SourceError: If one is absent, with where it was sought and how to get it.
@@ -155,7 +155,7 @@ def find_recording(
 def find_databases(
     loaded: Loaded, section: CanSection | CanLogSection, key: Key
 ) -> list[tuple[Path, int | str | None]]:
-    """The DBC files with the buses on which they hold; sought in the recording's folder, then beside the YAML.
+    """Return the DBC files with the buses on which they hold; sought in the recording's folder, then beside the YAML.
 
     Raises:
         SourceError: If one is absent.
@@ -172,7 +172,7 @@ def find_databases(
 
 
 def failure(loaded: Loaded, key: Key, text: str) -> SourceError:
-    """An error of the source about what stands at `key`."""
+    """Return an error of the source about what stands at `key`."""
     return SourceError(f"{loaded.places.at(key)}: {dotted(key)} {text}")
 
 
@@ -181,7 +181,7 @@ def _beside(loaded: Loaded, path: Path) -> Path:
 
 
 def _root(loaded: Loaded, section: CanSection | RecordingSection) -> Path:
-    """The folder of a recording: NISUS_DATA in place of `folder`, where the YAML gives one."""
+    """Return the folder of a recording: NISUS_DATA in place of `folder`, where the YAML gives one."""
     folder = section.folder if isinstance(section, RecordingSection) else None
     if folder is None:
         return _beside(loaded, Path())

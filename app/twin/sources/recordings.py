@@ -35,7 +35,7 @@ def _open(opening: Opening) -> Source:
 
 
 def _shares(opening: Opening) -> list[list[Path] | None]:
-    """Which part reads which of the `--log` files: by name, else tables to the table and logs to the CAN log."""
+    """Return the `--log` files of each part: by name, else tables to the table and logs to the CAN log."""
     section: MergedSection = opening.section
     shares: list[list[Path] | None] = [[] for _ in section.parts]
     for file in opening.log_files or ():
