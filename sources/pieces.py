@@ -22,7 +22,7 @@ def pieces_of(name: str) -> list[Piece]:
 
 
 def needs(name: str) -> tuple[str, ...]:
-    """Return the names to compile before something can run: a filter and the loop over the events, or a kernel alone."""
+    """Return the names to compile before something can run: a filter and the loop over events, or a kernel alone."""
     return (name,) if name in KERNELS else (folds.LOOP, name)
 
 
