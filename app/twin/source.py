@@ -68,17 +68,7 @@ class Plan:
     def open(
         self, report: Report, *, live: bool = True, speed: float | None = None, faults: Faults | None = None
     ) -> Source:
-        """Open the source, behind its faults.
-
-        Args:
-            report: Receives counted events: errors, losses and rejections.
-            live: False takes a recording in place of a bus.
-            speed: Times real time, for a source that is not live; None is as fast as it is read.
-            faults: A layer that was made before, for a source that is opened again.
-
-        Raises:
-            SourceError: If it cannot be opened, with the remedy.
-        """
+        """Open the source behind its faults; see `Twin.open_source`."""
         from sources.faults.source import with_faults
 
         layer = self.faults() if faults is None else faults
@@ -103,12 +93,8 @@ class Plan:
         return with_faults(source, layer)
 
     def player(self, report: Report, *, interface: str | None = None, channel: str | int | None = None) -> Player:
-        """Return the twin's asset, ready to play on its bus, or on another one.
-
-        Raises:
-            SourceError: If the source is not a bus, it has no `asset`, or the bus cannot be opened.
-        """
-        return make_player(self.loaded, self.model, report, interface=interface, channel=channel)
+        """Return the twin's asset, ready to play; see `Twin.player`."""
+        return make_player(self.loaded, self.model, report, interface=interface, channel=channel)[1]
 
 
 def plan_source(loaded: Loaded, model: StateSpaceModel, log_files: Sequence[Path] | None) -> Plan:

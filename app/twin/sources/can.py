@@ -37,7 +37,7 @@ def _open(opening: Opening) -> Source:
         return bus
     # Nobody outside this process could speak on it. The listener is there first, so it hears the first frame.
     try:
-        asset, player = _make_player(opening.loaded, opening.model, report)
+        asset, player = make_player(opening.loaded, opening.model, report)
         return PlayedBus(bus, player, asset)
     except NisusError:
         bus.close()
@@ -61,24 +61,12 @@ def make_player(
     *,
     interface: str | None = None,
     channel: str | int | None = None,
-) -> Player:
-    """Return the twin's asset, ready to play on its bus, or on another one.
+) -> tuple[Simulator, Player]:
+    """Return the twin's simulated asset and its player, for its bus or another one.
 
     Raises:
         SourceError: If the source is not a bus, it has no `asset`, or the bus cannot be opened.
     """
-    return _make_player(loaded, model, report, interface=interface, channel=channel)[1]
-
-
-def _make_player(
-    loaded: Loaded,
-    model: StateSpaceModel,
-    report: Report,
-    *,
-    interface: str | None = None,
-    channel: str | int | None = None,
-) -> tuple[Simulator, Player]:
-    """Return the asset and its player."""
     from sources.can.player import Player
     from sources.faults.layer import Faults
     from sources.faults.source import with_faults
