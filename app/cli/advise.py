@@ -14,7 +14,7 @@ from sources.inspect import RecordingContents
 from ..present.result import TableColumn, Topic, to_json, to_text
 from ..studies.advice.draft import python_text, yaml_text
 from ..studies.advice.measured import Measured, digits, percent, seconds_text
-from ..studies.advice.plan import Moves, Plan, plan
+from ..studies.advice.plan import DraftPlan, Moves, plan
 from ..studies.advice.relations import Pair
 from ..studies.advice.signals import Signal, signals
 from ..studies.advice.verdict import Advice, advice_json, apply, lasting_lines, lines
@@ -102,7 +102,7 @@ def _draft(arguments: Arguments, files: tuple[Path, ...]) -> int:
     return 0
 
 
-def _write(arguments: Arguments, out: Path, found: RecordingContents, drafted: Plan) -> None:
+def _write(arguments: Arguments, out: Path, found: RecordingContents, drafted: DraftPlan) -> None:
     """Write the two files of the draft, and print the next steps."""
     if out.suffix not in (".yaml", ".yml", ""):
         raise ConfigError(f"--out {out}: must end in .yaml")
@@ -144,7 +144,7 @@ def _noise_remark(one: Signal) -> str:
     return "noise is its resolution" if one.noise <= 1.01 * one.resolution / math.sqrt(12.0) else ""
 
 
-def _plan_topics(drafted: Plan) -> list[Topic]:
+def _plan_topics(drafted: DraftPlan) -> list[Topic]:
     """Return related signals, states and inputs in words."""
     pairs = tuple(_pair_text(drafted, pair) for pair in drafted.pairs) or ("no two of these signals are related",)
     topics = [Topic("Related signals", pairs), Topic("States", tuple(_state_text(item) for item in drafted.states))]
@@ -152,7 +152,7 @@ def _plan_topics(drafted: Plan) -> list[Topic]:
     return topics + ([Topic("Inputs", inputs)] if inputs else [])
 
 
-def _pair_text(drafted: Plan, pair: Pair) -> str:
+def _pair_text(drafted: DraftPlan, pair: Pair) -> str:
     one, other = drafted.signals[pair.first].name, drafted.signals[pair.second].name
     share = f"explains {percent(pair.explained)}"
     line = f"{digits(pair.offset)} + {digits(pair.gain)}"
@@ -178,7 +178,7 @@ def _state_text(item: Moves) -> str:
     return f"{item.name}: {moves}; Q {digits(item.q)} per second; {r}"
 
 
-def _draft_json(every: list[Signal], drafted: Plan) -> dict[str, Any]:
+def _draft_json(every: list[Signal], drafted: DraftPlan) -> dict[str, Any]:
     """Return `signals`, `pairs`, `states` and `inputs` for scripts."""
     names = [one.name for one in drafted.signals]
     return {

@@ -21,12 +21,12 @@ from estimators.track import DIVERGED
 
 from ..twin.twin import Twin, load_twin
 from .processes import beside, jobs_of
-from .scores import Row, Spread
+from .scores import FilterScore, Spread
 
 SEEDS = 8
 """Folds of a filter that draws random members; others are folded once."""
 
-BUDGET = 20.0
+BUDGET_S = 20.0
 """Default processor seconds for the folds of one filter."""
 
 MIN_TIMED_S = 0.2
@@ -34,7 +34,7 @@ MIN_TIMED_S = 0.2
 
 
 class Outcome(NamedTuple):
-    """Scores of one fold; see `Row`."""
+    """Scores of one fold; see `FilterScore`."""
 
     rmse: dict[str, float]
     nis: float
@@ -51,7 +51,7 @@ def draws(entry: Estimator) -> bool:
     return any(option.name in ("particles", "members") for option in entry.options)
 
 
-def fold_row(twin: Twin, estimator: str, logs: Sequence[Events], budget: float = BUDGET) -> Row:
+def fold_row(twin: Twin, estimator: str, logs: Sequence[Events], budget: float = BUDGET_S) -> FilterScore:
     """Fold one filter over each of the logs, or, if it draws and there is one log, over that with several seeds.
 
     A filter that takes more than `budget` seconds of one processor folds a shorter span of the log; but the one that
@@ -75,7 +75,7 @@ def fold_row(twin: Twin, estimator: str, logs: Sequence[Events], budget: float =
             outcomes.append(outcome_of(fold, events, seconds))
     except NisusError as error:
         nothing = Spread(np.nan)
-        return Row(estimator, {}, nothing, (np.nan, np.nan), nothing, np.nan, options, failure=str(error))
+        return FilterScore(estimator, {}, nothing, (np.nan, np.nan), nothing, np.nan, options, failure=str(error))
     return row_of(estimator, outcomes, options, span)
 
 
@@ -161,10 +161,12 @@ def outcome_of(fold: Fold, events: Events, seconds: float) -> Outcome:
     )
 
 
-def row_of(estimator: str, outcomes: Sequence[Outcome], options: Mapping[str, float], span: float | None) -> Row:
+def row_of(
+    estimator: str, outcomes: Sequence[Outcome], options: Mapping[str, float], span: float | None
+) -> FilterScore:
     """Outcomes of several seeds or logs as one row."""
     since = [outcome.since for outcome in outcomes if np.isfinite(outcome.since)]
-    return Row(
+    return FilterScore(
         estimator=estimator,
         rmse={unit: _spread([outcome.rmse[unit] for outcome in outcomes]) for unit in outcomes[0].rmse},
         nis=_spread([outcome.nis for outcome in outcomes]),
@@ -211,8 +213,8 @@ def compare(
     names: Sequence[str],
     logs: Sequence[Events],
     jobs: int | None = None,
-    budget: float = BUDGET,
-) -> Iterator[Row]:
+    budget: float = BUDGET_S,
+) -> Iterator[FilterScore]:
     """Fold each filter over the logs, in processes of their own; rows come as they are done.
 
     Args:
@@ -246,5 +248,5 @@ def _share(name: str, overrides: dict[str, str], logs: list[tuple[np.ndarray, ..
     numba.set_num_threads(1)  # the processors have a filter each, and a step costs what it costs one
 
 
-def _fold(estimator: str, budget: float) -> Row:
+def _fold(estimator: str, budget: float) -> FilterScore:
     return fold_row(_shared["twin"], estimator, _shared["logs"], budget)

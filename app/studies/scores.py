@@ -31,7 +31,7 @@ class Spread(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Row:
+class FilterScore:
     """Scores of one filter on a log.
 
     `rmse` by unit: the root mean square over the states of that unit whose truth is known, or, where no truth is,
@@ -71,7 +71,7 @@ def spread(title: str) -> str:
     return f"{name} spread{bracket}{unit}"
 
 
-def cells(rows: Sequence[Row], events: int, seconds: float) -> list[dict[str, str]]:
+def cells(rows: Sequence[FilterScore], events: int, seconds: float) -> list[dict[str, str]]:
     """The rows as text by column, empty where there is nothing to say; every row has the same columns.
 
     Rejected measurements have a column if there are any.
@@ -227,7 +227,7 @@ def read_scores(twin: Path) -> list[dict[str, str]]:
         return []
 
 
-def row_json(row: Row) -> dict[str, Any]:
+def row_json(row: FilterScore) -> dict[str, Any]:
     """Return a row for scripts: every figure is its mean, with the standard deviations under `spread`."""
     figures: dict[str, Any] = {"rmse": {unit: figure.value for unit, figure in row.rmse.items()}}
     spreads: dict[str, Any] = {"rmse": {unit: figure.spread for unit, figure in row.rmse.items()}}

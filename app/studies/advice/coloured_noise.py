@@ -36,7 +36,7 @@ MAX_APPENDED = 3
 MIN_GAIN_NATS = 10.0
 """Least gain in likelihood: each adds two parameters, and the best of several is taken."""
 
-BUDGET = 30.0
+BUDGET_S = 30.0
 """Processor seconds for all trials; the best result so far is reported."""
 
 MIN_EFFECT = 0.05
@@ -130,7 +130,7 @@ def _related(trial: _Trial) -> list[Calibration]:
 def _explained(model: StateSpaceModel, estimator: str, begun: _Trial) -> _Trial:
     """Append the best noise for the most correlated row, repeatedly until the budget is spent."""
     log, best, given_up = without_queries(begun.fold.log), begun, set[str]()
-    end = time.thread_time() + BUDGET
+    end = time.thread_time() + BUDGET_S
     while len(best.appended) < MAX_APPENDED and time.thread_time() < end:
         rows = [entry for entry in _related(best) if entry.subject not in given_up]
         if not rows:

@@ -12,7 +12,7 @@ import numpy as np
 from sources.can.frames import BusName
 from sources.inspect import RecordingContents
 
-from .plan import Moves, Plan, Reads
+from .plan import DraftPlan, Moves, Reads
 from .signals import Signal
 
 
@@ -28,7 +28,7 @@ def _text(value: str) -> str:
     return '"' + value.replace("\\", "\\\\").replace('"', '\\"') + '"'
 
 
-def python_text(name: str, model: str, plan: Plan) -> str:
+def python_text(name: str, model: str, plan: DraftPlan) -> str:
     """The model's file: a random walk, a constant speed or a first-order lag for each state."""
     states, noises, sensors, steps, functions = [], [], [], [], []
     parameters: list[str] = []
@@ -106,7 +106,7 @@ def step(x, u, p, dt, out):
 '''
 
 
-def _title(plan: Plan) -> str:
+def _title(plan: DraftPlan) -> str:
     number = len(plan.signals)
     return f"{number} signal{'s' if number > 1 else ''} of a recording"
 
@@ -163,7 +163,7 @@ def _function(reads: Reads, k: int) -> str:
 def yaml_text(
     name: str,
     model: str,
-    plan: Plan,
+    plan: DraftPlan,
     found: RecordingContents,
     databases: Sequence[tuple[Path, BusName]],
     unit: str,

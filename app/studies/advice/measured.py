@@ -22,7 +22,7 @@ from estimators.registry import find_entry, unfit
 
 from ...twin.twin import Twin
 
-BUDGET = 20.0
+BUDGET_S = 20.0
 """Seconds of one processor for a fold; of a log that takes longer the first part is folded."""
 
 TRIED = 64
@@ -30,7 +30,7 @@ TRIED = 64
 
 
 @dataclass(frozen=True)
-class Folded:
+class TimedFold:
     """A fold over the log, or the part of it that the budget allows, and the seconds of one processor a reading."""
 
     fold: Fold
@@ -43,7 +43,7 @@ class Measured:
 
     twin: Twin
     log: Log
-    _folds: dict[tuple[str, tuple[tuple[str, float], ...]], Folded] = field(default_factory=dict)
+    _folds: dict[tuple[str, tuple[tuple[str, float], ...]], TimedFold] = field(default_factory=dict)
 
     @cached_property
     def rate(self) -> float:
@@ -73,7 +73,7 @@ class Measured:
         name = self.twin.estimator if own.peaks is not None else "pf"
         return peaks(name, self.twin.model, self.twin.tuning.with_options(self.twin.options_of(name)), self.log)
 
-    def folded(self, estimator: str, options: Mapping[str, float] | None = None, budget: float = BUDGET) -> Folded:
+    def folded(self, estimator: str, options: Mapping[str, float] | None = None, budget: float = BUDGET_S) -> TimedFold:
         """The log folded by a filter, with the options that the twin has for it, and these.
 
         Raises:
@@ -93,7 +93,7 @@ class Measured:
             return -np.inf
         return likelihood_of(fold, fold.n)
 
-    def _fold(self, estimator: str, options: Mapping[str, float], budget: float) -> Folded:
+    def _fold(self, estimator: str, options: Mapping[str, float], budget: float) -> TimedFold:
         twin, log = self.twin, self.log
         tuning = replace(twin.tuning, baseline=None).with_options(options)
         fold = Fold(estimator, twin.model, tuning, log.copy(), policy=twin.policy, expected=twin.expected)
@@ -108,7 +108,7 @@ class Measured:
         # The fold ends where the budget ended.
         fold.log.n = fold.n
         readings = int(np.sum(log.kind[: fold.n] == READING))
-        return Folded(fold, (time.process_time() - begun) / max(1, readings))
+        return TimedFold(fold, (time.process_time() - begun) / max(1, readings))
 
 
 def likelihood_of(fold: Fold, n: int) -> float:

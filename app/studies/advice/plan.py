@@ -11,7 +11,7 @@ from estimators.errors import ConfigError, nearest
 from sources.inspect import RecordingContents
 
 from .relations import Driven, Pair, driven, pairs, simulated
-from .signals import FEWEST, Signal, noise_of, signals, walk_of
+from .signals import MIN_VALUES, Signal, noise_of, signals, walk_of
 
 MAX_SIGNALS = 6
 """Signals that are taken where none are named."""
@@ -53,7 +53,7 @@ class Moves:
 
 
 @dataclass(frozen=True)
-class Plan:
+class DraftPlan:
     """A draft: its states, the inputs by their names, the pairs that were found among the signals, and these."""
 
     states: tuple[Moves, ...]
@@ -62,7 +62,7 @@ class Plan:
     pairs: tuple[Pair, ...]
 
 
-def plan(found: RecordingContents, wanted: Sequence[str]) -> Plan:
+def plan(found: RecordingContents, wanted: Sequence[str]) -> DraftPlan:
     """The signals that are named, or those that vary most finely, each in its role.
 
     Raises:
@@ -74,8 +74,10 @@ def plan(found: RecordingContents, wanted: Sequence[str]) -> Plan:
     picked = [_named(name, found, every) for name in wanted] if wanted else _finest(found, every)
     for one in picked:
         count = one.series.values.size
-        if count < FEWEST:
-            raise ConfigError(f"--signals {one.name}: has {count} values; its noise can be estimated from {FEWEST} on")
+        if count < MIN_VALUES:
+            raise ConfigError(
+                f"--signals {one.name}: has {count} values; its noise can be estimated from {MIN_VALUES} on"
+            )
     told = pairs(picked)
     taken: set[str] = set()
     names = [_identifier(one.name, taken) for one in picked]
@@ -93,7 +95,7 @@ def plan(found: RecordingContents, wanted: Sequence[str]) -> Plan:
         if leads[k] == k and k not in used:
             others = [pair for pair in told if pair.one and leads[pair.second] == k and pair.first == k]
             states.append(_moves(k, picked, names, others, lags.get(k)))
-    return Plan(tuple(states), tuple((names[k], picked[k]) for k in used), tuple(picked), tuple(told))
+    return DraftPlan(tuple(states), tuple((names[k], picked[k]) for k in used), tuple(picked), tuple(told))
 
 
 def _lags(picked: Sequence[Signal], leads: Sequence[int]) -> dict[int, Driven]:
@@ -153,7 +155,7 @@ def _named(name: str, found: RecordingContents, every: Sequence[Signal]) -> Sign
     silent = [s for m in found.messages for s in m.signals if name in (s.name, f"{m.name}.{s.name}")]
     silent += [s for s in found.columns if s.name == name]
     if not fits and silent:
-        raise ConfigError(f"--signals {name}: has 0 values; its noise can be estimated from {FEWEST} on")
+        raise ConfigError(f"--signals {name}: has 0 values; its noise can be estimated from {MIN_VALUES} on")
     if not fits:
         raise ConfigError(f"--signals {name}: is not in the log; {nearest(name, [one.name for one in every])}")
     if len({one.message for one in fits}) > 1:

@@ -86,13 +86,19 @@ def curvature(measured: Measured) -> Claim:
     question = "Is the curvature of f and h significant over the spread of the estimate?"
     found = measured.linearity
     if found.reason:
-        return Claim("curvature", question, UNTOLD, None, LIMITS.bias, APART, found.reason)
+        return Claim("curvature", question, UNTOLD, None, LIMITS.bias, FILTERS_APART, found.reason)
     name, apart = worst(found)
     reason = f"ekf and ukf agree to within {apart_text(apart)} (95th percentile; largest for {name})"
     if not np.isfinite(apart):
         reason = f"ekf loses {name} where ukf does not"
     return Claim(
-        "curvature", question, YES if apart > LIMITS.bias else NO, apart, LIMITS.bias, APART, reason + _gain(measured)
+        "curvature",
+        question,
+        YES if apart > LIMITS.bias else NO,
+        apart,
+        LIMITS.bias,
+        FILTERS_APART,
+        reason + _gain(measured),
     )
 
 
@@ -104,7 +110,7 @@ def _gain(measured: Measured) -> str:
     return f"; the likelihood of ukf is higher by {digits(other - one)} nats per measurement" if other > one else ""
 
 
-LEFT = 0.9
+MAX_PRIOR_LEFT = 0.9
 """Share of the prior deviation; a state that keeps more was not observed."""
 
 
@@ -114,27 +120,27 @@ def observed(measured: Measured) -> Claim:
     of = "of its prior deviation left to the least observable state"
     found, model = measured.gramian, measured.twin.model
     if found.whole is None:
-        return Claim("observed", question, UNTOLD, None, LEFT, of, found.reason)
+        return Claim("observed", question, UNTOLD, None, MAX_PRIOR_LEFT, of, found.reason)
     if found.whole.beyond:
-        return Claim("observed", question, UNTOLD, None, LEFT, of, found.note)
+        return Claim("observed", question, UNTOLD, None, MAX_PRIOR_LEFT, of, found.note)
     free = np.flatnonzero(model.prior_std > 0.0)
     if not free.size:
-        return Claim("observed", question, YES, 0.0, LEFT, of, "every state is certain at first")
+        return Claim("observed", question, YES, 0.0, MAX_PRIOR_LEFT, of, "every state is certain at first")
     left = found.whole.deviation[free]
     worst, most = model.state_names[int(free[np.argmax(left)])], float(left.max())
-    unseen = [model.state_names[int(k)] for k in free[left > LEFT]]
+    unseen = [model.state_names[int(k)] for k in free[left > MAX_PRIOR_LEFT]]
     reason = (
         f"after all readings {worst} keeps {percent(most)} of its prior deviation, the most of all states; the Gramian "
         f"has rank {found.whole.rank} of {model.nx} and conditioning {digits(found.whole.conditioning)}"
     )
     if not unseen:
-        return Claim("observed", question, YES, most, LEFT, of, reason)
+        return Claim("observed", question, YES, most, MAX_PRIOR_LEFT, of, reason)
     names = ", ".join(unseen)
     remedy = (
         f"no filter recovers {names}: add a sensor that it moves, or take it out of the state; until then it keeps its "
         f"prior and drifts, and its band is all that is known of it"
     )
-    return Claim("observed", question, NO, most, LEFT, of, f"{reason}; not seen: {names}", remedy)
+    return Claim("observed", question, NO, most, MAX_PRIOR_LEFT, of, f"{reason}; not seen: {names}", remedy)
 
 
 PREFERRED = ("ensrf", "letkf", "etkf", "enkf")
@@ -218,15 +224,15 @@ def _radii(measured: Measured, estimator: str) -> list[float]:
 
 STEADY = "kf-steady"
 
-APART = "σ between ekf and ukf (95th percentile)"
+FILTERS_APART = "σ between ekf and ukf (95th percentile)"
 
 EXACT = 1e-9
 """Difference in σ of two filters on a linear model, by rounding."""
 
-UNEVEN = 0.01
+PERIOD_TOLERANCE = 0.01
 """Share of the period by which the time between two readings may differ from it."""
 
-LOST = 0.001
+MAX_UNEVEN_SHARE = 0.001
 """Share of the intervals that may differ: a fixed gain cannot follow lost or late measurements."""
 
 
@@ -239,7 +245,7 @@ def worst(found: Linearity) -> tuple[str, float]:
 def linear(measured: Measured) -> Claim:
     """Check by the model's declaration, or by the effect of linearisation along the log."""
     question = "Are f and h linear?"
-    of = APART
+    of = FILTERS_APART
     found, model = measured.linearity, measured.twin.model
     if found.reason:
         if model.linear:
@@ -262,23 +268,25 @@ def steady(measured: Measured) -> tuple[Claim, float]:
     twin, log = measured.twin, measured.log
     against = unfit(find_entry(STEADY), twin.model)
     if against:
-        return Claim("steady", question, NO, None, LOST, of, f"{STEADY} does not apply: {against}"), 0.0
+        return Claim("steady", question, NO, None, MAX_UNEVEN_SHARE, of, f"{STEADY} does not apply: {against}"), 0.0
     value = log.value[: log.n, : len(twin.model.sensors[0].rows)]
     there = (log.kind[: log.n] == READING) & np.isfinite(value).all(axis=1)
     apart = np.diff(log.t[: log.n][there]) * 1e-9
     if not apart.size:
-        return Claim("steady", question, UNTOLD, None, LOST, of, "the log has one reading"), 0.0
+        return Claim("steady", question, UNTOLD, None, MAX_UNEVEN_SHARE, of, "the log has one reading"), 0.0
     period = float(np.median(apart))
-    uneven = float(np.mean(np.abs(apart - period) > UNEVEN * period))
+    uneven = float(np.mean(np.abs(apart - period) > PERIOD_TOLERANCE * period))
     reason = f"{twin.model.sensor_names[0]} reads every {digits(period)} s, with {percent(uneven)} of the intervals off"
-    if uneven > LOST:
-        return Claim("steady", question, NO, uneven, LOST, of, f"{reason}: the gain has to follow them"), period
+    if uneven > MAX_UNEVEN_SHARE:
+        return Claim(
+            "steady", question, NO, uneven, MAX_UNEVEN_SHARE, of, f"{reason}: the gain has to follow them"
+        ), period
     try:
         one, other = (
             measured.folded(name, given).fold.track for name, given in ((STEADY, {"period": period}), ("kf", {}))
         )
     except EstimatorError as error:
-        return Claim("steady", question, NO, uneven, LOST, of, str(error)), period
+        return Claim("steady", question, NO, uneven, MAX_UNEVEN_SHARE, of, str(error)), period
     with np.errstate(all="ignore"):
         share = np.abs(one.mean - other.mean) / other.std
     far = float(np.nanquantile(np.nanmax(share, axis=1), DIFFERENCE_QUANTILE))
@@ -325,7 +333,7 @@ def several(measured: Measured) -> Claim:
 TAILS_QUESTION = "Are the innovations heavy-tailed?"
 TAILS_OF = "excess kurtosis of the innovations"
 
-WORSE = 0.01
+MAX_LARGER_INNOVATION = 0.01
 """Share by which weights may make the mean innovation larger; where the asset jumps they make it much larger."""
 
 LEAST_DOF = 3.0
@@ -381,7 +389,7 @@ def heavy(measured: Measured, estimator: str, options: dict[str, float] | None =
     before, after = (float(np.mean(np.abs(one.innovation / scale)[both])) for one in (track, other))
     change = after / before - 1.0
     reason += f"; weighed so, the innovations are {100 * abs(change):.2g} % {'larger' if change > 0 else 'smaller'}"
-    if change > WORSE:
+    if change > MAX_LARGER_INNOVATION:
         reason += ": the asset jumps, not the sensor; weights would reject good measurements"
         return Claim("tails", TAILS_QUESTION, NO, worst.kurtosis, HEAVY_KURTOSIS, TAILS_OF, reason), np.inf
     return Claim("tails", TAILS_QUESTION, YES, worst.kurtosis, HEAVY_KURTOSIS, TAILS_OF, reason), dof
@@ -400,7 +408,7 @@ def with_weights(estimator: str, dof: float) -> tuple[str, dict[str, float]]:
 SPEED = 1e9
 """Multiplications and additions a second of one processor in small dense matrices, of the order of magnitude."""
 
-SHARE = 0.5
+MAX_PROCESSOR_SHARE = 0.5
 """Of one processor that an estimate may take; the rest is for late readings and refolds."""
 
 
@@ -413,7 +421,7 @@ def small(measured: Measured) -> Claim:
     n, m = model.nx, max(len(sensor.rows) for sensor in model.sensors)
     flops = 4.0 * n**3 + 6.0 * m * n**2
     share = rate * flops / SPEED
-    fits = n <= LARGE and share <= SHARE
+    fits = n <= LARGE and share <= MAX_PROCESSOR_SHARE
     reason = (
         f"{_counted(n, 'state')}: a covariance takes {bytes_text(8.0 * n**2)} and 4 n³ + 6 m n² = {digits(flops)} "
         f"operations a reading of m = {_counted(m, 'row')}; at {digits(rate)} readings a second that is "
@@ -425,7 +433,7 @@ def small(measured: Measured) -> Claim:
         figure, threshold, of = float(n), float(LARGE), "states"
         reason += f"; beyond {LARGE:,} states no filter here forms one"
     else:
-        figure, threshold, of = share, SHARE, "of a processor for a covariance"
+        figure, threshold, of = share, MAX_PROCESSOR_SHARE, "of a processor for a covariance"
     question = "Does the state dimension suit a full covariance at this rate?"
     return Claim("size", question, YES if fits else NO, figure, threshold, of, reason)
 
@@ -447,7 +455,7 @@ def affordable(measured: Measured, estimator: str, options: dict[str, float] | N
         f"{estimator} took {seconds_text(folded.seconds)} a reading ({digits(runs)} model runs a step); times "
         f"{digits(measured.rate)} readings a second that is {percent(share)} of a processor"
     )
-    if share <= SHARE:
-        return Claim("cost", COST_QUESTION, YES, share, SHARE, COST_OF, reason)
+    if share <= MAX_PROCESSOR_SHARE:
+        return Claim("cost", COST_QUESTION, YES, share, MAX_PROCESSOR_SHARE, COST_OF, reason)
     remedy = "fewer readings, fewer members, or a simpler filter: time.late and decimation are for the edge"
-    return Claim("cost", COST_QUESTION, NO, share, SHARE, COST_OF, reason, remedy)
+    return Claim("cost", COST_QUESTION, NO, share, MAX_PROCESSOR_SHARE, COST_OF, reason, remedy)

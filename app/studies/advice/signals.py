@@ -11,7 +11,7 @@ import numpy as np
 
 from sources.inspect import RecordingContents, Series, holes
 
-FEWEST = 20
+MIN_VALUES = 20
 """Values needed to estimate a noise."""
 
 SKIPPED = re.compile(
@@ -21,7 +21,7 @@ SKIPPED = re.compile(
 
 DEGREES = ("deg", "°", "degree", "degrees")
 
-STEPS = 8
+MAX_SWITCH_LEVELS = 8
 """Levels up to which a signal is a switch and no measurement."""
 
 
@@ -82,11 +82,11 @@ def signal(message: str | None, series: Series) -> Signal:
 
 
 def _kind(series: Series, levels: np.ndarray) -> str:
-    if series.values.size < FEWEST:
+    if series.values.size < MIN_VALUES:
         return "short"
     if levels.size == 1:
         return "constant"
-    if levels.size <= STEPS:
+    if levels.size <= MAX_SWITCH_LEVELS:
         return "switch"
     if SKIPPED.search(series.name):
         return "counter"

@@ -16,7 +16,7 @@ from app.cli.main import main
 from app.studies.compare import fold_row, refold, tidy, within
 from app.studies.scores import (
     SCORES,
-    Row,
+    FilterScore,
     ScoreCell,
     Spread,
     cells,
@@ -38,8 +38,10 @@ from tests.support import as_log
 
 NOTHING = Spread(np.nan)
 ROWS = [
-    Row("kf", {"°C": Spread(1.04321), "V": Spread(0.01)}, Spread(0.823), (0.7, 1.3), Spread(0.892), 1.26e-6, {}),
-    Row(
+    FilterScore(
+        "kf", {"°C": Spread(1.04321), "V": Spread(0.01)}, Spread(0.823), (0.7, 1.3), Spread(0.892), 1.26e-6, {}
+    ),
+    FilterScore(
         "pf",
         {"°C": Spread(1.04321, 0.0123), "V": Spread(123.4, 56.7)},
         Spread(0.8231, 1e-9),
@@ -53,7 +55,7 @@ ROWS = [
         since=12.5,
         lost=0.25,
     ),
-    Row("ukf", {}, NOTHING, (np.nan, np.nan), NOTHING, np.nan, {}, failure="no factor"),
+    FilterScore("ukf", {}, NOTHING, (np.nan, np.nan), NOTHING, np.nan, {}, failure="no factor"),
 ]
 LINES = cells(ROWS, events=241, seconds=120.0)
 
