@@ -75,7 +75,7 @@ def test_the_catalogue_says_what_a_kind_takes(page):
     # The scripted source is no asset whose parameters could change.
     assert set(kinds) == set(KINDS) - {"model"}
     assert kinds["spike"]["parameters"][1] == {
-        "name": "rate", "unit": "1", "help": "probability, a reading", "default": None,
+        "name": "rate", "unit": "1", "help": "probability for each measurement", "default": None,
     }  # fmt: skip
 
 
