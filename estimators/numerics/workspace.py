@@ -89,12 +89,13 @@ def declare_layout(
             begin = f"at_{start} + {WORD} * ({skipped or 0})" if place else "at"
             lines += [f"    at_{name} = {begin}", f"    _{name}, end = {take}(at_{name}, {shape})"]
             lines += [] if place else ["    at = end"]
-    lines.append(f"    return _kind({', '.join(f'_{name}' for name in fields)}, at)")
+    # No field of a named tuple begins with an underscore, so no local is called like the tuple.
+    lines.append(f"    return __kind({', '.join(f'_{name}' for name in fields)}, at)")
     # As of namedtuple itself, the caller's module is where pickle finds the class again.
     module = sys._getframe(1).f_globals["__name__"]
     made: Any = namedtuple(kind, [*fields, "end"], module=module)  # type: ignore[misc]
     names: dict[str, Any] = {function.__name__: function for function in (*functions, *_TAKES)}
-    names |= {"__name__": module, "_kind": made}
+    names |= {"__name__": module, "__kind": made}
     exec("\n".join(lines), names)
     return made, layout(names[kind])
 

@@ -10,6 +10,7 @@ from estimators.ensemble import analysis, shared
 from estimators.fold import Fold
 from estimators.log import READING, TICK, Events, Log
 from estimators.model.state_space import Field, Noise, Row, Sensor, StateSpaceModel
+from estimators.numerics.workspace import declare_layout, size_of
 from estimators.registry import ESTIMATORS
 from estimators.tuning import Tuning
 from tests.estimators.linear_models import random_linear
@@ -135,3 +136,9 @@ def test_localised_ensemble_filters_keep_to_their_room(name, n, rows, members, r
         monkeypatch.setattr(module, "crews", lambda numbers, start: crews)
     options = {"members": members, "inflation": 1.1} | ({"radius": radius} if name != "etkf" else {"rotation": 1})
     check(name, ring(n, rows), options)
+
+
+def test_a_field_of_a_layout_may_have_any_name():
+    """Names of the generated function are its own: a field `kind` once took the place of the tuple."""
+    _, layout_of = declare_layout("Named", "n", kind="1", made="n", at="n, 2", place="n = made")
+    assert size_of(layout_of, 3) == 1 + 3 + 6
