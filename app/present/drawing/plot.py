@@ -194,7 +194,7 @@ def plot_track(
     """Draw a fold: a panel per state with its measurements, and the NIS.
 
     Args:
-        model: What was folded with.
+        model: Model of the fold.
         events: The log's events, n of them.
         track: Their rows, n of them.
         episodes: Faults, shaded from start to end.

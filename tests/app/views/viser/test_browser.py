@@ -59,11 +59,6 @@ def page(browser, view):
     assert errors == []
 
 
-def inputs(page):
-    """What the fields of the panel show now."""
-    return page.evaluate("[...document.querySelectorAll('input')].map(input => input.value)")
-
-
 def test_the_chart_is_drawn_with_band_and_line(page):
     low, high = page.evaluate(f"(() => {{ const y = {CHARTS}[0].scales.y; return [y.min, y.max]; }})()")
     assert low <= 0.0 and 1.3 < high < 20.0
@@ -83,21 +78,13 @@ def test_the_chart_is_drawn_with_band_and_line(page):
     assert colours["estimate"] > 100 and colours["band"] > 1000
 
 
-def test_typed_variance_reaches_the_engine(page, engine):
-    field = page.locator("input[value='0.01']")
-    field.fill("0.5")
-    wait_for(lambda: engine.commands)
-    assert engine.commands == [SetTuning("Q.temperature", 0.5)]
-    page.get_by_text("revision 1").wait_for()
-
-
 def test_a_chosen_axis_is_drawn_and_the_other_takes_its_place(page, view):
     before = view.stage.scene
     page.get_by_role("combobox", name="x", exact=True).click()
     page.get_by_role("option", name="rate", exact=True).click()
     wait_for(lambda: view.stage.scene is not before)
     assert [axis.state for axis in view.stage.scene.axes] == [1, 0]
-    wait_for(lambda: view.panel.choices["y"].handle.value == "temperature")
+    wait_for(lambda: view.panel.choices["y"].value == "temperature")
 
 
 def test_each_pane_gets_a_camera_that_fills_it(page, view):
@@ -122,9 +109,7 @@ def test_dragged_slider_reaches_the_engine(page, engine):
     for step in range(1, 31):
         page.mouse.move(x + 2 * step, y)
     page.mouse.up()
-    # More commands may come while this one is looked at: what counts is where engine and panel come to agree.
     wait_for(lambda: engine.status().tuning.get("Q.temperature") > 0.05)
-    wait_for(lambda: f"{engine.status().tuning.get('Q.temperature'):.4g}" in inputs(page))
     assert all(isinstance(command, SetTuning) and command.key == "Q.temperature" for command in engine.commands)
 
 
@@ -143,7 +128,9 @@ def test_two_browsers_show_the_same(page, browser, view, engine):
     second.wait_for_function(f"{CHARTS}.length === 1 && {CHARTS}[0].data[0].length >= 30")
     engine.submit(SetTuning("R.winding", 0.25))
     for one in (page, second):
-        one.wait_for_function("[...document.querySelectorAll('input')].some(input => input.value === '0.25')")
+        one.get_by_text("revision 1").wait_for()
+    place = np.log10(0.25 / 4.0)
+    wait_for(lambda: abs(view.panel.controls.handles["R.winding"].value - place) < 0.01)
     other.close()
     assert engine.commands == [SetTuning("R.winding", 0.25)]
 
