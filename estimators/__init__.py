@@ -1,6 +1,6 @@
 """Pure numerics: models, the log, the fold, the filters, diagnostics. No I/O, no clock.
 
-What a script needs is here by name, and loaded when it is first asked for: `import estimators` compiles nothing.
+Names for scripts are loaded on first use: `import estimators` compiles nothing.
 """
 
 from __future__ import annotations

@@ -42,7 +42,7 @@ class Source(Protocol):
 
 @runtime_checkable
 class Spanned(Protocol):
-    """A source that may know its time span before it is read."""
+    """A source with a time span that can be known before reading."""
 
     @property
     def span(self) -> tuple[int, int] | None:

@@ -1,4 +1,4 @@
-"""Baseline figures of a fold: what they are, how they are stored, and whether they got worse.
+"""Baseline figures of a fold: definition, storage and comparison.
 
 A fold is a pure function, so on one log a deterministic filter gives the same figures again, and any change is real.
 A negligible change is allowed: a tenth of the figure's standard error over the log, which would add half a percent to

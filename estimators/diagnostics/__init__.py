@@ -1,1 +1,1 @@
-"""What a track was worth: health, scores, calibration, causes of failure, pictures of a field."""
+"""Assessment of a track: health, scores, calibration, causes of failure, pictures of a field."""

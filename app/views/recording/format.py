@@ -240,7 +240,7 @@ class RecordingFile:
         """Hand everything to the operating system.
 
         Raises:
-            OSError: If the file cannot grow; what was written before can be read.
+            OSError: If the file cannot grow; earlier content remains readable.
         """
         self._file.flush()
 

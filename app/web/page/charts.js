@@ -67,7 +67,7 @@ export class Charts {
     this.ask();
   }
 
-  // Ask for what the view shows, in as many points as there are pixels for.
+  // Request the visible span, with as many points as there are pixels.
   ask() {
     if (!this.layout) return; // not yet
     const points = Math.max(50, Math.min(2000, Math.round((this.node.clientWidth - 60) / DENSITY)));

@@ -69,7 +69,7 @@ export class Faults {
     this.showUnits();
   }
 
-  /* "row" in a unit is that of what is chosen; rows of several units have none in common. */
+  /* "row" in a unit is the unit of the chosen sensor; rows of several units have none in common. */
   showUnits() {
     const { sensors, inputs, parameters } = this.catalogue;
     const [what, name] = this.target.value.split(/\.(.*)/s);

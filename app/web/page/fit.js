@@ -148,8 +148,7 @@ function group(prefix, title, keys) {
   return { head: element("label", { title: keys.join(", ") }, all, `${title} `, element("small", {}, String(keys.length))), list, wanted };
 }
 
-// What came of a fit: the verdict in words, every entry before and after, and what both predict, of what was fitted to
-// and of what was held out.
+// Result of a fit: verdict, every entry before and after, and predictions on fitted and held-out data.
 
 const ALONE = "left alone: the data cannot tell";
 const EDGE = "at the edge of its range: the best may lie beyond";
@@ -208,10 +207,10 @@ function scores({ before, after }) {
 }
 
 const about = ({ result, revision, events, elapsed }) =>
-  element("p", { class: "about" }, `From run ${revision}, ${result.estimator}: ${result.folds} folds of ${events.toLocaleString("en")} events in ${compact(elapsed, 2)} s.${result.power < 1 ? ` Of what the fitted blocks say ${compact(result.power, 2)} is believed, in the intervals too: with more of it the others are predicted no better.` : ""}`);
+  element("p", { class: "about" }, `From run ${revision}, ${result.estimator}: ${result.folds} folds of ${events.toLocaleString("en")} events in ${compact(elapsed, 2)} s.${result.power < 1 ? ` The likelihood of the fitted blocks is weighted by ${compact(result.power, 2)}, also in the intervals: a larger weight does not improve the held-out predictions.` : ""}`);
 
-// Dual estimation: what was fitted on the last window beside the running twin. What won is a card above the knobs, to be
-// accepted or dismissed; every fit, with its evidence, is in a panel.
+// Dual estimation: fits of the last window beside the running twin. A proposal is a card above the sliders, to be accepted
+// or dismissed; every fit, with its evidence, is in a panel.
 
 export class Refit {
   constructor(model, link, tune) {
@@ -293,8 +292,8 @@ export class Refit {
   }
 }
 
-// Advice: which estimator the log speaks for, as cards. One for what is recommended, which applies itself, and one for each
-// claim with the figure that made it; where noises are off, its card opens the fit.
+// Advice on the estimator, as cards: one for the recommendation, with a button that applies it, and one per claim with its
+// figure; a card about wrong noise opens the fit.
 
 const ADVICE_PERIOD = 500; // ms between two looks at whether it is there
 

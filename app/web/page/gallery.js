@@ -1,4 +1,4 @@
-// The gallery: every twin with a picture, what it teaches and the question it answers; beside them the recordings.
+// The gallery: every twin with its picture, lesson and question; beside them the recordings.
 
 import { keys } from "./controls.js";
 import { $, element, setText } from "./dom.js";

@@ -163,8 +163,8 @@ export class Knob {
   }
 }
 
-// Around a knob: a small curve of likelihood and NIS over values about the present one, folded in the background, and
-// what the innovations themselves say of each R and of Q.
+// Around a slider: a small curve of likelihood and NIS over values near the present one, folded in the background, and
+// the values of R and Q that the innovations suggest.
 
 const [WIDTH, HEIGHT, EDGE] = [260, 64, 6]; // of the drawing
 const MOST = 3; // curves that stay open
@@ -241,7 +241,7 @@ export class Around {
     this.mark();
   }
 
-  // What is said of a key: {value, text, take}, or null. Of Q it is one factor of all: sizes alone tell no more.
+  // The suggestion for a key, {value, text, take}, or null. Q has one common factor: sizes alone do not determine more.
   saying(key) {
     const knob = this.tune.knobs.get(key);
     if (key.startsWith("Q.")) {
@@ -296,7 +296,7 @@ class Curve {
 
   take(swept) {
     this.when = performance.now();
-    if (!swept.points.length && !swept.done && this.swept) return; // the older curve says more than none
+    if (!swept.points.length && !swept.done && this.swept) return; // keep the older curve
     this.swept = swept;
     this.node.dataset.done = swept.done;
     this.draw();

@@ -104,8 +104,8 @@ function when(seconds) {
 
 const RECORDING = ".rrd";
 
-// `twins` gives the names of those that could read a log, the likeliest first; `say` tells what goes on and what not,
-// `follow` how it goes with what is being opened.
+// `twins` lists the twins that could read a log, the most likely first; `say` reports progress and errors,
+// `follow` reports the progress of opening.
 export function drops({ twins, say, follow }) {
   const over = element("div", { class: "drop-here", hidden: true }, element("p", {}, "Drop it: a recording opens for review, a log is read by a twin"));
   document.body.append(over);

@@ -85,7 +85,7 @@ export function setTimeCursor(id, timeline, time, play) {
   return new Uint8Array(field(6, request));
 }
 
-// Rerun's web viewer in a canvas of this page. It has no connection of its own: what it shows is handed to it.
+// Rerun's web viewer in a canvas of this page. It has no connection of its own: the page hands its data over.
 
 const CHANNEL = "nisus";
 const PATIENCE = 30000; // ms until bytes must have been taken in
@@ -168,7 +168,7 @@ export class Viewer {
     this.announced = true;
   }
 
-  // The viewer shows another recording before it has its rows and colours: until then, what was shown last covers it.
+  // The viewer shows another recording before it has its rows and colours: until then the last picture covers it.
   hold() {
     this.cover.width = this.canvas.width;
     this.cover.height = this.canvas.height;

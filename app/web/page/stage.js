@@ -25,9 +25,9 @@ export class Stage {
     view.addEventListener("change", place);
   }
 
-  // Of Viser's page. The query of the socket's address says what is shown, so that no more than that is sent. In the
-  // frame this machine has its other name: what is another site the browser draws in a process of its own, and charts
-  // and knobs need not wait for three.js. Cookies do not go there, so a pass does.
+  // Address of Viser's page. Its query lists the shown parts, so that nothing else is sent. The frame uses this machine's
+  // other name: a browser draws another site in a process of its own, so charts and sliders do not wait for three.js.
+  // Cookies are not sent there, so a pass is.
   address(framed) {
     const names = { "127.0.0.1": "localhost", localhost: "127.0.0.1" };
     const other = framed && this.there?.pass && names[location.hostname];

@@ -119,8 +119,8 @@ function read(text) {
   return Number.isFinite(whole) ? BigInt(whole) * 1_000_000n + BigInt(fraction.padEnd(DIGITS, "0")) : null;
 }
 
-// One time for the windows of one twin: the page tells which moment it shows, and Rerun in a window of its own tells the
-// page where it was scrubbed to. Windows of one browser hear each other; nothing goes over the network.
+// One time for the windows of one twin: the page sends the moment it shows, and Rerun in its own window sends the moment
+// it was scrubbed to. Windows of one browser hear each other; nothing goes over the network.
 
 const name = (boot) => `nisus time ${boot}`;
 
