@@ -213,8 +213,8 @@ def place(outlook: Outlook, aspect: float) -> tuple[np.ndarray, np.ndarray]:
 def _distance(outlook: Outlook, aspect: float) -> float:
     """Return the distance at which a camera sees the points, with a margin.
 
-    A point c is seen if |c · r| <= tan(h/2) (d + c · f), with f forward, r to the right and h the angle across; likewise
-    upwards, with the vertical angle.
+    A point c is seen if |c · r| <= tan(h/2) (d + c · f), with f forward, r to the right, h the angle across;
+    likewise upwards, with the vertical angle.
     """
     forward = -_unit(outlook.direction)
     right = _unit(np.cross(forward, outlook.up))
