@@ -1,9 +1,11 @@
 """The fold is a pure function of its log: pieces, order of arrival, copies and cuts leave every bit as it was."""
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
+from numba import njit
 
 from estimators.errors import EstimatorError
 from estimators.fold import Fold, fold
@@ -41,11 +43,16 @@ def reading(t, sensor, values, width=MODEL.width):
     return Events.one(t, t, READING, sensor, values, width)
 
 
+@cache
 def in_python(name):
     """An entry whose compiled functions the Python loop calls, each with the context behind the view."""
 
     def behind(function):
-        return lambda view, *rest: function(view.context, *rest)
+        @njit(error_model="numpy")
+        def call(context, rest):
+            return function(context, *rest)  # it has no wrapper for Python
+
+        return lambda view, *rest: call(view.context, rest)
 
     entry = ESTIMATORS[name]
     return replace(entry, name=f"{name}-python", interpreted=True, functions=tuple(map(behind, entry.functions)))
