@@ -79,7 +79,7 @@ def test_a_linear_model_is_forecast_by_its_matrices(estimator):
 @pytest.mark.parametrize("estimator, count", [("pf", {"particles": 2000}), ("enkf", {"members": 2000})])
 def test_members_have_the_quantiles_and_first_passages_of_paths(estimator, count):
     log = log_of(WALK.width, (0.0, READING, 1.2), (1.0, READING, 1.4))
-    made = folded(estimator, WALK, log, **count)
+    made = folded(estimator, WALK, log, options=count)
     exact = folded("kf", WALK, log)
     (mean,), ((start,),) = exact.moments()
     n, limit, horizon, step = 2000, 3.0, 10.0, 0.25

@@ -117,7 +117,7 @@ def test_what_has_no_name_in_the_file_is_refused(tmp_path: Path, f: str) -> None
         BOX.replace("EXECUTOR", "'processes'").replace(" f=f,", f" f={f},").replace("FACTOR = 1.0\n", called + " = 1\n")
     )
     with pytest.raises(
-        ModelError, match="model box: f fails on .*stand by their names in a module or file, use threads"
+        ModelError, match="model box: f fails on .*processes need functions defined in a module or file, use threads"
     ):
         run(tmp_path, text)
 

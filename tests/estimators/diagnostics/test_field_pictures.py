@@ -139,7 +139,7 @@ def test_a_large_field_is_averaged_over_squares_the_last_ones_smaller():
 
 
 def test_pictures_keep_within_their_memory_and_their_numbers_stay(monkeypatch):
-    monkeypatch.setattr(module, "MEMORY", 12 * 8 * 10)
+    monkeypatch.setattr(module, "MAX_PICTURE_BYTES", 12 * 8 * 10)
     field = Field("t", "K", (2, 4))
     pictures = module.Pictures(field, 1.0)
     log = Log(8)

@@ -92,7 +92,9 @@ def test_the_others_say_why_not(estimator):
 
 def test_a_variance_is_tuned_to_zero_only_where_the_model_says_so():
     assert Tuning.of(model()).set("R.y", 1.0).set("R.y", 0.0).get("R.y") == 0.0
-    with pytest.raises(ConfigError, match=r"R\.y is 0; a variance must be positive, or zero where the model says"):
+    with pytest.raises(
+        ConfigError, match=r"R\.y is 0; a variance must be positive, or zero where the model declares zero noise"
+    ):
         Tuning.of(model(variance=1.0)).set("R.y", 0.0)
     with pytest.raises(ConfigError, match=r"R\.y is -1; a variance must be positive"):
         Tuning.of(model()).set("R.y", -1.0)

@@ -250,7 +250,7 @@ def test_the_memory_is_bounded_and_the_bits_are_the_same(estimator, notes, monke
     log = long_log()
     whole = smooth_with_pairs(estimator, log)
     rooms = []
-    made = moments_back.Recorder
+    made = moments_back.StepRecorder
 
     def noting(*given):
         rooms.append(given[-1])

@@ -313,7 +313,7 @@ def test_particles_are_replaced():
     log, _ = simulate(np.random.default_rng(13), 60)
     tuning = Tuning.of(COUPLED)
     found = sensitivity("pf", COUPLED, tuning, log)
-    assert found.estimator == "ekf" and "pf draws at random" in found.note
+    assert found.estimator == "ekf" and "pf is a Monte Carlo filter" in found.note
     np.testing.assert_array_equal(found.fisher, sensitivity("ekf", COUPLED, tuning, log).fisher)
 
 
@@ -321,4 +321,4 @@ def test_what_is_too_large_or_silent_is_refused_with_a_reason():
     model = MODELS["thermal_field"]
     found = sensitivity("enkf", model, Tuning.of(model), Log.of(model))
     assert "states; sensitivities are computed up to 64" in found.reason and not found.responses
-    assert "no reading" in sensitivity("ekf", WALK, Tuning.of(WALK), Log.of(WALK)).reason
+    assert "no measurement" in sensitivity("ekf", WALK, Tuning.of(WALK), Log.of(WALK)).reason
