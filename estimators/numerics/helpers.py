@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import CellType, CodeType, FunctionType
 from typing import Any
+from uuid import UUID
 
 from .jit import jit
 
@@ -40,7 +41,7 @@ def _with_helpers(function: Any, known: dict[Any, Any]) -> Any:
     closure = tuple(CellType(item) for item in cells) if cells else None
     made = FunctionType(function.__code__, world, function.__name__, function.__defaults__, closure)
     made.__kwdefaults__, made.__module__ = function.__kwdefaults__, function.__module__
-    made.__qualname__ = f"{function.__qualname__}_{_digest([*helpers.values(), *inner])}"
+    made.__qualname__ = f"{function.__qualname__}_{_digest([*helpers.values(), *inner])[:12]}"
     for name, item in helpers.items():
         world[name] = _compiled(item, known)
     for cell, item in zip(closure or (), cells, strict=True):
@@ -54,6 +55,9 @@ def _compiled(helper: Any, known: dict[Any, Any]) -> Any:
         # Registered first, so that a function that calls itself through its helpers does not recurse forever.
         known[helper] = helper
         known[helper] = jit(_with_helpers(helper, known))
+        # Numba tells closures apart by what they hold, a compiled function by an identifier that is random by default:
+        # one made from the source finds the code that another process compiled.
+        known[helper]._set_uuid(str(UUID(_digest([helper])[:32])))
     return known[helper]
 
 
@@ -84,4 +88,4 @@ def _digest(helpers: list[Any]) -> str:
         names = [helper.__globals__.get(name) for name in _names(helper.__code__)]
         helpers += [item for item in names if _plain(item)]
         helpers += [cell.cell_contents for cell in helper.__closure__ or () if _plain(cell.cell_contents)]
-    return digest.hexdigest()[:12]
+    return digest.hexdigest()
