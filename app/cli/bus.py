@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 import time
 from collections import Counter
 from pathlib import Path
@@ -10,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from estimators.errors import ConfigError
 
-from ..terminal import complain, restore, when_asked_to_end
+from ..terminal import EndRequest, complain, restore, when_asked_to_end
 from ..twin.twin import Twin, load_twin
 from .options import settings
 
@@ -88,7 +87,7 @@ def _logger(path: Path) -> Any:
 
 def _play(player: Any, duration: float | None) -> None:
     """Send frames until the asset ends, the time is up, or a signal arrives."""
-    done = threading.Event()
+    done = EndRequest()
     previous = when_asked_to_end(done.set)
     end = time.monotonic() + duration if duration is not None else float("inf")
     try:

@@ -24,7 +24,7 @@ from estimators.errors import SourceError
 
 from ..concurrency import run_all
 from ..live.commands import Record
-from ..terminal import complain, restore, when_asked_to_end
+from ..terminal import EndRequest, complain, restore, when_asked_to_end
 from ..views.recording.rrd_file import NEVER, Split
 from .door import Door
 from .running import Opening, RunningTwin
@@ -241,7 +241,7 @@ class Session:
         Raises:
             NisusError: If the page cannot be served, or, in the end, that `record` could not be written.
         """
-        done = threading.Event()
+        done = EndRequest()
         opening: BrowserPage | None = None
         previous = when_asked_to_end(done.set)
         try:
@@ -255,13 +255,12 @@ class Session:
                 if self._page.open_browser:
                     opening = self._open(self.url)
             end = time.monotonic() + duration if duration is not None else float("inf")
-            while not done.is_set() and time.monotonic() < end:
+            while not done.wait(min(0.2, max(0.0, end - time.monotonic()))) and time.monotonic() < end:
                 if until_finished and self.engine.status().finished:
                     break
                 if opening is not None and self.door is not None and self.door.entered.is_set():
                     opening.close()
                     opening = None
-                done.wait(min(0.2, max(0.0, end - time.monotonic())))
         except KeyboardInterrupt:
             pass
         finally:

@@ -32,6 +32,32 @@ def test_works_are_done_side_by_side_and_all_before_it_returns():
     run_all()
 
 
+SIGNALS_IN_WAIT = """
+import os, signal, sys
+from app.terminal import EndRequest, when_asked_to_end
+done = EndRequest()
+when_asked_to_end(done.set)
+calls = []
+def look(frame, event, arg):
+    if frame.f_code is not look.__code__ and len(calls) < 50:
+        calls.append(frame.f_code.co_name)
+        os.kill(os.getpid(), signal.SIGTERM)
+sys.setprofile(look)
+while not done.wait(0.01):
+    pass
+sys.setprofile(None)
+print(len(calls) > 2 and done.wait(0.0))
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="os.kill ends a process there")
+def test_a_signal_at_any_moment_of_the_wait_ends_it():
+    told = subprocess.run(
+        [sys.executable, "-c", SIGNALS_IN_WAIT], cwd=ROOT, capture_output=True, text=True, check=True, timeout=PATIENCE
+    )
+    assert told.stdout == "True\n"
+
+
 def test_what_fails_is_raised_once_all_are_done():
     failing, done = threading.Event(), []
 
