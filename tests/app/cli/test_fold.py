@@ -24,6 +24,7 @@ from estimators.log import Log
 from estimators.models import MODELS
 from estimators.track import HEALTH_NAMES
 from estimators.tuning import Tuning
+from tests.app.present.export.test_report import data_of
 
 DRIVE = """\
 model: motor_winding
@@ -333,8 +334,19 @@ def test_what_is_smoothed_is_drawn_in_recording_and_report(tmp_path: Path) -> No
     with pytest.raises(ConfigError, match=r"run\.rrd: is there already"):
         fold_twin(Fold(name, out=out))
     assert out.read_bytes() == before
-    # A chart in the report has three curves in its colour, and a word on it; without --smooth there is none.
+    # The charts of the report have it too, with a sentence; without --smooth there is none.
     text = html.read_text()
-    assert text.count('stroke="#264c46"') >= 3 * 2 and "the readings after each moment too" in text
+    assert "smoothed states, which also use later measurements" in text
+    data, columns = data_of(text)
+    assert set(data["streams"]) == {"live", "smoothed"}
+    seconds, shown = columns("smoothed")
+    states = ("temperature", "rate")
+    assert set(shown) == {f"{kind}:{state}" for kind in ("mean", "upper", "lower") for state in states}
+    np.testing.assert_allclose(seconds, (table["t_ns"] - table["t_ns"][0]) * 1e-9, atol=1e-9)
+    for state in states:
+        mean, std = table[f"{state}_smooth"], table[f"{state}_smooth_std"]
+        for kind, drawn in (("mean", mean), ("upper", mean + 2 * std), ("lower", mean - 2 * std)):
+            np.testing.assert_allclose(shown[f"{kind}:{state}"], drawn, rtol=1e-6, atol=1e-6)
     assert fold_twin(Fold(name, html=html)) == 0
-    assert "#264c46" not in html.read_text()
+    text = html.read_text()
+    assert set(data_of(text)[0]["streams"]) == {"live"} and "smoothed states" not in text

@@ -61,7 +61,7 @@ def test_one_wrong_stamp_does_not_blind_the_twin(start):
     wait_for(lambda: row_count(engine) == 299)
     counts = fresh_status(engine).counts
     assert counts[WRONG_TIME] == 1 and "stale" not in counts and "held" not in counts
-    (text,) = [line.text for line in engine.notices.since(0) if "refused" in line.text]
+    (text,) = [line.text for line in engine.notices.since(0) if "rejected" in line.text]
     assert text.startswith("winding: its time, 3700 s, is 3601 s after the newest") and "\n" not in text
 
 
