@@ -31,8 +31,10 @@ $("theme").addEventListener("click", () => {
 const answer = await fetch("/api/model");
 if (!answer.ok) throw new Error(await answer.text());
 const model = await answer.json();
+const kinds = await Promise.all(settings.charts.map((name) => import(`/page/charts/${name}`)));
 window.nisus = { model, drawn: 0, revision: null };
 
+// Nothing is awaited from here on: what arrives before all listen would be lost.
 const link = new Link(settings.boot);
 window.nisus.link = link;
 
@@ -58,7 +60,6 @@ link.addEventListener("notices", (event) => {
 });
 
 const view = new View(model.window);
-const kinds = await Promise.all(settings.charts.map((name) => import(`/page/charts/${name}`)));
 const charts = new Charts($("charts"), model, link, view, kinds);
 window.nisus.charts = charts;
 window.nisus.view = view;
