@@ -41,7 +41,10 @@ export class Charts {
     link.addEventListener("frames", () => this.draw());
     link.addEventListener("episodes", (event) => {
       this.episodes = event.detail;
-      if (performance.now() - this.drawnAt > QUIET) this.draw(); // of a twin that has ended, no frame follows
+      clearTimeout(this.marking);
+      // Of a twin that has ended, no frame follows.
+      if (performance.now() - this.drawnAt > QUIET) this.draw();
+      else this.marking = setTimeout(() => this.draw(), QUIET);
     });
     link.addEventListener("status", (event) => this.update(event.detail));
     new ResizeObserver(() => this.ask()).observe(node);
