@@ -161,7 +161,9 @@ class _Content:
                 if hasattr(column, "flatten")
             }
             if part == "twin":
-                self.header = {name: values[0] for name, values in columns.items()}
+                # Written again when the twin's files are saved; one chunk may hold both, and the last row counts.
+                last = {name: batch.column(name)[-1].as_py() for name in columns}
+                self.header = {name: values[0] for name, values in last.items() if values}
             elif part == "summary":
                 self.summary = json.loads(columns["json"][-1])
             elif part == "notices":

@@ -191,6 +191,8 @@ class RecordingPart:
         if before is None:
             self._events, self._charts = engine.cursor(follows_log=True), engine.cursor(follows_log=True)
             self._start, self._base = -1, engine.base()
+            # To open the first file of a process takes a second, in which the twin may be edited.
+            self._asked_of = engine.here()
             self.disk = Disk(path.absolute().parent)
         else:
             # The same cursors, so that no late measurement is missed in between.
@@ -198,6 +200,7 @@ class RecordingPart:
             # Health uses earlier rows, so they are repeated.
             self._start, self._base = engine.origin(self._events.next - MAX_ROWS_PER_READING * engine.policy.window)
             self._events.next = self._start
+            self._asked_of = None
         self._drawn_from = self._charts.next
         self._revision = -1
         self._before = before._revision if before else -1
@@ -260,6 +263,9 @@ class RecordingPart:
                 if self._engine.twin is not self._twin:
                     self._twin = self._engine.twin
                     self.file.twin(self._twin.text, self._twin.overrides, self._twin.version)
+                if (here := self._asked_of) is not None and here.revision != pull.revision:
+                    self.file.tuning(here.tuning, here.estimator, pull.first, here.revision)
+                self._asked_of = None
                 self.file.tuning(tuning, estimator, pull.first, pull.revision)
                 # Also after an edit while this part was created: its base may be of the revision before.
                 if (begun or self._before not in (-1, pull.revision)) and not pull.fresh:
