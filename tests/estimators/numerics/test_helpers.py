@@ -14,6 +14,7 @@ from estimators.log import READING, Events, Log
 from estimators.model.joint import JointParameter, joint
 from estimators.model.state_space import Noise, Parameter, Row, Sensor, State, StateSpaceModel
 from estimators.numerics.helpers import with_helpers
+from estimators.numerics.jit import jit
 from estimators.tuning import Tuning
 
 LIMIT = 41.0
@@ -79,6 +80,22 @@ def test_a_helper_in_a_closure_is_compiled_too():
     out = np.empty(1)
     compile_model(tank(own)).f(np.array([6.0]), np.zeros(0), np.array([0.1]), 1.0, out)
     assert out[0] == 2.0
+
+
+def scaled(factor):
+    def helper(a):
+        return factor * a
+
+    def outer(a):
+        return helper(a) + 1.0
+
+    return outer
+
+
+def test_helpers_of_one_source_that_enclose_other_values_are_told_apart():
+    """Also where the machine code of the first is in the cache."""
+    found = [jit(with_helpers(scaled(factor)))(10.0) for factor in (2.0, 3.0, 2.0)]
+    assert found == [21.0, 31.0, 21.0]
 
 
 def test_functions_without_helpers_are_left_as_they_are():
