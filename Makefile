@@ -7,7 +7,7 @@ BIN := $(VENV)/bin
 PYTEST := $(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile
 
 # Tests of what is written in vector instructions, which LLVM splits where a processor's vectors are shorter.
-VECTORS := simd_rows simd_exp linalg inverse_root symmetric
+VECTORS := simd simd_rows linalg inverse_root symmetric
 
 .PHONY: run test fast generic versions bench shots docs size clean
 
