@@ -18,9 +18,8 @@ from estimators.fit.dual import WindowFit, walk
 from estimators.fit.fit import Fitted, fit
 from estimators.fit.recording import Recording
 
-from ..live.tunings.fitted import settings_of
 from ..live.tunings.tuning_yaml import tuning_yaml
-from ..live.tunings.versions import check_free, keep, version_text
+from ..live.tunings.versions import check_free, keep, settings_of, version_text
 from ..present.result import to_text
 from ..present.runs_json import fit_json
 from ..studies.tune import heading, sections, window_json, window_topics, windows_verdict

@@ -29,11 +29,10 @@ from .changes import merged
 from .counts import RowCounts
 from .execute import execute
 from .feeder import Feeder
-from .interface import Records
 from .jobs import Jobs
 from .outputs import Status
 from .refolder import Refolded, Refolder
-from .running_fold import RunningFold
+from .running_fold import Records, Running
 from .status import StatusSettings, busy_status, status_of
 from .watchdog import Watchdog
 from .watchers import IdleTicks, Watchers
@@ -54,7 +53,7 @@ STATUS_TIMEOUT_S = 0.03
 """Seconds for which a status waits for the fold, longer than a batch usually takes."""
 
 
-class Engine(RunningFold):
+class Engine(Running):
     """A running twin: the thread that advances the fold, its source, commands, watchers and background jobs."""
 
     def __init__(
@@ -152,14 +151,7 @@ class Engine(RunningFold):
         self._inbox.put(partial(execute, command, self))
 
     def reload(self, twin: Twin, why: str, *, exact: bool = False) -> None:
-        """Queue a change to another twin of the same shape, or to the same one as it was saved anew.
-
-        Args:
-            twin: Of which `changes.obstacle` has nothing to say.
-            why: The file that was saved or the version that was loaded.
-            exact: Whether all its settings are taken; if not, settings changed on the page stay, unless the twin's
-                files changed them too.
-        """
+        """Queue a change to another twin; see `Running.reload`."""
         self._inbox.put(partial(self._reload, twin, why, exact))
 
     @property
@@ -168,17 +160,17 @@ class Engine(RunningFold):
         return self._feeder.source
 
     def options_of(self, estimator: str) -> Mapping[str, float]:
-        """Return the options with which an estimator starts: its running ones, its last ones, or those of the YAML."""
+        """Return the options with which an estimator starts."""
         if estimator == self.estimator:
             return self.tuning.options
         return self._last_options.get(estimator, self.twin.options_of(estimator))
 
     def episodes(self) -> list[Episode]:
-        """Return all episodes in the order of their start; at most a second behind the rows."""
+        """Return all episodes in the order of their start."""
         return self._watchers.episodes()
 
     def status(self) -> Status:
-        """Return the status, computed at most ten times a second; while the fold is at work, mostly the last one."""
+        """Return the status."""
         last = self._status
         if last is not None and time.monotonic() - last[0] < STATUS_PERIOD_S:
             return last[1]
@@ -350,7 +342,7 @@ class Engine(RunningFold):
         self._fold_on()
 
     def retune(self, estimator: str, tuning: Tuning) -> None:
-        """Fold the history again beside the running fold, over a copy of the log, once the filter is compiled."""
+        """Fold the history again beside the running fold, once the filter is compiled."""
         self._last_options[self.estimator] = self.tuning.options
         if tuning.model is not self.model:
             # Of a revision before the twin's files were saved.

@@ -22,7 +22,7 @@ from estimators.registry import find_estimator
 from estimators.track import DIVERGED, HEALTH_NAMES, TRACKING, WAITING, estimated_rows
 
 from .counts import last_run
-from .interface import Running
+from .running_fold import Running
 
 PERIOD_S, MAX_PERIOD_S = 0.4, 3.0
 """Seconds between two updates: when they are cheap, and at most."""

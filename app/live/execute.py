@@ -19,7 +19,7 @@ from sources.source import Paced, Source, span_of
 from ..ingest import maintenance_text
 from . import commands
 from .faults import carry_out
-from .interface import Running
+from .running_fold import Running
 
 if TYPE_CHECKING:
     from estimators.tuning import Tuning

@@ -14,8 +14,8 @@ from estimators.snapshots import Base
 from estimators.track import Track
 from estimators.tuning import Tuning
 
-from .interface import Running
 from .outputs import Pull
+from .running_fold import Running
 
 END_OF_TIME = 2**62
 """Later than every event, ns."""

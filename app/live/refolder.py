@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 from estimators.errors import NisusError
 from estimators.fold import Fold
@@ -20,6 +21,36 @@ MAX_BATCH_EVENTS = 16_384
 
 REFOLD_REMEDY = "the running estimate goes on. Correct the model, or choose another tuning"
 """End of the line about a refold that does not return."""
+
+
+class FairLock:
+    """First-come, first-served lock: a thread that releases it and takes it again at once comes after the waiting one.
+
+    The engine folds in batches and lets readers in between; with an ordinary lock it would have it again before they
+    wake. The next thread waits at the inner lock, all others at the outer one.
+    """
+
+    def __init__(self) -> None:
+        self._outer, self._lock = threading.Lock(), threading.Lock()
+
+    def acquire(self, timeout: float = -1) -> bool:
+        """Take it within so many seconds at each of the two locks; return whether that was possible."""
+        if not self._outer.acquire(timeout=timeout):
+            return False
+        try:
+            return self._lock.acquire(timeout=timeout)
+        finally:
+            self._outer.release()
+
+    def release(self) -> None:
+        """Release it."""
+        self._lock.release()
+
+    def __enter__(self) -> None:
+        self.acquire()
+
+    def __exit__(self, *_: Any) -> None:
+        self.release()
 
 
 class BatchSizer:

@@ -4,74 +4,72 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterator
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
+from estimators.diagnostics.episodes import Episode
 from estimators.diagnostics.health import HealthPolicy
 from estimators.errors import EstimatorError
 from estimators.fold import Fold
 from estimators.log import READING, Events, Log
 from estimators.numerics.peaks import peaks_of
 from estimators.snapshots import SPARSE_EVERY, Base
+from estimators.tuning import Tuning
+from sources.source import Source
 
+from .commands import Command
 from .counts import RowCounts
-from .interface import WINDOW_EVENTS
+from .jobs import Jobs
 from .notices import Notices
-from .outputs import Belief, Cursor, EventWindow, Here, Pull, event_window
-from .refolder import BatchSizer, Requests
+from .outputs import Belief, Cursor, EventWindow, Here, Pull, Status, event_window
+from .refolder import BatchSizer, FairLock, Requests
 from .revisions import Revisions
 from .watchdog import Watchdog
 
 if TYPE_CHECKING:
     from estimators.diagnostics.field_pictures import Picture
-    from estimators.tuning import Tuning
 
     from ..twin.twin import Twin
+
+WINDOW_EVENTS = 4000
+"""Events of a window that is folded many times over."""
 
 RATE_EVENTS = 1024
 """Last events from which the sample rate is found."""
 
 
-class FairLock:
-    """First-come, first-served lock: a thread that releases it and takes it again at once comes after the waiting one.
+class Records(Protocol):
+    """Recorder of a running twin."""
 
-    The engine folds in batches and lets readers in between; with an ordinary lock it would have it again before they
-    wake. The next thread waits at the inner lock, all others at the outer one.
+    finished: list[Path]
+    failure: str
+    folder: Path
+    """Folder of recordings that are given by name."""
+
+    @property
+    def path(self) -> Path | None:
+        """The file that is being written."""
+
+    def record(self, path: Path | None) -> None:
+        """Record into a new file from now on, or finish the open one."""
+
+
+class Running(ABC):
+    """A running twin: its log, the fold that follows it, and earlier revisions. The engine adds source and commands.
+
+    The public methods may be called from any thread and never wait for a viewer: they hold the lock only to copy. The
+    private ones below change the fold on the engine's thread and hold the lock for one batch at most. In between, the
+    log may have events that are not folded yet; readers never see them.
     """
 
-    def __init__(self) -> None:
-        self._outer, self._lock = threading.Lock(), threading.Lock()
-
-    def acquire(self, timeout: float = -1) -> bool:
-        """Take it within so many seconds at each of the two locks; return whether that was possible."""
-        if not self._outer.acquire(timeout=timeout):
-            return False
-        try:
-            return self._lock.acquire(timeout=timeout)
-        finally:
-            self._outer.release()
-
-    def release(self) -> None:
-        """Release it."""
-        self._lock.release()
-
-    def __enter__(self) -> None:
-        self.acquire()
-
-    def __exit__(self, *_: Any) -> None:
-        self.release()
-
-
-class RunningFold:
-    """The log, the fold that follows it, and earlier revisions.
-
-    The methods at the end change it and hold the lock for one batch at most; readers hold it only to copy. In between
-    the log may have events that are not folded yet; readers never see them.
-    """
+    jobs: Jobs
+    recorder: Records | None
 
     def __init__(self, twin: Twin, watchdog: Watchdog, base: Base | None, ready: Callable[[str], bool]) -> None:
         """Prepare the fold.
@@ -237,11 +235,57 @@ class RunningFold:
             return Here(self._revision, fold.estimator.name, fold.tuning, fold.base_here(), t, step)
 
     def last_events(self, limit: int = WINDOW_EVENTS, *, rows: bool = False) -> EventWindow | None:
-        """Copy the last events, to fold them again; see `Running`."""
+        """Copy the last events, to fold them again; None while there are none.
+
+        With `rows` the window has its track and begins where all revisions have a snapshot; without, it is None while
+        a refold is under way.
+        """
         with self._reading():
             if self._requests.waiting and not rows:
                 return None
             return event_window(self._fold, self._revision, limit, origin=self._base, rows=rows)
+
+    # Added by the engine
+
+    @property
+    @abstractmethod
+    def source(self) -> Source:
+        """The source of the measurements; it may be reopened."""
+
+    @abstractmethod
+    def submit(self, command: Command) -> None:
+        """Queue a command."""
+
+    @abstractmethod
+    def reload(self, twin: Twin, why: str, *, exact: bool = False) -> None:
+        """Queue a change to another twin of the same shape, or to the same one as it was saved anew.
+
+        Args:
+            twin: The new twin; `changes.obstacle` must have found no obstacle.
+            why: Reason of the new revision.
+            exact: Whether all its settings are taken; if not, settings changed on the page stay, unless the twin's
+                files changed them too.
+        """
+
+    @abstractmethod
+    def status(self) -> Status:
+        """Return the status, computed at most ten times a second; while the fold is at work, mostly the last one."""
+
+    @abstractmethod
+    def episodes(self) -> list[Episode]:
+        """Return all episodes in the order of their start; at most a second behind the rows."""
+
+    @abstractmethod
+    def options_of(self, estimator: str) -> Mapping[str, float]:
+        """Return the options with which an estimator starts: its running ones, its last ones, or those of the YAML."""
+
+    @abstractmethod
+    def retune(self, estimator: str, tuning: Tuning) -> None:
+        """Fold the history again beside the running fold, over a copy of the log; on the engine's thread."""
+
+    @abstractmethod
+    def insert(self, event: Events) -> None:
+        """Put an event of the engine's own into the log; on the engine's thread."""
 
     # On the engine's thread
 

@@ -16,10 +16,9 @@ from sources.source import Paced, Source
 from .alerts import Alerts, SilentSource
 from .counts import Latency
 from .episode_log import EpisodeLog
-from .integrity import PERIOD_S, ProtectionMonitor
-from .interface import Running
+from .fault_monitors import CHECK_PERIOD_S, PERIOD_S, ProtectionMonitor, RootCause
 from .notices import Notices
-from .root_cause import CHECK_PERIOD_S, RootCause
+from .running_fold import Running
 
 if TYPE_CHECKING:
     from estimators.diagnostics.episodes import Episode

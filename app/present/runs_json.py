@@ -8,11 +8,10 @@ from typing import TYPE_CHECKING, Any
 from estimators.registry import ESTIMATORS
 
 from ..live.changes import difference, in_words
-from ..live.interface import Running
 from ..live.revisions import Revision
-from ..live.runs.noise import NoiseEstimates
+from ..live.running_fold import Running
 from ..live.runs.scores import RunScore, RunScores
-from ..live.runs.sweep import Swept
+from ..live.runs.sweep import NoiseEstimates, Swept
 from .result import plain
 
 if TYPE_CHECKING:

@@ -15,9 +15,10 @@ from estimators.log import READING
 from estimators.model.state_space import StateSpaceModel
 
 from .channels import channels, read_faults
-from .sources.can import make_player
-from .sources.kind import Opening, find_databases, find_recording
-from .sources.registry import SOURCES
+from .sources.asset import SIMULATOR
+from .sources.can import CAN, CAN_LOG, make_player
+from .sources.kind import Kind, Opening, find_databases, find_recording
+from .sources.recordings import MERGED, TABLE
 
 if TYPE_CHECKING:
     from sources.can.player import Player
@@ -156,3 +157,13 @@ def missing(loaded: Loaded) -> str | None:
     except SourceError as error:
         return str(error)
     return None
+
+
+SOURCES: dict[str, Kind] = {
+    "simulator": SIMULATOR,
+    "can": CAN,
+    "can_log": CAN_LOG,
+    "table": TABLE,
+    "merged": MERGED,
+}
+"""By the `type` of the section."""

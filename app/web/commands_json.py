@@ -12,7 +12,7 @@ from estimators.errors import ConfigError, nearest
 
 from ..live import commands, faults
 from ..live.execute import PLAYBACK, REFOLDING, check_maintenance, check_playback, retuned
-from ..live.interface import Running
+from ..live.running_fold import Running
 from .http import parse, shown
 
 MAX_NAME_BYTES = 255

@@ -10,12 +10,10 @@ from starlette.routing import Route
 from estimators.errors import ConfigError
 
 from ..live.history_copy import END_OF_TIME
-from ..live.interface import Running
 from ..live.jobs import DONE
-from ..live.runs.fitting import FitAttempt, Fitting
-from ..live.runs.refits import FITTING, LiveRefit, Refits
-from ..live.tunings.fitted import settings_of
-from ..live.tunings.versions import keep, version_text
+from ..live.running_fold import Running
+from ..live.runs.refits import FITTING, FitAttempt, Fitting, LiveRefit, Refits
+from ..live.tunings.versions import keep, settings_of, version_text
 from ..studies.advice.advising import Advising
 from .http import get, one_line, post
 from .runs_api import checked_note

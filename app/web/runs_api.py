@@ -16,11 +16,10 @@ from estimators.diagnostics.sensitivity.responses import digits
 from estimators.errors import ConfigError, printable
 
 from ..live.changes import difference
-from ..live.interface import Running
 from ..live.revisions import MAX_NOTE_LENGTH, Revision
-from ..live.runs.noise import noise
+from ..live.running_fold import Running
 from ..live.runs.scores import RunScore, RunScores
-from ..live.runs.sweep import Sweeps
+from ..live.runs.sweep import Sweeps, noise
 from ..live.tunings.tuning_yaml import tuning_yaml
 from ..live.tunings.versions import Settings, figures, keep, listing, load_into, version_text
 from ..present.export.report import Reported, report

@@ -21,7 +21,7 @@ from starlette.websockets import WebSocket
 
 from estimators.errors import ConfigError, NisusError
 
-from ..live.interface import Running
+from ..live.running_fold import Running
 from ..live.runs.refits import Refits
 from ..present.drawing.colors import EITHER, THEMES
 from ..present.export.alarm_guide import alarms_text, as_html

@@ -17,7 +17,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from estimators.errors import ConfigError, nearest
 
-from ..live.interface import Running
+from ..live.running_fold import Running
 from ..present.series.chart_stream import ChartQuery, ChartStream, check_query
 from ..present.series.series import Series
 from ..views.rerun.feed import RerunFeed

@@ -14,9 +14,9 @@ from estimators.track import HEALTH_NAMES
 
 from ..live import faults
 from ..live.changes import began_as, turned
-from ..live.interface import Running
 from ..live.outputs import Status
 from ..live.revisions import Revisions
+from ..live.running_fold import Running
 from ..present.export.report_charts import charted_model
 from ..present.series.columns import columns_of
 

@@ -12,9 +12,9 @@ from estimators.diagnostics.score import Score, score
 from estimators.errors import NisusError
 
 from ..history_copy import copy_rows
-from ..interface import Running
 from ..outputs import Pull
 from ..revisions import Revision
+from ..running_fold import Running
 
 REST_FACTOR, MIN_AGE_S = 20.0, 1.0
 """The score of the running revision is reused for so many times its own duration, and for so many seconds at least."""

@@ -7,23 +7,27 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from config.tuning_schema import AcceptedSection, EvidenceSection, VersionSection
+from config.tuning_schema import AcceptedSection, EvidenceSection, MovedSection, VersionSection
 from config.tunings import OWN, Version, check_name, folders, load_version, version_files, version_of
 from config.yaml_files import as_section, shown_path, writing
 from estimators.diagnostics.score import Score
-from estimators.errors import ConfigError
+from estimators.errors import LARGEST, ConfigError
 from estimators.fold import Fold
 from estimators.log import Log
 from estimators.tuning import Tuning
 
 from ...twin.twin import Twin, with_version
 from ..changes import obstacle
-from ..interface import Running
+from ..running_fold import Running
 from .tuning_yaml import tuning_yaml
+
+if TYPE_CHECKING:
+    from estimators.fit.fit import Fitted
+    from estimators.fit.judge import PartScore
 
 NIS, LIKELIHOOD, RMSE, COVERAGE, REFUSED = "nis", "log_likelihood", "rmse", "coverage", "refused"
 
@@ -208,3 +212,63 @@ def load_into(engine: Running, name: str, why: str | None = None) -> None:
     # Compiled before the engine's thread asks for it.
     Fold(twin.estimator, twin.model, twin.tuning, Log.of(twin.model), pairs=twin.pairs, idle=True)
     engine.reload(twin, f"version {name}" if why is None else why, exact=True)
+
+
+def settings_of(found: Fitted, fitted_on: Sequence[str], note: str = "") -> Settings:
+    """Return filter, tuning and held-out scores of a fit.
+
+    Args:
+        found: Result of the fit.
+        fitted_on: Names of the recordings.
+        note: Note of the version.
+    """
+    tuning, prior = found.setting
+    beliefs = {}
+    if prior is not None:
+        stds = np.sqrt(np.diag(prior[1]))
+        beliefs = {
+            name: {"mean": float(mean), "std": float(std)}
+            for name, mean, std in zip(tuning.model.state_names, prior[0], stds, strict=True)
+        }
+    return Settings(
+        found.estimator,
+        tuning,
+        note,
+        tuple(fitted_on),
+        _scores(found.after.held_out),
+        beliefs,
+        evidence=_evidence(found) if found.proposed else None,
+    )
+
+
+def _scores(part: PartScore) -> dict[str, float]:
+    predicted = {**part.sensors, **part.withheld, **part.states}
+    scores = {
+        NIS: part.nis,
+        LIKELIHOOD: part.log_density,
+        **{f"{RMSE}.{name}": item.rms for name, item in predicted.items()},
+        **{f"{COVERAGE}.{name}": item.coverage for name, item in predicted.items()},
+    }
+    return {name: float(value) for name, value in scores.items() if np.isfinite(value)}
+
+
+def _evidence(found: Fitted) -> EvidenceSection:
+    from estimators.fit.dual import shift
+
+    def digits(value: float) -> float | None:
+        return float(f"{value:.4g}") if np.isfinite(value) and abs(value) <= LARGEST else None
+
+    entries = {
+        line.key: MovedSection(
+            before=line.before,
+            after=line.after,
+            low=digits(line.low),
+            high=digits(line.high),
+            sigma=digits(shift(line)) or 0.0,
+        )
+        for line in found.lines
+        if not line.alone
+    }
+    before = {name: float(f"{value:.{DIGITS}g}") for name, value in _scores(found.before.held_out).items()}
+    gain, error = digits(found.verdict.gain) or 0.0, digits(found.verdict.error) or 0.0
+    return EvidenceSection(gain=gain, error=error, before=before, entries=entries)

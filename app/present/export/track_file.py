@@ -14,9 +14,9 @@ from estimators.interface.table import table_of
 from estimators.registry import find_entry
 
 from ...live.history_copy import copy_rows
-from ...live.interface import Running
 from ...live.outputs import Pull
 from ...live.revisions import Revision
+from ...live.running_fold import Running
 
 PIECE = 8192
 """Rows that are formatted at once."""

@@ -10,8 +10,8 @@ import numpy as np
 
 from estimators.track import estimated_rows
 
-from ...live.interface import Running
 from ...live.outputs import Cursor, Pull
+from ...live.running_fold import Running
 from .columns import Column, Rows
 from .levels_of_detail import FIRST, Groups, Pyramid, grouped
 

@@ -15,10 +15,10 @@ import numpy as np
 from estimators.fold import Fold
 from estimators.log import Events, Log
 
-from ...live.interface import Running
 from ...live.jobs import Job
 from ...live.outputs import Cursor, Pull
 from ...live.revisions import Revision
+from ...live.running_fold import Running
 from .charted_run import ROWS, Levels, less
 from .columns import Column
 from .levels_of_detail import FIRST, Groups, grouped

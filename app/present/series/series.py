@@ -5,8 +5,8 @@ from __future__ import annotations
 import threading
 from collections.abc import Iterable
 
-from ...live.interface import Running
 from ...live.outputs import Pull
+from ...live.running_fold import Running
 from .chart_stream import ChartStream
 from .charted_run import DifferenceRun, KeptRun, LiveRun, Run
 from .columns import columns_of

@@ -12,9 +12,9 @@ from estimators.errors import EstimatorError
 from estimators.pieces import SMOOTHER
 from estimators.smoothing.smooth import check_smooth, smooth
 
-from ...live.interface import Running
 from ...live.jobs import Job
 from ...live.outputs import EventWindow, Pull
+from ...live.running_fold import Running
 from ...live.workshop import Workshop
 
 MAX_SMOOTHED_EVENTS, MAX_PARTICLE_EVENTS = 65_536, 2_000

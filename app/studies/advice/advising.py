@@ -8,8 +8,8 @@ from typing import Any
 from estimators.errors import ConfigError
 
 from ...live.history_copy import copy_log
-from ...live.interface import Running
 from ...live.jobs import RUNNING, Job
+from ...live.running_fold import Running
 
 
 class Advising:

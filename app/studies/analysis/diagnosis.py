@@ -16,10 +16,10 @@ from estimators.model.state_space import LARGE
 from estimators.registry import find_entry
 from estimators.track import Track
 
-from ...live.integrity import reason_against
-from ...live.interface import Running
+from ...live.fault_monitors import reason_against
 from ...live.jobs import Job, PacedExecutor
 from ...live.outputs import EventWindow, Status
+from ...live.running_fold import Running
 from .numbers import listed, number
 from .row_figures import rows_json
 

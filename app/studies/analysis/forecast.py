@@ -14,8 +14,8 @@ from estimators.forecast import Crossing, Forecast, first_time, forecast
 from estimators.log import INPUT, Events
 from estimators.model.state_space import StateSpaceModel
 
-from ...live.interface import Running
 from ...live.outputs import Here
+from ...live.running_fold import Running
 from .numbers import listed, number
 
 MAX_CHANGES = 200

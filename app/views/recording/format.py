@@ -31,8 +31,8 @@ from estimators.track import Track
 from estimators.tuning import Tuning
 
 from ...live.history_copy import copy_rows
-from ...live.interface import Running
 from ...live.outputs import Pull
+from ...live.running_fold import Running
 from .rrd_file import RrdFile
 
 FORMAT = 2

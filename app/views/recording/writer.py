@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from estimators.smoothing.walk import Smoothed
     from estimators.track import Track
 
-    from ...live.interface import Running
+    from ...live.running_fold import Running
     from ...twin.twin import Twin
 
 LOG_PERIOD_S = 0.4

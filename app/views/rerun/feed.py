@@ -28,9 +28,9 @@ from .rows import RerunRows
 from .sink import free_closed_streams
 
 if TYPE_CHECKING:
-    from ...live.interface import Running
     from ...live.notices import Notice
     from ...live.outputs import Pull
+    from ...live.running_fold import Running
 
 MAX_PULL_ROWS = 20_000
 """Rows pulled at once, so that a long history does not hold the engine's lock for long."""

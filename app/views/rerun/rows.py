@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import rerun as rr
 
@@ -10,9 +12,9 @@ from estimators.diagnostics.field_pictures import Picture
 from estimators.log import READING, Events
 from estimators.track import FAILED, HEALTH_NAMES, Track
 
-from ...live.interface import Running
 from ...live.notices import Notice
 from ...live.outputs import Pull
+from ...live.running_fold import Running
 from ...present.drawing.colors import EITHER, Palette
 from ...present.drawing.direct_readings import observed
 from ...present.series.columns import Rows, columns_of, rows_of
@@ -37,7 +39,7 @@ class RerunRows:
     def __init__(
         self,
         stream: rr.RecordingStream,
-        engine: Running,
+        engine: Running | SimpleNamespace,
         *,
         series: float | None,
         layout: bool = True,

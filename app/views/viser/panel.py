@@ -16,8 +16,8 @@ from estimators.registry import ESTIMATORS, unfit
 from estimators.track import DIVERGED, HEALTH_NAMES, TRACKING
 
 from ...live.commands import Command, Reset, SetEstimator, SetTuning
-from ...live.interface import Running
 from ...live.outputs import Status
+from ...live.running_fold import Running
 from ...present.drawing.colors import LIGHT, RGB, Palette, round_step
 from ...present.drawing.plot import SECONDS, TimeUnit, time_unit
 from ...present.series.chart_stream import drawn

@@ -14,8 +14,8 @@ import viser
 from estimators.errors import ConfigError
 from estimators.model.state_space import StateSpaceModel
 
-from ...live.interface import Running
 from ...live.outputs import Belief
+from ...live.running_fold import Running
 from ...present.drawing.colors import LIGHT, kinds
 from .belief_scene import BeliefScene
 from .field_scenes import FieldScene, FieldSurfaceScene

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from typing import Any
 from urllib.parse import parse_qs
 
-from ...live.interface import Running
+from ...live.running_fold import Running
 from ...present.drawing.colors import THEMES
 from ...present.series.series import Series
 from .guarded_server import addresses, guarded_server, unprinted

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from app.live.integrity import ProtectionMonitor, reason_against
+from app.live.fault_monitors import ProtectionMonitor, reason_against
 from app.live.jobs import Job, JobCancelled
 from app.live.outputs import EventWindow, event_window
 from app.twin.twin import load_twin

@@ -389,7 +389,7 @@ def test_conversions_that_make_no_sense_are_one_line() -> None:
 def test_every_type_of_the_schema_has_its_line_in_the_registry():
     from typing import get_args
 
-    from app.twin.sources.registry import SOURCES
+    from app.twin.source import SOURCES
     from config.source_schema import SourceSection
 
     types = [get_args(section.model_fields["type"].annotation)[0] for section in get_args(get_args(SourceSection)[0])]

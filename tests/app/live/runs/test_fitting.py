@@ -6,7 +6,7 @@ import pytest
 
 from app.live.history_copy import COPY_EVENTS
 from app.live.jobs import CANCELLED, DONE, FAILED
-from app.live.runs.fitting import Fitting
+from app.live.runs.refits import Fitting
 from estimators.errors import ConfigError
 from estimators.fit.fit import fit
 from estimators.fit.recording import Recording

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from app.cli.prepare import prepare
-from app.live.runs.noise import doubts
+from app.live.runs.sweep import doubts
 from app.twin.log_reader import read_log
 from app.twin.twin import load_twin
 from estimators.diagnostics.innovations import SensorNoise, sensor_noise

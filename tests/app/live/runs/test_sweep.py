@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from app.live.jobs import Job, JobCancelled
-from app.live.runs.noise import noise
 from app.live.runs.sweep import (
     FACTORS,
     MATCHED,
@@ -12,6 +11,7 @@ from app.live.runs.sweep import (
     Point,
     Sweeps,
     Swept,
+    noise,
     scaled,
     value_of,
     values_around,

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
+from app.live.fault_monitors import RootCause
 from app.live.jobs import Job
 from app.live.notices import Notices
 from app.live.outputs import event_window
-from app.live.root_cause import RootCause
 from estimators.diagnostics.episodes import Episode, episodes
 from estimators.fold import Fold
 from estimators.log import READING, Log
