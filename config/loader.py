@@ -16,7 +16,7 @@ from estimators.errors import ConfigError, nearest
 from .problems import report, shown
 from .schema import TwinSection
 from .tunings import Version, find_version, keep_options, overlay
-from .yaml_files import Key, Places, dotted, parse, read_text, shown_path
+from .yaml_files import Key, ValuePlaces, dotted, parse, read_text, shown_path
 
 TWINS = Path(str(resources.files("config"))) / "twins"
 """Folder of the twins that ship."""
@@ -33,7 +33,7 @@ class Loaded:
     config: TwinSection
     path: Path
     text: str
-    places: Places
+    places: ValuePlaces
     version: Version | None = None
     without: Loaded | None = None
 
@@ -121,7 +121,7 @@ def _name(path: Path) -> str:
     return "".join(letter if letter.isalnum() or letter in "_-" else "_" for letter in path.stem) or "twin"
 
 
-def _override(data: dict[str, Any], places: Places, dotted_key: str, text: str) -> None:
+def _override(data: dict[str, Any], places: ValuePlaces, dotted_key: str, text: str) -> None:
     """Put one command-line value where it belongs; the schema judges the result."""
     option = f"--set {dotted_key}={text}"
     try:

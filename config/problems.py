@@ -11,7 +11,7 @@ from pydantic_core import ErrorDetails
 from estimators.errors import ConfigError, nearest
 
 from .source_schema import PartSection, SourceSection
-from .yaml_files import Key, Places, dotted
+from .yaml_files import Key, ValuePlaces, dotted
 
 MOST = 5
 """Problems shown at once."""
@@ -37,7 +37,7 @@ def shown(value: Any) -> str:
     return str(value) if len(str(value)) <= 60 else str(value)[:57] + "..."
 
 
-def report(error: ValidationError, data: Any, places: Places) -> ConfigError:
+def report(error: ValidationError, data: Any, places: ValuePlaces) -> ConfigError:
     """Return one ConfigError with a line for each of the first problems."""
     found: dict[tuple, str] = {}  # One line a key: pydantic repeats itself for each kind that a value might have been.
     problems = error.errors(include_url=False)
@@ -54,7 +54,7 @@ def report(error: ValidationError, data: Any, places: Places) -> ConfigError:
     return ConfigError("\n".join(lines))
 
 
-def _line(problem: ErrorDetails, key: Key, value: Any, places: Places) -> str:
+def _line(problem: ErrorDetails, key: Key, value: Any, places: ValuePlaces) -> str:
     kind, context = problem["type"], problem.get("ctx", {})
     if kind == "missing":
         name = problem["loc"][-1]

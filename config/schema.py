@@ -14,6 +14,7 @@ from pydantic_core import PydanticCustomError
 from .fields import (
     LONGEST,
     Count,
+    DuplicatesSection,
     Duration,
     ErrorSection,
     Flag,
@@ -23,15 +24,17 @@ from .fields import (
     Option,
     Positive,
     Positives,
+    Ranges,
     Seconds,
     Section,
     SomeSeconds,
     SpreadSection,
+    StuckSection,
     Text,
     Texts,
     Time,
+    Validity,
 )
-from .limits_schema import DuplicatesSection, Ranges, StuckSection, Validity
 from .source_schema import FaultSection, SourceSection
 
 GateProbability = Annotated[float, Field(strict=True, ge=0.5, lt=1)]

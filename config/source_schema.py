@@ -15,6 +15,7 @@ from .fields import (
     Number,
     Numbers,
     Positive,
+    Range,
     Seconds,
     Section,
     SomeSeconds,
@@ -25,24 +26,6 @@ from .fields import (
     as_list,
     one_of,
 )
-
-
-class RangeSection(Section):
-    """A range of values, its ends included."""
-
-    min: Number | None = None
-    """Lowest value. Default: no limit."""
-    max: Number | None = None
-    """Highest value. Default: no limit."""
-
-
-def _range(value: Any) -> Any:
-    if isinstance(value, bool):
-        value = int(value)
-    return {"min": value, "max": value} if isinstance(value, (int, float)) else value
-
-
-Range = Annotated[RangeSection, BeforeValidator(_range, json_schema_input_type=float | bool | RangeSection)]
 
 
 class AccuracySection(Section):

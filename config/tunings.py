@@ -14,9 +14,9 @@ from pydantic import ValidationError
 
 from estimators.errors import ConfigError, nearest
 
+from .companion_schema import TuningSection, VersionSection
 from .problems import report, shown
-from .tuning_schema import TuningSection, VersionSection
-from .yaml_files import Key, Places, parse, read_text, shown_path
+from .yaml_files import Key, ValuePlaces, parse, read_text, shown_path
 
 OWN = "own"
 """The name under which what the twin's file itself says is listed."""
@@ -40,7 +40,7 @@ class Version:
     text: str
     data: Mapping[str, Any]
     section: TuningSection
-    places: Places
+    places: ValuePlaces
 
     @property
     def head(self) -> VersionSection:
@@ -141,7 +141,7 @@ def check_name(name: str) -> str:
     return name
 
 
-def overlay(data: dict[str, Any], places: Places, version: Version) -> None:
+def overlay(data: dict[str, Any], places: ValuePlaces, version: Version) -> None:
     """Put a version's values in place of a twin's; errors about them name the version's file and line.
 
     Entries are replaced one by one, so that what a version does not say (limits of a sensor, another filter's options)
@@ -162,7 +162,7 @@ def overlay(data: dict[str, Any], places: Places, version: Version) -> None:
             _merge(data, (key,), value, places, version)
 
 
-def _merge(data: dict[str, Any], key: Key, value: dict[str, Any], places: Places, version: Version) -> None:
+def _merge(data: dict[str, Any], key: Key, value: dict[str, Any], places: ValuePlaces, version: Version) -> None:
     own = data.get(str(key[-1]))
     if not isinstance(own, dict):
         own = {}
@@ -177,12 +177,12 @@ def _merge(data: dict[str, Any], key: Key, value: dict[str, Any], places: Places
             _placed(places, (*key, name), version)
 
 
-def _placed(places: Places, key: Key, version: Version) -> None:
+def _placed(places: ValuePlaces, key: Key, version: Version) -> None:
     for inner in [inner for inner in version.places.lines if inner[: len(key)] == key]:
         places.options[inner] = version.places.at(inner)
 
 
-def keep_options(data: dict[str, Any], places: Places) -> None:
+def keep_options(data: dict[str, Any], places: ValuePlaces) -> None:
     """Move the options of the YAML's own filter to `filters`, before another name takes its place.
 
     So they are there when that filter runs after all: named on the command line, chosen on the page, or compared.

@@ -40,7 +40,7 @@ for _name, _pattern, _first in (
 
 
 @dataclass
-class Places:
+class ValuePlaces:
     """Where each value stands: `file:line`, or the command-line option that gave it."""
 
     file: str
@@ -57,7 +57,7 @@ class Places:
         return f"{self.file}:1"
 
 
-def parse(text: str, file: str) -> tuple[Any, Places]:
+def parse(text: str, file: str) -> tuple[Any, ValuePlaces]:
     """Parse YAML.
 
     Args:
@@ -70,7 +70,7 @@ def parse(text: str, file: str) -> tuple[Any, Places]:
     Raises:
         ConfigError: In one line, if it is not YAML that a twin can be.
     """
-    places = Places(file)
+    places = ValuePlaces(file)
     try:
         node = yaml.compose(text, Loader=_Loader)
     except yaml.reader.ReaderError as error:
@@ -93,7 +93,7 @@ def parse(text: str, file: str) -> tuple[Any, Places]:
 class _Builder:
     """Turns YAML nodes into plain data and notes their lines."""
 
-    def __init__(self, places: Places) -> None:
+    def __init__(self, places: ValuePlaces) -> None:
         self.places = places
         self.count = 0
 

@@ -12,15 +12,12 @@ import numpy as np
 from estimators.errors import SourceError, shown_name
 from estimators.log import READING
 
-from .can.databases import load_database, same_bus
-from .can.decoder import Decoder
-from .can.frames import EXTENDED, BusName, LogSummary, Raw
-from .can.log import CanLog, check_log
-from .can.readers import read_frames
+from .can.decoder import Decoder, load_database, same_bus
+from .can.log import CanLog, check_log, frames_reader
+from .can.readers import EXTENDED, BusName, LogSummary, Raw
 from .formats import CAN_LOGS, suffix_of
-from .reader_process import IsolatedReader
 from .source import Channel
-from .tables.rows import Rows, names_of, rows_of
+from .tables.rows import TableRows, names_of, rows_of
 from .tables.text import UNREADABLE, csv_header
 
 MAX_FRAME_BYTES = 64
@@ -35,7 +32,7 @@ TIME_NAMES = ("t", "time", "timestamp", "seconds", "time_s", "t_s", "date", "dat
 
 
 @dataclass(frozen=True)
-class Series:
+class SignalSeries:
     """Values of one signal or column: times (ns) and finite values, (n,); `missing` counts the others."""
 
     name: str
@@ -53,7 +50,7 @@ class Message:
     key: int
     t: np.ndarray
     name: str | None = None
-    signals: tuple[Series, ...] = ()
+    signals: tuple[SignalSeries, ...] = ()
 
 
 @dataclass
@@ -64,7 +61,7 @@ class RecordingContents:
     kind: str
     t: np.ndarray
     messages: list[Message] = field(default_factory=list)
-    columns: list[Series] = field(default_factory=list)
+    columns: list[SignalSeries] = field(default_factory=list)
     time: str = ""
     faults: list[str] = field(default_factory=list)
 
@@ -127,7 +124,7 @@ def _logs(files: list[Path], databases: list[tuple[Path, BusName]]) -> Recording
     errors = 0
     for path in files:
         check_log(path)
-        reader = IsolatedReader(read_frames, path, None, MAX_FRAME_BYTES)
+        reader = frames_reader(path, None, MAX_FRAME_BYTES)
         try:
             while not reader.ended:
                 item = reader.take(1.0)
@@ -171,7 +168,7 @@ def _named(
             faults.append(text)
 
     named: dict[int, tuple[str, Path]] = {}
-    series: dict[tuple[str, str], Series] = {}
+    series: dict[tuple[str, str], SignalSeries] = {}
     for path, bus in databases:
         by_key = {m.frame_id | (EXTENDED if m.is_extended_frame else 0): m for m in load_database(path).messages}
         mine = {}
@@ -212,9 +209,9 @@ def _named(
     ]
 
 
-def _series(name: str, unit: str, t: np.ndarray, values: np.ndarray) -> Series:
+def _series(name: str, unit: str, t: np.ndarray, values: np.ndarray) -> SignalSeries:
     known = np.isfinite(values)
-    return Series(name, unit, t[known], values[known], int(np.sum(~known)))
+    return SignalSeries(name, unit, t[known], values[known], int(np.sum(~known)))
 
 
 def _tables(files: list[Path], time: str | None, unit: str) -> RecordingContents:
@@ -247,7 +244,7 @@ def _tables(files: list[Path], time: str | None, unit: str) -> RecordingContents
     return RecordingContents(files, "table", t, columns=found, time=chosen, faults=faults)
 
 
-def _rows(path: Path, time: str, unit: str, columns: list[str], faults: list[str]) -> Iterator[Rows]:
+def _rows(path: Path, time: str, unit: str, columns: list[str], faults: list[str]) -> Iterator[TableRows]:
     """Yield the rows of one table as far as it can be read."""
     try:
         for rows in rows_of(path, time, unit, columns, lambda: 1.0):

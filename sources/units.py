@@ -6,6 +6,8 @@ import re
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from estimators.errors import SourceError
 
 if TYPE_CHECKING:
@@ -155,3 +157,28 @@ def spread_factor(given: str | None, wanted: str, where: str, *, squared: bool) 
     if squared and wanted.strip():
         wanted = f"({_normal(wanted)})**2"
     return conversion(given, wanted, where)[0]
+
+
+def to_ns(seconds: Any) -> np.ndarray:
+    """Float seconds as int64 nanoseconds.
+
+    A float of today's epoch seconds has steps of 238 ns. Loggers write microseconds, which such a float can tell
+    apart: where one microsecond reads back as this very float, that microsecond is meant. Elsewhere the float's own
+    value is taken, exact to the nanosecond, where `seconds * 1e9` would round to steps of 256 ns.
+    """
+    seconds = np.asarray(seconds, np.float64)
+    micros = np.round(seconds * 1e6)
+    whole = np.floor(seconds)
+    exact = whole.astype(np.int64) * 1_000_000_000 + np.round((seconds - whole) * 1e9).astype(np.int64)
+    # Below 2^23 s a float resolves a nanosecond by itself.
+    coarse = np.abs(seconds) >= 2.0**23
+    return np.where(coarse & (micros / 1e6 == seconds), micros.astype(np.int64) * 1000, exact)
+
+
+def second_ns(seconds: float) -> int:
+    """`to_ns` of one number, without arrays: for frames as they arrive."""
+    micros = round(seconds * 1e6)
+    if abs(seconds) >= 2.0**23 and micros / 1e6 == seconds:
+        return micros * 1000
+    whole = int(seconds // 1)
+    return whole * 1_000_000_000 + round((seconds - whole) * 1e9)

@@ -10,8 +10,8 @@ import numpy as np
 
 from estimators.errors import ConfigError
 from sources.can.decoder import shown_id
-from sources.can.frames import EXTENDED, BusName
-from sources.inspect import Message, RecordingContents, Series, inspect_recordings
+from sources.can.readers import EXTENDED, BusName
+from sources.inspect import Message, RecordingContents, SignalSeries, inspect_recordings
 from sources.tables.rows import UNITS
 
 from ..format_time import FIRST_DATED_NS, format_time
@@ -109,7 +109,7 @@ def _time_cells(t: np.ndarray, start: int) -> tuple[Cell, ...]:
     return int(t.size), _rate(t), float(t[0] - start) * 1e-9, float(t[-1] - start) * 1e-9, gap
 
 
-def _series_cells(series: Series, start: int) -> tuple[Cell, ...]:
+def _series_cells(series: SignalSeries, start: int) -> tuple[Cell, ...]:
     low, high = (float(series.values.min()), float(series.values.max())) if series.values.size else (None, None)
     return *_time_cells(series.t, start), low, high
 
@@ -160,7 +160,7 @@ def _span(t: np.ndarray) -> dict[str, Any]:
     }
 
 
-def _series(series: Series) -> dict[str, Any]:
+def _series(series: SignalSeries) -> dict[str, Any]:
     known = series.values.size > 0
     return {
         "name": series.name,

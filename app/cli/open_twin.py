@@ -77,7 +77,7 @@ def opened_review(path: Path) -> Opening:
     recorded = read_recording(path)
 
     def open_source(report: Callable[[str, str], None]) -> Source:
-        from sources.memory import MemorySource
+        from sources.merged import MemorySource
 
         return MemorySource(recorded.events)
 

@@ -33,8 +33,8 @@ import numpy as np
 from pydantic import ValidationError
 from scipy.stats import t as student
 
+from config.companion_schema import FigureSection, ReferenceSection
 from config.problems import report, shown
-from config.tuning_schema import FigureSection, ReferenceSection
 from config.yaml_files import as_flow, parse, read_text, shown_path, writing
 from estimators.diagnostics.field_pictures import Picture
 from estimators.diagnostics.health import PROBABILITY

@@ -15,9 +15,9 @@ from typing import Any
 import numba
 import numpy as np
 
+from config.companion_schema import AcceptedSection, FigureSection, ReferenceSection
 from config.loader import find, shipped
 from config.source_schema import SimulatorSection
-from config.tuning_schema import AcceptedSection, FigureSection, ReferenceSection
 from config.tunings import OWN, Version, accepted_version, folders, named, ships
 from config.yaml_files import shown_path
 from estimators.errors import ConfigError, NisusError, SourceError, printable

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from config.learned_schema import LearnedHeadSection
+from config.companion_schema import LearnedHeadSection
 from config.yaml_files import as_flow, as_section
 from estimators.diagnostics.sensitivity.responses import digits
 from estimators.fit.judge import PartScore

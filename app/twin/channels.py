@@ -6,8 +6,9 @@ from collections.abc import Mapping, Sequence
 from math import inf
 from typing import TYPE_CHECKING, Any
 
+from config.fields import RangeSection
 from config.loader import Loaded
-from config.source_schema import ChannelSection, FaultSection, RangeSection, SignalSection
+from config.source_schema import ChannelSection, FaultSection, SignalSection
 from config.yaml_files import Key
 from estimators.log import INPUT, READING, TRUTH
 from estimators.model.state_space import Field, StateSpaceModel

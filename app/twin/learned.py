@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from config.learned_schema import CorrectionSection, load_correction
+from config.companion_schema import CorrectionSection, load_correction
 from config.loader import Loaded
 from config.yaml_files import shown_path
 from estimators.errors import ConfigError

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from config.limits_schema import bounds
+from config.fields import bounds
 from config.loader import Loaded, shown_path
 from config.schema import SensorSection, TwinSection
 from config.source_schema import AssetSection

@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from config.companion_schema import TuningSection
 from config.loader import Loaded, load, load_text
 from config.schema import TwinSection
 from config.source_schema import AssetSection
-from config.tuning_schema import TuningSection
 from config.tunings import OWN, Version, find_version
 from config.yaml_files import parse
 from estimators.diagnostics.commission import baseline_of, lost_from

@@ -19,7 +19,7 @@ from estimators.log import Events
 
 from ..source import NEVER, Report, ignore
 from .decoder import Decoder, Expected, shown_id
-from .frames import EXTENDED, BusName
+from .readers import EXTENDED, BusName
 
 MAX_READ_FRAMES = 4096
 """Frames of one read; those queued beyond come with the next."""

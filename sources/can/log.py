@@ -14,14 +14,13 @@ import can
 from estimators.errors import SourceError
 from estimators.log import Events
 
-from ..clock import second_ns
 from ..formats import CAN_LOGS, is_compressed, suffix_of
-from ..reader_process import IsolatedReader, read_isolated
 from ..source import NEVER, TRUNCATED, Report, ignore
+from ..units import second_ns
+from ..worker_process import IsolatedReader, read_isolated
 from .decoder import Decoder
-from .frames import BusName, LogSummary, Raw, unreadable
-from .mf4 import mf4_span
-from .readers import open_reader, read_frames
+from .mf4 import mf4_span, read_mf4
+from .readers import BusName, LogSummary, Raw, open_reader, read_messages, unreadable
 
 
 class CanLog:
@@ -68,7 +67,7 @@ class CanLog:
 
     def _one(self, path: Path) -> Generator[Events, None, None]:
         before = self.frames
-        reader = IsolatedReader(read_frames, path, self._decoder.wanted, self._decoder.longest)
+        reader = frames_reader(path, self._decoder.wanted, self._decoder.longest)
         fault = ""
         try:
             while not reader.ended:
@@ -109,6 +108,11 @@ class CanLog:
     def close(self) -> None:
         """Close the open file."""
         self._batches.close()
+
+
+def frames_reader(path: Path, wanted: frozenset[int] | None, longest: int) -> IsolatedReader:
+    """Return the frames of a log, read in a process of its own; arguments as those of `read_messages`."""
+    return IsolatedReader(read_mf4 if suffix_of(path) == ".mf4" else read_messages, path, wanted, longest)
 
 
 def check_log(path: Path) -> None:

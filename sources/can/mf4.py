@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from .frames import CHUNK_FRAMES, EXTENDED, BusName, LogSummary, Raw, unreadable
+from .readers import CHUNK_FRAMES, EXTENDED, BusName, LogSummary, Raw, unreadable
 
 
 @contextmanager
@@ -55,7 +55,7 @@ def _open(path: Path) -> tuple[Any, BytesIO]:
 
 
 def read_mf4(path: Path, wanted: frozenset[int] | None, longest: int) -> Iterator[Raw | LogSummary]:
-    """Yield the wanted frames of a file in order of time, and its summary; see `readers.read_frames`.
+    """Yield the wanted frames of a file in order of time, and its summary; see `readers.read_messages`.
 
     Raises:
         SourceError: If nothing can be read.

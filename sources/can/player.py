@@ -17,7 +17,7 @@ from estimators.log import INPUT, READING, TRUTH, Events
 from ..source import Channel, Report, Source, ignore
 from ..units import conversion
 from .bus import open_bus
-from .databases import BusName, find_messages
+from .decoder import BusName, find_messages
 
 INPUT_REPEAT_NS = 1_000_000_000
 """ns after which an unchanged input is sent again."""

@@ -9,37 +9,20 @@ from collections.abc import Iterator
 from contextlib import suppress
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..clock import second_ns
+from estimators.errors import SourceError
+
 from ..formats import suffix_of
-from .frames import CHUNK_FRAMES, EXTENDED, BusName, LogSummary, Raw, unreadable
+from ..units import second_ns
 
 FIRST_CHUNK_FRAMES = 256
 """Frames of the first chunk, so that it arrives at once."""
 
 MAX_TIME_S = 2.0**62 / 1e9
 """Distance of a valid time from 1970, s."""
-
-
-def read_frames(path: Path, wanted: frozenset[int] | None, longest: int) -> Iterator[Raw | LogSummary]:
-    """Yield the frames of a log in their order, and at last its summary.
-
-    Args:
-        path: The log.
-        wanted: Ids of the wanted frames, EXTENDED added; None is all.
-        longest: Bytes of a frame to return.
-
-    Raises:
-        SourceError: If nothing can be read.
-    """
-    if suffix_of(path) == ".mf4":
-        from .mf4 import read_mf4
-
-        return read_mf4(path, wanted, longest)
-    return _read_messages(path, wanted, longest)
 
 
 def open_reader(path: Path) -> Any:
@@ -56,7 +39,17 @@ def open_reader(path: Path) -> Any:
         raise unreadable(path, error) from None
 
 
-def _read_messages(path: Path, wanted: frozenset[int] | None, longest: int) -> Iterator[Raw | LogSummary]:
+def read_messages(path: Path, wanted: frozenset[int] | None, longest: int) -> Iterator[Raw | LogSummary]:
+    """Yield the frames of a log that python-can reads, in their order, and at last its summary.
+
+    Args:
+        path: The log.
+        wanted: Ids of the wanted frames, EXTENDED added; None is all.
+        longest: Bytes of a frame to return.
+
+    Raises:
+        SourceError: If nothing can be read.
+    """
     reader = open_reader(path)
     seen: Counter[tuple[BusName, int]] = Counter()
     buses: dict[BusName, int] = {}
@@ -157,3 +150,42 @@ def _missing_end(path: Path, reader: Any) -> str:
             file.seek(-1, os.SEEK_END)
             return "" if file.read(1) in (b"\n", b"\r") else "its last line is incomplete"
     return ""
+
+
+EXTENDED = 1 << 31
+"""Added to the arbitration id of an extended frame, so that one number identifies it."""
+
+CHUNK_FRAMES = 8192
+"""Frames of a chunk."""
+
+BusName = int | str | None
+
+
+class Raw(NamedTuple):
+    """Frames of a log, not decoded.
+
+    Columns of one length n: times (ns), ids (EXTENDED added to extended ones), positions of their buses in `buses`,
+    lengths, and bytes (n, longest). `total` counts all frames read for them, wanted or not.
+    """
+
+    t: np.ndarray
+    key: np.ndarray
+    bus: np.ndarray
+    length: np.ndarray
+    data: np.ndarray
+    buses: tuple[BusName, ...]
+    total: int
+
+
+class LogSummary(NamedTuple):
+    """Summary after a file's last frames: data frames by bus and id, error frames, and damage."""
+
+    seen: dict[tuple[BusName, int], int]
+    errors: int
+    fault: str
+
+
+def unreadable(path: Path, reason: object) -> SourceError:
+    """Return the error of a file of which nothing can be read."""
+    gist = " ".join(str(reason).split())[:160] or type(reason).__name__
+    return SourceError(f"{path}: it cannot be read as {suffix_of(path)[1:].upper()} ({gist}); check that it is one")

@@ -1,82 +1,186 @@
-"""Effects of faults: on values, on times, and on the delivery of events."""
+"""Effects of faults on single events: on values, on times, and on delivery; and a fault with its time window."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import ceil
 
 import numpy as np
 
-from estimators.log import INPUT
+from estimators.log import INPUT, MARK, READING, Events
+from estimators.model.state_space import StateSpaceModel
 
-from .effect import Effect, Item, Moment, Target
+from .kinds import Fault, find_kind, numbers
+
+
+def ns(seconds: float) -> int:
+    """Return seconds as whole nanoseconds."""
+    return round(seconds * 1e9)
+
+
+@dataclass(slots=True)
+class FaultedEvent:
+    """An event. `at` is its true time of measurement, ns, whatever the stamp `t`; `value` is never written to."""
+
+    t: int
+    arrival: int
+    kind: int
+    channel: int
+    value: np.ndarray
+    at: int
+
+    def with_cells(self, cells: slice, values: np.ndarray) -> FaultedEvent:
+        """Return a copy with other values in some columns."""
+        value = self.value.copy()
+        value[cells] = values
+        return replace(self, value=value)
+
+    def alone(self, kind: int, channel: int, column: int, value: float) -> FaultedEvent:
+        """Return another event of this true time with one value."""
+        values = np.full_like(self.value, np.nan)
+        values[column] = value
+        return FaultedEvent(self.at, self.arrival, kind, channel, values, self.at)
+
+
+def items_of(events: Events) -> list[FaultedEvent]:
+    """Return the events of a batch, one by one."""
+    columns = (events.t.tolist(), events.arrival.tolist(), events.kind.tolist(), events.channel.tolist())
+    return [FaultedEvent(*row, row[0]) for row in zip(*columns, events.value, strict=True)]
+
+
+def events_of(items: Sequence[FaultedEvent], width: int) -> Events:
+    """Return events as a batch of at least `width` value columns."""
+    if not items:
+        return Events.empty(width)
+    value = np.full((len(items), max(width, *(item.value.size for item in items))), np.nan)
+    for row, item in zip(value, items, strict=True):
+        row[: item.value.size] = item.value
+    return Events(
+        np.array([item.t for item in items], np.int64),
+        np.array([item.arrival for item in items], np.int64),
+        np.array([item.kind for item in items], np.int8),
+        np.array([item.channel for item in items], np.int32),
+        value,
+    )
+
+
+class Target:
+    """Events and values that a fault affects. `channel` is its number in the log's marks: sensors, inputs, all."""
+
+    def __init__(self, fault: Fault, model: StateSpaceModel) -> None:
+        self._rows = [len(sensor.rows) for sensor in model.sensors]
+        self._nu = len(model.inputs)
+        self._kinds: tuple[int, ...] = ()
+        self.sensors: tuple[int, ...] = ()
+        self.input: int | None = None
+        self._row: int | None = None
+        self.channel = len(self._rows) + self._nu
+        if fault.sensor is not None:
+            self.channel = model.sensor_names.index(fault.sensor)
+            self.sensors = (self.channel,)
+            if fault.other is not None:
+                self.sensors += (model.sensor_names.index(fault.other),)
+            if fault.row is not None:
+                self._row = [row.name for row in model.sensors[self.channel].rows].index(fault.row)
+        elif fault.input is not None:
+            self.input = model.input_names.index(fault.input)
+            self.channel = len(self._rows) + self.input
+        elif fault.parameter is None:
+            # Of the whole twin, a stuck fault affects the sensors only.
+            self._kinds = (READING,) if fault.kind == "stuck" else (READING, INPUT)
+
+    def has(self, item: FaultedEvent) -> bool:
+        """Return whether an event is affected; one that leaves an input unchanged is not."""
+        if self._kinds:
+            return item.kind in self._kinds
+        if self.input is not None:
+            return item.kind == INPUT and not np.isnan(item.value[self.input])
+        return item.kind == READING and item.channel in self.sensors
+
+    def cells(self, item: FaultedEvent) -> slice:
+        """Return the affected columns of an event's values, all rows of a sensor."""
+        if self.input is not None:
+            return slice(self.input, self.input + 1)
+        return slice(0, self._rows[item.channel] if item.kind == READING else self._nu)
+
+    def touched(self, size: int) -> np.ndarray:
+        """Return which of `size` rows are affected, shape (size,)."""
+        return np.ones(size, bool) if self._row is None else np.arange(size) == self._row
+
+    def split(self, item: FaultedEvent) -> tuple[list[FaultedEvent], FaultedEvent]:
+        """Return the unaffected part of an event (other inputs), if there is one, and the affected part."""
+        if self.input is None:
+            return [], item
+        mine = np.full_like(item.value, np.nan)
+        mine[self.input] = item.value[self.input]
+        rest = item.value.copy()
+        rest[self.input] = np.nan
+        return ([replace(item, value=rest)] if not np.isnan(rest).all() else []), replace(item, value=mine)
+
+
+@dataclass(frozen=True)
+class Moment:
+    """State of the fault at an event: whether it is active, whether it draws, and ns since it began."""
+
+    during: bool
+    draws: bool
+    since: int
+
+
+class Effect:
+    """Effect of a fault on the events of its target, in their order of arrival; by default none.
+
+    `lost` counts removed events. `last` is the last value of the target, if that is an input.
+    """
+
+    def __init__(self, kind: str, target: Target, given: dict[str, float], rng: np.random.Generator) -> None:
+        self._kind, self._target, self._given, self._rng = kind, target, given, rng
+        self.lost = 0
+        self.last: float | None = None
+
+    def apply(self, item: FaultedEvent, moment: Moment) -> list[FaultedEvent]:
+        """Return the events in place of one event."""
+        return [item]
+
+    def turn(self, item: FaultedEvent, moment: Moment) -> list[FaultedEvent]:
+        """Return the events to insert before the event with which the fault begins or ends."""
+        return []
+
+    def flush(self) -> list[FaultedEvent]:
+        """Return the events that are still held back at the end."""
+        return []
+
+    def _hit(self, moment: Moment) -> bool:
+        """Draw whether the fault affects an event."""
+        return moment.draws and bool(self._rng.random() < self._given.get("rate", 1.0))
+
+    def _last_input(self, item: FaultedEvent) -> list[FaultedEvent]:
+        """Return the last value of the target, an input that may not change for long, as an event."""
+        if self._target.input is None or self.last is None:
+            return []
+        return [item.alone(INPUT, 0, self._target.input, self.last)]
 
 
 class Silence(Effect):
     """Removes the events of its target; an input keeps its last value, which is repeated at the end of the fault."""
 
-    def __init__(self, kind: str, target: Target, numbers: dict[str, float], rng: np.random.Generator) -> None:
-        self._target = target
-        self._last: float | None = None
-
-    def set_input(self, value: float) -> None:
-        """Set the value of the target, an input, when the fault is created."""
-        self._last = value
-
-    def apply(self, item: Item, moment: Moment) -> list[Item]:
+    def apply(self, item: FaultedEvent, moment: Moment) -> list[FaultedEvent]:
         """Return the part of the event that is not affected."""
-        if self._target.input is not None:
-            self._last = float(item.value[self._target.input])
-        if not moment.during:
-            return [item]
-        self.lost += 1
-        return self._target.split(item)[0]
+        self.lost += moment.during
+        return self._target.split(item)[0] if moment.during else [item]
 
-    def turn(self, item: Item, moment: Moment) -> list[Item]:
-        """Return the last value of an input at the end, since it may not change for long."""
-        if moment.during or self._target.input is None or self._last is None:
-            return []
-        value = np.full_like(item.value, np.nan)
-        value[self._target.input] = self._last
-        return [Item(item.at, item.arrival, INPUT, 0, value, item.at)]
+    def turn(self, item: FaultedEvent, moment: Moment) -> list[FaultedEvent]:
+        """Return the last value of an input at the end."""
+        return [] if moment.during else self._last_input(item)
 
 
 class Swap(Effect):
     """Exchanges the measurements of two sensors."""
 
-    def __init__(self, first: int, second: int) -> None:
-        self._other = {first: second, second: first}
-
-    def apply(self, item: Item, moment: Moment) -> list[Item]:
+    def apply(self, item: FaultedEvent, moment: Moment) -> list[FaultedEvent]:
         """Return the measurement under the other sensor's name."""
-        return [item.but(channel=self._other[item.channel])] if moment.during else [item]
-
-
-@dataclass(frozen=True)
-class ValueState:
-    """Inputs of a value effect: y (ny,), the held values, seconds since the start, a hit, draws of N(0, 1) (ny,)."""
-
-    y: np.ndarray
-    held: np.ndarray
-    seconds: float
-    hit: bool
-    draw: np.ndarray
-    size: float
-
-
-VALUE_EFFECTS: dict[str, Callable[[ValueState], np.ndarray]] = {
-    "bias": lambda now: now.y + now.size,
-    "drift": lambda now: now.y + now.size * now.seconds,
-    "scale": lambda now: now.y * now.size,
-    # Lost values stay lost.
-    "stuck": lambda now: np.where(np.isnan(now.y), now.y, now.held),
-    "spike": lambda now: now.y + now.size * now.draw if now.hit else now.y,
-    "noise": lambda now: now.y + now.size * now.draw,
-    "quantisation": lambda now: np.round(now.y / now.size) * now.size,
-    "dropout": lambda now: np.full(now.y.size, np.nan) if now.hit else now.y,
-}
-"""Changed values, by kind of fault."""
+        return [replace(item, channel=sum(self._target.sensors) - item.channel)] if moment.during else [item]
 
 
 class ValueEffect(Effect):
@@ -86,142 +190,194 @@ class ValueEffect(Effect):
     scheduled fault do not depend on its end, and a fault on one row leaves those of the others.
     """
 
-    def __init__(self, kind: str, target: Target, numbers: dict[str, float], rng: np.random.Generator) -> None:
-        self._change = VALUE_EFFECTS[kind]
-        self._target, self._rng = target, rng
-        self._size, self._rate = numbers.get("size", 0.0), numbers.get("rate", 1.0)
+    def __init__(self, kind: str, target: Target, given: dict[str, float], rng: np.random.Generator) -> None:
+        super().__init__(kind, target, given, rng)
         self._held: dict[tuple[int, int], np.ndarray] = {}
-        self._last: np.ndarray | None = None
 
-    def set_input(self, value: float) -> None:
-        """Set the value of the target, an input, when the fault is created."""
-        self._last = np.array([value])
-
-    def apply(self, item: Item, moment: Moment) -> list[Item]:
+    def apply(self, item: FaultedEvent, moment: Moment) -> list[FaultedEvent]:
         """Return the event with changed values."""
         cells = self._target.cells(item)
         y = item.value[cells]
-        if item.kind == INPUT:
-            self._last = y
-        return [item.with_cells(cells, self._changed(y, item, moment))]
-
-    def _changed(self, y: np.ndarray, item: Item, moment: Moment) -> np.ndarray:
-        hit, draw = False, np.zeros(y.size)
-        if moment.draws:
-            hit = bool(self._rng.random() < self._rate)
-            draw = self._rng.standard_normal(y.size)
-        key = (item.kind, item.channel)
-        held = self._held.get(key)
+        hit = self._hit(moment)
+        draw = self._rng.standard_normal(y.size) if moment.draws else np.zeros(y.size)
+        held = self._held.get((item.kind, item.channel))
         if not moment.during or held is None:
-            self._held[key] = held = y if held is None else np.where(np.isnan(y), held, y)
+            held = y if held is None else np.where(np.isnan(y), held, y)
+            self._held[item.kind, item.channel] = held
         if not moment.during:
-            return y
-        changed = self._change(ValueState(y, held, moment.seconds, hit, draw, self._size))
-        return np.where(self._target.touched(y.size), changed, y)
+            return [item]
+        changed = self._changed(y, held, moment.since / 1e9, hit, draw)
+        return [item.with_cells(cells, np.where(self._target.touched(y.size), changed, y))]
 
-    def turn(self, item: Item, moment: Moment) -> list[Item]:
+    def _changed(self, y: np.ndarray, held: np.ndarray, seconds: float, hit: bool, draw: np.ndarray) -> np.ndarray:
+        """Return the changed values of y (ny,); `held` are those before the start, `draw` is N(0, 1), both (ny,)."""
+        size = self._given.get("size", 0.0)
+        match self._kind:
+            case "bias":
+                return y + size
+            case "drift":
+                return y + size * seconds
+            case "scale":
+                return y * size
+            case "stuck":
+                return np.where(np.isnan(y), y, held)  # Lost values stay lost.
+            case "noise":
+                return y + size * draw
+            case "quantisation":
+                return np.round(y / size) * size
+            case "spike" if hit:
+                return y + size * draw
+            case "dropout" if hit:
+                return np.full(y.size, np.nan)
+        return y
+
+    def turn(self, item: FaultedEvent, moment: Moment) -> list[FaultedEvent]:
         """Return an input's value at the start and end, since it holds until it changes."""
-        if self._target.input is None or self._last is None:
-            return []
-        value = np.full_like(item.value, np.nan)
-        cells = slice(self._target.input, self._target.input + 1)
-        event = Item(item.at, item.arrival, INPUT, 0, value, item.at)
-        if not moment.during:
-            return [event.with_cells(cells, self._last)]
-        return [event.with_cells(cells, self._changed(self._last, event, replace(moment, draws=False)))]
-
-
-def ns(seconds: float) -> int:
-    """Return seconds as whole nanoseconds."""
-    return round(seconds * 1e9)
-
-
-@dataclass(frozen=True)
-class TimeState:
-    """Inputs of a time effect: ns since the start at arrival, seconds since it at measurement, a hit, a draw, numbers.
-
-    `draw` is one of the standard exponential distribution.
-    """
-
-    since: int
-    seconds: float
-    hit: bool
-    draw: float
-    size: float
-    every: float
-    count: int
-
-
-Shifts = list[tuple[int, int]]
-"""For each event in place of one: ns added to its stamp, and to its arrival."""
-
-
-def _bursts(now: TimeState) -> Shifts:
-    every = ns(now.every)
-    return [(0, max(1, ceil(now.since / every)) * every - now.since)]
-
-
-def _duplicate(now: TimeState) -> Shifts:
-    count = now.count if now.hit else 0
-    return [(ns(k * now.every), ns(k * now.every)) for k in range(count + 1)]
-
-
-TIME_EFFECTS: dict[str, Callable[[TimeState], Shifts]] = {
-    "delay": lambda now: [(0, ns(now.size))],
-    "jitter": lambda now: [(0, ns(now.size * now.draw))],
-    "bursts": _bursts,
-    "duplicate": _duplicate,
-    "clock_jump": lambda now: [(ns(now.size), 0)],
-    "clock_drift": lambda now: [(ns(now.size * now.seconds), 0)],
-}
-"""Shifts of an event's times, by kind of fault."""
+        calm = replace(moment, draws=False)
+        return [changed for event in self._last_input(item) for changed in self.apply(event, calm)]
 
 
 class TimeEffect(Effect):
     """Shifts the times of its target's events. A delayed one is delivered at its new time of arrival."""
 
-    def __init__(self, kind: str, target: Target, numbers: dict[str, float], rng: np.random.Generator) -> None:
-        self._shift = TIME_EFFECTS[kind]
-        self._target, self._rng = target, rng
-        self._size, self._rate = numbers.get("size", 0.0), numbers.get("rate", 1.0)
-        self._every, self._count = numbers.get("every", 0.0), round(numbers.get("count", 1.0))
-
-    def apply(self, item: Item, moment: Moment) -> list[Item]:
+    def apply(self, item: FaultedEvent, moment: Moment) -> list[FaultedEvent]:
         """Return the event with shifted times, and its repetitions."""
-        hit, draw = False, 0.0
-        if moment.draws:
-            hit = bool(self._rng.random() < self._rate)
-            draw = float(self._rng.standard_exponential())
+        hit = self._hit(moment)
+        draw = float(self._rng.standard_exponential()) if moment.draws else 0.0
         if not moment.during:
             return [item]
         rest, mine = self._target.split(item)
-        # A late event arrives later than it was measured.
-        since = moment.since + mine.arrival - mine.at
-        shifts = self._shift(TimeState(since, moment.seconds, hit, draw, self._size, self._every, self._count))
-        return [*rest, *(mine.but(t=mine.t + stamp, arrival=mine.arrival + late) for stamp, late in shifts)]
+        shifts = self._shifts(mine, moment, hit, draw)
+        return [*rest, *(replace(mine, t=mine.t + stamp, arrival=mine.arrival + late) for stamp, late in shifts)]
+
+    def _shifts(self, item: FaultedEvent, moment: Moment, hit: bool, draw: float) -> list[tuple[int, int]]:
+        """Return for each event in place of one the ns added to its stamp and to its arrival."""
+        size, every = self._given.get("size", 0.0), self._given.get("every", 0.0)
+        match self._kind:
+            case "delay":
+                return [(0, ns(size))]
+            case "jitter":
+                return [(0, ns(size * draw))]
+            case "bursts":
+                since = moment.since + item.arrival - item.at  # A late event arrives later than it was measured.
+                return [(0, max(1, ceil(since / ns(every))) * ns(every) - since)]
+            case "duplicate":
+                count = round(self._given["count"]) if hit else 0
+                return [(ns(k * every), ns(k * every)) for k in range(count + 1)]
+            case "clock_jump":
+                return [(ns(size), 0)]
+        return [(ns(size * (moment.since / 1e9)), 0)]  # clock_drift
 
 
 class Reorder(Effect):
     """Holds an event back until the next one of its kind and channel, and delivers it after that."""
 
-    def __init__(self, kind: str, target: Target, numbers: dict[str, float], rng: np.random.Generator) -> None:
-        self._target, self._rng, self._rate = target, rng, numbers["rate"]
-        self._kept: dict[tuple[int, int], Item] = {}
+    def __init__(self, kind: str, target: Target, given: dict[str, float], rng: np.random.Generator) -> None:
+        super().__init__(kind, target, given, rng)
+        self._kept: dict[tuple[int, int], FaultedEvent] = {}
 
-    def apply(self, item: Item, moment: Moment) -> list[Item]:
+    def apply(self, item: FaultedEvent, moment: Moment) -> list[FaultedEvent]:
         """Return nothing, the event, or the event and the one before it."""
-        hit = moment.draws and bool(self._rng.random() < self._rate)
+        hit = self._hit(moment)
         rest, mine = self._target.split(item)
         key = (mine.kind, mine.channel)
         before = self._kept.pop(key, None)
         if before is not None:
-            return [*rest, mine, before.but(arrival=max(before.arrival, mine.arrival))]
+            return [*rest, mine, replace(before, arrival=max(before.arrival, mine.arrival))]
         if hit and moment.during:
             self._kept[key] = mine
             return rest
         return [item]
 
-    def flush(self) -> list[Item]:
+    def flush(self) -> list[FaultedEvent]:
         """Return the events without a next one."""
         kept, self._kept = list(self._kept.values()), {}
         return kept
+
+
+_VALUES = ("bias", "drift", "scale", "stuck", "spike", "noise", "quantisation", "dropout")
+_TIMES = ("delay", "jitter", "bursts", "duplicate", "clock_jump", "clock_drift")
+EFFECTS: dict[str, type[Effect]] = {
+    **dict.fromkeys(_VALUES, ValueEffect),
+    **dict.fromkeys(_TIMES, TimeEffect),
+    "reorder": Reorder,
+    "silence": Silence,
+    "swap": Swap,
+    "model": Effect,  # The asset itself changes; its events pass unchanged.
+}
+"""Effect of each kind of fault."""
+
+
+class ActiveFault:
+    """One fault from `start` until `end`, ns, of the true time of measurement.
+
+    A `scheduled` fault draws from the first event on, so that its draws do not depend on its start; an injected one
+    from its start on, as it has not seen earlier events. So both draw the same numbers when the source begins again.
+    `inputs` are the last inputs before it was injected.
+    """
+
+    def __init__(
+        self,
+        fault: Fault,
+        model: StateSpaceModel,
+        seed: tuple[int, int],
+        start: int,
+        end: int,
+        *,
+        scheduled: bool,
+        inputs: np.ndarray,
+    ) -> None:
+        self.start, self.end = start, end
+        self.begun = self.ended = False
+        self.touched = 0
+        self.since: int | None = None
+        self._target = Target(fault, model)
+        kind = find_kind(fault.kind)
+        self._code = kind.code
+        self._scheduled = scheduled
+        rng = np.random.default_rng(seed if fault.seed is None else fault.seed)
+        self._effect = EFFECTS[kind.name](kind.name, self._target, numbers(fault), rng)
+        index = self._target.input
+        if index is not None and not np.isnan(inputs[index]):
+            self._effect.last = float(inputs[index])
+
+    @property
+    def lost(self) -> int:
+        """Events that it removed."""
+        return self._effect.lost
+
+    def process(self, items: list[FaultedEvent]) -> list[FaultedEvent]:
+        """Return the events in place of these, in order, with marks at its start and end."""
+        out: list[FaultedEvent] = []
+        for item in items:
+            # A mark is not an event of the asset, and has the time of the event beside it.
+            if item.kind == MARK:
+                out.append(item)
+                continue
+            if not self.begun and item.at >= self.start:
+                self.begun, self.since = True, item.at
+                out += self._edge(item, True)
+            if self.begun and not self.ended and item.at >= self.end:
+                self.ended = True
+                out += self._edge(item, False)
+            if not self._target.has(item):
+                out.append(item)
+                continue
+            if self._target.input is not None:
+                self._effect.last = float(item.value[self._target.input])
+            moment = self._moment(item, self.start <= item.at < self.end)
+            self.touched += moment.during
+            out += self._effect.apply(item, moment)
+        return out
+
+    def flush(self) -> list[FaultedEvent]:
+        """Return the events that it still holds back at the end."""
+        return self._effect.flush()
+
+    def _edge(self, item: FaultedEvent, during: bool) -> list[FaultedEvent]:
+        """Return the mark of its start or end, and the events that its effect inserts there."""
+        mark = item.alone(MARK, self._target.channel, 0, self._code if during else -self._code)
+        return [mark, *self._effect.turn(item, self._moment(item, during))]
+
+    def _moment(self, item: FaultedEvent, during: bool) -> Moment:
+        return Moment(during, self._scheduled or item.at >= self.start, item.at - self.start)

@@ -15,7 +15,7 @@ MAX_DELAY_S = 1e6
 
 
 @dataclass(frozen=True)
-class Parameter:
+class FaultParameter:
     """A number of a kind of fault; required without a default. `holds` checks it, `rule` describes the check.
 
     In `unit`, "row" stands for the unit of the sensor's row or of the input.
@@ -30,7 +30,7 @@ class Parameter:
 
 
 @dataclass(frozen=True)
-class Kind:
+class FaultKind:
     """One kind of fault; `code` stands for it in the log's stamps, so it never changes.
 
     `of` are its possible targets: sensor, input, parameter, or twin (the whole). `rows`: it may affect a single row.
@@ -40,75 +40,77 @@ class Kind:
     code: int
     help: str
     of: tuple[str, ...]
-    parameters: tuple[Parameter, ...] = ()
+    parameters: tuple[FaultParameter, ...] = ()
     rows: bool = False
     other: bool = False
 
 
-def _size(unit: str, text: str) -> Parameter:
-    return Parameter("size", unit, text, None, lambda x: abs(x) <= LARGEST, f"must lie within {LARGEST:g}")
+def _size(unit: str, text: str) -> FaultParameter:
+    return FaultParameter("size", unit, text, None, lambda x: abs(x) <= LARGEST, f"must lie within {LARGEST:g}")
 
 
-def _positive(unit: str, text: str) -> Parameter:
-    return Parameter(
+def _positive(unit: str, text: str) -> FaultParameter:
+    return FaultParameter(
         "size", unit, text, None, lambda x: 0.0 < x <= LARGEST, f"must be positive, and {LARGEST:g} at most"
     )
 
 
-def _seconds(name: str, text: str, default: float | None = None) -> Parameter:
+def _seconds(name: str, text: str, default: float | None = None) -> FaultParameter:
     def holds(x: float) -> bool:
         return (0.0 < x if default is None else 0.0 <= x) and x <= MAX_DELAY_S
 
     low = "positive" if default is None else "zero or positive"
-    return Parameter(name, "s", text, default, holds, f"must be {low}, and {MAX_DELAY_S:g} s at most")
+    return FaultParameter(name, "s", text, default, holds, f"must be {low}, and {MAX_DELAY_S:g} s at most")
 
 
-def _rate(text: str, default: float | None = 1.0) -> Parameter:
-    return Parameter("rate", "1", text, default, lambda x: 0.0 < x <= 1.0, "is a probability, above 0 and 1 at most")
+def _rate(text: str, default: float | None = 1.0) -> FaultParameter:
+    return FaultParameter(
+        "rate", "1", text, default, lambda x: 0.0 < x <= 1.0, "is a probability, above 0 and 1 at most"
+    )
 
 
 VALUE = ("sensor", "input")
 ANY = ("sensor", "input", "twin")
 
 _LIST = (
-    Kind("bias", 1, "size is added to the value", VALUE, (_size("row", "offset"),), rows=True),
-    Kind("drift", 2, "size is added for every second since the start", VALUE,
+    FaultKind("bias", 1, "size is added to the value", VALUE, (_size("row", "offset"),), rows=True),
+    FaultKind("drift", 2, "size is added for every second since the start", VALUE,
          (_size("row/s", "change a second"),), rows=True),
-    Kind("scale", 3, "the value is multiplied by size", VALUE, (_size("1", "the factor"),), rows=True),
-    Kind("stuck", 4, "the last value before the start is repeated", ("sensor", "input", "twin"), rows=True),
-    Kind("spike", 5, "with probability rate a draw of that standard deviation is added", VALUE,
+    FaultKind("scale", 3, "the value is multiplied by size", VALUE, (_size("1", "the factor"),), rows=True),
+    FaultKind("stuck", 4, "the last value before the start is repeated", ("sensor", "input", "twin"), rows=True),
+    FaultKind("spike", 5, "with probability rate a draw of that standard deviation is added", VALUE,
          (_positive("row", "standard deviation of a spike"), _rate("probability for each measurement", None)),
          rows=True),
-    Kind("noise", 6, "a draw of that standard deviation is added to each measurement", VALUE,
+    FaultKind("noise", 6, "a draw of that standard deviation is added to each measurement", VALUE,
          (_positive("row", "standard deviation of the added noise"),), rows=True),
-    Kind("quantisation", 7, "values are rounded to multiples of size", VALUE,
-         (Parameter("size", "row", "the step", None, lambda x: 1e-9 <= x <= LARGEST,
+    FaultKind("quantisation", 7, "values are rounded to multiples of size", VALUE,
+         (FaultParameter("size", "row", "the step", None, lambda x: 1e-9 <= x <= LARGEST,
                     f"must be 1e-9 or more, and {LARGEST:g} at most"),),
          rows=True),
-    Kind("dropout", 8, "with probability rate a measurement arrives empty", ANY,
+    FaultKind("dropout", 8, "with probability rate a measurement arrives empty", ANY,
          (_rate("probability for each measurement"),)),
-    Kind("silence", 9, "nothing arrives; an input keeps its last value", ANY),
-    Kind("delay", 10, "events arrive later by size", ANY, (_seconds("size", "the delay"),)),
-    Kind("jitter", 11, "events arrive later by a draw of an exponential distribution", ANY,
+    FaultKind("silence", 9, "nothing arrives; an input keeps its last value", ANY),
+    FaultKind("delay", 10, "events arrive later by size", ANY, (_seconds("size", "the delay"),)),
+    FaultKind("jitter", 11, "events arrive later by a draw of an exponential distribution", ANY,
          (_seconds("size", "mean of the delays"),)),
-    Kind("bursts", 12, "events are held back, and arrive together every so many seconds", ANY,
+    FaultKind("bursts", 12, "events are held back, and arrive together every so many seconds", ANY,
          (_seconds("every", "seconds between two arrivals"),)),
-    Kind("reorder", 13, "with probability rate a measurement arrives after the next one of its kind", ANY,
+    FaultKind("reorder", 13, "with probability rate a measurement arrives after the next one of its kind", ANY,
          (_rate("probability for each measurement"),)),
-    Kind("duplicate", 14, "with probability rate a measurement is repeated", ANY,
+    FaultKind("duplicate", 14, "with probability rate a measurement is repeated", ANY,
          (_rate("probability for each measurement"),
           _seconds("every", "seconds between repetitions, by stamp and arrival; 0 repeats the stamp", 0.0),
-          Parameter("count", "1", "repetitions of a measurement", 1.0,
+          FaultParameter("count", "1", "repetitions of a measurement", 1.0,
                     lambda x: 1.0 <= x <= 1000.0 and x == round(x), "must be a whole number from 1 to 1000"))),
-    Kind("clock_jump", 15, "the clock of the stamps is ahead by size", ANY,
-         (Parameter("size", "s", "how far ahead; negative is behind", None, lambda x: abs(x) <= 1e9,
+    FaultKind("clock_jump", 15, "the clock of the stamps is ahead by size", ANY,
+         (FaultParameter("size", "s", "how far ahead; negative is behind", None, lambda x: abs(x) <= 1e9,
                     "must lie within 1e9 s"),)),
-    Kind("clock_drift", 16, "the clock of the stamps gains size seconds a second", ANY,
-         (Parameter("size", "s/s", "gain; negative loses", None, lambda x: abs(x) < 1.0,
+    FaultKind("clock_drift", 16, "the clock of the stamps gains size seconds a second", ANY,
+         (FaultParameter("size", "s/s", "gain; negative loses", None, lambda x: abs(x) < 1.0,
                     "must lie between -1 and 1"),)),
-    Kind("swap", 17, "the measurements of sensor and other are exchanged", ("sensor",),
+    FaultKind("swap", 17, "the measurements of sensor and other are exchanged", ("sensor",),
          other=True),
-    Kind("model", 18, "a true parameter of the simulated asset is multiplied by size", ("parameter",),
+    FaultKind("model", 18, "a true parameter of the simulated asset is multiplied by size", ("parameter",),
          (_size("1", "the factor"),)),
 )  # fmt: skip
 
@@ -119,7 +121,7 @@ OLD_NAMES = {"outliers": "spike"}
 """Former names of kinds."""
 
 
-def find_kind(name: str) -> Kind:
+def find_kind(name: str) -> FaultKind:
     """Return the kind of a current or former name."""
     return KINDS[OLD_NAMES.get(name, name)]
 
@@ -132,7 +134,7 @@ def problem(fault: Fault, model: StateSpaceModel) -> tuple[str, str] | None:
     return _of_target(fault, kind, model) or _of_numbers(fault, kind)
 
 
-def _of_target(fault: Fault, kind: Kind, model: StateSpaceModel) -> tuple[str, str] | None:
+def _of_target(fault: Fault, kind: FaultKind, model: StateSpaceModel) -> tuple[str, str] | None:
     known = {
         "sensor": list(model.sensor_names),
         "input": list(model.input_names),
@@ -171,7 +173,7 @@ def _of_target(fault: Fault, kind: Kind, model: StateSpaceModel) -> tuple[str, s
     return None
 
 
-def _of_numbers(fault: Fault, kind: Kind) -> tuple[str, str] | None:
+def _of_numbers(fault: Fault, kind: FaultKind) -> tuple[str, str] | None:
     if not (isfinite(fault.start) and 0.0 <= fault.start <= LARGEST):
         return "start", f"is {fault.start:g} s; it must be zero or positive, and {LARGEST:g} s at most"
     if not fault.start < fault.end or not (fault.end <= LARGEST or fault.end == inf):

@@ -14,9 +14,7 @@ from estimators.errors import SourceError
 from estimators.log import INPUT, Events
 from estimators.model.state_space import StateSpaceModel
 
-from .active import ActiveFault
-from .effect import Item, events_of, items_of
-from .effects import ns
+from .effects import ActiveFault, FaultedEvent, events_of, items_of, ns
 from .kinds import NEVER_NS, Change, Changeable, Fault, find_kind, problem
 
 LINGER_NS = ns(60.0)
@@ -80,7 +78,7 @@ class Faults:
     def _begin(self) -> None:
         """Reset to the state before the first event."""
         self._active: list[tuple[_Entry, ActiveFault]] = []
-        self._waiting: list[tuple[int, int, Item]] = []
+        self._waiting: list[tuple[int, int, FaultedEvent]] = []
         self._lost = 0
         self._sent = 0
         self._origin: int | None = None
@@ -185,7 +183,7 @@ class Faults:
                     self._activate(entry)
             width = batch.value.shape[1]
             if self._active or self._waiting:
-                out: list[Item] = []
+                out: list[FaultedEvent] = []
                 for item in items_of(batch):
                     self._clock = item.arrival if self._clock is None else max(self._clock, item.arrival)
                     out += self._due(self._clock - 1)
@@ -207,22 +205,22 @@ class Faults:
     def finish(self) -> Events:
         """Return the events that are still held back when the source has ended."""
         with self._lock:
-            kept: list[Item] = []
+            kept: list[FaultedEvent] = []
             for k, (_, active) in enumerate(self._active):
                 kept += self._through(active.flush(), k + 1)
             return events_of(self._send(kept) + self._due(NEVER_NS), self._model.width)
 
     # With the lock held
 
-    def _through(self, items: list[Item], first: int = 0) -> list[Item]:
+    def _through(self, items: list[FaultedEvent], first: int = 0) -> list[FaultedEvent]:
         for _, active in self._active[first:]:
             items = active.process(items)
         return items
 
-    def _leave(self, at: int) -> list[Item]:
+    def _leave(self, at: int) -> list[FaultedEvent]:
         """Remove faults that ended long ago, which would slow every event; return the events that they hold back."""
         gone = [k for k, (_, active) in enumerate(self._active) if active.ended and at > active.end + LINGER_NS]
-        kept: list[Item] = []
+        kept: list[FaultedEvent] = []
         for k in gone:
             kept += self._through(self._active[k][1].flush(), k + 1)
             self._lost += self._active[k][1].lost
@@ -230,7 +228,7 @@ class Faults:
             self._active = [item for k, item in enumerate(self._active) if k not in gone]
         return kept
 
-    def _send(self, items: list[Item]) -> list[Item]:
+    def _send(self, items: list[FaultedEvent]) -> list[FaultedEvent]:
         """Return events that have arrived; the others wait."""
         out = []
         for item in items:
@@ -241,7 +239,7 @@ class Faults:
                 out.append(item)
         return out
 
-    def _due(self, until: int) -> list[Item]:
+    def _due(self, until: int) -> list[FaultedEvent]:
         out = []
         while self._waiting and self._waiting[0][0] <= until:
             out.append(heapq.heappop(self._waiting)[2])

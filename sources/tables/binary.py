@@ -1,6 +1,6 @@
 """Parquet, MATLAB and NumPy files: their columns, and their rows a few thousand at a time.
 
-The libraries that read them run in a process of their own, with limited memory (`sources/reader_process.py`).
+The libraries that read them run in a process of their own, with limited memory (`sources/worker_process.py`).
 
 - Parquet: a column each.
 - MATLAB up to version 7: every vector of numbers, named as in MATLAB: `meas.Voltage`, `runs(3).t` (counted from 1),
@@ -24,8 +24,8 @@ import numpy as np
 from estimators.errors import SourceError
 
 from ..formats import is_compressed, open_binary
-from ..reader_process import memory_error, memory_limit
 from ..source import TRUNCATED
+from ..worker_process import memory_error, memory_limit
 from .text import CHUNK_ROWS, Chunk, Problem, parse_numbers
 
 CHUNK_VALUES = 65_536

@@ -15,9 +15,9 @@ import numpy as np
 
 from estimators.errors import SourceError
 
-from ..clock import to_ns
 from ..formats import suffix_of
-from ..reader_process import IsolatedReader, read_isolated
+from ..units import to_ns
+from ..worker_process import IsolatedReader, read_isolated
 from .binary import mat_names, npz_names, parquet_names, read_mat, read_npz, read_parquet
 from .text import Chunk, Problem, csv_header, read_csv
 
@@ -41,7 +41,7 @@ _BINARY: dict[str, tuple[_Names, _Read]] = {
 """By the ending of the name. All others are CSV."""
 
 
-class Rows(NamedTuple):
+class TableRows(NamedTuple):
     """Rows of a table: line (or row) of each, time (ns) and whether it is known, values (n, columns), mask of blanks.
 
     `problems` are those found on the way: key, line, text.
@@ -73,7 +73,7 @@ def names_of(path: Path) -> list[str]:
 
 def rows_of(
     path: Path, time: str, unit: str, columns: Sequence[str], timeout: Callable[[], float]
-) -> Iterator[Rows | None]:
+) -> Iterator[TableRows | None]:
     """Yield the rows of a table, some thousands at once; None where none came within `timeout()` seconds.
 
     Raises:
@@ -100,7 +100,7 @@ def _about(path: Path, error: SourceError) -> SourceError:
     return error if known else SourceError(f"{path}: it cannot be read ({error}); check that it is complete")
 
 
-def read_rows(path: Path, time: str, unit: str, columns: Sequence[str]) -> Iterator[Rows]:
+def read_rows(path: Path, time: str, unit: str, columns: Sequence[str]) -> Iterator[TableRows]:
     """Yield the rows of a table in this process."""
     problems: list[tuple[str, int, str]] = []
 
@@ -112,11 +112,11 @@ def read_rows(path: Path, time: str, unit: str, columns: Sequence[str]) -> Itera
     read = read_csv if is_text(path) else _BINARY[suffix_of(path)][1]
     for chunk in read(path, time, columns, lambda *problem: problems.append(problem)):
         t, known = column_ns(chunk.time, unit)
-        yield Rows(chunk.line, t, known, chunk.values, chunk.blank, taken())
+        yield TableRows(chunk.line, t, known, chunk.values, chunk.blank, taken())
     if problems:
         none = np.zeros(0, np.int64)
         nothing = np.zeros((0, len(columns)))
-        yield Rows(none, none, none.astype(np.bool_), nothing, nothing.astype(np.bool_), taken())
+        yield TableRows(none, none, none.astype(np.bool_), nothing, nothing.astype(np.bool_), taken())
 
 
 def _names(path: Path) -> Iterator[list[str]]:

@@ -15,7 +15,7 @@ from ..formats import suffix_of
 from ..mapping import ABSENT, PRESENT, ChannelMapping
 from ..source import NEVER, TRUNCATED, Channel, Report, ignore
 from .order import Order
-from .rows import UNITS, Rows, is_text, names_of, rows_of
+from .rows import UNITS, TableRows, is_text, names_of, rows_of
 from .text import find_decimal_comma, has_rows
 
 
@@ -98,7 +98,7 @@ class Table:
             gist = str(error).removeprefix(f"{path}: ")
             self._report(TRUNCATED, f"{path.name}: damaged after {self._count - before} rows: {gist}")
 
-    def _events(self, path: Path, rows: Rows, first: bool) -> Events:
+    def _events(self, path: Path, rows: TableRows, first: bool) -> Events:
         """Return the events of the next rows of a file, or of its first ones."""
         for key, line, text in rows.problems:
             self._report(key, f"{path.name}:{line}: {text}")

@@ -19,7 +19,7 @@ from ..formats import open_binary
 from ..source import TRUNCATED
 
 CHUNK_ROWS = 4096
-"""Rows of a chunk, at most."""
+"""TableRows of a chunk, at most."""
 
 MAX_LINE_LENGTH = 2**20
 """Characters of a line; a longer one is read as several."""
@@ -35,7 +35,7 @@ Problem = Callable[[str, int, str], None]
 
 
 class Chunk(NamedTuple):
-    """Rows of a table: the raw time column, the values (n, columns), and a mask of blank ones.
+    """TableRows of a table: the raw time column, the values (n, columns), and a mask of blank ones.
 
     `line` is the line (CSV) or row (other formats) of each, counted from 1.
     """

@@ -46,9 +46,9 @@ def fail():
 
 def frames_then_abort(path, wanted, longest):
     """A log's reader that dies after its first frames."""
-    from sources.can.readers import read_frames
+    from sources.can.readers import read_messages
 
-    yield next(read_frames(path, wanted, longest))
+    yield next(read_messages(path, wanted, longest))
     os.abort()
 
 

@@ -168,7 +168,7 @@ def test_a_reader_that_dies_leaves_what_it_gave(tmp_path, messages, monkeypatch)
     path, other = tmp_path / "a.blf", tmp_path / "b.log"
     write(path, messages)
     write(other, messages[:10])
-    monkeypatch.setattr(can_log, "read_frames", readers_that_fail.frames_then_abort)
+    monkeypatch.setattr(can_log, "read_messages", readers_that_fail.frames_then_abort)
     reports = Reports()
     log = CanLog([path], decoder_of(tmp_path), report=reports)
     got = read_all(log)
@@ -177,7 +177,7 @@ def test_a_reader_that_dies_leaves_what_it_gave(tmp_path, messages, monkeypatch)
     assert reports.texts["truncated file"] == (
         "a.blf: the file is damaged after 256 frames (its reader was ended by SIGABRT)"
     )
-    monkeypatch.setattr(can_log, "read_frames", readers_that_fail.abort_at_once)
+    monkeypatch.setattr(can_log, "read_messages", readers_that_fail.abort_at_once)
     with pytest.raises(SourceError, match=r"a\.blf: it cannot be read as BLF \(its reader was ended by SIGABRT\)"):
         read_all(CanLog([path], decoder_of(tmp_path)))
 

@@ -5,8 +5,7 @@ import pytest
 
 from estimators.errors import SourceError
 from estimators.log import Events
-from sources.memory import MemorySource
-from sources.merged import Merged
+from sources.merged import MemorySource, Merged
 from tests.sources.can.can_tools import same
 from tests.support import read_all
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from estimators.log import Events
-from sources.memory import MemorySource
+from sources.merged import MemorySource
 from sources.pacer import MAX_BATCH_EVENTS, Pacer
 from tests.support import SECOND, read_all
 

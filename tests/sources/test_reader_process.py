@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 
 from estimators.errors import SourceError
-from sources import reader_process as module
-from sources.reader_process import IsolatedReader, ReaderError, read_isolated
+from sources import worker_process as module
+from sources.worker_process import IsolatedReader, ReaderError, read_isolated
 from tests.sources.readers_that_fail import abort, allocate, counting, fail, folder, hang, leave, pid_then, shout
 
 PATH = Path("recording")  # the functions do not read it
@@ -172,7 +172,7 @@ import sys
 sys.path[:0] = {paths!r}
 from tests.sources.readers_that_fail import hang, pid_then
 from pathlib import Path
-from sources.reader_process import IsolatedReader
+from sources.worker_process import IsolatedReader
 reader = IsolatedReader(pid_then, Path('recording'), hang)
 while (pid := reader.take(1.0)) is None:
     pass

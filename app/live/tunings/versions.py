@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from config.tuning_schema import AcceptedSection, EvidenceSection, MovedSection, VersionSection
+from config.companion_schema import AcceptedSection, EvidenceSection, MovedSection, VersionSection
 from config.tunings import OWN, Version, check_name, folders, load_version, version_files, version_of
 from config.yaml_files import as_section, shown_path, writing
 from estimators.diagnostics.score import Score

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sources.can.frames import BusName
+from sources.can.readers import BusName
 from sources.inspect import RecordingContents
 
 from .plan import DraftPlan, Moves, Reads

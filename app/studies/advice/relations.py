@@ -10,7 +10,7 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 from scipy.signal import lfilter
 
-from sources.inspect import Series
+from sources.inspect import SignalSeries
 
 from .signals import Signal, common
 
@@ -88,7 +88,7 @@ def driven(found: Sequence[Signal], target: int, candidates: Sequence[int]) -> D
     return best._replace(tau=tau, gains=gains, offset=float(weights[0]), explained=explained, start=float(weights[1]))
 
 
-def simulated(found: Sequence[Signal], lag: Driven) -> Series:
+def simulated(found: Sequence[Signal], lag: Driven) -> SignalSeries:
     """Return a signal minus its lag behind the drivers, which is simulated without measurements."""
     t, values = common([found[lag.signal].series, *(found[k].series for k in lag.drivers)])
     weights = np.array([lag.offset, lag.start, *lag.gains])

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sources.inspect import RecordingContents, Series, holes
+from sources.inspect import RecordingContents, SignalSeries, holes
 
 MIN_VALUES = 20
 """Values needed to estimate a noise."""
@@ -37,7 +37,7 @@ class Signal(NamedTuple):
 
     name: str
     message: str | None
-    series: Series
+    series: SignalSeries
     rate: float
     holes: int
     longest: float
@@ -50,12 +50,12 @@ class Signal(NamedTuple):
 
 def signals(found: RecordingContents) -> list[Signal]:
     """All signals with values, in the order of the recording."""
-    offers: list[tuple[str | None, Series]] = [(m.name, series) for m in found.messages for series in m.signals]
+    offers: list[tuple[str | None, SignalSeries]] = [(m.name, series) for m in found.messages for series in m.signals]
     offers += [(None, series) for series in found.columns]
     return [signal(message, series) for message, series in offers if series.values.size]
 
 
-def signal(message: str | None, series: Series) -> Signal:
+def signal(message: str | None, series: SignalSeries) -> Signal:
     """Describe one series."""
     wraps = series.unit in DEGREES and bool(np.any(np.abs(np.diff(series.values)) > 300.0))
     if wraps:
@@ -81,7 +81,7 @@ def signal(message: str | None, series: Series) -> Signal:
     )
 
 
-def _kind(series: Series, levels: np.ndarray) -> str:
+def _kind(series: SignalSeries, levels: np.ndarray) -> str:
     if series.values.size < MIN_VALUES:
         return "short"
     if levels.size == 1:
@@ -131,7 +131,7 @@ WALK_INTERVALS = 20
 """Intervals over which a slow walk is looked for."""
 
 
-def noise_of(series: Series) -> tuple[bool, float, float]:
+def noise_of(series: SignalSeries) -> tuple[bool, float, float]:
     """Whether a signal moves smoothly, its process noise in one second, and the variance of its readings.
 
     Of a random walk with noisy readings, y = x + v, the differences d have E d² = q dt + 2 r and E d_k d_(k+1) = -r. Of
@@ -169,7 +169,7 @@ def noise_of(series: Series) -> tuple[bool, float, float]:
     return True, max(second - 6 * r, 0.01 * second) / (2 / 3 * dt**3), r
 
 
-def walk_of(series: Series) -> float:
+def walk_of(series: SignalSeries) -> float:
     """Variance that a random walk with noisy readings adds in one second, whether it moves smoothly or not.
 
     E d² = q dt + 2 r of its differences, r by its roughness (`rough`).
@@ -190,7 +190,7 @@ MAX_GAP_INTERVALS = 5.0
 """Usual intervals, beyond which nothing is known between two values."""
 
 
-def common(series: Sequence[Series]) -> tuple[np.ndarray, np.ndarray]:
+def common(series: Sequence[SignalSeries]) -> tuple[np.ndarray, np.ndarray]:
     """Means of several signals over equal intervals: times (n,) in s from the first, and values (n, signals).
 
     Intervals are those of the slowest signal or longer, so that there are no more than 4000. What has no value of its
@@ -210,7 +210,7 @@ def common(series: Sequence[Series]) -> tuple[np.ndarray, np.ndarray]:
     return (middles - begin) * 1e-9, np.column_stack(columns)
 
 
-def _mean(series: Series, edges: np.ndarray, middles: np.ndarray, gap: float) -> np.ndarray:
+def _mean(series: SignalSeries, edges: np.ndarray, middles: np.ndarray, gap: float) -> np.ndarray:
     which = np.searchsorted(edges, series.t, side="right") - 1
     inside = (which >= 0) & (which < middles.size)
     count = np.bincount(which[inside], minlength=middles.size)

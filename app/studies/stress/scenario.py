@@ -22,7 +22,7 @@ from estimators.track import TRACKING, WAITING
 from estimators.tuning import Tuning
 from sources.faults.layer import Faults
 from sources.faults.source import with_faults
-from sources.memory import MemorySource
+from sources.merged import MemorySource
 from sources.simulator import Simulator
 
 from ...twin.sources.asset import make_asset

@@ -114,7 +114,7 @@ def test_what_the_model_leaves_out_is_learned_kept_and_folded(heated, kind, caps
 
 def load_correction(path):
     from app.twin.learned import learned_of
-    from config.learned_schema import load_correction as load
+    from config.companion_schema import load_correction as load
 
     return learned_of(load(path)[0], path).correction
 

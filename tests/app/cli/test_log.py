@@ -9,7 +9,7 @@ import pytest
 from app.cli.main import main
 from app.studies.advice.signals import noise_of
 from app.twin.twin import load_twin
-from sources.inspect import Series
+from sources.inspect import SignalSeries
 
 DBC = """VERSION ""
 
@@ -136,7 +136,7 @@ def test_what_cannot_be_taken_is_said(drive, capsys):
 
 def series(values, dt=0.1):
     t = (np.arange(values.size) * dt * 1e9).astype(np.int64)
-    return Series("x", "", t, values)
+    return SignalSeries("x", "", t, values)
 
 
 def test_the_noise_of_a_signal_is_found_in_its_differences():

@@ -13,8 +13,8 @@ from estimators.errors import SourceError
 from estimators.log import READING, Events
 from sources.can.decoder import Decoder
 from sources.can.log import CanLog
-from sources.clock import to_ns
 from sources.source import Channel, Condition
+from sources.units import to_ns
 from tests.sources.can.can_tools import Reports, dbc, frame, same, sensor
 from tests.support import read_all
 
@@ -266,7 +266,7 @@ def test_times_keep_the_microseconds_of_a_log():
 
 
 def test_a_database_that_cantools_reads_is_read_once(tmp_path):
-    from sources.can.databases import load_database
+    from sources.can.decoder import load_database
 
     path = dbc(tmp_path)
     assert load_database(path) is load_database(path)

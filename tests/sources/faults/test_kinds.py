@@ -8,7 +8,7 @@ from estimators.models import MODELS
 from sources.faults.kinds import KINDS, Fault
 from sources.faults.layer import Faults
 from sources.faults.source import FaultySource
-from sources.memory import MemorySource
+from sources.merged import MemorySource
 from tests.support import SECOND, read_all
 
 MODEL = MODELS["motor_drive"]

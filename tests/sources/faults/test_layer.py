@@ -12,7 +12,7 @@ from estimators.numerics.jit import plain
 from sources.faults.kinds import KINDS, Fault
 from sources.faults.layer import LINGER_NS, Faults
 from sources.faults.source import FaultySource, PacedFaultySource, with_faults
-from sources.memory import MemorySource
+from sources.merged import MemorySource
 from sources.pacer import Pacer
 from sources.simulator import Simulator
 from sources.source import Paced

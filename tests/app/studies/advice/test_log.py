@@ -8,12 +8,12 @@ import pytest
 from app.cli.main import main
 from app.studies.advice.relations import driven, pairs
 from app.studies.advice.signals import rough, signal
-from sources.inspect import Series
+from sources.inspect import SignalSeries
 
 
 def series(name, values, dt=0.1, start=0.0):
     t = np.round((start + np.arange(values.size) * dt) * 1e9).astype(np.int64)
-    return Series(name, "", t, values)
+    return SignalSeries(name, "", t, values)
 
 
 def test_noise_is_found_beneath_a_curve():

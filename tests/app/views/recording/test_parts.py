@@ -24,7 +24,7 @@ from app.web.commands_json import command_from_json
 from estimators.errors import ConfigError
 from estimators.fold import Fold
 from estimators.log import Log
-from sources.memory import MemorySource
+from sources.merged import MemorySource
 from tests.app.scripted import MODEL, Scripted, pull_all, readings, twin, wait_for
 from tests.conftest import ROOT
 from tests.support import assert_same

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from app.views.viser.vehicle_parts import PeakTrail
+from app.views.viser.vehicle_scene import PeakTrail
 
 T = np.arange(10, dtype=np.int64) * 10**9
 MEAN = np.column_stack((np.arange(10.0), np.full(10, 5.0)))  # in the middle, where nothing is

@@ -10,8 +10,7 @@ from app.present.drawing.colors import LIGHT
 from app.views.viser.field_scenes import SURFACE_HEIGHT, FieldSurfaceScene
 from app.views.viser.machine_scenes import FINGER, PAD, PART_WIDTH, GripperScene
 from app.views.viser.scene import History
-from app.views.viser.vehicle_parts import FADING_S, MAX_AGE_S, Beacons, Beams
-from app.views.viser.vehicle_scene import VehicleScene
+from app.views.viser.vehicle_scene import FADING_S, MAX_AGE_S, Beacons, Beams, VehicleScene
 from config.schema import SceneSection
 from estimators.diagnostics.field_pictures import Picture
 from estimators.log import READING, TRUTH

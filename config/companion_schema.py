@@ -1,14 +1,18 @@
-"""The schema of a tuning version: a YAML of its own beside the twin's.
+"""The schema of a learned correction: a YAML of its own, which a twin's YAML names under `learned`.
 
-The docstring under each field is its documentation.
+It holds the training windows, so that the correction can be computed from them anywhere. The docstring under each field
+is its documentation.
 """
 
 from __future__ import annotations
 
-from typing import Annotated
+from pathlib import Path
+from typing import Annotated, Literal
 
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import BeforeValidator, Field, ValidationError, model_validator
 from pydantic_core import PydanticCustomError
+
+from estimators.errors import ConfigError
 
 from .fields import (
     Count,
@@ -18,12 +22,116 @@ from .fields import (
     Number,
     Option,
     Positive,
+    Positives,
     Section,
     SpreadSection,
     Text,
+    Texts,
     as_list,
 )
+from .problems import report, shown
 from .schema import EstimatorSection, GateProbability, GateSection, NormalSection, PriorSection, as_estimator, as_gate
+from .yaml_files import ValuePlaces, parse, read_text, shown_path
+
+Table = Annotated[tuple[Annotated[tuple[Number, ...], Field(min_length=1)], ...], Field(min_length=2)]
+
+
+class LearnedHeadSection(Section):
+    """Origin and scores of a correction."""
+
+    twin: Text
+    """Name of the twin whose physics it corrects."""
+    model: Text
+    """Name of its model: states and inputs of another mean something else."""
+    saved: Text
+    """Time of saving, as 2026-11-22T10:30:00Z."""
+    learned_on: Annotated[tuple[Text, ...], BeforeValidator(as_list, json_schema_input_type=str | list[str])] = ()
+    """The recordings from which it was learned."""
+    how: str = ""
+    """How it was chosen."""
+    scores: dict[str, Number] = {}
+    """Scores on the held-out blocks: rmse.NAME, coverage.NAME, crps.NAME, nis, log_density, and
+    the same of the physics alone under physics.*."""
+
+
+class CorrectionSection(Section):
+    """A correction of the rates of some states by features, learned from windows of recordings (nisus learn)."""
+
+    learned: LearnedHeadSection
+    """Origin and scores."""
+    kind: Literal["gp", "ridge", "net"]
+    """gp: a Gaussian process. ridge: ridge regression. net: a network of an ONNX file, which makes the model a black
+    box."""
+    corrects: Texts
+    """The states whose rates are corrected."""
+    features: Texts
+    """States and inputs on which the correction depends."""
+    noise: dict[str, NotNegative]
+    """Variance that a second adds to each corrected state where there is no training data, in the square of its unit:
+    the noise NAME_learned, which can be tuned like any other."""
+    points: Table
+    """The features of each window, in their units, in the order of `features`."""
+    rates: Table | None = None
+    """Error of the model's rate in each window, in units of the corrected states a second. Not for a net."""
+    lengths: Positives | None = None
+    """gp: the length scale of each feature, in its unit."""
+    ratio: Positive | None = None
+    """gp: variance of a window's noise over the variance of the correction."""
+    penalty: Positive | None = None
+    """ridge: penalty added to the diagonal of the normal equations, for standardised features."""
+    degree: Literal[1, 2] = 1
+    """ridge: 2 has products and squares of the features too. Default: 1."""
+    net: Text | None = None
+    """net: the ONNX file, beside this one. It takes features (N, d) and gives rates (N, k)."""
+
+    @model_validator(mode="after")
+    def _fits(self) -> CorrectionSection:
+        needs = {"gp": ("rates", "lengths", "ratio"), "ridge": ("rates", "penalty"), "net": ("net",)}[self.kind]
+        for key in needs:
+            if getattr(self, key) is None:
+                raise PydanticCustomError(
+                    "neither", "is of kind {kind} and has no {key}", {"kind": self.kind, "key": key}
+                )
+        sizes = {"points": len(self.features), "rates": len(self.corrects)}
+        for key, size in sizes.items():
+            wrong = next((row for row in getattr(self, key) or () if len(row) != size), None)
+            if wrong is not None:
+                raise PydanticCustomError(
+                    "length", "has a row of {n} numbers; each needs {size}", {"n": len(wrong), "size": size, "key": key}
+                )
+        if self.rates is not None and len(self.rates) != len(self.points):
+            raise PydanticCustomError(
+                "length", "has {n} rows; points has {size}",
+                {"n": len(self.rates), "size": len(self.points), "key": "rates"},
+            )  # fmt: skip
+        if self.lengths is not None and len(self.lengths) != len(self.features):
+            raise PydanticCustomError(
+                "length", "has {n} numbers; it needs one for each of {size} features",
+                {"n": len(self.lengths), "size": len(self.features), "key": "lengths"},
+            )  # fmt: skip
+        if set(self.noise) != set(self.corrects):
+            raise PydanticCustomError(
+                "length", "names {names}; it must name each corrected state, and no other",
+                {"names": ", ".join(self.noise) or "nothing", "key": "noise"},
+            )  # fmt: skip
+        return self
+
+
+def load_correction(path: Path) -> tuple[CorrectionSection, ValuePlaces]:
+    """Read and check a correction's file.
+
+    Raises:
+        ConfigError: With a line for each of the first problems.
+    """
+    file = shown_path(path)
+    data, places = parse(read_text(path, "nisus learn --help"), file)
+    if not isinstance(data, dict):
+        what = "empty" if data is None else shown(data)
+        raise ConfigError(f"{file}:1: the file is {what}; a correction is a mapping, written by `nisus learn`")
+    try:
+        return CorrectionSection.model_validate(data), places
+    except ValidationError as error:
+        raise report(error, data, places) from None
 
 
 class TunedSensorSection(SpreadSection):
