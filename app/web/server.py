@@ -83,8 +83,8 @@ class PageServer:
         self._engine = engine
         self._review = review
         self._choices = choices
-        self._series = Series(engine)
-        self._runs = RunsApi(engine, self._series)
+        self.series = Series(engine)
+        self._runs = RunsApi(engine, self.series)
         self.refits = refits or Refits(engine)
         self._fit = FitApi(engine, self.refits)
         self._forecasts, self._diagnosis = Forecasts(engine), Diagnosis(engine)
@@ -234,7 +234,7 @@ class PageServer:
         return FileResponse(path, media_type="application/octet-stream", filename=path.name)
 
     async def _page_stream(self, browser: WebSocket) -> None:
-        await PageStream(browser, self._engine, self._series, self._state, self._boot).run()
+        await PageStream(browser, self._engine, self.series, self._state, self._boot).run()
 
     async def _rerun_stream(self, browser: WebSocket) -> None:
         await browser.accept()
@@ -244,6 +244,6 @@ class PageServer:
         await feed_rerun(browser, feed, self._rerun_status)
 
     def _rerun_status(self) -> dict[str, Any]:
-        origin = self._series.origin()
+        origin = self.series.origin()
         status = {"status": status_json(self._engine), "boot": self._boot, "recordings": sorted(self._recordings())}
         return status | {"origin": None if origin is None else str(origin)}

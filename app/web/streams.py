@@ -18,7 +18,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 from estimators.errors import ConfigError, nearest
 
 from ..live.running_fold import Running
-from ..present.series.chart_stream import ChartQuery, ChartStream, check_query
+from ..present.series.chart_stream import ChartQuery, ChartStream
 from ..present.series.series import Series
 from ..views.rerun.feed import RerunFeed
 from .http import MAX_BODY_BYTES, one_line, parse
@@ -124,27 +124,24 @@ class PageStream:
             self._drawn.set()
         if "pair" in message:
             self._pair, self._estimated = pair_from_json(message["pair"], self._engine), None
-        bodies = message.get("lanes", {})
+        bodies = message.get("streams", {})
         if not isinstance(bodies, dict):
-            raise ConfigError(f"page: lanes is {bodies!r}; it must be an object")
+            raise ConfigError(f"page: streams is {bodies!r}; it must be an object")
         # All are checked before any is changed.
-        queries = {name: None if body is None else self._query(body) for name, body in bodies.items()}
-        if len({*self._streams, *queries}) > MAX_STREAMS:
-            raise ConfigError(f"page: there are more than {MAX_STREAMS} chart streams; close some")
-        if not queries:
-            return
-        closed = [self._streams[name] for name in queries if name in self._streams]
         opened = {
-            name: ChartStream(name, query, self._series.columns) for name, query in queries.items() if query is not None
+            name: ChartStream(name, parse(ChartQuery, body, f"stream {name}"), self._series.columns)
+            for name, body in bodies.items()
+            if body is not None
         }
-        kept = {name: stream for name, stream in self._streams.items() if name not in queries}
-        self._streams = {**kept, **opened}
+        if len({*self._streams, *bodies}) > MAX_STREAMS:
+            raise ConfigError(f"page: there are more than {MAX_STREAMS} chart streams; close some")
+        if not bodies:
+            return
+        closed = [self._streams[name] for name in bodies if name in self._streams]
+        self._streams = {name: stream for name, stream in self._streams.items() if name not in bodies} | opened
         # In a thread, as the levels of detail of a long history may have to be made.
         await in_thread(self._exchange, closed, list(opened.values()))
         self._asked.set()
-
-    def _query(self, body: Any) -> ChartQuery:
-        return check_query(parse(ChartQuery, body, "lane"), self._series.columns)
 
     def _exchange(self, closed: list[ChartStream], opened: list[ChartStream]) -> None:
         """Open streams, then close others: levels that both need are kept."""

@@ -165,7 +165,7 @@ async def _watch(run: Running, seconds: float) -> int:
     got, end = 0, time.monotonic() + seconds
     origin: Any = run.address
     async with websockets.connect(address + "/api/stream", additional_headers=headers, origin=origin) as stream:
-        await stream.send(json.dumps({"lanes": {"charts": {"columns": columns, "span": 120, "points": 600}}}))
+        await stream.send(json.dumps({"streams": {"charts": {"columns": columns, "span": 120, "points": 600}}}))
         while time.monotonic() < end:
             try:
                 message = await asyncio.wait_for(stream.recv(), 1.0)

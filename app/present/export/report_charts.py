@@ -26,7 +26,7 @@ from estimators.tuning import Tuning
 from ...live.outputs import Pull
 from ..drawing.direct_readings import observed
 from ..series.chart_stream import ChartQuery, ChartStream
-from ..series.charted_run import KeptRun
+from ..series.charted_run import ChartedRun, KeptRows
 from ..series.columns import columns_of, rows_of
 
 PAGE = Path(__file__).resolve().parents[2] / "web" / "page"
@@ -92,7 +92,7 @@ def _frame(tuning: Tuning, events: Events, track: Track, kinds: tuple[str, ...] 
         for name, column in columns.items()
         if name.startswith(kinds) and np.isfinite(column.values(events, track)).any()
     )
-    run, origin = KeptRun(pull, columns), int(events.t[0])
+    run, origin = ChartedRun(KeptRows(pull), columns), int(events.t[0])
     stream = ChartStream("report", ChartQuery(names, points=MAX_GROUPS), columns)
     stream.look(run, origin, int(events.t[-1]))
     run.sync(stream.levelled)

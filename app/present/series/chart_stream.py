@@ -1,4 +1,4 @@
-"""Columns of one run between two times, as no more points than a chart can show.
+"""Columns of one run between two times, in no more points than a chart can show.
 
 A stream remembers what it has sent and gives only groups of rows that are new or have changed since.
 """
@@ -9,84 +9,74 @@ import json
 import math
 import struct
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
+from pydantic import Field
 
 from estimators.errors import ConfigError
 
-from .charted_run import Run
+from .charted_run import ChartedRun
 from .columns import DOTS, LOWER, UPPER, Column
 from .levels_of_detail import FACTOR, FIRST, Groups
 
 SLACK = 1.3
-"""By how much the number of groups may leave its bounds before their size changes: else charts would flicker."""
-
-MAX_POINTS, MAX_COLUMNS, MAX_SECONDS = 4000, 400, 1e9
-"""Of one query."""
+"""Factor by which the number of groups may leave its bounds before their size changes: charts would flicker."""
 
 LAST_ROW = 2**62
 """After every row."""
 
+Seconds = Annotated[float, Field(gt=-1e9, lt=1e9)]
+
 
 @dataclass(frozen=True)
 class ChartQuery:
-    """Columns that a browser asks for.
+    """Columns that a browser asks for; `columns_of` lists them.
 
-    `run` is "live", "previous", "smoothed", the number of a pinned revision, or "difference:" and such a number (see
-    `DifferenceRun`). Times are seconds since the first event; `since` None is the first, `until` None the newest, and
-    with `span` the last seconds are followed. `points` is the largest number of groups.
+    `run` is "live", "previous", "smoothed", the number of a pinned run, or "difference:" and such a number. Times are
+    seconds since the first event; `since` None is the first, `until` None the newest, and with `span` the last seconds
+    are followed. `points` is the largest number of groups.
     """
 
-    columns: tuple[str, ...]
+    columns: Annotated[tuple[str, ...], Field(max_length=400)]
     run: str = "live"
-    since: float | None = None
-    until: float | None = None
-    span: float | None = None
-    points: int = 600
-
-
-def check_query(query: ChartQuery, columns: dict[str, Column]) -> ChartQuery:
-    """Return a query from a browser, checked.
-
-    Raises:
-        ConfigError: If a column does not exist, or a number is out of bounds.
-    """
-    if len(query.columns) > MAX_COLUMNS:
-        raise ConfigError(f"lane: columns has {len(query.columns)} names; it may have {MAX_COLUMNS}")
-    unknown = next((name for name in query.columns if name not in columns), None)
-    if unknown is not None:
-        raise ConfigError(f"lane: there is no column {unknown!r}; /api/model lists them")
-    for key in ("since", "until", "span"):
-        value = getattr(query, key)
-        if value is not None and not abs(value) < MAX_SECONDS:
-            raise ConfigError(f"lane: {key} is {value!r}; it must be a number of seconds, or null")
-    if not 2 <= query.points <= MAX_POINTS:
-        raise ConfigError(f"lane: points is {query.points!r}; it must be a whole number from 2 to {MAX_POINTS}")
-    return query
+    since: Seconds | None = None
+    until: Seconds | None = None
+    span: Seconds | None = None
+    points: Annotated[int, Field(ge=2, le=4000)] = 600
 
 
 class ChartStream:
-    """Makes frames for one query of one browser."""
+    """Frames for one query of one browser."""
 
-    def __init__(self, name: str, wanted: ChartQuery, columns: dict[str, Column]) -> None:
-        self.name, self.wanted = name, wanted
-        self._kinds = np.array([columns[column].kind for column in wanted.columns])
-        self._size = 0
+    def __init__(self, name: str, query: ChartQuery, columns: dict[str, Column]) -> None:
+        """Take a query.
+
+        Raises:
+            ConfigError: If there is no such column.
+        """
+        unknown = next((column for column in query.columns if column not in columns), None)
+        if unknown is not None:
+            raise ConfigError(f"stream {name}: there is no column {unknown!r}; /api/model lists them")
+        self.name, self.query = name, query
+        self._kinds = np.array([columns[column].kind for column in query.columns])
+        self.size = 0
+        """Rows in a group."""
         self._rows = (0, 0)
         """Rows that the query covers: the first, and the one after the last."""
         self._sent, self._end = (0, 0), 0
         """Groups that the browser has, from the first to before the second; the row after their last."""
-        self._told: object = None
+        self._sent_as: object = None
         """Run, generation and group size of those."""
         self._dirty = LAST_ROW
         """First row that has changed since the last frame."""
-        self._offsets = np.full(len(wanted.columns), np.nan)
+        self._offsets = np.full(len(query.columns), np.nan)
 
-    def changed(self, row: int) -> None:
+    def mark_changed(self, row: int) -> None:
         """Note that rows from this one on are new or have changed."""
         self._dirty = min(self._dirty, row)
 
-    def look(self, run: Run, origin: int, newest: int) -> None:
+    def look(self, run: ChartedRun, origin: int, newest: int) -> None:
         """Find the rows that the query covers, and the size of their groups.
 
         Args:
@@ -94,46 +84,46 @@ class ChartStream:
             origin: Time of the first event, ns, from which seconds count.
             newest: Time of the last one.
         """
-        wanted = self.wanted
-        until = newest if wanted.until is None else min(newest, _instant(origin, wanted.until))
-        since = _instant(origin, wanted.since) if wanted.since is not None else origin
-        if wanted.span is not None:
-            since = max(since, until - round(wanted.span * 1e9))
-        # One row more to either side, so that lines leave the chart at its edges.
+        query = self.query
+        until = newest if query.until is None else min(newest, _instant(origin, query.until))
+        since = _instant(origin, query.since) if query.since is not None else origin
+        if query.span is not None:
+            since = max(since, until - round(query.span * 1e9))
+        # One more row on either side, so that lines leave the chart at its edges.
         start, stop = run.span(since, until + 1)
         self._rows = max(0, start - 1), stop + 1
-        self._size = self._sized(self._rows[1] - self._rows[0])
+        self.size = self._sized(self._rows[1] - self._rows[0])
 
     @property
     def levelled(self) -> tuple[str, ...]:
-        """Columns of which it needs levels of detail: none while groups are small enough to be made of rows."""
-        return self.wanted.columns if self._size >= FIRST else ()
+        """Columns that need levels of detail: none while groups are small enough to be made of rows."""
+        return self.query.columns if self.size >= FIRST else ()
 
-    def frame(self, run: Run, origin: int) -> bytes | None:
+    def frame(self, run: ChartedRun, origin: int) -> bytes | None:
         """Return the changes since the last frame, or None; the levels of the run must be up to date."""
-        (start, stop), size = self._rows, self._size
-        told = (run, run.generation, size)
+        (start, stop), size = self._rows, self.size
+        sent_as = (run, run.generation, size)
         end = min(stop, run.end)
         if end > self._end:
-            # Also rows that had come into sight only after it was looked for them.
-            self.changed(self._end)
+            # Rows may have arrived after `look`.
+            self.mark_changed(self._end)
         first, last = start // size, -(-end // size)
         have_first, have_last = self._sent
-        fresh = told != self._told or first < have_first or first > have_last
+        fresh = sent_as != self._sent_as or first < have_first or first > have_last
         at = first if fresh else min(have_last, self._dirty // size)
         at = max(first, min(at, last))
         if not fresh and (at >= last or self._dirty >= run.end):
             return None
-        groups = run.groups(size, at, last, list(self.wanted.columns))
-        self._told, self._dirty, self._end = told, LAST_ROW, end
+        groups = run.groups(size, at, last, list(self.query.columns))
+        self._sent_as, self._dirty, self._end = sent_as, LAST_ROW, end
         # The last group may grow.
         self._sent = (first, groups.start + groups.n)
         return self._packed(groups, origin, fresh, first, run.revision)
 
     def _sized(self, rows: int) -> int:
         """Return the size of groups: the smallest that the points allow, or the last one if that nearly does."""
-        points = self.wanted.points
-        kept = self._size
+        points = self.query.points
+        kept = self.size
         if kept and rows <= SLACK * points * kept and (kept == 1 or rows * SLACK > points * kept / FACTOR):
             return kept
         size = 1
@@ -147,21 +137,21 @@ class ChartStream:
         # Single precision around a value of each column: positions on the earth need more than it holds.
         unknown = np.isnan(self._offsets)
         self._offsets[unknown] = [_some(column) for column in values.T[unknown]]
-        told = fresh or bool((unknown & ~np.isnan(self._offsets)).any())
+        rebased = fresh or bool((unknown & ~np.isnan(self._offsets)).any())
         offsets = np.nan_to_num(self._offsets)
         header = json.dumps(
             {
-                "lane": self.name,
+                "stream": self.name,
                 "revision": revision,
-                "run": self.wanted.run,
+                "run": self.query.run,
                 "fresh": fresh,
                 "first": first,
                 "start": groups.start,
                 "each": 1 if groups.size == 1 else 2,
                 "size": groups.size,
                 "points": int(seconds.size),
-                "columns": list(self.wanted.columns) if fresh else None,
-                "offsets": offsets.tolist() if told else None,
+                "columns": list(self.query.columns) if fresh else None,
+                "offsets": offsets.tolist() if rebased else None,
             },
             separators=(",", ":"),
         ).encode()

@@ -12,7 +12,7 @@ from estimators.model.state_space import StateSpaceModel
 from estimators.track import FAILED, GATED, HELD_OUT, USED, Track, estimated_rows
 
 LINE, UPPER, LOWER, DOTS = "line", "upper", "lower", "dots"
-"""How the rows of a bucket become its points: both extremes; the highest or the lowest alone; a few rows among many."""
+"""How the rows of a group become its points: both extremes; the highest or the lowest; single dots."""
 
 
 class Rows:
@@ -24,11 +24,11 @@ class Rows:
 
     @cached_property
     def estimated(self) -> np.ndarray:
-        """Which rows hold an estimate, (n,)."""
+        """Mask of rows with an estimate, (n,)."""
         return estimated_rows(self.track)
 
     def of_sensor(self, sensor: int) -> np.ndarray:
-        """Which are readings of a sensor, (n,)."""
+        """Return the mask of measurements of a sensor, (n,)."""
         if sensor not in self._of_sensors:
             events = self.events
             self._of_sensors[sensor] = (events.kind == READING) & (events.channel == sensor)
@@ -39,7 +39,7 @@ Values = Callable[[Rows], np.ndarray]
 
 
 class Column:
-    """A name, how its buckets are drawn, and how its values (n,) come from n rows."""
+    """Chart column: name, kind of drawing, and function from n rows to values (n,)."""
 
     __slots__ = ("kind", "name", "of")
 
@@ -47,12 +47,12 @@ class Column:
         self.name, self.kind, self.of = name, kind, of
 
     def values(self, events: Events, track: Track) -> np.ndarray:
-        """Of these rows alone."""
+        """Return the values of these rows."""
         return self.of(Rows(events, track))
 
 
 def columns_of(model: StateSpaceModel) -> dict[str, Column]:
-    """Every column of a model, by name. Bands are ± 2 σ, in the unit of the state or the row."""
+    """Return every column of a model, by name. Bands are ± 2 σ, in the unit of the state or the row."""
     found: list[Column] = []
     for j, state in enumerate(model.shown_states):
         spread = 0.0 if j == model.mode else 2.0  # a probability has no band
@@ -86,7 +86,7 @@ def columns_of(model: StateSpaceModel) -> dict[str, Column]:
 
 
 def rows_of(model: StateSpaceModel) -> list[tuple[str, int, int]]:
-    """Name, sensor and row within it of every row of a reading."""
+    """Return name, sensor and row within it of every row of a measurement."""
     return [
         (model.row_names[start + row], sensor, row)
         for sensor, start in enumerate(model.row_start)

@@ -1,7 +1,7 @@
-"""Levels of detail: rows in groups of 16, 64, 256, ..., of each of which only the extremes are kept.
+"""Levels of detail: the extremes of rows in groups of 16, 64, 256, ...
 
-A group is a run of absolute row indices, so a chart does not shimmer while its window slides, a peak of one row stays
-visible however many are drawn, and only the newest groups change when rows arrive.
+A group is a range of absolute row indices. So a chart does not shimmer while its window slides, a peak of one row stays
+visible at any scale, and only the newest groups change when rows arrive.
 """
 
 from __future__ import annotations
@@ -11,14 +11,14 @@ from typing import NamedTuple
 import numpy as np
 
 FIRST = 16
-"""Rows in a group of the finest level; finer ones are made from the rows themselves."""
+"""Rows in a group of the finest level; finer groups are made from the rows."""
 
 FACTOR = 4
-"""Groups of one level that are one of the next."""
+"""Groups of one level in a group of the next."""
 
 
 class Groups(NamedTuple):
-    """Groups that follow each other, of `size` rows each; the first has number `start`.
+    """Consecutive groups of `size` rows; the first has number `start`.
 
     first, last (k,): times of their first and last rows, ns. low, high (k, columns): their extremes, NaN of none.
     rising (k, columns): whether the last row of a group is not below its first.
@@ -37,31 +37,15 @@ class Groups(NamedTuple):
         """Number of groups."""
         return int(self.first.size)
 
-    def since(self, number: int) -> Groups:
-        """Those from a number on."""
-        return self.part(number, self.start + self.n)
-
     def part(self, start: int, stop: int) -> Groups:
-        """Those with numbers from `start` to before `stop`, as far as they are there."""
+        """Return those with numbers from `start` to before `stop`, as far as they exist."""
         start = max(start, self.start)
         rows = slice(start - self.start, max(start, stop) - self.start)
         return Groups(self.size, start, *(column[rows] for column in self[2:]))
 
-    def followed(self, more: Groups) -> Groups:
-        """These up to where the others begin, and then the others."""
-        before = self.part(self.start, more.start)
-        columns = (np.concatenate(pair) for pair in zip(before[2:], more[2:], strict=True))
-        return Groups(self.size, before.start if before.n else more.start, *columns)
-
-
-def no_groups(size: int, columns: int) -> Groups:
-    """None yet."""
-    times, values = np.zeros(0, np.int64), np.zeros((0, columns))
-    return Groups(size, 0, times, times, values, values, np.zeros((0, columns), bool))
-
 
 def grouped(size: int, first: int, t: np.ndarray, values: np.ndarray) -> Groups:
-    """Rows in groups.
+    """Return rows in groups.
 
     Args:
         size: Rows in a group.
@@ -70,14 +54,14 @@ def grouped(size: int, first: int, t: np.ndarray, values: np.ndarray) -> Groups:
         values: Shape (n, columns).
     """
     if not t.size:
-        return no_groups(size, values.shape[1])
+        return Groups(size, 0, t, t, values, values, values > 0.0)
     start, starts, lasts = _ends(size, first, t.size)
     low, high = _extremes(np.fmin, size, first, values), _extremes(np.fmax, size, first, values)
     return Groups(size, start, t[starts], t[lasts], low, high, values[lasts] >= values[starts])
 
 
 def coarser(groups: Groups) -> Groups:
-    """Groups of `FACTOR` of these."""
+    """Return groups of `FACTOR` of these."""
     start, starts, lasts = _ends(FACTOR, groups.start, groups.n)
     low = _extremes(np.fmin, FACTOR, groups.start, groups.low)
     high = _extremes(np.fmax, FACTOR, groups.start, groups.high)
@@ -88,14 +72,14 @@ def coarser(groups: Groups) -> Groups:
 
 
 def _ends(size: int, first: int, n: int) -> tuple[int, np.ndarray, np.ndarray]:
-    """Number of the first group of n rows, and the first and the last row of each, counted from `first`."""
+    """Return the number of the first group of n rows, and the first and last row of each, counted from `first`."""
     start = first // size
     ends = np.arange(start + 1, (first + n - 1) // size + 1) * size - first
     return start, np.concatenate(([0], ends)), np.concatenate((ends, [n])) - 1
 
 
 def _extremes(extreme: np.ufunc, size: int, first: int, values: np.ndarray) -> np.ndarray:
-    """Extremes (k, columns) of the rows of each group.
+    """Return the extremes (k, columns) of the rows of each group.
 
     Along rows this short, `reduceat` takes six times as long as pairs of neighbours, pairs of pairs and so on.
     """
@@ -119,10 +103,10 @@ class Pyramid:
         self._levels = [_Level(FIRST, columns)]
 
     def update(self, first: int, t: np.ndarray, values: np.ndarray) -> None:
-        """Take rows that are new or rewritten; all known ones after them are void.
+        """Take rows that are new or rewritten; they replace all known ones from there on.
 
         Args:
-            first: Absolute index of the first row, a multiple of `FIRST`, or the oldest row that is still there.
+            first: Absolute index of the first row, a multiple of `FIRST`, or the oldest row that still exists.
             t: Their times, shape (n,), ascending.
             values: Shape (n, columns).
         """
@@ -136,7 +120,8 @@ class Pyramid:
             self._levels[k].put(fresh)
             if not fresh.n:
                 break
-            fresh = coarser(self._levels[k].groups.since(fresh.start // FACTOR * FACTOR))
+            groups = self._levels[k].groups
+            fresh = coarser(groups.part(fresh.start // FACTOR * FACTOR, groups.start + groups.n))
 
     def forget(self, oldest: int) -> None:
         """Drop the groups whose rows are all older than that index."""
@@ -144,7 +129,7 @@ class Pyramid:
             level.drop(oldest // level.groups.size)
 
     def level(self, size: int) -> Groups:
-        """The groups of that size; those of the coarsest level where there are none so large."""
+        """Return the groups of that size."""
         for level in self._levels:
             if level.groups.size == size:
                 return level.groups

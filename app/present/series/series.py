@@ -5,21 +5,20 @@ from __future__ import annotations
 import threading
 from collections.abc import Iterable
 
-from ...live.outputs import Pull
 from ...live.running_fold import Running
 from .chart_stream import ChartStream
-from .charted_run import DifferenceRun, KeptRun, LiveRun, Run
+from .charted_run import ChartedRun, KeptRows, RowSource
 from .columns import columns_of
-from .pinned_runs import PinnedFold, PinnedRun
+from .pinned_fold import PinnedFold
 from .smoothed import Smoother
 
 LIVE, PREVIOUS, SMOOTHED = "live", "previous", "smoothed"
 
-ALL = 2**62
-"""Later than every event."""
+END_OF_TIME = 2**62
+"""Later than every event, ns."""
 
-LESS = "difference:"
-"""Before the name of a revision: its means less those of what runs."""
+DIFFERENCE = "difference:"
+"""Before the number of a pinned run: its means less those of the running fold."""
 
 
 class Series:
@@ -28,18 +27,19 @@ class Series:
     def __init__(self, engine: Running) -> None:
         self._engine = engine
         self.columns = columns_of(engine.model)
+        self.streams: set[ChartStream] = set()
+        """Open chart streams."""
+        self.runs: dict[str, ChartedRun] = {}
+        """Runs that they show, by name."""
         self._lock = threading.Lock()
-        self._live: LiveRun | None = None
-        self._kept: dict[str, KeptRun | DifferenceRun | PinnedRun] = {}
-        self._besides: dict[str, PinnedFold] = {}
-        self._smoothing: Smoother | None = None
-        self._lanes: set[ChartStream] = set()
+        self._pinned: dict[str, PinnedFold] = {}
+        self._smoother: Smoother | None = None
         self._origin: int | None = None
 
     def origin(self) -> int | None:
-        """The time from which charts count seconds, ns: the start of a recording, else the first event that was seen.
+        """Return the time from which charts count, ns: the start of a recording, else the first event that was seen.
 
-        None while nothing has come.
+        None before the first event.
         """
         span = self._engine.status().span
         first, newest = self._engine.span() if span is None else span
@@ -47,100 +47,74 @@ class Series:
             self._origin = first
         return self._origin
 
-    def open(self, lane: ChartStream) -> None:
+    def open(self, stream: ChartStream) -> None:
         """Open a chart stream."""
         with self._lock:
-            self._lanes.add(lane)
+            self.streams.add(stream)
 
-    def close(self, lane: ChartStream) -> None:
+    def close(self, stream: ChartStream) -> None:
         """Close a chart stream."""
         with self._lock:
-            self._lanes.discard(lane)
-            if not self._lanes:
-                self._kept.clear()
-                self._leave(set())
-                if self._live is not None:
-                    self._live.close()
-                    self._live = None
+            self.streams.discard(stream)
+            self._prune()
 
-    def frames(self, lanes: Iterable[ChartStream]) -> list[bytes]:
+    def frames(self, streams: Iterable[ChartStream]) -> list[bytes]:
         """Return frames with the changes of these streams since the last call."""
         with self._lock:
             origin, newest = self.origin(), self._engine.span()[1]
             if origin is None or not newest:
                 return []
-            looked_at = {lane.wanted.run for lane in self._lanes}
-            self._kept = {name: run for name, run in self._kept.items() if name in looked_at}
-            self._leave({name.removeprefix(LESS) for name in looked_at})
-            asked = [lane for lane in lanes if lane in self._lanes]
-            # Once for each name: what it stands for may change meanwhile.
-            runs = {name: self._find(name) for name in dict.fromkeys(lane.wanted.run for lane in asked)}
-            shown = [(lane, run) for lane in asked if (run := runs[lane.wanted.run]) is not None]
-            for lane, run in shown:
-                lane.look(run, origin, newest)
+            self._prune()
+            asked = [stream for stream in streams if stream in self.streams]
+            # Once for each name: its rows may be replaced meanwhile.
+            runs = {name: self._find(name) for name in dict.fromkeys(stream.query.run for stream in asked)}
+            shown = [(stream, run) for stream in asked if (run := runs[stream.query.run]) is not None]
+            for stream, run in shown:
+                stream.look(run, origin, newest)
             for name, run in runs.items():
                 if run is not None:
-                    self._sync(run, [lane for lane in self._lanes if lane.wanted.run == name])
-            return [frame for lane, run in shown if (frame := lane.frame(run, origin)) is not None]
+                    viewers = [stream for stream in self.streams if stream.query.run == name]
+                    run.sync({column for stream in viewers for column in stream.levelled})
+                    for stream in viewers:
+                        stream.mark_changed(run.changed)
+            return [frame for stream, run in shown if (frame := stream.frame(run, origin)) is not None]
 
-    def _sync(self, run: Run, lanes: list[ChartStream]) -> None:
-        """Bring a run up to date for the streams that show it."""
-        run.sync({column for lane in lanes for column in lane.levelled})
-        for lane in lanes:
-            lane.changed(run.changed)
-
-    def _find(self, name: str) -> Run | None:
+    def _find(self, name: str) -> ChartedRun | None:
         """Return a run by name: running, previous, smoothed, pinned, or a difference; None if there is none."""
+        source, run = self._source(name.removeprefix(DIFFERENCE)), self.runs.get(name)
+        if run is not None and run.source != source:
+            self.runs.pop(name).close()
+        if source is not None and name not in self.runs:
+            self.runs[name] = ChartedRun(source, self.columns, self._engine if name.startswith(DIFFERENCE) else None)
+        return self.runs.get(name)
+
+    def _source(self, name: str) -> RowSource | None:
+        engine = self._engine
         if name == LIVE:
-            if self._live is None:
-                self._live = LiveRun(self._engine, self.columns)
-            return self._live
-        pull = self._pulled(name.removeprefix(LESS))
-        kept = self._kept.get(name)
-        if pull is None:
-            self._kept.pop(name, None)
-            return None
-        beside = self._beside(name.removeprefix(LESS), pull)
-        if beside is not None and beside.caught_up:
-            if not isinstance(kept, PinnedRun) or kept.fold is not beside:
-                kept = PinnedRun(beside, self.columns, self._engine if name.startswith(LESS) else None)
-                self._kept[name] = kept
-            return kept
-        if isinstance(kept, PinnedRun):
-            kept = None
-        if kept is None or kept.of is not pull:
-            if name.startswith(LESS):
-                kept = DifferenceRun(pull, self.columns, self._engine)
-            else:
-                kept = KeptRun(pull, self.columns)
-            self._kept[name] = kept
-        return kept
-
-    def _beside(self, name: str, pull: Pull) -> PinnedFold | None:
-        """The fold of a pinned run that goes on; None while there is nothing that its kept rows lack."""
-        found = self._besides.get(name)
-        if (
-            found is None
-            and name not in (PREVIOUS, SMOOTHED)
-            and self._engine.index_at(ALL) > pull.first + len(pull.events)
-        ):
-            found = self._besides[name] = PinnedFold(self._engine, self._engine.revisions.find(int(name)))
-        return found
-
-    def _leave(self, looked_at: set[str]) -> None:
-        """End the folds of pinned runs that no client shows, and the smoother."""
-        if self._smoothing is not None and SMOOTHED not in looked_at:
-            self._smoothing.stop()
-            self._smoothing = None
-        for name in self._besides.keys() - looked_at:
-            self._besides.pop(name).stop()
-
-    def _pulled(self, name: str) -> Pull | None:
+            return engine
         if name == SMOOTHED:
-            if self._smoothing is None:
-                self._smoothing = Smoother(self._engine)
-            return self._smoothing.latest
+            self._smoother = self._smoother or Smoother(engine)
+            smoothed = self._smoother.latest
+            return None if smoothed is None else KeptRows(smoothed)
         if name == PREVIOUS:
-            return self._engine.previous()
-        pinned = {str(run.number): run.track for run in self._engine.revisions.runs if run.pinned}
-        return pinned.get(name)
+            previous = engine.previous()
+            return None if previous is None else KeptRows(previous)
+        run = next((run for run in engine.revisions.runs if run.pinned and str(run.number) == name), None)
+        if run is None or run.track is None:
+            return None
+        if name not in self._pinned and engine.index_at(END_OF_TIME) > run.track.first + len(run.track.events):
+            self._pinned[name] = PinnedFold(engine, run)
+        fold = self._pinned.get(name)
+        return fold if fold is not None and fold.caught_up else KeptRows(run.track)
+
+    def _prune(self) -> None:
+        """Drop runs that no stream shows, and stop their folds."""
+        shown = {stream.query.run for stream in self.streams}
+        for name in self.runs.keys() - shown:
+            self.runs.pop(name).close()
+        sources = {name.removeprefix(DIFFERENCE) for name in shown}
+        for name in self._pinned.keys() - sources:
+            self._pinned.pop(name).stop()
+        if self._smoother is not None and SMOOTHED not in sources:
+            self._smoother.stop()
+            self._smoother = None

@@ -1,7 +1,7 @@
-"""The running estimate, smoothed again and again while a client shows it.
+"""Smoothed estimate of the running twin, updated while a client shows it.
 
-A job copies the last events, folds them and smooths backwards, then rests nine times as long as that took. Without new
-events it does nothing: a recording that has ended is smoothed once.
+A job copies the last events, folds them and smooths backwards, then rests nine times as long as that took. It does
+nothing without new events: a recording that has ended is smoothed once.
 """
 
 from __future__ import annotations
@@ -13,49 +13,57 @@ from estimators.pieces import SMOOTHER
 from estimators.smoothing.smooth import check_smooth, smooth
 
 from ...live.jobs import Job
-from ...live.outputs import EventWindow, Pull
+from ...live.outputs import Pull
 from ...live.running_fold import Running
 from ...live.workshop import Workshop
 
 MAX_SMOOTHED_EVENTS, MAX_PARTICLE_EVENTS = 65_536, 2_000
-"""Events that are smoothed, the last ones; fewer for particle filters."""
+"""Last events that are smoothed; fewer for particle filters."""
 
 PERIOD_S, REST_FACTOR = 0.5, 9.0
-"""Seconds between two looks at least, and the rest as a multiple of the work."""
+"""Least time between two looks, and the rest as a multiple of the work."""
 
 
 class Smoother:
-    """Smooths the last events of a twin. Any thread may read `latest`: the smoothed rows, None while there are none."""
+    """Smooths the last events of a twin. `latest` has the smoothed rows, None while there are none; thread-safe."""
 
     def __init__(self, engine: Running) -> None:
         self._engine = engine
         self.latest: Pull | None = None
-        self._seen: tuple[int, int, int] | None = None
+        self._smoothed: tuple[int, int, int] | None = None
         self._refused = ""
         self._compiled = False
-        self._job = engine.jobs.run("smoother", self.look, every=PERIOD_S, failed=self._refuse)
+        self.job = engine.jobs.run("smoother", self.look, every=PERIOD_S, failed=self._refuse)
 
     def stop(self) -> None:
         """End after the fold that is under way; no client shows the smoothed estimate."""
-        self._job.cancel()
+        self.job.cancel()
 
     def look(self, job: Job) -> float:
-        """Smooth, if an event has come; return the seconds until the next look."""
+        """Smooth, if there are new events; return the seconds until the next look."""
         if not self._compiled:
             _compile(job)
             self._compiled = True
         begun = time.thread_time()
-        taken = self._engine.last_events(MAX_PARTICLE_EVENTS if "pf" in self._engine.estimator else MAX_SMOOTHED_EVENTS)
-        if taken is not None and (taken.revision, taken.first, taken.end) != self._seen:
-            self._seen = taken.revision, taken.first, taken.end
+        window = self._engine.last_events(
+            MAX_PARTICLE_EVENTS if "pf" in self._engine.estimator else MAX_SMOOTHED_EVENTS
+        )
+        if window is not None and (window.revision, window.first, window.end) != self._smoothed:
+            self._smoothed = window.revision, window.first, window.end
             try:
-                self.latest = smoothed(taken)
+                fold = window.fold()
+                check_smooth(fold.estimator, fold.model, fold.options)
+                fold.advance()
+                log, track = fold.log, smooth(fold).instead_of(fold.track)
+                self.latest = Pull(
+                    window.revision, False, log.first, log.events, track, oldest=log.first, version=log.version
+                )
             except EstimatorError as error:
                 self._refuse(str(error), "")
         return max(PERIOD_S, REST_FACTOR * (time.thread_time() - begun))
 
     def _refuse(self, reason: str, prefix: str = "not smoothed: ") -> None:
-        """Show nothing, and say why, once."""
+        """Drop the smoothed rows, and report each reason once."""
         self.latest = None
         if reason != self._refused:
             self._refused = reason
@@ -71,13 +79,3 @@ def _compile(job: Job) -> None:
             job.rest(PERIOD_S)
     finally:
         workshop.stop()
-
-
-def smoothed(taken: EventWindow) -> Pull:
-    """Return the rows of a window with smoothed moments."""
-    fold = taken.fold()
-    check_smooth(fold.estimator, fold.model, fold.options)
-    fold.advance()
-    track = smooth(fold).instead_of(fold.track)
-    log = fold.log
-    return Pull(taken.revision, False, log.first, log.events, track, oldest=log.first, version=log.version)

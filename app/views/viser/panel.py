@@ -21,7 +21,7 @@ from ...live.running_fold import Running
 from ...present.drawing.colors import LIGHT, RGB, Palette, round_step
 from ...present.drawing.plot import SECONDS, TimeUnit, time_unit
 from ...present.series.chart_stream import drawn
-from ...present.series.charted_run import LiveRun
+from ...present.series.charted_run import ChartedRun
 from ...present.series.columns import columns_of
 from ...present.series.levels_of_detail import FACTOR
 from .stage import Choice, Stage
@@ -179,7 +179,7 @@ class NisChart:
         self._engine, self._unit = engine, unit
         self._columns = columns_of(engine.model)
         self._kinds = np.array([self._columns[name].kind for name in self.COLUMNS])
-        self._run: LiveRun | None = None
+        self._run: ChartedRun | None = None
         hidden, line = "rgba(0,0,0,0)", {"spanGaps": True, "points": {"show": False}}
         axis = {"font": "11px sans-serif", "stroke": _css(LIGHT.previous), "ticks": {"size": 4}}
         below = {"size": 24, "label": f"time [{unit.name}]", "labelSize": 14, "labelFont": "11px sans-serif"}
@@ -214,7 +214,7 @@ class NisChart:
     def draw(self, origin: int) -> None:
         """Send the charts' window, over time since `origin` (ns)."""
         if self._run is None:
-            self._run = LiveRun(self._engine, self._columns)
+            self._run = ChartedRun(self._engine, self._columns)
         self._run.sync(self.COLUMNS)
         newest = self._engine.span()[1]
         start, stop = self._run.span(newest - int(self._engine.twin.config.view.window * 1e9), newest + 1)

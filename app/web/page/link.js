@@ -13,8 +13,8 @@ export class Link extends EventTarget {
     this.boot = boot;
     this.status = {};
     this.episodes = [];
-    this.lanes = {}; // what was asked for, to ask again after a break
-    this.takers = {}; // by lane: take(header, seconds, columns)
+    this.streams = {}; // what was asked for, to ask again after a break
+    this.takers = {}; // by stream: take(header, seconds, columns)
     this.delay = 250;
     this.turned = -Infinity; // when something was edited, or folded anew
     document.addEventListener("visibilitychange", () => (document.hidden ? this.close("hidden") : this.open()));
@@ -33,7 +33,7 @@ export class Link extends EventTarget {
     socket.onopen = () => {
       this.delay = 250;
       this.tell("connection", "live");
-      this.say({ lanes: this.lanes, pair: this.pair ?? null });
+      this.say({ streams: this.streams, pair: this.pair ?? null });
     };
     socket.onclose = () => {
       if (this.socket !== socket) return;
@@ -76,13 +76,13 @@ export class Link extends EventTarget {
   // Ask for a chart stream (app/present/series/chart_stream.py) in place of the one of that name; null closes it.
   look(name, wanted, take) {
     if (wanted === null) {
-      delete this.lanes[name];
+      delete this.streams[name];
       delete this.takers[name];
     } else {
-      this.lanes[name] = wanted;
+      this.streams[name] = wanted;
       this.takers[name] = take;
     }
-    this.say({ lanes: { [name]: wanted } });
+    this.say({ streams: { [name]: wanted } });
   }
 
   // The belief over a pair of states now, told as "belief" as it changes; null for no more.
@@ -94,7 +94,7 @@ export class Link extends EventTarget {
   take(data) {
     if (typeof data !== "string") {
       const [header, seconds, columns] = unpack(data);
-      this.takers[header.lane]?.(header, seconds, columns);
+      this.takers[header.stream]?.(header, seconds, columns);
       return;
     }
     const message = JSON.parse(data);

@@ -102,13 +102,13 @@ def test_a_page_that_looks_at_charts_is_told_of_the_twin_while_the_fold_is_at_wo
         f"ws://{client.host}/api/stream", origin=client.origin, additional_headers={"Cookie": client.cookie}
     ) as stream:
         assert "boot" in json.loads(stream.recv(PATIENCE))
-        lane = {"columns": ["mean:winding"], "points": 100}
-        stream.send(json.dumps({"lanes": {"charts": lane}, "pair": ["winding", "rate"]}))
+        query = {"columns": ["mean:winding"], "points": 100}
+        stream.send(json.dumps({"streams": {"charts": query}, "pair": ["winding", "rate"]}))
         said = ""
         # Every word on the twin, though its rows are asked for and do not come.
         while "the measurements so far are being folded (" not in said:
             said = stream.recv(PATIENCE)
-        stream.send(json.dumps({"lanes": {"charts": None}}))
+        stream.send(json.dumps({"streams": {"charts": None}}))
     with connect(
         f"ws://{client.host}/api/stream", origin=client.origin, additional_headers={"Cookie": client.cookie}
     ) as stream:

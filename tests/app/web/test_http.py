@@ -7,7 +7,7 @@ import math
 import pytest
 from starlette.requests import Request
 
-from app.present.series.chart_stream import ChartQuery, check_query
+from app.present.series.chart_stream import ChartQuery, ChartStream
 from app.present.series.columns import columns_of
 from app.web.http import get, parse, post
 from estimators.errors import ConfigError
@@ -70,6 +70,6 @@ def test_a_query_becomes_arguments():
     ids=str,
 )  # fmt: skip
 def test_a_chart_query_that_breaks_a_rule_is_refused(body):
-    with pytest.raises(ConfigError, match="^lane: .*") as refused:
-        check_query(parse(ChartQuery, body, "lane"), columns_of(MODELS["motor_winding"]))
+    with pytest.raises(ConfigError, match="^stream x: .*") as refused:
+        ChartStream("x", parse(ChartQuery, body, "stream x"), columns_of(MODELS["motor_winding"]))
     assert "\n" not in str(refused.value)

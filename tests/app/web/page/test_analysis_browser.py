@@ -158,7 +158,7 @@ def test_rows_in_order_do_not_hide_a_mean_nis_that_is_not(page, place):
 
 def test_nothing_is_asked_while_both_are_hidden(page):
     page.get_by_role("tab", name="Charts").click()
-    until(page, "!('whatif' in window.nisus.link.lanes) && !window.nisus.panes.whatif.busy")
+    until(page, "!('whatif' in window.nisus.link.streams) && !window.nisus.panes.whatif.busy")
     asked = [questions(page, path) for path in ("/api/forecast", "/api/diagnose")]
     drawn = page.evaluate("window.nisus.drawn")
     # Long enough for several of either, by what the charts have drawn meanwhile at ten a second at most.

@@ -10,7 +10,7 @@ import pytest
 from app.live.commands import SetTuning
 from tests.app.scripted import pull_all, wait_for
 from tests.app.web.page.browsed import PATIENCE, browsed, running, until
-from tests.app.web.page.test_quiet_browser import lanes
+from tests.app.web.page.test_quiet_browser import streams
 
 pytestmark = pytest.mark.browser
 
@@ -80,7 +80,7 @@ def test_many_states_of_a_kind_are_one_chart_in_which_the_odd_one_stands_out(sho
     until(page, "window.nisus.charts.live.x.length > 0")
     keys = [key for key, _ in page.evaluate("window.nisus.charts.layout.shown()")]
     assert keys[:3] == ["group:soc", "group:v1", "group:temperature"] and not [key for key in keys if "state:" in key]
-    wanted = {column for column in lanes(session)["charts"] if column.startswith(("mean:", "upper:"))}
+    wanted = {column for column in streams(session)["charts"] if column.startswith(("mean:", "upper:"))}
     states = [state.name for state in session.engine.model.shown_states]
     assert wanted == {f"mean:{name}" for name in states}  # and none of the bands of charts that are hidden
     last = pull_all(session.engine).track.mean[-1]
@@ -97,7 +97,7 @@ def test_many_states_of_a_kind_are_one_chart_in_which_the_odd_one_stands_out(sho
     assert strong == pytest.approx(soc[lowest], rel=1e-6)
     # The band is that of the strong one alone, and no other is asked for.
     until(page, "window.nisus.charts.strong.edges('soc_5')[0].length > 0")
-    assert {column for column in lanes(session)["strong"] if "soc" in column} == {"upper:soc_5", "lower:soc_5"}
+    assert {column for column in streams(session)["strong"] if "soc" in column} == {"upper:soc_5", "lower:soc_5"}
     upper, lower = page.evaluate("window.nisus.charts.strong.edges('soc_5').map((values) => values.at(-1))")
     half = 2 * pull_all(session.engine).track.std[-1, states.index("soc_5")]
     assert (upper, lower) == pytest.approx((soc[lowest] + half, soc[lowest] - half), rel=1e-5)
@@ -121,7 +121,7 @@ def test_many_states_of_a_kind_are_one_chart_in_which_the_odd_one_stands_out(sho
     # Each of them can be had.
     page.get_by_text("Shown", exact=True).click()
     page.locator("#layout li").filter(has_text="soc 5").first.get_by_role("checkbox").check()
-    wait_for(lambda: "upper:soc_5" in lanes(session)["charts"], PATIENCE)
+    wait_for(lambda: "upper:soc_5" in streams(session)["charts"], PATIENCE)
 
 
 def test_a_dozen_states_and_more_are_a_picture_of_space_and_time(shown):

@@ -17,9 +17,9 @@ def session():
         yield session
 
 
-def lanes(session):
-    """What the server is asked for: the columns of each lane."""
-    return {lane.name: set(lane.wanted.columns) for lane in session.server._series._lanes}
+def streams(session):
+    """What the server is asked for: the columns of each stream."""
+    return {stream.name: set(stream.query.columns) for stream in session.server.series.streams}
 
 
 def test_the_charts_go_to_another_moment_of_the_stretch_that_they_show(page, session):
@@ -85,9 +85,9 @@ def test_hidden_charts_ask_for_nothing(page, session):
     engine = session.engine
     engine.submit(Pin(0))
     engine.submit(SetTuning("Q.winding", 0.5))
-    wait_for(lambda: {"overview", "charts", "previous", "run 0", "less 0"} == lanes(session).keys(), PATIENCE)
+    wait_for(lambda: {"overview", "charts", "previous", "run 0", "less 0"} == streams(session).keys(), PATIENCE)
     page.get_by_role("tab", name="Diagnose").click()
-    wait_for(lambda: lanes(session).keys() == {"overview"}, PATIENCE)
+    wait_for(lambda: streams(session).keys() == {"overview"}, PATIENCE)
     # The bar of time goes on, and knows what the charts would show.
     page.evaluate("window.nisus.view.show(10, 20)")
     assert page.evaluate("window.nisus.charts.range") == [10, 20]
@@ -95,17 +95,17 @@ def test_hidden_charts_ask_for_nothing(page, session):
     assert page.evaluate("window.nisus.charts.range[1]") == pytest.approx(300, rel=0.01)
     drawn = page.evaluate("window.nisus.drawn")
     page.get_by_role("tab", name="Charts").click()
-    wait_for(lambda: lanes(session).keys() == {"overview", "charts", "previous", "run 0", "less 0"}, PATIENCE)
+    wait_for(lambda: streams(session).keys() == {"overview", "charts", "previous", "run 0", "less 0"}, PATIENCE)
     until(page, f"window.nisus.drawn > {drawn} && window.nisus.revision === 1")
 
 
 def test_a_chart_that_is_not_chosen_is_not_sent(page, session):
-    wait_for(lambda: "innovation:yoke" in lanes(session).get("charts", ()), PATIENCE)
+    wait_for(lambda: "innovation:yoke" in streams(session).get("charts", ()), PATIENCE)
     page.get_by_text("Shown", exact=True).click()
     for name in ("yoke", "magnet"):
         page.locator("#layout li", has_text=name).last.get_by_role("checkbox").uncheck()
-    wait_for(lambda: "innovation:yoke" not in lanes(session)["charts"], PATIENCE)
-    assert "mean:magnet" not in lanes(session)["charts"] and "mean:yoke" in lanes(session)["charts"]
+    wait_for(lambda: "innovation:yoke" not in streams(session)["charts"], PATIENCE)
+    assert "mean:magnet" not in streams(session)["charts"] and "mean:yoke" in streams(session)["charts"]
 
 
 def test_all_of_q_is_one_command_one_revision_and_one_undo(page, session):

@@ -82,7 +82,7 @@ def test_pin_overlay_and_unpin(page, session):
     wait_for(lambda: not any(run.pinned for run in engine.revisions.runs), PATIENCE)
     wait_for(lambda: page.locator(".chart.difference").is_hidden(), PATIENCE)
     wait_for(lambda: coloured(page, "#charts") == 0, PATIENCE)
-    until(page, "Object.keys(window.nisus.link.lanes).every(name => !/^(run|less) /.test(name))")
+    until(page, "Object.keys(window.nisus.link.streams).every(name => !/^(run|less) /.test(name))")
 
 
 def likelihood(track):
