@@ -1,4 +1,4 @@
-"""Plot of the estimate over two or three states: ellipses or ellipsoids of 1σ and 2σ, particles, trail and truth."""
+"""Plot of the estimate over up to three states: ellipses or ellipsoids of 1σ and 2σ, particles, trail and truth."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from estimators.numerics.peaks import Peak
 
 from ...live.outputs import Belief
 from ...present.drawing.colors import Palette, mixed, round_step, tick_text
-from .scene import History, Outlook, circle, disc, ellipsoid, segments
+from .scene import History, Outlook, PeakMarks, Shapes, circle, disc, ellipsoid, segments
 
-TRAIL = 80
+TRAIL_ROWS = 80
 """Rows of the track in the trail."""
 
 TICKS = (-2, -1, 0, 1, 2)
-PEAKS = 6
+MAX_PEAKS = 6
 """Largest number of marked peaks."""
 
 HALF_AXIS_TICKS = 2.5
 """Half an axis, in ticks."""
 
-SIZES = ((1, 0.022), (3, 0.036), (10, 0.06), (100, 0.1))
+PARTICLE_SIZES = ((1, 0.022), (3, 0.036), (10, 0.06), (100, 0.1))
 """Number of equal particles, and size of their common point: heavier particles are larger."""
 
 MAX_POSITION = 1.3
@@ -66,76 +66,56 @@ class BeliefScene:
         self.axes = [_Axis(j) for j in axes]
         self.flat = flat = len(axes) < 3
         self._known = False
-        self.root = api.add_frame("/scene", show_axes=False)
-        line = {"thickness_units": "screen"}
+        shapes = Shapes(api)
+        self.root = shapes.frame()
         ticks = np.array(TICKS) / HALF_AXIS_TICKS
-        api.add_line_segments("/scene/grid", _grid(ticks, flat), palette.rule, thickness=1, **line)
-        api.add_line_segments("/scene/box", _frame(flat), palette.bound, thickness=1.5, **line)
-        shown = range(2 if flat else 3)
+        shapes.lines("grid", palette.rule, 1, _grid(ticks, flat))
+        shapes.lines("box", palette.bound, 1.5, _frame(flat))
         self._labels = [
-            [api.add_label(f"/scene/ticks/{k}/{i}", " ", position=_beside(k, tick, 1.09, flat), anchor="center-center",
-                           font_screen_scale=0.75, visible=k < len(axes)) for i, tick in enumerate(ticks)]
-            for k in shown
-        ]  # fmt: skip
+            [
+                shapes.label(f"ticks/{k}/{i}", position=_beside(k, tick, 1.09, flat), anchor="center-center")
+                for i, tick in enumerate(ticks)
+            ]
+            for k in range(len(axes))
+        ]
         self._titles = [
-            api.add_label(f"/scene/titles/{k}", " ", position=_title_place(k, flat), font_screen_scale=0.9,
-                          anchor="bottom-left" if k and (flat or k == 2) else "center-center", visible=k < len(axes))
-            for k in shown
-        ]  # fmt: skip
-        one = np.zeros((1, 3), np.float32)
-        dot = {"point_shape": "circle", "precision": "float32", "point_shading": "flat"}
-        light = mixed(palette.estimate, palette.panel, 0.35)
-        self._trail = api.add_line_segments("/scene/trail", np.zeros((1, 2, 3), np.float32), light, thickness=2, **line)
-        self._clouds = [
-            api.add_point_cloud(f"/scene/points/{k}", one, mixed(palette.estimate, palette.panel, 0.2), point_size=size,
-                                visible=False, point_shape="circle", point_shading="flat")
-            for k, (_, size) in enumerate(SIZES)
-        ]  # fmt: skip
-        self._truth = api.add_point_cloud("/scene/truth", one, palette.truth, point_size=0.05, visible=False,
-                                          **dot | {"point_shape": "diamond"})  # fmt: skip
-        self._belief = api.add_frame("/scene/belief", show_axes=False)
-        self._mean = api.add_point_cloud(
-            "/scene/belief/mean", one + [0.0, 0.0, 0.04 if flat else 0.0], palette.estimate, point_size=0.04, **dot
-        )
-        self._peaks = [
-            (
-                api.add_point_cloud(
-                    f"/scene/peaks/{k}/mean", one, palette.estimate, point_size=0.05, visible=False, **dot
-                ),
-                api.add_label(f"/scene/peaks/{k}/weight", " ", visible=False, font_screen_scale=0.8,
-                              anchor="bottom-left"),
+            shapes.label(
+                f"titles/{k}", scale=0.9, position=_title_place(k, flat),
+                anchor="bottom-left" if k and (flat or k == 2) else "center-center",
             )
-            for k in range(PEAKS)
+            for k in range(len(axes))
         ]  # fmt: skip
-        self._bodies = [self._body(api, sigmas, palette, line) for sigmas in (1, 2)]
+        self._trail = shapes.lines("trail", mixed(palette.estimate, palette.panel, 0.35), 2)
+        light = mixed(palette.estimate, palette.panel, 0.2)
+        self._clouds = [
+            shapes.dots(f"points/{k}", light, size, visible=False, precision="float16")
+            for k, (_, size) in enumerate(PARTICLE_SIZES)
+        ]
+        self._truth = shapes.dots("truth", palette.truth, 0.05, shape="diamond", visible=False)
+        below = shapes.below("belief")
+        self._belief = below.frame()
+        below.dots("mean", palette.estimate, 0.04, np.array([[0.0, 0.0, 0.04 if flat else 0.0]], np.float32))
+        self._marks = PeakMarks(shapes, MAX_PEAKS, palette.estimate, 0.05, scale=0.8)
+        self._bodies = [(sigmas, self._body(below, sigmas, palette)) for sigmas in (1, 2)]
         margin = np.array([[-1.3, -1.32, 0.0], [1.12, -1.32, 0.0], [-1.3, 1.22, 0.0], [1.12, 1.22, 0.0]])
         if flat:
             self.outlook = Outlook.from_above(margin)
         else:
             box = np.stack(np.meshgrid([-1.15, 1.15], [-1.15, 1.15], [-1.1, 1.15]), axis=-1).reshape(-1, 3)
             titles = np.array([_title_place(k, False) for k in range(3)])
-            self.outlook = Outlook(
-                np.vstack((box, titles)), np.array([3.6, -5.2, 3.4]), np.array([0.0, 0.0, 1.0]), np.radians(33)
-            )
+            self.outlook = Outlook(np.vstack((box, titles)), np.array([3.6, -5.2, 3.4]), fov=float(np.radians(33)))
 
-    def _body(self, api: viser.SceneApi, sigmas: int, palette: Palette, line: dict[str, Any]) -> tuple[int, list[Any]]:
-        """Return the handles of the ellipse or ellipsoid of a number of σ, with that number."""
-        name, flat = f"/scene/belief/{sigmas}", {"cast_shadow": False, "receive_shadow": False}
-        opacity = {1: 0.28, 2: 0.16}[sigmas]
+    def _body(self, shapes: Shapes, sigmas: int, palette: Palette) -> list[Any]:
+        """Return the handles of the ellipse or ellipsoid of a number of σ."""
+        style = {"color": palette.estimate, "opacity": {1: 0.28, 2: 0.16}[sigmas]}
         if not self.flat:
-            body = api.add_icosphere(f"{name}/body", 1.0, palette.estimate, opacity=opacity, subdivisions=4, **flat)
-            return sigmas, [body]
-        vertices, faces = disc()
-        plate = api.add_mesh_simple(
-            f"{name}/disc", vertices, faces, color=palette.estimate, opacity=opacity, side="double", **flat
-        )
-        rim = api.add_line_segments(f"{name}/rim", circle(), palette.estimate, thickness=3.0 - sigmas, **line)
-        return sigmas, [plate, rim]
+            return [shapes.body("icosphere", f"{sigmas}/body", 1.0, subdivisions=4, **style)]
+        plate = shapes.body("mesh_simple", f"{sigmas}/disc", *disc(), side="double", **style)
+        return [plate, shapes.lines(f"{sigmas}/rim", palette.estimate, 3.0 - sigmas, circle())]
 
     def draw(self, history: History, belief: Belief, heavy: bool = True) -> None:
         """Send the present estimate; trail and particles only if `heavy`."""
-        axes, index = self.axes, [axis.state for axis in self.axes]
-        lift = np.array([0.0, 0.0, 0.02 if self.flat else 0.0])
+        index = [axis.state for axis in self.axes]
         mean, cov = belief.mean[index], belief.cov[np.ix_(index, index)]
         known = bool(np.isfinite(mean).all() and np.isfinite(cov).all())
         # Otherwise the earlier drawing would stay for an estimate that is not a number.
@@ -144,17 +124,14 @@ class BeliefScene:
         self._belief.visible = known
         if known:
             heavy |= self._draw_belief(mean, cov)
-        self._mark(index, belief.peaks if known else (), lift)
-        self._truth.visible = self._put(self._truth, self._true_point(history, index), lift)
+        self._draw_peaks(index, belief.peaks if known else ())
+        self._put(self._truth, self._true_point(history, index))
         if heavy:
-            self._draw_points(belief.points[:, index] if known and len(belief.points) else np.zeros((0, len(axes))))
-            trail = self._place(history.settled("mean", TRAIL)[:, self._columns(index)])
+            self._draw_points(belief.points[:, index] if known and len(belief.points) else np.zeros((0, len(index))))
+            columns = [int(np.searchsorted(self.model.shown, j)) for j in index]
+            trail = self._place(history.settled("mean", TRAIL_ROWS)[:, columns])
             trail[(np.abs(trail) > 1.0).any(axis=1)] = np.nan
             self._trail.points = segments(trail)
-
-    def _columns(self, index: list[int]) -> list[int]:
-        """Return the columns of these states in the track."""
-        return [int(np.searchsorted(self.model.shown, j)) for j in index]
 
     def _draw_belief(self, mean: np.ndarray, cov: np.ndarray) -> bool:
         """Move the ellipses; return whether an axis changed, which moves everything else."""
@@ -184,46 +161,41 @@ class BeliefScene:
     def _draw_points(self, states: np.ndarray) -> None:
         """Draw the particles; equal ones as one point, larger for a larger number."""
         points, counts = np.unique(states, axis=0, return_counts=True)
-        bounds = [size for size, _ in SIZES] + [np.inf]
+        bounds = [size for size, _ in PARTICLE_SIZES] + [np.inf]
         for k, handle in enumerate(self._clouds):
-            handle.visible = self._put(handle, points[(counts >= bounds[k]) & (counts < bounds[k + 1])], 0.02)
+            self._put(handle, points[(counts >= bounds[k]) & (counts < bounds[k + 1])])
 
-    def _mark(self, index: list[int], peaks: tuple[Peak, ...], lift: np.ndarray) -> None:
-        """Draw a dot with its weight at each of several peaks."""
-        for k, (dot, label) in enumerate(self._peaks):
-            place = self._place(peaks[k].mean[None, index])[0] if k < len(peaks) else np.full(3, np.nan)
-            shown = bool(np.isfinite(place).all() and (np.abs(place) <= MAX_POSITION).all())
-            if shown:
-                dot.points = (place + 2 * lift)[None].astype(np.float32)
-                label.position = tuple(place + 2 * lift + [0.04, 0.04, 0.0])
-                label.text = f"{100 * peaks[k].weight:.0f} %"
-            dot.visible = label.visible = shown
+    def _draw_peaks(self, index: list[int], peaks: tuple[Peak, ...]) -> None:
+        lift = 0.04 if self.flat else 0.0
+        places = self._place(np.array([peak.mean[index] for peak in peaks]).reshape(-1, len(index)))
+        places[(np.abs(places) > MAX_POSITION).any(axis=1)] = np.nan
+        texts = [f"{100 * peak.weight:.0f} %" for peak in peaks]
+        self._marks.draw(list(places + [0.0, 0.0, lift]), texts, (0.04, 0.04, 0.0))
 
-    def _put(self, handle: Any, states: np.ndarray, lift: np.ndarray | float) -> bool:
-        """Draw states as points; return whether any is in view."""
+    def _put(self, handle: Any, states: np.ndarray) -> None:
+        """Draw the states that are in view as points."""
         places = self._place(states)
-        places[:, 2] += np.max(lift) if self.flat else 0.0
+        places[:, 2] += 0.02 if self.flat else 0.0
         places = places[np.isfinite(places).all(axis=1) & (np.abs(places) <= MAX_POSITION).all(axis=1)]
         if len(places):
             handle.points = places
-        return bool(len(places))
+        handle.visible = bool(len(places))
 
     def _true_point(self, history: History, index: list[int]) -> np.ndarray:
+        """Return the last true values of the states, (1, k); NaN where one is not known."""
         events = history.events(slice(-4096, None))
-        point = np.full((1, len(index)), np.nan)
-        for k, j in enumerate(index):
-            values = truth_of(events, j)[1]
-            if values.size:
-                point[0, k] = values[-1]
-        return point
+        known = [truth_of(events, j)[1] for j in index]
+        return np.array([[values[-1] if values.size else np.nan for values in known]])
 
     def _place(self, states: np.ndarray) -> np.ndarray:
+        """Return states (n, k) as positions (n, 3), NaN on an axis without a scale."""
         out = np.zeros((len(states), 3))
         for k, axis in enumerate(self.axes):
             out[:, k] = axis.place(states[:, k]) if axis.step else np.nan
         return out
 
     def _number(self, k: int, axis: _Axis) -> None:
+        """Set title and numbers of an axis."""
         state = self.model.states[axis.state]
         unit = f" [{state.unit}]" if state.unit and state.unit != "1" else ""
         self._titles[k].text = f"{self.model.label(state.name).replace('_', ' ')}{unit}"

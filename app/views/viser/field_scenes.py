@@ -25,7 +25,7 @@ from ...present.drawing.colors import (
     sensor_colors,
     take_innovations,
 )
-from .scene import History, Outlook, segments
+from .scene import History, Outlook, Shapes, put_points, segments, set_color, set_text
 
 PICTURE_PERIOD_S = 0.5
 """Seconds between two pictures."""
@@ -45,8 +45,6 @@ MAX_SURFACE_BARS = 9
 SURFACE_HEIGHT = 0.6
 """Height of the highest value above the lowest; the longer side is 2 long."""
 
-UNSHADED = {"cast_shadow": False, "receive_shadow": False}
-
 
 class FieldView:
     """The latest pictures of a field, the kind that is chosen, and its scale; scenes draw them."""
@@ -64,7 +62,8 @@ class FieldView:
         # The longer side of the picture is 2 long.
         self._size = 2.0 * np.array([self._frame.width, self._frame.height])
         self._size /= max(self._frame.width, self._frame.height)
-        self.root = api.add_frame("/scene", show_axes=False)
+        self._shapes = Shapes(api)
+        self.root = self._shapes.frame()
 
     def show(self, title: str) -> None:
         """Show the picture of that title."""
@@ -104,33 +103,23 @@ class FieldScene(FieldView):
         turn = (0.0, 1.0, 0.0, 0.0)  # Viser's images have their top at -y
         blank = np.full((frame.height, frame.width, 3), 240, np.uint8)
         at = (self._left + 0.5 * size[0], 0.0, 0.0)
-        self._image = api.add_image("/scene/field", blank, *size, format="png", wxyz=turn, position=at, **UNSHADED)
+        shapes = self._shapes
+        self._image = shapes.body("image", "field", blank, *size, format="png", wxyz=turn, position=at)
         at = (right + 0.11, 0.0, 0.0)
-        bar = blank[:, :1]
-        self._bar = api.add_image("/scene/scale", bar, 0.06, size[1], format="png", wxyz=turn, position=at, **UNSHADED)
-        self._labels = [
-            api.add_label(f"/scene/ticks/{k}", " ", anchor="center-left", font_screen_scale=0.75, visible=False)
-            for k in range(MAX_TICKS)
-        ]
+        self._bar = shapes.body("image", "scale", blank[:, :1], 0.06, size[1], format="png", wxyz=turn, position=at)
+        self._labels = [shapes.label(f"ticks/{k}", anchor="center-left", visible=False) for k in range(MAX_TICKS)]
         self._tick_x = right + 0.17
-        self._title = api.add_label(
-            "/scene/title", " ", position=(self._left, 0.5 * size[1] + 0.05, 0.0), anchor="bottom-left",
-            font_screen_scale=0.9,
-        )  # fmt: skip
+        at = (self._left, 0.5 * size[1] + 0.05, 0.0)
+        self._title = shapes.label("title", scale=0.9, position=at, anchor="bottom-left")
         corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1], [0, 0]]) * size + [self._left, -0.5 * size[1]]
-        edge = segments(np.column_stack((corners, np.full(5, 0.002))))
-        api.add_line_segments("/scene/frame", edge, theme.bound, thickness=1.5, thickness_units="screen")
-        dots = {"point_shape": "circle", "precision": "float32", "point_shading": "flat"}
+        shapes.lines("frame", theme.bound, 1.5, segments(np.column_stack((corners, np.full(5, 0.002)))))
         self._points = None
         if len(places):
             where = self._place(frame.pixels(places), 0.006)
-            below = where - np.array([0.0, 0.0, 0.002], np.float32)
-            api.add_point_cloud("/scene/sensors/rims", below, RIM, point_size=0.022, **dots)
-            colors = sensor_colors(self._normalised)
-            self._points = api.add_point_cloud("/scene/sensors/dots", where, colors, point_size=0.016, **dots)
+            shapes.dots("sensors/rims", RIM, 0.022, where - np.array([0.0, 0.0, 0.002], np.float32))
+            self._points = shapes.dots("sensors/dots", sensor_colors(self._normalised), 0.016, where)
         cells = self._place(frame.pixels(np.array([state.position for state in model.shown_states], float)), 0.01)
-        diamonds = dots | {"point_shape": "diamond"}
-        api.add_point_cloud("/scene/cells", cells, theme.estimate, point_size=0.03, **diamonds)
+        shapes.dots("cells", theme.estimate, 0.03, cells, shape="diamond")
         across, upright = (self._left, right + 0.32), (-0.5 * size[1] - 0.04, 0.5 * size[1] + 0.14)
         self.outlook = Outlook.from_above(np.array([[x, y, 0.0] for x in across for y in upright]))
 
@@ -180,26 +169,17 @@ class FieldSurfaceScene(FieldView):
         self._faces = _triangles(len(y), len(x))
         sparse = [np.linspace(0, n - 1, min(n, MAX_SURFACE_BARS)).round().astype(int) for n in (len(y), len(x))]
         self._bars_at = (sparse[0][:, None] * len(x) + sparse[1]).ravel()
-        start = np.zeros((3, 3), np.float32), np.array([[0, 1, 2]], np.uint32)
-        self._meshes = [
-            api.add_mesh_simple(
-                f"/scene/bands/{k}", *start, color=theme.bound, visible=False, side="double", **UNSHADED
-            )
-            for k in range(SURFACE_COLORS)
-        ]
-        line = {"thickness": 1.5, "thickness_units": "screen"}
-        self._bars = api.add_line_segments("/scene/bars", np.zeros((1, 2, 3), np.float32), theme.ink, **line)
+        shapes, start = self._shapes, (np.zeros((3, 3), np.float32), np.array([[0, 1, 2]], np.uint32))
+        style = {"color": theme.bound, "visible": False, "side": "double"}
+        self._meshes = [shapes.body("mesh_simple", f"bands/{k}", *start, **style) for k in range(SURFACE_COLORS)]
+        self._bars = shapes.lines("bars", theme.ink, 1.5)
         low = -0.5 * SURFACE_HEIGHT
         floor = np.column_stack((np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]]) * half, np.full(5, low)))
         upright = np.array([[-half[0], -half[1], low], [-half[0], -half[1], -low]])
-        api.add_line_segments("/scene/frame", np.concatenate((segments(floor), segments(upright))), theme.bound, **line)
-        self._labels = [
-            api.add_label(f"/scene/ticks/{k}", " ", anchor="center-right", font_screen_scale=0.75, visible=False)
-            for k in range(MAX_TICKS)
-        ]
-        self._title = api.add_label(
-            "/scene/title", " ", position=(-half[0], half[1], 0.15 - low), anchor="bottom-left", font_screen_scale=0.9
-        )
+        shapes.lines("frame", theme.bound, 1.5, np.concatenate((segments(floor), segments(upright))))
+        self._labels = [shapes.label(f"ticks/{k}", anchor="center-right", visible=False) for k in range(MAX_TICKS)]
+        at = (-half[0], half[1], 0.15 - low)
+        self._title = shapes.label("title", scale=0.9, position=at, anchor="bottom-left")
         x, y = 1.12 * half
         corners = np.array([[a, b, c] for a in (-x, x) for b in (-y, y) for c in (low, SURFACE_HEIGHT)])
         self.outlook = Outlook(corners, np.array([-0.35, -1.0, 0.75]))
@@ -219,8 +199,7 @@ class FieldSurfaceScene(FieldView):
         if std is not None:
             at, reach = self._bars_at, 2 * std[pick].ravel()[self._bars_at]
             ends = [np.column_stack((self._x[at], self._y[at], self._height(values[at] + s))) for s in (-reach, reach)]
-            lines = np.stack(ends, axis=1)
-            self._bars.points = lines[np.isfinite(lines).all(axis=(1, 2))].astype(np.float32)
+            put_points(self._bars, np.stack(ends, axis=1))
         self._title.text = f"{self._name} [{self._unit}]; colour: {self._kind.title}"
         left, front = -0.5 * self._size
         draw_ticks(self._labels, upright, lambda share: (left - 0.03, front, (share - 0.5) * SURFACE_HEIGHT))
@@ -239,8 +218,7 @@ class FieldSurfaceScene(FieldView):
             mesh.visible = bool(len(mine))
             if len(mine):
                 used, numbers = np.unique(mine, return_inverse=True)
-                if tuple(mesh.color) != tuple(color):
-                    mesh.color = tuple(color)
+                set_color(mesh, tuple(color))
                 mesh.vertices = corners[used].astype(np.float32)
                 mesh.faces = numbers.reshape(-1, 3).astype(np.uint32)
 
@@ -254,8 +232,7 @@ def draw_ticks(labels: list[viser.LabelHandle], scale: Scale, place: Callable[[f
         if k < len(ticks):
             share, text = ticks[k]
             label.position = place(share)
-            if label.text != text:
-                label.text = text
+            set_text(label, text)
 
 
 def _triangles(rows: int, columns: int) -> np.ndarray:

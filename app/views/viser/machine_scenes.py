@@ -18,7 +18,7 @@ from estimators.model.state_space import StateSpaceModel
 from ...live.outputs import Belief
 from ...present.drawing.colors import ESTIMATE, RGB, UNKNOWN_INDEX, Palette, Scale, gradient, mixed, with_deviation
 from .field_scenes import draw_ticks
-from .scene import History, Outlook, about_z, segments
+from .scene import History, Outlook, Shapes, about_z, put_points, segments, set_color, set_text
 
 HEIGHT, RADIUS, PITCH = 1.4, 0.3, 0.78
 CELLS_PER_ROW = 4
@@ -36,8 +36,8 @@ class BatteryScene:
         names = model.state_names
         self._charge = [names.index(name) for name in charge]
         self._temperature = [names.index(name) for name in temperature]
-        self.root = api.add_frame("/scene", show_axes=False)
-        flat = {"cast_shadow": False, "receive_shadow": False}
+        shapes = Shapes(api)
+        self.root = shapes.frame()
         columns = min(CELLS_PER_ROW, len(charge))
         self._feet = np.array([
             [(k % columns - 0.5 * (columns - 1)) * PITCH, 0.0, -(k // columns) * (HEIGHT + 0.5)]
@@ -45,24 +45,18 @@ class BatteryScene:
         ])  # fmt: skip
         self._fills, self._doubts, self._texts = [], [], []
         for k, foot in enumerate(self._feet):
-            cell = f"/scene/cells/{k}"
-            middle = foot + [0.0, 0.0, 0.5 * HEIGHT]
-            api.add_cylinder(f"{cell}/can", RADIUS + 0.02, HEIGHT, palette.bound, opacity=0.16, position=middle, **flat)
-            self._fills.append(api.add_cylinder(f"{cell}/fill", RADIUS, 1.0, palette.previous, position=middle, **flat))
-            self._doubts.append(
-                api.add_cylinder(f"{cell}/doubt", RADIUS + 0.03, 1.0, palette.estimate, opacity=0.4, position=middle,
-                                 **flat)
-            )  # fmt: skip
-            self._texts.append(
-                api.add_label(f"{cell}/text", " ", position=foot + [0.0, 0.0, HEIGHT + 0.08], anchor="bottom-center",
-                              font_screen_scale=0.85)
-            )  # fmt: skip
+            cell, at = shapes.below(f"cells/{k}"), {"position": foot + [0.0, 0.0, 0.5 * HEIGHT]}
+            cell.body("cylinder", "can", RADIUS + 0.02, HEIGHT, palette.bound, opacity=0.16, **at)
+            self._fills.append(cell.body("cylinder", "fill", RADIUS, 1.0, palette.previous, **at))
+            self._doubts.append(cell.body("cylinder", "doubt", RADIUS + 0.03, 1.0, palette.estimate, opacity=0.4, **at))
+            top = foot + [0.0, 0.0, HEIGHT + 0.08]
+            self._texts.append(cell.label("text", scale=0.85, position=top, anchor="bottom-center"))
         low = float(self._feet[:, 2].min())
         self._bar = None
         if temperature:
             labels = [f"cell {k + 1}" for k in range(len(temperature))] if len(temperature) > 1 else ["temperature"]
             unit = model.states[self._temperature[0]].unit
-            self._bar = ScaleBar(api, "/scene/scale", labels, unit, palette, y=0.0, top=low - 0.15)
+            self._bar = ScaleBar(shapes.below("scale"), labels, unit, palette, y=0.0, top=low - 0.15)
             low = self._bar.bottom
         top, wide = HEIGHT + 0.3, max(1.05, 0.5 * columns * PITCH)
         middle = np.array([0.0, 0.0, 0.5 * (low + top)])
@@ -78,22 +72,18 @@ class BatteryScene:
         if self._bar is not None:
             self._bar.fit(mean[self._temperature], std[self._temperature])
             for fill, j in zip(self._fills, self._temperature, strict=True):
-                color = self._bar.color(mean[j])
-                if tuple(fill.color) != color:
-                    fill.color = color
+                set_color(fill, self._bar.color(mean[j]))
         for k, j in enumerate(self._charge):
             low, middle, high = (float(np.clip(mean[j] + s * std[j], 0.0, 1.0)) for s in (-2, 0, 2))
             known = bool(np.isfinite(mean[j]) and np.isfinite(std[j]))
             self._fills[k].visible = self._doubts[k].visible = known
-            text = f"{100 * mean[j]:.0f} ± {200 * std[j]:.0f} %" if known else "–"
-            if self._texts[k].text != text:
-                self._texts[k].text = text
+            set_text(self._texts[k], f"{100 * mean[j]:.0f} ± {200 * std[j]:.0f} %" if known else "–")
             if known:
                 self._stand(self._fills[k], k, 0.0, middle)
                 self._stand(self._doubts[k], k, low, high)
 
     def _stand(self, handle: viser.CylinderHandle, k: int, low: float, high: float) -> None:
-        """Let a cylinder reach from one share of a cell's height to another."""
+        """Set the ends of a cylinder, as shares of a cell's height."""
         tall = max(HEIGHT * (high - low), MIN_SLAB_HEIGHT)
         handle.scale = (1.0, 1.0, tall)
         handle.position = self._feet[k] + [0.0, 0.0, HEIGHT * low + 0.5 * tall]
@@ -123,38 +113,31 @@ class GripperScene:
         )
         self._unit = model.states[self._depth].unit
         self._apart, self._touching = palette.previous, palette.estimate
-        self.root = api.add_frame("/scene", show_axes=False)
-        self.world = api.add_frame("/scene/world", show_axes=False)
-        flat = {"cast_shadow": False, "receive_shadow": False}
-        line, world = {"thickness_units": "screen"}, "/scene/world"
-        nothing = np.zeros((1, 2, 3), np.float32)
+        self.root = Shapes(api).frame()
+        shapes = Shapes(api, "/scene/world")
+        self.world = shapes.frame()
         steel, body = mixed(palette.faint, palette.panel, 0.25), mixed(palette.bound, palette.panel, 0.45)
-        self._part = api.add_box(f"{world}/part", body, (PART_WIDTH, 2 * HALF_DEPTH, 2 * HALF_HEIGHT), **flat)
-        tall = HALF_HEIGHT + 2.0 + FINGER_TOP
+        deep, tall = 1.4 * HALF_DEPTH, HALF_HEIGHT + 2.0 + FINGER_TOP
+        self._part = shapes.body("box", "part", body, (PART_WIDTH, 2 * HALF_DEPTH, 2 * HALF_HEIGHT))
         self._fingers = [
             (
-                api.add_box(f"{world}/fingers/{k}/steel", steel, (FINGER, 1.4 * HALF_DEPTH, tall), **flat),
-                api.add_box(f"{world}/fingers/{k}/pad", self._apart, (1.0, 1.4 * HALF_DEPTH, 2 * HALF_HEIGHT), **flat),
+                shapes.body("box", f"fingers/{k}/steel", steel, (FINGER, deep, tall)),
+                shapes.body("box", f"fingers/{k}/pad", self._apart, (1.0, deep, 2 * HALF_HEIGHT)),
             )
             for k in range(2)
         ]
-        self._palm = api.add_box(f"{world}/palm", steel, (1.0, 1.4 * HALF_DEPTH, PALM_HEIGHT), **flat)
+        self._palm = shapes.body("box", "palm", steel, (1.0, deep, PALM_HEIGHT))
         size = (1.0, 2.3 * HALF_DEPTH, 2 * HALF_HEIGHT + 2.0)
         self._doubts = [
-            api.add_box(f"{world}/doubt/{name}", palette.estimate, size, opacity=0.3, **flat)
-            for name in ("surface", "finger")
+            shapes.body("box", f"doubt/{name}", palette.estimate, size, opacity=0.3) for name in ("surface", "finger")
         ]
-        self._gap = api.add_line_segments(f"{world}/gap", nothing, palette.ink, thickness=2, **line)
-        self._truth = api.add_line_segments(f"{world}/truth", nothing, palette.truth, thickness=3, **line)
-        self._cloud = api.add_point_cloud(
-            f"{world}/cloud", np.zeros((1, 3), np.float32), palette.estimate, point_size=0.35, point_shape="circle",
-            precision="float32", point_shading="flat", visible=False,
-        )  # fmt: skip
-        text = {"font_screen_scale": 0.9}
-        self._says = api.add_label(f"{world}/says", " ", anchor="bottom-center", **text)
-        self._between = api.add_label(f"{world}/between", " ", anchor="bottom-center", **text)
-        self._where = api.add_label(f"{world}/where", " ", anchor="top-center", **text)
-        # The gripper closes about the part's middle, which is where the view has its own.
+        self._gap = shapes.lines("gap", palette.ink, 2)
+        self._truth = shapes.lines("truth", palette.truth, 3)
+        self._cloud = shapes.dots("cloud", palette.estimate, 0.35, visible=False)
+        self._says = shapes.label("says", scale=0.9, anchor="bottom-center")
+        self._between = shapes.label("between", scale=0.9, anchor="bottom-center")
+        self._where = shapes.label("where", scale=0.9, anchor="top-center")
+        # The gripper closes about the middle of the part, which is the middle of the view.
         prior = model.prior_mean
         self._middle = float(prior[self._surface]) + 0.5 * PART_WIDTH
         across = 0.5 * PART_WIDTH + abs(float(prior[self._depth])) + PAD + FINGER + 8.0
@@ -164,8 +147,7 @@ class GripperScene:
         corners = np.array(
             [[x, y, z] for x in (-across, across) for y in (-HALF_DEPTH, HALF_DEPTH) for z in (low, high)]
         )
-        self.outlook = Outlook(
-            corners - [0.0, 0.0, self._height], np.array([-0.2, -1.0, 0.22]))  # fmt: skip
+        self.outlook = Outlook(corners - [0.0, 0.0, self._height], np.array([-0.2, -1.0, 0.22]))
 
     def draw(self, history: History, belief: Belief, heavy: bool = True) -> None:
         """Send finger, part and contact; particles and truth only if `heavy`."""
@@ -173,10 +155,9 @@ class GripperScene:
         surface, depth = belief.mean[pick]
         contact = float(belief.mean[self._contact])
         known = bool(np.isfinite([surface, depth, contact]).all())
-        for handle in (self._part, self._palm, *self._doubts, *(one for pair in self._fingers for one in pair)):
+        bodies = [self._part, self._palm, *self._doubts, *(one for pair in self._fingers for one in pair)]
+        for handle in (*bodies, self._says, self._between, self._where):
             handle.visible = known
-        for label in (self._says, self._between, self._where):
-            label.visible = known
         if not known:
             self._gap.visible = self._cloud.visible = self._truth.visible = False
             return
@@ -205,8 +186,7 @@ class GripperScene:
             steel.position = (0.5 * (ends[0] + ends[1]), 0.0, FINGER_TOP - 0.5 * tall)
             pad.position = (0.5 * (ends[1] + ends[2]), 0.0, 0.0)
             pad.scale = (max(abs(ends[2] - ends[1]), 0.1), 1.0, 1.0)
-            if tuple(pad.color) != color:
-                pad.color = color
+            set_color(pad, color)
         self._palm.position = (surface + 0.5 * PART_WIDTH, 0.0, FINGER_TOP + 0.5 * PALM_HEIGHT)
         self._palm.scale = (PART_WIDTH + 2 * (surface - back + FINGER), 1.0, 1.0)
 
@@ -227,24 +207,21 @@ class GripperScene:
             (self._where, f"part at {with_deviation(surface, spread[0])} {unit}", (middle, -HALF_HEIGHT - 5.0)),
         )
         for label, text, (x, z) in texts:
-            if label.text != text:
-                label.text = text
+            set_text(label, text)
             label.position = (x, -HALF_DEPTH, z)
 
     def _draw_cloud(self, points: np.ndarray) -> None:
         """Draw the surface of the part by each particle."""
         at = points[:, self._surface] if len(points) else np.zeros(0)
         at = at[np.isfinite(at)]
-        self._cloud.visible = bool(at.size)
-        if at.size:
-            rows = np.linspace(-HALF_DEPTH, HALF_DEPTH, at.size)
-            self._cloud.points = np.column_stack((at, rows, np.full(at.size, -HALF_HEIGHT - 2.0))).astype(np.float32)
+        rows = np.linspace(-HALF_DEPTH, HALF_DEPTH, at.size)
+        put_points(self._cloud, np.column_stack((at, rows, np.full(at.size, -HALF_HEIGHT - 2.0))))
 
     def _draw_truth(self, history: History) -> None:
         """Draw the true surface and finger."""
         events = history.events()
-        told = [truth_of(events, j)[1] for j in (self._surface, self._depth)]
-        surface, depth = (values[-1] if values.size else np.nan for values in told)
+        known = [truth_of(events, j)[1] for j in (self._surface, self._depth)]
+        surface, depth = (values[-1] if values.size else np.nan for values in known)
         lines = [
             [x, -1.15 * HALF_DEPTH, z]
             for x in (surface, surface + depth)
@@ -312,28 +289,25 @@ class MotorScene:
 
     def __init__(self, api: viser.SceneApi, model: StateSpaceModel, parts: Mapping[str, str], palette: Palette) -> None:
         self._states = [model.state_names.index(name) for name in parts.values()]
-        self.root = api.add_frame("/scene", show_axes=False)
-        api.add_frame("/scene/motor", show_axes=False, wxyz=about_z(AXIS_ANGLE))
-        flat = {"cast_shadow": False, "receive_shadow": False, "side": "double", "flat_shading": True}
-        iron = mixed(palette.faint, palette.panel, 0.35)
-        for name, solid in {
-            "shaft": (0.0, 0.13, 0.0, 360.0, 1.0),
-            "rotor": (0.13, 0.36, 0.0, 360.0, 0.6),
-        }.items():
-            api.add_mesh_simple(f"/scene/motor/{name}", *mesh([solid]), color=iron, **flat)
-        self._parts: list[list[viser.MeshHandle]] = []
+        shapes = Shapes(api)
+        self.root = shapes.frame()
+        motor = shapes.below("motor")
+        motor.frame(wxyz=about_z(AXIS_ANGLE))
+        style = {"color": mixed(palette.faint, palette.panel, 0.35), "side": "double", "flat_shading": True}
+        motor.body("mesh_simple", "shaft", *mesh([(0.0, 0.13, 0.0, 360.0, 1.0)]), **style)
+        motor.body("mesh_simple", "rotor", *mesh([(0.13, 0.36, 0.0, 360.0, 0.6)]), **style)
         for part in ("yoke", "tooth", "winding", "magnet"):
-            slices = sectors(part)
             if part not in parts:
-                api.add_mesh_simple(f"/scene/motor/{part}", *mesh(slices), color=iron, **flat)
-        for part in parts:
-            slices = sectors(part)
-            self._parts.append([
-                api.add_mesh_simple(f"/scene/motor/{part}/{k}", *mesh(slices[k :: len(SIGMAS)]), color=iron, **flat)
+                motor.body("mesh_simple", part, *mesh(sectors(part)), **style)
+        self._parts = [
+            [
+                motor.body("mesh_simple", f"{part}/{k}", *mesh(sectors(part)[k :: len(SIGMAS)]), **style)
                 for k in range(len(SIGMAS))
-            ])  # fmt: skip
+            ]
+            for part in parts
+        ]
         unit = model.states[self._states[0]].unit
-        self._bar = ScaleBar(api, "/scene/scale", list(parts), unit, palette, y=-0.8, top=-1.15)
+        self._bar = ScaleBar(shapes.below("scale"), list(parts), unit, palette, y=-0.8, top=-1.15)
         corners = np.array([[x, y, z] for x in (-1.05, 1.05) for y in (-0.8, 0.8) for z in (self._bar.bottom, 1.02)])
         middle = np.array([0.0, 0.0, 0.5 * (self._bar.bottom + 1.02)])
         self.root.position = -middle
@@ -348,9 +322,7 @@ class MotorScene:
         self._bar.fit(mean, std)
         for handles, at, spread in zip(self._parts, mean, std, strict=True):
             for handle, sigmas in zip(handles, SIGMAS, strict=True):
-                color = self._bar.color(at + sigmas * spread)
-                if tuple(handle.color) != color:
-                    handle.color = color
+                set_color(handle, self._bar.color(at + sigmas * spread))
 
 
 MAX_SCALE_TICKS = 9
@@ -362,41 +334,30 @@ class ScaleBar:
     """Upright scale of colours, x from -1 to 1, with mean and ± 2σ of each quantity below it."""
 
     def __init__(
-        self, api: viser.SceneApi, name: str, labels: Sequence[str], unit: str, theme: Palette, *, y: float, top: float
+        self, shapes: Shapes, labels: Sequence[str], unit: str, theme: Palette, *, y: float, top: float
     ) -> None:
         self._labels, self._unit, self._y, self._top = labels, unit, y, top
         self._scale, self._colors = Scale(ESTIMATE), gradient(ESTIMATE.colors)
         strip = np.repeat(self._colors[:UNKNOWN_INDEX][None], 8, axis=0)
         # An image lies in the plane of x and y, its top at -y: up it goes by a right angle about x.
         half = float(np.sqrt(0.5))
-        api.add_image(
-            f"{name}/strip", strip, 2.0, 0.09, format="png", wxyz=(half, -half, 0.0, 0.0),
-            position=(0.0, y, top - 0.05), cast_shadow=False, receive_shadow=False,
-        )  # fmt: skip
-        self._ticks = [
-            api.add_label(f"{name}/ticks/{k}", " ", anchor="top-center", font_screen_scale=0.75, visible=False)
-            for k in range(MAX_SCALE_TICKS)
-        ]
-        line = {"thickness_units": "screen"}
-        nothing = np.zeros((1, 2, 3), np.float32)
-        self._bands = api.add_line_segments(f"{name}/bands", nothing, theme.estimate, thickness=4, **line)
-        self._means = api.add_line_segments(f"{name}/means", nothing, theme.ink, thickness=3, **line)
+        upright = {"wxyz": (half, -half, 0.0, 0.0), "position": (0.0, y, top - 0.05)}
+        shapes.body("image", "strip", strip, 2.0, 0.09, format="png", **upright)
+        self._ticks = [shapes.label(f"ticks/{k}", anchor="top-center", visible=False) for k in range(MAX_SCALE_TICKS)]
+        self._bands = shapes.lines("bands", theme.estimate, 4)
+        self._means = shapes.lines("means", theme.ink, 3)
         self._texts = [
-            api.add_label(f"{name}/text/{k}", label, position=(-1.0, y, self._row(k) + 0.05), anchor="bottom-left",
-                          font_screen_scale=0.85)
+            shapes.label(f"text/{k}", label, 0.85, position=(-1.0, y, self._row(k) + 0.05), anchor="bottom-left")
             for k, label in enumerate(labels)
-        ]  # fmt: skip
+        ]
         self.bottom = self._row(len(labels) - 1) - 0.05
 
     def fit(self, mean: np.ndarray, std: np.ndarray) -> None:
         """Show quantities; both (k,), NaN where one is unknown."""
         self._scale.fit(np.concatenate((mean - 2 * std, mean + 2 * std)))
-        for k, (label, place) in enumerate(zip(self._labels, zip(mean, std, strict=True), strict=True)):
-            at, spread = place
-            known = f"{label}  {with_deviation(at, 2 * spread)} {self._unit}"
-            text = known if np.isfinite(at + spread) else f"{label}  –"
-            if self._texts[k].text != text:
-                self._texts[k].text = text
+        for text, label, at, spread in zip(self._texts, self._labels, mean, std, strict=True):
+            known = np.isfinite(at + spread)
+            set_text(text, f"{label}  {with_deviation(at, 2 * spread)} {self._unit}" if known else f"{label}  –")
         draw_ticks(self._ticks, self._scale, lambda share: (2 * share - 1, self._y, self._top - 0.1))
         rows = np.array([self._row(k) for k in range(len(mean))])
         self._bands.points = self._lines(mean - 2 * std, mean + 2 * std, rows, rows)

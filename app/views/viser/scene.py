@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 import viser
@@ -10,6 +11,7 @@ import viser
 from estimators.log import Events
 
 from ...live.outputs import Pull
+from ...present.drawing.colors import RGB
 
 
 def ellipsoid(cov: np.ndarray, sigmas: float = 2.0) -> tuple[np.ndarray, tuple[float, float, float, float]]:
@@ -58,8 +60,7 @@ def segments(points: np.ndarray) -> np.ndarray:
     """Return a polyline (n, 3) as segments (n - 1, 2, 3), without those at rows that are not finite."""
     pairs = np.stack((points[:-1], points[1:]), axis=1) if len(points) > 1 else np.zeros((0, 2, 3))
     pairs = pairs[np.isfinite(pairs).all(axis=(1, 2))]
-    # Viser draws nothing sensible of an empty array; a segment without length is invisible.
-    return pairs.astype(np.float32) if len(pairs) else np.zeros((1, 2, 3), np.float32)
+    return pairs.astype(np.float32) if len(pairs) else NO_LINE
 
 
 def disc(sides: int = 64) -> tuple[np.ndarray, np.ndarray]:
@@ -75,6 +76,91 @@ def circle(sides: int = 64) -> np.ndarray:
     """Return the rim of that disc as segments (sides, 2, 3)."""
     angle = np.linspace(0, 2 * np.pi, sides + 1)
     return segments(np.stack((np.cos(angle), np.sin(angle), np.zeros(sides + 1)), axis=1))
+
+
+NO_LINE, NO_POINT = np.zeros((1, 2, 3), np.float32), np.zeros((1, 3), np.float32)
+"""In place of empty lines or points, of which Viser draws nothing sensible."""
+
+UNSHADED = {"cast_shadow": False, "receive_shadow": False}
+
+
+class Shapes:
+    """Adds shapes below one path: lines as thick as pixels, flat dots, bodies without shadows."""
+
+    def __init__(self, api: viser.SceneApi, path: str = "/scene") -> None:
+        self.api, self.path = api, path
+
+    def below(self, name: str) -> Shapes:
+        """Return the same below another path."""
+        return Shapes(self.api, f"{self.path}/{name}")
+
+    def frame(self, **more: Any) -> viser.FrameHandle:
+        """Add a frame at the path; removing it removes all below."""
+        return self.api.add_frame(self.path, show_axes=False, **more)
+
+    def lines(
+        self, name: str, color: RGB, thickness: float, points: np.ndarray = NO_LINE, **more: Any
+    ) -> viser.LineSegmentsHandle:
+        """Add line segments (n, 2, 3)."""
+        path = f"{self.path}/{name}"
+        return self.api.add_line_segments(path, points, color, thickness=thickness, thickness_units="screen", **more)
+
+    def dots(
+        self, name: str, color: Any, size: float, points: np.ndarray = NO_POINT, shape: str = "circle", **more: Any
+    ) -> viser.PointCloudHandle:
+        """Add points (n, 3) of one colour, or of a colour each."""
+        style: dict[str, Any] = {"precision": "float32", "point_shading": "flat", "point_shape": shape, **more}
+        return self.api.add_point_cloud(f"{self.path}/{name}", points, color, point_size=size, **style)
+
+    def label(self, name: str, text: str = " ", scale: float = 0.75, **more: Any) -> viser.LabelHandle:
+        """Add a text."""
+        return self.api.add_label(f"{self.path}/{name}", text, font_screen_scale=scale, **more)
+
+    def body(self, kind: str, name: str, *form: Any, **more: Any) -> Any:
+        """Add a body of a kind of Viser's: box, cylinder, icosphere, mesh_simple, image."""
+        return getattr(self.api, f"add_{kind}")(f"{self.path}/{name}", *form, **UNSHADED, **more)
+
+
+def set_text(label: viser.LabelHandle, text: str) -> None:
+    """Set a text, and send it only if it is another one."""
+    if label.text != text:
+        label.text = text
+
+
+def set_color(handle: Any, color: RGB) -> None:
+    """Set a colour, and send it only if it is another one."""
+    if tuple(handle.color) != tuple(color):
+        handle.color = color
+
+
+def put_points(handle: Any, points: np.ndarray) -> None:
+    """Draw the finite ones of points (n, 3) or of lines (n, 2, 3); hide the handle without any."""
+    points = points[np.isfinite(points).all(axis=tuple(range(1, points.ndim)))]
+    handle.visible = bool(len(points))
+    if len(points):
+        handle.points = points.astype(np.float32)
+
+
+class PeakMarks:
+    """A dot with its weight at each of several peaks of an estimate."""
+
+    def __init__(self, shapes: Shapes, count: int, color: RGB, size: float, scale: float = 1.0) -> None:
+        self.handles = [
+            (
+                shapes.dots(f"peaks/{k}/mean", color, size, visible=False),
+                shapes.label(f"peaks/{k}/weight", scale=scale, visible=False, anchor="bottom-left"),
+            )
+            for k in range(count)
+        ]
+
+    def draw(self, places: Sequence[np.ndarray], texts: Sequence[str], beside: Sequence[float]) -> None:
+        """Draw the marks at places (3,), NaN for none, with their texts `beside` (3,) them."""
+        for k, (dot, label) in enumerate(self.handles):
+            shown = k < len(places) and bool(np.isfinite(places[k]).all())
+            if shown:
+                dot.points = places[k][None].astype(np.float32)
+                label.position, label.text = tuple(places[k] + beside), texts[k]
+            dot.visible = label.visible = shown
 
 
 _EVENTS = ("t", "kind", "channel", "value")
@@ -162,14 +248,14 @@ class History:
 MARGIN = 0.94
 """Share of the view that the points fill."""
 
-WORTH = 0.75
-"""A scene is turned by a right angle if it then can be seen from that share of the distance."""
+MAX_TURNED_DISTANCE = 0.75
+"""A scene is turned by a right angle if this then reduces the camera's distance to that share or less."""
 
-FAR = 20_000.0
-"""Up to where a camera sees; a road may be long."""
+MAX_SIGHT = 20_000.0
+"""Distance up to which a camera sees; a road may be long."""
 
-SAME = 0.02
-"""Relative change of a pane's aspect from which on it is another pane."""
+MAX_ASPECT_CHANGE = 0.02
+"""Relative change of a pane's aspect from which the camera is placed again."""
 
 
 class Outlook(NamedTuple):
@@ -205,7 +291,7 @@ def place(outlook: Outlook, aspect: float) -> tuple[np.ndarray, np.ndarray]:
     if outlook.turns:
         turned = outlook._replace(direction=_turned(outlook.direction), up=_turned(outlook.up))
         distance = _distance(turned, aspect)
-        if distance < WORTH * straight:
+        if distance < MAX_TURNED_DISTANCE * straight:
             return _unit(turned.direction) * distance, turned.up
     return _unit(outlook.direction) * straight, outlook.up
 
@@ -251,9 +337,9 @@ class Cameras:
 
         async def updated(camera: viser.CameraHandle) -> None:
             known = self._aspects.get(camera.client.client_id)
-            # A browser may come to where all of them begin only after it got a place of its own.
+            # A browser may move to the common initial position only after it got its own.
             begins = self._first is not None and np.allclose(camera.position, self._first, rtol=1e-4)
-            if known is None or abs(camera.aspect - known) > SAME * known or begins:
+            if known is None or abs(camera.aspect - known) > MAX_ASPECT_CHANGE * known or begins:
                 self._fit(camera)
 
         async def gone(client: viser.ClientHandle) -> None:
@@ -265,11 +351,11 @@ class Cameras:
     def show(self, outlook: Outlook) -> None:
         """Look at another scene."""
         if self._outlook is None:
-            # Once only: it would move the cameras of browsers that are there.
+            # Once only: it would move the cameras of connected browsers.
             camera = self._server.initial_camera
             self._first, camera.up = place(outlook, 1.0)
             camera.position = self._first
-            camera.look_at, camera.fov, camera.far = np.zeros(3), outlook.fov, FAR
+            camera.look_at, camera.fov, camera.far = np.zeros(3), outlook.fov, MAX_SIGHT
         self._outlook = outlook
         for client in self._server.get_clients().values():
             self._fit(client.camera)
@@ -283,7 +369,7 @@ class Cameras:
             camera.fov = self._outlook.fov
             camera.position = position
             camera.look_at = np.zeros(3)
-            # Viser sends no direction that it takes to be the browser's already, and it takes one for it that a browser
-            # which came to where all of them begin has lost again: so another one first.
+            # Viser does not send a direction that it takes to be the browser's already, even if the browser has lost it
+            # by moving to the common initial position: so send another one first.
             camera.up_direction = np.roll(up, 1)
             camera.up_direction = up

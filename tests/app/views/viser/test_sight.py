@@ -9,7 +9,7 @@ import viser
 from app.present.drawing.colors import LIGHT
 from app.views.viser.field_scenes import SURFACE_HEIGHT, FieldSurfaceScene
 from app.views.viser.machine_scenes import FINGER, PAD, PART_WIDTH, GripperScene
-from app.views.viser.scene import History
+from app.views.viser.scene import History, Shapes
 from app.views.viser.vehicle_scene import FADING_S, MAX_AGE_S, Beacons, Beams, VehicleScene
 from config.schema import SceneSection
 from estimators.diagnostics.field_pictures import Picture
@@ -107,7 +107,7 @@ def test_a_gripper_shows_how_sure_it_is_and_what_is_true(server):
 
 def test_beams_end_at_walls_and_at_what_was_read(server):
     angles = {"scan": (0.0, np.pi / 2, np.pi, -np.pi / 2)}
-    beams = Beams(server.scene, "/beams", AGV, angles, LIGHT, dot=0.1)
+    beams = Beams(Shapes(server.scene, "/beams"), AGV, angles, LIGHT, dot=0.1)
     mean, p = np.array([2.0, 0.5, np.pi / 2]), Tuning.of(AGV).p
     # It faces north, 2 m east of the middle: walls are 1 m ahead, 26 m to its left, 2 m behind and 22 m to its right.
     told = rows(AGV, [(1.0, READING, 0, [1.2, 26.0, 1.5, np.nan], 0)])
@@ -134,7 +134,7 @@ def test_beams_end_at_walls_and_at_what_was_read(server):
 
 def test_a_ring_is_as_wide_as_its_beacon_reads(server):
     names = {f"range_{k}": (f"anchor_{k}_east", f"anchor_{k}_north") for k in (1, 2, 3)}
-    beacons = Beacons(server.scene, "/beacons", ROVER, names, LIGHT, size=1.0)
+    beacons = Beacons(Shapes(server.scene, "/beacons"), ROVER, names, LIGHT, size=1.0)
     tuning = Tuning.of(ROVER).set("p.anchor_2_east", 7.0).set("p.anchor_2_north", -3.0)
     told = rows(
         ROVER,

@@ -347,7 +347,7 @@ def test_peaks_are_marked_with_their_weights_while_there_are_several(view, engin
         Peak(weight, belief.mean + side * std, belief.cov) for weight, side in ((0.75, 0.5), (0.25, -0.5))
     )
     view.stage.scene.draw(view.history, engine.belief())
-    (first, heavy), (second, light), (third, _) = view.stage.scene._peaks[:3]
+    (first, heavy), (second, light), (third, _) = view.stage.scene._marks.handles[:3]
     assert first.visible and second.visible and not third.visible
     assert (heavy.text, light.text) == ("75 %", "25 %")
     place = [axis.place(engine.peaks[1].mean[axis.state]) for axis in view.stage.scene.axes]
@@ -378,10 +378,10 @@ def test_vehicle_scene_stands_at_the_heaviest_peak_among_its_walls():
         scene.draw(rows, belief)
         assert tuple(scene._vehicle.position[:2]) == (4.0, 0.5)
         assert scene._cloud.visible and scene._cloud.points.shape == (2, 3)
-        assert [label.text for _, label in scene._peaks if label.visible] == ["70 % drawn", "30 %"]
+        assert [label.text for _, label in scene._marks.handles if label.visible] == ["70 % drawn", "30 %"]
         scene.draw(rows, SimpleNamespace(**{**vars(belief), "peaks": peaks[:1]}))
         assert tuple(scene._vehicle.position[:2]) == (2.5, 0.0)
-        assert not any(label.visible for _, label in scene._peaks)
+        assert not any(label.visible for _, label in scene._marks.handles)
     finally:
         server.stop()
 
