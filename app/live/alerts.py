@@ -1,9 +1,8 @@
-"""Report unusable measurements, lost estimates and silent sources of the running twin; see also episode_log.py."""
+"""Report unusable measurements and lost estimates of the running twin as its rows arrive; see also episode_log.py."""
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import numpy as np
 
@@ -11,9 +10,12 @@ from estimators.diagnostics.failure_cause import failures
 from estimators.fold import Fold
 from estimators.fold_failures import cause_of
 from estimators.gate.isolation import AGREES
-from estimators.track import STALE, WAITING, estimated_rows
+from estimators.log import Log
+from estimators.model.sensor import Limits
+from estimators.model.state_space import StateSpaceModel
+from estimators.track import FAILED, GATED, MISSING, REASONS, VERDICT_NAMES, Track, estimated_rows
 
-from .counts import UNSETTLED, complaints, refusals
+from .counts import last_run
 from .notices import Notices
 
 MAX_CAUSE_SEARCHES = 3
@@ -21,17 +23,14 @@ MAX_CAUSE_SEARCHES = 3
 
 
 class Alerts:
-    """Report unusable measurements and lost estimates of a fold as its rows arrive."""
+    """Report unusable measurements and lost estimates of a fold."""
 
     def __init__(self, notices: Notices, in_alarm: Callable[[], frozenset[str]] = frozenset) -> None:
-        """`in_alarm`: returns the sensors with an open episode."""
+        """`in_alarm`: returns the sensors with an open episode, whose rejected measurements need no report."""
         self._notices, self._in_alarm = notices, in_alarm
-        self._recoveries = 0
-        self._lost: tuple[int, int] | None = None
-        self._failures = 0
-        self._decided = -np.inf
         self._said: set[str] = set()
-        self._tries, self._fresh = 0, False
+        self.again()
+        self._examine_all = False
 
     @property
     def lost(self) -> int | None:
@@ -39,124 +38,104 @@ class Alerts:
         return None if self._lost is None else self._lost[1]
 
     def again(self) -> None:
-        """Reset the counts for another fold."""
-        self._recoveries = self._failures = 0
+        """Reset the counts for another fold, none of whose rows has been examined."""
+        self._recoveries = self._failures = self._searches = 0
         self._decided = -np.inf
-        self._lost = None
+        self._lost: tuple[int, int] | None = None
         self._said.clear()
-        # None of its rows has been examined.
-        self._tries, self._fresh = 0, True
+        self._examine_all = True
 
     def look(self, fold: Fold, before: int) -> None:
         """Report the rows from `before` on."""
-        track, log = fold.track, fold.log
+        say, report = self._notices.say, self._notices.report
         known = {f"gated {name}" for name in self._in_alarm()}
-        for key, text in complaints(fold.model, log.channel, track, before):
+        for key, text in rejections(fold.model, fold.log, fold.track, before):
             if key not in known:
-                self._notices.report(key, text, counted=False)
-        for key, text in refusals(fold.model, log, track, before):
-            self._notices.report(key, text, counted=False)
-        self._look_at_failures(fold)
-        self._look_for_cause(fold, before)
-        self._look_at_decisions(fold)
-        count, told = fold.recoveries(), self._recoveries
-        self._recoveries = count
-        if count > told:
-            name = fold.estimator.name
-            text = f"{name}: no particle explained a reading; the cloud was widened, {count} time(s) so far"
-            self._notices.report("recovered", text, counted=False)
-        was_lost = self._lost is not None
-        self._lost = self._look_for_numbers(fold, before)
-        if self._lost is not None and not was_lost:
-            text = "the estimate is not a number; Reset, or another filter, may help"
-            self._notices.say(text, level="error", t=self._lost[1])
-
-    def _look_for_numbers(self, fold: Fold, before: int) -> tuple[int, int] | None:
-        """Return index and time of the first of the last rows without a finite estimate; None if there is none."""
-        track, log = fold.track, fold.log
-        end = len(track)
-        if not end or estimated_rows(track.select(slice(end - 1, end)))[0]:
-            return None
-        known = self._lost
-        if (
-            known is not None
-            and known[0] < log.first + before
-            and not estimated_rows(track.select(slice(before, end))).any()
-        ):
-            return known
-        while end > 0:
-            start = max(0, end - UNSETTLED)
-            good = np.flatnonzero(estimated_rows(track.select(slice(start, end))))
-            if good.size:
-                end = start + int(good[-1]) + 1
-                break
-            end = start
-        return log.first + end, int(log.t[end])
-
-    def _look_at_decisions(self, fold: Fold) -> None:
-        """Report decisions about rejected sensors, each once, even if a late measurement repeats one."""
-        new = [decision for decision in fold.decisions if decision.time > self._decided]
-        for decision in new:
-            level = "info" if decision.outcome == AGREES else "warn"
-            self._notices.report(f"{decision.outcome} {decision.sensor}", decision.text, level=level)
-            self._decided = decision.time
-
-    def _look_at_failures(self, fold: Fold) -> None:
-        """Report errors of a black-box model, each text once."""
-        count, known = fold.failures, self._failures
-        self._failures = count
+                report(key, text, counted=False)
+        failed, self._failures = fold.failures > self._failures, fold.failures
         text = str(fold.failure)
-        if count > known and text not in self._said:
+        if failed and text not in self._said:
             self._said.add(text)
             more = "the readings concerned count as failed, and the estimate goes on where the model answers again"
-            self._notices.report("model failed", f"{text}; {more}", level="error", counted=False)
+            report("model failed", f"{text}; {more}", level="error", counted=False)
+        self._search_cause(fold, before)
+        # A late measurement repeats decisions; each is reported once.
+        for decision in [decision for decision in fold.decisions if decision.time > self._decided]:
+            level = "info" if decision.outcome == AGREES else "warn"
+            report(f"{decision.outcome} {decision.sensor}", decision.text, level=level)
+            self._decided = decision.time
+        recoveries, self._recoveries = self._recoveries, fold.recoveries()
+        if self._recoveries > recoveries:
+            text = "no particle explained a reading; the cloud was widened"
+            report("recovered", f"{fold.estimator.name}: {text}, {self._recoveries} time(s) so far", counted=False)
+        was_lost, self._lost = self._lost is not None, self._first_lost_row(fold, before)
+        if self._lost is not None and not was_lost:
+            text = "the estimate is not a number; Reset, or another filter, may help"
+            say(text, level="error", t=self._lost[1])
 
-    def _look_for_cause(self, fold: Fold, before: int) -> None:
+    def _first_lost_row(self, fold: Fold, before: int) -> tuple[int, int] | None:
+        """Return index and time of the first of the last rows without a finite estimate; None if there is none."""
+        track, log, known = fold.track, fold.log, self._lost
+        if not fold.n:
+            return None
+        fresh = estimated_rows(track.select(slice(min(before, fold.n - 1), fold.n)))
+        if fresh[-1]:
+            return None
+        if known is not None and known[0] < log.first + before and not fresh.any():
+            return known
+        index = last_run(estimated_rows(track))
+        return log.first + index, int(log.t[index])
+
+    def _search_cause(self, fold: Fold, before: int) -> None:
         """Report, once per fold, the model function that made a measurement or the estimate fail."""
-        first = 0 if self._fresh else before
-        self._fresh = False
-        if self._tries >= MAX_CAUSE_SEARCHES or fold.failure is not None:
+        first, self._examine_all = 0 if self._examine_all else before, False
+        if self._searches >= MAX_CAUSE_SEARCHES or fold.failure is not None:
             return
         rows = failures(fold.track, first)
         if rows.size:
-            self._tries += 1
+            self._searches += 1
             text = cause_of(fold, int(rows[0]))
             if text is not None:
-                self._tries = MAX_CAUSE_SEARCHES
+                self._searches = MAX_CAUSE_SEARCHES
                 self._notices.say(text, level="error", t=int(fold.log.t[rows[0]]))
 
 
-class SilentSource:
-    """Health of a twin whose source is open but has no events yet."""
+def rejections(model: StateSpaceModel, log: Log, track: Track, first: int) -> Iterator[tuple[str, str]]:
+    """Yield key and text of the last measurement that was not used, from row `first` on.
 
-    def __init__(self, notices: Notices, stale_after: float, clock: Callable[[], float] = time.monotonic) -> None:
-        """`stale_after`: seconds without an event after which a live source is stale; `clock` returns seconds."""
-        self._notices, self._after, self._clock = notices, stale_after, clock
-        self._since = clock()
-        self._told = False
+    One of each verdict, and of those that the plausibility checks rejected one of each sensor and reason.
+    """
+    for code, what in ((GATED, "rejected by the gate"), (MISSING, "has no value"), (FAILED, "could not be used")):
+        rows = np.flatnonzero(track.verdict[first:] == code)
+        if rows.size:
+            row = first + int(rows[-1])
+            sensor = model.sensors[log.channel[row]].name
+            nis = f" (NIS {track.nis[row]:.3g})" if np.isfinite(track.nis[row]) else ""
+            yield f"{VERDICT_NAMES[code]} {sensor}", f"{sensor}: measurement {what}{nis}"
+    last = {
+        (int(log.channel[first + i]), reason): (first + i, k)
+        for i, k in np.argwhere(track.screened[first:]).tolist()
+        for reason in range(len(REASONS))
+        if int(track.screened[first + i, k]) & (1 << reason)
+    }
+    for (sensor, reason), (i, k) in last.items():
+        text = _implausible(model, sensor, k, REASONS[reason], float(log.value[i, k]))
+        yield f"{REASONS[reason]} {model.sensors[sensor].name}", text
 
-    @property
-    def health(self) -> int:
-        """Waiting, or stale."""
-        return STALE if self._told else WAITING
 
-    @property
-    def cause(self) -> str:
-        """Reason why the twin is stale, or "" while it waits."""
-        if not self._told:
-            return ""
-        return f"nothing has come since the twin started, {self._clock() - self._since:.0f} s ago; check the source"
-
-    def look(self, *, live: bool) -> None:
-        """Report a live source without events, once it is stale; a recording may be paused."""
-        if live and not self._told and self._clock() - self._since > self._after:
-            self._told = True
-            text = f"stale: nothing has come since the twin started, {self._after:g} s ago; check the source"
-            self._notices.say(text, level="warn")
-
-    def broken(self) -> None:
-        """Note that the first event has arrived."""
-        if self._told:
-            self._told = False
-            silent = self._clock() - self._since
-            self._notices.say(f"the source speaks, {silent:.0f} s after the twin started")
+def _implausible(model: StateSpaceModel, sensor: int, k: int, reason: str, value: float) -> str:
+    limits, unit = model.sensors[sensor].limits or Limits(), model.sensors[sensor].rows[k].unit
+    what = f"{model.row_names[model.row_start[sensor] + k]}: {value:.6g} {unit}"
+    if reason in ("range", "saturated"):
+        pairs = limits.range if reason == "range" else limits.saturation
+        low, high = pairs[k % len(pairs)]
+        ends = f"{low:g} to {high:g} {unit}"
+        if reason == "range":
+            return f"{what} is outside {ends}; not used: look at the sensor, or widen its range"
+        return f"{what} is where its converter clips, {ends}; not used: the quantity may lie anywhere beyond"
+    if reason == "rate":
+        most = f"{limits.rate[k % len(limits.rate)]:g} {unit}/s"
+        return f"{what} is further from the last good reading than {most} allows; not used until it comes back"
+    if reason == "stuck":
+        return f"{what} has been repeated for too long; not used until it changes: look at the sensor"
+    return f"{what} came again; it counts once: look for what repeats readings on their way"

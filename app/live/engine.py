@@ -6,6 +6,7 @@ do, or fail to do, reaches this thread.
 
 from __future__ import annotations
 
+import math
 import queue
 import threading
 import time
@@ -25,15 +26,14 @@ from ..concurrency import run_all
 from ..ingest import Ingest
 from ..terminal import complain
 from . import commands
+from .batches import BatchSizer
 from .changes import merged
-from .counts import RowCounts
 from .execute import execute
 from .feeder import Feeder
-from .jobs import Jobs
+from .jobs import Job, Jobs
 from .outputs import Status
-from .refolder import Refolded, Refolder
 from .running_fold import Records, Running
-from .status import StatusSettings, busy_status, status_of
+from .status import busy_status, known_fields, status_of
 from .watchdog import Watchdog
 from .watchers import IdleTicks, Watchers
 from .workshop import Workshop
@@ -41,10 +41,14 @@ from .workshop import Workshop
 if TYPE_CHECKING:
     from estimators.diagnostics.episodes import Episode
     from estimators.events.clocks import Passed
+    from estimators.fold import Fold
     from estimators.tuning import Tuning
     from sources.source import Source
 
     from ..twin.twin import Twin
+
+REFOLD_REMEDY = "the running estimate goes on. Correct the model, or choose another tuning"
+"""End of the line about a refold that does not return."""
 
 STATUS_PERIOD_S = 0.1
 """Seconds for which a status is reused."""
@@ -98,7 +102,10 @@ class Engine(Running):
             restarted=self._restart,
             finished=self._finish,
         )
-        self._refolder = Refolder(lambda done: self._inbox.put(partial(self._adopt, done)))
+        # One at a time, at the priority of the engine; of the requests that arrive meanwhile only the latest counts.
+        self._refolds = Jobs(self.notices, "refold", threads=1, niceness=0)
+        # A long history may take minutes: only a function that does not return ends a refold.
+        self._refold_watchdog = Watchdog(self._give_up, then=REFOLD_REMEDY, long=math.inf)
         self.reloads = 0
         self._stopping = threading.Event()
         self._finished = False
@@ -120,7 +127,8 @@ class Engine(Running):
     def start(self) -> None:
         """Begin to read and fold."""
         self._watchdog.start()
-        self._refolder.start()
+        self._refold_watchdog.start()
+        self._refolds.start()
         self._thread.start()
         self._feeder.start()
         self._watchers.start()
@@ -131,9 +139,10 @@ class Engine(Running):
     def stop(self) -> None:
         """Stop reading and folding."""
         self._stopping.set()
-        run_all(self._join, self._feeder.stop, self._workshop.stop, self._refolder.stop, self.jobs.stop)
+        run_all(self._join, self._feeder.stop, self._workshop.stop, self._refolds.stop, self.jobs.stop)
         self._watchers.stop()
         self._watchdog.stop()
+        self._refold_watchdog.stop()
 
     def _join(self) -> None:
         """Wait for the batch that is being folded."""
@@ -142,7 +151,7 @@ class Engine(Running):
 
     def settle(self) -> None:
         """Carry out all that waits (events, commands, refolds, jobs) in this thread, for an engine without `start`."""
-        while self._feeder.read(0.0) or not self._inbox.empty() or self._refolder.step() or self.jobs.step():
+        while self._feeder.read(0.0) or not self._inbox.empty() or self._refolds.step() or self.jobs.step():
             if not self._inbox.empty():
                 self._round(0.0)
 
@@ -179,34 +188,29 @@ class Engine(Running):
                 status = self._status_now()
             else:
                 # A refold counts as waiting until the revision that came of it is shown.
-                settings = self._settings(self._requests.waiting or last[1].revision != self._revision)
-                status = busy_status(last[1], settings, self.model, self.source, self._watchdog.busy)
+                fields = self._known_fields(self._requests.waiting or last[1].revision != self._revision)
+                status = busy_status(last[1], fields, self._watchdog.busy)
         self._status = (time.monotonic(), status)
         return status
 
     def _status_now(self) -> Status:
         """Return the status of a fold that does not change meanwhile."""
-        return status_of(
-            self._fold,
-            self._row_counts,
-            self._watchers,
-            self.source,
-            self._settings(self._requests.waiting),
-            revision=self._revision,
-            inflated=self._late,
-            held=self._intake.held,
-            notices=self.notices.counts(),
-        )
+        fields = self._known_fields(self._requests.waiting) | {"revision": self._revision}
+        counts = self.notices.counts(), {"inflated": self._late, "held": self._intake.held}
+        return status_of(self._fold, self._row_counts, self._watchers, self.source, fields, *counts)
 
-    def _settings(self, refolding: bool) -> StatusSettings:
-        return StatusSettings(
-            self.estimator,
-            self.tuning,
-            refolding,
-            self._finished,
-            self.recorder.path if self.recorder is not None else None,
-            self._awaited,
-            self._workshop.states(),
+    def _known_fields(self, refolding: bool) -> dict[str, Any]:
+        """Return the fields of a status that are known without the fold; see `known_fields`."""
+        return known_fields(
+            self.model,
+            self.source,
+            estimator=self.estimator,
+            tuning=self.tuning,
+            refolding=refolding,
+            finished=self._finished,
+            recording=self.recorder.path if self.recorder is not None else None,
+            awaited=self._awaited,
+            compiling=self._workshop.states(),
         )
 
     # On the engine's own thread
@@ -357,13 +361,32 @@ class Engine(Running):
             self._workshop.ask(estimator, lambda name: self._inbox.put(partial(self._compiled, name)))
             return
         log, base = self._log.copy(), self._base
-        self._refolder.request(ticket, lambda: self._make_fold(estimator, tuning, log, base))
+        self._refolds.run(
+            "refold",
+            lambda job: self._refold(ticket, self._make_fold(estimator, tuning, log, base), job),
+            stale=lambda: ticket != self._requests.newest,
+            failed=lambda reason: self._inbox.put(partial(self._adopt, ticket, None, reason)),
+        )
 
-    def _adopt(self, done: Refolded) -> None:
+    def _refold(self, ticket: int, fold: Fold, job: Job) -> None:
+        """Advance a new fold to its end, in a job."""
+        batches, self._refolding = BatchSizer(), ticket
+        with self._refold_watchdog.watched(fold):
+            while batches.advance(fold) and not job.cancelled:
+                pass
+        self._inbox.put(partial(self._adopt, ticket, fold))
+
+    def _give_up(self, text: str, level: str) -> None:
+        """Leave a refold in a function that does not return; its answer, should it come, is no longer waited for."""
+        if level == "error":
+            self._refolds.abandon()
+            self._inbox.put(partial(self._adopt, self._refolding, None, text))
+
+    def _adopt(self, ticket: int, fold: Fold | None, error: str = "") -> None:
         """Replace the running fold by a finished refold, after that has caught up with the log."""
-        wanted, changed_from = self._requests.look(done.ticket)
-        fold, error, again = done.fold, done.error, False
-        row_counts: RowCounts | None = None
+        wanted, changed_from = self._requests.look(ticket)
+        again = False
+        row_counts = None
         if wanted and fold is not None:
             try:
                 # Nobody but this thread moves the log, and nobody sees this fold yet.
@@ -381,10 +404,10 @@ class Engine(Running):
                 self._watchers.alerts.look(fold, fold.n)
             elif wanted and not again:
                 self.notices.say(f"not folded again: {error}", level="error")
-                if done.ticket == self._requests.newest:
+                if ticket == self._requests.newest:
                     # The running fold goes on, and the page shows its settings.
                     self.estimator, self.tuning = self._fold.estimator.name, self._fold.tuning
-            self._requests.answer(done.ticket)
+            self._requests.answer(ticket)
         if again and not self._stopping.is_set():
             # The log was cut meanwhile.
             self.retune(self.estimator, self.tuning)

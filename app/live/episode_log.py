@@ -1,4 +1,4 @@
-"""Track the episodes of the running twin, and report when they begin and end, in a thread of its own.
+"""Track the episodes of the running twin, and report when they begin and end, in a repeated background job.
 
 New rows are pulled with a cursor, as a view does, and fed to an `EpisodeTracker`. Another revision, or a late
 measurement that belongs before the rows it keeps, begins a new tracker; what lasts through that is not reported again.
@@ -22,6 +22,8 @@ from estimators.registry import find_estimator
 from estimators.track import DIVERGED, HEALTH_NAMES, TRACKING, WAITING, estimated_rows
 
 from .counts import last_run
+from .jobs import Job
+from .outputs import Pull
 from .running_fold import Running
 
 PERIOD_S, MAX_PERIOD_S = 0.4, 3.0
@@ -102,50 +104,39 @@ class EpisodeLog:
         """`max_rows`: see `EpisodeTracker`."""
         self._engine, self._max_rows = engine, max_rows
         self._cursor = engine.cursor()
-        self.tracker = self._new_tracker(0)
+        self.tracker = self._new_tracker(engine.rows(0, 0))
         self._health = WAITING
         self.summary = EpisodeSummary()
-        self._stopping = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="episodes", daemon=True)
+        self._lock = threading.Lock()
 
-    def _new_tracker(self, first: int) -> EpisodeTracker:
-        tuning, estimator = self._engine.folded_with()
+    def _new_tracker(self, pull: Pull) -> EpisodeTracker:
+        assert pull.settings is not None
+        tuning, estimator = pull.settings
         marginal = find_estimator(estimator, tuning.model).family in ("particle", "ensemble")
         return EpisodeTracker(
-            self._engine.model, tuning, marginal, first=first, max_rows=self._max_rows, max_closed=MAX_CLOSED
+            self._engine.model, tuning, marginal, first=pull.first, max_rows=self._max_rows, max_closed=MAX_CLOSED
         )
 
-    def start(self) -> None:
-        """Start the thread."""
-        self._thread.start()
-
     def stop(self) -> None:
-        """Update once more, and end."""
-        self._stopping.set()
-        if self._thread.is_alive():
-            self._thread.join(timeout=2.0)
+        """Update once more, for the last rows, and give the cursor back."""
+        try:
+            self.update()
+        except Exception as error:  # noqa: BLE001  diagnostics must not keep the twin from ending
+            self._engine.notices.report("episodes", f"{type(error).__name__}: {error}", level="error")
         self._engine.release(self._cursor)
 
-    @property
-    def running(self) -> bool:
-        """Whether the thread runs."""
-        return self._thread.is_alive()
-
-    def _run(self) -> None:
-        wait = PERIOD_S
-        while True:
-            stopping = self._stopping.wait(wait)
-            begun = time.monotonic()
-            try:
-                self.update()
-            except Exception as error:  # noqa: BLE001  diagnostics must not stop the twin
-                self._engine.notices.report("episodes", f"{type(error).__name__}: {error}", level="error")
-            if stopping:
-                return
-            wait = float(np.clip((time.monotonic() - begun) / PROCESSOR_SHARE, PERIOD_S, MAX_PERIOD_S))
+    def look(self, job: Job) -> float:
+        """Update, in a repeated job; return the seconds to the next update."""
+        begun = time.monotonic()
+        self.update()
+        return min(max((time.monotonic() - begun) / PROCESSOR_SHARE, PERIOD_S), MAX_PERIOD_S)
 
     def update(self) -> None:
         """Feed the new rows, and report which episodes have begun and ended."""
+        with self._lock:
+            self._update()
+
+    def _update(self) -> None:
         before, again = self.tracker.entries, False
         while True:
             log, passage = self._cursor.log, self._engine.notices.passage
@@ -159,7 +150,7 @@ class EpisodeLog:
                 # In another revision, episodes that last are known. Another log has had none yet.
                 again = log == self._cursor.log
                 before = before if again else []
-                self.tracker = self._new_tracker(pull.first)
+                self.tracker = self._new_tracker(pull)
             self.tracker.feed(pull.events, pull.track, pull.first)
             if len(pull.events) < PULLED_ROWS:
                 break

@@ -44,7 +44,7 @@ def copy_log(
     for start in range(at, end, COPY_EVENTS):
         check()
         pull = engine.rows(start, min(start + COPY_EVENTS, end))
-        if engine.folded_with()[0] is not tuning or pull.first != start:
+        if pull.settings is None or pull.settings[0] is not tuning or pull.first != start:
             raise ConfigError("the history changed while it was copied; try again")
         pieces.append(pull.events)
     events = Events.concat(pieces, engine.model.width)

@@ -1,6 +1,5 @@
-"""Background jobs of a running twin: one pool of threads at the lowest priority.
+"""Background jobs of a running twin: pools of threads for work that takes many folds and must not delay the engine.
 
-Work that needs many folds (protection levels, sweeps, fits, smoothing) runs here and never delays the engine.
 A job is a function that takes its `Job`; it calls `check` or `rest` often, which end it once nobody wants the result.
 """
 
@@ -39,7 +38,8 @@ class JobCancelled(Exception):  # noqa: N818  no error: the result is not wanted
 class Job:
     """Handle of one job: state, result, and cancellation.
 
-    `state` is RUNNING from the moment of the request, then DONE with `result`, FAILED with `reason`, or CANCELLED.
+    `state` is RUNNING from the moment of the request, then DONE with `result`, FAILED with `reason`, or CANCELLED; one
+    of these three is final, and everything else is set before it.
     """
 
     def __init__(
@@ -54,32 +54,39 @@ class Job:
         """See `Jobs.run`."""
         self.name, self.work, self.every, self.failed = name, work, every, failed
         self._stale = stale
+        self._lock = threading.Lock()
         self._cancelled = threading.Event()
         self.state, self.reason = RUNNING, ""
         self.result: Any = None
         self.begun = time.monotonic()
-        self.ended: float | None = None
+        self._ended: float | None = None
 
     @property
     def over(self) -> bool:
         """Whether it has ended."""
-        return self.ended is not None
+        return self.state in (CANCELLED, FAILED, DONE)
 
     @property
     def elapsed(self) -> float:
         """Seconds from the request to the end, or until now."""
-        return (time.monotonic() if self.ended is None else self.ended) - self.begun
+        return (time.monotonic() if self._ended is None else self._ended) - self.begun
+
+    @property
+    def cancelled(self) -> bool:
+        """Whether it was asked to end."""
+        return self._cancelled.is_set()
 
     @property
     def wanted(self) -> bool:
         """Whether the result is still wanted."""
-        return not (self._cancelled.is_set() or self._stale())
+        return not (self.cancelled or self._stale())
 
     def cancel(self) -> None:
         """Ask the job to end; it does so at its next `check`."""
-        if not self.over:
-            self.state = CANCELLING
-        self._cancelled.set()
+        with self._lock:
+            if not self.over:
+                self.state = CANCELLING
+            self._cancelled.set()
 
     def check(self) -> None:
         """Raise `JobCancelled` if the result is no longer wanted."""
@@ -105,10 +112,11 @@ class Job:
             state, reason = FAILED, f"{type(error).__name__}: {error}"
         if state == FAILED:
             self.failed(reason)
-        if self.every is not None and state != CANCELLED and not self._cancelled.is_set():
-            return self.every if state == FAILED or answer is None else float(answer)
-        self.result, self.reason, self.ended = answer, reason, time.monotonic()
-        self.state = state
+        if self.every is not None and state != CANCELLED and not self.cancelled:
+            return self.every if answer is None else float(answer)
+        with self._lock:
+            self.result, self.reason, self._ended = answer, reason, time.monotonic()
+            self.state = state
         return None
 
 
@@ -129,15 +137,24 @@ class PacedExecutor(Executor):
 
 
 class Jobs:
-    """Pool of at most `MAX_JOBS` threads, started as they are needed."""
+    """Pool of threads, started as they are needed."""
 
-    def __init__(self, notices: Notices, *, clock: Callable[[], float] = time.monotonic) -> None:
-        """Prepare; jobs wait until `start`. Failures are reported to `notices`."""
-        self._notices, self._clock = notices, clock
+    def __init__(
+        self,
+        notices: Notices,
+        name: str = "job",
+        *,
+        threads: int = MAX_JOBS,
+        niceness: int = LOWEST_PRIORITY,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """Prepare; jobs wait until `start`. Failures go to `notices`; `name` is that of the threads, numbered."""
+        self._notices, self._name, self._clock = notices, name, clock
+        self._limit, self._niceness = threads, niceness
         self._wake = threading.Condition()
         self._queue: list[tuple[float, int, Job]] = []
         self._order = itertools.count()
-        self._under_way: set[Job] = set()
+        self._under_way: dict[Job, threading.Thread] = {}
         self._threads: list[threading.Thread] = []
         self._idle = 0
         self._open = self._stopping = False
@@ -161,7 +178,11 @@ class Jobs:
                 another number of seconds. None: one call.
             failed: Called with the reason if the work raises; by default that is a notice. A repeated job goes on.
         """
-        job = Job(name, work, stale=stale, every=every, failed=failed or self._reporter(name))
+
+        def report(reason: str) -> None:
+            self._notices.report(f"job {name}", f"{name}: {reason}", level="error", counted=False)
+
+        job = Job(name, work, stale=stale, every=every, failed=failed or report)
         self._put(job, 0.0)
         return job
 
@@ -182,6 +203,12 @@ class Jobs:
         for thread in self._threads:
             thread.join(max(0.0, end - time.monotonic()))
 
+    def abandon(self) -> None:
+        """Leave the jobs under way, which do not return, in their threads; continue with other threads."""
+        with self._wake:
+            self._threads = [thread for thread in self._threads if thread not in self._under_way.values()]
+            self._hire()
+
     def step(self) -> bool:
         """Run the next job that is due in this thread; return whether there was one."""
         with self._wake:
@@ -191,9 +218,6 @@ class Jobs:
         self._carry_out(job)
         return True
 
-    def _reporter(self, name: str) -> Callable[[str], None]:
-        return lambda reason: self._notices.report(f"job {name}", f"{name}: {reason}", level="error", counted=False)
-
     def _put(self, job: Job, delay: float) -> None:
         with self._wake:
             heapq.heappush(self._queue, (self._clock() + delay, next(self._order), job))
@@ -202,8 +226,8 @@ class Jobs:
 
     def _hire(self) -> None:
         """Start a thread if jobs wait and none is idle."""
-        if self._open and not self._stopping and self._queue and not self._idle and len(self._threads) < MAX_JOBS:
-            thread = threading.Thread(target=self._serve, name=f"job {len(self._threads)}", daemon=True)
+        if self._open and not self._stopping and self._queue and not self._idle and len(self._threads) < self._limit:
+            thread = threading.Thread(target=self._serve, name=f"{self._name} {len(self._threads)}", daemon=True)
             self._threads.append(thread)
             self._idle += 1
             thread.start()
@@ -213,13 +237,13 @@ class Jobs:
 
     def _take(self) -> Job:
         job = heapq.heappop(self._queue)[2]
-        self._under_way.add(job)
+        self._under_way[job] = threading.current_thread()
         return job
 
     def _serve(self) -> None:
-        if sys.platform == "linux":
+        if self._niceness and sys.platform == "linux":
             # Threads that a job starts inherit it.
-            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), LOWEST_PRIORITY)
+            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), self._niceness)
         while True:
             with self._wake:
                 while not self._stopping and not self._is_due():
@@ -231,11 +255,13 @@ class Jobs:
                 self._hire()
             self._carry_out(job)
             with self._wake:
+                if threading.current_thread() not in self._threads:
+                    return
                 self._idle += 1
 
     def _carry_out(self, job: Job) -> None:
         again = job.run()
         with self._wake:
-            self._under_way.discard(job)
+            self._under_way.pop(job, None)
         if again is not None and math.isfinite(again):
             self._put(job, again)

@@ -49,7 +49,8 @@ class Pull:
     absolute index of the first row; if it was pulled before, a late measurement rewrote the rows from there on.
     `pictures` are those of a large field since the cursor; a picture replaces an earlier one of the same index.
     `oldest` is the absolute index of the first row that still exists, `changed` that of the first row here that is new
-    or rewritten; those before it are here for alignment. `version` is the model's at the row `oldest`.
+    or rewritten; those before it are here for alignment. `version` is the model's at the row `oldest`. `settings` are
+    tuning and estimator of the fold that has these rows.
     """
 
     revision: int
@@ -62,6 +63,7 @@ class Pull:
     oldest: int = 0
     changed: int = 0
     version: int = 1
+    settings: tuple[Tuning, str] | None = None
 
 
 @dataclass(frozen=True)

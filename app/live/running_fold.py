@@ -23,12 +23,12 @@ from estimators.snapshots import SPARSE_EVERY, Base
 from estimators.tuning import Tuning
 from sources.source import Source
 
+from .batches import BatchSizer, FairLock, Requests
 from .commands import Command
 from .counts import RowCounts
 from .jobs import Jobs
 from .notices import Notices
 from .outputs import Belief, Cursor, EventWindow, Here, Pull, Status, event_window
-from .refolder import BatchSizer, FairLock, Requests
 from .revisions import Revisions
 from .watchdog import Watchdog
 
@@ -170,11 +170,14 @@ class Running(ABC):
             start = min(max(start, self._log.first), end)
             return self._copy(start, max(start, min(stop, end)))
 
-    def _copy(self, start: int, stop: int, **fields: Any) -> Pull:
-        log, rows = self._log, slice(start - self._log.first, stop - self._log.first)
-        events = Events(*(column.copy() for column in log.events.select(rows)))
-        pull = Pull(self._revision, False, start, events, self._fold.track.select(rows).copy(), oldest=log.first)
-        return replace(pull, version=log.version, **fields)
+    def _copy(self, start: int, stop: int, *, fresh: bool = False, **fields: Any) -> Pull:
+        log, fold, rows = self._log, self._fold, slice(start - self._log.first, stop - self._log.first)
+        events, track = Events(*(column.copy() for column in log.events.select(rows))), fold.track.select(rows).copy()
+        settings = fold.tuning, fold.estimator.name
+        pull = Pull(
+            self._revision, fresh, start, events, track, oldest=log.first, version=log.version, settings=settings
+        )
+        return replace(pull, **fields)
 
     def index_at(self, t: int) -> int:
         """Return the absolute index of the first folded event at or after a time, ns; else that after the last."""

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -25,40 +24,23 @@ from .faults import Faulty
 from .outputs import Status
 from .watchers import Watchers
 
-if TYPE_CHECKING:
-    from estimators.tuning import Tuning
-
 FOLDED = "the measurements so far are being folded"
 """Cause of a twin without a row yet."""
 
 
-class StatusSettings(NamedTuple):
-    """The part of a status that is known without the fold.
+def known_fields(model: StateSpaceModel, source: Source, **fields: Any) -> dict[str, Any]:
+    """Return the fields of a status that are known without the fold, of which the engine gives those that it holds.
 
-    `estimator` and `tuning` are the requested ones, which differ from the fold's while a refold is waited for
-    (`refolding`). `finished` says whether the source has ended, `recording` is the file that is being written,
-    `awaited` the filter for whose compiling a refold waits, `compiling` see `Status`.
+    `estimator` and `tuning` are the requested ones, which differ from the fold's while a refold is waited for.
     """
-
-    estimator: str
-    tuning: Tuning
-    refolding: bool
-    finished: bool
-    recording: Path | None
-    awaited: str | None
-    compiling: Mapping[str, float | None]
-
-    def fields(self, model: StateSpaceModel, source: Source) -> dict[str, Any]:
-        """Return these, and those that follow from them and from the source, as fields of a status."""
-        options = find_estimator(self.estimator, model).complete(dict(self.tuning.options))
-        return {**self._asdict(), "options": options, **playback_status(source)}
+    options = find_estimator(fields["estimator"], model).complete(dict(fields["tuning"].options))
+    return {**fields, "options": options, **playback_status(source)}
 
 
-def busy_status(last: Status, settings: StatusSettings, model: StateSpaceModel, source: Source, busy: float) -> Status:
-    """Return the last status of a fold that has been at work for `busy` seconds, with the present settings."""
-    fields = settings.fields(model, source)
-    if last.t is None and busy >= 1.0 and settings.awaited is None:
-        fields["cause"] = f"{FOLDED} ({busy:.0f} s so far)"
+def busy_status(last: Status, fields: Mapping[str, Any], busy: float) -> Status:
+    """Return the last status of a fold that has been at work for `busy` seconds, with the present known fields."""
+    if last.t is None and busy >= 1.0 and fields["awaited"] is None:
+        fields = {**fields, "cause": f"{FOLDED} ({busy:.0f} s so far)"}
     return replace(last, **fields)
 
 
@@ -67,12 +49,9 @@ def status_of(
     rows: RowCounts,
     watchers: Watchers,
     source: Source,
-    settings: StatusSettings,
-    *,
-    revision: int,
-    inflated: int,
-    held: int,
+    fields: Mapping[str, Any],
     notices: Mapping[str, int],
+    late: Mapping[str, int],
 ) -> Status:
     """Return the status of a fold that does not change meanwhile.
 
@@ -81,11 +60,9 @@ def status_of(
         rows: Counts of its rows.
         watchers: Its watchers.
         source: Of its measurements.
-        settings: The part that is known without the fold.
-        revision: Number of the fold.
-        inflated: Late measurements whose noise was inflated.
-        held: Events that wait for the next one to show whether their time is right.
+        fields: Those that are known without the fold, and the revision.
         notices: Counts of notices by key.
+        late: Counts of measurements whose time is late or in doubt, by key.
     """
     model, log, track = fold.model, fold.log, fold.track
     last = fold.n - 1
@@ -95,14 +72,13 @@ def status_of(
     account = watchers.episode_log.summary
     leading = account.leading(dict(zip(model.sensor_names, states, strict=True)))
     layer = source.faults if isinstance(source, Faulty) else None
-    optional = {"inflated": inflated, "held": held, "recovered": fold.recoveries()}
+    optional = {**late, "recovered": fold.recoveries()}
     return Status(
-        **settings.fields(model, source),
-        revision=revision,
+        **fields,
         t=t,
         health=health,
         since=int(log.t[last_run(track.health)]) if last >= 0 else None,
-        cause=watchers.cause(leading, health) if last >= 0 else _cause_without_rows(fold, watchers, settings),
+        cause=watchers.cause(leading, health) if last >= 0 else _cause_without_rows(fold, watchers, fields),
         sensors=account.of_sensors(model.sensor_names, states),
         episodes_open=len(account.lasting),
         lost=watchers.alerts.lost,
@@ -121,7 +97,7 @@ def status_of(
         nis_judged=_judged(fold),
         latency_ms=watchers.latency.percentile(99.0),
         latency_p50_ms=watchers.latency.percentile(50.0),
-        integrity=watchers.integrity.of(revision),
+        integrity=watchers.integrity.of(fields["revision"]),
         faults=layer.status() if layer is not None else (),
     )
 
@@ -139,9 +115,10 @@ def _judged(fold: Fold) -> float:
     return nis_verdict(track, events, fold.model, baseline).judged
 
 
-def _cause_without_rows(fold: Fold, watchers: Watchers, settings: StatusSettings) -> str:
-    if fold.idle and settings.awaited is not None:
-        begun = settings.compiling.get(settings.awaited)
+def _cause_without_rows(fold: Fold, watchers: Watchers, fields: Mapping[str, Any]) -> str:
+    awaited = fields["awaited"]
+    if fold.idle and awaited is not None:
+        begun = fields["compiling"].get(awaited)
         since = f" ({begun:.0f} s so far)" if begun else ""
-        return f"{settings.awaited} is being compiled, which happens once{since}; measurements are kept meanwhile"
+        return f"{awaited} is being compiled, which happens once{since}; measurements are kept meanwhile"
     return FOLDED if fold.idle else watchers.silence.cause

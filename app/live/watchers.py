@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from estimators.diagnostics.clock_fit import ClockFit, LeastDelays
 from estimators.log import INPUT, READING, Events
-from estimators.track import TRACKING, WAITING
+from estimators.track import STALE, TRACKING, WAITING
 from sources.source import Paced, Source
 
-from .alerts import Alerts, SilentSource
-from .counts import Latency
+from .alerts import Alerts
+from .episode_log import PERIOD_S as EPISODES_PERIOD_S
 from .episode_log import EpisodeLog
 from .fault_monitors import CHECK_PERIOD_S, PERIOD_S, ProtectionMonitor, RootCause
 from .notices import Notices
@@ -40,7 +41,7 @@ class Watchers:
 
     def start(self) -> None:
         """Begin to monitor."""
-        self.episode_log.start()
+        self._jobs.run("episodes", self.episode_log.look, every=EPISODES_PERIOD_S)
         self._jobs.run("protection levels", self.integrity.look, every=PERIOD_S)
         self._jobs.run("root cause", self.root_cause.update, every=CHECK_PERIOD_S)
 
@@ -151,3 +152,65 @@ class HostClock:
                 "machine's; synchronise them",
                 level="warn",
             )
+
+
+LATENCIES = 4096
+
+
+class Latency:
+    """Recent times from arrival to row."""
+
+    def __init__(self) -> None:
+        self._ms = np.zeros(LATENCIES)
+        self._n = 0
+
+    def note(self, batch: Events) -> None:
+        """Note a batch that was folded."""
+        arrivals = batch.arrival[batch.kind == READING]
+        if not arrivals.size:
+            return
+        took = (time.time_ns() - arrivals[-LATENCIES:]) * 1e-6
+        at = (self._n + np.arange(took.size)) % LATENCIES
+        self._ms[at] = took
+        self._n += took.size
+
+    def percentile(self, percent: float) -> float | None:
+        """Return a percentile, ms; None while there is none."""
+        count = min(self._n, LATENCIES)
+        return float(np.percentile(self._ms[:count], percent)) if count else None
+
+
+class SilentSource:
+    """Health of a twin whose source is open but has no events yet."""
+
+    def __init__(self, notices: Notices, stale_after: float, clock: Callable[[], float] = time.monotonic) -> None:
+        """`stale_after`: seconds without an event after which a live source is stale; `clock` returns seconds."""
+        self._notices, self._after, self._clock = notices, stale_after, clock
+        self._since = clock()
+        self._told = False
+
+    @property
+    def health(self) -> int:
+        """Waiting, or stale."""
+        return STALE if self._told else WAITING
+
+    @property
+    def cause(self) -> str:
+        """Reason why the twin is stale, or "" while it waits."""
+        if not self._told:
+            return ""
+        return f"nothing has come since the twin started, {self._clock() - self._since:.0f} s ago; check the source"
+
+    def look(self, *, live: bool) -> None:
+        """Report a live source without events, once it is stale; a recording may be paused."""
+        if live and not self._told and self._clock() - self._since > self._after:
+            self._told = True
+            text = f"stale: nothing has come since the twin started, {self._after:g} s ago; check the source"
+            self._notices.say(text, level="warn")
+
+    def broken(self) -> None:
+        """Note that the first event has arrived."""
+        if self._told:
+            self._told = False
+            silent = self._clock() - self._since
+            self._notices.say(f"the source speaks, {silent:.0f} s after the twin started")

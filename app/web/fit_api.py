@@ -124,15 +124,15 @@ def _attempt_json(attempt: FitAttempt) -> dict[str, Any]:
     """Return a fit as JSON; `values` are the proposed values of its entries, by key."""
     found: dict[str, Any] = {
         "number": attempt.number,
-        "state": attempt.state,
+        "state": attempt.job.state,
         "wanted": list(attempt.wanted),
         "estimator": attempt.estimator,
         "revision": attempt.revision,
         "events": attempt.events,
         "seconds": attempt.seconds,
         "folds": attempt.folds,
-        "elapsed": attempt.elapsed,
-        "reason": one_line(attempt.reason),
+        "elapsed": attempt.job.elapsed,
+        "reason": one_line(attempt.job.reason),
     }
     if attempt.fitted is None:
         return found
@@ -156,10 +156,10 @@ def _refit_json(refit: LiveRefit) -> dict[str, Any]:
         "events": attempt.events,
         "seconds": attempt.seconds,
         "folds": attempt.folds,
-        "elapsed": attempt.elapsed,
+        "elapsed": attempt.job.elapsed,
     }
-    if refit.fitted is None or refit.state == FITTING:
+    if attempt.fitted is None or refit.state == FITTING:
         return found
     from ..present.runs_json import fit_json
 
-    return found | {"result": fit_json(refit.fitted)}
+    return found | {"result": fit_json(attempt.fitted)}

@@ -81,7 +81,8 @@ def test_the_recording_is_closed_after_the_last_row_and_has_it(tmp_path, monkeyp
 
     def end(part, *, short=False):
         # Who moves the rows has ended; what looks at the last of them too.
-        assert not running.engine._thread.is_alive() and not running.engine._watchers.episode_log.running
+        assert not running.engine._thread.is_alive()
+        assert running.engine._watchers.episode_log.tracker.n == row_count(running.engine)
         order.append(row_count(running.engine))
         ended(part, short=short)
         assert finished(path)

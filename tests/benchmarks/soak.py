@@ -178,7 +178,7 @@ class Soak:
     def watch(self) -> None:
         """Who watches is still there, and the twin has come to itself."""
         status, alive = self.engine.status(), {thread.name for thread in threading.enumerate()}
-        for name in ("engine", "episodes"):
+        for name in ("engine", "job 0"):
             self._expect(name in alive, f"the thread {name} has ended")
         errors = self.engine.notices.counts().get("engine error", 0)
         self._expect(errors == 0, f"{errors} errors of the engine")

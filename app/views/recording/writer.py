@@ -259,7 +259,8 @@ class RecordingPart:
                 # A late measurement belongs before the start.
                 self._move(pull.first)
             if pull.revision != self._revision:
-                tuning, estimator = self._engine.folded_with()
+                assert pull.settings is not None
+                tuning, estimator = pull.settings
                 if self._engine.twin is not self._twin:
                     self._twin = self._engine.twin
                     self.file.twin(self._twin.text, self._twin.overrides, self._twin.version)

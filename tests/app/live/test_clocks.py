@@ -7,10 +7,9 @@ import pytest
 
 from app.ingest import CLOCK_MOVED, Planned
 from app.live import commands
-from app.live.alerts import SilentSource
 from app.live.engine import Engine
 from app.live.notices import Notices
-from app.live.watchers import HostClock
+from app.live.watchers import HostClock, SilentSource
 from app.views.recording.reader import read_recording
 from app.views.recording.writer import Recorder
 from app.web.commands_json import command_from_json

@@ -293,8 +293,8 @@ def test_without_measurements_a_live_twin_predicts(started):
 
 def refolded(engine):
     """The refold of the newest request, which is not adopted yet."""
-    ticket, make = engine._refolder._pending
-    return engine._refolder._fold(ticket, make)
+    assert engine._refolds.step()
+    return engine._inbox.get()
 
 
 def test_a_late_measurement_between_two_requests_reaches_the_answer_of_the_first():
@@ -305,10 +305,10 @@ def test_a_late_measurement_between_two_requests_reaches_the_answer_of_the_first
     first = refolded(engine)
     engine._accept([readings(times[[60]], values[[60]])])
     engine.retune("kf", engine.tuning.set("Q.rate", 0.2))
-    engine._adopt(first)
+    first()
     assert_same(pull_all(engine).track, reference(times, values, "kf", FIRST.set("Q.rate", 0.1)))
     assert engine.status().refolding
-    engine._adopt(refolded(engine))
+    refolded(engine)()
     assert_same(pull_all(engine).track, reference(times, values, "kf", FIRST.set("Q.rate", 0.2)))
 
 
@@ -369,7 +369,7 @@ def test_nobody_sees_the_old_rows_without_a_refold_that_is_waited_for(estimator,
     engine.retune(estimator, engine.tuning.with_options(options))
     done = refolded(engine)
     engine._lock = lock
-    engine._adopt(done)
+    done()
     assert engine._fold.estimator.name == engine.estimator == ends and not engine._requests.waiting
     assert lock.seen == [True, True]
 

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 import app.live.watchdog
-from app.live.refolder import Refolder
+from app.live.commands import SetTuning
 from app.live.watchdog import CHECK_AFTER_S, STALLED_AFTER_S, Watchdog, unanswered
 from app.views.recording.reader import finished, read_recording
-from tests.app.scripted import wait_for
+from tests.app.scripted import Stepped, fresh_status, wait_for
 from tests.conftest import ROOT
 
 MODEL = """
@@ -131,7 +131,7 @@ class Work:
 
 @pytest.fixture
 def asked_of_work(monkeypatch):
-    monkeypatch.setattr(app.live.watchdog, "questions_of", lambda work: iter(work.questions))
+    monkeypatch.setattr(app.live.watchdog, "questions_of", lambda work: iter(getattr(work, "questions", ())))
 
 
 def test_work_that_takes_long_is_named_only_if_a_question_is_not_answered(asked_of_work):
@@ -165,29 +165,32 @@ def test_questions_are_asked_until_one_is_not_answered():
     assert np.all(np.array(asked[:10]) == [*range(5)] * 2)
 
 
+def errors(engine):
+    return [line.text for line in engine.notices.since(0) if line.level == "error"]
+
+
 def test_a_refold_that_never_returns_is_given_up_and_the_next_one_made(monkeypatch, asked_of_work):
     monkeypatch.setattr(app.live.watchdog, "CHECK_AFTER_S", 0.0)
     monkeypatch.setattr(app.live.watchdog, "ANSWER_TIMEOUT_S", 0.1)
-    leave, answers = threading.Event(), []
+    leave, engine = threading.Event(), Stepped(100).engine
     stuck = Work(("f at x", leave.wait))
     stuck.advance = lambda limit: leave.wait()
-    good = Work()
-    good.advance = lambda limit: 0
-    refolder = Refolder(answers.append)
-    refolder.start()
+    engine.start()
     try:
-        refolder.request(1, lambda: stuck)
-        wait_for(lambda: answers)
-        assert (answers[0].ticket, answers[0].fold) == (1, None)
-        error = answers[0].error
-        assert error.startswith("f at x has not returned for ") and "running estimate goes on" in error
-        refolder.request(2, lambda: good)
-        wait_for(lambda: len(answers) == 2)
-        assert (answers[1].ticket, answers[1].fold, answers[1].error) == (2, good, "")
+        with monkeypatch.context() as patch:
+            patch.setattr(engine, "_make_fold", lambda *args: stuck)
+            engine.submit(SetTuning("Q.rate", 0.1))
+            wait_for(lambda: errors(engine))
+        (text,) = errors(engine)
+        assert text.startswith("not folded again: f at x has not returned for ") and "running estimate goes on" in text
+        assert engine.tuning is engine.twin.tuning and not fresh_status(engine).refolding
+        engine.submit(SetTuning("Q.rate", 0.2))
+        wait_for(lambda: engine.folded_with()[0].get("Q.rate") == 0.2)
+        # What comes of the first one after all is no answer any more.
         leave.set()
-        refolder.request(3, lambda: good)
-        wait_for(lambda: len(answers) == 3)
-        assert [answer.ticket for answer in answers] == [1, 2, 3]
+        engine.submit(SetTuning("Q.rate", 0.3))
+        wait_for(lambda: engine.folded_with()[0].get("Q.rate") == 0.3)
+        assert fresh_status(engine).revision == 2 and len(errors(engine)) == 1
     finally:
         leave.set()
-        refolder.stop()
+        engine.stop()

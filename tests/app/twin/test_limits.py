@@ -9,7 +9,8 @@ import pytest
 
 from app.cli.arguments import Fold as Arguments
 from app.cli.fold import fold_twin
-from app.live.counts import RowCounts, refusals
+from app.live.alerts import rejections
+from app.live.counts import RowCounts
 from app.twin.twin import load_twin
 from app.views.recording.format import base_from_json, base_to_json
 from estimators.errors import ConfigError
@@ -184,7 +185,7 @@ def test_counts_and_lines_name_sensor_value_and_rule(tmp_path) -> None:
     log.add("winding", [0, 1, 1, 2, 3], [30, 30, 30, 500, 60])
     fold = Fold("kf", twin.model, Tuning.of(twin.model), log)
     fold.advance()
-    lines = dict(refusals(twin.model, log, fold.track, 0))
+    lines = dict(rejections(twin.model, log, fold.track, 0))
     assert lines["duplicate winding"].startswith("winding: 30 °C came again; it counts once: look for what")
     assert lines["range winding"].startswith("winding: 500 °C is outside -40 to 180 °C; not used: look at the sensor")
     assert lines["rate winding"].startswith("winding: 60 °C is further from the last good reading than 5 °C/s allows;")

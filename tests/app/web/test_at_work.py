@@ -133,7 +133,7 @@ def test_a_refold_catches_up_beside_the_fold_that_is_shown(running):
     solver.let_go()
     wait_for(lambda: row_count(engine) == READINGS)
     solver.left = threading.Semaphore(0)
-    solver.hold("refold")
+    solver.hold("refold 0")
     engine.submit(SetTuning("Q.rate", 0.5))
     assert solver.at_work.wait(PATIENCE)
     engine.source.put(readings([20.5, 21.0], [60.0, 61.0]))

@@ -43,8 +43,8 @@ def test_a_fit_beside_the_twin_is_the_fit_of_its_log():
     n = COPY_EVENTS + 900
     engine = Stepped(n, seed=3, step=0.05).engine
     found, expected = fitted(engine, WANTED), alone(n)
-    assert (found.state, found.events, found.folds) == (DONE, n, expected.folds)
-    assert found.seconds == pytest.approx(0.1 * (n - 1)) and found.elapsed > 0.0
+    assert (found.job.state, found.events, found.folds) == (DONE, n, expected.folds)
+    assert found.seconds == pytest.approx(0.1 * (n - 1)) and found.job.elapsed > 0.0
     assert found.fitted.lines == expected.lines
     assert found.fitted.verdict == expected.verdict
     # Nothing was applied.
@@ -53,7 +53,7 @@ def test_a_fit_beside_the_twin_is_the_fit_of_its_log():
 
 def test_the_last_events_are_folded_from_a_snapshot_on():
     found = fitted(Stepped(6000, seed=3, step=0.05).engine, WANTED, 3000)
-    assert found.state == DONE and found.fitted.before.fitted.n + found.fitted.before.held_out.n == found.events
+    assert found.job.state == DONE and found.fitted.before.fitted.n + found.fitted.before.held_out.n == found.events
     # From the last snapshot at or before the event that was asked for.
     assert 3000 <= found.events < 6000
 
@@ -76,10 +76,10 @@ def test_one_at_a_time():
         fitting.begin(WANTED)
     fitting.cancel()
     engine.settle()
-    assert (fitting.latest.state, fitting.latest.fitted, fitting.latest.reason) == (CANCELLED, None, "")
+    assert (fitting.latest.job.state, fitting.latest.fitted, fitting.latest.job.reason) == (CANCELLED, None, "")
     fitting.begin(WANTED)
     engine.settle()
-    assert fitting.latest.state == DONE and fitting.latest.number == 2
+    assert fitting.latest.job.state == DONE and fitting.latest.number == 2
 
 
 def test_a_fit_that_is_cancelled_ends_after_its_current_folds(monkeypatch):
@@ -95,7 +95,7 @@ def test_a_fit_that_is_cancelled_ends_after_its_current_folds(monkeypatch):
     monkeypatch.setattr(Fold, "advance", advance)
     fitting.begin(WANTED)
     engine.settle()
-    assert (fitting.latest.state, fitting.latest.fitted) == (CANCELLED, None)
+    assert (fitting.latest.job.state, fitting.latest.fitted) == (CANCELLED, None)
     assert 0 < fitting.latest.folds < alone(600).folds
 
 
@@ -105,7 +105,7 @@ def test_a_fit_that_is_cancelled_ends_after_its_current_folds(monkeypatch):
 )
 def test_why_there_is_none(n, wanted, reason):
     found = fitted(Stepped(n, seed=3, step=0.05).engine, wanted)
-    assert found.state == FAILED and reason in found.reason
+    assert found.job.state == FAILED and reason in found.job.reason
 
 
 def test_an_empty_request_is_rejected():

@@ -103,7 +103,7 @@ def test_adopted_by_hand_a_version_with_its_evidence_goes_on(begin):
     assert twin.engine.revisions.runs[-1].number == 0 and not version_files(twin.twin.path)
     assert twin.accept(1) == "refit-1"
     version = load_version(version_files(twin.twin.path)["refit-1"])
-    (line,) = twin.refits.known[0].fitted.lines
+    (line,) = twin.refits.known[0].attempt.fitted.lines
     assert twin.engine.tuning.get("R.winding") == line.after and line.low < 25.0 < line.high
     evidence = version.head.evidence
     moved = evidence.entries["R.winding"]

@@ -19,13 +19,13 @@ from app.live.engine import Engine
 from app.views.recording.format import tuning_from_json
 from app.views.recording.reader import finished, read_recording
 from app.views.recording.rrd_file import NEVER, Split, parse_split
-from app.views.recording.writer import Recorder
+from app.views.recording.writer import Recorder, RecordingPart
 from app.web.commands_json import command_from_json
 from estimators.errors import ConfigError
 from estimators.fold import Fold
 from estimators.log import Log
 from sources.merged import MemorySource
-from tests.app.scripted import MODEL, Scripted, pull_all, readings, twin, wait_for
+from tests.app.scripted import MODEL, Scripted, Stepped, pull_all, readings, twin, wait_for
 from tests.conftest import ROOT
 from tests.support import assert_same
 
@@ -196,6 +196,26 @@ def test_an_edit_while_a_part_is_begun_reviews_to_the_same_bits(start, tmp_path)
     end = third.first + third.rows
     # What health and age at the start look back at is in the part before.
     assert_same(refold(third).select(slice(1000, None)), last.track.select(slice(third.first + 1000, end)))
+
+
+def test_an_edit_between_a_pull_and_its_tuning_is_written_once(tmp_path, monkeypatch):
+    stepped = Stepped(50)
+    part, written = RecordingPart(stepped.engine, tmp_path / "run.rrd", lambda stream: None), []
+    pull = stepped.engine.pull
+    before = stepped.engine.tuning.get("Q.rate")
+    monkeypatch.setattr(part, "_drawing", lambda pull: None)
+    monkeypatch.setattr(part.file, "tuning", lambda tuning, *at: written.append((at[-1], tuning.get("Q.rate"))))
+
+    def pull_then_edit(*request):
+        found = pull(*request)
+        if found.revision == 0:
+            stepped.submit(commands.SetTuning("Q.rate", 0.5))
+        return found
+
+    monkeypatch.setattr(stepped.engine, "pull", pull_then_edit)
+    part.write()
+    part.write()
+    assert written == [(0, before), (1, 0.5)]
 
 
 @pytest.mark.parametrize("estimator", ["kf", "pf"])

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from app.live.refolder import BATCH_PERIOD_S, MAX_BATCH_EVENTS, BatchSizer, FairLock
+from app.live.batches import BATCH_PERIOD_S, MAX_BATCH_EVENTS, BatchSizer, FairLock
 from tests.app.scripted import wait_for
 
 
