@@ -10,8 +10,7 @@ from estimators.diagnostics.episodes import Episode, TrackedEpisode, episodes
 from estimators.fold import Fold
 from estimators.log import Log
 from estimators.track import GATED
-from estimators.tuning import Tuning
-from tests.app.scripted import MODEL, Replayed, Scripted, readings, twin, wait_for
+from tests.app.scripted import MODEL, Replayed, Scripted, Stepped, readings, twin
 
 N = 1800
 """Readings, one a second: twice as noisy from the 300th to the 500th, stuck from the 1600th on."""
@@ -46,6 +45,11 @@ def whole(engine):
     return episodes(fold)
 
 
+def watch(engine):
+    """Let the episode log look, as its job does."""
+    engine._watchers.episode_log.update()
+
+
 def said(engine):
     return [line.text for line in engine.notices.since(0)]
 
@@ -62,8 +66,8 @@ def test_in_pieces_it_is_what_one_fold_says(engine, asset, piece):
     for start in range(0, N, piece):
         engine._accept([readings(t[start : start + piece], y[start : start + piece])])
         if piece > 1 or start % 5 == 0:
-            engine._watchers.episode_log.update()
-    engine._watchers.episode_log.update()
+            watch(engine)
+    watch(engine)
     expected = whole(engine)
     assert len(expected) >= 2 and expected[0].end is not None and expected[-1].cause == "stuck"
     same(engine.episodes(), expected)
@@ -75,11 +79,11 @@ def test_readings_that_come_late_take_rows_back(engine, asset):
     prompt = np.setdiff1d(np.arange(600), late)
     for part in np.array_split(prompt, 12):
         engine._accept([readings(t[part], y[part])])
-        engine._watchers.episode_log.update()
+        watch(engine)
     before = engine.episodes()
     for part in np.array_split(late[::-1], 5):
         engine._accept([readings(t[part], y[part])])
-        engine._watchers.episode_log.update()
+        watch(engine)
     same(engine.episodes(), whole(engine))
     assert before != engine.episodes()
     assert sum("too narrow" in text for text in said(engine)) == 1
@@ -90,7 +94,7 @@ def test_each_is_said_once_when_it_begins_and_when_it_is_over(engine, asset):
     lasted = False
     for start in range(0, 1580, 8):
         engine._accept([readings(t[start : start + 8], y[start : start + 8])])
-        engine._watchers.episode_log.update()
+        watch(engine)
         status = engine.status()
         engine._status = None
         if status.episodes_open:
@@ -155,52 +159,33 @@ def test_what_lasts_hides_no_later_loss(engine, rows):
 
 
 def test_another_revision_begins_anew_and_says_nothing_twice(asset):
-    source = Scripted()
-    engine = Engine(twin(), lambda report: source)
-    engine.start()
-    try:
-        t, y = asset
-        source.put(readings(t[:400], y[:400]))
-        wait_for(lambda: any(episode.end is None for episode in engine.episodes()))
-        wait_for(lambda: any("too narrow" in text for text in said(engine)))
-        # As narrow as before, or nearly.
-        engine.submit(commands.SetTuning("R.winding", 3.0))
-        wait_for(lambda: engine.status().revision == 1)
-        wait_for(lambda: engine.episodes() and not same_as(engine, Tuning.of(MODEL)))
-        same(engine.episodes(), whole(engine))
-        assert sum("too narrow" in text for text in said(engine)) == 1
-        # Wide bands explain the readings: what was open has gone, and is not carried on.
-        engine.submit(commands.SetTuning("R.winding", 100.0))
-        wait_for(lambda: engine.status().revision == 2)
-        wait_for(lambda: all(episode.cause != "narrow" for episode in engine.episodes()))
-        same(engine.episodes(), whole(engine))
-    finally:
-        engine.stop()
-
-
-def same_as(engine, tuning):
-    log = Log.of(MODEL)
-    log.extend(engine._log.events)
-    fold = Fold("kf", MODEL, tuning, log, pairs=engine.pairs, policy=engine.policy)
-    fold.advance()
-    return engine.episodes() == episodes(fold)
+    stepped = Stepped()
+    engine, t, y = stepped.engine, asset[0][:400], asset[1][:400]
+    stepped.put(readings(t, y))
+    watch(engine)
+    assert engine.episodes()[-1].end is None and sum("too narrow" in text for text in said(engine)) == 1
+    # As narrow as before, or nearly.
+    stepped.submit(commands.SetTuning("R.winding", 3.0))
+    watch(engine)
+    same(engine.episodes(), whole(engine))
+    assert sum("too narrow" in text for text in said(engine)) == 1
+    # Wide bands explain the readings: what was open has gone, and is not carried on.
+    stepped.submit(commands.SetTuning("R.winding", 100.0))
+    watch(engine)
+    assert all(episode.cause != "narrow" for episode in engine.episodes())
+    same(engine.episodes(), whole(engine))
 
 
 def test_a_source_that_begins_again_has_an_episode_log_of_its_own(asset):
-    source = Replayed()
-    engine = Engine(twin(), lambda report: source)
-    engine.start()
-    try:
-        t, y = asset
-        source.put(readings(t[:400], y[:400]))
-        wait_for(lambda: any(episode.end is None for episode in engine.episodes()))
-        source.restarts += 1
-        source.put(readings(t[:400], y[:400]))
+    stepped = Stepped(source=Replayed())
+    engine, t, y = stepped.engine, asset[0][:400], asset[1][:400]
+    for begun in (1, 2):
+        stepped.put(readings(t, y))
+        watch(engine)
         # What lasted in the life before is said again in this one.
-        wait_for(lambda: sum("too narrow" in text for text in said(engine)) == 2)
+        assert sum("too narrow" in text for text in said(engine)) == begun
         same(engine.episodes(), whole(engine))
-    finally:
-        engine.stop()
+        stepped.source.restart()
 
 
 def test_a_refused_sensor_is_said_once_and_not_reading_by_reading(asset):
@@ -221,7 +206,7 @@ def test_a_refused_sensor_is_said_once_and_not_reading_by_reading(asset):
         if np.any(engine._fold.track.verdict[-10:] == GATED):
             refused += known
             told.append((known, any(text.startswith("winding: measurement rejected") for text in new)))
-        engine._watchers.episode_log.update()
+        watch(engine)
     assert refused > 3 and all(line != known for known, line in told)
     assert sum("is refused by the gate" in text for text in said(engine)) == 1
 
