@@ -14,8 +14,8 @@ from ..live.execute import MAX_SPEED
 from ..terminal import complain
 from ..views.recording.format import TAKEN
 from ..views.recording.rrd_file import NEVER, parse_split
+from ..web.door import check_port
 from ..web.gallery.gallery import StartRequest
-from ..web.port import check_port
 from ..web.session import Page, Session
 from .open_twin import FileOpener, live_source, open_session, opened_review, opened_twin
 from .options import settings

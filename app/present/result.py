@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 import textwrap
 import time
 from collections.abc import Mapping, Sequence
@@ -125,22 +126,24 @@ def number_text(value: Cell, decimals: int | None = None, scale: float = 1.0, ab
     return digits(scale * value) if decimals is None else f"{scale * value:,.{decimals}f}"
 
 
-def plain(value: Any) -> Any:
+def plain(value: Any, *, infinity_text: bool = False) -> Any:
     """Return a copy that JSON can hold.
 
-    Named tuples and dataclasses become objects, arrays and tuples lists, NaN and infinity null.
+    Named tuples and dataclasses become objects, arrays and tuples lists, NaN null, and infinity null or "inf".
     """
-    if isinstance(value, Mapping):
-        return {str(key): plain(item) for key, item in value.items()}
-    if hasattr(value, "_asdict"):
-        return plain(value._asdict())
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {field.name: plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
     if isinstance(value, (np.ndarray, np.generic)):
-        return plain(value.tolist())
+        value = value.tolist()
+    elif hasattr(value, "_asdict"):
+        value = value._asdict()
+    elif dataclasses.is_dataclass(value) and not isinstance(value, type):
+        value = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
+    if isinstance(value, Mapping):
+        return {str(key): plain(item, infinity_text=infinity_text) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
-        return [plain(item) for item in value]
-    return None if isinstance(value, float) and not np.isfinite(value) else value
+        return [plain(item, infinity_text=infinity_text) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return str(value) if infinity_text and math.isinf(value) else None
+    return value
 
 
 def to_json(value: Any) -> str:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from estimators.registry import ESTIMATORS
 
-from ..live.changes import difference, in_words
+from ..live.changes import SettingChange, in_words
 from ..live.revisions import Revision
 from ..live.running_fold import Running
 from ..live.runs.scores import RunScore, RunScores
@@ -25,27 +25,41 @@ def runs_json(scores: RunScores, engine: Running) -> list[dict[str, Any]]:
     rows = [row.unit for sensor in engine.model.sensors for row in sensor.rows]
     units |= dict(zip(engine.model.row_names, rows, strict=True))
     found = scores.all()
-    running = found[-1][0]
-    return [_run(run, known, run is running, units) for run, known in found]
+    runs = []
+    for run, known in found:
+        running = run is found[-1][0]
+        kept = running or run.track is not None
+        names = ("number", "estimator", "began", "loaded", "name", "note", "place")
+        runs.append(
+            {name: getattr(run, name) for name in names}
+            | {
+                "title": ESTIMATORS[run.estimator].title,
+                "what": what_changed(run),
+                "running": running,
+                "kept": kept,
+                "score": None if known is None else _score(known, units),
+                "unscored": "" if known else "no readings yet" if kept else "not scored: its track is gone",
+            }
+        )
+    return runs
 
 
-def _run(run: Revision, known: RunScore | None, running: bool, units: dict[str, str]) -> dict[str, Any]:
-    kept = running or run.track is not None
-    return {
-        "number": run.number,
-        "estimator": run.estimator,
-        "title": ESTIMATORS[run.estimator].title,
-        "began": run.began,
-        "what": what_changed(run),
-        "running": running,
-        "loaded": run.loaded,
-        "name": run.name,
-        "note": run.note,
-        "place": run.place,
-        "kept": kept,
-        "score": None if known is None else _score(known, units),
-        "unscored": "" if known is not None else "no readings yet" if kept else "not scored: its track is gone",
+def _score(known: RunScore, units: dict[str, str]) -> dict[str, Any]:
+    score = known.score
+    fits = [(name, "truth", fit) for name, fit in score.states.items()]
+    fits += [(name, "held out", fit) for name, fit in score.held_out.items()]
+    if score.field is not None:
+        fits.append(("all cells", "truth", score.field))
+    verdict = score.nis_verdict
+    found = {name: getattr(known, name) for name in ("rows", "seconds", "log_likelihood_reading", "step_us")}
+    found |= {
+        name: getattr(score, name) for name in ("nis", "nis_low", "nis_high", "log_likelihood", "readings", "refused")
     }
+    found |= {"nis_judged": verdict.measure, "nis_place": verdict.place, "nis_words": verdict.words}
+    found["fits"] = [
+        {"name": name, "against": against, "unit": units.get(name, "")} | fit._asdict() for name, against, fit in fits
+    ]
+    return dict(plain(found))
 
 
 def what_changed(run: Revision) -> str:
@@ -55,9 +69,8 @@ def what_changed(run: Revision) -> str:
     return words if run.loaded is None else f"back to run {run.loaded}: {words}"
 
 
-def difference_json(run: Revision, other: Revision) -> list[dict[str, Any]]:
-    """Return the entries in which two runs differ, with both values."""
-    changes = difference(run.estimator, run.tuning, other.estimator, other.tuning)
+def changes_json(changes: Sequence[SettingChange]) -> list[dict[str, Any]]:
+    """Return changed entries with their values before and after."""
     return [{"key": key, "values": plain([before, after])} for key, before, after in changes]
 
 
@@ -70,45 +83,12 @@ def swept_json(swept: Swept) -> dict[str, Any]:
 def noise_json(noise: NoiseEstimates) -> dict[str, Any]:
     """Return the estimated R by key and the sweep of all of Q; `doubt` is the reason not to use an estimate."""
     estimates = {
-        key: {
-            "value": found.variance if found.variance > 0.0 else None,
-            "std": found.std,
-            "n": found.n,
-            "doubt": noise.doubts.get(key, ""),
-        }
+        key: {"value": found.variance if found.variance > 0.0 else None, "std": found.std, "n": found.n}
+        | {"doubt": noise.doubts.get(key, "")}
         for key, found in noise.sensors.items()
     }
     q = swept_json(noise.q) | {"doubt": noise.doubts.get("Q", "")}
     return {"revision": noise.revision, "R": plain(estimates), "reason": noise.reason, "Q": q}
-
-
-def _score(known: RunScore, units: dict[str, str]) -> dict[str, Any]:
-    found = known.score
-    fits = [(name, "truth", fit) for name, fit in found.states.items()]
-    fits += [(name, "held out", fit) for name, fit in found.held_out.items()]
-    if found.field is not None:
-        fits.append(("all cells", "truth", found.field))
-    return plain(
-        {
-            "rows": known.rows,
-            "seconds": known.seconds,
-            "nis": found.nis,
-            "nis_low": found.nis_low,
-            "nis_high": found.nis_high,
-            "nis_judged": found.nis_verdict.measure,
-            "nis_place": found.nis_verdict.place,
-            "nis_words": found.nis_verdict.words,
-            "log_likelihood": found.log_likelihood,
-            "log_likelihood_reading": known.log_likelihood_reading,
-            "readings": found.readings,
-            "refused": found.refused,
-            "step_us": known.step_us,
-            "fits": [
-                {"name": name, "against": against, "unit": units.get(name, ""), **fit._asdict()}
-                for name, against, fit in fits
-            ],
-        }
-    )
 
 
 HIGH_CORRELATION = 0.9
@@ -129,25 +109,16 @@ def fit_json(fitted: Fitted) -> dict[str, Any]:
     # Half a second of imports, which a twin without a fit need not wait for.
     from estimators.fit.dual import shift
 
-    return plain(
-        {
-            "estimator": fitted.estimator,
-            "proposed": fitted.proposed,
-            "verdict": {
-                "gain": fitted.verdict.gain,
-                "error": fitted.verdict.error,
-                "reasons": fitted.verdict.reasons,
-            },
-            "entries": [{**line._asdict(), "sigma": shift(line)} for line in fitted.lines],
-            "power": fitted.power,
-            "skipped": fitted.skipped,
-            "left_out": fitted.left_out,
-            "correlated": correlated(fitted),
-            "before": {"fitted": part_json(fitted.before.fitted), "held_out": part_json(fitted.before.held_out)},
-            "after": {"fitted": part_json(fitted.after.fitted), "held_out": part_json(fitted.after.held_out)},
-            "folds": fitted.folds,
-        }
-    )
+    names = ("estimator", "proposed", "power", "skipped", "left_out", "folds")
+    verdict = fitted.verdict
+    found = {name: getattr(fitted, name) for name in names} | {
+        "verdict": {"gain": verdict.gain, "error": verdict.error, "reasons": verdict.reasons},
+        "entries": [line._asdict() | {"sigma": shift(line)} for line in fitted.lines],
+        "correlated": correlated(fitted),
+    }
+    for name, score in (("before", fitted.before), ("after", fitted.after)):
+        found[name] = {"fitted": part_json(score.fitted), "held_out": part_json(score.held_out)}
+    return dict(plain(found))
 
 
 def correlated(fitted: Fitted) -> list[dict[str, Any]]:
@@ -163,19 +134,9 @@ def correlated(fitted: Fitted) -> list[dict[str, Any]]:
 
 def part_json(part: PartScore) -> dict[str, Any]:
     """Return the scores of one part of the recordings."""
-
-    def predictions(items: Mapping[str, PredictionScore]) -> dict[str, Any]:
+    found = {name: getattr(part, name) for name in ("log_density", "nis", "coverage")} | {"readings": part.n}
+    for group in ("sensors", "withheld", "states"):
+        scores: Mapping[str, PredictionScore] = getattr(part, group)
         names = ("unit", "n", "rms", "coverage", "crps")
-        return {key: {name: getattr(item, name) for name in names} for key, item in items.items()}
-
-    return plain(
-        {
-            "readings": part.n,
-            "log_density": part.log_density,
-            "nis": part.nis,
-            "coverage": part.coverage,
-            "sensors": predictions(part.sensors),
-            "withheld": predictions(part.withheld),
-            "states": predictions(part.states),
-        }
-    )
+        found[group] = {key: {name: getattr(item, name) for name in names} for key, item in scores.items()}
+    return dict(plain(found))

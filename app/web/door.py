@@ -1,13 +1,16 @@
 """The one port of the page: open as long as the process, while the application behind it changes.
 
-That is a twin, another twin, or none. Clients of an application that is replaced are disconnected; they reconnect and
-find the new one. Port, token and access rules stay.
+The application is that of a twin, of another twin, or none. Clients of a replaced application are disconnected;
+they reconnect and find the new one. Port, token and access rules stay.
 """
 
 from __future__ import annotations
 
 import asyncio
-import json
+import errno
+import os
+import secrets
+import socket
 import threading
 import time
 import uuid
@@ -19,18 +22,20 @@ import uvicorn
 from starlette.applications import Starlette
 from starlette.responses import JSONResponse, PlainTextResponse
 from starlette.routing import BaseRoute
+from starlette.types import ASGIApp, Receive, Scope, Send
 from starlette.websockets import WebSocket
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-from .gate import App, Gate, Receive, Scope, Send, session_token
-from .port import listen
+from estimators.errors import ConfigError
 
-GONE = 1012
-"""WebSocket's code for a service that starts anew."""
+from .gate import Gate, with_security_headers
 
-NOTHING = "no twin runs; choose one in the gallery"
+SERVICE_RESTART = 1012
+"""Close code of a WebSocket whose application is replaced."""
 
-CONNECTIONS = 96
+NO_TWIN = "no twin runs; choose one in the gallery"
+
+MAX_CONNECTIONS = 96
 """Open connections. A page holds up to eight; each of its Viser panes costs one more descriptor within the process, and
 some systems allow 256 in all."""
 
@@ -41,79 +46,117 @@ REQUEST_TIMEOUT_S = 10.0
 """From the first byte of a request, or the connection, to the last byte of its body."""
 
 
-def _policy(port: int, scripts: str) -> str:
-    """A content security policy under which no request leaves this server."""
-    # Not every browser takes 'self' to include the WebSockets of the same address.
-    names = (f"127.0.0.1:{port}", f"localhost:{port}")
-    sockets, here = (" ".join(f"{scheme}://{name}" for name in names) for scheme in ("ws", "http"))
-    return (
-        f"default-src 'self'; script-src 'self' {scripts}; style-src 'self' 'unsafe-inline'; "
-        f"img-src 'self' data: blob:; font-src 'self' data:; connect-src 'self' data: blob: {sockets}; "
-        f"worker-src 'self' blob: data:; frame-src 'self' {here}; frame-ancestors 'self' {here}; object-src 'none'; "
-        "base-uri 'none'; form-action 'self'"
-    )
+def listen(port: int) -> tuple[list[socket.socket], bool]:
+    """Listen on 127.0.0.1, and on ::1 where it exists, as `localhost` may mean either; port 0 takes a free one.
+
+    Returns:
+        The sockets, and whether `localhost` leads to them and to no other program.
+
+    Raises:
+        ConfigError: If the port is not free on 127.0.0.1.
+    """
+    try:
+        first = _listener(socket.AF_INET, "127.0.0.1", port)
+    except (OSError, OverflowError) as error:
+        reason = getattr(error, "strerror", None) or "is not a port"
+        raise ConfigError(f"port {port}: {reason}; choose another with --port") from None
+    try:
+        return [first, _listener(socket.AF_INET6, "::1", first.getsockname()[1])], True
+    except OSError as error:
+        return [first], error.errno not in (errno.EADDRINUSE, errno.EACCES)
 
 
-class Shown:
+def _listener(family: socket.AddressFamily, host: str, port: int) -> socket.socket:
+    listener = socket.socket(family, socket.SOCK_STREAM)
+    try:
+        if os.name == "posix":
+            # Otherwise a port that was just closed stays taken for a minute.
+            listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listener.bind((host, port))
+        listener.listen(128)
+    except BaseException:
+        listener.close()
+        raise
+    listener.setblocking(False)
+    return listener
+
+
+def check_port(port: int) -> None:
+    """Check that a port is free, before anything is compiled for a page on it; raises as `listen`."""
+    for listener in listen(port)[0]:
+        listener.close()
+
+
+class ShownApplication:
     """An application behind the door; `boot` distinguishes it from those before."""
 
-    def __init__(self, application: App, boot: str) -> None:
+    def __init__(self, application: ASGIApp, boot: str) -> None:
         self.application, self.boot = application, boot
-        self.left = asyncio.Event()
-        """Set by the server's thread when another application has taken its place."""
-        self.over = threading.Event()
+        self.replaced = asyncio.Event()
+        """Set in the server's thread when another application has taken its place."""
+        self.disconnected = threading.Event()
         """Set once it has no connection left either."""
         self._open = 0
 
     async def stream(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Serve a WebSocket while this application is shown."""
+        """Serve a WebSocket until the application is replaced."""
+
+        async def receive_until_replaced() -> Any:
+            message, end = asyncio.ensure_future(receive()), asyncio.ensure_future(self.replaced.wait())
+            try:
+                await asyncio.wait({message, end}, return_when=asyncio.FIRST_COMPLETED)
+                return message.result() if message.done() else {"type": "websocket.disconnect", "code": SERVICE_RESTART}
+            finally:
+                message.cancel()
+                end.cancel()
+
         self._open += 1
         try:
-            await self.application(scope, _until(receive, self.left), send)
+            await self.application(scope, receive_until_replaced, send)
         finally:
             self._open -= 1
-            self._look()
+            self._check()
 
-    def leave(self) -> None:
+    def replace(self) -> None:
         """Give way to another application; in the server's thread."""
-        self.left.set()
-        self._look()
+        self.replaced.set()
+        self._check()
 
-    def _look(self) -> None:
-        if self.left.is_set() and not self._open:
-            self.over.set()
+    def _check(self) -> None:
+        if self.replaced.is_set() and not self._open:
+            self.disconnected.set()
 
 
 class Door:
-    """Serves its own routes, then the application that is shown, from a thread of its own."""
+    """Serves its own routes, then the present application, in a thread."""
 
     def __init__(self, port: int) -> None:
         """Take the port; 0 takes a free one.
 
         Raises:
-            ConfigError: If the port cannot be had.
+            ConfigError: If the port is not free.
         """
-        self._listening = listen(port)
-        self.port = self._listening.port
-        self._token = session_token()
-        self._shown = Shown(self._nothing, uuid.uuid4().hex)
-        self._page: App | None = None
+        self.sockets, localhost = listen(port)
+        self.port = int(self.sockets[0].getsockname()[1])
+        self._token = secrets.token_urlsafe(32)
+        self._shown = ShownApplication(self._no_twin, uuid.uuid4().hex)
+        self._page: ASGIApp | None = None
         self._own = Starlette()
         self._own.router.default = self._behind
         self._own.router.redirect_slashes = False
         self._loop: asyncio.AbstractEventLoop | None = None
-        gate = Gate(_WithHeaders(self._enter, self.port), self._token, self.port)
+        gate = Gate(with_security_headers(self._enter, self.port), self._token, self.port)
         self.entered = gate.entered
-        self.stage_pass = gate.stage_pass if self._listening.localhost else None
-        """Pass for a frame under the other loopback name to see the stage; None where that name may not be ours."""
+        self.stage_pass = gate.stage_pass if localhost else None
+        """Pass of the stage for a frame under `localhost`; None where that may be another program."""
         config = uvicorn.Config(
             gate, log_config=None, log_level="critical", access_log=False,
-            server_header=False, lifespan="off", ws_per_message_deflate=False, timeout_graceful_shutdown=1, 
+            server_header=False, lifespan="off", ws_per_message_deflate=False, timeout_graceful_shutdown=1,
             http=BoundedProtocol, backlog=BACKLOG,
         )  # fmt: skip
         self._server = uvicorn.Server(config)
         self._thread = threading.Thread(
-            target=self._server.run, kwargs={"sockets": self._listening.sockets}, name="page server", daemon=True
+            target=self._server.run, kwargs={"sockets": self.sockets}, name="page server", daemon=True
         )
 
     @property
@@ -127,16 +170,16 @@ class Door:
         return self._shown.boot
 
     @property
-    def furnished(self) -> bool:
-        """Whether it has routes of its own: a gallery."""
+    def has_gallery(self) -> bool:
+        """Whether it has routes of its own."""
         return bool(self._own.routes)
 
-    def furnish(self, routes: Sequence[BaseRoute], page: App) -> None:
-        """Add routes that are always served, and the page for when nothing is shown; before the start."""
+    def add_gallery(self, routes: Sequence[BaseRoute], page: ASGIApp) -> None:
+        """Add routes that are always served, and the page for when no twin runs; before the start."""
         self._own.router.routes.extend(routes)
         self._page = page
 
-    def show(self, application: App | None, boot: str | None = None) -> threading.Event:
+    def show(self, application: ASGIApp | None, boot: str | None = None) -> threading.Event:
         """Put another application behind the door, or none; from any thread.
 
         Returns:
@@ -144,12 +187,12 @@ class Door:
         """
         before = self._shown
         boot = uuid.uuid4().hex if boot is None else boot
-        self._shown = Shown(self._nothing if application is None else application, boot)
+        self._shown = ShownApplication(self._no_twin if application is None else application, boot)
         if self._loop is not None and not self._loop.is_closed():
-            self._loop.call_soon_threadsafe(before.leave)
+            self._loop.call_soon_threadsafe(before.replace)
         else:
-            before.over.set()
-        return before.over
+            before.disconnected.set()
+        return before.disconnected
 
     def start(self) -> None:
         """Serve."""
@@ -162,7 +205,8 @@ class Door:
         self._server.should_exit = True
         if self._thread.is_alive():
             self._thread.join(timeout=5.0)
-        self._listening.close()
+        for listener in self.sockets:
+            listener.close()
 
     async def _enter(self, scope: Scope, receive: Receive, send: Send) -> None:
         self._loop = asyncio.get_running_loop()
@@ -174,69 +218,23 @@ class Door:
         serve = shown.stream if scope["type"] == "websocket" else shown.application
         await serve(scope, receive, send)
 
-    async def _nothing(self, scope: Scope, receive: Receive, send: Send) -> None:
+    async def _no_twin(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer while no twin runs: a page that still shows one reloads, others get the reason."""
         if scope["type"] == "websocket":
             browser = WebSocket(scope, receive, send)
             await browser.accept()
-            await browser.send_text(json.dumps({"boot": self.boot}))
-            await browser.close(GONE)
+            await browser.send_json({"boot": self.boot})
+            await browser.close(SERVICE_RESTART)
         elif scope["path"] == "/" and self._page is not None:
             await self._page(scope, receive, send)
         elif scope["path"].startswith("/api/"):
-            await JSONResponse({"error": NOTHING}, 409)(scope, receive, send)
+            await JSONResponse({"error": NO_TWIN}, 409)(scope, receive, send)
         else:
-            await PlainTextResponse(f"Nisus: {NOTHING}.\n", 404)(scope, receive, send)
-
-
-def _until(receive: Receive, left: asyncio.Event) -> Receive:
-    """Return a `receive` that disconnects once the application has gone."""
-
-    async def take() -> Any:
-        said, gone = asyncio.ensure_future(receive()), asyncio.ensure_future(left.wait())
-        try:
-            await asyncio.wait({said, gone}, return_when=asyncio.FIRST_COMPLETED)
-            return said.result() if said.done() else {"type": "websocket.disconnect", "code": GONE}
-        finally:
-            said.cancel()
-            gone.cancel()
-
-    return take
-
-
-class _WithHeaders:
-    """Adds the security headers to every answer."""
-
-    def __init__(self, application: App, port: int) -> None:
-        self._application = application
-        common = [
-            (b"x-content-type-options", b"nosniff"),
-            (b"referrer-policy", b"no-referrer"),
-            (b"cross-origin-resource-policy", b"same-origin"),
-            (b"cross-origin-opener-policy", b"same-origin"),
-        ]
-        own = _policy(port, "'wasm-unsafe-eval'")
-        # Viser's client is one file of inline scripts that unpack themselves.
-        viser = _policy(port, "'unsafe-inline' 'unsafe-eval' 'wasm-unsafe-eval' blob: data:")
-        self._own = [*common, (b"content-security-policy", own.encode())]
-        self._viser = [*common, (b"content-security-policy", viser.encode())]
-
-    async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
-        extra = self._viser if scope.get("path", "").startswith("/viser") else self._own
-
-        async def send_more(message: Any) -> None:
-            if message["type"] == "http.response.start":
-                headers = [*message.get("headers", []), *extra]
-                if not any(name == b"cache-control" for name, _ in headers):
-                    headers.append((b"cache-control", b"no-cache"))
-                message = {**message, "headers": headers}
-            await send(message)
-
-        await self._application(scope, receive, send_more)
+            await PlainTextResponse(f"Nisus: {NO_TWIN}.\n", 404)(scope, receive, send)
 
 
 class BoundedProtocol(H11Protocol):
-    """uvicorn's HTTP, with a time for each request and a number of connections, neither of which uvicorn bounds."""
+    """uvicorn's HTTP with a timeout for each request and a limit of connections, which uvicorn lacks."""
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         """Take the connection; if there are too many, the one idle for longest is closed."""
@@ -245,7 +243,7 @@ class BoundedProtocol(H11Protocol):
         self._deadline: asyncio.TimerHandle | None = None
         self._watch()
         there = [other for other in self.connections if not other.transport.is_closing()]  # type: ignore[union-attr]
-        if len(there) > CONNECTIONS:
+        if len(there) > MAX_CONNECTIONS:
             idle = [other for other in there if isinstance(other, BoundedProtocol) and other._idle(self)]
             min(idle, key=lambda other: other._since, default=self).transport.abort()
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from starlette.routing import Route
 
@@ -18,6 +18,9 @@ from ..studies.advice.advising import Advising
 from .http import get, one_line, post
 from .runs_api import checked_note
 
+if TYPE_CHECKING:
+    from estimators.fit.fit import Fitted
+
 
 class FitApi:
     """Routes for fits and advice, and the work behind them."""
@@ -30,16 +33,16 @@ class FitApi:
     def routes(self) -> list[Route]:
         """Return the routes."""
         return [
-            Route("/api/fit", get(self._fit)),
-            Route("/api/fit", post(self._begin, status=202), methods=["POST"]),
-            Route("/api/fit", get(self._cancel), methods=["DELETE"]),
-            Route("/api/fit/keep", post(self._keep), methods=["POST"]),
-            Route("/api/advice", get(self._advice)),
-            Route("/api/advice", post(self._advise, status=202), methods=["POST"]),
-            Route("/api/refit", get(self._refit)),
-            Route("/api/refit", post(self._refit_now, status=202), methods=["POST"]),
-            Route("/api/refit/accept", post(self._accept), methods=["POST"]),
-            Route("/api/refit/dismiss", post(self._dismiss), methods=["POST"]),
+            get("/api/fit", self._fit),
+            post("/api/fit", self._begin, status=202),
+            get("/api/fit", self._cancel, method="DELETE"),
+            post("/api/fit/keep", self._keep),
+            get("/api/advice", self._advice),
+            post("/api/advice", self._advise, status=202),
+            get("/api/refit", self._refit),
+            post("/api/refit", self._refit_now, status=202),
+            post("/api/refit/accept", self._accept),
+            post("/api/refit/dismiss", self._dismiss),
         ]
 
     def _fit(self) -> Any:
@@ -58,6 +61,7 @@ class FitApi:
         return self._fit()
 
     def _cancel(self) -> Any:
+        """Cancel the fit under way."""
         self.fitting.cancel()
         return self._fit()
 
@@ -73,13 +77,14 @@ class FitApi:
         return {"name": name}
 
     def _advice(self) -> Any:
+        """Return the advice, or the state of its search."""
         found = self._advising
         current = found.revision == self._engine.revisions.runs[-1].number
         state = {"state": found.state, "revision": found.revision, "current": current, "reason": one_line(found.reason)}
         return state | ({"advice": found.advice} if found.state == DONE else {})
 
     def _advise(self) -> Any:
-        """Begin to find the estimator that suits the log."""
+        """Begin to search the estimator that suits the log."""
         self._advising.begin()
         return self._advice()
 
@@ -89,18 +94,12 @@ class FitApi:
         """Return for the status: the last fit of a window, its state, and the proposed one; None without `refit`."""
         if self._refits.section is None:
             return None
-        known, offered = self._refits.known, self._refits.open
-        last = known[-1] if known else None
-        return {
-            "last": None if last is None else last.number,
-            "state": None if last is None else last.state,
-            "proposed": None if offered is None else offered.number,
-        }
+        last, proposed = next(reversed(self._refits.known), None), self._refits.open
+        return {"last": last and last.number, "state": last and last.state, "proposed": proposed and proposed.number}
 
     def _refit(self) -> Any:
-        """Return the YAML's section, when the next fit is due, and every fit, newest first."""
-        refits, section = self._refits, self._refits.section
-        due = refits.due
+        """Return the YAML's section, the time of the next fit, and every fit, newest first."""
+        refits, section, due = self._refits, self._refits.section, self._refits.due
         return {
             "section": None if section is None else section.model_dump(mode="json"),
             "due": None if due is None else str(due),
@@ -108,58 +107,44 @@ class FitApi:
         }
 
     def _refit_now(self) -> Any:
+        """Fit the last window at once."""
         self._refits.now()
         return self._refit()
 
     def _accept(self, number: int) -> Any:
-        """Keep a proposed fit as a tuning version, and go on with it."""
+        """Keep a proposed fit as a tuning version, and load it."""
         return {"name": self._refits.accept(number)}
 
     def _dismiss(self, number: int) -> Any:
+        """Dismiss a proposed fit."""
         self._refits.dismiss(number)
         return self._refit()
 
 
 def _attempt_json(attempt: FitAttempt) -> dict[str, Any]:
     """Return a fit as JSON; `values` are the proposed values of its entries, by key."""
-    found: dict[str, Any] = {
-        "number": attempt.number,
-        "state": attempt.job.state,
-        "wanted": list(attempt.wanted),
-        "estimator": attempt.estimator,
-        "revision": attempt.revision,
-        "events": attempt.events,
-        "seconds": attempt.seconds,
-        "folds": attempt.folds,
-        "elapsed": attempt.job.elapsed,
-        "reason": one_line(attempt.job.reason),
-    }
-    if attempt.fitted is None:
-        return found
-    from ..present.runs_json import fit_json
-
-    values = {line.key: line.after for line in attempt.fitted.lines if not line.alone}
-    return found | {"result": fit_json(attempt.fitted), "values": values}
+    found = _progress_json(attempt) | {"reason": one_line(attempt.job.reason)}
+    found |= {name: getattr(attempt, name) for name in ("number", "wanted", "estimator")} | {"state": attempt.job.state}
+    if attempt.fitted is not None:
+        found |= _result_json(attempt.fitted)
+        found["values"] = {line.key: line.after for line in attempt.fitted.lines if not line.alone}
+    return found
 
 
 def _refit_json(refit: LiveRefit) -> dict[str, Any]:
     """Return a fit of a window as JSON; times as text, since JavaScript's numbers cannot hold them."""
-    attempt = refit.attempt
-    found: dict[str, Any] = {
-        "number": refit.number,
-        "state": refit.state,
-        "text": one_line(refit.text),
-        "name": refit.name,
-        "start": str(refit.start),
-        "end": str(refit.end),
-        "revision": attempt.revision,
-        "events": attempt.events,
-        "seconds": attempt.seconds,
-        "folds": attempt.folds,
-        "elapsed": attempt.job.elapsed,
-    }
-    if attempt.fitted is None or refit.state == FITTING:
-        return found
-    from ..present.runs_json import fit_json
+    found = _progress_json(refit.attempt) | {name: getattr(refit, name) for name in ("number", "state", "name")}
+    found |= {"text": one_line(refit.text), "start": str(refit.start), "end": str(refit.end)}
+    fitted = refit.attempt.fitted
+    return found if fitted is None or refit.state == FITTING else found | _result_json(fitted)
 
-    return found | {"result": fit_json(attempt.fitted)}
+
+def _progress_json(attempt: FitAttempt) -> dict[str, Any]:
+    found = {name: getattr(attempt, name) for name in ("revision", "events", "seconds", "folds")}
+    return found | {"elapsed": attempt.job.elapsed}
+
+
+def _result_json(fitted: Fitted) -> dict[str, Any]:
+    from ..present.runs_json import fit_json  # which imports SciPy's optimisers, 0.5 s
+
+    return {"result": fit_json(fitted)}

@@ -19,11 +19,11 @@ from pydantic import TypeAdapter, ValidationError
 from starlette.concurrency import run_in_threadpool
 from starlette.requests import ClientDisconnect, Request
 from starlette.responses import JSONResponse, PlainTextResponse, Response
+from starlette.routing import Route
 
 from estimators.errors import ConfigError, NisusError, nearest, printable, quoted, shown_name
 
 T = TypeVar("T")
-Endpoint = Callable[[Request], Awaitable[Response]]
 Runner = Callable[[Callable[[], Any]], Awaitable[Any]]
 
 PAGE = Path(__file__).parent / "page"
@@ -36,7 +36,7 @@ MAX_REASON_CHARACTERS = 500
 """Longest error line; it may quote the request."""
 
 QUEUE_TIMEOUT_S = 15.0
-"""How long a question waits for the one before it."""
+"""Longest wait of a request for the one before it."""
 
 RULES = {
     "float_type": "a number", "float_parsing": "a number", "int_type": "a whole number",
@@ -74,22 +74,27 @@ def page_file(name: str, settings: Mapping[str, Any]) -> Response:
     return Response((PAGE / name).read_text().replace("{{settings}}", text), media_type="text/html")
 
 
-def get(work: Callable[..., Any], *, refused: int = 400, run: Runner = run_in_threadpool) -> Endpoint:
-    """Return an endpoint that calls `work` in a thread and answers with its result as JSON.
+def get(
+    path: str, work: Callable[..., Any], *, method: str = "GET", refused: int = 400, run: Runner = run_in_threadpool
+) -> Route:
+    """Return a route that calls `work` in a thread and answers with its result as JSON.
 
     Parameters of `work` come from the path and the query, converted to their annotated types; one that is called
     `request` is the request itself. A `Response` is passed on; a `NisusError` is answered in one line.
 
     Args:
-        work: A plain function.
+        path: Path of the route, with parameters in braces.
+        work: A plain function; its docstring describes the endpoint.
+        method: Method of the request.
         refused: Status code of an error.
         run: Runs a call; by default in the server's threads.
     """
     kind, takes_request = _parameters(work), "request" in inspect.signature(work).parameters
+    names = [item.name for item in dataclasses.fields(kind)]
 
     async def endpoint(request: Request) -> Response:
         texts = {**request.query_params, **request.path_params}
-        given = {name: texts[name] for name in _names(kind) if name in texts}
+        given = {name: texts[name] for name in names if name in texts}
         subject = request.url.path.rpartition("/")[2].partition(".")[0]
 
         def call() -> Any:
@@ -98,11 +103,11 @@ def get(work: Callable[..., Any], *, refused: int = 400, run: Runner = run_in_th
 
         return await _answered(call, run, 200, refused)
 
-    return endpoint
+    return Route(path, endpoint, methods=[method], name=work.__name__)
 
 
-def post(work: Callable[..., Any], *, status: int = 200, run: Runner = run_in_threadpool) -> Endpoint:
-    """Return an endpoint that calls `work` in a thread with the fields of the request's JSON body; see `get`.
+def post(path: str, work: Callable[..., Any], *, status: int = 200, run: Runner = run_in_threadpool) -> Route:
+    """Return a route that calls `work` in a thread with the fields of the request's JSON body; see `get`.
 
     The body must be an object of exactly the parameters of `work`; one that is called `body` is the whole body.
     """
@@ -126,7 +131,7 @@ def post(work: Callable[..., Any], *, status: int = 200, run: Runner = run_in_th
 
         return await _answered(call, run, status, 400)
 
-    return endpoint
+    return Route(path, endpoint, methods=["POST"], name=work.__name__)
 
 
 async def _answered(call: Callable[[], Any], run: Runner, status: int, refused: int) -> Response:
@@ -202,9 +207,9 @@ class OneAtATime:
 
 
 def parse(kind: type[T], given: Any, subject: str, *, text: bool = False) -> T:
-    """Return a dataclass made of the fields of a JSON object, strictly: no text where a number is wanted.
+    """Return a dataclass made of the fields of a JSON object, strictly: no text in place of a number.
 
-    Infinity is written "inf" where a number is wanted.
+    Infinity is written "inf" in place of a number.
 
     Args:
         kind: The dataclass.
@@ -218,23 +223,21 @@ def parse(kind: type[T], given: Any, subject: str, *, text: bool = False) -> T:
     fields = {item.name: item for item in dataclasses.fields(kind)}  # type: ignore[arg-type]
     names = ", ".join(fields)
     if not isinstance(given, dict):
-        raise ConfigError(
-            f"{subject}: the body is {shown(given)}; it must be an object" + (f" of {names}" if names else "")
-        )
-    for name in given:
-        if name not in fields:
-            remedy = nearest(name, fields) if fields else "it takes no field"
-            raise ConfigError(f"{subject}: {shown_name(name)} is not known; {remedy}")
+        wanted = f"an object of {names}" if names else "an object"
+        raise ConfigError(f"{subject}: the body is {shown(given)}; it must be {wanted}")
+    for name in given.keys() - fields:
+        remedy = nearest(name, fields) if fields else "it takes no field"
+        raise ConfigError(f"{subject}: {shown_name(name)} is not known; {remedy}")
     for name, item in fields.items():
         if name not in given and item.default is dataclasses.MISSING:
             raise ConfigError(f"{subject}: {name} is missing; it takes {names}")
-    adapter: TypeAdapter[T] = _adapter(typing.cast(Any, kind))
+    adapter = _adapter(typing.cast(Any, kind))
     try:
         if text:
-            return adapter.validate_python(given)
+            return typing.cast(T, adapter.validate_python(given))
         hints = typing.get_type_hints(kind)
         checked = {name: _number(f"{subject}: {name}", value, hints[name]) for name, value in given.items()}
-        return adapter.validate_json(json.dumps(checked), strict=True)
+        return typing.cast(T, adapter.validate_json(json.dumps(checked), strict=True))
     except ValidationError as error:
         raise ConfigError(_line(error, given, subject)) from None
 
@@ -245,19 +248,11 @@ def _number(where: str, value: Any, hint: Any) -> Any:
         return {key: _number(f"{where}.{shown_name(key)}", item, hint) for key, item in value.items()}
     if isinstance(value, int) and abs(value) >= 2**53:
         raise ConfigError(f"{where} is too large; it must be below 2^53")
-    if isinstance(value, str) and not _encodable(value):
-        raise ConfigError(f"{where} is {shown(value)}; it must have letters that can be shown, no half ones")
+    if isinstance(value, str) and any("\ud800" <= letter <= "\udfff" for letter in value):
+        raise ConfigError(f"{where} is {shown(value)}; it must be text that can be shown, without half letters")
     if value == "inf" and "float" in str(hint):
         return math.inf
     return "NaN" if isinstance(value, float) and math.isnan(value) else value
-
-
-def _encodable(text: str) -> bool:
-    try:
-        text.encode()
-    except UnicodeEncodeError:
-        return False
-    return True
 
 
 def _line(error: ValidationError, given: Any, subject: str) -> str:
@@ -280,22 +275,15 @@ def shown(value: Any) -> str:
     return quoted(value) if isinstance(value, str) else shown_name(json.dumps(value))
 
 
-@cache
-def _adapter(kind: Any) -> TypeAdapter[Any]:
-    return TypeAdapter(kind)
-
-
-def _names(kind: type) -> list[str]:
-    return [item.name for item in dataclasses.fields(kind)]
+_adapter = cache(TypeAdapter)
 
 
 def _parameters(work: Callable[..., Any]) -> type:
     """Return a dataclass of the parameters of a function, without `request` and `body`."""
-    hints = typing.get_type_hints(work)
+    hints = typing.get_type_hints(work, include_extras=True)
     fields: list[Any] = []
-    for name, parameter in inspect.signature(work).parameters.items():
-        if name in ("request", "body"):
-            continue
-        default = [] if parameter.default is parameter.empty else [dataclasses.field(default=parameter.default)]
-        fields.append((name, hints[name], *default))
+    for name, item in inspect.signature(work).parameters.items():
+        if name not in ("request", "body"):
+            default = () if item.default is item.empty else (dataclasses.field(default=item.default),)
+            fields.append((name, hints[name], *default))
     return dataclasses.make_dataclass(work.__name__, fields)

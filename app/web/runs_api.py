@@ -18,28 +18,26 @@ from estimators.errors import ConfigError, printable
 from ..live.changes import difference
 from ..live.revisions import MAX_NOTE_LENGTH, Revision
 from ..live.running_fold import Running
-from ..live.runs.scores import RunScore, RunScores
+from ..live.runs.scores import RunScores
 from ..live.runs.sweep import Sweeps, noise
 from ..live.tunings.tuning_yaml import tuning_yaml
 from ..live.tunings.versions import Settings, figures, keep, listing, load_into, version_text
 from ..present.export.report import Reported, report
-from ..present.export.track_file import KINDS, RunRows, encoded, rows_of_run, tables
+from ..present.export.track_file import KINDS, encoded, rows_of_run, tables
 from ..present.result import to_html
-from ..present.runs_json import difference_json, noise_json, runs_json, swept_json, what_changed
+from ..present.runs_json import changes_json, noise_json, runs_json, swept_json, what_changed
+from ..present.series.chart_stream import Seconds
 from ..present.series.series import Series
 from ..studies.guard import last
 from ..twin.twin import with_version
 from .http import OneAtATime, get, post
-
-MAX_SECONDS = 1e9
-"""Largest time of a query, to either side."""
 
 MAX_ERRORS = 6
 """States whose error the report gives for each run."""
 
 
 class RunsApi:
-    """Routes for runs and tuning versions. Scores and sweeps are computed when somebody asks for them."""
+    """Routes for runs and tuning versions. Scores and sweeps are computed on request."""
 
     def __init__(self, engine: Running, series: Series) -> None:
         self._engine, self._series = engine, series
@@ -50,41 +48,48 @@ class RunsApi:
         """Return the routes."""
         copying = OneAtATime("export")
         return [
-            Route("/api/runs", get(self._runs)),
-            Route("/api/runs/{number:int}.yaml", get(self._yaml, refused=404)),
-            Route("/api/runs/{number:int}/against/{other:int}", get(self._difference, refused=404)),
-            Route("/api/around", get(self._around)),
-            Route("/api/noise", get(self._noise)),
-            Route("/api/tunings", get(self._tunings)),
-            Route("/api/tunings", post(self._keep), methods=["POST"]),
-            Route("/api/tunings/load", post(self._load), methods=["POST"]),
-            Route("/api/tunings/{name}/against", get(self._against, refused=404)),
-            *(Route(f"/api/track.{kind}", get(self._track, refused=409, run=copying)) for kind in KINDS),
-            Route("/api/report.html", get(self._report, refused=409, run=copying)),
+            get("/api/runs", self._runs),
+            get("/api/runs/{number:int}.yaml", self._yaml, refused=404),
+            get("/api/runs/{number:int}/against/{other:int}", self._difference, refused=404),
+            get("/api/around", self._around),
+            get("/api/noise", self._noise),
+            get("/api/tunings", self._tunings),
+            post("/api/tunings", self._keep),
+            post("/api/tunings/load", self._load),
+            get("/api/tunings/{name}/against", self._against, refused=404),
+            *(get(f"/api/track.{kind}", self._track, refused=409, run=copying) for kind in KINDS),
+            get("/api/report.html", self._report, refused=409, run=copying),
         ]
 
     def _runs(self) -> Any:
+        """Return every run with its changes and scores."""
         return runs_json(self.scores, self._engine)
 
     def _yaml(self, number: int) -> Response:
+        """Answer with the twin's YAML with the settings of a run."""
         run, twin = self._engine.revisions.find(number), self._engine.twin
         heading = f"# {twin.name}, run {run.number}" + (f": {run.name}" if run.name else "")
         notes = "".join(f"# {line}\n" for line in run.note.splitlines())
         text = f"{heading}\n{notes}{tuning_yaml(twin.config, run.estimator, run.tuning)}"
-        return PlainTextResponse(text, headers=_attachment(f"{twin.name}-run{run.number}.yaml"))
+        return PlainTextResponse(text, headers=self._attachment(number, ".yaml"))
 
     def _difference(self, number: int, other: int) -> Any:
-        return difference_json(self._engine.revisions.find(number), self._engine.revisions.find(other))
+        """Return the entries in which two runs differ."""
+        one, two = self._engine.revisions.find(number), self._engine.revisions.find(other)
+        return changes_json(difference(one.estimator, one.tuning, two.estimator, two.tuning))
 
     def _around(self, key: str = "") -> Any:
+        """Return the likelihood around the value of an entry."""
         return swept_json(self._sweeps.around(key))
 
     def _noise(self) -> Any:
+        """Return R and Q as estimated from the innovations."""
         return noise_json(noise(self._engine, self._sweeps))
 
     # Tuning versions
 
     def _tunings(self) -> Any:
+        """List the tuning versions."""
         twin = self._engine.twin
         return {"running": self._engine.status().tuning.name, "versions": listing(twin), "guard": last(twin.path)}
 
@@ -103,7 +108,7 @@ class RunsApi:
         return {"name": name}
 
     def _load(self, name: str) -> Any:
-        """Go on with a version; the history is folded again with it."""
+        """Load a version; the history is folded again with it."""
         load_into(self._engine, _listed(name))
         return {"name": name}
 
@@ -111,21 +116,23 @@ class RunsApi:
         """List the entries in which a version differs from the running tuning."""
         tuning, estimator = self._engine.folded_with()
         twin = with_version(self._engine.twin, _listed(name))
-        changes = difference(twin.estimator, twin.tuning, estimator, tuning)
-        return [{"key": change.key, "values": [change.before, change.after]} for change in changes]
+        return changes_json(difference(twin.estimator, twin.tuning, estimator, tuning))
 
-    # Files. A copy of the rows is taken first, in pieces, so that writing holds nobody up.
+    # Files: of a copy of the rows, so that writing holds up no other reader.
 
     def _track(
-        self, request: Request, run: int | None = None, since: float | None = None, until: float | None = None
+        self, request: Request, run: int | None = None, since: Seconds | None = None, until: Seconds | None = None
     ) -> Response:
         """Answer with the rows of a run (default: the running one) between two times of the charts, s."""
         rows = rows_of_run(self._engine, run)
         kind = request.url.path.rpartition(".")[2]
-        parts = encoded(kind, tables(rows, rows.between(self._instant("since", since), self._instant("until", until))))
+        origin = self._series.origin() or 0
+        start, end = (None if at is None else origin + round(at * 1e9) for at in (since, until))
+        parts = encoded(kind, tables(rows, rows.between(start, end)))
         ends = (request.query_params.get(name, "") for name in ("since", "until"))
         span = f"-{'-to-'.join(ends)}s" if {"since", "until"} & request.query_params.keys() else ""
-        return StreamingResponse(parts, media_type=KINDS[kind], headers=_attachment(f"{self._name(rows)}{span}.{kind}"))
+        headers = self._attachment(rows.run.number, f"{span}.{kind}")
+        return StreamingResponse(parts, media_type=KINDS[kind], headers=headers)
 
     def _report(self, run: int | None = None) -> Response:
         """Answer with the report of a run (default: the running one) as one file."""
@@ -143,7 +150,7 @@ class RunsApi:
             rows.marginal, tuple(about), bounds, _scored(self.scores), self._earlier(found, episodes),
         )  # fmt: skip
         text = to_html(f"{engine.twin.name}, run {found.number}", report(reported))
-        return HTMLResponse(text, headers=_attachment(f"{self._name(rows)}.html"))
+        return HTMLResponse(text, headers=self._attachment(found.number, ".html"))
 
     def _earlier(self, run: Revision, now: Sequence[Episode]) -> tuple[tuple[str, Sequence[Episode]], ...]:
         """Return the episodes of earlier runs that no later run has as well, newest run first."""
@@ -155,16 +162,10 @@ class RunsApi:
                 found.append((f"{other.number} {other.name}".rstrip() + f": {what_changed(other)}", new))
         return tuple(found)
 
-    def _instant(self, name: str, seconds: float | None) -> int | None:
-        """Return a time of the charts as one of the log, ns."""
-        if seconds is None:
-            return None
-        if not abs(seconds) < MAX_SECONDS:
-            raise ConfigError(f"track: {name} is {seconds}; it must be a number of seconds")
-        return (self._series.origin() or 0) + round(seconds * 1e9)
-
-    def _name(self, rows: RunRows) -> str:
-        return f"{self._engine.twin.name}-run{rows.run.number}"
+    def _attachment(self, number: int, rest: str) -> dict[str, str]:
+        """Return the header that names a file of a run."""
+        name = re.sub(r"[^\w.-]+", "_", f"{self._engine.twin.name}-run{number}{rest}", flags=re.ASCII)
+        return {"Content-Disposition": f'attachment; filename="{name}"'}
 
 
 def checked_note(note: str) -> str:
@@ -185,20 +186,14 @@ def _listed(name: str) -> str:
     return name
 
 
-def _attachment(name: str) -> dict[str, str]:
-    safe = re.sub(r"[^\w.-]+", "_", name, flags=re.ASCII)
-    return {"Content-Disposition": f'attachment; filename="{safe}"'}
-
-
 def _scored(scores: RunScores) -> tuple[tuple[str, ...], ...]:
     """Return a line for each run: name, change, NIS, log-likelihood, errors."""
-
-    def line(run: Revision, known: RunScore | None) -> tuple[str, ...]:
-        name = f"{run.number} {run.name}".rstrip()
-        if known is None:
-            return name, what_changed(run), "", "", "not scored: its track is gone"
-        fits = {**known.score.states, **known.score.held_out}
-        errors = ", ".join(f"{subject} {digits(fit.rmse)}" for subject, fit in list(fits.items())[:MAX_ERRORS])
-        return name, what_changed(run), digits(known.score.nis), f"{known.log_likelihood_reading:.4g}", errors
-
-    return tuple(line(run, known) for run, known in scores.all())
+    lines = []
+    for run, known in scores.all():
+        line = "", "", "not scored: its track is gone"
+        if known is not None:
+            fits = [*{**known.score.states, **known.score.held_out}.items()][:MAX_ERRORS]
+            errors = ", ".join(f"{subject} {digits(fit.rmse)}" for subject, fit in fits)
+            line = digits(known.score.nis), f"{known.log_likelihood_reading:.4g}", errors
+        lines.append((f"{run.number} {run.name}".rstrip(), what_changed(run), *line))
+    return tuple(lines)

@@ -14,13 +14,14 @@ from typing import TYPE_CHECKING, Any
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
 from starlette.requests import Request
-from starlette.responses import FileResponse, PlainTextResponse, Response
-from starlette.routing import Mount, Route, WebSocketRoute
+from starlette.responses import FileResponse, HTMLResponse, PlainTextResponse, Response
+from starlette.routing import BaseRoute, Mount, Route, WebSocketRoute
 from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocket
 
 from estimators.errors import ConfigError, NisusError
 
+from ..live.faults import catalogue_json
 from ..live.running_fold import Running
 from ..live.runs.refits import Refits
 from ..present.drawing.colors import EITHER, THEMES
@@ -35,20 +36,20 @@ from .fit_api import FitApi
 from .http import PAGE, OneAtATime, get, page_file, post
 from .runs_api import RunsApi
 from .streams import PageStream, feed_rerun
-from .twin_json import episodes_json, faults_json, model_json, status_json
+from .twin_json import episodes_json, model_json, status_json
 from .viewer_assets import FILES, viewer_assets, viewer_version
 from .viser_proxy import ViserProxy
 
 if TYPE_CHECKING:
     from ..views.viser.stage import Choices
 
-AWAITED_PERIOD_S = 0.5
+COMPILE_POLL_PERIOD_S = 0.5
 """Between two looks at whether the first filter is compiled."""
 
 CHART_FILES = sorted(path.name for path in (PAGE / "charts").glob("*.js"))
-"""Kinds of charts, one a file."""
+"""Kinds of charts, one per file."""
 
-FOR_EVER = "public, max-age=31536000, immutable"
+IMMUTABLE = "public, max-age=31536000, immutable"
 MEDIA_TYPES = {".js": "text/javascript", ".wasm": "application/wasm"}
 
 
@@ -69,20 +70,18 @@ class PageServer:
         """Take the port, if it is not open yet.
 
         Args:
-            engine: What to show.
+            engine: The running twin.
             port: On 127.0.0.1; 0 takes a free one. Or an open door, which shows this once it is started.
-            viser_port: Where the private Viser server listens; None if there is none.
-            secret: What Viser asks for.
-            review: The recording that is reviewed, offered beside those that this process writes.
+            viser_port: Port of the private Viser server; None if there is none.
+            secret: Secret of the Viser server.
+            review: The reviewed recording, offered beside those that this process writes.
             choices: Options of Viser's scene; None if there is no scene.
             refits: Fits of the last window; None for none.
 
         Raises:
-            ConfigError: If the port cannot be taken.
+            ConfigError: If the port is not free.
         """
-        self._engine = engine
-        self._review = review
-        self._choices = choices
+        self._engine, self._review, self._choices = engine, review, choices
         self.series = Series(engine)
         self._runs = RunsApi(engine, self.series)
         self.refits = refits or Refits(engine)
@@ -105,12 +104,12 @@ class PageServer:
         return self.door.url
 
     def start(self) -> threading.Event:
-        """Serve; the Rerun viewer's files are prepared later, if this machine does not have them yet."""
-        threading.Thread(target=self._prepare, name="viewer assets", daemon=True).start()
-        over = self.door.show(self.application, self._boot)
+        """Serve; return an event that is set once the application before has no connection left."""
+        threading.Thread(target=self._prepare_viewer, name="viewer assets", daemon=True).start()
+        disconnected = self.door.show(self.application, self._boot)
         if self._own_door:
             self.door.start()
-        return over
+        return disconnected
 
     def stop(self) -> None:
         """Stop all work, close all connections, and the port if it is this twin's own."""
@@ -118,37 +117,35 @@ class PageServer:
         if self._own_door:
             self.door.stop()
 
-    def _prepare(self) -> None:
-        # The first filter comes first, unless somebody looks at Explore already: both take all processors.
+    def _prepare_viewer(self) -> None:
+        """Unpack the Rerun viewer's files, after the first filter is compiled or once a browser opens Explore."""
         while self._engine.status().awaited is not None and not self._explored.is_set():
-            if self._stopping.wait(AWAITED_PERIOD_S):
+            if self._stopping.wait(COMPILE_POLL_PERIOD_S):
                 return
         try:
             self._assets.set_result(viewer_assets(lambda line: print(line, file=sys.stderr, flush=True)))
         except NisusError as error:
             self._assets.set_exception(error)
 
-    def _routes(self) -> list[Any]:
-        engine = self._engine
-        forecasting, diagnosing = OneAtATime("forecast"), OneAtATime("diagnosis")
-        routes: list[Any] = [
-            Route("/", get(lambda: self._page("index.html"))),
-            Route("/explore", get(lambda: self._page("explore.html"))),
-            Route("/alarms", get(self._alarms)),
-            Route("/api/status", get(self._state)),
-            Route("/api/model", get(lambda: model_json(engine))),
-            Route("/api/episodes", get(lambda: episodes_json(engine))),
-            Route("/api/faults", get(lambda: faults_json(engine))),
+    def _routes(self) -> list[BaseRoute]:
+        routes: list[BaseRoute] = [
+            get("/", self._index),
+            get("/explore", self._explore),
+            get("/alarms", self._alarms),
+            get("/api/status", self._status),
+            get("/api/model", self._model),
+            get("/api/episodes", self._episodes),
+            get("/api/faults", self._faults),
             *self._runs.routes(),
             *self._fit.routes(),
-            Route("/api/command", post(self._command, status=202), methods=["POST"]),
-            Route("/api/forecast", get(self._forecasts.may, refused=409)),
-            Route("/api/forecast", post(self._forecast, run=forecasting), methods=["POST"]),
-            Route("/api/diagnose", get(self._diagnosis.look, refused=503, run=diagnosing)),
-            Route("/api/scene", get(self._scene)),
-            Route("/api/scene", post(self._choose), methods=["POST"]),
-            Route("/api/recordings", get(self._list_recordings)),
-            Route("/rec/{name}", get(self._recording)),
+            post("/api/command", self._command, status=202),
+            get("/api/forecast", self._forecasts.may, refused=409),
+            post("/api/forecast", self._forecast, run=OneAtATime("forecast")),
+            get("/api/diagnose", self._diagnosis.look, refused=503, run=OneAtATime("diagnosis")),
+            get("/api/scene", self._scene),
+            post("/api/scene", self._choose),
+            get("/api/recordings", self._list_recordings),
+            get("/rec/{name}", self._recording),
             Route(f"/viewer/{viewer_version()}/{{name}}", self._viewer_file),
             WebSocketRoute("/api/stream", self._page_stream),
             WebSocketRoute("/rerun/stream", self._rerun_stream),
@@ -164,8 +161,16 @@ class PageServer:
 
     def _page(self, name: str) -> Response:
         settings = {"viewer": f"/viewer/{viewer_version()}", "boot": self._boot, "viser": self._viser is not None}
-        settings["charts"] = CHART_FILES
-        return page_file(name, settings | {"gallery": self.door.furnished, "stage_pass": self.door.stage_pass})
+        settings |= {"charts": CHART_FILES, "gallery": self.door.has_gallery, "stage_pass": self.door.stage_pass}
+        return page_file(name, settings)
+
+    def _index(self) -> Response:
+        """Answer with the page."""
+        return self._page("index.html")
+
+    def _explore(self) -> Response:
+        """Answer with a page of the Rerun viewer alone."""
+        return self._page("explore.html")
 
     def _alarms(self) -> Response:
         """Answer with docs/alarms.md, to which episodes refer."""
@@ -173,20 +178,38 @@ class PageServer:
             text = as_html(alarms_text())
         except ConfigError as error:
             return PlainTextResponse(f"Nisus: {error}\n", 404)
-        return Response((PAGE / "alarms.html").read_text().replace("{{text}}", text), media_type="text/html")
+        return HTMLResponse((PAGE / "alarms.html").read_text().replace("{{text}}", text))
 
-    def _state(self) -> dict[str, Any]:
-        scene = [] if self._choices is None else self._choices.json()
-        status = {**status_json(self._engine), "recordings": sorted(self._recordings()), "scene": scene}
-        reloads = getattr(self._engine, "reloads", 0)
-        return {**status, "unread": self.unread, "reloads": reloads, "refit": self._fit.brief()}
+    def _status(self) -> dict[str, Any]:
+        """Return the state of the twin."""
+        return status_json(self._engine) | {
+            "recordings": sorted(self._recordings()),
+            "scene": [] if self._choices is None else self._choices.json(),
+            "unread": self.unread,
+            "reloads": getattr(self._engine, "reloads", 0),
+            "refit": self._fit.brief(),
+        }
 
-    def _command(self, body: Any) -> Any:
+    def _model(self) -> dict[str, Any]:
+        """Return names, units and configured values of the twin, and the estimators."""
+        return model_json(self._engine)
+
+    def _episodes(self) -> list[dict[str, Any]]:
+        """Return all episodes by their start."""
+        return episodes_json(self._engine)
+
+    def _faults(self) -> dict[str, Any]:
+        """Return the faults that can be injected into the source."""
+        return catalogue_json(self._engine.source, self._engine.model)
+
+    def _command(self, body: Any) -> dict[str, str]:
+        """Carry out `{"command": NAME, field: value, ...}` (app/live/commands.py)."""
         command = command_from_json(body, self._engine)
         self._engine.submit(command)
         return {"submitted": type(command).__name__}
 
     def _forecast(self, body: Any) -> Any:
+        """Forecast from the present estimate."""
         return self._forecasts.ask(question_from_json(body, self._engine.model))
 
     def _scene(self) -> Any:
@@ -196,6 +219,7 @@ class PageServer:
         return self._choices.json()
 
     def _choose(self, key: str, value: str) -> Any:
+        """Choose an option of the scene."""
         if self._choices is not None:
             self._choices.choose(key, value)
         return self._scene()
@@ -209,9 +233,8 @@ class PageServer:
             folder = await asyncio.wrap_future(self._assets)
         except NisusError as error:
             return PlainTextResponse(f"{error}\n", 503)
-        path = folder / f"{name}.gz"
-        headers = {"Cache-Control": FOR_EVER, "Vary": "Accept-Encoding"}
-        media_type = MEDIA_TYPES[Path(name).suffix]
+        path, media_type = folder / f"{name}.gz", MEDIA_TYPES[Path(name).suffix]
+        headers = {"Cache-Control": IMMUTABLE, "Vary": "Accept-Encoding"}
         if "gzip" in request.headers.get("accept-encoding", ""):
             return FileResponse(path, media_type=media_type, headers={**headers, "Content-Encoding": "gzip"})
         content = await run_in_threadpool(lambda: gzip.decompress(path.read_bytes()))
@@ -223,18 +246,20 @@ class PageServer:
         paths = [*(recorder.finished if recorder is not None else ()), *([self._review] if self._review else [])]
         return {path.name: path for path in paths}
 
-    def _list_recordings(self) -> Any:
+    def _list_recordings(self) -> list[dict[str, Any]]:
+        """Return names and sizes of the recordings of this process."""
         found = {name: path for name, path in self._recordings().items() if path.is_file()}
         return [{"name": name, "bytes": path.stat().st_size} for name, path in sorted(found.items())]
 
     def _recording(self, name: str) -> Response:
+        """Answer with a recording."""
         path = self._recordings().get(name)
         if path is None or not path.is_file():
             return PlainTextResponse("Nisus: this process has no such recording.\n", 404)
         return FileResponse(path, media_type="application/octet-stream", filename=path.name)
 
     async def _page_stream(self, browser: WebSocket) -> None:
-        await PageStream(browser, self._engine, self.series, self._state, self._boot).run()
+        await PageStream(browser, self._engine, self.series, self._status, self._boot).run()
 
     async def _rerun_stream(self, browser: WebSocket) -> None:
         await browser.accept()
@@ -245,5 +270,9 @@ class PageServer:
 
     def _rerun_status(self) -> dict[str, Any]:
         origin = self.series.origin()
-        status = {"status": status_json(self._engine), "boot": self._boot, "recordings": sorted(self._recordings())}
-        return status | {"origin": None if origin is None else str(origin)}
+        return {
+            "status": status_json(self._engine),
+            "boot": self._boot,
+            "recordings": sorted(self._recordings()),
+            "origin": None if origin is None else str(origin),
+        }

@@ -37,22 +37,21 @@ class GalleryApi:
         door = gallery.session.door
         assert door is not None, "a gallery needs a page"
         self._door = door
-        page = get(self._page)
         routes = [
-            Route("/gallery", page),
+            get("/gallery", self._page),
             Mount("/page", StaticFiles(directory=PAGE)),
-            Route("/api/session", get(self.state)),
-            Route("/api/gallery", get(self._cards)),
-            Route("/api/gallery/start", post(self._start, status=202), methods=["POST"]),
-            Route("/api/gallery/stop", post(self._stop), methods=["POST"]),
-            Route("/api/gallery/picture", get(self._picture)),
-            Route("/api/gallery/recordings", get(self._list)),
-            Route("/api/gallery/recordings/open", post(self._open, status=202), methods=["POST"]),
-            Route("/api/gallery/recordings/delete", post(self._delete), methods=["POST"]),
+            get("/api/session", self.state),
+            get("/api/gallery", self._cards),
+            post("/api/gallery/start", self._start, status=202),
+            post("/api/gallery/stop", self._stop),
+            get("/api/gallery/picture", self._picture),
+            get("/api/gallery/recordings", self._list),
+            post("/api/gallery/recordings/open", self._open, status=202),
+            post("/api/gallery/recordings/delete", self._delete),
             Route("/api/gallery/recordings/drop", self._drop, methods=["POST"]),
-            Route("/recordings/{name}", get(self._download)),
+            get("/recordings/{name}", self._download),
         ]
-        door.furnish(routes, Starlette(routes=[Route("/", page)]))
+        door.add_gallery(routes, Starlette(routes=[get("/", self._page)]))
 
     def _page(self) -> Response:
         return page_file("gallery.html", {"boot": self._door.boot})

@@ -13,7 +13,7 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 from app.views.viser import guarded_server as private_viser
 from app.web import door
-from app.web.door import CONNECTIONS
+from app.web.door import MAX_CONNECTIONS as CONNECTIONS
 from app.web.http import MAX_BODY_BYTES as BODY
 from tests.app.scripted import readings, wait_for
 from tests.app.served import PATIENCE

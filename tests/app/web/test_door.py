@@ -137,7 +137,7 @@ def test_a_port_in_use_is_one_line(page):
 
 
 def test_it_listens_on_loopback_only(page):
-    assert {listener.getsockname()[0] for listener in page.server.door._listening.sockets} <= {"127.0.0.1", "::1"}
+    assert {listener.getsockname()[0] for listener in page.server.door.sockets} <= {"127.0.0.1", "::1"}
 
 
 # The stage, framed under the other name of this machine, where the browser sends no cookie

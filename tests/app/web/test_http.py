@@ -14,7 +14,7 @@ from estimators.errors import ConfigError
 from estimators.models import MODELS
 
 
-def answer(endpoint, body=b"", query=""):
+def answer(route, body=b"", query=""):
     """Status and body of the answer to a request."""
 
     async def receive():
@@ -22,30 +22,30 @@ def answer(endpoint, body=b"", query=""):
 
     headers = [(b"content-type", b"application/json")]
     scope = {"type": "http", "method": "POST", "path": "/api/x", "query_string": query.encode(), "headers": headers}
-    response = asyncio.run(endpoint(Request(scope, receive)))
+    response = asyncio.run(route.endpoint(Request(scope, receive)))
     return response.status_code, bytes(response.body).decode()
 
 
 @pytest.mark.parametrize("body", [b"", b"{", b"\xff\xfe", b"[" * 30_000, b"1" * 5000])
 def test_a_body_that_is_no_json_is_refused(body):
-    status, text = answer(post(lambda body: body), body)
+    status, text = answer(post("/api/x", lambda body: body), body)
     assert status == 400 and "the body is no JSON" in text
 
 
 def test_a_body_becomes_arguments():
-    assert answer(post(lambda body: body), b"[1]") == (200, "[1]")
+    assert answer(post("/api/x", lambda body: body), b"[1]") == (200, "[1]")
 
     def keep(run: int, name: str, note: str = "") -> list:
         return [run, name, note]
 
-    assert answer(post(keep, status=202), b'{"run": 3, "name": "a"}') == (202, '[3,"a",""]')
+    assert answer(post("/api/x", keep, status=202), b'{"run": 3, "name": "a"}') == (202, '[3,"a",""]')
     for body, words in (
         ({"run": "3", "name": "a"}, "x: run is '3'; it must be a whole number"),
         ({"run": 3}, "x: name is missing; it takes run, name, note"),
         ({"run": 3, "nam": "a"}, "nam is not known; did you mean name?"),
         ([], "it must be an object of run, name, note"),
     ):
-        status, text = answer(post(keep), json.dumps(body).encode())
+        status, text = answer(post("/api/x", keep), json.dumps(body).encode())
         assert status == 400 and words in json.loads(text)["error"]
 
 
@@ -53,9 +53,9 @@ def test_a_query_becomes_arguments():
     def look(run: int | None = None, since: float = 0.0) -> list:
         return [run, since]
 
-    assert answer(get(look), query="run=3&since=2.5&other=1") == (200, "[3,2.5]")
-    assert answer(get(look)) == (200, "[null,0.0]")
-    status, text = answer(get(look, refused=409), query="run=three")
+    assert answer(get("/api/x", look), query="run=3&since=2.5&other=1") == (200, "[3,2.5]")
+    assert answer(get("/api/x", look)) == (200, "[null,0.0]")
+    status, text = answer(get("/api/x", look, refused=409), query="run=three")
     assert status == 409 and "x: run is 'three'; it must be a whole number" in text
 
 

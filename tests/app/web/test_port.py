@@ -7,7 +7,7 @@ import pytest
 import app.cli.open_twin
 import app.cli.run
 from app.cli.main import main
-from app.web.port import check_port
+from app.web.door import check_port
 from estimators.errors import ConfigError
 
 
