@@ -1,6 +1,6 @@
-"""The schema of a learned correction: a YAML of its own, which a twin's YAML names under `learned`.
+"""Schemas of files beside a twin's YAML: learned corrections, tuning versions, recorded scores.
 
-It holds the training windows, so that the correction can be computed from them anywhere. The docstring under each field
+A correction holds its training windows, so that it can be computed from them anywhere. The docstring under each field
 is its documentation.
 """
 
@@ -9,10 +9,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import BeforeValidator, Field, ValidationError, model_validator
-from pydantic_core import PydanticCustomError
-
-from estimators.errors import ConfigError
+from pydantic import BeforeValidator, Field, model_validator
 
 from .fields import (
     Count,
@@ -28,10 +25,11 @@ from .fields import (
     Text,
     Texts,
     as_list,
+    refused,
 )
-from .problems import report, shown
+from .problems import check_section
 from .schema import EstimatorSection, GateProbability, GateSection, NormalSection, PriorSection, as_estimator, as_gate
-from .yaml_files import ValuePlaces, parse, read_text, shown_path
+from .yaml_files import ValuePlaces, read_text
 
 Table = Annotated[tuple[Annotated[tuple[Number, ...], Field(min_length=1)], ...], Field(min_length=2)]
 
@@ -89,31 +87,19 @@ class CorrectionSection(Section):
         needs = {"gp": ("rates", "lengths", "ratio"), "ridge": ("rates", "penalty"), "net": ("net",)}[self.kind]
         for key in needs:
             if getattr(self, key) is None:
-                raise PydanticCustomError(
-                    "neither", "is of kind {kind} and has no {key}", {"kind": self.kind, "key": key}
-                )
-        sizes = {"points": len(self.features), "rates": len(self.corrects)}
-        for key, size in sizes.items():
+                raise refused("absent", f"is of kind {self.kind} and has no {key}")
+        for key, size in (("points", len(self.features)), ("rates", len(self.corrects))):
             wrong = next((row for row in getattr(self, key) or () if len(row) != size), None)
             if wrong is not None:
-                raise PydanticCustomError(
-                    "length", "has a row of {n} numbers; each needs {size}", {"n": len(wrong), "size": size, "key": key}
-                )
+                raise refused("relation", f"has a row of {len(wrong)} numbers; each needs {size}", key)
         if self.rates is not None and len(self.rates) != len(self.points):
-            raise PydanticCustomError(
-                "length", "has {n} rows; points has {size}",
-                {"n": len(self.rates), "size": len(self.points), "key": "rates"},
-            )  # fmt: skip
+            raise refused("relation", f"has {len(self.rates)} rows; points has {len(self.points)}", "rates")
         if self.lengths is not None and len(self.lengths) != len(self.features):
-            raise PydanticCustomError(
-                "length", "has {n} numbers; it needs one for each of {size} features",
-                {"n": len(self.lengths), "size": len(self.features), "key": "lengths"},
-            )  # fmt: skip
+            text = f"has {len(self.lengths)} numbers; it needs one for each of {len(self.features)} features"
+            raise refused("relation", text, "lengths")
         if set(self.noise) != set(self.corrects):
-            raise PydanticCustomError(
-                "length", "names {names}; it must name each corrected state, and no other",
-                {"names": ", ".join(self.noise) or "nothing", "key": "noise"},
-            )  # fmt: skip
+            text = f"names {', '.join(self.noise) or 'nothing'}; it must name each corrected state, and no other"
+            raise refused("relation", text, "noise")
         return self
 
 
@@ -123,15 +109,9 @@ def load_correction(path: Path) -> tuple[CorrectionSection, ValuePlaces]:
     Raises:
         ConfigError: With a line for each of the first problems.
     """
-    file = shown_path(path)
-    data, places = parse(read_text(path, "nisus learn --help"), file)
-    if not isinstance(data, dict):
-        what = "empty" if data is None else shown(data)
-        raise ConfigError(f"{file}:1: the file is {what}; a correction is a mapping, written by `nisus learn`")
-    try:
-        return CorrectionSection.model_validate(data), places
-    except ValidationError as error:
-        raise report(error, data, places) from None
+    text = read_text(path, "nisus learn --help")
+    section, _, places = check_section(CorrectionSection, text, path, "a correction is a mapping, see `nisus learn`")
+    return section, places
 
 
 class TunedSensorSection(SpreadSection):
@@ -241,11 +221,8 @@ class FigureSection(Section):
     @model_validator(mode="after")
     def _alike(self) -> FigureSection:
         if len(self.values) != len(self.allowed):
-            raise PydanticCustomError(
-                "length",
-                "has {n} entries; values has {m}",
-                {"n": len(self.allowed), "m": len(self.values), "key": "allowed"},
-            )
+            text = f"has {len(self.allowed)} entries; values has {len(self.values)}"
+            raise refused("relation", text, "allowed")
         return self
 
 
@@ -273,14 +250,9 @@ class ReferenceSection(Section):
     def _complete(self) -> ReferenceSection:
         folds = len(self.events) * self.seeds
         if len(self.sums) != len(self.events):
-            raise PydanticCustomError(
-                "length", "has {n} entries; events has {m}", {"n": len(self.sums), "m": len(self.events), "key": "sums"}
-            )
+            raise refused("relation", f"has {len(self.sums)} entries; events has {len(self.events)}", "sums")
         for name, each in self.figures.items():
             if len(each.values) != folds:
-                raise PydanticCustomError(
-                    "length",
-                    "has {name} of {n} folds; there are {m}",
-                    {"name": name, "n": len(each.values), "m": folds, "key": "figures"},
-                )
+                text = f"has {name} of {len(each.values)} folds; there are {folds}"
+                raise refused("relation", text, "figures")
         return self

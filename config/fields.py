@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Discriminator, Field, Tag, model_validator
@@ -11,17 +11,30 @@ from pydantic_core import PydanticCustomError
 
 from estimators.errors import LARGEST
 
-LONGEST = 1e9
+MAX_DURATION_S = 1e9
 """Seconds that anything may last: 32 years."""
 
-LATEST = 9e9
+MAX_TIME_S = 9e9
 """Seconds from 1970 until the year 2255: times are int64 nanoseconds, which end soon after."""
+
+
+def refused(kind: Literal["value", "relation", "both", "absent"], text: str, key: str = "") -> PydanticCustomError:
+    """Return an error, which `problems.report` completes to a line with place, key and value.
+
+    Args:
+        kind: value: of a single value. relation: of the section's `key` with others. both: of a section with a key too
+            many, `key`. absent: of a section that lacks a key.
+        text: Rule that a value breaks; for the other kinds the words after the name of the key or section.
+        key: The key that is at fault.
+    """
+    return PydanticCustomError(kind, "{text}", {"text": text, "key": key})
+
 
 Number = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-LARGEST, le=LARGEST)]
 Positive = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=0, le=LARGEST)]
 NotNegative = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0, le=LARGEST)]
-Seconds = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=0, le=LONGEST)]
-SomeSeconds = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0, le=LONGEST)]
+Seconds = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=0, le=MAX_DURATION_S)]
+SomeSeconds = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0, le=MAX_DURATION_S)]
 TIME_UNITS = {"ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0}
 """Units in which a duration may be given, in seconds."""
 
@@ -35,11 +48,11 @@ def as_seconds(value: Any) -> Any:
         return float(number) * TIME_UNITS[unit]
     except (ValueError, KeyError):
         rule = f"give seconds, or a number with one of {', '.join(TIME_UNITS)}, as in 5 min"
-        raise PydanticCustomError("duration", "{rule}", {"rule": rule}) from None
+        raise refused("value", rule) from None
 
 
 Duration = Annotated[Seconds, BeforeValidator(as_seconds, json_schema_input_type=Seconds | str)]
-Time = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-LATEST, le=LATEST)]
+Time = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-MAX_TIME_S, le=MAX_TIME_S)]
 Count = Annotated[int, Field(strict=True, ge=1)]
 Option = Number | Annotated[str, Field(min_length=1)]
 Flag = Annotated[bool, Field(strict=True)]
@@ -90,11 +103,9 @@ def one_of(section: Section, *keys: str, required: bool) -> None:
     """Refuse a section that gives two of `keys`, or none where one is needed."""
     given = [key for key in keys if getattr(section, key) is not None]
     if len(given) > 1:
-        raise PydanticCustomError(
-            "both", "gives both {first} and {second}", {"first": given[0], "second": given[1], "key": given[1]}
-        )
+        raise refused("both", f"gives both {given[0]} and {given[1]}", given[1])
     if required and not given:
-        raise PydanticCustomError("neither", "gives neither {keys}", {"keys": " nor ".join(keys)})
+        raise refused("absent", f"gives neither {' nor '.join(keys)}")
 
 
 class BoundedSection(Section):
@@ -111,11 +122,8 @@ class BoundedSection(Section):
     def _inside(self) -> BoundedSection:
         for value in self.value:
             if not self.low <= value <= self.to:
-                raise PydanticCustomError(
-                    "order",
-                    "is {value}; it must lie between from ({low}) and to ({high})",
-                    {"value": f"{value:g}", "low": f"{self.low:g}", "high": f"{self.to:g}", "key": "value"},
-                )
+                text = f"is {value:g}; it must lie between from ({self.low:g}) and to ({self.to:g})"
+                raise refused("relation", text, "value")
         return self
 
 
@@ -146,7 +154,7 @@ class LevelSection(Section):
         for key in ("variance", "std"):
             given = getattr(self, key)
             if isinstance(given, BoundedSection) and len(given.value) > 1:
-                raise PydanticCustomError("length", "has several values; give one", {"key": key})
+                raise refused("relation", "has several values; give one", key)
         return self
 
     @property
@@ -259,22 +267,22 @@ def _as_pairs(value: Any) -> Any:
     if not isinstance(value, (list, tuple)) or any(isinstance(item, (list, tuple)) for item in value):
         return value
     if len(value) != 2:
-        raise PydanticCustomError("range", "give the least and the greatest value, null for none")
+        raise refused("value", "give the least and the greatest value, null for none")
     return [value]
 
 
 def _rising(pairs: tuple[Pair, ...]) -> tuple[Pair, ...]:
     for low, high in pairs:
         if low is not None and high is not None and not low < high:
-            raise PydanticCustomError("range", "the first must be below the second")
+            raise refused("value", "the first must be below the second")
     return pairs
 
 
 def _holds_something(given: RangeSection) -> RangeSection:
     if given.min is None and given.max is None:
-        raise PydanticCustomError("neither", "gives neither {keys}", {"keys": "min nor max"})
+        raise refused("absent", "gives neither min nor max")
     if given.min is not None and given.max is not None and not given.min < given.max:
-        raise PydanticCustomError("range", "its min must be below its max")
+        raise refused("value", "its min must be below its max")
     return given
 
 
@@ -312,7 +320,7 @@ class StuckSection(Section):
     def _one(self) -> StuckSection:
         one_of(self, "readings", "seconds", required=False)
         if self.readings is None and self.seconds is None and self.quantum is None:
-            raise PydanticCustomError("neither", "gives neither {keys}", {"keys": "readings, seconds nor quantum"})
+            raise refused("absent", "gives neither readings, seconds nor quantum")
         return self
 
 

@@ -1,23 +1,24 @@
-"""What pydantic found wrong, as lines that a user can act on: `file:line: key is value; rule`."""
+"""Check YAML against a schema; report errors of pydantic as `file:line: key is value; rule`."""
 
 from __future__ import annotations
 
 import re
-from typing import Any, get_args
+from pathlib import Path
+from typing import Any, TypeVar, get_args
 
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
 from estimators.errors import ConfigError, nearest
 
 from .source_schema import PartSection, SourceSection
-from .yaml_files import Key, ValuePlaces, dotted
+from .yaml_files import Key, ValuePlaces, dotted, parse, shown_path
 
-MOST = 5
+MAX_PROBLEMS = 5
 """Problems shown at once."""
 
-FEW = 8
-"""Words up to which all that a value may be are shown; of more, the near ones."""
+MAX_LISTED_WORDS = 8
+"""Choices up to which all are listed; of more, the nearest ones."""
 
 
 def shown(value: Any) -> str:
@@ -37,6 +38,31 @@ def shown(value: Any) -> str:
     return str(value) if len(str(value)) <= 60 else str(value)[:57] + "..."
 
 
+S = TypeVar("S", bound=BaseModel)
+
+
+def check_section(kind: type[S], text: str, path: Path, rule: str) -> tuple[S, dict[str, Any], ValuePlaces]:
+    """Check YAML against a schema; return the section, the data, and the place of each value.
+
+    Args:
+        kind: The schema.
+        text: The YAML.
+        path: Its file.
+        rule: What the file must be, if it is no mapping.
+
+    Raises:
+        ConfigError: With a line for each of the first problems.
+    """
+    file = shown_path(path)
+    data, places = parse(text, file)
+    if not isinstance(data, dict):
+        raise ConfigError(f"{file}:1: the file is {shown(data)}; {rule}")
+    try:
+        return kind.model_validate(data), data, places
+    except ValidationError as error:
+        raise report(error, data, places) from None
+
+
 def report(error: ValidationError, data: Any, places: ValuePlaces) -> ConfigError:
     """Return one ConfigError with a line for each of the first problems."""
     found: dict[tuple, str] = {}  # One line a key: pydantic repeats itself for each kind that a value might have been.
@@ -48,9 +74,9 @@ def report(error: ValidationError, data: Any, places: ValuePlaces) -> ConfigErro
         place = (key, problem["loc"][-1] if problem["type"] == "missing" else None)
         found.setdefault(place, _line(problem, key, value, places))
     lines = list(found.values())
-    more = len(lines) - MOST
+    more = len(lines) - MAX_PROBLEMS
     if more > 0:
-        lines[MOST:] = [f"{places.file}: and {more} more"]
+        lines[MAX_PROBLEMS:] = [f"{places.file}: and {more} more"]
     return ConfigError("\n".join(lines))
 
 
@@ -64,12 +90,12 @@ def _line(problem: ErrorDetails, key: Key, value: Any, places: ValuePlaces) -> s
     if kind == "unknown_key":
         stray = (*key, context["key"])
         return f"{places.at(stray)}: {dotted(stray)} is not known; {nearest(context['key'], context['known'])}"
-    if kind in ("length", "order"):
+    if kind == "relation":
         key = (*key, context["key"])
         return f"{places.at(key)}: {dotted(key)} {problem['msg']}"
     if kind == "both":
         return f"{places.at((*key, context['key']))}: {dotted(key)} {problem['msg']}; keep one"
-    if kind == "neither":
+    if kind == "absent":
         return f"{places.at(key)}: {dotted(key)} {problem['msg']}; add it"
     if kind == "union_tag_not_found":
         return f"{places.at(key)}: {dotted((*key, 'type'))} is missing; {_choices(problem)}"
@@ -125,7 +151,7 @@ def _rule(kind: str, context: dict[str, Any], text: str, value: Any) -> str:
         return f"it must be below {context['lt']:g}"
     if kind == "literal_error":
         words = re.findall(r"'([^']*)'", context["expected"])
-        return nearest(str(value), words) if len(words) > FEW else f"it must be {context['expected']}"
+        return nearest(str(value), words) if len(words) > MAX_LISTED_WORDS else f"it must be {context['expected']}"
     if kind == "too_short":
         return f"it needs {context['min_length']} or more entries"
     if kind == "too_long":

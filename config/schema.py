@@ -9,10 +9,9 @@ import json
 from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, model_validator
-from pydantic_core import PydanticCustomError
 
 from .fields import (
-    LONGEST,
+    MAX_DURATION_S,
     Count,
     DuplicatesSection,
     Duration,
@@ -34,6 +33,7 @@ from .fields import (
     Texts,
     Time,
     Validity,
+    refused,
 )
 from .source_schema import FaultSection, SourceSection
 
@@ -170,17 +170,14 @@ class TimeSection(Section):
     `nisus fold` prints. Default: auto."""
     late_allowed: Seconds = 0.25
     """Seconds that one rewind may take, for late: auto. Default: 0.25."""
-    tick: Annotated[float, Field(strict=True, ge=0.01, le=LONGEST)] = 0.5
+    tick: Annotated[float, Field(strict=True, ge=0.01, le=MAX_DURATION_S)] = 0.5
     """Seconds without a measurement after which the estimate is predicted and shown. Default: 0.5."""
 
     @model_validator(mode="after")
     def _order(self) -> TimeSection:
         if self.degraded_after is not None and self.stale_after < self.degraded_after:
-            raise PydanticCustomError(
-                "order",
-                "is {value} s; it must not be below degraded_after ({other} s)",
-                {"value": self.stale_after, "other": self.degraded_after, "key": "stale_after"},
-            )
+            text = f"is {self.stale_after} s; it must not be below degraded_after ({self.degraded_after} s)"
+            raise refused("relation", text, "stale_after")
         return self
 
 
@@ -231,11 +228,11 @@ class SceneSection(Section):
     def _complete(self) -> SceneSection:
         needed = {"vehicle": "position", "motor": "parts", "battery": "charge", "gripper": "states"}.get(self.kind)
         if needed is not None and not getattr(self, needed):
-            raise PydanticCustomError("neither", "is a {kind} and has no {keys}", {"kind": self.kind, "keys": needed})
+            raise refused("absent", f"is a {self.kind} and has no {needed}")
         if self.kind == "gripper" and len(self.states or ()) < 3:
-            raise PydanticCustomError("neither", "is a gripper and has not all of surface, depth and contact", {})
+            raise refused("absent", "is a gripper and has not all of surface, depth and contact")
         if self.temperature and len(self.temperature) != len(self.charge or ()):
-            raise PydanticCustomError("neither", "has not as many temperatures as states of charge", {})
+            raise refused("absent", "has not as many temperatures as states of charge")
         return self
 
 

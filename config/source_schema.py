@@ -6,10 +6,9 @@ from abc import abstractmethod
 from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, model_validator
-from pydantic_core import PydanticCustomError
 
 from .fields import (
-    LONGEST,
+    MAX_DURATION_S,
     Count,
     LevelSection,
     Number,
@@ -25,6 +24,7 @@ from .fields import (
     Time,
     as_list,
     one_of,
+    refused,
 )
 
 
@@ -91,25 +91,16 @@ class ChannelSection(Section):
         for key in ("units", "scale", "offset"):
             values = getattr(self, key)
             if values is not None and len(values) not in (1, count):
-                raise PydanticCustomError(
-                    "length",
-                    "has {have} entries; give one, or one for each of the {count} values",
-                    {"have": len(values), "count": count, "key": key},
-                )
+                text = f"has {len(values)} entries; give one, or one for each of the {count} values"
+                raise refused("relation", text, key)
         own = self.accuracy
         for word, entries in (("names", own.names), ("units has", own.units), ("scale has", own.scale)) if own else ():
             if entries is not None and len(entries) not in (1, count):
-                raise PydanticCustomError(
-                    "length",
-                    "{word} {have}; give one, or one for each of the {count} values",
-                    {"word": word, "have": len(entries), "count": count, "key": "accuracy"},
-                )
+                text = f"{word} {len(entries)}; give one, or one for each of the {count} values"
+                raise refused("relation", text, "accuracy")
         if self.convert == "east_north" and count != 2:
-            raise PydanticCustomError(
-                "length",
-                "is east_north; it needs two values, latitude and longitude, and {count} are named",
-                {"count": count, "key": "convert"},
-            )
+            text = f"is east_north; it needs two values, latitude and longitude, and {count} are named"
+            raise refused("relation", text, "convert")
         return self
 
 
@@ -188,13 +179,9 @@ class ProfileSection(Section):
         if self.steps is not None:
             times = [t for t, _ in self.steps]
             if any(b <= a for a, b in zip(times, times[1:], strict=False)):
-                raise PydanticCustomError("order", "must have rising times; put them in order", {"key": "steps"})
+                raise refused("relation", "must have rising times; put them in order", "steps")
         if self.repeat is not None and (self.steps is None or self.repeat <= self.steps[-1][0]):
-            raise PydanticCustomError(
-                "order",
-                "is {value} s; it needs steps that all begin before it",
-                {"value": self.repeat, "key": "repeat"},
-            )
+            raise refused("relation", f"is {self.repeat} s; it needs steps that all begin before it", "repeat")
         return self
 
 
@@ -240,7 +227,7 @@ class AssetSection(Section):
 
     seed: Annotated[int, Field(strict=True, ge=0)] = 0
     """Seed of the noise; the same seed gives the same run. Default: 0."""
-    step: Annotated[float, Field(strict=True, ge=1e-6, le=LONGEST)] = 1.0
+    step: Annotated[float, Field(strict=True, ge=1e-6, le=MAX_DURATION_S)] = 1.0
     """Seconds between two steps of the simulation. Default: 1."""
     duration: Seconds | None = None
     """Seconds after which it ends. Default: null, never."""

@@ -10,13 +10,11 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from pydantic import ValidationError
-
 from estimators.errors import ConfigError, nearest
 
 from .companion_schema import TuningSection, VersionSection
-from .problems import report, shown
-from .yaml_files import Key, ValuePlaces, parse, read_text, shown_path
+from .problems import check_section
+from .yaml_files import Key, ValuePlaces, read_text, shown_path
 
 OWN = "own"
 """The name under which what the twin's file itself says is listed."""
@@ -115,15 +113,8 @@ def load_version(path: Path) -> Version:
 
 def version_of(name: str, text: str, path: Path) -> Version:
     """Check a version that has been read already; raises as `load_version`."""
-    file = shown_path(path)
-    data, places = parse(text, file)
-    if not isinstance(data, dict):
-        what = "empty" if data is None else shown(data)
-        raise ConfigError(f"{file}:1: the file is {what}; a tuning version is a mapping that begins with `version:`")
-    try:
-        section = TuningSection.model_validate(data)
-    except ValidationError as error:
-        raise report(error, data, places) from None
+    rule = "a tuning version is a mapping that begins with `version:`"
+    section, data, places = check_section(TuningSection, text, path, rule)
     return Version(name, path, text, data, section, places)
 
 

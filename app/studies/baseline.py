@@ -30,12 +30,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from pydantic import ValidationError
 from scipy.stats import t as student
 
 from config.companion_schema import FigureSection, ReferenceSection
-from config.problems import report, shown
-from config.yaml_files import as_flow, parse, read_text, shown_path, writing
+from config.problems import check_section
+from config.yaml_files import as_flow, read_text, writing
 from estimators.diagnostics.field_pictures import Picture
 from estimators.diagnostics.health import PROBABILITY
 from estimators.diagnostics.score import score
@@ -269,14 +268,8 @@ def read_baseline(path: Path) -> ReferenceSection | None:
     """
     if not path.is_file():
         return None
-    file = shown_path(path)
-    data, places = parse(read_text(path, "nisus guard --accept"), file)
-    if not isinstance(data, dict):
-        raise ConfigError(f"{file}:1: the file is {shown(data)}; write it anew with `nisus guard --accept`")
-    try:
-        return ReferenceSection.model_validate(data)
-    except ValidationError as error:
-        raise report(error, data, places) from None
+    text = read_text(path, "nisus guard --accept")
+    return check_section(ReferenceSection, text, path, "write it anew with `nisus guard --accept`")[0]
 
 
 def write_baseline(path: Path, name: str, found: ReferenceSection) -> None:
