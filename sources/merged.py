@@ -10,7 +10,7 @@ import numpy as np
 from estimators.errors import SourceError
 from estimators.log import Events
 
-from .source import Endless, Source, span_of
+from .source import Source, is_endless, span_of
 
 
 class Merged:
@@ -45,7 +45,7 @@ class Merged:
     @property
     def endless(self) -> bool:
         """Whether one of them has no end."""
-        return any(isinstance(source, Endless) and source.endless for source in self._sources)
+        return any(map(is_endless, self._sources))
 
     def read(self, timeout: float) -> Events | None:
         """Return the next events of all sources, up to the earliest time to which every one of them is known."""

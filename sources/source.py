@@ -41,25 +41,7 @@ class Source(Protocol):
 
 
 @runtime_checkable
-class Spanned(Protocol):
-    """A source with a time span that can be known before reading."""
-
-    @property
-    def span(self) -> tuple[int, int] | None:
-        """First and last time, ns; None if not known."""
-
-
-@runtime_checkable
-class Endless(Protocol):
-    """A source that may be endless."""
-
-    @property
-    def endless(self) -> bool:
-        """Whether it has no end."""
-
-
-@runtime_checkable
-class Paced(Source, Spanned, Protocol):
+class Paced(Source, Protocol):
     """A source with controls of its time, from any thread while another reads."""
 
     speed: float
@@ -84,8 +66,19 @@ class Paced(Source, Spanned, Protocol):
 
 
 def span_of(source: Source) -> tuple[int, int] | None:
-    """Return first and last time of a source, ns; None if not known."""
-    return source.span if isinstance(source, Spanned) else None
+    """Return first and last time of a source, ns; None if not known before it is read."""
+    return getattr(source, "span", None)
+
+
+def is_endless(source: Source) -> bool:
+    """Return whether a source has no end."""
+    return getattr(source, "endless", False)
+
+
+def controls_of(source: Source) -> Paced | None:
+    """Return the controls of a source's time, also of one behind faults; None if it sets its own pace."""
+    inner = getattr(source, "inner", source)
+    return inner if isinstance(inner, Paced) else None
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from estimators.fold_checks import check_variances
 from estimators.log import RESET, Events
 from estimators.model.state_space import StateSpaceModel
 from estimators.registry import checked, find_estimator
-from sources.source import Paced, Source, span_of
+from sources.source import Source, controls_of, span_of
 
 from ..ingest import maintenance_text
 from . import commands
@@ -178,7 +178,7 @@ def check_playback(command: Any) -> None:
 
 def playback_status(source: Source) -> dict[str, Any]:
     """Return the fields of a status that follow from the source: paused, speed, seekable, span (ns)."""
-    paced = source if isinstance(source, Paced) else None
+    paced = controls_of(source)
     return {
         "paused": paced is not None and paced.paused,
         "speed": paced.speed if paced is not None else None,
@@ -194,14 +194,15 @@ def play(source: Source, command: Any, first: int) -> None:
         ConfigError: If the source cannot be paused or sought, or as `check_playback`.
     """
     check_playback(command)
-    if not isinstance(source, Paced):
+    paced = controls_of(source)
+    if paced is None:
         raise ConfigError("a live source cannot be paused, stepped or sought; only a replay or a simulation can")
     if isinstance(command, commands.Pause):
-        source.pause() if command.paused else source.resume()
+        paced.pause() if command.paused else paced.resume()
     elif isinstance(command, commands.Speed):
-        source.set_speed(command.factor)
+        paced.set_speed(command.factor)
     elif isinstance(command, commands.Step):
-        source.step()
+        paced.step()
     else:
-        span = source.span
-        source.seek((span[0] if span else first) + round(command.seconds * 1e9))
+        span = span_of(paced)
+        paced.seek((span[0] if span else first) + round(command.seconds * 1e9))

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from estimators.errors import NisusError
-from sources.source import Paced
+from sources.source import controls_of
 
 if TYPE_CHECKING:
     from sources.source import Source
@@ -85,7 +85,8 @@ class Feeder:
         return len(batch)
 
     def _restarts(self) -> int:
-        return self.source.restarts if isinstance(self.source, Paced) else 0
+        paced = controls_of(self.source)
+        return paced.restarts if paced is not None else 0
 
     def _run(self) -> None:
         wait, ended = 0.1, False
@@ -93,7 +94,7 @@ class Feeder:
             try:
                 if self.read(READ_TIMEOUT_S) is not None:
                     ended = False
-                elif not isinstance(self.source, Paced):
+                elif controls_of(self.source) is None:
                     self._inbox.put(self._finished)
                     return
                 elif not ended:

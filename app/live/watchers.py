@@ -12,7 +12,7 @@ import numpy as np
 from estimators.diagnostics.clock_fit import ClockFit, LeastDelays
 from estimators.log import INPUT, READING, Events
 from estimators.track import STALE, TRACKING, WAITING
-from sources.source import Paced, Source
+from sources.source import Source, controls_of
 
 from .alerts import Alerts
 from .episode_log import PERIOD_S as EPISODES_PERIOD_S
@@ -93,7 +93,7 @@ class IdleTicks:
             assert self._newest is not None
             # Counted from the newest reading: a driver's clock need not be this machine's.
             now: int | None = self._newest + int(silent * 1e9)
-        elif isinstance(source, Paced) and (source.paused or source.speed == np.inf):
+        elif (paced := controls_of(source)) is not None and (paced.paused or paced.speed == np.inf):
             # As fast as possible, the playhead is ahead of what has been read.
             now = None
         else:

@@ -13,7 +13,7 @@ from estimators.errors import ConfigError, SourceError
 from estimators.fold import Fold
 from estimators.late import inflated
 from estimators.log import Log
-from sources.source import NEVER, TRUNCATED, WRONG_TIME, Endless
+from sources.source import NEVER, TRUNCATED, WRONG_TIME, is_endless
 from sources.tables.order import REMARKS as ORDER
 
 from ..ingest import CLOCK_MOVED, Ingest
@@ -72,7 +72,7 @@ def read_log(twin: Twin, duration: float | None) -> tuple[Log, Counter[str]]:
 
     remark = remarking(count)
     source = twin.open_source(remark, live=False)
-    if duration is None and isinstance(source, Endless) and source.endless:
+    if duration is None and is_endless(source):
         source.close()
         raise SourceError(f"{twin.name}: its source has no end; give --duration SECONDS")
     log = Log.of(twin.model)

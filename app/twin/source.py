@@ -70,7 +70,7 @@ class Plan:
         self, report: Report, *, live: bool = True, speed: float | None = None, faults: Faults | None = None
     ) -> Source:
         """Open the source behind its faults; see `Twin.open_source`."""
-        from sources.faults.source import with_faults
+        from sources.faults.layer import FaultySource
 
         layer = self.faults() if faults is None else faults
         section = self.loaded.config.source
@@ -91,7 +91,7 @@ class Plan:
 
             source.close()
             source = Pacer(bare, speed=speed)
-        return with_faults(source, layer)
+        return FaultySource(source, layer)
 
     def player(self, report: Report, *, interface: str | None = None, channel: str | int | None = None) -> Player:
         """Return the twin's asset, ready to play; see `Twin.player`."""

@@ -14,6 +14,7 @@ from estimators.errors import SourceError
 from estimators.log import INPUT, Events
 from estimators.model.state_space import StateSpaceModel
 
+from ..source import Source, is_endless, span_of
 from .effects import ActiveFault, FaultedEvent, events_of, items_of, ns
 from .kinds import NEVER_NS, Change, Changeable, Fault, find_kind, problem
 
@@ -305,3 +306,52 @@ class Faults:
         entry.change = change
         if not (self._asset.live or entry.scheduled):
             entry.base = change.start
+
+
+class FaultySource:
+    """Source of the events of `inner` under `faults`.
+
+    It stands outside the pacer of a replay, so that an injected fault affects the next events to be played, including
+    those that were read ahead. When the pacer begins again by seeking back, so do the faults.
+    """
+
+    def __init__(self, inner: Source, faults: Faults) -> None:
+        self.inner, self.faults = inner, faults
+        self.live = inner.live
+        self._restarts = self._count_restarts()
+
+    @property
+    def span(self) -> tuple[int, int] | None:
+        """First and last time of the source inside, ns; None if it is not known."""
+        return span_of(self.inner)
+
+    @property
+    def endless(self) -> bool:
+        """Whether the source inside has no end."""
+        return is_endless(self.inner)
+
+    def _count_restarts(self) -> int:
+        return getattr(self.inner, "restarts", 0)
+
+    def read(self, timeout: float) -> Events | None:
+        """Return the next events and the delayed ones that are due; None at the end."""
+        now = self.inner.now()
+        batch = self.inner.read(timeout)
+        if self._count_restarts() != self._restarts:
+            self._restarts = self._count_restarts()
+            self.faults.restart()
+        if batch is None:
+            rest = self.faults.finish()
+            return rest if len(rest) else None
+        if len(batch) or now is None:
+            return self.faults.pass_on(batch)
+        # All events that arrived until `now` have been returned.
+        return self.faults.release(now)
+
+    def now(self) -> int | None:
+        """Return the present time of the source inside, ns."""
+        return self.inner.now()
+
+    def close(self) -> None:
+        """Close the source inside."""
+        self.inner.close()

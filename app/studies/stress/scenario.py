@@ -20,8 +20,7 @@ from estimators.log import MARK, READING, TICK, TRUTH, Events, Log
 from estimators.snapshots import Base
 from estimators.track import TRACKING, WAITING
 from estimators.tuning import Tuning
-from sources.faults.layer import Faults
-from sources.faults.source import with_faults
+from sources.faults.layer import Faults, FaultySource
 from sources.merged import MemorySource
 from sources.simulator import Simulator
 
@@ -105,7 +104,7 @@ def plain_log(twin: Twin, seed: int, duration: float) -> Events:
         SourceError: If the source cannot be opened, or has no events.
     """
     asset = asset_of(twin, seed)
-    source = with_faults(asset, twin.faults()) if asset is not None else twin.open_source(_ignore, live=False)
+    source = FaultySource(asset, twin.faults()) if asset is not None else twin.open_source(_ignore, live=False)
     return _read(source, twin.model.width, duration)
 
 
@@ -213,13 +212,13 @@ class Bench:
         faults = mistake.fault(start, end)
         if not mistake.of_asset:
             layer = Faults(self.twin.model, faults, seed=self.seed)
-            return _everything(with_faults(MemorySource(self.events), layer), self.twin.model.width)
+            return _everything(FaultySource(MemorySource(self.events), layer), self.twin.model.width)
         asset = asset_of(self.twin, self.seed)
         if asset is None:
             raise SourceError(f"{mistake.name}: {self.twin.name} has no simulated asset")
         layer = Faults(self.twin.model, [*self.twin.plan.scheduled, *faults], seed=self.seed)
         layer.attach(asset)
-        return _read(with_faults(asset, layer), self.twin.model.width, self.duration)
+        return _read(FaultySource(asset, layer), self.twin.model.width, self.duration)
 
     def _tuning(self, estimator: str, mistake: Mistake | None) -> Tuning:
         tuning = replace(self.twin.tuning.with_options(self.twin.options_of(estimator)), seed=self.seed)

@@ -68,8 +68,7 @@ def make_player(
         SourceError: If the source is not a bus, it has no `asset`, or the bus cannot be opened.
     """
     from sources.can.player import Player
-    from sources.faults.layer import Faults
-    from sources.faults.source import with_faults
+    from sources.faults.layer import Faults, FaultySource
 
     section, key = loaded.config.source, ("source",)
     if not isinstance(section, CanSection):
@@ -84,7 +83,7 @@ def make_player(
     )
     faults.attach(asset)
     player = Player(
-        with_faults(asset, faults),
+        FaultySource(asset, faults),
         find_databases(loaded, section, key),
         [item for _, item in channels(loaded, section, key, model)],
         interface=interface or section.interface,

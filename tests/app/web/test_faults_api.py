@@ -8,15 +8,14 @@ from app.web.commands_json import command_from_json
 from estimators.errors import NisusError
 from estimators.log import MARK, READING
 from sources.faults.kinds import KINDS
-from sources.faults.layer import Faults
-from sources.faults.source import with_faults
+from sources.faults.layer import Faults, FaultySource
 from tests.app.scripted import MODEL, pull_all, readings, wait_for
 from tests.app.web.test_bounds import NASTY
 
 
 @pytest.fixture
 def page(serve):
-    return serve(behind=lambda source: with_faults(source, Faults(MODEL)))
+    return serve(behind=lambda source: FaultySource(source, Faults(MODEL)))
 
 
 def ask(page, **body):

@@ -6,8 +6,7 @@ import pytest
 from estimators.log import INPUT, MARK, READING, Events
 from estimators.models import MODELS
 from sources.faults.kinds import KINDS, Fault
-from sources.faults.layer import Faults
-from sources.faults.source import FaultySource
+from sources.faults.layer import Faults, FaultySource
 from sources.merged import MemorySource
 from tests.support import SECOND, read_all
 

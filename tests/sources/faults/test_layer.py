@@ -10,12 +10,11 @@ from estimators.log import MARK, READING, TRUTH, Events
 from estimators.models import MODELS
 from estimators.numerics.jit import plain
 from sources.faults.kinds import KINDS, Fault
-from sources.faults.layer import LINGER_NS, Faults
-from sources.faults.source import FaultySource, PacedFaultySource, with_faults
+from sources.faults.layer import LINGER_NS, Faults, FaultySource
 from sources.merged import MemorySource
 from sources.pacer import Pacer
 from sources.simulator import Simulator
-from sources.source import Paced
+from sources.source import controls_of
 from tests.sources.faults.test_kinds import DRIVE, FIRST, MODEL, SECOND_ONE, START, N, said, stream, through
 from tests.sources.test_pacer import Clock
 from tests.support import SECOND, assert_same, read_all
@@ -195,7 +194,7 @@ def paced(*faults, **more):
     clock = Clock()
     layer = Faults(MODEL, faults)
     pacer = Pacer(lambda: MemorySource(stream(), batch=10), clock=clock, **more)
-    return with_faults(pacer, layer), layer, clock
+    return FaultySource(pacer, layer), layer, clock
 
 
 def due(source):
@@ -209,37 +208,37 @@ def due(source):
 
 def test_pause_step_and_seek_go_through_to_the_pacer():
     source, _, clock = paced(Fault("bias", FIRST, size=5.0, start=10, end=20))
-    assert isinstance(source, PacedFaultySource) and isinstance(source, Paced) and not source.live
-    assert source.span == (START * SECOND, (START + N - 1) * SECOND) and source.speed == 1.0
+    assert controls_of(source) is source.inner and not source.live
+    assert source.span == (START * SECOND, (START + N - 1) * SECOND) and source.inner.speed == 1.0
     assert due(source) == [(0.0, 0.0)]
-    source.pause()
+    source.inner.pause()
     clock.advance(5)
-    assert source.paused and due(source) == []
-    source.step()
+    assert source.inner.paused and due(source) == []
+    source.inner.step()
     assert due(source) == [(1.0, 0.1)]
-    source.resume()
-    source.seek((START + 12) * SECOND)
+    source.inner.resume()
+    source.inner.seek((START + 12) * SECOND)
     first = due(source)
     np.testing.assert_allclose([y - 0.1 * t for t, y in first], [0.0] * 8 + [5.0] * 3)
     # Back: what was injected and what was scheduled come where they came, with the same bits.
-    source.seek((START + 12) * SECOND - 1)
+    source.inner.seek((START + 12) * SECOND - 1)
     again = due(source)
-    assert source.restarts == 1 and [t for t, _ in again] == [float(k) for k in range(12)]
+    assert source.inner.restarts == 1 and [t for t, _ in again] == [float(k) for k in range(12)]
     assert again[2:] == first[:-1]
 
 
 def test_an_injected_fault_comes_again_where_it_came_when_the_replay_is_sought_back():
     source, layer, clock = paced()
-    source.seek((START + 10) * SECOND)
+    source.inner.seek((START + 10) * SECOND)
     due(source)
     layer.inject(Fault("noise", FIRST, size=1.0))
-    source.seek((START + 20) * SECOND)
+    source.inner.seek((START + 20) * SECOND)
     first = due(source)
     layer.clear()
-    source.set_speed(np.inf)
+    source.inner.set_speed(np.inf)
     rest = due(source)
     assert first[0][0] == 11.0 and all(y != 0.1 * t for t, y in first) and all(y == 0.1 * t for t, y in rest)
-    source.seek(START * SECOND)
+    source.inner.seek(START * SECOND)
     again = due(source)
     assert again[11:21] == first and again[21:] == rest
 
@@ -334,7 +333,7 @@ def test_a_model_change_that_is_injected_is_stamped_where_it_holds_and_ends_with
         return changed
 
     clock = Clock()
-    source = with_faults(Pacer(opened, clock=clock), layer)
+    source = FaultySource(Pacer(opened, clock=clock), layer)
     assert layer.can_change
     got = []
 

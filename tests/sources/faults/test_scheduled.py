@@ -10,8 +10,7 @@ from estimators.errors import ConfigError, SourceError
 from estimators.log import MARK, READING
 from estimators.models import MODELS
 from sources.faults.kinds import Fault
-from sources.faults.layer import Faults
-from sources.faults.source import FaultySource
+from sources.faults.layer import Faults, FaultySource
 from sources.simulator import SensorPlan, Simulator
 from tests.sources.can.can_tools import same
 from tests.support import read_all
