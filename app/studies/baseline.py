@@ -30,7 +30,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from config.companion_schema import FigureSection, ReferenceSection
 from config.problems import check_section
@@ -247,7 +247,7 @@ def _deviation(folds: np.ndarray) -> float:
 
 def _quantile(freedom: int) -> float:
     # One fold alone does not show how large chance is.
-    return float(student.ppf(1.0 - FALSE_ALARM, freedom)) if freedom else np.inf
+    return float(stdtrit(freedom, 1.0 - FALSE_ALARM)) if freedom else np.inf
 
 
 def fingerprint(log: Log) -> tuple[int, float]:
