@@ -153,5 +153,5 @@ def open_session(
         own = [wanted.twin] if wanted is not None and wanted.twin is not None and wanted.twin not in shipped() else []
         gallery = Gallery(session, opener, first=wanted, own=own)
         GalleryApi(gallery, Recordings(recordings, lambda: session.recorded))
-        session.beside.append(SavedFiles(gallery))
+        session.threads.append(SavedFiles(gallery))
     return session

@@ -1,13 +1,11 @@
-"""The process that runs twins: one port, one twin at a time, until Ctrl-C."""
+"""Process that runs twins: one port, one twin at a time, until Ctrl-C."""
 
 from __future__ import annotations
 
-import contextlib
 import ctypes
 import gc
 import html
 import os
-import shutil
 import sys
 import tempfile
 import threading
@@ -37,14 +35,14 @@ if TYPE_CHECKING:
     from ..views.recording.writer import Recorder
 
 DISCONNECT_TIMEOUT_S = 3.0
-"""How long browsers may keep connections to a stopped twin."""
+"""Longest wait for browsers that keep connections to a stopped twin."""
 
 MALLOC_OPTIONS = ((-8, 2), (-3, 1 << 20), (-1, 1 << 20))
 """Of glibc: M_ARENA_MAX, M_MMAP_THRESHOLD, M_TRIM_THRESHOLD. By default each thread has a heap, and large arrays go
 there once one was freed, so edits scatter free memory: after 60 edits motor_can held 608 MB, with these options 479."""
 
-SWITCH = 0.0005
-"""Seconds after which Python lets another thread run; its default of 5 ms is as long as a reading may take in all."""
+SWITCH_INTERVAL_S = 0.0005
+"""Time after which Python lets another thread run; the default of 5 ms is the time budget of a measurement."""
 
 
 @dataclass(frozen=True)
@@ -58,8 +56,8 @@ class Page:
 def _settle(gone: threading.Event | None = None, before: Callable[[], Engine | None] | None = None) -> None:
     """Keep the objects of a start out of garbage collections, which would delay measurements by milliseconds.
 
-    The twin before is garbage once it has no connection left (`gone`) and its last request is answered: `before`
-    gives its engine until then.
+    The previous twin is garbage once it has no connection left (`gone`) and its last request is answered; `before`
+    returns its engine until then.
     """
     end = time.monotonic() + DISCONNECT_TIMEOUT_S
     if gone is not None:
@@ -71,13 +69,13 @@ def _settle(gone: threading.Event | None = None, before: Callable[[], Engine | N
         gc.collect()
     gc.freeze()
     if gone is not None:
-        # What is free lies scattered over the arenas of threads that have ended; glibc keeps it unless it is asked.
-        with contextlib.suppress(OSError, AttributeError):
+        # glibc keeps free memory in the arenas of ended threads unless asked.
+        with suppress(OSError, AttributeError):
             ctypes.CDLL(None).malloc_trim(0)
 
 
-class Beside(Protocol):
-    """A thread of the session."""
+class SessionThread(Protocol):
+    """A thread that starts and stops with the session."""
 
     def start(self) -> None:
         """Begin."""
@@ -104,17 +102,17 @@ class Session:
         """Put it together; nothing runs yet.
 
         Args:
-            twin: What to run first; None for nothing.
-            open_source: See `Engine`; of a twin.
-            page: Where to serve the page; None for no page.
-            split: Into what parts to split a recording.
+            twin: First twin; None for the gallery alone.
+            open_source: Opens the source of a `twin` that is no `Opening`; see `Engine`.
+            page: Port of the page; None for no page.
+            split: Parts into which a recording is split.
             recordings: Folder of recordings made on the page; None is the working directory.
 
         Raises:
             NisusError: If the source cannot be opened, or the port is in use.
         """
-        sys.setswitchinterval(SWITCH)
-        with contextlib.suppress(OSError, AttributeError):  # not glibc
+        sys.setswitchinterval(SWITCH_INTERVAL_S)
+        with suppress(OSError, AttributeError):  # not glibc
             for option, value in MALLOC_OPTIONS:
                 ctypes.CDLL(None).mallopt(option, value)
         self._page, self._split, self._recordings = page, split, recordings
@@ -122,8 +120,7 @@ class Session:
         self.running: RunningTwin | None = None
         self._changing = threading.RLock()
         self._recorded: list[Path] = []
-        self.beside: list[Beside] = []
-        """Threads that start and stop with the session."""
+        self.threads: list[SessionThread] = []
         if page is not None:
             self.door = Door(page.port)
         try:
@@ -138,22 +135,22 @@ class Session:
 
     @property
     def engine(self) -> Engine:
-        """That of the running twin."""
+        """Engine of the running twin."""
         return self._ran.engine
 
     @property
     def recorder(self) -> Recorder:
-        """That of the running twin."""
+        """Recorder of the running twin."""
         return self._ran.recorder
 
     @property
     def view(self) -> Any:
-        """Its scene; None without a page."""
+        """Viser scene; None without a page."""
         return self._ran.view
 
     @property
     def server(self) -> Any:
-        """Its page server; None without a page."""
+        """Page server; None without a page."""
         return self._ran.server
 
     @property
@@ -168,7 +165,7 @@ class Session:
 
     @property
     def recorded(self) -> list[Path]:
-        """Files that this session has recorded, in any folder."""
+        """Files recorded by this session, in any folder."""
         running = self.running
         return [*self._recorded, *([] if running is None else running.recorder.written)]
 
@@ -181,14 +178,14 @@ class Session:
         return RunningTwin(opening, door=self.door, split=self._split, recordings=self._recordings)
 
     def change(self, make: Callable[[], RunningTwin] | None, *, stop_first: bool = False) -> None:
-        """Run another twin in place of the one that runs, or none; from any thread.
+        """Replace the running twin by another, or by none; from any thread.
 
         Args:
-            make: Puts it together. If that fails, what runs goes on, unless it had to be stopped first.
-            stop_first: Stop what runs before `make` is called: both would listen to one bus.
+            make: Assembles the next twin. If it fails, the running one goes on, unless it had to be stopped first.
+            stop_first: Stop the running twin before `make` is called: both would read one bus.
 
         Raises:
-            NisusError: What `make` raises.
+            NisusError: As `make` does.
         """
         with self._changing:
             before, after, stopped = self.running, None, False
@@ -204,7 +201,7 @@ class Session:
                 if make is not None and stop_first:
                     after = make()
             finally:
-                # What browsers see until here is the twin that stands still.
+                # Until here browsers see the stopped twin.
                 if stopped:
                     self.running = after
                     del before
@@ -221,19 +218,19 @@ class Session:
         if self.running is not None:
             self.running.start()
         _settle()
-        for item in self.beside:
+        for item in self.threads:
             item.start()
 
     def stop(self) -> None:
         """Stop everything; a recording is finished."""
-        for item in self.beside:
+        for item in self.threads:
             item.stop()
         with self._changing:
             ends = [item.stop for item in (self.running, self.door) if item is not None]
             run_all(*ends)
 
     def _open(self, url: str) -> BrowserPage | None:
-        """Open the page in a browser; where that cannot be, the printed address is there."""
+        """Open the page in a browser; None if that fails, as the address is printed too."""
         try:
             opening = BrowserPage(url)
         except OSError as error:
@@ -291,29 +288,28 @@ REDIRECT = """<!doctype html>
 
 
 class BrowserPage:
-    """A file that leads to the page, in a folder of its own, until it has been used."""
+    """A file of this user that leads to the page, until it has been used: no command line shows the token."""
 
     def __init__(self, url: str) -> None:
         """Write the file.
 
         Raises:
-            OSError: If no folder for it can be made.
+            OSError: If it cannot be written.
         """
         # The runtime folder is the user's own, and is emptied when they log out, should this process be killed.
         root = os.environ.get("XDG_RUNTIME_DIR")
         usable = root is not None and os.access(root, os.W_OK | os.X_OK)
-        # Made for this user only, as mkdtemp does; the file is too, whatever the umask says.
-        self._folder = Path(tempfile.mkdtemp(prefix="nisus-", dir=root if usable else None))
-        self.path = self._folder / "open.html"
-        handle = os.open(self.path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+        # mkstemp makes a file for this user only, whatever the umask.
+        handle, name = tempfile.mkstemp(".html", "nisus-", root if usable else None)
+        self.path = Path(name)
         with os.fdopen(handle, "w", encoding="utf-8") as file:
             file.write(REDIRECT.format(url=html.escape(url)))
 
     def show(self) -> None:
-        """Start the browser, in a thread: one in the terminal does not return before it is left."""
+        """Start the browser, in a thread: one in the terminal does not return before the user leaves it."""
         threading.Thread(target=webbrowser.open, args=(self.path.as_uri(),), daemon=True).start()
 
     def close(self) -> None:
         """Remove the file."""
         with suppress(OSError):
-            shutil.rmtree(self._folder)
+            self.path.unlink()

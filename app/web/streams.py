@@ -10,6 +10,7 @@ import contextlib
 import json
 import time
 from collections.abc import Awaitable, Callable
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -28,26 +29,26 @@ FRAME_PERIOD_S = 0.1
 STATUS_PERIOD_S = 0.25
 RERUN_PERIOD_S = 0.2
 RERUN_STATUS_PERIOD_S = 0.5
-"""Least times between two messages of a kind."""
+"""Shortest times between two messages of a kind."""
 
 MAX_STREAMS = 24
 """Chart streams of one page."""
 
 MAX_PARTICLES = 400
-"""Drawn in the chart of one state over another; of more, every so many-th."""
+"""Particles in the chart of one state over another; a larger cloud is thinned."""
 
 
 async def serve(browser: WebSocket, *works: Awaitable[None]) -> list[Exception]:
-    """Run works beside each other until the first ends, then end the others and close the connection.
+    """Run works concurrently until the first ends, then end the others and close the connection.
 
     Returns:
-        What went wrong, apart from the browser's leaving.
+        Their errors, except disconnections.
     """
     tasks = [asyncio.ensure_future(work) for work in works]
     try:
         await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
     finally:
-        # Cancelled first, then awaited: no thread works for this browser any more afterwards.
+        # Awaited, so that no thread works for this browser any more afterwards.
         for task in tasks:
             task.cancel()
         outcomes = await asyncio.gather(*tasks, return_exceptions=True)
@@ -67,6 +68,15 @@ async def in_thread(work: Callable[..., Any], *arguments: Any) -> Any:
         raise
 
 
+@dataclass(frozen=True)
+class PageMessage:
+    """Message of a page: it has drawn the last frames; the pair of states to show; chart streams, null to close one."""
+
+    drawn: bool = False
+    pair: tuple[str, str] | None = None
+    streams: dict[str, ChartQuery | None] = field(default_factory=dict)
+
+
 class PageStream:
     """Serves one page: JSON in text messages, frames of its chart streams in binary ones."""
 
@@ -81,7 +91,7 @@ class PageStream:
         self._boot = boot
         self._episodes: list[dict[str, Any]] | None = None
         self._notice = 0
-        self._pair: tuple[int, int] | None = None
+        self._pair: tuple[int, ...] | None = None
         self._estimated: tuple[int, int] | None = None
 
     async def run(self) -> None:
@@ -118,27 +128,28 @@ class PageStream:
                 await self._browser.send_text(json.dumps({"error": one_line(str(error))}))
 
     async def _take(self, message: Any) -> None:
-        if not isinstance(message, dict):
-            raise ConfigError(f"page: {message!r} is no object")
-        if message.get("drawn"):
+        wanted = parse(PageMessage, message, "page")
+        if wanted.drawn:
             self._drawn.set()
         if "pair" in message:
-            self._pair, self._estimated = pair_from_json(message["pair"], self._engine), None
-        bodies = message.get("streams", {})
-        if not isinstance(bodies, dict):
-            raise ConfigError(f"page: streams is {bodies!r}; it must be an object")
+            known = list(self._engine.model.state_names)
+            for name in wanted.pair or ():
+                if name not in known:
+                    raise ConfigError(f"pair: state {name!r} does not exist; {nearest(name, known)}")
+            self._pair = None if wanted.pair is None else tuple(known.index(name) for name in wanted.pair)
+            self._estimated = None
+        if not wanted.streams:
+            return
         # All are checked before any is changed.
         opened = {
-            name: ChartStream(name, parse(ChartQuery, body, f"stream {name}"), self._series.columns)
-            for name, body in bodies.items()
-            if body is not None
+            name: ChartStream(name, query, self._series.columns)
+            for name, query in wanted.streams.items()
+            if query is not None
         }
-        if len({*self._streams, *bodies}) > MAX_STREAMS:
+        if len({*self._streams, *wanted.streams}) > MAX_STREAMS:
             raise ConfigError(f"page: there are more than {MAX_STREAMS} chart streams; close some")
-        if not bodies:
-            return
-        closed = [self._streams[name] for name in bodies if name in self._streams]
-        self._streams = {name: stream for name, stream in self._streams.items() if name not in bodies} | opened
+        closed = [stream for name, stream in self._streams.items() if name in wanted.streams]
+        self._streams = {name: self._streams[name] for name in self._streams.keys() - wanted.streams} | opened
         # In a thread, as the levels of detail of a long history may have to be made.
         await in_thread(self._exchange, closed, list(opened.values()))
         self._asked.set()
@@ -151,10 +162,12 @@ class PageStream:
             self._series.close(stream)
 
     async def _tell(self) -> None:
-        """Send what has changed of status, episodes and notices, again and again."""
+        """Send changes of status, episodes and notices."""
         while True:
             begun = time.monotonic()
-            status, episodes, origin = await in_thread(self._look)
+            status, episodes, origin = await in_thread(
+                lambda: (self._status(), episodes_json(self._engine), self._series.origin())
+            )
             status["origin"] = None if origin is None else str(origin)
             news = {key: value for key, value in status.items() if key not in self._sent or self._sent[key] != value}
             self._sent = status
@@ -171,9 +184,6 @@ class PageStream:
             if message:
                 await self._send(message)
             await asyncio.sleep(max(0.001, STATUS_PERIOD_S - (time.monotonic() - begun)))
-
-    def _look(self) -> tuple[dict[str, Any], list[dict[str, Any]], int | None]:
-        return self._status(), episodes_json(self._engine), self._series.origin()
 
     async def _draw(self) -> None:
         """Send chart points, once the page has drawn the last ones."""
@@ -203,33 +213,15 @@ class PageStream:
         now = (self._sent["revision"], self._sent["t"])
         if now != self._estimated:
             self._estimated = now
-            await self._send({"belief": await in_thread(belief_json, self._engine, *self._pair)})
+            await self._send({"belief": await in_thread(belief_json, self._engine, list(self._pair))})
 
     async def _send(self, message: dict[str, Any]) -> None:
         await self._browser.send_text(json.dumps(message, allow_nan=False, separators=(",", ":")))
 
 
-def pair_from_json(names: Any, engine: Running) -> tuple[int, int] | None:
-    """Return the indices of two states by their names; None for null.
-
-    Raises:
-        ConfigError: If they are not two names of states.
-    """
-    if names is None:
-        return None
-    known = list(engine.model.state_names)
-    if not isinstance(names, list) or len(names) != 2 or not all(isinstance(name, str) for name in names):
-        raise ConfigError(f"pair is {names!r}; it must be the names of two states, or null")
-    for name in names:
-        if name not in known:
-            raise ConfigError(f"pair: state {name!r} does not exist; {nearest(name, known)}")
-    return known.index(names[0]), known.index(names[1])
-
-
-def belief_json(engine: Running, i: int, j: int) -> dict[str, Any] | None:
+def belief_json(engine: Running, pair: list[int]) -> dict[str, Any] | None:
     """Return mean (2), covariance [a, b, c] of [[a, b], [b, c]] and particles (k, 2); None while not finite."""
     belief = engine.belief()
-    pair = [i, j]
     mean, cov = belief.mean[pair], belief.cov[np.ix_(pair, pair)]
     if not (np.isfinite(mean).all() and np.isfinite(cov).all()):
         return None
@@ -248,7 +240,7 @@ async def feed_rerun(browser: WebSocket, feed: RerunFeed, status: Callable[[], d
     drawn.set()
 
     async def listen() -> None:
-        # Any short text says that the last frame is drawn; the page sends nothing longer.
+        # Any short text means that the last frame is drawn; the page sends nothing longer.
         while (word := (await browser.receive()).get("text")) is not None and len(word) <= MAX_BODY_BYTES:
             drawn.set()
 

@@ -24,31 +24,26 @@ from pathlib import Path
 from estimators.errors import ConfigError
 
 FILES = ("re_viewer.js", "re_viewer_bg.wasm")
-PATIENCE = 60.0
-"""Seconds until the program must answer; it is large, and its first start reads it all from disk."""
-
-
-def cache_folder() -> Path:
-    """The user's cache folder for Nisus."""
-    root = os.environ.get("XDG_CACHE_HOME")
-    return (Path(root) if root else Path.home() / ".cache") / "nisus"
+VIEWER_TIMEOUT_S = 60.0
+"""Longest wait for the program; it is large, and its first start reads it all from disk."""
 
 
 def viewer_version() -> str:
-    """Version of the installed rerun-sdk, which the viewer has to match."""
+    """Return the version of the installed rerun-sdk, which the viewer must match."""
     return version("rerun-sdk")
 
 
 def viewer_assets(progress: Callable[[str], None] = lambda line: None) -> Path:
-    """The folder that holds the viewer's files, each compressed (`NAME.gz`); made if it is not there.
+    """Return the folder of the viewer's files, each compressed (`NAME.gz`); they are made if absent.
 
     Args:
-        progress: Called with lines for people, when it takes time.
+        progress: Called with a line of text when it takes time.
 
     Raises:
-        ConfigError: If the files cannot be had or kept.
+        ConfigError: If the files cannot be made or written.
     """
-    folder = cache_folder() / f"rerun-{viewer_version()}"
+    root = os.environ.get("XDG_CACHE_HOME")
+    folder = (Path(root) if root else Path.home() / ".cache") / "nisus" / f"rerun-{viewer_version()}"
     if all((folder / f"{name}.gz").is_file() for name in FILES):
         return folder
     progress(f"preparing the Rerun {viewer_version()} viewer, once")
@@ -77,19 +72,14 @@ def _program() -> Path:
 
 
 def _served_files(home: Path) -> dict[str, bytes]:
-    """Run the program's web server and take what it serves."""
+    """Run the program's web server and fetch its files."""
     analytics = home / ".config" / "rerun" / "analytics.json"
     analytics.parent.mkdir(parents=True)
     analytics.write_text(json.dumps({"analytics_enabled": False, "analytics_id": "", "metadata": {}}))
     settings = {
         **os.environ,
-        "HOME": str(home),
-        "USERPROFILE": str(home),
-        "APPDATA": str(home),
-        "LOCALAPPDATA": str(home),
-        "XDG_CONFIG_HOME": str(home / ".config"),
-        "XDG_DATA_HOME": str(home / ".local"),
-        "XDG_CACHE_HOME": str(home / ".cache"),
+        **dict.fromkeys(("HOME", "USERPROFILE", "APPDATA", "LOCALAPPDATA"), str(home)),
+        **{f"XDG_{name}_HOME": str(home / f".{name.lower()}") for name in ("CONFIG", "DATA", "CACHE")},
         # `--serve-web` would open the user's browser.
         "BROWSER": "true" if sys.platform != "win32" else "",
         "DISPLAY": "",
@@ -110,10 +100,10 @@ def _served_files(home: Path) -> dict[str, bytes]:
 
 def _fetch(url: str, process: subprocess.Popen[bytes], log: Path) -> bytes:
     opener = urllib.request.build_opener(urllib.request.ProxyHandler({}))
-    end = time.monotonic() + PATIENCE
+    end = time.monotonic() + VIEWER_TIMEOUT_S
     while True:
         try:
-            with opener.open(url, timeout=PATIENCE) as answer:
+            with opener.open(url, timeout=VIEWER_TIMEOUT_S) as answer:
                 return bytes(answer.read())
         except (urllib.error.URLError, OSError) as error:
             if process.poll() is None and time.monotonic() < end:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import http.client
-from typing import Any
+from contextlib import suppress
 from urllib.parse import quote, urlencode
 
 import websockets
@@ -15,26 +15,25 @@ from websockets.asyncio.client import ClientConnection, connect
 
 from ..views.viser.guarded_server import HEADER
 from .http import PAGE
+from .streams import serve
 
-PASSED_ON = ("content-type", "content-encoding", "etag", "last-modified", "cache-control")
-ASKED = ("accept", "accept-encoding", "if-none-match")
+RESPONSE_HEADERS = ("content-type", "content-encoding", "etag", "last-modified", "cache-control")
+REQUEST_HEADERS = ("accept", "accept-encoding", "if-none-match")
 HEAD = b"<head>"
 SCRIPT = PAGE / "viser_frame.js"
-AHEAD = "<script>{script}</script>"
-"""What goes into Viser's page ahead of its own script; in the text, as a frame under another name may fetch no more."""
 
 SCENE_ALONE = """<style>
   [data-dock-region], [data-dock-region-handle], [data-floating-window], .mantine-Paper-root,
   .mantine-Notifications-root { display: none !important; }
   [data-dock-root] > div { inset: 0 !important; width: 100% !important; }
 </style>"""
-"""And where the page has all that Viser's panel would: the scene in all of the frame."""
+"""Style of a frame that shows the scene alone; the page has the controls."""
 
-LARGEST = 256 * 1024 * 1024
-"""Bytes of one message; a scene's first one holds all its point clouds."""
+MAX_MESSAGE_BYTES = 256 * 2**20
+"""Largest message; a scene's first one holds all its point clouds."""
 
-WAITING = 4
-"""Messages of Viser that may wait for a slow browser; Viser holds its own back then, and drops what is outdated."""
+MAX_QUEUED_MESSAGES = 4
+"""Messages of Viser that may wait for a slow browser; Viser then holds its own back, and drops outdated ones."""
 
 
 class ViserProxy:
@@ -47,24 +46,24 @@ class ViserProxy:
     async def http(self, request: Request) -> Response:
         """Fetch a file of Viser's client."""
         path = "/" + quote(request.path_params["path"])
-        # Its page as it is, neither compressed nor from before, as something goes into it.
+        # The page uncompressed and not from a cache, as it is changed here.
         asked = {} if path == "/" else dict(request.headers)
         try:
             status, headers, body = await asyncio.to_thread(self._fetch, path, asked)
         except (OSError, http.client.HTTPException) as error:
             return PlainTextResponse(f"Nisus: the Viser pane does not answer ({error}).\n", 502)
         if path == "/":
-            ahead = AHEAD.format(script=SCRIPT.read_text())
-            ahead += SCENE_ALONE if "scene" in request.query_params else ""
-            body = body.replace(HEAD, HEAD + ahead.encode(), 1)
+            # In the text, as a frame under another name may fetch no more.
+            script = f"<script>{SCRIPT.read_text()}</script>" + (SCENE_ALONE if "scene" in request.query_params else "")
+            body = body.replace(HEAD, HEAD + script.encode(), 1)
         answer = Response(body, status)
         for name, value in headers:
-            if name.lower() in PASSED_ON and not (path == "/" and name.lower() == "etag"):
+            if name.lower() in RESPONSE_HEADERS and not (path == "/" and name.lower() == "etag"):
                 answer.headers[name] = value
         return answer
 
     def _fetch(self, path: str, headers: dict[str, str]) -> tuple[int, list[tuple[str, str]], bytes]:
-        wanted = {name: value for name, value in headers.items() if name in ASKED}
+        wanted = {name: value for name, value in headers.items() if name in REQUEST_HEADERS}
         connection = http.client.HTTPConnection("127.0.0.1", self._port, timeout=30.0)
         try:
             connection.request("GET", path, headers=wanted | {HEADER: self._secret})
@@ -75,7 +74,7 @@ class ViserProxy:
 
     async def websocket(self, browser: WebSocket) -> None:
         """Couple a browser's WebSocket with one of Viser's, until either closes."""
-        # The pass has opened the gate; it is nobody else's business.
+        # The pass is for the gate alone.
         query = urlencode([(name, value) for name, value in browser.query_params.multi_items() if name != "pass"])
         path = quote(browser.path_params.get("path", ""))
         url = f"ws://127.0.0.1:{self._port}/{path}" + (f"?{query}" if query else "")
@@ -83,39 +82,23 @@ class ViserProxy:
         try:
             viser = await connect(
                 url, additional_headers={HEADER: self._secret}, subprotocols=offered or None, compression=None,
-                max_size=LARGEST, max_queue=WAITING, ping_interval=None, proxy=None,
+                max_size=MAX_MESSAGE_BYTES, max_queue=MAX_QUEUED_MESSAGES, ping_interval=None, proxy=None,
             )  # fmt: skip
         except (OSError, websockets.WebSocketException):
             await browser.close(1013)
             return
         async with viser:
             await browser.accept(subprotocol=viser.subprotocol)
-            tasks = [asyncio.create_task(self._up(browser, viser)), asyncio.create_task(self._down(browser, viser))]
-            try:
-                await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
-            finally:
-                for task in tasks:
-                    task.cancel()
-                await asyncio.gather(*tasks, return_exceptions=True)
+            await serve(browser, self._up(browser, viser), self._down(browser, viser))
 
     async def _up(self, browser: WebSocket, viser: ClientConnection) -> None:
-        try:
-            while True:
-                message: Any = await browser.receive()
-                if message["type"] == "websocket.disconnect":
-                    return
+        with suppress(websockets.ConnectionClosed):
+            while (message := await browser.receive())["type"] != "websocket.disconnect":
                 data = message.get("bytes")
                 await viser.send(data if data is not None else message["text"])
-        except websockets.ConnectionClosed:
-            return
 
     async def _down(self, browser: WebSocket, viser: ClientConnection) -> None:
-        try:
+        with suppress(WebSocketDisconnect, websockets.ConnectionClosed, RuntimeError):
             async for message in viser:
-                if isinstance(message, str):
-                    await browser.send_text(message)
-                else:
-                    await browser.send_bytes(message)
+                await (browser.send_text(message) if isinstance(message, str) else browser.send_bytes(message))
             await browser.close(viser.close_code or 1000)
-        except (WebSocketDisconnect, websockets.ConnectionClosed, RuntimeError):
-            return

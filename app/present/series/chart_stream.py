@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
-from pydantic import Field
+from pydantic import ConfigDict, Field
 
 from estimators.errors import ConfigError
 
@@ -37,6 +37,8 @@ class ChartQuery:
     seconds since the first event; `since` None is the first, `until` None the newest, and with `span` the last seconds
     are followed. `points` is the largest number of groups.
     """
+
+    __pydantic_config__ = ConfigDict(extra="forbid")
 
     columns: Annotated[tuple[str, ...], Field(max_length=400)]
     run: str = "live"

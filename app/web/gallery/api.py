@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,7 @@ from .gallery import Gallery, StartRequest
 from .recordings import RECORDING, Recordings
 
 COMPILING_SHOWN_AFTER_S = 1.0
-"""Loading a model from the cache takes less."""
+"""Longer than loading a model from the cache."""
 
 PIECE_BYTES = 4 * 2**20
 """Size of the pieces in which a page sends a dropped file; each has its own timeout."""
@@ -54,6 +55,7 @@ class GalleryApi:
         door.add_gallery(routes, Starlette(routes=[get("/", self._page)]))
 
     def _page(self) -> Response:
+        """Answer with the page of the gallery."""
         return page_file("gallery.html", {"boot": self._door.boot})
 
     def state(self) -> dict[str, Any]:
@@ -64,36 +66,38 @@ class GalleryApi:
         compiling = begun is not None and time.monotonic() - begun > COMPILING_SHOWN_AFTER_S
         return {
             "boot": self._door.boot,
-            "running": None
-            if running is None
-            else {
-                "name": None if request is None else request.twin,
+            "running": running
+            and {
+                "name": request and request.twin,
                 "title": running.engine.twin.name if request is None else request.name,
                 "review": running.opening.review is not None,
             },
-            "starting": None
-            if starting is None
-            else {
+            "starting": starting
+            and {
                 "name": starting[0].twin,
                 "title": starting[0].name,
                 "seconds": round(time.monotonic() - starting[1], 1),
                 "doing": "compiling" if compiling else "",
             },
-            "failed": None if failed is None else {"title": failed.name, "text": one_line(failed.text)},
+            "failed": failed and {"title": failed[0].name, "text": one_line(failed[1])},
         }
 
     def _cards(self) -> Any:
-        return [card.json() for card in shelf(self._gallery.own)]
+        """Return a card for each twin."""
+        return [asdict(card) for card in shelf(self._gallery.own)]
 
     def _start(self, twin: str) -> Any:
+        """Begin to start a twin."""
         self._gallery.start(StartRequest(twin))
         return self.state()
 
     def _stop(self) -> Any:
+        """Stop the running twin."""
         self._gallery.stop()
         return self.state()
 
     def _picture(self, twin: str = "") -> Response:
+        """Answer with the picture of a twin."""
         if twin not in self._gallery.names():
             return PlainTextResponse(f"Nisus: {quoted(twin)} is no twin of this gallery.\n", 404)
         path = picture_file(find(twin))
@@ -104,12 +108,9 @@ class GalleryApi:
     # Recordings
 
     def _list(self) -> Any:
-        found = self._recordings.entries(self._is_writing)
-        return {
-            "folder": str(self._recordings.folder),
-            "piece": PIECE_BYTES,
-            "files": [entry.json() for entry in found],
-        }
+        """List the recordings and logs."""
+        files = self._recordings.entries(self._is_writing)
+        return {"folder": str(self._recordings.folder), "piece": PIECE_BYTES, "files": files}
 
     def _open(self, name: str, twin: str | None = None) -> Any:
         """Review a recording, or run a twin on a log."""
@@ -123,6 +124,7 @@ class GalleryApi:
         return {"opening": path.name}
 
     def _delete(self, name: str) -> Any:
+        """Delete a recording or log."""
         path = self._idle(name)
         self._recordings.delete(name)
         return {"deleted": path.name}
@@ -157,6 +159,7 @@ class GalleryApi:
         return Json({"name": name})
 
     def _download(self, name: str) -> Response:
+        """Answer with a recording or log."""
         try:
             path = self._recordings.find(name)
         except NisusError as error:

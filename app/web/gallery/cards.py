@@ -1,12 +1,11 @@
-"""Where a twin's picture for the gallery is kept: those of twins that ship in a folder of their own."""
+"""Cards of the gallery: what each twin is, and where its picture is kept."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
 
 from config.loader import TWINS, Loaded, find, load, shipped
 from estimators.errors import NisusError
@@ -49,10 +48,6 @@ class Card:
     picture: bool = False
     missing: str | None = None
     error: str | None = None
-
-    def json(self) -> dict[str, Any]:
-        """Return the card for the page."""
-        return asdict(self)
 
 
 def shelf(own: Iterable[str] = ()) -> list[Card]:

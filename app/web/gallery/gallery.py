@@ -37,14 +37,6 @@ class StartRequest:
         return f"{name} on {', '.join(log.name for log in self.logs)}" if self.logs else name
 
 
-@dataclass(frozen=True)
-class FailedStart:
-    """A start that failed, and the reason in one line."""
-
-    name: str
-    text: str
-
-
 class Opener(Protocol):
     """Reads a requested twin from its files, and compiles it."""
 
@@ -88,8 +80,9 @@ class Gallery:
         self.starting: tuple[StartRequest, float] | None = None
         self.compiling: float | None = None
         """Start of the compilation under way, s; None without one."""
-        self.failed: FailedStart | None = None
-        self._opener = opener
+        self.failed: tuple[StartRequest, str] | None = None
+        """The last start that failed, and the reason in one line."""
+        self.opener = opener
         self._lock = threading.Lock()
 
     def names(self) -> list[str]:
@@ -104,7 +97,7 @@ class Gallery:
         """
         if wanted.twin is not None and wanted.twin not in self.names():
             raise ConfigError(f"{quoted(wanted.twin)} is no twin of this gallery; {nearest(wanted.twin, self.names())}")
-        self._begin(wanted, lambda: self._start(wanted))
+        self._begin(wanted)
 
     def again(self, remark: str) -> None:
         """Begin to start the running twin anew, with a notice of the reason.
@@ -115,11 +108,7 @@ class Gallery:
         wanted = self.running
         if wanted is None:
             raise ConfigError("nothing runs that could be started anew")
-        self._begin(wanted, lambda: self._start(wanted, remark))
-
-    def prepare(self, twin: Twin) -> None:
-        """Compile a twin's model and filter; raises as `Opener.prepare`."""
-        self._opener.prepare(twin)
+        self._begin(wanted, remark)
 
     def stop(self) -> None:
         """Stop the running twin; the gallery stays."""
@@ -127,41 +116,39 @@ class Gallery:
             self.running = None
         self.session.change(None)
 
-    def _begin(self, wanted: StartRequest, work: Callable[[], None]) -> None:
+    def _begin(self, wanted: StartRequest, remark: str | None = None) -> None:
         with self._lock:
             if self.starting is not None:
                 raise ConfigError(f"{self.starting[0].name} is being started; wait until it runs")
             self.starting, self.failed = (wanted, time.monotonic()), None
-        threading.Thread(target=self._carry_out, args=(wanted, work), name="gallery", daemon=True).start()
+        threading.Thread(target=self._carry_out, args=(wanted, remark), name="gallery", daemon=True).start()
 
-    def _carry_out(self, wanted: StartRequest, work: Callable[[], None]) -> None:
+    def _carry_out(self, wanted: StartRequest, remark: str | None) -> None:
         failed = None
         try:
-            work()
+            self._start(wanted, remark)
         except NisusError as error:
-            failed = FailedStart(wanted.name, str(error).splitlines()[0])
+            failed = wanted, str(error).splitlines()[0]
         except Exception as error:  # noqa: BLE001  a driver or a user's model may raise anything
-            failed = FailedStart(wanted.name, f"{type(error).__name__}: {error}")
+            failed = wanted, f"{type(error).__name__}: {error}"
         with self._lock:
             self.starting, self.failed = None, failed
             if self.session.running is None:
                 self.running = None
 
-    def _start(self, wanted: StartRequest, remark: str | None = None) -> None:
-        opening = self._opener.open(wanted)
+    def _start(self, wanted: StartRequest, remark: str | None) -> None:
+        opening = self.opener.open(wanted)
         if remark is not None:
             opening = replace(opening, remarks=[*opening.remarks, ("warn", remark)])
         self.compiling = time.monotonic()
         try:
-            opening = self._opener.made_ready(opening)
+            opening = self.opener.made_ready(opening)
         finally:
             self.compiling = None
-        self._put(wanted, opening)
-
-    def _put(self, wanted: StartRequest, opening: Opening) -> None:
-        """Run it in place of the running twin."""
-        # Two on one bus would hear each other's asset.
-        both = _on_a_bus(opening) and self._runs_on_a_bus()
+        running = self.session.running
+        # Two twins on one bus would read each other's asset.
+        both = running is not None and _reads_a_bus(running.opening) and _reads_a_bus(opening)
+        del running  # which is to be collected once it is replaced
         try:
             self.session.change(lambda: self.session.prepared(opening), stop_first=both)
         except BaseException:
@@ -170,25 +157,21 @@ class Gallery:
             raise
         self.running = wanted
 
-    def _runs_on_a_bus(self) -> bool:
-        ran = self.session.running
-        return ran is not None and _on_a_bus(ran.opening)
 
-
-def _on_a_bus(opening: Opening) -> bool:
+def _reads_a_bus(opening: Opening) -> bool:
     return opening.review is None and opening.twin.config.source.type == "can" and opening.twin.plan.log_files is None
 
 
-EVERY = 0.4
-"""Seconds between two looks at the files. An editor may write in pieces: a file is read once it is unchanged."""
+FILE_POLL_PERIOD_S = 0.4
+"""Between two looks at the files. An editor may write in pieces: a file is read once it is unchanged."""
 
 
 class SavedFiles:
     """Watches the files of the running twin, in a thread of its own."""
 
-    def __init__(self, gallery: Gallery, *, every: float = EVERY) -> None:
+    def __init__(self, gallery: Gallery, *, every: float = FILE_POLL_PERIOD_S) -> None:
         self._gallery, self._every = gallery, every
-        # Not to be kept alive by being looked at.
+        # A weak reference does not keep it alive.
         self._of: weakref.ref[RunningTwin] | None = None
         self._files: tuple[Path, ...] = ()
         self._known: Stamp = ()
@@ -239,7 +222,7 @@ class SavedFiles:
                 twin = with_version(twin, chosen)
             reason = obstacle(engine.twin, twin)
             if reason is None:
-                self._gallery.prepare(twin)
+                self._gallery.opener.prepare(twin)
         except (NisusError, OSError) as error:
             self._refuse(running, str(error).splitlines()[0])
             return
@@ -248,7 +231,7 @@ class SavedFiles:
             return
         running.server.unread = None
         if twin.config == engine.twin.config and what == shown_path(twin.path):
-            return  # a comment
+            return  # only a comment changed
         if reason is not None:
             self._gallery.again(f"{what} was saved and {reason}: the twin was started anew")
             return

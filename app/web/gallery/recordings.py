@@ -1,6 +1,6 @@
-"""The folder of recordings and of logs that were dropped on the page: list, receive, delete.
+"""The folder of recordings and dropped logs: list, receive, delete.
 
-Outside it are only the files that this session itself has recorded, wherever the command line said.
+Of other folders only the files are listed that this session itself has recorded, wherever the command line said.
 """
 
 from __future__ import annotations
@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 import threading
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -20,53 +20,24 @@ from ...views.recording.rrd_file import Disk
 
 RECORDING = ".rrd"
 LOGS = tuple(dict.fromkeys((*CAN_LOGS, *TABLES)))
-"""Endings of files that can replace a twin's own recording."""
+"""Suffixes of files that can replace a twin's own recording."""
+
 PART = ".part"
-"""Ending of a file that is still arriving; its name begins with a point, so that lists do not show it."""
+"""Suffix of a file that is still arriving; its name begins with a dot, so that lists do not show it."""
 
-LARGEST = 256 * 2**20
-"""Bytes up to which a recording is looked through for the list."""
+MAX_SUMMARISED_BYTES = 256 * 2**20
+"""Largest recording that is read for the list."""
 
-LONGEST_NAME = 200
-"""Bytes of a file's name, so that a number and the ending of a part still fit."""
+MAX_NAME_BYTES = 200
+"""Longest file name, so that a number and the suffix of a part still fit."""
 
-
-@dataclass(frozen=True)
-class Entry:
-    """One file, in a `folder` if it is elsewhere. `facts` are those of a recording, `error` says why there are none."""
-
-    name: str
-    bytes: int
-    modified: float
-    log: bool
-    facts: Facts | None = None
-    error: str | None = None
-    looking: bool = False
-    folder: str | None = None
-
-    def json(self) -> dict[str, Any]:
-        """As the page gets it."""
-        facts = self.facts
-        told: dict[str, Any] = {"twin": None, "estimator": None, "seconds": None, "summary": {}}
-        if facts is not None:
-            told |= {"twin": facts.twin, "estimator": facts.estimator, "seconds": facts.seconds}
-            told |= {"summary": facts.summary}
-        return {
-            "name": self.name,
-            "bytes": self.bytes,
-            "modified": self.modified,
-            "log": self.log,
-            "error": self.error,
-            "looking": self.looking,
-            "folder": self.folder,
-            **told,
-        }
+NO_FACTS: dict[str, Any] = {"twin": None, "estimator": None, "seconds": None, "summary": {}}
 
 
 class Recordings:
     """One folder. Names come from a browser, so each is checked before a file is touched.
 
-    `recorded` gives the files that the session has recorded; those outside the folder are listed by their names, too.
+    `recorded` returns the files that the session has recorded; those outside the folder are listed, too.
     """
 
     def __init__(self, folder: Path, recorded: Callable[[], Sequence[Path]] = lambda: ()) -> None:
@@ -75,45 +46,46 @@ class Recordings:
         self._lock = threading.Lock()
         self._looking = False
 
-    def entries(self, busy: Callable[[Path], bool] = lambda path: False) -> list[Entry]:
-        """Return the files, newest first. Facts of a recording are read in a thread, for the next call.
+    def entries(self, busy: Callable[[Path], bool] = lambda path: False) -> list[dict[str, Any]]:
+        """Return the files, newest first: facts of a recording, or an `error`; `folder` is set outside this one.
+
+        Facts are read in a thread, for the next call; `looking` says that they are missing.
 
         Args:
             busy: Whether a file is being written.
         """
-        found: list[Entry] = []
+        found: list[dict[str, Any]] = []
         unknown: list[tuple[Path, tuple[str, int, int]]] = []
         inside = sorted(self.folder.iterdir()) if self.folder.is_dir() else []
         for path in [*inside, *self._elsewhere().values()]:
-            suffix = path.suffix.lower()
+            log = path.suffix.lower() != RECORDING
             if path.is_symlink() or not path.is_file() or path.name.startswith("."):
                 continue
-            if suffix != RECORDING and not is_recording(path.name):
+            if log and not is_recording(path.name):
                 continue
             stat = path.stat()
             key = (str(path), stat.st_mtime_ns, stat.st_size)
             known = self._known.get(key)
-            log = suffix != RECORDING
             if busy(path):
                 known = "is being recorded"
-            elif known is None and not log and stat.st_size > LARGEST:
-                known = "is large: open it to see what it holds"
-            elif known is None and not log:
+            elif not log and known is None and stat.st_size > MAX_SUMMARISED_BYTES:
+                known = "is large: open it to see its content"
+            elif not log and known is None:
                 unknown.append((path, key))
             found.append(
-                Entry(
-                    path.name,
-                    stat.st_size,
-                    stat.st_mtime,
-                    log,
-                    facts=known if isinstance(known, Facts) else None,
-                    error=known if isinstance(known, str) else None,
-                    looking=known is None and not log,
-                    folder=None if path in inside else str(path.parent),
-                )  # fmt: skip
+                {
+                    "name": path.name,
+                    "bytes": stat.st_size,
+                    "modified": stat.st_mtime,
+                    "log": log,
+                    "error": known if isinstance(known, str) else None,
+                    "looking": known is None and not log,
+                    "folder": None if path in inside else str(path.parent),
+                }
+                | (asdict(known) if isinstance(known, Facts) else NO_FACTS)
             )
         self._look(unknown)
-        return sorted(found, key=lambda entry: -entry.modified)
+        return sorted(found, key=lambda entry: -entry["modified"])
 
     def _look(self, unknown: list[tuple[Path, tuple[str, int, int]]]) -> None:
         with self._lock:
@@ -140,10 +112,10 @@ class Recordings:
         return {name: path for name, path in found.items() if not (self.folder / name).exists()}
 
     def find(self, name: Any) -> Path:
-        """The file of that name.
+        """Return the file of that name.
 
         Raises:
-            ConfigError: If the name is none of a file of this folder, or that this session has recorded.
+            ConfigError: If no file of this folder, or of this session, has that name.
         """
         path = self._elsewhere().get(name) if isinstance(name, str) else None
         path = path or self.folder / _checked(name)
@@ -164,13 +136,13 @@ class Recordings:
             raise ConfigError(f"{path.name}: {error.strerror}; it cannot be deleted") from None
 
     def receive(self, name: Any, offset: int, data: bytes, *, last: bool) -> str | None:
-        """Take a piece of a file that a browser sends, in their order; the first begins it anew.
+        """Append a piece of a file that a browser sends; the first piece starts the file.
 
         Returns:
-            The name under which it is here, once the last piece has come: another one if that was taken.
+            Name of the file after the last piece: another one if the given one was taken.
 
         Raises:
-            ConfigError: If its name will not do, a piece is missing, or the disk has no room.
+            ConfigError: If the name is invalid, a piece is missing, or the disk is full.
         """
         checked = _checked(name)
         if Path(checked).suffix.lower() != RECORDING and not is_recording(checked):
@@ -193,7 +165,7 @@ class Recordings:
             raise ConfigError(f"{checked}: {error.strerror}; it cannot be kept in {self.folder}") from None
 
     def _keep(self, part: Path, name: str) -> str:
-        """Give a file that is complete its name, or the next one that is free."""
+        """Rename a complete file to its name, or to the next one that is free."""
         stem, dot, rest = name.partition(".")
         for k in range(1, 1000):
             free = self.folder / (name if k == 1 else f"{stem}-{k}{dot}{rest}")
@@ -208,14 +180,14 @@ class Recordings:
 
 
 def _checked(name: Any) -> str:
-    """A name that can only mean a file right in the folder.
+    """Return a name that can only mean a file directly in the folder.
 
     Raises:
-        ConfigError: If it is none.
+        ConfigError: If it could mean another one.
     """
     if not isinstance(name, str) or not name:
         raise ConfigError("name is missing; give that of a file in the folder of recordings")
     plain = name == Path(name).name and not set(name) & set('/\\:*?"<>|')
-    if not plain or name.startswith(".") or not name.isprintable() or len(os.fsencode(name)) > LONGEST_NAME:
+    if not plain or name.startswith(".") or not name.isprintable() or len(os.fsencode(name)) > MAX_NAME_BYTES:
         raise ConfigError(f"{quoted(name)} is no name of a file in the folder of recordings")
     return name

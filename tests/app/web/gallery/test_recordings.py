@@ -52,7 +52,7 @@ def test_nothing_outside_the_folder_can_be_touched(folder, name):
 def test_only_recordings_and_logs_are_listed(folder):
     (folder / "drive.MF4").write_bytes(b"")
     (folder / "drive.asc.gz").write_bytes(b"")
-    assert {entry.name: entry.log for entry in Recordings(folder).entries()} == {
+    assert {entry["name"]: entry["log"] for entry in Recordings(folder).entries()} == {
         "here.rrd": False, "drive.MF4": True, "drive.asc.gz": True,
     }  # fmt: skip
     assert Recordings(folder / "nowhere").entries() == []
@@ -62,7 +62,7 @@ def test_what_cannot_be_read_says_so(folder):
     recordings = Recordings(folder)
 
     def error():
-        return next(entry.error for entry in recordings.entries() if entry.name == "here.rrd")
+        return next(entry["error"] for entry in recordings.entries() if entry["name"] == "here.rrd")
 
     assert error() is None
     wait_for(lambda: error() is not None, PATIENCE)
@@ -76,7 +76,7 @@ def test_a_file_comes_in_pieces_and_never_replaces_another(folder):
     data = os.urandom(10_000)
     for name in ("here.rrd", "link.rrd", "folder.rrd"):
         assert recordings.receive(name, 0, data[:4000], last=False) is None
-        assert name not in [entry.name for entry in recordings.entries() if entry.bytes == 4000]
+        assert name not in [entry["name"] for entry in recordings.entries() if entry["bytes"] == 4000]
         kept = recordings.receive(name, 4000, data[4000:], last=True)
         assert kept == name.replace(".", "-2.") and (folder / kept).read_bytes() == data
     assert (folder / "here.rrd").read_bytes() == b"RRF2 and so on"

@@ -235,7 +235,7 @@ def test_a_file_is_read_once_it_stays_as_it_is(pump):
 
     class Watched:
         running, starting = Running(), None
-        session = property(lambda self: self)
+        session = opener = property(lambda self: self)
 
         def prepare(self, twin):
             pass
