@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from types import SimpleNamespace
 from typing import NamedTuple
 
 import numpy as np
 from numba import types
 
-from estimators.errors import LARGEST, SourceError
+from estimators.errors import LARGEST
 from estimators.log import INPUT, READING, TRUTH, Events
 from estimators.numerics.jit import B1, F1, F2, I1, i64, jit
 
@@ -162,74 +163,50 @@ class ChannelMapping:
         self._report = report
         order = (INPUT, READING, TRUTH)
         self._channels: list[Channel] = []
-        group, kind, index, row, where = [0], [], [], [0], [0]
-        slot, factors, scale, offset, where_slot, selects, low, high = ([] for _ in range(8))
-        own_slot, own_factor, own_squared = [], [], []
+        tables = SimpleNamespace(**{name: [] for name in Tables._fields})
+        for starts in (tables.group, tables.row, tables.where):
+            starts.append(0)
         for channels, names, units in groups:
             positions = {name: k for k, name in enumerate(names)}
             # True states in order, for the blocks.
             for channel in sorted(channels, key=lambda c: (order.index(c.kind), c.index if c.kind == TRUTH else 0)):
                 self._channels.append(channel)
-                kind.append(channel.kind)
-                index.append(channel.index)
+                tables.kind.append(channel.kind)
+                tables.target.append(channel.index)
                 for k, name in enumerate(channel.signals):
-                    slot.append(positions[name])
-                    unit = channel.units[k] or units[positions[name]]
-                    factors.append(self._factor(channel, name, unit, channel.model_units[k]))
+                    tables.slot.append(positions[name])
+                    wanted = "deg" if channel.convert else channel.model_units[k]
+                    given = channel.units[k] or units[positions[name]]
+                    factor, shift = conversion(given, wanted, f"{channel.name}: {name}")
+                    tables.factor.append(factor)
+                    tables.shift.append(shift)
                     # Scale and offset of a position apply to metres, not to degrees.
-                    scale.append(1.0 if channel.convert else channel.scale[k])
-                    offset.append(0.0 if channel.convert else channel.offset[k])
+                    tables.scale.append(1.0 if channel.convert else channel.scale[k])
+                    tables.offset.append(0.0 if channel.convert else channel.offset[k])
                     own = channel.accuracy
                     at = positions[own.signals[k]] if own is not None else -1
-                    own_slot.append(at)
-                    own_factor.append(0.0 if own is None else self._own_factor(channel, own, k, units[at]))
-                    own_squared.append(own is not None and own.squared)
-                row.append(len(slot))
+                    tables.own_slot.append(at)
+                    tables.own_factor.append(0.0 if own is None else _own_factor(channel, own, k, units[at]))
+                    tables.own_squared.append(own is not None and own.squared)
+                tables.row.append(len(tables.slot))
                 for condition in (*channel.where, *channel.only):
-                    where_slot.append(positions[condition.signal])
-                    selects.append(condition in channel.only)
-                    low.append(condition.low)
-                    high.append(condition.high)
-                where.append(len(where_slot))
-            group.append(len(self._channels))
-        whole, real = np.int64, np.float64
+                    tables.where_slot.append(positions[condition.signal])
+                    tables.selects.append(condition in channel.only)
+                    tables.low.append(condition.low)
+                    tables.high.append(condition.high)
+                tables.where.append(len(tables.where_slot))
+            tables.group.append(len(self._channels))
         self._tables = Tables(
-            group=np.array(group, whole),
-            kind=np.array(kind, whole),
-            target=np.array(index, whole),
-            row=np.array(row, whole),
-            slot=np.array(slot, whole),
-            factor=np.array([factor for factor, _ in factors], real),
-            shift=np.array([shift for _, shift in factors], real),
-            scale=np.array(scale, real),
-            offset=np.array(offset, real),
-            own_slot=np.array(own_slot, whole),
-            own_factor=np.array(own_factor, real),
-            own_squared=np.array(own_squared, whole),
-            where=np.array(where, whole),
-            where_slot=np.array(where_slot, whole),
-            selects=np.array(selects, whole),
-            low=np.array(low, real),
-            high=np.array(high, real),
+            **{
+                name: np.array(column, np.int64 if name in INT_COLUMNS else np.float64)
+                for name, column in vars(tables).items()
+            }
         )
         self._columns = width + max((len(c.signals) for c in self._channels if c.accuracy is not None), default=0)
         self._most = int(np.diff(self._tables.group).max(initial=0))
         # By sensor: a message with two ids has its channels twice here.
         self._positions = {c.index: c for c in self._channels if c.convert == "east_north"}
         self._origins = {index: channel.origin for index, channel in self._positions.items()}
-
-    @staticmethod
-    def _factor(channel: Channel, name: str, unit: str | None, wanted: str) -> tuple[float, float]:
-        if channel.convert == "east_north":
-            return conversion(unit, "deg", f"{channel.name}: {name}")
-        if channel.convert is not None:
-            raise SourceError(f"{channel.name}: convert is {channel.convert!r}; only east_north is known")
-        return conversion(unit, wanted, f"{channel.name}: {name}")
-
-    @staticmethod
-    def _own_factor(channel: Channel, own: Accuracy, k: int, unit: str | None) -> float:
-        where = f"{channel.name}: {own.signals[k]}"
-        return own.scale[k] * spread_factor(own.units[k] or unit, channel.model_units[k], where, squared=own.squared)
 
     def events(
         self,
@@ -267,29 +244,19 @@ class ChannelMapping:
         return batch
 
     def _report_losses(self, refused: np.ndarray, cut: np.ndarray, unreported: np.ndarray) -> None:
-        for c in np.flatnonzero(refused):
-            channel = self._channels[c]
+        for k, channel in enumerate(self._channels):
+            name, own = channel.name, channel.accuracy
             rule = " and ".join(f"{w.signal} in {w.low:g} to {w.high:g}" for w in channel.where)
-            for _ in range(refused[c]):
-                self._report(f"condition {channel.name}", f"{channel.name}: measurement rejected; it needs {rule}")
-        for c in np.flatnonzero(cut):
-            channel = self._channels[c]
-            for _ in range(cut[c]):
-                self._report(
-                    f"short frame {channel.name}",
-                    f"{channel.name}: a frame of {channel.message} ends before {', '.join(channel.signals)}",
-                )
-
-        for c in np.flatnonzero(unreported):
-            channel = self._channels[c]
-            assert channel.accuracy is not None
-            names = ", ".join(dict.fromkeys(channel.accuracy.signals))
-            what = "variance" if channel.accuracy.squared else "standard deviation"
-            for _ in range(unreported[c]):
-                self._report(
-                    f"accuracy {channel.name}",
-                    f"{channel.name}: {names} has no positive {what} of a measurement; the tuned R is used",
-                )
+            reported = ", ".join(dict.fromkeys(own.signals)) if own is not None else ""
+            what = "variance" if own is not None and own.squared else "standard deviation"
+            ends = f"a frame of {channel.message} ends before {', '.join(channel.signals)}"
+            for count, key, text in (
+                (refused[k], "condition", f"measurement rejected; it needs {rule}"),
+                (cut[k], "short frame", ends),
+                (unreported[k], "accuracy", f"{reported} has no positive {what} of a measurement; the tuned R is used"),
+            ):
+                for _ in range(count):
+                    self._report(f"{key} {name}", f"{name}: {text}")
 
     def _place(self, batch: Events, channel: Channel) -> None:
         """Convert latitude and longitude to east and north in place; the first valid fix is the default origin."""
@@ -310,6 +277,12 @@ class ChannelMapping:
         for k in range(2):
             factor, shift = conversion("m", channel.model_units[k], channel.name)
             batch.value[rows, k] = channel.scale[k] * (factor * metres[:, k] + shift) + channel.offset[k]
+
+
+def _own_factor(channel: Channel, own: Accuracy, k: int, unit: str | None) -> float:
+    """Return the factor of a reported accuracy of row k, whose unit is `unit` unless the channel declares one."""
+    where = f"{channel.name}: {own.signals[k]}"
+    return own.scale[k] * spread_factor(own.units[k] or unit, channel.model_units[k], where, squared=own.squared)
 
 
 SEMI_MAJOR = 6378137.0

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -98,7 +98,7 @@ class Simulator:
         variances = dict(truth_noise or {})
         self._q = np.array([variances.get(item.name, item.variance) for item in truth.noises], float)
         profiles = dict(inputs or {})
-        self._profiles = [profiles.get(item.name, Constant(item.default)) for item in model.inputs]
+        self._profiles = [profiles.get(item.name, constant_input(item.default)) for item in model.inputs]
         plans = dict(sensors or {})
         self._plans = [plans.get(sensor.name, SensorPlan()) for sensor in model.sensors]
         self._std = [
@@ -125,7 +125,7 @@ class Simulator:
         return round(k * self._step * 1e9)
 
     def _inputs(self, t: float) -> np.ndarray:
-        return np.array([profile.at(t) for profile in self._profiles], float)
+        return np.array([profile(t) for profile in self._profiles], float)
 
     def read(self, timeout: float) -> Events | None:
         """Return the events of the next steps; None at the end."""
@@ -265,56 +265,33 @@ def _runs(states: np.ndarray, width: int) -> list[tuple[int, int]]:
     return runs
 
 
-@dataclass(frozen=True)
-class Constant:
-    """The same value always."""
-
-    value: float
-
-    def at(self, t: float) -> float:
-        """Value at t seconds."""
-        return self.value
+Profile = Callable[[float], float]
+"""Value of an input at t seconds."""
 
 
-@dataclass(frozen=True)
-class Steps:
-    """From each of `times` (s, rising) on, the value beside it; again from the start after `repeat` seconds."""
-
-    times: tuple[float, ...]
-    values: tuple[float, ...]
-    repeat: float | None = None
-
-    def at(self, t: float) -> float:
-        """Value at t seconds; before the first time, the first value."""
-        if self.repeat is not None:
-            t = t % self.repeat
-        return self.values[max(0, int(np.searchsorted(self.times, t, side="right")) - 1)]
+def constant_input(value: float) -> Profile:
+    """Return the profile of a constant."""
+    return lambda t: value
 
 
-@dataclass(frozen=True)
-class Sine:
-    """mean + amplitude · sin(2π t / period + phase); period in s, phase in rad."""
+def stepped_input(times: Sequence[float], values: Sequence[float], repeat: float | None = None) -> Profile:
+    """Return a profile that has from each of `times` (s, rising) on the value beside it; before, the first value.
 
-    mean: float
-    amplitude: float
-    period: float
-    phase: float = 0.0
+    It starts again after `repeat` seconds.
+    """
 
-    def at(self, t: float) -> float:
-        """Value at t seconds."""
-        return self.mean + self.amplitude * float(np.sin(2.0 * np.pi * t / self.period + self.phase))
+    def at(t: float) -> float:
+        t = t if repeat is None else t % repeat
+        return values[max(0, int(np.searchsorted(times, t, side="right")) - 1)]
 
-
-@dataclass(frozen=True)
-class Sum:
-    """Several profiles added up."""
-
-    parts: tuple[Profile, ...]
-
-    def at(self, t: float) -> float:
-        """Value at t seconds."""
-        return sum(part.at(t) for part in self.parts)
+    return at
 
 
-Profile = Constant | Steps | Sine | Sum
-"""Any of them."""
+def sine_input(mean: float, amplitude: float, period: float, phase: float = 0.0) -> Profile:
+    """Return the profile mean + amplitude · sin(2π t / period + phase); period in s, phase in rad."""
+    return lambda t: mean + amplitude * float(np.sin(2.0 * np.pi * t / period + phase))
+
+
+def summed_inputs(parts: Sequence[Profile]) -> Profile:
+    """Return the sum of profiles."""
+    return lambda t: sum(part(t) for part in parts)

@@ -5,6 +5,7 @@ The same loop serves a live bus, a few frames at a time, and recordings, thousan
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -179,41 +180,25 @@ def ordered(message: Any, names: tuple[str, ...]) -> list[Any]:
 
 def tabulate(messages: list[tuple[Any, list[Any]]]) -> Signals:
     """Return the tables of messages (cantools) and their wanted signals, in the order of `ordered`."""
-    first, ids_first, known_first = [0], [0], [0]
-    columns: list[list[Any]] = [[] for _ in range(9)]
-    start, length, big, kind, scale, offset, parent, ids, known = columns
+    tables = SimpleNamespace(**{name: [] for name in Signals._fields})
+    for starts in (tables.first, tables.ids_first, tables.known_first):
+        starts.append(0)
     for message, signals in messages:
         names = [signal.name for signal in signals]
         for signal in signals:
-            start.append(_network_start(signal))
-            length.append(signal.length)
-            big.append(signal.byte_order != "little_endian")
-            kind.append(
-                (FLOAT32 if signal.length == 32 else FLOAT64)
-                if signal.is_float
-                else (SIGNED if signal.is_signed else UNSIGNED)
-            )
-            scale.append(float(signal.conversion.scale))
-            offset.append(float(signal.conversion.offset))
-            parent.append(-1 if signal.multiplexer_signal is None else names.index(signal.multiplexer_signal))
-            ids.extend(signal.multiplexer_ids or ())
-            ids_first.append(len(ids))
+            floats = FLOAT32 if signal.length == 32 else FLOAT64
+            tables.start.append(_network_start(signal))
+            tables.length.append(signal.length)
+            tables.big.append(signal.byte_order != "little_endian")
+            tables.kind.append(floats if signal.is_float else SIGNED if signal.is_signed else UNSIGNED)
+            tables.scale.append(float(signal.conversion.scale))
+            tables.offset.append(float(signal.conversion.offset))
+            tables.parent.append(-1 if signal.multiplexer_signal is None else names.index(signal.multiplexer_signal))
+            tables.ids.extend(signal.multiplexer_ids or ())
+            tables.ids_first.append(len(tables.ids))
             selected = [s for s in message.signals if s.multiplexer_signal == signal.name]
-            known.extend(sorted({value for s in selected for value in s.multiplexer_ids or ()}))
-            known_first.append(len(known))
-        first.append(len(start))
-    whole, real = np.int64, np.float64
-    return Signals(
-        first=np.array(first, whole),
-        start=np.array(start, whole),
-        length=np.array(length, whole),
-        big=np.array(big, np.bool_),
-        kind=np.array(kind, whole),
-        scale=np.array(scale, real),
-        offset=np.array(offset, real),
-        parent=np.array(parent, whole),
-        ids=np.array(ids, whole),
-        ids_first=np.array(ids_first, whole),
-        known=np.array(known, whole),
-        known_first=np.array(known_first, whole),
-    )
+            tables.known.extend(sorted({value for s in selected for value in s.multiplexer_ids or ()}))
+            tables.known_first.append(len(tables.known))
+        tables.first.append(len(tables.start))
+    kinds = {"big": np.bool_, "scale": np.float64, "offset": np.float64}
+    return Signals(**{name: np.array(column, kinds.get(name, np.int64)) for name, column in vars(tables).items()})

@@ -7,7 +7,7 @@ from estimators.errors import SourceError
 from estimators.log import INPUT, READING, TICK, TRUTH, truth_of
 from estimators.model.state_space import Input, Jump, Noise, Parameter, Row, Sensor, State, StateSpaceModel
 from estimators.models import MODELS
-from sources.simulator import Constant, SensorPlan, Simulator, Sine, Steps, Sum
+from sources.simulator import SensorPlan, Simulator, constant_input, sine_input, stepped_input, summed_inputs
 from tests.sources.can.can_tools import same
 from tests.support import read_all
 
@@ -99,7 +99,7 @@ def test_inputs_parameters_rates_and_losses():
         step=0.5,
         duration=6.0,
         truth_parameters={"gain": 4.0},
-        inputs={"u": Steps((0.0, 2.0), (0.5, 1.0))},
+        inputs={"u": stepped_input((0.0, 2.0), (0.5, 1.0))},
         sensors=QUIET,
     )
     got = read_all(source)
@@ -173,12 +173,12 @@ def test_true_noise_has_its_variance():
 
 
 def test_profiles():
-    steps = Steps((0.0, 2.0, 5.0), (1.0, 2.0, 3.0), repeat=10.0)
-    assert [steps.at(t) for t in (-0.0, 1.9, 2.0, 4.9, 5.0, 9.9, 10.0, 12.5)] == [1, 1, 2, 2, 3, 3, 1, 2]
-    assert Steps((1.0,), (4.0,)).at(0.0) == 4.0
-    sine = Sine(mean=1.0, amplitude=2.0, period=4.0, phase=np.pi / 2)
-    assert [sine.at(t) for t in (0.0, 1.0, 2.0)] == pytest.approx([3.0, 1.0, -1.0])
-    assert Sum((Constant(1.5), steps, sine)).at(2.0) == pytest.approx(1.5 + 2.0 - 1.0)
+    stepped = stepped_input((0.0, 2.0, 5.0), (1.0, 2.0, 3.0), repeat=10.0)
+    assert [stepped(t) for t in (-0.0, 1.9, 2.0, 4.9, 5.0, 9.9, 10.0, 12.5)] == [1, 1, 2, 2, 3, 3, 1, 2]
+    assert stepped_input((1.0,), (4.0,))(0.0) == 4.0
+    sine = sine_input(mean=1.0, amplitude=2.0, period=4.0, phase=np.pi / 2)
+    assert [sine(t) for t in (0.0, 1.0, 2.0)] == pytest.approx([3.0, 1.0, -1.0])
+    assert summed_inputs((constant_input(1.5), stepped, sine))(2.0) == pytest.approx(1.5 + 2.0 - 1.0)
 
 
 def test_what_is_out_of_range_is_refused():

@@ -121,19 +121,19 @@ def _check_same(loaded: Loaded, key: Key, truth: StateSpaceModel, model: StateSp
 
 def _profile(sections: tuple[ProfileSection, ...]) -> Profile:
     """Return the sum of an input's profiles."""
-    from sources.simulator import Constant, Sine, Steps, Sum
+    from sources.simulator import constant_input, sine_input, stepped_input, summed_inputs
 
     parts: list[Profile] = []
     for section in sections:
         if section.steps is not None:
             times, values = zip(*section.steps, strict=True)
-            parts.append(Steps(times, values, section.repeat))
+            parts.append(stepped_input(times, values, section.repeat))
         elif section.sine is not None:
             sine = section.sine
-            parts.append(Sine(sine.mean, sine.amplitude, sine.period, sine.phase))
+            parts.append(sine_input(sine.mean, sine.amplitude, sine.period, sine.phase))
         else:
-            parts.append(Constant(section.constant or 0.0))
-    return parts[0] if len(parts) == 1 else Sum(tuple(parts))
+            parts.append(constant_input(section.constant or 0.0))
+    return parts[0] if len(parts) == 1 else summed_inputs(tuple(parts))
 
 
 def _open(opening: Opening) -> Source:

@@ -12,7 +12,7 @@ from estimators.fold import Fold
 from estimators.log import READING, Log
 from estimators.models import MODELS
 from estimators.tuning import Tuning
-from sources.simulator import Constant, Simulator, Steps
+from sources.simulator import Simulator, constant_input, stepped_input
 from tests.support import read_all
 
 MODEL = MODELS["motor_drive"]
@@ -21,7 +21,11 @@ MODEL = MODELS["motor_drive"]
 @pytest.fixture(scope="module")
 def folded():
     """A minute and a half of a motor whose yoke reads 2 °C too high from a minute on."""
-    inputs = {"i_q": Steps((0.0, 20.0), (60.0, 200.0)), "speed": Constant(250.0), "coolant": Constant(40.0)}
+    inputs = {
+        "i_q": stepped_input((0.0, 20.0), (60.0, 200.0)),
+        "speed": constant_input(250.0),
+        "coolant": constant_input(40.0),
+    }
     log = Log.of(MODEL)
     log.extend(read_all(Simulator(MODEL, seed=2, step=0.1, duration=90.0, inputs=inputs)))
     wrong = (log.kind[: log.n] == READING) & (log.channel[: log.n] == MODEL.sensor_names.index("yoke"))

@@ -15,7 +15,7 @@ from estimators.log import truth_of
 from estimators.models.uwb_rover import UWB_ROVER, uwb_rover
 from estimators.track import Track
 from estimators.tuning import Tuning
-from sources.simulator import Constant, Simulator, Sine
+from sources.simulator import Simulator, constant_input, sine_input
 from tests.conftest import absent
 from tests.support import as_log, read_all
 
@@ -59,7 +59,7 @@ def test_a_simulated_rover_is_tracked_within_what_the_filter_says(estimator: str
         step=0.1,
         duration=120.0,
         initial={"east": 0.5, "north": -0.5, "range_scale": 1.04},
-        inputs={"speed": Constant(0.8), "yaw_rate": Sine(0.0, 0.4, 20.0)},
+        inputs={"speed": constant_input(0.8), "yaw_rate": sine_input(0.0, 0.4, 20.0)},
     )
     log = as_log(read_all(source))
     track = fold(estimator, model, Tuning.of(model), log)

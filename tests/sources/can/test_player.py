@@ -12,7 +12,7 @@ from estimators.model.state_space import Input, Noise, Row, Sensor, State, State
 from sources.can.bus import CanBus
 from sources.can.decoder import Decoder
 from sources.can.player import Encoder, Player
-from sources.simulator import SensorPlan, Simulator, Steps
+from sources.simulator import SensorPlan, Simulator, stepped_input
 from sources.source import Channel
 from tests.sources.can.can_tools import Reports, dbc
 from tests.support import read_all
@@ -72,7 +72,7 @@ def asset():
         seed=4,
         step=0.5,
         duration=60.0,
-        inputs={"power": Steps(times=(0.0, 20.0), values=(3.0, 30.0))},
+        inputs={"power": stepped_input(times=(0.0, 20.0), values=(3.0, 30.0))},
         sensors={"temp": SensorPlan(drop_every=10)},
     )
 

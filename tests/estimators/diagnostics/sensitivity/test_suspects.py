@@ -7,7 +7,7 @@ from estimators.diagnostics.sensitivity.suspects import in_words, suspects
 from estimators.log import INPUT, READING, Log
 from estimators.models import MODELS
 from estimators.tuning import Tuning
-from sources.simulator import Constant, Simulator, Steps
+from sources.simulator import Simulator, constant_input, stepped_input
 from tests.support import read_all
 
 MODEL = MODELS["motor_drive"]
@@ -18,10 +18,10 @@ SINCE = 60.0
 def log():
     """Two minutes of the motor, drawn from the model that the filter believes, under a load that changes."""
     inputs = {
-        "i_q": Steps((0.0, 20.0, 70.0, 90.0), (60.0, 200.0, 120.0, 240.0)),
-        "speed": Steps((0.0, 30.0, 80.0), (150.0, 350.0, 200.0)),
-        "coolant": Constant(40.0),
-        "ambient": Constant(22.0),
+        "i_q": stepped_input((0.0, 20.0, 70.0, 90.0), (60.0, 200.0, 120.0, 240.0)),
+        "speed": stepped_input((0.0, 30.0, 80.0), (150.0, 350.0, 200.0)),
+        "coolant": constant_input(40.0),
+        "ambient": constant_input(22.0),
     }
     found = Log.of(MODEL)
     found.extend(read_all(Simulator(MODEL, seed=4, step=0.1, duration=120.0, inputs=inputs)))
