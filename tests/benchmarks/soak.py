@@ -8,9 +8,11 @@ history was full, and what watches the twin must still be there. It exits with 1
 from __future__ import annotations
 
 import argparse
+import resource
 import sys
 import threading
 import time
+from pathlib import Path
 
 import numpy as np
 
@@ -23,8 +25,6 @@ from estimators.track import HEALTH_NAMES, SUSPECT, TRACKING, VERDICT_NAMES
 from sources.faults.kinds import Fault
 from sources.faults.layer import Faults
 from sources.source import WRONG_TIME
-
-from .live import resident
 
 TWIN = "motor_can"
 STEP = 0.003
@@ -63,6 +63,11 @@ MIXES: tuple[tuple[dict[str, object], ...], ...] = (
     ({"kind": "duplicate", "rate": 0.2, "every": 0.5, "count": 2}, {"kind": "delay", "sensor": "tooth", "size": 3.0}),
     ({"kind": "silence"},),
 )  # fmt: skip
+
+
+def resident() -> float:
+    """Return resident memory of this process, MB."""
+    return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize() / 1e6
 
 
 class Soaked:

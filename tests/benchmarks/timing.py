@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from statistics import median
 from time import perf_counter, process_time
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias, TypeVar
 
 from app.present.result import number_text, plain
 from estimators.errors import NisusError
@@ -70,6 +70,15 @@ def seconds(call: Callable[[], object]) -> float:
     return process_time() - begun
 
 
+T = TypeVar("T")
+
+
+def timed(call: Callable[[], T]) -> tuple[T, float]:
+    """Return the result of one call, and its processor seconds."""
+    begun = process_time()
+    return call(), process_time() - begun
+
+
 def both(call: Callable[[], object]) -> tuple[float, float]:
     """Return the clock and the processor seconds of one call."""
     begun = perf_counter()
@@ -95,11 +104,6 @@ def compare(
     ours(), theirs()
     rounds = [(seconds(ours) / steps[0], seconds(theirs) / steps[1]) for _ in range(repetitions)]
     return Pair(median(a for a, _ in rounds), median(b for _, b in rounds), median(b / a for a, b in rounds))
-
-
-def judged(value: float, bound: float, *, at_least: bool) -> str:
-    """Return whether a figure meets its bound, in words."""
-    return "PASS" if (value >= bound if at_least else value <= bound) else "FALLS SHORT"
 
 
 def run_sections(sections: Sequence[Section], file: Path | None = None) -> dict[str, Any]:
