@@ -20,7 +20,7 @@ from config.tunings import OWN, Version, find_version
 from config.yaml_files import parse
 from estimators.diagnostics.commission import baseline_of, lost_from
 from estimators.diagnostics.health import HealthPolicy
-from estimators.errors import ConfigError, EstimatorError
+from estimators.errors import LARGEST, ConfigError, EstimatorError
 from estimators.fold_checks import check_variances
 from estimators.model.state_space import StateSpaceModel
 from estimators.registry import checked, find_entry, find_estimator
@@ -353,6 +353,8 @@ def _set(tuning: Tuning, key: str, text: str) -> Tuning:
         raise ConfigError(f"{option}: {key} must be {'true or false' if wants_bool else 'a number'}")
     try:
         return tuning.set(key, value if key in tuning_keys else None)
+    except OverflowError:
+        raise ConfigError(f"--set {key}: {key} is too large; it must be {LARGEST:g} at most") from None
     except ConfigError as error:
         more = "" if key in tuning_keys else f"; or a key of the YAML: {', '.join(TwinSection.model_fields)}"
         raise ConfigError(f"{option}: {error}{more}") from None

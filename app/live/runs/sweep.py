@@ -1,6 +1,6 @@
-"""Sweep a parameter: likelihood and NIS of the last events over several values of one entry of the tuning.
+"""Sweep a parameter: likelihood and NIS of the last events over several values of one entry; noise estimates.
 
-A job folds them, one value after another, the nearest first, and ends as soon as another tuning runs.
+A job folds the events, one value after another, the nearest first, and ends as soon as another tuning runs.
 """
 
 from __future__ import annotations
@@ -106,15 +106,6 @@ class Swept:
         return None
 
 
-@dataclass(frozen=True)
-class Matched:
-    """Noise of each sensor row by covariance matching, repeated until R converges, for a revision."""
-
-    revision: int
-    events: int
-    rows: dict[str, SensorNoise]
-
-
 class Sweeps:
     """Sweeps of the running twin, one after another in one job; the last request comes first."""
 
@@ -124,7 +115,7 @@ class Sweeps:
         self._wanted: list[str] = []
         self._job: Job | None = None
         self._known: dict[str, Swept] = {}
-        self._matched: Matched | None = None
+        self._matched: tuple[int, int, dict[str, SensorNoise]] = (-1, 0, {})
 
     def around(self, key: str) -> Swept:
         """Return the sweep of a key as far as it is done, and queue the rest.
@@ -134,35 +125,33 @@ class Sweeps:
         """
         value = value_of(self._engine.tuning, key)
         known, revision = self._known.get(key), self._engine.revisions.runs[-1].number
-        if known is not None and known.revision == revision and not self._outdated(known):
-            return known
-        self._want(key)
-        # Return the previous sweep until the new one is ready.
-        return known if known is not None and known.revision == revision else Swept(key, revision, value, 0)
+        if known is None or known.revision != revision:
+            known = Swept(key, revision, value, 0)
+            self._want(key)
+        elif known.done and known.events < min(MAX_SWEEP_EVENTS - MIN_SWEEP_EVENTS, self._events() / STALE_GROWTH):
+            # Return the previous sweep until the new one is ready.
+            self._want(key)
+        return known
 
-    def matched(self) -> Matched | None:
-        """Return the noise after covariance matching of all of R; None until it is known.
+    def matched(self) -> dict[str, SensorNoise] | None:
+        """Return the noise of each row after covariance matching of all of R; None until it is known.
 
         If R alone was wrong, the innovations are white then; any other error leaves them correlated.
         """
-        known, revision = self._matched, self._engine.revisions.runs[-1].number
-        current = known is not None and known.revision == revision
-        if not current or (
-            known is not None and known.events < self._engine.index_at(END_OF_TIME) / STALE_GROWTH < MAX_SWEEP_EVENTS
-        ):
+        revision, events, rows = self._matched
+        current = revision == self._engine.revisions.runs[-1].number
+        if not current or events < self._events() / STALE_GROWTH < MAX_SWEEP_EVENTS:
             self._want(MATCHED)
-        return known if current else None
+        return rows if current else None
+
+    def _events(self) -> int:
+        return self._engine.index_at(END_OF_TIME)
 
     def _want(self, key: str) -> None:
         with self._lock:
             self._wanted = [key, *(other for other in self._wanted if other != key)][:MAX_SWEEPS]
             if self._job is None or self._job.over:
                 self._job = self._engine.jobs.run("sweep", self._work)
-
-    def _outdated(self, known: Swept) -> bool:
-        return known.done and known.events < min(
-            MAX_SWEEP_EVENTS - MIN_SWEEP_EVENTS, self._engine.index_at(END_OF_TIME) / STALE_GROWTH
-        )
 
     def _work(self, job: Job) -> None:
         while (key := self._next(job)) is not None:
@@ -214,7 +203,11 @@ class Sweeps:
         """Fold with the R that the innovations of the previous fold imply, until it converges."""
         tuning, track = taken.tuning, taken.track
         for _ in range(MAX_MATCHING_FOLDS):
-            following = _with(tuning, sensor_noise(track, taken.events, tuning))
+            r = tuning.r.copy()
+            for name, estimate in sensor_noise(track, taken.events, tuning).items():
+                if estimate.variance > 0.0:
+                    r[tuning.model.row_names.index(name)] = estimate.variance
+            following = replace(tuning, r=r)
             moved = np.abs(np.log(following.r[following.r > 0.0] / tuning.r[following.r > 0.0]))
             if not moved.size or moved.max() < MATCHING_TOLERANCE:
                 break
@@ -223,7 +216,7 @@ class Sweeps:
                 track = self._fold(taken, tuning, job)
             except NisusError:
                 return
-        self._matched = Matched(taken.revision, len(taken.events), sensor_noise(track, taken.events, tuning))
+        self._matched = taken.revision, len(taken.events), sensor_noise(track, taken.events, tuning)
 
     def _point(self, taken: EventWindow, key: str, factor: float, tuning: Tuning, job: Job) -> Point:
         """Fold one value."""
@@ -233,9 +226,11 @@ class Sweeps:
         except NisusError:
             return Point(factor, value, None, None)
         found = score(track, taken.events, self._engine.model, gate=tuning.gate)
-        likelihood, nis = found.log_likelihood, mean_nis(track, tuning.gate)
-        failed = _failures(track) > _failures(taken.track)
-        return Point(factor, value, _number(likelihood, failed), _number(nis, failed))
+        # A value at which more measurements fail has no likelihood to be compared.
+        failed = np.sum(track.verdict == FAILED) > np.sum(taken.track.verdict == FAILED)
+        known = (None if failed or not np.isfinite(each) else float(each)
+                 for each in (found.log_likelihood, mean_nis(track, tuning.gate)))  # fmt: skip
+        return Point(factor, value, *known)
 
     def _fold(self, taken: EventWindow, tuning: Tuning, job: Job) -> Track:
         fold = taken.fold(tuning=tuning, policy=self._engine.policy)
@@ -303,25 +298,8 @@ def scaled(tuning: Tuning, key: str, factor: float) -> Tuning:
     return replace(tuning, q=tuning.q * factor) if key == "Q" else replace(tuning, r=tuning.r * factor)
 
 
-def _with(tuning: Tuning, noises: Mapping[str, SensorNoise]) -> Tuning:
-    """Return the tuning with these variances in R, where they are positive."""
-    r = tuning.r.copy()
-    for name, noise in noises.items():
-        if noise.variance > 0.0:
-            r[tuning.model.row_names.index(name)] = noise.variance
-    return replace(tuning, r=r)
-
-
-def _failures(track: Track) -> int:
-    return int(np.sum(track.verdict == FAILED))
-
-
-def _number(value: float, failed: bool) -> float | None:
-    return None if failed or not np.isfinite(value) else float(value)
-
-
-CHANCE = 1e-3
-"""Of innovations as correlated as they are, were the filter right, below which they are called so."""
+MAX_CHANCE = 1e-3
+"""Probability of innovations as correlated, were the filter right, below which they are called correlated."""
 
 
 @dataclass(frozen=True)
@@ -339,34 +317,19 @@ class NoiseEstimates:
 
 
 def noise(engine: Running, sweeps: Sweeps) -> NoiseEstimates:
-    """Estimate the noise from the last events of the running twin."""
+    """Estimate the noise from the last innovations of the running twin: each R, and all of Q scaled."""
     taken, q = engine.last_events(MAX_SWEEP_EVENTS, rows=True), sweeps.around("Q")
     if taken is None:
         return NoiseEstimates(q.revision, {}, "no readings yet", q, {})
-    reason = _reason_against(engine, taken.tuning.options.get("adapt", 0.0))
-    rows = {} if reason else sensor_noise(taken.track, taken.events, taken.tuning)
-    found = _by_key(engine, taken.tuning, rows)
-    if any(_doubtful(noise) for noise in found.values()):
+    reason = "the filter adapts its noise itself" if taken.tuning.options.get("adapt", 0.0) else ""
+    if engine.twin.plan.brings_variances:
+        reason = "the readings bring their own variances"
+    found = _by_key(taken.tuning, {} if reason else sensor_noise(taken.track, taken.events, taken.tuning))
+    if any(estimate.chance < MAX_CHANCE for estimate in found.values()):
         # A wrong R alone leaves correlated innovations too; with the right one they are white.
         matched = sweeps.matched()
-        if matched is not None:
-            found = _by_key(engine, taken.tuning, matched.rows)
+        found = found if matched is None else _by_key(taken.tuning, matched)
     return NoiseEstimates(taken.revision, found, reason, q, doubts(found, q.level))
-
-
-def _by_key(engine: Running, tuning: Tuning, rows: Mapping[str, SensorNoise]) -> dict[str, SensorNoise]:
-    """Return the estimates by the tuning's keys: of one row, or of all rows that share an entry."""
-    found = {}
-    for item in tuning.items():
-        if item.key.startswith("R."):
-            known = [rows[name] for name in _rows_of(engine, item.key[2:]) if name in rows]
-            if known:
-                found[item.key] = _mean(known)
-    return found
-
-
-def _doubtful(noise: SensorNoise) -> bool:
-    return noise.chance < CHANCE
 
 
 def doubts(found: Mapping[str, SensorNoise], level: float | None) -> dict[str, str]:
@@ -379,38 +342,38 @@ def doubts(found: Mapping[str, SensorNoise], level: float | None) -> dict[str, s
         found: Estimated R by key.
         level: Factor of all of Q at which the NIS is consistent; None if not known.
     """
-    correlated = {key: noise for key, noise in found.items() if _doubtful(noise)}
-    said = {
-        key: f"the innovations are correlated ({noise.correlation:+.2f} with the next, where chance allows "
-        f"±{2.0 / np.sqrt(noise.n):.2f}): a state is missing, Q is wrong, or the sensor's error lasts; their size does "
-        f"not determine R"
-        for key, noise in correlated.items()
+    correlated = {key: estimate for key, estimate in found.items() if estimate.chance < MAX_CHANCE}
+    reasons = {
+        key: f"the innovations are correlated ({estimate.correlation:+.2f} with the next, where chance allows "
+        f"±{2.0 / np.sqrt(estimate.n):.2f}): a state is missing, Q is wrong, or the sensor's error lasts; their size "
+        f"does not determine R"
+        for key, estimate in correlated.items()
     }
-    signs = {np.sign(noise.correlation) for noise in correlated.values()}
+    signs = {np.sign(estimate.correlation) for estimate in correlated.values()}
     if level is not None and signs and np.sign(np.log(level)) not in signs:
         more = "larger" if 1.0 in signs else "smaller"
-        said["Q"] = f"the innovations are correlated, for which Q would have to be {more}: look for a missing state"
-    return said
+        reasons["Q"] = f"the innovations are correlated, for which Q would have to be {more}: look for a missing state"
+    return reasons
 
 
-def _reason_against(engine: Running, adapt: float) -> str:
-    if engine.twin.plan.brings_variances:
-        return "the readings bring their own variances"
-    return "the filter adapts its noise itself" if adapt else ""
-
-
-def _rows_of(engine: Running, name: str) -> tuple[str, ...]:
-    """A row, or all rows of a sensor that share an entry."""
-    model = engine.model
-    if name in model.row_names:
-        return (name,)
-    k = model.sensor_names.index(name)
-    return tuple(model.row_names[model.row_start[k] : model.row_start[k] + len(model.sensors[k].rows)])
-
-
-def _mean(known: list[SensorNoise]) -> SensorNoise:
-    variances, stds, counts, _, chances = (np.array(column, float) for column in zip(*known, strict=True))
-    std, worst = float(np.sqrt(np.sum(stds**2)) / len(known)), int(np.argmin(chances))
-    # The least of many chances is small by chance.
-    chance = min(1.0, len(known) * float(chances[worst]))
-    return SensorNoise(float(variances.mean()), std, int(counts.sum()), known[worst].correlation, chance)
+def _by_key(tuning: Tuning, rows: Mapping[str, SensorNoise]) -> dict[str, SensorNoise]:
+    """Return the estimates by the tuning's keys: of one row, or of all rows that share an entry."""
+    model, found = tuning.model, {}
+    for name in (item.key[2:] for item in tuning.items() if item.key.startswith("R.")):
+        names: Sequence[str] = (name,)
+        if name not in model.row_names:
+            k = model.sensor_names.index(name)
+            names = model.row_names[model.row_start[k] : model.row_start[k] + len(model.sensors[k].rows)]
+        known = [rows[row] for row in names if row in rows]
+        if known:
+            variances, stds, counts, _, chances = (np.array(column, float) for column in zip(*known, strict=True))
+            worst = int(np.argmin(chances))
+            found[f"R.{name}"] = SensorNoise(
+                float(variances.mean()),
+                float(np.sqrt(np.sum(stds**2)) / len(known)),
+                int(counts.sum()),
+                known[worst].correlation,
+                # The least of many chances is small by chance.
+                min(1.0, len(known) * float(chances[worst])),
+            )
+    return found

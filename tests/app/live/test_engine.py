@@ -170,19 +170,19 @@ def test_a_refold_replaces_the_whole_history(command, estimator, tuned):
 
 
 def test_with_threads_measurements_that_come_during_a_refold_are_not_lost(started):
-    times, values = series(30_000)
+    times, values = series(60_000)
     source = Scripted()
     engine = started(source)
-    source.put(readings(times[:25_000], values[:25_000]))
-    wait_for(lambda: row_count(engine) == 25_000)
+    source.put(readings(times[:50_000], values[:50_000]))
+    wait_for(lambda: row_count(engine) == 50_000)
     engine.submit(commands.SetTuning("Q.rate", 0.01))
-    late = [25_850, 25_900]
-    for start in range(25_000, 30_000, 250):
+    late = [50_850, 50_900]
+    for start in range(50_000, 60_000, 250):
         piece = np.setdiff1d(np.arange(start, start + 250), late)
         source.put(readings(times[piece], values[piece]))
-        if start == 25_750:
+        if start == 50_750:
             source.put(readings(times[late], values[late]))
-    wait_for(lambda: row_count(engine) == 30_000 and not engine.status().refolding)
+    wait_for(lambda: row_count(engine) == 60_000 and not engine.status().refolding)
     assert_same(pull_all(engine).track, reference(times, values, "kf", FIRST.set("Q.rate", 0.01)))
 
 

@@ -108,6 +108,56 @@ def test_a_failure_is_a_notice_or_told_to_its_owner_and_a_repeated_job_goes_on(j
     assert jobs.step() and told == [reason] * 3
 
 
+def test_nobody_sees_a_job_over_before_its_final_state_and_result():
+    class Observed(Job):
+        def __setattr__(self, name, value):
+            super().__setattr__(name, value)
+            if hasattr(self, "ended_by"):
+                seen.append((self.over, self.state, self.result))
+
+    seen = []
+    job = Observed("observed", lambda job: "found")
+    job.ended_by = None
+    job.run()
+    assert seen[-1] == (True, DONE, "found")
+    assert all(over == (state == DONE) and result in (None, "found") for over, state, result in seen)
+    assert all(result == "found" for over, _, result in seen if over)
+
+
+def test_a_job_that_ends_while_it_is_cancelled_keeps_its_final_state():
+    class Racing(Job):
+        @property
+        def over(self):
+            found = super().over
+            if not ending.ident:
+                ending.start()
+                ending.join(0.1)
+            return found
+
+    job = Racing("racing", lambda job: 1)
+    ending = threading.Thread(target=job.run)
+    job.cancel()
+    ending.join(60.0)
+    assert job.state in (CANCELLED, DONE)
+    job.cancel()
+    assert job.state in (CANCELLED, DONE)
+
+
+def test_jobs_that_do_not_return_are_left_behind(notices):
+    jobs = Jobs(notices, "refold", threads=1, niceness=0)
+    leave, begun = threading.Event(), threading.Event()
+    stuck = jobs.run("stuck", lambda job: (begun.set(), leave.wait(60.0)))
+    after = jobs.run("after", lambda job: threading.current_thread().name)
+    jobs.start()
+    assert begun.wait(60.0) and not after.over
+    jobs.abandon()
+    wait_for(lambda: after.over)
+    assert after.result == "refold 0" and not stuck.over
+    leave.set()
+    wait_for(lambda: stuck.over)
+    jobs.stop()
+
+
 def test_a_paced_executor_maps_in_order_and_ends_with_its_job():
     job = Job("levels")
     found = PacedExecutor(job).map(lambda a, b: a + b, [1, 2, 3], [10, 20, 30])

@@ -9,7 +9,6 @@ import viser
 
 from app.cli.main import main
 from app.live import commands
-from app.live.engine import Engine
 from app.live.execute import play
 from app.twin.twin import load_twin, restore_twin
 from app.views.viser.view import ViserView
@@ -24,7 +23,7 @@ from estimators.models import MODELS
 from estimators.registry import ESTIMATORS, unfit
 from estimators.track import DIVERGED, FAILED, GATED, USED
 from estimators.tuning import Tuning
-from tests.app.scripted import Scripted, pull_all, wait_for
+from tests.app.scripted import Stepped, pull_all
 from tests.conftest import ROOT
 from tests.support import SECOND
 
@@ -40,28 +39,8 @@ BAD = {
 PATH = ROOT / "config" / "twins" / "motor_winding.yaml"
 
 
-@pytest.fixture
-def start():
-    engines = []
-
-    def start(made):
-        source = Scripted()
-        engine = Engine(made, lambda report: source)
-        engine.start()
-        engines.append(engine)
-        return source, engine
-
-    yield start
-    for engine in engines:
-        engine.stop()
-
-
 def reading(model, second, values):
     return Events.one(round(second * SECOND), round(second * SECOND), READING, 0, values, model.width)
-
-
-def errors(engine):
-    return [line.text for line in engine.notices.since(0) if line.level == "error"]
 
 
 def one_line(text, expected):
@@ -70,41 +49,31 @@ def one_line(text, expected):
 
 @pytest.mark.parametrize("way", ["yaml", "filters", "set", "api", "page"])
 @pytest.mark.parametrize("case", BAD)
-def test_an_option_that_cannot_be_is_one_line_and_changes_nothing(case, way, start):
+def test_an_option_that_cannot_be_is_one_line_and_changes_nothing(case, way):
     name, option, value, expected = BAD[case]
-    if way in ("yaml", "filters", "set"):
-        with pytest.raises(NisusError) as caught:
-            if way == "set":
-                overrides = {"estimator": name, f"estimator.options.{option}": str(value)}
-                place = f"--set estimator.options.{option}={value}: "
-                load_twin("motor_winding", overrides=overrides)
-            else:
-                text, line = with_option(way, name, option, value)
-                place = f"motor_winding.yaml:{line}: "
-                restore_twin(text, PATH)
-        one_line(str(caught.value), expected)
-        assert place in str(caught.value)
-        return
-    source, engine = start(load_twin("motor_winding", overrides={"estimator": name}))
-    if way == "api":
-        with pytest.raises(NisusError) as caught:
-            command_from_json({"command": "SetOption", "name": option, "value": value}, engine)
-        one_line(str(caught.value), expected)
-        return
-    source.put(reading(engine.model, 1.0, [40.0]))
-    wait_for(lambda: len(pull_all(engine).events) == 1)
-    estimator, options = engine.status().estimator, engine.status().options
-    from_the_page(engine, option, value)
-    wait_for(lambda: errors(engine))
-    (text,) = errors(engine)
-    one_line(text, expected)
-    wait_for(lambda: not engine.status().refolding)
-    engine._status = None
-    assert (engine.status().estimator, engine.status().options) == (estimator, options)
-    assert pull_all(engine).revision == 0
-    source.put(reading(engine.model, 2.0, [41.0]))
-    wait_for(lambda: len(pull_all(engine).events) == 2)
-    assert pull_all(engine).track.verdict[1] == USED
+    place = ""
+    stepped = Stepped(of=load_twin("motor_winding", overrides={"estimator": name}))
+    stepped.put(reading(stepped.engine.model, 1.0, [40.0]))
+    before = stepped.status()
+    with pytest.raises(NisusError) as caught:
+        if way == "set":
+            place = f"--set estimator.options.{option}={value}: "
+            load_twin("motor_winding", overrides={"estimator": name, f"estimator.options.{option}": str(value)})
+        elif way == "api":
+            command_from_json({"command": "SetOption", "name": option, "value": value}, stepped.engine)
+        elif way == "page":
+            # As a page that asks without the API's checks.
+            stepped.submit(commands.SetOption(option, value))
+        else:
+            text, line = with_option(way, name, option, value)
+            place = f"motor_winding.yaml:{line}: "
+            restore_twin(text, PATH)
+    one_line(str(caught.value), expected)
+    assert place in str(caught.value)
+    status = stepped.status()
+    assert (status.estimator, status.options, status.revision) == (before.estimator, before.options, 0)
+    stepped.put(reading(stepped.engine.model, 2.0, [41.0]))
+    assert pull_all(stepped.engine).track.verdict[1] == USED
 
 
 def with_option(way, name, option, value):
@@ -116,33 +85,46 @@ def with_option(way, name, option, value):
     return head + tail[tail.index("\ngate:") :], head.count("\n") + 1
 
 
-def from_the_page(engine, option, value):
-    """As a page that asks without the API's checks."""
-    engine.submit(commands.SetOption(option, value))
-
-
 @pytest.mark.parametrize("value", ["abc", "inf", None, [1], {}])
-def test_an_option_that_is_no_number_is_refused_by_the_api(value, start):
-    _, engine = start(load_twin("motor_winding", overrides={"estimator": "ukf"}))
+def test_an_option_that_is_no_number_is_refused_by_the_api(value):
+    engine = Stepped(of=load_twin("motor_winding", overrides={"estimator": "ukf"})).engine
     with pytest.raises(NisusError) as caught:
         command_from_json({"command": "SetOption", "name": "alpha", "value": value}, engine)
     one_line(str(caught.value), "alpha" if isinstance(value, str) else "value")
 
 
-def test_a_number_beyond_all_numbers_is_refused(start):
-    _, engine = start(load_twin("motor_winding"))
-    key = engine.tuning.keys()[0]
-    with pytest.raises(ConfigError, match="value is too large"):
-        command_from_json({"command": "SetTuning", "key": key, "value": 10**400}, engine)
-    with pytest.raises(ConfigError, match=rf"{key} is 1e\+300; it must be 1e\+50 at most"):
-        command_from_json({"command": "SetTuning", "key": key, "value": 1e300}, engine)
+BEYOND = "1" + "0" * 400
+"""More than a float can hold."""
 
 
-def test_a_choice_may_be_given_as_its_word(start):
-    source, engine = start(load_twin("motor_winding", overrides={"estimator": "ekf"}))
-    source.put(reading(engine.model, 1.0, [40.0]))
-    engine.submit(command_from_json({"command": "SetOption", "name": "robust", "value": "huber"}, engine))
-    wait_for(lambda: engine.status().options["robust"] == 1.0)
+@pytest.mark.parametrize(
+    ("way", "value", "expected"),
+    [
+        ("api", 10**400, "SetTuning: value is too large; it must be below 2^53"),
+        ("api", 1e300, "Q.temperature is 1e+300; it must be 1e+50 at most"),
+        ("yaml", "1e300", "motor_winding.yaml:19: noise.temperature.variance is 1e+300; it must be 1e+50 at most"),
+        ("yaml", BEYOND, "motor_winding.yaml:19: noise.temperature.variance is 1000000"),
+        ("set", "1e300", "--set Q.temperature=1e300: Q.temperature is 1e+300; it must be 1e+50 at most"),
+        ("set", BEYOND, "Q.temperature is too large; it must be 1e+50 at most"),
+    ],
+)
+def test_a_number_beyond_all_numbers_is_refused_with_its_place_and_rule(way, value, expected):
+    with pytest.raises(ConfigError) as caught:
+        if way == "api":
+            engine = Stepped(of=load_twin("motor_winding")).engine
+            command_from_json({"command": "SetTuning", "key": "Q.temperature", "value": value}, engine)
+        elif way == "set":
+            load_twin("motor_winding", overrides={"Q.temperature": value})
+        else:
+            restore_twin(PATH.read_text().replace("variance: 0.01}", f"variance: {value}}}"), PATH)
+    one_line(str(caught.value), expected)
+    assert len(str(caught.value)) < 200
+
+
+def test_a_choice_may_be_given_as_its_word():
+    stepped = Stepped(of=load_twin("motor_winding", overrides={"estimator": "ekf"}))
+    stepped.submit(command_from_json({"command": "SetOption", "name": "robust", "value": "huber"}, stepped.engine))
+    assert stepped.status().options["robust"] == 1.0
 
 
 def test_a_covariance_that_is_none_is_refused_when_the_model_loads():
@@ -188,36 +170,31 @@ def test_a_spike_is_gated_and_leaves_no_trace(name, spike):
 
 
 @pytest.mark.parametrize("name", ["pf", "pf-reg", "pf-ekf", "apf"])
-def test_particles_that_all_weigh_nothing_recover_and_it_is_said(name, start):
+def test_particles_that_all_weigh_nothing_recover_and_it_is_said(name):
     """Without a gate: the square of such a residual is beyond the numbers, so every density is zero."""
-    source, engine = start(load_twin("motor_winding", overrides={"estimator": name}))
+    stepped = Stepped(of=load_twin("motor_winding", overrides={"estimator": name}))
     for second, value in enumerate([40.0, 1e200, 41.0, 40.5, 39.5], start=1):
-        source.put(reading(engine.model, second, [value]))
-    wait_for(lambda: len(pull_all(engine).events) == 5)
-    track = pull_all(engine).track
+        stepped.put(reading(stepped.engine.model, second, [value]))
+    track, counts = pull_all(stepped.engine).track, stepped.status().counts
     assert track.verdict.tolist() == [USED, FAILED, USED, USED, USED]
     assert np.isfinite(track.mean).all() and abs(track.mean[-1, 0] - 40.0) < 5.0
-    wait_for(lambda: engine.status().counts.get("recovered") == 1)
-    assert engine.status().counts["failed"] == 1
+    assert (counts["recovered"], counts["failed"]) == (1, 1)
     text = f"{name}: no particle explained a reading; the cloud was widened, 1 time(s) so far"
-    assert text in [line.text for line in engine.notices.since(0)]
+    assert text in stepped.notices()
 
 
 @pytest.mark.parametrize("twin", ["lorenz63", "road_car"])
-def test_an_estimate_that_is_no_number_stays_off_the_page(twin, start):
-    made = load_twin(twin, overrides={"estimator": "ekf", "gate": "null"})
-    source, engine = start(made)
-    model = engine.model
-    source.put(reading(model, 1.0, model.prior_mean[: len(model.sensors[0].rows)]))
-    wait_for(lambda: len(pull_all(engine).events) == 1)
+def test_an_estimate_that_is_no_number_stays_off_the_page(twin):
+    stepped = Stepped(of=load_twin(twin, overrides={"estimator": "ekf", "gate": "null"}))
+    engine = stepped.engine
+    values = engine.model.prior_mean[: len(engine.model.sensors[0].rows)]
+    stepped.put(reading(engine.model, 1.0, values))
     engine._fold._now.state[:] = np.nan
-    source.put(reading(model, 1.1, model.prior_mean[: len(model.sensors[0].rows)]))
-    wait_for(lambda: len(pull_all(engine).events) == 2)
+    stepped.put(reading(engine.model, 1.1, values))
     view = ViserView(engine, secret="s3cret")
     try:
         view.frame()
-        engine._status = None
-        status = engine.status()
+        status = stepped.status()
         assert (status.health, status.since) == (DIVERGED, int(1.1 * SECOND))
         for text in (view.panel.status.content, str(status_json(engine))):
             assert "nan" not in text.lower()
@@ -225,8 +202,7 @@ def test_an_estimate_that_is_no_number_stays_off_the_page(twin, start):
         for node in vars(view.stage.scene).values():
             if isinstance(node, viser.SceneNodeHandle):
                 assert np.isfinite([*node.position, *node.wxyz]).all()
-        engine.submit(commands.Reset())
-        wait_for(lambda: len(pull_all(engine).events) == 3)
+        stepped.submit(commands.Reset())
         assert np.isfinite(pull_all(engine).track.mean[2]).all()
     finally:
         view.stop()

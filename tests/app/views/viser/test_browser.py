@@ -12,7 +12,7 @@ from estimators.log import READING, TRUTH, Events
 from estimators.models import MODELS
 from estimators.track import TRACKING
 from tests.app.fake_engine import FakeEngine, events
-from tests.app.live.test_reset import JUMP, RESET_AT, asset, stubborn
+from tests.app.live.test_reset import JUMP, RESET_AT, T, Y, stubborn_twin
 from tests.app.scripted import Scripted, readings, wait_for
 from tests.app.served import shown_twin
 
@@ -146,7 +146,7 @@ def test_two_browsers_show_the_same(page, browser, view, engine):
 
 
 def test_a_lost_filter_says_since_when_and_what_to_do(browser):
-    made, plain = stubborn("kf"), shown_twin()
+    made, plain = stubborn_twin("kf"), shown_twin()
     made.config = plain.config
     source = Scripted()
     engine = Engine(made, lambda report: source)
@@ -155,8 +155,7 @@ def test_a_lost_filter_says_since_when_and_what_to_do(browser):
     view.start()
     context = browser.new_context(viewport={"width": 900, "height": 1000}, extra_http_headers={HEADER: "s3cret"})
     try:
-        t, y = asset(RESET_AT + 10)
-        source.put(readings(t[:RESET_AT], y[:RESET_AT]))
+        source.put(readings(T[:RESET_AT], Y[:RESET_AT]))
         page = context.new_page()
         page.set_default_timeout(60_000)
         page.goto(f"http://127.0.0.1:{view.port}/")
