@@ -7,14 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from estimators.diagnostics.field_pictures import Picture
 from estimators.errors import ConfigError
 from estimators.log import READING, Events, Log
 from estimators.snapshots import Base
 from estimators.track import Track
 from estimators.tuning import Tuning
 
-from .outputs import Pull
+from .outputs import Cursor, Pull
 from .running_fold import Running
 
 END_OF_TIME = 2**62
@@ -59,22 +58,37 @@ COPY_ROWS = 16_384
 
 
 def copy_rows(engine: Running) -> Pull | None:
-    """Copy all rows; None while there are none, or if a late measurement or another revision came in between."""
+    """Copy all rows; None while there are none."""
     cursor = engine.cursor()
-    parts: list[Pull] = []
-    pictures: dict[int, Picture] = {}
     try:
-        while not parts or len(parts[-1].events) == COPY_ROWS:
-            pull = engine.pull(cursor, COPY_ROWS)
-            if parts and (pull.fresh or pull.first != parts[-1].first + len(parts[-1].events)):
-                return None
-            parts.append(pull)
-            pictures |= {picture.before: picture for picture in pull.pictures}
+        found = pull_rest(engine, cursor, engine.pull(cursor, COPY_ROWS), COPY_ROWS)
     finally:
         engine.release(cursor)
-    if not len(parts[0].events):
-        return None
+    return found if len(found.events) else None
+
+
+def pull_rest(engine: Running, cursor: Cursor, pull: Pull, size: int) -> Pull:
+    """Return a fresh pull of `size` rows joined with all rows after it.
+
+    If another revision begins meanwhile its rows are returned; rows that a late measurement rewrote are the later ones.
+    Notices are those of all pulls.
+    """
+    parts, notices = [pull], list(pull.notices)
+    while len(parts[-1].events) == size:
+        more = engine.pull(cursor, size)
+        notices += more.notices
+        parts = [more] if more.fresh else [*parts, more]
+    first = parts[0].first
     events = Events.concat([part.events for part in parts], engine.model.width)
     columns = zip(*(part.track for part in parts), strict=True)
     track = Track(*(np.concatenate(column) for column in columns))
-    return replace(parts[0], events=events, track=track, pictures=[pictures[index] for index in sorted(pictures)])
+    index = np.concatenate([part.first + np.arange(len(part.events)) for part in parts])
+    # A row is valid if every later one has a larger index.
+    kept = index < np.append(np.minimum.accumulate(index[::-1])[::-1][1:], np.iinfo(index.dtype).max)
+    if not kept.all():
+        events, track = events.select(kept), track.select(kept)
+    pictures = {picture.before: picture for part in parts for picture in part.pictures}
+    return replace(
+        parts[-1], fresh=True, first=first, events=events, track=track, notices=notices,
+        pictures=[pictures[k] for k in sorted(pictures)],
+    )  # fmt: skip

@@ -19,9 +19,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import rerun as rr
 
-from estimators.log import Events
-from estimators.track import Track
-
+from ...live.history_copy import pull_rest
 from ...live.notices import MAX_LINES
 from ...present.drawing.colors import EITHER, Palette
 from .rows import RerunRows
@@ -81,13 +79,15 @@ class RerunFeed:
             later()
             return self._read()
         pull = self._engine.pull(self._cursor, MAX_PULL_ROWS)
+        if pull.fresh:
+            pull = pull_rest(self._engine, self._cursor, pull, MAX_PULL_ROWS)
         self._notices.extend(pull.notices)
         if pull.fresh and self._rows is not None and not len(pull.events):
             # The source has just restarted: the charts stay as they are until there are rows.
             self._cursor.revision = -1
             return []
         if pull.fresh:
-            return self._begin(self._whole(pull))
+            return self._begin(pull)
         if self._rows is None or not (len(pull.events) or pull.notices or pull.pictures):
             return []
         self._rows(pull)
@@ -104,35 +104,6 @@ class RerunFeed:
             self._stream.disconnect()
             self._stream = self._bytes = self._rows = self._later = None
             free_closed_streams()
-
-    def _whole(self, pull: Pull) -> Pull:
-        """Return all rows of a revision that just began, pulled in pieces."""
-        parts = [pull]
-        while len(parts[-1].events) == MAX_PULL_ROWS:
-            more = self._engine.pull(self._cursor, MAX_PULL_ROWS)
-            self._notices.extend(more.notices)
-            # Another revision may begin meanwhile, or a late measurement rewrite rows; the later ones apply.
-            parts = [more] if more.fresh else [*parts, more]
-        if len(parts) == 1:
-            return parts[0]
-        events: list[Events] = []
-        tracks: list[Track] = []
-        end = parts[0].first
-        pictures = {picture.before: picture for part in parts for picture in part.pictures}
-        for part in parts:
-            if part.first < end:
-                events, tracks = _cut(events, tracks, part.first - parts[0].first)
-            events.append(part.events)
-            tracks.append(part.track)
-            end = part.first + len(part.events)
-        return replace(
-            parts[-1],
-            fresh=True,
-            first=parts[0].first,
-            events=Events.concat(events, 0),
-            track=Track(*(np.concatenate(column) for column in zip(*tracks, strict=True))),
-            pictures=[pictures[index] for index in sorted(pictures)],
-        )
 
     def _begin(self, pull: Pull) -> list[Message]:
         """Start another recording: first the window of the charts, then the rest."""
@@ -188,14 +159,3 @@ class RerunFeed:
 def _labelled(line: Notice, revision: int) -> Notice:
     """Return a notice for the table of a revision; one of another revision is labelled."""
     return line if line.revision == revision else replace(line, text=f"revision {line.revision}: {line.text}")
-
-
-def _cut(events: list[Events], tracks: list[Track], rows: int) -> tuple[list[Events], list[Track]]:
-    """Return the first `rows` rows of some pieces."""
-    kept_readings, kept_tracks = [], []
-    for reading, track in zip(events, tracks, strict=True):
-        count = min(rows, len(reading))
-        kept_readings.append(reading.select(slice(0, count)))
-        kept_tracks.append(track.select(slice(0, count)))
-        rows -= count
-    return kept_readings, kept_tracks
