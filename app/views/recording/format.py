@@ -11,7 +11,9 @@ from __future__ import annotations
 import base64
 import json
 import math
+import os
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +35,7 @@ from estimators.tuning import Tuning
 from ...live.history_copy import copy_rows
 from ...live.outputs import Pull
 from ...live.running_fold import Running
-from .rrd_file import RrdFile
+from .rrd_file import END_MESSAGE, MESSAGE_HEADER, STREAM_HEADER, messages
 
 FORMAT = 2
 READABLE = (1, 2)
@@ -45,21 +47,9 @@ TIMELINE = "event"
 
 def tuning_to_json(tuning: Tuning, estimator: str) -> str:
     """Return a tuning and its estimator as text, which keeps float64 exactly."""
-    return json.dumps(
-        {
-            "estimator": estimator,
-            "q": tuning.q.tolist(),
-            "r": tuning.r.tolist(),
-            "p": tuning.p.tolist(),
-            "used": tuning.used.tolist(),
-            "gate": tuning.gate,
-            "gate_kind": tuning.gate_kind,
-            "reopen": tuning.reopen,
-            "options": dict(tuning.options),
-            "seed": tuning.seed,
-            "name": tuning.name,
-        }
-    )
+    arrays = {name: getattr(tuning, name).tolist() for name in ("q", "r", "p", "used")}
+    plain = {name: getattr(tuning, name) for name in ("gate", "gate_kind", "reopen", "seed", "name")}
+    return json.dumps({"estimator": estimator, **arrays, **plain, "options": dict(tuning.options)})
 
 
 def tuning_from_json(text: str, model: StateSpaceModel) -> tuple[Tuning, str]:
@@ -133,12 +123,19 @@ def base_from_json(text: str) -> Base | None:
     )
 
 
+FLUSH_TIMEOUT_S = 5.0
+
 TAKEN = "is there already; choose another name, or remove it"
 """Message about a path that is taken."""
 
 
 class RecordingFile:
-    """A recording that is being written, in a stream of its own, so that no viewer can delay it."""
+    """A recording that is being written, in a stream of its own, so that no viewer can delay it.
+
+    Rerun's own file sink keeps an entry for each column of each chunk in memory, some kilobytes a chunk; it follows
+    links and overwrites files; and it waits without a limit for a full disk. So the bytes are taken from the stream and
+    written here. A viewer reads a file without Rerun's footer from its start.
+    """
 
     def __init__(
         self,
@@ -165,23 +162,19 @@ class RecordingFile:
         Raises:
             SourceError: If the file cannot be written.
         """
-        self.path = path
+        self.path, self.size = path, 0
         self.stream = rr.RecordingStream(f"{PREFIX}{name}", recording_id=f"{name}-{path.stem}")
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            self._file = RrdFile(path, self.stream)
+            self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0), 0o666)
         except FileExistsError:
             raise SourceError(f"recording {path}: {TAKEN}") from None
         except OSError as error:
             raise SourceError(f"recording {path}: {error.strerror}; choose another folder") from None
+        self._bytes = self.stream.binary_stream()
         self.rows = 0
         self._header = {"name": name, "path": str(twin_path), "base": base_to_json(base)}
         self.twin(text, overrides or {}, version)
-
-    @property
-    def size(self) -> int:
-        """Size of the file in bytes."""
-        return self._file.size
 
     def twin(self, text: str, overrides: Mapping[str, str], version: Version | None) -> None:
         """Write the twin's YAML and its tuning version; the last ones count."""
@@ -192,19 +185,15 @@ class RecordingFile:
 
     def base(self, base: Base | None, index: int, revision: int) -> None:
         """Write the start of a revision's fold from event `index` on; None is the prior."""
-        self.stream.send_columns(
-            "/nisus/base",
-            indexes=[rr.TimeColumn(TIMELINE, sequence=[index])],
-            columns=rr.AnyValues.columns(json=[base_to_json(base)], revision=[revision]),
-        )
+        self._write_json("base", base_to_json(base), index, revision)
 
     def tuning(self, tuning: Tuning, estimator: str, index: int, revision: int) -> None:
         """Write the tuning that applies from event `index` on."""
-        self.stream.send_columns(
-            "/nisus/tuning",
-            indexes=[rr.TimeColumn(TIMELINE, sequence=[index])],
-            columns=rr.AnyValues.columns(json=[tuning_to_json(tuning, estimator)], revision=[revision]),
-        )
+        self._write_json("tuning", tuning_to_json(tuning, estimator), index, revision)
+
+    def _write_json(self, name: str, text: str, index: int, revision: int) -> None:
+        columns = rr.AnyValues.columns(json=[text], revision=[revision])
+        self.stream.send_columns(f"/nisus/{name}", indexes=[rr.TimeColumn(TIMELINE, sequence=[index])], columns=columns)
 
     def summary(self, found: Mapping[str, Any]) -> None:
         """Write the scores of the session, for lists."""
@@ -237,24 +226,47 @@ class RecordingFile:
         self.rows += count
 
     def flush(self) -> None:
-        """Hand everything to the operating system.
+        """Hand the messages logged since to the operating system.
 
         Raises:
-            OSError: If the file cannot grow; earlier content remains readable.
+            OSError: If the file cannot grow; it then ends where it ended before.
         """
-        self._file.flush()
-
-    def abandon(self) -> None:
-        """Close the file as it is."""
-        self._file.abandon()
+        data = self._bytes.read(flush_timeout_sec=FLUSH_TIMEOUT_S)
+        if data:
+            # Each piece is a stream of its own: the file keeps the header of the first, and no footer.
+            end = next((at for at, kind, _ in messages(data) if kind == END_MESSAGE), len(data))
+            self._append(data[STREAM_HEADER if self.size else 0 : end])
 
     def close(self) -> None:
-        """Complete and close the file.
+        """Write the rest and the end message, and close the file also if that fails.
 
         Raises:
             OSError: As `flush`.
         """
-        self._file.close()
+        try:
+            self.flush()
+            self._append(MESSAGE_HEADER.pack(END_MESSAGE, 0))
+        finally:
+            self.abandon()
+
+    def abandon(self) -> None:
+        """Close the file as it is."""
+        if self._file >= 0:
+            os.close(self._file)
+            self._file = -1
+            self.stream.disconnect()
+
+    def _append(self, data: bytes) -> None:
+        rest = memoryview(data)
+        try:
+            while rest:
+                rest = rest[os.write(self._file, rest) :]
+        except OSError:
+            with suppress(OSError):
+                os.ftruncate(self._file, self.size)
+                os.lseek(self._file, self.size, os.SEEK_SET)
+            raise
+        self.size += len(data)
 
 
 def summary_of(engine: Running) -> dict[str, Any]:
@@ -291,13 +303,11 @@ def _error(found: Score, model: StateSpaceModel) -> dict[str, Any] | None:
     units = {state.name: state.unit for state in model.shown_states}
     rows = [row.unit for sensor in model.sensors for row in sensor.rows]
     units |= dict(zip(model.row_names, rows, strict=True))
-    fits = [("truth", found.states), ("held out", found.held_out)]
-    for against, part in fits:
+    for against, part in (("truth", found.states), ("held out", found.held_out)):
         for name, fit in part.items():
             if math.isfinite(fit.rmse):
-                coverage = _finite(fit.coverage)
-                unit = units.get(name, "")
-                return {"name": name, "rmse": fit.rmse, "unit": unit, "coverage": coverage, "against": against}
+                values = {"name": name, "rmse": fit.rmse, "unit": units.get(name, "")}
+                return {**values, "coverage": _finite(fit.coverage), "against": against}
     return None
 
 

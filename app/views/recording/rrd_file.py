@@ -1,25 +1,16 @@
-"""The file of a recording: written message by message, split into parts, and closed before the disk is full.
-
-Rerun's own file sink keeps an entry for each column of each chunk in memory, some kilobytes a chunk; it follows links
-and overwrites files; and it waits without a limit for a full disk. So the bytes are taken from the stream and written
-here. A viewer reads a file without Rerun's footer from its start.
-"""
+"""Messages of .rrd files, parts of a split recording, and the space on its disk."""
 
 from __future__ import annotations
 
 import math
-import os
 import re
 import shutil
 import struct
 import time
 from collections.abc import Callable, Iterator
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
-
-import rerun as rr
 
 from estimators.errors import ConfigError
 
@@ -31,8 +22,6 @@ STREAM_HEADER, MESSAGE_HEADER = 12, struct.Struct("<QQ")
 
 END_MESSAGE = 0
 """Kind of the message that closes a stream."""
-
-FLUSH_TIMEOUT_S = 5.0
 
 RESERVED_BYTES = 32 * 2**20
 """Free bytes at which a recording ends: enough to close it, and for other programs."""
@@ -50,65 +39,6 @@ SIZES = {"kB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12}
 TIMES = {"s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0}
 MIN_PART_BYTES, MIN_PART_S = 10**5, 1.0
 """Size and duration below which a part would hold little but its header."""
-
-
-class RrdFile:
-    """Writes the messages of a stream into a new file."""
-
-    def __init__(self, path: Path, stream: rr.RecordingStream) -> None:
-        """Create the file; the path must be free, also of a broken link.
-
-        Raises:
-            OSError: If it cannot be created, or the path is taken.
-        """
-        self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0), 0o666)
-        self._stream = stream
-        self._bytes = stream.binary_stream()
-        self.size = 0
-
-    def flush(self) -> None:
-        """Hand the messages logged since to the operating system.
-
-        Raises:
-            OSError: If the file cannot grow; it then ends where it ended before.
-        """
-        data = self._bytes.read(flush_timeout_sec=FLUSH_TIMEOUT_S)
-        if not data:
-            return
-        # Each piece is a stream of its own: the file keeps the header of the first, and no footer.
-        end = next((at for at, kind, _ in messages(data) if kind == END_MESSAGE), len(data))
-        self._write(data[STREAM_HEADER if self.size else 0 : end])
-
-    def close(self) -> None:
-        """Write the rest and the end message, and close the file also if that fails.
-
-        Raises:
-            OSError: As `flush`.
-        """
-        try:
-            self.flush()
-            self._write(MESSAGE_HEADER.pack(END_MESSAGE, 0))
-        finally:
-            self.abandon()
-
-    def abandon(self) -> None:
-        """Close the file as it is."""
-        if self._file >= 0:
-            os.close(self._file)
-            self._file = -1
-            self._stream.disconnect()
-
-    def _write(self, data: bytes) -> None:
-        rest = memoryview(data)
-        try:
-            while rest:
-                rest = rest[os.write(self._file, rest) :]
-        except OSError:
-            with suppress(OSError):
-                os.ftruncate(self._file, self.size)
-                os.lseek(self._file, self.size, os.SEEK_SET)
-            raise
-        self.size += len(data)
 
 
 def messages(data: bytes) -> Iterator[tuple[int, int, int]]:
