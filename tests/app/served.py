@@ -133,8 +133,8 @@ class Client:
 class ServedEngine:
     """A scripted engine behind the page's port, with a stand-in for Viser; fields of answers are JSON."""
 
-    def __init__(self, twin=None, review=None, behind=lambda source: source):
-        self.source = Scripted()
+    def __init__(self, twin=None, review=None, behind=lambda source: source, source=None):
+        self.source = source or Scripted()
         self.engine = Engine(shown_twin() if twin is None else twin, lambda report: behind(self.source))
         self.viser = FakeViser()
         self.choices = Choices([Choice("x", "x", ("temperature", "rate"), "temperature")])

@@ -1,12 +1,14 @@
-"""The colours of the page, for Viser's scenes and Rerun's charts: one meaning each, in light and in dark.
+"""Colours of the page for Viser's scenes and Rerun's charts: one meaning each, in light and in dark.
 
-`app/web/page/chart.css` has the same under the same names (a test compares them), chosen so that who sees no red or no
-green tells them apart (after Okabe and Ito, 2008).
+The page's style sheet defines them, so that users who see no red or no green can distinguish them (after Okabe and Ito,
+2008).
 """
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, field, fields
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -15,13 +17,15 @@ from estimators.diagnostics.field_pictures import Picture, plane_shape, reductio
 from estimators.log import READING, Events
 from estimators.model.state_space import StateSpaceModel
 from estimators.model.states import Field
-from estimators.track import Track
+from estimators.track import HEALTH_NAMES, Track
 
 RGB = tuple[int, int, int]
 
+STYLE = Path(__file__).resolve().parents[2] / "web" / "page" / "chart.css"
+
 
 def rgb(color: str) -> RGB:
-    """`#rrggbb` as three numbers from 0 to 255."""
+    """Return `#rrggbb` as three numbers from 0 to 255."""
     return int(color[1:3], 16), int(color[3:5], 16), int(color[5:7], 16)
 
 
@@ -51,26 +55,17 @@ class Palette:
     health: dict[str, RGB] = field(hash=False)
 
 
-LIGHT = Palette(
-    ground=rgb("#f3f5f8"), panel=rgb("#ffffff"), ink=rgb("#14202f"), faint=rgb("#5b6a7d"), rule=rgb("#d9dfe8"),
-    grid=rgb("#edf0f4"), estimate=rgb("#0b62c4"), truth=rgb("#111827"), reading=rgb("#c47b00"), refused=rgb("#c72a08"),
-    previous=rgb("#808b98"), bound=rgb("#8390a1"), smoothed=rgb("#264c46"),
-    health={
-        "waiting": rgb("#7b8798"), "tracking": rgb("#007d57"), "suspect": rgb("#c08200"), "degraded": rgb("#ab3f00"),
-        "diverged": rgb("#7d1224"), "stale": rgb("#7b8798"),
-    },
-)  # fmt: skip
+def _palette(selector: str) -> Palette:
+    """Return the colours that a rule of the page's style sheet sets."""
+    rule = STYLE.read_text().partition(f"{selector} {{")[2].partition("\n}")[0]
+    found = {name: rgb(color) for name, color in re.findall(r"--([\w-]+): (#[0-9a-f]{6});", rule)}
+    names = [item.name for item in fields(Palette) if item.name != "health"]
+    return Palette(
+        **{name: found[name] for name in names}, health={name: found[f"health-{name}"] for name in HEALTH_NAMES}
+    )
 
-DARK = Palette(
-    ground=rgb("#0c1118"), panel=rgb("#131a23"), ink=rgb("#e4eaf2"), faint=rgb("#94a3b5"), rule=rgb("#273242"),
-    grid=rgb("#1c2531"), estimate=rgb("#69b1ff"), truth=rgb("#f3f4f6"), reading=rgb("#f2b134"), refused=rgb("#f0592c"),
-    previous=rgb("#6c7788"), bound=rgb("#7d8b9e"), smoothed=rgb("#a8d293"),
-    health={
-        "waiting": rgb("#8a97a8"), "tracking": rgb("#2ecd9b"), "suspect": rgb("#ffe066"), "degraded": rgb("#d98a2d"),
-        "diverged": rgb("#e85a6e"), "stale": rgb("#8a97a8"),
-    },
-)  # fmt: skip
 
+LIGHT, DARK = _palette(":root"), _palette(':root[data-theme="dark"]')
 THEMES = {"light": LIGHT, "dark": DARK}
 
 

@@ -8,7 +8,6 @@ from urllib.parse import quote
 import numpy as np
 import pytest
 from rerun.chunk import RrdReader
-from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 from app.live import commands
@@ -54,15 +53,9 @@ def test_foreign_host_is_refused(page, hosts, upgrade):
 )
 @pytest.mark.parametrize(
     "method, path",
-    [
-        ("GET", "/"),
-        ("POST", "/api/command"),
-        ("POST", "/api/scene"),
-        ("GET", "/viser/"),
-        ("WS", STREAM),
-        ("WS", "/viser/"),
-    ],
-)
+    [("GET", "/"), ("POST", "/api/command"), ("POST", "/api/scene"), ("GET", "/viser/"), ("WS", STREAM),
+     ("WS", "/viser/")],
+)  # fmt: skip
 def test_foreign_origin_is_refused(page, origin, method, path):
     client = page.client
     headers = [("Host", client.host), ("Cookie", client.cookie), ("Origin", origin.format(port=client.port))]
@@ -72,42 +65,24 @@ def test_foreign_origin_is_refused(page, origin, method, path):
 
 
 @pytest.mark.parametrize("path", [STREAM, "/viser/"])
-def test_websocket_without_origin_is_refused(page, path):
+def test_websocket_without_origin_or_token_is_refused(page, path):
     client = page.client
     refused(client.raw("GET", path, [("Host", client.host), ("Cookie", client.cookie)], upgrade=True))
+    refused(client.raw("GET", path, [("Host", client.host), ("Origin", client.origin)], upgrade=True), "token")
     assert not page.viser.requests
 
 
 @pytest.mark.parametrize(
     "path",
-    [
-        "/",
-        "/explore",
-        "/api/status",
-        "/api/scene",
-        "/api/track.csv",
-        "/api/report.html",
-        "/alarms",
-        "/api/recordings",
-        "/rec/reviewed.rrd",
-        "/page/style.css",
-        "/viser/",
-        "/nothing",
-    ],
-)
+    ["/", "/explore", "/api/status", "/api/scene", "/api/track.csv", "/api/report.html", "/alarms", "/api/recordings",
+     "/rec/reviewed.rrd", "/page/style.css", "/viser/", "/nothing"],
+)  # fmt: skip
 def test_no_token_no_answer(page, path):
     client = page.client
     refused(client.raw("GET", path, [("Host", client.host)]), "token")
     refused(client.raw("GET", path + "?token=" + "x" * 43, [("Host", client.host)]), "token")
     name = client.cookie.partition("=")[0]
     refused(client.raw("GET", path, [("Host", client.host), ("Cookie", f"{name}=" + "0" * 64)]), "token")
-    assert not page.viser.requests
-
-
-@pytest.mark.parametrize("path", [STREAM, "/viser/"])
-def test_no_token_no_websocket(page, path):
-    client = page.client
-    refused(client.raw("GET", path, [("Host", client.host), ("Origin", client.origin)], upgrade=True), "token")
     assert not page.viser.requests
 
 
@@ -224,68 +199,6 @@ def test_every_answer_forbids_to_leave_the_machine(page):
         assert {"default-src", "connect-src", "script-src", "frame-ancestors"} <= rules.keys()
 
 
-def test_status_is_strict_json_and_counts(page):
-    page.source.put(readings([1.0, 2.0, 3.0], [40.0, np.nan, 41.0]))
-    wait_for(lambda: page.rows() == 3)
-
-    def strict(name):
-        raise AssertionError(f"{name} is not JSON")
-
-    wait_for(lambda: json.loads(page.client.get("/api/status").text)["counts"]["readings"] == 3)
-    status = json.loads(page.client.get("/api/status").text, parse_constant=strict)
-    assert status["counts"]["missing"] == 1
-    assert (status["twin"], status["estimator"], status["revision"]) == ("scripted", "kf", 0)
-    assert status["t"] == 3_000_000_000
-
-
-def test_commands_reach_the_engine(page):
-    page.source.put(readings([1.0, 2.0], [40.0, 41.0]))
-    wait_for(lambda: page.rows() == 2)
-    assert page.client.post("/api/command", {"command": "SetTuning", "key": "Q.rate", "value": 0.25}).status < 300
-    wait_for(lambda: page.engine.folded_with()[0].get("Q.rate") == 0.25)
-    assert page.client.post("/api/command", {"command": "SetEstimator", "name": "ukf"}).status < 300
-    wait_for(lambda: page.engine.folded_with()[1] == "ukf")
-    assert page.client.post("/api/command", {"command": "UseSensor", "name": "temperature", "used": False}).status in (
-        (202,) if "temperature" in page.engine.model.sensor_names else (400,)
-    )
-
-
-@pytest.mark.parametrize(
-    "body, says",
-    [
-        (b"{", ""),
-        (b"[]", "command"),
-        (b"[" * 60_000, ""),
-        ({"command": {"a": 1}}, "command"),
-        ({"command": ["Reset"]}, "command"),
-        ({"command": "SetOption", "name": "alpha", "value": "much"}, "alpha"),
-        ({"command": "Shutdown"}, "Shutdown"),
-        ({"command": "SetTuning", "key": "Q.rate"}, "value"),
-        ({"command": "SetTuning", "key": "Q.rate", "value": "much"}, "much"),
-        ({"command": "SetTuning", "key": "Q.rate", "value": True}, "true"),
-        ({"command": "SetTuning", "key": "Q.rate", "value": -1.0}, "Q.rate"),
-        ({"command": "SetTuning", "key": "Q.rat", "value": 1.0}, "Q.rate"),
-        (b'{"command": "SetTuning", "key": "Q.rate", "value": NaN}', "NaN"),
-        ({"command": "SetEstimator", "name": "kalman"}, "kalman"),
-        ({"command": "SetOption", "name": "alpha", "value": 1.0}, "alpha"),
-        ({"command": "UseSensor", "name": "nose", "used": True}, "nose"),
-        ({"command": "Speed", "factor": 0.0}, "factor"),
-        ({"command": "Pause", "paused": True}, "live source"),
-        ({"command": "Record", "path": "/tmp/somewhere.rrd"}, "somewhere"),
-        ({"command": "Record", "path": "../up.rrd"}, "up.rrd"),
-        ({"command": "Record", "path": "x.txt"}, ".rrd"),
-        ({"command": "Reset", "hard": True}, "hard"),
-    ],
-    ids=lambda value: str(value)[:80],
-)
-def test_a_bad_command_is_answered_with_one_line(page, body, says):
-    answer = page.client.post("/api/command", body)
-    assert answer.status == 400
-    said = json.loads(answer.text)["error"] if answer.text.startswith("{") else answer.text.strip()
-    assert "\n" not in said and says in said
-    assert "Traceback" not in answer.text
-
-
 # Viser behind it
 
 
@@ -326,8 +239,7 @@ def test_a_secret_of_the_browser_is_not_passed_on(page):
 def test_viser_messages_pass_both_ways(page):
     with page.connect("/viser/?a=b", subprotocols=["viser-test"]) as viser:
         assert viser.subprotocol == "viser-test"
-        big = bytes(3_000_000)
-        for message in ("text", b"bytes", big):
+        for message in ("text", b"bytes"):
             viser.send(message)
             assert viser.recv(timeout=PATIENCE) == message
     assert page.viser.requests[-1] == ("/?a=b", [SECRET])
@@ -337,38 +249,31 @@ def test_viser_messages_pass_both_ways(page):
 
 
 class Viewer:
-    """What a browser does: takes bytes of each recording, and says that it has drawn them."""
+    """Browser that reads the rows of each recording, and answers that it has drawn them."""
 
     def __init__(self, connection, tmp_path):
-        self.connection = connection
-        self.file = tmp_path / "piece.rrd"
-        self.names = []
-        self.recordings = []
-        self.statuses = []
+        self.connection, self.file = connection, tmp_path / "piece.rrd"
+        self.names, self.statuses = [], []
+        self.rows = []
+        """Of each recording: by path, times (ns) and values of the pieces that came."""
 
     def take(self):
         message = self.connection.recv(timeout=PATIENCE)
         if isinstance(message, bytes):
-            self.decode(message)
+            self.file.write_bytes(message)
+            for chunk in RrdReader(str(self.file)).stream():
+                columns = (batch := chunk.to_record_batch()).schema.names
+                if not chunk.is_static and "Scalars:scalars" in columns:
+                    t = batch.column(columns.index("time")).cast("int64").to_numpy()
+                    values = batch.column(columns.index("Scalars:scalars")).flatten().to_numpy().reshape(t.size, -1)
+                    self.rows[-1].setdefault(chunk.entity_path, []).append((t, values))
             self.connection.send("drawn")
             return
         said = json.loads(message)
         if "recording" in said:
             self.names.append(said["recording"])
-            self.recordings.append({})
-        if "status" in said:
-            self.statuses.append(said["status"])
-
-    def decode(self, data):
-        self.file.write_bytes(data)
-        for chunk in RrdReader(str(self.file)).stream():
-            batch = chunk.to_record_batch()
-            columns = batch.schema.names
-            if chunk.is_static or "Scalars:scalars" not in columns:
-                continue
-            t = batch.column(columns.index("time")).cast("int64").to_numpy()
-            values = batch.column(columns.index("Scalars:scalars")).flatten().to_numpy().reshape(t.size, -1)
-            self.recordings[-1].setdefault(chunk.entity_path, []).append((t, values))
+            self.rows.append({})
+        self.statuses += [said["status"]] if "status" in said else []
 
     def until(self, condition):
         end = time.monotonic() + 3 * PATIENCE
@@ -377,13 +282,11 @@ class Viewer:
             self.take()
 
     def column(self, path, which=-1):
-        """Times (ns) and values that came under a path of one recording."""
-        parts = self.recordings[which].get(path, []) if self.recordings else []
-        if not parts:
-            return np.zeros(0, np.int64), np.zeros((0, 1))
-        t = np.concatenate([part[0] for part in parts])
+        """Times (ns) and values under a path of one recording, in the order of time."""
+        parts = self.rows[which].get(path, []) if self.rows else []
+        t, values = (np.concatenate([part[k] for part in parts] or [np.zeros((0, 1)[: k + 1])]) for k in (0, 1))
         order = np.argsort(t, kind="stable")
-        return t[order], np.concatenate([part[1] for part in parts])[order]
+        return t[order], values[order]
 
 
 def test_the_feed_holds_the_track_and_the_next_revision_replaces_it(page, tmp_path):
@@ -404,10 +307,10 @@ def test_the_feed_holds_the_track_and_the_next_revision_replaces_it(page, tmp_pa
 
         page.source.put(readings(t + 25.0, 65 + t))
         viewer.until(lambda: viewer.column(state)[0].size >= 100)
-        assert len(viewer.recordings) == 1
+        assert len(viewer.rows) == 1
 
         page.engine.submit(commands.SetTuning("Q.rate", 3.0))
-        viewer.until(lambda: len(viewer.recordings) == 2 and viewer.column(state)[0].size >= 100)
+        viewer.until(lambda: len(viewer.rows) == 2 and viewer.column(state)[0].size >= 100)
         assert viewer.names[0] != viewer.names[1]
         np.testing.assert_array_equal(viewer.column(state)[1][:, 0], pull_all(page.engine).track.mean[:, 0])
         viewer.until(lambda: viewer.column(f"/previous{state}")[0].size >= 100)
@@ -446,9 +349,3 @@ def test_a_viewer_that_leaves_is_forgotten(page, tmp_path):
         wait_for(lambda: len(page.engine._cursors) == 2)
     # What is left is the engine's own, of its episode log.
     wait_for(lambda: len(page.engine._cursors) == 1)
-
-
-def test_streams_are_refused_after_the_head_not_after_the_work(page):
-    with pytest.raises(InvalidStatus):
-        connect(f"ws://{page.client.host}{STREAM}", origin="http://evil.example", proxy=None)
-    assert len(page.engine._cursors) == 1
