@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 import rerun as rr
 
-from app.cli.main import main
 from app.live import commands
 from app.live.engine import Engine
 from app.live.outputs import Pull
@@ -22,11 +21,12 @@ from app.views.recording.writer import Recorder
 from app.views.viser.scene import History
 from estimators.diagnostics.score import score
 from estimators.errors import SourceError
-from estimators.fold import Fold, fold
+from estimators.fold import fold
 from estimators.log import TRUTH, Events, Log
 from estimators.track import Track
 from estimators.tuning import Tuning
 from tests.app.scripted import MODEL, Scripted, pull_all, readings, twin, wait_for
+from tests.app.views.recording.test_parts import refold
 from tests.conftest import ROOT
 from tests.support import SECOND, assert_same
 
@@ -45,16 +45,6 @@ def running():
     yield source, engine, recorder
     engine.stop()
     recorder.stop()
-
-
-def refold(recorded):
-    """The recorded readings through the fold, as a review does it."""
-    tuning, estimator = tuning_from_json(recorded.tuning, MODEL)
-    log = Log(MODEL.width)
-    log.extend(recorded.events)
-    fold = Fold(estimator, MODEL, tuning, log, pairs=np.array([[0, 1]]), base=recorded.base)
-    fold.advance()
-    return fold.track
 
 
 def steady(count):
@@ -127,19 +117,6 @@ def test_a_recording_is_listed_from_when_it_is_asked_for_until_it_is_finished(tm
         going_on.set()
         engine.stop()
         recorder.stop()
-
-
-def test_several_recordings_one_after_the_other(running, tmp_path):
-    source, engine, recorder = running
-    source.put(readings([1.0, 2.0], [40, 41]))
-    wait_for(lambda: len(pull_all(engine).events) == 2)
-    for name in ("a.rrd", "b.rrd"):
-        engine.submit(commands.Record(tmp_path / name))
-        wait_for(lambda name=name: recorder.path == tmp_path / name)
-        engine.submit(commands.Record(None))
-        wait_for(lambda name=name: tmp_path / name in recorder.finished)
-    assert read_recording(tmp_path / "a.rrd").rows == 2
-    assert read_recording(tmp_path / "b.rrd").rows == 2
 
 
 def test_a_recording_that_is_being_finished_is_among_the_files(running, tmp_path, monkeypatch):
@@ -356,11 +333,3 @@ def test_a_file_that_takes_no_more_is_one_line_and_keeps_what_it_has(tmp_path):
     recorded = read_recording(path)
     assert recorded.rows > 10
     assert_same(refold(recorded), steady(recorded.rows))
-
-
-def test_a_recording_that_is_there_is_not_written_over(tmp_path, capsys):
-    there = tmp_path / "yesterday.rrd"
-    there.write_bytes(b"yesterday")
-    assert main(["run", "motor_winding", "--headless", "--record", str(there)]) == 2
-    assert "is there already; choose another name, or remove it" in capsys.readouterr().err
-    assert there.read_bytes() == b"yesterday"

@@ -119,19 +119,6 @@ def test_upgrade_without_the_secret_is_refused_on_the_wire(server):
             assert raw.recv(64).startswith(b"HTTP/1.1 403")
 
 
-def test_upgrade_with_the_secret_gets_the_scene(server):
-    async def first_message():
-        async with websockets.connect(
-            f"ws://127.0.0.1:{server.get_port()}/",
-            additional_headers={HEADER: "s3cret"},
-            subprotocols=[f"viser-v{viser.__version__}"],
-            compression=None,
-        ) as connection:
-            return await asyncio.wait_for(connection.recv(), 10)
-
-    assert len(asyncio.run(first_message())) > 0
-
-
 def test_serve_is_restored_and_the_tunnel_gone(server):
     assert websockets.asyncio.server.serve.__module__.startswith("websockets")
     assert _messages.ShareUrlRequest not in server._websock_server._incoming_handlers
@@ -355,13 +342,6 @@ def test_peaks_are_marked_with_their_weights_while_there_are_several(view, engin
     engine.peaks = ()
     view.stage.scene.draw(view.history, engine.belief())
     assert not (first.visible or second.visible)
-
-
-def test_the_thread_draws_and_stops(engine):
-    view = ViserView(engine, secret="x")
-    view.start()
-    view.stop()
-    assert not view._thread.is_alive()
 
 
 def test_vehicle_scene_stands_at_the_heaviest_peak_among_its_walls():
