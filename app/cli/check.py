@@ -13,7 +13,7 @@ from estimators.diagnostics.calibration import BANDS
 from estimators.diagnostics.episodes import episode_json
 from estimators.diagnostics.sensitivity import GramianView, Sensitivity, bounds_of
 from estimators.diagnostics.sensitivity.gramian import directions
-from estimators.diagnostics.sensitivity.responses import digits, range_text, size_text, subject_text
+from estimators.diagnostics.sensitivity.responses import digits
 from estimators.track import HEALTH_NAMES
 
 from ..present.export.calibration_lines import calibration_lines
@@ -89,7 +89,7 @@ def _observability_figures(checked: Checked) -> dict[str, Any]:
         "windows": [_view(checked, view) for view in found.windows],
         "blame": [{"one": one, "other": other, "correlation": value} for one, other, value in blamed(told)],
         "deviation": {
-            f"{nudge.kind} {nudge.name}": plain(value) for nudge, value in zip(told.nudges, told.deviation, strict=True)
+            nudge.subject: plain(value) for nudge, value in zip(told.nudges, told.among().deviation, strict=True)
         },
     }
 
@@ -111,16 +111,13 @@ def smallest_visible(found: Sensitivity) -> list[dict[str, Any]]:
     """Return one entry per nudge: detectable `size` in `unit`, and the undetectable range `low` to `high`."""
     return [
         {
-            "kind": nudge.kind,
-            "name": nudge.name,
-            "unit": nudge.unit,
-            "value": plain(nudge.value),
-            "size": plain(size),
-            "low": plain(low),
-            "high": plain(high),
-            "seen": bool(np.isfinite(size)),
+            **{name: plain(getattr(fault.nudge, name)) for name in ("kind", "name", "unit", "value")},
+            "size": plain(fault.visible),
+            "low": plain(fault.low),
+            "high": plain(fault.high),
+            "seen": bool(np.isfinite(fault.visible)),
         }
-        for nudge, size, (low, high) in zip(found.nudges, found.smallest_visible, found.unseen, strict=True)
+        for fault in found.faults
     ]
 
 
@@ -283,9 +280,10 @@ def _visible(checked: Checked) -> Topic:
         return Topic(title, (f"Not computed: {found.reason}.",))
     seconds = float(found.t[-1] - found.t[0]) * 1e-9
     rows = []
-    for nudge, size, (low, high) in zip(found.nudges, found.smallest_visible, found.unseen, strict=True):
-        seen = size_text(nudge, size) if np.isfinite(size) else "cannot be seen within its range"
-        rows.append((subject_text(nudge), seen, range_text(nudge, low, high)))
+    for fault in found.faults:
+        seen = np.isfinite(fault.visible)
+        size = fault.nudge.size_text(fault.visible) if seen else "cannot be seen within its range"
+        rows.append((fault.nudge.subject, size, fault.range_text))
     said = [f"{found.note}."] if found.note else []
     said.append(f"A constant fault, there for all of {seconds:.4g} s, seen with a probability of 95 %.")
     return Topic(title, tuple(said), ("fault", "smallest visible", "passes unseen"), _cut(rows))

@@ -24,7 +24,7 @@ from estimators.diagnostics.sensitivity.checklist import (
 )
 from estimators.diagnostics.sensitivity.held_out import HeldOut, held_out
 from estimators.diagnostics.sensitivity.posterior import FREQUENT_SHARE, Peaks, Tail, peaks, tails
-from estimators.diagnostics.sensitivity.responses import digits, subject_text
+from estimators.diagnostics.sensitivity.responses import digits
 from estimators.fold import Fold
 from estimators.log import MAINTENANCE, READING, Log
 from estimators.registry import find_entry
@@ -182,7 +182,7 @@ def blamed(found: Sensitivity) -> list[tuple[str, str, float]]:
 
     Their estimates would be correlated beyond 0.9 if these two were unknown and all others known.
     """
-    names = [subject_text(nudge) for nudge in found.nudges]
+    names = [nudge.subject for nudge in found.nudges]
     root = np.sqrt(np.diag(found.fisher))
     with np.errstate(all="ignore"):
         c = -found.fisher / np.outer(root, root)

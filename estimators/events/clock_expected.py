@@ -10,18 +10,18 @@ from numba import types
 from ..numerics.jit import B1, I1, I2, i64, inlined, jit_brief
 from .batch import INPUT, READING, TRUTH
 
-SECOND = 10**9
+SECOND_NS = 10**9
 
-ENOUGH = 3
+MIN_AGREEING_EVENTS = 3
 """Number of events that must agree on another time, and of steps after which the period of a channel is known."""
 
-PERIODS, PERIODS_LIVE = 10, 3
+MAX_PERIODS_AHEAD, MAX_PERIODS_AHEAD_LIVE = 10, 3
 """Number of periods by which an event may be ahead of the newest, without and with known arrivals."""
 
-AHEAD_OF_ARRIVAL = SECOND
+MIN_OFFSET_TOLERANCE_NS = SECOND_NS
 """Smallest tolerance, ns, by which t - arrival may exceed its recent maximum; otherwise half the horizon."""
 
-RELAX = 1000
+OFFSET_DECAY_TIME = 1000
 """The maximum of t - arrival decays by one part in so many of the elapsed time. No clock drifts faster, and after
 minutes of long delays the offset of the clock is still known."""
 
@@ -37,13 +37,13 @@ SEEN, LAST, FIRST, STEPS, TOTAL, OFFSET, ARRIVED, LIVE, HOLDING, GAP_FROM, GAP_T
 def _reach(state, row, horizon, live):
     """Return how far ahead of the newest the next time of a channel may be, ns; -1 while its period is unknown."""
     last = state.shape[0] - 1
-    if state[row, STEPS] < ENOUGH:
+    if state[row, STEPS] < MIN_AGREEING_EVENTS:
         row = last
-    if state[row, STEPS] < ENOUGH:
+    if state[row, STEPS] < MIN_AGREEING_EVENTS:
         return -1
     period = state[row, TOTAL] // state[row, STEPS]
     # Half a horizon remains, so that slightly delayed events of other channels are not stale.
-    return max(horizon // 2, PERIODS_LIVE * period) if live else max(horizon, PERIODS * period)
+    return max(horizon // 2, MAX_PERIODS_AHEAD_LIVE * period) if live else max(horizon, MAX_PERIODS_AHEAD * period)
 
 
 @inlined
@@ -60,7 +60,7 @@ def _judge(state, row, t, arrival, live, horizon):
         return FITS
     if live:
         offset = state[row if state[row, SEEN] else everything, OFFSET]
-        if t - arrival <= offset + max(horizon // 2, AHEAD_OF_ARRIVAL):
+        if t - arrival <= offset + max(horizon // 2, MIN_OFFSET_TOLERANCE_NS):
             return FITS
         # Stamped by a correct clock: the other events were delayed longer, within the horizon.
         if -horizon <= offset and t <= arrival:
@@ -79,14 +79,14 @@ def _note(state, row, t, arrival, live, horizon):
         step = t - state[k, LAST]
         if step > 0:
             period = state[k, TOTAL] // max(1, state[k, STEPS])
-            if state[k, STEPS] < ENOUGH or step <= max(horizon, PERIODS * period):
+            if state[k, STEPS] < MIN_AGREEING_EVENTS or step <= max(horizon, MAX_PERIODS_AHEAD * period):
                 state[k, STEPS] += 1
                 state[k, TOTAL] += step
             else:
                 state[k, GAP_FROM], state[k, GAP_TO] = state[k, LAST], t
             state[k, LAST] = t
-        passed = min(max(arrival - state[k, ARRIVED], 0), SECOND)
-        state[k, OFFSET] = max(t - arrival, state[k, OFFSET] - passed // RELAX)
+        passed = min(max(arrival - state[k, ARRIVED], 0), SECOND_NS)
+        state[k, OFFSET] = max(t - arrival, state[k, OFFSET] - passed // OFFSET_DECAY_TIME)
         state[k, ARRIVED] = arrival
         if live:
             state[k, LIVE] = 1

@@ -37,7 +37,6 @@ from .batch import INPUT, READING, TRUTH, Events
 from .clock_expected import (
     AHEAD,
     BACK,
-    ENOUGH,
     FIRST,
     FITS,
     GAP_FROM,
@@ -45,19 +44,20 @@ from .clock_expected import (
     HOLDING,
     LAST,
     LIVE,
+    MAX_PERIODS_AHEAD,
+    MIN_AGREEING_EVENTS,
     OFFSET,
-    PERIODS,
-    SECOND,
+    SECOND_NS,
     SEEN,
     STEPS,
     TOTAL,
     compiled,
 )
 
-SETTLED = 2 * SECOND
+SETTLING_TIME_NS = 2 * SECOND_NS
 """Time, by the source's clock, over which held events must agree before they pass."""
 
-ZONE = 900 * SECOND
+ZONE_STEP_NS = 900 * SECOND_NS
 """Time zones, and daylight saving time, differ by a multiple of 15 minutes."""
 
 MAX_HELD, MAX_HELD_LIVE = 1 << 17, 4096
@@ -70,8 +70,8 @@ class ClockGuard:
     def __init__(self, sensors: int, horizon: int) -> None:
         """Guard the events of a model with `sensors` sensors; `horizon` is the log's, ns."""
         self._sensors, self._horizon = sensors, horizon
-        self._agree = min(max(SECOND // 2, horizon // 2), SETTLED)
-        self._settled = max(SETTLED, 2 * self._agree)
+        self._agree = min(max(SECOND_NS // 2, horizon // 2), SETTLING_TIME_NS)
+        self._settled = max(SETTLING_TIME_NS, 2 * self._agree)
         self._spread = horizon + self._agree
         self._everything = sensors + 2
         self._state = np.zeros((sensors + 3, 11), np.int64)
@@ -228,7 +228,7 @@ class ClockGuard:
         daylight saving time. Files of whole quarter-hours in the wrong order look like that too; those end where the
         channel begins, which is known once the source has `ended`.
         """
-        if len(run.at) < ENOUGH or run.span < self._settled:
+        if len(run.at) < MIN_AGREEING_EVENTS or run.span < self._settled:
             return False
         begin = int(self._state[row, FIRST])
         if run.ahead or run.live or run.highest > begin + self._horizon:
@@ -236,11 +236,11 @@ class ClockGuard:
         step = self._step_back(run, row)
         if any(abs(abs(known) - step) <= self._agree for known in self._steps):
             return True
-        if step % ZONE:
+        if step % ZONE_STEP_NS:
             return False
         near = self._precision(row)
         if ended:
-            return begin - run.highest > self._horizon + PERIODS * near
+            return begin - run.highest > self._horizon + MAX_PERIODS_AHEAD * near
         return abs(begin - run.t[0] - self._zone(begin - run.t[0])) > near
 
     def _step_back(self, run: Run, row: int) -> int:
@@ -257,11 +257,11 @@ class ClockGuard:
 
     def _precision(self, row: int) -> int:
         """Return how exactly (ns) the times of a channel show a step of its clock."""
-        return min(max(self._agree, self._period(row)), ZONE // 15)
+        return min(max(self._agree, self._period(row)), ZONE_STEP_NS // 15)
 
     def _zone(self, step: int) -> int:
-        """Return the nearest multiple of `ZONE`."""
-        return (step + ZONE // 2) // ZONE * ZONE
+        """Return the nearest multiple of `ZONE_STEP_NS`."""
+        return (step + ZONE_STEP_NS // 2) // ZONE_STEP_NS * ZONE_STEP_NS
 
     def _can_be_set_back(self, work: Work, i: int) -> bool:
         """Return whether a time that went back may be due to a clock rather than to a block of late measurements.

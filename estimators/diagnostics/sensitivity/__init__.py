@@ -1,4 +1,4 @@
-"""What could be wrong without anyone noticing: sensitivities, smallest visible faults, integrity, observability."""
+"""Undetectable faults of a twin: sensitivities, minimal detectable faults, protection levels, observability."""
 
 from .gramian import Gramian, GramianView, gramian
 from .responses import Nudge, Response

@@ -17,7 +17,7 @@ from ...tuning import Tuning
 from ..calibration import LIMITS, standardised
 from ..innovations import ljung_box
 from ..intervals import Interval, correlation_interval
-from .responses import MOST_STATES, digits, each
+from .responses import MAX_STATES, digits, each
 
 SPREAD_TOLERANCE = 0.1
 """Share by which the standard deviations of an ensemble may be off by chance."""
@@ -215,8 +215,8 @@ def linearity(
 
 
 def _reason_against(model: StateSpaceModel) -> str:
-    if model.grid is not None or model.nx > MOST_STATES:
-        return f"{model.name} has {model.nx:,} states; a linearised model is tried up to {MOST_STATES}"
+    if model.grid is not None or model.nx > MAX_STATES:
+        return f"{model.name} has {model.nx:,} states; a linearised model is tried up to {MAX_STATES}"
     for name in (LINEARISED, UNSCENTED):
         unsuited = unfit(find_entry(name), model)
         if unsuited:

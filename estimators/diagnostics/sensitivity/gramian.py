@@ -27,19 +27,7 @@ from ...model.state_space import StateSpaceModel
 from ...snapshots import Base
 from ...track import USED
 from ...tuning import Tuning
-from .responses import (
-    STEP,
-    FoldInputs,
-    Nudge,
-    Start,
-    astray,
-    each,
-    most_events,
-    moved,
-    reason_against,
-    refold,
-    stand_in,
-)
+from .responses import STEP, Nudge, Start, astray, each, max_events, reason_against, stand_in
 
 RANK_INFORMATION = 1.0
 """Information, in units of the prior's, from which the measurements determine a direction better than the prior."""
@@ -118,7 +106,7 @@ def gramian(
         tuning = tuning.with_options({})
     fold = Fold(name, model, tuning, log, base=base)
     t = log.t[: log.n]
-    begin = max(0, log.n - (most or most_events(model, 2 * model.nx)))
+    begin = max(0, log.n - (most or max_events(model, 2 * model.nx)))
     cuts = np.searchsorted(t, np.linspace(t[begin], t[-1], windows + 1)[1:-1])
     begins = [begin, *(int(k) for k in cuts)]
     bases = []
@@ -144,8 +132,7 @@ def _view(
     part.n = end
     if begin:
         part.drop_front(begin)
-    given = FoldInputs(tuning, part, base)
-    begun = Start(estimator, given, refold(estimator, given), begin, "")
+    begun = Start.of(estimator, tuning, part, base)
     used = begun.track.verdict == USED
     told = [_response(begun, j, std)[used] for j, std in enumerate(model.prior_std.tolist())]
     g = information(told)
@@ -174,12 +161,12 @@ def _view(
 
 def _response(begun: Start, j: int, std: float) -> np.ndarray:
     """S^-1/2 dν (N, ny) by one prior deviation of state j."""
-    base, tracks = begun.given.base, []
+    tracks = []
     for size in (-STEP, STEP):
-        mean = base.mean.copy()
+        mean = begun.base.mean.copy()
         mean[j] += size * std
-        tracks.append(refold(begun.estimator, begun.given._replace(base=base._replace(mean=mean))))
-    return moved(begun, tracks[1], tracks[0]).whitened / (2.0 * STEP)
+        tracks.append(begun.refold(base=begun.base._replace(mean=mean)))
+    return begun.moved(tracks[1], tracks[0]).whitened / (2.0 * STEP)
 
 
 def _in_words(weights: np.ndarray, model: StateSpaceModel, left: float) -> str:
@@ -242,7 +229,8 @@ def information(whitened: Sequence[np.ndarray]) -> np.ndarray:
 def uncertainty(fisher: np.ndarray, nudges: Sequence[Nudge]) -> Uncertainty:
     """Invert the information (k, k) of k nudges, as far as it can be."""
     k = len(nudges)
-    alone = _reciprocal(np.sqrt(np.diag(fisher)))
+    with np.errstate(divide="ignore"):
+        alone = np.diag(fisher) ** -0.5
     seen = np.isfinite(alone)
     unit = np.where(seen, alone, 0.0)
     values, vectors = np.linalg.eigh(fisher * np.outer(unit, unit))
@@ -279,7 +267,3 @@ def in_words(weights: np.ndarray, nudges: Sequence[Nudge], most: int = 4) -> str
     parts = [nudges[j].in_words(float(weights[j] / largest) * nudges[j].scale) for j in order[:most]]
     more = f" and {len(order) - most} more" if len(order) > most else ""
     return (f"{parts[0]} with {', '.join(parts[1:])}" if len(parts) > 1 else parts[0]) + more
-
-
-def _reciprocal(values: np.ndarray) -> np.ndarray:
-    return np.divide(1.0, values, out=np.full(values.shape, np.inf), where=values > 0.0)

@@ -32,25 +32,89 @@ R = TypeVar("R")
 
 
 class Response(NamedTuple):
-    """Effect of one unit of a nudge on N events, `innovation` and `whitened` NaN where there is none.
+    """Difference of two tracks of N events, or its derivative by a nudge; NaN where there is none.
 
     innovation (N, ny) is dν, whitened (N, ny) S^-1/2 dν, states (N, shown) dx, of the states that a track keeps.
     """
 
-    nudge: Nudge
     innovation: np.ndarray
     whitened: np.ndarray
     states: np.ndarray
 
 
 class Start(NamedTuple):
-    """The fold that is nudged: estimator, inputs, track, index of its first event in the log, and a note."""
+    """A fold to be perturbed: its inputs, its track, the index of its first event in the log, and a note."""
 
     estimator: str
-    given: FoldInputs
-    track: Track
+    tuning: Tuning
+    log: Log
+    base: Base
     first: int
     note: str
+    track: Track
+
+    @classmethod
+    def of(cls, estimator: str, tuning: Tuning, log: Log, base: Base, first: int = 0, note: str = "") -> Start:
+        """Fold these inputs once."""
+        return cls(estimator, tuning, log, base, first, note, _track(estimator, tuning, log, base))
+
+    def refold(self, *, tuning: Tuning | None = None, log: Log | None = None, base: Base | None = None) -> Track:
+        """Return the track of a fold with some inputs replaced."""
+        return _track(self.estimator, tuning or self.tuning, log or self.log, base or self.base)
+
+    def with_fault(self, nudge: Nudge, size: float) -> Track:
+        """Return the track of a fold with a fault of this size."""
+        model, tuning = self.tuning.model, self.tuning
+        if nudge.kind == PARAMETER:
+            p = tuning.p.copy()
+            p[[item.name for item in model.parameters].index(nudge.name)] += size
+            return self.refold(tuning=replace(tuning, p=p))
+        other = self.log.copy()
+        kind, value = other.kind[: other.n], other.value[: other.n]
+        if nudge.kind == INPUT_:
+            k = model.input_names.index(nudge.name)
+            value[kind == INPUT, k] += size
+            u = self.base.u.copy()
+            u[k] += size
+            return self.refold(log=other, base=self.base._replace(u=u))
+        row = model.row_names.index(nudge.name)
+        sensor = int(np.searchsorted(model.row_start, row, side="right")) - 1
+        own = np.flatnonzero((kind == READING) & (other.channel[: other.n] == sensor))
+        off = size if nudge.kind == SENSOR else size * 1e-9 * (other.t[own] - other.t[0])
+        value[own, row - model.row_start[sensor]] += off
+        return self.refold(log=other)
+
+    def moved(self, new: Track, old: Track | None = None) -> Response:
+        """Subtract a track from another, by default that of the fold without nudge; angles by the shorter way."""
+        model, log, old = self.tuning.model, self.log, old or self.track
+        innovation, states = new.innovation - old.innovation, new.mean - old.mean
+        reading, channel = log.kind[: log.n] == READING, log.channel[: log.n]
+        whitened = new.whitened - old.whitened
+        for s, sensor in enumerate(model.sensors):
+            own = reading & (channel == s)
+            for k, row in enumerate(sensor.rows):
+                if row.circular:
+                    innovation[own, k] = _shorter(innovation[own, k])
+            # By the S of the fold without nudge, where its square root is known. A change of S also changes the
+            # whitened innovations, by less than its effect on their distribution.
+            if len(sensor.rows) == 1 or not np.isfinite(whitened[own]).any():
+                whitened[own] = innovation[own] / self.track.innovation_std[own]
+        for j, state in enumerate(model.shown_states):
+            if state.circular:
+                states[:, j] = _shorter(states[:, j])
+        return Response(innovation, whitened, states)
+
+    def respond(self, nudge: Nudge) -> Response:
+        """Return the derivative by a nudge, as a difference over a step; central where the range allows."""
+        low, high = max(-nudge.step, nudge.low), min(nudge.step, nudge.high)
+        below, above = (self.track if size == 0.0 else self.with_fault(nudge, size) for size in (low, high))
+        return Response(*(change / (high - low) for change in self.moved(above, below)))
+
+
+def _track(estimator: str, tuning: Tuning, log: Log, base: Base) -> Track:
+    fold = Fold(estimator, tuning.model, tuning, log, base=base)
+    fold.advance()
+    return fold.track
 
 
 def stand_in(estimator: str, model: StateSpaceModel) -> tuple[str, str]:
@@ -100,56 +164,7 @@ def start(estimator: str, model: StateSpaceModel, tuning: Tuning, log: Log, base
     still.value[refused, : still.width] = np.nan
     if at:
         still.drop_front(at)
-    given = FoldInputs(replace(tuning, gate=None), still, base)
-    return Start(name, given, refold(name, given), at, note)
-
-
-def refold(estimator: str, given: FoldInputs) -> Track:
-    """Return the track of a fold of these inputs."""
-    fold = Fold(estimator, given.tuning.model, given.tuning, given.log, base=given.base)
-    fold.advance()
-    return fold.track
-
-
-def respond(begun: Start, nudge: Nudge) -> Response:
-    """Return the derivative by a nudge, as a difference over a step; central where the range allows."""
-    low, high = max(-nudge.step, nudge.low), min(nudge.step, nudge.high)
-    below, above = (
-        begun.track if size == 0.0 else refold(begun.estimator, nudged(begun.given, nudge, size))
-        for size in (low, high)
-    )
-    return Response(nudge, *(change / (high - low) for change in moved(begun, above, below)))
-
-
-class TrackDifference(NamedTuple):
-    """Difference of two tracks; see `Response`."""
-
-    innovation: np.ndarray
-    whitened: np.ndarray
-    states: np.ndarray
-
-
-def moved(begun: Start, new: Track, old: Track | None = None) -> TrackDifference:
-    """Subtract a track from another, by default that of the fold without nudge; angles by the shorter way."""
-    model = begun.given.tuning.model
-    log = begun.given.log
-    old = old or begun.track
-    innovation, states = new.innovation - old.innovation, new.mean - old.mean
-    reading, channel = log.kind[: log.n] == READING, log.channel[: log.n]
-    whitened = new.whitened - old.whitened
-    for s, sensor in enumerate(model.sensors):
-        own = reading & (channel == s)
-        for k, row in enumerate(sensor.rows):
-            if row.circular:
-                innovation[own, k] = _shorter(innovation[own, k])
-        # By the S of the fold without nudge, where its square root is known: where S moves, too, the whitened rows hold
-        # what that does to the innovations there are. It is less than what a change of S tells in truth.
-        if len(sensor.rows) == 1 or not np.isfinite(whitened[own]).any():
-            whitened[own] = innovation[own] / begun.track.innovation_std[own]
-    for j, state in enumerate(model.shown_states):
-        if state.circular:
-            states[:, j] = _shorter(states[:, j])
-    return TrackDifference(innovation, whitened, states)
+    return Start.of(name, replace(tuning, gate=None), still, base, at, note)
 
 
 def _shorter(angle: np.ndarray) -> np.ndarray:
@@ -201,17 +216,25 @@ class Nudge(NamedTuple):
         return f"{kind}{self.name} {size:+.3g} {self.unit}"
 
     @property
-    def largest(self) -> float:
-        """Size of the largest fault in the range."""
-        return max(abs(self.low), abs(self.high))
+    def subject(self) -> str:
+        """Kind and name."""
+        return f"{self.kind} {self.name}"
 
+    def size_text(self, size: float) -> str:
+        """Return the size of a fault without its sign: of a parameter in percent of its value, else in its unit."""
+        if self.kind == PARAMETER and self.value:
+            return f"{digits(100.0 * size / abs(self.value))} %"
+        return f"{digits(size)} {self.unit}".rstrip()
 
-class FoldInputs(NamedTuple):
-    """Inputs of a fold, each of which may be nudged."""
-
-    tuning: Tuning
-    log: Log
-    base: Base
+    def range_text(self, low: float, high: float) -> str:
+        """Return the range of undetectable sizes: `-31 to +92 %`, or `± 2.51 °C`."""
+        if not (np.isfinite(low) and np.isfinite(high)):
+            return "any size"
+        percent = self.kind == PARAMETER and bool(self.value)
+        scale, unit = (100.0 / abs(self.value), "%") if percent else (1.0, self.unit)
+        first, last = digits(scale * low, "+"), digits(scale * high, "+")
+        both = f"± {last[1:]}" if first[1:] == last[1:] and first != last else f"{first} to {last}"
+        return f"{both} {unit}".rstrip()
 
 
 def nudges_of(model: StateSpaceModel, tuning: Tuning, log: Log, kinds: Sequence[str] = KINDS) -> list[Nudge]:
@@ -220,8 +243,8 @@ def nudges_of(model: StateSpaceModel, tuning: Tuning, log: Log, kinds: Sequence[
     seconds = float(log.t[log.n - 1] - log.t[0]) * 1e-9 if log.n else 0.0
     units = [row.unit for sensor in model.sensors for row in sensor.rows]
     kind, channel = log.kind[: log.n], log.channel[: log.n]
-    speak = tuning.used & np.isin(np.arange(len(model.sensors)), channel[kind == READING])
-    in_use = np.repeat(speak, [len(sensor.rows) for sensor in model.sensors])
+    reporting = tuning.used & np.isin(np.arange(len(model.sensors)), channel[kind == READING])
+    in_use = np.repeat(reporting, [len(sensor.rows) for sensor in model.sensors])
     for name, unit, variance, used in zip(model.row_names, units, tuning.r, in_use, strict=True):
         if used:
             scale = float(np.sqrt(variance)) or 1.0
@@ -243,30 +266,6 @@ def nudges_of(model: StateSpaceModel, tuning: Tuning, log: Log, kinds: Sequence[
     return [nudge for nudge in found if nudge.kind in kinds]
 
 
-def nudged(given: FoldInputs, nudge: Nudge, size: float) -> FoldInputs:
-    """Return a copy of the inputs of a fold with a nudge of this size."""
-    tuning, log, base = given
-    model = tuning.model
-    if nudge.kind == PARAMETER:
-        p = tuning.p.copy()
-        p[[item.name for item in model.parameters].index(nudge.name)] += size
-        return FoldInputs(replace(tuning, p=p), log, base)
-    other = log.copy()
-    kind, value = other.kind[: other.n], other.value[: other.n]
-    if nudge.kind in (SENSOR, DRIFT):
-        row = model.row_names.index(nudge.name)
-        sensor = int(np.searchsorted(model.row_start, row, side="right")) - 1
-        own = np.flatnonzero((kind == READING) & (other.channel[: other.n] == sensor))
-        off = size if nudge.kind == SENSOR else size * 1e-9 * (other.t[own] - other.t[0])
-        value[own, row - model.row_start[sensor]] += off
-        return FoldInputs(tuning, other, base)
-    k = model.input_names.index(nudge.name)
-    value[kind == INPUT, k] += size
-    u = base.u.copy()
-    u[k] += size
-    return FoldInputs(tuning, other, base._replace(u=u))
-
-
 def digits(value: float, sign: str = "") -> str:
     """Format a number with three digits, with an exponent only where that is shorter: `2,280`, `0.0375`, `1.8e+10`.
 
@@ -278,57 +277,31 @@ def digits(value: float, sign: str = "") -> str:
     return f"{value:{sign if value else ''}.3g}"
 
 
-def subject_text(nudge: Nudge) -> str:
-    """Return the kind and name of a nudge."""
-    return f"{nudge.kind} {nudge.name}"
-
-
-def size_text(nudge: Nudge, size: float) -> str:
-    """Return the size of a fault without its sign: of a parameter in percent of its value, else in its unit."""
-    if nudge.kind == PARAMETER and nudge.value:
-        return f"{digits(100.0 * size / abs(nudge.value))} %"
-    return f"{digits(size)} {nudge.unit}".rstrip()
-
-
-def range_text(nudge: Nudge, low: float, high: float) -> str:
-    """From where to where a fault passes unseen: `-31 to +92 %`, or `± 2.51 °C`."""
-    if not (np.isfinite(low) and np.isfinite(high)):
-        return "any size"
-    percent = nudge.kind == PARAMETER and bool(nudge.value)
-    scale, unit = (100.0 / abs(nudge.value), "%") if percent else (1.0, nudge.unit)
-    first, last = digits(scale * low, "+"), digits(scale * high, "+")
-    both = f"± {last[1:]}" if first[1:] == last[1:] and first != last else f"{first} to {last}"
-    return f"{both} {unit}".rstrip()
-
-
-def fault_text(nudge: Nudge, low: float, high: float) -> str:
-    """A fault that passes unseen: `parameter magnet_ambient, -31 to +92 %`."""
-    return f"{subject_text(nudge)}, {range_text(nudge, low, high)}"
-
-
-MOST_STATES = 64
+MAX_STATES = 64
 """States up to which a model is refolded for each of its nudges."""
 
-MOST_EVENTS = 20_000
+MAX_REFOLD_EVENTS = 20_000
 """Events that are refolded at most, the last of the log."""
 
-MOST_NUMBERS = 32_000_000
+MAX_RESPONSE_NUMBERS = 32_000_000
 """Numbers in all responses at most."""
 
-MOST_WORK = 2_000_000_000
+MAX_REFOLD_OPERATIONS = 2_000_000_000
 """Events times nudges times nx³, as a covariance costs: some ten seconds."""
 
 
 def reason_against(model: StateSpaceModel, log: Log) -> str:
     """Return why sensitivities are not computed, or ""."""
-    if model.grid is not None or model.nx > MOST_STATES:
-        return f"{model.name} has {model.nx:,} states; sensitivities are computed up to {MOST_STATES}"
+    if model.grid is not None or model.nx > MAX_STATES:
+        return f"{model.name} has {model.nx:,} states; sensitivities are computed up to {MAX_STATES}"
     if not (log.kind[: log.n] == READING).any():
         return "the log has no measurement"
     return ""
 
 
-def most_events(model: StateSpaceModel, nudges: int) -> int:
+def max_events(model: StateSpaceModel, nudges: int) -> int:
     """Return the number of events to refold for this number of nudges, by their cost."""
     numbers = nudges * (2 * model.ny + 2 * len(model.shown))
-    return max(1, min(MOST_EVENTS, MOST_NUMBERS // numbers, MOST_WORK // (nudges * model.nx**3)))
+    return max(
+        1, min(MAX_REFOLD_EVENTS, MAX_RESPONSE_NUMBERS // numbers, MAX_REFOLD_OPERATIONS // (nudges * model.nx**3))
+    )

@@ -29,15 +29,12 @@ from .responses import (
     DRIFT,
     KINDS,
     SENSOR,
-    FoldInputs,
     Nudge,
     Start,
     astray,
     each,
     nudges_of,
     reason_against,
-    refold,
-    respond,
     stand_in,
 )
 
@@ -94,14 +91,12 @@ def suspects(
     if begun is None:
         return []
     seen = np.nan_to_num(begun.track.whitened)
+    nudges = nudges_of(model, tuning, begun.log, (*KINDS, DRIFT))
     found = []
-    for response in each(
-        lambda nudge: respond(begun, nudge), nudges_of(model, tuning, begun.given.log, (*KINDS, DRIFT)), executor
-    ):
+    for nudge, response in zip(nudges, each(begun.respond, nudges, executor), strict=True):
         moved = np.nan_to_num(response.whitened)
         power = float(np.sum(moved**2))
         if power > 0.0:
-            nudge = response.nudge
             size = float(np.clip(np.sum(moved * seen) / power, nudge.low, nudge.high))
             gain = float(size * np.sum(moved * seen) - 0.5 * size**2 * power)
             found.append(Suspect(nudge, size, power**-0.5, gain))
@@ -118,11 +113,9 @@ def _start(
     fold.advance(first)
     if first and astray(estimator, name, fold.track.select(slice(0, first))):
         return None
-    here = fold.base_here()
     still = log.copy()
     still.drop_front(first)
-    given = FoldInputs(replace(own, gate=None), still, here)
-    return Start(name, given, refold(name, given), first, note)
+    return Start.of(name, replace(own, gate=None), still, fold.base_here(), first, note)
 
 
 def likeliest(found: Sequence[Suspect]) -> tuple[Suspect, ...]:

@@ -1,6 +1,6 @@
 """Minimal detectable faults: for the optimal test of a known fault, and for the detectors that watch the twin.
 
-The effect of a fault on the innovations is known here row by row. Scaled by s, the optimal test detects it from
+The effect of a fault on the innovations is known row by row. Scaled by s, the optimal test detects it from
 
     s² Σ ΔνᵀS⁻¹Δν = λ,    √λ = z + √(z² + 2h)
 
@@ -32,7 +32,7 @@ from ...track import USED, Track
 from ...tuning import Tuning
 from ..detector_state import detector_context, no_baseline
 from ..detectors import MAX_SIGMA, RATIOS
-from .responses import Response, Start, moved, nudged, refold
+from .responses import Nudge, Response, Start
 
 BISECTIONS = 10
 """Bisections of the bracket of a multiple, a factor of two wide: to 0.1 %."""
@@ -189,34 +189,50 @@ MAX_SIZE_CHANGE = 4.0
 
 
 class UndetectableFault(NamedTuple):
-    """Undetectable sizes of one nudge, in its unit.
+    """Undetectable sizes of one nudge, in its unit, and its response.
 
     low (zero or less) to high: undetectable, within the nudge's range. visible: size of the smallest detectable fault
     of either sign, infinite if none in the range is. error (N, shown): the largest |x(fault) - x| at low and high.
     nonlinearity: relative difference between the first size tried and that predicted by the derivative.
     """
 
+    nudge: Nudge
+    response: Response
     low: float
     high: float
     visible: float
     error: np.ndarray
     nonlinearity: float
 
+    @property
+    def range_text(self) -> str:
+        """Range of undetectable sizes, in words."""
+        return self.nudge.range_text(self.low, self.high)
 
-def undetectable_fault(begun: Start, response: Response, tests: FaultTests) -> UndetectableFault:
-    """Return the undetectable faults of a nudge, in both directions."""
-    nudge = response.nudge
+    @property
+    def text(self) -> str:
+        """The fault with this range: `parameter magnet_ambient, -31 to +92 %`."""
+        return f"{self.nudge.subject}, {self.range_text}"
+
+
+def undetectable_fault(begun: Start, nudge: Nudge, response: Response, tests: FaultTests) -> UndetectableFault:
+    """Return the undetectable faults of a nudge with this derivative, in both directions."""
     size = tests.multiple(response.whitened, response.innovation / begun.track.innovation_std)
     if not np.isfinite(size):
         # No innovation changes: a state that moves can be wrong without limit, or up to the end of the range.
         moves = np.abs(response.states)
-        error = np.multiply(moves, nudge.largest, out=np.zeros_like(moves), where=moves > 0.0)
-        return UndetectableFault(nudge.low, nudge.high, np.inf, error, 0.0)
-    low = _search(begun, response, tests, size, -1.0)
-    high = _search(begun, response, tests, size, 1.0)
-    error = np.maximum(low.error, high.error)
+        largest = max(abs(nudge.low), abs(nudge.high))
+        error = np.multiply(moves, largest, out=np.zeros_like(moves), where=moves > 0.0)
+        return UndetectableFault(nudge, response, nudge.low, nudge.high, np.inf, error, 0.0)
+    low, high = (_search(begun, nudge, tests, size, sign) for sign in (-1.0, 1.0))
     return UndetectableFault(
-        -low.size, high.size, min(low.shown, high.shown), error, max(low.nonlinearity, high.nonlinearity)
+        nudge=nudge,
+        response=response,
+        low=-low.size,
+        high=high.size,
+        visible=min(low.shown, high.shown),
+        error=np.maximum(low.error, high.error),
+        nonlinearity=max(low.nonlinearity, high.nonlinearity),
     )
 
 
@@ -229,16 +245,15 @@ class _Side(NamedTuple):
     nonlinearity: float
 
 
-def _search(begun: Start, response: Response, tests: FaultTests, linear: float, sign: float) -> _Side:
+def _search(begun: Start, nudge: Nudge, tests: FaultTests, linear: float, sign: float) -> _Side:
     """Search the detectable size: scale by the detectable multiple, then bisect."""
-    nudge = response.nudge
     limit = nudge.high if sign > 0.0 else -nudge.low
     if limit <= 0.0:
-        return _Side(0.0, np.inf, np.zeros_like(response.states), 0.0)
+        return _Side(0.0, np.inf, np.zeros_like(begun.track.mean), 0.0)
     size = min(linear, limit)
     nonlinearity, hidden, shown = 0.0, None, np.inf
     for k in range(MAX_REFOLDS):
-        innovation, whitened, states = moved(begun, refold(begun.estimator, nudged(begun.given, nudge, sign * size)))
+        innovation, whitened, states = begun.moved(begun.with_fault(nudge, sign * size))
         # An estimate that is not finite is always detected.
         finite = bool(np.all(np.isfinite(states)))
         multiple = tests.multiple(whitened, innovation / begun.track.innovation_std) if finite else 0.0
@@ -260,5 +275,5 @@ def _search(begun: Start, response: Response, tests: FaultTests, linear: float, 
             size = min(limit, size * float(np.clip(multiple, 1.0 / MAX_SIZE_CHANGE, MAX_SIZE_CHANGE)))
     # No size was close enough: the response jumps, or hardly grows. The largest size tried undetected is a bound.
     if hidden is None:
-        return _Side(0.0, shown, np.zeros_like(response.states), nonlinearity)
+        return _Side(0.0, shown, np.zeros_like(begun.track.mean), nonlinearity)
     return hidden._replace(shown=shown)

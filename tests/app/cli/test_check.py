@@ -3,14 +3,13 @@
 import json
 import re
 from html.parser import HTMLParser
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from app.cli.main import main
 from app.present.result import Bar, Topic, to_html
-from estimators.diagnostics.sensitivity.responses import range_text
+from estimators.diagnostics.sensitivity.responses import Nudge
 
 REQUIRED = {"checklist", "observability", "smallest_visible", "integrity", "held_out", "open_loop"}
 MORE = {"twin", "estimator", "span", "timing", "calibration", "posterior", "linearity", "dimension", "health"}
@@ -141,7 +140,7 @@ def test_answers_are_marked_by_what_they_mean(checked):
      (0.0, 0.0, "0 to 0 °C"), (-1.8e10, 1.8e10, "± 1.8e+10 °C"), (-1.0, np.inf, "any size")],
 )  # fmt: skip
 def test_ranges_in_words(low, high, text):
-    assert range_text(SimpleNamespace(kind="sensor", value=0.0, unit="°C"), low, high) == text
+    assert Nudge("sensor", "winding", "°C", 1.0, -np.inf, np.inf, 1.0).range_text(low, high) == text
 
 
 def test_text_is_the_same_page(capsys):

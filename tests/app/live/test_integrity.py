@@ -49,7 +49,7 @@ def test_the_status_shows_the_sensitivity_of_the_same_events():
     assert_close(found.bounds, bounds_of(MODEL, computed), 1e-12)
     # Of the one sensor's noise of 2 °C.
     (smallest,) = found.smallest
-    size = float(computed.smallest_visible[0])
+    size = float(computed.faults[0].visible)
     assert (smallest.subject, smallest.size) == ("sensor winding", f"{size:.3g} °C" if np.isfinite(size) else "none")
     assert smallest.share == pytest.approx(size / 2.0)
     after = status_json(engine)

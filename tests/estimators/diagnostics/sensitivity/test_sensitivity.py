@@ -39,12 +39,24 @@ def walk():
     return sensitivity("ekf", WALK, Tuning.of(WALK), walk_log(), seen_by="best")
 
 
+def responses(found):
+    return [fault.response for fault in found.faults]
+
+
+def visible(found):
+    return np.array([fault.visible for fault in found.faults])
+
+
+def unseen(found):
+    return np.array([(fault.low, fault.high) for fault in found.faults])
+
+
 def readings(found, array):
-    return array[np.isfinite(found.responses[0].innovation[:, 0])]
+    return array[np.isfinite(found.faults[0].response.innovation[:, 0])]
 
 
 def test_responses_of_a_walk_in_closed_form(walk):
-    sensor, push, slope, delay = walk.responses
+    sensor, push, slope, delay = responses(walk)
     assert [(n.kind, n.name) for n in walk.nudges] == [
         ("sensor", "level"),
         ("input", "push"),
@@ -73,18 +85,18 @@ def test_information_and_smallest_visible_faults_in_closed_form(walk):
     assert walk.fisher[0, 0] == pytest.approx((1 - KEPT ** (2 * N)) / (1 - KEPT**2) / S, rel=1e-9)
     # Readings in a day, one a second, times the tests of the one row.
     assert walk.h[0] == pytest.approx(np.log(86400.0 * TESTS), rel=1e-9)
-    visible = np.sqrt(walk.noncentrality / np.diag(expected))
-    np.testing.assert_allclose(walk.smallest_visible[:3], visible[:3], rtol=1e-6)
-    np.testing.assert_allclose(walk.unseen[:3], np.stack([-visible[:3], visible[:3]], axis=1), rtol=1e-6)
+    size = np.sqrt(walk.noncentrality / np.diag(expected))[:3]
+    np.testing.assert_allclose(visible(walk)[:3], size, rtol=1e-6)
+    np.testing.assert_allclose(unseen(walk)[:3], np.stack([-size, size], axis=1), rtol=1e-6)
 
 
 def test_what_the_readings_cannot_tell_apart(walk):
     # An input, and two parameters that do the same: the log tells their sum, and the sensor's bias beside it.
-    assert np.isfinite(walk.deviation[0]) and np.all(np.isinf(walk.deviation[1:]))
+    assert np.isfinite(walk.among().deviation[0]) and np.all(np.isinf(walk.among().deviation[1:]))
     pair = walk.among([0, 1])
     cov = np.linalg.inv(np.stack([SENSOR, DRIFT]) @ np.stack([SENSOR, DRIFT]).T / S)
     np.testing.assert_allclose(pair.deviation, np.sqrt(np.diag(cov)), rtol=1e-6)
-    np.testing.assert_allclose(walk.deviation[0], pair.deviation[0], rtol=1e-6)
+    np.testing.assert_allclose(walk.among().deviation[0], pair.deviation[0], rtol=1e-6)
     assert pair.correlation[0, 1] == pytest.approx(cov[0, 1] / np.sqrt(cov[0, 0] * cov[1, 1]), abs=1e-6)
     # One at the other's cost: the sum stays when one rises and the other falls.
     assert walk.among([1, 2]).correlation[0, 1] == pytest.approx(-1.0, abs=1e-6)
@@ -98,24 +110,24 @@ def test_a_fault_is_as_large_as_the_model_bends(walk):
     change = np.sqrt(walk.noncentrality / (DRIFT @ DRIFT / S))
     assert change < 0.95  # else a longer delay could never be seen, and this shows nothing
     k = walk.place("parameter", "delay")
-    low, high = walk.unseen[k]
+    low, high = unseen(walk)[k]
     # Sizes are sought until √λ is within 5 % and then scaled: the change of the drift is, too, within its square.
     for size in (low, high):
         assert abs(1.0 / (1.0 + size) - 1.0) == pytest.approx(change, rel=0.06)
     assert high > 1.2 * -low
-    assert walk.smallest_visible[k] == pytest.approx(-low)
-    assert walk.nonlinearity[k] > 0.1 > 1e-6 > walk.nonlinearity[0]
+    assert visible(walk)[k] == pytest.approx(-low)
+    assert walk.faults[k].nonlinearity > 0.1 > 1e-6 > walk.faults[0].nonlinearity
     # What it does to the state is what that change of the drift does, not what the derivative says.
-    assert walk.over_time.bias[-1, 0] == pytest.approx(
-        max(abs(walk.responses[0].states[-1, 0] * walk.unseen[0, 1]), abs(change * KEPT * DRIFT[-1])), rel=0.06
+    assert walk.bounds.bias[-1, 0] == pytest.approx(
+        max(abs(responses(walk)[0].states[-1, 0] * unseen(walk)[0, 1]), abs(change * KEPT * DRIFT[-1])), rel=0.06
     )
 
 
 def test_the_range_of_a_parameter_ends_its_faults():
     tuning = Tuning.of(WALK).set("p.slope", 4.99)
     found = sensitivity("ekf", WALK, tuning, walk_log(), kinds=("parameter",))
-    assert found.unseen[0, 1] == pytest.approx(0.01) and found.unseen[0, 0] < -0.1
-    assert found.smallest_visible[0] == pytest.approx(-found.unseen[0, 0])
+    assert unseen(found)[0, 1] == pytest.approx(0.01) and unseen(found)[0, 0] < -0.1
+    assert visible(found)[0] == pytest.approx(-unseen(found)[0, 0])
 
 
 def test_the_noncentrality_passes_the_threshold_with_its_probability():
@@ -129,7 +141,7 @@ def test_the_noncentrality_passes_the_threshold_with_its_probability():
 def test_a_fault_of_the_smallest_visible_size_is_seen():
     """A cumulative sum that knows the fault's shape finds it in 95 %, counted over simulated innovations."""
     found = sensitivity("ekf", WALK, Tuning.of(WALK), walk_log(), kinds=("sensor",), seen_by="best")
-    shape = readings(found, found.responses[0].whitened)[:, 0] * found.smallest_visible[0]
+    shape = readings(found, responses(found)[0].whitened)[:, 0] * visible(found)[0]
     runs = 2000
     e = np.random.default_rng(3).normal(size=(runs, N)) + shape
     ratios = np.concatenate([np.zeros((runs, 1)), np.cumsum(shape * e - 0.5 * shape**2, axis=1)], axis=1)
@@ -199,17 +211,17 @@ def test_errors_under_unseen_faults_stay_below_the_bound(seen_by):
     n, runs, tuning = 150, 500, Tuning.of(COUPLED)
     log, _ = simulate(rng, n)
     found = sensitivity("ekf", COUPLED, tuning, log, seen_by=seen_by)
-    assert np.all(np.isfinite(found.integrity))
-    np.testing.assert_array_equal(found.integrity, found.integrity_bias + norm.ppf(0.975) * found.std[-1])
-    rows = np.flatnonzero(np.isfinite(found.responses[0].innovation[:, 0]))
+    assert np.all(np.isfinite(found.bounds.bound[-1]))
+    np.testing.assert_array_equal(found.bounds.bound[-1], found.bounds.bias[-1] + norm.ppf(0.975) * found.std[-1])
+    rows = np.flatnonzero(np.isfinite(responses(found)[0].innovation[:, 0]))
     inside = beyond = 0
     for _ in range(runs):
         k = rng.integers(len(found.nudges))
-        log, xs = faulty(rng, n, found.nudges[k], rng.uniform(*found.unseen[k]))
+        log, xs = faulty(rng, n, found.nudges[k], rng.uniform(*unseen(found)[k]))
         track = fold("ekf", COUPLED, tuning, log)
         j, at = rng.integers(2), rng.integers(n)
         error = abs(track.mean[rows[at], j] - xs[at, j])
-        inside += error <= found.over_time.bound[rows[at], j]
+        inside += error <= found.bounds.bound[rows[at], j]
         beyond += error > norm.ppf(0.975) * track.std[rows[at], j]
     # Fewer would come about once in a thousand, if 95 % were inside.
     assert inside >= binom.ppf(1e-3, runs, 0.95)
@@ -222,16 +234,16 @@ def test_the_worst_fault_is_as_bad_as_the_bound_says():
     n, runs, tuning = 150, 100, Tuning.of(COUPLED)
     found = sensitivity("ekf", COUPLED, tuning, simulate(rng, n)[0])
     for j in range(2):
-        k = found.integrity_cause[j]
+        k = found.bounds.cause[-1][j]
         # A bias of the sensor: what it does is linear in it, whatever the log.
         assert found.nudges[k].kind == "sensor"
-        for end in found.unseen[k]:
+        for end in unseen(found)[k]:
             errors = []
             for _ in range(runs):
                 log, xs = faulty(rng, n, found.nudges[k], end)
                 errors.append(fold("ekf", COUPLED, tuning, log).mean[-1, j] - xs[-1, j])
             assert abs(np.mean(errors)) == pytest.approx(
-                found.integrity_bias[j], abs=4.0 * found.std[-1, j] / np.sqrt(runs)
+                found.bounds.bias[-1][j], abs=4.0 * found.std[-1, j] / np.sqrt(runs)
             )
 
 
@@ -253,11 +265,11 @@ def test_the_bank_sees_faults_of_the_smallest_visible_size():
     n, runs, tuning = 150, 60, Tuning.of(COUPLED)
     found = sensitivity("ekf", COUPLED, tuning, simulate(rng, n)[0])
     best = sensitivity("ekf", COUPLED, tuning, simulate(rng, n)[0], seen_by="best")
-    assert np.all(found.smallest_visible >= best.smallest_visible * 0.9)
+    assert np.all(visible(found) >= visible(best) * 0.9)
     for k, nudge in enumerate(found.nudges):
-        low, high = found.unseen[k]
-        size = high if high == found.smallest_visible[k] else low
-        assert abs(size) == found.smallest_visible[k]
+        low, high = unseen(found)[k]
+        size = high if high == visible(found)[k] else low
+        assert abs(size) == visible(found)[k]
         said = {
             factor: sum(
                 bool(np.any(fold("ekf", COUPLED, tuning, faulty(rng, n, nudge, factor * size)[0]).alarms))
@@ -281,8 +293,8 @@ def test_what_was_refused_stays_refused():
     value[spike, 0] = np.nan
     without = sensitivity("ekf", WALK, Tuning.of(WALK), log)
     np.testing.assert_array_equal(found.fisher, without.fisher)
-    np.testing.assert_array_equal(found.integrity, without.integrity)
-    assert np.isnan(found.responses[0].innovation[spike, 0])
+    np.testing.assert_array_equal(found.bounds.bound[-1], without.bounds.bound[-1])
+    assert np.isnan(responses(found)[0].innovation[spike, 0])
 
 
 def test_the_last_part_of_a_log_is_that_log_from_a_base():
@@ -297,7 +309,7 @@ def test_the_last_part_of_a_log_is_that_log_from_a_base():
     rest.drop_front(at)
     again = sensitivity("ekf", COUPLED, tuning, rest, base=base, executor=None)
     np.testing.assert_array_equal(found.fisher, again.fisher)
-    np.testing.assert_array_equal(found.over_time.bound, again.over_time.bound)
+    np.testing.assert_array_equal(found.bounds.bound, again.bounds.bound)
 
 
 def test_a_sensor_held_out_is_neither_nudged_nor_a_witness():
@@ -305,8 +317,8 @@ def test_a_sensor_held_out_is_neither_nudged_nor_a_witness():
     found = sensitivity("ekf", WALK, Tuning.of(WALK).set("use.level", False), log)
     assert found.nudges[0].kind == "input"
     # Nobody sees it, and the drift carries the state away without limit.
-    assert np.all(found.fisher == 0.0) and np.isinf(found.smallest_visible[0])
-    assert np.isinf(found.integrity[0]) and found.integrity_cause[0] == 0
+    assert np.all(found.fisher == 0.0) and np.isinf(visible(found)[0])
+    assert np.isinf(found.bounds.bound[-1][0]) and found.bounds.cause[-1][0] == 0
 
 
 def test_particles_are_replaced():
@@ -320,5 +332,5 @@ def test_particles_are_replaced():
 def test_what_is_too_large_or_silent_is_refused_with_a_reason():
     model = MODELS["thermal_field"]
     found = sensitivity("enkf", model, Tuning.of(model), Log.of(model))
-    assert "states; sensitivities are computed up to 64" in found.reason and not found.responses
+    assert "states; sensitivities are computed up to 64" in found.reason and not found.faults
     assert "no measurement" in sensitivity("ekf", WALK, Tuning.of(WALK), Log.of(WALK)).reason
