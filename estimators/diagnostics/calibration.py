@@ -19,8 +19,7 @@ from ..numerics.quantiles import chi_square_quantile, normal_quantile
 from ..track import GATED, HELD_OUT, USED, Track
 from .intervals import UNKNOWN, Interval, correlation_interval, mean_interval, scale_interval, share_interval
 
-BANDS = (0.50, 0.90, 0.95)
-"""Shares of the readings, or of the truth, that these bands should hold."""
+BANDS = (0.50, 0.90, 0.95)  # Shares of the readings, or of the truth, that these bands should hold
 
 
 class CalibrationLimits(NamedTuple):

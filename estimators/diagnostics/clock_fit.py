@@ -20,11 +20,8 @@ SEGMENT_NS = 10**9
 
 MAX_SEGMENTS = 512
 
-MIN_SEGMENTS = 8
-"""Stretches below which no drift is told."""
-
-OUTLIER_DEVIATIONS = 10.0
-"""Robust deviations above the line beyond which a stretch was held up."""
+MIN_SEGMENTS = 8  # Stretches below which no drift is told
+OUTLIER_DEVIATIONS = 10.0  # Robust deviations above the line beyond which a stretch was held up
 
 
 class ClockFit(NamedTuple):

@@ -23,8 +23,7 @@ from .health import JUDGED_MEAN, MAX_ROWS_PER_READING, MIN_WINDOW_EVENTS, Health
 BASELINE_MARGIN = 1.5
 """Factor on the highest value of a test, which is added to its threshold, and on the highest NIS over a window."""
 
-MIN_MEASUREMENTS = 50
-"""Measurements of a row from which it has a baseline."""
+MIN_MEASUREMENTS = 50  # Measurements of a row from which it has a baseline
 
 
 class Normal(NamedTuple):

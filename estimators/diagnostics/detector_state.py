@@ -22,15 +22,13 @@ TWIN = 9
 # Sensor: W of the joint tests, then the number of measurements, time of the first and the last, longest gap, threshold
 # of the tests, time at which it drops out, whether it has, alarms of the joint tests.
 COUNT, FIRST, LAST, LONGEST_GAP, THRESHOLD, DUE, SILENT, JOINT_MASK = range(JOINT, JOINT + 8)
-SENSOR = JOINT + 8
-"""Numbers in the state for each sensor."""
+SENSOR = JOINT + 8  # Numbers in the state for each sensor
 
 # Row: W of its tests, then its alarms; the last e, and the same whitened by the baseline; the last value; its smallest
 # step; length of the present run of equal values; repeated values, of how many; measurements since the last outlier;
 # the next e that each filter of `GAINS` predicts.
 MASK, RAW, WHITE, VALUE, QUANTUM, RUN, EQUAL, COUNTED, CALM_FOR, EXPECTED = range(TESTS, TESTS + 10)
-ROW = EXPECTED + len(GAINS)
-"""Numbers in the state for each row."""
+ROW = EXPECTED + len(GAINS)  # Numbers in the state for each row
 
 # Shown state: mean square of its standardised errors, how many true values were given, whether it is missed. The
 # inputs that hold follow.

@@ -75,17 +75,13 @@ from .detectors import (
     UNKNOWN_QUANTUM,
 )
 
-HEADROOM_NATS = 1.0
-"""Amount by which W may exceed its threshold, so that it falls again when the cause has gone."""
-
-CLEARING_SHARE = 0.85
-"""Share of the threshold above which an alarm lasts."""
+HEADROOM_NATS = 1.0  # Amount by which W may exceed its threshold, so that it falls again when the cause has gone
+CLEARING_SHARE = 0.85  # Share of the threshold above which an alarm lasts
 
 CALM_MEASUREMENTS, OUTLIER_FROM = 500, 3.5
 """Measurements without |e| beyond this after which earlier outliers are forgotten."""
 
-KNOWN_PERIOD = 16.0
-"""Measurements from which the period of a sensor is known; with fewer it may pause for longer."""
+KNOWN_PERIOD = 16.0  # Measurements from which the period of a sensor is known; with fewer it may pause for longer
 
 
 @inlined

@@ -53,8 +53,7 @@ def correlation_ratio(phi: float) -> Ratio:
     return 0.5 - 0.5 / rest, phi / rest, -0.5 * phi * phi / rest, 0.0, -0.5 * math.log(rest)
 
 
-OUTLIER_SIGMA = 5.0
-"""Standard deviation of e of an outlier."""
+OUTLIER_SIGMA = 5.0  # Standard deviation of e of an outlier
 
 
 def outlier_density(share: float, *, rare: bool = False) -> Density:
@@ -318,8 +317,7 @@ IMPOVERISHED, OUTSIDE, TRUTH_MISSED = 1 << 59, 1 << 60, 1 << 61
 """Bits of `Track.flags` above those of the sensors that dropped out: few particles carry the estimate; outside the
 range in which the model was fitted; a known true state is outside its band."""
 
-SENSOR_FLAGS = 58
-"""Sensors with a bit of their own in `Track.flags`; the others share the last."""
+SENSOR_FLAGS = 58  # Sensors with a bit of their own in `Track.flags`; the others share the last
 
 # What follows is compiled into the kernels as constants.
 
@@ -334,11 +332,8 @@ RATIOS = np.array([test for _, test in _QUADRATIC])
 """Coefficients (a, b, c, d, f) of the quadratic tests, (QUADRATIC, 5)."""
 
 QUADRATIC = len(RATIOS)
-LAGGED = int(np.sum(RATIOS[:, 1] != 0.0))
-"""Quadratic tests, and how many of them, the last, need the e before."""
-
-MAX_SIGMA = 6.0
-"""|e| is clipped here: a more distant value carries no more evidence."""
+LAGGED = int(np.sum(RATIOS[:, 1] != 0.0))  # Quadratic tests, and how many of them, the last, need the e before
+MAX_SIGMA = 6.0  # |e| is clipped here: a more distant value carries no more evidence
 
 GAINS, FADING = (0.2, 0.5), 0.95
 """Gains of a filter that follows noise: its innovations are (1 - L) / (1 - (1 - gain) L) of white noise, L the lag;
@@ -356,8 +351,7 @@ FOLLOWED = np.array([_followed_ratio(gain) for gain in GAINS])
 """Coefficients (a, b, c) of m ← fading m + a e, log Λ = ½ e² - b (e - m)² + c, (gains, 3); m predicts e."""
 
 DENSITIES = len(_DENSITIES)
-DENSITY_STEPS = 256.0
-"""Steps per σ of the tabulated log Λ, between which it is interpolated (error below 1e-5)."""
+DENSITY_STEPS = 256.0  # Steps per σ of the tabulated log Λ, between which it is interpolated (error below 1e-5)
 
 _GRID = np.arange(2.0 * MAX_SIGMA * DENSITY_STEPS + 2.0) / DENSITY_STEPS - MAX_SIGMA
 DENSITY_RATIOS = np.array([test.log_ratio(_GRID) for _, test in _DENSITIES])
@@ -384,11 +378,8 @@ JOINT = len(JOINT_RATIOS)
 JOINT_BITS = np.array([DISAGREEING] * 3 + [AGREEING] * 3)
 """Tests of all rows of a sensor together, by its NIS: coefficients (JOINT, 5) and alarms (JOINT,)."""
 
-REJECTED_SHARE = 0.3
-"""Share of rejected readings that is tested against what the gate rejects by chance."""
-
-REPEAT_PROBABILITY = 0.999
-"""Probability that a stuck sensor repeats its last value."""
+REJECTED_SHARE = 0.3  # Share of rejected readings that is tested against what the gate rejects by chance
+REPEAT_PROBABILITY = 0.999  # Probability that a stuck sensor repeats its last value
 
 UNKNOWN_QUANTUM = 0.5
 """Probability of a repeated value of a sensor that has never changed: its quantum is not known yet."""

@@ -17,17 +17,13 @@ from .detectors import MAX_SIGMA
 
 INTERVAL_SIGMAS = float(normal_quantile(0.975))
 
-OUTLIER_FROM_SIGMA = 4.0
-"""|e| from which an innovation is an outlier."""
-
-MIN_PAIRS = 4
-"""Innovations up to which a correlation is not estimated."""
+OUTLIER_FROM_SIGMA = 4.0  # |e| from which an innovation is an outlier
+MIN_PAIRS = 4  # Innovations up to which a correlation is not estimated
 
 KINDS = ("shifted", "narrow", "wide", "correlated", "alternating", "spiky")
 """Detectors whose effect is estimated here, by name."""
 
-EVIDENCE = "evidence"
-"""Kind of a series of log Λ of a test in place of e, for detectors of which nothing else is known."""
+EVIDENCE = "evidence"  # Kind of a series of log Λ of a test in place of e, for detectors of which nothing else is known
 
 
 class InnovationEffect(NamedTuple):

@@ -23,8 +23,7 @@ from ..track import FAILED, GATED, Track, estimated_rows
 SIGMA_OFFSETS = (1.0, -1.0, 3.0, -3.0)
 """Standard deviations from the estimate, a state at a time; the sigma points of nx states lie at about √nx."""
 
-MAX_STEPS = 100
-"""Steps of a prediction that are repeated at most; a longer prediction has longer steps."""
+MAX_STEPS = 100  # Steps of a prediction that are repeated at most; a longer prediction has longer steps
 
 
 class Estimate(NamedTuple):

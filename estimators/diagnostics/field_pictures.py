@@ -15,8 +15,7 @@ from ..log import MARK, TRUTH, Log
 from ..model.states import Field
 from ..numerics.quantiles import normal_quantile
 
-MAX_SIDE = 200
-"""Cells of a picture along an axis at most; a larger field is averaged over squares."""
+MAX_SIDE = 200  # Cells of a picture along an axis at most; a larger field is averaged over squares
 
 MAX_PICTURE_BYTES = 64 * 2**20
 """Bytes that the pictures of a fold may take; then every second of the older ones keeps its numbers only."""

@@ -27,11 +27,8 @@ from ..numerics.quantiles import chi_square_quantile
 from ..numerics.simd import total as sum_of
 from ..track import DIVERGED, FAILED, GATED, TRACKING, USED, borrowed_columns
 
-MIN_WINDOW_EVENTS = 10
-"""Events in a window below which it is not judged."""
-
-MAX_ROWS_PER_READING = 20
-"""Rows for each measurement of the window, beyond which a measurement is too old to count."""
+MIN_WINDOW_EVENTS = 10  # Events in a window below which it is not judged
+MAX_ROWS_PER_READING = 20  # Rows for each measurement of the window, beyond which a measurement is too old to count
 
 
 class HealthPolicy(NamedTuple):
@@ -187,12 +184,10 @@ def assess(first, last, t, kind, channel, track, normal, policy, bounds):
             track.consistency[i] = track.consistency[i - 1]
 
 
-PROBABILITY = 0.95
-"""Probability of the bounds in charts and reports."""
+PROBABILITY = 0.95  # Probability of the bounds in charts and reports
 
 JUDGED_MEAN, MEAN, VARIANCE = range(3)
-NORMALS = 3
-"""Expected NIS of a sensor: mean, at least 1, for divergence; mean and variance of one degree of freedom."""
+NORMALS = 3  # Expected NIS of a sensor: mean, at least 1, for divergence; mean and variance of one degree of freedom
 
 
 def normal_nis(model: StateSpaceModel, baseline: np.ndarray) -> np.ndarray:

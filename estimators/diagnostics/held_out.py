@@ -21,11 +21,8 @@ from ..track import HELD_OUT, Track
 from ..tuning import Tuning
 from .health import PROBABILITY
 
-LAST_MEASUREMENTS = 200
-"""Readings of a row that are looked at, the last."""
-
-MIN_MEASUREMENTS = 10
-"""Below which nothing is said."""
+LAST_MEASUREMENTS = 200  # Readings of a row that are looked at, the last
+MIN_MEASUREMENTS = 10  # Below which nothing is said
 
 
 class Offset(NamedTuple):

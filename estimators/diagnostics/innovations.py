@@ -17,8 +17,7 @@ from ..track import GATED, USED, Track
 from ..tuning import Tuning
 from .intervals import correlation_interval
 
-TWO_SIDED = normal_quantile(0.975)
-"""Standard errors to either side of a 95 % interval."""
+TWO_SIDED = normal_quantile(0.975)  # Standard errors to either side of a 95 % interval
 
 
 class Autocorrelation(NamedTuple):
@@ -112,8 +111,7 @@ def memory(r: np.ndarray) -> int:
     return int(fallen[0]) + 1 if fallen.size else r.size
 
 
-MIN_INNOVATIONS = 50
-"""Readings of a row from which on its noise is estimated."""
+MIN_INNOVATIONS = 50  # Readings of a row from which on its noise is estimated
 
 
 class SensorNoise(NamedTuple):

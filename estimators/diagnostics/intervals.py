@@ -16,14 +16,9 @@ import numpy as np
 from scipy.fft import dct
 from scipy.special import stdtrit
 
-PROBABILITY = 0.95
-"""Of every interval here."""
-
-N_COSINES = 12
-"""Projections; fewer for a series that has not twice as many values."""
-
-MIN_VALUES = 8
-"""Values that an interval takes at least."""
+PROBABILITY = 0.95  # Of every interval here
+N_COSINES = 12  # Projections; fewer for a series that has not twice as many values
+MIN_VALUES = 8  # Values that an interval takes at least
 
 
 class Interval(NamedTuple):

@@ -20,8 +20,7 @@ from .consistency import NisVerdict
 from .field_pictures import Picture
 from .health import MAX_ROWS_PER_READING, PROBABILITY, nis_bounds, normal_nis
 
-BASELINE_CLIP_SIGMA = 6.0
-"""σ at which the innovations of a row are clipped in a baseline (commission.py)."""
+BASELINE_CLIP_SIGMA = 6.0  # σ at which the innovations of a row are clipped in a baseline (commission.py)
 
 
 class Fit(NamedTuple):

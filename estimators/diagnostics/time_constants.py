@@ -8,11 +8,8 @@ from ..errors import ModelError
 from ..model.state_space import StateSpaceModel
 from ..numerics.jit import plain
 
-MOST = 200
-"""States beyond which the eigenvalues are not worth their time."""
-
-UNSTABLE = 1.0 - 1e-9
-"""Modulus from which on a mode does not decay: a random walk, or one that grows."""
+MOST = 200  # States beyond which the eigenvalues are not worth their time
+UNSTABLE = 1.0 - 1e-9  # Modulus from which on a mode does not decay: a random walk, or one that grows
 
 _STEP = 6e-6
 

@@ -13,8 +13,7 @@ READING, INPUT, TRUTH, TICK, RESET, MARK, MAINTENANCE = range(7)
 """Kinds of event: a measurement of a sensor; inputs; a true state (scored, never used); a query; a reset to the prior;
 start or end of an injected fault; maintenance, which resets the covariance of a state to the prior's."""
 
-BEFORE = -(2**62)
-"""Earlier than any event, and far enough from the end of int64 to subtract a horizon."""
+BEFORE = -(2**62)  # Earlier than any event, and far enough from the end of int64 to subtract a horizon
 
 KIND_NAMES = ("reading", "input", "truth", "tick", "reset", "mark", "maintenance")
 

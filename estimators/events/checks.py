@@ -17,11 +17,8 @@ from ..model.state_space import EventLayout
 from ..numerics.jit import i64, jit_brief
 from .batch import BEFORE, INPUT, KIND_NAMES, MAINTENANCE, MARK, READING, TRUTH, Events
 
-FINE, TIME, KIND, CHANNEL, VALUES, STRAY, VARIANCE = range(7)
-"""Rules, by which `_look` names a violation."""
-
-_ANY = np.zeros(0, np.int64)
-"""Rows of the sensors of an unknown model."""
+FINE, TIME, KIND, CHANNEL, VALUES, STRAY, VARIANCE = range(7)  # Rules, by which `_look` names a violation
+_ANY = np.zeros(0, np.int64)  # Rows of the sensors of an unknown model
 
 
 def _read_only(element: types.Type, dimensions: int) -> types.Array:

@@ -54,14 +54,9 @@ from .clock_expected import (
     compiled,
 )
 
-SETTLING_TIME_NS = 2 * SECOND_NS
-"""Time, by the source's clock, over which held events must agree before they pass."""
-
-ZONE_STEP_NS = 900 * SECOND_NS
-"""Time zones, and daylight saving time, differ by a multiple of 15 minutes."""
-
-MAX_HELD, MAX_HELD_LIVE = 1 << 17, 4096
-"""Largest number of held events of a channel, without and with known arrivals."""
+SETTLING_TIME_NS = 2 * SECOND_NS  # Time, by the source's clock, over which held events must agree before they pass
+ZONE_STEP_NS = 900 * SECOND_NS  # Time zones, and daylight saving time, differ by a multiple of 15 minutes
+MAX_HELD, MAX_HELD_LIVE = 1 << 17, 4096  # Largest number of held events of a channel, without and with known arrivals
 
 
 class ClockGuard:

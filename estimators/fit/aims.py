@@ -37,8 +37,7 @@ from ..track import FAILED, GATED, HELD_OUT, USED, Track
 from .entries import Setting
 from .recording import Recording
 
-FAILURE_COST = 1e3
-"""Nats that a failed measurement costs."""
+FAILURE_COST = 1e3  # Nats that a failed measurement costs
 
 LIKELIHOOD, WITNESSES, CRPS, ERROR = AIMS = ("likelihood", "witnesses", "crps", "error")
 

@@ -21,12 +21,8 @@ from ..model.state_space import LARGE, Field
 from ..registry import find_estimator
 from ..tuning import Tuning
 
-OVER = "over"
-"""Group of the correlation times of coloured noise: the parameters that `coloured` appends."""
-
-
-GROUPS = ("Q", "R", "p", "options", "prior", OVER)
-"""Groups of entries."""
+OVER = "over"  # Group of the correlation times of coloured noise: the parameters that `coloured` appends
+GROUPS = ("Q", "R", "p", "options", "prior", OVER)  # Groups of entries
 
 
 SCALE = "scale"
@@ -47,12 +43,8 @@ SPREAD = {
 """Deviation of the weak prior, in logarithms: two decades of a variance is one of a standard deviation."""
 
 
-DIGITS = 4
-"""Significant digits of a proposed value: finer than any interval."""
-
-
-MAX_FACTOR = 1e4
-"""Largest factor between a value and that of the twin where nothing else bounds it."""
+DIGITS = 4  # Significant digits of a proposed value: finer than any interval
+MAX_FACTOR = 1e4  # Largest factor between a value and that of the twin where nothing else bounds it
 
 
 @dataclass(frozen=True)

@@ -29,11 +29,8 @@ MAX_DEVIATION = 0.25
 """Deviation of an identified entry, in deviations of its weak prior: for a variance a factor of 3 in its standard
 deviation."""
 
-MAX_COST = 2.0
-"""Nats that it may cost to reset an entry that is not identified: the size of chance."""
-
-MAX_RESETS = 3
-"""Times that entries are reset and the others fitted again."""
+MAX_COST = 2.0  # Nats that it may cost to reset an entry that is not identified: the size of chance
+MAX_RESETS = 3  # Times that entries are reset and the others fitted again
 
 
 class EntryFit(NamedTuple):

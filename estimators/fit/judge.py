@@ -53,32 +53,13 @@ from .objective import ALONE, Cancelled, Go, Objective
 from .recording import Recording
 from .uncertainty import LikelihoodCurvature, Z
 
-GAIN_BATCHES = 20
-"""Batches of time over which a difference is averaged, for its standard error."""
-
-
-MIN_SIGMAS = 2.0
-"""Standard errors that a gain must exceed, and a loss before it counts."""
-
-
-MIN_TOTAL_GAIN = 1.0
-"""Nats that a fit must gain on all held-out data: with less it is the same tuning in other digits."""
-
-
-MAX_LOSS = 0.05
-"""Share by which the score of a held-out prediction may grow before it counts."""
-
-
-MIN_COVERAGE = 0.9
-"""Coverage of a 95 % band from which on it is not too narrow."""
-
-
-MAX_COVERAGE_LOSS = 0.05
-"""Coverage that may be lost before it counts, below `MIN_COVERAGE`."""
-
-
-UNITS = {LIKELIHOOD: "a reading", WITNESSES: "a reading or witness"}
-"""Unit of a gain in nats, by aim."""
+GAIN_BATCHES = 20  # Batches of time over which a difference is averaged, for its standard error
+MIN_SIGMAS = 2.0  # Standard errors that a gain must exceed, and a loss before it counts
+MIN_TOTAL_GAIN = 1.0  # Nats that a fit must gain on all held-out data: with less it is the same tuning in other digits
+MAX_LOSS = 0.05  # Share by which the score of a held-out prediction may grow before it counts
+MIN_COVERAGE = 0.9  # Coverage of a 95 % band from which on it is not too narrow
+MAX_COVERAGE_LOSS = 0.05  # Coverage that may be lost before it counts, below `MIN_COVERAGE`
+UNITS = {LIKELIHOOD: "a reading", WITNESSES: "a reading or witness"}  # Unit of a gain in nats, by aim
 
 
 class PredictionScore(NamedTuple):
@@ -296,8 +277,7 @@ def narrower(what: str, old: PredictionScore, new: PredictionScore) -> Iterator[
         yield f"{what} leaves its band: {100 * new.coverage:.0f} % inside after {100 * old.coverage:.0f} %"
 
 
-POWERS = tuple(0.25**k for k in range(9))
-"""Powers to try: at the last, 65,536 measurements count as one."""
+POWERS = tuple(0.25**k for k in range(9))  # Powers to try: at the last, 65,536 measurements count as one
 
 
 class Tempered(NamedTuple):

@@ -35,33 +35,19 @@ from .aims import Aim
 from .entries import Setting, TuningEntry, with_values
 from .recording import Recording
 
-FAILED_FOLD = -1e12
-"""Nats of a point at which no fold is possible."""
+FAILED_FOLD = -1e12  # Nats of a point at which no fold is possible
 
 STEP = 1e-4
 """Step of the differences, in logarithms or deviations: the error of a difference, half the step times the curvature,
 is far below the deviation of an estimate, and rounding even more."""
 
-ALONE = ("particle", "ensemble")
-"""Families whose folds run one after the other: each of them uses all processors."""
-
-MAX_ROUNDS = 8
-"""Most rounds of the optimiser, each with a new scale."""
-
-ROUND_STEPS = 15
-"""Steps of the optimiser per round."""
-
-GRADIENT = 0.02
-"""Gradient at the maximum, in deviations of an estimate: half its square is the remaining gain, in nats."""
-
-MIN_GAIN = 0.01
-"""Nats that a round must gain to be followed by another."""
-
-SEARCH_FOLDS = 60
-"""Most folds per entry of a search without derivatives."""
-
-Go = Callable[[int], bool]
-"""Callback with the number of folds done since the last call; returns whether to continue."""
+ALONE = ("particle", "ensemble")  # Families whose folds run one after the other: each of them uses all processors
+MAX_ROUNDS = 8  # Most rounds of the optimiser, each with a new scale
+ROUND_STEPS = 15  # Steps of the optimiser per round
+GRADIENT = 0.02  # Gradient at the maximum, in deviations of an estimate: half its square is the remaining gain, in nats
+MIN_GAIN = 0.01  # Nats that a round must gain to be followed by another
+SEARCH_FOLDS = 60  # Most folds per entry of a search without derivatives
+Go = Callable[[int], bool]  # Callback with the number of folds done since the last call; returns whether to continue
 
 
 class Cancelled(Exception):

@@ -16,20 +16,14 @@ from ..log import INPUT, MAINTENANCE, READING, RESET, TRUTH, Log
 from ..snapshots import Base
 from ..tuning import Tuning
 
-BLOCKS = 9
-"""Default number of blocks per log."""
-
-HELD_OUT_EVERY = 3
-"""Every third block is held out, the last one too: a fit is used on data that come after it."""
-
-RUN_PROBABILITY = 1e-3
-"""Probability by chance of a run of repetitions that is long enough to count as stuck, per log."""
+BLOCKS = 9  # Default number of blocks per log
+HELD_OUT_EVERY = 3  # Every third block is held out, the last one too: a fit is used on data that come after it
+RUN_PROBABILITY = 1e-3  # Probability by chance of a run of repetitions that is long enough to count as stuck, per log
 
 MIN_RUN_SHARE = 0.05
 """Smallest share of a sensor's readings in a run that counts: a shorter run biases R by less than its interval."""
 
-MIN_REPEAT_PROBABILITY = 0.01
-"""Lower bound of the probability that a reading repeats."""
+MIN_REPEAT_PROBABILITY = 0.01  # Lower bound of the probability that a reading repeats
 
 
 class Recording(NamedTuple):

@@ -23,33 +23,22 @@ from scipy.optimize import minimize
 
 from .objective import Objective
 
-Z = 1.959963984540054
-"""Half-width of a 95 % interval, in deviations."""
-
-SCORE_BATCHES = 40
-"""Batches of time whose scores are summed."""
+Z = 1.959963984540054  # Half-width of a 95 % interval, in deviations
+SCORE_BATCHES = 40  # Batches of time whose scores are summed
 
 MIN_CURVATURE = 1e-8
 """Share of the largest eigenvalue of H, in units of its diagonal, below which there is no curvature."""
 
-MAX_MISFIT = 0.2
-"""Share by which the drop at the end of an interval may differ from that of a parabola, in its root."""
+MAX_MISFIT = 0.2  # Share by which the drop at the end of an interval may differ from that of a parabola, in its root
 
 MIN_LOOSENESS = 0.1
 """Share of the weak prior's deviation above which an entry may need a profile. Below it, only the gate makes the
 likelihood rough."""
 
-MAX_SECANTS = 3
-"""Most points of a profile on one side."""
-
-ROOT_TOLERANCE = 0.05
-"""Relative error of the root at the end of an interval."""
-
-PROFILE_STEPS = 5
-"""Steps of the optimiser over the other entries; at most twice as many gradients."""
-
-PROFILE_GRADIENT = 0.2
-"""Gradient at their maximum, in deviations: half its square is the remaining gain, in nats."""
+MAX_SECANTS = 3  # Most points of a profile on one side
+ROOT_TOLERANCE = 0.05  # Relative error of the root at the end of an interval
+PROFILE_STEPS = 5  # Steps of the optimiser over the other entries; at most twice as many gradients
+PROFILE_GRADIENT = 0.2  # Gradient at their maximum, in deviations: half its square is the remaining gain, in nats
 
 
 class LikelihoodCurvature(NamedTuple):

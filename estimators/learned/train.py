@@ -29,24 +29,16 @@ from .windows import Windows
 GP, RIDGE, NET = KINDS = ("gp", "ridge", "net")
 
 
-MIN_WINDOWS = 8
-"""Fewest windows to train on."""
+MIN_WINDOWS = 8  # Fewest windows to train on
 
 
 MAX_WINDOWS = 400
 """Most windows of a Gaussian process: a step takes as many exponentials, Q half their square in products."""
 
 
-REACHES = (1.0, 2.0, 4.0)
-"""Length scales to try, in standard deviations of the features."""
-
-
-RATIOS = (0.3, 1.0, 3.0, 10.0, 30.0, 100.0)
-"""Ratios to try of the variance of a window to that of the correction."""
-
-
-PENALTIES = (0.1, 1.0, 10.0, 100.0, 1000.0)
-"""Penalties of a ridge to try."""
+REACHES = (1.0, 2.0, 4.0)  # Length scales to try, in standard deviations of the features
+RATIOS = (0.3, 1.0, 3.0, 10.0, 30.0, 100.0)  # Ratios to try of the variance of a window to that of the correction
+PENALTIES = (0.1, 1.0, 10.0, 100.0, 1000.0)  # Penalties of a ridge to try
 
 
 NEEDS = "it needs scikit-learn: pip install 'nisus[learned]'"

@@ -22,12 +22,8 @@ from ..model.hybrid import gathered, places
 from ..model.state_space import StateSpaceModel
 from ..smoothing.smooth import smooth
 
-MIN_LENGTH_SHARE = 0.5
-"""Shortest window, as a share of the length; the inverse is the longest."""
-
-
-RATE_STEP = 1e-3
-"""Step of the derivative with respect to a rate, in prior standard deviations of its state."""
+MIN_LENGTH_SHARE = 0.5  # Shortest window, as a share of the length; the inverse is the longest
+RATE_STEP = 1e-3  # Step of the derivative with respect to a rate, in prior standard deviations of its state
 
 
 class Windows(NamedTuple):

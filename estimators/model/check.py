@@ -103,8 +103,7 @@ def indefinite(Q: np.ndarray) -> str | None:
     return None
 
 
-Values = dict[str, Any]
-"""Arguments of a model's functions, by their names in the model's docstring."""
+Values = dict[str, Any]  # Arguments of a model's functions, by their names in the model's docstring
 
 
 def prior_values(model: StateSpaceModel) -> Values:

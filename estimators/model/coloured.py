@@ -36,8 +36,7 @@ from ..errors import ModelError
 from .state_space import Field, Noise, Parameter, Sensor, State, StateSpaceModel, per_second, squared
 from .wrapping import as_inner, noise_function
 
-TIME_RANGE = 100.0
-"""Factor by which a correlation time may be tuned below or above the given one."""
+TIME_RANGE = 100.0  # Factor by which a correlation time may be tuned below or above the given one
 
 
 class ColouredError(NamedTuple):

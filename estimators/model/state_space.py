@@ -23,11 +23,8 @@ from .states import CellNames, Field, State
 LARGE = 1024
 """States beyond which no filter forms an (nx, nx) matrix: priors are diagonal, moments are means and variances."""
 
-TRUTH_BLOCK = 32
-"""States up to which one event of the log holds the whole true state."""
-
-SHOWN = 64
-"""States that a track keeps of a model that does not choose them."""
+TRUTH_BLOCK = 32  # States up to which one event of the log holds the whole true state
+SHOWN = 64  # States that a track keeps of a model that does not choose them
 
 __all__ = [
     "LARGE", "Field", "Input", "Jump", "Limits", "Noise", "Parameter", "Row", "Sensor", "State", "StateSpaceModel",

@@ -20,12 +20,8 @@ from pickle import PicklingError
 from types import CodeType, ModuleType
 from typing import Any
 
-MARK = "~"
-"""Separates the name of a function from the digest of the files that its own file imports."""
-
-
-_guarded: set[str] = set()
-"""Model files, and those that they import beside them."""
+MARK = "~"  # Separates the name of a function from the digest of the files that its own file imports
+_guarded: set[str] = set()  # Model files, and those that they import beside them
 
 
 def _refuse_exit(files: tuple[Path, ...]) -> None:

@@ -27,8 +27,7 @@ EAST, NORTH, HEADING = range(3)
 SPEED, YAW_RATE = range(2)
 
 
-FAR = 60.0
-"""Range of a beam that meets no wall, m; only from outside the building."""
+FAR = 60.0  # Range of a beam that meets no wall, m; only from outside the building
 
 
 OUTLINE = (

@@ -32,8 +32,7 @@ NODES = (0.0, 0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0
 """States of charge at which the open-circuit voltage is given."""
 
 
-NEARLY_EMPTY = 0.05
-"""State of charge over which the rise of R1 fades by e."""
+NEARLY_EMPTY = 0.05  # State of charge over which the rise of R1 fades by e
 
 
 OPEN_CIRCUIT = (2.712, 3.092, 3.241, 3.346, 3.386, 3.454, 3.535, 3.598, 3.668, 3.767, 3.860, 3.949, 4.063, 4.165)
@@ -44,8 +43,7 @@ TEMPERATURES = (20.0, 38.0)
 1000 K in B, which they do not identify, moves the resistances by 6 % at most."""
 
 
-CURRENTS = (-7.6, 20.9)
-"""Currents of those recordings, A: charged by US06's braking, discharged by its sprints."""
+CURRENTS = (-7.6, 20.9)  # Currents of those recordings, A: charged by US06's braking, discharged by its sprints
 
 
 COMMON = (

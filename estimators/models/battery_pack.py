@@ -42,8 +42,7 @@ NEIGHBOUR = len(COMMON)
 CAPACITY = NEIGHBOUR + 1
 
 
-R0 = CAPACITY + CELLS
-"""Index of the parameters of the first cell; those of the others follow."""
+R0 = CAPACITY + CELLS  # Index of the parameters of the first cell; those of the others follow
 
 
 NUMBERS = range(1, CELLS + 1)

@@ -17,16 +17,9 @@ from ..model.state_space import Noise, Parameter, Row, Sensor, StateSpaceModel
 from ..model.states import Field
 from ..numerics.smoothed_noise import exponential
 
-SPACING = (27.8, 16.3)
-"""Side of a cell to the south and to the east, km."""
-
-
-LENGTH = 400.0
-"""Correlation length of the noise, km."""
-
-
-SHAPE = (33, 49)
-"""Cells from 58° to 50° north, and from 10° west to 2° east."""
+SPACING = (27.8, 16.3)  # Side of a cell to the south and to the east, km
+LENGTH = 400.0  # Correlation length of the noise, km
+SHAPE = (33, 49)  # Cells from 58° to 50° north, and from 10° west to 2° east
 
 
 STATIONS = tuple((i, j) for i in (3, 10, 16, 22, 29) for j in (3, 9, 15, 21, 27, 33, 39, 45))

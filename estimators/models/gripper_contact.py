@@ -32,8 +32,7 @@ MASS, DAMPING, STIFFNESS, RATE, ROUGHNESS = range(5)
 PUSH, SLIP, DRIFT = range(3)
 
 
-MILLI = 1000.0
-"""mm in a metre: forces are in N, masses in kg, lengths in mm."""
+MILLI = 1000.0  # mm in a metre: forces are in N, masses in kg, lengths in mm
 
 
 def f(x, u, p, dt, out):

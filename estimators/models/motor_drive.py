@@ -27,8 +27,7 @@ from ..model.rk4 import rk4
 from ..model.state_space import Input, Noise, Parameter, Row, Sensor, State, StateSpaceModel
 from ..numerics.jit import jit
 
-COPPER = 0.00393
-"""Temperature coefficient of copper's resistivity at 20 °C, 1/K."""
+COPPER = 0.00393  # Temperature coefficient of copper's resistivity at 20 °C, 1/K
 
 
 WINDING, TOOTH, YOKE, MAGNET = range(4)

@@ -18,12 +18,8 @@ from ..model.states import Field
 from ..numerics.jit import jit
 from ..numerics.smoothed_noise import exponential
 
-SPACING = 0.01
-"""Side of a cell, m."""
-
-
-CORRELATED = 0.1
-"""Correlation length of the noise, m."""
+SPACING = 0.01  # Side of a cell, m
+CORRELATED = 0.1  # Correlation length of the noise, m
 
 
 @jit

@@ -47,8 +47,7 @@ from .recorder import MEMBERS
 from .smooth import KINDS, check_smooth
 from .walk import Smoothed, Walk
 
-MAX_EXTRAPOLATION = 5.0
-"""Largest extrapolation of the logarithm of a variance."""
+MAX_EXTRAPOLATION = 5.0  # Largest extrapolation of the logarithm of a variance
 
 
 class EmFit(NamedTuple):

@@ -38,12 +38,8 @@ from .recorder import (
 )
 from .walk import QUERIES, Smoothed, StateJump, Stretch
 
-HERE = 3
-"""Kind of a query's note: asked at the time of the state before it. STAYED: at that of the next event."""
-
-
-NOWHERE = -(2**63)
-"""In place of the time of the event after a query: there is none, or its state is unrelated."""
+HERE = 3  # Kind of a query's note: asked at the time of the state before it. STAYED: at that of the next event
+NOWHERE = -(2**63)  # In place of the time of the event after a query: there is none, or its state is unrelated
 
 
 class Moments(NamedTuple):

@@ -27,8 +27,7 @@ from ..numerics.jit import inlined, jit
 from ..numerics.linalg import root, wrap
 from ..numerics.workspace import declare_layout
 
-STAYED, MOVED, CUT = range(3)
-"""Effect of an event on the state before any update: none; predicted; restarted or lost."""
+STAYED, MOVED, CUT = range(3)  # Effect of an event on the state before any update: none; predicted; restarted or lost
 
 
 StepNote, step_layout = declare_layout(

@@ -34,8 +34,7 @@ KINDS = {
 """Filters that are smoothed by means and covariances."""
 
 
-PARTICLES = ("pf", "pf-reg")
-"""Filters that are smoothed by trajectories."""
+PARTICLES = ("pf", "pf-reg")  # Filters that are smoothed by trajectories
 
 
 def check_smooth(estimator: Estimator, model: StateSpaceModel, options: Mapping[str, float | str]) -> None:
@@ -72,8 +71,7 @@ def smooth(fold: Fold) -> Smoothed:
     return out
 
 
-MIN_REMOVED_SHARE = 1e-3
-"""Share of a variance that later measurements must remove; with less, rounding dominates."""
+MIN_REMOVED_SHARE = 1e-3  # Share of a variance that later measurements must remove; with less, rounding dominates
 
 
 def consistency(track: Track, smoothed: Smoothed, model: StateSpaceModel) -> dict[str, float]:

@@ -23,8 +23,7 @@ from ..detectors import (
 from .episode import JOINED, AlarmRun, Episode, FoundEpisode, JudgedRows, runs
 from .wording import SensorFacts, TwinFacts
 
-CONTRADICTING = REFUSED | STUCK | SHIFTED_UP | SHIFTED_DOWN
-"""Alarms of a sensor that contradicts the estimate."""
+CONTRADICTING = REFUSED | STUCK | SHIFTED_UP | SHIFTED_DOWN  # Alarms of a sensor that contradicts the estimate
 
 
 def _found(

@@ -12,8 +12,7 @@ from ...model.state_space import StateSpaceModel
 from ...track import GATED, USED, Track
 from ...tuning import Tuning
 
-JOINED = 100
-"""Rows without an alarm after which the next alarm begins another episode."""
+JOINED = 100  # Rows without an alarm after which the next alarm begins another episode
 
 
 class Episode(NamedTuple):

@@ -14,8 +14,7 @@ from ..effects import EVIDENCE, KINDS, InnovationEffect, against, common_scale, 
 from .episode import JOINED, AlarmRun, Episode, FoundEpisode, JudgedRows, runs, standardised, without_baseline
 from .wording import SensorFacts, return_text
 
-MAX_MEASUREMENTS = 4000
-"""Measurements of an episode, and before it, from which onset and size are estimated."""
+MAX_MEASUREMENTS = 4000  # Measurements of an episode, and before it, from which onset and size are estimated
 
 WANDERING_CORRELATION = 0.5
 """Lag-1 correlation from which innovations that are too large are explained by a moving mean, not by noise."""
@@ -23,26 +22,16 @@ WANDERING_CORRELATION = 0.5
 RECOVERED_NATS = float(np.log(1000.0))
 """log Λ from which measurements after an effect are normal again: a thousand times more likely without it."""
 
-REMAINING_NATS = 2.0
-"""log Λ below which no effect remains: that of a size at the end of its 95 % interval."""
-
-LOSS_SHARE = 0.5
-"""Share of rejected or repeated measurements of an episode from which it is a loss of the sensor."""
-
-ALARMS_OF = {kind: detector_of(kind).bits for kind in KINDS}
-"""Alarms by the effect that they show."""
-
-LOSSES = tuple(detector.name for detector in DETECTORS if detector.sensor_lost)
-"""Causes of which a sensor is lost."""
-
-OF_ALL_ROWS = ("disagreeing", "agreeing")
-"""Causes of a sensor as a whole, not of one of its rows."""
+REMAINING_NATS = 2.0  # log Λ below which no effect remains: that of a size at the end of its 95 % interval
+LOSS_SHARE = 0.5  # Share of rejected or repeated measurements of an episode from which it is a loss of the sensor
+ALARMS_OF = {kind: detector_of(kind).bits for kind in KINDS}  # Alarms by the effect that they show
+LOSSES = tuple(detector.name for detector in DETECTORS if detector.sensor_lost)  # Causes of which a sensor is lost
+OF_ALL_ROWS = ("disagreeing", "agreeing")  # Causes of a sensor as a whole, not of one of its rows
 
 UNKNOWN_EFFECTS = tuple(detector for detector in DETECTORS if detector.alarms and not detector.effect)
 """Detectors whose alarms have episodes of their own, sized by their own tests."""
 
-KNOWN_EFFECTS = sum(detector.bits for detector in DETECTORS if detector.effect)
-"""Alarms of all others."""
+KNOWN_EFFECTS = sum(detector.bits for detector in DETECTORS if detector.effect)  # Alarms of all others
 
 ALARM_KEYS = {"sensor": KNOWN_EFFECTS, "lost": LOST, **{detector.name: detector.bits for detector in UNKNOWN_EFFECTS}}
 """Alarms by the first part of the keys of a sensor's episodes."""

@@ -22,19 +22,15 @@ from .conditions import dropouts, impoverished_particles, left_ranges, lost_esti
 from .episode import JOINED, Episode, FoundEpisode, JudgedRows, standardised, without_baseline
 from .sensors import ALARM_KEYS, LOSSES, OF_ALL_ROWS, UNKNOWN_EFFECTS, evidence, sensor_alarms
 
-MAX_ROWS = 65_536
-"""Rows kept at most; at least half of them once there were as many."""
-
-MAX_BYTES = 64 * 2**20
-"""Memory of the kept rows; rows of a large field are fewer."""
+MAX_ROWS = 65_536  # Rows kept at most; at least half of them once there were as many
+MAX_BYTES = 64 * 2**20  # Memory of the kept rows; rows of a large field are fewer
 
 CONDITIONS = (sensor_alarms, dropouts, missed_truths, left_ranges, impoverished_particles, lost_estimates)
 
 JOINED_ROWS = {**dict.fromkeys(ALARM_KEYS, JOINED), "truth": JOINED, "range": JOINED}
 """Rows without an alarm that an episode bridges, by the first part of its key; 0 for the others."""
 
-REJECTIONS = {"refused": GATED, "screened": SCREENED}
-"""Verdict on the measurements of an episode, by its cause."""
+REJECTIONS = {"refused": GATED, "screened": SCREENED}  # Verdict on the measurements of an episode, by its cause
 
 
 class FoldLike(Protocol):

@@ -10,14 +10,12 @@ from ...compiled.model import compile_model
 from ...model.indicator import indicator
 from ...model.state_space import StateSpaceModel
 
-CORRELATED_FROM = 0.15
-"""Lag-1 correlation of the innovations from which Q explains their scale, not R."""
+CORRELATED_FROM = 0.15  # Lag-1 correlation of the innovations from which Q explains their scale, not R
 
 CALENDAR_FROM_S = 1e8
 """Seconds from which a time is one of the calendar (after 1973), not one since the start of a recording."""
 
-MAX_STATES = 64
-"""States up to which the states that a sensor observes are listed."""
+MAX_STATES = 64  # States up to which the states that a sensor observes are listed
 
 
 def since(seconds: float) -> str:

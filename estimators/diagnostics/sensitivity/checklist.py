@@ -19,8 +19,7 @@ from ..innovations import ljung_box
 from ..intervals import Interval, correlation_interval
 from .responses import MAX_STATES, digits, each
 
-SPREAD_TOLERANCE = 0.1
-"""Share by which the standard deviations of an ensemble may be off by chance."""
+SPREAD_TOLERANCE = 0.1  # Share by which the standard deviations of an ensemble may be off by chance
 
 MAX_PROCESSOR_SHARE = 0.5
 """Share of one processor that an estimate may take: the rest is for late readings and for refolds."""
@@ -80,8 +79,7 @@ def spread_error(members: float) -> float:
     return float(1.0 / np.sqrt(2.0 * (members - 1.0))) if members > 1.0 else np.inf
 
 
-QUANTILES = (0.5, 0.99, 1.0)
-"""Of lateness."""
+QUANTILES = (0.5, 0.99, 1.0)  # Of lateness
 
 
 class Arrivals(NamedTuple):
@@ -130,8 +128,7 @@ def arrivals(model: StateSpaceModel, log: Log) -> tuple[Arrivals, ...]:
     return tuple(found)
 
 
-MIN_DIFFERENCE = 0.001
-"""Smallest share of σ that is reported."""
+MIN_DIFFERENCE = 0.001  # Smallest share of σ that is reported
 
 DIFFERENCE_QUANTILE = 0.95
 """Quantile of the differences along the track; a few at the start, with the spread of the prior, do not matter."""

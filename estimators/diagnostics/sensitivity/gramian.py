@@ -185,12 +185,8 @@ def _in_words(weights: np.ndarray, model: StateSpaceModel, left: float) -> str:
 MIN_EIGENVALUE = 1e-10
 """Eigenvalue of the information, scaled to a unit diagonal, that differences cannot distinguish from zero."""
 
-MIN_NULL_SHARE = 1e-3
-"""Share of a nudge in a direction below which it is not part of it."""
-
-
-MIN_NAMED_SHARE = 0.05
-"""Share of the largest part of a direction below which another is not named."""
+MIN_NULL_SHARE = 1e-3  # Share of a nudge in a direction below which it is not part of it
+MIN_NAMED_SHARE = 0.05  # Share of the largest part of a direction below which another is not named
 
 
 class Direction(NamedTuple):

@@ -22,40 +22,22 @@ from ...tuning import Tuning
 from ..calibration import standardised
 from ..innovations import jarque_bera
 
-MAX_LOOKS = 150
-"""Times at which the cloud is looked at; finding its peaks takes milliseconds."""
+MAX_LOOKS = 150  # Times at which the cloud is looked at; finding its peaks takes milliseconds
 
 MOST_STATES = 12
 """States up to which the shape of a particle cloud is informative: beyond, too few particles explain a measurement."""
 
 MOST_EVENTS = 4000
 
-DISTINCT_SHARE = 0.2
-"""Share of a cloud's members that must differ after a reading; of fewer, clusters are of chance."""
-
-COLLAPSED_SHARE = 0.5
-"""Share of looks at a collapsed cloud from which its shape is not informative."""
-
-MIN_PEAK_WEIGHT = 0.001
-"""Share of the other cloud that a peak must have there, too."""
-
-NEAR_SIGMA = 3.0
-"""Standard deviations in each state, within which a point belongs to a peak."""
-
-PEAK_DIP = 0.5
-"""Share of the points at either end, of which there must be fewer in the middle between two peaks."""
-
-FREQUENT_SHARE = 0.05
-"""Share of the looks with more than one peak, from which on the posterior has several."""
-
-HEAVY_KURTOSIS = 1.0
-"""Excess kurtosis that matters: that of Student's t with ten degrees of freedom."""
-
-FAR_SIGMA = 4.0
-"""Standard deviations beyond which a normal innovation lies once in 16,000 readings."""
-
-MIN_TAIL_MEASUREMENTS = 50
-"""Readings of which a kurtosis is taken at least."""
+DISTINCT_SHARE = 0.2  # Share of a cloud's members that must differ after a reading; of fewer, clusters are of chance
+COLLAPSED_SHARE = 0.5  # Share of looks at a collapsed cloud from which its shape is not informative
+MIN_PEAK_WEIGHT = 0.001  # Share of the other cloud that a peak must have there, too
+NEAR_SIGMA = 3.0  # Standard deviations in each state, within which a point belongs to a peak
+PEAK_DIP = 0.5  # Share of the points at either end, of which there must be fewer in the middle between two peaks
+FREQUENT_SHARE = 0.05  # Share of the looks with more than one peak, from which on the posterior has several
+HEAVY_KURTOSIS = 1.0  # Excess kurtosis that matters: that of Student's t with ten degrees of freedom
+FAR_SIGMA = 4.0  # Standard deviations beyond which a normal innovation lies once in 16,000 readings
+MIN_TAIL_MEASUREMENTS = 50  # Readings of which a kurtosis is taken at least
 
 
 class Peaks(NamedTuple):

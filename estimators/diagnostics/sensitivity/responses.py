@@ -22,8 +22,7 @@ from ...tuning import Tuning
 DETERMINISTIC_FILTERS = ("ekf", "ukf", "kf")
 """Deterministic filters that replace a Monte Carlo one, the first that applies."""
 
-MAX_DIVERGED_SHARE = 0.1
-"""Share of diverged rows up to which a filter can replace another."""
+MAX_DIVERGED_SHARE = 0.1  # Share of diverged rows up to which a filter can replace another
 
 THREADS = int(numba.config.NUMBA_NUM_THREADS)
 
@@ -180,8 +179,7 @@ def each(work: Callable[[T], R], items: Iterable[T], executor: Executor | str | 
 
 SENSOR, INPUT_, PARAMETER = KINDS = ("sensor", "input", "parameter")
 
-DRIFT = "drift"
-"""Kind of a nudge that grows in proportion to the time since the first event, of a sensor row."""
+DRIFT = "drift"  # Kind of a nudge that grows in proportion to the time since the first event, of a sensor row
 
 STEP = 1e-3
 """Step of a difference, as a share of the nudge's scale: the error of a central difference is of the order of its
@@ -277,17 +275,10 @@ def digits(value: float, sign: str = "") -> str:
     return f"{value:{sign if value else ''}.3g}"
 
 
-MAX_STATES = 64
-"""States up to which a model is refolded for each of its nudges."""
-
-MAX_REFOLD_EVENTS = 20_000
-"""Events that are refolded at most, the last of the log."""
-
-MAX_RESPONSE_NUMBERS = 32_000_000
-"""Numbers in all responses at most."""
-
-MAX_REFOLD_OPERATIONS = 2_000_000_000
-"""Events times nudges times nx³, as a covariance costs: some ten seconds."""
+MAX_STATES = 64  # States up to which a model is refolded for each of its nudges
+MAX_REFOLD_EVENTS = 20_000  # Events that are refolded at most, the last of the log
+MAX_RESPONSE_NUMBERS = 32_000_000  # Numbers in all responses at most
+MAX_REFOLD_OPERATIONS = 2_000_000_000  # Events times nudges times nx³, as a covariance costs: some ten seconds
 
 
 def reason_against(model: StateSpaceModel, log: Log) -> str:

@@ -34,8 +34,7 @@ from .responses import (
 )
 from .visibility import UndetectableFault, fault_tests, undetectable_fault
 
-PROBABILITY = 0.95
-"""Probability that an error stays below the protection level, under the worst undetectable fault."""
+PROBABILITY = 0.95  # Probability that an error stays below the protection level, under the worst undetectable fault
 
 TWO_SIGMA = normal_quantile(0.5 + PROBABILITY / 2.0)
 """Half width of a 95 % band in standard deviations, "± 2 σ", as in the protection level."""

@@ -38,14 +38,9 @@ from .responses import (
     stand_in,
 )
 
-MAX_EVENTS = 4000
-"""Events since the beginning of an episode that are refolded at most."""
-
-EQUAL_NATS = 3.0
-"""Nats within which two faults explain equally much."""
-
-MIN_NATS = 5.0
-"""Nats below which a fault explains nothing."""
+MAX_EVENTS = 4000  # Events since the beginning of an episode that are refolded at most
+EQUAL_NATS = 3.0  # Nats within which two faults explain equally much
+MIN_NATS = 5.0  # Nats below which a fault explains nothing
 
 
 class Suspect(NamedTuple):

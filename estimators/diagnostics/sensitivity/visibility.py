@@ -34,11 +34,8 @@ from ..detector_state import detector_context, no_baseline
 from ..detectors import MAX_SIGMA, RATIOS
 from .responses import Nudge, Response, Start
 
-BISECTIONS = 10
-"""Bisections of the bracket of a multiple, a factor of two wide: to 0.1 %."""
-
-MAX_MULTIPLE = 2.0**12
-"""Multiple of the optimal test's minimal fault beyond which the detectors detect nothing."""
+BISECTIONS = 10  # Bisections of the bracket of a multiple, a factor of two wide: to 0.1 %
+MAX_MULTIPLE = 2.0**12  # Multiple of the optimal test's minimal fault beyond which the detectors detect nothing
 
 
 class FaultTests(NamedTuple):
@@ -179,13 +176,11 @@ def exceeds(shifts, ratios, h, peaks, z):
     return False
 
 
-SIZE_TOLERANCE = 0.05
-"""Relative distance to the detectable size within which a fault is scaled to it."""
+SIZE_TOLERANCE = 0.05  # Relative distance to the detectable size within which a fault is scaled to it
 
 MAX_REFOLDS = 6
 
-MAX_SIZE_CHANGE = 4.0
-"""Factor by which a size may change from one refold to the next."""
+MAX_SIZE_CHANGE = 4.0  # Factor by which a size may change from one refold to the next
 
 
 class UndetectableFault(NamedTuple):

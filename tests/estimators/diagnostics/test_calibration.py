@@ -1,5 +1,7 @@
 """Tracks whose innovations are drawn with known faults: what is said, and that nothing is said of the others."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.signal import lfilter
@@ -7,36 +9,12 @@ from scipy.stats import chi2, norm
 
 from estimators.diagnostics.calibration import CalibrationLimits, calibrations, truth_calibration
 from estimators.events.batch import READING, TRUTH, Events
-from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
+from estimators.model.state_space import State
 from estimators.track import GATED, HELD_OUT, MISSING, USED, Track
+from tests.models import FLOAT_AND_SONAR
 from tests.support import SECOND
 
-
-def still(x, u, p, dt, out):
-    out[0] = x[0]
-    out[1] = x[1]
-
-
-def one(x, u, p, out):
-    out[0] = x[0]
-
-
-def two(x, u, p, out):
-    out[0] = x[0]
-    out[1] = x[0]
-
-
-MODEL = StateSpaceModel(
-    name="level",
-    title="level",
-    states=(State("level", "m", 0.0, 1.0), State("heading", "rad", 0.0, 1.0, circular=True)),
-    noises=(Noise("level", "m²/s", 0.1),),
-    sensors=(
-        Sensor("float", (Row("float", "m", 1.0),), h=one),
-        Sensor("sonar", (Row("near", "m", 1.0), Row("far", "m", 1.0)), h=two),
-    ),
-    f=still,
-)
+MODEL = replace(FLOAT_AND_SONAR, states=(*FLOAT_AND_SONAR.states, State("heading", "rad", 0.0, 1.0, circular=True)))
 
 
 def read(e: np.ndarray, gate: float | None = None, std: float = 3.0) -> tuple[Events, Track]:

@@ -18,37 +18,12 @@ from estimators.diagnostics.detectors import ALARM_NAMES, BITS, NARROW
 from estimators.diagnostics.health import JUDGED_MEAN, MAX_ROWS_PER_READING, MIN_WINDOW_EVENTS, HealthPolicy, normal_nis
 from estimators.fold import Fold
 from estimators.log import READING, RESET, Events
-from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
 from estimators.track import DIVERGED
 from estimators.tuning import Tuning
+from tests.models import level_model
 from tests.support import SECOND, as_log
 
-
-def still(x, u, p, dt, out):
-    out[:] = x
-
-
-def level(x, u, p, out):
-    out[0] = x[0]
-
-
-def pair(x, u, p, out):
-    out[0] = x[0]
-    out[1] = x[0]
-
-
-MODEL = StateSpaceModel(
-    name="level",
-    title="a level that walks at random, as the model believes",
-    states=(State("level", "m", mean=0.0, std=1.0),),
-    noises=(Noise("level", "m²/s", 0.01),),
-    sensors=(
-        Sensor("gauge", (Row("gauge", "m", 0.04),), h=level),
-        Sensor("floats", (Row("left", "m", 0.09), Row("right", "m", 0.09)), h=pair),
-    ),
-    f=still,
-    linear=True,
-)
+MODEL = level_model({"gauge": 0.04, "floats": {"left": 0.09, "right": 0.09}}, 0.01, linear=True)
 
 
 def asset(seed, n=3000, *, change=None):

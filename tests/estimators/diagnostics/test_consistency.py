@@ -8,34 +8,9 @@ from estimators.diagnostics.consistency import NisVerdict
 from estimators.diagnostics.health import JUDGED_MEAN, MEAN, VARIANCE, nis_bounds, normal_nis
 from estimators.diagnostics.score import nis_verdict
 from estimators.log import READING, Events
-from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
 from estimators.track import GATED, USED, Track
+from tests.models import FLOAT_AND_SONAR as MODEL
 
-
-def still(x, u, p, dt, out):
-    out[:] = x
-
-
-def one(x, u, p, out):
-    out[0] = x[0]
-
-
-def two(x, u, p, out):
-    out[0] = x[0]
-    out[1] = x[0]
-
-
-MODEL = StateSpaceModel(
-    name="level",
-    title="level",
-    states=(State("level", "m", 0.0, 1.0),),
-    noises=(Noise("level", "m²/s", 0.1),),
-    sensors=(
-        Sensor("float", (Row("float", "m", 1.0),), h=one),
-        Sensor("sonar", (Row("near", "m", 1.0), Row("far", "m", 1.0)), h=two),
-    ),
-    f=still,
-)
 BASELINE = np.array([[0.3, 0.5, 0.7], [0.0, 1.0, 0.0], [-0.5, 2.0, -0.4]])  # bias, scale, correlation of each row
 N = 400
 RUNS = 4000

@@ -21,20 +21,19 @@ from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceMo
 from estimators.models import MODELS
 from estimators.registry import ESTIMATORS
 from estimators.track import (
-    DEGRADED,
     DIVERGED,
     FAILED,
     GATED,
     HELD_OUT,
     MISSING,
     NONE,
-    STALE,
     SUSPECT,
     TRACKING,
     USED,
     Track,
 )
 from estimators.tuning import Tuning
+from tests.models import first_state, level_model, unchanged
 from tests.support import SECOND
 
 MOTOR = MODELS["motor_winding"]
@@ -147,15 +146,8 @@ def test_true_states_come_in_blocks():
     The filter stays at its prior, mean j/10 and 95 % band 1.96 * 0.5, so every number follows by hand.
     """
     names = [f"s{j}" for j in range(40)]
-    many = StateSpaceModel(
-        name="many",
-        title="many",
-        states=tuple(State(name, "", mean=j / 10, std=0.5, circular=j == 33) for j, name in enumerate(names)),
-        noises=(Noise("s0", "", 0.0),),
-        sensors=(Sensor("compass", (Row("compass", "", 0.01),), h=itself),),
-        f=unmoved,
-        linear=True,
-    )
+    states = tuple(State(name, "", mean=j / 10, std=0.5, circular=j == 33) for j, name in enumerate(names))
+    many = level_model({"compass": 0.01}, 0.0, state="s0", states=states, linear=True)
     nan = np.nan
     low, high = np.full(32, nan), np.full(32, nan)
     low[0], low[5], low[31] = 0.3, 1.5, 3.1  # errors -0.3, -1, 0
@@ -182,26 +174,13 @@ def test_true_states_come_in_blocks():
         assert fits[name].rmse == pytest.approx(rmse, rel=1e-12, abs=1e-14) and fits[name].coverage == coverage
 
 
-def unmoved(x, u, p, dt, out):
-    for j in range(x.size):
-        out[j] = x[j]
-
-
-def still(x, u, p, dt, out):
-    out[0] = x[0]
-
-
-def itself(x, u, p, out):
-    out[0] = x[0]
-
-
 COMPASS = StateSpaceModel(
     name="compass",
     title="compass",
     states=(State("heading", "rad", mean=-3.1, std=0.1, circular=True),),
     noises=(Noise("heading", "rad²/s", 0.01),),
-    sensors=(Sensor("compass", (Row("compass", "rad", 0.01, circular=True),), h=itself),),
-    f=still,
+    sensors=(Sensor("compass", (Row("compass", "rad", 0.01, circular=True),), h=first_state),),
+    f=unchanged,
     linear=True,
 )
 
@@ -222,27 +201,6 @@ def healths(log, policy=None, gate=None):
 
 
 GOOD = list(-3.1 + 0.1 * np.random.default_rng(0).normal(0, 1, 60))
-
-
-def test_good_readings_track():
-    assert np.all(healths(history(GOOD)) == TRACKING)
-
-
-def test_silence_degrades_then_goes_stale_and_a_reading_heals():
-    """Defaults: degraded after 5 s without a reading that is used, stale after 30 s."""
-    log = history(GOOD[:20])
-    last = 19
-    for seconds in (5, 5.001, 29.999, 30.001):
-        log.extend(Events.one(round((last + seconds) * SECOND), 0, TICK, 0, (), 1))
-    log.extend(Events.one(60 * SECOND, 0, READING, 0, -3.1, 1))
-    track = fold("kf", COMPASS, Tuning.of(COMPASS), log)
-    assert list(track.health[20:]) == [TRACKING, DEGRADED, DEGRADED, STALE, TRACKING]
-    np.testing.assert_allclose(track.age[20:], [5, 5.001, 29.999, 30.001, 0], atol=1e-12)
-
-
-def test_missing_readings_are_silence():
-    log = history(GOOD[:20] + [np.nan] * 6)
-    assert list(healths(log)[-2:]) == [TRACKING, DEGRADED]
 
 
 def test_readings_too_far_off_are_suspect_then_diverge():
@@ -271,33 +229,6 @@ def test_an_estimate_that_is_not_finite_is_divergence():
     track = fold("kf", COMPASS, tuning, history([-3.1, -3.1, -3.1], step=1e6))
     assert track.health[-1] == DIVERGED
     assert not np.isfinite(track.std[-1, 0]) or not np.isfinite(track.mean[-1, 0])
-
-
-def test_window_is_the_last_readings():
-    policy = HealthPolicy(window=7)
-    track = fold("kf", COMPASS, Tuning.of(COMPASS), history(GOOD), policy=policy)
-    for k in (0, 3, 6, 7, 30, 59):
-        rows = slice(max(0, k - 6), k + 1)
-        count = rows.stop - rows.start
-        np.testing.assert_allclose(track.nis_mean[k], track.nis[rows].mean(), rtol=1e-13)
-        np.testing.assert_allclose(track.nis_low[k], chi2.ppf(0.025, count) / count, rtol=1e-12)
-        np.testing.assert_allclose(track.nis_high[k], chi2.ppf(0.975, count) / count, rtol=1e-12)
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_health_does_not_depend_on_pieces(seed):
-    rng = np.random.default_rng(seed)
-    regimes = ([-3.1, -3.0], [-3.1, 0.0, 2.0], [np.nan], [-3.6, -2.6])
-    values = np.concatenate([rng.choice(regimes[int(rng.integers(4))], 25) for _ in range(16)])
-    log = history(values, step=0.7)
-    tuning = Tuning.of(COMPASS).set("gate", 0.999)
-    whole = fold("kf", COMPASS, tuning, log)
-    assert len(set(whole.health)) > 1
-    growing = Fold("kf", COMPASS, tuning, log)
-    while growing.advance(int(rng.integers(1, 50))):
-        pass
-    for name in ("health", "age", "nis_mean", "nis_low", "nis_high"):
-        np.testing.assert_array_equal(getattr(growing.track, name), getattr(whole, name))
 
 
 def events_of(rng, n):

@@ -7,34 +7,9 @@ from scipy.stats import chi2, f, multivariate_t
 from estimators.diagnostics.field_pictures import Picture
 from estimators.diagnostics.score import score
 from estimators.log import READING, Events
-from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
 from estimators.track import GATED, HELD_OUT, MISSING, USED, Track
+from tests.models import FLOAT_AND_SONAR as MODEL
 
-
-def still(x, u, p, dt, out):
-    out[0] = x[0]
-
-
-def one(x, u, p, out):
-    out[0] = x[0]
-
-
-def two(x, u, p, out):
-    out[0] = x[0]
-    out[1] = x[0]
-
-
-MODEL = StateSpaceModel(
-    name="level",
-    title="level",
-    states=(State("level", "m", 0.0, 1.0),),
-    noises=(Noise("level", "m²/s", 0.1),),
-    sensors=(
-        Sensor("float", (Row("float", "m", 1.0),), h=one),
-        Sensor("sonar", (Row("near", "m", 1.0), Row("far", "m", 1.0)), h=two),
-    ),
-    f=still,
-)
 NAN = np.nan
 GATE = 0.99
 # Sensor, verdict, innovations and their deviations, NIS, log-likelihood.

@@ -8,30 +8,14 @@ from estimators.diagnostics.health import HealthPolicy
 from estimators.fold import Fold
 from estimators.interface.table import table_of
 from estimators.log import READING, TICK, Events, Log
-from estimators.model import Noise, Row, Sensor, State, StateSpaceModel
 from estimators.tuning import Tuning
+from tests.models import level_model
 from tests.support import SECOND
 
 POLICY = HealthPolicy(stale_after=60.0)
 
 
-def f(x, u, p, dt, out):
-    out[0] = x[0]
-
-
-def h(x, u, p, out):
-    out[0] = x[0]
-
-
-MODEL = StateSpaceModel(
-    name="level",
-    title="a level seen by three gauges",
-    states=(State("level", "m", 0.0, 1.0),),
-    noises=(Noise("level", "m2/s", 1e-6),),
-    sensors=tuple(Sensor(name, (Row("level", "m", 1.0),), h=h) for name in ("one", "two", "three")),
-    f=f,
-    linear=True,
-)
+MODEL = level_model(dict.fromkeys(("one", "two", "three"), 1.0), 1e-6, linear=True)
 
 
 def log_until(end: int, silent_from: int) -> Log:

@@ -6,7 +6,7 @@ from scipy.linalg import expm
 
 from estimators.diagnostics.time_constants import jacobian, time_constants
 from estimators.errors import ModelError
-from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
+from tests.models import level_model
 
 
 @pytest.mark.parametrize("dt", [0.01, 0.5, 5.0])
@@ -40,10 +40,7 @@ def failing(x, u, p, dt, out):
 
 
 def model(f):
-    return StateSpaceModel(
-        name="one", title="one", states=(State("a", "m", 2.0, 1.0),), noises=(Noise("a", "m²/s", 0.1),),
-        sensors=(Sensor("a", (Row("a", "m", 1.0),), h=lambda x, u, p, out: None),), f=f,
-    )  # fmt: skip
+    return level_model({"a": 1.0}, 0.1, state="a", name="one", mean=2.0, f=f)
 
 
 def test_the_jacobian_is_taken_at_the_point_given():

@@ -11,8 +11,8 @@ from statsmodels.tsa.stattools import breakvar_heteroskedasticity_test
 from estimators.diagnostics.innovations import heteroscedasticity, jarque_bera, ljung_box
 from estimators.fold import fold
 from estimators.log import READING, Events
-from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
 from estimators.tuning import Tuning
+from tests.models import level_model
 from tests.support import SECOND, as_log
 
 LEVEL, IRREGULAR = 1469.1, 15098.5
@@ -27,23 +27,7 @@ GAPS = [3, 20, 21, 22, 70]
 AGREE = 1e-6
 
 
-def unmoved(x, u, p, dt, out):
-    out[0] = x[0]
-
-
-def flow(x, u, p, out):
-    out[0] = x[0]
-
-
-NILE = StateSpaceModel(
-    name="nile",
-    title="flow of the Nile",
-    states=(State("level", "", *PRIOR),),
-    noises=(Noise("level", "", LEVEL),),
-    sensors=(Sensor("flow", (Row("flow", "", IRREGULAR),), h=flow),),
-    f=unmoved,
-    linear=True,
-)
+NILE = level_model({"flow": IRREGULAR}, LEVEL, mean=PRIOR[0], std=PRIOR[1], linear=True)
 
 
 def innovations_of(series: np.ndarray) -> np.ndarray:

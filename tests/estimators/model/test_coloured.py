@@ -19,6 +19,7 @@ from estimators.model.state_space import Noise, Parameter, Row, Sensor, State, S
 from estimators.models import MODELS
 from estimators.registry import find_estimator
 from estimators.tuning import Tuning
+from tests.models import level_model
 
 TAU, Q, R, STD, ERROR, ERROR_TIME = 7.0, 0.3, 0.04, 2.0, 0.6, 20.0
 
@@ -28,16 +29,8 @@ STEPS = np.array([0.0, 1e-3, 0.5, 2.0, 0.01, 9.0, 300.0, 0.25, 7.0, 40.0, 1e-2, 
 EXACT = ("kf", "sr-kf", "ekf", "iekf", "ukf", "ckf", "sr-ekf", "sr-ukf", "filterpy-kf")
 
 
-def stay(x, u, p, dt, out):
-    out[0] = x[0]
-
-
 def slope_of_stay(x, u, p, dt, out):
     out[0, 0] = 1.0
-
-
-def told(x, u, p, out):
-    out[0] = x[0]
 
 
 def slope_of_told(x, u, p, out):
@@ -48,15 +41,7 @@ def density(y, x, u, p, r):
     return -0.5 * (y[0] - x[0]) ** 2 / r[0] - 0.5 * math.log(2.0 * math.pi * r[0])
 
 
-WALK = StateSpaceModel(
-    name="walk",
-    title="A level that wanders",
-    states=(State("level", "m", mean=1.0, std=STD),),
-    noises=(Noise("level", "m²/s", Q),),
-    sensors=(Sensor("gauge", (Row("gauge", "m", R),), h=told),),
-    f=stay,
-    linear=True,
-)
+WALK = level_model({"gauge": R}, Q, mean=1.0, std=STD, linear=True)
 
 
 def wandered(times, tau=TAU):

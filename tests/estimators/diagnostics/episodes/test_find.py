@@ -13,9 +13,10 @@ from estimators.diagnostics.episodes import JOINED, Episode, episode_json, episo
 from estimators.diagnostics.health import HealthPolicy
 from estimators.fold import Fold
 from estimators.log import INPUT, READING, RESET, TICK, TRUTH, Events
-from estimators.model.state_space import Input, Noise, Row, Sensor, State, StateSpaceModel
+from estimators.model.state_space import Input, State
 from estimators.track import DIVERGED, GATED, TRACKING, USED
 from estimators.tuning import Tuning
+from tests.models import level_model
 from tests.support import SECOND, as_log
 
 ROWS = 8
@@ -25,24 +26,11 @@ def walk(x, u, p, dt, out):
     out[0] = x[0] + dt * u[0]
 
 
-def one(x, u, p, out):
-    out[0] = x[0]
-
-
-def many(x, u, p, out):
-    out[:] = x[0]
-
-
-MODEL = StateSpaceModel(
-    name="level",
-    title="a level, a gauge and a chain of floats",
+MODEL = level_model(
+    {"gauge": 0.04, "chain": {f"c{k}": 1.0 for k in range(ROWS)}},
+    0.0025,
     states=(State("level", "m", mean=0.0, std=1.0, fitted=(-20.0, 20.0)),),
     inputs=(Input("feed", "m/s", fitted=(-1.0, 1.0)),),
-    noises=(Noise("level", "m²/s", 0.0025),),
-    sensors=(
-        Sensor("gauge", (Row("gauge", "m", 0.04),), h=one),
-        Sensor("chain", tuple(Row(f"c{k}", "m", 1.0) for k in range(ROWS)), h=many),
-    ),
     f=walk,
     linear=True,
 )

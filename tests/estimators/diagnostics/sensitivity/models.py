@@ -4,6 +4,7 @@ import numpy as np
 
 from estimators.log import Log
 from estimators.model.state_space import Input, Noise, Parameter, Row, Sensor, State, StateSpaceModel
+from tests.models import first_state, level_model
 
 Q, R = 0.04, 0.25
 """Of the walk: variance that a step of one second adds, and that of a reading."""
@@ -19,48 +20,25 @@ def drift(x, u, p, dt, out):
     out[0] = x[0] + dt * (u[0] + p[0] + 1.0 / p[1])
 
 
-def level(x, u, p, out):
-    out[0] = x[0]
-
-
-WALK = StateSpaceModel(
-    name="walk",
-    title="A random walk that drifts, in the filter's steady state from the first reading on",
-    states=(State("x", "m", mean=0.0, std=float(np.sqrt(PREDICTED))),),
+WALK = level_model(
+    {"level": R},
+    Q,
+    state="x",
+    std=float(np.sqrt(PREDICTED)),
     inputs=(Input("push", "m/s"),),
     parameters=(Parameter("slope", "m/s", 0.0, -5.0, 5.0), Parameter("delay", "s/m", 1.0, 0.05, 400.0)),
-    noises=(Noise("x", "m²/s", Q),),
-    sensors=(Sensor("level", (Row("level", "m", R),), h=level),),
     f=drift,
 )
+"""A random walk that drifts, in the filter's steady state from the first measurement on."""
 
 
-def still(x, u, p, dt, out):
-    out[0] = x[0]
-
-
-def twice(x, u, p, out):
-    out[0] = x[0]
-    out[1] = x[0]
-
-
-TWICE = StateSpaceModel(
-    name="twice",
-    title="A random walk read by two rows of one sensor",
-    states=(State("x", "m", mean=0.0, std=1.0),),
-    noises=(Noise("x", "m²/s", Q),),
-    sensors=(Sensor("level", (Row("coarse", "m", R), Row("fine", "m", 0.5 * R)), h=twice),),
-    f=still,
-)
+TWICE = level_model({"level": {"coarse": R, "fine": 0.5 * R}}, Q, state="x")
+"""A random walk read by two rows of one sensor."""
 
 
 def coupled(x, u, p, dt, out):
     out[0] = x[0] + dt * (p[0] * (x[1] - x[0]) + u[0])
     out[1] = x[1] + dt * (p[1] * (x[0] - x[1]) - p[2] * (x[1] - u[1]))
-
-
-def shell(x, u, p, out):
-    out[0] = x[0]
 
 
 COUPLED = StateSpaceModel(
@@ -74,7 +52,7 @@ COUPLED = StateSpaceModel(
         Parameter("loss", "1/s", 0.05, 0.0, 0.5),
     ),
     noises=(Noise("shell", "°C²/s", 0.01), Noise("core", "°C²/s", 0.01)),
-    sensors=(Sensor("shell", (Row("shell", "°C", 0.04),), h=shell),),
+    sensors=(Sensor("shell", (Row("shell", "°C", 0.04),), h=first_state),),
     f=coupled,
 )
 

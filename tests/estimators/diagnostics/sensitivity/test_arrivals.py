@@ -4,25 +4,9 @@ import numpy as np
 
 from estimators.diagnostics.sensitivity.checklist import arrivals, dimension, spread_error
 from estimators.log import READING, Events, Log
-from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
+from tests.models import level_model
 
-
-def still(x, u, p, dt, out):
-    out[0] = x[0]
-
-
-def level(x, u, p, out):
-    out[0] = x[0]
-
-
-MODEL = StateSpaceModel(
-    name="one",
-    title="one",
-    states=(State("x", "m", 0.0, 1.0),),
-    noises=(Noise("x", "m²/s", 1.0),),
-    sensors=tuple(Sensor(name, (Row(name, "m", 1.0),), h=level) for name in ("fast", "silent")),
-    f=still,
-)
+MODEL = level_model({"fast": 1.0, "silent": 1.0}, 1.0, state="x")
 
 
 def log_of(times, values, late=None) -> Log:

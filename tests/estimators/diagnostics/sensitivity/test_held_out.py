@@ -6,8 +6,8 @@ import pytest
 from estimators.diagnostics.calibration import BANDS
 from estimators.diagnostics.sensitivity.held_out import held_out
 from estimators.log import Log
-from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
 from estimators.tuning import Tuning
+from tests.models import level_model
 
 Q, R_A, R_B = 0.04, 0.25, 0.5
 PREDICTED = Q / 2.0 * (1.0 + np.sqrt(1.0 + 4.0 * R_A / Q))
@@ -16,25 +16,7 @@ KEPT = R_A / (PREDICTED + R_A)
 """Share of an error that a reading of `a` leaves, and the correlation of one error with the next."""
 
 
-def still(x, u, p, dt, out):
-    out[0] = x[0]
-
-
-def level(x, u, p, out):
-    out[0] = x[0]
-
-
-WALK = StateSpaceModel(
-    name="walk",
-    title="A random walk read by two sensors",
-    states=(State("x", "m", mean=0.0, std=float(np.sqrt(PREDICTED))),),
-    noises=(Noise("x", "m²/s", Q),),
-    sensors=(
-        Sensor("a", (Row("a", "m", R_A),), h=level),
-        Sensor("b", (Row("b", "m", R_B),), h=level),
-    ),
-    f=still,
-)
+WALK = level_model({"a": R_A, "b": R_B}, Q, state="x", std=float(np.sqrt(PREDICTED)))
 
 N = 20_000
 

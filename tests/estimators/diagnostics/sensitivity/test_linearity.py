@@ -6,31 +6,14 @@ import pytest
 from estimators.diagnostics.sensitivity.checklist import linearity
 from estimators.fold import fold
 from estimators.log import Log
-from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
+from estimators.model.state_space import StateSpaceModel
 from estimators.tuning import Tuning
-
-
-def still(x, u, p, dt, out):
-    out[0] = x[0]
-
-
-def level(x, u, p, out):
-    out[0] = x[0]
-
-
-def square(x, u, p, out):
-    out[0] = x[0] * x[0]
+from tests.models import first_state, level_model, many_states
+from tests.models import first_state_squared as square
 
 
 def model(h, std: float) -> StateSpaceModel:
-    return StateSpaceModel(
-        name="one",
-        title="one state",
-        states=(State("x", "m", mean=3.0, std=std),),
-        noises=(Noise("x", "m²/s", 0.01),),
-        sensors=(Sensor("y", (Row("y", "m", 1.0),), h=h),),
-        f=still,
-    )
+    return level_model({"y": 1.0}, 0.01, state="x", mean=3.0, std=std, h=h)
 
 
 def log_of(one: StateSpaceModel, values) -> Log:
@@ -40,7 +23,7 @@ def log_of(one: StateSpaceModel, values) -> Log:
 
 
 def test_a_straight_line_passes_without_difference():
-    one = model(level, 2.0)
+    one = model(first_state, 2.0)
     rng = np.random.default_rng(1)
     x = 3.0 + np.cumsum(0.1 * rng.normal(size=500))
     found = linearity(one, Tuning.of(one), log_of(one, x + rng.normal(size=500)))
@@ -67,14 +50,7 @@ def test_a_curve_is_told_by_what_it_does_to_the_prediction():
 
 
 def test_what_no_gaussian_filter_carries_is_said():
-    large = StateSpaceModel(
-        name="many",
-        title="many",
-        states=tuple(State(f"x{k}", "m", 0.0, 1.0) for k in range(65)),
-        noises=(Noise("x0", "m²/s", 1.0),),
-        sensors=(Sensor("y", (Row("y", "m", 1.0),), h=level),),
-        f=still,
-    )
+    large = many_states(65)
     found = linearity(large, Tuning.of(large), log_of(large, [0.0]))
     assert found.passes is None
     assert found.reason == "many has 65 states; a linearised model is tried up to 64"

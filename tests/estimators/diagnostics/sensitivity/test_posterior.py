@@ -6,31 +6,15 @@ import pytest
 from estimators.diagnostics.sensitivity.posterior import FAR_SIGMA, peaks, tails
 from estimators.fold import fold
 from estimators.log import Log
-from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
+from estimators.model.state_space import StateSpaceModel
 from estimators.tuning import Tuning
-
-
-def still(x, u, p, dt, out):
-    out[0] = x[0]
-
-
-def level(x, u, p, out):
-    out[0] = x[0]
-
-
-def square(x, u, p, out):
-    out[0] = x[0] * x[0]
+from tests.models import first_state as level
+from tests.models import first_state_squared as square
+from tests.models import level_model, many_states
 
 
 def model(h, variance: float = 1.0) -> StateSpaceModel:
-    return StateSpaceModel(
-        name="one",
-        title="one state",
-        states=(State("x", "m", mean=0.0, std=3.0),),
-        noises=(Noise("x", "m²/s", 0.001),),
-        sensors=(Sensor("y", (Row("y", "m", variance),), h=h),),
-        f=still,
-    )
+    return level_model({"y": variance}, 0.001, state="x", std=3.0, h=h)
 
 
 def log_of(one: StateSpaceModel, values) -> Log:
@@ -59,14 +43,7 @@ def test_a_cloud_that_collapses_tells_nothing():
 
 
 def test_too_many_states_for_particles():
-    many = StateSpaceModel(
-        name="many",
-        title="many",
-        states=tuple(State(f"x{k}", "m", 0.0, 1.0) for k in range(13)),
-        noises=(Noise("x0", "m²/s", 1.0),),
-        sensors=(Sensor("y", (Row("y", "m", 1.0),), h=level),),
-        f=still,
-    )
+    many = many_states(13)
     found = peaks("pf", many, Tuning.of(many), log_of(many, [0.0]))
     assert found.reason.startswith("13 states are too many")
 
