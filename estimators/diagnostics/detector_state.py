@@ -109,7 +109,7 @@ def fresh(model: StateSpaceModel) -> np.ndarray:
     state[NEXT_DUE], state[BEGUN] = np.inf, np.nan
     _sensors(model, state)[:, DUE] = np.inf
     _rows(model, state)[:, [RAW, WHITE, VALUE]] = np.nan
-    state[state.size - model.nu :] = [item.default for item in model.inputs]
+    state[state.size - model.nu :] = model.default_inputs
     return state
 
 

@@ -95,7 +95,7 @@ def windows(
     target, place = places(physics, corrects), places(physics, features)
     values = gathered(known, u, place)
     compiled = compile_model(physics)
-    p = np.array([item.value for item in physics.parameters], float)
+    p = physics.default_parameters
     count = int((t[-1] - t[0]) * 1e-9 / seconds)
     edges = np.searchsorted(t, t[0] + np.round(np.arange(count + 1) * seconds * 1e9).astype(np.int64))
     found = []

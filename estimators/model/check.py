@@ -110,8 +110,8 @@ def prior_values(model: StateSpaceModel) -> Values:
     """Return the arguments at the prior, with default inputs and the declared parameters and noises."""
     return {
         "x": model.prior_mean.copy(),
-        "u": np.array([item.default for item in model.inputs], float),
-        "p": np.array([item.value for item in model.parameters], float),
+        "u": model.default_inputs.copy(),
+        "p": model.default_parameters.copy(),
         "q": np.array([noise.variance for noise in model.noises], float),
         "z": np.random.default_rng(0).standard_normal(model.nx),
         "dt": min(1.0, model.max_step),
@@ -162,17 +162,38 @@ def refuse_writing(
                 )
 
 
+def _call(
+    model: StateSpaceModel, what: str, function: Callable, takes: str, values: Values, *out: np.ndarray, sizes: str = ""
+) -> Any:
+    """Call a plain function with copies of its arguments and `out`; return its result as a float if it has no `out`.
+
+    Raises:
+        ModelError: With the function's file and line, if it raises anything; `sizes` are the declared ones.
+    """
+    given = [item.copy() if isinstance(item, np.ndarray) else item for item in map(values.get, takes.split(", "))]
+    try:
+        with np.errstate(all="ignore"):
+            result = plain(function)(*given, *out)
+            return result if out else float(result)
+    except Exception as error:  # noqa: BLE001  the user's own function may raise anything
+        at = f"x = {numbers(values['x'])}, u = {numbers(values['u'])}, p = {numbers(values['p'])}"
+        signature = f"({takes}, out)" if out else f"({takes}) and returns a float"
+        remedy = _remedy(error, function, signature, sizes, at) if sizes else f"it takes {signature}"
+        raise ModelError(
+            f"{place(function, error)}model {model.name}: {what} fails at the prior: {type(error).__name__}: "
+            f"{_gist(error)}; {remedy}"
+        ) from None
+
+
 def probe(model: StateSpaceModel) -> None:
     """Run the plain functions with arrays of the declared sizes, so that an index out of range is an error."""
-    values = prior_values(model)
-    x, u, p, n = values["x"], values["u"], values["p"], model.nx
+    values, n = prior_values(model), model.nx
     calls: list[tuple[str, Callable | None, str, tuple[int, ...]]] = [
         ("f", model.f, "x, u, p, dt", (n,)),
         ("F", model.F, "x, u, p, dt", (n, n)),
         ("Q", model.Q, "x, u, p, q, dt", (n, n)),
         ("shape", model.shape, "z, p", (n,)),
     ]
-    at = f"x = {numbers(x)}, u = {numbers(u)}, p = {numbers(p)}"
     for sensor in model.sensors:
         m = len(sensor.rows)
         calls.append((f"h of sensor {sensor.name}", sensor.h, "x, u, p", (m,)))
@@ -180,34 +201,21 @@ def probe(model: StateSpaceModel) -> None:
     for what, function, takes, shape in calls:
         if function is None or (model.black_box and what not in ("Q", "shape")):
             continue
-        out = np.full(shape, np.nan)
-        if what == "Q":
-            out[:] = 0.0
-        given = [item.copy() if isinstance(item, np.ndarray) else item for item in map(values.get, takes.split(", "))]
-        try:
-            with np.errstate(all="ignore"):
-                plain(function)(*given, out)
-        except Exception as error:  # noqa: BLE001  the user's own function may raise anything
-            sizes = f"{n} states, {u.size} inputs and {p.size} parameters, out of shape {shape}"
-            raise ModelError(
-                f"{place(function, error)}model {model.name}: {what} fails at the prior: {type(error).__name__}: "
-                f"{_gist(error)}; {_remedy(error, function, f'({takes}, out)', sizes, at)}"
-            ) from None
+        out = np.full(shape, 0.0 if what == "Q" else np.nan)
+        sizes = f"{n} states, {model.nu} inputs and {len(model.parameters)} parameters, out of shape {shape}"
+        _call(model, what, function, takes, values, out, sizes=sizes)
         refuse_writing(model, what, function, takes, np.zeros(shape))
+        named = f"{place(function)}model {model.name}: {what}"
         bad = np.argwhere(~np.isfinite(out))
         if bad.size:
-            first = ", ".join(map(str, bad[0]))
+            at = f"x = {numbers(values['x'])}, u = {numbers(values['u'])}, p = {numbers(values['p'])}"
             raise ModelError(
-                f"{place(function)}model {model.name}: {what} leaves {len(bad)} of {out.size} entries of out unset or "
-                f"not finite at the prior, the first of them out[{first}]; it must fill them all with finite numbers "
-                f"at {at}"
+                f"{named} leaves {len(bad)} of {out.size} entries of out unset or not finite at the prior, the first "
+                f"of them out[{', '.join(map(str, bad[0]))}]; it must fill them all with finite numbers at {at}"
             )
         wrong = indefinite(out) if what == "Q" else None
         if wrong:
-            raise ModelError(
-                f"{place(function)}model {model.name}: Q {wrong} at the prior; a covariance must be symmetric and "
-                "positive semidefinite"
-            )
+            raise ModelError(f"{named} {wrong} at the prior; a covariance must be symmetric and positive semidefinite")
 
 
 def probe_angles(model: StateSpaceModel, h: Sequence[Callable]) -> None:
@@ -215,8 +223,7 @@ def probe_angles(model: StateSpaceModel, h: Sequence[Callable]) -> None:
     if model.nx > LARGE or not np.any(model.circular):
         return
     x = model.prior_mean + 0.3 * model.prior_std
-    u = np.array([item.default for item in model.inputs], float)
-    p = np.array([item.value for item in model.parameters], float)
+    u, p = model.default_inputs, model.default_parameters
     for sensor, expected in zip(model.sensors, h, strict=True):
         here, there = np.empty(len(sensor.rows)), np.empty(len(sensor.rows))
         expected(x, u, p, here)
@@ -238,30 +245,20 @@ def probe_angles(model: StateSpaceModel, h: Sequence[Callable]) -> None:
 
 def probe_likelihoods(model: StateSpaceModel) -> None:
     """Run each sensor's own log_likelihood once, at the measurement that the prior predicts."""
-    x = np.array([state.mean for state in model.states], float)
-    u = np.array([item.default for item in model.inputs], float)
-    p = np.array([item.value for item in model.parameters], float)
+    values = prior_values(model)
     for sensor in model.sensors:
         # A row without noise has none: only particle filters would use it, and they refuse such a model.
         if sensor.log_likelihood is None or any(row.variance == 0.0 for row in sensor.rows):
             continue
-        y = np.zeros(len(sensor.rows))
-        r = np.array([row.variance for row in sensor.rows], float)
-        plain(sensor.h)(x, u, p, y)
-        named = f"model {model.name}: log_likelihood of sensor {sensor.name}"
-        try:
-            value = float(plain(sensor.log_likelihood)(y.copy(), x.copy(), u.copy(), p.copy(), r.copy()))
-        except Exception as error:  # noqa: BLE001  the user's own function may raise anything
-            raise ModelError(
-                f"{place(sensor.log_likelihood, error)}{named} fails at the prior: {type(error).__name__}: "
-                f"{_gist(error)}; it takes (y, x, u, p, r) and returns a float"
-            ) from None
-        what = f"log_likelihood of sensor {sensor.name}"
-        refuse_writing(model, what, sensor.log_likelihood, "y, x, u, p, r", more={"y": y + 0.5, "r": r})
+        y, r = np.zeros(len(sensor.rows)), np.array([row.variance for row in sensor.rows], float)
+        plain(sensor.h)(values["x"].copy(), values["u"], values["p"], y)
+        what, takes = f"log_likelihood of sensor {sensor.name}", "y, x, u, p, r"
+        value = _call(model, what, sensor.log_likelihood, takes, values | {"y": y, "r": r})
+        refuse_writing(model, what, sensor.log_likelihood, takes, more={"y": y + 0.5, "r": r})
         if np.isnan(value) or value == np.inf:
             raise ModelError(
-                f"{place(sensor.log_likelihood)}{named} is {value} at the prior; it must be a finite number, or -inf "
-                "where the reading is impossible"
+                f"{place(sensor.log_likelihood)}model {model.name}: {what} is {value} at the prior; it must be a "
+                "finite number, or -inf where the reading is impossible"
             )
 
 
@@ -279,8 +276,7 @@ def check_parts(model: StateSpaceModel, f: Callable, h: Sequence[Callable]) -> N
     if model.jump is None and not model.conditionally_linear and not model.linear:
         return
     rng = np.random.default_rng(0)
-    u = np.array([item.default for item in model.inputs], float)
-    p = np.array([item.value for item in model.parameters], float)
+    u, p = model.default_inputs, model.default_parameters
     q = np.array([max(noise.variance, 1e-12) for noise in model.noises], float)
     dt = min(0.1, model.max_step)
     for _ in range(8):
@@ -298,15 +294,9 @@ def check_parts(model: StateSpaceModel, f: Callable, h: Sequence[Callable]) -> N
 def _check_jump(model: StateSpaceModel, x: Any, u: Any, p: Any, q: Any, dt: float) -> None:
     assert model.jump is not None
     name = model.jump.state
-    c = np.full(len(model.jump.modes), np.nan)
-    after = np.full(model.nx, np.nan)
-    try:
-        plain(model.jump.chances)(x.copy(), u, p, dt, c)
-    except Exception as error:  # noqa: BLE001  the user's own function may raise anything
-        raise ModelError(
-            f"model {model.name}: jump.chances fails with {model.nx} states and {c.size} modes: "
-            f"{type(error).__name__}: {error}; it takes (x, u, p, dt, out)"
-        ) from None
+    c, after = np.full(len(model.jump.modes), np.nan), np.full(model.nx, np.nan)
+    sizes = f"{model.nx} states and {c.size} modes"
+    _call(model, "jump.chances", model.jump.chances, "x, u, p, dt", {"x": x, "u": u, "p": p, "dt": dt}, c, sizes=sizes)
     refuse_writing(model, "jump.chances", model.jump.chances, "x, u, p, dt", c.copy())
     if not (np.all(c >= 0.0) and abs(c.sum() - 1.0) < 1e-9):
         raise ModelError(

@@ -154,17 +154,6 @@ def check_range(what: str, pair: Pair | None) -> None:
         raise ModelError(f"{what} is {pair[0]:g} to {pair[1]:g}; the first must be below the second")
 
 
-def check_limits(what: str, limits: Limits | None, rows: int) -> None:
-    """Refuse limits that do not fit a sensor of so many rows.
-
-    Raises:
-        ModelError: Beginning with `what`.
-    """
-    wrong = limits.flaw(rows) if limits is not None else None
-    if wrong:
-        raise ModelError(f"{what}: {wrong}")
-
-
 @dataclass(frozen=True)
 class Row:
     """One row of a sensor, with the variance of its noise; `circular` and `position` as in `State`."""

@@ -9,7 +9,7 @@ that every filter calls.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from functools import cached_property
@@ -17,7 +17,7 @@ from functools import cached_property
 import numpy as np
 
 from ..errors import LARGEST, ModelError
-from .sensor import Limits, Row, Sensor, Stuck, check_limits, check_range, correlation_error
+from .sensor import Limits, Row, Sensor, Stuck, check_range, correlation_error
 from .states import CellNames, Field, State
 
 LARGE = 1024
@@ -120,6 +120,12 @@ class EventLayout:
         return np.array(self.rows, np.int64)
 
 
+def _twice(what: str, names: Sequence[str]) -> Iterator[str]:
+    """Yield the first name that occurs twice, as a flaw."""
+    for name in sorted({name for name in names if names.count(name) > 1})[:1]:
+        yield f"{what} {name!r} twice; every name must differ"
+
+
 @dataclass(frozen=True)
 class StateSpaceModel:
     """A state-space model; see the module's equations.
@@ -166,107 +172,101 @@ class StateSpaceModel:
 
     def __post_init__(self) -> None:
         """Refuse models that no filter could run: nothing to estimate, duplicate names, numbers out of range."""
-        for kind in ("states", "sensors", "noises"):
-            if not getattr(self, kind):
-                raise ModelError(f"model {self.name}: {kind} is empty; name at least one")
+        for flaw in self._flaws():
+            raise ModelError(f"model {self.name}: {flaw}")
+
+    def _flaws(self) -> Iterator[str]:
         field = isinstance(self.states, Field)
-        for kind in (
-            ("sensors", "noises", "inputs", "parameters")
-            if field
-            else ("states", "sensors", "noises", "inputs", "parameters")
-        ):
-            names = [item.name for item in getattr(self, kind)]
-            twice = sorted({name for name in names if names.count(name) > 1})
-            if twice:
-                raise ModelError(f"model {self.name}: {kind} names {twice[0]!r} twice; every name must differ")
+        for kind in ("states", "sensors", "noises", "inputs", "parameters"):
+            items = getattr(self, kind)
+            if not items and kind in ("states", "sensors", "noises"):
+                yield f"{kind} is empty; name at least one"
+            yield from _twice(f"{kind} names", () if field and kind == "states" else [item.name for item in items])
         for state in () if field else self.states:
             if not (0.0 <= state.std <= LARGEST and abs(state.mean) <= LARGEST):
-                raise ModelError(
-                    f"model {self.name}: the prior of {state.name} is {state.mean} ± {state.std}; "
-                    f"both must be finite, {LARGEST:g} at most, and the second zero or positive"
+                yield (
+                    f"the prior of {state.name} is {state.mean} ± {state.std}; both must be finite, {LARGEST:g} at "
+                    "most, and the second zero or positive"
                 )
         for item in self.parameters:
             if not item.low <= item.high:
-                raise ModelError(
-                    f"model {self.name}: parameter {item.name} ranges from {item.low:g} to {item.high:g}; "
-                    "the first must not be above the second"
+                yield (
+                    f"parameter {item.name} ranges from {item.low:g} to {item.high:g}; the first must not be above "
+                    "the second"
                 )
-        for sensor in self.sensors:
-            rows = [row.name for row in sensor.rows]
-            if not rows:
-                raise ModelError(f"model {self.name}: sensor {sensor.name} has no rows; name at least one")
-            if len(set(rows)) < len(rows):
-                raise ModelError(f"model {self.name}: sensor {sensor.name} names a row twice; every name must differ")
-            wrong = correlation_error(sensor.correlation, len(rows)) if sensor.correlation is not None else None
-            if wrong:
-                raise ModelError(f"model {self.name}: the correlation of sensor {sensor.name} {wrong}")
-            check_limits(f"model {self.name}: sensor {sensor.name}", sensor.limits, len(rows))
         for noise in self.noises:
             if not (noise.variance >= 0 and np.isfinite(noise.variance)):
-                raise ModelError(
-                    f"model {self.name}: noise {noise.name} has variance {noise.variance}; it must be zero or positive"
-                )
+                yield f"noise {noise.name} has variance {noise.variance}; it must be zero or positive"
         for sensor in self.sensors:
+            if not sensor.rows:
+                yield f"sensor {sensor.name} has no rows; name at least one"
+            if len({row.name for row in sensor.rows}) < len(sensor.rows):
+                yield f"sensor {sensor.name} names a row twice; every name must differ"
+            wrong = correlation_error(sensor.correlation, len(sensor.rows)) if sensor.correlation is not None else None
+            if wrong:
+                yield f"the correlation of sensor {sensor.name} {wrong}"
+            wrong = sensor.limits.flaw(len(sensor.rows)) if sensor.limits is not None else None
+            if wrong:
+                yield f"sensor {sensor.name}: {wrong}"
             for row in sensor.rows:
                 if not (row.variance >= 0 and np.isfinite(row.variance)):
-                    raise ModelError(
-                        f"model {self.name}: sensor {sensor.name}.{row.name} has variance {row.variance}; "
-                        "it must be positive, or zero of a row without noise"
+                    yield (
+                        f"sensor {sensor.name}.{row.name} has variance {row.variance}; it must be positive, or zero "
+                        "of a row without noise"
                     )
-        if self.Q is None:
-            strays = [noise.name for noise in self.noises if not self.acts_on(noise.name)]
-            if strays:
-                raise ModelError(
-                    f"model {self.name}: noise {strays[0]!r} is not a state or field; name one, "
-                    "or write Q(x, u, p, q, dt, out)"
-                )
-        elif self.shape is not None or self.nx > LARGE:
-            raise ModelError(
-                f"model {self.name}: Q of {self.nx:,} states would be a matrix of {8e-9 * self.nx**2:.3g} GB; name the "
-                "noise after the field and correlate it with shape(z, p, out), which takes Q's place"
+        stray = next((noise.name for noise in self.noises if not self.acts_on(noise.name)), None)
+        if self.Q is None and stray is not None:
+            yield f"noise {stray!r} is not a state or field; name one, or write Q(x, u, p, q, dt, out)"
+        if self.Q is not None and (self.shape is not None or self.nx > LARGE):
+            yield (
+                f"Q of {self.nx:,} states would be a matrix of {8e-9 * self.nx**2:.3g} GB; name the noise after the "
+                "field and correlate it with shape(z, p, out), which takes Q's place"
             )
-        if self.black_box:
-            if self.F is not None or any(s.H is not None or s.log_likelihood is not None for s in self.sensors):
-                raise ModelError(
-                    f"model {self.name}: a black box gives f and h of blocks of states only; leave out F, H and "
-                    "log_likelihood"
-                )
-        elif self.executor is not None:
-            raise ModelError(f"model {self.name}: executor is for a black box; set black_box=True or leave it out")
+        if self.black_box and (self.F or any(s.H or s.log_likelihood for s in self.sensors)):
+            yield "a black box gives f and h of blocks of states only; leave out F, H and log_likelihood"
+        if self.executor is not None and not self.black_box:
+            yield "executor is for a black box; set black_box=True or leave it out"
         if isinstance(self.executor, str) and self.executor not in ("threads", "processes"):
-            raise ModelError(
-                f"model {self.name}: executor is {self.executor!r}; it must be 'threads', 'processes', or a "
-                "concurrent.futures.Executor"
+            yield (
+                f"executor is {self.executor!r}; it must be 'threads', 'processes', or a concurrent.futures.Executor"
             )
-        self._check_parts()
+        yield from self._flaws_of_parts()
         if not self.max_step > 0:
-            raise ModelError(f"model {self.name}: max_step is {self.max_step} s; it must be positive")
+            yield f"max_step is {self.max_step} s; it must be positive"
 
-    def _check_parts(self) -> None:
-        """Refuse a mode or a linear part that is not among the states."""
+    def _flaws_of_parts(self) -> Iterator[str]:
+        """Yield what is wrong with the mode and the linear part."""
         if isinstance(self.states, Field) and (self.jump or self.conditionally_linear):
-            raise ModelError(f"model {self.name}: a field has no mode and no linear part; list the states")
+            yield "a field has no mode and no linear part; list the states"
         for name in self.conditionally_linear:
             if name not in self.state_names or (self.jump and name == self.jump.state):
-                what = "the mode" if name in self.state_names else "no state"
-                raise ModelError(f"model {self.name}: conditionally_linear names {name!r}, {what}")
+                yield f"conditionally_linear names {name!r}, {'the mode' if name in self.state_names else 'no state'}"
         if len(set(self.conditionally_linear)) < len(self.conditionally_linear):
-            raise ModelError(f"model {self.name}: conditionally_linear names a state twice")
+            yield "conditionally_linear names a state twice"
         if self.jump is None:
             return
         if self.jump.state not in self.state_names:
-            raise ModelError(f"model {self.name}: jump names {self.jump.state!r}, no state; name one of them")
-        state = self.states[self.mode]
-        last = len(self.jump.modes) - 1
+            yield f"jump names {self.jump.state!r}, no state; name one of them"
+        state, last = self.states[self.mode], len(self.jump.modes) - 1
         if last < 1 or not 0 <= state.mean <= last or state.circular:
-            raise ModelError(
-                f"model {self.name}: the mode {state.name} has {last + 1} values and the prior mean {state.mean:g}; it "
-                f"needs at least 2, a mean between 0 and {max(1, last)}, and must not be an angle"
+            yield (
+                f"the mode {state.name} has {last + 1} values and the prior mean {state.mean:g}; it needs at least 2, "
+                f"a mean between 0 and {max(1, last)}, and must not be an angle"
             )
         if self.Q is None and any(noise.name == state.name for noise in self.noises):
-            raise ModelError(f"model {self.name}: a noise acts on the mode {state.name}, which jumps; leave it out")
+            yield f"a noise acts on the mode {state.name}, which jumps; leave it out"
         if self.black_box or self.linear:
-            raise ModelError(f"model {self.name}: a model with a jump is neither linear nor a black box; say neither")
+            yield "a model with a jump is neither linear nor a black box; say neither"
+
+    @cached_property
+    def default_inputs(self) -> np.ndarray:
+        """Inputs before their first value, (nu,)."""
+        return np.array([item.default for item in self.inputs], float)
+
+    @cached_property
+    def default_parameters(self) -> np.ndarray:
+        """Declared values of the parameters."""
+        return np.array([item.value for item in self.parameters], float)
 
     @cached_property
     def mode(self) -> int:

@@ -174,7 +174,7 @@ def _round(fold: Fold) -> tuple[np.ndarray, np.ndarray]:
     cov[:, i, j] = cov[:, j, i] = out.cross
     rows = slice(0, fold.n)
     over_q, over_r = np.zeros((2, len(model.noises))), np.zeros((2, fold.tuning.r.size))
-    u = np.array([item.default for item in model.inputs], float)
+    u = model.default_inputs.copy()
     gather(
         fold.machine.context, log.t[rows], log.kind[rows], log.channel[rows], log.value[rows], log.width,
         fold.track.verdict, fold.track.screened, out.mean, cov, lag, u, np.asarray(model.row_start, np.int64),

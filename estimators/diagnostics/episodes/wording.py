@@ -34,8 +34,7 @@ def spaced(unit: str) -> str:
 def observed_states(model: StateSpaceModel) -> np.ndarray:
     """Return which states each sensor's measurement depends on at the prior, (sensors, nx) of bool."""
     compiled = compile_model(indicator(model))
-    x0, u = model.prior_mean.copy(), np.array([item.default for item in model.inputs], float)
-    p = np.array([item.value for item in model.parameters], float)
+    x0, u, p = model.prior_mean.copy(), model.default_inputs, model.default_parameters
     observed = np.zeros((len(model.sensors), model.nx), bool)
     for s, sensor in enumerate(model.sensors):
         y, moved = np.empty(len(sensor.rows)), np.empty(len(sensor.rows))
