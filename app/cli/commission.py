@@ -44,7 +44,7 @@ def commission_twin(arguments: Arguments) -> int:
         raise ConfigError(
             f"{twin.name}: {broken}; commission on data on which everything was in order, or --force it to be normal"
         )
-    text = lines(commission(fold, fold.evidence))
+    text = lines(commission(fold))
     if not arguments.write:
         print(text, end="")
         return 0

@@ -7,17 +7,18 @@ is the bias, scale and correlation of each row, and the highest value of each te
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 
+from ..fold import Fold
 from ..log import READING, RESET
 from ..model.state_space import StateSpaceModel
 from ..track import FAILED, GATED, USED
 from .detector_state import gate_log_ratios, no_baseline, threshold_of
 from .detector_tests import highest
 from .detectors import ALARM_NAMES, BITS
-from .episodes import FoldLike, judged_rows, standardised
+from .episodes import judged_rows, standardised
 from .health import JUDGED_MEAN, MAX_ROWS_PER_READING, MIN_WINDOW_EVENTS, HealthPolicy, normal_nis
 
 BASELINE_MARGIN = 1.5
@@ -41,19 +42,11 @@ class Normal(NamedTuple):
     nis: float = 0.0
 
 
-class JudgedFold(FoldLike, Protocol):
-    """A fold and its health policy."""
-
-    @property
-    def policy(self) -> HealthPolicy: ...  # noqa: D102
-
-
-def commission(fold: JudgedFold, evidence: np.ndarray) -> dict[str, Normal]:
+def commission(fold: Fold) -> dict[str, Normal]:
     """Return the baseline of a fold whose tuning is accepted, by sensor row.
 
     Args:
         fold: Over data without faults.
-        evidence: State of its detectors at the end.
 
     Returns:
         The baseline of each row that has `MIN_MEASUREMENTS` measurements.
@@ -63,7 +56,7 @@ def commission(fold: JudgedFold, evidence: np.ndarray) -> dict[str, Normal]:
     for s, sensor in enumerate(model.sensors):
         rows = np.flatnonzero((log.kind[: fold.n] == READING) & (log.channel[: fold.n] == s))
         verdict = track.verdict[rows]
-        h = threshold_of(model, evidence, s)
+        h = threshold_of(model, fold.evidence, s)
         for k in range(len(sensor.rows)):
             e = standardised(judged_rows(fold), rows, k)
             known = np.isfinite(e)
@@ -94,7 +87,7 @@ def commission(fold: JudgedFold, evidence: np.ndarray) -> dict[str, Normal]:
     return {name: normal._replace(nis=nis[name]) for name, normal in found.items()}
 
 
-def _most_nis(fold: JudgedFold, normal: np.ndarray) -> np.ndarray:
+def _most_nis(fold: Fold, normal: np.ndarray) -> np.ndarray:
     """Return the highest NIS over the window at measurements of each sensor, (sensors,).
 
     In multiples of `normal` (sensors,) times the expected NIS; the windows are those of `health.assess`.

@@ -2,9 +2,9 @@
 
 from .episode import JOINED, Episode, FoundEpisode, JudgedRows, episode_json, standardised
 from .sensors import ALARM_KEYS, LOSSES
-from .tracker import EpisodeTracker, FoldLike, TrackedEpisode, episodes, episodes_of, found_in, judged_rows
+from .tracker import EpisodeTracker, TrackedEpisode, episodes, episodes_of, found_in, judged_rows
 
 __all__ = [
-    "ALARM_KEYS", "JOINED", "LOSSES", "Episode", "EpisodeTracker", "FoldLike", "FoundEpisode", "JudgedRows",
+    "ALARM_KEYS", "JOINED", "LOSSES", "Episode", "EpisodeTracker", "FoundEpisode", "JudgedRows",
     "TrackedEpisode", "episode_json", "episodes", "episodes_of", "found_in", "judged_rows", "standardised",
 ]  # fmt: skip

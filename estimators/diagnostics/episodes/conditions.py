@@ -51,7 +51,9 @@ def dropouts(judged: JudgedRows) -> Iterator[FoundEpisode]:
             cause = "silent" if last else "never heard"
             start, over = (last or int(t[0])) * 1e-9, run.over(t)
             size = (t[run.end - 1] * 1e-9 if over is None else over) - start
-            facts = SensorFacts(model, s, None, cause, start, size, lasted=None if run.lasts else size)
+            facts = SensorFacts(
+                model=model, s=s, cause=cause, start=start, size=size, lasted=None if run.lasts else size
+            )
             text = detector_of(cause).text(facts)
             episode = Episode(start, over, sensor.name, cause, size, np.nan, np.nan, "s", text)
             at, until = int(t[run.begin]), int(t[run.end - 1])
@@ -82,7 +84,7 @@ def missed_truths(judged: JudgedRows) -> Iterator[FoundEpisode]:
             rms, size = (float(np.sqrt(np.mean(each**2))) for each in (error, off))
             start = events.t[rows[begin]] * 1e-9
             over = None if lasts else events.t[rows[end - 1]] * 1e-9
-            facts = TwinFacts(state.name, "missed", start, size, state.unit, rms)
+            facts = TwinFacts(name=state.name, cause="missed", start=start, size=size, unit=state.unit, about=rms)
             yield _found("truth", facts, over, float(off.min()), float(off.max()), run, events.t[rows])
 
 
@@ -109,7 +111,14 @@ def _outside(item: State | Input, value: np.ndarray, t: np.ndarray) -> Iterator[
         own = value[run.begin : run.end]
         smallest, largest = float(np.nanmin(own)), float(np.nanmax(own))
         size = largest if largest > high else smallest
-        facts = TwinFacts(item.name, "outside", run.start(t), size, item.unit, limits=f"{low:g} to {high:g}")
+        facts = TwinFacts(
+            name=item.name,
+            cause="outside",
+            start=run.start(t),
+            size=size,
+            unit=item.unit,
+            limits=f"{low:g} to {high:g}",
+        )
         yield _found("range", facts, run.over(t), smallest, largest, run, t)
 
 
@@ -126,7 +135,7 @@ def impoverished_particles(judged: JudgedRows) -> Iterator[FoundEpisode]:
         size = float(np.median(effective))
         ancestors = float(np.nanmin(track.ancestors[rows]))
         words = "one particle" if ancestors < 2.0 else f"{ancestors:.0f} particles"
-        facts = TwinFacts("twin", "impoverished", run.start(t), size, ancestors=words)
+        facts = TwinFacts(name="twin", cause="impoverished", start=run.start(t), size=size, ancestors=words)
         yield _found("particles", facts, run.over(t), low, high, run, t)
 
 
@@ -157,6 +166,6 @@ def _lost(judged: JudgedRows, code: int, run: AlarmRun) -> FoundEpisode:
     start = run.start(t) - (float(judged.track.age[run.begin]) if code == STALE else 0.0)
     size = (t[run.end - 1] - t[run.begin]) * 1e-9
     off = contradicting_sensors(judged, run.end) if code == DIVERGED else ()
-    facts = TwinFacts("twin", cause, start, size, off=off, sensors=len(judged.model.sensors))
+    facts = TwinFacts(name="twin", cause=cause, start=start, size=size, off=off, sensors=len(judged.model.sensors))
     found = _found("twin", facts, run.over(t), np.nan, np.nan, run, t)
     return found._replace(key=("twin", cause))

@@ -124,9 +124,13 @@ def _episode(judged: JudgedRows, s: int, rows: np.ndarray, run: AlarmRun, shown:
         reasons = " and ".join(reason for place, reason in enumerate(REASONS) if bits >> place & 1)
     start = events.t[rows[begun]] * 1e-9
     detector = detector_of(cause)
-    facts = SensorFacts(model, s, None if cause in OF_ALL_ROWS else k, cause, start, size, about, correlation, reasons)
+    row = model.sensors[s].rows[k]
+    facts = SensorFacts(
+        model=model, s=s, k=None if cause in OF_ALL_ROWS else k, cause=cause, start=start, size=size, unit=row.unit,
+        about=about, correlation=correlation, reasons=reasons,
+    )  # fmt: skip
     text = detector.text(facts)
-    unit = model.sensors[s].rows[k].unit if cause == "stuck" else detector.unit if detector.effect else "nats"
+    unit = row.unit if cause == "stuck" else detector.unit if detector.effect else "nats"
     if run.lasts and over < rows.size and (back or run.end < rows.size):
         text = f"{text}; {return_text(cause, events.t[rows[over]] * 1e-9)}"
     return Episode(

@@ -8,11 +8,12 @@ most likely end depends are kept.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...log import READING, Events, Log
+from ...fold import Fold
+from ...log import READING, Events
 from ...model.state_space import StateSpaceModel
 from ...track import GATED, SCREENED, Track
 from ...tuning import Tuning
@@ -33,24 +34,7 @@ JOINED_ROWS = {**dict.fromkeys(ALARM_KEYS, JOINED), "truth": JOINED, "range": JO
 REJECTIONS = {"refused": GATED, "screened": SCREENED}  # Verdict on the measurements of an episode, by its cause
 
 
-class FoldLike(Protocol):
-    """A fold, as far as episodes need it."""
-
-    @property
-    def model(self) -> StateSpaceModel: ...  # noqa: D102
-    @property
-    def tuning(self) -> Tuning: ...  # noqa: D102
-    @property
-    def marginal(self) -> bool: ...  # noqa: D102
-    @property
-    def log(self) -> Log: ...  # noqa: D102
-    @property
-    def n(self) -> int: ...  # noqa: D102
-    @property
-    def track(self) -> Track: ...  # noqa: D102
-
-
-def episodes(fold: FoldLike) -> list[Episode]:
+def episodes(fold: Fold) -> list[Episode]:
     """Return the episodes of a fold, in the order of their start."""
     return episodes_of(judged_rows(fold))
 
@@ -62,7 +46,7 @@ def episodes_of(judged: JudgedRows) -> list[Episode]:
     return tracker.episodes
 
 
-def judged_rows(fold: FoldLike) -> JudgedRows:
+def judged_rows(fold: Fold) -> JudgedRows:
     """Return the rows of a fold so far, as views."""
     return JudgedRows(fold.model, fold.tuning, fold.marginal, fold.log.events.select(slice(0, fold.n)), fold.track)
 

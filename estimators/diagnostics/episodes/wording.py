@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -47,20 +47,51 @@ def observed_states(model: StateSpaceModel) -> np.ndarray:
     return observed
 
 
-class SensorFacts(NamedTuple):
+@dataclass(frozen=True, kw_only=True)
+class Facts:
+    """Facts of any episode.
+
+    size: see `Detector.effect`. about: mean of the innovations of a row, or error of a state, in `unit`.
+    """
+
+    cause: str
+    start: float
+    size: float = np.nan
+    unit: str = ""
+    about: float = np.nan
+
+    @property
+    def since(self) -> str:
+        """Start of the episode."""
+        return since(self.start)
+
+    @property
+    def spaced_unit(self) -> str:
+        """Unit, as it follows a number."""
+        return spaced(self.unit)
+
+    @property
+    def percent(self) -> float:
+        """Size as a percentage."""
+        return 100.0 * self.size
+
+    @property
+    def offset(self) -> str:
+        """Absolute value of `about`, with its unit."""
+        return f"{abs(self.about):.3g}{self.spaced_unit}"
+
+
+@dataclass(frozen=True, kw_only=True)
+class SensorFacts(Facts):
     """Facts of an episode of sensor s, or of its row k.
 
-    size: see `Detector.effect`. about: mean of the innovations, in the row's unit; correlation: their lag-1
-    correlation. reasons: limits that the measurements violate. lasted: duration of a dropout that is over, s.
+    correlation: lag-1 correlation of the innovations. reasons: limits that the measurements violate. lasted: duration
+    of a dropout that is over, s.
     """
 
     model: StateSpaceModel
     s: int
-    k: int | None
-    cause: str
-    start: float
-    size: float = np.nan
-    about: float = np.nan
+    k: int | None = None
     correlation: float = 0.0
     reasons: str = ""
     lasted: float | None = None
@@ -74,26 +105,6 @@ class SensorFacts(NamedTuple):
     def name(self) -> str:
         """Name of the row, or of the sensor."""
         return self.sensor if self.k is None else self.model.row_names[self.model.row_start[self.s] + self.k]
-
-    @property
-    def spaced_unit(self) -> str:
-        """Unit of the row."""
-        return spaced(self.model.sensors[self.s].rows[self.k or 0].unit)
-
-    @property
-    def since(self) -> str:
-        """Start of the episode."""
-        return since(self.start)
-
-    @property
-    def percent(self) -> float:
-        """Size as a percentage."""
-        return 100.0 * self.size
-
-    @property
-    def offset(self) -> str:
-        """Absolute mean innovation, with its unit."""
-        return f"{abs(self.about):.3g}{self.spaced_unit}"
 
     @property
     def sigmas(self) -> float:
@@ -150,38 +161,19 @@ class SensorFacts(NamedTuple):
         return "was never heard" if self.cause == "never heard" else f"is silent {self.since}"
 
 
-class TwinFacts(NamedTuple):
-    """Facts of an episode of a state, an input or the twin; see `SensorFacts`.
+@dataclass(frozen=True, kw_only=True)
+class TwinFacts(Facts):
+    """Facts of an episode of a state, an input or the twin.
 
     limits: range in which the model was fitted. ancestors: particles from which all descend. off: sensors that
     contradict the estimate, of `sensors` in all.
     """
 
     name: str
-    cause: str
-    start: float
-    size: float
-    unit: str = ""
-    about: float = np.nan
     limits: str = ""
     ancestors: str = ""
     off: tuple[str, ...] = ()
     sensors: int = 0
-
-    @property
-    def since(self) -> str:
-        """Start of the episode."""
-        return since(self.start)
-
-    @property
-    def spaced_unit(self) -> str:
-        """Unit of the state or input."""
-        return spaced(self.unit)
-
-    @property
-    def offset(self) -> str:
-        """Error of the estimate, with its unit."""
-        return f"{self.about:.3g}{self.spaced_unit}"
 
     @property
     def contradiction(self) -> str:

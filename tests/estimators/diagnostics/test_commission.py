@@ -54,7 +54,7 @@ def folded(log, baseline=None, policy=None):
 def normals():
     fold = folded(asset(0))
     assert fold.track.alarms.any(axis=1).mean() > 0.5
-    return commission(fold, fold.evidence)
+    return commission(fold)
 
 
 def test_the_normal_is_that_of_the_innovations(normals):
@@ -118,7 +118,7 @@ def lurching(n=600, at=200, until=212):
 def test_the_highest_nis_over_a_window_is_by_definition():
     """Over every reading and those before it, with a reset that begins anew: a loop over rows, as its words say."""
     fold = folded(lurching())
-    normals = commission(fold, fold.evidence)
+    normals = commission(fold)
     normal = normal_nis(MODEL, baseline_of(MODEL, normals))[:, JUDGED_MEAN]
     log, track, most = fold.log, fold.track, [0.0, 0.0]
     for i in np.flatnonzero(log.kind[: log.n] == READING):
@@ -138,7 +138,7 @@ def test_what_was_accepted_is_not_called_lost_and_what_is_half_as_bad_again_is()
     log = lurching()
     before = folded(log)
     assert np.any(before.track.health == DIVERGED)
-    normals = commission(before, before.evidence)
+    normals = commission(before)
     policy = HealthPolicy(diverged_nis=lost_from(normals))
     baseline = baseline_of(MODEL, normals)
     again = folded(log, baseline, policy)
@@ -157,6 +157,6 @@ def test_what_is_far_from_lost_changes_nothing(normals):
 
 def test_too_few_readings_have_no_normal():
     fold = folded(asset(0, n=MIN_MEASUREMENTS))
-    assert len(commission(fold, fold.evidence)) == 3
+    assert len(commission(fold)) == 3
     fold = folded(asset(0, n=MIN_MEASUREMENTS - 1))
-    assert commission(fold, fold.evidence) == {}
+    assert commission(fold) == {}
