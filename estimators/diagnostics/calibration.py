@@ -13,11 +13,12 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import ndtr
 
-from ..events.batch import READING, Events, truth_of
+from ..events.batch import READING, Events
 from ..model.state_space import StateSpaceModel
 from ..numerics.quantiles import chi_square_quantile, normal_quantile
 from ..track import GATED, HELD_OUT, USED, Track
 from .intervals import UNKNOWN, Interval, correlation_interval, mean_interval, scale_interval, share_interval
+from .references import true_states
 
 BANDS = (0.50, 0.90, 0.95)  # Shares of the readings, or of the truth, that these bands should hold
 
@@ -114,34 +115,18 @@ def truth_calibration(
     `ratio` is the state's NEES. Args: see `calibrations`.
     """
     found = []
-    mode = model.jump.state if model.jump else None
-    for k, (j, state) in enumerate(zip(model.shown, model.shown_states, strict=True)):
-        rows, truth = truth_of(events, int(j))
-        error = truth - track.mean[rows, k]
-        if state.circular:
-            error = (error + np.pi) % (2.0 * np.pi) - np.pi
+    for item in true_states(model, events, track):
         with np.errstate(all="ignore"):
-            e = error / track.std[rows, k]
+            e = item.error / item.std
         known = np.isfinite(e)
-        if state.name == mode or not known.any():
+        if (model.jump and item.name == model.jump.state) or not known.any():
             continue
-        e = e[known]
+        e, name = e[known], item.name
         coverage, verdicts = _coverage(e, limits)
         ratio, bias = scale_interval(e**2), mean_interval(e)
-        found.append(
-            Calibration(
-                state.name,
-                "truth",
-                *_window(events.t[rows[known]]),
-                ratio,
-                _root(ratio),
-                bias,
-                UNKNOWN,
-                UNKNOWN,
-                coverage,
-                truth_words(state.name, verdicts, bias, limits),
-            )
-        )
+        said = truth_words(name, verdicts, bias, limits)
+        window = _window(events.t[item.rows[known]])
+        found.append(Calibration(name, "truth", *window, ratio, _root(ratio), bias, UNKNOWN, UNKNOWN, coverage, said))
     return found
 
 

@@ -13,6 +13,7 @@ from ..events.batch import TRUTH, Events
 from ..model.state_space import StateSpaceModel
 from ..numerics.quantiles import chi_square_quantile
 from .health import PROBABILITY
+from .references import wrapped
 
 
 class NisVerdict(NamedTuple):
@@ -112,7 +113,7 @@ def nees(model: StateSpaceModel, events: Events, mean: np.ndarray, cov: np.ndarr
             continue
         last = together[-1]
         error = truth - mean[last]
-        error[circular] = (error[circular] + np.pi) % (2.0 * np.pi) - np.pi
+        error[circular] = wrapped(error[circular])
         times.append(events.t[last] * 1e-9)
         values.append(_square(error[known], cov[last][np.ix_(known, known)]))
         dof.append(int(known.sum()))

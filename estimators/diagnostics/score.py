@@ -12,13 +12,14 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import betainc, gammaln
 
-from ..log import READING, Events, truth_of
+from ..log import READING, Events
 from ..model.state_space import StateSpaceModel
 from ..numerics.quantiles import chi_square_quantile, normal_quantile
-from ..track import GATED, HELD_OUT, MISSING, USED, VERDICT_NAMES, Track
+from ..track import GATED, MISSING, USED, VERDICT_NAMES, Track
 from .consistency import NisVerdict
 from .field_pictures import Picture
 from .health import MAX_ROWS_PER_READING, PROBABILITY, nis_bounds, normal_nis
+from .references import held_out_references, true_states
 
 BASELINE_CLIP_SIGMA = 6.0  # σ at which the innovations of a row are clipped in a baseline (commission.py)
 
@@ -94,6 +95,11 @@ def score(
     count, verdicts = int(used.sum()), np.bincount(track.verdict, minlength=len(VERDICT_NAMES))
     gated = int(verdicts[GATED])
     likelihood = float(track.log_likelihood[used].sum())
+    held_out = {}
+    for item in (item for s in range(len(model.sensors)) for item in held_out_references(model, events, track, s)):
+        finite = np.isfinite(item.error)
+        if finite.any():
+            held_out[item.name] = _fit(-item.error[finite], item.std[finite])
     return Score(
         nis=nis,
         nis_low=low,
@@ -105,8 +111,8 @@ def score(
         gated=gated,
         refused=gated / (gated + count) if gated + count else np.nan,
         missing=int(verdicts[MISSING]),
-        states=_against_truth(track, events, model),
-        held_out=_held_out(track, events, model),
+        states={item.name: _fit(-item.error, item.std) for item in true_states(model, events, track)},
+        held_out=held_out,
         field=_over_field(pictures),
         commissioned=commissioned,
         nis_judged=judged,
@@ -138,31 +144,6 @@ def _over_field(pictures: Sequence[Picture]) -> Fit | None:
     cells = np.array([picture.cells for picture in told], float)
     square = np.average([picture.rmse**2 for picture in told], weights=cells)
     return Fit(float(np.sqrt(square)), float(np.average([picture.inside for picture in told], weights=cells)))
-
-
-def _against_truth(track: Track, events: Events, model: StateSpaceModel) -> dict[str, Fit]:
-    fits: dict[str, Fit] = {}
-    for k, (j, state) in enumerate(zip(model.shown, model.shown_states, strict=True)):
-        rows, values = truth_of(events, int(j))
-        if rows.size:
-            error = track.mean[rows, k] - values
-            if state.circular:
-                error = (error + np.pi) % (2.0 * np.pi) - np.pi
-            fits[state.name] = _fit(error, track.std[rows, k])
-    return fits
-
-
-def _held_out(track: Track, events: Events, model: StateSpaceModel) -> dict[str, Fit]:
-    fits: dict[str, Fit] = {}
-    held = track.verdict == HELD_OUT
-    for i, sensor in enumerate(model.sensors):
-        rows = held & (events.channel == i)
-        for k in range(len(sensor.rows)):
-            error, std = track.innovation[rows, k], track.innovation_std[rows, k]
-            finite = np.isfinite(error)
-            if finite.any():
-                fits[model.row_names[model.row_start[i] + k]] = _fit(-error[finite], std[finite])
-    return fits
 
 
 def _fit(error: np.ndarray, std: np.ndarray) -> Fit:

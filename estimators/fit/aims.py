@@ -23,17 +23,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import NamedTuple
 
 import numpy as np
 from scipy.special import ndtr
 
+from ..diagnostics.references import held_out_references, references
 from ..diagnostics.score import log_density
 from ..errors import EstimatorError, nearest, quoted
 from ..fold import Fold
-from ..log import READING, Log, truth_of
-from ..model.state_space import StateSpaceModel
-from ..track import FAILED, GATED, HELD_OUT, USED, Track
+from ..log import READING, Log
+from ..track import FAILED, GATED, USED, Track
 from .entries import Setting
 from .recording import Recording
 
@@ -43,57 +42,6 @@ LIKELIHOOD, WITNESSES, CRPS, ERROR = AIMS = ("likelihood", "witnesses", "crps", 
 
 MAX_ERROR = 5.0
 """Error in root mean squares at which errors are clipped for the correlation time: one peak must not dominate it."""
-
-
-class Reference(NamedTuple):
-    """A quantity that a fold did not use: a true state (`truth`), or a row of a held-out sensor.
-
-    At the events `rows` (n,): `error` (n,), reference less prediction, and `std` (n,) of the prediction, in `unit`.
-    """
-
-    name: str
-    unit: str
-    truth: bool
-    rows: np.ndarray
-    error: np.ndarray
-    std: np.ndarray
-
-    @property
-    def log_density(self) -> np.ndarray:
-        """Log density of the reference under its prediction, (n,)."""
-        found: np.ndarray = -0.5 * (self.error / self.std) ** 2 - np.log(self.std) - 0.5 * np.log(2.0 * np.pi)
-        return found
-
-    def finite(self) -> Reference:
-        """Return the events with a finite error and a positive standard deviation."""
-        kept = np.isfinite(self.error) & (self.std > 0.0)
-        return self._replace(rows=self.rows[kept], error=self.error[kept], std=self.std[kept])
-
-
-def references(model: StateSpaceModel, log: Log, track: Track) -> list[Reference]:
-    """Return the references of a folded log: true states first, then the rows of held-out sensors."""
-    found = []
-    for column, (j, state) in enumerate(zip(model.shown, model.shown_states, strict=True)):
-        rows, true = truth_of(log.events, int(j))
-        error, std = true - track.mean[rows, column], track.std[rows, column]
-        if state.circular:
-            error = (error + np.pi) % (2.0 * np.pi) - np.pi
-        found.append(Reference(state.name, state.unit, True, rows, error, std).finite())
-    for s in range(len(model.sensors)):
-        found += sensor_references(model, log, track, s)
-    return [item for item in found if item.rows.size]
-
-
-def sensor_references(model: StateSpaceModel, log: Log, track: Track, s: int) -> list[Reference]:
-    """Return the rows of a sensor that a fold held out."""
-    own = np.flatnonzero((log.kind[: log.n] == READING) & (log.channel[: log.n] == s) & (track.verdict == HELD_OUT))
-    first = model.row_start[s]
-    return [
-        Reference(
-            model.row_names[first + k], row.unit, False, own, track.innovation[own, k], track.innovation_std[own, k]
-        ).finite()
-        for k, row in enumerate(model.sensors[s].rows)
-    ]
 
 
 def correlation_time(values: np.ndarray) -> float:
@@ -145,7 +93,8 @@ class Aim:
         for s in self.sensors:
             track = track_of(estimator, setting, recording, without=s)
             first = model.row_start[s]
-            for k, item in enumerate(sensor_references(model, recording.log, track, s)):
+            for k, item in enumerate(held_out_references(model, recording.log.events, track, s)):
+                item = item.finite()
                 scale = 1.0 if self.scale is None else self.scale[first + k]
                 loss = crps(item.error, item.std) / scale if self.kind == CRPS else 0.5 * (item.error / scale) ** 2
                 found[item.rows] -= np.where(np.isfinite(loss), loss, FAILURE_COST)
@@ -155,7 +104,7 @@ class Aim:
         """Return the score of each event of one fold, (n,), for an aim that holds no sensor out."""
         found = self.own * densities(track, setting.tuning.gate)
         if self.weights:
-            for item in references(setting.tuning.model, log, track):
+            for item in references(setting.tuning.model, log.events, track):
                 # A reference that was absent when the fit began has no weight.
                 found[item.rows] += self.weights.get(item.name, 0.0) * np.maximum(item.log_density, -FAILURE_COST)
         return found
@@ -192,7 +141,8 @@ def aim_of(kind: str, estimator: str, setting: Setting, recordings: list[Recordi
     for record in recordings:
         for s in sensors:
             track = track_of(estimator, setting, record, without=s)
-            for k, item in enumerate(sensor_references(model, record.log, track, s)):
+            for k, item in enumerate(held_out_references(model, record.log.events, track, s)):
+                item = item.finite()
                 loss = crps(item.error, item.std) if kind == CRPS else item.error**2
                 losses.setdefault(model.row_start[s] + k, []).append(loss[~record.held_out[item.rows]])
     scale = np.ones(len(model.row_names))
@@ -213,7 +163,7 @@ def _weighted(estimator: str, setting: Setting, recordings: list[Recording]) -> 
         # Per finite row of a measurement.
         used = (track.verdict == USED) & ~record.held_out
         squares = {"": track.nis[used] / np.maximum(track.dof[used], 1)}
-        for item in references(setting.tuning.model, record.log, track):
+        for item in references(setting.tuning.model, record.log.events, track):
             squares[item.name] = ((item.error / item.std) ** 2)[~record.held_out[item.rows]]
         for name, values in squares.items():
             values = values[np.isfinite(values)]

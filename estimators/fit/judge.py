@@ -30,6 +30,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..diagnostics.innovations import mean_nis
+from ..diagnostics.references import Reference, held_out_references, references
 from ..diagnostics.sensitivity.responses import each
 from ..log import READING, TRUTH
 from ..registry import find_estimator
@@ -40,11 +41,8 @@ from .aims import (
     LIKELIHOOD,
     WITNESSES,
     Aim,
-    Reference,
     crps,
     densities,
-    references,
-    sensor_references,
     sensors_in_turn,
     track_of,
 )
@@ -180,8 +178,9 @@ def _part(
         used = part & (track.verdict == USED)
         normal.append((track.innovation[used] / track.innovation_std[used]).ravel())
         tracks.append(track.select(part))
-        found = [(0, item) for s, other in zip(sensors, others) for item in sensor_references(model, log, other, s)]
-        found += [(2 if item.truth else 1, item) for item in references(model, log, track)]
+        in_turn = (held_out_references(model, log.events, other, s) for s, other in zip(sensors, others, strict=True))
+        found = [(0, item.finite()) for items in in_turn for item in items]
+        found += [(2 if item.truth else 1, item) for item in references(model, log.events, track)]
         for group, item in found:
             kept = part[item.rows]
             if kept.any():

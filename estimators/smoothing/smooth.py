@@ -9,6 +9,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from ..diagnostics.references import wrapped
 from ..errors import EstimatorError
 from ..estimator import Estimator
 from ..fold import Fold
@@ -89,7 +90,7 @@ def consistency(track: Track, smoothed: Smoothed, model: StateSpaceModel) -> dic
     """
     moved = track.mean - smoothed.mean
     circular = np.array([state.circular for state in model.shown_states], bool)
-    moved[:, circular] = (moved[:, circular] + np.pi) % (2.0 * np.pi) - np.pi
+    moved[:, circular] = wrapped(moved[:, circular])
     before = track.std**2
     taken = before - smoothed.std**2
     informed = taken > MIN_REMOVED_SHARE * before

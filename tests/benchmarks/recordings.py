@@ -19,8 +19,9 @@ import numpy as np
 from app.twin.defaults import bounds_of
 from app.twin.log_reader import read_log
 from app.twin.twin import Twin, load_twin
+from estimators.diagnostics.references import references
 from estimators.errors import NisusError
-from estimators.fit.aims import AIMS, WITNESSES, correlation_time, references, track_of
+from estimators.fit.aims import AIMS, WITNESSES, correlation_time, track_of
 from estimators.fit.entries import Setting
 from estimators.fit.fit import fit
 from estimators.fit.judge import PartScore, Z, worths
@@ -69,7 +70,7 @@ def outside(twin: Twin, setting: Setting, log: Log, second: np.ndarray) -> list[
     """Of each witness whose band holds less or more than it should on the second half: how sure that is."""
     track = track_of(twin.estimator, setting, Recording(log, 1.0, second))
     found = []
-    for item in references(twin.model, log, track):
+    for item in references(twin.model, log.events, track):
         squares = (item.error / item.std) ** 2
         late = second[item.rows]
         if not late.any() or not (~late).any():

@@ -20,6 +20,7 @@ from ..detectors import (
     STUCK,
     detector_of,
 )
+from ..references import wrapped
 from .episode import JOINED, AlarmRun, Episode, FoundEpisode, JudgedRows, runs
 from .wording import SensorFacts, TwinFacts
 
@@ -78,7 +79,7 @@ def missed_truths(judged: JudgedRows) -> Iterator[FoundEpisode]:
             own = rows[begin:end]
             error = track.mean[own, column] - values[begin:end]
             if state.circular:
-                error = (error + np.pi) % (2.0 * np.pi) - np.pi
+                error = wrapped(error)
             sure = track.std[own, column] > 0.0
             off = np.abs(error[sure]) / track.std[own[sure], column]
             rms, size = (float(np.sqrt(np.mean(each**2))) for each in (error, off))

@@ -17,6 +17,7 @@ from ...tuning import Tuning
 from ..calibration import LIMITS, standardised
 from ..innovations import ljung_box
 from ..intervals import Interval, correlation_interval
+from ..references import wrapped
 from .responses import MAX_STATES, digits, each
 
 SPREAD_TOLERANCE = 0.1  # Share by which the standard deviations of an ensemble may be off by chance
@@ -232,7 +233,7 @@ def _curvature(name: str, apart: np.ndarray) -> Curvature:
 def _apart(one: np.ndarray, other: np.ndarray, std: np.ndarray, circular: bool) -> np.ndarray:
     difference = one - other
     if circular:
-        difference = (difference + np.pi) % (2.0 * np.pi) - np.pi
+        difference = wrapped(difference)
     with np.errstate(all="ignore"):
         share = np.abs(difference) / std
     lost = np.isfinite(other) & ~np.isfinite(one)

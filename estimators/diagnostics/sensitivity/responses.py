@@ -18,6 +18,7 @@ from ...registry import find_entry, find_estimator, unfit
 from ...snapshots import Base
 from ...track import DIVERGED, MISSING, NONE, USED, Track
 from ...tuning import Tuning
+from ..references import wrapped
 
 DETERMINISTIC_FILTERS = ("ekf", "ukf", "kf")
 """Deterministic filters that replace a Monte Carlo one, the first that applies."""
@@ -93,14 +94,14 @@ class Start(NamedTuple):
             own = reading & (channel == s)
             for k, row in enumerate(sensor.rows):
                 if row.circular:
-                    innovation[own, k] = _shorter(innovation[own, k])
+                    innovation[own, k] = wrapped(innovation[own, k])
             # By the S of the fold without nudge, where its square root is known. A change of S also changes the
             # whitened innovations, by less than its effect on their distribution.
             if len(sensor.rows) == 1 or not np.isfinite(whitened[own]).any():
                 whitened[own] = innovation[own] / self.track.innovation_std[own]
         for j, state in enumerate(model.shown_states):
             if state.circular:
-                states[:, j] = _shorter(states[:, j])
+                states[:, j] = wrapped(states[:, j])
         return Response(innovation, whitened, states)
 
     def respond(self, nudge: Nudge) -> Response:
@@ -164,10 +165,6 @@ def start(estimator: str, model: StateSpaceModel, tuning: Tuning, log: Log, base
     if at:
         still.drop_front(at)
     return Start.of(name, replace(tuning, gate=None), still, base, at, note)
-
-
-def _shorter(angle: np.ndarray) -> np.ndarray:
-    return (angle + np.pi) % (2.0 * np.pi) - np.pi
 
 
 def each(work: Callable[[T], R], items: Iterable[T], executor: Executor | str | None) -> list[R]:

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
+from estimators.diagnostics.references import references
 from estimators.errors import ConfigError
-from estimators.fit.aims import LIKELIHOOD, WITNESSES, aim_of, correlation_time, references
+from estimators.fit.aims import LIKELIHOOD, WITNESSES, aim_of, correlation_time
 from estimators.fit.entries import Setting
 from estimators.fit.fit import fit
 from estimators.fit.judge import worths
@@ -58,7 +59,7 @@ def test_true_states_and_unused_sensors_are_witnesses():
     tuning = Tuning.of(MODEL).set("use.silent", False)
     fold = Fold("kf", MODEL, tuning, log)
     fold.advance()
-    truth, sensor = references(MODEL, log, fold.track)
+    truth, sensor = references(MODEL, log.events, fold.track)
     assert (truth.name, truth.truth, sensor.name, sensor.truth) == ("level", True, "silent", False)
     np.testing.assert_array_equal(truth.error, xs - fold.track.mean[truth.rows, 0])
     np.testing.assert_allclose(sensor.error, ys - fold.track.mean[sensor.rows, 0], atol=1e-12)
