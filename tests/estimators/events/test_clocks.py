@@ -80,13 +80,6 @@ def test_a_clock_that_was_set_is_named_and_goes_on(ahead):
     assert moved.by == round(ahead * SECOND) and moved.t == round(t[200] * SECOND)
 
 
-def test_a_clock_that_is_set_there_and_back_is_followed_both_times():
-    t = T + np.where((T >= 200) & (T < 900), HOUR, 0.0)
-    made = Outcome(events(t, T + DELAY))
-    np.testing.assert_array_equal(made.seconds, T)
-    assert [move.by for move in made.moved] == [round(HOUR * SECOND), -round(HOUR * SECOND)]
-
-
 def test_a_step_is_known_within_the_jitter_of_the_delay():
     """The least delay of those that settled it, against the least of the ones before: off by the jitter at most."""
     jitter = np.random.default_rng(4).uniform(0.0, 0.3, T.size)
@@ -246,11 +239,6 @@ def test_a_block_that_was_held_up_on_its_way_is_late_not_another_clock(until):
     made = Outcome(stream)
     assert (made.log.n, made.stale) == without_guard(stream)
     assert not made.moved and not made.refused
-
-
-def test_files_in_a_wrong_order_are_stale_as_before():
-    made = Outcome(events(np.concatenate((T[1000:], T[:1000]))))
-    assert made.stale == 1000 and not made.moved
 
 
 def test_the_host_clock_that_is_set_is_no_matter():

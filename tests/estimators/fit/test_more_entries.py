@@ -107,11 +107,3 @@ def test_a_filter_that_draws_is_fitted_without_slopes(monkeypatch):
 
 
 assert DECADES == 2.0 * DECADE
-
-
-def test_a_group_without_entries_is_said_beside_those_that_have_some():
-    log = log_of(simulated(4, 50, q=1.0))
-    found, skipped = entries_of("kf", Tuning.of(MODEL), [log], ("R.float", "over"))
-    assert [item.key for item in found] == ["R.float"] and [item.key for item in skipped] == ["over"]
-    with pytest.raises(ConfigError, match="nothing of over can be fitted: there is no such entry"):
-        entries_of("kf", Tuning.of(MODEL), [log], ("over",))

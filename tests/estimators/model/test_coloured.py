@@ -44,6 +44,10 @@ def density(y, x, u, p, r):
 WALK = level_model({"gauge": R}, Q, mean=1.0, std=STD, linear=True)
 
 
+BOTH = coloured(WALK, {"level": TAU}, {"gauge": ColouredError((ERROR**2,), ERROR_TIME)})
+"""With a disturbance and an error of its sensor."""
+
+
 def wandered(times, tau=TAU):
     """Covariance of ∫c dt from 0 to each of the times, c an OU process in its steady state.
 
@@ -97,9 +101,8 @@ def agree(estimator, model, level, readings, times):
 def test_both_kinds_of_lasting_error_are_the_regression_on_their_covariance(estimator):
     times = np.cumsum(STEPS)
     level = STD**2 + wandered(times)
-    model = coloured(WALK, {"level": TAU}, {"gauge": ColouredError((ERROR**2,), ERROR_TIME)})
-    assert model.linear and model.state_names == ("level", "level_disturbance", "gauge_error")
-    agree(estimator, model, level, level + lasted(times) + R * np.eye(len(times)), times)
+    assert BOTH.linear and BOTH.state_names == ("level", "level_disturbance", "gauge_error")
+    agree(estimator, BOTH, level, level + lasted(times) + R * np.eye(len(times)), times)
 
 
 @pytest.mark.parametrize("estimator", ["kf", "ekf"])
@@ -149,13 +152,12 @@ def discrete(model, dt):
 
 @pytest.mark.parametrize("a", [1e-7, 1e-4, 0.0499, 0.0501, 1.0, 3.0])
 def test_a_step_is_that_of_the_exponential_of_a_matrix(a):
-    model = coloured(WALK, {"level": TAU}, {"gauge": ColouredError((ERROR**2,), ERROR_TIME)})
     dt = a * TAU
     A = np.array([[0.0, 1.0, 0.0], [0.0, -1.0 / TAU, 0.0], [0.0, 0.0, -1.0 / ERROR_TIME]])
     G = np.diag([0.0, Q / TAU**2, 2.0 * ERROR**2 / ERROR_TIME])
     # Van Loan (1978), doi:10.1109/TAC.1978.1101743.
     whole = expm(np.block([[-A, G], [np.zeros((3, 3)), A.T]]) * dt)
-    F, noise = discrete(model, dt)
+    F, noise = discrete(BOTH, dt)
     np.testing.assert_allclose(F, whole[3:, 3:].T, rtol=1e-12, atol=1e-15)
     # Rounding of entries of order e^a times those of order one.
     np.testing.assert_allclose(noise, whole[3:, 3:].T @ whole[:3, 3:], rtol=1e-9, atol=1e-15 * np.exp(a))
@@ -164,22 +166,20 @@ def test_a_step_is_that_of_the_exponential_of_a_matrix(a):
 @pytest.mark.parametrize("dt", [0.01, 3.0, 900.0])
 @pytest.mark.parametrize("parts", [2, 7, 1000])
 def test_a_step_is_as_many_shorter_ones(parts, dt):
-    model = coloured(WALK, {"level": TAU}, {"gauge": ColouredError((ERROR**2,), ERROR_TIME)})
-    F, noise = discrete(model, dt)
-    G, more = discrete(model, dt / parts)
+    F, noise = discrete(BOTH, dt)
+    G, more = discrete(BOTH, dt / parts)
     together, spread = np.eye(3), np.zeros((3, 3))
     for _ in range(parts):
         together, spread = G @ together, G @ spread @ G.T + more
     np.testing.assert_allclose(together, F, rtol=1e-11, atol=1e-14)
     np.testing.assert_allclose(spread, noise, rtol=1e-10, atol=1e-14)
-    np.testing.assert_array_equal(discrete(model, 0.0)[1], 0.0)
+    np.testing.assert_array_equal(discrete(BOTH, 0.0)[1], 0.0)
 
 
 def test_it_begins_in_its_steady_state_which_a_step_keeps():
-    model = coloured(WALK, {"level": TAU}, {"gauge": ColouredError((ERROR**2,), ERROR_TIME)})
-    spread = np.diag(model.prior_std**2)[1:, 1:]
+    spread = np.diag(BOTH.prior_std**2)[1:, 1:]
     assert spread[0, 0] == pytest.approx(0.5 * Q / TAU) and spread[1, 1] == pytest.approx(ERROR**2)
-    F, noise = discrete(model, 2.5)
+    F, noise = discrete(BOTH, 2.5)
     np.testing.assert_allclose(F[1:, 1:] @ spread @ F[1:, 1:].T + noise[1:, 1:], spread, rtol=1e-13)
 
 
@@ -198,10 +198,9 @@ def test_statsmodels_finds_the_same_likelihood():
 
 
 def test_a_steady_gain_is_that_of_the_kalman_filter_in_the_end():
-    model = coloured(WALK, {"level": TAU}, {"gauge": ColouredError((ERROR**2,), ERROR_TIME)})
     y = 1.0 + np.cumsum(np.random.default_rng(2).normal(0.0, 0.7, 600))
     log = log_of(np.arange(600.0), y)
-    exact, steady = (fold(name, model, Tuning.of(model), log) for name in ("kf", "kf-steady"))
+    exact, steady = (fold(name, BOTH, Tuning.of(BOTH), log) for name in ("kf", "kf-steady"))
     # The slowest mode of the error decays over some 20 s; after 300 s nothing of the start is left.
     np.testing.assert_allclose(steady.mean[300:], exact.mean[300:], rtol=0, atol=1e-6)
     np.testing.assert_allclose(steady.std[300:], exact.std[300:], rtol=0, atol=1e-9)
@@ -209,14 +208,13 @@ def test_a_steady_gain_is_that_of_the_kalman_filter_in_the_end():
 
 @pytest.mark.parametrize("estimator", ["pf", "pf-reg", "rbpf", "enkf", "etkf", "ensrf", "letkf"])
 def test_members_agree_with_the_kalman_filter_within_chance(estimator):
-    model = coloured(WALK, {"level": TAU}, {"gauge": ColouredError((ERROR**2,), ERROR_TIME)})
     rng = np.random.default_rng(4)
     log = log_of(np.arange(40.0), 1.0 + np.cumsum(rng.normal(0.0, 0.5, 40)))
-    exact = fold("kf", model, Tuning.of(model), log)
-    entry = find_estimator(estimator, model)
+    exact = fold("kf", BOTH, Tuning.of(BOTH), log)
+    entry = find_estimator(estimator, BOTH)
     size = next(option.name for option in entry.options if option.name in ("particles", "members"))
     n = 20_000 if size == "particles" else 5_000
-    found = fold(estimator, model, Tuning.of(model).with_options({size: float(n)}), log)
+    found = fold(estimator, BOTH, Tuning.of(BOTH).with_options({size: float(n)}), log)
     # Of n independent members a mean has the error σ/√n; resampling leaves some twentieth of them independent.
     error = np.abs(found.mean - exact.mean) / exact.std
     assert error.max() < 5.0 * np.sqrt(20.0 / n)
@@ -297,14 +295,13 @@ def two_rows(x, u, p, out):
 
 
 def test_correlation_times_and_variances_are_turned_while_it_runs():
-    model = coloured(WALK, {"level": TAU}, {"gauge": ColouredError((ERROR**2,), ERROR_TIME)})
     log = log_of(np.arange(50.0), np.sin(np.arange(50.0)))
-    tuning = Tuning.of(model).set("p.level_disturbance_time", 2.0).set("p.gauge_error_time", 3.0)
-    turned = fold("kf", model, tuning.set("Q.level", 0.1).set("Q.gauge_error", 0.5), log)
+    tuning = Tuning.of(BOTH).set("p.level_disturbance_time", 2.0).set("p.gauge_error_time", 3.0)
+    turned = fold("kf", BOTH, tuning.set("Q.level", 0.1).set("Q.gauge_error", 0.5), log)
     walk = replace(WALK, noises=(replace(WALK.noises[0], variance=0.1),))
     declared = coloured(walk, {"level": 2.0}, {"gauge": ColouredError((0.5,), 3.0)})
     # The belief at the start is the model's, as ever; the rest is what it is turned to.
-    declared = replace(declared, states=model.states)
+    declared = replace(declared, states=BOTH.states)
     np.testing.assert_allclose(fold("kf", declared, Tuning.of(declared), log).mean, turned.mean, rtol=1e-12)
     assert [item.key for item in tuning.items()] == [
         "Q.level", "Q.gauge_error", "R.gauge", "p.level_disturbance_time", "p.gauge_error_time"
