@@ -41,7 +41,7 @@ def density(y, x, u, p, r):
     return -0.5 * (y[0] - x[0]) ** 2 / r[0] - 0.5 * math.log(2.0 * math.pi * r[0])
 
 
-WALK = level_model({"gauge": R}, Q, mean=1.0, std=STD, linear=True)
+WALK = level_model({"gauge": R}, Q, name="walk", mean=1.0, std=STD, linear=True)
 
 
 BOTH = coloured(WALK, {"level": TAU}, {"gauge": ColouredError((ERROR**2,), ERROR_TIME)})
