@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from estimators.diagnostics.commission import Normal, commission
+from estimators.diagnostics.episodes.baseline import Normal, commission
 from estimators.errors import ConfigError
 from estimators.fold import Fold
 from estimators.log import READING

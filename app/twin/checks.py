@@ -6,8 +6,8 @@ from typing import Any
 
 from config.loader import Loaded
 from config.yaml_files import Key
-from estimators.diagnostics.commission import Normal
 from estimators.diagnostics.detectors import ALARM_NAMES
+from estimators.diagnostics.episodes.baseline import Normal
 from estimators.errors import ConfigError, nearest
 from estimators.fit.entries import check_key
 from estimators.model.state_space import StateSpaceModel

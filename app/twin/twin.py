@@ -18,7 +18,7 @@ from config.schema import TwinSection
 from config.source_schema import AssetSection
 from config.tunings import OWN, Version, find_version
 from config.yaml_files import parse
-from estimators.diagnostics.commission import baseline_of, lost_from
+from estimators.diagnostics.episodes.baseline import baseline_of, lost_from
 from estimators.diagnostics.health import HealthPolicy
 from estimators.errors import LARGEST, ConfigError, EstimatorError
 from estimators.fold_checks import check_variances

@@ -11,8 +11,8 @@ from app.cli.commission import commission_twin, lines
 from app.live.tunings.versions import write_section
 from app.twin.log_reader import read_log
 from app.twin.twin import load_twin
-from estimators.diagnostics.commission import Normal, baseline_of, lost_from
 from estimators.diagnostics.detectors import ALARM_NAMES
+from estimators.diagnostics.episodes.baseline import Normal, baseline_of, lost_from
 from estimators.errors import ConfigError
 from estimators.fold import fold
 from estimators.track import DIVERGED

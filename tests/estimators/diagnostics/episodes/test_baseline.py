@@ -5,7 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from estimators.diagnostics.commission import (
+from estimators.diagnostics.detector_state import no_baseline
+from estimators.diagnostics.detectors import ALARM_NAMES, BITS, NARROW
+from estimators.diagnostics.episodes.baseline import (
     BASELINE_MARGIN,
     MIN_MEASUREMENTS,
     Normal,
@@ -13,8 +15,6 @@ from estimators.diagnostics.commission import (
     commission,
     lost_from,
 )
-from estimators.diagnostics.detector_state import no_baseline
-from estimators.diagnostics.detectors import ALARM_NAMES, BITS, NARROW
 from estimators.diagnostics.health import JUDGED_MEAN, MAX_ROWS_PER_READING, MIN_WINDOW_EVENTS, HealthPolicy, normal_nis
 from estimators.fold import Fold
 from estimators.log import READING, RESET, Events

@@ -11,15 +11,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..fold import Fold
-from ..log import READING, RESET
-from ..model.state_space import StateSpaceModel
-from ..track import FAILED, GATED, USED
-from .detector_state import gate_log_ratios, no_baseline, threshold_of
-from .detector_tests import highest
-from .detectors import ALARM_NAMES, BITS
-from .episodes import judged_rows, standardised
-from .health import JUDGED_MEAN, MAX_ROWS_PER_READING, MIN_WINDOW_EVENTS, HealthPolicy, normal_nis
+from ...fold import Fold
+from ...log import READING, RESET
+from ...model.state_space import StateSpaceModel
+from ...track import FAILED, GATED, USED
+from ..detector_state import gate_log_ratios, no_baseline, threshold_of
+from ..detector_tests import highest
+from ..detectors import ALARM_NAMES, BITS
+from ..health import JUDGED_MEAN, MAX_ROWS_PER_READING, MIN_WINDOW_EVENTS, HealthPolicy, normal_nis
+from . import judged_rows, standardised
 
 BASELINE_MARGIN = 1.5
 """Factor on the highest value of a test, which is added to its threshold, and on the highest NIS over a window."""
