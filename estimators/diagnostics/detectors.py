@@ -115,6 +115,18 @@ def anchor(heading: str) -> str:
     return heading.lower().replace(" ", "-")
 
 
+CALENDAR_FROM_S = 1e8
+"""Seconds from which a time is one of the calendar (after 1973), not one since the start of a recording."""
+
+
+def since(seconds: float) -> str:
+    """Return "since ..." with a time of day, or with seconds of the log."""
+    if seconds < CALENDAR_FROM_S:
+        return f"since {seconds:.1f} s"
+    of_day = int(seconds) % 86400
+    return f"since {of_day // 3600:02}:{of_day // 60 % 60:02}:{of_day % 60:02} UTC"
+
+
 DETECTORS = (
     Detector(
         "narrow",

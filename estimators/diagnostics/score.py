@@ -21,7 +21,7 @@ from .field_pictures import Picture
 from .health import MAX_ROWS_PER_READING, PROBABILITY, nis_bounds, normal_nis
 from .references import held_out_references, true_states
 
-BASELINE_CLIP_SIGMA = 6.0  # σ at which the innovations of a row are clipped in a baseline (commission.py)
+BASELINE_CLIP_SIGMA = 6.0  # σ at which the innovations of a row are clipped in a baseline (episodes/baseline.py)
 
 
 class Fit(NamedTuple):

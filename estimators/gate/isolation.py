@@ -24,7 +24,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from ..diagnostics.episodes.wording import since
+from ..diagnostics.detectors import since
 from ..log import READING, Log
 from ..model.state_space import StateSpaceModel
 from ..snapshots import Story

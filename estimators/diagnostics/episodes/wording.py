@@ -9,21 +9,12 @@ import numpy as np
 from ...compiled.model import compile_model
 from ...model.indicator import indicator
 from ...model.state_space import StateSpaceModel
+from ..detectors import since
 
 CORRELATED_FROM = 0.15  # Lag-1 correlation of the innovations from which Q explains their scale, not R
 
-CALENDAR_FROM_S = 1e8
-"""Seconds from which a time is one of the calendar (after 1973), not one since the start of a recording."""
 
 MAX_STATES = 64  # States up to which the states that a sensor observes are listed
-
-
-def since(seconds: float) -> str:
-    """Return "since ..." with a time of day, or with seconds of the log."""
-    if seconds < CALENDAR_FROM_S:
-        return f"since {seconds:.1f} s"
-    of_day = int(seconds) % 86400
-    return f"since {of_day // 3600:02}:{of_day // 60 % 60:02}:{of_day % 60:02} UTC"
 
 
 def spaced(unit: str) -> str:
