@@ -56,7 +56,7 @@ class Tuning:
     `gate_kind` is "soft", used with inflated noise (gate/soften.py). For a sensor that stays rejected, the fold decides
     whether the sensor or the estimate is wrong (gate/isolation.py); if that cannot be decided, the sensor is trusted
     again after `reopen` seconds, None for never. `options` are the estimator's. `baseline` (rows, ...) is the baseline
-    of the innovations when the tuning was accepted (diagnostics/episodes/baseline.py), None for white ones. `name` is the name
+    of the innovations when the tuning was accepted (episodes/baseline.py), None for white ones. `name` is the name
     of the loaded version, with a `*` once an entry has been changed, or empty. `version` counts the tunings of this
     process.
     """

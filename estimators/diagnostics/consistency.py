@@ -19,7 +19,7 @@ from .references import wrapped
 class NisVerdict(NamedTuple):
     """A mean NIS, the 95 % bounds that it should lie in, and whether these are what was normal when commissioned.
 
-    What was normal was taken from all readings, each row at most 6 σ (episodes/baseline.py): `judged` is the mean NIS of the
+    What was normal was taken from all readings, each row at most 6 σ (baseline.py): `judged` is the mean NIS of the
     same, which is compared; NaN where it is the NIS itself.
     """
 

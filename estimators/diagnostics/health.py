@@ -1,7 +1,7 @@
 """Health limits of a twin, the expected mean NIS, and the NIS of a window against its chi-square bounds.
 
 For a consistent filter, innovations are white and normal, and the sum of NIS is chi-square. A commissioned twin
-(`episodes/baseline.py`) has a baseline instead: the innovations of each row have a bias b, a scale s and a lag-1 correlation
+(`baseline.py`) has a baseline instead: the innovations of each row have a bias b, a scale s and a lag-1 correlation
 φ. Then E e² = b² + s², and a long sum of n of them has the variance
 
     n (2 s⁴ (1 + φ²) / (1 - φ²) + 4 b² s² (1 + φ) / (1 - φ)),
