@@ -229,7 +229,7 @@ def parse(kind: type[T], given: Any, subject: str, *, text: bool = False) -> T:
         remedy = nearest(name, fields) if fields else "it takes no field"
         raise ConfigError(f"{subject}: {shown_name(name)} is not known; {remedy}")
     for name, item in fields.items():
-        if name not in given and item.default is dataclasses.MISSING:
+        if name not in given and item.default is item.default_factory is dataclasses.MISSING:
             raise ConfigError(f"{subject}: {name} is missing; it takes {names}")
     adapter = _adapter(typing.cast(Any, kind))
     try:

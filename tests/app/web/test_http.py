@@ -10,6 +10,7 @@ from starlette.requests import Request
 from app.present.series.chart_stream import ChartQuery, ChartStream
 from app.present.series.columns import columns_of
 from app.web.http import get, parse, post
+from app.web.streams import PageMessage
 from estimators.errors import ConfigError
 from estimators.models import MODELS
 
@@ -47,6 +48,10 @@ def test_a_body_becomes_arguments():
     ):
         status, text = answer(post("/api/x", keep), json.dumps(body).encode())
         assert status == 400 and words in json.loads(text)["error"]
+
+
+def test_a_message_may_leave_out_what_has_a_default():
+    assert parse(PageMessage, {"drawn": True}, "page") == PageMessage(drawn=True, pair=None, streams={})
 
 
 def test_a_query_becomes_arguments():
