@@ -13,8 +13,6 @@ from estimators.registry import ESTIMATORS
 from estimators.tuning import GATE_KEYS, Tuning
 
 if TYPE_CHECKING:
-    from estimators.tuning import Tuning
-
     from ..twin.twin import Twin
 
 
@@ -42,64 +40,53 @@ def difference(estimator: str, tuning: Tuning, other_estimator: str, other: Tuni
     The rows of a sensor that share an entry are one change, unless only their mean is the same.
     """
     model = tuning.model
+
+    def entries(group: str, names: Sequence[str], before: np.ndarray, after: np.ndarray) -> list[SettingChange]:
+        # Most edits leave the group as it is, which is then the same array.
+        rows: list[int] = [] if before is after else np.flatnonzero(before != after).tolist()
+        return [SettingChange(f"{group}.{names[k]}", float(before[k]), float(after[k])) for k in rows]
+
+    def entry(key: str) -> list[SettingChange]:
+        before, after = tuning.get(key), other.get(key)
+        return [] if before == after else [SettingChange(key, before, after)]
+
     found: list[SettingChange] = []
     if estimator != other_estimator:
         found.append(SettingChange("estimator", estimator, other_estimator))
     else:
-        entry = ESTIMATORS[estimator]
-        options, others = (entry.complete(dict(each.options)) for each in (tuning, other))
+        options, others = (ESTIMATORS[estimator].complete(dict(each.options)) for each in (tuning, other))
         found += [
             SettingChange(f"options.{name}", was, others[name]) for name, was in options.items() if others[name] != was
         ]
-    found += _entries("Q", [noise.name for noise in model.noises], tuning.q, other.q)
-    found += _of_readings(tuning, other)
-    found += _entries("p", [parameter.name for parameter in model.parameters], tuning.p, other.p)
+    found += entries("Q", [noise.name for noise in model.noises], tuning.q, other.q)
+    if tuning.r is not other.r:
+        shared = {item.key for item in tuning.items()} - {f"R.{name}" for name in model.row_names}
+        for sensor, start in zip(model.sensors, model.row_start, strict=True):
+            own, key = slice(start, start + len(sensor.rows)), f"R.{sensor.name}"
+            together = entry(key) if key in shared else []
+            found += together or entries("R", model.row_names[own], tuning.r[own], other.r[own])
+    found += entries("p", [parameter.name for parameter in model.parameters], tuning.p, other.p)
     used = np.flatnonzero(tuning.used != other.used)
     found += [SettingChange(f"use.{model.sensor_names[k]}", bool(tuning.used[k]), bool(other.used[k])) for k in used]
-    gates = [(key, tuning.get(key), other.get(key)) for key in GATE_KEYS]
-    return (*found, *(SettingChange(*gate) for gate in gates if gate[1] != gate[2]))
+    return (*found, *(change for key in GATE_KEYS for change in entry(key)))
 
 
 def in_words(changes: Sequence[SettingChange], most: int = 3) -> str:
     """Return the first changes in one line: Q.winding 0.01 → 0.1, ekf → ukf, yoke held out."""
-    said = [_words(*change) for change in changes[:most]]
-    return ", ".join(said) + (f" and {len(changes) - most} more" if len(changes) > most else "")
 
+    def words(change: SettingChange) -> str:
+        key, none = change.key, "never" if change.key == "gate.reopen" else "off"
+        if key.startswith("use."):
+            return f"{key[4:]} {'used' if change.after else 'held out'}"
+        before, after = (
+            none if value is None else f"{value:.6g}" if isinstance(value, float) else str(value)
+            for value in (change.before, change.after)
+        )
+        return f"{'' if key == 'estimator' else key.removeprefix('options.') + ' '}{before} → {after}"
 
-def _words(key: str, before: float | bool | str | None, after: float | bool | str | None) -> str:
-    if key == "estimator":
-        return f"{before} → {after}"
-    if key.startswith("use."):
-        return f"{key[4:]} {'used' if after else 'held out'}"
-    none = "never" if key == "gate.reopen" else "off"
-    first, second = (none if value is None else f"{value:.6g}" if isinstance(value, float) else str(value)
-                     for value in (before, after))  # fmt: skip
-    return f"{key.removeprefix('options.')} {first} → {second}"
+    more = f" and {len(changes) - most} more" if len(changes) > most else ""
+    return ", ".join(map(words, changes[:most])) + more
 
-
-def _entries(group: str, names: Sequence[str], before: np.ndarray, after: np.ndarray) -> list[SettingChange]:
-    # Most edits leave the group as it is, which is then the same array.
-    rows: list[int] = [] if before is after else np.flatnonzero(before != after).tolist()
-    return [SettingChange(f"{group}.{names[k]}", float(before[k]), float(after[k])) for k in rows]
-
-
-def _of_readings(tuning: Tuning, other: Tuning) -> list[SettingChange]:
-    if tuning.r is other.r:
-        return []
-    model = tuning.model
-    found: list[SettingChange] = []
-    shared = {item.key for item in tuning.items()} - {f"R.{name}" for name in model.row_names}
-    for sensor, start in zip(model.sensors, model.row_start, strict=True):
-        own, key = slice(start, start + len(sensor.rows)), f"R.{sensor.name}"
-        if key in shared and tuning.get(key) != other.get(key):
-            found.append(SettingChange(key, tuning.get(key), other.get(key)))
-        else:
-            found += _entries("R", model.row_names[own], tuning.r[own], other.r[own])
-    return found
-
-
-if TYPE_CHECKING:
-    from ..twin.twin import Twin
 
 RESTART_SECTIONS = ("name", "source", "faults", "time", "maintenance", "history", "view")
 """Sections of the YAML that only a restart applies."""
@@ -108,13 +95,9 @@ RESTART_SECTIONS = ("name", "source", "faults", "time", "maintenance", "history"
 def obstacle(before: Twin, after: Twin) -> str | None:
     """Return why a running twin cannot go on with the one that was saved, but must be restarted; None if it can."""
     old, new = shape(before.model), shape(after.model)
-    for what in old:
-        if old[what] != new[what]:
-            return f"its {what} changed"
-    for section in RESTART_SECTIONS:
-        if getattr(before.config, section) != getattr(after.config, section):
-            return f"its `{section}` changed"
-    return None
+    changed = [f"its {what} changed" for what in old if old[what] != new[what]]
+    sections = [name for name in RESTART_SECTIONS if getattr(before.config, name) != getattr(after.config, name)]
+    return next(iter([*changed, *(f"its `{name}` changed" for name in sections)]), None)
 
 
 def shape(model: StateSpaceModel) -> Mapping[str, Any]:
@@ -144,20 +127,12 @@ def merged(before: Twin, after: Twin, estimator: str, tuning: Tuning) -> tuple[s
     else:
         chosen, options = estimator, dict(tuning.options)
         given, was = after.options_of(chosen), before.options_of(chosen)
-        for name in given.keys() | was.keys():
-            if given.get(name) != was.get(name):
-                options.pop(name, None)
-                options |= {name: given[name]} if name in given else {}
-    found = replace(
-        new,
-        q=taken("q"),
-        r=taken("r"),
-        p=taken("p"),
-        used=taken("used"),
-        gate=(new if new.gate != old.gate else tuning).gate,
-        gate_kind=(new if new.gate_kind != old.gate_kind else tuning).gate_kind,
-        reopen=(new if new.reopen != old.reopen else tuning).reopen,
-        seed=tuning.seed,
-    ).with_options(options)
+        changed = {name for name in given.keys() | was.keys() if given.get(name) != was.get(name)}
+        options = {name: value for name, value in options.items() if name not in changed}
+        options |= {name: value for name, value in given.items() if name in changed}
+    fields: dict[str, Any] = {name: taken(name) for name in ("q", "r", "p", "used")}
+    for name in ("gate", "gate_kind", "reopen"):
+        fields[name] = getattr(new if getattr(new, name) != getattr(old, name) else tuning, name)
+    found = replace(new, **fields, seed=tuning.seed).with_options(options)
     same = not difference(after.estimator, new, chosen, found)
     return chosen, replace(found, name=new.name) if same else found

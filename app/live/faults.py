@@ -129,23 +129,19 @@ def carry_out(command: commands.InjectFault | commands.ClearFault, source: Sourc
     return f"fault {number} begins: {fault_text(fault, model)}"
 
 
-def unit_of(fault: Fault, model: StateSpaceModel) -> str:
-    """Return the unit of the values that a fault changes; empty if they have several."""
-    if fault.input is not None:
-        return model.inputs[model.input_names.index(fault.input)].unit
-    if fault.sensor is None:
-        return ""
-    rows = model.sensors[model.sensor_names.index(fault.sensor)].rows
-    units = {row.unit for row in rows if fault.row in (None, row.name)}
-    return units.pop() if len(units) == 1 else ""
-
-
 def fault_text(fault: Fault, model: StateSpaceModel) -> str:
     """Describe a fault in a few words: bias of winding, size 2 °C."""
-    own = unit_of(fault, model)
+    units: set[str] = set()
+    if fault.input is not None:
+        units = {item.unit for item in model.inputs if item.name == fault.input}
+    elif fault.sensor is not None:
+        rows = model.sensors[model.sensor_names.index(fault.sensor)].rows
+        units = {row.unit for row in rows if fault.row in (None, row.name)}
+    # Values of several units have none in common.
+    own = (units.pop() if len(units) == 1 else "") or "units"
     kind = find_kind(fault.kind)
-    units = {item.name: item.unit.replace("row", own or "units") for item in kind.parameters}
-    parts = [f"{name} {value:g} {units[name]}".removesuffix(" 1") for name, value in numbers(fault).items()]
+    unit_of = {item.name: item.unit.replace("row", own) for item in kind.parameters}
+    parts = [f"{name} {value:g} {unit_of[name]}".removesuffix(" 1") for name, value in numbers(fault).items()]
     with_other = f" and {fault.other}" if fault.other is not None else ""
     return ", ".join([f"{kind.name} of {fault.target}{with_other}", *parts])
 

@@ -101,10 +101,10 @@ class Revisions:
             return
         changes = difference(running.estimator, running.tuning, estimator, tuning)
         why, self.why = self.why, ""
-        dragged = (
-            bool(earlier) and not same and not why and now - running.began < DRAG_S and _same_entry(running, changes)
-        )
-        if dragged:
+        # Both were edits of the same single entry, and the one between is not marked.
+        keys, before_keys = [change.key for change in changes], [change.key for change in running.changes]
+        same_entry = len(keys) == 1 and keys == before_keys and not running.marked
+        if earlier and not same and not why and now - running.began < DRAG_S and same_entry:
             before = earlier[-1]
             changes = difference(before.estimator, before.tuning, estimator, tuning)
         else:
@@ -113,7 +113,9 @@ class Revisions:
         if same:
             begun = replace(begun, loaded=same[0].number, name=same[-1].name, note=same[-1].note)
             earlier = [run for run in earlier if run.pinned or all(run.number != other.number for other in same)]
-        self._become(_recent([*earlier, begun]))
+        surplus = max(0, len(earlier) + 1 - MAX_REVISIONS)
+        forgotten = [run.number for run in earlier[:-1] if not run.marked][:surplus]
+        self._become([*(run for run in earlier if run.number not in forgotten), begun])
 
     def restarted(self, number: int, *, keep: bool = False) -> None:
         """Continue the running revision under another number: folded again, or over a log that has begun again.
@@ -164,11 +166,7 @@ class Revisions:
         self._change(number, place=self.free_place(number))
 
     def unpin(self, number: int) -> None:
-        """Unpin a revision, and drop its track.
-
-        Raises:
-            ConfigError: If the revision is not known.
-        """
+        """Unpin a revision, and drop its track; raises as `find`."""
         self._change(number, place=None)
         self._become([*map(_without_track, self.runs[:-2]), *self.runs[-2:]])
 
@@ -196,21 +194,9 @@ class Revisions:
         # At once, so that a reader in another thread never sees half of it.
         self.runs = tuple(runs)
         self.version += 1
-        for told in tuple(self.watchers):
-            told()
-
-
-def _same_entry(running: Revision, changes: tuple[SettingChange, ...]) -> bool:
-    """Whether both were edits of the same single entry, and the one between is not marked."""
-    keys = [change.key for change in changes]
-    return len(keys) == 1 and keys == [change.key for change in running.changes] and not running.marked
+        for notify in tuple(self.watchers):
+            notify()
 
 
 def _without_track(run: Revision) -> Revision:
     return run if run.pinned or run.track is None else replace(run, track=None)
-
-
-def _recent(runs: list[Revision]) -> list[Revision]:
-    surplus = len(runs) - MAX_REVISIONS
-    forgotten = [run.number for run in runs[:-2] if not run.marked][: max(0, surplus)]
-    return [run for run in runs if run.number not in forgotten]

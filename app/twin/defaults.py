@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from config.schema import TwinSection
-from config.source_schema import SimulatorSection
+from config.source_schema import AssetSection, SimulatorSection
 from estimators.diagnostics.time_constants import MOST, jacobian, time_constants
 from estimators.errors import EstimatorError, ModelError
 from estimators.estimator import Estimator
@@ -17,10 +17,10 @@ from estimators.model.state_space import StateSpaceModel
 from estimators.snapshots import Snapshots
 from estimators.tuning import Tuning
 
-LEAST = 3.0
+MIN_DEGRADED_S = 3.0
 """Seconds: below this a reading that is a little late would be a dropout."""
 
-PERIODS = 3.0
+MISSED_PERIODS = 3.0
 """Periods of the slowest sensor that must be missed, where they are known."""
 
 
@@ -37,8 +37,8 @@ def degraded_after(config: TwinSection, model: StateSpaceModel) -> DegradedAfter
     if section.degraded_after is not None:
         return DegradedAfter(section.degraded_after, "time.degraded_after")
     slowest = _slowest(model)
-    period = _slowest_sensor(config)
-    least = LEAST if period is None else max(LEAST, PERIODS * period)
+    period = sensor_period(config)
+    least = MIN_DEGRADED_S if period is None else max(MIN_DEGRADED_S, MISSED_PERIODS * period)
     if slowest is None:
         reason = "the model has no time constant (nothing in it decays), so the least that makes sense"
         seconds = least
@@ -46,7 +46,9 @@ def degraded_after(config: TwinSection, model: StateSpaceModel) -> DegradedAfter
         reason = f"the slowest time constant of the model, {slowest:.4g} s"
         seconds = max(slowest, least)
         if seconds > slowest:
-            reason += f", is below {least:g} s" + ("" if least == LEAST else ", three periods of the slowest sensor")
+            reason += f", is below {least:g} s" + (
+                "" if least == MIN_DEGRADED_S else ", three periods of the slowest sensor"
+            )
     if seconds > section.stale_after:
         seconds, reason = section.stale_after, f"{reason}, and no later than time.stale_after"
     return DegradedAfter(float(seconds), reason)
@@ -65,13 +67,14 @@ def _slowest(model: StateSpaceModel) -> float | None:
     return float(constants[0]) if constants.size else None
 
 
-def _slowest_sensor(config: TwinSection) -> float | None:
-    """Seconds between two readings of the slowest sensor, where the source simulates it."""
-    asset = getattr(config.source, "asset", None) or config.source
-    step, sensors = getattr(asset, "step", None), getattr(asset, "sensors", {})
-    if step is None:
+def sensor_period(config: TwinSection, name: str | None = None) -> float | None:
+    """Return the seconds between two measurements of a simulated sensor, or of the slowest; None for other sources."""
+    source = config.source
+    asset = source if isinstance(source, AssetSection) else getattr(source, "asset", None)
+    if asset is None:
         return None
-    return float(step * max([getattr(item, "every", 1) for item in sensors.values()], default=1))
+    plans = asset.sensors.values() if name is None else [asset.sensors[name]] if name in asset.sensors else []
+    return float(asset.step * max((plan.every for plan in plans), default=1))
 
 
 def bounds_of(config: TwinSection, model: StateSpaceModel) -> dict[str, tuple[float, float]]:

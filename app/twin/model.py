@@ -16,7 +16,6 @@ import numpy as np
 from config.fields import bounds
 from config.loader import Loaded, shown_path
 from config.schema import SensorSection, TwinSection
-from config.source_schema import AssetSection
 from config.yaml_files import Key, dotted
 from estimators.errors import ConfigError, ModelError, NisusError, nearest
 from estimators.model.assemble import AppendError, assemble
@@ -30,6 +29,7 @@ from estimators.models import MODELS
 from estimators.plausibility import DAY, surprise
 
 from .checks import check_named, check_names, one_each
+from .defaults import sensor_period
 from .learned import load_learned
 
 
@@ -325,21 +325,10 @@ def _of_row(values: tuple[Any, ...], k: int, default: Any) -> Any:
 
 def _too_long(limits: Limits, sensor: Sensor, config: TwinSection) -> str | None:
     """Return a window of duplicates that would make every measurement a copy; None if it does not."""
-    within, stale = limits.duplicates, config.time.stale_after
+    within, stale, period = limits.duplicates, config.time.stale_after, sensor_period(config, sensor.name)
     what = f"duplicates.within is {within:g} s"
-    period = _period(sensor, config)
     if period is not None and within >= period:
         return f"{what}; it must be below the sensor's period ({period:g} s), or its next reading counts as a copy"
     if within >= stale:
         return f"{what}; it must be below time.stale_after ({stale:g} s), as a sensor that stands still would be silent"
     return None
-
-
-def _period(sensor: Sensor, config: TwinSection) -> float | None:
-    """Return the seconds between two measurements of a simulated sensor, None for other sources."""
-    source = config.source
-    asset = source if isinstance(source, AssetSection) else getattr(source, "asset", None)
-    if asset is None:
-        return None
-    plan = asset.sensors.get(sensor.name)
-    return float(asset.step * (1 if plan is None else plan.every))

@@ -94,7 +94,11 @@ class Plan:
         return FaultySource(source, layer)
 
     def player(self, report: Report, *, interface: str | None = None, channel: str | int | None = None) -> Player:
-        """Return the twin's asset, ready to play; see `Twin.player`."""
+        """Return the asset of a twin on a CAN bus, ready to play there, or on another `interface` and `channel`.
+
+        Raises:
+            SourceError: If the source is not a bus, it has no `asset`, or the bus cannot be opened.
+        """
         return make_player(self.loaded, self.model, report, interface=interface, channel=channel)[1]
 
 
@@ -129,9 +133,10 @@ def plan_source(loaded: Loaded, model: StateSpaceModel, log_files: Sequence[Path
 def _scheduled(loaded: Loaded, model: StateSpaceModel) -> tuple[Fault, ...]:
     """Return the faults of the YAML that act on the source's events: those of a simulator, then those of the twin."""
     section = loaded.config.source
+    simulated = isinstance(section, AssetSection) or (isinstance(section, CanSection) and section.asset is not None)
     found = read_faults(loaded, loaded.config.faults, ("faults",), model)
     for k, fault in enumerate(found):
-        if fault.parameter is not None and not isinstance(section, AssetSection) and not _has_asset(section):
+        if fault.parameter is not None and not simulated:
             raise loaded.error(
                 ("faults", k, "kind"),
                 f"is {fault.kind}; it needs a simulated asset, and the source is a {section.type}",
@@ -139,10 +144,6 @@ def _scheduled(loaded: Loaded, model: StateSpaceModel) -> tuple[Fault, ...]:
     if isinstance(section, AssetSection):
         found = [*read_faults(loaded, section.faults, (*KEY, "faults"), model), *found]
     return tuple(found)
-
-
-def _has_asset(section: object) -> bool:
-    return isinstance(section, CanSection) and section.asset is not None
 
 
 def missing(loaded: Loaded) -> str | None:

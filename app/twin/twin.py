@@ -34,7 +34,6 @@ from .model import configure, find_model, model_files
 from .source import Plan, plan_source
 
 if TYPE_CHECKING:
-    from sources.can.player import Player
     from sources.faults.layer import Faults
     from sources.source import Report, Source
 
@@ -181,14 +180,6 @@ class Twin:
             SourceError: If it cannot be opened, with the remedy.
         """
         return self.plan.open(report, live=live, speed=speed, faults=faults)
-
-    def player(self, report: Report, *, interface: str | None = None, channel: str | int | None = None) -> Player:
-        """Return the asset of a twin on a CAN bus, ready to play there, or on another `interface` and `channel`.
-
-        Raises:
-            SourceError: If the source is not a bus, it has no `asset`, or the bus cannot be opened.
-        """
-        return self.plan.player(report, interface=interface, channel=channel)
 
 
 def load_twin(

@@ -14,7 +14,7 @@ from sources.pieces import FRAMES, VALUES
 
 from ..channels import channels, read_faults
 from .asset import check_asset, make_asset
-from .kind import Kind, Opening, about, blamed, closed, failure, find_databases, find_recording
+from .kind import Kind, Opening, blamed, closed, failure, find_databases, find_recording
 
 if TYPE_CHECKING:
     from sources.can.decoder import Decoder
@@ -152,7 +152,7 @@ def open_can_log(opening: Opening) -> Source:
         if opening.log_files is not None:
             raise
         where = "recording" if isinstance(opening.section, CanSection) else "files"
-        raise about(opening.loaded, (*opening.key, where), str(error)) from None
+        raise failure(opening.loaded, (*opening.key, where), str(error), ": ") from None
 
 
 CAN_LOG = Kind(open_can_log, kernels=(FRAMES, VALUES), files=closed(open_can_log))

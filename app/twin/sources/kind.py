@@ -14,7 +14,6 @@ from config.source_schema import CanLogSection, CanSection, RecordingSection
 from config.yaml_files import Key, dotted
 from estimators.errors import SourceError
 from estimators.model.state_space import StateSpaceModel
-from sources.pieces import VALUES
 
 from ..channels import channels
 
@@ -77,36 +76,19 @@ def blamed(opening: Opening, build: Callable[[list[Channel]], T]) -> T:
         build([])
     except SourceError as error:
         if str(error) == reason:  # No channel's fault: a file, or the column that holds the time.
-            raise about(loaded, key, reason) from None
+            raise failure(loaded, key, reason, ": ") from None
     for place, channel in named:
         try:
             build([channel])
         except SourceError as error:
-            raise about(loaded, place, str(error).removeprefix(f"{channel.name}: ")) from None
-    raise about(loaded, key, reason)
-
-
-def recording(make: Callable[[Opening, list[Path], list[Channel]], Source]) -> Kind:
-    """Return a type whose sections are recordings: `make(opening, files, channels)` gives the source.
-
-    Its section has `folder`, `files` and `get` (config/source_schema.py, RecordingSection) beside maps of channels.
-    """
-
-    def open_recording(opening: Opening) -> Source:
-        files = find_recording(opening.loaded, opening.section, opening.key, opening.log_files)
-        return blamed(opening, lambda channels: make(opening, files, channels))
-
-    return Kind(open_recording, kernels=(VALUES,), files=closed(open_recording))
+            text = str(error).removeprefix(f"{channel.name}: ")
+            raise failure(loaded, place, text, ": ") from None
+    raise failure(loaded, key, reason, ": ")
 
 
 def closed(open_: Callable[[Opening], Source]) -> Callable[[Opening], None]:
     """Opens a recording, and closes it again."""
     return lambda opening: open_(opening).close()
-
-
-def about(loaded: Loaded, key: Key, text: str) -> SourceError:
-    """Return an error of a source with its place in the YAML."""
-    return SourceError(f"{loaded.places.at(key)}: {dotted(key)}: {text}")
 
 
 DATA = "NISUS_DATA"
@@ -171,9 +153,9 @@ def find_databases(
     return found
 
 
-def failure(loaded: Loaded, key: Key, text: str) -> SourceError:
-    """Return an error of the source about what stands at `key`."""
-    return SourceError(f"{loaded.places.at(key)}: {dotted(key)} {text}")
+def failure(loaded: Loaded, key: Key, text: str, joint: str = " ") -> SourceError:
+    """Return an error of the source about the value at `key`, after which `joint` stands."""
+    return SourceError(f"{loaded.places.at(key)}: {dotted(key)}{joint}{text}")
 
 
 def _beside(loaded: Loaded, path: Path) -> Path:

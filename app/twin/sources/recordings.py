@@ -11,9 +11,10 @@ from config.source_schema import CanLogSection, MergedSection, TableSection
 from config.yaml_files import Key
 from estimators.errors import SourceError
 from sources.formats import TABLES, suffix_of
+from sources.pieces import VALUES
 
 from .can import CAN_LOG
-from .kind import Kind, Opening, closed, recording
+from .kind import Kind, Opening, blamed, closed, find_recording
 
 if TYPE_CHECKING:
     from sources.source import Channel, Source
@@ -62,23 +63,28 @@ def _sections(section: MergedSection, key: Key) -> dict[Key, Any]:
     return {(*key, "parts", k): part for k, part in enumerate(section.parts)}
 
 
-def _make(opening: Opening, files: list[Path], channels: list[Channel]) -> Source:
+def _open_table(opening: Opening) -> Source:
     from sources.tables.table import Table
 
     section: TableSection = opening.section
-    return Table(
-        files,
-        time_column=section.time.column,
-        time_unit=section.time.unit,
-        time_shift=section.time.shift,
-        channels=channels,
-        width=opening.model.width,
-        report=opening.report,
-        horizon=opening.loaded.config.time.horizon,
-    )
+    files = find_recording(opening.loaded, section, opening.key, opening.log_files)
+
+    def table(channels: list[Channel]) -> Table:
+        return Table(
+            files,
+            time_column=section.time.column,
+            time_unit=section.time.unit,
+            time_shift=section.time.shift,
+            channels=channels,
+            width=opening.model.width,
+            report=opening.report,
+            horizon=opening.loaded.config.time.horizon,
+        )
+
+    return blamed(opening, table)
 
 
-TABLE = recording(_make)
+TABLE = Kind(_open_table, kernels=(VALUES,), files=closed(_open_table))
 
 PARTS: dict[type, Kind] = {CanLogSection: CAN_LOG, TableSection: TABLE}
 """Types that may be merged: recordings whose clocks agree."""

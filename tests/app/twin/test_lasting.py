@@ -1,18 +1,17 @@
 """Errors that last, in a twin's YAML: what is appended, what is refused, and a simulation whose time is known."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 from app.twin.log_reader import read_log
-from app.twin.twin import Twin, restore_twin
 from config.schema import json_schema
 from estimators.diagnostics.score import score
-from estimators.errors import ConfigError
 from estimators.fold import Fold, fold
 from estimators.forecast import forecast
 from estimators.log import READING, Log, truth_of
+from tests.app.twin.written import refusal, twin_of
+
+pytestmark = pytest.mark.usefixtures("inside")
 
 LASTING = """\
 model: motor_winding
@@ -24,17 +23,6 @@ sensors:
 estimator: kf
 source: {type: simulator, seed: 1, step: 1.0, duration: 4000}
 """
-
-
-def twin_of(text: str, **overrides: str) -> Twin:
-    return restore_twin(text, Path("motor.yaml"), overrides)
-
-
-def refused(text: str) -> str:
-    with pytest.raises(ConfigError) as caught:
-        twin_of(text)
-    assert "\n" not in str(caught.value)
-    return str(caught.value)
 
 
 def test_states_parameters_and_noises_are_appended() -> None:
@@ -64,8 +52,8 @@ def test_what_is_appended_may_be_named_wherever_a_state_or_a_parameter_may() -> 
     assert twin.model.state_names[-2:] == ("winding_error", "winding_error_time")
     error = twin.model.states[3]
     assert (error.mean, error.std, error.fitted) == (1.0, 3.0, (-9.0, 9.0))
-    assert twin_of(LASTING, **{"p.winding_error_time": "60"}).tuning.get("p.winding_error_time") == 60.0
-    assert twin_of(LASTING, **{"noise.temperature.over": "2 min"}).model.parameters[0].value == 120.0
+    assert twin_of(LASTING, overrides={"p.winding_error_time": "60"}).tuning.get("p.winding_error_time") == 60.0
+    assert twin_of(LASTING, overrides={"noise.temperature.over": "2 min"}).model.parameters[0].value == 120.0
 
 
 @pytest.mark.parametrize(
@@ -110,12 +98,12 @@ def test_a_time_may_have_a_unit(given: str, seconds: float) -> None:
     ],
 )
 def test_what_cannot_last_is_one_line_with_its_place(old: str, new: str, words: str) -> None:
-    assert refused(LASTING.replace(old, new)) == words
+    assert refusal(LASTING.replace(old, new)) == words
 
 
 def test_a_field_has_no_lasting_error() -> None:
     field = "model: thermal_field\nnoise: {temperature: {std: 1, over: 9}}\nsource: {type: simulator}\n"
-    assert refused(field) == (
+    assert refusal(field) == (
         "motor.yaml:2: noise.temperature.over: model thermal_field is a field, whose noise cannot have a "
         "correlation time"
     )

@@ -1,11 +1,16 @@
 """A correction's file beside a twin: what is wrong with it is one line with its place."""
 
+from pathlib import Path
+
 import pytest
 
 from app.cli.open_twin import opened_twin
 from app.twin.twin import load_twin
 from estimators.errors import ConfigError
 from estimators.models import MODELS
+from tests.app.twin.written import refusal, twin_of
+
+pytestmark = pytest.mark.usefixtures("inside")
 
 RIGHT = """\
 learned: {twin: motor_winding, model: motor_winding, saved: 2026-11-22T10:30:00Z}
@@ -25,34 +30,30 @@ source: {type: simulator, seed: 1, step: 1.0, duration: 60}
 """
 
 
-def twin_with(folder, text):
-    (folder / "correction.yaml").write_text(text)
-    (folder / "motor.yaml").write_text(TWIN)
-    return load_twin(folder / "motor.yaml")
+def corrected(text, **options):
+    Path("correction.yaml").write_text(text)
+    return twin_of(TWIN, **options)
 
 
-def test_what_it_says_is_in_the_model(tmp_path):
-    model = twin_with(tmp_path, RIGHT).model
+def test_what_it_says_is_in_the_model():
+    model = corrected(RIGHT).model
     assert [(item.name, item.unit, item.variance) for item in model.noises][-1] == (
         "temperature_learned",
         "°C²/s",
         0.25,
     )
     # The same content is the same object, and what was compiled of it.
-    assert twin_with(tmp_path, RIGHT).model.f is model.f
-    assert twin_with(tmp_path, RIGHT.replace("0.2", "0.3")).model.f is not model.f
+    assert corrected(RIGHT).model.f is model.f
+    assert corrected(RIGHT.replace("0.2", "0.3")).model.f is not model.f
 
 
-def test_its_noise_is_tuned_like_any_other(tmp_path):
-    twin = twin_with(tmp_path, RIGHT)
-    assert "Q.temperature_learned" in twin.tuning.keys()
-    changed = load_twin(tmp_path / "motor.yaml", overrides={"Q.temperature_learned": "0.5"})
-    assert changed.tuning.q[-1] == 0.5
+def test_its_noise_is_tuned_like_any_other():
+    assert "Q.temperature_learned" in corrected(RIGHT).tuning.keys()
+    assert corrected(RIGHT, overrides={"Q.temperature_learned": "0.5"}).tuning.q[-1] == 0.5
 
 
-def test_a_twin_without_is_what_it_was(tmp_path):
-    twin_with(tmp_path, RIGHT)
-    bare = load_twin(tmp_path / "motor.yaml", overrides={"learned": "null"})
+def test_a_twin_without_is_what_it_was():
+    bare = corrected(RIGHT, overrides={"learned": "null"})
     alone = load_twin("motor_winding").model
     assert bare.model.f is alone.f and bare.model.Q is alone.Q and bare.model.noises == MODELS["motor_winding"].noises
 
@@ -72,19 +73,17 @@ def test_a_twin_without_is_what_it_was(tmp_path):
         ("ratio: 1", "ratio: 1\nmore: 2", "more is not known"),
     ],
 )
-def test_what_is_wrong_has_its_line(tmp_path, before, after, said):
+def test_what_is_wrong_has_its_line(before, after, said):
     assert before in RIGHT
     with pytest.raises(ConfigError) as caught:
-        twin_with(tmp_path, RIGHT.replace(before, after))
+        corrected(RIGHT.replace(before, after))
     assert said in str(caught.value) and "\n" not in str(caught.value)
 
 
-def test_a_file_that_is_not_there(tmp_path):
-    (tmp_path / "motor.yaml").write_text(TWIN)
-    with pytest.raises(ConfigError, match="motor.yaml:2: learned is 'correction.yaml'; there is no file"):
-        load_twin(tmp_path / "motor.yaml")
+def test_a_file_that_is_not_there():
+    assert refusal(TWIN).startswith("motor.yaml:2: learned is 'correction.yaml'; there is no file")
 
 
-def test_a_page_looks_at_it_too(tmp_path):
-    twin_with(tmp_path, RIGHT)
-    assert tmp_path / "correction.yaml" in opened_twin(str(tmp_path / "motor.yaml")).files
+def test_a_page_looks_at_it_too():
+    corrected(RIGHT)
+    assert Path("correction.yaml").absolute() in opened_twin("motor.yaml").files

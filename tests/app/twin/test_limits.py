@@ -11,13 +11,15 @@ from app.cli.arguments import Fold as Arguments
 from app.cli.fold import fold_twin
 from app.live.alerts import rejections
 from app.live.counts import RowCounts
-from app.twin.twin import load_twin
 from app.views.recording.format import base_from_json, base_to_json
 from estimators.errors import ConfigError
 from estimators.fold import Fold
 from estimators.log import Log
 from estimators.model.sensor import Limits, Stuck
 from estimators.tuning import Tuning
+from tests.app.twin.written import refusal, twin_of
+
+pytestmark = pytest.mark.usefixtures("inside")
 
 TWIN = """\
 model: motor_winding
@@ -36,10 +38,8 @@ source:
 """
 
 
-def write(folder: Path, limits: str, more: str = "") -> str:
-    path = folder / "twin.yaml"
-    path.write_text(TWIN.format(limits=limits, more=more))
-    return str(path)
+def limited(limits: str, more: str = "") -> str:
+    return TWIN.format(limits=limits, more=more)
 
 
 @pytest.mark.parametrize(
@@ -55,26 +55,26 @@ def write(folder: Path, limits: str, more: str = "") -> str:
         ("use: true", None),
     ],
 )
-def test_limits_reach_the_sensor(tmp_path, limits, expected) -> None:
-    assert load_twin(write(tmp_path, limits)).model.sensors[0].limits == expected
+def test_limits_reach_the_sensor(limits, expected) -> None:
+    assert twin_of(limited(limits)).model.sensors[0].limits == expected
 
 
-def test_a_range_of_validity_takes_the_place_of_the_models(tmp_path) -> None:
-    model = load_twin(write(tmp_path, "use: true", "valid: {temperature: {min: 0, max: 150}}")).model
+def test_a_range_of_validity_takes_the_place_of_the_models() -> None:
+    model = twin_of(limited("use: true", "valid: {temperature: {min: 0, max: 150}}")).model
     assert [state.fitted for state in model.states if state.name == "temperature"] == [(0.0, 150.0)]
 
 
 @pytest.mark.parametrize(
     ("limits", "more", "said"),
     [
-        ("range: [5, 1]", "", r"twin.yaml:6: sensors.winding.range is \[5, 1\]; the first must be below the second"),
-        ("range: [5]", "", r"twin.yaml:6: sensors.winding.range is \[5\]; give the least and the greatest value"),
-        ("range: [[1, 2], [1, 2]]", "", "twin.yaml:6: sensors.winding.range has 2 entries; give one, or 1"),
-        ("rate: -1", "", "twin.yaml:6: sensors.winding.rate is -1; it must be positive"),
-        ("stuck: {quantum: 0}", "", "twin.yaml:6: sensors.winding.stuck.quantum is 0; it must be positive"),
-        ("stuck: {readings: 1}", "", "twin.yaml:6: sensors.winding.stuck.readings is 1; it must be 2 or more"),
+        ("range: [5, 1]", "", r"motor.yaml:6: sensors.winding.range is \[5, 1\]; the first must be below the second"),
+        ("range: [5]", "", r"motor.yaml:6: sensors.winding.range is \[5\]; give the least and the greatest value"),
+        ("range: [[1, 2], [1, 2]]", "", "motor.yaml:6: sensors.winding.range has 2 entries; give one, or 1"),
+        ("rate: -1", "", "motor.yaml:6: sensors.winding.rate is -1; it must be positive"),
+        ("stuck: {quantum: 0}", "", "motor.yaml:6: sensors.winding.stuck.quantum is 0; it must be positive"),
+        ("stuck: {readings: 1}", "", "motor.yaml:6: sensors.winding.stuck.readings is 1; it must be 2 or more"),
         ("stuck: {readings: 3, seconds: 1}", "", "sensors.winding.stuck gives both readings and seconds; keep one"),
-        ("stuck: {}", "", "twin.yaml:6: sensors.winding.stuck gives neither readings, seconds nor quantum"),
+        ("stuck: {}", "", "motor.yaml:6: sensors.winding.stuck gives neither readings, seconds nor quantum"),
         ("duplicates: {within: -1}", "", "sensors.winding.duplicates.within is -1; it must be zero or positive"),
         (
             "use: true",
@@ -86,18 +86,18 @@ def test_a_range_of_validity_takes_the_place_of_the_models(tmp_path) -> None:
             "valid: {rate: {min: 1, max: 1}}",
             "valid.rate is a mapping; its min must be below its max",
         ),
-        ("use: true", "valid: {temperature: {}}", "twin.yaml:7: valid.temperature gives neither min nor max; add it"),
+        ("use: true", "valid: {temperature: {}}", "motor.yaml:7: valid.temperature gives neither min nor max; add it"),
         (
             "duplicates: {within: 50}",
             "",
-            "twin.yaml:6: sensors.winding.duplicates.within is 50 s; it must be below time.s",
+            "motor.yaml:6: sensors.winding.duplicates.within is 50 s; it must be below time.s",
         ),
         ("duplicates: {within: 1e30}", "", "sensors.winding.duplicates.within is 1e.30; it must be 1e"),
         ("stuck: {seconds: 1e12}", "", "sensors.winding.stuck.seconds is 1000000000000.0; it must be 1e"),
         (
             "range: [0, 50]\n    stuck: {quantum: 100}",
             "",
-            "twin.yaml:7: sensors.winding.stuck.quantum is 100 °C; it must be below what the sensor can say, 50 °C",
+            "motor.yaml:7: sensors.winding.stuck.quantum is 100 °C; it must be below what the sensor can say, 50 °C",
         ),
         (
             "stuck: {quantum: 100}",
@@ -112,7 +112,7 @@ def test_a_range_of_validity_takes_the_place_of_the_models(tmp_path) -> None:
         ("range: [0, 50]\n    saturation: [50, 90]", "", "no reading keeps both"),
         ("range: [20, 20.1]", "", "sensors.winding.range leaves 0.1 °C, less than the noise of the sensor .0.5 °C"),
         ("saturation: [20, 20.1]", "", "sensors.winding.saturation leaves 0.1 °C"),
-        ("use: true", "gate: 0.05", "twin.yaml:7: gate is 0.05; it must be 0.5 or more"),
+        ("use: true", "gate: 0.05", "motor.yaml:7: gate is 0.05; it must be 0.5 or more"),
         ("use: true", "gate: {probability: 0.99, reopen: 1e12}", "gate.reopen is 1000000000000.0; it must be 1e"),
         ("use: true", "time: {horizon: 1e12}", "time.horizon is 1000000000000.0; it must be 1e"),
         ("use: true", "time: {tick: 1e-9}", "time.tick is 1e-09; it must be 0.01 or more"),
@@ -134,23 +134,21 @@ def test_a_range_of_validity_takes_the_place_of_the_models(tmp_path) -> None:
         (
             "use: true",
             "faults: [{kind: stuk, sensor: winding}]",
-            "twin.yaml:7: faults.0..kind is 'stuk'; did you mean stuck",
+            "motor.yaml:7: faults.0..kind is 'stuk'; did you mean stuck",
         ),
     ],
 )
-def test_what_means_nothing_is_refused_with_its_place(tmp_path, limits, more, said) -> None:
+def test_what_means_nothing_is_refused_with_its_place(limits, more, said) -> None:
     with pytest.raises(ConfigError, match=said):
-        load_twin(write(tmp_path, limits, more))
+        twin_of(limited(limits, more))
 
 
-def test_a_quantum_says_nothing_of_a_sensor_without_noise(tmp_path) -> None:
-    path = write(tmp_path, "stuck: {quantum: 0.1}")
-    Path(path).write_text(Path(path).read_text().replace("std: 0.5", "std: 0"))
-    with pytest.raises(ConfigError, match="gives a quantum alone, which needs a sensor with noise"):
-        load_twin(path)
+def test_a_quantum_says_nothing_of_a_sensor_without_noise() -> None:
+    text = limited("stuck: {quantum: 0.1}").replace("std: 0.5", "std: 0")
+    assert "gives a quantum alone, which needs a sensor with noise" in refusal(text)
 
 
-def log_with_faults(folder: Path) -> None:
+def log_with_faults() -> None:
     """A log of 60 s: 10 of them not valid, three out of range, of which one is written twice, and a jump."""
     rng = np.random.default_rng(1)
     values = 30 + rng.normal(0, 0.5, 60)
@@ -158,12 +156,13 @@ def log_with_faults(folder: Path) -> None:
     values[40] = 60.0
     rows = [f"{t},{y:.6f},{int(not 5 <= t < 15)}" for t, y in enumerate(values)]
     rows.insert(21, rows[20])
-    (folder / "log.csv").write_text("\n".join(["t,T,ok", *rows]) + "\n")
+    Path("log.csv").write_text("\n".join(["t,T,ok", *rows]) + "\n")
 
 
-def test_what_was_refused_is_counted_told_and_kept(tmp_path, capsys) -> None:
-    log_with_faults(tmp_path)
-    path, out = write(tmp_path, "range: [-40, 180]\n    rate: 5"), tmp_path / "out.parquet"
+def test_what_was_refused_is_counted_told_and_kept(capsys) -> None:
+    log_with_faults()
+    path, out = "motor.yaml", Path("out.parquet")
+    twin_of(limited("range: [-40, 180]\n    rate: 5"))
     assert fold_twin(Arguments(path, json=True)) == 0
     told = json.loads(capsys.readouterr().out)
     # The spikes are both out of range and too fast.
@@ -179,8 +178,8 @@ def test_what_was_refused_is_counted_told_and_kept(tmp_path, capsys) -> None:
     assert sorted(spikes["value_0"]) == [-300.0, 500.0, 500.0] and set(spikes["verdict"]) == {"screened"}
 
 
-def test_counts_and_lines_name_sensor_value_and_rule(tmp_path) -> None:
-    twin = load_twin(write(tmp_path, "range: [-40, 180]\n    rate: 5"))
+def test_counts_and_lines_name_sensor_value_and_rule() -> None:
+    twin = twin_of(limited("range: [-40, 180]\n    rate: 5"))
     log = Log.of(twin.model)
     log.add("winding", [0, 1, 1, 2, 3], [30, 30, 30, 500, 60])
     fold = Fold("kf", twin.model, Tuning.of(twin.model), log)
@@ -196,8 +195,8 @@ def test_counts_and_lines_name_sensor_value_and_rule(tmp_path) -> None:
     assert (found["duplicate winding"], found["range winding"], found["rate winding"]) == (1, 1, 2)
 
 
-def test_a_base_keeps_what_the_screen_remembers(tmp_path) -> None:
-    twin = load_twin(write(tmp_path, "rate: 5"))
+def test_a_base_keeps_what_the_screen_remembers() -> None:
+    twin = twin_of(limited("rate: 5"))
     log = Log.of(twin.model)
     log.add("winding", np.arange(100.0), np.full(100, 30.0))
     fold = Fold("kf", twin.model, Tuning.of(twin.model), log)
@@ -208,18 +207,13 @@ def test_a_base_keeps_what_the_screen_remembers(tmp_path) -> None:
     assert again.edge.tobytes() == base.edge.tobytes() and base.edge.any()
 
 
-def test_copies_closer_than_a_simulated_sensors_period(tmp_path) -> None:
+def test_copies_closer_than_a_simulated_sensors_period() -> None:
     """The asset tells its period: 4 steps of half a second."""
     text = """\
 model: motor_winding
 sensors: {winding: {duplicates: {within: %s}}}
 source: {type: simulator, step: 0.5, duration: 10, sensors: {winding: {every: 4}}}
 """
-    path = tmp_path / "twin.yaml"
-    path.write_text(text % 2)
-    with pytest.raises(
-        ConfigError, match=r"twin.yaml:2: .*within is 2 s; it must be below the sensor's period \(2 s\)"
-    ):
-        load_twin(path)
-    path.write_text(text % 1.9)
-    assert load_twin(path).model.sensors[0].limits == Limits(duplicates=1.9)
+    said = refusal(text % 2)
+    assert said.startswith("motor.yaml:2: ") and "within is 2 s; it must be below the sensor's period (2 s)" in said
+    assert twin_of(text % 1.9).model.sensors[0].limits == Limits(duplicates=1.9)

@@ -12,13 +12,14 @@ from app.cli.fold import fold_twin
 from app.live.commands import SetEstimator, SetOption
 from app.live.execute import retuned
 from app.twin.log_reader import read_log
-from app.twin.twin import Twin, load_twin, restore_twin
+from app.twin.twin import restore_twin
 from app.views.recording.format import tuning_from_json
 from app.views.recording.reader import read_recording
 from estimators.errors import ConfigError, EstimatorError
 from estimators.fold import fold
 from estimators.log import READING, TRUTH, Log
 from estimators.models import MODELS
+from tests.app.twin.written import refusal, twin_of
 
 ROVER = """\
 model: pair.py:Pair
@@ -67,22 +68,8 @@ source:
 
 
 @pytest.fixture(autouse=True)
-def _inside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Messages show paths as they look from the working directory."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.delenv("NISUS_DATA", raising=False)
+def _pair(inside: None) -> None:
     Path("pair.py").write_text(PAIR)
-
-
-def twin_of(text: str, **options: object) -> Twin:
-    Path("twin.yaml").write_text(text)
-    return load_twin("twin.yaml", **options)  # type: ignore[arg-type]
-
-
-def message(text: str, **options: object) -> str:
-    with pytest.raises(ConfigError) as caught:
-        twin_of(text, **options)
-    return str(caught.value)
 
 
 def correlated(matrix: str) -> str:
@@ -123,19 +110,19 @@ def test_the_simulated_sensor_is_correlated_too() -> None:
     ],
 )  # fmt: skip
 def test_a_correlation_that_is_none_is_one_line(matrix: str, expected: str) -> None:
-    assert message(correlated(matrix)) == f"twin.yaml:3: sensors.fix.correlation {expected}"
+    assert refusal(correlated(matrix)) == f"motor.yaml:3: sensors.fix.correlation {expected}"
 
 
 def test_a_correlation_must_be_rows_of_numbers() -> None:
-    assert (
-        message(correlated("[1, 0.5]")) == "twin.yaml:3: sensors.fix.correlation[0] is 1; it must be a list\n"
-        "twin.yaml:3: sensors.fix.correlation[1] is 0.5; it must be a list"
-    )
+    with pytest.raises(ConfigError) as caught:
+        twin_of(correlated("[1, 0.5]"))
+    place = "motor.yaml:3: sensors.fix.correlation"
+    assert str(caught.value) == f"{place}[0] is 1; it must be a list\n{place}[1] is 0.5; it must be a list"
 
 
 def test_localisation_needs_rows_that_have_places_of_their_own() -> None:
     text = correlated("[[1, 0.5], [0.5, 1]]").replace("estimator: kf", "estimator: {name: enkf, options: {radius: 1}}")
-    assert message(text).startswith("twin.yaml:6: estimator enkf: radius is 1, but the rows of pair's sensor fix are")
+    assert refusal(text).startswith("motor.yaml:6: estimator enkf: radius is 1, but the rows of pair's sensor fix are")
 
 
 def test_the_identity_correlates_nothing() -> None:
@@ -160,8 +147,8 @@ def test_a_sensor_without_noise_and_a_state_that_is_certain() -> None:
 ])  # fmt: skip
 def test_a_filter_that_cannot_bear_certainty_says_what_can(old: str, new: str, what: str) -> None:
     text = ROVER.replace(old, new).replace("estimator: kf", "estimator: ukf")
-    assert message(text) == (
-        f"twin.yaml:6: estimator ukf does not apply: in pair {what}, and ukf takes no singular covariance; give it a "
+    assert refusal(text) == (
+        f"motor.yaml:6: estimator ukf does not apply: in pair {what}, and ukf takes no singular covariance; give it a "
         "small variance, or use kf, ekf, iekf, sr-kf, sr-ekf, sr-ukf"
     )
 
@@ -180,8 +167,8 @@ def test_a_field_must_be_uncertain() -> None:
     text = (
         f"model: field_era5\nestimator: enkf\nprior:\n  {name}: {{std: 0}}\nsource: {{type: simulator, duration: 1}}\n"
     )
-    assert message(text) == (
-        f"twin.yaml:4: prior.{name}.std is 0; that of a field must be positive, or its members would be alike"
+    assert refusal(text) == (
+        f"motor.yaml:4: prior.{name}.std is 0; that of a field must be positive, or its members would be alike"
     )
 
 
@@ -214,22 +201,22 @@ def test_a_reading_brings_its_own_noise_from_a_table() -> None:
 
 
 @pytest.mark.parametrize(("old", "new", "expected"), [
-    ("{std: a}", "{std: a, variance: a}", "twin.yaml:10: source.sensors.winding.accuracy gives both std and variance; keep one"),  # noqa: E501
-    ("{std: a}", "{scale: 2}", "twin.yaml:10: source.sensors.winding.accuracy gives neither std nor variance; add it"),
-    ("{std: a}", "{std: [a, a]}", "twin.yaml:10: source.sensors.winding.accuracy names 2; give one, or one for each of the 1 values"),  # noqa: E501
-    ("estimator: kf", "estimator: {name: kf, options: {adapt: R}}", "twin.yaml:2: estimator kf: readings bring their own variance, but adapt learns one R of each sensor; set adapt to off or Q"),  # noqa: E501
-    ("  sensors:\n    winding: ", "  sensors: {winding: {columns: w}}\n  truth:\n    temperature: ", "twin.yaml:11: source.truth.temperature.accuracy is for sensors; leave it out"),  # noqa: E501
+    ("{std: a}", "{std: a, variance: a}", "motor.yaml:10: source.sensors.winding.accuracy gives both std and variance; keep one"),  # noqa: E501
+    ("{std: a}", "{scale: 2}", "motor.yaml:10: source.sensors.winding.accuracy gives neither std nor variance; add it"),
+    ("{std: a}", "{std: [a, a]}", "motor.yaml:10: source.sensors.winding.accuracy names 2; give one, or one for each of the 1 values"),  # noqa: E501
+    ("estimator: kf", "estimator: {name: kf, options: {adapt: R}}", "motor.yaml:2: estimator kf: readings bring their own variance, but adapt learns one R of each sensor; set adapt to off or Q"),  # noqa: E501
+    ("  sensors:\n    winding: ", "  sensors: {winding: {columns: w}}\n  truth:\n    temperature: ", "motor.yaml:11: source.truth.temperature.accuracy is for sensors; leave it out"),  # noqa: E501
 ])  # fmt: skip
 def test_an_accuracy_that_cannot_be_used_is_one_line(old: str, new: str, expected: str) -> None:
     assert old in TABLE
-    assert message(TABLE.replace(old, new)) == expected
+    assert refusal(TABLE.replace(old, new)) == expected
 
 
 def test_what_readings_bring_is_recorded_and_folded_again() -> None:
     """A recording has the variances; the fold of them is the one that was recorded, and not that of the tuned R."""
     Path("run.csv").write_text("t,w,a\n1,40,0.5\n2,42,\n3,41,3\n")
-    Path("twin.yaml").write_text(TABLE)
-    assert fold_twin(Arguments("twin.yaml", out=Path("run.rrd"))) == 0
+    Path("motor.yaml").write_text(TABLE)
+    assert fold_twin(Arguments("motor.yaml", out=Path("run.rrd"))) == 0
     recorded = read_recording(Path("run.rrd"))
     twin = restore_twin(recorded.text, recorded.twin_path)
     np.testing.assert_array_equal(recorded.events.value[:, twin.model.width], [0.25, np.nan, 9.0])
@@ -276,6 +263,6 @@ def test_options_that_are_choices_may_be_words(word: str) -> None:
 
 def test_a_word_that_is_no_choice_is_one_line() -> None:
     text = ROVER.replace("estimator: kf", "estimator: {name: kf, options: {adapt: sometimes}}")
-    assert message(text) == "twin.yaml:6: estimator kf: adapt is 'sometimes'; it must be one of off, R, Q"
+    assert refusal(text) == "motor.yaml:6: estimator kf: adapt is 'sometimes'; it must be one of off, R, Q"
     text = ROVER.replace("estimator: kf", "estimator: {name: kf, options: {inflation: R}}")
-    assert message(text) == "twin.yaml:6: estimator kf: inflation is 'R'; it must be a number"
+    assert refusal(text) == "motor.yaml:6: estimator kf: inflation is 'R'; it must be a number"

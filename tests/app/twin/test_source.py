@@ -5,10 +5,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from app.twin.twin import Twin, load_twin
+from app.twin.twin import Twin
 from estimators.errors import ConfigError, NisusError, SourceError
 from estimators.log import INPUT, READING, TRUTH, Events
 from estimators.models import MODELS
+from tests.app.twin.written import refusal, twin_of
 from tests.support import read_all
 
 DBC = """\
@@ -50,20 +51,12 @@ CSV = "t_ms,temp_f,rate\n0,32,60\n500,212,30\n1000,,0\n"
 
 
 @pytest.fixture(autouse=True)
-def _inside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Messages show paths as they look from the working directory."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.delenv("NISUS_DATA", raising=False)
+def _recordings(inside: None) -> None:
     Path("data").mkdir()
     Path("data/thermal.dbc").write_text(DBC)
     Path("data/drive.log").write_text(
         "(1.000000) can0 100#401F0100\n(1.500000) can0 100#FFFF0000\n(2.000000) can0 100#50230100\n"
     )
-
-
-def twin_of(text: str, **options: object) -> Twin:
-    Path("motor.yaml").write_text(text)
-    return load_twin("motor.yaml", **options)  # type: ignore[arg-type]
 
 
 def events(twin: Twin, *, live: bool = False) -> Events:
@@ -285,9 +278,7 @@ source:
 def test_a_simulation_that_would_never_end_is_one_line(step: str, duration: str, expected: str) -> None:
     runs = f"{1e9 / MODELS['motor_drive'].max_step:.3g}"
     text = LENGTHY.replace("STEP", step).replace("DURATION", duration)
-    with pytest.raises(ConfigError) as caught:
-        twin_of(text)
-    assert str(caught.value) == expected.replace("RUNS", runs)
+    assert refusal(text) == expected.replace("RUNS", runs)
 
 
 def test_a_long_simulation_may_be_as_long_as_said() -> None:
@@ -337,7 +328,7 @@ def test_a_virtual_bus_plays_its_own_asset() -> None:
 )
 def test_what_has_no_asset_cannot_play_one(text: str, expected: str) -> None:
     with pytest.raises(SourceError) as caught:
-        twin_of(text).player(lambda key, text: None)
+        twin_of(text).plan.player(lambda key, text: None)
     assert str(caught.value) == expected
 
 

@@ -5,9 +5,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from app.twin.twin import Twin, load_twin, restore_twin
+from app.twin.twin import load_twin, restore_twin
 from estimators.compiled.model import compile_model
 from estimators.errors import ConfigError, ModelError, NisusError
+from tests.app.twin.written import refusal, twin_of
+
+pytestmark = pytest.mark.usefixtures("inside")
 
 MOTOR = """\
 model: motor_winding
@@ -45,24 +48,6 @@ def Pump():
         sensors=(Sensor("level", (Row("level", "m", 0.01),), h=h),), f=f,
     )
 """
-
-
-@pytest.fixture(autouse=True)
-def _inside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Messages show paths as they look from the working directory."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.delenv("NISUS_DATA", raising=False)
-
-
-def twin_of(text: str, **options: object) -> Twin:
-    Path("motor.yaml").write_text(text)
-    return load_twin("motor.yaml", **options)  # type: ignore[arg-type]
-
-
-def message(text: str, kind: type[NisusError] = ConfigError, **options: object) -> str:
-    with pytest.raises(kind) as caught:
-        twin_of(text, **options)
-    return str(caught.value)
 
 
 def test_the_yaml_sets_the_model_and_the_tuning_up() -> None:
@@ -109,11 +94,11 @@ def test_overrides_set_the_tuning_and_the_yaml() -> None:
     ],
 )
 def test_an_override_that_breaks_a_rule_is_one_line(key: str, value: str, expected: str) -> None:
-    assert message(MOTOR, overrides={key: value}) == expected
+    assert refusal(MOTOR, overrides={key: value}) == expected
 
 
 def test_an_unknown_override_names_what_is_near() -> None:
-    text = message(MOTOR, overrides={"Q.temprature": "1"})
+    text = refusal(MOTOR, overrides={"Q.temprature": "1"})
     said = "Q.temprature is not a tuning key of motor_winding; did you mean Q.temperature"
     assert text.startswith(f"--set Q.temprature=1: {said}")
     assert "; or a key of the YAML: name, title, teaches" in text and "\n" not in text
@@ -207,9 +192,8 @@ def test_an_unknown_override_names_what_is_near() -> None:
 )
 def test_what_the_model_lacks_is_one_line_with_what_is_near(old: str, new: str, expected: str) -> None:
     assert old in MOTOR
-    text = message(MOTOR.replace(old, new, 1))
+    text = refusal(MOTOR.replace(old, new, 1))
     assert text.startswith(expected) if expected.endswith(" ") else text == expected
-    assert "\n" not in text
 
 
 def test_a_parameter_out_of_its_range_is_one_line() -> None:
@@ -218,7 +202,7 @@ def test_a_parameter_out_of_its_range_is_one_line() -> None:
         text.replace("f=f,", 'f=f, parameters=(Parameter("area", "m²", 1.0, low=0.5, high=2.0),),')
     )
     yaml = "model: ./pump.py:Pump\nparameters:\n  area: 3\nsource: {type: simulator}\n"
-    assert message(yaml) == "motor.yaml:3: parameters.area is 3 m²; it must lie between 0.5 and 2"
+    assert refusal(yaml) == "motor.yaml:3: parameters.area is 3 m²; it must lie between 0.5 and 2"
 
 
 def test_a_model_from_a_file_beside_the_yaml(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -311,9 +295,8 @@ def test_a_model_file_that_fails_is_one_line_in_the_users_code(
     python: str, reference: str, kind: type[NisusError], expected: str
 ) -> None:
     Path("pump.py").write_text(python)
-    text = message(f"model: {reference}\nsource: {{type: simulator}}\n", kind)
+    text = refusal(f"model: {reference}\nsource: {{type: simulator}}\n", kind)
     assert text.startswith(expected) if expected.endswith(" ") else text == expected
-    assert "\n" not in text
 
 
 def test_a_model_whose_shapes_disagree_is_refused_when_compiled() -> None:
