@@ -11,8 +11,7 @@ from pydantic_core import PydanticCustomError
 
 from estimators.errors import LARGEST
 
-MAX_DURATION_S = 1e9
-"""Seconds that anything may last: 32 years."""
+MAX_DURATION_S = 1e9  # Seconds that anything may last: 32 years
 
 MAX_TIME_S = 9e9
 """Seconds from 1970 until the year 2255: times are int64 nanoseconds, which end soon after."""

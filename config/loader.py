@@ -18,8 +18,7 @@ from .schema import TwinSection
 from .tunings import Version, find_version, keep_options, overlay
 from .yaml_files import Key, ValuePlaces, dotted, parse, read_text, shown_path
 
-TWINS = Path(str(resources.files("config"))) / "twins"
-"""Folder of the twins that ship."""
+TWINS = Path(str(resources.files("config"))) / "twins"  # Folder of the twins that ship
 
 
 @dataclass(frozen=True)

@@ -14,11 +14,8 @@ from estimators.errors import ConfigError, nearest
 from .source_schema import PartSection, SourceSection
 from .yaml_files import Key, ValuePlaces, dotted, parse, shown_path
 
-MAX_PROBLEMS = 5
-"""Problems shown at once."""
-
-MAX_LISTED_WORDS = 8
-"""Choices up to which all are listed; of more, the nearest ones."""
+MAX_PROBLEMS = 5  # Problems shown at once
+MAX_LISTED_WORDS = 8  # Choices up to which all are listed; of more, the nearest ones
 
 
 def shown(value: Any) -> str:

@@ -16,17 +16,14 @@ from .companion_schema import TuningSection, VersionSection
 from .problems import check_section
 from .yaml_files import Key, ValuePlaces, read_text, shown_path
 
-OWN = "own"
-"""The name under which what the twin's file itself says is listed."""
+OWN = "own"  # The name under which what the twin's file itself says is listed
 
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,59}")
 
-SPREADS = ("variance", "std")
-"""Two ways to say the same: one takes the other's place."""
+SPREADS = ("variance", "std")  # Two ways to say the same: one takes the other's place
 
 _CONFIG = Path(str(resources.files("config")))
-SHIPPED = _CONFIG / "tunings"
-"""Folder of the versions that ship, a folder for each twin."""
+SHIPPED = _CONFIG / "tunings"  # Folder of the versions that ship, a folder for each twin
 
 
 @dataclass(frozen=True)

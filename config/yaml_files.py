@@ -15,8 +15,7 @@ import yaml
 from estimators.errors import ConfigError
 
 Key = tuple[str | int, ...]
-MAX_VALUES = 100_000
-"""A twin has a few hundred values; nested aliases could otherwise ask for billions."""
+MAX_VALUES = 100_000  # A twin has a few hundred values; nested aliases could otherwise ask for billions
 
 
 class _Loader(yaml.SafeLoader):

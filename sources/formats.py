@@ -6,8 +6,7 @@ import os
 from pathlib import Path
 from typing import BinaryIO
 
-CAN_LOGS = (".asc", ".blf", ".csv", ".db", ".log", ".mf4", ".trc")
-"""Endings of CAN logs."""
+CAN_LOGS = (".asc", ".blf", ".csv", ".db", ".log", ".mf4", ".trc")  # Endings of CAN logs
 
 TABLES = (".csv", ".parquet", ".pq", ".mat", ".npz")
 """Endings of tables. A table of any other ending is read as CSV."""

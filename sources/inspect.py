@@ -20,8 +20,7 @@ from .source import Channel
 from .tables.rows import TableRows, names_of, rows_of
 from .tables.text import UNREADABLE, csv_header
 
-MAX_FRAME_BYTES = 64
-"""Bytes of the longest frame, of CAN FD."""
+MAX_FRAME_BYTES = 64  # Bytes of the longest frame, of CAN FD
 
 MIN_GAP_S = 1.0
 MIN_GAP_INTERVALS = 20.0

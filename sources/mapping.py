@@ -285,8 +285,7 @@ def _own_factor(channel: Channel, own: Accuracy, k: int, unit: str | None) -> fl
     return own.scale[k] * spread_factor(own.units[k] or unit, channel.model_units[k], where, squared=own.squared)
 
 
-SEMI_MAJOR = 6378137.0
-"""WGS84, m."""
+SEMI_MAJOR = 6378137.0  # WGS84, m
 FLATTENING = 1 / 298.257223563
 ECCENTRICITY2 = FLATTENING * (2 - FLATTENING)
 

@@ -15,8 +15,7 @@ from .source import Source, span_of
 MAX_BATCH_EVENTS = 4096
 """Events returned at once at most, which bounds the work of the reader at full speed."""
 
-MAX_TIME_NS = 2**62
-"""Last position of the playhead, since times are int64."""
+MAX_TIME_NS = 2**62  # Last position of the playhead, since times are int64
 
 
 class Pacer:

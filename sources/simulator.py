@@ -16,8 +16,7 @@ from estimators.numerics.jit import plain
 
 from .faults.kinds import NEVER_NS, Change
 
-BATCH_EVENTS = 32
-"""Events after which `read` returns; a change of the asset affects unread events only."""
+BATCH_EVENTS = 32  # Events after which `read` returns; a change of the asset affects unread events only
 
 
 @dataclass(frozen=True)

@@ -171,8 +171,7 @@ DRAIN_S = 0.1
 MAX_IDLE_WORKERS = 2
 """Idle readers that are kept; each has loaded its libraries, which takes longer than most files."""
 
-EXIT_TIMEOUT_S = 5.0
-"""Seconds between the end of a process's pipe and its own."""
+EXIT_TIMEOUT_S = 5.0  # Seconds between the end of a process's pipe and its own
 
 
 class ReaderError(SourceError):

@@ -21,8 +21,7 @@ from ..source import NEVER, Report, ignore
 from .decoder import Decoder, Expected, shown_id
 from .readers import EXTENDED, BusName
 
-MAX_READ_FRAMES = 4096
-"""Frames of one read; those queued beyond come with the next."""
+MAX_READ_FRAMES = 4096  # Frames of one read; those queued beyond come with the next
 
 IP_MULTICAST_ALL = (socket.IPPROTO_IP, 49)
 IPV6_MULTICAST_ALL = (socket.IPPROTO_IPV6, 29)

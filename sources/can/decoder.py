@@ -254,8 +254,7 @@ def _valued(batch: Events, width: int, kind: int, index: int) -> bool:
 FrameCounts = Mapping[tuple[BusName, int], int]
 """Data frames by bus and id (EXTENDED added)."""
 
-MAX_NAMED_IDS = 3
-"""Ids, or buses, named in place of a missing one."""
+MAX_NAMED_IDS = 3  # Ids, or buses, named in place of a missing one
 
 
 class Expected(NamedTuple):

@@ -137,11 +137,8 @@ def check_log(path: Path) -> None:
     open_reader(path).stop()
 
 
-SPAN_TIMEOUT_S = 5.0
-"""Seconds to wait for the span, which only draws a slider."""
-
-TAIL_BYTES = 4096
-"""Bytes at the end of a text log that hold its last lines."""
+SPAN_TIMEOUT_S = 5.0  # Seconds to wait for the span, which only draws a slider
+TAIL_BYTES = 4096  # Bytes at the end of a text log that hold its last lines
 
 
 def log_span(files: list[Path]) -> tuple[int, int] | None:

@@ -210,8 +210,7 @@ def _wanted(
     return Raw(t, keys[rows], places, length, data, names, len(signal))
 
 
-VLSD = 1
-"""Flag of a channel group whose records are of varying length."""
+VLSD = 1  # Flag of a channel group whose records are of varying length
 
 _HEADER = struct.Struct("<4sIQQ")
 

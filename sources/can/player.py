@@ -19,8 +19,7 @@ from ..units import conversion
 from .bus import open_bus
 from .decoder import BusName, find_messages
 
-INPUT_REPEAT_NS = 1_000_000_000
-"""ns after which an unchanged input is sent again."""
+INPUT_REPEAT_NS = 1_000_000_000  # ns after which an unchanged input is sent again
 
 MAX_DELAY_NS = 1_000_000_000
 """ns of delay (the process was suspended) beyond which time is skipped instead of sending a burst of frames."""

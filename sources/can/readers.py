@@ -18,11 +18,8 @@ from estimators.errors import SourceError
 from ..formats import suffix_of
 from ..units import second_ns
 
-FIRST_CHUNK_FRAMES = 256
-"""Frames of the first chunk, so that it arrives at once."""
-
-MAX_TIME_S = 2.0**62 / 1e9
-"""Distance of a valid time from 1970, s."""
+FIRST_CHUNK_FRAMES = 256  # Frames of the first chunk, so that it arrives at once
+MAX_TIME_S = 2.0**62 / 1e9  # Distance of a valid time from 1970, s
 
 
 def open_reader(path: Path) -> Any:
@@ -155,8 +152,7 @@ def _missing_end(path: Path, reader: Any) -> str:
 EXTENDED = 1 << 31
 """Added to the arbitration id of an extended frame, so that one number identifies it."""
 
-CHUNK_FRAMES = 8192
-"""Frames of a chunk."""
+CHUNK_FRAMES = 8192  # Frames of a chunk
 
 BusName = int | str | None
 

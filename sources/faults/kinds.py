@@ -10,8 +10,7 @@ from typing import Protocol, runtime_checkable
 from estimators.errors import LARGEST, nearest, quoted
 from estimators.model.state_space import StateSpaceModel
 
-MAX_DELAY_S = 1e6
-"""Seconds by which a fault may delay an event, eleven days."""
+MAX_DELAY_S = 1e6  # Seconds by which a fault may delay an event, eleven days
 
 
 @dataclass(frozen=True)
@@ -114,11 +113,8 @@ _LIST = (
          (_size("1", "the factor"),)),
 )  # fmt: skip
 
-KINDS = {kind.name: kind for kind in _LIST}
-"""By name."""
-
-OLD_NAMES = {"outliers": "spike"}
-"""Former names of kinds."""
+KINDS = {kind.name: kind for kind in _LIST}  # By name
+OLD_NAMES = {"outliers": "spike"}  # Former names of kinds
 
 
 def find_kind(name: str) -> FaultKind:
@@ -199,8 +195,7 @@ def numbers(fault: Fault) -> dict[str, float]:
     return {name: float(value if value is not None else defaults[name] or 0.0) for name, value in given.items()}
 
 
-NEVER_NS = 2**62
-"""Time after any event, ns."""
+NEVER_NS = 2**62  # Time after any event, ns
 
 
 @dataclass

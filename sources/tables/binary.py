@@ -31,8 +31,7 @@ from .text import CHUNK_ROWS, Chunk, Problem, parse_numbers
 CHUNK_VALUES = 65_536
 """Values of a chunk of a NumPy archive; a row of a field has thousands."""
 
-MAX_COLUMNS = 1_000_000
-"""Columns of a NumPy archive, each of which has a name."""
+MAX_COLUMNS = 1_000_000  # Columns of a NumPy archive, each of which has a name
 
 
 @contextmanager

@@ -9,11 +9,8 @@ from estimators.log import BEFORE
 
 from ..source import WRONG_TIME, Report
 
-MAX_EQUAL_TIMES = 100_000
-"""Consecutive rows of equal time from which on the time column is reported."""
-
-BACKWARDS, STANDING = REMARKS = ("times run backwards", "time stands still")
-"""Keys under which it is reported."""
+MAX_EQUAL_TIMES = 100_000  # Consecutive rows of equal time from which on the time column is reported
+BACKWARDS, STANDING = REMARKS = ("times run backwards", "time stands still")  # Keys under which it is reported
 
 MIN_ORDERED_TIMES = 3
 """Ordered times that must follow before a first time is reported as wrong, or rows as reversed."""

@@ -18,17 +18,10 @@ from estimators.errors import SourceError, quoted
 from ..formats import open_binary
 from ..source import TRUNCATED
 
-CHUNK_ROWS = 4096
-"""TableRows of a chunk, at most."""
-
-MAX_LINE_LENGTH = 2**20
-"""Characters of a line; a longer one is read as several."""
-
-COMMA_CHECK_LINES = 100
-"""Lines in which a decimal comma is sought before a table is read."""
-
-UNREADABLE = "unreadable value"
-"""Key of values that are not numbers."""
+CHUNK_ROWS = 4096  # Rows of a chunk, at most
+MAX_LINE_LENGTH = 2**20  # Characters of a line; a longer one is read as several
+COMMA_CHECK_LINES = 100  # Lines in which a decimal comma is sought before a table is read
+UNREADABLE = "unreadable value"  # Key of values that are not numbers
 
 Problem = Callable[[str, int, str], None]
 """problem(key, line or row number, text)."""

@@ -217,8 +217,7 @@ PARAMETERS = ("r0", "capacity")
 SPREAD = {"r0": (0.005, 3e-5), "capacity": (0.15, 2e-4)}
 """Initial deviation of each in joint estimation, and its drift in √s: at least the wear of the capacity in a cycle."""
 
-WORN = {"r0": 1.5, "capacity": 0.8}
-"""Value of each after the last cycle, as a share of the initial one."""
+WORN = {"r0": 1.5, "capacity": 0.8}  # Value of each after the last cycle, as a share of the initial one
 
 
 def one_cycle(number: int, parameters: Sequence[str], drift: float = 1.0) -> tuple[Twin, Log]:

@@ -35,8 +35,7 @@ from .timing import BenchmarkRow, Bound, run_sections
 
 DAY = 86400.0
 
-RUN = 200_000
-"""Readings of a run, each from a start of its own."""
+RUN = 200_000  # Readings of a run, each from a start of its own
 
 
 class Case(NamedTuple):

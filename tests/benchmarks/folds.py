@@ -34,8 +34,7 @@ from .timing import BenchmarkRow, Bound, both, medians, seconds
 REFOLD_READINGS = 100_000
 DEFAULT_TWIN = "motor_can"
 
-SMOOTHED, SHORT = 100_000, 10_000
-"""Readings that are smoothed, and that the peers smooth."""
+SMOOTHED, SHORT = 100_000, 10_000  # Readings that are smoothed, and that the peers smooth
 
 SMOOTHERS = ("kf", "ekf", "iekf", "ukf", "ckf", "sr-kf", "sr-ekf", "sr-ukf")
 F = np.kron(np.array([[1.0, 0.1], [0.0, 1.0]]), np.eye(2))

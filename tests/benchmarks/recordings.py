@@ -29,8 +29,7 @@ from estimators.fit.recording import Recording
 from estimators.log import Log
 from estimators.registry import find_entry, unfit
 
-GOOD = (0.9, 0.98)
-"""Coverage that a band of 95 % should have of what was withheld."""
+GOOD = (0.9, 0.98)  # Coverage that a band of 95 % should have of what was withheld
 
 
 class Case(NamedTuple):

@@ -27,17 +27,10 @@ from sources.faults.layer import Faults
 from sources.source import WRONG_TIME
 
 TWIN = "motor_can"
-STEP = 0.003
-"""Seconds between the asset's steps, each of three readings: a thousand a second."""
-
-AT_ONCE = 512
-"""Events of the asset that are passed on together."""
-
-TRANSIT = 1_000_000
-"""ns from the measurement to its arrival."""
-
-EVERY = 8.0
-"""Seconds of the asset between two mixes."""
+STEP = 0.003  # Seconds between the asset's steps, each of three readings: a thousand a second
+AT_ONCE = 512  # Events of the asset that are passed on together
+TRANSIT = 1_000_000  # ns from the measurement to its arrival
+EVERY = 8.0  # Seconds of the asset between two mixes
 
 CALM = 120.0
 """Seconds of the asset at the end without a fault, in which the twin must come to itself."""
@@ -45,8 +38,7 @@ CALM = 120.0
 FLAT = 2.0
 """MB that a million events may add, by the line fitted: a leak of two bytes an event."""
 
-LEAST = 60
-"""Samples of memory for a line, two a second."""
+LEAST = 60  # Samples of memory for a line, two a second
 
 MIXES: tuple[tuple[dict[str, object], ...], ...] = (
     ({"kind": "delay", "sensor": "winding", "size": 0.5},

@@ -38,10 +38,8 @@ from ...live.running_fold import Running
 from .rrd_file import END_MESSAGE, MESSAGE_HEADER, STREAM_HEADER, messages
 
 FORMAT = 2
-READABLE = (1, 2)
-"""Formats that can be read; the first also stored the track."""
-PREFIX = "nisus_"
-"""Start of the application id that Rerun shows; the name of the twin follows."""
+READABLE = (1, 2)  # Formats that can be read; the first also stored the track
+PREFIX = "nisus_"  # Start of the application id that Rerun shows; the name of the twin follows
 TIMELINE = "event"
 
 
@@ -125,8 +123,7 @@ def base_from_json(text: str) -> Base | None:
 
 FLUSH_TIMEOUT_S = 5.0
 
-TAKEN = "is there already; choose another name, or remove it"
-"""Message about a path that is taken."""
+TAKEN = "is there already; choose another name, or remove it"  # Message about a path that is taken
 
 
 class RecordingFile:

@@ -14,20 +14,17 @@ from typing import BinaryIO
 
 from estimators.errors import ConfigError
 
-MAGIC = b"RRF2"
-"""First bytes of an .rrd."""
+MAGIC = b"RRF2"  # First bytes of an .rrd
 
 STREAM_HEADER, MESSAGE_HEADER = 12, struct.Struct("<QQ")
 """Bytes before the first message of an .rrd; header of each message: its kind, and the number of bytes that follow."""
 
-END_MESSAGE = 0
-"""Kind of the message that closes a stream."""
+END_MESSAGE = 0  # Kind of the message that closes a stream
 
 RESERVED_BYTES = 32 * 2**20
 """Free bytes at which a recording ends: enough to close it, and for other programs."""
 
-LOW_DISK_BYTES = 1e9
-"""Free bytes below which there is a warning, however slowly the file grows."""
+LOW_DISK_BYTES = 1e9  # Free bytes below which there is a warning, however slowly the file grows
 
 LOW_DISK_S = 900.0
 """A file that will fill the disk in less time, at its growth so far, is warned of."""
@@ -37,8 +34,7 @@ GROWTH_SETTLING_S = 60.0
 
 SIZES = {"kB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12}
 TIMES = {"s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0}
-MIN_PART_BYTES, MIN_PART_S = 10**5, 1.0
-"""Size and duration below which a part would hold little but its header."""
+MIN_PART_BYTES, MIN_PART_S = 10**5, 1.0  # Size and duration below which a part would hold little but its header
 
 
 def messages(data: bytes) -> Iterator[tuple[int, int, int]]:

@@ -36,14 +36,12 @@ if TYPE_CHECKING:
     from ...live.running_fold import Running
     from ...twin.twin import Twin
 
-LOG_PERIOD_S = 0.4
-"""Seconds between two writes of the log: a killed process loses less."""
+LOG_PERIOD_S = 0.4  # Seconds between two writes of the log: a killed process loses less
 
 CHARTS_PERIOD_S = 5.0
 """Seconds between two writes of the charts. Each of their many entities costs the same for one row as for thousands."""
 
-EDIT_REST_S = 5.0
-"""Seconds without an edit after which the file gets a new base."""
+EDIT_REST_S = 5.0  # Seconds without an edit after which the file gets a new base
 
 MAX_PULL_ROWS = 20_000
 """Rows pulled at once, so that a long history does not hold the engine's lock for long."""

@@ -33,8 +33,7 @@ if TYPE_CHECKING:
 MAX_PULL_ROWS = 20_000
 """Rows pulled at once, so that a long history does not hold the engine's lock for long."""
 
-HISTORY_STRETCHES = 3000
-"""Stretches into which a whole history is cut for drawing."""
+HISTORY_STRETCHES = 3000  # Stretches into which a whole history is cut for drawing
 
 FIRST_WINDOWS = 1.5
 """Length that a new revision sends first, in windows of the charts; the rest of a long history follows."""

@@ -16,8 +16,7 @@ from ...present.drawing.colors import EITHER, RGB, Frame, Palette, kinds
 from ...present.drawing.direct_readings import observed
 from .sink import NOTICES_PATH, SCALE_GAP, TIMELINE, band_color, pair_name, row_title, with_unit
 
-MAX_SENSOR_LANES = 6
-"""Sensors at most whose states are drawn, below the twin's health."""
+MAX_SENSOR_LANES = 6  # Sensors at most whose states are drawn, below the twin's health
 
 MAX_VISIBLE_CHARTS = 3
 """Charts of states that are shown at the same time; more come in tabs, which cost nothing while they are hidden."""

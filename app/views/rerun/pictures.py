@@ -146,17 +146,13 @@ class FieldDrawing:
             sink.columns(f"/field/{kind.name}/sensors", np.array([t]), dots.partition([count]))
 
 
-ELLIPSE_POINTS = 65
-"""Points of an ellipse, the first one again at the end."""
-
-TRAIL_POINTS = 100
-"""Points of the trail behind the mean."""
+ELLIPSE_POINTS = 65  # Points of an ellipse, the first one again at the end
+TRAIL_POINTS = 100  # Points of the trail behind the mean
 
 WINDOW_ELLIPSES = 400
 """Ellipses in one window of the charts, or in a longer history that is drawn at once."""
 
-PICTURE_RATIO = 2.5
-"""Approximate width of the picture over its height."""
+PICTURE_RATIO = 2.5  # Approximate width of the picture over its height
 
 LABEL_HALF_WIDTH, LABEL_HEIGHT = 0.2, 0.4
 """Shares of the picture's width and height that the labels take, beside and below their point."""

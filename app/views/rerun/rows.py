@@ -22,11 +22,8 @@ from .layout import MAX_SENSOR_LANES, blueprint, styles
 from .pictures import FieldDrawing, PairDrawing
 from .sink import NOTICES_PATH, Sink, last_of_each_time, pair_name, send_blueprint, state_colors
 
-WINDOW_STRETCHES = 1200
-"""Stretches into which the charts' window is cut; each is drawn by its extremes."""
-
-LATE_MEMORY_NS = 30 * 10**9
-"""Age up to which a late measurement is recognised as already drawn."""
+WINDOW_STRETCHES = 1200  # Stretches into which the charts' window is cut; each is drawn by its extremes
+LATE_MEMORY_NS = 30 * 10**9  # Age up to which a late measurement is recognised as already drawn
 
 
 class RerunRows:

@@ -105,8 +105,7 @@ class Sink:
         self.stream.send_columns(f"{self.root}{path}", indexes=[self.times(t)], columns=what)
 
 
-NOTICES_PATH = "/events"
-"""Path of the notices of all revisions."""
+NOTICES_PATH = "/events"  # Path of the notices of all revisions
 
 TIMELINE = "time"
 

@@ -15,21 +15,16 @@ from ...live.outputs import Belief
 from ...present.drawing.colors import Palette, mixed, round_step, tick_text
 from .scene import History, Outlook, PeakMarks, Shapes, circle, disc, ellipsoid, segments
 
-TRAIL_ROWS = 80
-"""Rows of the track in the trail."""
+TRAIL_ROWS = 80  # Rows of the track in the trail
 
 TICKS = (-2, -1, 0, 1, 2)
-MAX_PEAKS = 6
-"""Largest number of marked peaks."""
-
-HALF_AXIS_TICKS = 2.5
-"""Half an axis, in ticks."""
+MAX_PEAKS = 6  # Largest number of marked peaks
+HALF_AXIS_TICKS = 2.5  # Half an axis, in ticks
 
 PARTICLE_SIZES = ((1, 0.022), (3, 0.036), (10, 0.06), (100, 0.1))
 """Number of equal particles, and size of their common point: heavier particles are larger."""
 
-MAX_POSITION = 1.3
-"""Position on an axis, which ends at 1, up to which points are drawn."""
+MAX_POSITION = 1.3  # Position on an axis, which ends at 1, up to which points are drawn
 
 
 class _Axis:

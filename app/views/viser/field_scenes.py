@@ -27,23 +27,15 @@ from ...present.drawing.colors import (
 )
 from .scene import History, Outlook, Shapes, put_points, segments, set_color, set_text
 
-PICTURE_PERIOD_S = 0.5
-"""Seconds between two pictures."""
-
-MAX_TICKS = 12
-"""Numbers beside the scale."""
-
-MAX_SURFACE_CORNERS = 48
-"""Corners of the surface along its longer side."""
+PICTURE_PERIOD_S = 0.5  # Seconds between two pictures
+MAX_TICKS = 12  # Numbers beside the scale
+MAX_SURFACE_CORNERS = 48  # Corners of the surface along its longer side
 
 SURFACE_COLORS = 20
 """Colours of the surface; each is a mesh of its own, of which only the triangles change."""
 
-MAX_SURFACE_BARS = 9
-"""Bars of ± 2 σ along the longer side of the surface."""
-
-SURFACE_HEIGHT = 0.6
-"""Height of the highest value above the lowest; the longer side is 2 long."""
+MAX_SURFACE_BARS = 9  # Bars of ± 2 σ along the longer side of the surface
+SURFACE_HEIGHT = 0.6  # Height of the highest value above the lowest; the longer side is 2 long
 
 
 class FieldView:

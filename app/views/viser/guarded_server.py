@@ -25,8 +25,7 @@ from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 from websockets.protocol import State
 
-BACKLOG = 64
-"""Connections waiting for acceptance."""
+BACKLOG = 64  # Connections waiting for acceptance
 
 
 HEADER = "X-Nisus-Secret"

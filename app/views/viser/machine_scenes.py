@@ -22,8 +22,7 @@ from .scene import History, Outlook, Shapes, about_z, put_points, segments, set_
 
 HEIGHT, RADIUS, PITCH = 1.4, 0.3, 0.78
 CELLS_PER_ROW = 4
-MIN_SLAB_HEIGHT = 0.004
-"""Smallest height of a slab."""
+MIN_SLAB_HEIGHT = 0.004  # Smallest height of a slab
 
 
 class BatteryScene:
@@ -92,8 +91,7 @@ class BatteryScene:
 PART_WIDTH, HALF_DEPTH, HALF_HEIGHT = 30.0, 10.0, 12.0
 """Width of the part, and half of its depth and of its height, mm."""
 
-FINGER, PAD = 7.0, 4.0
-"""Thickness of a finger and of its pad, mm."""
+FINGER, PAD = 7.0, 4.0  # Thickness of a finger and of its pad, mm
 
 FINGER_TOP, PALM_HEIGHT = 34.0, 8.0
 """Upper end of the fingers above the middle of the part, and height of the palm, mm."""
@@ -237,11 +235,8 @@ class GripperScene:
 
 
 SLOTS, MAGNETS = 12, 8
-CUT_DEGREES = 90.0
-"""Angle that is cut out of the stator, degrees."""
-
-AXIS_ANGLE = 0.3
-"""Angle between the axis and the view, radians."""
+CUT_DEGREES = 90.0  # Angle that is cut out of the stator, degrees
+AXIS_ANGLE = 0.3  # Angle between the axis and the view, radians
 
 SIGMAS = (-2.0, 0.0, 2.0)
 
@@ -326,8 +321,7 @@ class MotorScene:
 
 
 MAX_SCALE_TICKS = 9
-ROW_HEIGHT = 0.26
-"""Height of the line of a quantity, with its text."""
+ROW_HEIGHT = 0.26  # Height of the line of a quantity, with its text
 
 
 class ScaleBar:

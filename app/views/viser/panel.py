@@ -28,8 +28,7 @@ from .stage import Choice, Stage
 
 CHART_PERIOD_S = 0.5
 PANEL_WIDTH_PX = 360
-SLIDER_DECADES = 3.0
-"""Powers of ten that a slider reaches to either side of the configured variance."""
+SLIDER_DECADES = 3.0  # Powers of ten that a slider reaches to either side of the configured variance
 
 EDIT_HOLD_S = 2.0
 """Seconds after an edit in which the controls are not set to the engine's older values."""

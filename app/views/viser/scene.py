@@ -245,17 +245,13 @@ class History:
         return rows
 
 
-MARGIN = 0.94
-"""Share of the view that the points fill."""
+MARGIN = 0.94  # Share of the view that the points fill
 
 MAX_TURNED_DISTANCE = 0.75
 """A scene is turned by a right angle if this then reduces the camera's distance to that share or less."""
 
-MAX_SIGHT = 20_000.0
-"""Distance up to which a camera sees; a road may be long."""
-
-MAX_ASPECT_CHANGE = 0.02
-"""Relative change of a pane's aspect from which the camera is placed again."""
+MAX_SIGHT = 20_000.0  # Distance up to which a camera sees; a road may be long
+MAX_ASPECT_CHANGE = 0.02  # Relative change of a pane's aspect from which the camera is placed again
 
 
 class Outlook(NamedTuple):

@@ -30,14 +30,9 @@ BELIEF, FIELD, SURFACE = "belief", "field", "surface"
 VEHICLE, MOTOR, BATTERY, GRIPPER = "vehicle", "motor", "battery", "gripper"
 FOLLOW, STAY = "vehicle", "place"
 
-FIELD_SCENES = (FieldScene, FieldSurfaceScene)
-"""Scenes of a large field, drawn from its pictures."""
-
-AMBIENT, ABOVE = 2.5, 0.9
-"""Strength of the lights; π of the first alone would show each colour unchanged."""
-
-HEAVY_PERIOD_S = 0.4
-"""Seconds between two redraws of lines and point clouds."""
+FIELD_SCENES = (FieldScene, FieldSurfaceScene)  # Scenes of a large field, drawn from its pictures
+AMBIENT, ABOVE = 2.5, 0.9  # Strength of the lights; π of the first alone would show each colour unchanged
+HEAVY_PERIOD_S = 0.4  # Seconds between two redraws of lines and point clouds
 
 
 class Scene(Protocol):

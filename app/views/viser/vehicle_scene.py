@@ -28,43 +28,31 @@ MAX_TRAIL_SPREAD = 20.0
 MAX_TRAIL_STEP = 20.0
 """Multiple of the median step above which a step of the trail is drawn as a gap."""
 
-TRAIL_POINTS = 300
-"""Largest number of points of a trail."""
+TRAIL_POINTS = 300  # Largest number of points of a trail
 
 MAX_PEAKS = 4
-MAX_POSITION_DOTS = 600
-"""Largest number of position measurements of a sensor."""
-
-FOLLOW_SHARE = 0.3
-"""Share of the way to the vehicle that the view moves in one frame."""
+MAX_POSITION_DOTS = 600  # Largest number of position measurements of a sensor
+FOLLOW_SHARE = 0.3  # Share of the way to the vehicle that the view moves in one frame
 
 FOV = float(np.radians(40))
-SLANTED = np.array([0.0, -0.68, 0.73])
-"""Direction from the vehicle to the initial camera."""
+SLANTED = np.array([0.0, -0.68, 0.73])  # Direction from the vehicle to the initial camera
 
 FROM_ABOVE = np.array([0.0, -0.12, 0.99])
 """Direction from walls to the initial camera, nearly from above: a corridor would otherwise be a line."""
 
-FREE_RADIUS = 4.0
-"""Radius of the initial view without walls and beacons, in lengths of the vehicle."""
+FREE_RADIUS = 4.0  # Radius of the initial view without walls and beacons, in lengths of the vehicle
 
 MIN_RADIUS = 0.7
 """Smallest radius of the initial view with walls or beacons, in lengths of the vehicle."""
 
-BEACON_MARGIN = 1.2
-"""Factor by which the initial view reaches beyond the beacons, for their names."""
+BEACON_MARGIN = 1.2  # Factor by which the initial view reaches beyond the beacons, for their names
 
 MAX_FILLED_ELLIPSE = 2.5
 """Multiple of the view's radius from which an ellipse is drawn as an outline only."""
 
-MAX_FRAMES = 4096
-"""Frames that a trail of peaks keeps."""
-
-FADING_S = 10.0
-"""Seconds over which a range ring pales; then it is gone."""
-
-MAX_AGE_S = 3.0
-"""Age in seconds from which the measurement of a beam is no longer drawn."""
+MAX_FRAMES = 4096  # Frames that a trail of peaks keeps
+FADING_S = 10.0  # Seconds over which a range ring pales; then it is gone
+MAX_AGE_S = 3.0  # Age in seconds from which the measurement of a beam is no longer drawn
 
 RING_SIDES = 180
 BEAM_HEIGHT = 0.12

@@ -16,20 +16,14 @@ from .panel import Panel
 from .scene import History
 from .stage import FIELD_SCENES, Stage
 
-FRAME_PERIOD_S = 0.1
-"""Seconds between two cheap frames."""
-
-MAX_CPU_SHARE = 0.08
-"""Share of a core that drawing may take: expensive frames are drawn less often."""
-
-MAX_FRAME_PERIOD_S = 2.0
-"""Largest time between two frames, seconds."""
+FRAME_PERIOD_S = 0.1  # Seconds between two cheap frames
+MAX_CPU_SHARE = 0.08  # Share of a core that drawing may take: expensive frames are drawn less often
+MAX_FRAME_PERIOD_S = 2.0  # Largest time between two frames, seconds
 
 EDIT_REST_S = 0.4
 """Seconds without an edit before the page's scene follows: the browser draws it on one thread with the charts."""
 
-MAX_EDIT_WAIT_S = 1.0
-"""Seconds between two frames of that scene while a slider is dragged."""
+MAX_EDIT_WAIT_S = 1.0  # Seconds between two frames of that scene while a slider is dragged
 
 MAX_PULL_ROWS = 16_384
 """Rows pulled at once, so that a long history does not hold the engine's lock for long."""

@@ -19,8 +19,7 @@ from tests.sources.faults.test_kinds import DRIVE, FIRST, MODEL, SECOND_ONE, STA
 from tests.sources.test_pacer import Clock
 from tests.support import SECOND, assert_same, read_all
 
-NUMBERS = {"size": 0.3, "rate": 0.4, "every": 3.0, "count": 2}
-"""What any kind takes."""
+NUMBERS = {"size": 0.3, "rate": 0.4, "every": 3.0, "count": 2}  # What any kind takes
 
 
 def some(name, **more):
