@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import time
 
-FIRST_DATED_NS = 10**18
-"""Nanoseconds since 1970 from which on a time has a date: those of this century."""
+FIRST_DATED_NS = 10**18  # nanoseconds since 1970 from which on a time has a date: those of this century
 
 
 def format_time(t: int) -> str:

@@ -13,11 +13,8 @@ from estimators.log import INPUT, READING, Events
 from estimators.model.state_space import StateSpaceModel
 from sources.source import WRONG_TIME, Report
 
-CLOCK_MOVED = "clock moved"
-"""Key of jumps of a source's clock."""
-
-MAINTENANCE = "maintenance"
-"""Key of maintenance."""
+CLOCK_MOVED = "clock moved"  # key of jumps of a source's clock
+MAINTENANCE = "maintenance"  # key of maintenance
 
 
 class Planned(NamedTuple):

@@ -10,8 +10,7 @@ from typing import Any
 
 from estimators.errors import printable
 
-ENDING = ("SIGTERM", "SIGHUP")
-"""From a service manager, and from a terminal that closes; Windows has the first only."""
+ENDING = ("SIGTERM", "SIGHUP")  # from a service manager, and from a terminal that closes; Windows has the first only
 
 
 class EndRequest:

@@ -458,5 +458,4 @@ COMMANDS: dict[type, str] = {
 }
 """Module and function of every command, imported when the command runs."""
 
-NAMES = {command.__name__.lower(): command for command in COMMANDS}
-"""Command by its name on the command line."""
+NAMES = {command.__name__.lower(): command for command in COMMANDS}  # command by its name on the command line

@@ -16,8 +16,7 @@ from .options import settings
 if TYPE_CHECKING:
     from .arguments import Bus
 
-GROUP = "239.74.163.2"
-"""python-can's own multicast address."""
+GROUP = "239.74.163.2"  # python-can's own multicast address
 
 FORMATS = (".asc", ".blf", ".csv", ".log", ".mf4", ".trc")
 """What python-can writes and `nisus fold --log` reads; not .db, whose writer forgets what is queued when it stops."""

@@ -203,8 +203,7 @@ def _health_figures(checked: Checked) -> dict[str, Any]:
     }
 
 
-MAX_ROWS = 12
-"""Rows of a table on the page; JSON has all."""
+MAX_ROWS = 12  # rows of a table on the page; JSON has all
 
 LATENESS_UNKNOWN = "Lateness is not known: the log has only the time of measurement."
 

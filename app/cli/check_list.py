@@ -37,14 +37,9 @@ from ..twin.twin import Twin
 
 YES, PARTLY, NO, NONE = "yes", "partly", "no", "not told"
 
-MAX_CORRELATION = 0.9
-"""Correlation of two estimates from which on one takes the blame for the other."""
-
-MAX_CONDITIONING = 1e8
-"""Conditioning from which on the information of the worst direction is rounding."""
-
-UNOBSERVED_SHARE = 0.9
-"""Share of the prior deviation; a direction that keeps more is not observed."""
+MAX_CORRELATION = 0.9  # correlation of two estimates from which on one takes the blame for the other
+MAX_CONDITIONING = 1e8  # conditioning from which on the information of the worst direction is rounding
+UNOBSERVED_SHARE = 0.9  # share of the prior deviation; a direction that keeps more is not observed
 
 LINEARISES = ("ekf", "iekf", "sr_ekf", "filterpy_ekf", "pf_ekf")
 

@@ -26,8 +26,7 @@ if TYPE_CHECKING:
 MAX_FAULTY_SHARE = 0.1
 """Share of readings refused, of rows lost, or of one value in a row, beyond which data are not in order."""
 
-MAX_EQUAL_RUN = 50
-"""Equal readings in a row that are never too many."""
+MAX_EQUAL_RUN = 50  # equal readings in a row that are never too many
 
 
 def commission_twin(arguments: Arguments) -> int:

@@ -20,8 +20,7 @@ from .progress import progress
 if TYPE_CHECKING:
     from .arguments import Compare as Arguments
 
-ALL = "all"
-"""Name that stands for every bundled twin."""
+ALL = "all"  # name that stands for every bundled twin
 
 
 def compare_twin(arguments: Arguments) -> int:

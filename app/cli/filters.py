@@ -17,8 +17,7 @@ from .prepare import attend
 if TYPE_CHECKING:
     from .arguments import Filters as Arguments
 
-SAMPLE_S = 60.0
-"""Seconds of a twin's source from which its rate is taken."""
+SAMPLE_S = 60.0  # seconds of a twin's source from which its rate is taken
 
 
 def show_filters(arguments: Arguments) -> int:

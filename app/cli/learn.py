@@ -36,11 +36,8 @@ from .prepare import attend, prepare
 if TYPE_CHECKING:
     from .arguments import Learn as Arguments
 
-MIN_BLOCKS = 3
-"""Least number of blocks, of which one is held out."""
-
-STRETCHES = 9
-"""Long parts of each recording over which errors add up to choose between candidates."""
+MIN_BLOCKS = 3  # least number of blocks, of which one is held out
+STRETCHES = 9  # long parts of each recording over which errors add up to choose between candidates
 
 
 def learn_correction(arguments: Arguments) -> int:

@@ -21,8 +21,7 @@ from ..terminal import complain
 if TYPE_CHECKING:
     from .arguments import Log as Arguments
 
-MAX_LISTED = 5
-"""Gaps and faults that are listed; the others are counted."""
+MAX_LISTED = 5  # gaps and faults that are listed; the others are counted
 
 TIMES = (
     "number",

@@ -20,8 +20,7 @@ from ..terminal import complain
 from .arguments import COMMANDS, NAMES, Run
 from .options import check_numbers
 
-FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
-"""Errors of a device that takes no more output."""
+FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)  # errors of a device that takes no more output
 
 
 def carry_out(command: Any) -> int:

@@ -21,8 +21,7 @@ from ..live.watchdog import CallWatch
 from ..live.workshop import Workshop
 from ..twin.twin import Twin
 
-STATUS_DELAY_S = 1.0
-"""Seconds before the line appears; loading from the cache takes less."""
+STATUS_DELAY_S = 1.0  # seconds before the line appears; loading from the cache takes less
 
 
 def prepare(twin: Twin) -> None:

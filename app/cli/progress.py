@@ -12,8 +12,7 @@ from typing import TextIO
 from rich.console import Console
 from rich.progress import Progress
 
-LINE_PERIOD_S = 10.0
-"""Seconds between two lines."""
+LINE_PERIOD_S = 10.0  # seconds between two lines
 
 
 @contextmanager

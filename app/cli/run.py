@@ -30,8 +30,7 @@ if TYPE_CHECKING:
 
 __all__ = ["live_source", "run_twin"]
 
-MAX_FAILURES = 5
-"""Failures that a run without a page prints at its end."""
+MAX_FAILURES = 5  # failures that a run without a page prints at its end
 
 
 def run_twin(arguments: Run, workers: Sequence[Compiler] = ()) -> int:

@@ -26,8 +26,7 @@ from .progress import progress
 if TYPE_CHECKING:
     from .arguments import Stress as Arguments
 
-PIPE_WIDTH = 220
-"""Columns of the output where it is not a terminal."""
+PIPE_WIDTH = 220  # columns of the output where it is not a terminal
 
 
 def stress_twin(arguments: Arguments) -> int:

@@ -33,8 +33,7 @@ from .prepare import attend, prepare
 if TYPE_CHECKING:
     from .arguments import Tune as Arguments
 
-MIN_BLOCKS = 3
-"""Least number of blocks, of which one is held out."""
+MIN_BLOCKS = 3  # least number of blocks, of which one is held out
 
 
 def tune_twin(arguments: Arguments) -> int:

@@ -46,29 +46,14 @@ from estimators.track import DIVERGED, HELD_OUT, USED
 
 from ..live.tunings.versions import COVERAGE, LIKELIHOOD, NIS, REFUSED, RMSE, figures
 
-N_BLOCKS = 20
-"""Blocks of a log, with equally many events."""
-
-ALLOWED_SHARE = 0.1
-"""Part of a standard error that a figure may change by."""
-
-MAX_ALLOWED, MIN_ALLOWED = 0.02, 1e-6
-"""Limits of the allowed change, in units of `badness`."""
-
-LOST = "lost"
-"""Share of rows at which the estimate has diverged."""
-
-MIN_COUNT = 2
-"""Errors that may leave their band and rows that may be lost; a single one is rounding."""
-
-FALSE_ALARM = 1e-4
-"""Probability of calling a figure of a random filter worse when only its draws differ."""
-
-DIGITS = 10
-"""Significant digits of a stored figure: a thousandth of the smallest allowed change."""
-
-SAME_LOG = 1e-9
-"""Relative difference of the sums of one simulated log on two processors, by rounding."""
+N_BLOCKS = 20  # blocks of a log, with equally many events
+ALLOWED_SHARE = 0.1  # part of a standard error that a figure may change by
+MAX_ALLOWED, MIN_ALLOWED = 0.02, 1e-6  # limits of the allowed change, in units of `badness`
+LOST = "lost"  # share of rows at which the estimate has diverged
+MIN_COUNT = 2  # errors that may leave their band and rows that may be lost; a single one is rounding
+FALSE_ALARM = 1e-4  # probability of calling a figure of a random filter worse when only its draws differ
+DIGITS = 10  # significant digits of a stored figure: a thousandth of the smallest allowed change
+SAME_LOG = 1e-9  # relative difference of the sums of one simulated log on two processors, by rounding
 
 
 def fold_figures(fold: Fold, rows: np.ndarray | None = None) -> dict[str, float]:

@@ -23,14 +23,9 @@ from ..twin.twin import Twin, load_twin
 from .processes import beside, jobs_of
 from .scores import FilterScore, Spread
 
-SEEDS = 8
-"""Folds of a filter that draws random members; others are folded once."""
-
-BUDGET_S = 20.0
-"""Default processor seconds for the folds of one filter."""
-
-MIN_TIMED_S = 0.2
-"""Processor seconds for which a fold is timed."""
+SEEDS = 8  # folds of a filter that draws random members; others are folded once
+BUDGET_S = 20.0  # default processor seconds for the folds of one filter
+MIN_TIMED_S = 0.2  # processor seconds for which a fold is timed
 
 
 class Outcome(NamedTuple):

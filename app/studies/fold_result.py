@@ -32,17 +32,10 @@ from ..present.export.calibration_lines import calibration_lines
 from ..present.result import Figure, Topic, plain
 from ..twin.twin import Twin
 
-MAX_DECISIONS = 10
-"""Latest decisions on rejected sensors that are printed; JSON has all."""
-
-MAX_EPISODES = 10
-"""First episodes that are printed; JSON has all."""
-
-MAX_EXPLAINED = 3
-"""First episodes whose cause is searched for: each takes one fold per sensor, input and parameter."""
-
-MIN_DROPPED_SHARE = 0.05
-"""Share of measurements missing from the log above which the result is degraded."""
+MAX_DECISIONS = 10  # latest decisions on rejected sensors that are printed; JSON has all
+MAX_EPISODES = 10  # first episodes that are printed; JSON has all
+MAX_EXPLAINED = 3  # first episodes whose cause is searched for: each takes one fold per sensor, input and parameter
+MIN_DROPPED_SHARE = 0.05  # share of measurements missing from the log above which the result is degraded
 
 
 class ExplainedEpisode(NamedTuple):

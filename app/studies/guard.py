@@ -44,23 +44,15 @@ from .baseline import (
 from .compare import draws, tidy
 from .processes import beside, jobs_of
 
-SIMULATED_LOGS = 3
-"""Logs of a simulated asset, with consecutive seeds."""
+SIMULATED_LOGS = 3  # logs of a simulated asset, with consecutive seeds
 
 SEEDS, SEEDS_PER_LOG = 8, 4
 """Folds of a filter that draws, with consecutive seeds: of a single log, and of each of several."""
 
-BUDGET_S = 15.0
-"""Processor seconds for all folds of a recording; a shorter span of a longer one is guarded."""
-
-FIRST_SPAN_S = 10.0
-"""Seconds of the first part of a recording that is timed."""
-
-SUFFIX = ".guard.yaml"
-"""End of the name of a baseline file beside a twin."""
-
-VERDICT_FILE = "guard.json"
-"""Name of the file with the last verdict, in the folder of the tuning versions."""
+BUDGET_S = 15.0  # processor seconds for all folds of a recording; a shorter span of a longer one is guarded
+FIRST_SPAN_S = 10.0  # seconds of the first part of a recording that is timed
+SUFFIX = ".guard.yaml"  # end of the name of a baseline file beside a twin
+VERDICT_FILE = "guard.json"  # name of the file with the last verdict, in the folder of the tuning versions
 
 
 @dataclass(frozen=True)

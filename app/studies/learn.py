@@ -138,11 +138,8 @@ def _verdict(lesson: Lesson, keep: Path | None) -> Topic:
     return Topic("Verdict", ("Better on blocks from which it did not learn.", lines))
 
 
-DIGITS = 8
-"""Significant digits of measured values."""
-
-MIN_NOISE_SHARE = 1e-3
-"""Least uncertainty of a correction far from its data, as a share of the drift of the physics."""
+DIGITS = 8  # significant digits of measured values
+MIN_NOISE_SHARE = 1e-3  # least uncertainty of a correction far from its data, as a share of the drift of the physics
 
 
 def noises_of(

@@ -14,8 +14,7 @@ import numpy as np
 from config.loader import TWINS
 from config.yaml_files import writing
 
-GAP = "  "
-"""Between printed columns; no cell holds two spaces."""
+GAP = "  "  # between printed columns; no cell holds two spaces
 
 NIS, BAND, COST = "mean NIS", "in band [%]", "cost [µs/step]"
 SPAN, EVENTS, LENGTH = "span [s]", "events", "log [s]"
@@ -188,8 +187,7 @@ def read_span(line: Mapping[str, str]) -> float | None:
     return float(line[SPAN]) if line[SPAN] else None
 
 
-SCORES = TWINS.parent / "scores"
-"""Folder of the scores of the twins that ship."""
+SCORES = TWINS.parent / "scores"  # folder of the scores of the twins that ship
 
 
 def scores_file(twin: Path) -> Path:

@@ -16,8 +16,7 @@ from ..present.result import Topic
 from ..present.runs_json import correlated, fit_json
 from ..twin.twin import Twin
 
-MIN_UNFITTED_SHARE = 0.05
-"""Share of a window above which an unfitted end of a log is reported."""
+MIN_UNFITTED_SHARE = 0.05  # share of a window above which an unfitted end of a log is reported
 
 
 def window_json(recording: int, refit: WindowFit, origin: int) -> dict[str, Any]:

@@ -30,14 +30,9 @@ from .measured import NO, UNTOLD, YES, Claim, Measured, digits
 QUESTION = "Does coloured noise explain the correlated innovations?"
 OF = "correlation of one innovation with the next"
 
-MAX_APPENDED = 3
-"""Noises that are appended; beyond that the model itself needs work."""
-
-MIN_GAIN_NATS = 10.0
-"""Least gain in likelihood: each adds two parameters, and the best of several is taken."""
-
-BUDGET_S = 30.0
-"""Processor seconds for all trials; the best result so far is reported."""
+MAX_APPENDED = 3  # noises that are appended; beyond that the model itself needs work
+MIN_GAIN_NATS = 10.0  # least gain in likelihood: each adds two parameters, and the best of several is taken
+BUDGET_S = 30.0  # processor seconds for all trials; the best result so far is reported
 
 MIN_EFFECT = 0.05
 """Change of a row's innovations, in parts of their size, by four times the Q of a noise that has to do with it."""

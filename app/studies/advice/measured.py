@@ -22,11 +22,8 @@ from estimators.registry import find_entry, unfit
 
 from ...twin.twin import Twin
 
-BUDGET_S = 20.0
-"""Seconds of one processor for a fold; of a log that takes longer the first part is folded."""
-
-TRIED = 64
-"""Events folded at first, to know how long one takes."""
+BUDGET_S = 20.0  # seconds of one processor for a fold; of a log that takes longer the first part is folded
+TRIED = 64  # events folded at first, to know how long one takes
 
 
 @dataclass(frozen=True)

@@ -13,8 +13,7 @@ from sources.inspect import RecordingContents
 from .relations import Driven, Pair, driven, pairs, simulated
 from .signals import MIN_VALUES, Signal, noise_of, signals, walk_of
 
-MAX_SIGNALS = 6
-"""Signals that are taken where none are named."""
+MAX_SIGNALS = 6  # signals that are taken where none are named
 
 
 @dataclass(frozen=True)

@@ -110,8 +110,7 @@ def _gain(measured: Measured) -> str:
     return f"; the likelihood of ukf is higher by {digits(other - one)} nats per measurement" if other > one else ""
 
 
-MAX_PRIOR_LEFT = 0.9
-"""Share of the prior deviation; a state that keeps more was not observed."""
+MAX_PRIOR_LEFT = 0.9  # share of the prior deviation; a state that keeps more was not observed
 
 
 def observed(measured: Measured) -> Claim:
@@ -147,16 +146,12 @@ PREFERRED = ("ensrf", "letkf", "etkf", "enkf")
 """Filters of large states, the first that applies is taken: those that localise and draw no perturbations first."""
 
 MEMBERS = (20.0, 40.0, 80.0)
-RADIUS_SHARES = (0.05, 0.1, 0.2, 0.4)
-"""Radii that are tried, as shares of the extent of the field."""
+RADIUS_SHARES = (0.05, 0.1, 0.2, 0.4)  # radii that are tried, as shares of the extent of the field
 
 INFLATIONS = (1.0, 1.02, 1.05, 1.1)
 
-LIKELIHOOD_MARGIN = 0.01
-"""Nats per value; of options closer than this the cheapest is taken."""
-
-SWEEP_BUDGET_S = 2.0
-"""Seconds of one processor for each fold of the sweep."""
+LIKELIHOOD_MARGIN = 0.01  # nats per value; of options closer than this the cheapest is taken
+SWEEP_BUDGET_S = 2.0  # seconds of one processor for each fold of the sweep
 
 
 def sweep(measured: Measured, estimator: str) -> tuple[list[Claim], dict[str, float]]:
@@ -226,14 +221,9 @@ STEADY = "kf-steady"
 
 FILTERS_APART = "σ between ekf and ukf (95th percentile)"
 
-EXACT = 1e-9
-"""Difference in σ of two filters on a linear model, by rounding."""
-
-PERIOD_TOLERANCE = 0.01
-"""Share of the period by which the time between two readings may differ from it."""
-
-MAX_UNEVEN_SHARE = 0.001
-"""Share of the intervals that may differ: a fixed gain cannot follow lost or late measurements."""
+EXACT = 1e-9  # difference in σ of two filters on a linear model, by rounding
+PERIOD_TOLERANCE = 0.01  # share of the period by which the time between two readings may differ from it
+MAX_UNEVEN_SHARE = 0.001  # share of the intervals that may differ: a fixed gain cannot follow lost or late measurements
 
 
 def worst(found: Linearity) -> tuple[str, float]:
@@ -408,8 +398,7 @@ def with_weights(estimator: str, dof: float) -> tuple[str, dict[str, float]]:
 SPEED = 1e9
 """Multiplications and additions a second of one processor in small dense matrices, of the order of magnitude."""
 
-MAX_PROCESSOR_SHARE = 0.5
-"""Of one processor that an estimate may take; the rest is for late readings and refolds."""
+MAX_PROCESSOR_SHARE = 0.5  # of one processor that an estimate may take; the rest is for late readings and refolds
 
 
 def small(measured: Measured) -> Claim:

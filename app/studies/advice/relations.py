@@ -17,17 +17,10 @@ from .signals import Signal, common
 TRIED_TIME_CONSTANTS = 24
 """Time constants that are tried, from one interval to the length of the log, evenly by their logarithm."""
 
-MAX_DRIVERS = 4
-"""Drivers of a signal."""
-
-ERROR_FACTOR = 0.8
-"""Factor by which more drivers must lower the error on the second half to be worth it."""
-
-MIN_EXPLAINED = 0.5
-"""Share of the variance of the second half that drivers must explain to be taken."""
-
-MIN_DRIVER_TIMES = 60
-"""Common times that it takes."""
+MAX_DRIVERS = 4  # drivers of a signal
+ERROR_FACTOR = 0.8  # factor by which more drivers must lower the error on the second half to be worth it
+MIN_EXPLAINED = 0.5  # share of the variance of the second half that drivers must explain to be taken
+MIN_DRIVER_TIMES = 60  # common times that it takes
 
 
 class Driven(NamedTuple):
@@ -142,20 +135,11 @@ def _columns(t: np.ndarray, u: np.ndarray, tau: float) -> np.ndarray:
 ALIKE = 0.98
 """Share of the variance of one signal that a line through the other explains, from which on they are much alike."""
 
-NOISY = 0.8
-"""The same where what is left is white, so that it may be the noise of both."""
-
-RATE = 0.9
-"""The same of the changes of one signal by the integral of the other."""
-
-WHITE = 0.5
-"""Lag-one correlation of the residual above which it is not noise."""
-
-LAGS = 20
-"""Intervals by which one may follow the other."""
-
-MIN_PAIR_TIMES = 30
-"""Common times that it takes."""
+NOISY = 0.8  # the same where what is left is white, so that it may be the noise of both
+RATE = 0.9  # the same of the changes of one signal by the integral of the other
+WHITE = 0.5  # lag-one correlation of the residual above which it is not noise
+LAGS = 20  # intervals by which one may follow the other
+MIN_PAIR_TIMES = 30  # common times that it takes
 
 
 class Pair(NamedTuple):

@@ -11,8 +11,7 @@ import numpy as np
 
 from sources.inspect import RecordingContents, SignalSeries, holes
 
-MIN_VALUES = 20
-"""Values needed to estimate a noise."""
+MIN_VALUES = 20  # values needed to estimate a noise
 
 SKIPPED = re.compile(
     r"time|epoch|date|count|check|crc|valid|status|mode|error|alive|_id$|^id$|parity|accuracy", re.IGNORECASE
@@ -21,8 +20,7 @@ SKIPPED = re.compile(
 
 DEGREES = ("deg", "°", "degree", "degrees")
 
-MAX_SWITCH_LEVELS = 8
-"""Levels up to which a signal is a switch and no measurement."""
+MAX_SWITCH_LEVELS = 8  # levels up to which a signal is a switch and no measurement
 
 
 class Signal(NamedTuple):
@@ -127,8 +125,7 @@ def rough(t: np.ndarray, y: np.ndarray) -> float:
 MIN_STANDARD_ERRORS = 3.0
 """Standard errors of a variance of differences, √(8 / n) of it for white noise, below which it is not significant."""
 
-WALK_INTERVALS = 20
-"""Intervals over which a slow walk is looked for."""
+WALK_INTERVALS = 20  # intervals over which a slow walk is looked for
 
 
 def noise_of(series: SignalSeries) -> tuple[bool, float, float]:
@@ -183,11 +180,8 @@ def walk_of(series: SignalSeries) -> float:
     return max(power - 2.0 * r, 1e-12) / float(np.mean(dt[later]))
 
 
-MAX_GRID_TIMES = 4000
-"""Times of a grid, at most."""
-
-MAX_GAP_INTERVALS = 5.0
-"""Usual intervals, beyond which nothing is known between two values."""
+MAX_GRID_TIMES = 4000  # times of a grid, at most
+MAX_GAP_INTERVALS = 5.0  # usual intervals, beyond which nothing is known between two values
 
 
 def common(series: Sequence[SignalSeries]) -> tuple[np.ndarray, np.ndarray]:

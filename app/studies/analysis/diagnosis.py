@@ -23,27 +23,15 @@ from ...live.running_fold import Running
 from .numbers import listed, number
 from .row_figures import rows_json
 
-DIAGNOSED_ROWS = 20_000
-"""Last rows that are analysed."""
-
-COPY_ROWS = 4096
-"""Rows that are copied at once: the engine waits for no more."""
-
-REUSE_S = 1.0
-"""Seconds for which an answer is reused, for all clients."""
-
-LINE_POINTS = 200
-"""Points of a line over time."""
-
-MAX_CORRELATED_STATES = 48
-"""States of a correlation map."""
+DIAGNOSED_ROWS = 20_000  # last rows that are analysed
+COPY_ROWS = 4096  # rows that are copied at once: the engine waits for no more
+REUSE_S = 1.0  # seconds for which an answer is reused, for all clients
+LINE_POINTS = 200  # points of a line over time
+MAX_CORRELATED_STATES = 48  # states of a correlation map
 
 
-FIGURES_PERIOD_S = 20.0
-"""Seconds between two computations of the fold figures."""
-
-COST_TIME_S = 0.25
-"""Seconds of work after which the cost of a step is known well enough."""
+FIGURES_PERIOD_S = 20.0  # seconds between two computations of the fold figures
+COST_TIME_S = 0.25  # seconds of work after which the cost of a step is known well enough
 
 COST_CHUNK = 64
 

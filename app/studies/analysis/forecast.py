@@ -18,17 +18,10 @@ from ...live.outputs import Here
 from ...live.running_fold import Running
 from .numbers import listed, number
 
-MAX_CHANGES = 200
-"""Changes of one input."""
-
-MAX_COMPUTING_S = 8.0
-"""Seconds that a forecast may take to compute."""
-
-DEFAULT_STEP_S = 1.0
-"""Step after a single measurement."""
-
-SHARES = (0.1, 0.5, 0.9)
-"""Probabilities of crossing a limit whose times are returned."""
+MAX_CHANGES = 200  # changes of one input
+MAX_COMPUTING_S = 8.0  # seconds that a forecast may take to compute
+DEFAULT_STEP_S = 1.0  # step after a single measurement
+SHARES = (0.1, 0.5, 0.9)  # probabilities of crossing a limit whose times are returned
 
 
 class Question(NamedTuple):
@@ -216,20 +209,11 @@ def _number(where: str, value: Any) -> float:
     return float(value)
 
 
-REPEAT = "repeat"
-"""In place of an input's values: those that it had before."""
-
-Changes = list[tuple[float, float]]
-"""Changes of one input: seconds from now, and the value from then on."""
-
-MAX_STEPS = 20_000
-"""Steps of a forecast; each is as long as the time between measurements."""
-
-MAX_TIMES = 160
-"""Times in the answer."""
-
-COPY_ROWS = 16_384
-"""Rows copied at once, so that a long history does not hold the engine's lock for long."""
+REPEAT = "repeat"  # in place of an input's values: those that it had before
+Changes = list[tuple[float, float]]  # changes of one input: seconds from now, and the value from then on
+MAX_STEPS = 20_000  # steps of a forecast; each is as long as the time between measurements
+MAX_TIMES = 160  # times in the answer
+COPY_ROWS = 16_384  # rows copied at once, so that a long history does not hold the engine's lock for long
 
 
 def recorded(engine: Running, names: Sequence[str], now: int, horizon: float) -> dict[str, Changes]:

@@ -27,14 +27,12 @@ from .numbers import listed, number
 
 LAGS = 50
 
-MIN_READINGS = 50
-"""Measurements below which nothing is called consistent."""
+MIN_READINGS = 50  # measurements below which nothing is called consistent
 
 SLOW, SLOW_SHARE = 25, 0.02
 """A slow error is the part of the innovations' variance that remains over so many lags, if it exceeds this share."""
 
-MAX_ROWS = 24
-"""Rows that are analysed, as many as have charts."""
+MAX_ROWS = 24  # rows that are analysed, as many as have charts
 
 
 def rows_json(

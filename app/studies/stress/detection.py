@@ -40,17 +40,10 @@ from .scenario import (
 
 VISIBLE, INVISIBLE, CHANCE = FORETOLD = ("visible", "invisible", "by chance")
 
-DETECTION = 0.95
-"""Probability of detection of a visible fault, and of no alarm for an invisible one."""
-
-REHEARSALS = 5
-"""Logs in which a mistake is rehearsed."""
-
-DETECTION_SHARE = 0.5
-"""Share of the time that a mistake lasts within which each rehearsal must find what is visible."""
-
-REHEARSAL_SEED = 1000
-"""Seeds from here on are of rehearsals."""
+DETECTION = 0.95  # probability of detection of a visible fault, and of no alarm for an invisible one
+REHEARSALS = 5  # logs in which a mistake is rehearsed
+DETECTION_SHARE = 0.5  # share of the time that a mistake lasts within which each rehearsal must find what is visible
+REHEARSAL_SEED = 1000  # seeds from here on are of rehearsals
 
 
 class Foretold(NamedTuple):
@@ -175,8 +168,7 @@ def _readings(fold: Fold) -> np.ndarray:
     return np.flatnonzero(fold.log.kind[: fold.n] == READING)
 
 
-GATE = 0.9973
-"""Gate of the defended fold, where the twin has none."""
+GATE = 0.9973  # gate of the defended fold, where the twin has none
 
 
 OUTCOMES = NAMED, MISNAMED, MISSED, UNSEEN, RIGHTLY_SILENT, FALSE = (

@@ -15,8 +15,7 @@ from sources.faults.kinds import Fault
 
 from .scenario import Mistake
 
-SMALL_BANDS = frozenset({"narrow", "correlated", "shifted"})
-"""Causes that show an overconfident filter."""
+SMALL_BANDS = frozenset({"narrow", "correlated", "shifted"})  # causes that show an overconfident filter
 
 LARGE_BANDS = frozenset({"wide", "alternating"})
 SHIFT = frozenset({"shifted", "refused"})
