@@ -21,20 +21,51 @@ class TwinOptions:
     """Name of a bundled twin, or path to a YAML file."""
 
 
-@dataclass(frozen=True)
-class FoldOptions(TwinOptions):
-    """Options of a command that folds the log of a twin."""
+@dataclass(frozen=True, kw_only=True)
+class SetOption:
+    """Option of a command that changes settings of a twin."""
+
+    set: Repeated = ()
+    """KEY=VALUE, repeatable; see `nisus run --help`."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class EstimatorOption(SetOption):
+    """Option of a command that runs one estimator."""
 
     estimator: str | None = None
     """Estimator to use instead of the twin's own; `nisus filters` lists them."""
-    set: Repeated = ()
-    """KEY=VALUE, repeatable; see `nisus run --help`."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TuningOption(SetOption):
+    """Option of a command that starts from a tuning version."""
+
     tuning: str | None = None
     """Name of the tuning version to start from; `nisus tunings TWIN` lists them. Default: the twin's file."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LogOptions:
+    """Options of a command that reads the log of a twin."""
+
     log: tuple[Path, ...] = ()
     """Recordings to read instead of the twin's own."""
     duration: float | None = None
     """Read only this many seconds of the source."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class JsonOption:
+    """Option of a command with a result for scripts."""
+
+    json: Flag = False
+    """Print JSON."""
+
+
+@dataclass(frozen=True)
+class FoldOptions(LogOptions, TuningOption, EstimatorOption, TwinOptions):
+    """Options of a command that folds the log of a twin."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,18 +80,28 @@ class TableOptions:
     """Unit of the time column: s, ms, us, ns, min or h."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class PageOptions:
+    """Options of a command that opens the page."""
+
+    port: int = 9900
+    """Port of the page on 127.0.0.1; 0 picks a free one."""
+    recordings: Path = Path("recordings")
+    """Folder of recordings and of logs dropped on the page; created when needed."""
+    no_browser: Flag = False
+    """Print the URL without opening a browser."""
+    duration: float | None = None
+    """Stop after this many seconds."""
+
+
 @dataclass(frozen=True)
-class Run:
+class Run(PageOptions, TuningOption, EstimatorOption):
     """Run a twin and show it in the browser. Without a twin: the gallery of bundled twins."""
 
     twin: Annotated[str | None, tyro.conf.Positional] = None
     """Name of a bundled twin (see `nisus twins`), or path to a YAML file. Default: choose one in the gallery."""
-    estimator: str | None = None
-    """Estimator to use instead of the twin's own; `nisus filters` lists them."""
     set: Repeated = ()
     """KEY=VALUE, repeatable: Q.temperature=0.02, R.winding=9, p.NAME, use.SENSOR=false, gate, or a dotted YAML key."""
-    tuning: str | None = None
-    """Name of the tuning version to start from; `nisus tunings TWIN` lists them. Default: the twin's file."""
     log: tuple[Path, ...] = ()
     """Recordings to read instead of the twin's own."""
     record: Path | None = None
@@ -69,20 +110,12 @@ class Run:
     """Continue in a new file (run-2.rrd after run.rrd) at this size or duration: 1GB, 10min."""
     speed: float | None = None
     """Speed of replays and simulations, as a multiple of real time; inf is as fast as possible. Default: the twin's."""
-    duration: float | None = None
-    """Stop after this many seconds."""
-    port: int = 9900
-    """Port of the page on 127.0.0.1; 0 picks a free one."""
-    recordings: Path = Path("recordings")
-    """Folder of recordings and of logs dropped on the page; created when needed."""
-    no_browser: Flag = False
-    """Print the URL without opening a browser."""
     headless: Flag = False
     """Run without a page."""
 
 
 @dataclass(frozen=True)
-class Fold(FoldOptions):
+class Fold(JsonOption, FoldOptions):
     """Fold the log of a twin as fast as possible and print scores, calibration and fault episodes."""
 
     out: Path | None = None
@@ -93,26 +126,22 @@ class Fold(FoldOptions):
     """Draw the states with their measurements, and the NIS, into this .png, .pdf or .svg (needs `nisus[plot]`)."""
     smooth: Flag = False
     """Also smooth: estimate each state from all measurements, before and after. Adds columns to --out."""
-    json: Flag = False
-    """Print one JSON object."""
 
 
 @dataclass(frozen=True)
-class Check(FoldOptions):
+class Check(JsonOption, FoldOptions):
     """Print a checklist of what could be wrong with a twin without being detected.
 
     Linearity, size, shape of the posterior, observability, the smallest visible fault of every sensor, input and
     parameter, protection levels, timing, health, and the prediction of every sensor held out in turn.
     """
 
-    json: Flag = False
-    """Print one JSON object."""
     html: Path | None = None
     """Also write a self-contained HTML page."""
 
 
 @dataclass(frozen=True)
-class Advise(TableOptions):
+class Advise(JsonOption, TableOptions, LogOptions, EstimatorOption):
     """Recommend an estimator for a twin from its log, or draft a twin from recordings.
 
     For a twin: the simplest estimator whose assumptions hold on the log, with the figure behind each claim and the
@@ -121,18 +150,8 @@ class Advise(TableOptions):
 
     what: Annotated[tuple[str, ...], tyro.conf.Positional]
     """Name of a bundled twin, path to a YAML file, or recordings."""
-    estimator: str | None = None
-    """Estimator to start from instead of the twin's own."""
-    set: Repeated = ()
-    """KEY=VALUE, repeatable; see `nisus run --help`."""
-    log: tuple[Path, ...] = ()
-    """Recordings to read instead of the twin's own."""
-    duration: float | None = None
-    """Read only this many seconds of the source."""
     signals: str = ""
     """Signals of the recordings to use, separated by commas; see `nisus new --help`."""
-    json: Flag = False
-    """Print one JSON object."""
     apply: Flag = False
     """Write the lines into the twin's YAML; the previous file is kept beside it."""
     out: Path | None = None
@@ -141,7 +160,7 @@ class Advise(TableOptions):
 
 
 @dataclass(frozen=True)
-class Compare:
+class Compare(JsonOption, LogOptions, TuningOption):
     """Fold every applicable filter over the same log, in parallel, and print a table of scores.
 
     Filters that draw random members are folded with eight seeds; their figures are mean ± standard deviation of one
@@ -152,28 +171,18 @@ class Compare:
     """Name of a bundled twin, path to a YAML file, or `all` for every bundled twin."""
     estimators: tuple[str, ...] = ()
     """Compare only these filters."""
-    set: Repeated = ()
-    """KEY=VALUE, repeatable; see `nisus run --help`."""
-    tuning: str | None = None
-    """Name of the tuning version to start from; `nisus tunings TWIN` lists them. Default: the twin's file."""
-    log: tuple[Path, ...] = ()
-    """Recordings to read instead of the twin's own."""
-    duration: float | None = None
-    """Read only this many seconds of the source."""
     logs: int = 1
     """Number of simulated logs, with consecutive seeds; figures are mean ± standard deviation over them."""
     budget: float = 20.0
     """CPU seconds for each filter; a slower filter folds a shorter span, shown in its row."""
     jobs: int | None = None
     """Number of processes. Default: one per processor."""
-    json: Flag = False
-    """Print one JSON list."""
     write: Flag = False
     """Save the table as CSV: config/scores/NAME.csv for a bundled twin, else NAME.scores.csv beside the YAML."""
 
 
 @dataclass(frozen=True)
-class Tune(TwinOptions):
+class Tune(JsonOption, EstimatorOption, TwinOptions):
     """Fit noises, parameters and options to recordings, and propose the result if it predicts held-out data better.
 
     Each recording is divided into blocks of time, and every third is held out to judge the fit. So are each sensor in
@@ -189,8 +198,6 @@ class Tune(TwinOptions):
     squared error. Default: witnesses for recordings, likelihood for simulations."""
     predict: tuple[str, ...] = ()
     """Sensors that crps and error hold out. Default: each in turn."""
-    estimator: str | None = None
-    """Estimator to use instead of the twin's own; `nisus filters` lists them."""
     set: Repeated = ()
     """KEY=VALUE, repeatable; see `nisus run --help`. Sets the start of the fit, which is also its weak prior."""
     log: Repeated = ()
@@ -213,12 +220,10 @@ class Tune(TwinOptions):
     """Save the proposed tuning as a tuning version of this name; see `nisus tunings`."""
     note: str = ""
     """Note to save with --keep."""
-    json: Flag = False
-    """Print one JSON object."""
 
 
 @dataclass(frozen=True)
-class Learn(TwinOptions):
+class Learn(JsonOption, EstimatorOption, TwinOptions):
     """Learn the model error of a twin from recordings, as a correction with its own uncertainty.
 
     Each recording is divided into blocks of time; on every third the twin is judged with and without the correction.
@@ -238,10 +243,6 @@ class Learn(TwinOptions):
     """Degree of ridge: 2 adds squares and products of the features."""
     window: float = 30.0
     """Seconds over which the model is compared with the true states, or with smoothed states where there are none."""
-    estimator: str | None = None
-    """Estimator to use instead of the twin's own; `nisus filters` lists them."""
-    set: Repeated = ()
-    """KEY=VALUE, repeatable; see `nisus run --help`."""
     log: Repeated = ()
     """Recording to learn from instead of the twin's own, repeatable; FILE,FILE are parts of one recording."""
     duration: float | None = None
@@ -250,8 +251,6 @@ class Learn(TwinOptions):
     """Number of blocks with equally many measurements; every third is held out (of 3 the last)."""
     keep: Path | None = None
     """Write the correction to this .yaml file; a twin uses it with `learned: FILE`."""
-    json: Flag = False
-    """Print one JSON object."""
 
 
 @dataclass(frozen=True)
@@ -280,7 +279,7 @@ class Guard:
 
 
 @dataclass(frozen=True)
-class Stress:
+class Stress(JsonOption, TuningOption):
     """Inject faults into a twin and print how soon and how correctly they are detected.
 
     Tuning errors hold from the start. Sensor faults hold from one third to two thirds of the log, to show false alarms
@@ -299,14 +298,8 @@ class Stress:
     """Number of seeds for simulator, faults and filter."""
     duration: float = 600.0
     """Seconds of the log."""
-    set: Repeated = ()
-    """KEY=VALUE, repeatable; see `nisus run --help`."""
-    tuning: str | None = None
-    """Name of the tuning version to start from; `nisus tunings TWIN` lists them. Default: the twin's file."""
     log: tuple[Path, ...] = ()
     """Recordings to read instead of the twin's own."""
-    json: Flag = False
-    """Print one JSON list, an object per fault, filter and seed."""
 
 
 @dataclass(frozen=True)
@@ -331,19 +324,11 @@ class Filters:
 
 
 @dataclass(frozen=True)
-class Review:
+class Review(PageOptions):
     """Open a recording on the page, where its measurements can be folded again with other settings."""
 
     file: Annotated[Path, tyro.conf.Positional]
     """The .rrd file."""
-    port: int = 9900
-    """Port of the page on 127.0.0.1; 0 picks a free one."""
-    recordings: Path = Path("recordings")
-    """Folder of recordings and of logs dropped on the page; created when needed."""
-    no_browser: Flag = False
-    """Print the URL without opening a browser."""
-    duration: float | None = None
-    """Stop after this many seconds."""
 
 
 @dataclass(frozen=True)
@@ -375,11 +360,11 @@ class Twins:
 
 
 @dataclass(frozen=True)
-class Tunings(TwinOptions):
+class Tunings(JsonOption, FoldOptions):
     """List the tuning versions of a twin, compare two of them, save one or accept one.
 
     Versions are files FILE.tunings/NAME.yaml beside FILE.yaml; those of a bundled twin are in the user's data folder.
-    `own` is the twin's file itself.
+    `own` is the twin's file itself. --estimator, --set, --tuning, --log and --duration are for --save.
     """
 
     names: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
@@ -390,18 +375,6 @@ class Tunings(TwinOptions):
     """Accept the version of this name: `nisus guard` then folds with it."""
     note: str = ""
     """Note for --save and --accept."""
-    estimator: str | None = None
-    """For --save: estimator to use instead of the twin's own."""
-    set: Repeated = ()
-    """For --save: KEY=VALUE, repeatable; see `nisus run --help`."""
-    tuning: str | None = None
-    """For --save: version to start from. Default: the twin's file."""
-    log: tuple[Path, ...] = ()
-    """For --save: recordings to score on instead of the twin's own."""
-    duration: float | None = None
-    """For --save: read only this many seconds of the source."""
-    json: Flag = False
-    """Print JSON."""
 
 
 @dataclass(frozen=True)
@@ -413,13 +386,11 @@ class Schema:
 
 
 @dataclass(frozen=True)
-class Log(TableOptions):
+class Log(JsonOption, TableOptions):
     """List the content of recordings: buses, messages, signals or columns, with rates, time spans and gaps."""
 
     files: Annotated[tuple[Path, ...], tyro.conf.Positional]
     """CAN logs (MF4, BLF, ASC, TRC, candump, CSV, SQLite) or tables (CSV, Parquet, MATLAB, NumPy), in order."""
-    json: Flag = False
-    """Print one JSON object."""
 
 
 @dataclass(frozen=True)

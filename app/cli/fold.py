@@ -11,13 +11,11 @@ from config.yaml_files import writing
 from estimators.diagnostics.episodes import episodes
 from estimators.diagnostics.score import score
 from estimators.errors import ConfigError
-from estimators.fold import Fold
 from estimators.interface.table import table_of
 from estimators.registry import find_estimator
 from estimators.smoothing.smooth import check_smooth, smooth
 from estimators.smoothing.walk import Smoothed
 
-from ..live.watchdog import interruptible
 from ..present.drawing.plot import check_plot, plot_track
 from ..present.export.report import Reported, report
 from ..present.export.track_file import encoded
@@ -31,11 +29,10 @@ from ..studies.fold_result import (
     fold_topics,
     smoothing_score,
 )
+from ..studies.scores import pictures_of
 from ..twin.log_reader import read_log
-from ..twin.twin import load_twin
 from ..views.recording.format import TAKEN
-from .options import settings
-from .prepare import attend, prepare
+from .prepare import attend, fold_log, opened, prepare
 
 if TYPE_CHECKING:
     from .arguments import Fold as Arguments
@@ -43,8 +40,7 @@ if TYPE_CHECKING:
 
 def fold_twin(arguments: Arguments) -> int:
     """Run the command."""
-    overrides = settings(arguments.set, arguments.estimator, arguments.tuning)
-    twin = load_twin(arguments.twin, log_files=arguments.log or None, overrides=overrides)
+    twin = opened(arguments)
     out = arguments.out
     if out is not None and out.suffix not in (".csv", ".parquet", ".rrd"):
         raise ConfigError(f"--out {out}: must end in .csv, .parquet or .rrd")
@@ -57,25 +53,10 @@ def fold_twin(arguments: Arguments) -> int:
         check_smooth(find_estimator(twin.estimator, twin.model), twin.model, twin.tuning.options)
     prepare(twin)
     log, counts = read_log(twin, arguments.duration)
-    fold = Fold(
-        twin.estimator,
-        twin.model,
-        twin.tuning,
-        log,
-        pairs=twin.pairs,
-        policy=twin.policy,
-        picture=twin.picture if recorded else None,
-        expected=twin.expected,
-    )
     begun = time.perf_counter()
-
-    def work() -> None:
-        fold.advance()
-        fold.finish()
-
-    interruptible(fold, work)
+    fold = fold_log(twin, log, picture=twin.picture if recorded else None)
     seconds = (time.perf_counter() - begun) / log.n
-    pictures = fold.pictures.taken if fold.pictures is not None else []
+    pictures = pictures_of(fold)
     smoothed: Smoothed | None = attend(twin.model, lambda: smooth(fold), "smoothing") if arguments.smooth else None
     result = FoldResult(
         twin,
@@ -112,8 +93,7 @@ def _write(path: Path, result: FoldResult, smoothed: Smoothed | None) -> None:
     if path.suffix == ".rrd":
         from ..views.recording.writer import write_recording
 
-        pictures = fold.pictures.taken if fold.pictures is not None else []
-        write_recording(path, twin, fold.log, fold.track, pictures, found, smoothed)
+        write_recording(path, twin, fold.log, fold.track, pictures_of(fold), found, smoothed)
         return
     table = table_of(
         twin.model, fold.log.events, fold.track, found, smoothed=smoothed,

@@ -17,11 +17,56 @@ from estimators.registry import ESTIMATORS, unfit
 from sources.pieces import make, pieces_of
 
 from ..live.compilers import Compiler
-from ..live.watchdog import CallWatch
+from ..live.watchdog import CallWatch, interruptible
 from ..live.workshop import Workshop
-from ..twin.twin import Twin
+from ..twin.twin import Twin, load_twin
+from .options import settings
 
 STATUS_DELAY_S = 1.0  # seconds before the line appears; loading from the cache takes less
+
+
+def opened(arguments: Any) -> Twin:
+    """Return the twin that a command names, with its `--log`, `--set`, `--estimator` and `--tuning`.
+
+    Raises:
+        NisusError: If its YAML or its model is wrong.
+    """
+    overrides = settings(arguments.set, getattr(arguments, "estimator", None), getattr(arguments, "tuning", None))
+    return load_twin(arguments.twin, log_files=arguments.log or None, overrides=overrides)
+
+
+def prepared(arguments: Any) -> Twin:
+    """Return the twin that a command names, see `opened`, once its filter and model are compiled."""
+    twin = opened(arguments)
+    prepare(twin)
+    return twin
+
+
+def fold_log(twin: Twin, log: Log, *, picture: Any = None) -> Fold:
+    """Fold a log to its end, so that Ctrl-C ends even a model function that does not return.
+
+    Args:
+        twin: The twin.
+        log: The log.
+        picture: Function that takes pictures of the estimate for a recording.
+    """
+    fold = Fold(
+        twin.estimator,
+        twin.model,
+        twin.tuning,
+        log,
+        pairs=twin.pairs,
+        policy=twin.policy,
+        picture=picture,
+        expected=twin.expected,
+    )
+
+    def work() -> None:
+        fold.advance()
+        fold.finish()
+
+    interruptible(fold, work)
+    return fold
 
 
 def prepare(twin: Twin) -> None:

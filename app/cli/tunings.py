@@ -8,17 +8,15 @@ from config.tunings import OWN
 from config.yaml_files import shown_path
 from estimators.diagnostics.score import score
 from estimators.errors import ConfigError, printable
-from estimators.fold import Fold
 
 from ..live.changes import difference
 from ..live.tunings.versions import COVERAGE, Settings, accept, figures, keep, listing, version_text
-from ..live.watchdog import interruptible
 from ..present.result import TableColumn, Topic, to_json, to_text
 from ..studies.baseline import badness
+from ..studies.scores import pictures_of
 from ..twin.log_reader import read_log
 from ..twin.twin import load_twin
-from .options import settings
-from .prepare import prepare
+from .prepare import fold_log, prepared
 
 if TYPE_CHECKING:
     from .arguments import Tunings as Arguments
@@ -43,19 +41,10 @@ def tunings_of(arguments: Arguments) -> int:
 
 def _save(arguments: Arguments, name: str) -> None:
     """Fold the twin's log with the given settings, and save them with their scores."""
-    overrides = settings(arguments.set, arguments.estimator, arguments.tuning)
-    twin = load_twin(arguments.twin, log_files=arguments.log or None, overrides=overrides)
-    prepare(twin)
+    twin = prepared(arguments)
     log, _ = read_log(twin, arguments.duration)
-    fold = Fold(twin.estimator, twin.model, twin.tuning, log, policy=twin.policy, expected=twin.expected)
-
-    def work() -> None:
-        fold.advance()
-        fold.finish()
-
-    interruptible(fold, work)
-    pictures = fold.pictures.taken if fold.pictures is not None else []
-    scores = figures(score(fold.track, log.events, twin.model, pictures, gate=twin.tuning.gate))
+    fold = fold_log(twin, log)
+    scores = figures(score(fold.track, log.events, twin.model, pictures_of(fold), gate=twin.tuning.gate))
     given = Settings(twin.estimator, twin.tuning, printable(arguments.note), scores=scores)
     print(f"{shown_path(keep(twin, name, version_text(twin, given)))}: kept")
 

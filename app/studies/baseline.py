@@ -35,7 +35,6 @@ from scipy.special import stdtrit
 from config.companion_schema import FigureSection, ReferenceSection
 from config.problems import check_section
 from config.yaml_files import as_flow, read_text, writing
-from estimators.diagnostics.field_pictures import Picture
 from estimators.diagnostics.health import PROBABILITY
 from estimators.diagnostics.score import score
 from estimators.errors import ConfigError
@@ -45,6 +44,7 @@ from estimators.log import Log
 from estimators.track import DIVERGED, HELD_OUT, USED
 
 from ..live.tunings.versions import COVERAGE, LIKELIHOOD, NIS, REFUSED, RMSE, figures
+from .scores import pictures_of
 
 N_BLOCKS = 20  # blocks of a log, with equally many events
 ALLOWED_SHARE = 0.1  # part of a standard error that a figure may change by
@@ -65,9 +65,8 @@ def fold_figures(fold: Fold, rows: np.ndarray | None = None) -> dict[str, float]
     """
     rows = np.ones(fold.n, bool) if rows is None else rows
     track, events = fold.track.select(rows), fold.log.events.select(slice(0, fold.n)).select(rows)
-    taken: Sequence[Picture] = () if fold.pictures is None else fold.pictures.taken
     # A picture shows the field before its event.
-    pictures = [one for one in taken if 0 < one.before <= rows.size and rows[one.before - 1]]
+    pictures = [one for one in pictures_of(fold) if 0 < one.before <= rows.size and rows[one.before - 1]]
     found = figures(score(track, events, fold.model, pictures, gate=fold.tuning.gate))
     used = track.verdict == USED
     if NIS in found:
@@ -124,8 +123,7 @@ def _error_counts(fold: Fold) -> dict[str, int]:
         for k in range(len(sensor.rows)):
             name = model.row_names[model.row_start[s] + k]
             found[name] = found.get(name, 0) or int(np.isfinite(rows[:, k]).sum())
-    taken = [] if fold.pictures is None else fold.pictures.taken
-    return {**found, "field": sum(picture.cells for picture in taken)}
+    return {**found, "field": sum(picture.cells for picture in pictures_of(fold))}
 
 
 class ComparedFigure(NamedTuple):

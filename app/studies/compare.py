@@ -21,7 +21,7 @@ from estimators.track import DIVERGED
 
 from ..twin.twin import Twin, load_twin
 from .processes import beside, jobs_of
-from .scores import FilterScore, Spread
+from .scores import FilterScore, Spread, pictures_of
 
 SEEDS = 8  # folds of a filter that draws random members; others are folded once
 BUDGET_S = 20.0  # default processor seconds for the folds of one filter
@@ -128,7 +128,7 @@ def outcome_of(fold: Fold, events: Events, seconds: float) -> Outcome:
     """Return the scores of a fold over its first events."""
     model, track = fold.model, fold.track.select(slice(0, len(events)))
     fold.finish()
-    pictures = () if fold.pictures is None else [one for one in fold.pictures.taken if one.before <= len(events)]
+    pictures = [one for one in pictures_of(fold) if one.before <= len(events)]
     result = score(track, events, model, pictures, gate=fold.tuning.gate)
     fits, units = result.states, {state.name: state.unit for state in model.shown_states}
     if result.field is not None and model.grid is not None:

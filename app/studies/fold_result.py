@@ -24,7 +24,7 @@ from estimators.log import READING
 from estimators.plausibility import reasons_by_sensor
 from estimators.smoothing.smooth import consistency
 from estimators.smoothing.walk import Smoothed
-from estimators.track import FAILED, HEALTH_NAMES, REASONS, USED
+from estimators.track import FAILED, HEALTH_NAMES, REASONS, USED, Track
 from estimators.tuning import SHARED_ENTRY_ROWS
 from sources.source import WRONG_TIME
 
@@ -79,6 +79,12 @@ def calibration_of(twin: Twin, fold: Fold) -> list[Calibration]:
     return rows + truth_calibration(twin.model, events, track)
 
 
+def health_of(track: Track) -> dict[str, float]:
+    """Return the share of rows in each state of health."""
+    share = np.bincount(track.health, minlength=len(HEALTH_NAMES)) / max(1, len(track))
+    return dict(zip(HEALTH_NAMES, share.tolist(), strict=True))
+
+
 def dropped(counts: Mapping[str, int], fold: Fold) -> list[Episode]:
     """Return an episode if many measurements never reached the log."""
     lost = counts.get("stale", 0) + counts.get(WRONG_TIME, 0)
@@ -122,7 +128,6 @@ def fold_json(result: FoldResult) -> dict[str, Any]:
     one lasts) and `suspects`. `smoothed` has `rmse`, `coverage` and `consistency` of the smoothed states.
     """
     twin, fold, scored, counts = result.twin, result.fold, result.score, result.counts
-    share = np.bincount(fold.track.health, minlength=len(HEALTH_NAMES)) / len(fold.track)
     smoothing = result.smoothing
     found = {
         "twin": twin.name,
@@ -155,7 +160,7 @@ def fold_json(result: FoldResult) -> dict[str, Any]:
         "screened": _screened(result),
         "failure": _failure_cause(fold),
         "account": fold.account(),
-        "health": dict(zip(HEALTH_NAMES, share, strict=True)),
+        "health": health_of(fold.track),
         "calibration": [calibration_json(entry) for entry in result.calibration],
         "episodes": [_episode_json(item) for item in result.episodes],
         "seconds_per_event": result.seconds,

@@ -7,12 +7,16 @@ import io
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from config.loader import TWINS
 from config.yaml_files import writing
+
+if TYPE_CHECKING:
+    from estimators.diagnostics.field_pictures import Picture
+    from estimators.fold import Fold
 
 GAP = "  "  # between printed columns; no cell holds two spaces
 
@@ -62,6 +66,11 @@ class ScoreCell(NamedTuple):
     value: float
     spread: float
     rounding: float
+
+
+def pictures_of(fold: Fold) -> list[Picture]:
+    """Return the pictures that a fold took of a large field."""
+    return [] if fold.pictures is None else fold.pictures.taken
 
 
 def spread(title: str) -> str:

@@ -1,0 +1,432 @@
+"""Check of a twin over its log: undetectable faults, observability, consistency; as figures and as topics."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from config.source_schema import CanLogSection, CanSection, MergedSection
+from estimators.diagnostics.calibration import BANDS, Calibration
+from estimators.diagnostics.episodes import Episode, episode_json, episodes
+from estimators.diagnostics.sensitivity import Gramian, GramianView, Sensitivity, bounds_of, sensitivity
+from estimators.diagnostics.sensitivity.checklist import Arrivals, Dimension, Linearity, arrivals, dimension
+from estimators.diagnostics.sensitivity.gramian import directions
+from estimators.diagnostics.sensitivity.held_out import HeldOut, held_out
+from estimators.diagnostics.sensitivity.posterior import Peaks, Tail, tails
+from estimators.diagnostics.sensitivity.responses import digits
+from estimators.fold import Fold
+from estimators.log import READING, Log
+from estimators.track import Track
+
+from ..present.export.calibration_lines import calibration_lines
+from ..present.result import WORSE, Bar, Cell, Topic, plain
+from ..twin.twin import Twin
+from .advice.measured import Measured
+from .compare import timed
+from .fold_result import calibration_json, calibration_of, health_of
+
+BUDGET_S = 20.0  # seconds of one processor for the folds with held-out sensors, which limit the part of the log
+MAX_CORRELATION = 0.9  # correlation beyond which two faults are hardly distinguishable
+MAX_ROWS = 12  # rows of a table as text or HTML; JSON has all
+
+
+class ChecklistLine(NamedTuple):
+    """One question of the checklist: `answer` is yes, partly, no, or "not told"."""
+
+    key: str
+    question: str
+    answer: str
+    figures: str
+    remedy: str
+
+    @property
+    def mark(self) -> str:
+        """Rating of the answer, "good", "partly", "bad" or "": several peaks or heavy tails are bad news."""
+        good, bad = ("no", "") if self.key == "posterior" else ("yes", "no")
+        return {good: "good", bad: "bad", "not told": ""}.get(self.answer, "partly")
+
+
+@dataclass(frozen=True)
+class Checked:
+    """All measurements on a twin. `span` is the part of the log, from its start, that was folded, s; None: all."""
+
+    twin: Twin
+    log: Log
+    fold: Fold
+    counts: Counter[str]
+    span: float | None
+    dimension: Dimension
+    linearity: Linearity
+    peaks: Peaks
+    tails: tuple[Tail, ...]
+    gramian: Gramian
+    sensitivity: Sensitivity
+    arrivals: tuple[Arrivals, ...]
+    calibration: list[Calibration]
+    episodes: list[Episode]
+    held_out: HeldOut
+
+
+def check(twin: Twin, log: Log, counts: Counter[str]) -> Checked:
+    """Compute all measures of a twin over a log.
+
+    Raises:
+        NisusError: If the twin's own filter does not run.
+    """
+    model, tuning = twin.model, twin.tuning
+    reporting = np.unique(log.channel[: log.n][log.kind[: log.n] == READING]).size
+    fold, seconds = timed(twin, twin.estimator, log.events, tuning.seed, BUDGET_S / (reporting + 2))
+    span = None
+    if fold.n < log.n:
+        span = float(log.t[fold.n - 1] - log.t[0]) * 1e-9
+        log.n = fold.log.n = fold.n
+    fold.finish()
+    measured = Measured(twin, log)
+    readings = int(np.sum(log.kind[: log.n] == READING))
+    covariance = fold.estimator.family not in ("particle", "ensemble")
+    return Checked(
+        twin=twin,
+        log=log,
+        fold=fold,
+        counts=counts,
+        span=span,
+        dimension=dimension(model, measured.rate, seconds * log.n / max(1, readings), covariance=covariance),
+        linearity=measured.linearity,
+        peaks=measured.peaks,
+        tails=tails(model, log, fold.track, marginal=fold.marginal),
+        gramian=measured.gramian,
+        sensitivity=sensitivity(twin.estimator, model, tuning, log, false_alarm=twin.policy.false_alarm_every),
+        arrivals=tuple(item for item, fed in zip(arrivals(model, log), twin.expected, strict=True) if fed or item.n),
+        calibration=calibration_of(twin, fold),
+        episodes=episodes(fold),
+        held_out=held_out(twin.estimator, model, tuning, log),
+    )
+
+
+def confounded(found: Sensitivity) -> list[tuple[str, str, float]]:
+    """Return pairs of faults that the log hardly distinguishes, with the correlation of their estimates.
+
+    The correlation is that of two unknown faults with all others known; pairs beyond `MAX_CORRELATION` are returned,
+    the largest first.
+    """
+    names = [nudge.subject for nudge in found.nudges]
+    root = np.sqrt(np.diag(found.fisher))
+    with np.errstate(all="ignore"):
+        c = -found.fisher / np.outer(root, root)
+    pairs = [(names[i], names[j], float(c[i, j])) for i, j in zip(*np.triu_indices(len(names), 1), strict=True)]
+    return sorted((pair for pair in pairs if abs(pair[2]) > MAX_CORRELATION), key=lambda pair: -abs(pair[2]))
+
+
+def stamps(twin: Twin) -> str:
+    """Return the origin of the times of the measurements."""
+    source = twin.config.source
+    kinds = {type(part) for part in source.parts} if isinstance(source, MergedSection) else {type(source)}
+    if kinds & {CanSection, CanLogSection}:
+        return "frames are stamped where they are received, not at the sensor"
+    return "every reading has the time at which it was measured"
+
+
+def health_shares(track: Track) -> str:
+    """Return the share of the track in each state of health, the largest first."""
+    shares = sorted(health_of(track).items(), key=lambda pair: -pair[1])
+    return ", ".join(f"{name} {_percent(share)}" for name, share in shares if share)
+
+
+def _percent(share: float) -> str:
+    """Format a share, as 0 % or 100 % only where it is exact."""
+    if 0.0 < share < 0.0005:
+        return "less than 0.1 %"
+    return "more than 99.9 %" if 0.9995 <= share < 1.0 else f"{100 * share:.3g} %"
+
+
+def figures(checked: Checked, checklist: Sequence[ChecklistLine]) -> dict[str, Any]:
+    """Return all figures of a check; times in seconds of the log, null where there is no number.
+
+    `checklist`: question, answer (yes, partly, no, not told), figures, remedy. `observability`: the Gramian of the log
+    and of each window, and pairs of faults that the log hardly distinguishes. `smallest_visible`: minimal detectable
+    fault of every sensor row, input and parameter, null if there is none in its range, and the undetectable range `low`
+    to `high`. `integrity`: protection level of each state beside 2 σ, and its fault. `held_out`: prediction of each
+    sensor row by the others. `open_loop`: RMS without measurements, by sensor row and by state with known truth;
+    `worse` where that of the filter is larger.
+    """
+    twin, gramian, found, held = checked.twin, checked.gramian, checked.sensitivity, checked.held_out
+    linearity, policy = checked.linearity, twin.policy
+
+    def view(part: GramianView) -> dict[str, Any]:
+        return {
+            "begin": part.begin * 1e-9,
+            "end": part.end * 1e-9,
+            "rank": part.rank,
+            "conditioning": part.conditioning,
+            "eigenvalues": part.eigenvalues,
+            "left": dict(zip(twin.model.state_names, part.deviation, strict=True)),
+            "weakest": part.text,
+        }
+
+    integrity: dict[str, Any] = {"reason": found.reason, "states": {}}
+    if not found.reason:
+        bounds = bounds_of(twin.model, found)
+        integrity |= {
+            "note": found.note,
+            "estimator": found.estimator,
+            "states": {name: bound._asdict() | {"fault": bound.fault or None} for name, bound in bounds.items()},
+        }
+    result: dict[str, Any] = plain(
+        {
+            "twin": twin.name,
+            "estimator": twin.estimator,
+            "span": checked.span,
+            "checklist": {line.key: line for line in checklist},
+            "observability": {
+                "estimator": gramian.estimator,
+                "reason": gramian.reason,
+                "note": gramian.note,
+                "whole": None if gramian.whole is None else view(gramian.whole),
+                "windows": [view(part) for part in gramian.windows],
+                "blame": [dict(zip(("one", "other", "correlation"), pair, strict=True)) for pair in confounded(found)],
+                "deviation": {
+                    nudge.subject: value
+                    for nudge, value in zip(found.nudges, found.among().deviation, strict=True)
+                },
+            },
+            "smallest_visible": [
+                {
+                    **{name: getattr(fault.nudge, name) for name in ("kind", "name", "unit", "value")},
+                    "size": fault.visible,
+                    "low": fault.low,
+                    "high": fault.high,
+                    "seen": np.isfinite(fault.visible),
+                }
+                for fault in found.faults
+            ],
+            "integrity": integrity,
+            "held_out": {
+                row.row: {
+                    **{name: getattr(row, name) for name in ("sensor", "unit", "n", "rms", "bias")},
+                    "coverage": {
+                        f"{100 * band:.0f}": {"value": value, "low": low, "high": high}
+                        for band, value, (low, high) in zip(BANDS, row.coverage, row.intervals, strict=True)
+                    },
+                    "open_loop": row.open_loop,
+                    "worse": row.worse,
+                }
+                for row in held.rows
+            },
+            "open_loop": {
+                "sensors": {row.row: {"unit": row.unit, "rms": row.open_loop} for row in held.rows},
+                "states": {
+                    item.state: {
+                        "unit": item.unit,
+                        "rms": item.open_loop,
+                        "filter": item.filter,
+                        "worse": item.worse,
+                    }
+                    for item in held.states
+                },
+            },
+            "timing": {
+                "stamps": stamps(twin),
+                "horizon": twin.config.time.horizon,
+                "degraded_after": policy.degraded_after,
+                "stale_after": policy.stale_after,
+                "stale": checked.counts["stale"],
+                "sensors": {item.sensor: item for item in checked.arrivals},
+            },
+            "calibration": [calibration_json(entry) for entry in checked.calibration],
+            "posterior": {"peaks": checked.peaks, "tails": {tail.row: tail for tail in checked.tails}},
+            "linearity": {
+                **{name: getattr(linearity, name) for name in ("reason", "exact", "passes", "white", "text")},
+                "states": {item.name: item for item in linearity.states},
+                "rows": {item.name: item for item in linearity.rows},
+                "whiteness": {item.row: item for item in linearity.whiteness},
+            },
+            "dimension": checked.dimension,
+            "health": {
+                "share": health_of(checked.fold.track),
+                "false_alarm_every": policy.false_alarm_every,
+                "episodes": [episode_json(episode) for episode in checked.episodes],
+            },
+        }
+    )
+    return result
+
+
+def topics(checked: Checked, checklist: Sequence[ChecklistLine]) -> list[Topic]:
+    """Return a check as topics: title, checklist, faults, observability, held-out sensors, timing, health."""
+    twin, log = checked.twin, checked.log
+    seconds = float(log.t[log.n - 1] - log.t[0]) * 1e-9
+    part = "the first" if checked.span is not None else "all"
+    head = f"{twin.estimator} over {part} {seconds:.4g} s of its log, {log.n:,} events, {checked.dimension.nx:,} states"
+    lines = tuple((line.question, line.answer, line.figures, line.remedy) for line in checklist)
+    columns = ("question", "answer", "figures", "remedy")
+    health = [f"{health_shares(checked.fold.track)}.", *(episode.text for episode in checked.episodes[:MAX_ROWS])]
+    if len(checked.episodes) > MAX_ROWS:
+        health.append(f"... and {len(checked.episodes) - MAX_ROWS} more episodes.")
+    health += calibration_lines(checked.calibration, twin.model)[: 2 * MAX_ROWS]
+    return [
+        Topic(f"{twin.name}: {twin.title}", (head,)),
+        Topic("Checklist", (), columns, lines, marks=tuple(line.mark for line in checklist)),
+        *_fault_topics(checked),
+        *_held_out_topics(checked),
+        _timing(checked),
+        Topic("Health and calibration", tuple(health)),
+    ]
+
+
+def _table(
+    title: str,
+    columns: Sequence[str],
+    rows: Sequence[tuple[Cell, ...]],
+    *sentences: str,
+    bars: Sequence[Bar] = (),
+    legend: tuple[str, str] = ("", ""),
+) -> Topic:
+    """Return a topic with at most `MAX_ROWS` rows, a note on the others, and the sentences that are not empty."""
+    shown: list[tuple[Cell, ...]] = [tuple(plain(cell) for cell in row) for row in rows]
+    if len(rows) > MAX_ROWS + 1:
+        more = f"... and {len(rows) - MAX_ROWS} more, see --json"
+        shown = [*shown[:MAX_ROWS], (more, *[""] * (len(columns) - 1))]
+    said = tuple(filter(None, sentences))
+    return Topic(title, said, tuple(columns) if rows else (), tuple(shown), tuple(bars[:MAX_ROWS]), legend)
+
+
+def _fault_topics(checked: Checked) -> list[Topic]:
+    """Return protection levels, minimal detectable faults, observability, and faults that look alike."""
+    found, gramian, model = checked.sensitivity, checked.gramian, checked.twin.model
+    titles = (
+        "Protection levels: error of a state under one undetectable fault",
+        "Minimal detectable faults",
+        "Faults that are hard to distinguish",
+    )
+    if found.reason:
+        levels, smallest, alike = (Topic(title, (f"Not computed: {found.reason}.",)) for title in titles)
+    else:
+        note = f"{found.note}." if found.note else ""
+        bounds = bounds_of(model, found)
+        levels = _table(
+            titles[0],
+            ("state", "unit", "± 2 σ", "integrity bound", "by"),
+            [(name, item.unit, item.two_sigma, item.bound, item.fault or "none") for name, item in bounds.items()],
+            note,
+            bars=[Bar(name, item.unit, item.two_sigma, item.bound) for name, item in bounds.items()],
+            legend=("± 2 σ", "integrity bound"),
+        )
+        seconds = float(found.t[-1] - found.t[0]) * 1e-9
+        smallest = _table(
+            titles[1],
+            ("fault", "smallest visible", "passes unseen"),
+            [
+                (
+                    fault.nudge.subject,
+                    fault.nudge.size_text(fault.visible) if np.isfinite(fault.visible) else "undetectable in its range",
+                    fault.range_text,
+                )
+                for fault in found.faults
+            ],
+            note,
+            f"Smallest constant fault over all {seconds:.4g} s that is detected with a probability of 95 %.",
+        )
+        pairs = confounded(found)
+        free = (
+            [item for item in directions(found.fisher, found.nudges) if not item.deviation < 1.0]
+            if found.nudges
+            else []
+        )
+        alike = _table(
+            titles[2],
+            ("one", "other", "correlation"),
+            [(one, other, f"{value:+.2f}") for one, other, value in pairs],
+            note,
+            "The log does not distinguish these faults."
+            if pairs
+            else f"No two faults look alike: no correlation is beyond {MAX_CORRELATION:g}.",
+            f"With all unknown together {len(free)} combination(s) cannot be determined, first {free[0].text}."
+            if free
+            else "",
+        )
+    title = "Observability"
+    if gramian.whole is None:
+        return [levels, smallest, Topic(title, (f"Not computed: {gramian.reason}.",)), alike]
+    begin = float(gramian.whole.begin)
+    views = [
+        (
+            f"{(view.begin - begin) * 1e-9:.4g} to {(view.end - begin) * 1e-9:.4g} s",
+            f"{view.rank} of {model.nx}",
+            view.conditioning,
+            view.text,
+        )
+        for view in (gramian.whole, *gramian.windows)
+    ]
+    columns = ("part of the log", "rank", "conditioning", "weakest direction")
+    return [levels, smallest, _table(title, columns, views, f"{gramian.note}." if gramian.note else ""), alike]
+
+
+def _held_out_topics(checked: Checked) -> list[Topic]:
+    """Return the prediction of each held-out sensor, and the filter against the model alone."""
+    rows, states = checked.held_out.rows, checked.held_out.states
+    said = [
+        f"{row.row} is predicted {WORSE}: RMS {_text(row.rms)} {row.unit} by the other sensors, "
+        f"{_text(row.open_loop)} by the model alone."
+        for row in rows
+        if row.worse
+    ]
+    if len({row.sensor for row in rows}) == 1:
+        said.append("There is one sensor: held out, it leaves the open loop.")
+    held = _table(
+        "Each sensor held out and predicted by the others",
+        ("sensor row", "unit", "RMS", "bias", *(f"in {100 * band:.0f} %" for band in BANDS), "open loop", ""),
+        [
+            (
+                *(row.row, row.unit, row.rms, f"{row.bias:+.3g}"),
+                *(f"{100 * share:.3g}" for share in row.coverage),
+                row.open_loop,
+                WORSE if row.worse else "",
+            )
+            for row in rows
+        ],
+        *said[:MAX_ROWS],
+        bars=[Bar(row.row, row.unit, row.rms, row.open_loop) for row in rows],
+        legend=("RMS by the other sensors", "RMS without measurements"),
+    )
+    title = "Filter against the model alone, where the truth is known"
+    if not states:
+        return [held, Topic(title, ("The log has no true states: see the held-out sensors.",))]
+    open_loop = _table(
+        title,
+        ("state", "unit", "RMS of the filter", "RMS of the open loop", ""),
+        [(item.state, item.unit, item.filter, item.open_loop, WORSE if item.worse else "") for item in states],
+        *(
+            f"The filter makes {item.state} {WORSE}: RMS {_text(item.filter)} {item.unit} with measurements, "
+            f"{_text(item.open_loop)} without."
+            for item in states
+            if item.worse
+        ),
+        bars=[Bar(item.state, item.unit, item.filter, item.open_loop) for item in states],
+        legend=("filter", "open loop"),
+    )
+    return [held, open_loop]
+
+
+def _timing(checked: Checked) -> Topic:
+    known = any(np.isfinite(item.lateness).any() for item in checked.arrivals)
+    return _table(
+        "Arrival of measurements",
+        ("sensor", "readings", "a second", "longest gap, s", "missing, %", "lateness, s: half, 99 %, worst"),
+        [
+            (
+                *(item.sensor, item.n, item.rate, item.gap),
+                f"{100 * item.missing:.2g}" if np.isfinite(item.missing) else "-",
+                " / ".join(map(_text, item.lateness)) if known else "not known",
+            )
+            for item in checked.arrivals
+        ],
+        "" if known else "Lateness is not known: the log has only the time of measurement.",
+    )
+
+
+def _text(value: float) -> str:
+    return digits(value) if np.isfinite(value) else "-"
