@@ -17,12 +17,7 @@ DETECTION_COLUMNS: tuple[TableColumn | str, ...] = (
     *(TableColumn("green [%]", 0, 100.0), TableColumn("recovered [s]", 1), "first named", "right"),
 )
 ERROR_COLUMNS: tuple[TableColumn | str, ...] = (
-    "mistake",
-    "filter",
-    "state",
-    "undamaged",
-    "gate",
-    "no gate",
+    *("mistake", "filter", "state", "undamaged", "gate", "no gate"),
     TableColumn("in band [%]", 0, 100.0),
 )
 
