@@ -189,8 +189,7 @@ def figures(checked: Checked, checklist: Sequence[ChecklistLine]) -> dict[str, A
                 "windows": [view(part) for part in gramian.windows],
                 "blame": [dict(zip(("one", "other", "correlation"), pair, strict=True)) for pair in confounded(found)],
                 "deviation": {
-                    nudge.subject: value
-                    for nudge, value in zip(found.nudges, found.among().deviation, strict=True)
+                    nudge.subject: value for nudge, value in zip(found.nudges, found.among().deviation, strict=True)
                 },
             },
             "smallest_visible": [

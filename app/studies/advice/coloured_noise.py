@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from estimators.diagnostics.calibration import LIMITS, Calibration, calibrations
+from estimators.diagnostics.calibration import LIMITS, Calibration
 from estimators.errors import ModelError, NisusError
 from estimators.fit.entries import entries_of
 from estimators.fit.objective import Cancelled, Objective, maximise
@@ -26,9 +26,14 @@ from estimators.model.state_space import StateSpaceModel
 from estimators.tuning import Tuning
 
 from .measured import NO, UNTOLD, YES, Claim, Measured, digits
+from .questions import Question, correlated_rows, used_rows
 
-QUESTION = "Does coloured noise explain the correlated innovations?"
-OF = "correlation of one innovation with the next"
+COLOURED = Question(
+    "lasting",
+    "Does coloured noise explain the correlated innovations?",
+    LIMITS.correlation,
+    "correlation of one innovation with the next",
+)
 
 MAX_APPENDED = 3  # noises that are appended; beyond that the model itself needs work
 MIN_GAIN_NATS = 10.0  # least gain in likelihood: each adds two parameters, and the best of several is taken
@@ -71,7 +76,8 @@ class _Trial:
 
 def lasting(measured: Measured, estimator: str, options: Mapping[str, float] | None) -> tuple[Claim, Explained] | None:
     """Test the chosen filter; None if no row has correlated innovations."""
-    before = _begun(measured, estimator, options)
+    fold = measured.folded(estimator, options).fold
+    before = _Trial((), fold.tuning, fold, _likelihood(fold))
     related = _related(before)
     if not related:
         return None
@@ -79,11 +85,11 @@ def lasting(measured: Measured, estimator: str, options: Mapping[str, float] | N
     try:
         after = _explained(measured.twin.model, estimator, before)
     except NisusError as error:
-        return Claim("lasting", QUESTION, UNTOLD, worst, LIMITS.correlation, OF, str(error)), Explained()
+        return COLOURED.claim(UNTOLD, worst, str(error)), Explained()
     if after is before:
         reason = f"{related[0].subject} has correlation {worst:+.2f}, and no coloured noise raises the likelihood"
         text = "a state is missing, or the asset changes: see the innovations over time"
-        return Claim("lasting", QUESTION, NO, worst, LIMITS.correlation, OF, reason, text), Explained()
+        return COLOURED.claim(NO, worst, reason, text), Explained()
     left = _related(after)
     found = Explained(_sections(after), after.likelihood - before.likelihood, tuple(left))
     figure = max((entry.correlation.value for entry in _rows(after)), default=0.0)
@@ -96,12 +102,7 @@ def lasting(measured: Measured, estimator: str, options: Mapping[str, float] | N
         + (f"{len(left)} still {'is' if len(left) == 1 else 'are'}, {left[0].subject} most" if left else "none remains")
     )
     remedy = "put the lines with `over` into the YAML; nisus tune fits their size and time"
-    return Claim("lasting", QUESTION, NO if left else YES, figure, LIMITS.correlation, OF, reason, remedy), found
-
-
-def _begun(measured: Measured, estimator: str, options: Mapping[str, float] | None) -> _Trial:
-    fold = measured.folded(estimator, options).fold
-    return _Trial((), fold.tuning, fold, _likelihood(fold))
+    return COLOURED.claim(NO if left else YES, figure, reason, remedy), found
 
 
 def _likelihood(fold: Fold) -> float:
@@ -109,17 +110,13 @@ def _likelihood(fold: Fold) -> float:
 
 
 def _rows(trial: _Trial) -> list[Calibration]:
-    fold = trial.fold
-    found = calibrations(
-        fold.model, fold.log.events, fold.track, gate=fold.tuning.gate, marginal=fold.marginal, limits=LIMITS
-    )
-    return [entry for entry in found if entry.role == "used" and np.isfinite(entry.scale.high)]
+    return [entry for entry in used_rows(trial.fold) if np.isfinite(entry.scale.high)]
 
 
 def _related(trial: _Trial) -> list[Calibration]:
     """Return the rows with positive correlation, the largest first."""
-    rows = [entry for entry in _rows(trial) if entry.correlation.beyond(-LIMITS.correlation, LIMITS.correlation)]
-    return sorted((entry for entry in rows if entry.correlation.value > 0.0), key=lambda each: -each.correlation.value)
+    rows = [entry for entry in correlated_rows(_rows(trial)) if entry.correlation.value > 0.0]
+    return sorted(rows, key=lambda each: -each.correlation.value)
 
 
 def _explained(model: StateSpaceModel, estimator: str, begun: _Trial) -> _Trial:
@@ -145,10 +142,10 @@ def _candidates(model: StateSpaceModel, estimator: str, trial: _Trial, row: Cali
     fold = trial.fold
     index = fold.model.row_names.index(row.subject)
     k = int(np.searchsorted(fold.model.row_start, index, side="right")) - 1
-    said = np.flatnonzero((fold.log.kind[: fold.n] == READING) & (fold.log.channel[: fold.n] == k))
+    rows = np.flatnonzero((fold.log.kind[: fold.n] == READING) & (fold.log.channel[: fold.n] == k))
     column = index - int(fold.model.row_start[k])
-    innovation = fold.track.innovation[said, column]
-    period = float(np.median(np.diff(fold.log.t[said]))) * 1e-9
+    innovation = fold.track.innovation[rows, column]
+    period = float(np.median(np.diff(fold.log.t[rows]))) * 1e-9
     # Of a lag of first order the correlation over a period is exp(-period / time).
     over = float(
         np.clip(-period / np.log(np.clip(row.correlation.value, 0.05, 0.95)), period, MAX_TIME_FACTOR * period)
@@ -158,8 +155,9 @@ def _candidates(model: StateSpaceModel, estimator: str, trial: _Trial, row: Cali
         if noise.name in done or not _can(model, Appended(noise.name, None, over)):
             continue
         key = f"Q.{noise.name}"
-        other = _folded(estimator, fold, trial.tuning.set(key, 4.0 * float(trial.tuning.get(key) or 0.0)))
-        if np.nanstd(other.track.innovation[said, column] - innovation) > MIN_EFFECT * np.nanstd(innovation):
+        other = Fold(estimator, fold.model, trial.tuning.set(key, 4.0 * float(trial.tuning.get(key) or 0.0)), fold.log)
+        other.advance()
+        if np.nanstd(other.track.innovation[rows, column] - innovation) > MIN_EFFECT * np.nanstd(innovation):
             yield Appended(noise.name, None, over)
     sensor = model.sensors[k]
     one = Appended(None, sensor.name, over, float(trial.tuning.r[index]))
@@ -255,9 +253,3 @@ def _sections(trial: _Trial) -> dict[str, dict[str, object]]:
 
 def _figure(value: object) -> float:
     return float(f"{float(value):.3g}")  # type: ignore[arg-type]
-
-
-def _folded(estimator: str, fold: Fold, tuning: Tuning) -> Fold:
-    other = Fold(estimator, fold.model, tuning, fold.log)
-    other.advance()
-    return other
