@@ -67,6 +67,16 @@ def copy_rows(engine: Running) -> Pull | None:
     return found if len(found.events) else None
 
 
+def last_written(index: np.ndarray) -> np.ndarray:
+    """Return which rows are valid, (n,): a row that is written again cuts off those after it.
+
+    Args:
+        index: Absolute indices of rows in the order in which they were written, (n,).
+    """
+    later = np.minimum.accumulate(index[::-1])[::-1]
+    return np.append(index[:-1] < later[1:], np.ones(min(1, index.size), bool))
+
+
 def pull_rest(engine: Running, cursor: Cursor, pull: Pull, size: int) -> Pull:
     """Return a fresh pull of `size` rows joined with all rows after it.
 
@@ -83,8 +93,7 @@ def pull_rest(engine: Running, cursor: Cursor, pull: Pull, size: int) -> Pull:
     columns = zip(*(part.track for part in parts), strict=True)
     track = Track(*(np.concatenate(column) for column in columns))
     index = np.concatenate([part.first + np.arange(len(part.events)) for part in parts])
-    # A row is valid if every later one has a larger index.
-    kept = index < np.append(np.minimum.accumulate(index[::-1])[::-1][1:], np.iinfo(index.dtype).max)
+    kept = last_written(index)
     if not kept.all():
         events, track = events.select(kept), track.select(kept)
     pictures = {picture.before: picture for part in parts for picture in part.pictures}

@@ -127,9 +127,17 @@ class Decoder:
     def missing(item: Expected, seen: FrameCounts, *, least: int = 1) -> list[str]:
         """Describe a message whose channels have had no value; nothing if it was received fewer than `least` times."""
         count = sum(n for (bus, key), n in seen.items() if key == item.key and same_bus(item.bus, bus))
+        bus = "" if count or item.bus is None else f" on bus {item.bus}"
+        what = f"{item.name} ({shown_id(item.key)}{bus})"
         if not count:
-            return [never_received(item, seen)]
-        return [never_valued(item, channel, count) for channel in item.feeds] if count >= least else []
+            fed = ", ".join(item.feeds)
+            return [f"{what} was never received, so {fed} has no values; {_nearest_match(item, seen)}"]
+        remedy = "check its multiplexer in the DBC, and the conditions (where, only) of the channel"
+        return [
+            f"{channel}: {what} was received {count} times, never with {', '.join(signals)}; {remedy}"
+            for channel, signals in item.feeds.items()
+            if count >= least
+        ]
 
     def plan_of(self, key: int, bus: BusName) -> int:
         """Return the index of a frame's message, -1 if no channel needs it; `key` is its id, with EXTENDED added."""
@@ -275,25 +283,8 @@ def shown_id(key: int) -> str:
     return f"{key & ~EXTENDED:#x}{'x' if key & EXTENDED else ''}"
 
 
-def never_received(item: Expected, seen: FrameCounts) -> str:
-    """Describe a message without a frame, with the nearest match: its id on another bus, near ids, or the buses."""
-    where = "" if item.bus is None else f" on bus {item.bus}"
-    return (
-        f"{item.name} ({shown_id(item.key)}{where}) was never received, so {', '.join(item.feeds)} has no values; "
-        + (_nearest_match(item, seen))
-    )
-
-
-def never_valued(item: Expected, channel: str, count: int) -> str:
-    """Describe a channel without a value although frames of its message were received."""
-    signals = ", ".join(item.feeds[channel])
-    return (
-        f"{channel}: {item.name} ({shown_id(item.key)}) was received {count} times, never with {signals}; check its "
-        "multiplexer in the DBC, and the conditions (where, only) of the channel"
-    )
-
-
 def _nearest_match(item: Expected, seen: FrameCounts) -> str:
+    """Describe the nearest match of a missing message: its id on another bus, near ids, or the buses."""
     if not seen:
         return "no frame was received at all"
     buses = sorted({bus for bus, _ in seen}, key=str)

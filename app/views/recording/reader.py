@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import tempfile
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,6 +22,7 @@ from estimators.errors import SourceError
 from estimators.log import Events
 from estimators.snapshots import Base
 
+from ...live.history_copy import last_written
 from .format import FORMAT, PREFIX, READABLE, TIMELINE, base_from_json, version_from_json
 from .rrd_file import MAGIC, MESSAGE_HEADER, STREAM_HEADER, complete_until
 
@@ -225,22 +226,14 @@ def _latest(chunks: list[tuple[np.ndarray, dict[str, np.ndarray]]]) -> tuple[int
         name: np.concatenate([values.get(name, np.full(rows.size, np.nan)) for rows, values in chunks])
         for name in names
     }
-    # A row is valid if every later row has a larger index.
-    later = np.minimum.accumulate(index[::-1])[::-1]
-    keep = np.append(index[:-1] < later[1:], True)
+    keep = last_written(index)
     return int(index[keep][0]), {name: column[keep] for name, column in columns.items()}
 
 
 def _column(name: str, columns: dict[str, np.ndarray]) -> np.ndarray:
+    """Return a column of the events; one of several values is stored as name_0, name_1, ..."""
     if name in columns:
         return columns[name]
-    wide = list(_numbered(name, columns))
+    count = next(k for k in range(len(columns) + 1) if f"{name}_{k}" not in columns)
     rows = len(next(iter(columns.values()))) if columns else 0
-    return np.stack(wide, axis=1) if wide else np.zeros((rows, 0))
-
-
-def _numbered(name: str, columns: dict[str, np.ndarray]) -> Iterator[np.ndarray]:
-    k = 0
-    while f"{name}_{k}" in columns:
-        yield columns[f"{name}_{k}"]
-        k += 1
+    return np.stack([columns[f"{name}_{k}"] for k in range(count)], axis=1) if count else np.zeros((rows, 0))
