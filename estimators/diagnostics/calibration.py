@@ -20,15 +20,14 @@ from ..track import GATED, HELD_OUT, USED, Track
 from .intervals import UNKNOWN, Interval, correlation_interval, mean_interval, scale_interval, share_interval
 from .references import true_states
 
-BANDS = (0.50, 0.90, 0.95)  # Shares of the readings, or of the truth, that these bands should hold
+BANDS = (0.50, 0.90, 0.95)  # Nominal coverage of the bands
 
 
 class CalibrationLimits(NamedTuple):
-    """Sizes from which on something is said: the whole interval of a figure must lie beyond.
+    """Effect sizes that are reported: the whole interval of a figure must lie beyond.
 
-    Bands that would have to be wider by more than the share `width` to be right, or are wider by more than that than
-    they would have to be; a bias of more than `bias` σ; a correlation of more than `correlation`, either sign; more
-    than the share `refused` of the readings.
+    width: relative error of the width of a band; bias: in σ; correlation: of either sign; refused: share of rejected
+    measurements.
     """
 
     width: float = 0.25
@@ -41,15 +40,14 @@ LIMITS = CalibrationLimits()
 
 
 class Calibration(NamedTuple):
-    """How far the bands of one sensor row, or of one state, can be believed; in units of its band, σ.
+    """Calibration of the bands of one sensor row or state, in units of its band, σ.
 
-    Of a row it is the band of the prediction, S^½, and e = innovation / S^½; of a state its standard deviation, and
-    e = (truth - estimate) / std. `ratio` is the mean of e², 1 if the band is right, and `scale` its root: the bands
-    would have to be so many times as wide. `bias` is the mean of e; `correlation` that of each e with the next;
-    `refused` the share of readings that the gate refused; `coverage` the shares inside the bands `BANDS`. A sensor held
-    out has `coverage` alone, a state neither `correlation` nor `refused`. `words` say what matters, if anything does.
+    e is innovation / S^½ for a row, (truth - estimate) / std for a state. ratio: mean of e², 1 if the band is right;
+    scale: its root, the factor by which the bands should be wider. bias: mean of e. correlation: lag 1. refused: share
+    of rejected measurements. coverage: shares inside the bands `BANDS`. A held-out sensor has `coverage` alone, a state
+    neither `correlation` nor `refused`. words: sentences on the figures beyond their limits.
 
-    `start` and `end` are the times of the first and the last value, s, `n` how many there are.
+    start, end: times of the first and the last of n values, s.
     """
 
     subject: str
@@ -75,18 +73,18 @@ def calibrations(
     marginal: bool = False,
     limits: CalibrationLimits = LIMITS,
 ) -> list[Calibration]:
-    """Calibration of every sensor row with readings, those that were used or refused and those held out apart.
+    """Return the calibration of every sensor row with measurements; held-out ones have entries of their own.
 
-    A refused reading counts as one at the gate: as it is, one spike would speak for all; without it, the gate would
-    hide what it refuses. The mean of e² is divided by what this leaves of it in a consistent filter.
+    e of a rejected measurement is clipped at the gate: unclipped, one spike would dominate; without it, the figures
+    would not contain the rejections. The mean of e² is divided by its value after clipping in a consistent filter.
 
     Args:
-        model: Whose sensors.
+        model: The model.
         events: The folded events, or a window of them.
-        track: Its rows of the track.
-        gate: That of the tuning; None where nothing is refused.
-        marginal: Whether the filter's predictions are not Gaussian, and `Track.whitened` holds each row by itself.
-        limits: What matters.
+        track: Their rows of the track.
+        gate: Gate of the tuning; None without one.
+        marginal: Whether the filter's predictions are not Gaussian, so that `Track.whitened` holds each row by itself.
+        limits: Effect sizes to report.
     """
     found = []
     judged = (track.verdict == USED) | (track.verdict == GATED)
@@ -110,7 +108,7 @@ def calibrations(
 def truth_calibration(
     model: StateSpaceModel, events: Events, track: Track, *, limits: CalibrationLimits = LIMITS
 ) -> list[Calibration]:
-    """Calibration of every state whose truth is told, at those times; a mode that jumps has no band and is left out.
+    """Return the calibration of every state with a known truth, except a discrete mode, which has no band.
 
     `ratio` is the state's NEES. Args: see `calibrations`.
     """
@@ -131,9 +129,9 @@ def truth_calibration(
 
 
 def standardised(track: Track, row: int, marginal: bool) -> np.ndarray:
-    """e of one row of each event's sensor, (N,), as it would be drawn from N(0, 1); NaN where there is none.
+    """Return e of one row of each event's sensor, (N,), N(0, 1) for a consistent filter; NaN where there is none.
 
-    Return innovations over their standard deviations, or with `marginal` by the predictive distribution.
+    Innovations over their standard deviations, or with `marginal` normal scores of the predictive distribution.
     """
     with np.errstate(all="ignore"):
         e: np.ndarray = track.innovation[:, row] / track.innovation_std[:, row]
@@ -165,7 +163,7 @@ def _held_out(name: str, t: np.ndarray, e: np.ndarray, limits: CalibrationLimits
 
 
 def _coverage(e: np.ndarray, limits: CalibrationLimits) -> tuple[tuple[Interval, ...], Sequence[BandVerdict]]:
-    """Shares inside the bands, and those that are beyond what bands as wrong as the limits allow would hold."""
+    """Return the shares inside the bands, and the bands whose share is beyond the limits, the widest first."""
     shares, verdicts = [], []
     for band in BANDS:
         half = normal_quantile(0.5 + 0.5 * band)
@@ -188,7 +186,7 @@ def _window(t: np.ndarray) -> tuple[float, float, int]:
 
 
 class BandVerdict(NamedTuple):
-    """A band, by the share that it should hold, and the share that it does, which is beyond the limits."""
+    """Nominal coverage of a band, and its actual coverage, which is beyond the limits."""
 
     band: float
     share: Interval
@@ -208,7 +206,7 @@ FRACTIONS = (
 def reading_words(
     name: str, scale: Interval, bias: Interval, correlation: Interval, refused: Interval, limits: CalibrationLimits
 ) -> tuple[str, ...]:
-    """What matters of a sensor row whose readings are used."""
+    """Describe the calibration of a sensor in use, as far as it is beyond the limits."""
     said = []
     if scale.beyond(1.0 / (1.0 + limits.width), 1.0 + limits.width):
         said.append(f"{name}: bands {_off(scale.value)} (scale {_figures(scale, '.2f')})")
@@ -224,7 +222,7 @@ def reading_words(
 
 
 def held_out_words(name: str, verdicts: Sequence[BandVerdict]) -> tuple[str, ...]:
-    """What matters of a sensor row that is held out: the widest band that holds too many or too few."""
+    """Describe the calibration of a held-out sensor by the widest band beyond the limits."""
     return tuple(
         f"{name}: {_share(share)} of its readings in the {100 * band:.0f} % band of the prediction{_wide(band, share)}"
         for band, share in verdicts[:1]
@@ -234,7 +232,7 @@ def held_out_words(name: str, verdicts: Sequence[BandVerdict]) -> tuple[str, ...
 def truth_words(
     name: str, verdicts: Sequence[BandVerdict], bias: Interval, limits: CalibrationLimits
 ) -> tuple[str, ...]:
-    """What matters of a state whose truth is told."""
+    """Describe the calibration of a state, as far as it is beyond the limits."""
     said = [
         f"{name}: truth in its {100 * band:.0f} % band {_share(share)} of the time{_wide(band, share)}"
         for band, share in verdicts[:1]
@@ -246,7 +244,7 @@ def truth_words(
 
 
 def _off(scale: float) -> str:
-    """How far bands are off that would have to be `scale` times as wide."""
+    """Describe the error of bands that should be `scale` times as wide."""
     if not scale > 0.0:
         return "far too wide: the readings never differ from the prediction"
     factor, side = (scale, "too narrow") if scale > 1.0 else (1.0 / scale, "too wide")
@@ -255,7 +253,7 @@ def _off(scale: float) -> str:
 
 
 def _figures(figure: Interval, form: str) -> str:
-    """Value, low to high."""
+    """Return value, low and high as text."""
     value, low, high = (format(number, form) for number in figure)
     return f"{value}, {low} to {high}"
 

@@ -1,12 +1,12 @@
-"""Offset and drift of a source's clock against the host's, from when readings were stamped and when they arrived.
+"""Offset and drift of a source's clock against the host's, from timestamps and arrivals of measurements.
 
-Each arrival - t is the offset plus a delay that is never negative, so what the clock does shows at the lower edge: the
-least of each stretch of time, and a line through those. A stretch in which all were held up lies above the line, by
-more than the others scatter, and is left out.
+arrival - t is the offset plus a delay that is never negative, so a line is fitted to the smallest delay of each segment
+of time. Segments in which all measurements were delayed lie above the line by more than the others scatter, and are
+left out.
 
 Sources: Paxson (1998), doi:10.1145/277851.277865, for the minima of segments; Moon, Skelly & Towsley (1999),
-doi:10.1109/INFCOM.1999.749287, for why the line must lie beneath all points. The least delay of the path itself cannot
-be told from an offset, and is part of it.
+doi:10.1109/INFCOM.1999.749287, for why the line must lie beneath all points. The smallest delay of the path cannot be
+distinguished from an offset, and is part of it.
 """
 
 from __future__ import annotations
@@ -25,10 +25,11 @@ OUTLIER_DEVIATIONS = 10.0  # Robust deviations above the line beyond which a str
 
 
 class ClockFit(NamedTuple):
-    """What t - arrival is now.
+    """Offset and drift of t - arrival at present.
 
-    offset: seconds by which the source's clock is ahead of the host's, less the least delay. drift_ppm: what a second
-    of the host adds to it, in microseconds; NaN while too little is known. drift_error_ppm: half of its 95 % interval.
+    offset: seconds by which the source's clock is ahead of the host's, minus the smallest delay. drift_ppm: change of
+    the offset per second of the host, microseconds; NaN with too few segments. drift_error_ppm: half of its 95 %
+    interval.
     """
 
     offset: float
@@ -37,7 +38,7 @@ class ClockFit(NamedTuple):
 
 
 class LeastDelays:
-    """The least arrival - t of each stretch, in bounded memory; the same however the events were cut into batches."""
+    """Smallest arrival - t of each segment, in bounded memory; independent of the division into batches."""
 
     def __init__(self) -> None:
         self._stretch = SEGMENT_NS
@@ -46,10 +47,10 @@ class LeastDelays:
         self._delay: list[int] = []
 
     def note(self, t: np.ndarray, arrival: np.ndarray) -> None:
-        """Readings with their own and their arrival's times, ns, each (n,)."""
+        """Add measurements with their times and arrivals, ns, each (n,)."""
         delay = arrival - t
         stretch = arrival // SEGMENT_NS
-        # Of each stretch in the batch the least, and of these the first.
+        # The first of the smallest delays of each segment in the batch.
         order = np.lexsort((arrival, delay, stretch))
         first = np.ones(order.size, np.bool_)
         first[1:] = np.diff(stretch[order]) != 0
@@ -59,7 +60,7 @@ class LeastDelays:
     def _one(self, arrival: int, delay: int) -> None:
         at = arrival // self._stretch
         if self._at and at < self._at[-1]:
-            # The host's clock was set back: what was before is of another.
+            # The host's clock was set back: earlier delays are invalid.
             self._at, self._arrival, self._delay = [], [], []
         if self._at and self._at[-1] == at:
             if (delay, arrival) < (self._delay[-1], self._arrival[-1]):
@@ -76,10 +77,10 @@ class LeastDelays:
                 self._one(*earlier)
 
     def fit(self) -> ClockFit | None:
-        """The line beneath the delays; None before the first reading."""
+        """Return the line beneath the delays; None before the first measurement."""
         if not self._at:
             return None
-        # Relative to the last, so that nothing is lost to rounding.
+        # Relative to the last, against rounding.
         x = np.array([arrival - self._arrival[-1] for arrival in self._arrival], float) * 1e-9
         y = np.array([delay - self._delay[-1] for delay in self._delay], float) * 1e-9
         last = self._delay[-1] * 1e-9
@@ -97,9 +98,9 @@ class LeastDelays:
 
 
 def _robust_slope(x: np.ndarray, y: np.ndarray) -> float:
-    """The median of the slopes between all pairs of points, which a quarter of them cannot bend.
+    """Return the median of the slopes between all pairs of points, robust against a quarter of outliers.
 
-    Of the least of each few neighbours, so that a thousand pairs are enough. Source: Sen (1968),
+    The smallest delays of groups of neighbours are used, so that a thousand pairs suffice. Source: Sen (1968),
     doi:10.1080/01621459.1968.10480934.
     """
     groups = np.array_split(np.arange(x.size), min(x.size, 48))

@@ -17,10 +17,10 @@ from .references import wrapped
 
 
 class NisVerdict(NamedTuple):
-    """A mean NIS, the 95 % bounds that it should lie in, and whether these are what was normal when commissioned.
+    """A mean NIS, its 95 % bounds, and whether these are those of the baseline (`commissioned`).
 
-    What was normal was taken from all readings, each row at most 6 σ (baseline.py): `judged` is the mean NIS of the
-    same, which is compared; NaN where it is the NIS itself.
+    A baseline is computed from used and rejected measurements, each row clipped at 6 σ; `judged` is the mean NIS of the
+    same, which is compared with the bounds; NaN where that is the NIS itself.
     """
 
     nis: float
@@ -36,7 +36,7 @@ class NisVerdict(NamedTuple):
 
     @property
     def place(self) -> str:
-        """`inside`, `above` or `below` the bounds; nothing where there is no NIS."""
+        """`inside`, `above` or `below` the bounds; empty without a NIS."""
         if not np.isfinite(self.measure + self.low + self.high):
             return ""
         return "below" if self.measure < self.low else "above" if self.measure > self.high else "inside"
@@ -58,11 +58,11 @@ class NisVerdict(NamedTuple):
 
 
 class Nees(NamedTuple):
-    """Normalised estimation error squared, one entry a time at which the truth is known.
+    """Normalised estimation error squared, one entry per time with a known truth.
 
-    ε = (x - x̂)ᵀ P⁻¹ (x - x̂), over the states that are known, `dof` of them; in `runs` runs their mean. `low` and
-    `high` bound 95 % of these values if the filter is consistent; `inside` is the share that they do bound. NaN where
-    P has no inverse. Values of one run are correlated in time, so the mean of all has no bounds of its own.
+    ε = (x - x̂)ᵀ P⁻¹ (x - x̂), over the `dof` known states; its mean over `runs` runs. `low` and `high` bound 95 % of
+    these values if the filter is consistent. NaN where P has no inverse. Values of one run are correlated in time, so
+    the mean over time has no bounds.
 
     Source: Bar-Shalom, Li & Kirubarajan, Estimation with Applications to Tracking and Navigation (2001), 5.4.2.
     """
@@ -76,21 +76,21 @@ class Nees(NamedTuple):
 
     @property
     def mean(self) -> float:
-        """Mean over the times of ε a degree of freedom; about 1 if the filter is consistent."""
+        """Mean of ε per degree of freedom; about 1 if the filter is consistent."""
         return float(np.nansum(self.value) / self.dof[np.isfinite(self.value)].sum())
 
     @property
     def inside(self) -> float:
-        """Share of the times at which ε is within its bounds."""
+        """Share of times with ε inside its bounds."""
         known = np.isfinite(self.value)
         return float(np.mean((self.low <= self.value)[known] & (self.value <= self.high)[known]))
 
 
 def nees(model: StateSpaceModel, events: Events, mean: np.ndarray, cov: np.ndarray) -> Nees:
-    """NEES at the truth events.
+    """Return the NEES at the truth events.
 
     Args:
-        model: Whose states; errors of circular ones wrap.
+        model: The model; errors of circular states wrap.
         events: The folded events, N of them.
         mean: Estimates, (N, nx).
         cov: Covariances, (N, nx, nx).
@@ -101,7 +101,7 @@ def nees(model: StateSpaceModel, events: Events, mean: np.ndarray, cov: np.ndarr
     times, values, dof = [], [], []
     rows = np.flatnonzero(events.kind == TRUTH)
     circular = model.circular.astype(bool)
-    # Blocks of one time are one truth: their rows hold the same estimate.
+    # Events of one time are one truth: their rows hold the same estimate.
     for together in np.split(rows, 1 + np.flatnonzero(np.diff(events.t[rows]))):
         truth = np.full(model.nx, np.nan)
         for i in together:
@@ -123,10 +123,10 @@ def nees(model: StateSpaceModel, events: Events, mean: np.ndarray, cov: np.ndarr
 
 
 def mean_nees(runs: Sequence[Nees]) -> Nees:
-    """The mean over independent runs (other truths, other noise) at each time, with its narrower bounds.
+    """Return the mean over independent runs (other truths, other noise) at each time, with its narrower bounds.
 
     Raises:
-        EstimatorError: If the runs know the truth at other times, or there is none.
+        EstimatorError: If there is no run, or the runs have true values at different times.
     """
     if not runs:
         raise EstimatorError("mean_nees: there is no run; give at least one")
@@ -138,7 +138,7 @@ def mean_nees(runs: Sequence[Nees]) -> Nees:
 
 
 def _square(error: np.ndarray, P: np.ndarray) -> float:
-    """The error in units of its covariance; NaN if that has no inverse."""
+    """Return the squared error in units of its covariance; NaN if that has no inverse."""
     try:
         return float(error @ cho_solve(cho_factor(P), error))
     except (LinAlgError, ValueError):

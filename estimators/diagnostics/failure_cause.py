@@ -1,8 +1,8 @@
-"""Why a reading failed: the model's functions tried again, one by one, from the last estimate that was a number.
+"""Cause of a failed measurement: the model's functions are called again from the last finite estimate.
 
-A filter that gets no covariance, or no number, does not know which function of the model failed. This is found out
-afterwards, outside the fold: the path of the estimate to the failure is walked as the filter predicts, from the
-estimate and from places around it, where sigma points and particles are.
+If a filter obtains a number that is not finite, or a matrix that is no covariance, the function of the model that
+returned it is searched afterwards, outside the fold: the prediction is repeated from the estimate and from states
+around it, where sigma points and particles are.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class Estimate(NamedTuple):
 
 
 def failures(track: Track, first: int = 0) -> np.ndarray:
-    """Rows from `first` on whose reading failed (or was refused without a NIS), or whose estimate is not a number."""
+    """Return the rows from `first` on with a failed measurement (or rejected without a NIS) or no finite estimate."""
     rows = track.select(slice(first, len(track)))
     failed = (rows.verdict == FAILED) | (rows.verdict == GATED) & ~np.isfinite(rows.nis)
     return first + np.flatnonzero(~estimated_rows(rows) | failed)
@@ -50,7 +50,7 @@ def cause(
     sensor: int | None,
     predicted: Estimate | None,
 ) -> str | None:
-    """What of the model is no number, or no covariance, between an estimate and a reading dt seconds later.
+    """Return which function of a model fails between an estimate and a measurement dt seconds later.
 
     Args:
         compiled: The model.
@@ -58,13 +58,12 @@ def cause(
         u: Inputs, (nu,).
         p: Parameters.
         q: Noise variances.
-        dt: Seconds to the reading; 0 if nothing is predicted.
-        sensor: Which one's reading failed; None if the estimate did without one.
-        predicted: The estimate that the reading met, if it is a number.
+        dt: Seconds to the measurement; 0 without a prediction.
+        sensor: Index of the sensor whose measurement failed; None if the prediction did.
+        predicted: The predicted estimate, if it is finite.
 
     Returns:
-        One line that names the function, the place and the remedy; None if all of them are in order, or a black box
-        fails altogether.
+        One line with function, place and remedy; None if none of them fails, or a black box raises an error.
     """
     try:
         with np.errstate(all="ignore"):
@@ -90,14 +89,14 @@ def questions(
 
     Args:
         compiled: The model.
-        states: Where, (nx,) each.
+        states: States, (nx,) each.
         u: Inputs, (nu,).
         p: Parameters.
         q: Noise variances.
         dt: Seconds of the prediction.
 
     Yields:
-        The question in words, and what asks it.
+        Description of the call, and the call.
     """
     model = compiled.model
     for x in states:
@@ -114,7 +113,7 @@ def questions(
 
 
 def around(compiled: CompiledModel, estimate: Estimate) -> Iterator[np.ndarray]:
-    """States around an estimate, where asking there is cheap."""
+    """Yield states around an estimate of a small, compiled model."""
     if estimate.mean.size <= SHOWN and compiled.box is None:
         for away in SIGMA_OFFSETS:
             for j in np.flatnonzero(estimate.std > 0.0):

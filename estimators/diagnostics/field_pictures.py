@@ -1,8 +1,8 @@
-"""Pictures of a large field, taken while it is folded: its mean, its spread, and the truth where it was told.
+"""Pictures of a large field during a fold: its mean, standard deviation, and true values.
 
-A track keeps a few cells at every event; a picture is all cells at a few times. One is taken when a period of the
-log's time is over, and whenever most of the field's true values were told: that is also when the estimate is scored
-over all cells. Both follow from the log alone, so a refold takes the same pictures.
+A track keeps a few cells at every event; a picture has all cells at a few times: at the end of each period of the log's
+time, and whenever most of the true values are known, at which the estimate is scored over all cells. Both depend on the
+log alone, so a refold takes the same pictures.
 """
 
 from __future__ import annotations
@@ -24,10 +24,9 @@ MAX_PICTURE_BYTES = 64 * 2**20
 class Picture(NamedTuple):
     """A field before event `before` of the log, at the time `t` of the event before that.
 
-    Where most of the truth was told, `cells` is how many true values were, else 0; of their errors `rmse` is the root
-    mean square and `inside` the share inside the 95 % band (NaN without truth). `spread` is the root mean variance,
-    over the same cells, or all. `mean`, `std` and `truth` (rows, columns) are float32, NaN where unknown; None where
-    they were not kept or told.
+    cells: number of true values, 0 unless most are known; rmse: of their errors; inside: share inside the 95 % band
+    (NaN without truth). spread: root mean variance, over the same cells, or all. mean, std, truth (rows, columns):
+    float32, NaN where unknown; None if not kept.
     """
 
     before: int
@@ -45,11 +44,11 @@ class Pictures:
     """The pictures of one fold, in the order of events."""
 
     def __init__(self, field: Field, period: float | None) -> None:
-        """Begin without any.
+        """Create an empty collection.
 
         Args:
             field: Field of the pictures.
-            period: Seconds between two; None for those at which most of the truth is told only.
+            period: Seconds between two; None for pictures at times with most of the truth only.
         """
         self.field = field
         self.period = None if period is None else max(1, round(period * 1e9))
@@ -59,18 +58,18 @@ class Pictures:
         self._half = normal_quantile(0.975)
 
     def due(self, log: Log, n: int) -> bool:
-        """Whether one is to be taken before the log's event `n`: a time ends there, and a period or a telling."""
+        """Return whether a picture is due before event `n`: a time ends there, with a period or most of the truth."""
         if not 0 < n < log.n or log.t[n] == log.t[n - 1]:
             return False
         if self.period is not None and log.t[n] // self.period != log.t[n - 1] // self.period:
             return True
         last = n - 1
-        while last > 0 and log.kind[last] == MARK:  # the stamp of a fault tells nothing, and comes after what is told
+        while last > 0 and log.kind[last] == MARK:  # marks of faults follow true values
             last -= 1
-        return bool(log.kind[last] == TRUTH) and self._most_of(self._told(log, n))
+        return bool(log.kind[last] == TRUTH) and self._most_of(self._truth(log, n))
 
     def next(self, log: Log, n: int, end: int) -> int:
-        """The first event after `n` before which one is due; `end` if there is none."""
+        """Return the first event after `n` before which a picture is due; `end` if there is none."""
         t, kind = log.t[n:end], log.kind[n:end]
         new = t[1:] != t[:-1]
         likely = new & ((kind[:-1] == TRUTH) | (kind[:-1] == MARK))
@@ -82,7 +81,7 @@ class Pictures:
         return end
 
     def check(self, log: Log, n: int) -> bool:
-        """Whether one is to be taken now, before event `n`; one that should not be there is dropped."""
+        """Return whether to take a picture now, before event `n`; drop one that is no longer due."""
         there = bool(self.taken) and self.taken[-1].before == log.first + n
         wanted = self.due(log, n)
         if there and not wanted:
@@ -90,15 +89,15 @@ class Pictures:
         return wanted and not there
 
     def take(self, log: Log, n: int, mean: np.ndarray, variances: np.ndarray) -> None:
-        """Take one before event `n`.
+        """Take a picture before event `n`.
 
         Args:
             log: The log.
-            n: Events that went into it.
-            mean: Of every cell (nx,).
-            variances: Likewise (nx,).
+            n: Number of folded events.
+            mean: Mean of every cell (nx,).
+            variances: Variance of every cell (nx,).
         """
-        truth = self._told(log, n)
+        truth = self._truth(log, n)
         known = np.isfinite(truth)
         cells = int(known.sum()) if self._most_of(truth) else 0
         rmse, inside, spread = np.nan, np.nan, float(np.sqrt(variances.mean()))
@@ -126,19 +125,19 @@ class Pictures:
                 self.taken[k] = self.taken[k]._replace(mean=None, std=None, truth=None)
 
     def cut(self, index: int) -> None:
-        """Forget those after the absolute index `index`: what went into them will be folded again."""
+        """Drop the pictures after the absolute index `index`, whose events will be folded again."""
         while self.taken and self.taken[-1].before > index:
             self.taken.pop()
 
     def drop_front(self, first: int) -> None:
-        """Forget those before the absolute index `first`."""
+        """Drop the pictures before the absolute index `first`."""
         self.taken = [picture for picture in self.taken if picture.before >= first]
 
     def _most_of(self, truth: np.ndarray) -> bool:
         return 2 * int(np.isfinite(truth).sum()) > truth.size
 
-    def _told(self, log: Log, n: int) -> np.ndarray:
-        """The true values that were told at the time of event n - 1, (nx,), NaN where none was."""
+    def _truth(self, log: Log, n: int) -> np.ndarray:
+        """Return the true values at the time of event n - 1, (nx,), NaN where unknown."""
         truth = np.full(len(self.field), np.nan)
         at = log.t[n - 1]
         for k in range(int(np.searchsorted(log.t[:n], at)), n):
@@ -156,19 +155,19 @@ def layer(shape: tuple[int, ...]) -> tuple[int, int]:
 
 
 def reduction(shape: tuple[int, ...]) -> int:
-    """Cells along each side of the squares over which a picture averages."""
+    """Return the number of cells along each side of the squares over which a picture averages."""
     return max(1, -(-max(layer(shape)) // MAX_SIDE))
 
 
 def plane_shape(shape: tuple[int, ...]) -> tuple[int, int]:
-    """Rows and columns of a picture."""
+    """Return rows and columns of a picture."""
     side = reduction(shape)
     rows, columns = layer(shape)
     return -(-rows // side), -(-columns // side)
 
 
 def plane(values: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Values (nx,) of a field as a picture (rows, columns), float32; a square with an unknown cell is unknown."""
+    """Return values (nx,) as a picture (rows, columns), float32; a square with an unknown cell is NaN."""
     middle = values.reshape(-1, *layer(shape))
     image = middle[middle.shape[0] // 2]
     side = reduction(shape)

@@ -1,11 +1,11 @@
 """Offset of a held-out sensor against the prediction by the others.
 
-The mean of its last innovations ν, and what they allow it. Of the variance S of an innovation, R is noise, which a mean
-of n of them leaves R/n of; the rest, H P Hᵀ, is an error of the estimate that all of them share:
+The mean of its last n innovations ν is compared with its bound. Of the variance S of an innovation, R is noise, which
+averages to R/n; the rest, H P Hᵀ, is an error of the estimate that all of them share:
 
     |mean ν| ≤ z √(S - R + R/n)
 
-Nothing of a sensor that is held out enters the estimate, so what it reads is evidence of its own.
+The estimate does not use a held-out sensor, so its measurements are independent evidence.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ MIN_MEASUREMENTS = 10  # Below which nothing is said
 
 
 class Offset(NamedTuple):
-    """How far a row of a sensor that is held out reads from its prediction, and how far the others allow, `unit`."""
+    """Mean innovation of a row of a held-out sensor, and its bound, in `unit`; `alone`: no other sensor is used."""
 
     sensor: str
     row: str
@@ -37,12 +37,12 @@ class Offset(NamedTuple):
 
     @property
     def beyond(self) -> bool:
-        """Whether it is further off than the others allow."""
+        """Whether the offset exceeds its bound."""
         return abs(self.offset) > self.allowed
 
     @property
     def words(self) -> str:
-        """In one sentence; `alone`: where no other sensor is in use."""
+        """Description in one sentence."""
         unit = "" if self.unit == "1" else f" {self.unit}"
         whom = "the model alone predicts" if self.alone else "the others say"
         side = "above" if self.offset > 0 else "below"
@@ -56,12 +56,12 @@ class Offset(NamedTuple):
 
 
 def offsets(events: Events, track: Track, tuning: Tuning) -> list[Offset]:
-    """Of every row of the sensors that are held out at the end of a stretch of events, what its last readings show.
+    """Return the offsets of every row of the sensors that are held out at the end of consecutive events.
 
     Args:
-        events: A stretch.
-        track: Its track.
-        tuning: Under which.
+        events: The events.
+        track: Their track.
+        tuning: Tuning of the track.
     """
     model, found = tuning.model, []
     if bool(np.all(tuning.used)):

@@ -1,7 +1,6 @@
 """Statistics of innovations: distribution against N(0, 1), autocorrelation, tests of whiteness, and their size.
 
-All take one row's standardised innovations e (T,), see `calibration.standardised`; NaN is a missing one, which keeps
-its place in time.
+Arguments are one row's standardised innovations e (T,), see `calibration.standardised`; NaN for missing ones.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ class Autocorrelation(NamedTuple):
 
 
 class Histogram(NamedTuple):
-    """Counts (B,) in bins of equal width from `low` to `high`; what lies beyond is counted in the outer bins."""
+    """Counts (B,) in bins of equal width from `low` to `high`; the outer bins also count values beyond."""
 
     low: float
     high: float
@@ -44,7 +43,7 @@ class Ranks(NamedTuple):
 
 
 def autocorrelation(e: np.ndarray, lags: int) -> Autocorrelation:
-    """The sample autocorrelation.
+    """Return the sample autocorrelation.
 
     r_k = Σ z_t z_{t+k} / Σ z_t²,  bound = 1.96 / √n,
 
@@ -64,7 +63,7 @@ def autocorrelation(e: np.ndarray, lags: int) -> Autocorrelation:
 
 
 def histogram(e: np.ndarray, low: float = -4.0, high: float = 4.0, bins: int = 32) -> Histogram:
-    """How often e lies where."""
+    """Return the histogram of e."""
     inside = np.clip(e[np.isfinite(e)], low, np.nextafter(high, low))
     counts, _ = np.histogram(inside, bins, (low, high))
     return Histogram(low, high, counts)
@@ -73,8 +72,7 @@ def histogram(e: np.ndarray, low: float = -4.0, high: float = 4.0, bins: int = 3
 def quantile_pairs(e: np.ndarray, most: int = 60) -> np.ndarray:
     """Return points (k, 2) of a Q-Q plot: quantiles of a normal variable and of e; k ≤ `most`.
 
-    The i-th smallest of n stands at (i - ½) / n; of many the outermost are shown, and some at even steps of the normal
-    quantile between.
+    The i-th smallest of n is at (i - ½) / n. Of many values, those at even steps of the normal quantile are returned.
     """
     z = np.sort(e[np.isfinite(e)])
     n = z.size
@@ -87,7 +85,7 @@ def quantile_pairs(e: np.ndarray, most: int = 60) -> np.ndarray:
 
 
 def rank_histogram(e: np.ndarray, bins: int = 10) -> Ranks:
-    """In which of the bins each reading lay among what was predicted: Φ(e), flat where the prediction is right.
+    """Return the histogram of Φ(e), flat if the predictive distribution is right.
 
     A U shape means that the spread is too small, a hump that it is too large, a slope a bias.
 
@@ -100,13 +98,13 @@ def rank_histogram(e: np.ndarray, bins: int = 10) -> Ranks:
 
 
 def flat_range(n: int, bins: int) -> tuple[float, float]:
-    """The 95 % range of the count in one of so many equally likely bins, of n draws."""
+    """Return the 95 % range of the count in one of `bins` equally likely bins, for n draws."""
     half = TWO_SIDED * np.sqrt(n * (bins - 1.0)) / bins
     return n / bins - half, n / bins + half
 
 
 def memory(r: np.ndarray) -> int:
-    """After how many readings a correlation has fallen to a third of the first; as many as are known if it has not."""
+    """Return the lag at which a correlation has fallen to a third of the first; the largest lag if it has not."""
     fallen = np.flatnonzero(r < r[0] / 3.0) if r.size else np.zeros(0, int)
     return int(fallen[0]) + 1 if fallen.size else r.size
 
@@ -115,12 +113,11 @@ MIN_INNOVATIONS = 50  # Readings of a row from which on its noise is estimated
 
 
 class SensorNoise(NamedTuple):
-    """Variance of the noise of one sensor row as its innovations have it, in the square of the row's unit.
+    """Variance of the noise of one sensor row, estimated from n innovations, in the square of the row's unit.
 
-    `variance` is not positive where the innovations are smaller than the process noise and the model alone explain;
-    `std` is its standard deviation, were the innovations white and normal, `n` how many there are. `correlation` is
-    that of each with the next, and `chance` that of innovations as correlated as these in a filter that is right (a
-    Ljung-Box test): where it is small, the innovations are no noise, and the variance of none.
+    variance: not positive where the innovations are smaller than process noise and model explain; std: its standard
+    deviation for white, normal innovations. correlation: lag 1; chance: p-value of a Ljung-Box test. Where that is
+    small, the innovations are not white, and the variance is not that of noise.
     """
 
     variance: float
@@ -131,11 +128,14 @@ class SensorNoise(NamedTuple):
 
 
 def mean_nis(track: Track, gate: float | None) -> float:
-    """Mean NIS a degree of freedom of the readings used and refused, 1 if the filter is consistent; NaN without any.
+    """Return the mean NIS per degree of freedom of used and rejected measurements, 1 for a consistent filter.
 
     Args:
-        track: Its track.
-        gate: That of the tuning; None where nothing is refused.
+        track: The track.
+        gate: Gate of the tuning; None without one.
+
+    Returns:
+        NaN without measurements.
     """
     judged = (track.verdict == USED) | (track.verdict == GATED)
     nis, dof = track.nis[judged], track.dof[judged]
@@ -145,19 +145,17 @@ def mean_nis(track: Track, gate: float | None) -> float:
 
 
 def sensor_noise(track: Track, events: Events, tuning: Tuning) -> dict[str, SensorNoise]:
-    """Noise of the sensor rows with enough readings, as their innovations ν have it.
+    """Return the noise of the sensor rows with enough measurements, estimated from their innovations ν.
 
-    R̂ = mean ν² - (S - R), the innovations' covariance less what of it the filter lays to its own prediction, H P⁻ Hᵀ.
-    Each reading counts by 1 / S², the inverse of the variance of ν²: where S is settled, as in the source, all count
-    alike, and the first ones, predicted from a wide prior, do not spoil it. All that the innovations have too much or
-    too little is laid to R, so it means something only where they are white: with a Q too small it is too large, and
-    an error that lasts, of the model or of the sensor, is taken for one that the next reading averages away. P⁻
-    follows from R; taken again and again the estimate comes to rest.
+    R̂ = mean ν² - (S - R), the variance of the innovations minus that of the prediction, H P⁻ Hᵀ. Measurements have the
+    weight 1 / S², the inverse of the variance of ν², so those predicted from a wide prior count little. Any excess of
+    the innovations is attributed to R, so the estimate is valid only if they are white: with a Q that is too small, or
+    a slow error of model or sensor, it is too large. P⁻ depends on R; iterated, the estimate converges.
 
     Args:
-        track: Its track, under `tuning`.
-        events: Of what.
-        tuning: Its R held as it is: nothing brought variances, and the filter adapted none.
+        track: A track with this tuning.
+        events: Its events, without variances of their own.
+        tuning: The tuning; the filter must not adapt R.
 
     Source: Mohamed & Schwarz (1999), doi:10.1007/s001900050236, the R of the innovation-based filter; after Mehra
     (1970), doi:10.1109/TAC.1970.1099422.
@@ -190,23 +188,23 @@ def sensor_noise(track: Track, events: Events, tuning: Tuning) -> dict[str, Sens
 
 
 def _gates(gate: float | None, dof: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Every number of degrees of freedom up to the largest, and its gate: quantiles are dear, and few differ."""
+    """Return the degrees of freedom up to the largest, and their gates: quantiles are expensive, and few differ."""
     m = np.arange(1.0 + dof.max(initial=0))
     return m, np.full(m.size, np.inf) if gate is None else chi_square_quantile(gate, m)
 
 
 def _expected(g: np.ndarray, m: np.ndarray) -> np.ndarray:
-    """E min(χ²_m, g) of each; m where there is no gate."""
+    """Return E min(χ²_m, g) of each; m without a gate."""
     finite = np.isfinite(g)
     limit = np.where(finite, g, 1.0)
     return np.where(finite, m * chdtr(m + 2.0, limit) + limit * chdtrc(m, limit), m)
 
 
 class WhitenessTest(NamedTuple):
-    """A statistic, the chance of one as large under the null, and the degrees of freedom of its distribution.
+    """A statistic, its p-value, and the degrees of freedom of its distribution.
 
-    `dof` has one number for a chi-square, two (numerator, denominator) for an F. Statistic and p-value are NaN where
-    the series is too short, or constant.
+    `dof` has one number for a chi-square, two (numerator, denominator) for an F. Statistic and p-value are NaN if the
+    series is too short, or constant.
     """
 
     statistic: float
@@ -215,7 +213,7 @@ class WhitenessTest(NamedTuple):
 
 
 def ljung_box(innovations: np.ndarray, lags: int | None = None) -> WhitenessTest:
-    """Whether a series is correlated at lags 1 to `lags`.
+    """Test whether a series is correlated at lags 1 to `lags`.
 
     Q = n (n + 2) Σ_k r_k² / n_k,  r_k = Σ z_t z_{t+k} / Σ z_t²,  chi-square with `lags` degrees of freedom,
 
@@ -224,7 +222,7 @@ def ljung_box(innovations: np.ndarray, lags: int | None = None) -> WhitenessTest
 
     Args:
         innovations: Standardised innovations, (T,); NaN is a missing one.
-        lags: How many; None for 10, or a fifth of the values where that is less.
+        lags: Number of lags; None for 10, or a fifth of the values if that is less.
 
     Raises:
         ValueError: If `lags` is not positive.
@@ -236,12 +234,10 @@ def ljung_box(innovations: np.ndarray, lags: int | None = None) -> WhitenessTest
     lags = max(1, min(10, n // 5)) if lags is None else lags
     if lags < 1:
         raise ValueError(f"lags is {lags}; it must be 1 or more")
-    z = np.where(there, innovations - np.mean(innovations[there]), 0.0) if n else np.zeros(len(innovations))
-    square = float(z @ z)
     pairs = np.array([np.sum(there[k:] & there[:-k]) for k in range(1, lags + 1)])
-    if not square > 0.0 or not np.all(pairs):
+    r = autocorrelation(innovations, lags).r
+    if not np.all(np.isfinite(r)) or not np.all(pairs):
         return WhitenessTest(np.nan, np.nan, (lags,))
-    r = np.array([z[k:] @ z[:-k] for k in range(1, lags + 1)]) / square
     statistic = float(n * (n + 2) * np.sum(r**2 / pairs))
     return WhitenessTest(statistic, float(chdtrc(lags, statistic)), (lags,))
 
@@ -267,7 +263,7 @@ def jarque_bera(innovations: np.ndarray) -> WhitenessTest:
 
 
 def heteroscedasticity(innovations: np.ndarray) -> WhitenessTest:
-    """Whether the last third of a series has another variance than the first ("breakvar"), two-sided.
+    """Test whether the last third of a series has another variance than the first ("breakvar"), two-sided.
 
     H = Σ e_t² of the last h / Σ e_t² of the first h,  h = T / 3;  (n_first / n_last) H is F(n_last, n_first),
 

@@ -1,9 +1,9 @@
 """Intervals of means and shares of values that may be correlated in time, and of any distribution.
 
 The variance of a mean is 1/T of the long-run variance Ω of the series, its spectrum at frequency zero. It is estimated
-by the series' projections on a few slow cosines, and their number is the degrees of freedom of Student's t. Few of them
-make an interval that is a tenth wider than it would have to be for a white series, and that stays honest as long as the
-correlation is gone within some hundredth of the series.
+by the series' projections on a few slow cosines, whose number is the degrees of freedom of Student's t. With few
+cosines the interval is 10 % wider than necessary for a white series, and valid if the correlation decays within about
+1 % of the series.
 
 Source: Lazarus, Lewis, Stock & Watson (2018), doi:10.1080/07350015.2018.1506926, "EWC".
 """
@@ -29,7 +29,7 @@ class Interval(NamedTuple):
     high: float
 
     def beyond(self, low: float, high: float) -> bool:
-        """Whether all of it lies below `low` or above `high`."""
+        """Return whether the whole interval lies below `low` or above `high`."""
         return bool(self.high < low or self.low > high)
 
 
@@ -37,7 +37,7 @@ UNKNOWN = Interval(np.nan, np.nan, np.nan)
 
 
 def long_run_variance(x: np.ndarray) -> tuple[float, int]:
-    """Ω of a series (T,), and its degrees of freedom B.
+    """Return Ω of a series (T,), and its degrees of freedom B.
 
     Ω = 1/B Σ_j Λ_j²,  Λ_j = √(2/T) Σ_t x_t cos(π j (t + ½) / T),  j = 1 to B
     """
@@ -48,12 +48,12 @@ def long_run_variance(x: np.ndarray) -> tuple[float, int]:
 
 
 def _half(degrees: int) -> float:
-    """Standard errors to either side."""
+    """Return the half width in standard errors."""
     return float(stdtrit(degrees, 0.5 + 0.5 * PROBABILITY))
 
 
 def mean_interval(x: np.ndarray) -> Interval:
-    """The mean of a series (T,) of finite values in order of time."""
+    """Return the mean of a series (T,) of finite values in order of time."""
     if x.size < MIN_VALUES:
         return Interval(float(np.mean(x)), np.nan, np.nan) if x.size else UNKNOWN
     variance, degrees = long_run_variance(x)
@@ -62,7 +62,7 @@ def mean_interval(x: np.ndarray) -> Interval:
 
 
 def scale_interval(x: np.ndarray) -> Interval:
-    """The mean of a series (T,) of values that are not negative, its interval in proportion: always positive."""
+    """Return the mean of a series (T,) of non-negative values, with a proportional, always positive interval."""
     found = mean_interval(x)
     if not found.value > 0.0:
         return found
@@ -71,13 +71,11 @@ def scale_interval(x: np.ndarray) -> Interval:
 
 
 def share_interval(inside: np.ndarray, like: np.ndarray) -> Interval:
-    """The share of True in a series (T,), correlated in time as it is itself, or where it never changes as `like` is.
-
-    Wilson's interval for as many independent draws as would tell as much.
+    """Return the share of True in a series (T,), by Wilson's interval for the effective number of independent values.
 
     Args:
         inside: Boolean, (T,).
-        like: The values of which they are told, (T,).
+        like: Values from which `inside` was computed, (T,); their correlation counts where `inside` is constant.
 
     Source: Wilson (1927), doi:10.1080/01621459.1927.10502953.
     """
@@ -98,9 +96,9 @@ def share_interval(inside: np.ndarray, like: np.ndarray) -> Interval:
 
 
 def correlation_interval(x: np.ndarray) -> Interval:
-    """The correlation of each value of a series (T,) with the next, about its mean.
+    """Return the correlation of each value of a series (T,) with the next, about its mean.
 
-    r = Σ z_t z_{t+1} / Σ z_t²; its interval is that of the mean of what each pair adds to r,
+    r = Σ z_t z_{t+1} / Σ z_t²; its interval is that of the mean contribution of a pair,
     (z_t z_{t+1} - r (z_t² + z_{t+1}²) / 2) / mean z².
     """
     z = x - np.mean(x) if x.size else x
@@ -115,7 +113,7 @@ def correlation_interval(x: np.ndarray) -> Interval:
 
 
 def _independent(x: np.ndarray) -> tuple[float, int]:
-    """Independent values whose mean would be as uncertain as that of a series (T,), at most T; degrees of freedom."""
+    """Return the effective number of independent values of a series (T,), at most T, and the degrees of freedom."""
     variance, degrees = long_run_variance(x)
     own = float(np.var(x))
     return (float(np.clip(x.size * own / variance, 1.0, x.size)) if variance > 0.0 else float(x.size)), degrees

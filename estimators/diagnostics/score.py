@@ -1,7 +1,6 @@
 """Scores of a fold: NIS with its bounds, errors where the truth is known, predictions of held-out sensors.
 
-The log-likelihood counts the readings that the gate refused (see refusals.py); else it would prefer the filter that
-refuses what it does not expect.
+The log-likelihood includes rejected measurements (`log_density`); otherwise it would prefer filters that reject more.
 """
 
 from __future__ import annotations
@@ -25,9 +24,9 @@ BASELINE_CLIP_SIGMA = 6.0  # σ at which the innovations of a row are clipped in
 
 
 class Fit(NamedTuple):
-    """How well something was predicted: RMSE and mean error in its unit, share of errors inside their 95 % band.
+    """RMSE and mean error in the quantity's unit, and share of errors inside their 95 % band.
 
-    An error is the estimate less the truth, or a prediction less the reading.
+    An error is estimate minus truth, or prediction minus measurement.
     """
 
     rmse: float
@@ -36,16 +35,15 @@ class Fit(NamedTuple):
 
 
 class Score(NamedTuple):
-    """Mean NIS of the used readings with its 95 % bounds, log-likelihoods, counts, and fits.
+    """Mean NIS of the used measurements with its 95 % bounds, log-likelihoods, counts, and fits.
 
-    `log_likelihood` is that of the readings used and refused, `log_likelihood_used` that of the used ones alone, which
-    compares filters only where none refuses any. Readings that failed are in neither: they have no density. `refused`
-    is the share of the gate's verdicts that were refusals; NaN without any.
+    log_likelihood: of used and rejected measurements; log_likelihood_used: of the used ones, comparable only between
+    filters that reject none. Failed measurements are in neither, as they have no density. refused: share of rejections
+    among the gate's verdicts; NaN without any.
 
-    `states` are fits against the truth, by state; `held_out` fits of the readings of sensors held out, by sensor row.
-    `field` is that of all cells of a large field, over the times at which they were told; None without such.
-    `commissioned` is whether the bounds are of what was normal when the tuning was accepted, `nis_judged` what is then
-    compared with them (consistency.py).
+    states: fits against the truth, by state; held_out: fits of held-out measurements, by sensor row; field: fit of all
+    cells of a large field at the times of its true values, or None. commissioned: whether the bounds are those of the
+    baseline; nis_judged: the NIS to compare with these (consistency.py).
     """
 
     nis: float
@@ -79,15 +77,15 @@ def score(
     gate: float | None = None,
     baseline: np.ndarray | None = None,
 ) -> Score:
-    """Sum a track up. Errors are taken at the truth events, whose rows hold the estimate at that time.
+    """Return the score of a track. Errors are taken at truth events, whose rows hold the estimate at that time.
 
     Args:
-        track: Its track.
-        events: Of what.
-        model: Whose sensors and states.
-        pictures: Of a large field, which are summed up too; the track knows a few cells only.
-        gate: That of the tuning, the probability that a good reading passes: it sets the price of a refusal. Where
-            readings were refused and it is not given, the log-likelihood is NaN.
+        track: The track.
+        events: Its events.
+        model: The model.
+        pictures: Pictures of a large field, of which a track has a few cells only.
+        gate: Gate of the tuning, the probability that a good measurement passes, which enters the density of rejected
+            measurements. Without it, their log-likelihood is NaN.
         baseline: Baseline of the tuning, by which the NIS is judged.
     """
     used = track.verdict == USED
@@ -120,7 +118,7 @@ def score(
 
 
 def nis_verdict(track: Track, events: Events, model: StateSpaceModel, baseline: np.ndarray | None = None) -> NisVerdict:
-    """The mean NIS of the used readings of a track, judged; args as of `score`."""
+    """Return the verdict on the mean NIS of the used measurements of a track; args as of `score`."""
     used = track.verdict == USED
     rows = used if baseline is None else used | (track.verdict == GATED)
     count = int(rows.sum())
@@ -138,12 +136,12 @@ def nis_verdict(track: Track, events: Events, model: StateSpaceModel, baseline: 
 
 
 def _over_field(pictures: Sequence[Picture]) -> Fit | None:
-    told = [picture for picture in pictures if picture.cells]
-    if not told:
+    known = [picture for picture in pictures if picture.cells]
+    if not known:
         return None
-    cells = np.array([picture.cells for picture in told], float)
-    square = np.average([picture.rmse**2 for picture in told], weights=cells)
-    return Fit(float(np.sqrt(square)), float(np.average([picture.inside for picture in told], weights=cells)))
+    cells = np.array([picture.cells for picture in known], float)
+    square = np.average([picture.rmse**2 for picture in known], weights=cells)
+    return Fit(float(np.sqrt(square)), float(np.average([picture.inside for picture in known], weights=cells)))
 
 
 def _fit(error: np.ndarray, std: np.ndarray) -> Fit:
@@ -153,11 +151,16 @@ def _fit(error: np.ndarray, std: np.ndarray) -> Fit:
 
 
 def log_density(refused: Track, gate: float | None) -> np.ndarray:
-    """Log of p at refused readings, (N,), in the units of the rows; -inf where a NIS is not finite, NaN without a gate.
+    """Return the log density of rejected measurements, (N,), in the units of the rows.
+
+    The density outside the gate is the tail of a multivariate Cauchy density, scaled to the probability 1 - P.
 
     Args:
-        refused: Rows of a track whose verdict is that the gate refused the reading.
-        gate: P, as the tuning has it.
+        refused: Rows of a track with rejected measurements.
+        gate: P of the tuning.
+
+    Returns:
+        -inf where a NIS is not finite, NaN without a gate.
     """
     if gate is None:
         return np.full(len(refused), np.nan)
@@ -174,9 +177,9 @@ def log_density(refused: Track, gate: float | None) -> np.ndarray:
 
 
 def spread_ratio(track: Track, window: int) -> float:
-    """Predicted over actual variance of the innovations, over the last `window` readings that were used or gated.
+    """Return predicted over actual variance of the innovations of the last `window` used or rejected measurements.
 
-    1 / mean(ν² / S) over their rows: below 1 the spread is too small, above 1 too large. NaN where there is none.
+    1 / mean(ν² / S) over their rows: below 1 the spread is too small, above 1 too large. NaN without any.
     """
     verdict = track.verdict[-MAX_ROWS_PER_READING * window :]
     rows = np.flatnonzero((verdict == USED) | (verdict == GATED))[-window:] + len(track) - verdict.size

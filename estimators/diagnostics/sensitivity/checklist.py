@@ -1,4 +1,4 @@
-"""Is the state small enough for a covariance, or is an ensemble needed? Arithmetic."""
+"""Cost of a filter step, arrivals of measurements, and whether a linearised filter suits the model."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from ..intervals import Interval, correlation_interval
 from ..references import wrapped
 from .responses import MAX_STATES, digits, each
 
-SPREAD_TOLERANCE = 0.1  # Share by which the standard deviations of an ensemble may be off by chance
+SPREAD_TOLERANCE = 0.1  # Relative Monte Carlo error of the standard deviations of an ensemble
 
 MAX_PROCESSOR_SHARE = 0.5
 """Share of one processor that an estimate may take: the rest is for late readings and for refolds."""
@@ -29,11 +29,10 @@ MAX_PROCESSOR_SHARE = 0.5
 class Dimension(NamedTuple):
     """Cost of a filter step, and of the alternatives.
 
-    `flops` are those of a covariance step of n states and m rows, 4 n³ for F P Fᵀ and 6 m n² for the update; `memory`
-    is the covariance's, bytes. `share` of one processor is taken at `rate` readings a second by the filter in use, at
-    `seconds` a reading. `largest` is the n at which a covariance would take all of the processor, if n³ were all.
-    `members` is the ensemble whose σ is within 10 %: one of m members is off by 1 / √(2 (m - 1)). `passes`: `share` is
-    not above a half, and no covariance is needed that cannot be formed.
+    flops: of a covariance step of n states and m rows, 4 n³ for F P Fᵀ and 6 m n² for the update; memory: of the
+    covariance, bytes. share: of one processor, at `rate` measurements a second and `seconds` a measurement. largest: n
+    at which a covariance would take the whole processor, if the cost grew with n³. members: ensemble whose σ has a
+    Monte Carlo error of 10 %, 1 / √(2 (m - 1)). passes: `share` is at most a half, and the covariance can be formed.
     """
 
     nx: int
@@ -49,13 +48,13 @@ class Dimension(NamedTuple):
 
 
 def dimension(model: StateSpaceModel, rate: float, seconds: float, *, covariance: bool) -> Dimension:
-    """The arithmetic of one twin.
+    """Return the cost of a filter step.
 
     Args:
-        model: Whose states.
-        rate: Readings a second.
+        model: The model.
+        rate: Measurements per second.
         seconds: Measured time of the filter per measurement, with the events between.
-        covariance: Whether that filter carries one.
+        covariance: Whether the filter has a covariance.
     """
     n = model.nx
     rows = max(len(sensor.rows) for sensor in model.sensors)
@@ -76,7 +75,7 @@ def dimension(model: StateSpaceModel, rate: float, seconds: float, *, covariance
 
 
 def spread_error(members: float) -> float:
-    """Standard error of a standard deviation of so many normal members, as a share: 1 / √(2 (m - 1))."""
+    """Return the relative standard error of the standard deviation of m normal members, 1 / √(2 (m - 1))."""
     return float(1.0 / np.sqrt(2.0 * (members - 1.0))) if members > 1.0 else np.inf
 
 
@@ -84,12 +83,11 @@ QUANTILES = (0.5, 0.99, 1.0)  # Of lateness
 
 
 class Arrivals(NamedTuple):
-    """The readings of one sensor.
+    """Measurements of one sensor.
 
-    `period` is the median time between two, s, and `rate` readings a second by it. `gap` is the longest time without
-    one, s, which began at `gap_at` (s of the log); `missing` the share of readings that are not there, if the period
-    always held, or that have no finite value. lateness (3,) holds the quantiles `QUANTILES` of arrival less measured
-    time, s; NaN where arrivals are not known.
+    period: median time between two, s; rate: its inverse. gap: longest time without a measurement, s, from `gap_at` (s
+    of the log) on. missing: share of measurements that are absent at this period, or have no finite value. lateness
+    (3,): `QUANTILES` of arrival minus time of measurement, s; NaN where arrivals are not known.
     """
 
     sensor: str
@@ -103,10 +101,10 @@ class Arrivals(NamedTuple):
 
 
 def arrivals(model: StateSpaceModel, log: Log) -> tuple[Arrivals, ...]:
-    """Of every sensor of a model, also those that never speak (n = 0)."""
+    """Return the arrivals of every sensor; n = 0 for sensors that never report."""
     t, kind, channel = log.t[: log.n], log.kind[: log.n], log.channel[: log.n]
     reading = kind == READING
-    # A file says when something was measured; what arrives at the very time at which it was measured came from one.
+    # Files hold times of measurement only, so arrival equals time there.
     known = bool(np.any(log.arrival[: log.n][reading] != t[reading]))
     found = []
     for s, sensor in enumerate(model.sensors):
@@ -138,7 +136,7 @@ LINEARISED, UNSCENTED = "ekf", "ukf"
 
 
 class Curvature(NamedTuple):
-    """How far the two filters are apart in a state or in the prediction of a sensor row, in σ: RMS and quantile."""
+    """Difference of the two filters in a state or in the prediction of a sensor row, in σ: RMS and quantile."""
 
     name: str
     rms: float
@@ -156,10 +154,10 @@ class White(NamedTuple):
 
 
 class Linearity(NamedTuple):
-    """Whether a linearised model passes: `passes` is None where it cannot be told, `reason` says why.
+    """Whether a linearised model passes; `passes` is None where it cannot be determined, for the `reason`.
 
-    `exact`: f and h are linear by the model's own word, so the Kalman filter makes no error. `white` whether the
-    innovations of the linearised filter pass (no correlation that matters), `text` the verdict in words.
+    exact: f and h are declared linear, so the Kalman filter makes no error. white: the innovations of the linearised
+    filter have no relevant correlation. text: the verdict in words.
     """
 
     reason: str
@@ -184,7 +182,7 @@ def linearity(
 
     Args:
         model: Of at most 64 states, to which both apply.
-        tuning: As the twin's; options of its filter are not theirs and are left out.
+        tuning: As the twin's, without the options of its filter.
         log: The events; it must not grow meanwhile (give a copy).
         base: Where the log starts, if older events were dropped.
         executor: As `sensitivity`.
@@ -223,7 +221,7 @@ def _reason_against(model: StateSpaceModel) -> str:
 
 
 def _curvature(name: str, apart: np.ndarray) -> Curvature:
-    """Of differences in σ; infinite where one of the filters has no number and the other has."""
+    """Return RMS and quantile of differences in σ; infinite where only one of the filters has a finite estimate."""
     there = apart[~np.isnan(apart)]
     if not there.size:
         return Curvature(name, 0.0, 0.0)
@@ -237,7 +235,7 @@ def _apart(one: np.ndarray, other: np.ndarray, std: np.ndarray, circular: bool) 
     with np.errstate(all="ignore"):
         share = np.abs(difference) / std
     lost = np.isfinite(other) & ~np.isfinite(one)
-    # Where nothing is uncertain, rounding is no difference.
+    # Without uncertainty, rounding does not count as a difference.
     share = np.where((std == 0.0) & (np.abs(difference) <= 1e-9 * np.maximum(1.0, np.abs(other))), 0.0, share)
     return np.where(lost, np.inf, share)
 
@@ -270,7 +268,7 @@ def _rows(straight: Fold, curved: Fold) -> tuple[tuple[Curvature, ...], tuple[Wh
 
 
 def _judged(track: Track, k: int) -> np.ndarray:
-    """Standardised innovations of the readings that were used or refused; NaN elsewhere."""
+    """Return the standardised innovations of the measurements that were used or rejected; NaN elsewhere."""
     judged = (track.verdict == USED) | (track.verdict == GATED)
     return np.where(judged, standardised(track, k, False), np.nan)
 

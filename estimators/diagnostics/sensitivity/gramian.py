@@ -1,7 +1,7 @@
 """Observability along the track: information of measurements about the state at their beginning.
 
 The prior mean of each state is nudged, in units of its deviation, and the same log folded again. With P₀ = I in these
-units, and J = Oᵀ N⁻¹ O the information of the readings on the state at their beginning (process noise is in N),
+units, and J = Oᵀ N⁻¹ O the information of the measurements on the state at their beginning (process noise is in N),
 
     G_ij = Σ dν_iᵀ S⁻¹ dν_j = (I + J⁻¹)⁻¹,        I - G = (I + J)⁻¹
 
@@ -85,13 +85,13 @@ def gramian(
     """Nudge the prior mean of each state, and compute the information of a log about it.
 
     Args:
-        estimator: Of the twin; particles and ensembles are replaced by a filter without chance, see `note`.
+        estimator: Of the twin; particle and ensemble filters are replaced by a deterministic one, see `note`.
         model: Of at most 64 states.
         tuning: As the twin's.
         log: The events; it must not grow meanwhile (give a copy).
         base: Where the log starts, if older events were dropped.
         windows: Parts of equal time, or 0. Each begins at the estimate of that time with the covariance of the prior.
-        most: Events to look at, from the end; None for what takes seconds.
+        most: Number of events to refold, from the end; None for at most seconds.
         executor: As `sensitivity`.
 
     Raises:
@@ -134,11 +134,10 @@ def _view(
         part.drop_front(begin)
     begun = Start.of(estimator, tuning, part, base)
     used = begun.track.verdict == USED
-    told = [_response(begun, j, std)[used] for j, std in enumerate(model.prior_std.tolist())]
-    g = information(told)
+    g = information([_response(begun, j, std)[used] for j, std in enumerate(model.prior_std.tolist())])
     values, vectors = np.linalg.eigh(g)
     left = np.clip(1.0 - values, MIN_VARIANCE_SHARE, 1.0)
-    # A state that is certain at first cannot be nudged, and nothing need be told of it.
+    # A state that is certain at first cannot be nudged.
     free = model.prior_std > 0.0
     eigenvalues = np.clip(values, 0.0, None) / left
     order = [k for k in range(model.nx) if np.any(np.abs(vectors[free, k]) > MIN_VARIANCE_SHARE)]
@@ -160,7 +159,7 @@ def _view(
 
 
 def _response(begun: Start, j: int, std: float) -> np.ndarray:
-    """S^-1/2 dν (N, ny) by one prior deviation of state j."""
+    """Return S^-1/2 dν (N, ny) by one prior deviation of state j."""
     tracks = []
     for size in (-STEP, STEP):
         mean = begun.base.mean.copy()
@@ -170,7 +169,7 @@ def _response(begun: Start, j: int, std: float) -> np.ndarray:
 
 
 def _in_words(weights: np.ndarray, model: StateSpaceModel, left: float) -> str:
-    """The weakest direction, its largest parts in units, and how much of the prior's deviation is left in it."""
+    """Describe the weakest direction: its largest parts in units, and its remaining share of the prior deviation."""
     parts = [
         f"{model.state_names[int(j)]} {weights[j] * model.prior_std[j]:+.3g} {model.states[int(j)].unit}"
         for j in np.argsort(-np.abs(weights), kind="stable")[:4]
@@ -202,44 +201,40 @@ class Direction(NamedTuple):
 
 
 class Uncertainty(NamedTuple):
-    """How well each of some nudges can be told from a log, if all of them are unknown together.
+    """Uncertainty of some nudges if all of them are unknown together.
 
-    deviation (k,) in the nudges' units, infinite where the log cannot tell; `alone` (k,) the same where all others are
-    known. correlation (k, k) of the estimates: near ±1, one takes the blame for the other. `directions`, the worst told
-    first.
+    deviation (k,): in the nudges' units, infinite where the log does not determine it; alone (k,): the same if all
+    others are known. correlation (k, k): of the estimates; near ±1, two nudges cannot be distinguished.
     """
 
-    nudges: tuple[Nudge, ...]
     deviation: np.ndarray
     alone: np.ndarray
     correlation: np.ndarray
-    directions: tuple[Direction, ...]
 
 
 def information(whitened: Sequence[np.ndarray]) -> np.ndarray:
-    """F (k, k) of k responses S^-1/2 dν, each (N, ny), NaN where there is none."""
+    """Return F (k, k) of k responses S^-1/2 dν, each (N, ny), NaN where there is none."""
     rows = np.array([np.nan_to_num(each).ravel() for each in whitened])
     return rows @ rows.T
 
 
-def uncertainty(fisher: np.ndarray, nudges: Sequence[Nudge]) -> Uncertainty:
-    """Invert the information (k, k) of k nudges, as far as it can be."""
-    k = len(nudges)
+def uncertainty(fisher: np.ndarray) -> Uncertainty:
+    """Invert the information (k, k) of k nudges, as far as possible."""
     with np.errstate(divide="ignore"):
         alone = np.diag(fisher) ** -0.5
     seen = np.isfinite(alone)
     unit = np.where(seen, alone, 0.0)
     values, vectors = np.linalg.eigh(fisher * np.outer(unit, unit))
-    told = values > MIN_EIGENVALUE
+    determined = values > MIN_EIGENVALUE
     shares = vectors**2
-    spread = shares[:, told] @ (1.0 / values[told])
-    lost = ~seen | (shares[:, ~told].sum(axis=1) > MIN_NULL_SHARE**2)
+    spread = shares[:, determined] @ (1.0 / values[determined])
+    lost = ~seen | (shares[:, ~determined].sum(axis=1) > MIN_NULL_SHARE**2)
     deviation = np.where(lost, np.inf, np.sqrt(spread) * unit)
-    # Of what the log cannot tell, the null space says which goes with which; the rest is nothing beside it.
-    weight = np.where(told, 1.0 / np.maximum(values, MIN_EIGENVALUE), 1.0 / MIN_EIGENVALUE)
+    # The null space dominates the correlation of what the log does not determine.
+    weight = np.where(determined, 1.0 / np.maximum(values, MIN_EIGENVALUE), 1.0 / MIN_EIGENVALUE)
     cov = (vectors * weight) @ vectors.T
-    root = np.sqrt(np.diag(cov)) if k else np.zeros(0)
-    return Uncertainty(tuple(nudges), deviation, alone, cov / np.outer(root, root), directions(fisher, nudges))
+    root = np.sqrt(np.diag(cov))
+    return Uncertainty(deviation, alone, cov / np.outer(root, root))
 
 
 def directions(fisher: np.ndarray, nudges: Sequence[Nudge]) -> tuple[Direction, ...]:

@@ -1,4 +1,4 @@
-"""Predict each sensor from the others: fold the log with one sensor held out at a time, and once without any."""
+"""Prediction of each sensor by the others: folds with one sensor held out at a time, and with all held out."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ MONTE_CARLO_FAMILIES = ("particle", "ensemble")
 
 
 class HeldOutPrediction(NamedTuple):
-    """A sensor row that is predicted without its sensor, at `n` readings.
+    """Prediction of a sensor row without its sensor, over n measurements.
 
-    rms and bias (prediction less reading) in `unit`; coverage (3,) the shares of the readings inside the bands `BANDS`
-    of the prediction, intervals (3, 2) their 95 % intervals. `open_loop` is the RMS of the model without any reading.
+    rms, bias: of prediction minus measurement, in `unit`. coverage (3,): shares of the measurements inside the bands
+    `BANDS` of the prediction; intervals (3, 2): their 95 % intervals. open_loop: RMS of the model without measurements.
     """
 
     row: str
@@ -45,12 +45,12 @@ class HeldOutPrediction(NamedTuple):
 
     @property
     def worse(self) -> bool:
-        """Whether the other sensors make the prediction worse than none does."""
+        """Whether the prediction is worse than that of the open loop."""
         return worse(self.rms, self.open_loop)
 
 
 class Against(NamedTuple):
-    """A state whose truth is known: RMS error of the filter and of the open loop, in `unit`."""
+    """RMS error of a state with a known truth, of the filter and of the open loop, in `unit`."""
 
     state: str
     unit: str
@@ -59,19 +59,19 @@ class Against(NamedTuple):
 
     @property
     def worse(self) -> bool:
-        """Whether the filter makes the state worse than no filter."""
+        """Whether the error is larger than that of the open loop."""
         return worse(self.filter, self.open_loop)
 
 
 class HeldOut(NamedTuple):
-    """All rows of sensors that speak, and all states whose truth is known."""
+    """All rows of sensors that report, and all states with a known truth."""
 
     rows: tuple[HeldOutPrediction, ...]
     states: tuple[Against, ...]
 
 
 def worse(rms: float, floor: float) -> bool:
-    """Whether an error is larger than that of the open loop by more than the margin; an error of no size is not."""
+    """Return whether an error exceeds that of the open loop by more than the margin."""
     return bool(rms > (1.0 + WORSE_MARGIN) * floor)
 
 
@@ -84,12 +84,12 @@ def held_out(
     base: Base | None = None,
     executor: Executor | str | None = "threads",
 ) -> HeldOut:
-    """Fold the log without each sensor that speaks, without all, and as it is.
+    """Fold the log without each sensor that reports, without all, and as it is.
 
     Args:
         estimator: Of the twin.
-        model: Whose sensors.
-        tuning: As the twin's; a sensor that it holds out stays so throughout.
+        model: The model.
+        tuning: As the twin's; sensors that it holds out remain so.
         log: The events; it must not grow meanwhile (give a copy).
         base: Where the log starts, if older events were dropped.
         executor: As `sensitivity`.
@@ -99,11 +99,11 @@ def held_out(
         ModelError: As `Fold`.
     """
     kind, channel = log.kind[: log.n], log.channel[: log.n]
-    speak = [int(s) for s in np.unique(channel[kind == READING])]
-    nobody = tuning
+    reporting = [int(s) for s in np.unique(channel[kind == READING])]
+    none = tuning
     for name in model.sensor_names:
-        nobody = nobody.set(f"use.{name}", False)
-    without = [tuning.set(f"use.{model.sensor_names[s]}", False) for s in speak]
+        none = none.set(f"use.{name}", False)
+    without = [tuning.set(f"use.{model.sensor_names[s]}", False) for s in reporting]
 
     def run(other: Tuning) -> Fold:
         fold = Fold(estimator, model, other, log, base=base)
@@ -113,10 +113,10 @@ def held_out(
 
     if find_estimator(estimator, model).family in MONTE_CARLO_FAMILIES:
         executor = None
-    filtered, floor, *folds = each(run, [tuning, nobody, *without], executor)
+    filtered, floor, *folds = each(run, [tuning, none, *without], executor)
     open_rows = _score(floor).held_out
     rows: list[HeldOutPrediction] = []
-    for s, fold in zip(speak, folds, strict=True):
+    for s, fold in zip(reporting, folds, strict=True):
         rows += _predictions(fold, s, open_rows)
     return HeldOut(tuple(rows), tuple(_states(filtered, floor)))
 

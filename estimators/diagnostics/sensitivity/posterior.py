@@ -1,7 +1,7 @@
-"""The shape of the posterior: several peaks, or one peak and noise with heavy tails?
+"""Shape of the posterior: several peaks, or one peak and heavy-tailed noise.
 
-Peaks are those that two clouds of particles, which draw differently, share along the log. Tails are those of the
-innovations of the filter in use, each in units of its own standard deviation: a scale that is wrong makes no tails.
+A peak counts if two particle clouds with different seeds share it. Tails are those of the standardised innovations of
+the filter in use, relative to their own standard deviation.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from ...tuning import Tuning
 from ..calibration import standardised
 from ..innovations import jarque_bera
 
-MAX_LOOKS = 150  # Times at which the cloud is looked at; finding its peaks takes milliseconds
+MAX_LOOKS = 150  # Times at which the cloud is sampled; finding its peaks takes milliseconds
 
 MOST_STATES = 12
 """States up to which the shape of a particle cloud is informative: beyond, too few particles explain a measurement."""
@@ -43,9 +43,9 @@ MIN_TAIL_MEASUREMENTS = 50  # Readings of which a kurtosis is taken at least
 class Peaks(NamedTuple):
     """Peaks of a particle cloud at `looks` times: share with more than one peak, and their largest number.
 
-    `collapsed` is the share of the times at which so few members differed that peaks would be of chance; they do not
-    count. `reason` says why nothing can be told. `recoveries` counts how often the cloud lost the asset: then its shape
-    says little. `over`: seconds of the log.
+    collapsed: share of times at which too few particles differ for peaks to be informative; they do not count. reason:
+    why peaks are not computed, or "". recoveries: times that the cloud lost the asset; its shape is then hardly
+    informative. over: seconds of the log.
     """
 
     estimator: str
@@ -69,17 +69,17 @@ class Tail(NamedTuple):
 
     @property
     def heavy(self) -> bool:
-        """Whether the tails are heavier than a normal distribution's by more than matters."""
+        """Whether the tails are considerably heavier than those of a normal distribution."""
         return self.n >= MIN_TAIL_MEASUREMENTS and self.kurtosis > HEAVY_KURTOSIS
 
 
 def peaks(estimator: str, model: StateSpaceModel, tuning: Tuning, log: Log, *, base: Base | None = None) -> Peaks:
-    """Fold the first part of a log with particles twice, and look at the clouds on the way.
+    """Fold the first part of a log with two particle filters, and count the peaks of their clouds.
 
     Args:
         estimator: A particle filter.
-        model: Of at most 12 states.
-        tuning: With the options of that filter.
+        model: Model with at most 12 states.
+        tuning: Tuning with the options of that filter.
         log: The events; it must not grow meanwhile (give a copy).
         base: Where the log starts, if older events were dropped.
 
@@ -93,7 +93,7 @@ def peaks(estimator: str, model: StateSpaceModel, tuning: Tuning, log: Log, *, b
     if reason:
         return Peaks(estimator, reason, 0, np.nan, 0, 0, 0.0)
     end = min(log.n, MOST_EVENTS)
-    # After a reading, where a cloud that has lost its variety shows it: later, noise moves copies apart.
+    # Right after a measurement: later, process noise separates duplicated particles.
     stops = np.flatnonzero(log.kind[:end] == READING) + 1
     stops = stops[np.unique(np.linspace(0, stops.size - 1, min(stops.size, MAX_LOOKS)).round().astype(int))]
     folds = [Fold(estimator, model, replace(tuning, seed=tuning.seed + k), log, base=base) for k in range(2)]
@@ -119,9 +119,9 @@ def peaks(estimator: str, model: StateSpaceModel, tuning: Tuning, log: Log, *, b
 
 
 def _confirmed(found: list[Peak], points: np.ndarray, circular: np.ndarray) -> int:
-    """How many peaks of a cloud are apart in another one too, whose points (n, nx) are given; at least one.
+    """Return the number of peaks of a cloud that are separate in another cloud with points (n, nx), too; at least one.
 
-    What chance has split has points of the other cloud in the middle as at both ends.
+    Between peaks that are separate by chance, the other cloud has points.
     """
     kept: list[Peak] = []
     for peak in found:
@@ -142,12 +142,12 @@ def _apart(one: Peak, other: Peak, points: np.ndarray, circular: np.ndarray) -> 
 
 
 def _less(one: np.ndarray, other: np.ndarray, circular: np.ndarray) -> np.ndarray:
-    """The difference, of angles by the shorter way."""
+    """Return the difference, of angles by the shorter way."""
     return np.where(circular, (one - other + np.pi) % (2.0 * np.pi) - np.pi, one - other)
 
 
 def tails(model: StateSpaceModel, log: Log, track: Track, *, marginal: bool) -> tuple[Tail, ...]:
-    """Of every sensor row with readings that were used or refused; `marginal` as in calibration.py."""
+    """Return the tails of every sensor row with used or rejected measurements; `marginal` as in calibration.py."""
     judged = (log.kind[: len(track)] == READING) & ((track.verdict == USED) | (track.verdict == GATED))
     found = []
     for s, sensor in enumerate(model.sensors):

@@ -99,7 +99,7 @@ class Sensitivity(NamedTuple):
     def among(self, indices: Sequence[int] | None = None) -> Uncertainty:
         """Return the uncertainty of some nudges if these are unknown and all others are known; None for all."""
         some = list(range(len(self.faults)) if indices is None else indices)
-        return uncertainty(self.fisher[np.ix_(some, some)], [self.nudges[k] for k in some])
+        return uncertainty(self.fisher[np.ix_(some, some)])
 
 
 def sensitivity(
@@ -127,8 +127,8 @@ def sensitivity(
         tuning: As the twin's.
         log: The events; it must not grow meanwhile (give a copy). Rejected measurements stay rejected.
         base: Where the log starts, if older events were dropped; see `Fold.base_at`.
-        kinds: Which nudges, of "sensor", "input", "parameter".
-        most: Events to look at, from the end; None for what takes seconds and 256 MB at most.
+        kinds: Kinds of nudges, of "sensor", "input", "parameter".
+        most: Number of events to refold, from the end; None for at most seconds and 256 MB.
         seen_by: "bank" for the detectors of the twin, "best" for the optimal test of a known fault, a bound for all
             tests.
         false_alarm: Mean time between false alarms of all tests together, s.

@@ -8,6 +8,7 @@ from scipy.stats import binom, norm
 from estimators.diagnostics.detector_state import no_baseline
 from estimators.diagnostics.detectors import RATIOS, TESTS
 from estimators.diagnostics.sensitivity import sensitivity
+from estimators.diagnostics.sensitivity.gramian import directions
 from estimators.diagnostics.sensitivity.visibility import FaultTests, noncentrality, threshold
 from estimators.fold import Fold, fold
 from estimators.log import READING, Log
@@ -100,7 +101,7 @@ def test_what_the_readings_cannot_tell_apart(walk):
     assert pair.correlation[0, 1] == pytest.approx(cov[0, 1] / np.sqrt(cov[0, 0] * cov[1, 1]), abs=1e-6)
     # One at the other's cost: the sum stays when one rises and the other falls.
     assert walk.among([1, 2]).correlation[0, 1] == pytest.approx(-1.0, abs=1e-6)
-    worst = walk.among([1, 2]).directions[0]
+    worst = directions(walk.fisher[1:3, 1:3], walk.nudges[1:3])[0]
     assert np.isinf(worst.deviation) and np.prod(worst.weights) < 0
     assert "slope" in worst.text and "input push" in worst.text
 
