@@ -1,8 +1,7 @@
 """Train a correction on windows, choose it by cross-validation over blocks of time, and judge it on held-out blocks.
 
-A filter accumulates the error of a wrong rate in a hidden state, so candidates are judged by the drift that they would
-leave over a block, not by single windows: neighbours in time are alike, and predicting one from the other proves
-nothing. With e = r - m of the windows of a block in order, T long each,
+A filter accumulates the error of a wrong rate in a hidden state, and neighbouring windows are alike. So candidates are
+judged by the remaining drift over a block. With e = r - m of the windows of a block in order, T long each,
 
     drift = mean over n of (Σᵢ≤ₙ eᵢ T)² / (n T)
 
@@ -113,6 +112,7 @@ def drift(given: Windows, rates: np.ndarray) -> np.ndarray:
 
 
 def _check(kind: str, given: Windows, names: Sequence[str]) -> None:
+    """Reject windows from which a correction cannot be trained."""
     count = len(given.start)
     if count < MIN_WINDOWS or np.unique(given.block).size < 2:
         raise EstimatorError(
@@ -135,17 +135,14 @@ def _candidates(kind: str, given: Windows, degree: int, net: Callable | None) ->
         yield Candidate("trained elsewhere", lambda part: found)
     elif kind == RIDGE:
         for penalty in PENALTIES:
-            yield Candidate(f"degree {degree}, penalty {penalty:g}", partial(_ridge, penalty, degree))
+            ridge = lambda part, penalty=penalty: Ridge(part.features, part.rates, penalty, degree)  # noqa: E731
+            yield Candidate(f"degree {degree}, penalty {penalty:g}", ridge)
     else:
         yield Candidate("length scales by marginal likelihood", _likeliest)
         for reach in REACHES:
             for ratio in RATIOS:
                 words = f"length scales of {reach:g} deviations, noise ratio {ratio:g}"
                 yield Candidate(words, partial(_process, reach, ratio))
-
-
-def _ridge(penalty: float, degree: int, given: Windows) -> Ridge:
-    return Ridge(given.features, given.rates, penalty, degree)
 
 
 def _process(reach: float, ratio: float, given: Windows) -> GaussianProcess:

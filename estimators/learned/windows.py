@@ -1,21 +1,22 @@
-"""Training data from a recording: windows of time, and the rates by which the physics was wrong in them.
+"""Training data from a recording: windows of time, and the errors of the physics' rates in them.
 
     r: x(t + T) = x̂(t + T | x(t), r),   dx̂ = (f + r) dt
 
 x are the known states: the truth where the recording has it, otherwise the smoothed estimate. x̂ starts there and
 follows f through the window, with the recorded inputs and a rate r added; states that are not corrected follow their
-known values, as if sensors kept them there. The features of a window are their means over its time.
+known values. The features of a window are means over its time.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ..compiled.context import steps_of
 from ..compiled.model import compile_model
+from ..diagnostics.references import wrapped
 from ..fold import Fold
 from ..log import INPUT, READING, RESET, Log, truth_of
 from ..model.hybrid import gathered, places
@@ -29,8 +30,7 @@ RATE_STEP = 1e-3  # Step of the derivative with respect to a rate, in prior stan
 class Windows(NamedTuple):
     """M windows: features (M, d), rates (M, k) in units of the states per second, start and end (M,) in s, block (M,).
 
-    `block` is the number of the stretch of time that each lies in, in order; `held_out` (M,) is whether it is one to
-    judge by.
+    `block` is the number of the stretch of time of each window, in order; `held_out` (M,) marks those for the verdict.
     """
 
     features: np.ndarray
@@ -46,7 +46,7 @@ class Windows(NamedTuple):
 
     @staticmethod
     def joined(parts: Sequence[Windows]) -> Windows:
-        """Return those of several recordings, with distinct block numbers."""
+        """Return the windows of several recordings, with distinct block numbers."""
         shifted, first = [], 0
         for part in parts:
             shifted.append(part._replace(block=part.block + first))
@@ -115,25 +115,19 @@ def windows(
         weight = np.diff(t[edges[k] : edges[k + 1] + 1]) * 1e-9
         mean = weight @ values[rows] / lasted
         found.append((mean, rate, t[edges[k]] * 1e-9, t[edges[k + 1]] * 1e-9, k * stretches // count, judging[0]))
-    return Windows(
-        np.array([item[0] for item in found], float).reshape(-1, len(features)),
-        np.array([item[1] for item in found], float).reshape(-1, len(corrects)),
-        np.array([item[2] for item in found], float),
-        np.array([item[3] for item in found], float),
-        np.array([item[4] for item in found], int),
-        np.array([item[5] for item in found], bool),
-    )
+    columns: list[Any] = list(zip(*found, strict=True)) or [()] * 6
+    rest = (np.array(column, kind) for column, kind in zip(columns[2:], (float, float, int, bool), strict=True))
+    return Windows(np.reshape(columns[0], (-1, len(features))), np.reshape(columns[1], (-1, len(corrects))), *rest)
 
 
 def _inputs(model: StateSpaceModel, log: Log) -> np.ndarray:
     """Return the inputs that hold from each event on (events, nu)."""
     u = np.full((log.n, model.nu), np.nan)
-    told = log.kind[: log.n] == INPUT
-    u[told] = log.value[: log.n, : model.nu][told]
+    given = log.kind[: log.n] == INPUT
+    u[given] = log.value[: log.n, : model.nu][given]
     row = np.arange(log.n)
     for j, item in enumerate(model.inputs):
-        given = np.isfinite(u[:, j])
-        last = np.maximum.accumulate(np.where(given, row, -1))
+        last = np.maximum.accumulate(np.where(np.isfinite(u[:, j]), row, -1))
         u[:, j] = np.where(last >= 0, u[np.maximum(last, 0), j], item.default)
     return u
 
@@ -164,7 +158,7 @@ def _rates(
                     x[:] = out
                     x[target] += rates * dt / steps
         off = known[-1][target] - x[target]
-        return np.where(turned, (off + np.pi) % (2.0 * np.pi) - np.pi, off)
+        return np.where(turned, wrapped(off), off)
 
     off = missed(np.zeros(target.size))
     slopes = np.array([(off - missed(rates)) / rates[c] for c, rates in enumerate(np.diag(little))]).T

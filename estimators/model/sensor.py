@@ -24,7 +24,7 @@ MIN_CORRELATION_EIGENVALUE = 1e-9
 
 
 def as_correlation(matrix: Any) -> Correlation:
-    """Return the rows of a matrix, or of anything that NumPy takes for one."""
+    """Return the rows of a matrix, or of anything that NumPy converts to one."""
     return tuple(tuple(float(c) for c in row) for row in np.atleast_2d(np.asarray(matrix, float)))
 
 
@@ -48,7 +48,7 @@ def covariance_of(correlation: Correlation | None, r: np.ndarray) -> np.ndarray:
 
 
 def correlation_error(correlation: Correlation, ny: int) -> str | None:
-    """Return what is wrong with the correlation of ny rows, with the remedy; None if nothing is."""
+    """Return the flaw of a correlation of ny rows, with the remedy; None without one."""
     if len(correlation) != ny or any(len(row) != ny for row in correlation):
         return (
             f"has {len(correlation)} rows of {', '.join(str(len(row)) for row in correlation)}; it must be {ny} × {ny}"
@@ -78,10 +78,10 @@ difference of two has √2 standard deviations."""
 class Stuck:
     """When a row that repeats its value is stuck.
 
-    It is from its `readings`-th equal value on, or from the one that comes `seconds` after the first of them. Values
-    less than half a `quantum` apart are equal. Where neither number nor time is given, the run is as long as noise of
-    standard deviation `std` makes less than once a day at the sensor's rate: see screen.py. `quantum` and `std` have
-    one entry for all rows, or one a row; without `std`, the noise of the sensor's rows.
+    It is stuck from its `readings`-th equal value on, or from a value `seconds` after the first of them. Values less
+    than half a `quantum` apart are equal. Without number and time, the run is as long as noise of standard deviation
+    `std` causes less than once a day at the sensor's rate (plausibility.py). `quantum` and `std` have one entry for all
+    rows, or one per row; without `std`, the noise of the sensor's rows.
     """
 
     readings: int | None = None
@@ -90,7 +90,7 @@ class Stuck:
     std: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
-        """Refuse rules that always or never hold."""
+        """Reject rules that always or never apply."""
         if self.readings is None and self.seconds is None and not self.quantum:
             raise ModelError("stuck gives neither readings nor seconds nor quantum; add one")
         if self.readings is not None and self.readings < 2:
@@ -118,7 +118,7 @@ class Limits:
     duplicates: float = 0.0
 
     def __post_init__(self) -> None:
-        """Refuse limits that no measurement, or every one, would break."""
+        """Reject limits that no measurement, or every one, would violate."""
         for pair in self.range:
             check_range("range", pair)
         for pair in self.saturation:
@@ -130,7 +130,7 @@ class Limits:
             raise ModelError(f"duplicates is {self.duplicates:g} s; it must be zero or positive")
 
     def flaw(self, rows: int) -> str | None:
-        """Return what does not fit a sensor of so many rows, as `key has 2 entries; ...`; None if all does."""
+        """Return the key whose number of entries does not match the rows, as `key has 2 entries; ...`; None without."""
         stuck = self.stuck or Stuck(readings=2)
         for key, values in (
             ("range", self.range),
@@ -145,7 +145,7 @@ class Limits:
 
 
 def check_range(what: str, pair: Pair | None) -> None:
-    """Refuse an empty range.
+    """Reject an empty range.
 
     Raises:
         ModelError: Beginning with `what`.
@@ -174,7 +174,7 @@ class Sensor:
     now; rows of y that are missing are NaN. Particle filters use it; the others use h and r.
 
     `correlation` is the correlation matrix (ny, ny) of the rows' noise, where they are not independent: anything that
-    NumPy takes for a matrix. R_ij = correlation_ij √(r_i r_j), so the rows' variances are tuned as ever. Of a
+    NumPy converts to a matrix. R_ij = correlation_ij √(r_i r_j), so the rows' variances are tuned as ever. Of a
     covariance R, give the rows its diagonal and the sensor `correlation_of(R)`.
 
     `limits` bound what it can measure; measurements beyond are kept in the log and never used.
@@ -189,6 +189,6 @@ class Sensor:
     limits: Limits | None = None
 
     def __post_init__(self) -> None:
-        """Hold a matrix, which cannot be hashed, as its rows."""
+        """Store a matrix as its rows, which can be hashed."""
         if self.correlation is not None:
             object.__setattr__(self, "correlation", as_correlation(self.correlation))

@@ -46,7 +46,7 @@ class Noise:
 
 @dataclass(frozen=True)
 class Input:
-    """One entry of u, a known input, held until it changes; `default` until the first value; `fitted` as in `State`."""
+    """One entry of u, held until it changes; `default` before the first value; `fitted` as in `State`."""
 
     name: str
     unit: str
@@ -71,14 +71,14 @@ class Parameter:
 
 @dataclass(frozen=True)
 class Jump:
-    """A discrete mode: the state that takes the values 0, 1, …, their names, and how it jumps.
+    """A discrete mode: the state with the values 0, 1, …, their names, and the probabilities of jumps.
 
         m' ~ chances(x, u, p, dt),   then   x' = f(x with m', u, p, dt) + w
 
-    chances(x, u, p, dt, out) fills `out` (modes,) with the probability of each mode `dt` seconds on, from the state x,
-    its mode included. The mode's prior is that of its state: of two modes, the mean is the probability of the second;
-    of more, that of a Gaussian at the whole numbers. f keeps the mode (out[mode] = x[mode]) and no noise acts on it. f
-    and h must take any number for it, since filters that do not sample give them its mean (`indicator`).
+    chances(x, u, p, dt, out) fills `out` (modes,) with the probability of each mode after `dt` seconds, given the state
+    x with its mode. The mode's prior is that of its state: with two modes, the mean is the probability of the second;
+    with more, a Gaussian at the whole numbers. f keeps the mode (out[mode] = x[mode]) and no noise acts on it. f and h
+    must accept any number for it, since filters that do not sample use its mean (`indicator`).
 
     Source: Doucet, Gordon & Krishnamurthy (2001), Particle filters for state estimation of jump Markov linear systems,
     doi:10.1109/78.905890, section II (the mode jumps first, then the state moves in the new mode).
@@ -90,28 +90,28 @@ class Jump:
 
 
 class EventLayout:
-    """Sizes of a model's events: rows of each sensor, inputs and states.
+    """Sizes of a model's events.
 
     Args:
-        name: Of the model, for messages.
+        name: Name of the model, for messages.
         sensors: Names of its sensors.
-        rows: Rows of each.
-        nu: Inputs.
-        nx: States.
+        rows: Number of rows of each sensor.
+        nu: Number of inputs.
+        nx: Number of states.
     """
 
     def __init__(self, name: str, sensors: tuple[str, ...], rows: tuple[int, ...], nu: int, nx: int) -> None:
         self.name, self.sensors, self.rows, self.nu, self.nx = name, sensors, rows, nu, nx
 
     def same(self, other: EventLayout | None) -> bool:
-        """Return whether both take the same events."""
+        """Return whether both have events of the same sizes."""
         if other is None or self is other:
             return self is other
         return (self.rows, self.nu, self.nx) == (other.rows, other.nu, other.nx)
 
     @cached_property
     def least(self) -> int:
-        """Columns of an event that a fold reads: those of the longest reading, or all inputs."""
+        """Columns of an event that a fold reads: those of the longest measurement, or all inputs."""
         return max(*self.rows, self.nu)
 
     @cached_property
@@ -145,10 +145,10 @@ class StateSpaceModel:
     Steps longer than `max_step` seconds are split, so that f may use a simple integration scheme.
 
     A `black_box` is not compiled: f(X, u, p, dt) takes a block of states X (N, nx) and returns the next ones (N, nx), a
-    sensor's h(X, u, p) returns (N, ny). Row i of the result depends on row i alone, and on no chance. `executor` splits
-    the block: "threads" (for an f that gives up the GIL), "processes" (f and h must stand by their names in a module or
-    in the model's file, which each process runs once), or any concurrent.futures.Executor; None runs it as it is. Q and
-    shape remain functions of one state, which are compiled.
+    sensor's h(X, u, p) returns (N, ny). Row i of the result depends on row i alone, without randomness. `executor`
+    splits the block: "threads" (for an f that releases the GIL), "processes" (f and h must be module-level functions of
+    a module or of the model's file, which each process runs once), or any concurrent.futures.Executor; None does not
+    split. Q and shape remain compiled functions of one state.
     """
 
     name: str
@@ -235,7 +235,7 @@ class StateSpaceModel:
             yield f"max_step is {self.max_step} s; it must be positive"
 
     def _flaws_of_parts(self) -> Iterator[str]:
-        """Yield what is wrong with the mode and the linear part."""
+        """Yield the flaws of the mode and the linear part."""
         if isinstance(self.states, Field) and (self.jump or self.conditionally_linear):
             yield "a field has no mode and no linear part; list the states"
         for name in self.conditionally_linear:
@@ -336,12 +336,12 @@ class StateSpaceModel:
 
     @property
     def grid(self) -> Field | None:
-        """The field, if it has too many cells for a chart each; it is then drawn as pictures."""
+        """The field, if it has too many cells for a chart each; None otherwise."""
         return self.states if isinstance(self.states, Field) and self.nx > SHOWN else None
 
     @cached_property
     def shown(self) -> np.ndarray:
-        """Indices of the states whose estimates a track keeps, a column each: all, or those that a field names."""
+        """Indices of the states with a column in the track: all, or those that a field names."""
         if isinstance(self.states, Field) and self.states.shown:
             return np.array(self.states.shown, np.int64)
         if self.nx <= SHOWN:

@@ -1,4 +1,4 @@
-"""Fields: thousands of states of one kind on a grid, declared in one line instead of one by one."""
+"""States, and fields of states on a grid."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from .sensor import check_range
 class State:
     """One entry of x with its prior N(mean, std²); a `circular` one is an angle in radians and wraps to ±π.
 
-    `position` says where it is, for filters that let a reading act only near its sensor. `fitted` is the range over
-    which the model was fitted or checked; an estimate outside is suspect.
+    `position` is for filters that localise measurements. `fitted` is the range in which the model was fitted or
+    checked; an estimate outside makes the twin suspect.
     """
 
     name: str
@@ -31,13 +31,13 @@ class State:
     fitted: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
-        """Refuse a range that holds nothing."""
+        """Reject an empty range."""
         check_range(f"state {self.name}: fitted", self.fitted)
 
 
 @dataclass(frozen=True)
 class Field(Sequence[State]):
-    """The states of a quantity on a regular grid, the last index fastest; `field[k]` makes the k-th as it is asked for.
+    """States of a quantity on a regular grid, the last index fastest; `field[k]` creates the k-th on access.
 
     Cell (i, j) lies at (i·spacing, j·spacing), or per axis if `spacing` is a tuple; along a `periodic` axis the grid
     closes on itself. `mean` and `std` are the prior of every cell, or `means` of each. `shown` are the cells whose
@@ -55,7 +55,7 @@ class Field(Sequence[State]):
     shown: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
-        """Refuse a grid without cells, and a prior that is none."""
+        """Reject a grid without cells, and an invalid prior."""
         if not self.shape or min(self.shape) < 1:
             raise ModelError(f"field {self.name}: shape is {self.shape}; every axis needs at least one cell")
         if self.periodic and len(self.periodic) != len(self.shape):
@@ -91,7 +91,7 @@ class Field(Sequence[State]):
         return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(len(self), len(self.shape))
 
     def index(self, value: Any, start: int = 0, stop: int | None = None) -> int:
-        """Position of a state, by its name alone."""
+        """Return the index of a state, by its name."""
         return self.index_of(value.name)
 
     def index_of(self, name: str) -> int:
@@ -136,7 +136,7 @@ class Field(Sequence[State]):
 
 
 class CellNames(Sequence[str]):
-    """The names of a field's cells, made as they are asked for."""
+    """Names of a field's cells, created on access."""
 
     def __init__(self, field: Field) -> None:
         self._field = field
@@ -157,5 +157,5 @@ class CellNames(Sequence[str]):
         return True
 
     def index(self, value: Any, start: int = 0, stop: int | None = None) -> int:
-        """Flat index of a cell by name."""
+        """Return the flat index of a cell by name."""
         return self._field.index_of(value)
