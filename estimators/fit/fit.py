@@ -36,23 +36,23 @@ MAX_RESETS = 3  # Times that entries are reset and the others fitted again
 class EntryFit(NamedTuple):
     """One entry of the result, in its unit: before and after, and the 95 % interval.
 
-    `told` is whether the data identify it; an entry that they do not identify is reset where that costs nothing
-    (`alone`), and then `after` is `before`; otherwise only a bound is known. `deviation` is that of the estimate, on
-    the logarithm where `log` is true. `profile` is whether the interval is by profile likelihood, `edge` whether the
-    value is at an end of its range, so that the optimum may lie beyond.
+    told: whether the data identify it; an entry that they do not identify is reset where that costs nothing (`alone`),
+    and then `after` is `before`; otherwise only a bound is known. deviation: of the estimate, on the logarithm if
+    `log`. profile: whether the interval is by profile likelihood. edge: whether the value is at an end of its range, so
+    that the optimum may lie beyond.
     """
 
     key: str
     unit: str
     before: float
     after: float
-    low: float
-    high: float
-    deviation: float
-    log: bool
-    told: bool
-    alone: bool
-    profile: bool
+    low: float = np.nan
+    high: float = np.nan
+    deviation: float = np.nan
+    log: bool = False
+    told: bool = False
+    alone: bool = True
+    profile: bool = False
     edge: bool = False
 
 
@@ -223,10 +223,7 @@ def _lines(
     lines = []
     for item in entries:
         if item.key not in place:
-            nan = np.nan
-            lines.append(
-                EntryFit(item.key, item.unit, item.start, item.start, nan, nan, nan, item.log, False, True, False)
-            )
+            lines.append(EntryFit(item.key, item.unit, item.start, item.start, log=item.log))
             continue
         i = place[item.key]
         at = float(chosen.x[i])

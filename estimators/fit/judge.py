@@ -227,20 +227,23 @@ def verdict(before: Worth, after: Worth, aim: Aim, *, changed: bool = True) -> F
     elif aim.kind in UNITS and mean * other.aimed.size < MIN_TOTAL_GAIN:
         reasons.append(f"negligible gain: {mean * other.aimed.size:.2g} nats in total")
     # The references must not be predicted worse; without any, each sensor in turn stands in for them.
-    groups: list[tuple[str, dict[str, PredictionScore], dict[str, PredictionScore]]]
-    if one.withheld or one.states:
-        groups = [("sensor", one.withheld, other.withheld), ("true state", one.states, other.states)]
-    else:
-        groups = [("sensor", one.sensors, other.sensors)]
+    groups = {"withheld": "sensor", "states": "true state"} if one.withheld or one.states else {"sensors": "sensor"}
     against = [
         reason
-        for kind, olds, news in groups
-        for name, old in olds.items()
-        if name in news
-        for reason in _against(f"held-out {kind} {name}", old, news[name])
+        for group, kind in groups.items()
+        for name, old, new in _pairs(getattr(one, group), getattr(other, group))
+        for reason in _against(f"held-out {kind} {name}", old, new)
     ]
     reasons += against
     return FitVerdict(not reasons, mean, error, tuple(reasons), each, not against)
+
+
+def _pairs(
+    olds: dict[str, PredictionScore], news: dict[str, PredictionScore]
+) -> Iterator[tuple[str, PredictionScore, PredictionScore]]:
+    """Yield the predictions that two tunings share, by name."""
+    for name in (name for name in olds if name in news):
+        yield name, olds[name], news[name]
 
 
 def _gain(one: PartScore, other: PartScore, aim: Aim) -> tuple[float, float]:
@@ -355,11 +358,9 @@ def _as_good(one: Worth, best: Worth) -> bool:
 
 def _in_band(own: Worth, other: Worth) -> bool:
     """Return whether the bands of all references, fitted and held out, are wide enough or no narrower."""
-    pairs = [
-        (old, new[name])
-        for one, two in ((own.fitted, other.fitted), (own.held_out, other.held_out))
-        for olds, new in ((one.withheld, two.withheld), (one.states, two.states))
-        for name, old in olds.items()
-        if name in new
-    ]
-    return all(new.coverage >= min(MIN_COVERAGE, old.coverage) for old, new in pairs)
+    return all(
+        new.coverage >= min(MIN_COVERAGE, old.coverage)
+        for one, two in zip(own, other, strict=True)
+        for group in ("withheld", "states")
+        for _, old, new in _pairs(getattr(one, group), getattr(two, group))
+    )
