@@ -97,7 +97,8 @@ class ClockGuard:
             work = self._work(batch)
             at = work.begin
         while at < len(work.t):
-            stop = self._pass(work, at)
+            columns = work.t, work.raw, work.arrival, work.kind, work.channel
+            stop = int(self._scan(self._state, *columns, at, self._horizon))
             work.emit(range(at, stop))
             if stop < len(work.t):
                 self._suspect(work, stop)
@@ -122,6 +123,7 @@ class ClockGuard:
         return self._leave(work)
 
     def _work(self, batch: Events) -> Work:
+        """Return the held events and a batch whose times are shifted by the steps so far."""
         batch = plain_events(batch)
         rows = self._rows_of(batch)
         moved = batch._replace(t=batch.t + np.where(rows >= 0, self._shift[rows], 0))
@@ -131,16 +133,9 @@ class ClockGuard:
 
     def _rows_of(self, batch: Events) -> np.ndarray:
         """Return the row of the state for each event, as `row_of` does."""
-        rows = np.full(len(batch), -1, np.int64)
-        readings = (batch.kind == READING) & (batch.channel >= 0) & (batch.channel < self._sensors)
-        rows[readings] = batch.channel[readings]
-        rows[batch.kind == INPUT] = self._sensors
-        rows[batch.kind == TRUTH] = self._sensors + 1
-        return rows
-
-    def _pass(self, work: Work, start: int) -> int:
-        columns = work.t, work.raw, work.arrival, work.kind, work.channel
-        return int(self._scan(self._state, *columns, start, self._horizon))
+        reading = (batch.kind == READING) & (batch.channel >= 0) & (batch.channel < self._sensors)
+        cases = [reading, batch.kind == INPUT, batch.kind == TRUTH]
+        return np.select(cases, [batch.channel, self._sensors, self._sensors + 1], -1).astype(np.int64)
 
     def _verdict(self, work: Work, i: int) -> int:
         return int(self._judge(self._state, work.rows[i], work.t[i], work.arrival[i], work.live[i], self._horizon))
@@ -166,16 +161,16 @@ class ClockGuard:
             self._contradicts(work, run, i) if verdict == FITS else run.full or not self._agrees(work, run, i)
         ):
             if verdict != FITS and run.live and not run.full:
-                rest = [k for k in run.at if abs(self._offset(work, k) - self._offset(work, i)) <= self._spread]
+                rest = [k for k in run.at if abs(work.offset(k) - work.offset(i)) <= self._spread]
             self._dissolve(work, row, rest)
             run = None
-        if verdict == FITS or (run is None and verdict == BACK and not self._can_be_set_back(work, i)):
+        if verdict == FITS or (run is None and verdict == BACK and not self._can_be_set_back(work, row, i)):
             if verdict == FITS:
                 self._let_in(work, i)
             work.emit([i])
             return
         if run is None:
-            live = self._is_live(work, i)
+            live = work.live[i] or self._state[row, LIVE] > 0
             begin = int(self._state[self._everything, LAST])
             run = self._runs[row] = Run(verdict == AHEAD, live, begin, self._agree, MAX_HELD_LIVE if live else MAX_HELD)
             self._state[row, HOLDING] = 1
@@ -183,12 +178,6 @@ class ClockGuard:
             run.add(k, int(work.t[k]), int(work.arrival[k]))
         if self._shows_a_step(run, row):
             self._anchor(work, row)
-
-    def _is_live(self, work: Work, i: int) -> bool:
-        return bool(work.live[i] or self._state[work.rows[i], LIVE])
-
-    def _offset(self, work: Work, i: int) -> int:
-        return int(work.t[i]) - int(work.arrival[i])
 
     def _has_come(self, work: Work, run: Run) -> bool:
         """Return whether time has reached the events held ahead; the last of them, if arrivals are known."""
@@ -206,7 +195,7 @@ class ClockGuard:
         """Return whether an event implies the same clock as the held ones, except for delays."""
         t = int(work.t[i])
         if run.live:
-            lower = run.top - self._offset(work, i)
+            lower = run.top - work.offset(i)
             # Delayed, while others arrive on time.
             delayed = lower > 0 and int(work.arrival[i]) - run.arrived <= self._settled
             return delayed or abs(lower) <= self._spread
@@ -236,7 +225,7 @@ class ClockGuard:
         near = self._precision(row)
         if ended:
             return begin - run.highest > self._horizon + MAX_PERIODS_AHEAD * near
-        return abs(begin - run.t[0] - self._zone(begin - run.t[0])) > near
+        return abs(begin - run.t[0] - nearest_zone(begin - run.t[0])) > near
 
     def _step_back(self, run: Run, row: int) -> int:
         """Return the step (ns) by which a table's clock went back if its channel went on at its own pace.
@@ -244,7 +233,7 @@ class ClockGuard:
         The exact change of a time zone where it is near one: irregular samples do not tell their pace exactly.
         """
         step = int(self._state[row, LAST]) + self._period(row) - run.t[0]
-        near = self._zone(step)
+        near = nearest_zone(step)
         return near if near and abs(near - step) <= self._precision(row) else step
 
     def _period(self, row: int) -> int:
@@ -254,19 +243,14 @@ class ClockGuard:
         """Return how exactly (ns) the times of a channel show a step of its clock."""
         return min(max(self._agree, self._period(row)), ZONE_STEP_NS // 15)
 
-    def _zone(self, step: int) -> int:
-        """Return the nearest multiple of `ZONE_STEP_NS`."""
-        return (step + ZONE_STEP_NS // 2) // ZONE_STEP_NS * ZONE_STEP_NS
-
-    def _can_be_set_back(self, work: Work, i: int) -> bool:
+    def _can_be_set_back(self, work: Work, row: int, i: int) -> bool:
         """Return whether a time that went back may be due to a clock rather than to a block of late measurements.
 
         With known arrivals it always may. Otherwise events that fill the channel's last gap are late ones.
         """
-        if self._is_live(work, i):
-            return True
-        state, t, horizon = self._state[work.rows[i]], int(work.t[i]), self._horizon
-        return not (state[GAP_TO] > state[GAP_FROM] and state[GAP_FROM] - horizon <= t <= state[GAP_TO] + horizon)
+        begin, end = self._state[row, [GAP_FROM, GAP_TO]]
+        in_gap = begin < end and begin - self._horizon <= work.t[i] <= end + self._horizon
+        return bool(work.live[i] or self._state[row, LIVE] or not in_gap)
 
     def _anchor(self, work: Work, row: int) -> None:
         """Accept the held events, and correct their clock if it was set."""
@@ -326,6 +310,7 @@ class ClockGuard:
             work.refused.append(Refused(int(work.kind[i]), int(work.channel[i]), stamp, run.begin - shift))
 
     def _end(self, row: int) -> Run:
+        """Remove and return the held events of a row."""
         self._state[row, HOLDING] = 0
         return self._runs.pop(row)
 
@@ -364,6 +349,11 @@ class Passed(NamedTuple):
     settled: np.ndarray
     refused: list[Refused]
     moved: list[Moved]
+
+
+def nearest_zone(step: int) -> int:
+    """Return the nearest multiple of `ZONE_STEP_NS`."""
+    return (step + ZONE_STEP_NS // 2) // ZONE_STEP_NS * ZONE_STEP_NS
 
 
 def plain_events(batch: Events) -> Events:
@@ -447,6 +437,10 @@ class Work:
         later = np.flatnonzero(self.rows == row)
         self.t[held] += step
         self.t[later[later > held[-1]]] += step
+
+    def offset(self, i: int) -> int:
+        """Return t - arrival of an event, ns."""
+        return int(self.t[i]) - int(self.arrival[i])
 
     def select(self, at: list[int]) -> Events:
         """Return the events at these places."""
