@@ -31,7 +31,7 @@ from estimators.track import (
     WAITING,
 )
 from estimators.tuning import Tuning
-from tests.support import SECOND, as_log, assert_same
+from tests.support import SECOND, as_log, assert_same, folded
 
 
 def f(x, u, p, dt, out):
@@ -397,8 +397,7 @@ def test_the_bank_is_its_definition(seed):
     rng = np.random.default_rng(seed)
     events = as_log(stream(rng, 4000)).events
     tuning, expected = setting(rng, seed)
-    track = Fold("kf", MODEL, tuning, as_log(events), policy=POLICY, expected=expected)
-    track.advance()
+    track = folded("kf", MODEL, as_log(events), tuning, policy=POLICY, expected=expected)
     found = track.track
     said = by_definition(events, found, tuning.gate, tuning.baseline, expected)
     alarms, flags, health = (np.array(column) for column in zip(*said, strict=True))
@@ -415,8 +414,7 @@ def test_all_that_can_be_said_is_said_in_those_streams():
         rng = np.random.default_rng(seed)
         events = stream(rng, 4000)
         tuning, expected = setting(rng, seed)
-        growing = Fold("kf", MODEL, tuning, as_log(events), policy=POLICY, expected=expected)
-        growing.advance()
+        growing = folded("kf", MODEL, as_log(events), tuning, policy=POLICY, expected=expected)
         bits |= int(np.bitwise_or.reduce(growing.track.alarms, axis=None))
         flags |= int(np.bitwise_or.reduce(growing.track.flags))
         healths |= set(growing.track.health)
@@ -434,8 +432,7 @@ def test_pieces_and_late_arrivals_change_nothing(seed, pieces, late):
     rng = np.random.default_rng(seed)
     events = stream(rng, 600)
     tuning, expected = setting(rng, seed)
-    whole = Fold("kf", MODEL, tuning, as_log(events), policy=POLICY, expected=expected)
-    whole.advance()
+    whole = folded("kf", MODEL, as_log(events), tuning, policy=POLICY, expected=expected)
     # Readings of one sensor and time keep their order, as the log does: only whole times move.
     order = np.argsort(events.t + rng.integers(0, late + 1, events.t.max() // SECOND + 1)[events.t // SECOND] * SECOND,
                        kind="stable")  # fmt: skip

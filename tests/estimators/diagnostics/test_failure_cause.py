@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from estimators.diagnostics.failure_cause import failures
-from estimators.fold import Fold
 from estimators.fold_failures import cause_of
 from estimators.log import INPUT, READING, TICK, Events, Log
 from estimators.model.joint import JointParameter, joint
@@ -15,7 +14,7 @@ from estimators.model.state_space import Input, Noise, Parameter, Row, Sensor, S
 from estimators.track import FAILED
 from estimators.tuning import Tuning
 from tests.estimators.ensemble.blocks import BOX, both_block, f_block
-from tests.support import SECOND
+from tests.support import SECOND, folded
 
 
 def drift(x, u, p, dt, out):
@@ -59,9 +58,7 @@ def driven(model, name="ekf"):
         if k == 4:
             log.extend(Events.one(t, 0, INPUT, 0, [1.0], model.width))
         log.extend(Events.one(t, 0, READING, 0, [max(0.0, 0.5 * (k - 4))], model.width))
-    growing = Fold(name, model, Tuning.of(model), log)
-    growing.advance()
-    return growing
+    return folded(name, model, log)
 
 
 @pytest.mark.parametrize("name", ["ekf", "ukf", "pf", "filterpy-ukf"])
@@ -131,8 +128,7 @@ def test_the_inputs_that_held_are_taken():
     log = Log(model.width)
     for t, kind, value in ((0, READING, 0.0), (1, INPUT, 1.0), (2, TICK, np.nan), (4, READING, 3.0), (5, READING, 4.0)):
         log.extend(Events.one(t * SECOND, 0, kind, 0, [value], 1))
-    growing = Fold("ekf", model, Tuning.of(model), log)
-    growing.advance()
+    growing = folded("ekf", model, log)
     rows = failures(growing.track)
     assert rows[0] == 4
     assert "x = [3], u = [1], dt = 1 s" in cause_of(growing, 4)
@@ -152,8 +148,7 @@ def test_the_path_is_walked_in_the_models_own_steps():
     log = Log(model.width)
     for t, kind, value in ((0, READING, 0.0), (0, INPUT, 1.0), (4, READING, 4.0)):
         log.extend(Events.one(t * SECOND, 0, kind, 0, [value], 1))
-    growing = Fold("ekf", model, Tuning.of(model), log)
-    growing.advance()
+    growing = folded("ekf", model, log)
     assert list(failures(growing.track)) == [2]
     assert "f(x, u, dt) is [nan] at x = [2], u = [1], dt = 1 s" in cause_of(growing, 2)
 
@@ -171,8 +166,7 @@ def test_a_block_that_returns_no_number_is_named_too():
     log = Log(model.width)
     for t, kind, values in ((0.0, READING, [0.2, 0.1]), (0.1, INPUT, [2.0]), (0.2, READING, [0.2, 0.1])):
         log.extend(Events.one(round(t * SECOND), 0, kind, 0, values, model.width))
-    growing = Fold("enkf", model, Tuning.of(model), log)
-    growing.advance()
+    growing = folded("enkf", model, log)
     assert list(failures(growing.track)) == [2]
     assert re.search(r"test_failure_cause.py:\d+: model duffing: f\(x, u, dt\) is \[nan, nan\]", cause_of(growing, 2))
 
@@ -186,6 +180,5 @@ def test_a_reading_that_the_model_cannot_expect_has_failed_and_is_not_gated(esti
     log = Log(model.width)
     for t, kind, value in ((1, READING, 0.0), (2, INPUT, 50.0), (3, READING, 0.0)):
         log.extend(Events.one(t * SECOND, t * SECOND, kind, 0, value, model.width))
-    growing = Fold(estimator, model, tuning, log)
-    growing.advance()
+    growing = folded(estimator, model, log, tuning)
     assert growing.track.verdict[2] == FAILED

@@ -15,7 +15,7 @@ from estimators.diagnostics.health import (
     nis_bounds,
 )
 from estimators.diagnostics.score import score
-from estimators.fold import Fold, fold
+from estimators.fold import fold
 from estimators.log import READING, RESET, TICK, TRUTH, Events, Log
 from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
 from estimators.models import MODELS
@@ -35,6 +35,7 @@ from estimators.track import (
 from estimators.tuning import Tuning
 from tests.models import first_state, level_model, unchanged
 from tests.support import SECOND
+from tests.support import folded as advanced
 
 MOTOR = MODELS["motor_winding"]
 F = np.array([[1.0, 1.0], [0.0, 1.0]])
@@ -61,8 +62,7 @@ def averages(estimator, tuning, bias=0.0):
     nis = nees = 0.0
     for seed in range(RUNS):
         log = simulated(seed, bias)
-        folded = Fold(estimator, MOTOR, tuning, log)
-        folded.advance()
+        folded = advanced(estimator, MOTOR, log, tuning)
         nis += folded.track.nis[folded.track.verdict == USED].sum()
         mean, cov = folded.moments()
         error = mean - log.events.value[-2:, 0]

@@ -8,9 +8,9 @@ from estimators.diagnostics.health import HealthPolicy
 from estimators.fold import Fold
 from estimators.interface.table import table_of
 from estimators.log import READING, TICK, Events, Log
-from estimators.tuning import Tuning
 from tests.models import level_model
 from tests.support import SECOND
+from tests.support import folded as advanced
 
 POLICY = HealthPolicy(stale_after=60.0)
 
@@ -37,9 +37,7 @@ def log_until(end: int, silent_from: int) -> Log:
 
 
 def folded(end: int, silent_from: int) -> Fold:
-    fold = Fold("kf", MODEL, Tuning.of(MODEL), log_until(end, silent_from), policy=POLICY)
-    fold.advance()
-    return fold
+    return advanced("kf", MODEL, log_until(end, silent_from), policy=POLICY)
 
 
 def states(fold: Fold, used=(True, True, True)) -> list[str]:

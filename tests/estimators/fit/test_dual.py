@@ -10,9 +10,9 @@ from estimators.fit.dual import against, agrees, shift, tail, walk
 from estimators.fit.fit import fit
 from estimators.fit.objective import Cancelled
 from estimators.fit.recording import Recording
-from estimators.fold import Fold
 from estimators.tuning import Tuning
 from tests.estimators.fit.test_fit import MODEL, log_of
+from tests.support import folded
 
 Q, R = 0.2, 0.05
 WINDOW = 1500
@@ -62,8 +62,7 @@ def test_windows_follow_a_parameter_that_steps(stepped):
 def test_the_filter_lives_with_what_it_knew_at_the_time(stepped):
     log = wearing(2, [0.2, 0.2, 0.4, 0.4])
     for k, refit in enumerate(stepped):
-        fold = Fold("kf", MODEL, refit.tuning, log)
-        fold.advance()
+        fold = folded("kf", MODEL, log, refit.tuning)
         rows = slice(k * WINDOW, (k + 1) * WINDOW)
         np.testing.assert_array_equal(refit.lived.mean, fold.track.mean[rows])
         np.testing.assert_array_equal(refit.lived.std, fold.track.std[rows])
@@ -99,13 +98,11 @@ def test_windows_overlap_and_one_is_enough():
 
 def test_a_tail_is_folded_to_the_same_bits():
     log = wearing(4, [0.2, 0.2])
-    fold = Fold("kf", MODEL, believed(), log)
-    fold.advance()
+    fold = folded("kf", MODEL, log, believed())
     whole = fold.track.copy()
     for start in (0, 1, 130, 700, 999, 5000):
         part, base = tail(fold, start)
-        again = Fold("kf", MODEL, believed(), part, base=base)
-        again.advance()
+        again = folded("kf", MODEL, part, believed(), base=base)
         first = min(start, log.n - 1)
         assert part.n == log.n - first
         np.testing.assert_array_equal(again.track.mean, whole.mean[first:])

@@ -11,10 +11,10 @@ from estimators.fit.entries import Setting
 from estimators.fit.fit import fit
 from estimators.fit.judge import worths
 from estimators.fit.recording import Recording
-from estimators.fold import Fold
 from estimators.log import Log
 from estimators.tuning import Tuning
 from tests.estimators.fit.test_fit import MODEL, log_of, simulated
+from tests.support import folded
 
 
 def lasting_errors(seed: int, n: int = 800):
@@ -57,8 +57,7 @@ def test_true_states_and_unused_sensors_are_witnesses():
     log = known(xs, ys)
     log.add("silent", np.arange(50.0) + 0.5, ys)
     tuning = Tuning.of(MODEL).set("use.silent", False)
-    fold = Fold("kf", MODEL, tuning, log)
-    fold.advance()
+    fold = folded("kf", MODEL, log, tuning)
     truth, sensor = references(MODEL, log.events, fold.track)
     assert (truth.name, truth.truth, sensor.name, sensor.truth) == ("level", True, "silent", False)
     np.testing.assert_array_equal(truth.error, xs - fold.track.mean[truth.rows, 0])

@@ -10,12 +10,11 @@ from scipy.stats import chi2
 
 from estimators import MODELS, Log, fold, fold_many, mean_nees
 from estimators.errors import EventError, NisusError
-from estimators.fold import Fold
 from estimators.fold import fold as fold_track
 from estimators.log import INPUT, READING, TRUTH, Events
 from estimators.track import HELD_OUT, USED
 from estimators.tuning import Tuning
-from tests.support import SECOND, assert_same
+from tests.support import SECOND, assert_same, folded
 
 MOTOR = MODELS["motor_winding"]
 DRIVE = MODELS["motor_drive"]
@@ -203,8 +202,7 @@ def test_the_covariance_is_whole():
     track = fold("ekf", MODELS["lorenz63"], log, covariance=True)
     np.testing.assert_allclose(np.sqrt(np.diagonal(track.cov, axis1=1, axis2=2)), track.std, rtol=1e-14)
     np.testing.assert_array_equal(track.cov, np.transpose(track.cov, (0, 2, 1)))
-    growing = Fold("ekf", MODELS["lorenz63"], track.tuning, log)
-    growing.advance()
+    growing = folded("ekf", MODELS["lorenz63"], log, track.tuning)
     np.testing.assert_allclose(track.cov[-1], growing.moments()[1], rtol=1e-12)
 
 

@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 
 from estimators.errors import EstimatorError
-from estimators.fold import Fold
 from estimators.learned.train import GP, NET, RIDGE, drift, train
 from estimators.learned.windows import Windows, known_states, windows
 from estimators.log import Log
 from estimators.model.state_space import Input, Noise, Parameter, Row, Sensor, State, StateSpaceModel
-from estimators.tuning import Tuning
+from tests.support import folded as advanced
 
 
 def f(x, u, p, dt, out):
@@ -60,9 +59,7 @@ def cut(log, known, **changed):
 
 
 def folded(log):
-    fold = Fold("ekf", PHYSICS, Tuning.of(PHYSICS), log)
-    fold.advance()
-    return fold
+    return advanced("ekf", PHYSICS, log)
 
 
 def test_the_rate_of_a_window_is_what_the_physics_leaves_out():

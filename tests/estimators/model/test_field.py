@@ -13,7 +13,7 @@ from estimators.models.thermal_field import thermal_field
 from estimators.numerics.smoothed_noise import smooth
 from estimators.tuning import Tuning
 from sources.simulator import Simulator
-from tests.support import as_log, read_all
+from tests.support import as_log, folded, read_all
 
 
 def test_cells_have_names_places_and_a_prior():
@@ -86,8 +86,7 @@ def test_a_field_is_folded_and_scored_by_its_shown_cells():
     told = np.unique(events.channel[events.kind == TRUTH])
     assert told.tolist() == model.shown.tolist()
     tuning = Tuning.of(model).with_options({"members": 30, "radius": 0.3})
-    fold = Fold("ensrf", model, tuning, log)
-    fold.advance()
+    fold = folded("ensrf", model, log, tuning)
     mean, variances = fold.moments()
     X = fold._now.state[: 30 * model.nx].reshape(30, model.nx)
     np.testing.assert_allclose(mean, X.mean(0), rtol=1e-12)
@@ -109,8 +108,7 @@ def test_forecast_noise_has_the_models_shape():
     for k in (0, 1):
         log.extend(Events.one(k * 10**9, 0, READING, 0, [np.nan], model.width))
     tuning = Tuning.of(model).set("p.diffusivity", 0.0).set("p.relaxation", 1e6).set("p.heating", 0.0)
-    fold = Fold("etkf", model, tuning.set("Q.temperature", 3.0).with_options({"members": 10_000}), log)
-    fold.advance()
+    fold = folded("etkf", model, log, tuning.set("Q.temperature", 3.0).with_options({"members": 10_000}))
     i, j = np.divmod(np.arange(20), 5)
     distance = np.abs(i[:, None] - i) + np.abs(j[:, None] - j)
     expected = 4.0 * np.exp(-0.1 * distance)

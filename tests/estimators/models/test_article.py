@@ -8,13 +8,12 @@ import numpy as np
 import pytest
 
 from estimators.diagnostics.score import score
-from estimators.fold import Fold
 from estimators.log import READING, TICK, TRUTH, Events, Log
 from estimators.models import MODELS
 from estimators.track import MISSING, USED
-from estimators.tuning import Tuning
 from sources.simulator import SensorPlan, Simulator
 from tests.support import SECOND, read_all
+from tests.support import folded as advanced
 
 
 def example():
@@ -67,9 +66,7 @@ def rows():
 @pytest.fixture(scope="module", params=["kf", "ekf", "ukf"])
 def folded(request, rows):
     model = MODELS["motor_winding"]
-    folded = Fold(request.param, model, Tuning.of(model), example_log(rows), pairs=np.array([[0, 1]]))
-    folded.advance()
-    return folded
+    return advanced(request.param, model, example_log(rows), pairs=np.array([[0, 1]]))
 
 
 def test_every_row(folded, rows):

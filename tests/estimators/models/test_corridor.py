@@ -12,6 +12,7 @@ from estimators.fold import Fold
 from estimators.log import TRUTH, Log, truth_of
 from estimators.models.agv_corridor import AGV_CORRIDOR, OUTLINE, WALLS
 from estimators.tuning import Tuning
+from tests.support import folded
 
 ROOMS = ((-24, 24, -1.5, 1.5), (-12, -10, -3, -1.5), (10, 12, 1.5, 3), (-5.2, -4, 1.5, 3))
 """The building as rectangles, west, east, south and north: corridor, two alcoves, door."""
@@ -160,8 +161,7 @@ def narrow(**overrides: str):
 def test_a_gaussian_filter_leaves_the_building_and_its_nis_tells(drive, estimator) -> None:
     """Linearised or sampled over the whole building, four beams mean nothing: the 4 rows' mean NIS is no longer 4."""
     twin, log = drive
-    fold = Fold(estimator, twin.model, Tuning.of(twin.model), log)
-    fold.advance()
+    fold = folded(estimator, twin.model, log)
     events = log.events
     miss = [abs(fold.track.mean[-1, k] - truth_of(events, k)[1][-1]) for k in (0, 1)]
     assert max(miss) > 5.0
@@ -171,8 +171,7 @@ def test_a_gaussian_filter_leaves_the_building_and_its_nis_tells(drive, estimato
 def test_told_roughly_where_it_heads_the_ekf_chooses_that_peak_and_is_sure() -> None:
     """The heading is believed to be 0 ± 0.3, which is the other peak's: the door comes and goes, and it stays."""
     twin, log = narrow(**{"prior.heading.mean": "0.0", "prior.heading.std": "0.3"})
-    fold = Fold("ekf", twin.model, Tuning.of(twin.model), log)
-    fold.advance()
+    fold = folded("ekf", twin.model, log)
     rows, east = truth_of(log.events, 0)
     at = np.searchsorted(log.events.t[rows], 15e9)
     for k in (at, -1):

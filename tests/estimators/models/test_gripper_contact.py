@@ -8,9 +8,9 @@ import pytest
 from app.twin.log_reader import read_log
 from app.twin.twin import load_twin
 from estimators.compiled.model import compile_model
-from estimators.fold import Fold
 from estimators.log import truth_of
 from estimators.models.gripper_contact import CONTACT, DEPTH, GRIPPER_CONTACT, SURFACE, chances
+from tests.support import folded
 
 P = np.array([item.value for item in GRIPPER_CONTACT.parameters])
 SEEDS = (1, 2, 3, 4)
@@ -22,8 +22,7 @@ def contact(name, seed, particles=300, duration=15.0):
     twin = load_twin("gripper_contact", overrides={"source.seed": str(seed)})
     log, _ = read_log(twin, duration)
     tuning = twin.tuning.with_options({"particles": particles} if name in ("rbpf", "pf") else {})
-    run = Fold(name, twin.model, tuning, log)
-    run.advance()
+    run = folded(name, twin.model, log, tuning)
     rows, truth = truth_of(log.events, CONTACT)
     return run.track.mean[rows, CONTACT], truth, run
 

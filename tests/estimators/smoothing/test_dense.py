@@ -20,7 +20,7 @@ from estimators.smoothing.smooth import KINDS, smooth
 from estimators.track import GATED
 from estimators.tuning import Tuning
 from tests.estimators.linear_models import JointGaussian, random_linear, random_log
-from tests.support import SECOND
+from tests.support import SECOND, folded
 
 GAUSSIAN = [name for name in KINDS if ESTIMATORS[name].family == "Gaussian" and name != "kf-steady"]
 CASES = [(nx, nu, seed) for nx, nu in ((1, 0), (3, 2), (5, 1)) for seed in range(3)]
@@ -48,8 +48,7 @@ def moments(smoothed, nx):
 
 
 def smoothed_by(estimator, model, tuning, log):
-    fold = Fold(estimator, model, tuning, log, pairs=pairs_of(model.nx))
-    fold.advance()
+    fold = folded(estimator, model, log, tuning, pairs=pairs_of(model.nx))
     return moments(smooth(fold), model.nx)
 
 
@@ -202,8 +201,7 @@ def test_a_reset_and_a_maintenance(estimator):
     events += [maintained(round(changed * SECOND), 0, (1,), 1), query(0.8), query(1.0), query(1.2), query(1.9)]
     events += [Events.one(round(reset * SECOND), 0, RESET, 0, [], 1), query(2.5)]
     log = body_log(events)
-    fold = Fold(estimator, BODY, Tuning.of(BODY), log)
-    fold.advance()
+    fold = folded(estimator, BODY, log)
     chains, clock = [Chain(*START)], 0.0
     for i in range(log.n):
         t = log.t[i] / SECOND
@@ -226,8 +224,7 @@ def test_a_reset_and_a_maintenance(estimator):
 
 
 def smooth_with_pairs(estimator, log, tuning=None):
-    fold = Fold(estimator, BODY, tuning or Tuning.of(BODY), log, pairs=pairs_of(2))
-    fold.advance()
+    fold = folded(estimator, BODY, log, tuning or Tuning.of(BODY), pairs=pairs_of(2))
     return smooth(fold)
 
 
@@ -274,8 +271,7 @@ def test_the_fold_stays_as_it_is():
     for one, other in zip(state, fold.moments(), strict=True):
         np.testing.assert_array_equal(one, other)
     fold.advance()
-    whole = Fold("ukf", BODY, Tuning.of(BODY), log)
-    whole.advance()
+    whole = folded("ukf", BODY, log)
     np.testing.assert_array_equal(whole.track.mean, fold.track.mean)
 
 
@@ -284,8 +280,7 @@ def test_a_twin_that_was_found_wrong(estimator):
     """The readings that were refused at first speak, and the widening before them lets the place jump."""
     log = long_log(400, jump=60.0)
     tuning = Tuning.of(BODY).set("gate", 0.999).set("gate.reopen", 3.0)
-    fold = Fold(estimator, BODY, tuning, log, pairs=pairs_of(2))
-    fold.advance()
+    fold = folded(estimator, BODY, log, tuning, pairs=pairs_of(2))
     (decision,) = [d for d in fold.decisions if d.outcome in ("reopened", "believed")]
     refused = np.flatnonzero(fold.track.verdict == GATED)
     assert decision.first == refused[0] and decision.row > refused[0] + 1

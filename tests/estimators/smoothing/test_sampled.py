@@ -12,15 +12,14 @@ from estimators.smoothing.trajectories_back import TRAJECTORIES
 from estimators.tuning import Tuning
 from tests.estimators.smoothing.test_dense import BODY, PLACES, START, TIMES, Chain, body_log, moved, query, reading
 from tests.support import SECOND
+from tests.support import folded as advanced
 
 MEMBERS = 4000
 READINGS = [reading(t, y) for t, y in zip(TIMES, PLACES, strict=True)]
 
 
 def folded(estimator, log, model=BODY, **options):
-    fold = Fold(estimator, model, Tuning.of(model).with_options(options), log)
-    fold.advance()
-    return fold
+    return advanced(estimator, model, log, Tuning.of(model).with_options(options))
 
 
 @pytest.mark.parametrize(
@@ -75,8 +74,7 @@ def test_estimates_that_cannot_be_smoothed_are_refused():
         smooth(Fold("etkf", model, Tuning.of(model).with_options({"members": 40}), Log.of(model)))
     winding = MODELS["motor_winding"]
     log = body_log([Events.one(0, 0, READING, 0, [40.0], 1)])
-    fold = Fold("pf", winding, Tuning.of(winding).set("Q.rate", 0.0), log)
-    fold.advance()
+    fold = advanced("pf", winding, log, Tuning.of(winding).set("Q.rate", 0.0))
     with pytest.raises(EstimatorError, match="pf cannot be smoothed: in motor_winding .* has no noise of its own"):
         smooth(fold)
     model = MODELS["gripper_contact"]

@@ -16,12 +16,12 @@ from estimators.diagnostics.episodes.baseline import (
     lost_from,
 )
 from estimators.diagnostics.health import JUDGED_MEAN, MAX_ROWS_PER_READING, MIN_WINDOW_EVENTS, HealthPolicy, normal_nis
-from estimators.fold import Fold
 from estimators.log import READING, RESET, Events
 from estimators.track import DIVERGED
 from estimators.tuning import Tuning
 from tests.models import level_model
 from tests.support import SECOND, as_log
+from tests.support import folded as advanced
 
 MODEL = level_model({"gauge": 0.04, "floats": {"left": 0.09, "right": 0.09}}, 0.01, linear=True)
 
@@ -45,9 +45,7 @@ def asset(seed, n=3000, *, change=None):
 
 
 def folded(log, baseline=None, policy=None):
-    fold = Fold("kf", MODEL, replace(Tuning.of(MODEL), baseline=baseline), log, policy=policy)
-    fold.advance()
-    return fold
+    return advanced("kf", MODEL, log, replace(Tuning.of(MODEL), baseline=baseline), policy=policy)
 
 
 @pytest.fixture(scope="module")

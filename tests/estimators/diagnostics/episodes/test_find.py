@@ -11,13 +11,13 @@ from estimators.diagnostics.detector_state import no_baseline
 from estimators.diagnostics.detectors import BITS, CAUSES, IMPOVERISHED, NARROW, SHIFTED_DOWN, SHIFTED_UP, SPIKY, STUCK
 from estimators.diagnostics.episodes import JOINED, Episode, episode_json, episodes, found_in, judged_rows
 from estimators.diagnostics.health import HealthPolicy
-from estimators.fold import Fold
 from estimators.log import INPUT, READING, RESET, TICK, TRUTH, Events
 from estimators.model.state_space import Input, State
 from estimators.track import DIVERGED, GATED, TRACKING, USED
 from estimators.tuning import Tuning
 from tests.models import level_model
 from tests.support import SECOND, as_log
+from tests.support import folded as advanced
 
 ROWS = 8
 
@@ -70,9 +70,7 @@ def folded(*, gauge=None, chain=None, skip=None, gate=None, truth=0.0, feed=0.0,
                 batch.append(Events.one(t, t, READING, s, y[s][k], MODEL.width))
         batch.append(Events.one(t, t, TRUTH, 0, level[k] + (truth if off else 0.0), MODEL.width))
     tuning = Tuning.of(MODEL).set("gate", gate).set("gate.reopen", None)
-    fold = Fold("kf", MODEL, tuning, as_log(Events.concat(batch, MODEL.width)), policy=POLICY, expected=expected)
-    fold.advance()
-    return fold
+    return advanced("kf", MODEL, as_log(Events.concat(batch, MODEL.width)), tuning, policy=POLICY, expected=expected)
 
 
 def spiked(x, z, rng):
@@ -200,8 +198,7 @@ def test_silence():
 def test_a_sensor_that_should_speak_and_never_does():
     events = folded().log.events
     kept = events.select(np.flatnonzero((events.kind != READING) | (events.channel == 1)))
-    fold = Fold("kf", MODEL, Tuning.of(MODEL), as_log(kept), policy=POLICY, expected=np.array([1, 1]))
-    fold.advance()
+    fold = advanced("kf", MODEL, as_log(kept), policy=POLICY, expected=np.array([1, 1]))
     (each,) = episodes(fold)
     assert (each.subject, each.cause, each.start, each.end) == ("gauge", "never heard", 1.0, None)
     said = "gauge was never heard: other sensors see the same states; check its channel map and its bus"
@@ -426,8 +423,7 @@ def test_the_onset_of_an_episode_is_not_before_the_reset_nor_in_the_episode_befo
     cut, back = END + 100, BEGIN - 100
     first, second = of(0.8, np.arange(1, cut), 0), of(0.4, np.arange(back, N + 1), cut - back)
     parts = [first, Events.one(cut * SECOND, cut * SECOND, RESET, 0, (), MODEL.width), second]
-    fold = Fold("kf", MODEL, Tuning.of(MODEL), as_log(Events.concat(parts if begun_anew else parts[::2], MODEL.width)))
-    fold.advance()
+    fold = advanced("kf", MODEL, as_log(Events.concat(parts if begun_anew else parts[::2], MODEL.width)))
     found = [each for each in episodes(fold) if each.subject == "gauge"]
     assert found[0].start == pytest.approx(BEGIN, abs=10) and found[0].end == pytest.approx(END, abs=30)
     assert found[1].start == pytest.approx(cut + 100, abs=10)

@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 
 from estimators.diagnostics.episodes import found_in, judged_rows
-from estimators.fold import Fold
 from estimators.log import READING, Events
 from estimators.model.sensor import Limits
 from estimators.tuning import Tuning
-from tests.support import SECOND, as_log
+from tests.support import SECOND, as_log, folded
 
 from .test_find import MODEL, POLICY
 
@@ -33,8 +32,7 @@ def found(change, tuning, n=N):
         t = (k + 1) * SECOND
         batch.append(Events.one(t, t, READING, 0, y[k], MODEL.width))
         batch.append(Events.one(t, t, READING, 1, level[k] + rng.standard_normal(8), MODEL.width))
-    fold = Fold("kf", LIMITED, tuning, as_log(Events.concat(batch, MODEL.width)), policy=POLICY)
-    fold.advance()
+    fold = folded("kf", LIMITED, as_log(Events.concat(batch, MODEL.width)), tuning, policy=POLICY)
     items = found_in(judged_rows(fold))
     return {item.key[0]: item.episode for item in items if item.episode.subject == "gauge"}, len(items)
 

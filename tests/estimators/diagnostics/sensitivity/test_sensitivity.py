@@ -10,11 +10,12 @@ from estimators.diagnostics.detectors import RATIOS, TESTS
 from estimators.diagnostics.sensitivity import sensitivity
 from estimators.diagnostics.sensitivity.gramian import directions
 from estimators.diagnostics.sensitivity.visibility import FaultTests, noncentrality, threshold
-from estimators.fold import Fold, fold
+from estimators.fold import fold
 from estimators.log import READING, Log
 from estimators.models import MODELS
 from estimators.track import GATED
 from estimators.tuning import Tuning
+from tests.support import folded
 
 from .models import COUPLED, KEPT, TWICE, WALK, Q, R, S, simulate
 
@@ -302,8 +303,7 @@ def test_the_last_part_of_a_log_is_that_log_from_a_base():
     log, _ = simulate(np.random.default_rng(11), 1500)
     tuning = Tuning.of(COUPLED)
     found = sensitivity("ekf", COUPLED, tuning, log, most=1000)
-    whole = Fold("ekf", COUPLED, tuning, log)
-    whole.advance()
+    whole = folded("ekf", COUPLED, log, tuning)
     at, base = whole.base_at(log.n - 1000)
     assert (found.first, len(found.t)) == (at, log.n - at) and at > 0
     rest = log.copy()
