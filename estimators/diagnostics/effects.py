@@ -40,18 +40,25 @@ class InnovationEffect(NamedTuple):
     ratio: float
 
 
-def effects(e: np.ndarray) -> list[InnovationEffect]:
-    """All ways in which a run e (n,), finite, differs from white noise, the likeliest first.
+def _effect(
+    cause: str, size: float, half: float, ratio: float, low: float = -np.inf, high: float = np.inf
+) -> InnovationEffect:
+    """Return an effect with an interval of this half width, within `low` to `high`."""
+    return InnovationEffect(cause, size, max(low, size - half), min(high, size + half), ratio)
 
-    The mean is taken out before the scale, both before the correlation, and spikes are told from scale by what the
-    innovations without them have. They stand alone: several in a row on one side are a shift. What is further off than
-    `MAX_SIGMA` says no more than that.
+
+def effects(e: np.ndarray) -> list[InnovationEffect]:
+    """Return all deviations of a run e (n,), finite, from white noise, the one with the highest ratio first.
+
+    The mean is removed before the scale is estimated, both before the correlation. Outliers are isolated: several in a
+    row on one side are a shift. Their removal must leave the scale of white noise; otherwise the scale explains them.
+    Values beyond `MAX_SIGMA` are clipped.
     """
     e = np.clip(e, -MAX_SIGMA, MAX_SIGMA)
     n = e.size
     if n < 2:
         size = float(e[0]) if n else 0.0
-        return [InnovationEffect("shifted", size, size - INTERVAL_SIGMAS, size + INTERVAL_SIGMAS, 0.5 * size * size)]
+        return [_effect("shifted", size, INTERVAL_SIGMAS, 0.5 * size * size)]
     mean = float(e.mean())
     rest = e - mean
     variance = float(np.mean(rest**2))
@@ -60,11 +67,7 @@ def effects(e: np.ndarray) -> list[InnovationEffect]:
     bounded = float(np.clip(phi, -0.995, 0.995))
     # Correlated noise determines a mean less well than white noise.
     wide = np.sqrt(floor * (1.0 + max(bounded, 0.0)) / (1.0 - max(bounded, 0.0)) / n)
-    found = [
-        InnovationEffect(
-            "shifted", mean, mean - INTERVAL_SIGMAS * wide, mean + INTERVAL_SIGMAS * wide, 0.5 * n * mean**2
-        )
-    ]
+    found = [_effect("shifted", mean, INTERVAL_SIGMAS * wide, 0.5 * n * mean**2)]
     spikes = _alone(rest)
     calm = rest[~spikes]
     share = float(np.mean(spikes))
@@ -73,25 +76,21 @@ def effects(e: np.ndarray) -> list[InnovationEffect]:
         # A few outliers among normal innovations; otherwise it is the scale.
         gain = 0.5 * float(np.sum(rest[spikes] ** 2)) - int(spikes.sum()) * np.log(max(1.0 / max(share, 1e-9), 1.0))
         if own < 1.5 and share < 0.2:
-            half = INTERVAL_SIGMAS * np.sqrt(share * (1.0 - share) / n)
-            found.append(InnovationEffect("spiky", share, max(0.0, share - half), min(1.0, share + half), gain))
+            found.append(_effect("spiky", share, INTERVAL_SIGMAS * np.sqrt(share * (1.0 - share) / n), gain, 0.0, 1.0))
             variance, floor = own, own
+    found.append(_scale(variance, floor, n))
+    spread = INTERVAL_SIGMAS * np.sqrt((1.0 - bounded**2) / n)
+    cause, gain = "correlated" if phi > 0 else "alternating", -0.5 * n * float(np.log(1.0 - bounded**2))
+    found.append(_effect(cause, phi, spread, gain, -1.0, 1.0))
+    return sorted(found, key=lambda effect: -effect.ratio)
+
+
+def _scale(variance: float, floor: float, n: float) -> InnovationEffect:
+    """Return the effect of a variance, at least `floor` in its logarithm, of n values."""
     deviation = float(np.sqrt(floor))
     half = INTERVAL_SIGMAS / np.sqrt(2.0 * n) * deviation
-    cause = "narrow" if variance > 1.0 else "wide"
-    gain = 0.5 * n * (variance - 1.0 - np.log(floor))
-    found.append(InnovationEffect(cause, deviation, max(0.0, deviation - half), deviation + half, gain))
-    spread = INTERVAL_SIGMAS * np.sqrt((1.0 - bounded**2) / n)
-    found.append(
-        InnovationEffect(
-            "correlated" if phi > 0 else "alternating",
-            phi,
-            max(-1.0, phi - spread),
-            min(1.0, phi + spread),
-            -0.5 * n * float(np.log(1.0 - bounded**2)),
-        )
-    )
-    return sorted(found, key=lambda effect: -effect.ratio)
+    gain = 0.5 * n * (variance - 1.0 - float(np.log(floor)))
+    return _effect("narrow" if variance > 1.0 else "wide", deviation, half, gain, 0.0)
 
 
 def against(e: np.ndarray, effect: InnovationEffect) -> float:
@@ -113,11 +112,7 @@ def common_scale(e: np.ndarray, dof: np.ndarray) -> InnovationEffect:
     """Return the common scale of all rows of a sensor, from e = √(NIS / dof) (n,) and degrees of freedom (n,)."""
     whole = float(np.sum(dof))
     variance = max(float(np.sum(dof * e**2)) / whole, 1e-12)
-    deviation = float(np.sqrt(variance))
-    half = INTERVAL_SIGMAS / np.sqrt(2.0 * whole) * deviation
-    gain = 0.5 * whole * (variance - 1.0 - float(np.log(variance)))
-    cause = "narrow" if variance > 1.0 else "wide"
-    return InnovationEffect(cause, deviation, max(0.0, deviation - half), deviation + half, gain)
+    return _scale(variance, variance, whole)
 
 
 def _alone(e: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Episodes: what was wrong from when to when, with which sensor or state, by how much, and the remedy."""
+"""Episodes of faults: subject, cause, start, end, size and remedy."""
 
 from .episode import JOINED, Episode, FoundEpisode, JudgedRows, episode_json, standardised
 from .sensors import ALARM_KEYS, LOSSES

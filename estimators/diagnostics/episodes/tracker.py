@@ -263,7 +263,7 @@ class EpisodeTracker:
         return sorted([*self._closed, *ended, *found], key=lambda e: (e.episode.start, e.episode.subject))
 
     def _cut(self, entries: list[TrackedEpisode]) -> None:
-        """Drop the older half of the rows, and keep a summary of what was found there."""
+        """Drop the older half of the rows, and keep a summary of their episodes."""
         count = self.n // 2
         dropped = self._judged(slice(0, count))
         first = int(self.events.t[count])
@@ -297,7 +297,7 @@ def _copy(column: np.ndarray, to: np.ndarray) -> None:
 
 
 def _continued(known: TrackedEpisode, item: FoundEpisode, judged: JudgedRows) -> TrackedEpisode:
-    """Return an episode that began before the kept rows, with what they show of it."""
+    """Return an episode that began before the kept rows, updated by these."""
     old, new, dropped = known.episode, item.episode, known.dropped
     if item.at == known.at and new.cause != old.cause:
         # All its alarms are kept, and show more than the first of them.
