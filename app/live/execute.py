@@ -1,10 +1,11 @@
-"""Carry out the commands of users on the engine's thread, between two events."""
+"""Check the commands of users, and carry them out on the engine's thread, between two events."""
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from estimators.errors import ConfigError, nearest, printable, quoted
@@ -18,7 +19,7 @@ from sources.source import Source, controls_of, span_of
 
 from ..ingest import maintenance_text
 from . import commands
-from .faults import carry_out
+from .faults import prepared_fault
 from .running_fold import Running
 
 if TYPE_CHECKING:
@@ -47,35 +48,55 @@ MAX_SPEED = 1e9
 
 
 def execute(command: commands.Command, engine: Running) -> None:
-    """Carry one command out.
+    """Carry one command out; raises as `prepared`, with nothing changed."""
+    prepared(command, engine)()
+
+
+def prepared(command: commands.Command, engine: Running) -> Callable[[], Any]:
+    """Check a command, in any thread, and return what carries it out on the engine's thread.
 
     Raises:
-        NisusError: If it cannot be done, with the reason; nothing is changed then.
+        NisusError: If it cannot be done, with the reason.
     """
+    runs, model, (first, now) = engine.revisions, engine.model, engine.span()
     if isinstance(command, REFOLDING):
-        engine.retune(*retuned(command, engine))
-    elif isinstance(command, commands.Pin):
-        engine.revisions.pin(command.number)
-    elif isinstance(command, commands.Unpin):
-        engine.revisions.unpin(command.number)
-    elif isinstance(command, commands.Note):
-        engine.revisions.describe(command.number, command.name, command.note)
-    elif isinstance(command, commands.Reset):
+        return partial(engine.retune, *retuned(command, engine))
+    if isinstance(command, commands.InjectFault | commands.ClearFault):
+        act = prepared_fault(command, engine.source, model)
+        return lambda: engine.notices.say(act())
+    if isinstance(command, PLAYBACK):
+        return playback(engine.source, command, first)
+
+    def insert(event: Events, text: str) -> None:
         # An event of the log, so that refolds and recordings have it at its time.
-        engine.insert(Events.one(_now(engine), time.time_ns(), RESET, 0, [], engine.model.width))
-        engine.notices.say("estimate reset to the prior")
-    elif isinstance(command, commands.Maintenance):
-        states = check_maintenance(command.what, command.states, engine.model)
-        engine.insert(maintained(_now(engine), time.time_ns(), states, engine.model.width))
-        engine.notices.say(maintenance_text(command.what, states, engine.model))
-    elif isinstance(command, commands.Record):
-        if engine.recorder is None:
-            raise ConfigError("this session cannot record")
-        engine.recorder.record(command.path)
-    elif isinstance(command, commands.InjectFault | commands.ClearFault):
-        engine.notices.say(carry_out(command, engine.source, engine.model))
-    elif isinstance(command, PLAYBACK):
-        play(engine.source, command, engine.span()[0])
+        engine.insert(event)
+        engine.notices.say(text)
+
+    match command:
+        case commands.Pin(number):
+            runs.free_place(number)
+            return partial(runs.pin, number)
+        case commands.Unpin(number):
+            runs.find(number)
+            return partial(runs.unpin, number)
+        case commands.Note(number, name, note):
+            runs.check_words(number, name, note)
+            return partial(runs.describe, number, name, note)
+        case commands.Reset():
+            if not now:
+                raise ConfigError("Reset: nothing to reset; no measurement has arrived yet")
+            event = Events.one(now, time.time_ns(), RESET, 0, [], model.width)
+            return partial(insert, event, "estimate reset to the prior")
+        case commands.Maintenance(what, names):
+            states = maintained_states(what, names, model)
+            if not now:
+                raise ConfigError("Maintenance: no measurement has arrived yet; the estimate is still the prior")
+            event = maintained(now, time.time_ns(), states, model.width)
+            return partial(insert, event, maintenance_text(what, states, model))
+        case commands.Record(path):
+            if engine.recorder is None:
+                raise ConfigError("Record: this session cannot record")
+            return partial(engine.recorder.record, path)
 
 
 def retuned(command: REFOLDING, engine: Running) -> tuple[str, Tuning]:
@@ -132,15 +153,7 @@ def _check(entry: Estimator, engine: Running, options: Mapping[str, float]) -> N
         check_variances(entry, values)
 
 
-def _now(engine: Running) -> int:
-    """Return the time of the last event, ns."""
-    now = engine.span()[1]
-    if not now:
-        raise ConfigError("nothing to reset: no measurement has arrived yet")
-    return now
-
-
-def check_maintenance(what: str, states: Sequence[str], model: StateSpaceModel) -> list[int]:
+def maintained_states(what: str, states: Sequence[str], model: StateSpaceModel) -> list[int]:
     """Return the indices of the states that a maintenance concerns, ascending.
 
     Raises:
@@ -161,21 +174,6 @@ def check_maintenance(what: str, states: Sequence[str], model: StateSpaceModel) 
     return sorted(model.state_names.index(name) for name in states)
 
 
-def check_playback(command: Any) -> None:
-    """Reject a speed or a time out of range.
-
-    Raises:
-        ConfigError: If the speed is not positive or too large, or the time too far.
-    """
-    if isinstance(command, commands.Speed) and not (0.0 < command.factor <= MAX_SPEED or command.factor == math.inf):
-        raise ConfigError(
-            f"Speed: factor is {command.factor:g}; it must be positive and at most {MAX_SPEED:g}, or inf for as fast "
-            "as possible"
-        )
-    if isinstance(command, commands.Seek) and not abs(command.seconds) <= MAX_SEEK_S:
-        raise ConfigError(f"Seek: seconds is {command.seconds:g}; it must lie within {MAX_SEEK_S:g} s")
-
-
 def playback_status(source: Source) -> dict[str, Any]:
     """Return the fields of a status that follow from the source: paused, speed, seekable, span (ns)."""
     paced = controls_of(source)
@@ -187,22 +185,29 @@ def playback_status(source: Source) -> dict[str, Any]:
     }
 
 
-def play(source: Source, command: Any, first: int) -> None:
-    """Carry one of `PLAYBACK` out; `first` is the time of the first event, ns.
+def playback(source: Source, command: Any, first: int) -> Callable[[], Any]:
+    """Check one of `PLAYBACK`, and return what carries it out; `first` is the time of the first event, ns.
 
     Raises:
-        ConfigError: If the source cannot be paused or sought, or as `check_playback`.
+        ConfigError: If the source cannot be paused or sought, the speed is not positive or too large, or the time too
+            far.
     """
-    check_playback(command)
+    if isinstance(command, commands.Speed) and not (0.0 < command.factor <= MAX_SPEED or command.factor == math.inf):
+        raise ConfigError(
+            f"Speed: factor is {command.factor:g}; it must be positive and at most {MAX_SPEED:g}, or inf for as fast "
+            "as possible"
+        )
+    if isinstance(command, commands.Seek) and not abs(command.seconds) <= MAX_SEEK_S:
+        raise ConfigError(f"Seek: seconds is {command.seconds:g}; it must lie within {MAX_SEEK_S:g} s")
     paced = controls_of(source)
     if paced is None:
         raise ConfigError("a live source cannot be paused, stepped or sought; only a replay or a simulation can")
-    if isinstance(command, commands.Pause):
-        paced.pause() if command.paused else paced.resume()
-    elif isinstance(command, commands.Speed):
-        paced.set_speed(command.factor)
-    elif isinstance(command, commands.Step):
-        paced.step()
-    else:
-        span = span_of(paced)
-        paced.seek((span[0] if span else first) + round(command.seconds * 1e9))
+    match command:
+        case commands.Pause(paused):
+            return paced.pause if paused else paced.resume
+        case commands.Speed(factor):
+            return partial(paced.set_speed, factor)
+        case commands.Step():
+            return paced.step
+    span = span_of(paced)
+    return partial(paced.seek, (span[0] if span else first) + round(command.seconds * 1e9))

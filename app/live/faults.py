@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from math import inf
 from typing import Any, Protocol, runtime_checkable
@@ -93,40 +94,31 @@ def _target(kind: str, target: str, model: StateSpaceModel) -> tuple[str, str]:
     raise ConfigError(f"InjectFault: target is {quoted(target)}, no {' or '.join(takes)} of {model.name}; {remedy}")
 
 
-def check_fault(command: commands.InjectFault | commands.ClearFault, source: Source, model: StateSpaceModel) -> None:
-    """Reject a command that the source would reject.
+def prepared_fault(
+    command: commands.InjectFault | commands.ClearFault, source: Source, model: StateSpaceModel
+) -> Callable[[], str]:
+    """Check a command, and return what begins a fault, or ends one or all, and gives a line about it.
 
     Raises:
-        ConfigError: With the reason.
+        ConfigError: If the source cannot do it, with the reason.
     """
     layer = faults_of(source)
     if isinstance(command, commands.ClearFault):
-        if command.number is not None and command.number not in [item.number for item in layer.status()]:
-            raise ConfigError(
-                f"ClearFault: number is {command.number}; there is no such fault, see faults of the status"
-            )
-        return
-    if fault_of(command, model).parameter is not None and not layer.can_change:
+        number = command.number
+        if number is not None and number not in [item.number for item in layer.status()]:
+            raise ConfigError(f"ClearFault: number is {number}; there is no such fault, see faults of the status")
+        return lambda: f"{ended} fault(s) end" if (ended := layer.clear(number)) else "no fault to end"
+    fault = fault_of(command, model)
+    if fault.parameter is not None and not layer.can_change:
         raise ConfigError("InjectFault: kind is model; it needs a simulated asset, and this source is none")
 
+    def inject() -> str:
+        try:
+            return f"fault {layer.inject(fault)} begins: {fault_text(fault, model)}"
+        except SourceError as error:
+            raise ConfigError(f"InjectFault: {error}") from None
 
-def carry_out(command: commands.InjectFault | commands.ClearFault, source: Source, model: StateSpaceModel) -> str:
-    """Begin a fault, or end one or all; return a line about it.
-
-    Raises:
-        NisusError: If it cannot be done.
-    """
-    check_fault(command, source, model)
-    layer = faults_of(source)
-    if isinstance(command, commands.ClearFault):
-        ended = layer.clear(command.number)
-        return "no fault to end" if not ended else f"{ended} fault(s) end"
-    fault = fault_of(command, model)
-    try:
-        number = layer.inject(fault)
-    except SourceError as error:
-        raise ConfigError(f"InjectFault: {error}") from None
-    return f"fault {number} begins: {fault_text(fault, model)}"
+    return inject
 
 
 def fault_text(fault: Fault, model: StateSpaceModel) -> str:

@@ -10,8 +10,8 @@ from typing import Any
 
 from estimators.errors import ConfigError, nearest
 
-from ..live import commands, faults
-from ..live.execute import PLAYBACK, REFOLDING, check_maintenance, check_playback, retuned
+from ..live import commands
+from ..live.execute import prepared
 from ..live.running_fold import Running
 from .http import parse, shown
 
@@ -38,37 +38,13 @@ def command_from_json(body: Any, engine: Running) -> commands.Command:
     command = parse(COMMANDS[name], {key: value for key, value in body.items() if key != "command"}, name)
     if isinstance(command, commands.Record) and command.path is not None:
         path = _recording(str(body["path"]))
-        command = dataclasses.replace(command, path=path if engine.recorder is None else engine.recorder.folder / path)
-    _check(command, engine)
+        if engine.recorder is not None:
+            path = engine.recorder.folder / path
+            if os.path.lexists(path):
+                raise ConfigError(f"Record: path is {shown(path.name)}, which exists already; choose another name")
+        command = dataclasses.replace(command, path=path)
+    prepared(command, engine)
     return command
-
-
-def _check(command: commands.Command, engine: Running) -> None:
-    if isinstance(command, REFOLDING):
-        retuned(command, engine)
-    elif isinstance(command, commands.Pin):
-        engine.revisions.free_place(command.number)
-    elif isinstance(command, commands.Unpin):
-        engine.revisions.find(command.number)
-    elif isinstance(command, commands.Note):
-        engine.revisions.check_words(command.number, command.name, command.note)
-    elif isinstance(command, commands.Reset) and not engine.span()[1]:
-        raise ConfigError("Reset: nothing to reset; no measurement has arrived yet")
-    elif isinstance(command, commands.Maintenance):
-        check_maintenance(command.what, command.states, engine.model)
-        if not engine.span()[1]:
-            raise ConfigError("Maintenance: no measurement has arrived yet; the estimate is still the prior")
-    elif isinstance(command, commands.Record):
-        if engine.recorder is None:
-            raise ConfigError("Record: this session cannot record")
-        if command.path is not None and os.path.lexists(command.path):
-            raise ConfigError(f"Record: path is {shown(command.path.name)}, which exists already; choose another name")
-    elif isinstance(command, commands.InjectFault | commands.ClearFault):
-        faults.check_fault(command, engine.source, engine.model)
-    if isinstance(command, PLAYBACK):
-        check_playback(command)
-        if not engine.status().seekable:
-            raise ConfigError("a live source cannot be paused, stepped or sought; only a replay or a simulation can")
 
 
 def _recording(name: str) -> Path:

@@ -10,7 +10,7 @@ from app.cli.main import main
 from app.twin.defaults import natural_aim
 from app.twin.twin import load_twin
 from config.loader import TWINS
-from tests.app.live.tunings.test_tuning_yaml import pasted
+from tests.app.live.tunings.test_versions import pasted_text
 
 WRONG = ["--set", "R.winding=0.2", "--set", "source.duration=300"]
 
@@ -26,7 +26,7 @@ def test_a_wrong_noise_is_found_and_proposed(capsys, tmp_path):
     assert status == 0 and "Proposed: +" in out and "R.winding  0.2" in out
     text = file.read_text(encoding="utf-8")
     twin = load_twin("motor_winding")
-    found = pasted(twin, text).tuning
+    found = pasted_text(twin, text).tuning
     # 4 made the logs; of some 560 readings R has a deviation of 6 %.
     assert 4 * 0.76 < found.r[0] < 4 * 1.24
     assert float(yaml.safe_load(text)["sensors"]["winding"]["variance"]) == found.r[0]

@@ -113,18 +113,6 @@ def test_last_run_is_the_first_of_the_equal_ones():
         assert last_run(codes) == n - run
 
 
-def test_options_are_kept_for_each_filter():
-    made = twin()
-    made.options_of = lambda name: {"alpha": 0.5} if name == "ukf" else {}
-    stepped = Stepped(2, of=made)
-    stepped.submit(commands.SetEstimator("ukf"), commands.SetOption("beta", 1.0))
-    assert (stepped.status().options["alpha"], stepped.status().options["beta"]) == (0.5, 1.0)
-    stepped.submit(commands.SetEstimator("kf"))
-    assert "alpha" not in stepped.status().options
-    stepped.submit(commands.SetEstimator("ukf"))
-    assert (stepped.status().options["alpha"], stepped.status().options["beta"]) == (0.5, 1.0)
-
-
 @pytest.mark.parametrize(
     ("command", "reason"),
     [

@@ -1,7 +1,6 @@
 """What no filter can run with is refused in one line, or gives way visibly, by whatever way it comes."""
 
 from types import SimpleNamespace
-from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -9,7 +8,7 @@ import viser
 
 from app.cli.main import main
 from app.live import commands
-from app.live.execute import play
+from app.live.execute import playback
 from app.twin.twin import load_twin, restore_twin
 from app.views.viser.view import ViserView
 from app.web.commands_json import command_from_json
@@ -23,7 +22,7 @@ from estimators.models import MODELS
 from estimators.registry import ESTIMATORS, unfit
 from estimators.track import DIVERGED, FAILED, GATED, USED
 from estimators.tuning import Tuning
-from tests.app.scripted import Stepped, pull_all
+from tests.app.scripted import Replayed, Stepped, pull_all
 from tests.conftest import ROOT
 from tests.support import SECOND
 
@@ -212,17 +211,18 @@ def test_an_estimate_that_is_no_number_stays_off_the_page(twin):
 def test_a_seek_beyond_all_time_is_refused(seconds):
     source = SimpleNamespace(seek=lambda t: None, span=(0, SECOND))
     with pytest.raises(ConfigError, match="must lie within 1e\\+09 s"):
-        play(source, commands.Seek(seconds), 0)
+        playback(source, commands.Seek(seconds), 0)
 
 
 @pytest.mark.parametrize("factor", [1e300, 1.1e9, 0.0, -1.0, -np.inf, np.nan])
 def test_a_speed_that_no_clock_can_follow_is_refused(factor):
     speeds = []
-    source = Mock(set_speed=speeds.append)
+    source = Replayed()
+    source.set_speed = speeds.append
     with pytest.raises(ConfigError, match=r"Speed: factor is .* must be positive and at most 1e\+09, or inf"):
-        play(source, commands.Speed(factor), 0)
+        playback(source, commands.Speed(factor), 0)
     for good in (1e-3, 1e9, np.inf):
-        play(source, commands.Speed(good), 0)
+        playback(source, commands.Speed(good), 0)()
     assert speeds == [1e-3, 1e9, np.inf]
 
 

@@ -2,20 +2,24 @@
 
 import json
 import shutil
+import tempfile
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pyarrow.parquet
 import pytest
+import yaml
 
 from app.cli.arguments import Fold, Tunings
 from app.cli.fold import fold_twin
 from app.cli.main import main
 from app.cli.open_twin import recorded_twin
 from app.cli.tunings import tunings_of
+from app.live.tunings.tuning_yaml import tuning_yaml
 from app.live.tunings.versions import Settings, accept, keep, version_text
 from app.twin.log_reader import read_log
-from app.twin.twin import load_twin
+from app.twin.twin import load_twin, restore_twin
 from app.views.recording.reader import read_recording
 from config.loader import TWINS, shipped
 from config.tunings import accepted_version, find_version, folders, load_version, version_files
@@ -37,38 +41,97 @@ def same(a, b):
     assert (a.gate, a.gate_kind, a.reopen, a.seed) == (b.gate, b.gate_kind, b.reopen, b.seed)
 
 
-def applied(twin, tmp_path, estimator, tuning, **more):
-    path = tmp_path / "tried.yaml"
-    path.write_text(version_text(twin, Settings(estimator, tuning, **more)), encoding="utf-8")
-    return load_twin(twin.path, overrides={"tuning": str(path)})
+SECTIONS = ("estimator", "filters", "parameters", "noise", "sensors", "gate")
 
 
+def pasted(twin, estimator, tuning):
+    """The twin of a file that has these settings in place of its own."""
+    return pasted_text(twin, tuning_yaml(twin.config, estimator, tuning))
+
+
+def pasted_text(twin, text):
+    given, own = yaml.safe_load(text), yaml.safe_load(twin.text)
+    assert set(given) <= set(SECTIONS)
+    rest = yaml.safe_dump({key: value for key, value in own.items() if key not in SECTIONS})
+    return restore_twin(f"{text}{rest}", twin.path)
+
+
+def applied(twin, estimator, tuning, **more):
+    """The same twin under a version with these settings."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "tried.yaml"
+        path.write_text(version_text(twin, Settings(estimator, tuning, **more)), encoding="utf-8")
+        return load_twin(twin.path, overrides={"tuning": str(path)})
+
+
+either = pytest.mark.parametrize("back_of", [pasted, applied])
+
+
+@either
 @pytest.mark.parametrize("name", shipped())
-def test_a_twin_that_ships_comes_back(name, tmp_path):
+def test_a_twin_that_ships_comes_back(name, back_of):
     twin = load_twin(name)
-    back = applied(twin, tmp_path, twin.estimator, twin.tuning)
-    assert back.estimator == twin.estimator and back.tuning.name == "tried"
+    back = back_of(twin, twin.estimator, twin.tuning)
+    assert back.estimator == twin.estimator
     same(back.tuning, twin.tuning)
     np.testing.assert_array_equal(back.model.prior_mean, twin.model.prior_mean)
     for other in ESTIMATORS:
         assert back.options_of(other) == twin.options_of(other)
-    assert back.config == twin.config.model_copy(
-        update={key: getattr(back.config, key) for key in ("parameters", "noise", "sensors", "estimator", "gate")}
-    )
+    assert back.config == twin.config.model_copy(update={key: getattr(back.config, key) for key in SECTIONS})
 
 
-def test_what_was_turned_comes_back(tmp_path):
-    twin = load_twin("motor_can", overrides={"sensors.yoke.range": "[-40, 180]"})
+@either
+def test_what_was_turned_comes_back(back_of):
+    twin = load_twin("motor_can")
     tuning = twin.tuning.set("Q.winding", 1e-7).set("R.yoke", 0.1 + 0.2).set("use.tooth", False).set("gate", 0.99)
     tuning = tuning.set("gate.kind", "soft").set("gate.reopen", None).set("p.iron_magnet", 0.31)
     tuning = tuning.with_options({"adapt": 1.0, "memory": 50.0})
-    prior = {"magnet": {"mean": 55.0, "std": 2.0}}
-    back = applied(twin, tmp_path, "ekf", tuning, prior=prior)
+    back, entry = back_of(twin, "ekf", tuning), ESTIMATORS["ekf"]
     same(back.tuning, tuning)
-    entry = ESTIMATORS["ekf"]
     assert entry.complete(dict(back.tuning.options)) == entry.complete(dict(tuning.options))
-    magnet = back.model.state_names.index("magnet")
-    assert (back.model.prior_mean[magnet], back.model.prior_std[magnet]) == (55.0, 2.0)
+    assert back_of(twin, "ekf", twin.tuning.set("gate", None)).tuning.gate is None
+
+
+def test_words_stand_for_choices():
+    twin = load_twin("motor_can")
+    tuning = twin.tuning.set("use.tooth", False).set("gate.reopen", None).with_options({"adapt": 1.0})
+    text = tuning_yaml(twin.config, "ekf", tuning)
+    assert "adapt: R" in text and "use: false" in text and "reopen: never" in text
+
+
+def test_a_prior_comes_back():
+    twin = load_twin("motor_can")
+    model = applied(twin, "ekf", twin.tuning, prior={"magnet": {"mean": 55.0, "std": 2.0}}).model
+    magnet = model.state_names.index("magnet")
+    assert (model.prior_mean[magnet], model.prior_std[magnet]) == (55.0, 2.0)
+
+
+def test_limits_of_a_sensor_stay_with_it():
+    twin = load_twin("motor_can", overrides={"sensors.yoke.range": "[-40, 180]", "sensors.yoke.rate": "5"})
+    back = pasted(twin, "ekf", twin.tuning.set("R.yoke", 2.0))
+    yoke, before = back.config.sensors["yoke"], twin.config.sensors["yoke"]
+    assert (yoke.range, yoke.rate) == (before.range, before.rate) and yoke.range is not None
+    assert back.tuning.get("R.yoke") == 2.0
+
+
+def test_options_of_the_first_filter_are_kept_for_another():
+    twin = load_twin("motor_can", overrides={"estimator": "{name: enkf, options: {members: 77}}"})
+    back = pasted(twin, "ukf", twin.tuning.with_options({"alpha": 0.5}))
+    assert back.estimator == "ukf" and back.options_of("ukf") == {"alpha": 0.5}
+    assert back.options_of("enkf") == {"members": 77.0}
+
+
+def test_how_long_errors_last_stands_beside_their_size():
+    given = {"noise.winding": "{variance: 0.01, over: 2 min}", "sensors.yoke.error": "{std: 0.7, over: 40}"}
+    twin = load_twin("motor_can", overrides=given)
+    same(pasted(twin, "ekf", twin.tuning).tuning, twin.tuning)
+    tuning = twin.tuning.set("p.winding_disturbance_time", 33.3).set("p.yoke_error_time", 11.0)
+    tuning = tuning.set("Q.yoke_error", 0.1 + 0.2).set("Q.winding", 0.003)
+    same(pasted(twin, "ekf", tuning).tuning, tuning)
+    assert "_time" not in tuning_yaml(twin.config, "ekf", tuning)
+    # A correlation time that is estimated has no place in the tuning: the file's stays.
+    twin = load_twin("motor_can", overrides={**given, "estimate.winding_disturbance_time": "{std: 30}"})
+    assert "over: 120}" in tuning_yaml(twin.config, "ekf", twin.tuning)
 
 
 def test_what_a_version_does_not_say_stays_the_twins(own):
@@ -90,13 +153,13 @@ def test_the_asset_stays_as_it_is(own):
         np.testing.assert_array_equal(a, b)
 
 
-def test_another_filter_and_no_options(tmp_path):
+def test_another_filter_and_no_options():
     """The options of the file's own filter are kept for it; a version without options has none."""
     twin = load_twin("lorenz63")
-    other = applied(twin, tmp_path, "ekf", twin.tuning.with_options({}))
+    other = applied(twin, "ekf", twin.tuning.with_options({}))
     assert other.estimator == "ekf" and dict(other.tuning.options) == {}
     assert other.options_of(twin.estimator) == twin.options_of(twin.estimator)
-    bare = applied(twin, tmp_path, twin.estimator, twin.tuning.with_options({}))
+    bare = applied(twin, twin.estimator, twin.tuning.with_options({}))
     assert dict(bare.tuning.options) == {}
 
 
