@@ -10,7 +10,7 @@ import numpy as np
 from estimators.diagnostics.calibration import calibrations, truth_calibration
 from estimators.diagnostics.episodes import Episode
 from estimators.diagnostics.field_pictures import Picture
-from estimators.diagnostics.held_out import Offset, offsets
+from estimators.diagnostics.held_out import offsets
 from estimators.diagnostics.score import Score, score
 from estimators.diagnostics.sensitivity import Bound
 from estimators.diagnostics.sensitivity.responses import digits
@@ -29,15 +29,15 @@ from .calibration_lines import calibration_lines
 from .report_charts import charts_html
 
 MAX_ROWS = 60
-"""Of a table; the rest is counted."""
+"""Rows of a table; the rest is counted."""
 
 
 class Reported(NamedTuple):
     """A run to report: settings, rows and episodes.
 
-    `about` are further lines of its head, by name; `bounds` the protection levels of its states, where known; `others`
-    all runs of the session: number, change, scores; `before` the episodes of earlier runs, by number and change;
-    `smoothed` the smoothed states, if asked for.
+    `about` are further lines of the head, by name; `bounds` the protection levels of states, where known; `others` all
+    runs of the session: number, change, scores; `before` the episodes of earlier runs, by number and change; `smoothed`
+    the smoothed states, if requested.
     """
 
     twin: Twin
@@ -65,16 +65,21 @@ def report(run: Reported) -> list[Topic]:
     )
     if run.smoothed is not None:
         said += ("Dark lines: smoothed states, which also use later measurements, with ± 2σ.",)
-    return [
-        _head(run),
-        _scores(run, found),
-        episode_topic(run),
-        *_before(run),
-        Topic("Charts", said, html=(charts,)),
-        *_checks(run),
-        _tuning(run),
-        *([_runs(run)] if run.others else []),
-    ]
+    topics = [_head(run), _scores(run, found), episode_topic(run), *_before(run), Topic("Charts", said, html=(charts,))]
+    topics += [*_checks(run), _tuning(run)]
+    if run.others:
+        head = ("run", "change", "mean NIS", "log L per measurement", "RMSE")
+        topics.append(Topic("Runs of the session", (), head, run.others))
+    return [_cut(topic) for topic in topics]
+
+
+def _cut(topic: Topic) -> Topic:
+    """Return a topic with at most `MAX_ROWS` rows, and one with the number of the rest."""
+    left = len(topic.rows) - MAX_ROWS
+    if left <= 1:
+        return topic
+    rows = (*topic.rows[:MAX_ROWS], (f"... and {left} more", *[""] * (len(topic.rows[0]) - 1)))
+    return topic._replace(rows=rows, marks=(*topic.marks[:MAX_ROWS], "") if topic.marks else ())
 
 
 def _head(run: Reported) -> Topic:
@@ -99,8 +104,8 @@ def _source(twin: Twin) -> str:
     section = twin.config.source
     files = [path.name for path in twin.plan.log_files or ()]
     given = {name: getattr(section, name, None) for name in ("interface", "channel", "seed")}
-    told = files + [f"{name} {value}" for name, value in given.items() if value is not None]
-    return f"{section.type.replace('_', ' ')}, of {twin.path.name}" + (f": {', '.join(told)}" if told else "")
+    parts = files + [f"{name} {value}" for name, value in given.items() if value is not None]
+    return f"{section.type.replace('_', ' ')}, of {twin.path.name}" + (f": {', '.join(parts)}" if parts else "")
 
 
 def _scores(run: Reported, found: Score) -> Topic:
@@ -124,60 +129,48 @@ def _scores(run: Reported, found: Score) -> Topic:
     each = found.log_likelihood / judged if judged else np.nan
     rows.append(("log-likelihood", f"{found.log_likelihood:.6g}", f"{digits(each)} per measurement"))
     counts = np.bincount(track.verdict[run.events.kind == READING], minlength=len(VERDICT_NAMES))
-    told = [f"{name} {count:,}" for name, count in zip(VERDICT_NAMES[1:], counts[1:].tolist(), strict=True) if count]
-    rows.append(("measurements", f"{int(counts.sum()):,}", ", ".join(told)))
+    verdicts = [
+        f"{name} {count:,}" for name, count in zip(VERDICT_NAMES[1:], counts[1:].tolist(), strict=True) if count
+    ]
+    rows.append(("measurements", f"{int(counts.sum()):,}", ", ".join(verdicts)))
     shares = np.bincount(track.health, minlength=len(HEALTH_NAMES)) / max(1, len(track))
     worst = [f"{HEALTH_NAMES[k]} {100 * shares[k]:.3g} %" for k in np.argsort(-shares, kind="stable") if shares[k]]
     rows.append(("health at the end", HEALTH_NAMES[int(track.health[-1])], ", ".join(worst)))
     marks += [""] * (len(rows) - len(marks))
-    return Topic("Scores", (), ("", "", ""), _cut(rows), marks=_marks(marks, rows))
-
-
-def _marks(marks: Sequence[str], rows: Sequence[tuple[str, ...]]) -> tuple[str, ...]:
-    return tuple(marks) if len(rows) <= MAX_ROWS + 1 else (*marks[:MAX_ROWS], "")
-
-
-def _cut(rows: Sequence[tuple[str, ...]]) -> tuple[tuple[str, ...], ...]:
-    """Return at most `MAX_ROWS` rows, and one with the number of the rest."""
-    if len(rows) <= MAX_ROWS + 1:
-        return tuple(rows)
-    return (*rows[:MAX_ROWS], (f"... and {len(rows) - MAX_ROWS} more", *[""] * (len(rows[0]) - 1)))
+    return Topic("Scores", (), ("", "", ""), tuple(rows), marks=tuple(marks))
 
 
 def episode_topic(run: Reported) -> Topic:
     """Return the episodes of a run with causes, texts and responses."""
-    shown = tuple(f"{offset.words[0].upper()}{offset.words[1:]}." for offset in _offsets(run))
+    shown = tuple(
+        f"{offset.words[0].upper()}{offset.words[1:]}." for offset in offsets(run.events, run.track, run.tuning)
+    )
     if not run.episodes:
         of = " of the sensors in use" if shown else ""
         return Topic("Episodes", (f"No faults detected{of}.", *shown))
-    rows = [_told(item, run) for item in run.episodes]
+    rows = [_episode_row(item, run) for item in run.episodes]
     causes = [cause for cause in dict.fromkeys(item.cause for item in run.episodes) if advice(cause, "Response")]
     small = tuple(
         f"{cause.capitalize()}. Usual cause: {advice(cause, 'Usual cause')} Response: {advice(cause, 'Response')}"
         for cause in causes
     )
-    return Topic("Episodes", shown, ("time", "subject", "cause", "text and remedy"), _cut(rows), notes=small)
+    return Topic("Episodes", shown, ("time", "subject", "cause", "text and remedy"), tuple(rows), notes=small)
 
 
-def _told(item: Episode, run: Reported) -> tuple[str, str, str, str]:
+def _episode_row(item: Episode, run: Reported) -> tuple[str, str, str, str]:
     start = float(run.events.t[0]) * 1e-9
     end = "the end" if item.end is None else clock(round(item.end - start, 1))
     when = f"{clock(round(item.start - start, 1))} to {end}"
     return when, item.subject.replace("_", " "), item.cause, item.text
 
 
-def _offsets(run: Reported) -> list[Offset]:
-    """Return the offsets of held-out sensors."""
-    return offsets(run.events, run.track, run.tuning)
-
-
 def _before(run: Reported) -> list[Topic]:
     """Return episodes under the settings of earlier runs, which a later setting may hide."""
-    rows = [(name, *_told(item, run)) for name, episodes in run.before for item in episodes]
+    rows = [(name, *_episode_row(item, run)) for name, episodes in run.before for item in episodes]
     if not rows:
         return []
     said = "Over the same log with earlier settings; a later setting may hide them."
-    return [Topic("Episodes of earlier runs", (said,), ("run", "time", "subject", "cause", "text"), _cut(rows))]
+    return [Topic("Episodes of earlier runs", (said,), ("run", "time", "subject", "cause", "text"), tuple(rows))]
 
 
 def _checks(run: Reported) -> list[Topic]:
@@ -185,7 +178,7 @@ def _checks(run: Reported) -> list[Topic]:
     given = model, run.events, run.track
     found = [*calibrations(*given, gate=tuning.gate, marginal=run.marginal), *truth_calibration(*given)]
     lines = [(line,) for line in calibration_lines(found, model)]
-    parts = [Topic("Calibration (95 % intervals)", (), ("",), _cut(lines))] if lines else []
+    parts = [Topic("Calibration (95 % intervals)", (), ("",), tuple(lines))] if lines else []
     if run.bounds:
         title = "Protection levels: largest error that one undetected fault can cause"
         rows = [
@@ -195,7 +188,7 @@ def _checks(run: Reported) -> list[Topic]:
         ]  # fmt: skip
         bars = tuple(Bar(name, item.unit, item.two_sigma, item.bound) for name, item in run.bounds.items())[:MAX_ROWS]
         head = ("state", "unit", "± 2 σ", "protection level", "fault")
-        parts.append(Topic(title, (), head, _cut(rows), bars, ("± 2 σ", "protection level")))
+        parts.append(Topic(title, (), head, tuple(rows), bars, ("± 2 σ", "protection level")))
     return parts
 
 
@@ -205,26 +198,17 @@ def _tuning(run: Reported) -> Topic:
     began = "as recorded" if twin.recorded else "as configured"
     said = f"Changed: {in_words(changes, len(changes))}." if changes else f"All {began}."
     first = {item.key: item.value for item in twin.tuning.items()}
-    rows, marks = [], []
-    for item in tuning.items():
-        turned = item.value != first[item.key]
-        rows.append((item.key, f"{item.value:.6g}", item.unit, f"{first[item.key]:.6g}"))
-        marks.append("partly" if turned else "")
+    rows = [(item.key, f"{item.value:.6g}", item.unit, f"{first[item.key]:.6g}") for item in tuning.items()]
     for key in (*GATE_KEYS, *(f"use.{name}" for name in tuning.model.sensor_names)):
         now, before = tuning.get(key), twin.tuning.get(key)
         if key in GATE_KEYS or not now or now != before:
             rows.append((key, _value(now), "", _value(before)))
-            marks.append("partly" if now != before else "")
-    return Topic("Tuning", (said,), ("entry", "value", "unit", began), _cut(rows), marks=_marks(marks, rows))
+    marks = ["partly" if now != before else "" for _, now, _, before in rows]
+    return Topic("Tuning", (said,), ("entry", "value", "unit", began), tuple(rows), marks=tuple(marks))
 
 
 def _value(value: float | bool | str | None) -> str:
     return "off" if value is None else ("yes" if value else "no") if isinstance(value, bool) else str(value)
-
-
-def _runs(run: Reported) -> Topic:
-    head = ("run", "change", "mean NIS", "log L per measurement", "RMSE")
-    return Topic("Runs of the session", (), head, _cut(run.others))
 
 
 def clock(seconds: float) -> str:

@@ -1,14 +1,17 @@
 """Pictures of twins for the gallery: every bundled twin has one that shows its fold and loads nothing."""
 
+import base64
+import io
 import re
 import xml.etree.ElementTree as ET
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from app.cli.main import main
 from app.present.drawing import card
-from app.present.drawing.colors import LIGHT
+from app.present.drawing.colors import ESTIMATE, LIGHT, Scale, gradient
 from app.present.drawing.plot import hex_color
 from app.twin.log_reader import read_log
 from app.twin.twin import load_twin
@@ -26,12 +29,18 @@ def paths(svg, color):
     return [np.array(re.findall(r"(-?[\d.]+) (-?[\d.]+)", line), float) for line in lines]
 
 
-def test_a_card_shows_the_estimate_of_the_state_that_no_sensor_measures():
-    twin = load_twin("motor_winding")
+def drawn(name, **overrides):
+    """The picture of a twin, its log, and the fold that it shows."""
+    twin = load_twin(name, overrides=overrides)
     log, _ = read_log(twin, None)
-    (line,), (truth,) = (paths(card.picture_of(twin, log), color) for color in ("estimate", "truth"))
     fold = Fold(twin.estimator, twin.model, twin.tuning, log, pairs=twin.pairs)
     fold.advance()
+    return card.picture_of(twin, log), log, fold
+
+
+def test_a_card_shows_the_estimate_of_the_state_that_no_sensor_measures():
+    picture, log, fold = drawn("motor_winding")
+    (line,), (truth,) = (paths(picture, color) for color in ("estimate", "truth"))
     rate, seconds = fold.track.mean[:, 1], (log.t[: log.n] - log.t[0]) * 1e-9
     assert line[0, 0] == pytest.approx(card.MARGIN, abs=0.1)
     assert line[-1, 0] == pytest.approx(card.WIDTH - card.MARGIN, abs=0.1)
@@ -42,6 +51,17 @@ def test_a_card_shows_the_estimate_of_the_state_that_no_sensor_measures():
     assert scale[0] < 0.0
     assert np.median(np.abs(np.polyval(scale, told) - line[:, 1])) < 0.3
     assert len(truth) > 20
+
+
+def test_the_pixels_of_many_states_are_their_values_over_time():
+    picture, _, fold = drawn("lorenz96", **{"source.duration": "5"})
+    found = base64.b64decode(re.search(r'data:image/png;base64,([^"]+)"', picture)[1])
+    values = fold.track.mean.T
+    rows, columns = (-(-n // card.MAX_IMAGE_PIXELS) for n in values.shape)
+    values, scale = values[::rows, ::columns], Scale(ESTIMATE)
+    scale.fit(values)
+    expected = gradient(ESTIMATE.colors)[scale.indices(values)]
+    np.testing.assert_array_equal(np.asarray(Image.open(io.BytesIO(found)).convert("RGB")), expected)
 
 
 def test_a_path_keeps_its_shape_however_it_is_turned():

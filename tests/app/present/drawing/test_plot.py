@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from app.cli.main import main
-from app.present.drawing.plot import check_plot, plot_track, time_unit
+from app.present.drawing.plot import TrackSeries, check_plot, draw_state, new_figure, plot_track, time_unit
 from estimators import MODELS, Log, fold
 from estimators.errors import ConfigError
 
@@ -35,6 +35,24 @@ def test_a_plot_has_the_states_with_bands_and_measurements_and_the_nis(run):
     assert "measurement" not in {line.get_label() for line in rate.lines}
     mean = next(line for line in nis.lines if line.get_label() == "windowed mean").get_ydata()
     np.testing.assert_array_equal(mean, run.track.nis_mean)
+
+
+def test_the_line_of_an_angle_has_a_gap_where_it_leaves_the_chart():
+    """Three turns: the line leaves at π and comes back at -π, and is whole in between; so is the truth."""
+    model, n = MODELS["road_car"], 300
+    log, heading = Log.of(model), model.state_names.index("heading")
+    log.add("gnss_heading", np.arange(n) * 0.1, np.zeros(n))
+    run = fold("ekf", model, log)
+    angle = np.linspace(0.0, 6 * np.pi, n)
+    run.track.mean[:, heading], run.track.std[:, heading] = angle, 0.01
+    axes = new_figure(1.0, 1.0).add_subplot()
+    draw_state(axes, TrackSeries(model, run.events, run.track), "heading")
+    values = next(line for line in axes.lines if line.get_label() == "estimate").get_ydata()
+    wrapped = np.angle(np.exp(1j * angle))
+    leaves = 1 + np.flatnonzero(np.abs(np.diff(wrapped)) > np.pi)
+    assert leaves.size == 3 and np.flatnonzero(np.isnan(values)).tolist() == leaves.tolist()
+    known = ~np.isnan(values)
+    np.testing.assert_allclose(values[known], wrapped[known], atol=1e-12)
 
 
 @pytest.mark.parametrize(("ending", "magic"), [("png", b"\x89PNG"), ("pdf", b"%PDF"), ("svg", b"<?xml")])

@@ -1,10 +1,13 @@
-"""The page of a session in Chromium, as tests look at it."""
+"""Sessions with a page, and waiting for what it draws."""
 
 from __future__ import annotations
 
+import io
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
+
+import numpy as np
 
 from app.cli.run import live_source
 from app.twin.twin import load_twin
@@ -13,6 +16,8 @@ from tests.app.scripted import wait_for
 
 PATIENCE = 120.0
 """Seconds for a step on a busy machine without a graphics card; a test that works takes a fraction."""
+
+DRAWN = "window.nisus?.drawn > 0"
 
 
 def until(page: Any, expression: str) -> None:
@@ -41,17 +46,25 @@ def running(name: str, speed: float = float("inf"), **overrides: str) -> Iterato
         session.stop()
 
 
-@contextmanager
-def browsed(browser: Any, session: Session, width: int = 1440, scheme: str = "light") -> Iterator[Any]:
-    """A page of a height of 900 px, once it has drawn; nothing in it may have raised when it is closed."""
-    page = browser.new_context(viewport={"width": width, "height": 900}, color_scheme=scheme).new_page()
-    page.set_default_timeout(PATIENCE * 1000)
-    errors: list[str] = []
-    page.asked = []
-    page.on("request", lambda request: page.asked.append(request.url))
-    page.on("pageerror", lambda error: errors.append(str(error)))
-    page.goto(session.url)
-    until(page, "window.nisus?.drawn > 0")
-    yield page
-    page.context.close()
-    assert errors == []
+def settled(engine: Any, revision: int = 0) -> None:
+    """Wait until a revision runs, and no refold is under way."""
+    wait_for(lambda: engine.revisions.runs[-1].number >= revision and not engine.status().refolding, PATIENCE)
+
+
+def pixels(page: Any, selector: str, lower: float = 1.0) -> np.ndarray:
+    """Return the colours of an element, (rows, columns, 3), or of its lower part."""
+    from PIL import Image
+
+    box = page.locator(selector).first.bounding_box()
+    clip = box | {"y": box["y"] + (1 - lower) * box["height"], "height": lower * box["height"]}
+    picture = page.screenshot(clip=clip, timeout=PATIENCE * 1000)
+    return np.asarray(Image.open(io.BytesIO(picture)).convert("RGB")).astype(int)
+
+
+def drawn(page: Any, selector: str) -> dict[str, int]:
+    """Return how many pixels of an element are estimate (blue) and measurement (orange)."""
+    red, green, blue = np.moveaxis(pixels(page, selector), 2, 0)
+    return {
+        "estimate": int(np.sum((blue > 150) & (red < 90) & (green < 150))),
+        "reading": int(np.sum((red > 190) & (green > 110) & (green < 180) & (blue < 80))),
+    }

@@ -1,12 +1,48 @@
-"""The page that most browser tests open."""
+"""Pages of sessions in Chromium."""
+
+from urllib.parse import urlsplit
 
 import pytest
 
-from tests.app.web.page.browsed import browsed
+from tests.app.web.page.browsed import DRAWN, PATIENCE, until
 
 
 @pytest.fixture
-def page(browser, session):
+def visit(browser):
+    """visit(url): a page, once it has drawn. None may ask a stranger for anything or raise an exception.
+
+    `beside` is a page whose window (cookies and storage) it shares; `asked` has the addresses that it requested.
+    """
+    contexts, wrong = [], []
+
+    def visit(url, *, beside=None, ready=DRAWN, size=(1440, 900), scheme="light"):
+        if beside is None:
+            viewport = {"width": size[0], "height": size[1]}
+            contexts.append(browser.new_context(viewport=viewport, color_scheme=scheme))
+        page = (contexts[-1] if beside is None else beside.context).new_page()
+        page.set_default_timeout(PATIENCE * 1000)
+        own = tuple(f"http://{name}:{urlsplit(url).port}/" for name in ("127.0.0.1", "localhost"))
+        page.asked = []
+
+        def note(request):
+            page.asked.append(request.url)
+            if not request.url.startswith((*own, "blob:", "data:", "https://tel.rerun.io/")):
+                wrong.append(request.url)
+
+        page.on("request", note)
+        page.on("pageerror", lambda error: wrong.append(f"{error} {error.stack}"))
+        page.goto(url)
+        if ready is not None:
+            until(page, ready)
+        return page
+
+    yield visit
+    for context in contexts:
+        context.close()
+    assert wrong == []
+
+
+@pytest.fixture
+def page(visit, session):
     """The page of the session of the test's module."""
-    with browsed(browser, session) as page:
-        yield page
+    return visit(session.url)

@@ -3,8 +3,7 @@
 import pytest
 
 from tests.app.scripted import wait_for
-from tests.app.web.page.browsed import PATIENCE, running
-from tests.app.web.page.test_runs_browser import settled
+from tests.app.web.page.browsed import PATIENCE, running, settled
 
 pytestmark = pytest.mark.browser
 

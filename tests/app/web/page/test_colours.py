@@ -12,6 +12,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from app.present.drawing.colors import THEMES as PALETTES
+from app.present.drawing.colors import mixed
+
 STYLE = Path("app/web/page/chart.css").read_text()
 TEXT, GRAPHIC = 4.5, 3.0
 APART = 8.0
@@ -36,13 +39,9 @@ HEALTH = ("tracking", "suspect", "degraded", "diverged", "waiting")
 
 def theme(selector):
     """The variables of a theme: name to (red, green, blue, alpha), 0 to 1."""
-    rule = re.search(rf"^{re.escape(selector)} \{{(.*?)^\}}", STYLE, re.MULTILINE | re.DOTALL)[1]
-    found = {}
-    for name, color in re.findall(r"--([\w-]+): #([0-9a-f]{6}(?:[0-9a-f]{2})?);", rule):
-        found[name] = np.array(
-            [int(color[k : k + 2], 16) / 255 for k in range(0, len(color), 2)] + [1.0] * (len(color) == 6)
-        )
-    return found
+    rule = STYLE.partition(f"\n{selector} {{")[2].partition("\n}")[0]
+    found = re.findall(r"--([\w-]+): #([0-9a-f]{6})([0-9a-f]{2})?;", rule)
+    return {name: np.frombuffer(bytes.fromhex(color + (alpha or "ff")), np.uint8) / 255 for name, color, alpha in found}
 
 
 THEMES = {"light": theme(":root"), "dark": theme(':root[data-theme="dark"]')}
@@ -102,6 +101,16 @@ def test_the_formulas_are_those_of_their_sources():
     assert difference((50, 2.5, 0), (58, 24, 15)) == pytest.approx(19.4535, abs=1e-4)
     # Each kind of eye sees white and black as such.
     np.testing.assert_allclose([np.sum(matrix, axis=1) for matrix in SEEN.values()], 1.0, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", THEMES)
+def test_scenes_and_files_have_the_colours_of_the_page(name):
+    palette = PALETTES[name]
+    for key in ("panel", "estimate", "truth", "refused"):
+        assert np.array(getattr(palette, key)) / 255 == pytest.approx(THEMES[name][key][:3])
+    for health, color in palette.health.items():
+        assert np.array(color) / 255 == pytest.approx(THEMES[name][f"health-{health}"][:3])
+    assert mixed((0, 100, 200), (100, 0, 200), 0.25) == (25, 75, 200)
 
 
 @pytest.mark.parametrize("name", THEMES)

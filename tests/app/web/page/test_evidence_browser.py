@@ -9,20 +9,20 @@ import pytest
 
 from app.live.commands import SetTuning
 from tests.app.scripted import pull_all, wait_for
-from tests.app.web.page.browsed import PATIENCE, browsed, running, until
+from tests.app.web.page.browsed import PATIENCE, running, until
 from tests.app.web.page.test_quiet_browser import streams
 
 pytestmark = pytest.mark.browser
 
 
 @pytest.fixture
-def shown(browser):
+def shown(visit):
     """Runs a twin to its end and opens its page."""
     with ExitStack() as stack:
 
         def show(name, **overrides):
             session = stack.enter_context(running(name, **overrides))
-            return stack.enter_context(browsed(browser, session)), session
+            return visit(session.url), session
 
         yield show
 

@@ -9,8 +9,7 @@ from app.studies.baseline import ComparedFigure
 from app.studies.guard import GuardVerdict, keep_last
 from app.twin.twin import with_version
 from tests.app.scripted import wait_for
-from tests.app.web.page.browsed import PATIENCE, running
-from tests.app.web.page.test_runs_browser import settled
+from tests.app.web.page.browsed import PATIENCE, running, settled
 
 pytestmark = pytest.mark.browser
 

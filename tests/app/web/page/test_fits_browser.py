@@ -2,11 +2,8 @@
 
 import pytest
 
-from app.cli.run import live_source
-from app.twin.twin import load_twin
-from app.web.session import Page, Session
 from tests.app.scripted import wait_for
-from tests.app.web.page.browsed import PATIENCE, until
+from tests.app.web.page.browsed import PATIENCE, running, until
 
 pytestmark = pytest.mark.browser
 
@@ -45,15 +42,9 @@ WIDER = """() => {
 
 
 @pytest.mark.parametrize("name", ["motor_can", "agv_corridor", "battery_pack", "lorenz96"])
-def test_nothing_is_wider_than_its_column(name, browser):
-    twin = load_twin(name)
-    session = Session(twin, live_source(twin, 4.0), page=Page(0, open_browser=False))
-    session.start()
-    try:
-        page = browser.new_page(viewport={"width": 1440, "height": 900})
-        page.set_default_timeout(PATIENCE * 1000)
-        page.goto(session.url)
-        until(page, "window.nisus?.drawn > 3")
+def test_nothing_is_wider_than_its_column(name, visit):
+    with running(name, 4.0) as session:
+        page = visit(session.url, ready="window.nisus?.drawn > 3")
         # Rows with all their buttons: a run before the one that runs, and both have a name.
         page.evaluate("window.nisus.link.ask('UseSensor', {name: window.nisus.model.sensors[0], used: false})")
         wait_for(lambda: session.engine.status().revision > 0, PATIENCE)
@@ -79,6 +70,3 @@ def test_nothing_is_wider_than_its_column(name, browser):
                 page.get_by_role("button", name="Tune").first.click()
                 assert page.evaluate(WIDER) == [], (width, "Tune")
                 page.get_by_role("button", name="Tune").first.click()
-        page.close()
-    finally:
-        session.stop()

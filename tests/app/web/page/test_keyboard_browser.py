@@ -2,6 +2,7 @@
 
 import re
 
+import numpy as np
 import pytest
 
 from tests.app.scripted import wait_for
@@ -10,7 +11,6 @@ from tests.app.web.page.test_colours import TEXT, contrast, over
 
 pytestmark = pytest.mark.browser
 
-SIZE = {"width": 1440, "height": 900}
 MOST = 400
 """Presses of Tab until every control had its turn, at most."""
 
@@ -49,12 +49,8 @@ def session():
         yield session
 
 
-def opened(browser, session, scheme="light", size=SIZE):
-    context = browser.new_context(viewport=size, color_scheme=scheme)
-    page = context.new_page()
-    page.set_default_timeout(PATIENCE * 1000)
-    page.goto(session.url)
-    until(page, "window.nisus?.drawn > 0")
+def opened(visit, session, scheme="light"):
+    page = visit(session.url, scheme=scheme)
     page.get_by_text("Process noise Q").wait_for()
     return page
 
@@ -87,8 +83,8 @@ def walked(page):
 
 
 @pytest.mark.parametrize("show", [[], ["Runs", "What if"], ["Episodes", "Diagnose"]])
-def test_every_control_is_reached_by_tab_and_has_a_name(browser, session, show):
-    page = opened(browser, session)
+def test_every_control_is_reached_by_tab_and_has_a_name(visit, session, show):
+    page = opened(visit, session)
     # Paused, nothing comes or goes on the way; and the scene is Viser's, with focus of its own.
     page.get_by_role("tab", name="XY").click()
     page.get_by_label("Pause or continue").click()
@@ -116,13 +112,10 @@ def test_every_control_is_reached_by_tab_and_has_a_name(browser, session, show):
     finally:
         page.get_by_label("Pause or continue").click()
         wait_for(lambda: not session.engine.status().paused, PATIENCE)
-        page.context.close()
 
 
 def color(text):
     """What a browser computes: rgb(a), or color(srgb …) of a mixture."""
-    import numpy as np
-
     numbers = [float(part) for part in re.findall(r"-?\d+\.?\d*(?:e-?\d+)?", text.removeprefix("color(srgb"))]
     parts = np.array(numbers[:3]) / (1.0 if text.startswith("color(srgb") else 255.0)
     return np.append(parts, numbers[3] if len(numbers) > 3 else 1.0)
@@ -130,9 +123,9 @@ def color(text):
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize("tabs", [["Runs"], ["Episodes", "What if"], ["XY", "Diagnose"]])
-def test_all_text_can_be_read(browser, session, scheme, tabs):
+def test_all_text_can_be_read(visit, session, scheme, tabs):
     """As Chromium computes it: the colour of each text, on all backgrounds beneath it."""
-    page = opened(browser, session, scheme)
+    page = opened(visit, session, scheme)
     for tab in tabs:
         page.get_by_role("tab", name=tab, exact=True).click()
     wait_for(lambda: page.evaluate("document.getElementById('health').textContent.length > 3"), PATIENCE)
@@ -147,4 +140,3 @@ def test_all_text_can_be_read(browser, session, scheme, tabs):
         if found < TEXT:
             faint.append(f"{text!r}: {found:.2f}")
     assert faint == []
-    page.context.close()

@@ -2,11 +2,8 @@
 
 import pytest
 
-from app.cli.run import live_source
-from app.twin.twin import load_twin
-from app.web.session import Page, Session
 from tests.app.scripted import pull_all, wait_for
-from tests.app.web.page.browsed import PATIENCE, until
+from tests.app.web.page.browsed import PATIENCE, running, until
 
 pytestmark = pytest.mark.browser
 
@@ -33,79 +30,61 @@ def cursor_is(page, seconds, play):
     wait_for(there, PATIENCE)
 
 
-def test_page_and_rerun_show_one_time(browser):
-    twin = load_twin("motor_winding")
-    session = Session(twin, live_source(twin, float("inf")), page=Page(0, open_browser=False))
-    session.start()
-    page = browser.new_context(viewport={"width": 1200, "height": 800}).new_page()
-    try:
-        wait_for(lambda: session.engine.status().finished, PATIENCE)
-        end = float(pull_all(session.engine).events.t[-1]) * 1e-9
-        page.goto(session.url, timeout=PATIENCE * 1000)
-        until(page, "window.nisus?.drawn > 0")
-
-        # Held before Rerun is shown for the first time: it comes up where the page is.
-        page.evaluate("window.nisus.view.show(20, 50)")
-        page.get_by_role("tab", name="Explore").click()
-        until(page, "window.nisus.explored > 0")
-        cursor_is(page, 50.0, PAUSED)
-
-        # The page's own track, clicked; then back to the newest row.
-        box = page.locator("#timeline").bounding_box()
-        page.mouse.click(box["x"] + 0.75 * box["width"], box["y"] + 20)
-        cursor_is(page, 0.75 * end, PAUSED)
-        page.locator("#follow").click()
-        cursor_is(page, end, FOLLOWING)
-
-        # Scrubbed in Rerun: the page is held there, and says so; what follows there follows here.
-        page.evaluate(SCRUB, [30.5, PAUSED])
-        until(page, "Math.abs(window.nisus.view.at - 30.5) < 1e-6 && !window.nisus.view.following")
-        assert page.locator("#at").inner_text() == "at 0:30.5"
-        page.evaluate(SCRUB, [0, FOLLOWING])
-        until(page, "window.nisus.view.following")
-        assert page.locator("#at").inner_text() == ""
-
-        # Hidden, it is neither asked nor moved.
-        page.evaluate(SCRUB, [12.0, PAUSED])
-        until(page, "Math.abs(window.nisus.view.at - 12) < 1e-6")
-        page.get_by_role("tab", name="Charts").click()
-        page.evaluate("window.nisus.view.goTo(33, window.nisus.charts.range)")
-        assert page.evaluate("window.nisus.panes.explore.time.timer") is None
-        cursor_is(page, 12.0, PAUSED)
-        page.get_by_role("tab", name="Explore").click()
-        cursor_is(page, 33.0, PAUSED)
-    finally:
-        page.context.close()
-        session.stop()
+@pytest.fixture(scope="module")
+def session():
+    with running("motor_winding") as session:
+        yield session
 
 
-def test_rerun_in_a_window_of_its_own_shares_the_time_of_the_page(browser):
-    twin = load_twin("motor_winding")
-    session = Session(twin, live_source(twin, float("inf")), page=Page(0, open_browser=False))
-    session.start()
-    context = browser.new_context(viewport={"width": 1000, "height": 700})
-    page, alone = context.new_page(), context.new_page()
-    try:
-        wait_for(lambda: session.engine.status().finished, PATIENCE)
-        page.goto(session.url, timeout=PATIENCE * 1000)
-        until(page, "window.nisus?.drawn > 0")
-        page.evaluate("window.nisus.view.show(20, 50)")
-        alone.goto(session.url.partition("?")[0] + "explore", timeout=PATIENCE * 1000)
-        until(alone, "window.nisus?.explored > 0")
-        assert alone.locator("#shared").inner_text() == "one time with the page"
-        cursor_is(alone, 50.0, PAUSED)
-        # What is gone to on the page moves it, and what is scrubbed in it moves the page.
-        page.evaluate("window.nisus.view.goTo(33, window.nisus.charts.range)")
-        cursor_is(alone, 33.0, PAUSED)
-        alone.evaluate(SCRUB, [30.5, PAUSED])
-        until(page, "Math.abs(window.nisus.view.at - 30.5) < 1e-6 && !window.nisus.view.following")
-        alone.evaluate(SCRUB, [0, FOLLOWING])
-        until(page, "window.nisus.view.following")
-        # Without the page it says that it is alone, and is its own master.
-        page.goto("about:blank")
-        until(alone, "document.getElementById('shared').textContent.startsWith('a time of its own')")
-        alone.evaluate(SCRUB, [12.0, PAUSED])
-        until(alone, "Math.abs(window.nisus.view.at - 12) < 1e-6")
-    finally:
-        context.close()
-        session.stop()
+def test_page_and_rerun_show_one_time(page, session):
+    end = float(pull_all(session.engine).events.t[-1]) * 1e-9
+
+    # Held before Rerun is shown for the first time: it comes up where the page is.
+    page.evaluate("window.nisus.view.show(20, 50)")
+    page.get_by_role("tab", name="Explore").click()
+    until(page, "window.nisus.explored > 0")
+    cursor_is(page, 50.0, PAUSED)
+
+    # The page's own track, clicked; then back to the newest row.
+    box = page.locator("#timeline").bounding_box()
+    page.mouse.click(box["x"] + 0.75 * box["width"], box["y"] + 20)
+    cursor_is(page, 0.75 * end, PAUSED)
+    page.locator("#follow").click()
+    cursor_is(page, end, FOLLOWING)
+
+    # Scrubbed in Rerun: the page is held there, and says so; what follows there follows here.
+    page.evaluate(SCRUB, [30.5, PAUSED])
+    until(page, "Math.abs(window.nisus.view.at - 30.5) < 1e-6 && !window.nisus.view.following")
+    assert page.locator("#at").inner_text() == "at 0:30.5"
+    page.evaluate(SCRUB, [0, FOLLOWING])
+    until(page, "window.nisus.view.following")
+    assert page.locator("#at").inner_text() == ""
+
+    # Hidden, it is neither asked nor moved.
+    page.evaluate(SCRUB, [12.0, PAUSED])
+    until(page, "Math.abs(window.nisus.view.at - 12) < 1e-6")
+    page.get_by_role("tab", name="Charts").click()
+    page.evaluate("window.nisus.view.goTo(33, window.nisus.charts.range)")
+    assert page.evaluate("window.nisus.panes.explore.time.timer") is None
+    cursor_is(page, 12.0, PAUSED)
+    page.get_by_role("tab", name="Explore").click()
+    cursor_is(page, 33.0, PAUSED)
+
+
+def test_rerun_in_a_window_of_its_own_shares_the_time_of_the_page(visit, page, session):
+    page.evaluate("window.nisus.view.show(20, 50)")
+    alone = visit(session.url.partition("?")[0] + "explore", beside=page, ready="window.nisus?.explored > 0")
+    assert alone.locator("#shared").inner_text() == "one time with the page"
+    cursor_is(alone, 50.0, PAUSED)
+    # What is gone to on the page moves it, and what is scrubbed in it moves the page.
+    page.evaluate("window.nisus.view.goTo(33, window.nisus.charts.range)")
+    cursor_is(alone, 33.0, PAUSED)
+    alone.evaluate(SCRUB, [30.5, PAUSED])
+    until(page, "Math.abs(window.nisus.view.at - 30.5) < 1e-6 && !window.nisus.view.following")
+    alone.evaluate(SCRUB, [0, FOLLOWING])
+    until(page, "window.nisus.view.following")
+    # Without the page it says that it is alone, and is its own master.
+    page.goto("about:blank")
+    until(alone, "document.getElementById('shared').textContent.startsWith('a time of its own')")
+    alone.evaluate(SCRUB, [12.0, PAUSED])
+    until(alone, "Math.abs(window.nisus.view.at - 12) < 1e-6")

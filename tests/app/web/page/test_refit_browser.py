@@ -4,9 +4,8 @@ import pytest
 
 from app.live.tunings.versions import listing
 from tests.app.scripted import wait_for
-from tests.app.web.page.browsed import PATIENCE, browsed, running
+from tests.app.web.page.browsed import PATIENCE, running, settled
 from tests.app.web.page.test_fit_browser import TRUE, WRONG
-from tests.app.web.page.test_runs_browser import settled
 
 pytestmark = pytest.mark.browser
 
@@ -23,10 +22,10 @@ def session(tmp_path, monkeypatch):
 
 
 @pytest.fixture
-def page(browser, session):
-    with browsed(browser, session) as page:
-        wait_for(lambda: page.locator("#refit-accept").count() == 1, PATIENCE)
-        yield page
+def page(visit, session):
+    page = visit(session.url)
+    wait_for(lambda: page.locator("#refit-accept").count() == 1, PATIENCE)
+    return page
 
 
 def test_accepted_it_is_a_version_that_runs(page, session):

@@ -1,6 +1,5 @@
 """Runs and curves on the page: pinned, seen over the charts, taken away; a knob's curve against folds of its own."""
 
-import io
 import re
 
 import numpy as np
@@ -10,7 +9,7 @@ from estimators.fold import fold
 from estimators.log import Log
 from estimators.track import GATED, USED
 from tests.app.scripted import pull_all, wait_for
-from tests.app.web.page.browsed import PATIENCE, running, until
+from tests.app.web.page.browsed import PATIENCE, pixels, running, settled, until
 
 pytestmark = pytest.mark.browser
 
@@ -26,15 +25,7 @@ def session():
 
 def coloured(page, selector, colour=PINNED):
     """Pixels of a colour in an element."""
-    from PIL import Image
-
-    picture = page.screenshot(clip=page.locator(selector).first.bounding_box())
-    pixels = np.asarray(Image.open(io.BytesIO(picture)).convert("RGB")).astype(int)
-    return int(np.sum(np.abs(pixels - colour).sum(axis=2) < 60))
-
-
-def settled(engine, revision):
-    wait_for(lambda: engine.revisions.runs[-1].number >= revision and not engine.status().refolding, PATIENCE)
+    return int(np.sum(np.abs(pixels(page, selector) - colour).sum(axis=2) < 60))
 
 
 def test_pin_overlay_and_unpin(page, session):

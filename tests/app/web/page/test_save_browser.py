@@ -9,7 +9,7 @@ import pytest
 
 from app.live.commands import SetTuning
 from tests.app.scripted import pull_all, wait_for
-from tests.app.web.page.browsed import PATIENCE, running, until
+from tests.app.web.page.browsed import PATIENCE, running
 
 pytestmark = pytest.mark.browser
 
@@ -25,25 +25,14 @@ def session(request):
         yield session
 
 
-@pytest.fixture
-def context(browser):
-    made = browser.new_context(viewport={"width": 1440, "height": 900}, color_scheme="dark")
-    yield made
-    made.close()
-
-
-def opened(context, address):
-    page = context.new_page()
-    page.set_default_timeout(PATIENCE * 1000)
-    page.on("pageerror", lambda error: pytest.fail(str(error)))
-    page.goto(address)
-    until(page, "window.nisus?.drawn > 0 && Boolean(window.nisus.link.status.origin)")
-    return page
+def opened(visit, address, beside=None):
+    ready = "window.nisus?.drawn > 0 && Boolean(window.nisus.link.status.origin)"
+    return visit(address, beside=beside, ready=ready, scheme="dark")
 
 
 @pytest.fixture
-def page(context, session):
-    return opened(context, session.url)
+def page(visit, session):
+    return opened(visit, session.url)
 
 
 def saved(page, button, item, folder):
@@ -164,7 +153,7 @@ def test_the_track_that_is_shown(page, session, tmp_path):
     assert report.suffix == ".html" and "Scores" in report.read_text(encoding="utf-8")
 
 
-def test_a_link_goes_to_the_moment_and_holds_it(context, page, session):
+def test_a_link_goes_to_the_moment_and_holds_it(visit, page, session):
     hidden = page.evaluate("window.nisus.charts.charts.at(-1).what.key")
     page.get_by_text("Shown", exact=True).click()
     page.locator("#layout li").last.get_by_role("checkbox").uncheck()
@@ -176,7 +165,7 @@ def test_a_link_goes_to_the_moment_and_holds_it(context, page, session):
     assert "token" not in address and f"#twin={session.engine.twin.name}&from=1970-01-01T00:00:12.3456789Z" in address
 
     page.evaluate("localStorage.clear()")
-    other = opened(context, address)
+    other = opened(visit, address, page)
     wait_for(lambda: not other.evaluate("window.nisus.view.following"), PATIENCE)
     first, last = other.evaluate("window.nisus.charts.range")
     assert (first, last) == (pytest.approx(12.3456789, abs=1e-9), pytest.approx(22.5, abs=1e-8))

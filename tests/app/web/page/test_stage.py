@@ -1,10 +1,11 @@
 """The scene on the page in headless Chromium: chosen, large, and each view in a window of its own."""
 
+import numpy as np
 import pytest
 
 from app.web.http import PAGE
 from tests.app.scripted import wait_for
-from tests.app.web.page.browsed import PATIENCE, running, until
+from tests.app.web.page.browsed import PATIENCE, pixels, running, until
 
 pytestmark = pytest.mark.browser
 
@@ -15,14 +16,6 @@ def session():
         yield session
 
 
-@pytest.fixture
-def context(browser):
-    context = browser.new_context(viewport={"width": 1400, "height": 900})
-    context.set_default_timeout(PATIENCE * 1000)
-    yield context
-    context.close()
-
-
 def asked(session):
     """The queries of the browsers' sockets, as Viser's server knows them."""
     from app.views.viser.guarded_server import addresses
@@ -30,10 +23,9 @@ def asked(session):
     return sorted(addresses(session.view.server))
 
 
-def test_the_scene_is_chosen_enlarged_and_opened_alone(context, session):
+def test_the_scene_is_chosen_enlarged_and_opened_alone(visit, session):
     assert asked(session) == [] and session.view.history.n == 0
-    page = context.new_page()
-    page.goto(session.url)
+    page = visit(session.url)
     wait_for(lambda: asked(session) == ["theme=light&part=scene"], PATIENCE)
     wait_for(lambda: session.view.history.n > 0, PATIENCE)
     # Its panel is not kept up while only the page shows the scene.
@@ -58,7 +50,7 @@ def test_the_scene_is_chosen_enlarged_and_opened_alone(context, session):
     wait_for(lambda: asked(session) == [], PATIENCE)
     page.get_by_role("tab", name="Scene").click()
 
-    with context.expect_page() as opened:
+    with page.context.expect_page() as opened:
         page.get_by_label("Scene in a window of its own").click()
     alone = opened.value
     alone.get_by_text("Reset estimate").wait_for()
@@ -66,41 +58,26 @@ def test_the_scene_is_chosen_enlarged_and_opened_alone(context, session):
     wait_for(lambda: "revision 0" in session.view.panel.status.content, PATIENCE)
 
 
-def test_rerun_has_a_window_of_its_own(context, session):
-    page = context.new_page()
-    errors = []
-    page.on("pageerror", lambda error: errors.append(str(error)))
-    page.goto(session.url)
+def test_rerun_has_a_window_of_its_own(page, session):
     page.goto(f"{session.url.partition('?')[0]}explore")
     until(page, "window.nisus?.explored > 0")
     assert page.evaluate("document.getElementById('notice').hidden")
     assert page.evaluate("document.getElementById('rerun').clientHeight") > 700
-    assert errors == []
 
 
-def test_in_the_dark_the_scene_has_light_labels_on_dark(browser, session):
+def test_in_the_dark_the_scene_has_light_labels_on_dark(visit, session):
     """Viser draws black on white: boxes of some thousand pixels. Letters alone are a few hundred."""
-    import io
-
-    import numpy as np
-    from PIL import Image
-
-    page = browser.new_context(viewport={"width": 1400, "height": 900}, color_scheme="dark").new_page()
-    page.goto(session.url)
+    page = visit(session.url, scheme="dark")
     wait_for(lambda: session.view.history.n > 0, PATIENCE)
 
     def share(least):
         """Of the lower half, with a scale's numbers and the temperature in words: pixels as grey and as light."""
-        box = page.locator("#stage").bounding_box()
-        clip = box | {"y": box["y"] + box["height"] / 2, "height": box["height"] / 2}
-        image = Image.open(io.BytesIO(page.screenshot(clip=clip, timeout=PATIENCE * 1000))).convert("RGB")
-        pixels = np.asarray(image).astype(int)
-        return np.mean((pixels.min(axis=2) > least) & (np.ptp(pixels, axis=2) < 40))
+        found = pixels(page, "#stage", 0.5)
+        return np.mean((found.min(axis=2) > least) & (np.ptp(found, axis=2) < 40))
 
     wait_for(lambda: share(110) > 2e-4, PATIENCE)
     page.wait_for_timeout(2000)
     assert share(190) < 2e-3
-    page.context.close()
 
 
 def opacity(page):
@@ -121,9 +98,9 @@ def counted(page):
 
 
 @pytest.mark.parametrize("scene", [True, False], ids=["drawn", "never drawn"])
-def test_the_scene_is_hidden_until_it_is_drawn(context, scene):
+def test_the_scene_is_hidden_until_it_is_drawn(browser, scene):
     """By a clock of the test's own: an empty scene's four drawings do not show it, a fifth does, and 4 s do alone."""
-    page = context.new_page()
+    page = browser.new_page()
     page.clock.install(time=0)
     page.clock.pause_at(1000)
     page.set_content("<p>axes</p>")
@@ -142,11 +119,10 @@ def test_the_scene_is_hidden_until_it_is_drawn(context, scene):
         assert opacity(page) == "0"
         page.clock.run_for(200)
     assert opacity(page) == "1" and not counted(page)
+    page.close()
 
 
-def test_the_scene_is_seen_on_the_page(context, session):
-    page = context.new_page()
-    page.goto(session.url)
+def test_the_scene_is_seen_on_the_page(page, session):
     wait_for(lambda: asked(session) != [], PATIENCE)
     frame = page.locator("#stage").element_handle().content_frame()
     frame.wait_for_function("document.body && getComputedStyle(document.body).opacity === '1'")

@@ -7,13 +7,11 @@ import subprocess
 import numpy as np
 import pytest
 
-from app.cli.run import live_source
 from app.live.commands import Record
-from app.twin.twin import load_twin
 from app.views.recording.reader import read_recording
-from app.web.session import Page, Session
 from estimators.log import READING
 from tests.app.scripted import wait_for
+from tests.app.web.page.browsed import PATIENCE, running
 
 pytestmark = pytest.mark.browser
 
@@ -21,7 +19,6 @@ FLAGS = (
     "--headless=new --no-sandbox --disable-gpu --enable-unsafe-swiftshader --disable-background-networking "
     "--disable-component-update --disable-sync --no-first-run --disable-quic --remote-debugging-port=0"
 ).split()
-PATIENCE = 120.0
 LIVED = 300
 """Events, one a second of the twin, that come while the browser is suspended."""
 
@@ -47,11 +44,8 @@ def suspendable(chromium, tmp_path):
 def test_a_suspended_browser_costs_nothing(suspendable, tmp_path):
     sync_api = pytest.importorskip("playwright.sync_api")
     process, port = suspendable
-    twin = load_twin("motor_winding", overrides={"source.duration": "1000000"})
-    session = Session(twin, live_source(twin, 60.0), page=Page(0, open_browser=False))
     path = tmp_path / "suspended.rrd"
-    session.start()
-    try:
+    with running("motor_winding", 60.0, **{"source.duration": "1000000"}) as session:
         session.engine.submit(Record(path))
         with sync_api.sync_playwright() as playwright:
             page = playwright.chromium.connect_over_cdp(f"http://127.0.0.1:{port}").contexts[0].new_page()
@@ -67,8 +61,6 @@ def test_a_suspended_browser_costs_nothing(suspendable, tmp_path):
             wait_for(lambda: page.evaluate("window.nisus.drawn") > drawn, PATIENCE)
         session.engine.submit(Record(None))
         wait_for(lambda: session.recorder.finished, PATIENCE)
-    finally:
-        session.stop()
     recorded = read_recording(path)
     rows = recorded.events.t[recorded.events.kind == READING]
     assert rows.size > during
