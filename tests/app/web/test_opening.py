@@ -1,0 +1,180 @@
+"""Opening the page: a port that is taken is reported first, and no command line shows the token."""
+
+import os
+import re
+import signal
+import socket
+import stat
+import subprocess
+import sys
+from http.client import HTTPConnection
+from pathlib import Path
+from urllib.parse import unquote, urlsplit
+
+import pytest
+
+import app.cli.open_twin
+import app.cli.run
+from app.cli.main import main
+from app.live.engine import Engine
+from app.web import session as session_module
+from app.web.door import check_port
+from app.web.server import PageServer
+from app.web.session import BrowserPage
+from estimators.errors import ConfigError
+from tests.app.scripted import Scripted, wait_for
+from tests.app.served import SECRET, shown_twin
+from tests.app.web.page.browsed import PATIENCE
+
+posix = pytest.mark.skipif(os.name != "posix", reason="permissions and command lines as on POSIX")
+URL = 'http://127.0.0.1:9900/?token=a"b&c'
+
+
+@pytest.fixture
+def taken():
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        yield other.getsockname()[1]
+
+
+@pytest.mark.parametrize("command", ["run", "review"])
+def test_a_port_in_use_is_reported_before_anything_is_compiled(command, taken, monkeypatch, capsys):
+    for name in ("begin_to_compile", "read_recording"):
+        monkeypatch.setattr(app.cli.open_twin, name, lambda *_: pytest.fail("it went on"))
+    assert main([command, "motor_winding", "--port", str(taken), "--no-browser"]) == 2
+    assert re.fullmatch(rf"nisus: port {taken}: .* in use; .*--port\n", capsys.readouterr().err)
+
+
+def test_without_a_page_the_port_does_not_matter(taken, monkeypatch):
+    reached = []
+    monkeypatch.setattr(app.cli.run, "prepare", reached.append)
+    monkeypatch.setattr(app.cli.run, "open_session", lambda *_, **__: (_ for _ in ()).throw(ConfigError("enough")))
+    assert main(["run", "motor_winding", "--port", str(taken), "--headless"]) == 2
+    assert len(reached) == 1
+
+
+def test_a_port_that_was_checked_is_free_again():
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        free = other.getsockname()[1]
+    for port in (free, free, 0):
+        check_port(port)
+    for wrong in (-1, 70000):
+        with pytest.raises(ConfigError, match=f"port {wrong}: is not a port; choose another with --port"):
+            check_port(wrong)
+
+
+# The file that leads a browser to the page
+
+
+@pytest.fixture
+def runtime(tmp_path, monkeypatch):
+    folder = tmp_path / "runtime"
+    folder.mkdir(mode=0o700)
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(folder))
+    return folder
+
+
+@posix
+@pytest.mark.parametrize("usable", [True, False])
+def test_only_this_user_can_read_the_file_and_it_leads_to_the_page(runtime, tmp_path, monkeypatch, usable):
+    folder = runtime if usable else tmp_path / "temporary"
+    if not usable:
+        folder.mkdir()
+        monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path / "absent"))
+        monkeypatch.setattr("tempfile.tempdir", str(folder))
+    before = os.umask(0)
+    try:
+        opening = BrowserPage(URL)
+    finally:
+        os.umask(before)
+    assert opening.path.parent == folder and stat.S_IMODE(opening.path.stat().st_mode) == 0o600
+    assert 'content="0;url=http://127.0.0.1:9900/?token=a&quot;b&amp;c"' in opening.path.read_text()
+    shown = []
+    monkeypatch.setattr(session_module.webbrowser, "open", shown.append)
+    opening.show()
+    wait_for(lambda: shown)
+    assert Path(unquote(urlsplit(shown[0]).path)) == opening.path and "token" not in shown[0]
+    opening.close()
+    opening.close()
+    assert not list(folder.iterdir())
+
+
+BROWSER = """#!/bin/sh
+tr '\\0' ' ' < /proc/$$/cmdline > "$SEEN.part"
+cat "${1#file://}" >> "$SEEN.part"
+mv "$SEEN.part" "$SEEN"
+"""
+
+
+def program(*words):
+    return [sys.executable, "-c", f"import sys; from app.cli.main import main; sys.exit(main({list(words)!r}))"]
+
+
+@posix
+@pytest.mark.skipif(not Path("/proc/self/cmdline").exists(), reason="reads command lines from /proc")
+def test_two_runs_have_two_tokens_and_show_neither(tmp_path, runtime):
+    browser = tmp_path / "browser"
+    browser.write_text(BROWSER)
+    browser.chmod(0o755)
+    tokens = set()
+    for k in range(2):
+        seen = tmp_path / f"seen{k}"
+        settings = {**os.environ, "BROWSER": f"{browser} %s", "SEEN": str(seen)}
+        run = subprocess.Popen(
+            program("run", "motor_winding", "--port", "0"), env=settings, stdout=subprocess.PIPE, text=True
+        )
+        try:
+            printed = next(
+                found[0] for line in run.stdout if (found := re.search(r"http://127\.0\.0\.1:\d+/\S+", line))
+            )
+            wait_for(seen.exists)
+            address = urlsplit(printed)
+            token, said = address.query.removeprefix("token="), seen.read_text().splitlines()
+            assert said[0].startswith("/bin/sh") and token not in said[0]
+            assert f'url={printed}"' in "\n".join(said) and len(list(runtime.iterdir())) == 1
+            # The printed address still works, and the file is removed once a browser has come.
+            connection = HTTPConnection("127.0.0.1", address.port)
+            connection.request("GET", f"/?{address.query}")
+            assert connection.getresponse().status == 303
+            wait_for(lambda: not list(runtime.iterdir()))
+            tokens.add(token)
+        finally:
+            run.send_signal(signal.SIGTERM)
+            run.wait()
+    assert len(tokens) == 2
+
+
+@posix
+def test_the_file_is_removed_with_a_session_that_no_browser_opened(runtime):
+    words = program("run", "motor_winding", "--port", "0", "--duration", "1")
+    subprocess.run(words, env={**os.environ, "BROWSER": "true %s"}, check=True, stdout=subprocess.DEVNULL)
+    assert not list(runtime.iterdir())
+
+
+@pytest.mark.browser
+def test_the_file_opens_the_page_and_the_next_session_asks_for_its_own_address(browser, tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    engine = Engine(shown_twin(), lambda report: Scripted())
+    server = PageServer(engine, port=0, viser_port=None, secret=SECRET)
+    server.start()
+    opening = BrowserPage(server.url)
+    page = browser.new_context().new_page()
+    page.set_default_timeout(PATIENCE * 1000)
+    try:
+        page.goto(opening.path.as_uri())
+        page.locator("#connection[data-state=live]").wait_for(state="attached")
+        # The token is in a cookie then, no longer in the address.
+        assert page.url == f"http://127.0.0.1:{server.port}/" and server.entered.is_set()
+        page.reload()
+        page.locator("#connection[data-state=live]").wait_for(state="attached")
+        server.stop()
+        wait_for(lambda: "trying again" in page.locator("#connection").inner_text(), PATIENCE)
+        server = PageServer(engine, port=server.port, viser_port=None, secret=SECRET)
+        server.start()
+        page.get_by_text("This session has ended").wait_for()
+    finally:
+        page.context.close()
+        opening.close()
+        server.stop()
