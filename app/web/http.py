@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import dataclasses
+import html
 import inspect
 import json
 import math
@@ -18,7 +19,7 @@ from typing import Any, TypeVar
 from pydantic import TypeAdapter, ValidationError
 from starlette.concurrency import run_in_threadpool
 from starlette.requests import ClientDisconnect, Request
-from starlette.responses import JSONResponse, PlainTextResponse, Response
+from starlette.responses import HTMLResponse, JSONResponse, PlainTextResponse, Response
 from starlette.routing import Route
 
 from estimators.errors import ConfigError, NisusError, nearest, printable, quoted, shown_name
@@ -65,13 +66,16 @@ def one_line(text: str) -> str:
     return line if len(line) <= MAX_REASON_CHARACTERS else line[: MAX_REASON_CHARACTERS - 1] + "…"
 
 
-def page_file(name: str, settings: Mapping[str, Any]) -> Response:
-    """Answer with an HTML file of the page, its settings in an attribute of the body.
+def page_file(name: str, settings: Mapping[str, Any], **parts: str) -> Response:
+    """Answer with an HTML file of the page, with its settings in an attribute of the body, and other parts by name.
 
     In an attribute, not in a script: the security policy allows no inline scripts.
     """
-    text = json.dumps(dict(settings)).replace("&", "&amp;").replace('"', "&quot;")
-    return Response((PAGE / name).read_text().replace("{{settings}}", text), media_type="text/html")
+    text = (PAGE / name).read_text()
+    parts |= {"head": (PAGE / "head.html").read_text().rstrip(), "settings": html.escape(json.dumps(dict(settings)))}
+    for key, part in parts.items():
+        text = text.replace(f"{{{{{key}}}}}", part)
+    return HTMLResponse(text)
 
 
 def get(

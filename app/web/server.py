@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
 from starlette.requests import Request
-from starlette.responses import FileResponse, HTMLResponse, PlainTextResponse, Response
+from starlette.responses import FileResponse, PlainTextResponse, Response
 from starlette.routing import BaseRoute, Mount, Route, WebSocketRoute
 from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocket
@@ -178,7 +178,7 @@ class PageServer:
             text = as_html(alarms_text())
         except ConfigError as error:
             return PlainTextResponse(f"Nisus: {error}\n", 404)
-        return HTMLResponse((PAGE / "alarms.html").read_text().replace("{{text}}", text))
+        return page_file("alarms.html", {}, text=text)
 
     def _status(self) -> dict[str, Any]:
         """Return the state of the twin."""

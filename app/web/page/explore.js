@@ -16,13 +16,13 @@ export class Explore {
   async show() {
     if (this.stream) {
       this.time?.wake();
-      return this.stream.wake();
+      return this.stream.sleep(false);
     }
     if (this.starting) return;
     this.starting = true;
     try {
       this.viewer = await Viewer.open($("rerun"), $("before"), this.base, this.theme);
-      this.stream = new ExploreStream({ viewer: this.viewer, changed: () => {}, told: (message) => this.told(message) });
+      this.stream = new ExploreStream({ viewer: this.viewer, told: (message) => this.told(message) });
       window.nisus.viewer = this.viewer;
       this.time = window.nisus.exploreTime = new ExploreTime(this.viewer, this.page);
       this.time.wake();
@@ -34,7 +34,7 @@ export class Explore {
 
   hide() {
     this.time?.sleep();
-    this.stream?.sleep();
+    this.stream?.sleep(true);
   }
 
   told(message) {

@@ -185,7 +185,7 @@ export class Around {
       label.addEventListener("click", () => this.toggle(key));
       label.addEventListener("keydown", (event) => ["Enter", " "].includes(event.key) && (event.preventDefault(), event.stopPropagation(), this.toggle(key)));
     }
-    setInterval(() => link.socket && link.status.tuning && this.heard(link.status), LOOK);
+    setInterval(() => link.connected && link.status.tuning && this.heard(link.status), LOOK);
   }
 
   toggle(key) {

@@ -1,8 +1,8 @@
 // Connection of the page to the twin: status, episodes, notices and chart points arrive here; commands leave here.
 
+import { PageSocket } from "./socket.js";
 import { unpack } from "./stream.js";
 
-const SLOWEST = 8000; // ms between two attempts to connect
 const QUIET = 1000; // ms without news after which the last status is told again
 const SETTLED = 700; // ms after the last edit or revision
 
@@ -13,50 +13,24 @@ export class Link extends EventTarget {
     this.boot = boot;
     this.status = {};
     this.episodes = [];
-    this.streams = {}; // what was asked for, to ask again after a break
+    this.streams = {}; // queries by name, to ask again after a break
     this.takers = {}; // by stream: take(header, seconds, columns)
-    this.delay = 250;
     this.turned = -Infinity; // when something was edited, or folded anew
-    document.addEventListener("visibilitychange", () => (document.hidden ? this.close("hidden") : this.open()));
+    this.line = new PageSocket({
+      address: () => "/api/stream",
+      taken: (data) => this.take(data),
+      changed: (state) => {
+        this.tell("connection", state);
+        if (state === "live") this.say({ streams: this.streams, pair: this.pair ?? null });
+      },
+    });
     // A twin whose source has ended has no news, but ages and answers that are waited for go on.
-    setInterval(() => this.socket && this.told && performance.now() - this.told > QUIET && this.tell("status", this.status), QUIET);
-    if (!document.hidden) this.open();
+    setInterval(() => this.connected && this.told && performance.now() - this.told > QUIET && this.tell("status", this.status), QUIET);
+    this.line.open();
   }
 
-  open() {
-    clearTimeout(this.timer);
-    if (this.socket || document.hidden) return;
-    const socket = new WebSocket(`ws://${location.host}/api/stream`);
-    socket.binaryType = "arraybuffer";
-    this.socket = socket;
-    socket.onmessage = (event) => this.socket === socket && this.take(event.data);
-    socket.onopen = () => {
-      this.delay = 250;
-      this.tell("connection", "live");
-      this.say({ streams: this.streams, pair: this.pair ?? null });
-    };
-    socket.onclose = () => {
-      if (this.socket !== socket) return;
-      this.socket = null;
-      this.tell("connection", "waiting");
-      this.timer = setTimeout(() => this.open(), this.delay);
-      this.delay = Math.min(SLOWEST, 2 * this.delay);
-      this.askWhy();
-    };
-  }
-
-  // A browser does not say why a socket was refused. Each session has a token of its own: another one refuses ours.
-  async askWhy() {
-    const answer = await fetch("/api/status").catch(() => null);
-    if (answer?.status === 403) this.close("ended");
-  }
-
-  close(why) {
-    clearTimeout(this.timer);
-    const socket = this.socket;
-    this.socket = null;
-    socket?.close();
-    this.tell("connection", why);
+  get connected() {
+    return Boolean(this.line.socket);
   }
 
   // Whether a drag is over: scores and likelihood curves are not computed for every value on the way.
@@ -65,7 +39,7 @@ export class Link extends EventTarget {
   }
 
   say(message) {
-    if (this.socket?.readyState === WebSocket.OPEN) this.socket.send(JSON.stringify(message));
+    this.line.send(JSON.stringify(message));
   }
 
   tell(type, detail) {

@@ -25,7 +25,7 @@ export class Runs {
     this.versions = new Versions(link);
     node.replaceChildren(this.versions.node, this.error, this.table, this.compared);
     // Not by the status: a twin whose source has ended says no more.
-    setInterval(() => link.socket && link.status.runs && this.heard(link.status), LOOK);
+    setInterval(() => link.connected && link.status.runs && this.heard(link.status), LOOK);
   }
 
   // While the tab is shown, and nothing is being typed.
