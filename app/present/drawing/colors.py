@@ -68,45 +68,37 @@ def _palette(selector: str) -> Palette:
 LIGHT, DARK = _palette(":root"), _palette(':root[data-theme="dark"]')
 THEMES = {"light": LIGHT, "dark": DARK}
 
-
-def between(a: Palette, b: Palette) -> Palette:
-    """Return the palette halfway between two."""
-    both = {
-        item.name: mixed(getattr(a, item.name), getattr(b, item.name), 0.5)
+EITHER = Palette(
+    **{
+        item.name: mixed(getattr(LIGHT, item.name), getattr(DARK, item.name), 0.5)
         for item in fields(Palette)
         if item.name != "health"
-    }
-    return Palette(**both, health={name: mixed(color, b.health[name], 0.5) for name, color in a.health.items()})
-
-
-EITHER = between(LIGHT, DARK)
+    },
+    health={name: mixed(color, DARK.health[name], 0.5) for name, color in LIGHT.health.items()},
+)
 """For files, whose viewer may be light or dark."""
 
 
 WARM = ("#0b1354", "#3b2e8c", "#7b2f8d", "#b73779", "#e8604c", "#f9a03f", "#fcf3a6")
-"""Low to high values of a quantity."""
+"""From low to high values of a quantity."""
 
 SPREAD = ("#f7fbff", "#c6dbef", "#6baed6", "#2171b5", "#08306b")
-"""None to much."""
+"""From zero to large values."""
 
 SIGNED = ("#1d4ed8", "#7aa2f0", "#f5f5f5", "#f2a07a", "#b91c1c")
-"""Negative, none, positive."""
+"""From negative over zero to positive values."""
 
 UNKNOWN_INDEX = 255
 """Index of the colour of unknown values, grey."""
 
-NORMAL_DOT, LARGE_DOT, EXTREME_DOT, UNKNOWN_DOT, RIM = (
-    (255, 255, 255),
-    EITHER.reading,
-    EITHER.refused,
-    EITHER.faint,
-    (51, 65, 85),
-)
-"""Colours of a sensor: innovation below 2 σ, below 3 σ, above, none yet; and of its rim."""
+NORMAL_DOT, LARGE_DOT, EXTREME_DOT, UNKNOWN_DOT = (255, 255, 255), EITHER.reading, EITHER.refused, EITHER.faint
+"""Colours of a sensor: innovation below 2 σ, below 3 σ, above, none yet."""
+
+RIM = (51, 65, 85)
 
 
 class Kind(NamedTuple):
-    """One picture of a field: its name, its title, a shorter one, its colours from low to high."""
+    """Kind of picture of a field: name, title, short title, colours from low to high."""
 
     name: str
     title: str
@@ -134,7 +126,7 @@ def image_of(picture: Picture, kind: Kind) -> np.ndarray | None:
 
 def gradient(colors: tuple[str, ...]) -> np.ndarray:
     """Return 255 interpolated colours and that of unknown values, (256, 3) uint8."""
-    anchors = np.array([[int(c[k : k + 2], 16) for k in (1, 3, 5)] for c in colors], float)
+    anchors = np.array([rgb(color) for color in colors], float)
     at = np.linspace(0, len(colors) - 1, UNKNOWN_INDEX)
     columns = [np.interp(at, np.arange(len(colors)), anchors[:, k]) for k in range(3)]
     return np.vstack((np.stack(columns, axis=1).round(), [[205, 205, 210]])).astype(np.uint8)
@@ -172,23 +164,16 @@ class Scale:
 
     def indices(self, values: np.ndarray) -> np.ndarray:
         """Return the colour index of each value, uint8; unknown values get `UNKNOWN_INDEX`."""
-        place = (values - self.low) / (self.high - self.low) * (UNKNOWN_INDEX - 1)
-        known = np.isfinite(place)
-        return np.where(known, np.clip(np.where(known, place, 0.0), 0, UNKNOWN_INDEX - 1), UNKNOWN_INDEX).astype(
-            np.uint8
-        )
+        place = np.clip((values - self.low) / (self.high - self.low), 0.0, 1.0) * (UNKNOWN_INDEX - 1)
+        return np.where(np.isfinite(values) & np.isfinite(place), place, UNKNOWN_INDEX).astype(np.uint8)
 
     def ticks(self) -> list[tuple[float, str]]:
-        """Places from 0 (low) to 1 (high) of the numbers beside it, with their text; none before the first number."""
+        """Return places of tick labels from 0 (low) to 1 (high), with their text; none before the first value."""
         if not np.isfinite(self.low):
             return []
-        first = int(np.ceil(self.low / self.step - 1e-9))
-        last = int(np.floor(self.high / self.step + 1e-9))
-        width = self.high - self.low
-        return [
-            (float((k * self.step - self.low) / width), tick_text(k * self.step, self.step))
-            for k in range(first, last + 1)
-        ]
+        width, step = self.high - self.low, self.step
+        ticks = np.arange(np.ceil(self.low / step - 1e-9), np.floor(self.high / step + 1e-9) + 0.5) * step
+        return [(float((tick - self.low) / width), tick_text(float(tick), step)) for tick in ticks]
 
 
 @dataclass(frozen=True)
@@ -282,12 +267,8 @@ def sensor_colors(normalised: np.ndarray) -> np.ndarray:
 
 def round_step(span: float) -> float:
     """Return the smallest of 1, 2, 5 · 10ᵏ that is at least `span`."""
-    exponent = np.floor(np.log10(span))
-    for factor in (1.0, 2.0, 5.0, 10.0):
-        step = factor * 10.0**exponent
-        if step >= span * (1 - 1e-9):
-            return float(step)
-    return float(10.0 ** (exponent + 1))
+    power = 10.0 ** np.floor(np.log10(span))
+    return float(next(step for step in (power, 2 * power, 5 * power, 10 * power) if step >= span * (1 - 1e-9)))
 
 
 def tick_text(value: float, step: float) -> str:

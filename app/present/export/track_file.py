@@ -1,7 +1,8 @@
-"""The track of a run as CSV or Parquet, piece by piece: the columns that `nisus fold` writes."""
+"""Track of a run as CSV or Parquet, in pieces, with the columns of `nisus fold`."""
 
 from __future__ import annotations
 
+import io
 from collections.abc import Iterable, Iterator
 from typing import Any, NamedTuple
 
@@ -19,14 +20,14 @@ from ...live.revisions import Revision
 from ...live.running_fold import Running
 
 PIECE = 8192
-"""Rows that are formatted at once."""
+"""Rows formatted at once."""
 
 KINDS = {"csv": "text/csv", "parquet": "application/vnd.apache.parquet"}
-"""What can be written, and its media type."""
+"""Formats and their media types."""
 
 
 def tables(rows: RunRows, part: slice) -> Iterator[Any]:
-    """The rows of a part as tables of at most `PIECE` rows, at least one: they are of one schema."""
+    """Yield the rows of a part as tables of at most `PIECE` rows and one schema, at least one table."""
     run, pull = rows
     model, found = run.tuning.model, rows.episodes()
     versions = model_versions(pull.events, pull.version)
@@ -44,12 +45,15 @@ def tables(rows: RunRows, part: slice) -> Iterator[Any]:
 
 
 def encoded(kind: str, parts: Iterable[Any]) -> Iterator[bytes]:
-    """Tables of one schema as the bytes of one file, as they come."""
-    sink = _Sink()
-    writer = None
+    """Yield tables of one schema as the bytes of one file."""
+    import pyarrow.csv
+    import pyarrow.parquet
+
+    sink, writer = _Sink(), None
     for table in parts:
         if writer is None:
-            writer = _writer(kind, sink, table.schema)
+            make = pyarrow.csv.CSVWriter if kind == "csv" else pyarrow.parquet.ParquetWriter
+            writer = make(sink, table.schema)
         writer.write_table(table)
         yield sink.take()
     if writer is not None:
@@ -57,52 +61,32 @@ def encoded(kind: str, parts: Iterable[Any]) -> Iterator[bytes]:
         yield sink.take()
 
 
-def _writer(kind: str, sink: _Sink, schema: Any) -> Any:
-    if kind == "csv":
-        import pyarrow.csv
+class _Sink(io.BytesIO):
+    """Buffer whose bytes are taken while a file is written."""
 
-        return pyarrow.csv.CSVWriter(sink, schema)
-    import pyarrow.parquet
-
-    return pyarrow.parquet.ParquetWriter(sink, schema)
-
-
-class _Sink:
-    """A file that is handed on as it is written."""
-
-    closed = False
-
-    def __init__(self) -> None:
-        self._pieces: list[bytes] = []
-        self._at = 0
-
-    def write(self, data: Any) -> int:
-        piece = bytes(data)
-        self._pieces.append(piece)
-        self._at += len(piece)
-        return len(piece)
+    _taken = 0
 
     def tell(self) -> int:
-        return self._at
-
-    def flush(self) -> None:
-        pass
+        return self._taken + super().tell()
 
     def close(self) -> None:
-        pass
+        """Stay open: the last bytes are taken after the end of the file."""
 
     def take(self) -> bytes:
         """Return the bytes written since the last call."""
-        pieces, self._pieces = self._pieces, []
-        return b"".join(pieces)
+        data = self.getvalue()
+        self._taken += len(data)
+        self.seek(0)
+        self.truncate()
+        return data
 
 
 MAX_COPIES = 20
-"""Times that the rows are copied while a late reading, or another revision, comes in between."""
+"""Attempts to copy the rows while late measurements or another revision interrupt."""
 
 
 class RunRows(NamedTuple):
-    """A run, and the rows that it had folded."""
+    """A run and its rows."""
 
     run: Revision
     pull: Pull
@@ -120,7 +104,7 @@ class RunRows(NamedTuple):
         return episodes_of(JudgedRows(tuning.model, tuning, self.marginal, events, track))
 
     def between(self, since: int | None, until: int | None) -> slice:
-        """The rows from one time to another, ns; None is the end that there is."""
+        """Return the slice of rows from one time to another, ns; None is the start or the end."""
         t = self.pull.events.t
         start = 0 if since is None else int(np.searchsorted(t, since))
         stop = t.size if until is None else int(np.searchsorted(t, until, side="right"))
@@ -128,14 +112,14 @@ class RunRows(NamedTuple):
 
 
 def rows_of_run(engine: Running, number: int | None = None) -> RunRows:
-    """A run and its rows: of what runs a copy, of another what was kept.
+    """Return a run and its rows: a copy for the running one, the kept rows for another.
 
     Args:
-        engine: Whose.
-        number: Of the run; None is the one that runs.
+        engine: The running twin.
+        number: Number of the run; None is the running one.
 
     Raises:
-        ConfigError: If there is no such run, nothing has come yet, or its track is gone.
+        ConfigError: If there is no such run, no measurement has arrived, or its track is gone.
     """
     for _ in range(MAX_COPIES):
         running = engine.revisions.runs[-1]
