@@ -263,7 +263,7 @@ def _line(error: ValidationError, given: Any, subject: str) -> str:
     problems = error.errors(include_url=False)
     path, value = [], given
     for part in problems[0]["loc"]:  # the rest of a location names members of a union
-        if isinstance(value, dict) and part in value or isinstance(value, list) and isinstance(part, int):
+        if isinstance(value, dict) and part in value or isinstance(value, list) and part in range(len(value)):
             value = value[part]  # type: ignore[index]
             path.append(shown_name(str(part)))
     rules = [

@@ -245,6 +245,31 @@ def test_viser_messages_pass_both_ways(page):
     assert page.viser.requests[-1] == ("/?a=b", [SECRET])
 
 
+# The streams
+
+
+def test_a_page_gets_the_next_frames_once_it_has_drawn_the_last_ones(page):
+    def message(key):
+        """The next message that has a key."""
+        while True:
+            text = stream.recv(timeout=PATIENCE)
+            if isinstance(text, str) and key in (found := json.loads(text)):
+                return found[key]
+            assert isinstance(text, bytes) or "error" not in text
+
+    page.source.put(readings([1.0, 2.0], [40.0, 41.0]))
+    wait_for(lambda: page.rows() == 2)
+    with page.connect("/api/stream") as stream:
+        stream.send(json.dumps({"streams": {"charts": {"columns": ["nis"]}}}))
+        message("frames")
+        page.source.put(readings([3.0], [40.0]))
+        stream.send(json.dumps({"drawn": True}))
+        message("frames")
+        for wrong in ([], {"drwan": True}, {"streams": {"charts": {"columns": ["nis"], "of": 1}}}, {"pair": ["a"]}):
+            stream.send(json.dumps(wrong))
+            assert message("error").startswith("page: ")
+
+
 # The feed of the Rerun viewer
 
 
