@@ -12,7 +12,6 @@ import gc
 import logging
 import struct
 import sys
-from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from io import BytesIO
@@ -98,8 +97,7 @@ def _read(
     path: Path, mdf: Any, content: BytesIO, wanted: frozenset[int] | None, longest: int
 ) -> Iterator[Raw | LogSummary]:
     start = _start(mdf)
-    parts: list[Raw] = []
-    named: list[tuple[np.ndarray, np.ndarray | None]] = []
+    parts: list[tuple[np.ndarray, ...]] = []
     total = errors = 0
     fault = ""
     for index, group in enumerate(mdf.groups):
@@ -111,8 +109,7 @@ def _read(
             continue
         try:
             signal = mdf.get("CAN_DataFrame", group=index)
-            keys, buses = _names(signal)
-            part = _wanted(signal, keys, buses, start, wanted, longest)
+            parts.append(_columns(signal, start, wanted, longest))
         except MemoryError:
             raise
         except Exception as error:  # noqa: BLE001  as above; the other groups may be complete
@@ -122,80 +119,45 @@ def _read(
         total += len(signal)
         if len(signal) < cycles:
             fault = fault or f"{cycles - len(signal)} of {cycles} frames are missing"
-        named.append((keys, buses))
-        parts.append(part)
     fault = fault or lost_records(mdf, content.getvalue())
-    if parts:
-        yield from _in_order(parts, total)
-    elif fault:
+    if fault and not parts:
         raise unreadable(path, fault)
-    # Counted last: the frames are needed first.
-    yield LogSummary(_counted(named), errors, fault)
+    seen: dict[tuple[BusName, int], int] = {}
+    if parts:
+        codes, t, key, bus, length, data = (np.concatenate(column) for column in zip(*parts, strict=True))
+        numbers, places = np.unique(bus, return_inverse=True)
+        buses = tuple(None if number == NO_BUS else number for number in numbers.tolist())
+        order = np.argsort(t, kind="stable")
+        for first in range(0, max(1, t.size), CHUNK_FRAMES):
+            rows = order[first : first + CHUNK_FRAMES]
+            yield Raw(t[rows], key[rows], places[rows], length[rows], data[rows], buses, 0 if first else total)
+        # Counted last: the frames are needed first.
+        for code, count in zip(*(column.tolist() for column in np.unique(codes, return_counts=True)), strict=True):
+            number = code >> 32
+            seen[None if number == NO_BUS else number, code & 0xFFFFFFFF] = count
+    yield LogSummary(seen, errors, fault)
 
 
-def _in_order(parts: list[Raw], total: int) -> Iterator[Raw]:
-    """Yield the frames of all groups in order of time, some thousands at once."""
-    buses = tuple(dict.fromkeys(bus for part in parts for bus in part.buses))
-    places = [np.array([buses.index(bus) for bus in part.buses], np.int64)[part.bus] for part in parts]
-    t, key, length, data = (np.concatenate([part[k] for part in parts]) for k in (0, 1, 3, 4))
-    bus = np.concatenate(places)
-    order = np.argsort(t, kind="stable")
-    for first in range(0, max(1, t.size), CHUNK_FRAMES):
-        rows = order[first : first + CHUNK_FRAMES]
-        yield Raw(t[rows], key[rows], bus[rows], length[rows], data[rows], buses, 0 if first else total)
+NO_BUS = -1
+"""Number of the bus of a group without bus numbers."""
 
 
-def _field(signal: Any, name: str) -> np.ndarray | None:
-    full = f"CAN_DataFrame.{name}"
-    return np.asarray(signal.samples[full]) if full in signal.samples.dtype.names else None
+def _columns(signal: Any, start: int, wanted: frozenset[int] | None, longest: int) -> tuple[np.ndarray, ...]:
+    """Return bus and id of all frames of a group as one number, and the columns of the wanted frames as in `Raw`."""
 
+    def column(name: str) -> np.ndarray | None:
+        full = f"CAN_DataFrame.{name}"
+        return np.asarray(signal.samples[full]) if full in signal.samples.dtype.names else None
 
-def _names(signal: Any) -> tuple[np.ndarray, np.ndarray | None]:
-    """Return the ids of a group's frames, and their buses if it has them."""
-    ids = np.asarray(_field(signal, "ID"), np.int64)
-    keys = (ids & 0x1FFFFFFF) | (ids & EXTENDED)
-    extended = _field(signal, "IDE")
+    ids = np.asarray(column("ID"), np.int64)
+    key = (ids & 0x1FFFFFFF) | (ids & EXTENDED)
+    extended, buses = column("IDE"), column("BusChannel")
     if extended is not None:
-        keys |= np.where(np.asarray(extended, np.int64) != 0, EXTENDED, 0)
-    buses = _field(signal, "BusChannel")
-    return keys, None if buses is None else np.asarray(buses, np.int64)
-
-
-def _counted(named: list[tuple[np.ndarray, np.ndarray | None]]) -> dict[tuple[BusName, int], int]:
-    seen: Counter[tuple[BusName, int]] = Counter()
-    for keys, buses in named:
-        numbers = np.zeros(keys.size, np.int64) if buses is None else buses
-        for number in np.unique(numbers):
-            found, counts = np.unique(keys[numbers == number], return_counts=True)
-            bus = None if buses is None else int(number)
-            for key, count in zip(found.tolist(), counts.tolist(), strict=True):
-                seen[bus, key] += count
-    return dict(seen)
-
-
-def _wanted(
-    signal: Any,
-    keys: np.ndarray,
-    buses: np.ndarray | None,
-    start: int,
-    wanted: frozenset[int] | None,
-    longest: int,
-) -> Raw:
-    """Return the wanted frames of one group."""
-    if wanted is None:
-        rows = np.arange(keys.size)
-    else:
-        picked = np.zeros(keys.size, np.bool_)
-        for key in wanted:
-            picked |= keys == key
-        rows = np.flatnonzero(picked)
-    names: tuple[BusName, ...] = (None,)
-    places = np.zeros(rows.size, np.int64)
-    if buses is not None:
-        numbers, places = np.unique(buses[rows], return_inverse=True)
-        names = tuple(numbers.tolist())
+        key |= np.where(np.asarray(extended, np.int64) != 0, EXTENDED, 0)
+    bus = np.full(key.size, NO_BUS) if buses is None else np.asarray(buses, np.int64)
+    rows = np.arange(key.size) if wanted is None else np.flatnonzero(np.isin(key, list(wanted)))
     data = np.zeros((rows.size, longest), np.uint8)
-    given = np.asarray(_field(signal, "DataBytes"))
+    given = np.asarray(column("DataBytes"))
     if given.ndim == 2:
         given = given[rows, :longest]
         data[:, : given.shape[1]] = given
@@ -203,11 +165,11 @@ def _wanted(
         for i, row in enumerate(rows):
             item = np.frombuffer(bytes(given[row]), np.uint8)[:longest]
             data[i, : item.size] = item
-    length = np.minimum(np.asarray(_field(signal, "DataLength"), np.int64)[rows], longest)
+    length = np.minimum(np.asarray(column("DataLength"), np.int64)[rows], longest)
     # Bytes stored after a frame's end are not part of it.
     data[np.arange(longest) >= length[:, None]] = 0
     t = start + np.round(np.asarray(signal.timestamps, np.float64)[rows] * 1e9).astype(np.int64)
-    return Raw(t, keys[rows], places, length, data, names, len(signal))
+    return (bus << 32) + key, t, key[rows], bus[rows], length, data
 
 
 VLSD = 1  # Flag of a channel group whose records are of varying length

@@ -4,20 +4,13 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import viser
 
 from app.present.drawing.colors import ESTIMATE, LIGHT, gradient
 from app.views.viser.machine_scenes import HEIGHT, BatteryScene, MotorScene, mesh, sectors
-from app.views.viser.stage import choices_of
+from app.views.viser.stage import NO_AXIS, Choice, Choices, choices_of
 from config.schema import SceneSection, ViewSection
+from estimators.errors import ConfigError
 from estimators.models import MODELS
-
-
-@pytest.fixture(scope="module")
-def server():
-    server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
-    yield server
-    server.stop()
 
 
 def volume(vertices, faces):
@@ -102,3 +95,44 @@ def test_every_twin_has_the_belief_beside_its_picture():
 def test_a_picture_that_lacks_something_is_refused(fields):
     with pytest.raises(ValueError, match="has no|has not as many"):
         SceneSection(**fields)
+
+
+STATES = ("a", "b", "c")
+
+
+@pytest.fixture
+def choices():
+    return Choices([
+        Choice("show", "Show", ("motor", "belief"), "motor"),
+        Choice("x", "x", STATES, "a", "belief"), Choice("y", "y", STATES, "b", "belief"),
+        Choice("z", "z", (*STATES, NO_AXIS), "none", "belief"),
+        Choice("single", "Single", ("one",), "one"),
+    ])  # fmt: skip
+
+
+def test_only_what_there_is_to_choose_is_offered(choices):
+    assert [item["key"] for item in choices.json()] == ["show"]
+    choices.choose("show", "belief")
+    assert [(item["key"], item["value"]) for item in choices.json()] == [
+        ("show", "belief"), ("x", "a"), ("y", "b"), ("z", "none"),
+    ]  # fmt: skip
+
+
+def test_two_axes_never_have_the_same_state(choices):
+    choices.choose("x", "b")
+    assert [choices.values()[axis] for axis in "xyz"] == ["b", "a", "none"]
+    choices.choose("z", "c")
+    choices.choose("y", "c")
+    assert [choices.values()[axis] for axis in "xyz"] == ["b", "c", "a"]
+    # There is nothing that x could have instead.
+    choices.choose("z", "none")
+    with pytest.raises(ConfigError, match="b is on the x axis already"):
+        choices.choose("z", "b")
+
+
+@pytest.mark.parametrize(("key", "value", "said"), [("w", "a", "no choice 'w'"), ("x", "d", "x is 'd'; it must be")])
+def test_what_there_is_not_is_refused(choices, key, value, said):
+    before = choices.values()
+    with pytest.raises(ConfigError, match=said):
+        choices.choose(key, value)
+    assert choices.values() == before

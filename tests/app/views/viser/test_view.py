@@ -83,7 +83,7 @@ def edit(handle, value):
 
 
 @pytest.fixture(scope="module")
-def server():
+def guarded():
     server = guarded_server("s3cret", "test")
     yield server
     server.stop()
@@ -98,19 +98,19 @@ def get(port, path="/", **headers):
     return response.status, body
 
 
-def test_page_needs_the_secret(server):
-    port = server.get_port()
+def test_page_needs_the_secret(guarded):
+    port = guarded.get_port()
     status, body = get(port, **{HEADER: "s3cret"})
     assert status == 200 and b"<html" in body.lower()
     for headers in ({}, {HEADER: ""}, {HEADER: "s3cre"}, {HEADER: "s3crets"}, {HEADER: "S3CRET"}):
         assert get(port, **headers)[0] == 403
 
 
-def test_upgrade_without_the_secret_is_refused_on_the_wire(server):
+def test_upgrade_without_the_secret_is_refused_on_the_wire(guarded):
     """A raw socket: neither a missing header nor a header given twice opens a WebSocket."""
     key = base64.b64encode(os.urandom(16)).decode()
     for extra in ("", f"{HEADER}: wrong\r\n", f"{HEADER}: s3cret\r\n{HEADER}: wrong\r\n"):
-        with socket.create_connection(("127.0.0.1", server.get_port()), timeout=30) as raw:
+        with socket.create_connection(("127.0.0.1", guarded.get_port()), timeout=30) as raw:
             raw.sendall(
                 f"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n{extra}"
                 f"Sec-WebSocket-Key: {key}\r\nSec-WebSocket-Version: 13\r\n"
@@ -119,10 +119,10 @@ def test_upgrade_without_the_secret_is_refused_on_the_wire(server):
             assert raw.recv(64).startswith(b"HTTP/1.1 403")
 
 
-def test_serve_is_restored_and_the_tunnel_gone(server):
+def test_serve_is_restored_and_the_tunnel_gone(guarded):
     assert websockets.asyncio.server.serve.__module__.startswith("websockets")
-    assert _messages.ShareUrlRequest not in server._websock_server._incoming_handlers
-    with socket.create_connection(("127.0.0.1", server.get_port())) as raw:
+    assert _messages.ShareUrlRequest not in guarded._websock_server._incoming_handlers
+    with socket.create_connection(("127.0.0.1", guarded.get_port())) as raw:
         assert raw.getpeername()[0] == "127.0.0.1"
 
 
@@ -344,54 +344,48 @@ def test_peaks_are_marked_with_their_weights_while_there_are_several(view, engin
     assert not (first.visible or second.visible)
 
 
-def test_vehicle_scene_stands_at_the_heaviest_peak_among_its_walls():
-    server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
-    try:
-        walls = (((-5.0, -1.0), (5.0, -1.0), (5.0, 1.0)),)
-        section = SceneSection(kind="vehicle", position=("east", "north"), heading="heading", walls=walls)
-        scene = VehicleScene(server.scene, MODELS["agv_corridor"], section, LIGHT)
-        peaks = (Peak(0.7, np.array([4.0, 0.5, 0.0]), 0.01 * np.eye(3)), Peak(0.3, -np.ones(3), 0.01 * np.eye(3)))
-        cloud = np.array([[4.0, 0.5, 0.0], [-1.0, -1.0, -1.0], [np.nan, 0.0, 0.0]])
-        belief = SimpleNamespace(mean=np.array([2.5, 0.0, -0.3]), cov=np.eye(3), points=cloud, peaks=peaks)
-        rows = History(3, 4, 16)
-        rows.n = 1
-        scene.draw(rows, belief)
-        assert tuple(scene._vehicle.position[:2]) == (4.0, 0.5)
-        assert scene._cloud.visible and scene._cloud.points.shape == (2, 3)
-        assert [label.text for _, label in scene._marks.handles if label.visible] == ["70 % drawn", "30 %"]
-        scene.draw(rows, SimpleNamespace(**{**vars(belief), "peaks": peaks[:1]}))
-        assert tuple(scene._vehicle.position[:2]) == (2.5, 0.0)
-        assert not any(label.visible for _, label in scene._marks.handles)
-    finally:
-        server.stop()
+def test_vehicle_scene_stands_at_the_heaviest_peak_among_its_walls(server):
+    walls = (((-5.0, -1.0), (5.0, -1.0), (5.0, 1.0)),)
+    section = SceneSection(kind="vehicle", position=("east", "north"), heading="heading", walls=walls)
+    scene = VehicleScene(server.scene, MODELS["agv_corridor"], section, LIGHT)
+    peaks = (Peak(0.7, np.array([4.0, 0.5, 0.0]), 0.01 * np.eye(3)), Peak(0.3, -np.ones(3), 0.01 * np.eye(3)))
+    cloud = np.array([[4.0, 0.5, 0.0], [-1.0, -1.0, -1.0], [np.nan, 0.0, 0.0]])
+    belief = SimpleNamespace(mean=np.array([2.5, 0.0, -0.3]), cov=np.eye(3), points=cloud, peaks=peaks)
+    rows = History(3, 4, 16)
+    rows.n = 1
+    scene.draw(rows, belief)
+    assert tuple(scene._vehicle.position[:2]) == (4.0, 0.5)
+    assert scene._cloud.visible and scene._cloud.points.shape == (2, 3)
+    assert [label.text for _, label in scene._marks.handles if label.visible] == ["70 % drawn", "30 %"]
+    scene.draw(rows, SimpleNamespace(**{**vars(belief), "peaks": peaks[:1]}))
+    assert tuple(scene._vehicle.position[:2]) == (2.5, 0.0)
+    assert not any(label.visible for _, label in scene._marks.handles)
+    scene.root.remove()
 
 
-def test_the_first_view_holds_all_walls_and_stays_until_it_is_to_follow():
-    server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
-    try:
-        walls = (((80.0, -3.0), (140.0, -3.0), (140.0, 45.0)), ((90.0, 0.0), (80.0, 1.0)))
-        section = SceneSection(kind="vehicle", position=("east", "north"), heading="heading", walls=walls)
-        scene = VehicleScene(server.scene, MODELS["agv_corridor"], section, LIGHT)
-        np.testing.assert_allclose(scene.world.position, [-110.0, -21.0, 0.0])
-        # What a camera is to see are the walls, about their middle (test_numbers.py: it then sees them).
-        corners = scene.outlook.points[:5, :2] - scene.world.position[:2]
-        np.testing.assert_allclose(corners, [corner for line in walls for corner in line])
-        rows = History(3, 4, 16)
-        rows.n = 1
-        cov = 0.01 * np.eye(3)
-        belief = SimpleNamespace(mean=np.array([135.0, 1.0, 0.0]), cov=cov, points=np.zeros((0, 3)), peaks=())
+def test_the_first_view_holds_all_walls_and_stays_until_it_is_to_follow(server):
+    walls = (((80.0, -3.0), (140.0, -3.0), (140.0, 45.0)), ((90.0, 0.0), (80.0, 1.0)))
+    section = SceneSection(kind="vehicle", position=("east", "north"), heading="heading", walls=walls)
+    scene = VehicleScene(server.scene, MODELS["agv_corridor"], section, LIGHT)
+    np.testing.assert_allclose(scene.world.position, [-110.0, -21.0, 0.0])
+    # What a camera is to see are the walls, about their middle (test_numbers.py: it then sees them).
+    corners = scene.outlook.points[:5, :2] - scene.world.position[:2]
+    np.testing.assert_allclose(corners, [corner for line in walls for corner in line])
+    rows = History(3, 4, 16)
+    rows.n = 1
+    cov = 0.01 * np.eye(3)
+    belief = SimpleNamespace(mean=np.array([135.0, 1.0, 0.0]), cov=cov, points=np.zeros((0, 3)), peaks=())
+    scene.draw(rows, belief)
+    np.testing.assert_allclose(scene.world.position, [-110.0, -21.0, 0.0])
+    scene.follow = True
+    for _ in range(40):
         scene.draw(rows, belief)
-        np.testing.assert_allclose(scene.world.position, [-110.0, -21.0, 0.0])
-        scene.follow = True
-        for _ in range(40):
-            scene.draw(rows, belief)
-        np.testing.assert_allclose(scene.world.position, [-135.0, -1.0, 0.0], atol=0.01)
-        scene.follow = False
-        for _ in range(40):
-            scene.draw(rows, belief)
-        np.testing.assert_allclose(scene.world.position, [-110.0, -21.0, 0.0], atol=0.01)
-    finally:
-        server.stop()
+    np.testing.assert_allclose(scene.world.position, [-135.0, -1.0, 0.0], atol=0.01)
+    scene.follow = False
+    for _ in range(40):
+        scene.draw(rows, belief)
+    np.testing.assert_allclose(scene.world.position, [-110.0, -21.0, 0.0], atol=0.01)
+    scene.root.remove()
 
 
 def test_vehicle_scene_keeps_the_vehicle_in_the_middle():
