@@ -37,7 +37,7 @@ def live_source(twin: Twin, speed: float | None = None) -> Callable[[Callable[[s
     The faults that were injected last when a bus is opened again. `speed` is that which the twin's YAML says unless it
     is given.
     """
-    faults, times = twin.faults(), twin.config.view.speed if speed is None else speed
+    faults, times = twin.plan.faults(), twin.config.view.speed if speed is None else speed
     return lambda report: twin.open_source(remarking(report), speed=times, faults=faults)
 
 

@@ -332,7 +332,7 @@ class Engine(Running):
         estimator, tuning = twin.estimator, twin.tuning
         if not exact:
             estimator, tuning = merged(self.twin, twin, self.estimator, self.tuning)
-        self.twin, self.model, self._policy = twin, twin.model, twin.policy
+        self.twin, self.model, self.policy = twin, twin.model, twin.policy
         self.reloads += 1
         self.revisions.why = why
         # The options of the YAML count again.

@@ -1,7 +1,8 @@
-"""Isolate the most likely faulty sensor, input or parameter behind each open episode of the running twin.
+"""Jobs that fold the last events again to assess faults: root causes of open episodes, and protection levels.
 
-Sensor, input and parameter faults may look alike. Each is refolded with the last events, as a background job: soon
-after an episode has begun, and again whenever it lasts twice as long.
+Sensor, input and parameter faults may look alike, so each is refolded: soon after an episode has begun, and again
+whenever it lasts twice as long. Protection levels say how large an undetectable error of each state may be; those of a
+new revision are computed soon, those of one that goes on now and then (estimators/diagnostics/sensitivity).
 """
 
 from __future__ import annotations

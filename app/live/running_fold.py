@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from estimators.diagnostics.episodes import Episode
-from estimators.diagnostics.health import HealthPolicy
 from estimators.errors import EstimatorError
 from estimators.fold import Fold
 from estimators.log import READING, Events, Log
@@ -83,7 +82,7 @@ class Running(ABC):
         self.twin = twin
         self.model = twin.model
         self.pairs = twin.pairs
-        self._policy = twin.policy
+        self.policy = twin.policy
         self._history = max(2 * SPARSE_EVERY, twin.config.history)
         self.estimator, self.tuning = twin.estimator, twin.tuning
         self._lock = FairLock()
@@ -115,11 +114,6 @@ class Running(ABC):
                 self._lock.release()
 
     # From any thread
-
-    @property
-    def policy(self) -> HealthPolicy:
-        """Rules of the health."""
-        return self._policy
 
     def cursor(self, *, follows_log: bool = False, span: int | None = None) -> Cursor:
         """Return a cursor of one consumer for `pull`, to be given back with `release`; for the options see `Cursor`."""
@@ -321,7 +315,7 @@ class Running(ABC):
             tuning,
             log,
             pairs=self.pairs,
-            policy=self._policy,
+            policy=self.policy,
             base=base,
             picture=period,
             expected=self.twin.expected,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections import deque
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
@@ -155,29 +156,23 @@ class HostClock:
 
 
 LATENCIES = 4096
+"""Measurements of which the latency is kept."""
 
 
 class Latency:
-    """Recent times from arrival to row."""
+    """Recent times from arrival to row, ms."""
 
     def __init__(self) -> None:
-        self._ms = np.zeros(LATENCIES)
-        self._n = 0
+        self._recent: deque[float] = deque(maxlen=LATENCIES)
 
     def note(self, batch: Events) -> None:
         """Note a batch that was folded."""
-        arrivals = batch.arrival[batch.kind == READING]
-        if not arrivals.size:
-            return
-        took = (time.time_ns() - arrivals[-LATENCIES:]) * 1e-6
-        at = (self._n + np.arange(took.size)) % LATENCIES
-        self._ms[at] = took
-        self._n += took.size
+        arrivals = batch.arrival[batch.kind == READING][-LATENCIES:]
+        self._recent.extend(((time.time_ns() - arrivals) * 1e-6).tolist())
 
     def percentile(self, percent: float) -> float | None:
         """Return a percentile, ms; None while there is none."""
-        count = min(self._n, LATENCIES)
-        return float(np.percentile(self._ms[:count], percent)) if count else None
+        return float(np.percentile(self._recent.copy(), percent)) if self._recent else None
 
 
 class SilentSource:
@@ -187,30 +182,30 @@ class SilentSource:
         """`stale_after`: seconds without an event after which a live source is stale; `clock` returns seconds."""
         self._notices, self._after, self._clock = notices, stale_after, clock
         self._since = clock()
-        self._told = False
+        self._reported = False
 
     @property
     def health(self) -> int:
         """Waiting, or stale."""
-        return STALE if self._told else WAITING
+        return STALE if self._reported else WAITING
 
     @property
     def cause(self) -> str:
         """Reason why the twin is stale, or "" while it waits."""
-        if not self._told:
+        if not self._reported:
             return ""
         return f"nothing has come since the twin started, {self._clock() - self._since:.0f} s ago; check the source"
 
     def look(self, *, live: bool) -> None:
         """Report a live source without events, once it is stale; a recording may be paused."""
-        if live and not self._told and self._clock() - self._since > self._after:
-            self._told = True
+        if live and not self._reported and self._clock() - self._since > self._after:
+            self._reported = True
             text = f"stale: nothing has come since the twin started, {self._after:g} s ago; check the source"
             self._notices.say(text, level="warn")
 
     def broken(self) -> None:
         """Note that the first event has arrived."""
-        if self._told:
-            self._told = False
+        if self._reported:
+            self._reported = False
             silent = self._clock() - self._since
             self._notices.say(f"the source speaks, {silent:.0f} s after the twin started")

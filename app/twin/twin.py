@@ -161,10 +161,6 @@ class Twin:
         """Return the YAML's options of an estimator; choices as their numbers."""
         return _options(self.config, estimator)
 
-    def faults(self) -> Faults:
-        """Return a new layer of faults for `open_source`, with those of the YAML."""
-        return self.plan.faults()
-
     def open_source(
         self, report: Report, *, live: bool = True, speed: float | None = None, faults: Faults | None = None
     ) -> Source:
@@ -174,7 +170,7 @@ class Twin:
             report: Called as report(key, text) for counted events, from the source's thread.
             live: False asks for events that end: a recording in place of a bus.
             speed: Times real time, for a source that is not live; None is as fast as it is read.
-            faults: A layer of `faults`, for a source that is opened again; None makes one.
+            faults: A layer of `plan.faults`, for a source that is opened again; None makes one.
 
         Raises:
             SourceError: If it cannot be opened, with the remedy.

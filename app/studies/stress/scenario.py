@@ -104,7 +104,7 @@ def plain_log(twin: Twin, seed: int, duration: float) -> Events:
         SourceError: If the source cannot be opened, or has no events.
     """
     asset = asset_of(twin, seed)
-    source = FaultySource(asset, twin.faults()) if asset is not None else twin.open_source(_ignore, live=False)
+    source = FaultySource(asset, twin.plan.faults()) if asset is not None else twin.open_source(_ignore, live=False)
     return _read(source, twin.model.width, duration)
 
 

@@ -18,11 +18,11 @@ if TYPE_CHECKING:
     from sources.simulator import Profile, Simulator
     from sources.source import Source
 
-MOST_EVENTS = 1e8
+MAX_SIMULATED_EVENTS = 1e8
 """The most events that a simulation may produce; it makes some ten thousand a second."""
 
-WITHOUT_END = 100.0
-"""Seconds within which one without end may make that many."""
+ENDLESS_SPAN_S = 100.0
+"""Seconds within which a simulation without end may produce that many."""
 
 
 def make_asset(loaded: Loaded, model: StateSpaceModel, section: AssetSection, key: Key) -> Simulator:
@@ -81,12 +81,12 @@ def check_asset(loaded: Loaded, section: AssetSection, key: Key, model: StateSpa
 def _check_length(loaded: Loaded, section: AssetSection, key: Key, model: StateSpaceModel) -> None:
     """Refuse a simulation that would not end, or not get on, in a person's time."""
     step, duration = section.step, section.duration
-    seconds = max(WITHOUT_END, step) if duration is None else max(duration, step)
+    seconds = max(ENDLESS_SPAN_S, step) if duration is None else max(duration, step)
     plans = [section.sensors.get(sensor.name) for sensor in model.sensors]
     readings = sum(1.0 / (plan.every if plan else 1) for plan in plans)
     runs = max(1.0, step / model.max_step)
     count = seconds / step * max(runs, readings)
-    if count <= MOST_EVENTS:
+    if count <= MAX_SIMULATED_EVENTS:
         return
     other = dotted((*key, "duration"))
     if duration is None:
@@ -98,7 +98,7 @@ def _check_length(loaded: Loaded, section: AssetSection, key: Key, model: StateS
     raise loaded.error(
         (*key, name),
         f"is {value:g} s; the simulator would make {count:.3g} {'steps of f' if runs > readings else 'events'} in "
-        f"{seconds:g} s, and may make {MOST_EVENTS:.0e}; {remedy}",
+        f"{seconds:g} s, and may make {MAX_SIMULATED_EVENTS:.0e}; {remedy}",
     )
 
 

@@ -150,7 +150,7 @@ class Running(Stepped):
             log = Log(self.twin.model.width)
             log.extend(self.events)
             tuning = self.twin.tuning.with_options(self.twin.options_of(name))
-            fold = Fold(name, self.twin.model, tuning, log, pairs=self.twin.pairs, policy=self.engine._policy)
+            fold = Fold(name, self.twin.model, tuning, log, pairs=self.twin.pairs, policy=self.engine.policy)
             fold.advance()
             self.cold[name] = fold.track
         return self.cold[name]
