@@ -174,17 +174,6 @@ def maintained_states(what: str, states: Sequence[str], model: StateSpaceModel) 
     return sorted(model.state_names.index(name) for name in states)
 
 
-def playback_status(source: Source) -> dict[str, Any]:
-    """Return the fields of a status that follow from the source: paused, speed, seekable, span (ns)."""
-    paced = controls_of(source)
-    return {
-        "paused": paced is not None and paced.paused,
-        "speed": paced.speed if paced is not None else None,
-        "seekable": paced is not None,
-        "span": span_of(source),
-    }
-
-
 def playback(source: Source, command: Any, first: int) -> Callable[[], Any]:
     """Check one of `PLAYBACK`, and return what carries it out; `first` is the time of the first event, ns.
 

@@ -26,17 +26,6 @@ class Faulty(Protocol):
     faults: Faults
 
 
-def faults_of(source: Source) -> Faults:
-    """Return the fault layer of a running source.
-
-    Raises:
-        ConfigError: If it has none: a recording that is reviewed.
-    """
-    if not isinstance(source, Faulty):
-        raise ConfigError("this is the review of a recording; faults can be injected into a running source only")
-    return source.faults
-
-
 def fault_of(command: commands.InjectFault, model: StateSpaceModel) -> Fault:
     """Return the fault that a command asks for. A target is a sensor, an input or (of kind model) a parameter.
 
@@ -102,7 +91,9 @@ def prepared_fault(
     Raises:
         ConfigError: If the source cannot do it, with the reason.
     """
-    layer = faults_of(source)
+    if not isinstance(source, Faulty):
+        raise ConfigError("this is the review of a recording; faults can be injected into a running source only")
+    layer = source.faults
     if isinstance(command, commands.ClearFault):
         number = command.number
         if number is not None and number not in [item.number for item in layer.status()]:

@@ -16,10 +16,9 @@ from estimators.log import RESET, model_version_at
 from estimators.model.state_space import StateSpaceModel
 from estimators.registry import find_estimator
 from estimators.track import FAILED, GATED, USED
-from sources.source import Source
+from sources.source import Source, controls_of, span_of
 
 from .counts import RowCounts, last_run
-from .execute import playback_status
 from .faults import Faulty
 from .outputs import Status
 from .watchers import Watchers
@@ -33,8 +32,15 @@ def known_fields(model: StateSpaceModel, source: Source, **fields: Any) -> dict[
 
     `estimator` and `tuning` are the requested ones, which differ from the fold's while a refold is waited for.
     """
-    options = find_estimator(fields["estimator"], model).complete(dict(fields["tuning"].options))
-    return {**fields, "options": options, **playback_status(source)}
+    paced = controls_of(source)
+    return {
+        **fields,
+        "options": find_estimator(fields["estimator"], model).complete(dict(fields["tuning"].options)),
+        "paused": paced is not None and paced.paused,
+        "speed": paced.speed if paced is not None else None,
+        "seekable": paced is not None,
+        "span": span_of(source),
+    }
 
 
 def busy_status(last: Status, fields: Mapping[str, Any], busy: float) -> Status:

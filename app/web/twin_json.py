@@ -64,7 +64,12 @@ def status_json(engine: Running) -> dict[str, Any]:
             ],
         },
         # Protection levels beside 2 σ by state, their age, s, and why there are none.
-        "integrity": {} if levels is None else levels.bounds,
+        "integrity": {}
+        if levels is None
+        else {
+            name: {key: value for key, value in item._asdict().items() if key != "bias"}
+            for name, item in levels.bounds.items()
+        },
         "integrity_age": None if levels is None else levels.age(status.t),
         "integrity_note": "not computed yet" if levels is None else levels.reason,
     }

@@ -10,6 +10,7 @@ import numpy as np
 
 from estimators.diagnostics.score import Score, score
 from estimators.errors import NisusError
+from estimators.fold import Fold
 
 from ..history_copy import copy_rows
 from ..outputs import Pull
@@ -96,12 +97,23 @@ def _step_us(engine: Running, run: Revision) -> float:
     if part is None:
         return np.nan
     try:
-        fold = part.fold(run.estimator, run.tuning, engine.policy)
-        fold.advance(min(WARM_UP_EVENTS, fold.log.n // 2))
-        events, begun = 0, time.perf_counter()
-        while (done := fold.advance(WARM_UP_EVENTS)) and time.perf_counter() - begun < MAX_TIMING_S:
-            events += done
-        seconds = time.perf_counter() - begun
+        return 1e6 * seconds_per_event(
+            part.fold(run.estimator, run.tuning, engine.policy), WARM_UP_EVENTS, MAX_TIMING_S
+        )
     except NisusError:
         return np.nan
-    return 1e6 * seconds / (events + done) if events + done else np.nan
+
+
+def seconds_per_event(fold: Fold, chunk: int, budget: float = 0.0) -> float:
+    """Return the elapsed time of an event of a new fold, s; NaN without events.
+
+    Args:
+        fold: At its start; the first `chunk` events, half of all at most, are not timed.
+        chunk: Events that are folded at once.
+        budget: Seconds after which no other chunk begins.
+    """
+    fold.advance(min(chunk, fold.log.n // 2))
+    events, begun, seconds = 0, time.perf_counter(), 0.0
+    while (not events or seconds < budget) and (done := fold.advance(chunk)):
+        events, seconds = events + done, time.perf_counter() - begun
+    return seconds / events if events else np.nan

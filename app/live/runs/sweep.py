@@ -6,7 +6,6 @@ A job folds the events, one value after another, the nearest first, and ends as 
 from __future__ import annotations
 
 import threading
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -22,6 +21,7 @@ from ..history_copy import END_OF_TIME
 from ..jobs import Job, JobCancelled
 from ..outputs import EventWindow
 from ..running_fold import Running
+from .scores import seconds_per_event
 
 FACTORS = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0)
 
@@ -247,11 +247,7 @@ class Sweeps:
         """Return how many events can be folded in reasonable time, or the reason why none."""
         if self._engine.model.black_box:
             return 0, f"{self._engine.model.name} is a black box, too slow to be folded again beside what runs"
-        fold = taken.fold(policy=self._engine.policy)
-        fold.advance(min(TIMED_EVENTS, fold.log.n // 2))
-        start = time.perf_counter()
-        events = fold.advance(TIMED_EVENTS)
-        each = (time.perf_counter() - start) / max(1, events)
+        each = seconds_per_event(taken.fold(policy=self._engine.policy), TIMED_EVENTS)
         if each * len(taken.events) > MAX_VALUE_TIME_S:
             slow = f"{taken.estimator} takes {each * MIN_SWEEP_EVENTS:.0f} s for {MIN_SWEEP_EVENTS} events"
             return 0, f"{slow}, too slow to be folded again"

@@ -50,7 +50,7 @@ def tuning_yaml(
     known = {item.name: item.value for item in model.parameters}
     # How long errors last stands beside their size. Of parameters that are estimated the tuning has none.
     lasting = {name: section.over for name, section in config.noise.items() if section.over is not None}
-    erring = [sensor for sensor in model.sensors if _errs(config, sensor.name)]
+    erring = [sensor for sensor in model.sensors if sensor.name in config.sensors and config.sensors[sensor.name].error]
     times = {*map(disturbance_time, lasting), *(error_time(sensor.name) for sensor in erring)}
     turned = {name: value for name, value in values.items() if name in config.parameters or value != known[name]}
     turned = {**config.parameters, **turned} if whole else values
@@ -66,13 +66,12 @@ def tuning_yaml(
         {name: {"variance": _within(q, ranges.get(f"Q.{name}")), **over.get(name, {})} for name, q in noises.items()},
     )
     lines += as_section("sensors", _sensors(config, tuning, errors, values, whole))
-    lines.append(f"gate: {as_flow(_gate(tuning))}")
+    gate: Any = tuning.gate
+    if gate is not None and (tuning.gate_kind != "hard" or tuning.reopen != REOPEN_S):
+        reopen = "never" if tuning.reopen is None else tuning.reopen
+        gate = {"probability": gate, "kind": tuning.gate_kind, "reopen": reopen}
+    lines.append(f"gate: {as_flow(gate)}")
     return "\n".join(lines) + "\n"
-
-
-def _errs(config: TwinSection, sensor: str) -> bool:
-    """Return whether a sensor has a coloured error."""
-    return sensor in config.sensors and config.sensors[sensor].error is not None
 
 
 def _sensors(
@@ -112,15 +111,6 @@ def _within(value: float | list[float], bounds: tuple[float, float] | None) -> A
     if bounds is None or not all(bounds[0] <= item <= bounds[1] for item in values):
         return value
     return {"value": value, "from": bounds[0], **({"to": bounds[1]} if bounds[1] < LARGEST else {})}
-
-
-def _gate(tuning: Tuning) -> Any:
-    if tuning.gate is None:
-        return None
-    if tuning.gate_kind == "hard" and tuning.reopen == REOPEN_S:
-        return tuning.gate
-    reopen = "never" if tuning.reopen is None else tuning.reopen
-    return {"probability": tuning.gate, "kind": tuning.gate_kind, "reopen": reopen}
 
 
 def _option(entry: Estimator, name: str, value: float) -> float | str:
