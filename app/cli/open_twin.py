@@ -20,7 +20,7 @@ from ..views.recording.rrd_file import NEVER, Split
 from ..web.gallery.api import GalleryApi
 from ..web.gallery.gallery import Gallery, Opener, SavedFiles, StartRequest
 from ..web.gallery.recordings import Recordings
-from ..web.running import Opening, stamp_of
+from ..web.running import OpenedTwin, stamp_of
 from ..web.session import Page, Session
 from .prepare import begin_to_compile, compile_for, prepare_model
 
@@ -43,7 +43,7 @@ def live_source(twin: Twin, speed: float | None = None) -> Callable[[Callable[[s
 
 def opened_twin(
     name: str, *, logs: Sequence[Path] = (), overrides: Mapping[str, str] | None = None, speed: float | None = None
-) -> Opening:
+) -> OpenedTwin:
     """A twin on its source, and how to read it again when its files were changed.
 
     Raises:
@@ -54,7 +54,7 @@ def opened_twin(
         return load_twin(name, log_files=logs or None, overrides=overrides)
 
     twin = read()
-    return Opening(twin, live_source(twin, speed), files=twin.files, stamp=stamp_of(twin.files), again=read)
+    return OpenedTwin(twin, live_source(twin, speed), files=twin.files, stamp=stamp_of(twin.files), again=read)
 
 
 def recorded_twin(recorded: Recorded) -> Twin:
@@ -68,7 +68,7 @@ def recorded_twin(recorded: Recorded) -> Twin:
     return replace(twin, tuning=tuning, estimator=estimator, recorded=True)
 
 
-def opened_review(path: Path) -> Opening:
+def opened_review(path: Path) -> OpenedTwin:
     """Open a recording to fold it again. Its model is not compiled yet.
 
     Raises:
@@ -85,7 +85,7 @@ def opened_review(path: Path) -> Opening:
     if not recorded.closed:
         cut = f"{path.name}: was not closed (killed, or full disk); it is reviewed up to its last complete row"
         remarks.append(("warn", cut))
-    return Opening(
+    return OpenedTwin(
         recorded_twin(recorded),
         open_source,
         base=recorded.base,
@@ -103,12 +103,12 @@ class FileOpener:
     """
 
     def __init__(
-        self, given: Mapping[str, Callable[[], Opening]] | None = None, workers: Sequence[Compiler] = ()
+        self, given: Mapping[str, Callable[[], OpenedTwin]] | None = None, workers: Sequence[Compiler] = ()
     ) -> None:
         self._given = dict(given or {})
         self._workers = workers
 
-    def open(self, wanted: StartRequest) -> Opening:
+    def open(self, wanted: StartRequest) -> OpenedTwin:
         """See `Opener`. A log is folded as fast as it can be: it is there to be looked at from its beginning."""
         if wanted.recording is not None:
             return opened_review(wanted.recording)
@@ -117,7 +117,7 @@ class FileOpener:
             return self._given[name]()
         return opened_twin(name, logs=wanted.logs, speed=math.inf if wanted.logs else None)
 
-    def made_ready(self, opening: Opening) -> Opening:
+    def made_ready(self, opening: OpenedTwin) -> OpenedTwin:
         """See `Opener`."""
         workers, self._workers = self._workers, ()
         workshop = begin_to_compile(opening.twin, workers)
@@ -135,7 +135,7 @@ class FileOpener:
 
 
 def open_session(
-    opening: Opening | None,
+    opening: OpenedTwin | None,
     wanted: StartRequest | None,
     opener: Opener,
     *,

@@ -85,11 +85,11 @@ def run_twin(arguments: Run, workers: Sequence[Compiler] = ()) -> int:
 
 
 if TYPE_CHECKING:
-    from ..web.running import Opening
+    from ..web.running import OpenedTwin
     from .arguments import Review
 
 
-def open_review(path: Path, page: Page | None, recordings: Path = Path()) -> tuple[Session, Opening]:
+def open_review(path: Path, page: Page | None, recordings: Path = Path()) -> tuple[Session, OpenedTwin]:
     """Return a session over a recording, and its opened twin.
 
     Raises:

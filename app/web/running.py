@@ -43,7 +43,7 @@ def stamp_of(files: tuple[Path, ...]) -> Stamp:
 
 
 @dataclass(frozen=True)
-class Opening:
+class OpenedTwin:
     """A twin and its source, ready to run, or a recording of one.
 
     `open_source`, `base` and `horizon` are those of `Engine`; `review` is the reviewed recording, `said` the notices of
@@ -68,7 +68,7 @@ class RunningTwin:
     """Starts the parts of a running twin in order, and stops them in reverse."""
 
     def __init__(
-        self, opening: Opening, *, door: Door | None, split: Split = NEVER, recordings: Path | None = None
+        self, opening: OpenedTwin, *, door: Door | None, split: Split = NEVER, recordings: Path | None = None
     ) -> None:
         """Put it together; nothing runs yet.
 

@@ -25,7 +25,7 @@ from ..live.commands import Record
 from ..terminal import EndRequest, complain, restore, when_asked_to_end
 from ..views.recording.rrd_file import NEVER, Split
 from .door import Door
-from .running import Opening, RunningTwin
+from .running import OpenedTwin, RunningTwin
 
 if TYPE_CHECKING:
     from sources.source import Source
@@ -92,7 +92,7 @@ class Session:
 
     def __init__(
         self,
-        twin: Twin | Opening | None,
+        twin: Twin | OpenedTwin | None,
         open_source: Callable[[Callable[[str, str], None]], Source] | None = None,
         *,
         page: Page | None,
@@ -103,7 +103,7 @@ class Session:
 
         Args:
             twin: First twin; None for the gallery alone.
-            open_source: Opens the source of a `twin` that is no `Opening`; see `Engine`.
+            open_source: Opens the source of a `twin` that is no `OpenedTwin`; see `Engine`.
             page: Port of the page; None for no page.
             split: Parts into which a recording is split.
             recordings: Folder of recordings made on the page; None is the working directory.
@@ -124,10 +124,10 @@ class Session:
         if page is not None:
             self.door = Door(page.port)
         try:
-            if isinstance(twin, Opening):
+            if isinstance(twin, OpenedTwin):
                 self.running = self.prepared(twin)
             elif twin is not None and open_source is not None:
-                self.running = self.prepared(Opening(twin, open_source))
+                self.running = self.prepared(OpenedTwin(twin, open_source))
         except BaseException:
             if self.door is not None:
                 self.door.stop()
@@ -169,7 +169,7 @@ class Session:
         running = self.running
         return [*self._recorded, *([] if running is None else running.recorder.written)]
 
-    def prepared(self, opening: Opening) -> RunningTwin:
+    def prepared(self, opening: OpenedTwin) -> RunningTwin:
         """Return a twin for `change`, put together but not started.
 
         Raises:

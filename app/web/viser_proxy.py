@@ -19,7 +19,7 @@ from .streams import serve
 
 RESPONSE_HEADERS = ("content-type", "content-encoding", "etag", "last-modified", "cache-control")
 REQUEST_HEADERS = ("accept", "accept-encoding", "if-none-match")
-HEAD = b"<head>"
+HTML_HEAD = b"<head>"
 SCRIPT = PAGE / "viser_frame.js"
 
 SCENE_ALONE = """<style>
@@ -55,7 +55,7 @@ class ViserProxy:
         if path == "/":
             # In the text, as a frame under another name may fetch no more.
             script = f"<script>{SCRIPT.read_text()}</script>" + (SCENE_ALONE if "scene" in request.query_params else "")
-            body = body.replace(HEAD, HEAD + script.encode(), 1)
+            body = body.replace(HTML_HEAD, HTML_HEAD + script.encode(), 1)
         answer = Response(body, status)
         for name, value in headers:
             if name.lower() in RESPONSE_HEADERS and not (path == "/" and name.lower() == "etag"):

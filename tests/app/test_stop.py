@@ -13,7 +13,7 @@ from app.concurrency import run_all
 from app.twin.twin import load_twin
 from app.views.recording.reader import finished, read_recording
 from app.views.recording.writer import RecordingPart
-from app.web.running import Opening, RunningTwin
+from app.web.running import OpenedTwin, RunningTwin
 from tests.app.scripted import row_count, wait_for
 from tests.conftest import ROOT
 
@@ -76,7 +76,7 @@ def test_what_fails_is_raised_once_all_are_done():
 
 def test_the_recording_is_closed_after_the_last_row_and_has_it(tmp_path, monkeypatch):
     twin, path = load_twin("motor_winding"), tmp_path / "run.rrd"
-    running = RunningTwin(Opening(twin, live_source(twin, 100.0)), door=None, recordings=tmp_path)
+    running = RunningTwin(OpenedTwin(twin, live_source(twin, 100.0)), door=None, recordings=tmp_path)
     order = []
 
     def end(part, *, short=False):

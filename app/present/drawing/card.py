@@ -20,7 +20,7 @@ from estimators.log import Events, Log
 from estimators.model.state_space import StateSpaceModel
 from estimators.track import Track
 
-from .colors import DEVIATION, ERROR, ESTIMATE, LIGHT, Kind, Scale, gradient, image_of
+from .colors import DEVIATION, ERROR, ESTIMATE, LIGHT, PictureKind, Scale, gradient, image_of
 from .plot import TrackSeries, draw_state, hex_color, new_figure
 
 if TYPE_CHECKING:
@@ -187,7 +187,7 @@ def _draw_maps(axes: Axes, pictures: Sequence[Picture]) -> None:
     axes.set_aspect("equal")
 
 
-def _draw_image(axes: Axes, values: np.ndarray, kind: Kind, extent: tuple[float, float, float, float]) -> None:
+def _draw_image(axes: Axes, values: np.ndarray, kind: PictureKind, extent: tuple[float, float, float, float]) -> None:
     step = -(-np.array(values.shape) // MAX_IMAGE_PIXELS)
     values = values[:: step[0], :: step[1]]
     scale = Scale(kind)

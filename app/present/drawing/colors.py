@@ -97,8 +97,8 @@ NORMAL_DOT, LARGE_DOT, EXTREME_DOT, UNKNOWN_DOT = (255, 255, 255), EITHER.readin
 RIM = (51, 65, 85)
 
 
-class Kind(NamedTuple):
-    """Kind of picture of a field: name, title, short title, colours from low to high."""
+class PictureKind(NamedTuple):
+    """PictureKind of picture of a field: name, title, short title, colours from low to high."""
 
     name: str
     title: str
@@ -106,18 +106,18 @@ class Kind(NamedTuple):
     colors: tuple[str, ...]
 
 
-ESTIMATE = Kind("estimate", "estimate", "estimate", WARM)
-DEVIATION = Kind("std", "standard deviation", "std", SPREAD)
-ERROR = Kind("error", "estimate − truth", "error", SIGNED)
-TRUE = Kind("truth", "truth", "truth", WARM)
+ESTIMATE = PictureKind("estimate", "estimate", "estimate", WARM)
+DEVIATION = PictureKind("std", "standard deviation", "std", SPREAD)
+ERROR = PictureKind("error", "estimate − truth", "error", SIGNED)
+TRUE = PictureKind("truth", "truth", "truth", WARM)
 
 
-def kinds(truth: bool) -> tuple[Kind, ...]:
+def kinds(truth: bool) -> tuple[PictureKind, ...]:
     """Return the kinds of pictures of a field."""
     return (ESTIMATE, DEVIATION, ERROR, TRUE) if truth else (ESTIMATE, DEVIATION)
 
 
-def image_of(picture: Picture, kind: Kind) -> np.ndarray | None:
+def image_of(picture: Picture, kind: PictureKind) -> np.ndarray | None:
     """Return the values (rows, columns) of a kind of picture, or None."""
     if kind is ERROR:
         return None if picture.mean is None or picture.truth is None else picture.mean - picture.truth
@@ -135,7 +135,7 @@ def gradient(colors: tuple[str, ...]) -> np.ndarray:
 class Scale:
     """Range of a colour scale: round numbers that change rarely."""
 
-    def __init__(self, kind: Kind) -> None:
+    def __init__(self, kind: PictureKind) -> None:
         self.kind = kind
         self.low, self.high, self.step = np.nan, np.nan, 1.0
 

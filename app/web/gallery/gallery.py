@@ -16,7 +16,7 @@ from estimators.errors import ConfigError, NisusError, nearest, quoted
 
 from ...live.changes import obstacle
 from ...twin.twin import VERSION, Twin, with_version
-from ..running import Opening, RunningTwin, Stamp, stamp_of
+from ..running import OpenedTwin, RunningTwin, Stamp, stamp_of
 from ..session import Session
 
 
@@ -40,14 +40,14 @@ class StartRequest:
 class Opener(Protocol):
     """Reads a requested twin from its files, and compiles it."""
 
-    def open(self, wanted: StartRequest) -> Opening:
+    def open(self, wanted: StartRequest) -> OpenedTwin:
         """Read it.
 
         Raises:
             NisusError: If a file is absent or wrong.
         """
 
-    def made_ready(self, opening: Opening) -> Opening:
+    def made_ready(self, opening: OpenedTwin) -> OpenedTwin:
         """Compile its model, and begin to compile its filters.
 
         Raises:
@@ -158,7 +158,7 @@ class Gallery:
         self.running = wanted
 
 
-def _reads_a_bus(opening: Opening) -> bool:
+def _reads_a_bus(opening: OpenedTwin) -> bool:
     return opening.review is None and opening.twin.config.source.type == "can" and opening.twin.plan.log_files is None
 
 

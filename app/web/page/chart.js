@@ -277,7 +277,7 @@ const axis = () => ({
 
 // Time axis
 
-const HALF = 24; // px that a label at the right end may take from the axis to its left
+const LABEL_OVERHANG_PX = 24; // px that a label at the right end may take from the axis to its left
 
 // Steps of a clock, s.
 const STEPS = [
@@ -291,7 +291,7 @@ function clocks(self, splits) {
   const step = splits.length > 1 ? splits[1] - splits[0] : 1;
   const fraction = step >= 1 ? 0 : Math.min(3, Math.ceil(-Math.log10(step)));
   // One at the very end would be cut off.
-  const last = self.posToVal((self.over.clientWidth || self.bbox.width / devicePixelRatio) + 10 - HALF, "x");
+  const last = self.posToVal((self.over.clientWidth || self.bbox.width / devicePixelRatio) + 10 - LABEL_OVERHANG_PX, "x");
   return splits.map((value) => (value > last ? "" : clock(value, fraction)));
 }
 

@@ -6,7 +6,7 @@ import { Pins, Previous, Smoothed, Strong } from "./layers.js";
 import { Stream } from "./stream.js";
 
 const DENSITY = 1.6; // px to a group of rows
-const QUIET = 500; // ms without a frame
+const REDRAW_AFTER_MS = 500; // ms without a frame
 const MAX_HALVINGS = 4; // of the window, while there is less than that to show
 
 export class Charts {
@@ -43,8 +43,8 @@ export class Charts {
       this.episodes = event.detail;
       clearTimeout(this.marking);
       // Of a twin that has ended, no frame follows.
-      if (performance.now() - this.drawnAt > QUIET) this.draw();
-      else this.marking = setTimeout(() => this.draw(), QUIET);
+      if (performance.now() - this.drawnAt > REDRAW_AFTER_MS) this.draw();
+      else this.marking = setTimeout(() => this.draw(), REDRAW_AFTER_MS);
     });
     link.addEventListener("status", (event) => this.update(event.detail));
     new ResizeObserver(() => this.ask()).observe(node);

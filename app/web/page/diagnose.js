@@ -5,7 +5,7 @@ import { element, setText } from "./dom.js";
 import { compact, spaced, span, words } from "./format.js";
 
 const AGAIN = 3000; // ms between two looks
-const FEW = 6; // rows that are all open
+const MAX_OPEN_ROWS = 6; // rows that are all open
 const LEANS = 0.1; // share of the readings in one half of the ranks, beyond a half of them
 const UNEVEN = 1.4; // of the outer ranks against the others
 const ORDER = ["bad", "unknown", "good"];
@@ -52,7 +52,7 @@ export class Diagnose {
     const but = good && ["above", "below"].includes(found.nis_place) ? `, but the mean NIS is ${found.nis_place} its bounds` : "";
     const left = found.rows_in_all > found.rows.length ? ` (the first of ${found.rows_in_all})` : "";
     const rows = [...found.rows].sort((a, b) => ORDER.indexOf(a.tone) - ORDER.indexOf(b.tone));
-    const open = (row) => this.turned.get(row.name) ?? (found.rows.length <= FEW || row.tone === "bad");
+    const open = (row) => this.turned.get(row.name) ?? (found.rows.length <= MAX_OPEN_ROWS || row.tone === "bad");
     const focused = this.node.contains(document.activeElement) ? document.activeElement.getAttribute("aria-label") : null;
     const cost = found.cost === null ? "" : ` ${compact(found.cost, 3)} µs per event.`;
     this.node.replaceChildren(

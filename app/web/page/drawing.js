@@ -101,7 +101,7 @@ export const aboutMean = (mean, values) => values.map((value, k) => (typeof valu
 // Episodes
 
 const STRIP = 2; // px
-const SHARE = 0.15; // of a chart, beyond which the tint of episodes fades; their strip stays
+const MAX_TINTED_SHARE = 0.15; // of a chart, beyond which the tint of episodes fades; their strip stays
 
 // Episodes between two times as stretches that do not overlap, [[from, to]], and the strength of their tint, up to 1.
 function stretches(episodes, [low, high]) {
@@ -116,7 +116,7 @@ function stretches(episodes, [low, high]) {
     else found.push([from, to]);
   }
   const covered = found.reduce((sum, [from, to]) => sum + to - from, 0);
-  return { found, strength: Math.min(1, (SHARE * (high - low)) / (covered || 1e-9)) };
+  return { found, strength: Math.min(1, (MAX_TINTED_SHARE * (high - low)) / (covered || 1e-9)) };
 }
 
 // Behind the curves of a chart: episodes, and the moment that is looked at.

@@ -4,7 +4,7 @@ import { $, setText } from "./dom.js";
 import { span } from "./format.js";
 import { ExploreStream, FOLLOWING, PAUSED, setTimeCursor, Viewer } from "./rerun.js";
 
-const LATE = 1; // s by which Rerun may be behind without a word
+const MAX_LAG_S = 1; // s by which Rerun may be behind without a word
 
 export class Explore {
   // page: {link, view, charts}, whose time it shares; heard(status): in a window of its own, which has no link
@@ -52,7 +52,7 @@ export class Explore {
     const { newest, drawn } = this.revisions;
     const late = drawn !== null && drawn !== undefined && newest !== null && drawn !== newest;
     const lag = this.time?.lag ?? 0;
-    const text = late ? `Rerun still shows revision ${drawn}; drawing ${newest} …` : lag > LATE ? `Rerun is ${span(lag)} behind` : "";
+    const text = late ? `Rerun still shows revision ${drawn}; drawing ${newest} …` : lag > MAX_LAG_S ? `Rerun is ${span(lag)} behind` : "";
     setText($("behind"), text);
     $("behind").hidden = !text;
     if (message.failed) this.note(`Rerun stopped: ${message.failed}. Reload the page.`);
@@ -68,8 +68,8 @@ export class Explore {
 // cursor, and what follows the newest row here follows it there.
 
 const TIMELINE = "time"; // on which Rerun's rows stand, ns
-const LOOK = 200; // ms between two looks at Rerun's cursor
-const PATIENCE = 2000; // ms in which Rerun's older cursor is not taken for a new one
+const CURSOR_POLL_MS = 200; // ms between two looks at Rerun's cursor
+const CURSOR_HOLD_MS = 2000; // ms in which Rerun's older cursor is not taken for a new one
 
 class ExploreTime {
   constructor(viewer, { link, view, charts }) {
@@ -81,7 +81,7 @@ class ExploreTime {
 
   // While somebody sees it.
   wake() {
-    this.timer ??= setInterval(() => this.look(), LOOK);
+    this.timer ??= setInterval(() => this.look(), CURSOR_POLL_MS);
     this.known = null;
   }
 
@@ -137,7 +137,7 @@ class ExploreTime {
     const asked = view.following ? this.end : this.origin + BigInt(Math.round(view.at * 1e9));
     const time = asked < this.end ? asked : this.end;
     const play = view.following ? FOLLOWING : PAUSED;
-    this.wanted = { time, play, until: performance.now() + PATIENCE };
+    this.wanted = { time, play, until: performance.now() + CURSOR_HOLD_MS };
     viewer.control(setTimeCursor(viewer.id, TIMELINE, time, play));
   }
 

@@ -6,7 +6,7 @@ import { compact, spaced, words } from "./format.js";
 
 const DECADES = 3; // powers of ten to either side of the configured value
 const STEPS = 1000;
-const PATIENCE = 2000; // ms after an edit in which the engine's older value does not snap the line back
+const EDIT_HOLD_MS = 2000; // ms after an edit in which the engine's older value does not snap the line back
 const TURN = 60; // ms between two values of a drag that are sent
 
 export class Knob {
@@ -93,7 +93,7 @@ export class Knob {
   sync(value) {
     if (typeof value !== "number") return;
     if (Math.abs(value - this.value) <= 1e-9 * Math.abs(value)) this.edited = 0;
-    else if (performance.now() - this.edited > PATIENCE && document.activeElement !== this.field) this.show(value);
+    else if (performance.now() - this.edited > EDIT_HOLD_MS && document.activeElement !== this.field) this.show(value);
   }
 
   show(value) {
@@ -167,8 +167,8 @@ export class Knob {
 // the values of R and Q that the innovations suggest.
 
 const [WIDTH, HEIGHT, EDGE] = [260, 64, 6]; // of the drawing
-const MOST = 3; // curves that stay open
-const LOOK = 300; // ms between two looks at whether something is wanted
+const MAX_OPEN_CURVES = 3; // curves that stay open
+const CURVE_POLL_MS = 300; // ms between two looks at whether something is wanted
 const AGAIN = 10_000; // ms between two looks at what the innovations say
 const SOON = 1000; // the same while it is being folded
 const DROPS = 3; // how many of the values nearest the optimum rule the height of the curve
@@ -185,7 +185,7 @@ export class Around {
       label.addEventListener("click", () => this.toggle(key));
       label.addEventListener("keydown", (event) => ["Enter", " "].includes(event.key) && (event.preventDefault(), event.stopPropagation(), this.toggle(key)));
     }
-    setInterval(() => link.connected && link.status.tuning && this.heard(link.status), LOOK);
+    setInterval(() => link.connected && link.status.tuning && this.heard(link.status), CURVE_POLL_MS);
   }
 
   toggle(key) {
@@ -204,7 +204,7 @@ export class Around {
   show(key) {
     if (this.open.has(key) || !this.tune.knobs.has(key)) return;
     const oldest = [...this.open.keys()][0];
-    if (this.open.size === MOST && this.below(oldest, key)) this.close(oldest);
+    if (this.open.size === MAX_OPEN_CURVES && this.below(oldest, key)) this.close(oldest);
     setAttribute(this.tune.knobs.get(key).node.querySelector("label"), "aria-expanded", "true");
     this.open.set(key, new Curve(this, key, this.tune.knobs.get(key)));
   }

@@ -94,7 +94,7 @@ export class Strong {
 
 // Each place has its own colour, and its own dash beside the colour.
 const DASHES = [[], [9, 3], [3, 2], [10, 3, 2, 3]];
-const REACH = 1; // spans of a chart's own by which pinned runs may widen its axis to either side
+const MAX_PIN_SPANS = 1; // spans of a chart's own by which pinned runs may widen its axis to either side
 
 // Pinned runs: their lines on each state's chart, and below the charts their difference from the running one. The head
 // of that chart is their legend.
@@ -200,7 +200,7 @@ export class Pins {
   // The axis of a state's chart, widened for them, but not by one that is far off.
   widened([low, high], state, span) {
     const [under, over] = this.extent("stream", state.name, span);
-    const reach = REACH * (high - low);
+    const reach = MAX_PIN_SPANS * (high - low);
     return [Math.min(low, Math.max(under, low - reach)), Math.max(high, Math.min(over, high + reach))];
   }
 

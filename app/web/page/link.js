@@ -3,8 +3,8 @@
 import { PageSocket } from "./socket.js";
 import { unpack } from "./stream.js";
 
-const QUIET = 1000; // ms without news after which the last status is told again
-const SETTLED = 700; // ms after the last edit or revision
+const STATUS_REPEAT_MS = 1000; // ms without news after which the last status is told again
+const SETTLED_AFTER_MS = 700; // ms after the last edit or revision
 
 // Events: "status", "episodes", "notices", "frames", "connection"; each with `detail`.
 export class Link extends EventTarget {
@@ -25,7 +25,7 @@ export class Link extends EventTarget {
       },
     });
     // A twin whose source has ended has no news, but ages and answers that are waited for go on.
-    setInterval(() => this.connected && this.told && performance.now() - this.told > QUIET && this.tell("status", this.status), QUIET);
+    setInterval(() => this.connected && this.told && performance.now() - this.told > STATUS_REPEAT_MS && this.tell("status", this.status), STATUS_REPEAT_MS);
     this.line.open();
   }
 
@@ -35,7 +35,7 @@ export class Link extends EventTarget {
 
   // Whether a drag is over: scores and likelihood curves are not computed for every value on the way.
   get settled() {
-    return performance.now() - this.turned > SETTLED;
+    return performance.now() - this.turned > SETTLED_AFTER_MS;
   }
 
   say(message) {

@@ -4,7 +4,7 @@ const MARGIN = 0.08;
 const ROOMY = 0.5;
 const WIDE = 8; // times the usual width of a band, beyond which it does not rule the axis: a prior of ± 2000 m
 const SETTLING = 0.1; // share of the rows, the first ones, in which a line may settle
-const FEW = 0.05; // share of the dots, at either end, that may be wild
+const WILD_SHARE = 0.05; // share of the dots, at either end, that may be wild
 const FAR = 1; // times the span of all others, beyond which a value does not rule the axis
 const USUAL = 0.2; // share of the rows whose band is narrower than the usual one
 
@@ -80,7 +80,7 @@ function middle(columns, from, to) {
   if (!known.length) return [Infinity, -Infinity];
   known.sort((a, b) => a - b);
   const last = known.length - 1;
-  return [known[Math.floor(FEW * last)], known[Math.ceil((1 - FEW) * last)]];
+  return [known[Math.floor(WILD_SHARE * last)], known[Math.ceil((1 - WILD_SHARE) * last)]];
 }
 
 // First and last index of ascending times within a span.

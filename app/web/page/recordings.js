@@ -5,7 +5,7 @@ import { compact, spaced, span } from "./format.js";
 import { post } from "./session.js";
 
 const REST = 1500; // ms, while some file is still being looked through
-const SLOW = 5000;
+const POLL_MS = 5000;
 
 // `ask` has open(name, log) and say(text): what goes wrong.
 export class Recordings {
@@ -29,7 +29,7 @@ export class Recordings {
     const answer = await fetch("/api/gallery/recordings").catch(() => null);
     if (answer?.ok) this.draw(await answer.json());
     clearTimeout(this.timer);
-    this.timer = setTimeout(() => this.refresh(), this.looking ? REST : SLOW);
+    this.timer = setTimeout(() => this.refresh(), this.looking ? REST : POLL_MS);
   }
 
   draw({ folder, files }) {

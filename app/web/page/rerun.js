@@ -90,7 +90,7 @@ export function setTimeCursor(id, timeline, time, play) {
 // Rerun's web viewer in a canvas of this page. It has no connection of its own: the page hands its data over.
 
 const CHANNEL = "nisus";
-const PATIENCE = 30000; // ms until bytes must have been taken in
+const FEED_TIMEOUT_MS = 30000; // ms until bytes must have been taken in
 
 const frame = () => new Promise((resolve) => requestAnimationFrame(resolve));
 const pause = (ms) => new Promise((resolve) => setTimeout(resolve, ms));
@@ -185,7 +185,7 @@ export class Viewer {
     this.frames += 1n;
     this.handle.send_rrd_to_channel(CHANNEL, bytes);
     // The viewer takes in only so much between two frames.
-    while (performance.now() - begun < PATIENCE) {
+    while (performance.now() - begun < FEED_TIMEOUT_MS) {
       await frame();
       if (this.broken) throw new Error(this.broken);
       const { active, recordings } = this.state();
@@ -225,9 +225,9 @@ export class Viewer {
 
 // The stream of frames for Rerun, for as long as somebody can see them.
 
-const SHARE = 0.5; // part of the time that drawing may take; the panel beside it needs the rest
-const SLOW = 1000; // ms from which on a picture is dear, as where no graphics card draws it
-const SLOW_SHARE = 0.2; // then the twin itself may need the processor
+const DRAWING_SHARE = 0.5; // part of the time that drawing may take; the panel beside it needs the rest
+const SLOW_PICTURE_MS = 1000; // ms from which on a picture is dear, as where no graphics card draws it
+const SLOW_DRAWING_SHARE = 0.2; // then the twin itself may need the processor
 const MAX_REST = 8000; // ms
 
 export class ExploreStream {
@@ -265,7 +265,7 @@ export class ExploreStream {
     const took = await this.viewer.feed(new Uint8Array(data));
     this.layout = false;
     this.told({ drawn: true });
-    const share = took < SLOW ? SHARE : SLOW_SHARE;
+    const share = took < SLOW_PICTURE_MS ? DRAWING_SHARE : SLOW_DRAWING_SHARE;
     this.resting = setTimeout(() => this.ask(socket), Math.min(MAX_REST, took * (1 / share - 1)));
   }
 

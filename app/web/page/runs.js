@@ -6,7 +6,7 @@ import { compact, spaced, span } from "./format.js";
 import { swatch } from "./layers.js";
 import { gone } from "./save.js";
 
-const LOOK = 300; // ms between two looks at whether there is something new
+const RUNS_POLL_MS = 300; // ms between two looks at whether there is something new
 const AGAIN = 5000; // ms between two looks at the scores while the log grows
 const COVERED = 0.95; // share of errors that their 95 % band should hold
 const BEYOND = { above: " ▲", below: " ▼" }; // of a mean NIS outside its bounds
@@ -25,7 +25,7 @@ export class Runs {
     this.versions = new Versions(link);
     node.replaceChildren(this.versions.node, this.error, this.table, this.compared);
     // Not by the status: a twin whose source has ended says no more.
-    setInterval(() => link.connected && link.status.runs && this.heard(link.status), LOOK);
+    setInterval(() => link.connected && link.status.runs && this.heard(link.status), RUNS_POLL_MS);
   }
 
   // While the tab is shown, and nothing is being typed.

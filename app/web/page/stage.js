@@ -4,7 +4,7 @@
 import { $, element, setAttribute, setText } from "./dom.js";
 import { span } from "./format.js";
 
-const LATE = 1; // s by which the scene may be ahead of the charts without a word
+const MAX_LEAD_S = 1; // s by which the scene may be ahead of the charts without a word
 const LARGE = "nisus.stage.large";
 
 export class Stage {
@@ -19,7 +19,7 @@ export class Stage {
     // The scene shows the newest row; the charts may be held elsewhere.
     const place = () => {
       const ahead = view.following ? 0 : charts.newest - view.at;
-      setText($("stage-time"), ahead > LATE && Number.isFinite(ahead) ? `${span(ahead)} later than the charts` : "");
+      setText($("stage-time"), ahead > MAX_LEAD_S && Number.isFinite(ahead) ? `${span(ahead)} later than the charts` : "");
     };
     link.addEventListener("status", place);
     view.addEventListener("change", place);

@@ -134,7 +134,7 @@ class SvgContext {
   }
 }
 
-const HEAD = 50; // px for title, smaller line and legend
+const HEAD_PX = 50; // px for title, smaller line and legend
 
 // The text of an SVG file. draw(ctx, width, height) draws below the lines [title, smaller line] and the legend:
 // [[text, {tone, mark, ring, dash, width}]]. Paths that uPlot makes meanwhile record as well. Drawings are in pixels of
@@ -147,7 +147,7 @@ export function svgFile([width, height], [title, about], legend, draw, scale = d
     const { Path2D } = window;
     window.Path2D = SvgPath;
     try {
-      draw(context, width, height - HEAD);
+      draw(context, width, height - HEAD_PX);
     } finally {
       window.Path2D = Path2D;
     }
@@ -155,7 +155,7 @@ export function svgFile([width, height], [title, about], legend, draw, scale = d
       `<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 ${width} ${height}" width="${width}" height="${height}" font-family="${FAMILY}">`,
       `<title>${escaped(title)}</title><rect width="${width}" height="${height}" fill="${colour("panel")}"/>`,
       `<text x="10" y="19" fill="${colour("ink")}" font-size="14" font-weight="650">${escaped(title)}</text><text x="10" y="38" fill="${colour("faint")}" font-size="11.5">${escaped(about)}</text>`,
-      `<g transform="translate(0 ${HEAD})${scale === 1 ? "" : ` scale(${1 / scale})`}">`, ...context.clips, ...context.parts, "</g>", legendText(legend, width, colour), "</svg>",
+      `<g transform="translate(0 ${HEAD_PX})${scale === 1 ? "" : ` scale(${1 / scale})`}">`, ...context.clips, ...context.parts, "</g>", legendText(legend, width, colour), "</svg>",
     ].join("\n");
   });
 }

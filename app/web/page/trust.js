@@ -103,7 +103,7 @@ function refolding({ awaited, compiling, refolding: waits, revision }) {
 
 // Episodes, newest first, each with its remedy; and notices.
 
-const MOST = 200;
+const MAX_EPISODES = 200;
 
 // Names of measurement counts; a count of zero is not shown.
 const KINDS = [
@@ -124,7 +124,7 @@ export class Episodes {
       // After a reconnection all arrive again.
       const known = this.notices[0]?.number ?? -1;
       const fresh = event.detail.filter((notice) => notice.number > known).reverse();
-      this.notices = [...fresh, ...this.notices].slice(0, MOST);
+      this.notices = [...fresh, ...this.notices].slice(0, MAX_EPISODES);
       this.show(this.link.episodes);
     });
     link.addEventListener("status", ({ detail }) => {
@@ -166,7 +166,7 @@ export class Episodes {
       this.held.length ? element("h3", {}, "Held out") : "",
       list(this.held, (text) => element("li", { class: "event held-out" }, element("span", {}, text))),
       over.length ? element("h3", {}, `Before (${over.length})`) : "",
-      list(over.slice(0, MOST), (item) => this.entry(item)),
+      list(over.slice(0, MAX_EPISODES), (item) => this.entry(item)),
       element("h3", {}, "Events"),
       element("ol", {}, ...this.notices.flatMap((item, k) => this.event(item, this.notices[k - 1]))),
     );

@@ -12,7 +12,7 @@ const HINTS = {
   p: "Numbers of the model",
 };
 const GATES = [["off", null], ["95 %", 0.95], ["99 %", 0.99], ["99.73 %", 0.9973], ["99.99 %", 0.9999]];
-const MANY = 8; // entries from which on a group is closed at first
+const MAX_OPEN_ENTRIES = 8; // entries from which on a group is closed at first
 const KEPT = 100; // edits that can be undone
 
 export class Tune {
@@ -78,7 +78,7 @@ export class Tune {
       this.knobs.set(item.key, knob);
       return knob.node;
     });
-    return section(title, HINTS[prefix], items.length <= MANY, all, ...knobs);
+    return section(title, HINTS[prefix], items.length <= MAX_OPEN_ENTRIES, all, ...knobs);
   }
 
   // One line that scales all of a group.
@@ -121,7 +121,7 @@ export class Tune {
       this.sensors.set(name, [box, row.lastChild]);
       return row;
     });
-    return section("Sensors in use", "Off: held out (predicted and scored, but not used)", this.model.sensors.length <= MANY, ...rows);
+    return section("Sensors in use", "Off: held out (predicted and scored, but not used)", this.model.sensors.length <= MAX_OPEN_ENTRIES, ...rows);
   }
 
   sync(status) {

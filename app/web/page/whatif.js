@@ -15,7 +15,7 @@ const LONGEST_REST = 10000; // ms
 const SOON = 120; // ms after an edit
 const PAST = 0.35; // of the horizon, shown before now
 const MARGIN = 0.02; // of the horizon, before what is shown
-const MOST = 24; // states
+const MAX_CHARTED_STATES = 24; // states
 const STEPS = 200; // of the horizon's slider
 
 export class WhatIf {
@@ -28,7 +28,7 @@ export class WhatIf {
     this.limits = Object.fromEntries(Object.entries(kept.limits ?? {}).filter(([name]) => names.includes(name)));
     this.inputs = {}; // what was chosen: {kind, value, after}, by name
     this.stream = new Stream(link, "whatif");
-    this.states = [...model.states].sort((a, b) => (a.rows.length > 0) - (b.rows.length > 0)).slice(0, MOST);
+    this.states = [...model.states].sort((a, b) => (a.rows.length > 0) - (b.rows.length > 0)).slice(0, MAX_CHARTED_STATES);
     this.shown = false;
     link.addEventListener("frames", () => this.shown && this.draw());
   }

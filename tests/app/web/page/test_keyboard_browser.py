@@ -11,7 +11,7 @@ from tests.app.web.page.test_colours import TEXT, contrast, over
 
 pytestmark = pytest.mark.browser
 
-MOST = 400
+MAX_TAB_PRESSES = 400
 """Presses of Tab until every control had its turn, at most."""
 
 CONTROLS = """(() => {
@@ -72,7 +72,7 @@ def walked(page):
     """The numbers of the controls that Tab comes to, until it has been everywhere."""
     reached = []
     page.evaluate("document.activeElement?.blur()")
-    for _ in range(MOST):
+    for _ in range(MAX_TAB_PRESSES):
         page.keyboard.press("Tab")
         number = page.evaluate("document.activeElement?.dataset?.testNumber ?? null")
         if number is not None and reached and number == reached[0]:
