@@ -24,8 +24,8 @@ from .interpreted import fold_loop
 from .interpreted.fold_loop import UNSET
 from .interpreted.view import View, driven
 from .log import Log
-from .model.indicator import indicator
 from .model.state_space import LARGE, StateSpaceModel
+from .model.wrapping import indicator
 from .numerics.quantiles import chi_square_quantile
 from .plausibility import fresh_screen, limits_of
 from .snapshots import Base, Snapshot, Story

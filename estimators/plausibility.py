@@ -17,7 +17,7 @@ import numpy as np
 from numba import types
 
 from .compiled.context import circular_rows, context_type, sensor_rows
-from .model.sensor import RATE_NOISE_STDS, Stuck
+from .model.parts import RATE_NOISE_STDS, Stuck
 from .model.state_space import StateSpaceModel
 from .numerics.jit import F1, floats, i64, inlined, ints, jit, part
 from .numerics.linalg import wrap

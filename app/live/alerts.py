@@ -11,7 +11,7 @@ from estimators.fold import Fold
 from estimators.fold_failures import cause_of
 from estimators.gate.isolation import AGREES
 from estimators.log import Log
-from estimators.model.sensor import Limits
+from estimators.model.parts import Limits
 from estimators.model.state_space import StateSpaceModel
 from estimators.track import FAILED, GATED, MISSING, REASONS, VERDICT_NAMES, Track, estimated_rows
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from config.schema import TwinSection
 from config.source_schema import AssetSection, SimulatorSection
-from estimators.diagnostics.time_constants import MOST, jacobian, time_constants
+from estimators.diagnostics.time_constants import MAX_STATES, jacobian, time_constants
 from estimators.errors import EstimatorError, ModelError
 from estimators.estimator import Estimator
 from estimators.fold_checks import check_variances
@@ -55,7 +55,7 @@ def degraded_after(config: TwinSection, model: StateSpaceModel) -> DegradedAfter
 
 
 def _slowest(model: StateSpaceModel) -> float | None:
-    if model.black_box or model.nx > MOST:
+    if model.black_box or model.nx > MAX_STATES:
         return None
     u = np.array([item.default for item in model.inputs], float)
     p = np.array([item.value for item in model.parameters], float)

@@ -18,11 +18,10 @@ from config.loader import Loaded, shown_path
 from config.schema import SensorSection, TwinSection
 from config.yaml_files import Key, dotted
 from estimators.errors import ConfigError, ModelError, NisusError, nearest
-from estimators.model.assemble import AppendError, assemble
+from estimators.model.assemble import AppendError, JointParameter, assemble
 from estimators.model.coloured import ColouredError, disturbance_time, error_time
 from estimators.model.hybrid import learned_noise
-from estimators.model.joint import JointParameter
-from estimators.model.sensor import Correlation, Limits, Stuck, correlation_error
+from estimators.model.parts import Correlation, Limits, Stuck, correlation_error
 from estimators.model.state_space import Field, Sensor, State, StateSpaceModel
 from estimators.model.user_file import imported_beside, run_file
 from estimators.models import MODELS

@@ -8,7 +8,7 @@ by the accumulated log-likelihood ratio (CUSUM):
 With h = log(measurements between false alarms × tests) the mean time between false alarms of all tests together is at
 least the requested one, whatever is wrong and however long it lasts. The test in alarm names the cause.
 
-Where a tuning was accepted although its innovations are not white, a `baseline` holds their bias, scale and
+If a tuning was accepted although its innovations are not white, a `baseline` holds their bias, scale and
 correlation. e is standardised by it first, and the threshold of each test is raised by the highest W that the accepted
 data reached.
 

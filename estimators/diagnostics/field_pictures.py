@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..log import MARK, TRUTH, Log
-from ..model.states import Field
+from ..model.parts import Field
 from ..numerics.quantiles import normal_quantile
 
 MAX_SIDE = 200  # Cells of a picture along an axis at most; a larger field is averaged over squares

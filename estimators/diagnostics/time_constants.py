@@ -1,4 +1,4 @@
-"""How long a model remembers: the time constants of its linearisation."""
+"""Time constants of a linearised model."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from ..errors import ModelError
 from ..model.state_space import StateSpaceModel
 from ..numerics.jit import plain
 
-MOST = 200  # States beyond which the eigenvalues are not worth their time
+MAX_STATES = 200  # States beyond which the eigenvalues are not worth their time
 UNSTABLE = 1.0 - 1e-9  # Modulus from which on a mode does not decay: a random walk, or one that grows
 
 _STEP = 6e-6
 
 
 def jacobian(model: StateSpaceModel, x: np.ndarray, u: np.ndarray, p: np.ndarray, dt: float) -> np.ndarray:
-    """∂f/∂x (nx, nx) over dt, by central differences of the model's own Python.
+    """Return ∂f/∂x (nx, nx) over dt, by central differences of the model's plain function.
 
     Raises:
         ModelError: If the model fails there.
@@ -38,10 +38,7 @@ def jacobian(model: StateSpaceModel, x: np.ndarray, u: np.ndarray, p: np.ndarray
 
 
 def time_constants(F: np.ndarray, dt: float) -> np.ndarray:
-    """Seconds in which each mode that decays falls to 1/e, -dt/ln|λ| for the eigenvalues λ of F (n, n), slowest first.
-
-    Modes that do not decay, such as random walks, have none.
-    """
+    """Return the time constants -dt/ln|λ| of the decaying modes of F (n, n) with eigenvalues λ, s, slowest first."""
     if not np.all(np.isfinite(F)):
         return np.zeros(0)
     modulus = np.abs(np.linalg.eigvals(F))

@@ -14,8 +14,8 @@ import numpy as np
 
 from ..errors import EstimatorError
 from ..estimator import Options
+from ..model.parts import Field
 from ..model.state_space import StateSpaceModel
-from ..model.states import Field
 from ..numerics.jit import floats, ints, jit, matrix, threaded
 from ..numerics.simd import WIDE
 from ..numerics.simd_ir import LANES

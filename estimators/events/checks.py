@@ -122,7 +122,7 @@ def admitted(batch: Events, width: int, layout: EventLayout | None) -> Events:
 
 
 def _plain(batch: Events) -> Events:
-    """The batch with columns of one length and of the log's types.
+    """Return the batch with columns of one length and of the log's types.
 
     Raises:
         EventError: If a column cannot be that, with its name.
@@ -144,7 +144,7 @@ def _plain(batch: Events) -> Events:
 
 
 def _integers(name: str, column: np.ndarray, wanted: type) -> np.ndarray:
-    """Integers of another type as the log has them; floats would lose what stands after their point."""
+    """Convert integers to the log's type; reject floats, which would lose their decimals."""
     if column.dtype.kind not in "iu":
         unit = "whole nanoseconds: np.rint(1e9 * s).astype(np.int64)" if wanted is np.int64 else "integers"
         raise EventError(f"{name} holds {column.dtype} numbers; it must hold {unit}")
@@ -155,7 +155,7 @@ def _integers(name: str, column: np.ndarray, wanted: type) -> np.ndarray:
 
 
 def _broken(batch: Events, at: int, rule: int, width: int, layout: EventLayout | None) -> str:
-    """What is wrong with an event, and what would be right."""
+    """Return the flaw of an event and its remedy."""
     t, kind, channel = int(batch.t[at]), int(batch.kind[at]), int(batch.channel[at])
     value = batch.value[at]
     if rule == TIME:
@@ -192,5 +192,5 @@ def _broken(batch: Events, at: int, rule: int, width: int, layout: EventLayout |
 
 
 def _count(value: np.ndarray) -> int:
-    """Columns up to the last that is known."""
+    """Return the number of columns up to the last known value."""
     return 1 + int(np.flatnonzero(~np.isnan(value))[-1])

@@ -4,7 +4,7 @@ The filter runs with fixed parameters. From time to time the last window of its 
 from the filter's state where the window begins, with a weak prior about the current values. If the result is better on
 the window's held-out blocks, and beyond chance, it is proposed; once adopted, it replaces the current values and the
 log is folded again. In joint estimation the parameters are states instead, and one filter estimates both
-(`model/joint.py`): that needs no fit, but a drift rate for each parameter, and no held-out data judge the result.
+(`model/assemble.py`): that needs no fit, but a drift rate for each parameter, and no held-out data judge the result.
 
 Sources: Nelson & Stear (1976), doi:10.1109/TAC.1976.1101148, for two estimators, each of which takes the other's
 estimate as known; Plett (2006), doi:10.1016/j.jpowsour.2006.06.004, for both on a battery.

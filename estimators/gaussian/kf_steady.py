@@ -22,7 +22,7 @@ import numpy as np
 from ..compiled.context import options, row_count, steps_of, transition
 from ..errors import EstimatorError
 from ..estimator import Estimator, Option, Options
-from ..model.sensor import covariance_of
+from ..model.parts import covariance_of
 from ..model.state_space import StateSpaceModel
 from ..numerics.jit import by_address, inlined, part
 from ..numerics.linalg import congruence, unit_factor

@@ -18,7 +18,7 @@ from ..compiled.model import CompiledModel
 from ..errors import ModelError
 from ..estimator import Code, Estimator, Options
 from ..gaussian.shared import admit
-from ..model.sensor import covariance_of
+from ..model.parts import covariance_of
 from ..model.state_space import StateSpaceModel
 from ..track import FAILED
 from ..tuning import Tuning

@@ -7,18 +7,35 @@ The order is fixed, and each step wraps the model of the step before:
 3. `joint`: parameters, those of step 2 included, as the last states.
 
 So the physics keeps its states first, in their order: x = (physics, disturbances, sensor errors, parameters).
+
+Joint estimation moves parameters into the state:
+
+    x⁺ = (x, θ),   x' = f(x, u, p(θ), dt) + w,   θ' = θ + w_θ,   y = h(x, u, p(θ)) + v
+
+A moved parameter drifts as a random walk; with a drift of zero it is an unknown constant. It acts on the model only
+within its range, so that an estimate outside cannot make a divisor zero. Derivatives are by complex step, since the
+model's own do not include θ.
+
+Source: Ljung (1979), Asymptotic behavior of the extended Kalman filter as a parameter estimator for linear systems,
+doi:10.1109/TAC.1979.1101943, for the method and its limits: θ can be biased where Q and R are wrong.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
 
 from ..errors import ModelError
+from ..numerics.jit import jit
 from .coloured import ColouredError, coloured
 from .hybrid import LearnedCorrection, hybrid
-from .joint import JointParameter, joint
-from .state_space import StateSpaceModel
+from .state_space import Noise, State, StateSpaceModel, squared
+from .wrapping import as_inner
 
 
 class AppendError(ModelError):
@@ -73,3 +90,111 @@ def _blamed(kind: str, name: str) -> Iterator[None]:
         yield
     except ModelError as error:
         raise AppendError((kind, name), str(error)) from None
+
+
+class JointParameter(NamedTuple):
+    """A parameter to estimate: `std` of the prior about its value, and `drift`, the std that a second adds to it."""
+
+    std: float
+    drift: float = 0.0
+
+
+def joint(model: StateSpaceModel, estimated: Mapping[str, JointParameter]) -> StateSpaceModel:
+    """Return the model with these parameters as its last states, in the order of the model's parameters.
+
+    Raises:
+        ModelError: If it has no such parameter, or has a state of that name.
+    """
+    if not estimated:
+        return model
+    names = [item.name for item in model.parameters]
+    for name, given in estimated.items():
+        if name not in names:
+            raise ModelError(f"model {model.name} has no parameter {name!r} to estimate; it has {', '.join(names)}")
+        if name in model.state_names:
+            raise ModelError(f"model {model.name} has a state {name!r}; a parameter of that name cannot become one")
+        if not given.std > 0.0:
+            raise ModelError(
+                f"model {model.name}: the prior of {name} has std {given.std:g}; an estimated parameter must be "
+                "uncertain: give a positive std"
+            )
+    moved = [item for item in model.parameters if item.name in estimated]
+    kept = [item for item in model.parameters if item.name not in estimated]
+    # Where each of the model's parameters comes from: θ[k], or -1 - k for p[k] of those that stay.
+    place = tuple(moved.index(item) if item in moved else -1 - kept.index(item) for item in model.parameters)
+    low, high = (tuple(float(getattr(item, end)) for item in moved) for end in ("low", "high"))
+    layout = (model.nx, place, low, high)
+    noises = tuple(Noise(item.name, f"{squared(item.unit)}/s", estimated[item.name].drift ** 2) for item in moved)
+    return replace(
+        model,
+        states=(*model.states, *(State(m.name, m.unit, m.value, estimated[m.name].std) for m in moved)),
+        parameters=tuple(kept),
+        noises=(*model.noises, *noises),
+        f=_step(model.f, *layout),
+        F=None,
+        Q=None if model.Q is None else _noise(model.Q, len(model.noises), *layout),
+        sensors=tuple(replace(sensor, h=_sensor(sensor.h, *layout), H=None) for sensor in model.sensors),
+        jump=None if model.jump is None else replace(model.jump, chances=_chances(model.jump.chances, *layout)),
+        linear=False,
+    )
+
+
+@jit
+def _parameters(theta, p, place, low, high):
+    """Return p(θ): the model's own parameters, the moved ones held within their ranges."""
+    full = np.empty(len(place), theta.dtype)
+    for k in range(len(place)):
+        j = place[k]
+        if j < 0:
+            full[k] = p[-1 - j]
+        elif theta[j].real < low[j]:
+            full[k] = low[j]
+        elif theta[j].real > high[j]:
+            full[k] = high[j]
+        else:
+            full[k] = theta[j]
+    return full
+
+
+@lru_cache(maxsize=64)
+def _step(function: Callable, n: int, place: tuple, low: tuple, high: tuple) -> Callable:
+    inner = as_inner(function)
+
+    def f(x, u, p, dt, out):  # noqa: ANN001, ANN202
+        inner(x[:n], u, _parameters(x[n:], p, place, low, high), dt, out[:n])
+        for j in range(n, x.size):
+            out[j] = x[j]
+
+    return f
+
+
+@lru_cache(maxsize=64)
+def _chances(function: Callable, n: int, place: tuple, low: tuple, high: tuple) -> Callable:
+    inner = as_inner(function)
+
+    def chances(x, u, p, dt, out):  # noqa: ANN001, ANN202
+        inner(x[:n], u, _parameters(x[n:], p, place, low, high), dt, out)
+
+    return chances
+
+
+@lru_cache(maxsize=256)
+def _sensor(function: Callable, n: int, place: tuple, low: tuple, high: tuple) -> Callable:
+    inner = as_inner(function)
+
+    def h(x, u, p, out):  # noqa: ANN001, ANN202
+        inner(x[:n], u, _parameters(x[n:], p, place, low, high), out)
+
+    return h
+
+
+@lru_cache(maxsize=64)
+def _noise(function: Callable, nw: int, n: int, place: tuple, low: tuple, high: tuple) -> Callable:
+    inner = as_inner(function)
+
+    def Q(x, u, p, q, dt, out):  # noqa: ANN001, ANN202
+        inner(x[:n], u, _parameters(x[n:], p, place, low, high), q[:nw], dt, out[:n, :n])
+        for j in range(n, x.size):
+            out[j, j] = q[nw + j - n] * dt
+
+    return Q

@@ -17,8 +17,7 @@ from functools import cached_property
 import numpy as np
 
 from ..errors import LARGEST, ModelError
-from .sensor import Limits, Row, Sensor, Stuck, check_range, correlation_error
-from .states import CellNames, Field, State
+from .parts import CellNames, Field, Limits, Row, Sensor, State, Stuck, check_range, correlation_error
 
 LARGE = 1024
 """States beyond which no filter forms an (nx, nx) matrix: priors are diagonal, moments are means and variances."""

@@ -1,4 +1,9 @@
-"""What models made from other models share: their functions called by compiled wrappers, and noise."""
+"""Models made from other models: their functions called by compiled wrappers, noise, and modes as numbers.
+
+A mode as a continuous number, for filters that use means and covariances only, has the mean and the variance that a
+jump gives it (see `Jump`). Its estimate can leave its range, and one Gaussian stands for a mixture: these filters fail
+where that is a poor approximation.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +11,7 @@ import hashlib
 import inspect
 import uuid
 from collections.abc import Callable
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -21,8 +27,8 @@ from .state_space import StateSpaceModel
 def as_inner(function: Callable) -> Any:
     """Compile a model's function for a wrapper to call, under a name by which Numba's cache finds it again.
 
-    The cache tells closures apart by what they hold, and a compiled function by an identifier that is random in every
-    process; one made from the source finds the code that another process compiled, and never code of another source.
+    The cache distinguishes closures by their enclosed values, and compiled functions by an identifier that is random in
+    every process. An identifier made from the source finds the code that another process compiled from that source.
     """
     python = with_helpers(plain(function))
     inner = jit(python)
@@ -47,5 +53,95 @@ def _white_noise(acts_on: tuple[tuple[int, int], ...]) -> Callable:
     def Q(x, u, p, q, dt, out):  # noqa: ANN001, ANN202
         for i in range(pairs.shape[0]):
             out[pairs[i, 1], pairs[i, 1]] += q[pairs[i, 0]] * dt
+
+    return Q
+
+
+MIN_MODE_VARIANCE = 1e-6
+"""Variance that the mode keeps: with none, its estimate could never change, and some filters need a positive one."""
+
+
+def indicator(model: StateSpaceModel) -> StateSpaceModel:
+    """Return the model for filters that do not sample: the mode is continuous, with a jump's first two moments.
+
+    m' = Σ k c_k, and its noise has the variance Σ k² c_k - m'² (at least `MIN_MODE_VARIANCE`); c are the chances,
+    interpolated between those of the two modes next to m. Between the modes f and h are the model's own.
+    """
+    return model if model.jump is None else _indicator(model)
+
+
+@lru_cache(maxsize=32)
+def _indicator(model: StateSpaceModel) -> StateSpaceModel:
+    if model.jump is None:
+        return model
+    j, count = model.mode, len(model.jump.modes)
+    return replace(
+        model,
+        f=_step(model.f, model.jump.chances, j, count),
+        F=None,
+        Q=_noise(noise_function(model), model.jump.chances, j, count),
+        jump=None,
+        conditionally_linear=(),
+    )
+
+
+@jit
+def _between(m, count):
+    """Return the lower of the two modes next to m, and the fraction of the way to the upper one."""
+    low = 0
+    while low < count - 2 and m.real >= low + 1:
+        low += 1
+    if m.real <= low:
+        return low, 0.0 * m
+    if m.real >= low + 1:
+        return low, 0.0 * m + 1.0
+    return low, m - low
+
+
+@jit
+def _moments(c, part):
+    """Return mean and variance of the next mode, from the chances c (2, modes) of two modes and the second's weight."""
+    mean = 0.0 * part
+    square = 0.0 * part
+    for i in range(c.shape[1]):
+        share = (1.0 - part) * c[0, i] + part * c[1, i]
+        mean += share * i
+        square += share * i * i
+    return mean, square - mean * mean
+
+
+# Each wrapper calls the chances itself: a compiled function that takes another as an argument is not cached.
+def _step(function: Callable, chances: Callable, j: int, count: int) -> Callable:
+    inner, jumping = as_inner(function), as_inner(chances)
+
+    def f(x, u, p, dt, out):  # noqa: ANN001, ANN202
+        z = x.copy()
+        c = np.empty((2, count), x.dtype)
+        low, part = _between(x[j], count)
+        for k in range(2):
+            z[j] = low + k
+            jumping(z, u, p, dt, c[k])
+        mean, _ = _moments(c, part)
+        z[j] = mean
+        inner(z, u, p, dt, out)
+        out[j] = mean
+
+    return f
+
+
+def _noise(function: Callable, chances: Callable, j: int, count: int) -> Callable:
+    inner, jumping = as_inner(function), as_inner(chances)
+
+    def Q(x, u, p, q, dt, out):  # noqa: ANN001, ANN202
+        z = x.copy()
+        c = np.empty((2, count))
+        low, part = _between(x[j], count)
+        for k in range(2):
+            z[j] = low + k
+            jumping(z, u, p, dt, c[k])
+        mean, variance = _moments(c, part)
+        z[j] = mean
+        inner(z, u, p, q, dt, out)
+        out[j, j] = max(variance, MIN_MODE_VARIANCE)
 
     return Q

@@ -13,8 +13,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from ..model.parts import Field
 from ..model.state_space import Noise, Parameter, Row, Sensor, StateSpaceModel
-from ..model.states import Field
 from ..numerics.smoothed_noise import exponential
 
 SPACING = (27.8, 16.3)  # Side of a cell to the south and to the east, km

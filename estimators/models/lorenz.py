@@ -20,9 +20,9 @@ doi:10.1175/1520-0469(1998)055<0399:OSFSWO>2.0.CO;2.
 
 from __future__ import annotations
 
+from ..model.parts import Field
 from ..model.rk4 import rk4
 from ..model.state_space import Noise, Parameter, Row, Sensor, State, StateSpaceModel
-from ..model.states import Field
 
 
 def flow(x, u, p):

@@ -13,8 +13,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from ..model.parts import Field
 from ..model.state_space import Input, Noise, Parameter, Row, Sensor, StateSpaceModel
-from ..model.states import Field
 from ..numerics.jit import jit
 from ..numerics.smoothed_noise import exponential
 

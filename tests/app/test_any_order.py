@@ -15,7 +15,7 @@ from app.ingest import Ingest
 from estimators.diagnostics.health import HealthPolicy
 from estimators.fold import Fold
 from estimators.log import MAINTENANCE, MARK, READING, RESET, TICK, TRUTH, Events, Log, sorted_order
-from estimators.model.sensor import Limits
+from estimators.model.parts import Limits
 from estimators.tuning import Tuning
 from sources.source import WRONG_TIME
 from tests.estimators.test_plausibility import model

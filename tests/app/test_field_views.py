@@ -30,7 +30,7 @@ from app.views.viser.view import ViserView
 from estimators.errors import ConfigError
 from estimators.fold import Fold
 from estimators.log import READING, Log
-from estimators.model.states import Field
+from estimators.model.parts import Field
 from tests.app.scripted import Scripted, wait_for
 
 PLATE = """

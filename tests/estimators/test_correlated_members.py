@@ -8,7 +8,7 @@ import pytest
 from estimators.errors import EstimatorError
 from estimators.fold import Fold, fold
 from estimators.log import READING, Log
-from estimators.model.sensor import covariance_of
+from estimators.model.parts import covariance_of
 from estimators.models.lorenz import LORENZ96
 from estimators.registry import ESTIMATORS, checked
 from estimators.tuning import Tuning

@@ -13,7 +13,7 @@ from estimators.diagnostics.episodes import episodes
 from estimators.errors import ModelError
 from estimators.fold import Fold, fold
 from estimators.log import READING, Events, Log
-from estimators.model.sensor import RATE_NOISE_STDS, Limits, Stuck
+from estimators.model.parts import RATE_NOISE_STDS, Limits, Stuck
 from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
 from estimators.models import MODELS
 from estimators.track import DUPLICATE, MISSING, RANGE, RATE, REPEATED, SATURATED, SCREENED, SUSPECT, USED

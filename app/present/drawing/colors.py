@@ -15,8 +15,8 @@ import numpy as np
 
 from estimators.diagnostics.field_pictures import Picture, plane_shape, reduction
 from estimators.log import READING, Events
+from estimators.model.parts import Field
 from estimators.model.state_space import StateSpaceModel
-from estimators.model.states import Field
 from estimators.track import HEALTH_NAMES, Track
 
 RGB = tuple[int, int, int]

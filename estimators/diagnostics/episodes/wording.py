@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...compiled.model import compile_model
-from ...model.indicator import indicator
 from ...model.state_space import StateSpaceModel
+from ...model.wrapping import indicator
 from ..detectors import since
 
 CORRELATED_FROM = 0.15  # Lag-1 correlation of the innovations from which Q explains their scale, not R

@@ -15,7 +15,7 @@ from app.views.recording.format import base_from_json, base_to_json
 from estimators.errors import ConfigError
 from estimators.fold import Fold
 from estimators.log import Log
-from estimators.model.sensor import Limits, Stuck
+from estimators.model.parts import Limits, Stuck
 from estimators.tuning import Tuning
 from tests.app.twin.written import refusal, twin_of
 

@@ -7,7 +7,7 @@ from estimators.compiled.noise import add_noise, belief_root, has_correlated_row
 from estimators.errors import ModelError
 from estimators.fold import Fold
 from estimators.log import READING, Log
-from estimators.model.sensor import correlation_of, covariance_of
+from estimators.model.parts import correlation_of, covariance_of
 from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
 from estimators.tuning import Tuning
 from sources.simulator import Simulator

@@ -13,7 +13,7 @@ from estimators.diagnostics.detectors import ALARM_NAMES, OUTSIDE, TRUTH_MISSED
 from estimators.diagnostics.health import HealthPolicy
 from estimators.fold import Fold, fold
 from estimators.log import INPUT, READING, RESET, TICK, TRUTH, Events, Log
-from estimators.model.sensor import Limits
+from estimators.model.parts import Limits
 from estimators.model.state_space import Input, Noise, Row, Sensor, State, StateSpaceModel
 from estimators.track import (
     DEGRADED,

@@ -9,7 +9,7 @@ import pytest
 from estimators.diagnostics.failure_cause import failures
 from estimators.fold_failures import cause_of
 from estimators.log import INPUT, READING, TICK, Events, Log
-from estimators.model.joint import JointParameter, joint
+from estimators.model.assemble import JointParameter, joint
 from estimators.model.state_space import Input, Noise, Parameter, Row, Sensor, State, StateSpaceModel
 from estimators.track import FAILED
 from estimators.tuning import Tuning

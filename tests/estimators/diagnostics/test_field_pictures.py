@@ -8,7 +8,7 @@ from estimators.diagnostics.field_pictures import Picture, plane, plane_shape
 from estimators.diagnostics.score import score
 from estimators.fold import Fold
 from estimators.log import READING, TRUTH, Events, Log
-from estimators.model.states import Field
+from estimators.model.parts import Field
 from estimators.models.thermal_field import thermal_field
 from estimators.tuning import Tuning
 from sources.simulator import Simulator

@@ -3,11 +3,10 @@
 import numpy as np
 import pytest
 
-from estimators.model.assemble import AppendError, assemble
+from estimators.model.assemble import AppendError, JointParameter, assemble
 from estimators.model.coloured import ColouredError
 from estimators.model.correction import Ridge
 from estimators.model.hybrid import LearnedCorrection
-from estimators.model.joint import JointParameter
 from estimators.models import MODELS
 
 MODEL = MODELS["motor_winding"]

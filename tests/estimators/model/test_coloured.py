@@ -13,8 +13,8 @@ from estimators.compiled.model import compile_model
 from estimators.errors import ModelError
 from estimators.fold import fold
 from estimators.log import READING, Events, Log
+from estimators.model.assemble import JointParameter, joint
 from estimators.model.coloured import ColouredError, channels, coloured
-from estimators.model.joint import JointParameter, joint
 from estimators.model.state_space import Noise, Parameter, Row, Sensor, State, StateSpaceModel
 from estimators.models import MODELS
 from estimators.registry import find_estimator

@@ -11,10 +11,10 @@ from estimators.compiled.model import compile_model
 from estimators.errors import ModelError
 from estimators.fold import fold
 from estimators.log import Log
+from estimators.model.assemble import JointParameter, joint
 from estimators.model.coloured import coloured
 from estimators.model.correction import GaussianProcess, Net, Ridge
 from estimators.model.hybrid import LearnedCorrection, hybrid
-from estimators.model.joint import JointParameter, joint
 from estimators.model.state_space import Input, Noise, Parameter, Row, Sensor, State, StateSpaceModel
 from estimators.tuning import Tuning
 

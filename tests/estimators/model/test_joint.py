@@ -16,7 +16,7 @@ from estimators.diagnostics.score import score
 from estimators.errors import ModelError
 from estimators.fold import fold
 from estimators.log import READING, Events, Log
-from estimators.model.joint import JointParameter, joint
+from estimators.model.assemble import JointParameter, joint
 from estimators.model.state_space import Noise, Parameter, Row, Sensor, State, StateSpaceModel
 from estimators.models import MODELS
 from estimators.tuning import Tuning
@@ -145,7 +145,7 @@ def test_the_motors_derivatives_reach_the_resistance() -> None:
 
 def test_another_process_finds_the_compiled_code() -> None:
     code = (
-        "from estimators.models import MODELS; from estimators.model.joint import joint, JointParameter;"
+        "from estimators.models import MODELS; from estimators.model.assemble import joint, JointParameter;"
         "from estimators.compiled.model import compile_model;"
         "m = compile_model(joint(MODELS['motor_drive'], {'yoke_coolant': JointParameter(0.01)}));"
         "print(m.f.stats.cache_hits, *[len(h.stats.cache_hits) for h in m.h], sum(m.f.stats.cache_misses.values()))"

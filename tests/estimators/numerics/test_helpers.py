@@ -11,7 +11,7 @@ from estimators.compiled.model import compile_model
 from estimators.errors import ModelError
 from estimators.fold import fold
 from estimators.log import READING, Events, Log
-from estimators.model.joint import JointParameter, joint
+from estimators.model.assemble import JointParameter, joint
 from estimators.model.state_space import Noise, Parameter, Row, Sensor, State, StateSpaceModel
 from estimators.numerics.helpers import with_helpers
 from estimators.numerics.jit import jit

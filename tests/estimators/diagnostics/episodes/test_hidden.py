@@ -7,7 +7,7 @@ import pytest
 
 from estimators.diagnostics.episodes import found_in, judged_rows
 from estimators.log import READING, Events
-from estimators.model.sensor import Limits
+from estimators.model.parts import Limits
 from estimators.tuning import Tuning
 from tests.support import SECOND, as_log, folded
 
