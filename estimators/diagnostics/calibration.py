@@ -157,7 +157,10 @@ def _of_row(
 
 def _held_out(name: str, t: np.ndarray, e: np.ndarray, limits: CalibrationLimits) -> Calibration:
     coverage, verdicts = _coverage(e, limits)
-    words = held_out_words(name, verdicts)
+    words = tuple(
+        f"{name}: {_share(share)} of its readings in the {100 * band:.0f} % band of the prediction{_wide(band, share)}"
+        for band, share in verdicts[:1]
+    )
     unknown = UNKNOWN, UNKNOWN, UNKNOWN, UNKNOWN, UNKNOWN
     return Calibration(name, "held out", *_window(t), *unknown, coverage, words)
 
@@ -219,14 +222,6 @@ def reading_words(
     if refused.beyond(0.0, limits.refused):
         said.append(f"{name}: the gate refuses {_share(refused)} of the readings")
     return tuple(said)
-
-
-def held_out_words(name: str, verdicts: Sequence[BandVerdict]) -> tuple[str, ...]:
-    """Describe the calibration of a held-out sensor by the widest band beyond the limits."""
-    return tuple(
-        f"{name}: {_share(share)} of its readings in the {100 * band:.0f} % band of the prediction{_wide(band, share)}"
-        for band, share in verdicts[:1]
-    )
 
 
 def truth_words(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -102,13 +102,8 @@ def _numbers(name: str, values: Any) -> np.ndarray:
     try:
         return np.asarray(values, float)
     except (TypeError, ValueError):
-        raise EventError(f"{name} contains {_sample(values)!r}; all entries must be numbers") from None
-
-
-def _sample(values: Any) -> Any:
-    if isinstance(values, Iterable) and not isinstance(values, str):
-        return next(iter(values), None)
-    return values
+        sample = next(iter(np.asarray(values, object).flat), None)
+        raise EventError(f"{name} contains {sample!r}; all entries must be numbers") from None
 
 
 def _rows(name: str, values: Any, n: int, rows: int) -> np.ndarray:

@@ -28,7 +28,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -146,7 +146,20 @@ def coloured(
         states=(*model.states, *states),
         parameters=(*model.parameters, *parameters),
         noises=(*model.noises, *added),
-        **_functions(model, layout, first),
+        f=_step(model.f, layout),
+        F=None if model.F is None else _slope(model.F, layout),
+        Q=_noise(noise_function(model), layout),
+        sensors=tuple(
+            replace(
+                sensor,
+                h=_sensor(sensor.h, first.get(sensor.name), layout),
+                H=sensor.H and _sensor_slope(sensor.H, first.get(sensor.name), layout),
+                log_likelihood=sensor.log_likelihood
+                and _likelihood(sensor.log_likelihood, first.get(sensor.name), layout),
+            )
+            for sensor in model.sensors
+        ),
+        jump=None if model.jump is None else replace(model.jump, chances=_inside(model.jump.chances, layout)),
         conditionally_linear=(*model.conditionally_linear, *names) if model.conditionally_linear else (),
     )
 
@@ -239,20 +252,6 @@ def _time(name: str, over: float) -> Parameter:
     return Parameter(name, "s", over, over / TIME_RANGE, over * TIME_RANGE)
 
 
-def _functions(model: StateSpaceModel, layout: ColouredLayout, first: Mapping[str, int]) -> dict[str, Any]:
-    """Return the fields of a model that are functions, or hold them, around those of `model`.
-
-    `first` is the index of the first state that holds errors of a sensor, by sensor.
-    """
-    return {
-        "f": _step(model.f, layout),
-        "F": None if model.F is None else _slope(model.F, layout),
-        "Q": _noise(noise_function(model), layout),
-        "sensors": tuple(_with_error(sensor, first.get(sensor.name), layout) for sensor in model.sensors),
-        "jump": None if model.jump is None else replace(model.jump, chances=_inside(model.jump.chances, layout)),
-    }
-
-
 def _integrated(a: float) -> float:
     """Return the variance of ∫c dt that a step of a = dt/τ adds, over q dt: 1 - (2 (1 - e⁻ᵃ) - (1 - e⁻²ᵃ)/2) / a."""
     if a < 0.05:
@@ -325,16 +324,6 @@ def _noise(function: Callable, layout: ColouredLayout) -> Callable:
             out[n + i, n + i] = -variance * np.expm1(-2.0 * a)
 
     return Q
-
-
-def _with_error(sensor: Sensor, first: int | None, layout: ColouredLayout) -> Sensor:
-    """Return the sensor with the errors that begin at state `first`, or with none."""
-    return replace(
-        sensor,
-        h=_sensor(sensor.h, first, layout),
-        H=None if sensor.H is None else _sensor_slope(sensor.H, first, layout),
-        log_likelihood=(None if sensor.log_likelihood is None else _likelihood(sensor.log_likelihood, first, layout)),
-    )
 
 
 @lru_cache(maxsize=256)

@@ -176,5 +176,5 @@ def _named(name: str, module: ModuleType) -> Any:
 
 @lru_cache(maxsize=32)
 def _module(name: str, file: str, stamp: int) -> ModuleType:
-    """The file's module in this process; `stamp`, when the file was written, runs one that was edited again."""
+    """Return the file's module in this process; with another `stamp`, its time of writing, it is run again."""
     return run_file(name, Path(file))
