@@ -234,11 +234,7 @@ def gather(
                 off = value[i, k] - expected[k]
                 if circular[k] != 0:
                     off = wrap(off)
-                total = off * off
-                for a in range(n):
-                    for b in range(n):
-                        total += H[k, a] * cov[i, a, b] * H[k, b]
-                over_r[0, row_start[sensor] + k] += total
+                over_r[0, row_start[sensor] + k] += off * off + H[k] @ cov[i] @ H[k]
                 over_r[1, row_start[sensor] + k] += 1.0
 
 
@@ -260,22 +256,16 @@ def add_step(context, x, P, ahead, P_ahead, L, u, dt, jacobian, scratch, over_q)
         transition(context, at, u, dt / steps, to)
         at[:] = to
     circular = circular_states(context)
-    d = np.empty(n)
+    d = ahead - at
     for i in range(n):
-        d[i] = ahead[i] - at[i]
         if circular[i] != 0:
             d[i] = wrap(d[i])
     C = whole @ L
-    E = P_ahead - C - C.T + whole @ P @ whole.T
-    for i in range(n):
-        for j in range(n):
-            E[i, j] += d[i] * d[j]
+    E = P_ahead - C - C.T + whole @ P @ whole.T + np.outer(d, d)
     q = process_variances(context)
     Q = np.zeros((n, n))
     for j in range(nw):
-        for a in range(n):
-            for b in range(n):
-                Q[a, b] += q[j] * S[j, a, b]
+        Q += q[j] * S[j]
     if not root(Q, Q, n):
         return
     W = np.empty((n, n))
@@ -283,7 +273,5 @@ def add_step(context, x, P, ahead, P_ahead, L, u, dt, jacobian, scratch, over_q)
     for j in range(nw):
         A = S[j].copy()
         solve_semidefinite(Q, A, W)
-        for a in range(n):
-            over_q[1, j] += A[a, a]
-            for b in range(n):
-                over_q[0, j] += A[a, b] * E[b, a]
+        over_q[1, j] += np.trace(A)
+        over_q[0, j] += np.sum(A * E.T)

@@ -16,6 +16,7 @@ import numpy as np
 from scipy.spatial.distance import cdist
 
 from ..compiled.context import add_process_noise, steps_of, transition_points
+from ..diagnostics.references import wrapped
 from ..errors import EstimatorError
 from ..estimator import call_predict
 from ..fold import Fold
@@ -73,7 +74,8 @@ class TrajectoriesBack:
             )
         _, Qs = self._moved(self._machine.prior[0][None, :].copy(), self._fold.u, dt)
         bare = [name for name, variance in zip(model.state_names, np.diag(Qs[0]), strict=True) if not variance > 0.0]
-        if bare or np.linalg.matrix_rank(_scaled(Qs[0])) < model.nx:
+        scale = np.sqrt(np.diag(Qs[0]))
+        if bare or np.linalg.matrix_rank(Qs[0] / np.outer(scale, scale)) < model.nx:
             what = f"{', '.join(bare[:4])} has no noise of its own" if bare else "Q is singular"
             raise EstimatorError(
                 f"{self._fold.estimator.name} cannot be smoothed: in {model.name} {what}, so there is no density by "
@@ -165,7 +167,7 @@ class TrajectoriesBack:
         found = np.empty((len(at), len(X)))
         for k, x in enumerate(at):
             off = x - forward
-            off[:, self._circular] = (off[:, self._circular] + np.pi) % (2.0 * np.pi) - np.pi
+            off[:, self._circular] = wrapped(off[:, self._circular])
             found[k] = np.einsum("ni,nij,nj->n", off, np.broadcast_to(inverse, (len(X), *inverse.shape[1:])), off)
         return found + log_det
 
@@ -187,17 +189,10 @@ class TrajectoriesBack:
     def _tell(self, i: int, at: np.ndarray) -> None:
         """Fill a row."""
         off = at - at[0]
-        off[:, self._circular] = (off[:, self._circular] + np.pi) % (2.0 * np.pi) - np.pi
+        off[:, self._circular] = wrapped(off[:, self._circular])
         mean = at[0] + off.mean(axis=0)
-        mean[self._circular] = (mean[self._circular] + np.pi) % (2.0 * np.pi) - np.pi
+        mean[self._circular] = wrapped(mean[self._circular])
         cov = np.atleast_2d(np.cov(off.T))
         self._out.mean[i], self._out.std[i] = mean[self._shown], np.sqrt(np.diag(cov))[self._shown]
         first, second = self._fold.pairs.T
         self._out.cross[i] = cov[first, second]
-
-
-def _scaled(Q: np.ndarray) -> np.ndarray:
-    """Return a covariance as a correlation."""
-    scale = np.sqrt(np.diag(Q))
-    correlation: np.ndarray = Q / np.outer(scale, scale)
-    return correlation
