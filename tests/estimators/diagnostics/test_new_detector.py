@@ -32,33 +32,19 @@ from app.web.twin_json import episodes_json
 from estimators.diagnostics.detector_state import sensor_states
 from estimators.diagnostics.detectors import ALARM_NAMES, detector_of
 from estimators.diagnostics.episodes import EpisodeTracker, episodes, judged_rows
-from estimators.fold import Fold
-from estimators.log import READING, Events, Log
-from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
-from estimators.tuning import Tuning
+from estimators.log import Log
+from tests.models import level_model
+from tests.support import folded
 
-def f(x, u, p, dt, out):
-    out[0] = x[0]
-
-def h(x, u, p, out):
-    out[0] = x[0]
-
-model = StateSpaceModel(
-    name="level", title="a level", states=(State("level", "m", mean=0.0, std=1.0),), inputs=(),
-    noises=(Noise("level", "m2/s", 1e-8),), sensors=(Sensor("gauge", (Row("gauge", "m", 1.0),), h=h),), f=f,
-    linear=True,
-)
+model = level_model({"gauge": 1.0}, 1e-8, linear=True)
 rng = np.random.default_rng(0)
 z = rng.standard_normal(6000)
 # Skewness 1.5 at mean 0 and variance 1.
 g = rng.gamma(16.0 / 9.0, size=3000)
 z[3000:] = (g - 16.0 / 9.0) / (4.0 / 3.0)
 log = Log.of(model)
-t = (1 + np.arange(z.size)) * 10**9
-one = [Events.one(int(k), int(k), READING, 0, float(y), model.width) for k, y in zip(t, z)]
-log.extend(Events.concat(one, model.width))
-fold = Fold("kf", model, Tuning.of(model), log)
-fold.advance()
+log.add("gauge", 1.0 + np.arange(z.size), z)
+fold = folded("kf", model, log)
 found = episodes(fold)
 judged = judged_rows(fold)
 tracker = EpisodeTracker(model, fold.tuning, fold.marginal, max_rows=1000)
@@ -85,7 +71,7 @@ print(json.dumps({
 def told(tmp_path_factory):
     root = tmp_path_factory.mktemp("copy")
     shutil.copytree(ROOT / "estimators", root / "estimators", ignore=shutil.ignore_patterns("__pycache__"))
-    for name in ("app", "config", "sources", "docs"):
+    for name in ("app", "config", "sources", "docs", "tests"):
         (root / name).symlink_to(ROOT / name)
     table = root / "estimators/diagnostics/detectors.py"
     text = table.read_text()

@@ -7,7 +7,7 @@ from estimators.diagnostics.episodes import episodes
 from estimators.diagnostics.health import HealthPolicy
 from estimators.fold import Fold
 from estimators.interface.table import table_of
-from estimators.log import READING, TICK, Events, Log
+from estimators.log import Log
 from tests.models import level_model
 from tests.support import SECOND
 from tests.support import folded as advanced
@@ -21,18 +21,13 @@ MODEL = level_model(dict.fromkeys(("one", "two", "three"), 1.0), 1e-6, linear=Tr
 def log_until(end: int, silent_from: int) -> Log:
     """Ticks at each second; gauge one reads noise, two repeats itself from 100 s on, three falls silent."""
     rng = np.random.default_rng(11)
-    rows = []
-    for k in range(end):
-        rows.append((k + 0.1, READING, 0, rng.normal()))
-        rows.append((k + 0.2, READING, 1, rng.normal() if k < 100 else 0.25))
-        if k < silent_from:
-            rows.append((k + 0.3, READING, 2, rng.normal()))
-        rows.append((k + 0.4, TICK, 0, np.nan))
-    t = np.array([round(row[0] * SECOND) for row in rows], np.int64)
-    kinds, channels = (np.array([row[k] for row in rows]) for k in (1, 2))
-    values = np.array([row[3] for row in rows], float).reshape(-1, 1)
     log = Log.of(MODEL)
-    log.extend(Events(t, t.copy(), kinds.astype(np.int8), channels.astype(np.int32), values))
+    k = np.arange(float(end))
+    one, two, three = rng.normal(size=(3, end))
+    log.add("one", k + 0.1, one)
+    log.add("two", k + 0.2, np.where(k < 100, two, 0.25))
+    log.add("three", k[:silent_from] + 0.3, three[:silent_from])
+    log.add_ticks(k + 0.4)
     return log
 
 

@@ -11,7 +11,7 @@ from estimators.diagnostics.detector_state import no_baseline
 from estimators.diagnostics.detectors import BITS, CAUSES, IMPOVERISHED, NARROW, SHIFTED_DOWN, SHIFTED_UP, SPIKY, STUCK
 from estimators.diagnostics.episodes import JOINED, Episode, episode_json, episodes, found_in, judged_rows
 from estimators.diagnostics.health import HealthPolicy
-from estimators.log import INPUT, READING, RESET, TICK, TRUTH, Events
+from estimators.log import READING, RESET, Events, Log
 from estimators.model.state_space import Input, State
 from estimators.track import DIVERGED, GATED, TRACKING, USED
 from estimators.tuning import Tuning
@@ -60,17 +60,16 @@ def folded(*, gauge=None, chain=None, skip=None, gate=None, truth=0.0, feed=0.0,
     for s, (change, noises) in enumerate(((gauge, z), (chain, others))):
         if change is not None:
             y[s][within] = change(level[within, None], noises[within], rng)
-    batch = []
-    for k in range(N):
-        t, off = (k + 1) * SECOND, BEGIN <= k < END
-        batch.append(Events.one(t, t, INPUT, 0, feed if off else 0.0, MODEL.width))
-        batch.append(Events.one(t, t, TICK, 0, (), MODEL.width))
-        for s in range(2):
-            if not (off and skip is not None and s in skip):
-                batch.append(Events.one(t, t, READING, s, y[s][k], MODEL.width))
-        batch.append(Events.one(t, t, TRUTH, 0, level[k] + (truth if off else 0.0), MODEL.width))
+    t, off = np.arange(1.0, N + 1.0), (np.arange(N) >= BEGIN) & (np.arange(N) < END)
+    log = Log.of(MODEL)
+    log.add_inputs(t, feed=np.where(off, feed, 0.0))
+    log.add_ticks(t)
+    for s, sensor in enumerate(MODEL.sensor_names):
+        kept = ~off | (skip is None or s not in skip)
+        log.add(sensor, t[kept], y[s][kept])
+    log.add_truth(t, level=level + np.where(off, truth, 0.0))
     tuning = Tuning.of(MODEL).set("gate", gate).set("gate.reopen", None)
-    return advanced("kf", MODEL, as_log(Events.concat(batch, MODEL.width)), tuning, policy=POLICY, expected=expected)
+    return advanced("kf", MODEL, log, tuning, policy=POLICY, expected=expected)
 
 
 def spiked(x, z, rng):

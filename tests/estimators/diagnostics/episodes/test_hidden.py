@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from estimators.diagnostics.episodes import found_in, judged_rows
-from estimators.log import READING, Events
+from estimators.log import Log
 from estimators.model.parts import Limits
 from estimators.tuning import Tuning
-from tests.support import SECOND, as_log, folded
+from tests.support import folded
 
 from .test_find import MODEL, POLICY
 
@@ -27,12 +27,10 @@ def found(change, tuning, n=N):
     level = np.cumsum(0.05 * rng.standard_normal(N))
     y = level + 0.2 * rng.standard_normal(N)
     y[BEGIN:END] = change(y[BEGIN:END])
-    batch = []
-    for k in range(n):
-        t = (k + 1) * SECOND
-        batch.append(Events.one(t, t, READING, 0, y[k], MODEL.width))
-        batch.append(Events.one(t, t, READING, 1, level[k] + rng.standard_normal(8), MODEL.width))
-    fold = folded("kf", LIMITED, as_log(Events.concat(batch, MODEL.width)), tuning, policy=POLICY)
+    log, t = Log.of(LIMITED), np.arange(1.0, n + 1.0)
+    log.add("gauge", t, y[:n])
+    log.add("chain", t, level[:n, None] + rng.standard_normal((n, 8)))
+    fold = folded("kf", LIMITED, log, tuning, policy=POLICY)
     items = found_in(judged_rows(fold))
     return {item.key[0]: item.episode for item in items if item.episode.subject == "gauge"}, len(items)
 
