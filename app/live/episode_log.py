@@ -26,7 +26,7 @@ from .jobs import Job
 from .outputs import Pull
 from .running_fold import Running
 
-PERIOD_S, MAX_PERIOD_S = 0.4, 3.0
+EPISODES_PERIOD_S, MAX_EPISODES_PERIOD_S = 0.4, 3.0
 """Seconds between two updates: when they are cheap, and at most."""
 
 PROCESSOR_SHARE = 0.05
@@ -129,7 +129,7 @@ class EpisodeLog:
         """Update, in a repeated job; return the seconds to the next update."""
         begun = time.monotonic()
         self.update()
-        return min(max((time.monotonic() - begun) / PROCESSOR_SHARE, PERIOD_S), MAX_PERIOD_S)
+        return min(max((time.monotonic() - begun) / PROCESSOR_SHARE, EPISODES_PERIOD_S), MAX_EPISODES_PERIOD_S)
 
     def update(self) -> None:
         """Feed the new rows, and report which episodes have begun and ended."""

@@ -25,11 +25,17 @@ from .jobs import Job, JobCancelled, PacedExecutor
 from .notices import Notices
 from .outputs import EventWindow, ProtectionLevels
 
-CHECK_PERIOD_S = 1.0
+ROOT_CAUSE_PERIOD_S = 1.0
 """Seconds between two checks of the open episodes."""
 
 MIN_EPISODE_S = 3.0
 """Duration of an episode from which its cause can be isolated."""
+
+LEVELS_PERIOD_S = 15.0
+"""Seconds between two looks for new events."""
+
+LEVELS_CPU_SHARE = 0.01
+"""Share of one processor that the levels of one revision may take; more expensive ones are computed less often."""
 
 
 class _Isolated(NamedTuple):
@@ -110,13 +116,6 @@ def _is_open(episode: Episode) -> bool:
     return episode.end is None and detector_of(episode.cause).isolate
 
 
-PERIOD_S = 15.0
-"""Seconds between two looks for new events."""
-
-CPU_SHARE = 0.01
-"""Share of one processor that the levels of one revision may take; more expensive ones are computed less often."""
-
-
 class ProtectionMonitor:
     """Computes the protection levels again and again."""
 
@@ -145,7 +144,7 @@ class ProtectionMonitor:
         if known is not None and (time.monotonic() < self._due or known.t == taken.end):
             return
         self._latest = self._compute(taken, job)
-        self._due = time.monotonic() + (time.thread_time() - begun) / CPU_SHARE
+        self._due = time.monotonic() + (time.thread_time() - begun) / LEVELS_CPU_SHARE
 
     def _compute(self, taken: EventWindow, job: Job) -> ProtectionLevels:
         # The model of the fold: the twin's files may have been saved since.

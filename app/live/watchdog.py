@@ -21,8 +21,22 @@ from estimators.numerics.jit import plain
 
 from ..terminal import complain
 
+if TYPE_CHECKING:
+    from estimators.fold import Fold
+
 CALL_TIMEOUT_S = 10.0
 """Seconds that one call of a model's function may take before a line names it."""
+
+CHECK_AFTER_S = 3.0
+"""Seconds that a fold may take before the functions of its model are called one by one."""
+
+STALLED_AFTER_S = 60.0
+"""Seconds after which a fold is reported although each of its functions returns."""
+
+ANSWER_TIMEOUT_S = 1.0
+"""Seconds for one function to return."""
+
+STALLED_REMEDY = "the estimate stays as it is. Ctrl-C ends the program; correct the model"
 
 
 class CallWatch:
@@ -73,22 +87,6 @@ class CallWatch:
                     return frame
                 frame = frame.f_back
         return None
-
-
-if TYPE_CHECKING:
-    from estimators.fold import Fold
-
-CHECK_AFTER_S = 3.0
-"""Seconds that a fold may take before the functions of its model are called one by one."""
-
-STALLED_AFTER_S = 60.0
-"""Seconds after which a fold is reported although each of its functions returns."""
-
-ANSWER_TIMEOUT_S = 1.0
-"""Seconds for one function to return."""
-
-
-STALLED_REMEDY = "the estimate stays as it is. Ctrl-C ends the program; correct the model"
 
 
 class Watchdog:

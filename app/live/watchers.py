@@ -16,9 +16,8 @@ from estimators.track import STALE, TRACKING, WAITING
 from sources.source import Source, controls_of
 
 from .alerts import Alerts
-from .episode_log import PERIOD_S as EPISODES_PERIOD_S
-from .episode_log import EpisodeLog
-from .fault_monitors import CHECK_PERIOD_S, PERIOD_S, ProtectionMonitor, RootCause
+from .episode_log import EPISODES_PERIOD_S, EpisodeLog
+from .fault_monitors import LEVELS_PERIOD_S, ROOT_CAUSE_PERIOD_S, ProtectionMonitor, RootCause
 from .notices import Notices
 from .running_fold import Running
 
@@ -43,8 +42,8 @@ class Watchers:
     def start(self) -> None:
         """Begin to monitor."""
         self._jobs.run("episodes", self.episode_log.look, every=EPISODES_PERIOD_S)
-        self._jobs.run("protection levels", self.integrity.look, every=PERIOD_S)
-        self._jobs.run("root cause", self.root_cause.update, every=CHECK_PERIOD_S)
+        self._jobs.run("protection levels", self.integrity.look, every=LEVELS_PERIOD_S)
+        self._jobs.run("root cause", self.root_cause.update, every=ROOT_CAUSE_PERIOD_S)
 
     def stop(self) -> None:
         """Look at the last rows and end."""

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from app.live.engine import Engine
-from app.live.episode_log import MAX_PERIOD_S
+from app.live.episode_log import MAX_EPISODES_PERIOD_S
 from app.studies.stress.scenario import asset_of
 from app.twin.twin import Twin, load_twin
 from estimators.log import MARK, Events
@@ -143,7 +143,7 @@ class Soak:
         print(f"\n{source.seconds:.0f} s of the asset in {took:.0f} s ({used:.0f} s of the processor), ", end="")
         print(f"{source.sent / took:,.0f} events a second, {source.mixes} mixes of faults")
         # Episodes are updated every three seconds at least.
-        time.sleep(MAX_PERIOD_S + 0.5)
+        time.sleep(MAX_EPISODES_PERIOD_S + 0.5)
 
     def account(self) -> None:
         """Every event is a row, was too late, or was refused for its time."""

@@ -10,15 +10,14 @@ from app.live import commands
 from app.live.changes import turned
 from app.live.engine import Engine
 from app.twin.twin import load_twin
-from app.views.recording.writer import Recorder
+from app.views.recording.writer import RecordingPart
 from app.web.commands_json import command_from_json
 from app.web.twin_json import status_json
 from estimators.errors import ConfigError
 from estimators.tuning import Tuning
-from tests.app.scripted import Scripted, pull_all, readings, wait_for
+from tests.app.scripted import Scripted, Stepped, fresh_status, pull_all, readings
 from tests.support import assert_same
 
-BROWSER = SimpleNamespace(client_id=0)
 TURNED = (
     commands.SetEstimator("ukf"),
     commands.SetOption("alpha", 0.5),
@@ -28,39 +27,26 @@ TURNED = (
 
 
 def carry_out(engine, *wanted):
-    """Each command, and the refold after it."""
     for command in wanted:
-        revision = engine.status().revision
         engine.submit(command)
-        wait_for(lambda revision=revision: engine.status().revision > revision and not engine.status().refolding)
+    engine.settle()
+    fresh_status(engine)
 
 
 @pytest.fixture
 def review(tmp_path):
     """A review of a session whose filter was turned while it was recorded; and the track that it ended with."""
-    source = Scripted()
-    engine = Engine(load_twin("motor_winding"), lambda report: source)
-    recorder = engine.recorder = Recorder(engine, lambda stream: lambda pull: None)
-    recorder.start()
-    engine.start()
-    try:
-        path = tmp_path / "run.rrd"
-        engine.submit(commands.Record(path))
-        t = np.arange(1.0, 301.0)
-        source.put(readings(t, 40.0 + 0.05 * t + np.random.default_rng(1).normal(0.0, 1.5, 300)))
-        wait_for(lambda: len(pull_all(engine).events) == 300)
-        carry_out(engine, *TURNED)
-        seen = pull_all(engine).track
-        engine.submit(commands.Record(None))
-        wait_for(lambda: path in recorder.finished)
-    finally:
-        engine.stop()
-        recorder.stop()
-    session, _ = open_review(path, None)
-    session.start()
-    wait_for(lambda: session.engine.status().finished)
-    yield session.engine, seen
-    session.stop()
+    stepped = Stepped(of=load_twin("motor_winding"))
+    part = RecordingPart(stepped.engine, tmp_path / "run.rrd", lambda stream: lambda pull: None)
+    t = np.arange(1.0, 301.0)
+    stepped.put(readings(t, 40.0 + 0.05 * t + np.random.default_rng(1).normal(0.0, 1.5, 300)))
+    part.write()
+    stepped.submit(*TURNED)
+    part.end()
+    part.release()
+    session, _ = open_review(tmp_path / "run.rrd", None)
+    carry_out(session.engine)
+    return session.engine, pull_all(stepped.engine).track
 
 
 def test_a_review_goes_back_to_what_was_recorded(review):
