@@ -242,7 +242,7 @@ class ReferenceSection(Section):
     events: Annotated[tuple[Count, ...], Field(min_length=1)]
     """Events of each log."""
     sums: Annotated[tuple[NotNegative, ...], Field(min_length=1)]
-    """The sum of the sizes of each log's values, which tells one from another."""
+    """Sum of the magnitudes of each log's values, which identifies the log."""
     figures: dict[str, FigureSection]
     """Figures by name."""
 

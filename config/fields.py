@@ -85,7 +85,7 @@ class Section(BaseModel):
     @model_validator(mode="before")
     @classmethod
     def _known_keys(cls, data: Any) -> Any:
-        # Before pydantic's own check, which knows the stray key but not its neighbours.
+        # Before pydantic's own check, which reports the stray key but not its neighbours.
         if isinstance(data, dict):
             # `from` is a word of Python, and so the name of no field.
             fields = {field.alias or name: field for name, field in cls.model_fields.items()}

@@ -367,7 +367,7 @@ class FaultSection(Section):
     rounded to multiples of `size`. dropout: with probability `rate` a measurement arrives empty. silence: nothing
     arrives. delay: arrives `size` seconds later. jitter: later by random seconds of that mean, `size`. bursts: arrives
     together, every `every` seconds. reorder: with probability `rate` it arrives after the next one. duplicate: with
-    probability `rate` it is said `count` times more, `every` seconds apart. clock_jump: stamped `size` seconds ahead.
+    probability `rate` it is repeated `count` times, `every` seconds apart. clock_jump: stamped `size` seconds ahead.
     clock_drift: the clock gains `size` seconds a second. swap: readings of `sensor` come as those of `other`. model:
     the true parameter of a simulated asset is multiplied by `size`."""
     sensor: Text | None = None

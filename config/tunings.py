@@ -16,11 +16,11 @@ from .companion_schema import TuningSection, VersionSection
 from .problems import check_section
 from .yaml_files import Key, ValuePlaces, read_text, shown_path
 
-OWN = "own"  # The name under which what the twin's file itself says is listed
+OWN = "own"  # Name of the values in the twin's own file
 
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,59}")
 
-SPREADS = ("variance", "std")  # Two ways to say the same: one takes the other's place
+SPREADS = ("variance", "std")  # Alternatives: one replaces the other
 
 _CONFIG = Path(str(resources.files("config")))
 SHIPPED = _CONFIG / "tunings"  # Folder of the versions that ship, a folder for each twin
@@ -132,8 +132,8 @@ def check_name(name: str) -> str:
 def overlay(data: dict[str, Any], places: ValuePlaces, version: Version) -> None:
     """Put a version's values in place of a twin's; errors about them name the version's file and line.
 
-    Entries are replaced one by one, so that what a version does not say (limits of a sensor, another filter's options)
-    stays; estimator, gate and baseline are replaced as a whole.
+    Entries are replaced one by one, so that those which a version lacks stay (limits of a sensor, another filter's
+    options); estimator, gate and baseline are replaced as a whole.
     """
     given = {key: value for key, value in version.data.items() if key != "version"}
     if "estimator" in given and given["estimator"] is not None:

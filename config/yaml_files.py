@@ -40,7 +40,7 @@ for _name, _pattern, _first in (
 
 @dataclass
 class ValuePlaces:
-    """Where each value stands: `file:line`, or the command-line option that gave it."""
+    """Place of each value: `file:line`, or the command-line option that gave it."""
 
     file: str
     lines: dict[Key, int] = field(default_factory=dict)

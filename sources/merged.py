@@ -35,7 +35,7 @@ class Merged:
 
     @property
     def span(self) -> tuple[int, int] | None:
-        """First and last time of all, ns; None if a source does not tell."""
+        """First and last time of all, ns; None if one is not known."""
         spans = [span_of(source) for source in self._sources]
         if any(span is None for span in spans):
             return None

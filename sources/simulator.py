@@ -104,12 +104,12 @@ class Simulator:
             np.sqrt(plan.variances if plan.variances is not None else [row.variance for row in sensor.rows])
             for plan, sensor in zip(self._plans, model.sensors, strict=True)
         ]
-        # By what white noise becomes the sensor's, correlated as the model says.
+        # Factors of the correlation matrices, by which white noise becomes the sensor's.
         self._roots = [
             None if sensor.correlation is None else np.linalg.cholesky(np.array(sensor.correlation))
             for sensor in model.sensors
         ]
-        self._spoken = [0] * len(self._plans)
+        self._reported = [0] * len(self._plans)
         self._circular = np.flatnonzero(truth.circular)
         self._rng = np.random.default_rng(seed)
         self._factor: tuple[bytes, np.ndarray] | None = None
@@ -188,8 +188,8 @@ class Simulator:
                 y += self._rng.normal(0.0, self._std[i], size=y.size)
             else:
                 y += self._std[i] * (root @ self._rng.standard_normal(y.size))
-            lost = plan.drop_every is not None and self._spoken[i] % plan.drop_every == plan.drop_every - 1
-            self._spoken[i] += 1
+            lost = plan.drop_every is not None and self._reported[i] % plan.drop_every == plan.drop_every - 1
+            self._reported[i] += 1
             rows.append((t, READING, i, np.full(y.size, np.nan) if lost else y))
         runs = self._all if self._all_every is not None and self._k % self._all_every == 0 else self._shown_runs
         rows += [(t, TRUTH, first, self._x[first:end].copy()) for first, end in runs]
@@ -224,7 +224,7 @@ class Simulator:
         return p
 
     def _jump(self, dt: float) -> None:
-        """Draw the next mode as the model says."""
+        """Draw the next mode from the model's probabilities."""
         jump = self._truth.model.jump
         if jump is None:
             return

@@ -40,7 +40,7 @@ _SAME = {
     "DegC": "degC",
     "degrees": "deg",
 }
-"""Spellings that stand for one thing only (1/min on a bus is a rotation)."""
+"""Spellings with one meaning (1/min on a bus is a rotation)."""
 
 _OTHERWISE = {"g": "standard_gravity", "C": "degC", "F": "degF"}
 """Second meaning of a spelling, if the first one (gram, coulomb, farad) has the wrong dimension."""
@@ -57,7 +57,7 @@ def _normal(unit: str) -> str:
 
 @lru_cache(maxsize=1)
 def _registry() -> pint.UnitRegistry:
-    import pint  # Here, not above: it takes half a second, and most twins speak in the model's own units.
+    import pint  # Here, not above: it takes half a second, and most twins use the model's own units.
 
     return pint.UnitRegistry(cache_folder=None)
 
@@ -149,7 +149,7 @@ def conversion(given: str | None, wanted: str, where: str) -> tuple[float, float
 def spread_factor(given: str | None, wanted: str, where: str, *, squared: bool) -> float:
     """Return the factor from a standard deviation, or a variance if `squared`, in `given` to one in `wanted`.
 
-    A spread knows no zero point: one of 2 °C is 2 K.
+    A spread has no offset: one of 2 °C is 2 K.
 
     Raises:
         SourceError: As `conversion`.
@@ -160,10 +160,10 @@ def spread_factor(given: str | None, wanted: str, where: str, *, squared: bool) 
 
 
 def to_ns(seconds: Any) -> np.ndarray:
-    """Float seconds as int64 nanoseconds.
+    """Return float seconds as int64 nanoseconds.
 
-    A float of today's epoch seconds has steps of 238 ns. Loggers write microseconds, which such a float can tell
-    apart: where one microsecond reads back as this very float, that microsecond is meant. Elsewhere the float's own
+    A float of today's epoch seconds has steps of 238 ns. Loggers write microseconds, which such a float can
+    distinguish: where a microsecond reads back as this very float, it is taken. Elsewhere the float's own
     value is taken, exact to the nanosecond, where `seconds * 1e9` would round to steps of 256 ns.
     """
     seconds = np.asarray(seconds, np.float64)
@@ -176,7 +176,7 @@ def to_ns(seconds: Any) -> np.ndarray:
 
 
 def second_ns(seconds: float) -> int:
-    """`to_ns` of one number, without arrays: for frames as they arrive."""
+    """Return `to_ns` of one number, without arrays: for frames as they arrive."""
     micros = round(seconds * 1e6)
     if abs(seconds) >= 2.0**23 and micros / 1e6 == seconds:
         return micros * 1000

@@ -37,7 +37,7 @@ class WorkerProcess:
     """A process that runs one generator after another and returns their items over a pipe, which bounds its lead."""
 
     def __init__(self) -> None:
-        # The pipe is never written to: its end tells the worker, wherever it is, that this process has gone.
+        # The pipe is never written to: its end signals the worker that this process has ended.
         theirs, self._lifeline = os.pipe()
         self._process = subprocess.Popen(
             [sys.executable, "-P", "-c", _BOOT],
@@ -56,7 +56,7 @@ class WorkerProcess:
         self._write((theirs, list(sys.path)))
 
     def _write(self, *items: Any) -> None:
-        with suppress(BrokenPipeError):  # A worker that died says so where its answer is awaited.
+        with suppress(BrokenPipeError):  # The end of a worker is reported where its answer is awaited.
             for item in items:
                 pickle.dump(item, self._requests)
             self._requests.flush()
@@ -87,7 +87,7 @@ class WorkerProcess:
         self._process.kill()
 
     def end(self, grace: float = 0.0) -> str:
-        """End it, and say how it had ended if it had: its status comes up to `grace` seconds after its pipe closed."""
+        """End it; return how it ended: its status comes up to `grace` seconds after its pipe closed."""
         self.answers.close()
         with suppress(BrokenPipeError):
             self._requests.close()
@@ -274,7 +274,7 @@ class IsolatedReader:
             self._worker = None
             raise ReaderError(f"its reader {_end(worker, EXIT_TIMEOUT_S)}") from None
         if answer is None:
-            # No more than was meant to be waited: a machine that was suspended meanwhile has not hung.
+            # At most the timeout: a machine that was suspended meanwhile has not hung.
             self._waited += min(time.monotonic() - begun, timeout)
             if self._waited >= self._timeout:
                 self._worker = None

@@ -79,7 +79,7 @@ def extract(signals, plan, length, data, values, state, bad):
         data: Their bytes, (n, at least the longest message), zeros after the end.
         values: Filled, (n, signals of a message): physical value, NaN where there is none.
         state: Filled, same shape: PRESENT, ABSENT or SHORT.
-        bad: Filled, (n,): 1 where a multiplexer has a value that the database does not know, 2 where the frame ends
+        bad: Filled, (n,): 1 where a multiplexer has a value that the database lacks, 2 where the frame ends
             before a multiplexer.
     """
     as_bits = np.zeros(1, np.uint64)

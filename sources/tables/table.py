@@ -22,8 +22,8 @@ from .text import find_decimal_comma, has_rows
 class Table:
     """Reads tables of the same columns one after the other, as one recording.
 
-    A row gives an event for its inputs, then its readings, then its true values. An empty cell (null in Parquet) says
-    nothing: a row without any cell of a sensor is no reading of it. NaN, or text that is not a number, is a
+    A row gives an event for its inputs, then its readings, then its true values. An empty cell (null in Parquet) is
+    ignored: a row without any cell of a sensor is no measurement of it. NaN, or text that is not a number, is a
     missing value.
 
     Args:

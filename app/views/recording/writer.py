@@ -162,9 +162,9 @@ class Recorder:
     def _reason(self, error: Exception) -> str:
         if self._open is None:
             return f"{type(error).__name__}: {error}"
-        said = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
+        reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
         path = self._open.file.path
-        return f"{path}: it can no longer be written ({said}); the recording up to here can be reviewed"
+        return f"{path}: it can no longer be written ({reason}); the recording up to here can be reviewed"
 
     def _fail(self, text: str) -> None:
         if not self._asked:
@@ -352,8 +352,9 @@ def write_recording(
         for start in range(0, log.n, MAX_PULL_ROWS):
             rows = slice(start, min(log.n, start + MAX_PULL_ROWS))
             here = [picture for picture in pictures if start < picture.before <= rows.stop]
-            said = lines if start == 0 else []
-            pull = Pull(0, start == 0, start, log.events.select(rows), track.select(rows), said, here)
+            pull = Pull(
+                0, start == 0, start, log.events.select(rows), track.select(rows), lines if start == 0 else [], here
+            )
             file.write(pull)
             drawing(pull)
             if smoothed is not None:

@@ -1,7 +1,7 @@
 """Feed of one browser's Rerun viewer.
 
 There is no Rerun server. Each browser has a feed with a cursor and a stream of its own, and asks for the next bytes
-when it has drawn the last ones. So a viewer that stops reading delays nobody, and nothing is queued for it.
+when it has drawn the last ones. So a viewer that stops reading delays no other, and nothing is queued for it.
 
 Each revision is another Rerun recording under the same paths. The viewer shows the newest, with the layout, zoom and
 play state that the user chose, and the page closes the one before.

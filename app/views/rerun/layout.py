@@ -70,14 +70,14 @@ def blueprint(
     nis = chart(
         "NIS, windowed mean in its 95 % bounds",
         ["/nis/reading", "/previous/nis", "/nis/window"],
-        # From a little below zero, whose label would stand on that of the time.
+        # From a little below zero, whose label would overlap that of the time.
         axis_y=rrb.ScalarAxis(range=(-0.08 * nis_limit(model), nis_limit(model)), zoom_lock=True),
     )
-    told = len(model.sensors) if len(model.sensors) <= MAX_SENSOR_LANES else 0
+    lanes = len(model.sensors) if len(model.sensors) <= MAX_SENSOR_LANES else 0
     health = rrb.StateTimelineView(
         origin=f"{root}/",
-        contents=[f"+ {root}/health", *([f"+ {root}/sensor/**"] if told else [])],
-        name="health and sensors" if told else "health",
+        contents=[f"+ {root}/health", *([f"+ {root}/sensor/**"] if lanes else [])],
+        name="health and sensors" if lanes else "health",
         time_view=axis,
     )
     columns = rrb.TextLogColumns(timeline_columns=[TIMELINE], text_log_columns=["LogLevel", "Body"])
@@ -101,8 +101,8 @@ def blueprint(
         charts = _stacked(states)
         above = [*charts, rrb.Horizontal(*_tabs(innovations), nis)]
         # As high as the lanes, of which those of up to three sensors are read at once.
-        lanes = 0.75 + 0.4 * min(told, MAX_VISIBLE_CHARTS)
-        shares = [1.25 * min(len(states), MAX_VISIBLE_CHARTS) / len(charts)] * len(charts) + [1.1, lanes, 1.5]
+        height = 0.75 + 0.4 * min(lanes, MAX_VISIBLE_CHARTS)
+        shares = [1.25 * min(len(states), MAX_VISIBLE_CHARTS) / len(charts)] * len(charts) + [1.1, height, 1.5]
     return rrb.Blueprint(
         rrb.Vertical(*above, health, bottom, row_shares=shares),
         rrb.TopPanel(state="hidden"),

@@ -1,7 +1,7 @@
 """A Viser server that only our own page server can reach.
 
-Viser serves whoever connects, checks no Origin, and lets any client ask for a public tunnel. Here each HTTP request
-and each WebSocket upgrade must carry a secret that only the page's proxy knows, and the tunnel is gone.
+Viser serves every connection, checks no Origin, and lets any client request a public tunnel. Here each HTTP request
+and each WebSocket upgrade must carry a secret that only the page's proxy has, and the tunnel is removed.
 """
 
 from __future__ import annotations

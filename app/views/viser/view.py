@@ -35,7 +35,7 @@ class ViserView:
     Without a browser it pulls, computes and sends nothing. The address of a browser's WebSocket has its options:
     `?part=scene` for the scene without the panel, and `theme=dark`.
 
-    Browsers reach `port` through the page's server only, which knows `secret`.
+    Browsers reach `port` through the page's server only, which has `secret`.
     """
 
     def __init__(self, engine: Running, *, secret: str) -> None:
