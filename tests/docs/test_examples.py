@@ -1,4 +1,4 @@
-"""The scripts of the guides run, and what they find agrees with figures computed without the program."""
+"""The scripts of the guides run, and their results agree with figures computed independently."""
 
 import importlib.util
 import runpy

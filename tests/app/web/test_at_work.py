@@ -1,4 +1,4 @@
-"""A fold that takes long: the page answers meanwhile, with what is known; what reads rows waits for a piece of it.
+"""A slow fold: the page answers meanwhile; requests for rows wait for one portion of it.
 
 The model's solver is let on by the test, step by step, so that the fold stands where the test wants it.
 """

@@ -1,4 +1,4 @@
-"""What the API answers to a command that cannot be: one line with value, rule and remedy, in the words of JSON."""
+"""Refused commands are answered in one line with value, rule and remedy, in terms of JSON."""
 
 import dataclasses
 import math

@@ -1,4 +1,4 @@
-"""The one port of the page, as a stranger meets it: who is refused, what is served, who waits for whom."""
+"""The port of the page: access rules, served files, the Viser proxy and the streams."""
 
 import json
 import socket

@@ -1,4 +1,4 @@
-"""What the API says of health: episodes with a place in docs/alarms.md, the cause, and the state of each sensor."""
+"""Health in the API: episodes with their section of docs/alarms.md, the cause, and the state of each sensor."""
 
 import json
 import re

@@ -1,4 +1,4 @@
-"""A sensor that lies is held out: what gave it away stays in the report, and what it reads is said."""
+"""A biased sensor that is held out: its episode stays in the report, and its offset is shown."""
 
 import re
 

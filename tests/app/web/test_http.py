@@ -1,4 +1,4 @@
-"""Bodies and queries of requests: what is no JSON, or breaks a rule, is refused in one line."""
+"""Bodies and queries of requests: invalid ones are refused in one line."""
 
 import asyncio
 import json

@@ -1,4 +1,4 @@
-"""Runs and tuning versions over HTTP: listed, pinned, named, loaded, compared, kept and saved, and what is refused."""
+"""Runs and tuning versions over HTTP: list, pin, name, load, compare, keep, save, refuse."""
 
 import shutil
 

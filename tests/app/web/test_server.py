@@ -1,4 +1,4 @@
-"""What the black-box tests of the page do not reach: the token's file, browsers' own hints, the viewer's files."""
+"""Token and cookie, the browser's own headers, and the files of the Rerun viewer."""
 
 import asyncio
 import gzip

@@ -1,4 +1,4 @@
-"""Charts as files: what they hold is what was folded, and a missing Matplotlib is one line."""
+"""Charts as files show the fold; a missing Matplotlib is reported in one line."""
 
 import sys
 

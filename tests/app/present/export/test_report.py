@@ -1,4 +1,4 @@
-"""A report is one file that needs no other, and says what the fold says."""
+"""A report is one file without external resources, with the figures of the fold."""
 
 import base64
 import json

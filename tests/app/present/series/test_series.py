@@ -80,7 +80,7 @@ class Viewer:
 
 
 def shown(engine, *columns, **query):
-    """What a browser that comes now is given at once."""
+    """Points that a new browser gets at once."""
     viewer = Viewer(Series(engine), *columns, **query)
     viewer.look()
     viewer.close()

@@ -13,7 +13,7 @@ PATIENCE = 60.0
 
 
 class Opened:
-    """A session, its gallery and what a browser could ask of them."""
+    """A session with its gallery, and requests of a browser."""
 
     def __init__(self, session):
         self.session = session

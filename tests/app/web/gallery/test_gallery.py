@@ -1,4 +1,4 @@
-"""The gallery at its door: what is on the shelf, one twin after another behind one port, and what fails to start."""
+"""The gallery over HTTP: cards, one twin after another behind one port, failed starts."""
 
 import gc
 import json

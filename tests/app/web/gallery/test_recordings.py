@@ -1,4 +1,4 @@
-"""The folder of recordings: what a browser may do in it, and that nothing outside it can be touched."""
+"""The folder of recordings: list, receive, review, delete; nothing outside it can be touched."""
 
 import json
 import os
@@ -107,7 +107,7 @@ def test_a_part_that_is_a_link_is_not_followed(folder):
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory):
-    """A session that recorded, the folder, and what the recording should be known by."""
+    """A session that recorded, the folder, and the recorded rows."""
     folder = tmp_path_factory.mktemp("recordings")
     with opened(folder, "motor_winding", speed=1e6) as session:
         engine = session.engine
@@ -150,6 +150,15 @@ def test_a_download_stays_within_the_folder(recorded, target):
     assert answer.status == 404 and b"private" not in answer.body
 
 
+def drop(session, name, data, **more):
+    client = session.client
+    query = "&".join(f"{key}={value}" for key, value in {"name": name, "offset": 0, "last": 1, **more}.items())
+    kind = ("Content-Type", "application/octet-stream")
+    headers = [("Host", client.host), ("Cookie", client.cookie), ("Origin", client.origin), kind]
+    answer = client.raw("POST", f"/api/gallery/recordings/drop?{query}", headers, data)
+    return answer.status, json.loads(answer.body)
+
+
 def test_open_review_and_back_and_delete(recorded):
     session, folder, rows = recorded
     status, answer = session.post("/api/gallery/recordings/open", {"name": "run.rrd"})
@@ -160,20 +169,18 @@ def test_open_review_and_back_and_delete(recorded):
     # The same bits as live, by the same engine and page.
     np.testing.assert_array_equal(pull_all(session.engine).track.mean, rows.track.mean)
     assert session.get("/api/status")["began_as"] == "recorded"
+    # Dropped on a page it opens too, and a damaged one is named.
+    data = (folder / "run.rrd").read_bytes()
+    for name, content in (("given.rrd", data), ("broken.rrd", data[:100])):
+        assert drop(session, name, content) == (200, {"name": name})
+        session.post("/api/gallery/recordings/open", {"name": name})
+        state = session.settled()
+        assert state["running"]["title"] == "given.rrd" and (name in str(state["failed"])) == (name == "broken.rrd")
     assert session.start("motor_winding")["running"]["review"] is False
     assert session.post("/api/gallery/recordings/delete", {"name": "../recordings0/run.rrd"})[0] == 400
     assert session.post("/api/gallery/recordings/delete", {"name": "run.rrd"}) == (200, {"deleted": "run.rrd"})
     assert not (folder / "run.rrd").exists()
     assert session.post("/api/gallery/recordings/open", {"name": "run.rrd"})[0] == 400
-
-
-def drop(session, name, data, **more):
-    client = session.client
-    query = "&".join(f"{key}={value}" for key, value in {"name": name, "offset": 0, "last": 1, **more}.items())
-    kind = ("Content-Type", "application/octet-stream")
-    headers = [("Host", client.host), ("Cookie", client.cookie), ("Origin", client.origin), kind]
-    answer = client.raw("POST", f"/api/gallery/recordings/drop?{query}", headers, data)
-    return answer.status, json.loads(answer.body)
 
 
 def test_a_log_that_is_dropped_is_read_by_a_twin(tmp_path):
@@ -201,29 +208,6 @@ def test_a_log_that_is_dropped_is_read_by_a_twin(tmp_path):
         assert "simulator" in state["failed"]["text"] and state["running"]["title"] == "winding on drive.csv"
         assert drop(session, "evil.py", b"1")[0] == 400 and drop(session, "../up.csv", b"1")[0] == 400
         assert drop(session, "big.csv", b"1", offset="-1")[0] == 400
-
-
-def test_a_recording_that_is_dropped_opens(tmp_path, recorded_bytes):
-    with opened(tmp_path / "recordings") as session:
-        assert drop(session, "given.rrd", recorded_bytes) == (200, {"name": "given.rrd"})
-        session.post("/api/gallery/recordings/open", {"name": "given.rrd"})
-        assert session.settled()["running"]["title"] == "given.rrd"
-        drop(session, "broken.rrd", recorded_bytes[:100])
-        session.post("/api/gallery/recordings/open", {"name": "broken.rrd"})
-        state = session.settled()
-        assert "broken.rrd" in state["failed"]["text"] and state["running"]["title"] == "given.rrd"
-
-
-@pytest.fixture
-def recorded_bytes(tmp_path):
-    with opened(tmp_path, "motor_winding", speed=1e6) as session:
-        wait_for(lambda: session.engine.status().finished, PATIENCE)
-        session.engine.submit(Record(tmp_path / "given.rrd"))
-        wait_for(lambda: session.engine.status().recording is not None, PATIENCE)
-        session.engine.submit(Record(None))
-        wait_for(lambda: session.session.recorder.finished, PATIENCE)
-    assert read_recording(tmp_path / "given.rrd").name == "motor_winding"
-    return (tmp_path / "given.rrd").read_bytes()
 
 
 def test_what_the_session_recorded_elsewhere_is_listed_as_well_and_nothing_else_there(tmp_path):

@@ -1,4 +1,4 @@
-"""Sessions with a page, and waiting for what it draws."""
+"""Sessions with a page, and waiting for its drawings."""
 
 from __future__ import annotations
 

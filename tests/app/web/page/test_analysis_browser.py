@@ -52,7 +52,7 @@ def test_what_if_draws_a_fan_and_says_when_a_limit_is_reached(page, session):
 
 
 def chosen(page):
-    """Of i q, what the forecast was told, and what is drawn of it."""
+    """Course of i q that the forecast used."""
     return page.evaluate("window.nisus.panes.whatif.found.chosen.i_q ?? null")
 
 

@@ -1,4 +1,4 @@
-"""What the page says of a sensor that is held out, of R where the innovations are correlated, and of many states."""
+"""Held-out sensors, R with correlated innovations, and charts of many states on the page."""
 
 import json
 import re

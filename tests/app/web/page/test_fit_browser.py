@@ -1,4 +1,4 @@
-"""Fit and versions on the page: what is wrong is found, put in as one edit, taken back; what loses is not offered."""
+"""Fit and versions on the page: a wrong R is fitted, applied as one edit and undone; a worse fit is not proposed."""
 
 import json
 

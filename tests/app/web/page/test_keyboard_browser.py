@@ -115,7 +115,7 @@ def test_every_control_is_reached_by_tab_and_has_a_name(visit, session, show):
 
 
 def color(text):
-    """What a browser computes: rgb(a), or color(srgb …) of a mixture."""
+    """Parse a computed colour: rgb(a), or color(srgb …) of a mixture."""
     numbers = [float(part) for part in re.findall(r"-?\d+\.?\d*(?:e-?\d+)?", text.removeprefix("color(srgb"))]
     parts = np.array(numbers[:3]) / (1.0 if text.startswith("color(srgb") else 255.0)
     return np.append(parts, numbers[3] if len(numbers) > 3 else 1.0)

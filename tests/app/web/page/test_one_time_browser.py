@@ -1,4 +1,4 @@
-"""One time: what is scrubbed in Rerun's viewer moves the page, what is gone to on the page moves Rerun's cursor."""
+"""One time: scrubbing in Rerun's viewer moves the page, and navigation on the page moves Rerun's cursor."""
 
 import pytest
 

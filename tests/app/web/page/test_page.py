@@ -1,4 +1,4 @@
-"""The whole program in headless Chromium: what a person does on the page, what the engine and the files made of it."""
+"""The whole program in headless Chromium: actions on the page, and their effect on engine and files."""
 
 import numpy as np
 import pytest

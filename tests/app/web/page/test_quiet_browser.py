@@ -1,4 +1,4 @@
-"""What nobody looks at is not sent, and what waits for news of a twin that has ended does not wait for ever."""
+"""Hidden views request nothing; the page stays current after a twin has ended."""
 
 import numpy as np
 import pytest
@@ -18,12 +18,12 @@ def session():
 
 
 def streams(session):
-    """What the server is asked for: the columns of each stream."""
+    """Columns of each open chart stream."""
     return {stream.name: set(stream.query.columns) for stream in session.server.series.streams}
 
 
 def test_the_charts_go_to_another_moment_of_the_stretch_that_they_show(page, session):
-    """Nothing else is asked for, and all the same the line above each says what it was then."""
+    """No new request is sent, and the legend shows the values at that time."""
     until(page, "window.nisus.charts.live.x.length > 100")
     page.evaluate("window.nisus.view.show(50, 150, 60)")
     until(page, "window.nisus.charts.range[0] === 50 && window.nisus.charts.live.x.at(-1) < 151")
@@ -143,7 +143,7 @@ def test_the_last_status_is_told_again(page):
 
 
 def test_an_episode_that_is_told_at_rest_is_drawn(page, session):
-    """A strip on a chart of the stack, in the colour of what was wrong, once the twin has ended and no frame comes."""
+    """Its strip is drawn on a chart after the twin has ended and no frame arrives."""
     until(page, "performance.now() - window.nisus.charts.drawnAt > 700")
     drawn = page.evaluate("window.nisus.drawn")
     strip = """(() => {

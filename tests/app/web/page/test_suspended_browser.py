@@ -25,7 +25,7 @@ LIVED = 300
 
 @pytest.fixture
 def suspendable(chromium, tmp_path):
-    """A Chromium in a process group of its own, and the port on which it can be told what to do."""
+    """A Chromium in a process group of its own, and the port that controls it."""
     profile = tmp_path / "profile"
     process = subprocess.Popen(
         [chromium, *FLAGS, f"--user-data-dir={profile}", "about:blank"],

@@ -19,7 +19,7 @@ def session():
 
 
 def chart(page, key):
-    """The value axis of a chart, and what is marked at its edges."""
+    """Value axis of a chart, and the marks at its edges."""
     return page.evaluate(
         """(key) => {
           const chart = window.nisus.charts.charts.find((chart) => chart.what.key === key);
