@@ -168,6 +168,13 @@ class ServedEngine:
         answer = self.client.post(path, fields)
         return answer.status, json.loads(answer.text)
 
+    def refolded(self, act):
+        """Do something that folds the history again, and wait for the end of that."""
+        before = self.engine.status().revision
+        result = act()
+        wait_for(lambda: self.engine.status().revision > before and not self.engine.status().refolding)
+        return result
+
     def command(self, command, **fields):
         """The reason if a command was refused, else None once it is carried out."""
         before = self.engine.revisions.version

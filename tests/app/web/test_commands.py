@@ -14,24 +14,8 @@ from estimators.errors import NisusError
 
 KINDS = typing.get_args(commands.Command)
 ODD = (
-    "x",
-    "",
-    None,
-    True,
-    -1,
-    0,
-    0.5,
-    math.nan,
-    math.inf,
-    1e300,
-    10**400,
-    [],
-    [3],
-    {},
-    {"a": 1},
-    "a" * 2000,
-    "\x1b[2J",
-)
+    "x", "", None, True, -1, 0, 0.5, math.nan, math.inf, 1e300, 10**400, [], [3], {}, {"a": 1}, "a" * 2000, "\x1b[2J",
+)  # fmt: skip
 
 PYTHONS = ("None", "True", "False", "convert", "Error", "NoneType", "<class", "dict", "tuple", "input_value")
 """What only Python says."""

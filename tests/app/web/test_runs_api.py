@@ -136,15 +136,16 @@ def test_what_guard_said_last_is_listed_beside_the_versions(twin_page):
 
 
 def turn(twin_page, key, value):
-    before = twin_page.engine.status().revision
-    twin_page.engine.submit(SetTuning(key, value))
-    wait_for(lambda: twin_page.engine.status().revision > before and not twin_page.engine.status().refolding)
+    twin_page.refolded(lambda: twin_page.engine.submit(SetTuning(key, value)))
+
+
+def load(twin_page, name):
+    assert twin_page.refolded(lambda: twin_page.post("/api/tunings/load", name=name)) == (200, {"name": name})
 
 
 def test_a_run_is_kept_and_loaded_again(twin_page, tmp_path):
-    assert tunings(twin_page)["running"] == "own" and [item["name"] for item in tunings(twin_page)["versions"]] == [
-        "own"
-    ]
+    before = tunings(twin_page)
+    assert before["running"] == "own" and [item["name"] for item in before["versions"]] == ["own"]
     turn(twin_page, "R.winding", 0.5)
     assert tunings(twin_page)["running"] == "own*"
     assert twin_page.post("/api/tunings", run=1, name="quiet", note="tried") == (200, {"name": "quiet"})
@@ -154,9 +155,7 @@ def test_a_run_is_kept_and_loaded_again(twin_page, tmp_path):
     assert version["scores"]["nis"] == pytest.approx(score["nis"], rel=1e-7)
 
     turn(twin_page, "Q.rate", 5.0)
-    before = twin_page.engine.status().revision
-    assert twin_page.post("/api/tunings/load", name="quiet") == (200, {"name": "quiet"})
-    wait_for(lambda: twin_page.engine.status().revision > before and not twin_page.engine.status().refolding)
+    load(twin_page, "quiet")
     status = twin_page.engine.status()
     # What was turned since is left behind.
     twin = load_twin(tmp_path / "winding.yaml", overrides={"tuning": "quiet"})
@@ -169,9 +168,7 @@ def test_a_run_is_kept_and_loaded_again(twin_page, tmp_path):
     np.testing.assert_array_equal(twin_page.engine._fold.track.mean, fold.track.mean)
     assert twin_page.get("/api/runs")[-1]["what"].startswith("version quiet: ")
     # And back to what the file says.
-    before = status.revision
-    assert twin_page.post("/api/tunings/load", name="own") == (200, {"name": "own"})
-    wait_for(lambda: twin_page.engine.status().revision > before and not twin_page.engine.status().refolding)
+    load(twin_page, "own")
     assert twin_page.engine.status().tuning.name == "own" and twin_page.engine.status().tuning.get("R.winding") == 4.0
 
 

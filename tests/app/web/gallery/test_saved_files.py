@@ -1,6 +1,7 @@
 """A twin's file saved in an editor: folded again, refused with its line, or started anew."""
 
 import os
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -224,28 +225,14 @@ def test_a_recording_has_the_twin_as_it_was_saved_last(pump):
 
 def test_a_file_is_read_once_it_stays_as_it_is(pump):
     """An editor that writes in pieces is not met half-way; and a comment folds nothing."""
-
-    class Opening:
-        files = (pump,)
-        stamp = stamp_of((pump,))
-        again = staticmethod(lambda: read.append(pump.read_text()) or load_twin(pump))
-
-    class Running:
-        opening = Opening()
-
-    class Watched:
-        running, starting = Running(), None
-        session = opener = property(lambda self: self)
-
-        def prepare(self, twin):
-            pass
-
-    read, watched = [], Watched()
-    engine = type("Engine", (), {"twin": load_twin(pump), "reload": lambda self, twin, why: folds.append(why)})()
-    engine.notices = type("Notices", (), {"say": lambda self, text, level="info": None})()
-    folds = []
-    watched.running.engine, watched.running.server = engine, type("Server", (), {"unread": "old"})()
-    files = SavedFiles(watched)
+    read = []
+    running = Mock()
+    running.opening.files, running.opening.stamp = (pump,), stamp_of((pump,))
+    running.opening.again = lambda: read.append(pump.read_text()) or load_twin(pump)
+    running.engine.twin = load_twin(pump)
+    gallery = Mock(starting=None)
+    gallery.session.running = running
+    files = SavedFiles(gallery)
     files.look()
     save(pump, YAML + "#")
     files.look()
@@ -254,12 +241,11 @@ def test_a_file_is_read_once_it_stays_as_it_is(pump):
     files.look()
     assert not read
     files.look()
-    assert read == [YAML + "# a comment\n"] and not folds and watched.running.server.unread is None
+    assert read == [YAML + "# a comment\n"] and not running.engine.reload.called and running.server.unread is None
     save(pump, YAML.replace("0.01", "0.02"))
-    files.look()
-    files.look()
-    files.look()
-    assert len(read) == 2 and folds == ["pump.yaml saved"]
+    for _ in range(3):
+        files.look()
+    assert len(read) == 2 and [call.args[1] for call in running.engine.reload.mock_calls] == ["pump.yaml saved"]
 
 
 @pytest.mark.parametrize(
