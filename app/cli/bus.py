@@ -74,14 +74,14 @@ def _channel(arguments: Bus, twin: Twin) -> str | int:
 
 
 def _logger(path: Path) -> Any:
-    """A writer of python-can's for the format that the file's ending names."""
-    import can
+    """Return a writer for the format that the file's ending names."""
+    from sources.can import log_writer
 
     if not path.absolute().parent.is_dir():
         raise ConfigError(f"--record {path}: there is no folder {path.parent}; create it first")
     if path.suffix.lower() not in FORMATS:
         raise ConfigError(f"--record {path}: is not a CAN log format; end it in {', '.join(FORMATS)}")
-    return can.Logger(path)
+    return log_writer(path)
 
 
 def _play(player: Any, duration: float | None) -> None:

@@ -11,6 +11,7 @@ import pytest
 
 from estimators.errors import SourceError
 from estimators.log import READING, Events
+from sources.can import log_writer
 from sources.can.decoder import Decoder
 from sources.can.log import CanLog
 from sources.source import Channel, Condition
@@ -38,7 +39,7 @@ def write(path, messages):
     # python-can's SQLite writer appends, and loses what is beyond 500 frames when it is stopped.
     size = 400 if path.suffix == ".db" else len(messages)
     for start in range(0, len(messages), size):
-        with can.Logger(path) as logger:
+        with log_writer(path) as logger:
             for message in messages[start : start + size]:
                 logger(message)
 
