@@ -30,7 +30,7 @@ def page(visit, session):
 
 def test_accepted_it_is_a_version_that_runs(page, session):
     engine = session.engine
-    (line,) = session.running.refits.open.fitted.lines
+    (line,) = session.running.refits.open.attempt.fitted.lines
     assert line.low < TRUE < line.high
     row = page.locator("#refit tbody tr").inner_text()
     assert row.startswith("R.winding") and "100 → " in row and "σ" in row
