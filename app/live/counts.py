@@ -8,7 +8,7 @@ from estimators.model.state_space import StateSpaceModel
 from estimators.plausibility import reasons_by_sensor
 from estimators.track import FAILED, GATED, MISSING, REASONS, SCREENED, VERDICT_NAMES, Track
 
-UNSETTLED = 8192
+MAX_UNSETTLED_ROWS = 8192
 """Last rows, which are counted each time; a late measurement rarely reaches back further."""
 
 
@@ -39,7 +39,7 @@ class RowCounts:
 
     def count(self, track: Track, channel: np.ndarray) -> dict[str, int]:
         """Return counts in total, by verdict, and by sensor and reason, given all rows and their channels."""
-        settled = max(self._settled, len(track) - UNSETTLED)
+        settled = max(self._settled, len(track) - MAX_UNSETTLED_ROWS)
         self._counts += self._of(track, channel, slice(self._settled, settled))
         self._settled = settled
         table = self._counts + self._of(track, channel, slice(settled, len(track)))
@@ -68,7 +68,7 @@ def last_run(codes: np.ndarray) -> int:
     """Return the index of the first of the equal codes at the end of an array that is not empty."""
     end = len(codes)
     while end > 0:
-        start = max(0, end - UNSETTLED)
+        start = max(0, end - MAX_UNSETTLED_ROWS)
         others = np.flatnonzero(codes[start:end] != codes[-1])
         if others.size:
             return start + int(others[-1]) + 1

@@ -34,7 +34,7 @@ REFOLDING = (
 PLAYBACK = (commands.Pause, commands.Speed, commands.Step, commands.Seek)
 """Commands that only a paced source can carry out."""
 
-OPTION = "options."
+OPTION_PREFIX = "options."
 """Prefix of an option's name among the keys of `SetTunings`."""
 
 MAX_MAINTENANCE_TEXT = 200
@@ -128,12 +128,12 @@ def retuned(command: REFOLDING, engine: Running) -> tuple[str, Tuning]:
     if not values:
         raise ConfigError("SetTunings: values is empty; it takes the value of each key")
     changed: dict[str, Any] = {
-        key.removeprefix(OPTION): value for key, value in values.items() if key.startswith(OPTION)
+        key.removeprefix(OPTION_PREFIX): value for key, value in values.items() if key.startswith(OPTION_PREFIX)
     }
     if changed and isinstance(command, commands.SetTuning):
         raise ConfigError(f"{command.key} is an option of the estimator; set it with SetOption")
     for key, value in values.items():
-        if not key.startswith(OPTION):
+        if not key.startswith(OPTION_PREFIX):
             tuning = tuning.set(key, value)
     return estimator, _with_options(estimator, tuning, changed, engine) if changed else tuning
 

@@ -15,7 +15,7 @@ from sources.source import Source
 
 from . import commands
 
-FIELDS = {"end": "duration", "sensor": "target", "input": "target", "parameter": "target"}
+FAULT_FIELDS = {"end": "duration", "sensor": "target", "input": "target", "parameter": "target"}
 """Fields of a fault with another name in the command."""
 
 
@@ -58,7 +58,7 @@ def fault_of(command: commands.InjectFault, model: StateSpaceModel) -> Fault:
     wrong = problem(fault, model)
     if wrong:
         field, text = wrong
-        raise ConfigError(f"InjectFault: {FIELDS.get(field, field)} {text}")
+        raise ConfigError(f"InjectFault: {FAULT_FIELDS.get(field, field)} {text}")
     return fault
 
 

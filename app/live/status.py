@@ -23,7 +23,7 @@ from .faults import Faulty
 from .outputs import Status
 from .watchers import Watchers
 
-FOLDED = "the measurements so far are being folded"
+FOLDING_CAUSE = "the measurements so far are being folded"
 """Cause of a twin without a row yet."""
 
 
@@ -46,7 +46,7 @@ def known_fields(model: StateSpaceModel, source: Source, **fields: Any) -> dict[
 def busy_status(last: Status, fields: Mapping[str, Any], busy: float) -> Status:
     """Return the last status of a fold that has been at work for `busy` seconds, with the present known fields."""
     if last.t is None and busy >= 1.0 and fields["awaited"] is None:
-        fields = {**fields, "cause": f"{FOLDED} ({busy:.0f} s so far)"}
+        fields = {**fields, "cause": f"{FOLDING_CAUSE} ({busy:.0f} s so far)"}
     return replace(last, **fields)
 
 
@@ -127,4 +127,4 @@ def _cause_without_rows(fold: Fold, watchers: Watchers, fields: Mapping[str, Any
         begun = fields["compiling"].get(awaited)
         since = f" ({begun:.0f} s so far)" if begun else ""
         return f"{awaited} is being compiled, which happens once{since}; measurements are kept meanwhile"
-    return FOLDED if fold.idle else watchers.silence.cause
+    return FOLDING_CAUSE if fold.idle else watchers.silence.cause

@@ -154,7 +154,7 @@ class HostClock:
             )
 
 
-LATENCIES = 4096
+MAX_LATENCIES = 4096
 """Measurements of which the latency is kept."""
 
 
@@ -162,11 +162,11 @@ class Latency:
     """Recent times from arrival to row, ms."""
 
     def __init__(self) -> None:
-        self._recent: deque[float] = deque(maxlen=LATENCIES)
+        self._recent: deque[float] = deque(maxlen=MAX_LATENCIES)
 
     def note(self, batch: Events) -> None:
         """Note a batch that was folded."""
-        arrivals = batch.arrival[batch.kind == READING][-LATENCIES:]
+        arrivals = batch.arrival[batch.kind == READING][-MAX_LATENCIES:]
         self._recent.extend(((time.time_ns() - arrivals) * 1e-6).tolist())
 
     def percentile(self, percent: float) -> float | None:

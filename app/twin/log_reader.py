@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 REMARKS = (*ORDER, NEVER, TRUNCATED, CLOCK_MOVED)
 
-PRINTED_ONCE = (WRONG_TIME,)
+ONCE_PRINTED_KEYS = (WRONG_TIME,)
 """Warnings printed once, since there may be one per row."""
 
 
@@ -37,7 +37,7 @@ def remarking(report: Callable[[str, str], None]) -> Callable[[str, str], None]:
         if key in REMARKS and text not in said:
             said.add(text)
             complain(text)
-        elif key in PRINTED_ONCE and key not in said:
+        elif key in ONCE_PRINTED_KEYS and key not in said:
             said.add(key)
             complain(text)
         report(key, text)

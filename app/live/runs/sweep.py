@@ -43,7 +43,7 @@ CHUNK_EVENTS = 256
 STALE_GROWTH = 1.5
 """A sweep is out of date once the log has so many times its events."""
 
-MATCHED = "R, matched"
+MATCHED_R_KEY = "R, matched"
 """Key of the fold for `matched`."""
 
 MAX_MATCHING_FOLDS, MATCHING_TOLERANCE = 5, 0.05
@@ -141,7 +141,7 @@ class Sweeps:
         revision, events, rows = self._matched
         current = revision == self._engine.revisions.runs[-1].number
         if not current or events < self._events() / STALE_GROWTH < MAX_SWEEP_EVENTS:
-            self._want(MATCHED)
+            self._want(MATCHED_R_KEY)
         return rows if current else None
 
     def _events(self) -> int:
@@ -182,7 +182,7 @@ class Sweeps:
         most, reason = self._affordable(taken)
         if most > MIN_SWEEP_EVENTS:
             taken = self._engine.last_events(most, rows=True) or taken
-        if key == MATCHED:
+        if key == MATCHED_R_KEY:
             if not reason:
                 self._match(taken, job)
             return

@@ -6,7 +6,7 @@ import pytest
 from app.live.jobs import Job, JobCancelled
 from app.live.runs.sweep import (
     FACTORS,
-    MATCHED,
+    MATCHED_R_KEY,
     MATCHING_TOLERANCE,
     Point,
     Sweeps,
@@ -171,7 +171,7 @@ def test_an_r_that_is_wrong_alone_is_mended_and_a_wrong_q_is_not_laid_to_r(r, q,
     sweeps = Sweeps(engine)
     as_it_is = noise(engine, sweeps)
     assert bool(as_it_is.doubts) == (r > 1.0 or doubted)  # a gain that is wrong leaves a correlation
-    sweeps.sweep(MATCHED, Job("test"))
+    sweeps.sweep(MATCHED_R_KEY, Job("test"))
     found = noise(engine, sweeps)
     assert bool(found.doubts) == doubted
     if not doubted:
