@@ -72,7 +72,7 @@ class ClockGuard:
         self._state = np.zeros((sensors + 3, 11), np.int64)
         self._shift = np.zeros(sensors + 2, np.int64)
         self._steps: list[int] = []
-        self._runs: dict[int, Run] = {}
+        self._runs: dict[int, HeldRun] = {}
         self._held = Events.empty(0)
         self._raw = np.zeros(0, np.int64)
         self._reach, self._judge, self._note, self._scan = compiled()
@@ -172,18 +172,20 @@ class ClockGuard:
         if run is None:
             live = work.live[i] or self._state[row, LIVE] > 0
             begin = int(self._state[self._everything, LAST])
-            run = self._runs[row] = Run(verdict == AHEAD, live, begin, self._agree, MAX_HELD_LIVE if live else MAX_HELD)
+            run = self._runs[row] = HeldRun(
+                verdict == AHEAD, live, begin, self._agree, MAX_HELD_LIVE if live else MAX_HELD
+            )
             self._state[row, HOLDING] = 1
         for k in (*rest, i):
             run.add(k, int(work.t[k]), int(work.arrival[k]))
         if self._shows_a_step(run, row):
             self._anchor(work, row)
 
-    def _has_come(self, work: Work, run: Run) -> bool:
+    def _has_come(self, work: Work, run: HeldRun) -> bool:
         """Return whether time has reached the events held ahead; the last of them, if arrivals are known."""
         return run.ahead and self._verdict(work, run.at[-1 if run.live else 0]) == FITS
 
-    def _contradicts(self, work: Work, run: Run, i: int) -> bool:
+    def _contradicts(self, work: Work, run: HeldRun, i: int) -> bool:
         """Return whether an event that fits contradicts the held ones.
 
         By an unchanged clock it was measured at t - `OFFSET` of the host's time at the earliest. It contradicts the
@@ -191,7 +193,7 @@ class ClockGuard:
         """
         return not run.live or int(work.t[i]) - int(self._state[work.rows[i], OFFSET]) > run.begun + self._agree
 
-    def _agrees(self, work: Work, run: Run, i: int) -> bool:
+    def _agrees(self, work: Work, run: HeldRun, i: int) -> bool:
         """Return whether an event implies the same clock as the held ones, except for delays."""
         t = int(work.t[i])
         if run.live:
@@ -204,7 +206,7 @@ class ClockGuard:
         reach = int(self._reach(self._state, work.rows[i], self._horizon, False))
         return run.ahead or reach < 0 or t <= run.t[-1] + reach
 
-    def _shows_a_step(self, run: Run, row: int, ended: bool = False) -> bool:
+    def _shows_a_step(self, run: HeldRun, row: int, ended: bool = False) -> bool:
         """Return whether held events agree for long enough, and show a step of their clock.
 
         Events of a table that went back may also be files in the wrong order. They show a step if they reach into what
@@ -227,7 +229,7 @@ class ClockGuard:
             return begin - run.highest > self._horizon + MAX_PERIODS_AHEAD * near
         return abs(begin - run.t[0] - nearest_zone(begin - run.t[0])) > near
 
-    def _step_back(self, run: Run, row: int) -> int:
+    def _step_back(self, run: HeldRun, row: int) -> int:
         """Return the step (ns) by which a table's clock went back if its channel went on at its own pace.
 
         The exact change of a time zone where it is near one: irregular samples do not tell their pace exactly.
@@ -309,7 +311,7 @@ class ClockGuard:
             stamp, shift = int(work.raw[i]), int(self._shift[row])
             work.refused.append(Refused(int(work.kind[i]), int(work.channel[i]), stamp, run.begin - shift))
 
-    def _end(self, row: int) -> Run:
+    def _end(self, row: int) -> HeldRun:
         """Remove and return the held events of a row."""
         self._state[row, HOLDING] = 0
         return self._runs.pop(row)
@@ -365,7 +367,7 @@ def plain_events(batch: Events) -> Events:
     return Events(columns[0], columns[1], columns[2], columns[3], batch.value)
 
 
-class Run:
+class HeldRun:
     """Held events of one channel that agree on another time.
 
     `ahead` or back; `live` if arrivals are known. `begin` is the newest time of all events before. `agree` is the

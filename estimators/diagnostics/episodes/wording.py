@@ -39,7 +39,7 @@ def observed_states(model: StateSpaceModel) -> np.ndarray:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Facts:
+class EpisodeFacts:
     """Facts of any episode.
 
     size: see `Detector.effect`. about: mean of the innovations of a row, or error of a state, in `unit`.
@@ -73,7 +73,7 @@ class Facts:
 
 
 @dataclass(frozen=True, kw_only=True)
-class SensorFacts(Facts):
+class SensorFacts(EpisodeFacts):
     """Facts of an episode of sensor s, or of its row k.
 
     correlation: lag-1 correlation of the innovations. reasons: limits that the measurements violate. lasted: duration
@@ -153,7 +153,7 @@ class SensorFacts(Facts):
 
 
 @dataclass(frozen=True, kw_only=True)
-class TwinFacts(Facts):
+class TwinFacts(EpisodeFacts):
     """Facts of an episode of a state, an input or the twin.
 
     limits: range in which the model was fitted. ancestors: particles from which all descend. off: sensors that
