@@ -196,6 +196,18 @@ def test_a_late_measurement_replaces_the_rows_from_there_on():
     same(viewer, shown(stepped.engine, MEAN, READING))
 
 
+def test_rows_of_a_log_that_began_again_replace_those_before_also_where_there_are_none_yet():
+    stepped = Stepped(source=Replayed())
+    stepped.put(measured(700))
+    viewer = Viewer(Series(stepped.engine), MEAN, since=10.0, until=60.0)
+    viewer.look()
+    assert len(viewer.x) > 400
+    stepped.source.restart()
+    stepped.put(measured(20))
+    viewer.look()
+    assert len(viewer.x) <= 1 and all(viewer.x < 10.0)
+
+
 def test_two_points_a_group():
     """A line's extremes in the order in which they lead on; a band's edge twice; a dot that is alone once."""
     t = np.arange(4) * SECOND
