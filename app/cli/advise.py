@@ -12,7 +12,6 @@ from estimators.log import READING, Log
 from sources.inspect import RecordingContents
 
 from ..present.result import TableColumn, Topic, to_json, to_text
-from ..studies.advice.draft import python_text, yaml_text
 from ..studies.advice.measured import Measured, digits, percent, seconds_text
 from ..studies.advice.plan import DraftPlan, Moves, plan
 from ..studies.advice.relations import Pair
@@ -21,8 +20,8 @@ from ..studies.advice.verdict import Advice, advice_json, apply, lasting_lines, 
 from ..studies.advice.verdict import advise as recommend
 from ..twin.log_reader import read_log
 from ..twin.twin import Twin, load_twin
-from .log import database_of, look
-from .new import check_new, model_of, write_pair
+from .log import look
+from .new import write_draft
 from .options import names_of, settings
 from .prepare import attend, prepare
 
@@ -106,11 +105,7 @@ def _write(arguments: Arguments, out: Path, found: RecordingContents, drafted: D
     """Write the two files of the draft, and print the next steps."""
     if out.suffix not in (".yaml", ".yml", ""):
         raise ConfigError(f"--out {out}: must end in .yaml")
-    name, folder = out.stem, out.parent
-    check_new(name, folder)
-    model, databases = model_of(name), [database_of(text) for text in arguments.dbc]
-    text = yaml_text(name, model, drafted, found, databases, arguments.time_unit, folder)
-    written = write_pair(name, folder, text, python_text(name, model, drafted))
+    written = write_draft(out.stem, out.parent, found, drafted, arguments)
     if not arguments.json:
         print("\nWritten: " + " and ".join(map(str, written)))
         print(f"Next: nisus advise {written[0]}    to check its filter and noises")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import tempfile
 from collections.abc import Mapping
 from dataclasses import replace
@@ -23,14 +22,14 @@ from estimators.registry import find_estimator
 from estimators.smoothing.smooth import check_smooth
 from estimators.tuning import Tuning
 
-from ..present.result import to_text
+from ..present.result import to_json, to_text
 from ..studies.learn import Lesson, as_dict, correction_text, noises_of, scores_of, sections
 from ..terminal import complain
 from ..twin.learned import run_net
 from ..twin.log_reader import read_log
 from ..twin.model import physics_of
 from ..twin.twin import Twin, load_twin
-from .options import check_output, settings
+from .options import check_output, names_of, settings
 from .prepare import attend, prepare
 
 if TYPE_CHECKING:
@@ -42,7 +41,10 @@ STRETCHES = 9  # long parts of each recording over which errors add up to choose
 
 def learn_correction(arguments: Arguments) -> int:
     """Run the command."""
-    corrects, features = _names("--corrects", arguments.corrects), _names("--features", arguments.features)
+    corrects, features = names_of(arguments.corrects), names_of(arguments.features)
+    for option, names in (("--corrects", corrects), ("--features", features)):
+        if not names:
+            raise ConfigError(f"{option} names nothing; write names with commas")
     _check(arguments)
     net = None if arguments.net is None else run_net(arguments.net, len(features), len(corrects))
     overrides = {**settings(arguments.set, arguments.estimator), "learned": "null"}
@@ -99,7 +101,10 @@ def learn_correction(arguments: Arguments) -> int:
     recordings = [Recording(log, 1.0, held_out_rows(log, arguments.blocks)) for log in logs]
 
     def judge() -> list[PartScore]:
-        return [worths(twin.estimator, [Setting(each, None)], recordings, _go)[0].held_out for each in tunings]
+        return [
+            worths(twin.estimator, [Setting(each, None)], recordings, lambda folds: True)[0].held_out
+            for each in tunings
+        ]
 
     parts: list[PartScore] = attend(twin.model, judge, "judging")
     lesson = Lesson(
@@ -113,7 +118,7 @@ def learn_correction(arguments: Arguments) -> int:
         reasons=against(parts[:2], parts[2], corrects),
     )
     if arguments.json:
-        print(json.dumps({"twin": twin.name, **as_dict(lesson)}, allow_nan=False))
+        print(to_json({"twin": twin.name, **as_dict(lesson)}))
     else:
         print("\n".join(to_text(sections(twin.name, arguments.window, lesson, arguments.keep))))
     if lesson.better and arguments.keep is not None:
@@ -132,9 +137,7 @@ def _check(arguments: Arguments) -> None:
     if (arguments.kind == NET) != (arguments.net is not None):
         raise ConfigError("--net FILE.onnx: is for --kind net, which needs it")
     if arguments.keep is not None:
-        if arguments.keep.suffix not in (".yaml", ".yml"):
-            raise ConfigError(f"--keep {arguments.keep}: must end in .yaml")
-        check_output("--keep", arguments.keep)
+        check_output("--keep", arguments.keep, ".yaml", ".yml")
 
 
 def _tuned_physics(twin: Twin) -> StateSpaceModel:
@@ -145,21 +148,10 @@ def _tuned_physics(twin: Twin) -> StateSpaceModel:
     return replace(physics, parameters=parameters)
 
 
-def _names(option: str, text: str) -> tuple[str, ...]:
-    names = tuple(name.strip() for name in text.split(",") if name.strip())
-    if not names:
-        raise ConfigError(f"{option} names nothing; write names with commas")
-    return names
-
-
 def _tuned(tuning: Tuning, noise: Mapping[str, float]) -> Tuning:
     for name, variance in noise.items():
         tuning = tuning.set(f"Q.{name}", variance)
     return tuning
-
-
-def _go(folds: int) -> bool:
-    return True
 
 
 def _beside(net: Path | None, keep: Path) -> Path | None:

@@ -10,9 +10,14 @@ from config.loader import shipped
 from config.yaml_files import writing
 from estimators.errors import ConfigError
 
+from .options import names_of
+
 if TYPE_CHECKING:
+    from sources.inspect import RecordingContents
+
+    from ..studies.advice.plan import DraftPlan
     from .arguments import New as Arguments
-    from .arguments import Schema
+    from .arguments import Schema, TableOptions
 
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]*")
 
@@ -140,40 +145,44 @@ def write_schema(arguments: Schema) -> int:
 
 
 def new_twin(arguments: Arguments) -> int:
-    """Write the two files of a new twin and print their paths."""
-    for path in new_files(arguments):
-        print(path)
-    return 0
-
-
-def new_files(arguments: Arguments) -> tuple[Path, Path]:
-    """Write the two files: a pump, or the signals of a recording.
+    """Write the two files of a new twin, a pump or the signals of a recording, and print their paths.
 
     Raises:
         ConfigError: If the twin cannot be written so.
         SourceError: If a recording cannot be read.
     """
-    name, folder = arguments.name, arguments.folder
-    wanted = [text.strip() for text in arguments.signals.split(",") if text.strip()]
-    if not arguments.log:
-        if wanted or arguments.dbc:
-            raise ConfigError("--signals and --dbc are for recordings; name one with --log FILE")
-        return write_twin(name, folder)
+    if arguments.log:
+        from ..studies.advice.plan import plan
+        from .log import look
+
+        check_new(arguments.name, arguments.folder)
+        found = look(arguments.log, arguments.dbc, arguments.time, arguments.time_unit)
+        drafted = plan(found, names_of(arguments.signals))
+        paths = write_draft(arguments.name, arguments.folder, found, drafted, arguments)
+    elif names_of(arguments.signals) or arguments.dbc:
+        raise ConfigError("--signals and --dbc are for recordings; name one with --log FILE")
+    else:
+        paths = write_twin(arguments.name, arguments.folder)
+    for path in paths:
+        print(path)
+    return 0
+
+
+def write_draft(
+    name: str, folder: Path, found: RecordingContents, drafted: DraftPlan, options: TableOptions
+) -> tuple[Path, Path]:
+    """Write the two files of a draft from recordings.
+
+    Raises:
+        ConfigError: As `write_twin`.
+    """
     from ..studies.advice.draft import python_text, yaml_text
-    from ..studies.advice.plan import plan
-    from .log import database_of, look
+    from .log import database_of
 
     check_new(name, folder)
-    found = look(arguments.log, arguments.dbc, arguments.time, arguments.time_unit)
-    drafted = plan(found, wanted)
-    databases = [database_of(text) for text in arguments.dbc]
-    model = model_of(name)
-    return write_pair(
-        name,
-        folder,
-        yaml_text(name, model, drafted, found, databases, arguments.time_unit, folder),
-        python_text(name, model, drafted),
-    )
+    model, databases = model_of(name), [database_of(text) for text in options.dbc]
+    text = yaml_text(name, model, drafted, found, databases, options.time_unit, folder)
+    return write_pair(name, folder, text, python_text(name, model, drafted))
 
 
 def write_twin(name: str, folder: Path) -> tuple[Path, Path]:

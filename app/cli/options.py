@@ -10,12 +10,14 @@ from typing import get_args, get_type_hints
 from estimators.errors import ConfigError, quoted
 
 
-def check_output(option: str, path: Path) -> None:
+def check_output(option: str, path: Path, *endings: str) -> None:
     """Refuse a file that cannot be written, before minutes of work.
 
     Raises:
-        ConfigError: If it is a folder, or its folder is missing or not writable.
+        ConfigError: If it has none of the endings, is a folder, or its folder is missing or not writable.
     """
+    if endings and path.suffix not in endings:
+        raise ConfigError(f"{option} {path}: must end in {endings[0]}")
     folder = path.absolute().parent
     if path.is_dir():
         raise ConfigError(f"{option} {path}: is a folder; name a file in it")

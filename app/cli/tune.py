@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -27,7 +27,7 @@ from ..terminal import complain
 from ..twin.defaults import bounds_of, natural_aim
 from ..twin.log_reader import read_log, read_logs
 from ..twin.twin import Twin, load_twin
-from .options import check_output, settings
+from .options import check_output, names_of, settings
 from .prepare import attend, prepare
 
 if TYPE_CHECKING:
@@ -38,7 +38,7 @@ MIN_BLOCKS = 3  # least number of blocks, of which one is held out
 
 def tune_twin(arguments: Arguments) -> int:
     """Run the command."""
-    wanted = [key.strip() for key in arguments.fit.split(",") if key.strip()]
+    wanted = names_of(arguments.fit)
     if not wanted:
         raise ConfigError("--fit names nothing; write for example --fit Q,R")
     if arguments.blocks < MIN_BLOCKS:
@@ -46,13 +46,11 @@ def tune_twin(arguments: Arguments) -> int:
     if arguments.predict and arguments.aim not in (CRPS, ERROR):
         raise ConfigError("--predict: is for --aim crps and --aim error; the likelihood is that of every sensor")
     if arguments.save is not None:
-        if arguments.save.suffix not in (".yaml", ".yml"):
-            raise ConfigError(f"--save {arguments.save}: must end in .yaml")
-        check_output("--save", arguments.save)
+        check_output("--save", arguments.save, ".yaml", ".yml")
     if arguments.keep is not None:
         check_free(find(arguments.twin), arguments.keep)
     if arguments.windows is not None:
-        return tune_windows(arguments, wanted, _recordings)
+        return tune_windows(arguments, wanted, arguments.windows)
     if arguments.every is not None:
         raise ConfigError("--every: is the time between the ends of two --windows; give both")
     twin, recordings = _recordings(arguments)
@@ -75,15 +73,21 @@ def tune_twin(arguments: Arguments) -> int:
         print(json.dumps({"twin": twin.name, **fit_json(found)}, allow_nan=False))
     else:
         print("\n".join(to_text(sections(twin, found))))
-    if arguments.save is not None and found.proposed:
+    if not found.proposed:
+        return 1
+    _save(arguments, twin, found, arguments.log or (f"{twin.name}, its own log",))
+    return 0
+
+
+def _save(arguments: Arguments, twin: Twin, found: Fitted, fitted_on: Sequence[str]) -> None:
+    """Write a proposed tuning to the file of `--save` and to the version of `--keep`."""
+    if arguments.save is not None:
         text = heading(twin, found) + tuning_yaml(twin.config, twin.estimator, *found.setting)
         with writing(arguments.save, "--save"):
             arguments.save.write_text(text, encoding="utf-8")
-    if arguments.keep is not None and found.proposed:
-        fitted_on = arguments.log or (f"{twin.name}, its own log",)
-        given = settings_of(found, [str(name) for name in fitted_on], printable(arguments.note))
-        complain(f"{shown_path(keep(twin, arguments.keep, version_text(twin, given)))}: kept")
-    return 0 if found.proposed else 1
+    if arguments.keep is not None:
+        settings = settings_of(found, list(fitted_on), printable(arguments.note))
+        complain(f"{shown_path(keep(twin, arguments.keep, version_text(twin, settings)))}: kept")
 
 
 def _recordings(arguments: Arguments) -> tuple[Twin, list[Recording]]:
@@ -111,33 +115,24 @@ def _named(text: str) -> tuple[list[Path], float]:
         ConfigError: If the weight is no positive number.
     """
     files, at, weight = text.rpartition("@")
-    if not at:
-        return [Path(part) for part in text.split(",")], 1.0
     try:
-        number = float(weight)
+        number = float(weight) if at else None
     except ValueError:
-        # A file may have such a name.
+        number = None  # a file may have such a name
+    if number is None:
         return [Path(part) for part in text.split(",")], 1.0
     if not 0.0 < number < float("inf"):
         raise ConfigError(f"--log {text}: the weight is {weight}; it must be positive")
     return [Path(part) for part in files.split(",")], number
 
 
-Recordings = Callable[["Arguments"], tuple[Twin, list[Recording]]]
-
-
-def tune_windows(arguments: Arguments, wanted: Sequence[str], recordings: Recordings) -> int:
-    """Fit window after window; `recordings` reads the twin and its logs.
-
-    Returns:
-        0 if something was adopted, else 1.
-    """
-    assert arguments.windows is not None
-    window = _seconds("--windows", arguments.windows)
+def tune_windows(arguments: Arguments, wanted: Sequence[str], windows: str) -> int:
+    """Fit window after window; return 0 if something was adopted, else 1."""
+    window = _seconds("--windows", windows)
     every = window if arguments.every is None else _seconds("--every", arguments.every)
     if arguments.aim not in (None, LIKELIHOOD):
         raise ConfigError(f"--aim {arguments.aim}: windows are fitted by their likelihood; leave it out")
-    twin, given = recordings(arguments)
+    twin, given = _recordings(arguments)
     if any(item.weight != 1.0 for item in given):
         raise ConfigError("--log: with --windows each recording follows the one before; leave the weights out")
 
@@ -171,17 +166,8 @@ def tune_windows(arguments: Arguments, wanted: Sequence[str], recordings: Record
     adopted = [refit.fitted for _, refit in found if refit.fitted is not None and refit.proposed]
     if not adopted:
         return 1
-    last = adopted[-1]
-    if arguments.save is not None:
-        with writing(arguments.save, "--save"):
-            arguments.save.write_text(
-                heading(twin, last) + tuning_yaml(twin.config, twin.estimator, *last.setting), encoding="utf-8"
-            )
-    if arguments.keep is not None:
-        names = [str(name) for name in arguments.log or (f"{twin.name}, its own log",)]
-        settings = settings_of(last, [f"{', '.join(names)}: windows of {window:g} s"], printable(arguments.note))
-        path = keep(twin, arguments.keep, version_text(twin, settings))
-        complain(f"{shown_path(path)}: kept")
+    names = ", ".join(arguments.log or (f"{twin.name}, its own log",))
+    _save(arguments, twin, adopted[-1], [f"{names}: windows of {window:g} s"])
     return 0
 
 

@@ -16,7 +16,6 @@ import re
 import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from math import isfinite
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +26,7 @@ from estimators.fit.objective import ALONE
 from estimators.log import Log
 from estimators.registry import find_entry, unfit
 
+from ...present.result import plain
 from ...twin.twin import Twin
 from .coloured_noise import lasting
 from .measured import NO, UNTOLD, YES, Claim, Measured, digits
@@ -210,26 +210,10 @@ def advice_json(twin: Twin, log: Log, told: Advice) -> dict[str, Any]:
         "options": told.options,
         "because": list(told.because),
         "reasons": told.reasons,
-        "claims": [
-            {
-                "key": claim.key,
-                "question": claim.question,
-                "answer": claim.answer,
-                "figure": _number(claim.figure),
-                "threshold": _number(claim.threshold),
-                "of": claim.of,
-                "reason": claim.reason,
-                "remedy": claim.remedy,
-            }
-            for claim in told.claims
-        ],
+        "claims": [plain(claim) for claim in told.claims],
         "lines": lines(told) + lasting_lines(told),
         "remedies": told.remedies,
     }
-
-
-def _number(value: float | None) -> float | None:
-    return None if value is None or not isfinite(value) else float(value)
 
 
 ESTIMATOR = re.compile(r"^estimator[ \t]*:[^\n]*\n(?:(?:[ \t]*\n)*[ \t]+\S[^\n]*\n)*", re.MULTILINE)
