@@ -1,10 +1,15 @@
-"""A browser for the tests of a file."""
+"""A browser, the command line, and a twin file for the tests of `app`."""
 
+import json
+import shutil
 from collections.abc import Iterator
-from typing import Any
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import pytest
 
+from app.cli.main import main
+from config.loader import TWINS
 from tests.chromium import launched
 
 
@@ -13,3 +18,58 @@ def browser(chromium: str) -> Iterator[Any]:
     """Chromium, as Playwright drives it; each test opens a page of its own in it."""
     with launched(chromium) as started:
         yield started
+
+
+class Finished(NamedTuple):
+    """A command that has ended: exit status, and what it printed."""
+
+    status: int
+    out: str
+    err: str
+
+    @property
+    def json(self) -> Any:
+        """Its last line of output as strict JSON."""
+        return json.loads(self.out.splitlines()[-1], parse_constant=pytest.fail)
+
+    @property
+    def words(self) -> str:
+        """Its output on one line."""
+        return " ".join(self.out.split())
+
+
+class CommandLine:
+    """Runs commands in this process; arguments may be anything with a text."""
+
+    def __init__(self, capsys: pytest.CaptureFixture[str]) -> None:
+        self._capsys = capsys
+
+    def run(self, *arguments: object) -> Finished:
+        """Run a command, whatever its exit status."""
+        self._capsys.readouterr()
+        return Finished(main([str(argument) for argument in arguments]), *self._capsys.readouterr())
+
+    def __call__(self, *arguments: object) -> Finished:
+        """Run a command that succeeds."""
+        done = self.run(*arguments)
+        assert done.status == 0, done
+        return done
+
+    def refuses(self, *arguments: object) -> str:
+        """Run a command that is refused with status 2 and one line, and return the line."""
+        done = self.run(*arguments)
+        lines = [line for line in done.err.splitlines() if not line.startswith("compil")]
+        assert done.status == 2 and len(lines) == 1 and lines[0].startswith("nisus: "), done
+        return lines[0]
+
+
+@pytest.fixture
+def nisus(capsys: pytest.CaptureFixture[str]) -> CommandLine:
+    """The command line."""
+    return CommandLine(capsys)
+
+
+@pytest.fixture
+def winding(tmp_path: Path) -> Path:
+    """A twin file of a test's own: the bundled one of a motor winding."""
+    return Path(shutil.copy(TWINS / "motor_winding.yaml", tmp_path / "winding.yaml"))

@@ -8,10 +8,8 @@ import pytest
 
 from app.cli import bus
 from app.cli.arguments import Bus
-from app.cli.main import main
 from app.twin.sources.asset import make_asset
 from app.twin.twin import load_twin
-from estimators.errors import ConfigError
 from estimators.log import INPUT, READING, TRUTH, Events, truth_of
 from tests.support import read_all
 
@@ -94,37 +92,3 @@ def test_listeners_hear_what_the_bus_took(monkeypatch: pytest.MonkeyPatch) -> No
 )
 def test_the_channel(interface: str, channel: str | None, expected: str | int) -> None:
     assert bus._channel(Bus("motor_can", interface=interface, channel=channel), load_twin("motor_can")) == expected
-
-
-@pytest.mark.parametrize(
-    ("arguments", "expected"),
-    [
-        (["motor_can", "--duration", "0"], "--duration 0: must be positive"),
-        (["motor_can", "--interface", "virtual"], "stay in this process; use udp_multicast, or give --record"),
-        (["motor_can", "--interface", "socketcan"], "needs a channel; give --channel, for example can0"),
-        (["motor_winding"], "source is of type simulator"),
-        (
-            ["motor_can", "--interface", "virtual", "--record", "drive.txt"],
-            "--record drive.txt: is not a CAN log format",
-        ),
-        (
-            ["motor_can", "--interface", "virtual", "--record", "drive.db"],
-            "end it in .asc, .blf, .csv, .log, .mf4, .trc",
-        ),
-        (["motor_can", "--interface", "virtual", "--record", "no/drive.blf"], "there is no folder no; create it first"),
-        (["motor_can", "--interface", "no_such_bus", "--channel", "x"], "CAN bus no_such_bus:x: it cannot be opened"),
-    ],
-)
-def test_what_cannot_be_played_is_one_line(
-    arguments: list[str], expected: str, capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: Any
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    assert main(["bus", *arguments]) == 2
-    error = capsys.readouterr().err
-    assert expected in error and error.count("\n") == 1
-
-
-def test_an_unknown_format_is_refused_before_anything_is_written(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError):
-        bus._logger(tmp_path / "drive.txt")
-    assert not list(tmp_path.iterdir())

@@ -7,7 +7,6 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
-from app.cli.main import main
 from app.present.result import Bar, Topic, to_html
 from estimators.diagnostics.sensitivity.responses import Nudge
 
@@ -55,13 +54,13 @@ def parsed(text: str) -> Page:
 
 
 @pytest.fixture(scope="module")
-def checked(tmp_path_factory):
+def checked(tmp_path_factory, nisus):
     """JSON, HTML of the smallest twin."""
     html = tmp_path_factory.mktemp("check") / "check.html"
     with pytest.MonkeyPatch.context() as patch:
         printed: list[str] = []
         patch.setattr("builtins.print", lambda *words, **_: printed.append(" ".join(map(str, words))))
-        assert main(["check", "motor_winding", "--json", "--html", str(html)]) == 0
+        nisus("check", "motor_winding", "--json", "--html", str(html))
     return json.loads(printed[-1]), html.read_text(encoding="utf-8")
 
 
@@ -143,9 +142,8 @@ def test_ranges_in_words(low, high, text):
     assert Nudge("sensor", "winding", "°C", 1.0, -np.inf, np.inf, 1.0).range_text(low, high) == text
 
 
-def test_text_is_the_same_page(capsys):
-    assert main(["check", "motor_winding", "--duration", "20"]) == 0
-    out = capsys.readouterr().out
+def test_text_is_the_same_page(nisus):
+    out = nisus("check", "motor_winding", "--duration", "20").out
     assert "Checklist" in out and "integrity bound" in out and "There is one sensor" in out
     assert max(map(len, out.splitlines())) <= 160
 
@@ -153,8 +151,8 @@ def test_text_is_the_same_page(capsys):
 @pytest.mark.parametrize(
     "name, seconds", [("agv_corridor", 10), ("gripper_contact", 1), ("lorenz96", 1), ("thermal_field", 11)]
 )
-def test_what_does_not_apply_is_said_and_nothing_fails(name, seconds, capsys):
-    assert main(["check", name, "--duration", str(seconds), "--json"]) == 0
+def test_what_does_not_apply_is_said_and_nothing_fails(name, seconds, capsys, nisus):
+    nisus("check", name, "--duration", str(seconds), "--json")
     # Numbers that are none are null: JSON has no NaN.
     found = json.loads(capsys.readouterr().out, parse_constant=lambda word: pytest.fail(word))
     assert set(found) == REQUIRED | MORE

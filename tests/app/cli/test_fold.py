@@ -10,20 +10,18 @@ import pyarrow.parquet as pq
 import pytest
 from rerun.chunk import RrdReader
 
-from app.cli.arguments import Fold
-from app.cli.fold import fold_twin
 from app.present.result import to_text
 from app.studies.compare import fold_row
 from app.studies.fold_result import ExplainedEpisode, dropped, episodes_topic
 from app.twin.log_reader import read_log
 from app.twin.twin import load_twin
 from estimators.diagnostics.episodes import Episode
-from estimators.errors import ConfigError, EstimatorError
 from estimators.fold import Fold as FoldOf
 from estimators.log import Log
 from estimators.models import MODELS
 from estimators.track import HEALTH_NAMES
 from estimators.tuning import Tuning
+from tests.app.conftest import CommandLine
 from tests.app.present.export.test_report import data_of
 
 DRIVE = """\
@@ -35,14 +33,21 @@ source:
   sensors: {winding: {columns: y}}
   truth: {temperature: {columns: temperature}, rate: {columns: rate}}
 """
+BARE = DRIVE[: DRIVE.index("  truth")]  # without true states
 ROWS = "t,y,temperature,rate\n0,40,41,0.5\n1,40,,0.25\n2,41,42,\n"
 
 
-def test_true_states_have_columns_of_their_own(tmp_path: Path) -> None:
-    (tmp_path / "drive.csv").write_text(ROWS)
-    (tmp_path / "drive.yaml").write_text(DRIVE)
+def drive(folder: Path, rows: str = ROWS, text: str = DRIVE) -> Path:
+    """A recording and its twin."""
+    (folder / "drive.csv").write_text(rows)
+    (folder / "drive.yaml").write_text(text)
+    return folder / "drive.yaml"
+
+
+def test_true_states_have_columns_of_their_own(tmp_path: Path, nisus: CommandLine) -> None:
+    path = drive(tmp_path)
     out = tmp_path / "track.parquet"
-    assert fold_twin(Fold(str(tmp_path / "drive.yaml"), out=out, json=True)) == 0
+    nisus("fold", path, "--out", out, "--json")
     table = pq.read_table(out)
     truth = np.array(table["event"].to_pylist()) == "truth"
     nan = np.nan
@@ -51,7 +56,7 @@ def test_true_states_have_columns_of_their_own(tmp_path: Path) -> None:
         np.testing.assert_array_equal(column[truth], expected)
         assert np.isnan(column[~truth]).all() and np.sum(~truth) == 3
     # The events as they were read are in the table too.
-    log, _ = read_log(load_twin(str(tmp_path / "drive.yaml")), None)
+    log, _ = read_log(load_twin(path), None)
     np.testing.assert_array_equal(table["value_1"].to_numpy(), log.events.value[:, 1])
 
 
@@ -60,15 +65,13 @@ DROPS = pytest.mark.parametrize(("back", "dropped_rows"), [(3600.0, 0), (1234.0,
 
 @DROPS
 def test_a_clock_that_steps_back_is_bridged_or_named_and_never_called_tracking(
-    tmp_path: Path, capsys: pytest.CaptureFixture, back: float, dropped_rows: int
+    tmp_path: Path, nisus: CommandLine, back: float, dropped_rows: int
 ) -> None:
     """One line names it. Daylight saving time is bridged; any other step before the first row may be files reversed."""
     y = 40.0 + np.random.default_rng(5).normal(0, 2, 200)
     rows = [f"{k - back * (k >= 100)},{value}\n" for k, value in enumerate(y)]
-    (tmp_path / "drive.csv").write_text("t,y\n" + "".join(rows))
-    (tmp_path / "drive.yaml").write_text(DRIVE.replace(DRIVE[DRIVE.index("  truth") :], ""))
-    assert fold_twin(Fold(str(tmp_path / "drive.yaml"))) == 0
-    said = capsys.readouterr()
+    path = drive(tmp_path, "t,y\n" + "".join(rows), BARE)
+    said = nisus("fold", path)
     health = re.search(r"health at the end +(.*)", said.out)
     assert health is not None and re.search(r"readings +(\d+)", said.out)[1] == str(200 - dropped_rows)
     if dropped_rows:
@@ -84,20 +87,15 @@ def stuck_drive(tmp_path: Path) -> Path:
     """200 readings, one a second, of which the last 100 are equal."""
     y = 40.0 + np.random.default_rng(5).normal(0, 2, 200)
     y[100:] = 41.5
-    (tmp_path / "drive.csv").write_text("t,y\n" + "".join(f"{k},{value}\n" for k, value in enumerate(y)))
-    path = tmp_path / "drive.yaml"
-    path.write_text(DRIVE.replace("  truth: {temperature: {columns: temperature}, rate: {columns: rate}}\n", ""))
-    return path
+    return drive(tmp_path, "t,y\n" + "".join(f"{k},{value}\n" for k, value in enumerate(y)), BARE)
 
 
-def test_episodes_are_printed_told_to_scripts_and_kept(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+def test_episodes_are_printed_told_to_scripts_and_kept(tmp_path: Path, nisus: CommandLine) -> None:
     twin, out = str(stuck_drive(tmp_path)), tmp_path / "track.parquet"
-    assert fold_twin(Fold(twin, out=out)) == 0
-    lines = capsys.readouterr().out.splitlines()
+    lines = nisus("fold", twin, "--out", out).out.splitlines()
     assert any(line.startswith("1 episode(s); docs/alarms.md") for line in lines)
     assert "stuck, at the end: winding is stuck at 41.5 °C since 100.0 s" in " ".join(" ".join(lines[-3:]).split())
-    assert fold_twin(Fold(twin, json=True)) == 0
-    (episode,) = json.loads(capsys.readouterr().out, parse_constant=pytest.fail)["episodes"]
+    (episode,) = nisus("fold", twin, "--json").json["episodes"]
     assert {key: episode[key] for key in ("start", "end", "subject", "cause", "size", "low", "high", "unit")} == {
         "start": 100.0, "end": None, "subject": "winding", "cause": "stuck", "size": 41.5, "low": None, "high": None,
         "unit": "°C",
@@ -147,7 +145,7 @@ source: {type: table, files: drive.csv, time: {column: t, unit: s}, sensors: {ga
 """
 
 
-def test_what_a_black_box_failed_with_is_told(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+def test_what_a_black_box_failed_with_is_told(tmp_path: Path, nisus: CommandLine) -> None:
     """Of readings at 0, 1, 2, 4 and 5 s the last two are more than 1.5 s behind the last state that f reached."""
     (tmp_path / "drive.csv").write_text("t,y\n0,40\n1,40\n2,41\n4,41\n5,40\n")
     (tmp_path / "box.py").write_text(BOX)
@@ -156,31 +154,27 @@ def test_what_a_black_box_failed_with_is_told(tmp_path: Path, capsys: pytest.Cap
     said = (
         f"{tmp_path / 'box.py'}:6: model box: f fails on a block of 3 states: ValueError: the step is too long; mend it"
     )
-    assert fold_twin(Fold(path)) == 0
-    printed = capsys.readouterr().out
+    printed = nisus("fold", path).out
     assert re.search(r"\n  failed +2: no estimate", printed)
     assert f"the model failed 2 time(s)  {said}" in printed
-    assert fold_twin(Fold(path, json=True)) == 0
-    told = json.loads(capsys.readouterr().out)
+    told = nisus("fold", path, "--json").json
     assert told["failed"] == 2 and told["failure"].startswith(said)
     twin = load_twin(path)
     row = fold_row(twin, "filterpy-ukf", [read_log(twin, None)[0].events])
     assert row.failure.startswith(said)
 
 
-def test_the_calibration_is_printed(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+def test_the_calibration_is_printed(tmp_path: Path, nisus: CommandLine) -> None:
     """R as declared is 4; readings of a deviation of 3, and an estimate that is told to be 10 °C off at the end."""
     rng = np.random.default_rng(4)
     lines = [f"{t},{40 + 6 * rng.standard_normal()},{50 if t > 30 else ''}," for t in range(200)]
-    (tmp_path / "drive.csv").write_text("\n".join(["t,y,temperature,rate", *lines]))
-    (tmp_path / "drive.yaml").write_text(DRIVE)
-    assert fold_twin(Fold(str(tmp_path / "drive.yaml"))) == 0
-    head, *said = capsys.readouterr().out.partition("Calibration, 95 % intervals\n")[1:]
+    path = drive(tmp_path, "\n".join(["t,y,temperature,rate", *lines]))
+    head, *said = nisus("fold", path).out.partition("Calibration, 95 % intervals\n")[1:]
     assert head and re.search(r"^  winding: bands too narrow by a factor of 2\.\d \(scale 2\.\d\d, ", said[0])
     assert re.search(r"^  temperature: truth in its 95 % band \d\.?\d* % \(\S+ to \S+\) of the time$", said[0], re.M)
 
 
-def test_what_of_the_model_made_a_reading_fail_is_told(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+def test_what_of_the_model_made_a_reading_fail_is_told(tmp_path: Path, nisus: CommandLine) -> None:
     """h ends at 42 m, beyond which the level rises: √ of a negative number."""
     box = """\
         import numpy as np
@@ -200,15 +194,13 @@ def test_what_of_the_model_made_a_reading_fail_is_told(tmp_path: Path, capsys: p
     (tmp_path / "drive.csv").write_text("t,y\n0,40\n1,41\n2,41.9\n3,43\n")
     (tmp_path / "box.py").write_text(textwrap.dedent(box))
     (tmp_path / "box.yaml").write_text(BOXED.replace("filterpy-ukf", "ukf"))
-    assert fold_twin(Fold(str(tmp_path / "box.yaml"))) == 0
-    printed = capsys.readouterr().out
+    printed = nisus("fold", tmp_path / "box.yaml").out
     said = r"h\(x, u\) of sensor gauge is \[nan\] at x = \[4\d.*\], where the estimate got; it must be finite"
     assert re.search(rf"\n  because +{re.escape(str(tmp_path))}/box.py:7: model box: {said}", printed)
-    assert fold_twin(Fold(str(tmp_path / "box.yaml"), json=True)) == 0
-    assert re.search(said, json.loads(capsys.readouterr().out)["failure"])
+    assert re.search(said, nisus("fold", tmp_path / "box.yaml", "--json").json["failure"])
 
 
-def test_the_json_says_what_a_script_needs(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+def test_the_json_says_what_a_script_needs(tmp_path: Path, nisus: CommandLine) -> None:
     """Beside figures that are found from the events and the estimates in the table of `--out`."""
     rng = np.random.default_rng(2)
     t = np.arange(400) + 0.0
@@ -229,8 +221,10 @@ def test_the_json_says_what_a_script_needs(tmp_path: Path, capsys: pytest.Captur
     for used in (True, False):
         (tmp_path / "drive.yaml").write_text(yaml.replace("{std: 3}", f"{{std: 3, use: {str(used).lower()}}}"))
         out = tmp_path / "track.parquet"
-        assert fold_twin(Fold(str(tmp_path / "drive.yaml"), out=out, json=True)) == 0
-        figures[used] = json.loads(capsys.readouterr().out), pq.read_table(out).to_pandas()
+        figures[used] = (
+            nisus("fold", tmp_path / "drive.yaml", "--out", out, "--json").json,
+            pq.read_table(out).to_pandas(),
+        )
     told, table = figures[True]
     truth = table[table.event == "truth"]
     for state in ("temperature", "rate"):
@@ -285,12 +279,10 @@ def test_what_was_dropped_is_said_if_it_was_much() -> None:
     assert episode.text.startswith("90 % of the measurements were dropped, 90 of 100:")
 
 
-def test_what_is_smoothed_stands_beside_the_filter(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
-    (tmp_path / "drive.csv").write_text(ROWS)
-    (tmp_path / "drive.yaml").write_text(DRIVE)
+def test_what_is_smoothed_stands_beside_the_filter(tmp_path: Path, nisus: CommandLine) -> None:
+    path = drive(tmp_path)
     out = tmp_path / "track.csv"
-    assert fold_twin(Fold(str(tmp_path / "drive.yaml"), out=out, smooth=True, json=True)) == 0
-    said = json.loads(capsys.readouterr().out)
+    said = nisus("fold", path, "--out", out, "--smooth", "--json").json
     table = np.genfromtxt(out, delimiter=",", names=True, dtype=None, encoding=None)
     true = np.isfinite(table["temperature_true"])
     rmse = np.sqrt(np.mean((table["temperature_smooth"] - table["temperature_true"])[true] ** 2))
@@ -298,10 +290,10 @@ def test_what_is_smoothed_stands_beside_the_filter(tmp_path: Path, capsys: pytes
     assert np.all(table["temperature_smooth_std"] <= table["temperature_std"] * (1 + 1e-12))
     # What comes last is filtered with all that there is.
     assert table["rate_smooth"][-1] == table["rate"][-1] and table["rate_smooth"][0] != table["rate"][0]
-    assert fold_twin(Fold(str(tmp_path / "drive.yaml"), smooth=True)) == 0
-    assert f"RMSE temperature, smoothed  {rmse:.5g} °C" in capsys.readouterr().out
-    with pytest.raises(EstimatorError, match="filterpy-kf cannot be smoothed; use kf"):
-        fold_twin(Fold(str(tmp_path / "drive.yaml"), estimator="filterpy-kf", smooth=True))
+    assert f"RMSE temperature, smoothed  {rmse:.5g} °C" in nisus("fold", path, "--smooth").out
+    assert "filterpy-kf cannot be smoothed; use kf" in nisus.refuses(
+        "fold", path, "--estimator", "filterpy-kf", "--smooth"
+    )
 
 
 def smoothed_lines(path: Path) -> np.ndarray:
@@ -315,13 +307,11 @@ def smoothed_lines(path: Path) -> np.ndarray:
     return np.array([values for _, values in sorted(rows, key=lambda row: row[0])])
 
 
-def test_what_is_smoothed_is_drawn_in_recording_and_report(tmp_path: Path) -> None:
-    (tmp_path / "drive.csv").write_text(ROWS)
-    (tmp_path / "drive.yaml").write_text(DRIVE)
-    name = str(tmp_path / "drive.yaml")
+def test_what_is_smoothed_is_drawn_in_recording_and_report(tmp_path: Path, nisus: CommandLine) -> None:
+    name = drive(tmp_path)
     table_file, out, html = (tmp_path / f"run.{end}" for end in ("csv", "rrd", "html"))
-    assert fold_twin(Fold(name, out=table_file, smooth=True)) == 0
-    assert fold_twin(Fold(name, out=out, html=html, smooth=True)) == 0
+    nisus("fold", name, "--out", table_file, "--smooth")
+    nisus("fold", name, "--out", out, "--html", html, "--smooth")
     table = np.genfromtxt(table_file, delimiter=",", names=True, dtype=None, encoding=None)
     mean, std = table["temperature_smooth"], table["temperature_smooth_std"]
     # Rows of one time are drawn once, as the last of them.
@@ -331,8 +321,7 @@ def test_what_is_smoothed_is_drawn_in_recording_and_report(tmp_path: Path) -> No
     )
     # A recording is never replaced.
     before = out.read_bytes()
-    with pytest.raises(ConfigError, match=r"run\.rrd: is there already"):
-        fold_twin(Fold(name, out=out))
+    assert f"--out {out}: is there already" in nisus.refuses("fold", name, "--out", out)
     assert out.read_bytes() == before
     # The charts of the report have it too, with a sentence; without --smooth there is none.
     text = html.read_text()
@@ -347,6 +336,6 @@ def test_what_is_smoothed_is_drawn_in_recording_and_report(tmp_path: Path) -> No
         mean, std = table[f"{state}_smooth"], table[f"{state}_smooth_std"]
         for kind, drawn in (("mean", mean), ("upper", mean + 2 * std), ("lower", mean - 2 * std)):
             np.testing.assert_allclose(shown[f"{kind}:{state}"], drawn, rtol=1e-6, atol=1e-6)
-    assert fold_twin(Fold(name, html=html)) == 0
+    nisus("fold", name, "--html", html)
     text = html.read_text()
     assert set(data_of(text)[0]["streams"]) == {"live"} and "smoothed states" not in text

@@ -47,9 +47,8 @@ def drive(tmp_path):
     return tmp_path
 
 
-def test_what_was_written_is_listed(drive, capsys):
-    assert main(["log", str(drive / "drive.blf"), "--dbc", str(drive / "car.dbc"), "--json"]) == 0
-    found = json.loads(capsys.readouterr().out)
+def test_what_was_written_is_listed(drive, nisus):
+    found = nisus("log", str(drive / "drive.blf"), "--dbc", str(drive / "car.dbc"), "--json").json
     assert found["number"] == 720 and found["faults"] == []
     assert found["start_ns"] // 10**6 == START * 1000 and round((found["end_ns"] - found["start_ns"]) / 1e8) == 649
     [hole] = found["holes_ns"]
@@ -64,19 +63,18 @@ def test_what_was_written_is_listed(drive, capsys):
         "Temp": 600, "Rpm": 600, "Always": 600, "Never": 0, "Which": 600,
     }  # fmt: skip
     assert signals["Rpm"]["high"] == pytest.approx(2500, abs=1) and signals["Rpm"]["unit"] == "rpm"
-    assert main(["log", str(drive / "drive.blf")]) == 0
-    text = capsys.readouterr().out
+    text = nisus("log", str(drive / "drive.blf")).out
     assert "720 frames in 64.9 s, from 2023-11-14 22:13:20 UTC" in text and "1 gaps: 5.1 s at 29.9 s" in text
     assert "0x18fef100x" in text
 
 
-def test_a_bus_that_a_database_is_not_for_stays_without_names(drive, capsys):
-    assert main(["log", str(drive / "drive.blf"), "--dbc", f"{drive / 'car.dbc'}@1", "--json"]) == 0
+def test_a_bus_that_a_database_is_not_for_stays_without_names(drive, capsys, nisus):
+    nisus("log", str(drive / "drive.blf"), "--dbc", f"{drive / 'car.dbc'}@1", "--json")
     assert [m["name"] for m in json.loads(capsys.readouterr().out)["messages"]] == [None, None]
 
 
 @pytest.mark.parametrize("ending", [".csv", ".parquet", ".npz", ".mat"])
-def test_a_table_is_listed(tmp_path, capsys, ending):
+def test_a_table_is_listed(tmp_path, nisus, ending):
     path = tmp_path / f"a{ending}"
     columns = {"time": np.arange(50) * 0.5, "x": np.arange(50.0), "y": np.full(50, np.nan)}
     if ending == ".csv":
@@ -93,41 +91,39 @@ def test_a_table_is_listed(tmp_path, capsys, ending):
         from scipy.io import savemat
 
         savemat(path, columns)
-    assert main(["log", str(path), "--json"]) == 0
-    found = json.loads(capsys.readouterr().out)
+    found = nisus("log", str(path), "--json").json
     assert found["kind"] == "table" and found["time"] == "time" and found["number"] == 50
     x, y = found["columns"]
     assert (x["name"], x["number"], x["rate"], x["low"], x["high"]) == ("x", 50, 2.0, 0.0, 49.0)
     assert (y["name"], y["number"], y["missing"]) == ("y", 0, 50)
-    assert main(["log", str(path), "--time", "when"]) == 2
-    assert "which column holds the time is not known; name it with --time, one of time, x, y" in capsys.readouterr().err
+    assert "which column holds the time is not known; name it with --time, one of time, x, y" in nisus.refuses(
+        "log", str(path), "--time", "when"
+    )
 
 
 @pytest.mark.parametrize(("suffix", "arguments"), [("", []), ("_two", ["--signals", "Rpm,ENGINE.Temp"])])
-def test_a_twin_of_a_recording_folds_as_it_stands(drive, capsys, suffix, arguments):
+def test_a_twin_of_a_recording_folds_as_it_stands(drive, capsys, suffix, arguments, nisus):
     name = f"pump{suffix}"
     given = ["--log", str(drive / "drive.blf"), "--dbc", str(drive / "car.dbc"), *arguments]
-    assert main(["new", name, "--folder", str(drive), *given]) == 0
+    nisus("new", name, "--folder", str(drive), *given)
     path = drive / f"{name}.yaml"
     assert capsys.readouterr().out.splitlines() == [str(path), str(drive / f"{name}.py")]
     twin = load_twin(path)
     assert set(twin.model.sensor_names) == {"rpm", "temp"}
     assert twin.model.state_names == ("temp", "rpm", "rpm_rate") if not suffix else ("rpm", "rpm_rate", "temp")
-    assert main(["fold", str(path), "--json"]) == 0
-    score = json.loads(capsys.readouterr().out)
+    score = nisus("fold", str(path), "--json").json
     assert score["readings"] == 1200 and score["failed"] == 0
     # The temperature is a random walk, 0.3² a step; the engine speed is none, and its rate has a noise all the same.
     assert 0.5 < score["nis"]["mean"] < 1.5
-    assert main(["run", str(path), "--headless", "--speed", "inf"]) == 0
-    assert "readings 1200" in capsys.readouterr().out
+    assert "readings 1200" in nisus("run", str(path), "--headless", "--speed", "inf").out
 
 
-def test_what_cannot_be_taken_is_said(drive, capsys):
+def test_what_cannot_be_taken_is_said(drive, capsys, nisus):
     new = ["new", "pump", "--folder", str(drive), "--log", str(drive / "drive.blf")]
-    assert main([*new, "--dbc", str(drive / "car.dbc"), "--signals", "Tmp"]) == 2
-    assert "--signals Tmp: is not in the log; did you mean Temp?" in capsys.readouterr().err
-    assert main([*new, "--dbc", str(drive / "car.dbc"), "--signals", "Never"]) == 2
-    assert "Never: has 0 values" in capsys.readouterr().err
+    assert "--signals Tmp: is not in the log; did you mean Temp?" in nisus.refuses(
+        *new, "--dbc", str(drive / "car.dbc"), "--signals", "Tmp"
+    )
+    assert "Never: has 0 values" in nisus.refuses(*new, "--dbc", str(drive / "car.dbc"), "--signals", "Never")
     assert main(new) == 2
     assert "give one that describes it with --dbc" in capsys.readouterr().err
     assert main(["new", "pump", "--folder", str(drive), "--signals", "Temp"]) == 2
@@ -156,18 +152,16 @@ def test_the_noise_of_a_signal_is_found_in_its_differences():
 
 
 @pytest.mark.parametrize("command", ["log", "advise"])
-def test_tables_of_other_columns_are_one_line(tmp_path, capsys, command):
+def test_tables_of_other_columns_are_one_line(tmp_path, nisus, command):
     (tmp_path / "one.csv").write_text("time,a\n0,1\n1,2\n")
     (tmp_path / "two.csv").write_text("seconds,a\n2,1\n3,2\n")
-    assert main([command, str(tmp_path / "one.csv"), str(tmp_path / "two.csv")]) == 2
-    said = capsys.readouterr().err
+    said = nisus.refuses(command, str(tmp_path / "one.csv"), str(tmp_path / "two.csv"))
     assert said.count("\n") == 1 and "two.csv: it has no column time, which " in said
 
 
 @pytest.mark.parametrize("command", ["log", "advise"])
 @pytest.mark.parametrize("name", ["folder", "folder.csv"])
-def test_a_folder_is_called_one(tmp_path, capsys, command, name):
+def test_a_folder_is_called_one(tmp_path, nisus, command, name):
     (tmp_path / name).mkdir()
-    assert main([command, str(tmp_path / name)]) == 2
-    said = capsys.readouterr().err
+    said = nisus.refuses(command, str(tmp_path / name))
     assert said.count("\n") == 1 and f"{name}: it is a folder; name " in said

@@ -31,9 +31,8 @@ def test_every_command_has_a_module_a_function_and_help(name, capsys):
 
 @needs_full
 @pytest.mark.parametrize("words", [["fold", "motor_winding", "--duration", "20", "--html"], ["schema", "--out"]])
-def test_a_full_disk_is_reported_with_the_file(words, capsys):
-    assert main([*words, str(FULL)]) == 2
-    told = capsys.readouterr().err
+def test_a_full_disk_is_reported_with_the_file(words, nisus):
+    told = nisus.refuses(*words, str(FULL))
     assert f"{words[-1]} {FULL}: cannot be written: No space left" in told and told.count("nisus: ") == 1
 
 

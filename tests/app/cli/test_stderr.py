@@ -77,18 +77,6 @@ def test_times_that_run_backwards_are_said_once(
     assert line.endswith("sort the rows by t")
 
 
-@pytest.mark.parametrize(
-    ("words", "rule"),
-    [
-        (["--port", "abc"], "--port 'abc': must be a whole number"),
-        (["--port=9e3"], "--port '9e3': must be a whole number"),
-        (["--duration", "5s"], "--duration '5s': must be a number"),
-    ],
-)
-def test_what_is_no_number_is_told_in_a_line(words: list[str], rule: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert said(capsys, "run", "motor_can", *words) == [f"nisus: {rule}"]
-
-
 @pytest.mark.parametrize("options", [[], ["--headless"]])
 def test_files_of_a_source_are_looked_at_before_anything_is_compiled(
     drive: Path, options: list[str], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch

@@ -363,19 +363,6 @@ def test_what_ships_is_guarded():
         assert any(figure.startswith("rmse.") for figure in known.figures)
 
 
-def test_what_cannot_be_is_said_before_anything_is_folded(archive, capsys, monkeypatch):
-    monkeypatch.setattr("app.studies.guard.guard_log", lambda *_: pytest.fail("it was folded"))
-    for option, value, said in (
-        ("--junit", archive / "nowhere" / "a.xml", "there is no folder"),
-        ("--junit", archive, "is a folder; name a file in it"),
-        ("--jobs", "0", "--jobs 0: must be 1 or more"),
-        ("--jobs", "-3", "--jobs -3: must be 1 or more"),
-    ):
-        assert main(["guard", str(archive / "w0.yaml"), option, str(value)]) == 2
-        complaint = capsys.readouterr().err
-        assert said in complaint and complaint.count("\n") == 1
-
-
 def test_a_recording_that_cannot_be_read_leaves_the_others(archive, capsys):
     (archive / "broken.rrd").write_bytes(b"no recording" * 99)
     assert main(["guard", "--archive", str(archive), "--jobs", "1"]) == 2

@@ -1,10 +1,7 @@
 """The lines of an advice: what becomes of a YAML in which they are put."""
 
-import json
-
 import pytest
 
-from app.cli.main import main
 from app.studies.advice.verdict import Advice, apply, changed, lines, with_entry
 from config.yaml_files import parse
 from estimators.errors import ConfigError
@@ -69,12 +66,11 @@ def test_what_was_there_is_kept(tmp_path):
     assert "estimator: ekf" in path.read_text() and "estimator: ukf" in (tmp_path / "b.yaml").read_text()
 
 
-def test_the_command_says_and_applies(tmp_path, capsys):
+def test_the_command_says_and_applies(tmp_path, nisus):
     out = tmp_path / "winding.yaml"
-    assert main(["advise", "motor_winding", "--json", "--out", str(out)]) == 0
-    told = json.loads(capsys.readouterr().out)
+    told = nisus("advise", "motor_winding", "--json", "--out", str(out)).json
     assert told["estimator"] == "kf" and told["because"] == ["linear", "steady"]
     # One reading in 15 is lost, so the share of intervals that are twice as long is 1 in 15, rounded by the ends.
     steady = next(claim for claim in told["claims"] if claim["key"] == "steady")
     assert steady["figure"] == pytest.approx(1 / 15, abs=0.01) and steady["answer"] == "no"
-    assert main(["fold", str(out), "--json"]) == 0
+    nisus("fold", str(out), "--json")

@@ -1,11 +1,8 @@
 """The advice on a bare recording: noise, pairs and lags are found as they were put there; a draft that runs."""
 
-import json
-
 import numpy as np
 import pytest
 
-from app.cli.main import main
 from app.studies.advice.relations import driven, pairs
 from app.studies.advice.signals import rough, signal
 from sources.inspect import SignalSeries
@@ -98,37 +95,30 @@ def table(tmp_path):
     return path
 
 
-def test_a_draft_of_a_recording_runs_and_is_consistent(table, capsys):
+def test_a_draft_of_a_recording_runs_and_is_consistent(table, nisus):
     out = table.with_name("boiler.yaml")
-    assert main(["advise", str(table), "--json", "--out", str(out)]) == 0
-    told = json.loads(capsys.readouterr().out)
+    told = nisus("advise", str(table), "--json", "--out", str(out)).json
     assert {one["name"] for one in told["signals"]} == {"tank", "heater", "fan", "room", "room_again"}
     states = {item["name"]: item for item in told["states"]}
     assert set(states) == {"tank", "room"} and set(told["inputs"]) == {"heater", "fan"}
     assert set(states["tank"]["follows"]) == {"heater", "fan"}
     assert set(states["room"]["sensors"]) == {"room", "room_again"}
-    assert main(["fold", str(out), "--json"]) == 0
-    score = json.loads(capsys.readouterr().out)
+    score = nisus("fold", str(out), "--json").json
     assert score["readings"] == 12_000 and score["failed"] == 0
     assert 0.7 < score["nis"]["mean"] < 1.3
-    assert main(["advise", str(out)]) == 0
-    page = capsys.readouterr().out
+    page = nisus("advise", str(out)).out
     assert "Use kf, Kalman filter (as now)" in page and "\n  estimator: kf  #" in page
     assert "every band is right within a quarter, and no correlation is beyond 0.2 (3 rows)" in " ".join(page.split())
 
 
-def test_the_page_of_a_recording_says_what_was_found(table, capsys):
-    assert main(["advise", str(table)]) == 0
-    page = capsys.readouterr().out
+def test_the_page_of_a_recording_says_what_was_found(table, nisus):
+    page = nisus("advise", str(table)).out
     assert "room_again = 0.9" in page or "room_again = 1" in page
     assert "noise, so two sensors of one state" in " ".join(page.split())
     assert "tank: follows heater, fan" in page and "Write the draft with --out NAME.yaml" in page
 
 
-def test_options_of_the_other_kind_are_refused(table, capsys):
-    assert main(["advise", str(table), "--apply"]) == 2
-    assert "are for a twin" in capsys.readouterr().err
-    assert main(["advise", "motor_winding", "--dbc", "car.dbc"]) == 2
-    assert "--dbc and --signals are for recordings" in capsys.readouterr().err
-    assert main(["advise", "motor_winding", "motor_can"]) == 2
-    assert "one twin at a time" in capsys.readouterr().err
+def test_options_of_the_other_kind_are_refused(table, nisus):
+    assert "are for a twin" in nisus.refuses("advise", str(table), "--apply")
+    assert "--dbc and --signals are for recordings" in nisus.refuses("advise", "motor_winding", "--dbc", "car.dbc")
+    assert "one twin at a time" in nisus.refuses("advise", "motor_winding", "motor_can")
