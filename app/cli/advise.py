@@ -26,7 +26,7 @@ from .options import names_of, settings
 from .prepare import attend, prepare
 
 if TYPE_CHECKING:
-    from .arguments import Advise as Arguments
+    from .arguments import AdviseCommand as Arguments
 
 MAX_LISTED_SIGNALS = 40
 

@@ -95,7 +95,7 @@ class PageOptions:
 
 
 @dataclass(frozen=True)
-class Run(PageOptions, TuningOption, EstimatorOption):
+class RunCommand(PageOptions, TuningOption, EstimatorOption):
     """Run a twin and show it in the browser. Without a twin: the gallery of bundled twins."""
 
     twin: Annotated[str | None, tyro.conf.Positional] = None
@@ -115,7 +115,7 @@ class Run(PageOptions, TuningOption, EstimatorOption):
 
 
 @dataclass(frozen=True)
-class Fold(JsonOption, FoldOptions):
+class FoldCommand(JsonOption, FoldOptions):
     """Fold the log of a twin as fast as possible and print scores, calibration and fault episodes."""
 
     out: Path | None = None
@@ -129,7 +129,7 @@ class Fold(JsonOption, FoldOptions):
 
 
 @dataclass(frozen=True)
-class Check(JsonOption, FoldOptions):
+class CheckCommand(JsonOption, FoldOptions):
     """Print a checklist of what could be wrong with a twin without being detected.
 
     Linearity, size, shape of the posterior, observability, the smallest visible fault of every sensor, input and
@@ -141,7 +141,7 @@ class Check(JsonOption, FoldOptions):
 
 
 @dataclass(frozen=True)
-class Advise(JsonOption, TableOptions, LogOptions, EstimatorOption):
+class AdviseCommand(JsonOption, TableOptions, LogOptions, EstimatorOption):
     """Recommend an estimator for a twin from its log, or draft a twin from recordings.
 
     For a twin: the simplest estimator whose assumptions hold on the log, with the figure behind each claim and the
@@ -160,7 +160,7 @@ class Advise(JsonOption, TableOptions, LogOptions, EstimatorOption):
 
 
 @dataclass(frozen=True)
-class Compare(JsonOption, LogOptions, TuningOption):
+class CompareCommand(JsonOption, LogOptions, TuningOption):
     """Fold every applicable filter over the same log, in parallel, and print a table of scores.
 
     Filters that draw random members are folded with eight seeds; their figures are mean ± standard deviation of one
@@ -182,7 +182,7 @@ class Compare(JsonOption, LogOptions, TuningOption):
 
 
 @dataclass(frozen=True)
-class Tune(JsonOption, EstimatorOption, TwinOptions):
+class TuneCommand(JsonOption, EstimatorOption, TwinOptions):
     """Fit noises, parameters and options to recordings, and propose the result if it predicts held-out data better.
 
     Each recording is divided into blocks of time, and every third is held out to judge the fit. So are each sensor in
@@ -223,7 +223,7 @@ class Tune(JsonOption, EstimatorOption, TwinOptions):
 
 
 @dataclass(frozen=True)
-class Learn(JsonOption, EstimatorOption, TwinOptions):
+class LearnCommand(JsonOption, EstimatorOption, TwinOptions):
     """Learn the model error of a twin from recordings, as a correction with its own uncertainty.
 
     Each recording is divided into blocks of time; on every third the twin is judged with and without the correction.
@@ -254,7 +254,7 @@ class Learn(JsonOption, EstimatorOption, TwinOptions):
 
 
 @dataclass(frozen=True)
-class Guard:
+class GuardCommand:
     """Fold archived recordings with the accepted tunings of their twins and list figures that got worse.
 
     Without a name: the bundled twins with their bundled logs and those under NISUS_DATA. A figure is worse if it
@@ -279,7 +279,7 @@ class Guard:
 
 
 @dataclass(frozen=True)
-class Stress(JsonOption, TuningOption):
+class StressCommand(JsonOption, TuningOption):
     """Inject faults into a twin and print how soon and how correctly they are detected.
 
     Tuning errors hold from the start. Sensor faults hold from one third to two thirds of the log, to show false alarms
@@ -303,7 +303,7 @@ class Stress(JsonOption, TuningOption):
 
 
 @dataclass(frozen=True)
-class Commission(FoldOptions):
+class CommissionCommand(FoldOptions):
     """Record the normal innovations of a twin from fault-free data; later alarms then report changes from it.
 
     Prints the section `commissioned` for the twin's YAML, or writes it there.
@@ -316,7 +316,7 @@ class Commission(FoldOptions):
 
 
 @dataclass(frozen=True)
-class Filters:
+class FiltersCommand:
     """List the estimators: assumptions, options, cost, and when they fail."""
 
     twin: str | None = None
@@ -324,7 +324,7 @@ class Filters:
 
 
 @dataclass(frozen=True)
-class Review(PageOptions):
+class ReviewCommand(PageOptions):
     """Open a recording on the page, where its measurements can be folded again with other settings."""
 
     file: Annotated[Path, tyro.conf.Positional]
@@ -332,7 +332,7 @@ class Review(PageOptions):
 
 
 @dataclass(frozen=True)
-class Bus:
+class BusCommand:
     """Simulate the asset of a twin on a CAN bus."""
 
     twin: Twin
@@ -350,7 +350,7 @@ class Bus:
 
 
 @dataclass(frozen=True)
-class Twins:
+class TwinsCommand:
     """List the bundled twins, or describe one with the scores of every filter."""
 
     name: Annotated[str | None, tyro.conf.Positional] = None
@@ -360,7 +360,7 @@ class Twins:
 
 
 @dataclass(frozen=True)
-class Tunings(JsonOption, FoldOptions):
+class TuningsCommand(JsonOption, FoldOptions):
     """List the tuning versions of a twin, compare two of them, save one or accept one.
 
     Versions are files FILE.tunings/NAME.yaml beside FILE.yaml; those of a bundled twin are in the user's data folder.
@@ -378,7 +378,7 @@ class Tunings(JsonOption, FoldOptions):
 
 
 @dataclass(frozen=True)
-class Schema:
+class SchemaCommand:
     """Write the JSON Schema of a twin's YAML, for editors that complete and check."""
 
     out: Path | None = None
@@ -386,7 +386,7 @@ class Schema:
 
 
 @dataclass(frozen=True)
-class Log(JsonOption, TableOptions):
+class LogCommand(JsonOption, TableOptions):
     """List the content of recordings: buses, messages, signals or columns, with rates, time spans and gaps."""
 
     files: Annotated[tuple[Path, ...], tyro.conf.Positional]
@@ -394,7 +394,7 @@ class Log(JsonOption, TableOptions):
 
 
 @dataclass(frozen=True)
-class New(TableOptions):
+class NewCommand(TableOptions):
     """Write NAME.yaml and NAME.py, a runnable example (a pump) or a draft from the signals of a recording."""
 
     name: Annotated[str, tyro.conf.Positional]
@@ -408,25 +408,25 @@ class New(TableOptions):
 
 
 COMMANDS: dict[type, str] = {
-    Run: "run:run_twin",
-    Fold: "fold:fold_twin",
-    Check: "check:check_twin",
-    Advise: "advise:advise",
-    Compare: "compare:compare_twin",
-    Tune: "tune:tune_twin",
-    Learn: "learn:learn_correction",
-    Guard: "guard:guard",
-    Stress: "stress:stress_twin",
-    Commission: "commission:commission_twin",
-    Filters: "filters:show_filters",
-    Review: "run:review_recording",
-    Bus: "bus:play_bus",
-    Twins: "twins:show_twins",
-    Tunings: "tunings:tunings_of",
-    Schema: "new:write_schema",
-    Log: "log:show_log",
-    New: "new:new_twin",
+    RunCommand: "run:run_twin",
+    FoldCommand: "fold:fold_twin",
+    CheckCommand: "check:check_twin",
+    AdviseCommand: "advise:advise",
+    CompareCommand: "compare:compare_twin",
+    TuneCommand: "tune:tune_twin",
+    LearnCommand: "learn:learn_correction",
+    GuardCommand: "guard:guard",
+    StressCommand: "stress:stress_twin",
+    CommissionCommand: "commission:commission_twin",
+    FiltersCommand: "filters:show_filters",
+    ReviewCommand: "run:review_recording",
+    BusCommand: "bus:play_bus",
+    TwinsCommand: "twins:show_twins",
+    TuningsCommand: "tunings:tunings_of",
+    SchemaCommand: "new:write_schema",
+    LogCommand: "log:show_log",
+    NewCommand: "new:new_twin",
 }
 """Module and function of every command, imported when the command runs."""
 
-NAMES = {command.__name__.lower(): command for command in COMMANDS}  # command by its name on the command line
+NAMES = {command.__name__.removesuffix("Command").lower(): command for command in COMMANDS}  # as on the command line

@@ -14,7 +14,7 @@ from ..twin.twin import Twin, load_twin
 from .options import settings
 
 if TYPE_CHECKING:
-    from .arguments import Bus
+    from .arguments import BusCommand
 
 GROUP = "239.74.163.2"  # python-can's own multicast address
 
@@ -22,7 +22,7 @@ FORMATS = (".asc", ".blf", ".csv", ".log", ".mf4", ".trc")
 """What python-can writes and `nisus fold --log` reads; not .db, whose writer forgets what is queued when it stops."""
 
 
-def play_bus(arguments: Bus) -> int:
+def play_bus(arguments: BusCommand) -> int:
     """Run the command."""
     if arguments.duration is not None and not arguments.duration > 0:
         raise ConfigError(f"--duration {arguments.duration:g}: must be positive")
@@ -59,7 +59,7 @@ def play_bus(arguments: Bus) -> int:
     return 0
 
 
-def _channel(arguments: Bus, twin: Twin) -> str | int:
+def _channel(arguments: BusCommand, twin: Twin) -> str | int:
     """The channel that was given; else the twin's where it is of this interface, else the interface's own."""
     if arguments.channel is not None:
         return int(arguments.channel) if arguments.channel.isdecimal() else arguments.channel

@@ -13,7 +13,7 @@ from ..twin.log_reader import read_log
 from .prepare import attend, prepared
 
 if TYPE_CHECKING:
-    from .arguments import Check as Arguments
+    from .arguments import CheckCommand as Arguments
 
 
 def check_twin(arguments: Arguments) -> int:

@@ -21,7 +21,7 @@ from .options import settings
 from .prepare import prepare
 
 if TYPE_CHECKING:
-    from .arguments import Commission as Arguments
+    from .arguments import CommissionCommand as Arguments
 
 MAX_FAULTY_SHARE = 0.1
 """Share of readings refused, of rows lost, or of one value in a row, beyond which data are not in order."""

@@ -14,11 +14,10 @@ from ..terminal import complain
 from ..twin.log_reader import read_logs
 from ..twin.twin import load_twin
 from .options import settings
-from .prepare import prepare
-from .progress import progress
+from .prepare import prepare, progress
 
 if TYPE_CHECKING:
-    from .arguments import Compare as Arguments
+    from .arguments import CompareCommand as Arguments
 
 ALL = "all"  # name that stands for every bundled twin
 

@@ -15,7 +15,7 @@ from ..twin.twin import Twin, load_twin
 from .prepare import attend
 
 if TYPE_CHECKING:
-    from .arguments import Filters as Arguments
+    from .arguments import FiltersCommand as Arguments
 
 SAMPLE_S = 60.0  # seconds of a twin's source from which its rate is taken
 

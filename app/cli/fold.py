@@ -35,7 +35,7 @@ from ..views.recording.format import TAKEN
 from .prepare import attend, fold_log, opened, prepare
 
 if TYPE_CHECKING:
-    from .arguments import Fold as Arguments
+    from .arguments import FoldCommand as Arguments
 
 
 def fold_twin(arguments: Arguments) -> int:

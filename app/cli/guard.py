@@ -11,10 +11,10 @@ from estimators.errors import ConfigError, printable
 from ..present.result import to_text
 from ..studies.guard import chosen, guard_all, guard_topics, junit, keep_last
 from .options import check_output, settings
-from .progress import progress
+from .prepare import progress
 
 if TYPE_CHECKING:
-    from .arguments import Guard as Arguments
+    from .arguments import GuardCommand as Arguments
 
 
 def guard(arguments: Arguments) -> int:

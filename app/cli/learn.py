@@ -33,7 +33,7 @@ from .options import check_output, names_of, settings
 from .prepare import attend, prepare
 
 if TYPE_CHECKING:
-    from .arguments import Learn as Arguments
+    from .arguments import LearnCommand as Arguments
 
 MIN_BLOCKS = 3  # least number of blocks, of which one is held out
 STRETCHES = 9  # long parts of each recording over which errors add up to choose between candidates

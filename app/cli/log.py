@@ -19,7 +19,7 @@ from ..present.result import Cell, TableColumn, Topic, to_json, to_text
 from ..terminal import complain
 
 if TYPE_CHECKING:
-    from .arguments import Log as Arguments
+    from .arguments import LogCommand as Arguments
 
 MAX_LISTED = 5  # gaps and faults that are listed; the others are counted
 

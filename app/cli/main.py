@@ -17,7 +17,7 @@ import tyro
 from estimators.errors import NisusError
 
 from ..terminal import complain
-from .arguments import COMMANDS, NAMES, Run
+from .arguments import COMMANDS, NAMES, RunCommand
 from .options import check_numbers
 
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)  # errors of a device that takes no more output
@@ -27,7 +27,7 @@ def carry_out(command: Any) -> int:
     """Run one command; only its own module is imported, so that `nisus twins` answers at once."""
     module, _, function = COMMANDS[type(command)].partition(":")
     workers: tuple[Any, ...] = ()
-    if isinstance(command, Run) and command.twin is not None and not command.headless:
+    if isinstance(command, RunCommand) and command.twin is not None and not command.headless:
         from ..live.compilers import first_compilers
 
         workers = (first_compilers(),)  # started before the imports of `run`, which take seconds

@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from sources.inspect import RecordingContents
 
     from ..studies.advice.plan import DraftPlan
-    from .arguments import New as Arguments
-    from .arguments import Schema, TableOptions
+    from .arguments import NewCommand as Arguments
+    from .arguments import SchemaCommand, TableOptions
 
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]*")
 
@@ -131,7 +131,7 @@ def outflow(x, u, p, out):
 '''
 
 
-def write_schema(arguments: Schema) -> int:
+def write_schema(arguments: SchemaCommand) -> int:
     """Write the JSON Schema of a twin's YAML."""
     from config.schema import json_schema_text
 

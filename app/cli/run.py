@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from ..live.compilers import Compiler
-    from .arguments import Run
+    from .arguments import RunCommand
 
 
 __all__ = ["live_source", "run_twin"]
@@ -33,7 +33,7 @@ __all__ = ["live_source", "run_twin"]
 MAX_FAILURES = 5  # failures that a run without a page prints at its end
 
 
-def run_twin(arguments: Run, workers: Sequence[Compiler] = ()) -> int:
+def run_twin(arguments: RunCommand, workers: Sequence[Compiler] = ()) -> int:
     """Run the command; `workers` are idle compiler processes."""
     speed = arguments.speed
     if speed is not None and not (0.0 < speed <= MAX_SPEED or speed == math.inf):
@@ -86,7 +86,7 @@ def run_twin(arguments: Run, workers: Sequence[Compiler] = ()) -> int:
 
 if TYPE_CHECKING:
     from ..web.running import OpenedTwin
-    from .arguments import Review
+    from .arguments import ReviewCommand
 
 
 def open_review(path: Path, page: Page | None, recordings: Path = Path()) -> tuple[Session, OpenedTwin]:
@@ -105,7 +105,7 @@ def open_review(path: Path, page: Page | None, recordings: Path = Path()) -> tup
     return open_session(opening, StartRequest(recording=path), FileOpener(), page=page, recordings=recordings), opening
 
 
-def review_recording(arguments: Review) -> int:
+def review_recording(arguments: ReviewCommand) -> int:
     """Run the command."""
     page = Page(arguments.port, not arguments.no_browser)
     session, _ = open_review(arguments.file, page, arguments.recordings)

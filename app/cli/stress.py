@@ -13,11 +13,10 @@ from ..studies.stress.matrix import matrix
 from ..studies.stress.results import stress_topics
 from ..studies.stress.scenario import Bench, asset_of
 from ..terminal import complain
-from .prepare import opened, prepare
-from .progress import progress
+from .prepare import opened, prepare, progress
 
 if TYPE_CHECKING:
-    from .arguments import Stress as Arguments
+    from .arguments import StressCommand as Arguments
 
 
 def stress_twin(arguments: Arguments) -> int:

@@ -31,7 +31,7 @@ from .options import check_output, names_of, settings
 from .prepare import attend, prepare
 
 if TYPE_CHECKING:
-    from .arguments import Tune as Arguments
+    from .arguments import TuneCommand as Arguments
 
 MIN_BLOCKS = 3  # least number of blocks, of which one is held out
 

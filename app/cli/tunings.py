@@ -19,7 +19,7 @@ from ..twin.twin import load_twin
 from .prepare import fold_log, prepared
 
 if TYPE_CHECKING:
-    from .arguments import Tunings as Arguments
+    from .arguments import TuningsCommand as Arguments
 
 
 def tunings_of(arguments: Arguments) -> int:

@@ -11,7 +11,7 @@ from config.yaml_files import writing
 from ..studies.scores import printed, read_scores
 
 if TYPE_CHECKING:
-    from .arguments import Twins as Arguments
+    from .arguments import TwinsCommand as Arguments
 
 
 def show_twins(arguments: Arguments) -> int:

@@ -20,8 +20,7 @@ from ...live.fault_monitors import reason_against
 from ...live.jobs import Job, PacedExecutor
 from ...live.outputs import EventWindow, Status
 from ...live.running_fold import Running
-from .numbers import listed, number
-from .row_figures import rows_json
+from .row_figures import listed, number, rows_json
 
 DIAGNOSED_ROWS = 20_000  # last rows that are analysed
 COPY_ROWS = 4096  # rows that are copied at once: the engine waits for no more

@@ -16,7 +16,7 @@ from estimators.model.state_space import StateSpaceModel
 
 from ...live.outputs import Here
 from ...live.running_fold import Running
-from .numbers import listed, number
+from .row_figures import listed, number
 
 MAX_CHANGES = 200  # changes of one input
 MAX_COMPUTING_S = 8.0  # seconds that a forecast may take to compute

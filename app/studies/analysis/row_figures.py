@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -23,7 +24,6 @@ from estimators.track import FAILED, GATED, HELD_OUT, SCREENED, USED, Track
 from estimators.tuning import Tuning
 
 from ...present.series.columns import rows_of
-from .numbers import listed, number
 
 LAGS = 50
 
@@ -165,3 +165,14 @@ def _figures(calibration: Calibration | None) -> dict[str, Any]:
         "scale": calibration.scale, "bias": calibration.bias, "correlation": calibration.correlation,
     }  # fmt: skip
     return {name: [number(value, 3) for value in interval] for name, interval in figures.items()}
+
+
+def number(value: Any, digits: int = 6) -> float | None:
+    """Round to so many significant digits; None if it is not finite."""
+    value = float(value)
+    return float(f"{value:.{digits}g}") if math.isfinite(value) else None
+
+
+def listed(values: np.ndarray, digits: int = 6) -> list[Any]:
+    """Return an array as nested lists of rounded numbers."""
+    return [listed(row, digits) if np.ndim(row) else number(row, digits) for row in values]

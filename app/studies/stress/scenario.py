@@ -29,6 +29,7 @@ from ...twin.twin import Twin
 
 if TYPE_CHECKING:
     from sources.faults.kinds import Fault
+    from sources.source import Source
 
 ANY_SUBJECT: frozenset[str] = frozenset()
 """Subjects of a fault that concerns no particular sensor."""
@@ -104,31 +105,27 @@ def plain_log(twin: Twin, seed: int, duration: float) -> Events:
         SourceError: If the source cannot be opened, or has no events.
     """
     asset = asset_of(twin, seed)
-    source = FaultySource(asset, twin.plan.faults()) if asset is not None else twin.open_source(_ignore, live=False)
-    return _read(source, twin.model.width, duration)
+    if asset is not None:
+        return _read(FaultySource(asset, twin.plan.faults()), twin.model.width, duration)
+    return _read(twin.open_source(lambda key, text: None, live=False), twin.model.width, duration)
 
 
-def _ignore(key: str, text: str) -> None:
-    """Discard a notice."""
-
-
-def _read(source: object, width: int, duration: float) -> Events:
+def _read(source: Source, width: int, duration: float | None = None) -> Events:
+    """Read a source to its end, or the first `duration` seconds of it without fault marks."""
     parts: list[Events] = []
-    begin: int | None = None
     try:
-        while (batch := source.read(1.0)) is not None:  # type: ignore[attr-defined]
-            if not len(batch):
-                continue
-            begin = int(batch.t[0]) if begin is None else begin
-            parts.append(batch)
-            if batch.t[-1] - begin > duration * 1e9:
+        while (batch := source.read(1.0)) is not None:
+            parts += [batch] if len(batch) else []
+            if duration is not None and parts and parts[-1].t[-1] - parts[0].t[0] > duration * 1e9:
                 break
     finally:
-        source.close()  # type: ignore[attr-defined]
-    if begin is None:
+        source.close()
+    if not parts:
         raise SourceError("stress: the source has no events")
     events = Events.concat(parts, width)
-    return events.select((events.kind != MARK) & (events.t <= begin + round(duration * 1e9)))
+    if duration is None:
+        return events
+    return events.select((events.kind != MARK) & (events.t <= parts[0].t[0] + round(duration * 1e9)))
 
 
 class Bench:
@@ -212,7 +209,7 @@ class Bench:
         faults = mistake.fault(start, end)
         if not mistake.of_asset:
             layer = Faults(self.twin.model, faults, seed=self.seed)
-            return _everything(FaultySource(MemorySource(self.events), layer), self.twin.model.width)
+            return _read(FaultySource(MemorySource(self.events), layer), self.twin.model.width)
         asset = asset_of(self.twin, self.seed)
         if asset is None:
             raise SourceError(f"{mistake.name}: {self.twin.name} has no simulated asset")
@@ -248,17 +245,6 @@ def _share(word: float | None, length: int) -> float:
     share = np.inf if word is None else word * 1e9 / length
     return share if share < 1.0 else np.inf
 
-
-def _everything(source: object, width: int) -> Events:
-    """All that a source gives, stamps included."""
-    parts = []
-    while (batch := source.read(0.0)) is not None:  # type: ignore[attr-defined]
-        parts.append(batch)
-    return Events.concat(parts, width)
-
-
-if TYPE_CHECKING:
-    from estimators.fold import Fold
 
 SAME_EPISODE_NS = 1_000_000_000
 """ns between two episodes of one subject and cause that are the same, with a mistake and without."""

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from app.cli import bus
-from app.cli.arguments import Bus
+from app.cli.arguments import BusCommand
 from app.twin.sources.asset import make_asset
 from app.twin.twin import load_twin
 from estimators.log import INPUT, READING, TRUTH, Events, truth_of
@@ -46,7 +46,7 @@ def test_what_is_recorded_is_what_the_asset_said(suffix: str, tmp_path: Path, mo
     monkeypatch.setattr(bus, "_play", play_at_once)
     file = tmp_path / f"drive{suffix}"
     settings = ("source.asset.duration=12",)
-    assert bus.play_bus(Bus("motor_can", interface="virtual", set=settings, record=file)) == 0
+    assert bus.play_bus(BusCommand("motor_can", interface="virtual", set=settings, record=file)) == 0
     got = events(log=file)
     twin = load_twin("motor_can", overrides={"source.asset.duration": "12"})
     section: Any = twin.config.source
@@ -91,4 +91,6 @@ def test_listeners_hear_what_the_bus_took(monkeypatch: pytest.MonkeyPatch) -> No
     ],
 )
 def test_the_channel(interface: str, channel: str | None, expected: str | int) -> None:
-    assert bus._channel(Bus("motor_can", interface=interface, channel=channel), load_twin("motor_can")) == expected
+    assert (
+        bus._channel(BusCommand("motor_can", interface=interface, channel=channel), load_twin("motor_can")) == expected
+    )

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from app.cli.arguments import Commission
+from app.cli.arguments import CommissionCommand
 from app.cli.commission import commission_twin, lines
 from app.live.tunings.versions import write_section
 from app.twin.log_reader import read_log
@@ -54,14 +54,14 @@ def drive(folder: Path, text: str = TWIN) -> str:
 def test_what_is_printed_is_what_is_read_again(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     path = drive(tmp_path)
     assert load_twin(path).tuning.baseline is None
-    assert commission_twin(Commission(path)) == 0
+    assert commission_twin(CommissionCommand(path)) == 0
     printed = capsys.readouterr().out
     assert Path(path).read_text() == TWIN
     Path(path).write_text(TWIN + printed)
     baseline = load_twin(path).tuning.baseline
     assert baseline is not None and baseline[0, 1] > 1.5
     # Against white innovations, not against what was normal before: the same again.
-    assert commission_twin(Commission(path)) == 0
+    assert commission_twin(CommissionCommand(path)) == 0
     assert capsys.readouterr().out == printed
 
 
@@ -81,7 +81,7 @@ def test_every_figure_comes_back(tmp_path: Path) -> None:
 def test_the_rest_of_the_file_stays(tmp_path: Path, text: str, end: str) -> None:
     """Byte for byte, with line ends as they are; and written again it is the same."""
     path = Path(drive(tmp_path, text.replace("\n", end)))
-    assert commission_twin(Commission(str(path), write=True)) == 0
+    assert commission_twin(CommissionCommand(str(path), write=True)) == 0
     written = path.read_bytes()
     first = written.index(b"commissioned:")
     # Two lines of its own: the key, and a row with what was reached.
@@ -93,14 +93,14 @@ def test_the_rest_of_the_file_stays(tmp_path: Path, text: str, end: str) -> None
         part.replace("\n", end).encode() for part in expected
     )
     load_twin(str(path))
-    assert commission_twin(Commission(str(path), write=True)) == 0
+    assert commission_twin(CommissionCommand(str(path), write=True)) == 0
     assert path.read_bytes() == written
 
 
 def test_too_little_is_one_line(tmp_path: Path) -> None:
     path = drive(tmp_path)
     with pytest.raises(ConfigError) as problem:
-        commission_twin(Commission(path, duration=20.0, write=True))
+        commission_twin(CommissionCommand(path, duration=20.0, write=True))
     assert str(problem.value) == "no sensor row has 50 readings that were judged; commission on a longer recording"
     assert Path(path).read_text() == TWIN
 
@@ -145,4 +145,4 @@ def test_a_twin_is_commissioned_against_white_innovations_whatever_was_normal_be
 
     assert lost(twin.tuning) == 0.0 and lost(replace(twin.tuning, baseline=None)) > 0.5
     with pytest.raises(ConfigError, match="the twin is diverged or stale for"):
-        commission_twin(Commission(path))
+        commission_twin(CommissionCommand(path))

@@ -3,7 +3,7 @@
 import io
 import threading
 
-from app.cli.progress import line, lines, progress
+from app.cli.prepare import progress, progress_lines, progress_text
 
 
 class Heard(io.StringIO):
@@ -20,7 +20,7 @@ class Heard(io.StringIO):
 def test_lines_come_while_nothing_is_done_and_count_what_is():
     now = 100.0
     heard = Heard()
-    with lines("pump", 12, "filters", every=1e-3, clock=lambda: now, file=heard) as advance:
+    with progress_lines("pump", 12, "filters", every=1e-3, clock=lambda: now, file=heard) as advance:
         assert heard.written.wait(10.0)
         assert heard.getvalue().startswith("pump: 0 of 12 filters after 0 s\n")
         now = 130.0
@@ -34,8 +34,8 @@ def test_lines_come_while_nothing_is_done_and_count_what_is():
 
 
 def test_the_rest_takes_as_long_as_what_is_done():
-    assert line("pump", 12, 12, "filters", 40.0) == "pump: 12 of 12 filters after 40 s, about 0 s left"
-    assert line("pump", 8, 12, "filters", 40.0) == "pump: 8 of 12 filters after 40 s, about 20 s left"
+    assert progress_text("pump", 12, 12, "filters", 40.0) == "pump: 12 of 12 filters after 40 s, about 0 s left"
+    assert progress_text("pump", 8, 12, "filters", 40.0) == "pump: 8 of 12 filters after 40 s, about 20 s left"
 
 
 def test_short_work_says_nothing_in_a_pipe(capsys):

@@ -10,8 +10,8 @@ import pytest
 import yaml
 from scipy.stats import chi2
 
-from app.cli.arguments import Fold as FoldArguments
-from app.cli.arguments import Guard
+from app.cli.arguments import FoldCommand as FoldArguments
+from app.cli.arguments import GuardCommand
 from app.cli.fold import fold_twin
 from app.cli.guard import guard
 from app.cli.main import main
@@ -57,7 +57,7 @@ def archive(recorded, tmp_path):
 
 
 def guarded(folder, *twins, **more):
-    return guard(Guard(tuple(map(str, twins)), archive=folder, jobs=1, **more))
+    return guard(GuardCommand(tuple(map(str, twins)), archive=folder, jobs=1, **more))
 
 
 def kept(path, scale):

@@ -7,7 +7,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from app.cli.arguments import Fold as Arguments
+from app.cli.arguments import FoldCommand as Arguments
 from app.cli.fold import fold_twin
 from app.live.alerts import rejections
 from app.live.counts import RowCounts

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from app.cli.arguments import Fold as Arguments
+from app.cli.arguments import FoldCommand as Arguments
 from app.cli.fold import fold_twin
 from app.live.commands import SetEstimator, SetOption
 from app.live.execute import retuned

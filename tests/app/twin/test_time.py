@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from app.cli.arguments import Fold
+from app.cli.arguments import FoldCommand
 from app.cli.fold import fold_twin
 from app.twin.twin import load_twin
 from estimators.errors import ConfigError
@@ -60,7 +60,7 @@ def test_a_filter_of_one_gain_cannot_inflate(tmp_path):
 def test_maintenance_of_the_yaml_is_in_the_fold(tmp_path, capsys):
     more = "maintenance:\n- {at: 100, what: new fan, states: [rate]}\n"
     out = tmp_path / "track.parquet"
-    assert fold_twin(Fold(str(made(tmp_path, more=more)), out=out, json=True)) == 0
+    assert fold_twin(FoldCommand(str(made(tmp_path, more=more)), out=out, json=True)) == 0
     told = json.loads(capsys.readouterr().out)
     assert told["degraded_after"]["seconds"] == 6.0 and told["late"]["inflate"] is False
     assert told["wrong_time"] == told["stale"] == told["inflated"] == 0
@@ -92,7 +92,7 @@ def test_late_rows_of_a_table_are_used_either_way(tmp_path, how, capsys):
         "source: {type: table, files: log.csv, time: {column: t}, sensors: {winding: {columns: y}}}\n"
     )
     out = tmp_path / "track.parquet"
-    assert fold_twin(Fold(str(tmp_path / "twin.yaml"), out=out, json=True)) == 0
+    assert fold_twin(FoldCommand(str(tmp_path / "twin.yaml"), out=out, json=True)) == 0
     told = json.loads(capsys.readouterr().out)
     assert told["readings"] == 300 and told["stale"] == 0
     assert told["inflated"] == (1 if how == "inflate" else 0)

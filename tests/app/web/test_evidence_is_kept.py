@@ -12,7 +12,7 @@ from app.present.export.track_file import rows_of_run
 from app.twin.twin import load_twin
 from app.web.session import Page, Session
 from estimators.log import READING
-from tests.app.cli.test_check import parsed
+from tests.app.cli.test_check import Page
 from tests.app.scripted import wait_for
 from tests.app.served import Client
 

@@ -8,14 +8,14 @@ import pyarrow.csv
 import pyarrow.parquet as pq
 import pytest
 
-from app.cli.arguments import Fold
+from app.cli.arguments import FoldCommand
 from app.cli.fold import fold_twin
 from app.cli.run import live_source
 from app.live.commands import Maintenance, SetTuning
 from app.present.export import track_file
 from app.twin.twin import load_twin
 from app.web.session import Page, Session
-from tests.app.cli.test_check import parsed
+from tests.app.cli.test_check import Page
 from tests.app.scripted import pull_all, wait_for
 from tests.app.served import Client
 
@@ -45,7 +45,7 @@ def written(tmp_path_factory):
     """What `nisus fold` writes of the same twin."""
     folder = tmp_path_factory.mktemp("fold")
     for name in ("track.csv", "track.parquet"):
-        fold_twin(Fold(TWIN, set=(f"source.duration={SECONDS}",), out=folder / name))
+        fold_twin(FoldCommand(TWIN, set=(f"source.duration={SECONDS}",), out=folder / name))
     return folder
 
 

@@ -11,7 +11,7 @@ import pyarrow.parquet
 import pytest
 import yaml
 
-from app.cli.arguments import Fold, Tunings
+from app.cli.arguments import FoldCommand, TuningsCommand
 from app.cli.fold import fold_twin
 from app.cli.main import main
 from app.cli.open_twin import recorded_twin
@@ -176,15 +176,15 @@ def test_the_command_line_has_the_last_word(own):
 def test_kept_listed_compared_accepted(own, capsys):
     assert main(["tunings", str(own), "--save", "quiet", "--set", "R.winding=0.5", "--note", "a ‘quieter’ sensor"]) == 0
     with pytest.raises(ConfigError, match=r"quiet\.yaml: there is a version of that name; choose another name"):
-        tunings_of(Tunings(str(own), save="quiet"))
-    tunings_of(Tunings(str(own), save="loud", set=("R.winding=9",)))
+        tunings_of(TuningsCommand(str(own), save="quiet"))
+    tunings_of(TuningsCommand(str(own), save="loud", set=("R.winding=9",)))
     capsys.readouterr()
-    tunings_of(Tunings(str(own), json=True))
+    tunings_of(TuningsCommand(str(own), json=True))
     listed = {item["name"]: item for item in json.loads(capsys.readouterr().out)}
     assert set(listed) == {"own", "quiet", "loud"}
     assert listed["own"]["holds"] and listed["quiet"]["note"] == "a ‘quieter’ sensor"
     # What the fold says of itself.
-    fold_twin(Fold(str(own), tuning="quiet", json=True))
+    fold_twin(FoldCommand(str(own), tuning="quiet", json=True))
     told = json.loads(capsys.readouterr().out)
     assert told["tuning"] == "quiet"
     scores = listed["quiet"]["scores"]
@@ -193,17 +193,17 @@ def test_kept_listed_compared_accepted(own, capsys):
     assert scores["coverage.rate"] == pytest.approx(told["coverage"]["rate"], rel=1e-7)
     assert scores["log_likelihood"] * told["nis"]["n"] == pytest.approx(told["log_likelihood"], rel=1e-7)
 
-    tunings_of(Tunings(str(own), ("quiet", "loud"), json=True))
+    tunings_of(TuningsCommand(str(own), ("quiet", "loud"), json=True))
     compared = json.loads(capsys.readouterr().out)
     assert compared["entries"] == [{"key": "R.winding", "values": [0.5, 9.0]}]
     assert accepted_version(own) is None
     before = find_version(own, "quiet")
-    tunings_of(Tunings(str(own), accept="quiet", note="it is"))
+    tunings_of(TuningsCommand(str(own), accept="quiet", note="it is"))
     version = accepted_version(own)
     assert version.name == "quiet" and version.head.accepted.note == "it is"
     assert version.head.model_copy(update={"accepted": None}) == before.head
     assert {**version.data, "version": 0} == {**before.data, "version": 0}
-    tunings_of(Tunings(str(own)))
+    tunings_of(TuningsCommand(str(own)))
     assert "quiet *" in capsys.readouterr().out
 
 
@@ -230,9 +230,9 @@ def test_the_name_is_in_every_row_and_recording(own, tmp_path):
     tuning = replace(twin.tuning.set("Q.rate", 1e-4))
     normal = "commissioned:\n  winding: {bias: 0.25}\n"
     keep(twin, "tried", version_text(twin, Settings("kf", tuning, prior={"rate": {"std": 0.7}})) + normal)
-    fold_twin(Fold(str(own), tuning="tried", out=tmp_path / "a.parquet"))
+    fold_twin(FoldCommand(str(own), tuning="tried", out=tmp_path / "a.parquet"))
     assert set(pyarrow.parquet.read_table(tmp_path / "a.parquet").column("tuning").to_pylist()) == {"tried"}
-    fold_twin(Fold(str(own), tuning="tried", out=tmp_path / "a.rrd"))
+    fold_twin(FoldCommand(str(own), tuning="tried", out=tmp_path / "a.rrd"))
     # The recording holds the version whole: it is reviewed when that is gone.
     shutil.rmtree(folders(own)[0])
     back = recorded_twin(read_recording(tmp_path / "a.rrd"))
@@ -303,7 +303,7 @@ def test_one_that_cannot_be_read_is_listed_beneath_the_others(own, capsys):
     assert main(["tunings", str(own), "--save", "good"]) == 0
     (folders(own)[0] / "bad.yaml").write_text("- 1\n")
     capsys.readouterr()
-    tunings_of(Tunings(str(own)))
+    tunings_of(TuningsCommand(str(own)))
     table, beneath = capsys.readouterr().out.split("Cannot be read")
     assert [line.split()[0] for line in table.splitlines()[-3:-1]] == ["own", "good"]
     assert "bad.yaml:1: the file is [1]; a tuning version is a mapping" in " ".join(beneath.split())

@@ -17,7 +17,7 @@ from estimators.diagnostics.detectors import CAUSES
 from estimators.fold import fold
 from estimators.log import Log
 from estimators.tuning import Tuning
-from tests.app.cli.test_check import parsed
+from tests.app.cli.test_check import Page
 from tests.app.scripted import MODEL, readings
 
 

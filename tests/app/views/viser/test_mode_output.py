@@ -1,12 +1,12 @@
 """A discrete mode is shown as a probability in what `nisus fold` prints."""
 
-from app.cli.arguments import Fold
+from app.cli.arguments import FoldCommand
 from app.cli.fold import fold_twin
 from app.twin.twin import load_twin
 
 
 def test_fold_prints_the_probability_and_its_brier_score(capsys) -> None:
-    assert fold_twin(Fold("gripper_contact", duration=0.5)) == 0
+    assert fold_twin(FoldCommand("gripper_contact", duration=0.5)) == 0
     lines = capsys.readouterr().out.splitlines()
     (line,) = [line for line in lines if "probability of contact" in line]
     # Nothing is touched in the first half second, and the filter knows.
