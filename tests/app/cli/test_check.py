@@ -16,41 +16,31 @@ MORE = {"twin", "estimator", "span", "timing", "calibration", "posterior", "line
 QUESTIONS = ["linearity", "dimension", "posterior", "observability", "timing", "health", "tuning", "change"]
 
 
+VOID = ("meta", "br", "hr", "img", "link", "input")
+
+
 class Page(HTMLParser):
-    """What a browser would make of it: every tag must be closed, and nothing may be fetched."""
+    """Tags, attributes and text of HTML in which every tag must be closed."""
 
-    VOID = ("meta", "br", "hr", "img", "link", "input")
-
-    def __init__(self) -> None:
+    def __init__(self, html: str) -> None:
         super().__init__()
         self.open: list[str] = []
-        self.tags: set[str] = set()
         self.attributes: list[tuple[str, str, str | None]] = []
-        self.text: list[str] = []
+        self.tags, self.text = set[str](), list[str]()
+        self.feed(html)
+        self.close()
+        assert not self.open
 
     def handle_starttag(self, tag, attrs):
         self.tags.add(tag)
         self.attributes += [(tag, name, value) for name, value in attrs]
-        if tag not in self.VOID:
-            self.open.append(tag)
-
-    def handle_startendtag(self, tag, attrs):
-        self.tags.add(tag)
-        self.attributes += [(tag, name, value) for name, value in attrs]
+        self.open += [tag] if tag not in VOID else []
 
     def handle_endtag(self, tag):
-        assert self.open.pop() == tag
+        assert tag in VOID or self.open.pop() == tag
 
     def handle_data(self, data):
         self.text.append(data)
-
-
-def parsed(text: str) -> Page:
-    page = Page()
-    page.feed(text)
-    page.close()
-    assert page.open == []
-    return page
 
 
 @pytest.fixture(scope="module")
@@ -98,7 +88,7 @@ def test_figures_agree_with_each_other(checked):
 
 def test_html_is_one_file_without_scripts(checked):
     _, html = checked
-    page = parsed(html)
+    page = Page(html)
     assert not page.tags & {"script", "link", "iframe", "img", "object", "embed", "form", "input"}
     for tag, name, value in page.attributes:
         assert name not in ("src", "href", "srcset", "action", "onload", "onclick"), (tag, name, value)
@@ -111,7 +101,7 @@ def test_html_escapes_what_users_name():
     part = Topic(
         'a <b> & "c"', ("<script>alert(1)</script>",), ("<i>", ""), (("<u>", "yes"),), (Bar("<s>", "°C", 1.0, np.nan),)
     )
-    page = parsed(to_html("<title>", [Topic("head", ()), part]))
+    page = Page(to_html("<title>", [Topic("head", ()), part]))
     assert not page.tags & {"script", "b", "i", "u", "s"}
     assert "<script>alert(1)</script>" in page.text and "<u>" in page.text and "no number" in page.text
 
@@ -119,7 +109,7 @@ def test_html_escapes_what_users_name():
 def test_a_mark_says_whether_the_answer_is_good_news():
     """Asked for peaks and heavy tails, a twin does well to say no."""
     rows = (("all well?", "yes"), ("anything wrong?", "no"))
-    page = parsed(to_html("t", [Topic("head", ()), Topic("b", (), ("q", "a"), rows, marks=("good", "good"))]))
+    page = Page(to_html("t", [Topic("head", ()), Topic("b", (), ("q", "a"), rows, marks=("good", "good"))]))
     marks = [value for tag, name, value in page.attributes if (tag, name) == ("td", "class")]
     assert marks == ["short", "good short", "short", "good short"]
 

@@ -1,20 +1,18 @@
 """`nisus learn`: a body in a shell whose heating the model leaves out; what is kept, what is refused, what is said."""
 
-import json
 import sys
 
 import numpy as np
 import pytest
 import yaml
 
-from app.cli.main import main
 from app.twin.learned import run_net
 from app.twin.log_reader import read_log
 from app.twin.twin import load_twin
 from estimators.diagnostics.score import score
 from estimators.errors import ConfigError
-from estimators.fold import Fold
 from estimators.log import TRUTH
+from tests.support import folded
 
 MODEL = """\
 from estimators.model import Input, Noise, Row, Sensor, State, StateSpaceModel
@@ -48,7 +46,7 @@ source:
   sensors: {gauge: {columns: gauge}}
   truth: {body: {columns: body}}
 """
-LEARN = "learn", "--corrects", "body", "--features", "load", "--window", "10"
+LEARN = "--corrects", "body", "--features", "load", "--window", 10
 
 
 def heating(load):
@@ -80,19 +78,13 @@ def heated(tmp_path_factory):
     return vessel(tmp_path_factory.mktemp("heated"), 1.0)
 
 
-def learned(path, kind, capsys, *more):
-    name, *rest = LEARN
-    status = main([name, str(path), *rest, "--kind", kind, *more])
-    return status, capsys.readouterr()
-
-
 @pytest.mark.parametrize("kind", ["ridge", "gp"])
-def test_what_the_model_leaves_out_is_learned_kept_and_folded(heated, kind, capsys):
+def test_what_the_model_leaves_out_is_learned_kept_and_folded(heated, kind, nisus):
     if kind == "gp":
         pytest.importorskip("sklearn")
     keep = heated.with_name(f"{kind}.yaml")
-    status, said = learned(heated, kind, capsys, "--degree", "2", "--keep", str(keep))
-    assert status == 0 and "Better on blocks from which it did not learn." in said.out and "kept" in said.err
+    done = nisus("learn", heated, *LEARN, "--kind", kind, "--degree", 2, "--keep", keep)
+    assert "Better on blocks from which it did not learn." in done.out and "kept" in done.err
     alone = load_twin(heated)
     noise = {"learned": keep.name, "noise.body.variance": "0.03"}
     twin = load_twin(heated, overrides=noise)
@@ -104,9 +96,8 @@ def test_what_the_model_leaves_out_is_learned_kept_and_folded(heated, kind, caps
     errors = {}
     for name, each in (("physics", alone), ("hybrid", twin)):
         log, _ = read_log(each, None)
-        fold = Fold(each.estimator, each.model, each.tuning, log)
-        fold.advance()
-        errors[name] = score(fold.track, log.events, each.model).states["body"]
+        track = folded(each.estimator, each.model, log, each.tuning).track
+        errors[name] = score(track, log.events, each.model).states["body"]
     # The noise is what the command printed. Most of the error is gone.
     assert errors["hybrid"].rmse < 0.4 * errors["physics"].rmse
     assert errors["hybrid"].coverage > 0.85 > errors["physics"].coverage
@@ -119,18 +110,17 @@ def load_correction(path):
     return learned_of(load(path)[0], path).correction
 
 
-def test_where_the_model_has_all_of_it_nothing_is_kept(tmp_path, capsys):
+def test_where_the_model_has_all_of_it_nothing_is_kept(tmp_path, nisus):
     # A gain must exceed two standard errors. Of 17 such logs (seed 7, and 100 to 107 by both kinds) one did by chance.
     path = vessel(tmp_path, 0.0, seed=101)
     keep = tmp_path / "none.yaml"
-    status, said = learned(path, "ridge", capsys, "--keep", str(keep))
-    assert status == 1 and "Not better than the physics alone" in said.out and not keep.exists()
+    done = nisus.run("learn", path, *LEARN, "--kind", "ridge", "--keep", keep)
+    assert done.status == 1 and "Not better than the physics alone" in done.out and not keep.exists()
 
 
-def test_json_has_all_of_it(heated, capsys):
-    status, said = learned(heated, "ridge", capsys, "--degree", "2", "--json")
-    found = json.loads(said.out)
-    assert status == 0 and found["better"] and found["reasons"] == []
+def test_json_has_all_of_it(heated, nisus):
+    found = nisus("learn", heated, *LEARN, "--kind", "ridge", "--degree", 2, "--json").json
+    assert found["better"] and found["reasons"] == []
     told = found["held_out"]
     physics, wider, corrected = (told[key]["states"]["body"] for key in ("physics", "physics_wider", "corrected"))
     assert corrected["rms"] < 0.5 * min(physics["rms"], wider["rms"])
@@ -169,28 +159,18 @@ def test_a_net_says_the_same_alone_and_among_others(tmp_path, kind):
     np.testing.assert_array_equal(found, np.concatenate([run(row[None]) for row in z]))
 
 
-def test_a_net_is_judged_kept_and_folded(heated, capsys):
+def test_a_net_is_judged_kept_and_folded(heated, nisus):
     # A line in the load for what is a parabola: 0.4 load² of loads up to 2.
     net = net_file(heated.with_name("net.onnx"), [[0.6]], kind="FLOAT")
     keep = heated.with_name("net.yaml")
-    more = "--net", str(net), "--keep", str(keep), "--estimator", "enkf"
-    status, said = learned(heated, "net", capsys, *more)
-    assert "Blocks held out, folded" in said.out
-    assert status == 0, said.out
+    more = "--kind", "net", "--net", net, "--keep", keep, "--estimator", "enkf"
+    assert "Blocks held out, folded" in nisus("learn", heated, *LEARN, *more).out
     assert yaml.safe_load(keep.read_text())["net"] == "net.onnx"
     twin = load_twin(heated, overrides={"learned": keep.name, "estimator": "filterpy-ekf"})
     assert twin.model.black_box
     log, _ = read_log(twin, 100.0)
-    fold = Fold(twin.estimator, twin.model, twin.tuning, log)
-    fold.advance()
-    assert np.isfinite(fold.track.mean[log.kind[: log.n] == TRUTH]).all()
-
-
-def refused(capsys, *arguments):
-    assert main(list(arguments)) == 2
-    said = capsys.readouterr().err
-    assert said.count("\n") == 1
-    return said
+    track = folded(twin.estimator, twin.model, log, twin.tuning).track
+    assert np.isfinite(track.mean[log.kind[: log.n] == TRUTH]).all()
 
 
 @pytest.mark.parametrize(
@@ -209,9 +189,8 @@ def refused(capsys, *arguments):
         (["--estimator", "rbpf"], "rbpf"),
     ],
 )
-def test_what_cannot_be_is_one_line(heated, capsys, arguments, said):
-    name, *rest = LEARN
-    assert said in refused(capsys, name, str(heated), *rest, "--kind", "ridge", *arguments)
+def test_wrong_arguments_are_one_line(heated, nisus, arguments, said):
+    assert said in nisus.refuses("learn", heated, *LEARN, "--kind", "ridge", *arguments)
 
 
 def test_without_onnxruntime_a_line_says_what_to_install(tmp_path, monkeypatch):

@@ -26,7 +26,7 @@ from config.tunings import load_version
 from estimators.diagnostics.score import score
 from estimators.errors import ConfigError
 from estimators.events.batch import truth_of
-from estimators.fold import Fold
+from tests.support import folded
 
 RECORDINGS = 10
 PLANTED = 4
@@ -78,9 +78,8 @@ def rmse(path, scale):
     for k in range(3):
         twin = load_twin(path, overrides={"source.seed": str(seed + k)})
         log, _ = read_log(twin, None)
-        fold = Fold("kf", twin.model, scaled(twin, scale), log)
-        fold.advance()
-        found.append(score(fold.track, log.events, twin.model).states["temperature"].rmse)
+        track = folded("kf", twin.model, log, scaled(twin, scale)).track
+        found.append(score(track, log.events, twin.model).states["temperature"].rmse)
     return np.array(found)
 
 
@@ -157,15 +156,15 @@ def drawn(tmp_path):
 
 def test_other_draws_are_chance_and_five_percent_are_not(drawn, monkeypatch, capsys):
     """Ten reruns with other members are silent; the same members with R scaled are not."""
-    folded = guard_study._fold
+    own = guard_study._fold
     for k in range(1, 11):
         monkeypatch.setattr(
             guard_study,
             "_fold",
-            lambda twin, tuning, log, base, seed, k=k: folded(twin, tuning, log, base, seed + 100 * k),
+            lambda twin, tuning, log, base, seed, k=k: own(twin, tuning, log, base, seed + 100 * k),
         )
         assert guarded(None, drawn) == 0
-    monkeypatch.setattr(guard_study, "_fold", folded)
+    monkeypatch.setattr(guard_study, "_fold", own)
     assert guarded(None, drawn) == 0
     capsys.readouterr()
     assert guarded(None, drawn, set=("R.winding=6",)) == 1
@@ -212,8 +211,7 @@ def test_what_is_allowed_is_a_tenth_of_the_standard_error(tmp_path):
     for seed in range(20):
         twin = load_twin(path, overrides={"source.seed": str(seed)})
         log, _ = read_log(twin, None)
-        fold = Fold("kf", twin.model, twin.tuning, log)
-        fold.advance()
+        fold = folded("kf", twin.model, log, twin.tuning)
         each = fold.track.log_likelihood[fold.track.dof > 0]
         assert fold_figures(fold)["log_likelihood"] == pytest.approx(each.mean(), rel=1e-12)
         allowed = allowances(fold)["log_likelihood"]
@@ -227,8 +225,7 @@ def test_no_figure_may_change_by_more_than_two_percent(tmp_path):
     path = twin_file(tmp_path, "short", 3)
     twin = load_twin(path)
     log, _ = read_log(twin, 30.0)
-    fold = Fold("kf", twin.model, twin.tuning, log)
-    fold.advance()
+    fold = folded("kf", twin.model, log, twin.tuning)
     found = allowances(fold)
     assert all(allowed <= MAX_ALLOWED for name, allowed in found.items() if name.startswith(("rmse", "nis", "log")))
     # Two of 30 errors may leave the band.
@@ -296,8 +293,7 @@ def test_a_twin_without_truth_is_guarded_by_sensors_held_out(tmp_path, capsys):
     """Each in turn is predicted by the others."""
     twin = load_twin("motor_can")
     log, _ = read_log(twin, 60.0)
-    fold = Fold(twin.estimator, twin.model, twin.tuning.set("use.yoke", False), log, policy=twin.policy)
-    fold.advance()
+    fold = folded(twin.estimator, twin.model, log, twin.tuning.set("use.yoke", False), policy=twin.policy)
     expected = score(fold.track, log.events, twin.model, gate=twin.tuning.gate).held_out["yoke"].rmse
     text = yaml.safe_load((TWINS / "motor_can.yaml").read_text())
     del text["source"]["truth"], text["source"]["asset"]

@@ -1,0 +1,94 @@
+"""How `run` and `review` open a twin: its first speed, the gallery, and a review that judges as the run did."""
+
+import numpy as np
+import pytest
+
+from app.cli.open_twin import opened_twin, recorded_twin
+from app.twin.log_reader import read_log
+from app.twin.twin import load_twin
+from app.views.recording.reader import read_recording
+from app.views.recording.writer import write_recording
+from config.loader import load
+from estimators.diagnostics.episodes import episodes
+from estimators.errors import ConfigError
+from tests.support import assert_same, folded
+
+TWIN = (
+    "title: tank\nmodel: motor_winding\nestimator: kf\nsource:\n  type: simulator\n  seed: 1\n  step: 1\n"
+    "  duration: 60\n  initial: {temperature: 40}\n"
+)
+
+
+def speed_of(path, **options):
+    return opened_twin(str(path), **options).open_source(lambda text, level="info": None).speed
+
+
+@pytest.mark.parametrize(("view", "times"), [("", 1.0), ("view: {speed: 60}\n", 60.0)])
+def test_it_is_that_of_the_twin_or_that_of_the_command_line(tmp_path, view, times):
+    path = tmp_path / "tank.yaml"
+    path.write_text(TWIN + view)
+    assert speed_of(path) == times
+    assert speed_of(path, speed=5.0) == 5.0
+    assert speed_of(path, speed=np.inf) == np.inf
+    assert speed_of(path, overrides={"view.speed": "7"}) == 7.0
+
+
+@pytest.mark.parametrize("speed", ["0", "-1", ".inf", "fast", "1e12"])
+def test_one_that_cannot_be_is_said_with_its_place(tmp_path, speed):
+    path = tmp_path / "tank.yaml"
+    path.write_text(TWIN + f"view:\n  speed: {speed}\n")
+    with pytest.raises(ConfigError, match=r"tank\.yaml:11: view\.speed"):
+        load(str(path))
+
+
+def test_without_a_name_it_is_the_gallery(nisus, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert "Nisus shows the gallery at" in nisus("run", "--port", "0", "--no-browser", "--duration", "0.1").out
+    assert list(tmp_path.iterdir()) == []  # the folder of recordings is made when there is one
+
+
+COMMISSIONED = """
+model: motor_winding
+estimator: kf
+noise: {rate: {variance: 1.0e-4}}
+sensors: {winding: {std: 1.5}}
+source:
+  type: simulator
+  duration: 120
+  seed: 3
+  faults: [{kind: bias, sensor: winding, size: 30, start: 60, end: 90}]
+commissioned:
+  winding: {bias: 1.0, scale: 2.0, correlation: 0.3}
+"""
+
+
+def judged(twin, log, base=None):
+    how = {"pairs": twin.pairs, "policy": twin.policy, "expected": twin.expected, "base": base}
+    fold = folded(twin.estimator, twin.model, log, twin.tuning, **how)
+    return fold.track, episodes(fold)
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        {},
+        {"sensors.winding.range": "[-40, 55]"},
+        {"prior.temperature.mean": "90", "Q.rate": "0.01", "commissioned": "{}"},
+    ],
+)
+def test_a_review_judges_as_the_run_did(overrides, tmp_path):
+    yaml = tmp_path / "motor.yaml"
+    yaml.write_text(COMMISSIONED)
+    twin = load_twin(yaml, overrides=overrides)
+    log, _ = read_log(twin, None)
+    track, told = judged(twin, log)
+    write_recording(tmp_path / "run.rrd", twin, log, track)
+    recorded = read_recording(tmp_path / "run.rrd")
+    again = recorded_twin(recorded)
+    assert told
+    assert judged(again, log, recorded.base)[1] == told
+    assert_same(judged(again, log, recorded.base)[0], track)
+    # And what is compared does depend on what was left out before.
+    if overrides or twin.tuning.baseline is not None:
+        bare = load_twin(yaml, overrides={"commissioned": "{}"} if not overrides else {})
+        assert judged(bare, log)[1] != told
