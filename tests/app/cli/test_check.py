@@ -7,6 +7,7 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
+from app.cli.main import main
 from app.present.result import Bar, Topic, to_html
 from estimators.diagnostics.sensitivity.responses import Nudge
 
@@ -44,13 +45,13 @@ class Page(HTMLParser):
 
 
 @pytest.fixture(scope="module")
-def checked(tmp_path_factory, nisus):
+def checked(tmp_path_factory):
     """JSON, HTML of the smallest twin."""
     html = tmp_path_factory.mktemp("check") / "check.html"
     with pytest.MonkeyPatch.context() as patch:
         printed: list[str] = []
         patch.setattr("builtins.print", lambda *words, **_: printed.append(" ".join(map(str, words))))
-        nisus("check", "motor_winding", "--json", "--html", str(html))
+        assert main(["check", "motor_winding", "--json", "--html", str(html)]) == 0
     return json.loads(printed[-1]), html.read_text(encoding="utf-8")
 
 
@@ -141,10 +142,9 @@ def test_text_is_the_same_page(nisus):
 @pytest.mark.parametrize(
     "name, seconds", [("agv_corridor", 10), ("gripper_contact", 1), ("lorenz96", 1), ("thermal_field", 11)]
 )
-def test_what_does_not_apply_is_said_and_nothing_fails(name, seconds, capsys, nisus):
-    nisus("check", name, "--duration", str(seconds), "--json")
+def test_what_does_not_apply_is_said_and_nothing_fails(name, seconds, nisus):
     # Numbers that are none are null: JSON has no NaN.
-    found = json.loads(capsys.readouterr().out, parse_constant=lambda word: pytest.fail(word))
+    found = nisus("check", name, "--duration", seconds, "--json").json
     assert set(found) == REQUIRED | MORE
     if name in ("agv_corridor", "thermal_field"):
         assert found["integrity"]["reason"] == found["observability"]["reason"] != ""

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from scipy.stats import binom
 
-from app.cli.main import main
 from app.studies.stress.detection import CHANCE, DETECTION, INVISIBLE, MISNAMED, NAMED, VISIBLE, Foretold, Oracle, make
 from app.studies.stress.matrix import matrix
 from app.studies.stress.scenario import (
@@ -187,17 +186,15 @@ def test_a_change_of_the_asset_is_made_in_the_asset():
     assert not np.array_equal(Bench(twin, 2, 30.0).events.value, bench.events.value, equal_nan=True)
 
 
-def test_the_command_prints_a_table_or_json(capsys, nisus):
+def test_the_command_prints_a_table_or_json(nisus):
     given = ["stress", "motor_winding", "--only", "winding stuck", "R x100", "--seeds", "2", "--duration", "120"]
-    assert main(given) == 0
-    out = capsys.readouterr().out
+    out = nisus(*given).out
     assert "winding stuck" in out and "2/2" in out and "0 rows wrong and green" in out
     rows = nisus(*given, "--json").json
     assert [(row["mistake"], row["seed"]) for row in rows] == [
         ("R x100", 0), ("winding stuck", 0), ("R x100", 1), ("winding stuck", 1),
     ]  # fmt: skip
-    nisus("stress", "motor_winding", "--list", "--duration", "60")
-    assert "Q /100" in capsys.readouterr().out.splitlines()
+    assert "Q /100" in nisus("stress", "motor_winding", "--list", "--duration", 60).out.splitlines()
 
 
 def test_what_is_invisible_is_exactly_what_is_not_found():
