@@ -20,7 +20,7 @@ QUESTIONS = ["linearity", "dimension", "posterior", "observability", "timing", "
 VOID = ("meta", "br", "hr", "img", "link", "input")
 
 
-class Page(HTMLParser):
+class ParsedHtml(HTMLParser):
     """Tags, attributes and text of HTML in which every tag must be closed."""
 
     def __init__(self, html: str) -> None:
@@ -89,7 +89,7 @@ def test_figures_agree_with_each_other(checked):
 
 def test_html_is_one_file_without_scripts(checked):
     _, html = checked
-    page = Page(html)
+    page = ParsedHtml(html)
     assert not page.tags & {"script", "link", "iframe", "img", "object", "embed", "form", "input"}
     for tag, name, value in page.attributes:
         assert name not in ("src", "href", "srcset", "action", "onload", "onclick"), (tag, name, value)
@@ -102,7 +102,7 @@ def test_html_escapes_what_users_name():
     part = Topic(
         'a <b> & "c"', ("<script>alert(1)</script>",), ("<i>", ""), (("<u>", "yes"),), (Bar("<s>", "°C", 1.0, np.nan),)
     )
-    page = Page(to_html("<title>", [Topic("head", ()), part]))
+    page = ParsedHtml(to_html("<title>", [Topic("head", ()), part]))
     assert not page.tags & {"script", "b", "i", "u", "s"}
     assert "<script>alert(1)</script>" in page.text and "<u>" in page.text and "no number" in page.text
 
@@ -110,7 +110,7 @@ def test_html_escapes_what_users_name():
 def test_a_mark_says_whether_the_answer_is_good_news():
     """Asked for peaks and heavy tails, a twin does well to say no."""
     rows = (("all well?", "yes"), ("anything wrong?", "no"))
-    page = Page(to_html("t", [Topic("head", ()), Topic("b", (), ("q", "a"), rows, marks=("good", "good"))]))
+    page = ParsedHtml(to_html("t", [Topic("head", ()), Topic("b", (), ("q", "a"), rows, marks=("good", "good"))]))
     marks = [value for tag, name, value in page.attributes if (tag, name) == ("td", "class")]
     assert marks == ["short", "good short", "short", "good short"]
 

@@ -11,6 +11,7 @@ from app.views.recording.writer import write_recording
 from config.loader import load
 from estimators.diagnostics.episodes import episodes
 from estimators.errors import ConfigError
+from sources.source import controls_of
 from tests.support import assert_same, folded
 
 TWIN = (
@@ -20,7 +21,7 @@ TWIN = (
 
 
 def speed_of(path, **options):
-    return opened_twin(str(path), **options).open_source(lambda text, level="info": None).speed
+    return controls_of(opened_twin(str(path), **options).open_source(lambda text, level="info": None)).speed
 
 
 @pytest.mark.parametrize(("view", "times"), [("", 1.0), ("view: {speed: 60}\n", 60.0)])

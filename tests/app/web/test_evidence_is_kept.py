@@ -12,7 +12,7 @@ from app.present.export.track_file import rows_of_run
 from app.twin.twin import load_twin
 from app.web.session import Page, Session
 from estimators.log import READING
-from tests.app.cli.test_check import Page
+from tests.app.cli.test_check import ParsedHtml
 from tests.app.scripted import wait_for
 from tests.app.served import Client
 
@@ -52,7 +52,7 @@ def test_the_report_has_the_episode_of_the_run_before_though_two_edits_came_sinc
     assert not any(item.subject == "yoke" for item in session.engine.episodes())
     first = session.engine.revisions.find(0)
     assert first.track is None and any(item.subject == "yoke" for item in first.episodes)
-    text = " ".join(parsed(Client(session.server).get("/api/report.html").text).text)
+    text = " ".join(ParsedHtml(Client(session.server).get("/api/report.html").text).text)
     assert "Episodes of earlier runs" in text and "0: as it began" in text
     for item in first.episodes:
         assert item.text in text

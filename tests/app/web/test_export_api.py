@@ -15,7 +15,7 @@ from app.live.commands import Maintenance, SetTuning
 from app.present.export import track_file
 from app.twin.twin import load_twin
 from app.web.session import Page, Session
-from tests.app.cli.test_check import Page
+from tests.app.cli.test_check import ParsedHtml
 from tests.app.scripted import pull_all, wait_for
 from tests.app.served import Client
 
@@ -137,7 +137,7 @@ def test_versions_of_the_model_and_runs_that_are_kept(client, session, monkeypat
 
 def test_the_report_of_a_run_is_that_of_the_page(client, session):
     answer = client.get("/api/report.html?run=1")
-    page = parsed(answer.text)
+    page = ParsedHtml(answer.text)
     text = " ".join(page.text)
     assert answer.status == 200 and 'filename="motor_joint-run1.html"' in answer.headers["content-disposition"]
     assert not page.tags & {"link", "img", "iframe"}

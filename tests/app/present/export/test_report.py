@@ -17,7 +17,7 @@ from estimators.diagnostics.detectors import CAUSES
 from estimators.fold import fold
 from estimators.log import Log
 from estimators.tuning import Tuning
-from tests.app.cli.test_check import Page
+from tests.app.cli.test_check import ParsedHtml
 from tests.app.scripted import MODEL, readings
 
 
@@ -54,7 +54,7 @@ def data_of(html):
 
 def test_it_is_one_file_and_may_load_nothing(made):
     html, _ = made
-    page = parsed(html)
+    page = ParsedHtml(html)
     assert not page.tags & {"link", "iframe", "object", "embed", "form", "input", "a"}
     policy = next(value for tag, name, value in page.attributes if tag == "meta" and "default-src" in (value or ""))
     assert "default-src 'none'" in policy and "http" not in policy and "*" not in policy
@@ -66,14 +66,14 @@ def test_it_is_one_file_and_may_load_nothing(made):
 def test_it_says_who_made_it_when_and_of_what(made):
     html, _ = made
     assert re.search(r"Nisus [\d.]+, \d\d \w+ \d{4}, \d\d:\d\d UTC", html)
-    text = " ".join(parsed(html).text)
+    text = " ".join(ParsedHtml(html).text)
     assert "Kalman filter (kf)" in text and "simulator, of lying.yaml: seed 5" in text and "Q.rate=0.002" in text
     assert text.count("Time counts from the first event") == 1
 
 
 def test_figures_are_those_of_the_track(made):
     html, track = made
-    text = " ".join(parsed(html).text)
+    text = " ".join(ParsedHtml(html).text)
     error = track["temperature"].to_numpy() - track["temperature_true"].to_numpy()
     error = error[np.isfinite(error)]
     shown = re.search(r"RMSE of temperature\s+([\d.]+) °C", text)
@@ -86,7 +86,7 @@ def test_figures_are_those_of_the_track(made):
 
 def test_the_episode_is_there_with_its_remedy(made):
     html, _ = made
-    text = " ".join(parsed(html).text)
+    text = " ".join(ParsedHtml(html).text)
     assert "winding" in text and "Usual cause:" in text and "Response:" in text
     assert "1:40" in text
 
