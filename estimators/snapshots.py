@@ -8,19 +8,19 @@ import numpy as np
 
 from .track import Track
 
-EVERY, LATELY = 64, 1024
-"""Events between snapshots of the last `LATELY` events, where late readings fall."""
+NEAR_SPACING, NEAR_EVENTS = 64, 1024
+"""Events between snapshots of the last `NEAR_EVENTS` events, where late measurements fall."""
 
-WIDER_EVERY, RECENT = 256, 4096
-"""The same of the last `RECENT`: a later measurement takes the fold back further, so a few more events matter less."""
+RECENT_SPACING, RECENT_EVENTS = 256, 4096
+"""Events between snapshots of the last `RECENT_EVENTS` events, where few measurements fall back to."""
 
-SPARSE_EVERY = 1024
+PERMANENT_SPACING = 1024
 """Events between the snapshots that are never dropped."""
 
-MEMORY = 256 * 2**20
+MAX_SNAPSHOT_BYTES = 256 * 2**20
 """Bytes for the snapshots of a fold, half for the recent ones; snapshots of large states are farther apart."""
 
-PINNED = 64
+MAX_PINNED_SNAPSHOTS = 64
 """Snapshots kept after decisions that changed the state, as folding the events before does not reproduce these."""
 
 
@@ -83,12 +83,12 @@ class Snapshots:
 
     def __init__(self, nbytes: int) -> None:
         """Plan for states of `nbytes` bytes. The start, an old and a recent snapshot are kept, however large."""
-        self._most = max(1, MEMORY // 2 // nbytes)
-        self._every = EVERY
-        while RECENT // self._every > self._most:
+        self._most = max(1, MAX_SNAPSHOT_BYTES // 2 // nbytes)
+        self._every = NEAR_SPACING
+        while RECENT_EVENTS // self._every > self._most:
             self._every *= 2
-        self._sparse = max(SPARSE_EVERY, self._every)
-        self._wider = max(min(WIDER_EVERY, self._sparse), self._every)
+        self._sparse = max(PERMANENT_SPACING, self._every)
+        self._wider = max(min(RECENT_SPACING, self._sparse), self._every)
         self._kept: dict[int, Snapshot] = {}
         self._pinned: list[int] = []
 
@@ -113,18 +113,20 @@ class Snapshots:
     def next_stop(self, at: int, end: int) -> int:
         """Return the absolute index after `at` at which a fold that goes on to `end` takes the next snapshot."""
         # Stop only for snapshots that are still kept once the fold has reached the end.
-        zones = (0, self._sparse), (end - RECENT, self._wider), (end - LATELY, self._every)
+        zones = (0, self._sparse), (end - RECENT_EVENTS, self._wider), (end - NEAR_EVENTS, self._every)
         return min(-(-max(at + 1, begin) // stride) * stride for begin, stride in zones)
 
     def keep(self, at: int, first: int, snapshot: Snapshot, pinned: bool = False) -> None:
         """Keep a snapshot; drop those too close to others for their age. `first`: index of the log's first event."""
         self._kept[at] = snapshot
         if pinned:
-            self._pinned = [key for key in (*self._pinned, at) if key in self._kept][-min(PINNED, self._most) :]
-        for old, stride in ((at - LATELY, self._wider), (at - RECENT, self._sparse)):
+            self._pinned = [key for key in (*self._pinned, at) if key in self._kept][
+                -min(MAX_PINNED_SNAPSHOTS, self._most) :
+            ]
+        for old, stride in ((at - NEAR_EVENTS, self._wider), (at - RECENT_EVENTS, self._sparse)):
             if old % stride and old in self._kept and old != first and old not in self._pinned:
                 del self._kept[old]
-        for_ever = [key for key in self._kept if key <= at - RECENT and key not in self._pinned]
+        for_ever = [key for key in self._kept if key <= at - RECENT_EVENTS and key not in self._pinned]
         if len(for_ever) > self._most + 1:
             self._sparse *= 2
             for key in for_ever:

@@ -20,7 +20,7 @@ import numpy as np
 from estimators.errors import NisusError
 from estimators.late import inflated
 from estimators.log import TICK, Events
-from estimators.snapshots import SPARSE_EVERY, Base
+from estimators.snapshots import PERMANENT_SPACING, Base
 
 from ..concurrency import run_all
 from ..ingest import Ingest
@@ -242,7 +242,7 @@ class Engine(Running):
                 batches = []
                 item()
             try:
-                item = self._inbox.get_nowait() if sum(map(len, batches)) < SPARSE_EVERY else None
+                item = self._inbox.get_nowait() if sum(map(len, batches)) < PERMANENT_SPACING else None
             except queue.Empty:
                 item = None
         self._accept(batches)

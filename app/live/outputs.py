@@ -16,7 +16,7 @@ from estimators.diagnostics.sensitivity import Bound, Smallest
 from estimators.fold import Fold
 from estimators.log import Events, Log
 from estimators.numerics.peaks import Peak
-from estimators.snapshots import SPARSE_EVERY, Base
+from estimators.snapshots import PERMANENT_SPACING, Base
 from estimators.track import Track
 from estimators.tuning import Tuning
 from sources.faults.layer import FaultStatus
@@ -143,7 +143,7 @@ def event_window(
     index = max(0, fold.n - limit)
     if rows:
         first = fold.log.first
-        index = -(-(first + index) // SPARSE_EVERY) * SPARSE_EVERY - first
+        index = -(-(first + index) // PERMANENT_SPACING) * PERMANENT_SPACING - first
     at, base = fold.base_at(index)
     events = Events(*(column[at : fold.n].copy() for column in fold.log.events))
     track = fold.track.select(slice(at, fold.n) if rows else slice(0, 0)).copy()

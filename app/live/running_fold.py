@@ -18,7 +18,7 @@ from estimators.errors import EstimatorError
 from estimators.fold import Fold
 from estimators.log import READING, Events, Log
 from estimators.numerics.peaks import peaks_of
-from estimators.snapshots import SPARSE_EVERY, Base
+from estimators.snapshots import PERMANENT_SPACING, Base
 from estimators.tuning import Tuning
 from sources.source import Source
 
@@ -83,7 +83,7 @@ class Running(ABC):
         self.model = twin.model
         self.pairs = twin.pairs
         self.policy = twin.policy
-        self._history = max(2 * SPARSE_EVERY, twin.config.history)
+        self._history = max(2 * PERMANENT_SPACING, twin.config.history)
         self.estimator, self.tuning = twin.estimator, twin.tuning
         self._lock = FairLock()
         self._watchdog, self._ready = watchdog, ready
@@ -193,7 +193,7 @@ class Running(ABC):
         """
         with self._reading():
             first = self._log.first
-            at, base = self._fold.base_at(max(0, index // SPARSE_EVERY * SPARSE_EVERY - first))
+            at, base = self._fold.base_at(max(0, index // PERMANENT_SPACING * PERMANENT_SPACING - first))
             return first + at, base if at else self._base
 
     def folded_with(self) -> tuple[Tuning, str]:
@@ -298,7 +298,7 @@ class Running(ABC):
 
     def _clear(self, base: Base | None) -> None:
         """Begin an empty log and the fold that follows it."""
-        self._log = Log.resume(self.model, base, capacity=self._history + 4 * SPARSE_EVERY)
+        self._log = Log.resume(self.model, base, capacity=self._history + 4 * PERMANENT_SPACING)
         self._logs += 1
         self._base = base
         idle = not self._ready(self.estimator)
@@ -355,9 +355,9 @@ class Running(ABC):
 
     def _forget(self) -> None:
         """Once there are many events, drop the oldest up to a snapshot, from which later refolds start."""
-        if self._fold.idle or self._log.n <= self._history + 3 * SPARSE_EVERY:
+        if self._fold.idle or self._log.n <= self._history + 3 * PERMANENT_SPACING:
             return
-        count = (self._log.n - self._history) // SPARSE_EVERY * SPARSE_EVERY
+        count = (self._log.n - self._history) // PERMANENT_SPACING * PERMANENT_SPACING
         count, self._base = self._fold.base_at(count)
         if count:
             self._row_counts.forget(self._fold.track.select(slice(0, count)), self._log.channel[:count])

@@ -1,8 +1,8 @@
-"""The peaks of a cloud of points: where they are, how much of it each holds, how far each spreads.
+"""Peaks of a cloud of points: place, share of the points and spread of each.
 
 A kernel density of the whitened points links every point to its nearest neighbour of higher density (quick shift); the
 roots are candidates. Two candidates are one peak unless the density dips between them. Angles enter as points of the
-unit circle, so a peak at ±π is whole.
+unit circle, so a peak at ±π stays one peak.
 
 Sources: Vedaldi & Soatto (2008), Quick shift and kernel methods for mode seeking, doi:10.1007/978-3-540-88693-8_52;
 Rodriguez & Laio (2014), Clustering by fast search and find of density peaks, doi:10.1126/science.1242072;
@@ -15,25 +15,24 @@ from typing import NamedTuple
 
 import numpy as np
 
-SAMPLE = 400
-"""Points that the density is made of: its cost goes with their square."""
+MAX_DENSITY_POINTS = 400
+"""Points of the kernel density; its cost grows with their square."""
 
-DIP = 0.6
-"""Two peaks are one unless the density between them falls below this part of the lower one."""
+VALLEY_DENSITY_SHARE = 0.6
+"""Share of the lower peak's density below which the density between two peaks must fall to separate them."""
 
-LEAST = 0.02
-"""A peak with a smaller part of the points is a tail of the nearest one."""
+MIN_PEAK_SHARE = 0.02
+"""Share of the points below which a peak is a tail of the nearest one."""
 
+MIN_SPREAD_SHARE = 1e-12
+"""Spread, as a share of the largest value, below which a column has none."""
 
-ROUNDING = 1e-12
-"""A spread below this part of the values' size is none."""
-
-CANDIDATES = 12
-"""Peaks that are told from bumps of the density at most."""
+MAX_CANDIDATE_PEAKS = 12
+"""Largest number of candidate peaks."""
 
 
 class Peak(NamedTuple):
-    """One peak: its part of the probability, mean (nx,) and covariance (nx, nx)."""
+    """Peak: share of the probability, mean (nx,) and covariance (nx, nx)."""
 
     weight: float
     mean: np.ndarray
@@ -41,7 +40,7 @@ class Peak(NamedTuple):
 
 
 def peaks_of(points: np.ndarray, circular: np.ndarray) -> list[Peak]:
-    """The peaks of points of equal weight, the heaviest first.
+    """Return the peaks of points of equal weight, the heaviest first.
 
     Args:
         points: States, shape (n, nx).
@@ -51,7 +50,7 @@ def peaks_of(points: np.ndarray, circular: np.ndarray) -> list[Peak]:
     if not len(points):
         return []
     places = _whitened(points, circular)
-    few = places[np.arange(min(len(places), SAMPLE)) * len(places) // min(len(places), SAMPLE)]
+    few = places[np.arange(min(len(places), MAX_DENSITY_POINTS)) * len(places) // min(len(places), MAX_DENSITY_POINTS)]
     label = _peaks(few)
     if label.max() == 0:
         return [_peak(points, circular, 1.0)]
@@ -62,7 +61,7 @@ def peaks_of(points: np.ndarray, circular: np.ndarray) -> list[Peak]:
 
 
 def _whitened(points: np.ndarray, circular: np.ndarray) -> np.ndarray:
-    """Coordinates in which the cloud has unit covariance, but for directions in which it hardly extends."""
+    """Return coordinates in which the cloud has unit covariance, except in directions of very little extent."""
     columns = []
     for j in range(points.shape[1]):
         column = points[:, j]
@@ -72,19 +71,19 @@ def _whitened(points: np.ndarray, circular: np.ndarray) -> np.ndarray:
         # One scale for both coordinates of an angle: a short arc must stay an arc.
         spread = float(pair.std(axis=0).max())
         # Copies of one particle differ from their mean by its rounding alone, which is no spread.
-        columns.append(pair / spread if spread > ROUNDING * size else np.zeros_like(pair))
+        columns.append(pair / spread if spread > MIN_SPREAD_SHARE * size else np.zeros_like(pair))
     flat = np.hstack(columns)
     values, vectors = np.linalg.eigh(flat.T @ flat / len(flat))
     return flat @ vectors / np.sqrt(np.maximum(values, 0.01))
 
 
 def _squares(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Squared distances of all pairs."""
+    """Return the squared distances of all pairs."""
     return np.maximum((a * a).sum(1)[:, None] + (b * b).sum(1) - 2.0 * a @ b.T, 0.0)
 
 
 def _peaks(places: np.ndarray) -> np.ndarray:
-    """For each point the number of its peak, from 0."""
+    """Return the index of each point's peak."""
     n, d = places.shape
     # Copies of a particle are no further evidence of where the density lies.
     width = (4.0 / ((d + 2) * len(np.unique(places, axis=0)))) ** (1.0 / (d + 4))
@@ -103,7 +102,7 @@ def _peaks(places: np.ndarray) -> np.ndarray:
     # Dense and far from anything denser: Rodriguez & Laio (2014). Outliers are far, but not dense.
     chance = height * np.sqrt(np.where(np.isfinite(jump), jump, jump[np.isfinite(jump)].max(initial=1.0)))
     far = jump > width**2
-    root = far & (chance >= np.sort(chance[far])[-min(int(far.sum()), CANDIDATES)])
+    root = far & (chance >= np.sort(chance[far])[-min(int(far.sum()), MAX_CANDIDATE_PEAKS)])
     root[order[0]] = True
     label = np.empty(n, int)
     tops: list[int] = []
@@ -113,9 +112,9 @@ def _peaks(places: np.ndarray) -> np.ndarray:
             tops.append(int(i))
         else:
             label[i] = label[parent[i]]
-    # Of too few points nothing can be told: from the lowest up, such a tree hangs on its top's denser neighbour.
+    # Trees of too few points join their top's denser neighbour, from the lowest up.
     for k in range(len(tops) - 1, 0, -1):
-        if np.mean(label == k) < LEAST:
+        if np.mean(label == k) < MIN_PEAK_SHARE:
             label[label == k] = label[parent[tops[k]]]
     trees, label = np.unique(label, return_inverse=True)
     tops = [tops[k] for k in trees]
@@ -127,12 +126,12 @@ def _peaks(places: np.ndarray) -> np.ndarray:
         by_distance = sorted(range(k), key=lambda other: float(((places[tops[other]] - places[top]) ** 2).sum()))
         for other in by_distance:
             between = density(places[top] + steps * (places[tops[other]] - places[top]))
-            if between.min() > DIP * height[top] or not _valley(places, label, k, other):
+            if between.min() > VALLEY_DENSITY_SHARE * height[top] or not _valley(places, label, k, other):
                 into = joined[other]
                 break
         joined.append(into)
     label = np.array(joined)[label]
-    kept = [k for k in dict.fromkeys(joined) if np.mean(label == k) >= LEAST] or [joined[0]]
+    kept = [k for k in dict.fromkeys(joined) if np.mean(label == k) >= MIN_PEAK_SHARE] or [joined[0]]
     centres = places[[tops[k] for k in kept]]
     nearest = np.argmin(_squares(places, centres), axis=1)
     position = {k: i for i, k in enumerate(kept)}
@@ -140,7 +139,7 @@ def _peaks(places: np.ndarray) -> np.ndarray:
 
 
 def _valley(places: np.ndarray, label: np.ndarray, a: int, b: int) -> bool:
-    """Whether two trees stay apart when their points are projected on the line between their means.
+    """Return whether two trees stay separate when their points are projected on the line between their means.
 
     One dimension has points enough for a density, where many dimensions have gaps everywhere.
     """
@@ -157,11 +156,11 @@ def _valley(places: np.ndarray, label: np.ndarray, a: int, b: int) -> bool:
     grid = np.linspace(s.mean(), t.mean(), 25)
     density = np.exp(-0.5 * ((grid[:, None] - both) / width) ** 2).sum(axis=1)
     lower = min(density[:8].max(), density[-8:].max())
-    return bool(density[8:-8].min() < DIP * lower)
+    return bool(density[8:-8].min() < VALLEY_DENSITY_SHARE * lower)
 
 
 def _peak(points: np.ndarray, circular: np.ndarray, weight: float) -> Peak:
-    """Mean and covariance of one peak's points; angles about their mean direction."""
+    """Return one peak from its points; angles are averaged about their mean direction."""
     mean = points.mean(axis=0)
     for j in np.flatnonzero(circular):
         mean[j] = np.arctan2(np.sin(points[:, j]).mean(), np.cos(points[:, j]).mean())

@@ -11,11 +11,11 @@ from estimators.errors import EstimatorError
 from estimators.fold import Fold, fold
 from estimators.log import INPUT, READING, RESET, TICK, TRUTH, Events, Log
 from estimators.registry import ESTIMATORS
-from estimators.snapshots import RECENT
+from estimators.snapshots import RECENT_EVENTS
 from estimators.track import FAILED, GATED, HELD_OUT, MISSING, NONE, USED
 from estimators.tuning import Tuning
 from tests.estimators.linear_models import ROWS, random_linear, random_log
-from tests.support import SECOND, as_log, assert_same
+from tests.support import SECOND, as_log, assert_same, folded
 
 MATRICES = random_linear(np.random.default_rng(1), 3, 2)
 MODEL = MATRICES.model
@@ -112,8 +112,7 @@ def test_order_of_arrival_does_not_matter(estimator, seed):
 def test_a_reading_older_than_the_first_event(estimator):
     events = random_log(np.random.default_rng(4), MATRICES, 50).events
     log = as_log(events)
-    growing = Fold(estimator, MODEL, Tuning.of(MODEL), log)
-    growing.advance()
+    growing = folded(estimator, MODEL, log)
     changed, _ = log.extend(reading(int(events.t[0]) - SECOND, 1, [0.3, -0.4]))
     growing.rewind(changed)
     growing.advance()
@@ -122,12 +121,12 @@ def test_a_reading_older_than_the_first_event(estimator):
 
 @QUICK
 def test_rewind_far_behind_the_recent_snapshots(estimator):
-    events = random_log(np.random.default_rng(5), MATRICES, 2 * RECENT + 500).events
+    events = random_log(np.random.default_rng(5), MATRICES, 2 * RECENT_EVENTS + 500).events
     log = as_log(events)
     growing = Fold(estimator, MODEL, Tuning.of(MODEL), log)
     while growing.advance(700):
         pass
-    for index in (2 * RECENT, RECENT + 3, 1500, 1024, 1023, 5):
+    for index in (2 * RECENT_EVENTS, RECENT_EVENTS + 3, 1500, 1024, 1023, 5):
         growing.rewind(index)
         assert growing.n <= index
         growing.advance()
@@ -136,9 +135,9 @@ def test_rewind_far_behind_the_recent_snapshots(estimator):
 
 def test_a_fold_in_pieces_stops_no_more_often_than_one():
     """Snapshots are dense where late readings fall: at the end of the log, whatever is folded at once."""
-    log = as_log(random_log(np.random.default_rng(5), MATRICES, 3 * RECENT).events)
+    log = as_log(random_log(np.random.default_rng(5), MATRICES, 3 * RECENT_EVENTS).events)
     taken = []
-    for size in (log.n, RECENT, 700):
+    for size in (log.n, RECENT_EVENTS, 700):
         growing = Fold("kf", MODEL, Tuning.of(MODEL), log)
         remember, places = growing._remember, []
         growing._remember = lambda pinned=False, of=growing, to=places, do=remember: (to.append(of.n), do(pinned))
@@ -146,17 +145,17 @@ def test_a_fold_in_pieces_stops_no_more_often_than_one():
             pass
         taken.append(places)
     assert taken[0] == taken[1] == taken[2]
-    assert sum(place <= log.n - RECENT for place in taken[0]) == 2 * RECENT // 1024
+    assert sum(place <= log.n - RECENT_EVENTS for place in taken[0]) == 2 * RECENT_EVENTS // 1024
 
 
 @pytest.mark.parametrize("size", [1, 50, None], ids=["event by event", "in pieces", "at once"])
 def test_snapshots_are_the_denser_the_later(size):
     """64 events apart in the last 1,024, 256 in the last 4,096, 1,024 before; also while the log grows."""
-    events = random_log(np.random.default_rng(5), MATRICES, 3 * RECENT).events
+    events = random_log(np.random.default_rng(5), MATRICES, 3 * RECENT_EVENTS).events
     log = as_log(events.select(slice(0, 0)))
     growing = Fold("kf", MODEL, Tuning.of(MODEL), log)
-    for start in range(0, 3 * RECENT, size or 3 * RECENT):
-        log.extend(events.select(slice(start, start + (size or 3 * RECENT))))
+    for start in range(0, 3 * RECENT_EVENTS, size or 3 * RECENT_EVENTS):
+        log.extend(events.select(slice(start, start + (size or 3 * RECENT_EVENTS))))
         growing.advance()
     behind = log.n - np.arange(log.n + 1)
     at = np.arange(log.n + 1)
@@ -171,8 +170,7 @@ def test_follow_a_log_that_grew_meanwhile(estimator, late):
     events = everything(np.random.default_rng(6), 1500)
     tuning = Tuning.of(MODEL).set("R.first", 3.0)
     log = as_log(events.select(slice(0, 900)))
-    beside = Fold(estimator, MODEL, tuning, log.copy())
-    beside.advance(500)
+    beside = folded(estimator, MODEL, log.copy(), tuning, stop=500)
     log.extend(events.select(slice(900, None)))
     changed = None
     if late:
@@ -189,8 +187,7 @@ def test_drop_front_and_base_at(estimator):
     log = as_log(events)
     tuning = Tuning.of(MODEL)
     whole = fold(estimator, MODEL, tuning, log.copy())
-    growing = Fold(estimator, MODEL, tuning, log)
-    growing.advance(4000)
+    growing = folded(estimator, MODEL, log, tuning, stop=4000)
     at, base = growing.base_at(1500)
     assert 0 < at <= 1500
     fresh_log = as_log(events.select(slice(at, None)))
@@ -223,8 +220,7 @@ ALONE = ("mean", "std", "cross", "innovation", "innovation_std", "nis", "log_lik
 def test_the_same_filter_goes_on_from_a_cut_with_all_it_knew(name):
     events = everything(np.random.default_rng(9), 1500)
     tuning = Tuning.of(MODEL).with_options(KEEPING[name])
-    whole = Fold(name, MODEL, tuning, as_log(events))
-    whole.advance()
+    whole = folded(name, MODEL, as_log(events), tuning)
     at, base = whole.base_at(1200)
     assert 0 < at <= 1200 and base.estimator == name
 
@@ -255,10 +251,8 @@ def test_follow_over_a_cut(estimator):
     events = everything(np.random.default_rng(8), 5000)
     log = as_log(events.select(slice(0, 4000)))
     tuning = Tuning.of(MODEL)
-    live = Fold(estimator, MODEL, tuning, log)
-    live.advance()
-    beside = Fold(estimator, MODEL, tuning, log.copy())
-    beside.advance()
+    live = folded(estimator, MODEL, log, tuning)
+    beside = folded(estimator, MODEL, log.copy(), tuning)
     at, _ = live.base_at(1100)
     live.drop_front(at)
     log.drop_front(at)
@@ -350,8 +344,7 @@ def test_one_missing_row_leaves_the_others(estimator):
     """A NaN row is as if the sensor had not had that row."""
     t = 3 * SECOND
     y = np.array([0.4, np.nan, -1.0])
-    fold_ = Fold(estimator, MODEL, Tuning.of(MODEL), as_log(reading(t, 2, y)))
-    fold_.advance()
+    fold_ = folded(estimator, MODEL, as_log(reading(t, 2, y)))
     mean, cov = fold_.moments()
     keep = [0, 2]
     H, D, R = MATRICES.H[2][keep], MATRICES.D[2][keep], np.diag(MATRICES.R[2][keep])
@@ -427,8 +420,7 @@ def test_inputs_that_are_nan_stay(estimator):
         Events.one(0, 0, INPUT, 0, [5.0, np.nan], MODEL.width),
         Events.one(SECOND, 0, TICK, 0, (), MODEL.width),
     ]
-    growing = Fold(estimator, MODEL, Tuning.of(MODEL), as_log(Events.concat(events, MODEL.width)))
-    growing.advance()
+    growing = folded(estimator, MODEL, as_log(Events.concat(events, MODEL.width)))
     u = np.array([5.0, MATRICES.u[1]])
     np.testing.assert_array_equal(growing.u, u)
     expected = MATRICES.mean + MATRICES.A @ MATRICES.mean + MATRICES.B @ u

@@ -14,7 +14,7 @@ from estimators.numerics.workspace import declare_layout, size_of
 from estimators.registry import ESTIMATORS
 from estimators.tuning import Tuning
 from tests.estimators.linear_models import random_linear
-from tests.support import SECOND
+from tests.support import SECOND, folded
 
 GUARD = 16_384
 """Numbers before and after that no filter may touch: more than a block of particles takes."""
@@ -82,8 +82,7 @@ def check(name, model, options):
     entry = ESTIMATORS[name]
     tuning = Tuning.of(model).with_options(options)
     log = readings(model)
-    free = Fold(name, model, tuning, log)
-    free.advance()
+    free = folded(name, model, log, tuning)
     fold = Fold(name, model, tuning, log)
     work = entry.work_size(fold.options, model.nx, model.width)
     size = fold._now.state.size

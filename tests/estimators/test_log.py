@@ -14,7 +14,7 @@ from estimators.registry import ESTIMATORS
 from estimators.track import Track
 from estimators.tuning import Tuning
 from tests.estimators.linear_models import ROWS, random_linear
-from tests.support import SECOND, assert_same
+from tests.support import SECOND, assert_same, folded
 
 
 def any_seed(test):
@@ -323,8 +323,7 @@ def test_of_two_inputs_at_one_time_the_larger_holds():
         log = Log.of(MODEL)
         for event in order:
             log.extend(event)
-        growing = Fold("ekf", MODEL, Tuning.of(MODEL), log)
-        growing.advance()
+        growing = folded("ekf", MODEL, log)
         assert growing.u[0] == 2.0
 
 
@@ -341,8 +340,7 @@ def test_what_is_older_than_all_that_is_kept_is_stale(horizon):
     """It was folded on the base, with the clock set back to its own time."""
     log = Log.of(MODEL)
     log.extend(Events.concat([Events.one(k * SECOND, 0, READING, 0, 0.1, WIDTH) for k in range(2000)], WIDTH))
-    growing = Fold("kf", MODEL, Tuning.of(MODEL), log)
-    growing.advance()
+    growing = folded("kf", MODEL, log)
     at, base = growing.base_at(1500)
     growing.drop_front(at)
     log.drop_front(at)

@@ -10,7 +10,7 @@ from estimators.log import INPUT, MAINTENANCE, READING, TICK, Events, Log, last_
 from estimators.models import MODELS
 from estimators.registry import ESTIMATORS
 from estimators.tuning import Tuning
-from tests.support import SECOND, assert_same
+from tests.support import SECOND, assert_same, folded
 
 MODEL = MODELS["motor_winding"]
 INTERPRETED = next(name for name, entry in ESTIMATORS.items() if entry.interpreted)
@@ -146,8 +146,7 @@ def test_versions_go_on_after_the_oldest_events_are_dropped(count):
 
 def test_a_base_knows_its_version():
     log = log_of(stream(3000, at=(100, 200)))
-    made = Fold("kf", MODEL, Tuning.of(MODEL), log)
-    made.advance()
+    made = folded("kf", MODEL, log)
     at, base = made.base_at(2048)
     assert at == 2048 and base.version == 3 and made.base_at(10)[1].version == 1
 
@@ -155,13 +154,11 @@ def test_a_base_knows_its_version():
 def test_a_log_that_resumes_from_a_base_counts_versions_on():
     """`Log.resume` restores index, floor and version, so its rows carry the numbers of the log it continues."""
     log = log_of(stream(3000, at=(100, 200, 2500)))
-    made = Fold("kf", MODEL, Tuning.of(MODEL), log)
-    made.advance()
+    made = folded("kf", MODEL, log)
     at, base = made.base_at(2048)
     part = Log.resume(MODEL, base, log.events.select(slice(at, None)))
     np.testing.assert_array_equal(model_versions(part.events, part.version), model_versions(log.events)[at:])
-    again = Fold("kf", MODEL, Tuning.of(MODEL), part, base=base)
-    again.advance()
+    again = folded("kf", MODEL, part, base=base)
     assert (again.base_here().version, again.base_here().first) == (4, log.n)
     np.testing.assert_array_equal(again.track.mean, made.track.mean[at:])
     _, stale = part.extend(log.events.select(slice(0, 1)))

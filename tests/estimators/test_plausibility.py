@@ -18,7 +18,7 @@ from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceMo
 from estimators.models import MODELS
 from estimators.track import DUPLICATE, MISSING, RANGE, RATE, REPEATED, SATURATED, SCREENED, SUSPECT, USED
 from estimators.tuning import Tuning
-from tests.support import SECOND, assert_same
+from tests.support import SECOND, assert_same, folded
 
 BEAT = SECOND // 4
 """Times are multiples of a quarter of a second and values of a quarter of a unit: sums of these are exact."""
@@ -228,14 +228,12 @@ def test_a_fold_from_a_base_knows_what_came_before_it() -> None:
     walk = model(STRICT, STRICT)
     log = Log.of(walk)
     log.extend(stream(np.random.default_rng(5), walk, 3000))
-    whole = Fold("kf", walk, Tuning.of(walk), log)
-    whole.advance()
+    whole = folded("kf", walk, log)
     at, base = whole.base_at(2500)
     rest = Log.of(walk)
     rest.first, rest.floor = log.first + at, base.clock
     rest.extend(log.events.select(slice(at, log.n)))
-    again = Fold("kf", walk, Tuning.of(walk), rest, base=base)
-    again.advance()
+    again = folded("kf", walk, rest, base=base)
     assert at > 0
     np.testing.assert_array_equal(again.track.screened, whole.track.screened[at:])
     np.testing.assert_array_equal(again.track.mean, whole.track.mean[at:])
@@ -363,8 +361,7 @@ def test_a_sensor_whose_readings_all_break_their_limits_is_an_episode_of_its_own
     y[400:] += 100.0
     log = Log.of(walk)
     log.add("a", np.arange(600.0), y)
-    found = Fold("kf", walk, Tuning.of(walk), log)
-    found.advance()
+    found = folded("kf", walk, log)
     each = next(episode for episode in episodes(found) if episode.cause == "screened")
     assert (each.start, each.end, each.size) == (400.0, None, 1.0)
     assert "(range)" in each.text and "100 % of its readings are not used" in each.text

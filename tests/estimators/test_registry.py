@@ -13,6 +13,7 @@ from estimators.registry import ESTIMATORS, checked, find_estimator, unfit
 from estimators.tuning import Tuning
 from tests.estimators.interpreted.test_filterpy import PENDULUM
 from tests.estimators.linear_models import random_linear, random_log
+from tests.support import folded
 
 WINDING = MODELS["motor_winding"]
 ANYBODYS = replace(WINDING, conditionally_linear=WINDING.state_names)
@@ -165,8 +166,7 @@ def test_every_estimator_runs_every_model_it_applies_to(name, model):
         y = np.empty(len(sensor.rows))
         compiled.h[k](x, u, p, y)
         log.extend(Events.one(0, 0, READING, k, y, model.width))
-    fold = Fold(name, model, Tuning.of(model), log)
-    fold.advance()
+    fold = folded(name, model, log)
     mean, cov = fold.moments()
     std = model.prior_std
     if ESTIMATORS[name].family not in ("Gaussian", "reference") or name == "filterpy-enkf":
@@ -187,8 +187,7 @@ def test_ukf_points_have_the_moments_of_the_state():
     model = WINDING
     log = Log(1)
     log.extend(Events.one(0, 0, READING, 0, 36.0, 1))
-    fold = Fold("ukf", model, Tuning.of(model).with_options({"alpha": 0.7, "kappa": 1.0}), log)
-    fold.advance()
+    fold = folded("ukf", model, log, options={"alpha": 0.7, "kappa": 1.0})
     points = fold.points()
     mean, cov = fold.moments()
     assert points.shape == (5, 2)

@@ -222,8 +222,8 @@ def test_counts_are_those_of_the_revision_that_is_shown():
 
 def test_counts_of_forgotten_rows_are_those_of_the_filter_that_folded_them(monkeypatch):
     """The oldest rows were gated, and are gone: another filter has not seen them."""
-    monkeypatch.setattr("app.live.running_fold.SPARSE_EVERY", 64)
-    monkeypatch.setattr("estimators.snapshots.SPARSE_EVERY", 64)
+    monkeypatch.setattr("app.live.running_fold.PERMANENT_SPACING", 64)
+    monkeypatch.setattr("estimators.snapshots.PERMANENT_SPACING", 64)
     made = twin(history=64)
     made.tuning = made.tuning.set("gate", 0.9973)
     engine = Engine(made, lambda report: Scripted())

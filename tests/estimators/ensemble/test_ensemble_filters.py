@@ -18,7 +18,7 @@ from estimators.numerics.random import key_of, normal
 from estimators.snapshots import Base
 from estimators.tuning import Tuning
 from tests.estimators.linear_models import ROWS, JointGaussian, random_linear, random_log
-from tests.support import log_of
+from tests.support import folded, log_of
 
 NAMES = ["enkf", "etkf", "ensrf", "letkf"]
 EXACT = ["etkf", "ensrf", "letkf"]
@@ -167,8 +167,7 @@ def test_error_against_the_joint_gaussian_falls_as_one_over_root_n(name):
         errors = []
         for seed in range(12):
             tuning = Tuning.of(MATRICES.model).with_options({"members": members})
-            fold = Fold(name, MATRICES.model, replace(tuning, seed=seed), log)
-            fold.advance()
+            fold = folded(name, MATRICES.model, log, replace(tuning, seed=seed))
             found, found_cov = fold.moments()
             errors.append(np.concatenate(((found - mean) / std, (np.diag(found_cov) / std**2 - 1) / np.sqrt(2))))
         scaled.append(np.sqrt(np.mean(np.square(errors)) * members))
@@ -190,8 +189,7 @@ def test_missing_rows_gate_and_held_out(name):
     assert np.isnan(fold.track.innovation[0, 1])
     for tuning in (Tuning.of(model).set("gate", 0.5), Tuning.of(model).set("use.third", False)):
         far = log_of(model.width, (0, READING, [1e3, 1e3, 1e3], 2))
-        refused = Fold(name, model, tuning.with_options({"members": 30}), far)
-        refused.advance()
+        refused = folded(name, model, far, tuning.with_options({"members": 30}))
         np.testing.assert_array_equal(members_of(refused), before)
 
 
@@ -377,8 +375,7 @@ def test_bits_are_the_same_on_any_number_of_threads(name, monkeypatch):
     for crews in (1, 2, 5):
         for module in (shared, analysis):
             monkeypatch.setattr(module, "crews", lambda numbers, start, crews=crews: crews)
-        fold = Fold(name, LORENZ96, Tuning.of(LORENZ96).with_options(options), log)
-        fold.advance()
+        fold = folded(name, LORENZ96, log, options=options)
         states.append(fold._now.state.copy())
     assert localisation.threaded()
     np.testing.assert_array_equal(states[0], states[1])
@@ -453,8 +450,7 @@ def test_errors_on_lorenz_96_are_the_published_ones(name, options, published):
     first, truth, log = lorenz_run(1300)
     tuning = Tuning.of(LORENZ96).with_options(options).set("Q.x", 0.0)
     base = Base(first + 0.3 * np.random.default_rng(0).standard_normal(40), 0.1 * np.eye(40), 0, np.zeros(0))
-    fold = Fold(name, LORENZ96, tuning, log, base=base)
-    fold.advance()
+    fold = folded(name, LORENZ96, log, tuning, base=base)
     error = np.sqrt(np.mean((fold.track.mean[1:] - truth) ** 2, axis=1))[300:].mean()
     assert error == pytest.approx(published, rel=0.15)
     dof = 40

@@ -12,7 +12,7 @@ from estimators.log import READING
 from estimators.tuning import Tuning
 from tests.estimators.ensemble.test_ensemble_filters import MATRICES, NAMES, members_of
 from tests.estimators.linear_models import ROWS
-from tests.support import log_of
+from tests.support import folded, log_of
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -75,8 +75,7 @@ def test_rank_histogram_is_flat_where_truth_and_members_are_drawn_alike(name):
         x = MATRICES.mean + MATRICES.std * rng.normal(size=model.nx)
         y = MATRICES.H[1] @ x + MATRICES.D[1] @ MATRICES.u + np.sqrt(MATRICES.R[1]) * rng.normal(size=ROWS[1])
         tuning = Tuning.of(model).with_options({"members": 100})
-        fold = Fold(name, model, replace(tuning, seed=seed), log_of(model.width, (0, READING, y, 1)))
-        fold.advance()
+        fold = folded(name, model, log_of(model.width, (0, READING, y, 1)), replace(tuning, seed=seed))
         account = fold.account()
         assert account["members"] == 100 and sum(account["ranks"]) == ROWS[1]
         counts += account["ranks"]
@@ -90,8 +89,7 @@ def test_rank_histogram_shows_where_the_readings_lie():
     model = MATRICES.model
     for off, place in ((100.0, 9), (-100.0, 0)):
         y = MATRICES.H[0] @ MATRICES.mean + MATRICES.D[0] @ MATRICES.u + off
-        fold = Fold("etkf", model, Tuning.of(model), log_of(model.width, (0, READING, y, 0)))
-        fold.advance()
+        fold = folded("etkf", model, log_of(model.width, (0, READING, y, 0)))
         assert fold.account()["ranks"][place] == 1 and sum(fold.account()["ranks"]) == 1
         e = fold.track.innovation[0, 0] / fold.track.innovation_std[0, 0]
         assert fold.account()["spread"] == pytest.approx(1 / e**2)

@@ -13,7 +13,7 @@ from estimators.log import READING, Events, Log
 from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
 from estimators.track import GATED
 from estimators.tuning import Tuning
-from tests.support import as_log
+from tests.support import as_log, folded
 
 JUMP = 300.0
 """Seconds into the drive."""
@@ -30,8 +30,7 @@ class Drive:
         self.place = self.fold(self.events).track.mean[:, :2].copy()
 
     def fold(self, events, tuning=None, prior=None):
-        growing = Fold("ekf", self.twin.model, tuning or self.twin.tuning, as_log(events), prior=prior)
-        growing.advance()
+        growing = folded("ekf", self.twin.model, as_log(events), tuning or self.twin.tuning, prior=prior)
         return growing
 
     def changed(self, sensor, change, first=0.0, last=np.inf):

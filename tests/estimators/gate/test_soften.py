@@ -9,7 +9,7 @@ from estimators.log import Log
 from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
 from estimators.track import GATED, USED
 from estimators.tuning import Tuning
-from tests.support import assert_same
+from tests.support import assert_same, folded
 
 from .two_sensors import MODEL, TUNING
 
@@ -20,8 +20,7 @@ SOFT = TUNING.set("gate.kind", "soft")
 def one_reading(name, tuning, y=Y):
     log = Log.of(MODEL)
     log.add("a", [0.0], [y])
-    growing = Fold(name, MODEL, tuning, log)
-    growing.advance()
+    growing = folded(name, MODEL, log, tuning)
     return growing
 
 
@@ -99,8 +98,7 @@ def test_several_rows_against_a_dense_solution(name, y, brought):
     log = Log.of(PLANE)
     own = [0.09, 0.2] if brought else None
     log.add("s", [0.0], [y], **({"variance": [own]} if brought else {}))
-    growing = Fold(name, PLANE, Tuning.of(PLANE).set("gate", 0.999).set("gate.kind", "soft"), log)
-    growing.advance()
+    growing = folded(name, PLANE, log, Tuning.of(PLANE).set("gate", 0.999).set("gate.kind", "soft"))
     there = np.isfinite(y)
     H = np.array([[1.0, 0.0], [1.0, 1.0]])[there]
     std = np.sqrt(own or [0.04, 0.5])

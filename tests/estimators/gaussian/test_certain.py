@@ -11,7 +11,7 @@ from estimators.registry import ESTIMATORS, find_estimator
 from estimators.track import FAILED, USED
 from estimators.tuning import Tuning
 from tests.estimators.linear_models import JointGaussian, random_linear, random_log
-from tests.support import SECOND
+from tests.support import SECOND, folded
 
 SINGULAR = [name for name, entry in ESTIMATORS.items() if entry.singular]
 
@@ -72,8 +72,7 @@ def test_an_exact_reading_is_believed_and_a_second_one_at_that_time_fails(estima
     log.extend(
         Events.concat([Events.one(t * SECOND, 0, READING, 0, [y], 1) for t, y in ((0, 2.0), (0, 3.0), (2, 4.0))], 1)
     )
-    fold = Fold(estimator, model(), Tuning.of(model()), log)
-    fold.advance()
+    fold = folded(estimator, model(), log)
     np.testing.assert_array_equal(fold.track.verdict, [USED, FAILED, USED])
     np.testing.assert_allclose(fold.track.mean[:, 0], [2.0, 2.0, 4.0], rtol=1e-14)
     np.testing.assert_allclose(fold.track.std[:, 0], 0.0, atol=1e-15)

@@ -13,7 +13,7 @@ from estimators.track import FAILED, GATED, HELD_OUT, MISSING, USED
 from estimators.tuning import Tuning
 from tests.estimators.interpreted.test_filterpy import PENDULUM, log  # noqa: F401  log is a fixture
 from tests.estimators.test_fold import MODEL, everything
-from tests.support import SECOND, as_log, assert_same
+from tests.support import SECOND, as_log, assert_same, folded
 
 PAIRS = np.array([[0, 1], [0, 2], [1, 2]])
 
@@ -88,13 +88,12 @@ def test_angles_turn_past_pi(name):
 
 def one_reading(members):
     tuning = Tuning.of(MODEL).with_options({"members": members})
-    fold_ = Fold(
+    fold_ = folded(
         "filterpy-enkf",
         MODEL,
-        tuning,
         as_log(Events.concat([Events.one(0, 0, TICK, 0, (), 3), Events.one(SECOND, 0, READING, 1, [0.4, -0.7], 3)], 3)),
+        tuning,
     )
-    fold_.advance()
     return fold_
 
 
@@ -149,8 +148,7 @@ def test_a_covariance_without_a_factor_fails_and_is_no_exception():
     events = Log(2)
     events.extend(Events.one(0, 0, TICK, 0, (), 2))
     events.extend(Events.one(SECOND, 0, READING, 0, [0.5], 2))
-    fold_ = Fold("filterpy-ukf", PENDULUM, Tuning.of(PENDULUM), events)
-    fold_.advance(1)
+    fold_ = folded("filterpy-ukf", PENDULUM, events, stop=1)
     fold_._now.state[3:] = -np.eye(3).ravel()
     fold_.advance()
     assert np.all(np.isnan(fold_.track.mean[1]))

@@ -16,7 +16,7 @@ from estimators.tuning import Tuning
 from tests.estimators.linear_models import ROWS, random_linear
 from tests.estimators.particle.test_particle_filters import itself, scalar, square, still, within_half
 from tests.estimators.particle.test_rbpf import R, biased, jump_model
-from tests.support import log_of
+from tests.support import folded, log_of
 
 MATRICES = random_linear(np.random.default_rng(8), 3, 1)
 
@@ -228,8 +228,7 @@ def test_a_poor_cloud_is_told():
         values = 2.0 + np.cumsum(rng.normal(0, np.sqrt(0.3), 100)) + rng.normal(0, np.sqrt(variance), 100)
         tuning = replace(Tuning.of(model).with_options({"particles": 300}), gate=None)
         log = log_of(1, *((1.0 * k, READING, value) for k, value in enumerate(values)))
-        growing = Fold("pf", model, tuning, log)
-        growing.advance()
+        growing = folded("pf", model, log, tuning)
         told = np.flatnonzero(growing.track.flags & IMPOVERISHED)
         assert bool(told.size) == poor
         causes = [episode.cause for episode in episodes(growing)]

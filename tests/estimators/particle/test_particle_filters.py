@@ -15,7 +15,7 @@ from estimators.particle.cloud import RECOVERIES, block, members
 from estimators.track import FAILED, GATED, HELD_OUT, MISSING, USED
 from estimators.tuning import Tuning
 from tests.estimators.linear_models import JointGaussian, random_linear, random_log
-from tests.support import SECOND, log_of
+from tests.support import SECOND, folded, log_of
 
 NAMES = ("pf", "pf-reg", "pf-ekf", "apf")
 EXACT = ("pf", "pf-ekf", "apf")
@@ -189,8 +189,7 @@ def test_the_kernel_widens_the_cloud_by_its_bandwidth():
     model = scalar(noises=(Noise("s", "m²/s", 0.0),))
     log = log_of(1, (0, READING, 2.3), (1, TICK, 0))
     tuning = Tuning.of(model).with_options({"particles": 1e5, "fraction": 1.0, "bandwidth": 2.0})
-    run = Fold("pf-reg", model, tuning, log)
-    run.advance()
+    run = folded("pf-reg", model, log, tuning)
     h = 2.0 * (4 / 3) ** 0.2 * 1e5**-0.2
     variance = 0.25 * 0.04 / 0.29
     assert abs(run.track.std[0, 0] ** 2 / variance - 1) < 0.05
@@ -206,8 +205,7 @@ def test_two_peaks_stay_alive_and_are_reported(name):
         sensors=(Sensor("y", (Row("y", "m²", 0.3),), h=square),),
     )  # fmt: skip
     log = log_of(1, *((k, READING, 4.0 + 0.5 * rng.standard_normal()) for k in range(20)))
-    run = Fold(name, model, Tuning.of(model).with_options({"particles": 20_000}), log)
-    run.advance()
+    run = folded(name, model, log, options={"particles": 20_000})
     first, second = run.peaks()
     assert abs(abs(first.mean[0]) - 2.0) < 0.15 and abs(first.mean[0] + second.mean[0]) < 0.1
     # Half each, but for what 20 resamplings of a cloud of 20,000 let the share wander.
@@ -234,8 +232,7 @@ def test_a_sensor_may_have_a_likelihood_of_its_own(name):
 def test_a_cloud_that_explains_nothing_fails_visibly_and_recovers(name):
     model = scalar(sensors=(Sensor("y", (Row("y", "m", 0.04),), h=itself, log_likelihood=within_half),))
     log = log_of(1, *((0.01 * k, READING, 30.0) for k in range(40)))
-    run = Fold(name, model, Tuning.of(model).with_options({"particles": 2000}), log)
-    run.advance()
+    run = folded(name, model, log, options={"particles": 2000})
     verdict = run.track.verdict
     assert verdict[0] == FAILED and verdict[-1] == USED
     assert run._now.state[RECOVERIES] == np.sum(verdict == FAILED)
@@ -317,8 +314,7 @@ def test_the_likelihood_of_a_bent_sensor_is_that_of_quadrature(name):
 def test_particles_where_the_sensor_says_no_number_are_out(name):
     """y = √x, of which a sixth of the prior has none: the posterior is that of the others, by quadrature."""
     model = scalar(states=(State("s", "m", 0.5, 0.5),), sensors=(Sensor("y", (Row("y", "m", 0.04),), h=root),))
-    run = Fold(name, model, Tuning.of(model).with_options({"particles": 20_000}), log_of(1, (0, READING, 0.9)))
-    run.advance()
+    run = folded(name, model, log_of(1, (0, READING, 0.9)), options={"particles": 20_000})
     x = np.linspace(0.0, 4.0, 40_001)
     density = np.exp(-0.5 * ((x - 0.5) / 0.5) ** 2 - 0.5 * ((0.9 - np.sqrt(x)) / 0.2) ** 2)
     mean = np.average(x, weights=density)
@@ -335,8 +331,7 @@ def test_copies_of_one_particle_widen_too():
     sharp = Sensor("y", (Row("y", "m", 0.04),), h=itself, log_likelihood=within_half)
     model = scalar(sensors=(sharp,), noises=(Noise("s", "m²/s", 0.0),))
     log = log_of(1, *((0.01 * k, READING, 2.0 if k == 0 else 4.0) for k in range(60)))
-    run = Fold("pf", model, Tuning.of(model).with_options({"particles": 20}), log)
-    run.advance(1)
+    run = folded("pf", model, log, options={"particles": 20}, stop=1)
     block(run.options, run._now.state, 1)[:] = 2.0
     run.advance()
     failed = int((run.track.verdict == FAILED).sum())
@@ -354,11 +349,9 @@ def test_snapshots_of_large_states_keep_to_their_memory(monkeypatch):
     model = scalar()
     log = log_of(1, *((0.01 * k, READING, 2.0) for k in range(3000)))
     tuning = Tuning.of(model).with_options({"particles": 500})
-    plain = Fold("pf", model, tuning, log)
-    plain.advance()
-    monkeypatch.setattr("estimators.snapshots.MEMORY", 10 * plain._now.state.nbytes)
-    small = Fold("pf", model, tuning, log)
-    small.advance()
+    plain = folded("pf", model, log, tuning)
+    monkeypatch.setattr("estimators.snapshots.MAX_SNAPSHOT_BYTES", 10 * plain._now.state.nbytes)
+    small = folded("pf", model, log, tuning)
     assert len(plain._snapshots._kept) > 20
     assert sum(kept.state.nbytes for kept in small._snapshots._kept.values()) <= 12 * plain._now.state.nbytes
     small.rewind(2000)
@@ -369,10 +362,7 @@ def test_snapshots_of_large_states_keep_to_their_memory(monkeypatch):
 
 def test_points_are_drawn_by_weight():
     model = scalar()
-    run = Fold(
-        "pf", model, Tuning.of(model).with_options({"particles": 1e5, "fraction": 0}), log_of(1, (0, READING, 2.6))
-    )
-    run.advance()
+    run = folded("pf", model, log_of(1, (0, READING, 2.6)), options={"particles": 1e5, "fraction": 0})
     points, (mean, cov) = run.points(), run.moments()
     assert points.shape == (2000, 1) and members(run.options) == 100_000
     assert abs(points.mean() - mean[0]) < 5 * np.sqrt(cov[0, 0] / 2000)
@@ -387,8 +377,7 @@ def test_siblings_stand_side_by_side(name, scheme):
     tuning = Tuning.of(model).with_options({"particles": 3000, "resampling": scheme, "fraction": 1.0})
     if name == "apf":
         tuning = tuning.with_options({"particles": 3000, "resampling": scheme})
-    run = Fold(name, model, tuning, log_of(1, (0, TICK, 0), (1, READING, 2.3)))
-    run.advance(1)
+    run = folded(name, model, log_of(1, (0, TICK, 0), (1, READING, 2.3)), tuning, stop=1)
     before = block(run.options, run._now.state, 1)[:, 0].copy()
     run.advance()
     order = np.argsort(before)
@@ -439,8 +428,7 @@ def test_the_kernel_may_move_duplicates_only():
         ("pf", {}), ("pf-reg", {"jitter": 1}), ("pf-reg", {"jitter": 0}), ("pf-reg", {"jitter": 1, "bandwidth": 0.0}),
     ):  # fmt: skip
         tuning = Tuning.of(model).with_options({"particles": 3000, "fraction": 1.0, **options})
-        run = Fold(name, model, tuning, log_of(1, (0, READING, 2.3)))
-        run.advance()
+        run = folded(name, model, log_of(1, (0, READING, 2.3)), tuning)
         clouds[name, *options.values()] = block(run.options, run._now.state, 1)[:, 0].copy()
     drawn, moved, all_moved = clouds["pf",], clouds["pf-reg", 1], clouds["pf-reg", 0]
     _, family, size = np.unique(drawn, return_inverse=True, return_counts=True)

@@ -15,7 +15,7 @@ from estimators.particle.cloud import RECOVERIES
 from estimators.track import FAILED, USED
 from estimators.tuning import Tuning
 from tests.estimators.linear_models import random_linear, random_log
-from tests.support import SECOND, log_of
+from tests.support import SECOND, folded, log_of
 
 # A jump-Markov linear system: a walk that drifts in mode 1, seen by a sensor that is biased there.
 STAY = ((0.9, 0.1), (0.2, 0.8))
@@ -100,10 +100,8 @@ def test_with_nothing_to_sample_it_is_the_kalman_filter(nx):
     matrices = random_linear(rng, nx, 1)
     log = random_log(rng, matrices, 40)
     model = replace(matrices.model, conditionally_linear=matrices.model.state_names)
-    exact = Fold("kf", model, Tuning.of(model), log)
-    exact.advance()
-    run = Fold("rbpf", model, Tuning.of(model).with_options({"particles": 7}), log)
-    run.advance()
+    exact = folded("kf", model, log)
+    run = folded("rbpf", model, log, options={"particles": 7})
     for column in ("mean", "std", "innovation", "innovation_std", "nis", "log_likelihood"):
         a, b = getattr(exact.track, column), getattr(run.track, column)
         assert np.allclose(a, b, rtol=1e-9, atol=1e-9, equal_nan=True), column
@@ -217,8 +215,7 @@ def test_other_particle_filters_sample_the_mode(name):
     """Every particle is in one mode, and the mode's probability is the exact one, but for pf-reg's kernel."""
     answers, _ = exact_mixture()
     model, log = jump_model(), after_prior(*READINGS)
-    run = Fold(name, model, Tuning.of(model).with_options({"particles": 20_000}), log)
-    run.advance()
+    run = folded(name, model, log, options={"particles": 20_000})
     assert set(np.unique(run.points()[:, 2])) == {0.0, 1.0}
     for k, (mean, _) in enumerate(answers, start=1):
         # One run: √(p(1-p)/N) from each of six updates, a few times more by resampling.
@@ -246,8 +243,7 @@ def test_readings_beyond_the_numbers_fail_alone():
     model = jump_model()
     tuning = replace(Tuning.of(model).with_options({"particles": 200}), gate=None)
     log = after_prior(*READINGS[:3], 1e300, *READINGS[3:])
-    run = Fold("rbpf", model, tuning, log)
-    run.advance()
+    run = folded("rbpf", model, log, tuning)
     assert run.track.verdict[4] == FAILED and np.all(run.track.verdict[[1, 2, 3, 5, 6, 7]] == USED)
     assert run._now.state[RECOVERIES] == 0
     for column in (run.track.mean, run.track.std, run.points(), run.moments()[1]):
@@ -256,8 +252,7 @@ def test_readings_beyond_the_numbers_fail_alone():
 
 def test_slopes_that_are_no_numbers_leave_their_particles_out():
     model = jump_model(sensors=(Sensor("y", (Row("y", "m", 0.3),), h=biased, H=nan_slopes),))
-    run = Fold("rbpf", model, Tuning.of(model).with_options({"particles": 200}), after_prior(*READINGS))
-    run.advance()
+    run = folded("rbpf", model, after_prior(*READINGS), options={"particles": 200})
     assert np.all(run.track.verdict[1:] == USED) and np.all(np.isfinite(run.track.mean))
     assert np.all(run.track.mean[1:, 2] < 1e-12)
 
@@ -278,16 +273,14 @@ def test_a_cloud_without_weight_recovers_visibly():
     for t, on in ((3, 1.0), (4, 0.0)):
         log.extend(Events.one(t * SECOND, t * SECOND, INPUT, 0, np.array([on]), 3))
     log.extend(Events.one(5 * SECOND, 5 * SECOND, READING, 0, np.array([0.3]), 3))
-    run = Fold("rbpf", model, Tuning.of(model).with_options({"particles": 100}), log)
-    run.advance()
+    run = folded("rbpf", model, log, options={"particles": 100})
     assert run._now.state[RECOVERIES] == 1
     assert np.all(np.isfinite(run.track.mean)) and run.track.verdict[-1] == USED
 
 
 def test_peaks_are_reported_with_their_weights():
     model, log = jump_model(), after_prior(3.0)
-    run = Fold("rbpf", model, Tuning.of(model).with_options({"particles": 4000}), log)
-    run.advance()
+    run = folded("rbpf", model, log, options={"particles": 4000})
     first, second = run.peaks()
     p = run.track.mean[-1, 2]
     assert abs(first.weight - max(p, 1 - p)) < 0.05 and abs(first.weight + second.weight - 1) < 1e-9
