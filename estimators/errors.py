@@ -33,7 +33,7 @@ class EventError(NisusError):
     """An event that does not fit the log or the model."""
 
 
-MOST = 60
+MAX_QUOTED_CHARACTERS = 60
 """Characters of a text from a file that a message shows."""
 
 
@@ -44,12 +44,12 @@ def printable(text: str) -> str:
 
 def quoted(text: str) -> str:
     """A text from a file as a message shows it: shortened, in quotes, with unprintable characters escaped."""
-    return repr(text if len(text) <= MOST else text[: MOST - 3] + "...")
+    return repr(text if len(text) <= MAX_QUOTED_CHARACTERS else text[: MAX_QUOTED_CHARACTERS - 3] + "...")
 
 
 def shown_name(name: str) -> str:
     """A name from a file as a message shows it: as it is, unless it is empty, long or unprintable."""
-    return name if 0 < len(name) <= MOST and name.isprintable() else quoted(name)
+    return name if 0 < len(name) <= MAX_QUOTED_CHARACTERS and name.isprintable() else quoted(name)
 
 
 def nearest(name: str, names: Iterable[str]) -> str:

@@ -19,7 +19,22 @@ from numba import from_dtype, types
 from numba.core.serialize import dumps
 from numba.extending import intrinsic
 
-from ..numerics.jit import C1, F1, F2, by_address, caller, f64, flags, floats, i64, inlined, ints, jit, matrix, part
+from ..numerics.jit import (
+    C1,
+    F1,
+    F2,
+    by_address,
+    caller,
+    embedded,
+    f64,
+    flags,
+    floats,
+    i64,
+    ints,
+    jit,
+    matrix,
+    part,
+)
 
 f_signature = types.void(F1, F1, F1, f64, F1)
 f_complex_signature = types.void(C1, F1, F1, f64, C1)
@@ -175,7 +190,7 @@ def expect_points(context, sensor, X, u, out):
     call_h_rows(h, X.ctypes.data, stride, rows, u.ctypes.data, context.p, out.ctypes.data, out.shape[1])
 
 
-@inlined
+@embedded
 def add_process_noise(context, x, u, dt, P, scratch):
     """Add Q(x, u, p, q, dt) to P (nx, nx), or q·dt on the diagonal where the model gives no Q."""
     if context.Q == 0:

@@ -171,10 +171,10 @@ def assess(first, last, t, kind, channel, track, normal, policy, bounds):
                     used -= 1
                 begin += 1
             # Summed again each time: a running sum would keep the rounding of an outlier.
-            total = sum_of(end - begin, terms[0, begin:].ctypes.data)
-            due = sum_of(end - begin, terms[1 + JUDGED_MEAN, begin:].ctypes.data)
-            mean = sum_of(end - begin, terms[1 + MEAN, begin:].ctypes.data)
-            variance = sum_of(end - begin, terms[1 + VARIANCE, begin:].ctypes.data)
+            total = sum_of(end - begin, terms[0, begin:])
+            due = sum_of(end - begin, terms[1 + JUDGED_MEAN, begin:])
+            mean = sum_of(end - begin, terms[1 + MEAN, begin:])
+            variance = sum_of(end - begin, terms[1 + VARIANCE, begin:])
             _judge(i, total, due, mean, variance, dof, used, end - begin - used, track, policy, bounds)
         else:
             track.age[i] = track.age[i - 1] + (t[i] - t[i - 1]) * 1e-9

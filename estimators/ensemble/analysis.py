@@ -21,9 +21,8 @@ from ..model.state_space import LARGE
 from ..numerics.jit import jit
 from ..numerics.linalg import solve_transposed, solve_upper, wrap
 from ..numerics.normal_score import student_score
-from ..numerics.simd import WIDE
+from ..numerics.simd import WIDE, add_scaled
 from ..numerics.symmetric import factor, gram
-from ..numerics.vectors import add_scaled
 from ..numerics.workspace import (
     after,
     declare_layout,

@@ -14,9 +14,8 @@ from ..compiled.context import options as numbers
 from ..estimator import Option
 from ..numerics.jit import jit, matrix
 from ..numerics.random import key_of, normal
-from ..numerics.simd import WIDE
+from ..numerics.simd import WIDE, add_scaled, combine_rows, spread_rows
 from ..numerics.simd_ir import LANES
-from ..numerics.vectors import add_scaled, combine_rows, spread_rows
 from ..numerics.workspace import declare_layout, share, start_of
 from .localisation import localised, reached
 from .shared import CREWS, OWN, ROTATE

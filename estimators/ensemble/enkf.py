@@ -17,8 +17,8 @@ import numpy as np
 from ..compiled.context import options as numbers
 from ..numerics.jit import jit
 from ..numerics.random import key_of, normal
+from ..numerics.simd import add_scaled
 from ..numerics.symmetric import solve_rows
-from ..numerics.vectors import add_scaled
 from ..track import USED
 from .analysis import begin_analysis, find_places, work_size
 from .blocks import regress_all, transform_all

@@ -17,7 +17,7 @@ import numpy as np
 
 from ..compiled.context import options as numbers
 from ..numerics.jit import jit
-from ..numerics.vectors import add_scaled
+from ..numerics.simd import add_scaled
 from ..track import USED
 from .analysis import begin_analysis, find_places, work_size
 from .blocks import ROTATION, regress_all, rotate

@@ -18,8 +18,8 @@ import numpy as np
 
 from ..compiled.context import options as numbers
 from ..numerics.jit import jit
+from ..numerics.simd import add_scaled
 from ..numerics.symmetric import gram, symmetric_eigen
-from ..numerics.vectors import add_scaled
 from ..track import FAILED, USED
 from .analysis import begin_analysis, work_size
 from .blocks import ROTATION, rotate_members, transform_all

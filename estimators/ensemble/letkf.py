@@ -17,9 +17,8 @@ from ..compiled.context import context_at, place_of
 from ..compiled.context import options as numbers
 from ..numerics.inverse_root import root_action, scratch_of
 from ..numerics.jit import jit, matrix
-from ..numerics.simd import WIDE
+from ..numerics.simd import WIDE, add_scaled, dot, scaled
 from ..numerics.symmetric import gram
-from ..numerics.vectors import add_scaled, dot, scaled
 from ..numerics.workspace import declare_layout, share, size_of, start_of
 from ..track import FAILED, USED
 from .analysis import begin_analysis, find_places, work_size
@@ -120,7 +119,7 @@ def transform_columns(context, sensor, X, places, ZT, d, C, inflation, crew, cre
                     near[p] = k
                     d_near[p] = root * d[k]
                     roots[p] = root
-                    scaled(N, roots[p:], ZT[k], z[p])
+                    scaled(N, root, ZT[k], z[p])
                     most = max(most, taper)
                     p += 1
             if p == 0:

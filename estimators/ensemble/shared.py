@@ -37,7 +37,7 @@ from ..model.state_space import LARGE, StateSpaceModel
 from ..numerics.jit import ints, jit
 from ..numerics.linalg import wrap
 from ..numerics.random import key_of, normal, unit, word
-from ..numerics.vectors import add_scaled
+from ..numerics.simd import add_scaled
 from ..numerics.workspace import declare_layout, share, size_of, start_of, view
 from ..tuning import Tuning
 from .localisation import crews

@@ -11,7 +11,7 @@ import numpy as np
 from ..compiled.context import add_process_noise, options, sensor_rows, sensor_variances
 from ..estimator import Option, Options
 from ..model.state_space import StateSpaceModel
-from ..numerics.jit import floats, inlined, part
+from ..numerics.jit import embedded, floats, inlined, part
 from ..numerics.linalg import cholesky, solve_transposed, solve_upper
 
 JOSEPH, INFLATION, ROBUST, ROBUST_AT, ADAPT, ADAPT_RATE, ADAPT_BOUND, OWN = range(8)
@@ -112,7 +112,7 @@ def noise_scale(context, state):
     return state[state.size - 1] if options(context)[ADAPT] == ADAPT_Q else 1.0
 
 
-@inlined
+@embedded
 def add_noise(context, x, u, dt, state, P, scratch):
     """P ← growth·P + scale·Q; scratch is (nx, nx)."""
     scaled = options(context)[INFLATION] != 0.0 or options(context)[ADAPT] == ADAPT_Q
@@ -133,7 +133,7 @@ def multiply(a, P):
             P[i, j] *= a
 
 
-@inlined
+@embedded
 def reading_variances(context, sensor, state, r):
     """Fill r (ny,) with the variances, adapted or tuned, of one sensor's rows."""
     first, count = sensor_rows(context, sensor)

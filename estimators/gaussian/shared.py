@@ -26,7 +26,7 @@ def state_size(options: Options, nx: int) -> int:
     return nx + nx * nx
 
 
-@inlined
+@embedded
 def moments_of(state, n):
     """Return views of the mean x (n,) and the covariance P (n, n), or its factor, in a state."""
     x, at = take_vector(start_of(state), n)
@@ -70,7 +70,7 @@ def describe(context, state, mean, std, cross):
         cross[k] = P[pairs[2 * k], pairs[2 * k + 1]]
 
 
-@inlined
+@embedded
 def wrap_mean(context, x):
     """Bring the circular states back to ±π."""
     circular = circular_states(context)
@@ -79,7 +79,7 @@ def wrap_mean(context, x):
             x[i] = wrap(x[i])
 
 
-@inlined
+@embedded
 def move_to(context, forward, x):
     """x ← forward, its angles within ±π."""
     for i in range(x.size):
@@ -189,7 +189,7 @@ def make_independent(m, L, nu, S, C, H):
                 H[i, k] -= L[i, j] * H[j, k]
 
 
-@inlined
+@embedded
 def factor(S, U, m, n):
     """Factor S (m, m) = Uᵀ U; return False if S is not positive definite beyond rounding.
 
@@ -204,7 +204,7 @@ def factor(S, U, m, n):
     return True
 
 
-@inlined
+@embedded
 def judge(context, sensor, m, nu, U, score):
     """Return the verdict on an innovation with covariance Uᵀ U, and score it; nu (m,) becomes U⁻ᵀ nu.
 

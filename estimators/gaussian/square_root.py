@@ -78,7 +78,7 @@ def describe(context, state, mean, std, cross):
             cross[c] += U[k, i] * U[k, j]
 
 
-@inlined
+@embedded
 def noise_root(context, x, u, dt, state, V, scratch):
     """Fill V (nx, nx) with a factor of Q, as scaled by an adaptation; False if Q is indefinite."""
     n = context.nx
@@ -97,7 +97,7 @@ def noise_root(context, x, u, dt, state, V, scratch):
     return True
 
 
-@inlined
+@embedded
 def settle(context, forward, A, good, state):
     """Take the mean `forward` and the leading rows of A as the new state; NaN, which is seen, if there is none."""
     n = context.nx

@@ -13,7 +13,9 @@ from types import CellType, CodeType, FunctionType
 from typing import Any
 from uuid import UUID
 
-from .jit import jit
+from numba.core.serialize import dumps
+
+from .jit import jit, plain
 
 LIBRARIES = ("numpy", "scipy", "numba", "math", "cmath")
 """Packages whose functions Numba supports itself, or not at all."""
@@ -74,7 +76,7 @@ def _names(code: CodeType) -> Iterator[str]:
 
 
 def _digest(helpers: list[Any]) -> str:
-    """Return a digest of the sources of helpers and all their callees."""
+    """Return a digest of helpers and all their callees: their sources, enclosed values and defaults."""
     digest = hashlib.sha256()
     seen: list[Any] = []
     while helpers:
@@ -87,5 +89,9 @@ def _digest(helpers: list[Any]) -> str:
         digest.update(path.read_bytes() if path.is_file() else repr(helper.__code__.co_consts).encode())
         names = [helper.__globals__.get(name) for name in _names(helper.__code__)]
         helpers += [item for item in names if _plain(item)]
-        helpers += [cell.cell_contents for cell in helper.__closure__ or () if _plain(cell.cell_contents)]
+        cells = [cell.cell_contents for cell in helper.__closure__ or ()]
+        functions = [plain(item) for item in cells if _plain(plain(item))]
+        helpers += functions
+        values = [item for item in cells if plain(item) not in functions]
+        digest.update(dumps((values, helper.__defaults__, helper.__kwdefaults__)))
     return digest.hexdigest()

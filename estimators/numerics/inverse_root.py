@@ -15,23 +15,15 @@ Digital Library of Mathematical Functions, 22.2 and 20.2).
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-from llvmlite import ir
-from numba import types
 from numba.core import cgutils
-from numba.extending import intrinsic
 from scipy.special import ellipk, ellipkm1
 
-from . import simd_ir
 from .jit import jit
 from .simd import add_scaled, dot
-from .simd_ir import LANES
+from .simd_ir import LANES, integer, vector_code
 from .symmetric import begin, tridiagonal
 from .workspace import layout
-
-_i64 = types.int64
 
 _BLOCKS = 18
 """The finest rule has this many vectors of resolvents; it is good up to `_UP_TO[-1]`."""
@@ -85,70 +77,48 @@ def scratch_of(n: int) -> int:
     return n * (4 + 3 * LANES) + LANES
 
 
-@intrinsic
-def resolve(
-    typing_context: Any,
-    n: Any,
-    d: Any,
-    e: Any,
-    b: Any,
-    blocks: Any,
-    shifts: Any,
-    weights: Any,
-    scratch: Any,
-    out: Any,
-) -> Any:
+@vector_code()
+def resolve(v, n, d, e, b, blocks, shifts, weights, scratch, out):
     """out[:n] = Σ_k weights[k] (T + shifts[k] I)⁻¹ b, T tridiagonal with diagonal d[:n], and e[1:n] beside it.
 
     By elimination without exchanges, which is stable where all T + shifts[k] I are positive definite; `LANES` shifts at
     a time, which is what `blocks` counts. e[0] must be 0. `scratch` holds (3 n + 1) LANES numbers.
     """
-
-    def codegen(context: Any, builder: Any, signature: Any, given: Any) -> Any:
-        n, blocks = given[0], given[4]
-        d, e, b, shifts, weights, factors, out = (simd_ir.pointer(builder, given[k]) for k in (1, 2, 3, 5, 6, 7, 8))
-        lanes = simd_ir.constant(LANES)
-        values = builder.gep(factors, [builder.mul(builder.add(n, simd_ir.constant(1)), lanes)])
-        sums = builder.gep(values, [builder.mul(n, lanes)])
-        nothing, one = (ir.Constant(simd_ir.VECTOR, [number] * LANES) for number in (0.0, 1.0))
-        inverse, y = cgutils.alloca_once(builder, simd_ir.VECTOR), cgutils.alloca_once(builder, simd_ir.VECTOR)
-
-        def entry(pointer: Any, i: Any) -> Any:
-            return simd_ir.broadcast(builder, builder.load(builder.gep(pointer, [i])))
-
+    builder, lanes, zero = v.builder, integer(LANES), v.constant(0.0)
+    factors = scratch.data
+    values = builder.gep(factors, [builder.mul(builder.add(n, integer(1)), lanes)])
+    sums = builder.gep(values, [builder.mul(n, lanes)])
+    inverse, y = v.variable(), v.variable()
+    with cgutils.for_range(builder, n) as loop:
+        v.store(zero, sums, builder.mul(loop.index, lanes))
+    v.store(zero, factors, builder.mul(n, lanes))
+    with cgutils.for_range(builder, blocks) as block:
+        at = builder.mul(block.index, lanes)
+        shift, weight = v.load(shifts.data, at), v.load(weights.data, at)
+        builder.store(zero, inverse)
+        builder.store(zero, y)
         with cgutils.for_range(builder, n) as loop:
-            simd_ir.store(builder, nothing, sums, builder.mul(loop.index, lanes))
-        simd_ir.store(builder, nothing, factors, builder.mul(n, lanes))
-        with cgutils.for_range(builder, blocks) as block:
-            at = builder.mul(block.index, lanes)
-            shift, weight = simd_ir.load(builder, shifts, at), simd_ir.load(builder, weights, at)
-            builder.store(nothing, inverse)
-            builder.store(nothing, y)
-            with cgutils.for_range(builder, n) as loop:
-                i, to = loop.index, builder.mul(loop.index, lanes)
-                beside = entry(e, i)
-                factor = builder.fmul(beside, builder.load(inverse))
-                minus = builder.fneg(factor)
-                pivot = simd_ir.multiply_add(builder, minus, beside, builder.fadd(entry(d, i), shift))
-                value = simd_ir.multiply_add(builder, minus, builder.load(y), builder.fmul(weight, entry(b, i)))
-                inverted = builder.fdiv(one, pivot)
-                builder.store(inverted, inverse)
-                builder.store(value, y)
-                simd_ir.store(builder, factor, factors, to)
-                simd_ir.store(builder, builder.fmul(value, inverted), values, to)
-            builder.store(nothing, y)
-            with cgutils.for_range(builder, n) as loop:
-                to = builder.mul(builder.sub(builder.sub(n, simd_ir.constant(1)), loop.index), lanes)
-                factor = builder.fneg(simd_ir.load(builder, factors, builder.add(to, lanes)))
-                x = simd_ir.multiply_add(builder, factor, builder.load(y), simd_ir.load(builder, values, to))
-                builder.store(x, y)
-                simd_ir.store(builder, builder.fadd(simd_ir.load(builder, sums, to), x), sums, to)
+            i, to = loop.index, builder.mul(loop.index, lanes)
+            beside = v.entry(e.data, i)
+            factor = builder.fmul(beside, builder.load(inverse))
+            minus = builder.fneg(factor)
+            pivot = v.multiply_add(minus, beside, builder.fadd(v.entry(d.data, i), shift))
+            value = v.multiply_add(minus, builder.load(y), builder.fmul(weight, v.entry(b.data, i)))
+            inverted = builder.fdiv(v.constant(1.0), pivot)
+            builder.store(inverted, inverse)
+            builder.store(value, y)
+            v.store(factor, factors, to)
+            v.store(builder.fmul(value, inverted), values, to)
+        builder.store(zero, y)
         with cgutils.for_range(builder, n) as loop:
-            total = simd_ir.sum_of(builder, simd_ir.load(builder, sums, builder.mul(loop.index, lanes)))
-            builder.store(total, builder.gep(out, [loop.index]))
-        return context.get_dummy_value()
-
-    return types.void(_i64, _i64, _i64, _i64, _i64, _i64, _i64, _i64, _i64), codegen
+            to = builder.mul(builder.sub(builder.sub(n, integer(1)), loop.index), lanes)
+            factor = builder.fneg(v.load(factors, builder.add(to, lanes)))
+            x = v.multiply_add(factor, builder.load(y), v.load(values, to))
+            builder.store(x, y)
+            v.store(builder.fadd(v.load(sums, to), x), sums, to)
+    with cgutils.for_range(builder, n) as loop:
+        total = v.sum_of(v.load(sums, builder.mul(loop.index, lanes)))
+        builder.store(total, builder.gep(out.data, [loop.index]))
 
 
 @jit
@@ -193,11 +163,10 @@ def root_action(A, n, d, b, g, inverse_root, scratch):
     rule = 0
     while rule < _BLOCKS - 1 and _UP_TO[rule] < 1.0 + largest:
         rule += 1
-    to_d, to_e, to_x, to_rest = d.ctypes.data, e.ctypes.data, x.ctypes.data, rest.ctypes.data
-    resolve(n, to_d, to_e, g.ctypes.data, 1, _NO_SHIFT.ctypes.data, _ONE.ctypes.data, to_rest, to_x)
-    product = dot(n, b.ctypes.data, to_x)
+    resolve(n, d, e, g, 1, _NO_SHIFT, _ONE, rest, x)
+    product = dot(n, b, x)
     weights = _WEIGHTS[rule] if inverse_root else _SHRINKS[rule]
-    resolve(n, to_d, to_e, b.ctypes.data, rule + 1, _SHIFTS[rule].ctypes.data, weights.ctypes.data, to_rest, to_x)
+    resolve(n, d, e, b, rule + 1, _SHIFTS[rule], weights, rest, x)
     for k in range(n):
         b[k] = x[k]
     for k in range(n - 3, -1, -1):
@@ -210,5 +179,5 @@ def root_action(A, n, d, b, g, inverse_root, scratch):
 def _reflect(A, n, k, half, x):
     """x ← (I - v vᵀ / half) x, with v of row k."""
     first = begin(k)
-    v, to = A[k, first:].ctypes.data, x[first:].ctypes.data
-    add_scaled(n - first, -dot(n - first, v, to) / half, v, to)
+    v, own = A[k, first:], x[first:]
+    add_scaled(n - first, -dot(n - first, v, own) / half, v, own)

@@ -14,6 +14,7 @@ from typing import Any
 import numba
 from numba import carray, njit, types
 from numba.core import cgutils
+from numba.core.registry import CPUDispatcher
 from numba.experimental.function_type import _get_jit_address
 from numba.extending import intrinsic, register_jitable
 
@@ -54,11 +55,24 @@ jit_brief = partial(njit, cache=True, error_model="numpy", no_cfunc_wrapper=True
 """`jit` with the GIL, for calls of microseconds that run no model function: after releasing the GIL, a thread waits for
 it behind others."""
 
-by_address = partial(jit, no_cpython_wrapper=True)
-"""`jit` for functions that are called only through their address: a call from Python would end the program.
 
-Not for a function that is also compiled by `jit`, as the cache does not distinguish the two.
-"""
+class AddressOnly(CPUDispatcher):  # type: ignore[misc]
+    """Compiled function without a wrapper for Python: a call from Python is an error, where Numba ends the program."""
+
+    def __call__(self, *args: Any, **kwargs: Any) -> Any:
+        """Refuse the call."""
+        raise TypeError(f"{self.__name__} is called by compiled code only; call its `py_func` from Python")
+
+
+def by_address(function: Callable[..., Any]) -> Any:
+    """`jit` for functions that are called only by compiled code or through their address.
+
+    Not for a function that is also compiled by `jit`, as the cache does not distinguish the two.
+    """
+    made = jit(no_cpython_wrapper=True)(function)
+    made.__class__ = AddressOnly
+    return made
+
 
 part: Callable[[Callable[..., Any]], Any] = register_jitable(cache=True, nogil=True, error_model="numpy")
 """`jit` for functions that only compiled functions call, without the wrapper for Python, which takes a third of the

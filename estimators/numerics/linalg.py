@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from .jit import inlined, jit, part
+from .jit import embedded, inlined, jit, part
 
 EPSILON = float(np.finfo(float).eps)
 
@@ -144,7 +144,7 @@ def remove(R, n, v):
     return True
 
 
-@inlined
+@embedded
 def solve_transposed(U, m, b):
     """Overwrite b (m,) with U⁻ᵀ b for the leading m rows of upper U (forward substitution)."""
     for i in range(m):
@@ -153,7 +153,7 @@ def solve_transposed(U, m, b):
             b[j] -= U[i, j] * b[i]
 
 
-@inlined
+@embedded
 def solve_upper(U, m, b):
     """Overwrite b (m,) with U⁻¹ b for the leading m rows of upper U (back substitution)."""
     for i in range(m - 1, -1, -1):

@@ -1,17 +1,21 @@
 """Building blocks of vector code: LLVM instructions on vectors of `LANES` numbers, for simd.py and its like.
 
-The compiler splits them where the processor's vectors are shorter.
+Numba's own vectoriser is off, as small filters lose by it (see jit.py). The compiler splits vectors where the
+processor's are shorter.
 """
 
 from __future__ import annotations
 
+import inspect
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
 from llvmlite import ir
+from numba import types
 from numba.core import cgutils
+from numba.extending import intrinsic
 
 from .jit import jit
 
@@ -20,140 +24,191 @@ LANES = 8
 
 I32, I64, F64 = ir.IntType(32), ir.IntType(64), ir.DoubleType()
 VECTOR = ir.VectorType(F64, LANES)
-ZERO = ir.Constant(VECTOR, [0.0] * LANES)
 
 
 @jit
 def padded(n):
-    """How wide a row of n numbers is that takes whole vectors."""
+    """Return the length of a row of n numbers rounded up to whole vectors."""
     return (n + LANES - 1) // LANES * LANES
 
 
-def constant(number: int) -> Any:
-    """A whole number."""
+def vector_code(result: Any = types.void) -> Callable[[Callable[..., Any]], Any]:
+    """Decorator: make a function for compiled code out of one that writes its instructions.
+
+    The decorated function gets `Lanes` and the arguments: of a contiguous float64 array an object with `data`, the
+    pointer to its first number, and `shape`; of other numbers an int64 or a float64. `n` counts the numbers of a row
+    that are worked on. It returns the value of `result`, or None.
+    """
+
+    def decorate(write: Callable[..., Any]) -> Any:
+        def typed(typing_context: Any, *given: Any) -> Any:
+            arguments = [
+                t if isinstance(t, types.Array) else types.float64 if isinstance(t, types.Float) else types.int64
+                for t in given
+            ]
+
+            def codegen(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+                arrays = [
+                    context.make_array(t)(context, builder, value) if isinstance(t, types.Array) else value
+                    for t, value in zip(signature.args, values, strict=True)
+                ]
+                made = write(Lanes(builder), *arrays)
+                return context.get_dummy_value() if made is None else made
+
+            return result(*arguments), codegen
+
+        typed.__name__, typed.__doc__, typed.__module__ = write.__name__, write.__doc__, write.__module__
+        # Numba binds arguments by this signature, whose first parameter is the typing context.
+        typed.__signature__ = inspect.signature(write)  # type: ignore[attr-defined]
+        return intrinsic(typed)
+
+    return decorate
+
+
+def integer(number: int) -> Any:
+    """Return an int64 constant."""
     return ir.Constant(I64, number)
 
 
-def pointer(builder: Any, address: Any) -> Any:
-    """The numbers that begin at an address."""
-    return builder.inttoptr(address, F64.as_pointer())
+def sizes(builder: Any, array: Any) -> list[Any]:
+    """Return the shape of an array."""
+    return cgutils.unpack_tuple(builder, array.shape)  # type: ignore[no-any-return]
 
 
-def at(builder: Any, base: Any, index: Any) -> Any:
-    """The address of the vector that begins at base[index]; it need not be aligned to more than a number."""
-    return builder.bitcast(builder.gep(base, [index]), VECTOR.as_pointer())
+class Lanes:
+    """Instructions on vectors of `LANES` numbers, or on single numbers for the rest of a row."""
 
+    def __init__(self, builder: Any, wide: bool = True) -> None:
+        self.builder, self.wide = builder, wide
+        self.kind = VECTOR if wide else F64
 
-def load(builder: Any, base: Any, index: Any) -> Any:
-    """The vector that begins at base[index]."""
-    return builder.load(at(builder, base, index), align=8)
+    def constant(self, value: float) -> Any:
+        """Return a vector of one number, float64s of a float and int64s of an int."""
+        element = F64 if isinstance(value, float) else I64
+        return ir.Constant(ir.VectorType(element, LANES), [value] * LANES) if self.wide else ir.Constant(element, value)
 
+    def spread(self, value: Any) -> Any:
+        """Return a vector of one value."""
+        if not self.wide:
+            return value
+        undefined = ir.Constant(ir.VectorType(value.type, LANES), ir.Undefined)
+        one = self.builder.insert_element(undefined, value, ir.Constant(I32, 0))
+        return self.builder.shuffle_vector(one, undefined, ir.Constant(ir.VectorType(I32, LANES), [0] * LANES))
 
-def store(builder: Any, value: Any, base: Any, index: Any) -> None:
-    """Write a vector to base[index] and behind."""
-    builder.store(value, at(builder, base, index), align=8)
+    def entry(self, base: Any, index: Any) -> Any:
+        """Return a vector of the number base[index]."""
+        return self.spread(self.builder.load(self.builder.gep(base, [index])))
 
+    def variable(self, value: Any = None) -> Any:
+        """Return memory for a vector, set to `value` or zero."""
+        place = cgutils.alloca_once(self.builder, self.kind)
+        self.builder.store(self.constant(0.0) if value is None else value, place)
+        return place
 
-def first(builder: Any, count: Any) -> Any:
-    """The mask of a vector's first `count` numbers (all of them where there are more)."""
-    lanes = ir.Constant(ir.VectorType(I64, LANES), list(range(LANES)))
-    return builder.icmp_signed("<", lanes, broadcast(builder, count))
+    def _place(self, base: Any, index: Any) -> Any:
+        place = self.builder.gep(base, [index])
+        return self.builder.bitcast(place, VECTOR.as_pointer()) if self.wide else place
 
+    def load(self, base: Any, index: Any) -> Any:
+        """Return the vector that begins at base[index], which need not be aligned to more than a number."""
+        return self.builder.load(self._place(base, index), align=8)
 
-def load_first(builder: Any, base: Any, index: Any, mask: Any) -> Any:
-    """A vector of which only the masked numbers are read; the others are 0."""
-    place = at(builder, base, index)
-    kind = ir.FunctionType(VECTOR, [place.type, I32, mask.type, VECTOR])
-    function = cgutils.get_or_insert_function(builder.module, kind, f"llvm.masked.load.v{LANES}f64.p0v{LANES}f64")
-    return builder.call(function, [place, ir.Constant(I32, 8), mask, ZERO])
+    def store(self, value: Any, base: Any, index: Any) -> None:
+        """Write a vector to base[index] and the following numbers."""
+        self.builder.store(value, self._place(base, index), align=8)
 
+    def add_to(self, variable: Any, value: Any) -> None:
+        """Add a vector to a `variable`."""
+        self.builder.store(self.builder.fadd(self.builder.load(variable), value), variable)
 
-def store_first(builder: Any, value: Any, base: Any, index: Any, mask: Any) -> None:
-    """Write the masked numbers of a vector."""
-    place = at(builder, base, index)
-    kind = ir.FunctionType(ir.VoidType(), [VECTOR, place.type, I32, mask.type])
-    function = cgutils.get_or_insert_function(builder.module, kind, f"llvm.masked.store.v{LANES}f64.p0v{LANES}f64")
-    builder.call(function, [value, place, ir.Constant(I32, 8), mask])
+    def multiply_add_to(self, variable: Any, a: Any, b: Any) -> None:
+        """Add a b to a `variable`."""
+        self.builder.store(self.multiply_add(a, b, self.builder.load(variable)), variable)
 
+    def multiply_add(self, a: Any, b: Any, c: Any) -> Any:
+        """Return a b + c."""
+        name = f"llvm.fmuladd.v{LANES}f64" if self.wide else "llvm.fmuladd.f64"
+        kind = ir.FunctionType(self.kind, [self.kind] * 3)
+        return self.builder.call(cgutils.get_or_insert_function(self.builder.module, kind, name), [a, b, c])
 
-def broadcast(builder: Any, value: Any) -> Any:
-    """A vector of one number."""
-    undefined = ir.Constant(ir.VectorType(value.type, LANES), ir.Undefined)
-    one = builder.insert_element(undefined, value, ir.Constant(I32, 0))
-    return builder.shuffle_vector(one, undefined, ir.Constant(ir.VectorType(I32, LANES), [0] * LANES))
+    def first(self, count: Any) -> Any:
+        """Return the mask of a vector's first `count` numbers (all of them where there are more)."""
+        lanes = ir.Constant(ir.VectorType(I64, LANES), list(range(LANES)))
+        return self.builder.icmp_signed("<", lanes, self.spread(count))
 
+    def load_first(self, base: Any, index: Any, mask: Any) -> Any:
+        """Return a vector whose masked numbers are read; the others are 0."""
+        return self._masked("load", VECTOR, self._place(base, index), mask, [self.constant(0.0)])
 
-def multiply_add(builder: Any, a: Any, b: Any, c: Any) -> Any:
-    """a b + c, of numbers or of vectors."""
-    kind = c.type
-    name = "llvm.fmuladd.f64" if kind == F64 else f"llvm.fmuladd.v{LANES}f64"
-    function = cgutils.get_or_insert_function(builder.module, ir.FunctionType(kind, [kind] * 3), name)
-    return builder.call(function, [a, b, c])
+    def store_first(self, value: Any, base: Any, index: Any, mask: Any) -> None:
+        """Write the masked numbers of a vector."""
+        self._masked("store", ir.VoidType(), self._place(base, index), mask, [], value)
+
+    def _masked(self, name: str, result: Any, place: Any, mask: Any, after: list[Any], *before: Any) -> Any:
+        given = [*before, place, ir.Constant(I32, 8), mask, *after]
+        kind = ir.FunctionType(result, [item.type for item in given])
+        name = f"llvm.masked.{name}.v{LANES}f64.p0v{LANES}f64"
+        return self.builder.call(cgutils.get_or_insert_function(self.builder.module, kind, name), given)
+
+    def sum_of(self, vector: Any) -> Any:
+        """Return the sum of the numbers of a vector, added in pairs."""
+        numbers = [self.builder.extract_element(vector, ir.Constant(I32, k)) for k in range(LANES)]
+        while len(numbers) > 1:
+            numbers = [self.builder.fadd(a, b) for a, b in zip(numbers[::2], numbers[1::2], strict=True)]
+        return numbers[0]
 
 
 @contextmanager
 def steps(builder: Any, begin: Any, end: Any, step: int = 1) -> Iterator[Any]:
-    """A loop from `begin` up to `end`, which it does not reach."""
-    first = constant(begin) if isinstance(begin, int) else begin
-    with cgutils.for_range_slice(builder, first, end, constant(step), intp=I64) as (index, _):
+    """Context manager: a loop from `begin` up to `end`, which it does not reach."""
+    first = integer(begin) if isinstance(begin, int) else begin
+    with cgutils.for_range_slice(builder, first, end, integer(step), intp=I64) as (index, _):
         yield index
 
 
-def in_vectors(builder: Any, n: Any, whole: Any, single: Any) -> None:
-    """whole(i) for each full vector of n numbers, then single(i) for each number of the rest."""
-    full = builder.and_(n, constant(-LANES))
-    for begin, end, step, body in ((constant(0), full, LANES, whole), (full, n, 1, single)):
-        with steps(builder, begin, end, step) as i:
-            body(i)
+def in_vectors(v: Lanes, n: Any, body: Callable[[Lanes, Any], None]) -> None:
+    """Write body(lanes, i) for each full vector of n numbers, then for each number of the rest."""
+    full = v.builder.and_(n, integer(-LANES))
+    for begin, end, step in ((integer(0), full, LANES), (full, n, 1)):
+        with steps(v.builder, begin, end, step) as i:
+            body(Lanes(v.builder, step == LANES), i)
 
 
-def sum_of(builder: Any, vector: Any) -> Any:
-    """The numbers of a vector, added in pairs."""
-    numbers = [builder.extract_element(vector, ir.Constant(I32, k)) for k in range(LANES)]
-    while len(numbers) > 1:
-        numbers = [builder.fadd(a, b) for a, b in zip(numbers[::2], numbers[1::2], strict=True)]
-    return numbers[0]
+def sum_in_vectors(v: Lanes, n: Any, add: Callable[[Lanes, Any, Any], None]) -> Any:
+    """Return a sum over n numbers, in vectors: add(lanes, i, variable) adds to its variable."""
+    sums = {wide: Lanes(v.builder, wide).variable() for wide in (True, False)}
+    in_vectors(v, n, lambda lanes, i: add(lanes, i, sums[lanes.wide]))
+    return v.builder.fadd(v.sum_of(v.builder.load(sums[True])), v.builder.load(sums[False]))
 
 
-_LOWEST = -708.0
-"""e to this is the smallest normal number, nearly; below it `exp_minus` gives 0."""
+_MIN_EXPONENT = -708.0
+"""e to this is nearly the smallest normal number; below it `exp_minus` gives 0."""
 
-_HIGHEST = 709.0
+_MAX_EXPONENT = 709.0
 
 _LN2_HIGH, _LN2_LOW = float.fromhex("0x1.62e42fefa3800p-1"), float.fromhex("0x1.ef35793c76730p-45")
 """ln 2 in two parts; the first has 42 bits, so that its product with an exponent is exact (as in FDLIBM's e_exp.c)."""
 
 _ROUND = 1.5 * 2.0**52
-"""Adding and taking it away rounds to a whole number, which then stands in the low bits."""
+"""Adding and subtracting it rounds to an integer, which then stands in the low bits."""
 
 
-def exponential(builder: Any, x: Any) -> Any:
-    """e^x for a number or a vector of them, within a unit in the last place; 0 below `_LOWEST`.
+def exponential(v: Lanes, x: Any) -> Any:
+    """Return e^x within a unit in the last place; 0 below `_MIN_EXPONENT`.
 
     x = k ln 2 + r with |r| ≤ ln 2 / 2, and the Taylor polynomial of degree 13, whose remainder is under 5e-18.
     """
-    kind = x.type
-    wide = isinstance(kind, ir.VectorType)
-    whole_kind = ir.VectorType(I64, LANES) if wide else I64
-
-    def number(value: float) -> Any:
-        return ir.Constant(kind, [value] * LANES if wide else value)
-
-    def whole_number(value: int) -> Any:
-        return ir.Constant(whole_kind, [value] * LANES if wide else value)
-
-    low = builder.fcmp_ordered("<", x, number(_LOWEST))
-    high = builder.fcmp_ordered(">", x, number(_HIGHEST))
-    bounded = builder.select(low, number(_LOWEST), builder.select(high, number(_HIGHEST), x))
-    shifted = multiply_add(builder, bounded, number(1.4426950408889634), number(_ROUND))
+    builder, number = v.builder, v.constant
+    low = builder.fcmp_ordered("<", x, number(_MIN_EXPONENT))
+    high = builder.fcmp_ordered(">", x, number(_MAX_EXPONENT))
+    bounded = builder.select(low, number(_MIN_EXPONENT), builder.select(high, number(_MAX_EXPONENT), x))
+    shifted = v.multiply_add(bounded, number(1.4426950408889634), number(_ROUND))
     k = builder.fsub(shifted, number(_ROUND))
-    r = multiply_add(builder, k, number(-_LN2_HIGH), bounded)
-    r = multiply_add(builder, k, number(-_LN2_LOW), r)
+    r = v.multiply_add(k, number(-_LN2_HIGH), bounded)
+    r = v.multiply_add(k, number(-_LN2_LOW), r)
     value = number(1.0 / math.factorial(13))
     for power in range(12, -1, -1):
-        value = multiply_add(builder, value, r, number(1.0 / math.factorial(power)))
-    exponent = builder.add(builder.bitcast(shifted, whole_kind), whole_number(1023))
-    power_of_two = builder.bitcast(builder.shl(exponent, whole_number(52)), kind)
-    value = builder.fmul(value, power_of_two)
-    value = builder.select(low, number(0.0), value)
-    return builder.select(high, number(math.inf), value)
+        value = v.multiply_add(value, r, number(1.0 / math.factorial(power)))
+    exponent = builder.add(builder.bitcast(shifted, number(0).type), number(1023))
+    value = builder.fmul(value, builder.bitcast(builder.shl(exponent, number(52)), v.kind))
+    return builder.select(high, number(math.inf), builder.select(low, number(0.0), value))

@@ -25,16 +25,15 @@ _NOTHING = 1e-300
 @jit
 def gram(Z, count, n, G):
     """G = Zᵀ Z for the leading `count` rows and n columns of Z, both triangles."""
-    rows, apart, width = Z.ctypes.data, Z.shape[1], G.shape[1]
+    numbers, apart, width = Z[0], Z.shape[1], G.shape[1]
     fours = n // 4 * 4
     for k in range(0, fours, 4):
         # From the vector on that holds the diagonal; what is left of it is copied.
         first = k // LANES * LANES
-        to = G[k, first:].ctypes.data
-        combine_four(count, rows + 8 * k, apart, rows + 8 * first, apart, n - first, to, width)
+        combine_four(count, numbers[k:], apart, numbers[first:], apart, n - first, G[k, first:], width)
     for k in range(fours, n):
         first = k // LANES * LANES
-        combine(count, rows + 8 * k, apart, rows + 8 * first, apart, n - first, G[k, first:].ctypes.data)
+        combine(count, numbers[k:], apart, numbers[first:], apart, n - first, G[k, first:], width)
     for k in range(LANES, n):
         for j in range(k // LANES * LANES):
             G[k, j] = G[j, k]
@@ -58,7 +57,7 @@ def factor(A, n, U):
         for j in range(k, n):
             U[k, j] *= scale
         for i in range(k + 1, n):
-            add_scaled(n - i, -U[k, i], U[k, i:].ctypes.data, U[i, i:].ctypes.data)
+            add_scaled(n - i, -U[k, i], U[k, i:], U[i, i:])
     return True
 
 
@@ -69,10 +68,10 @@ def solve_rows(U, n, B, columns):
         for j in range(columns):
             B[i, j] /= U[i, i]
         for k in range(i + 1, n):
-            add_scaled(columns, -U[i, k], B[i].ctypes.data, B[k].ctypes.data)
+            add_scaled(columns, -U[i, k], B[i], B[k])
     for i in range(n - 1, -1, -1):
         for k in range(i + 1, n):
-            add_scaled(columns, -U[i, k], B[k].ctypes.data, B[i].ctypes.data)
+            add_scaled(columns, -U[i, k], B[k], B[i])
         for j in range(columns):
             B[i, j] /= U[i, i]
 
@@ -105,9 +104,9 @@ def symmetric_eigen(A, n, values, V, scratch):
         for j in range(n):
             w[j] = 0.0
         for j in range(k + 1, n):
-            add_scaled(n, A[k, j], V[j].ctypes.data, w.ctypes.data)
+            add_scaled(n, A[k, j], V[j], w)
         for j in range(k + 1, n):
-            add_scaled(n, -A[k, j] / halves[k], w.ctypes.data, V[j].ctypes.data)
+            add_scaled(n, -A[k, j] / halves[k], w, V[j])
     return _ql(n, values, scratch, V)
 
 
@@ -126,7 +125,7 @@ def tridiagonal(A, n, d, halves, scratch):
         scratch: At least 2 n numbers; gets T[k, k-1] in scratch[k].
     """
     e = scratch[:n]
-    to_w = scratch[n : 2 * n].ctypes.data
+    w = scratch[n : 2 * n]
     e[0] = 0.0
     for k in range(n - 2):
         d[k] = A[k, k]
@@ -134,7 +133,7 @@ def tridiagonal(A, n, d, halves, scratch):
         size = n - first
         for j in range(first, k + 1):
             A[k, j] = 0.0
-        row, u = A[k, first:].ctypes.data, k + 1 - first
+        row, v = A[k, first:], A[k, k + 1 :]
         head = A[k, k + 1]
         A[k, k + 1] = 0.0
         tail = dot(size, row, row)
@@ -153,10 +152,10 @@ def tridiagonal(A, n, d, halves, scratch):
         A[k, k + 1] = head - length
         # A ← A - (v qᵀ + q vᵀ) / half with q = w - (vᵀ w / (2 half)) v, w = A v. Before column k + 1 the same sums
         # apply the reflection from one side, to what is not looked at again.
-        below = A[k + 1, first:].ctypes.data
-        combine(size - u, row + 8 * u, 1, below, A.shape[1], size, to_w)
-        add_scaled(size, -dot(size, row, to_w) / (2.0 * half), row, to_w)
-        add_outer(size - u, size, -1.0 / half, row + 8 * u, to_w, to_w + 8 * u, row, below, A.shape[1])
+        below, rows = A[k + 1, first:], n - k - 1
+        combine(rows, v, 1, below, A.shape[1], size, w, 0)
+        add_scaled(size, -dot(size, row, w) / (2.0 * half), row, w)
+        add_outer(rows, size, -1.0 / half, v, w, w[k + 1 - first :], row, below, A.shape[1])
     for k in range(max(n - 2, 0), n):
         d[k] = A[k, k]
     if n > 1:
@@ -216,7 +215,7 @@ def _ql(n, d, e, V):
                 p = s * r
                 d[i + 1] = g + p
                 g = c * r - b
-                rotate(columns, c, s, V[i].ctypes.data, V[i + 1].ctypes.data)
+                rotate(columns, c, s, V[i], V[i + 1])
             if early:
                 continue
             d[low] -= p

@@ -25,9 +25,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numba import carray
-from numba.extending import overload, register_jitable
+from numba.extending import intrinsic, overload, register_jitable
 
-from .jit import _to_float, _to_int, floats, inlined, jit, plain
+from .jit import _to_float, _to_int, floats, i64, jit, plain
 
 WORD = 8
 """Bytes of a float64."""
@@ -126,10 +126,14 @@ def _take_integers(at, n):
     return take
 
 
-@inlined
-def start_of(work):
-    """The address at which a scratch array begins."""
-    return work.ctypes.data
+@intrinsic
+def start_of(typing_context: Any, work: Any) -> Any:
+    """Return the address at which a scratch array begins (NumPy's `ctypes` takes longer to compile)."""
+
+    def codegen(context: Any, builder: Any, signature: Any, given: Any) -> Any:
+        return builder.ptrtoint(context.make_array(work)(context, builder, given[0]).data, context.get_value_type(i64))
+
+    return i64(work), codegen
 
 
 def size_of(workspace: Callable[..., Any], *sizes: int) -> int:
@@ -146,7 +150,7 @@ def view(part: Part, array: np.ndarray) -> np.ndarray:
 @jit
 def after(work, end):
     """What of a scratch array follows a workspace that ends at the address `end`."""
-    used = (end - work.ctypes.data) // WORD
+    used = (end - start_of(work)) // WORD
     return floats(end, work.size - used)
 
 
@@ -154,4 +158,4 @@ def after(work, end):
 def share(work, crew, crews):
     """The part of a scratch array that belongs to one of several crews."""
     each = work.size // crews
-    return floats(work.ctypes.data + WORD * crew * each, each)
+    return floats(start_of(work) + WORD * crew * each, each)

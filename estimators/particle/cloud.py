@@ -24,7 +24,7 @@ from ..model.state_space import StateSpaceModel
 from ..numerics.jit import ints, jit, matrix, threaded
 from ..numerics.linalg import wrap
 from ..numerics.peaks import Peak, peaks_of
-from ..numerics.vectors import dot, exp_minus, total, weighted
+from ..numerics.simd import dot, exp_minus, total, weighted
 from ..numerics.workspace import WORD, declare_layout, layout, size_of, start_of, view
 from ..track import ANCESTORS, EFFECTIVE
 from ..tuning import Tuning

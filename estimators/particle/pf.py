@@ -37,7 +37,7 @@ from ..numerics.jit import ints, jit
 from ..numerics.linalg import wrap
 from ..numerics.normal_score import add_tails
 from ..numerics.random import fill_normals, key_of
-from ..numerics.vectors import all_finite, exp_minus
+from ..numerics.simd import all_finite, exp_minus
 from ..numerics.workspace import declare_layout
 from ..track import FAILED, MISSING, USED
 from ..tuning import Tuning
@@ -72,6 +72,7 @@ from .weights import (
     NO_KEY,
     OWN,
     add_up,
+    all_lost,
     block_of,
     keep_or_resample,
     normalise,
@@ -292,17 +293,13 @@ def smooth_block(context, u, dt, sensor, y, key, value, state, work, number):
 @jit
 def predict(context, u, dt, index, state, work):
     """x_i ← f(x_i) + w_i, w_i ~ N(0, Q). Source: Gordon, Salmond & Smith (1993)."""
-    n = count_of(context)
     index = next_draw(state)
     shared = work_of(context, work)
     if context.Q_varies == 0:
         noise_root(context, own_cloud(context, state).records[0], u, dt, shared.L, shared.spare)
     sweep(PROPAGATE, context, u, dt, 0, u, key_of(context.seed, index, PROCESS), 0.0, state, work)
-    lost = add_up(context, work)[0]
-    if lost > 0.0:
-        state[EQUAL] = 0.0
-        if lost >= n:
-            recover(context, index, state)
+    if all_lost(context, state, work):
+        recover(context, index, state)
 
 
 @jit

@@ -49,6 +49,7 @@ from .weights import (
     NO_KEY,
     OWN,
     add_up,
+    all_lost,
     block_of,
     members_own,
     range_of,
@@ -272,14 +273,10 @@ def settle_draw(P, value, i, joint, sums):
 @jit
 def predict(context, u, dt, index, state, work):
     """N(x, P) of every particle one step on: x ← f(x), P ← F P Fᵀ + Q."""
-    n = count_of(context)
     index = next_draw(state)
     sweep(MOVE, context, u, dt, 0, u, key_of(context.seed, index, PROCESS), 0.0, state, work)
-    lost = add_up(context, work)[0]
-    if lost > 0.0:
-        state[EQUAL] = 0.0
-        if lost >= n:
-            recover(context, index, state)
+    if all_lost(context, state, work):
+        recover(context, index, state)
 
 
 @jit

@@ -26,7 +26,6 @@ from ..numerics.peaks import peaks_of
 from ..numerics.random import key_of, normal
 from ..track import FAILED, MISSING, USED
 from .cloud import (
-    EQUAL,
     MAX_POINTS,
     PROCESS,
     RECOVER,
@@ -65,7 +64,7 @@ from .rbpf_blocks import (
     tune,
     work_size,
 )
-from .weights import NO_KEY, add_up, keep_or_resample, normalise, phases, sweep, work_of
+from .weights import NO_KEY, add_up, all_lost, keep_or_resample, normalise, phases, sweep, work_of
 
 
 @jit
@@ -145,14 +144,10 @@ def predict(context, u, dt, index, state, work):
 
     Source: Schön, Gustafsson & Nordlund (2005), theorem 1 and algorithm 1, step 4.
     """
-    n = count_of(context)
     index = next_draw(state)
     sweep(PREDICT, context, u, dt, 0, u, key_of(context.seed, index, PROCESS), 0.0, state, work)
-    lost = add_up(context, work)[0]
-    if lost > 0.0:
-        state[EQUAL] = 0.0
-        if lost >= n:
-            _recover(context, index, state)
+    if all_lost(context, state, work):
+        _recover(context, index, state)
 
 
 @jit

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numba import prange, types
@@ -23,15 +23,14 @@ from ..compiled.context import options as numbers
 from ..estimator import Options
 from ..model.state_space import StateSpaceModel
 from ..numerics.jit import F1, address, caller, f64, i64, ints, jit
-from ..numerics.vectors import exp_minus
+from ..numerics.simd import exp_minus
 from ..numerics.workspace import (
+    WORD,
     declare_layout,
     layout,
     size_of,
     start_of,
-    take_integers,
     take_matrix,
-    take_vector,
 )
 from .cloud import (
     BLOCK,
@@ -68,30 +67,6 @@ block_signature = types.void(context_type, F1, f64, i64, F1, types.uint64, f64, 
 call_block = caller(block_signature)
 
 
-class CloudScratch(NamedTuple):
-    """Scratch that all blocks share.
-
-    Weights w (N,), joint log weights (N,), the sums, a root L (nx, nx) and room for it, the covariance S of the
-    predicted measurement and its factor U (ny, ny), the innovation nu (ny,), the state from which deviations count
-    (nx,), and the points at which the blocks' strata begin. `ancestors` (N,), int64s, take the place of the weights
-    once particles are drawn by these. `blocks` is where the blocks' own parts start.
-    """
-
-    w: Any
-    ancestors: Any
-    joint: Any
-    sums: Any
-    L: Any
-    spare: Any
-    S: Any
-    U: Any
-    nu: Any
-    reference: Any
-    strata: Any
-    blocks: int
-    end: int
-
-
 Block, block_at = declare_layout("Block", "nx, ny", sums_size, sums="sums_size(nx, ny)", D=f"max(nx, ny) + 2, {CHUNK}")
 """A block's own scratch: its sums, and the deviations of a chunk of members."""
 
@@ -103,21 +78,31 @@ def blocks_of(n):
 
 
 @layout
-def work_at(at, nx, ny, n):
-    """Lay the scratch of a cloud out; a filter's own follows."""
-    ancestors, _ = take_integers(at, n)
-    w, at = take_vector(at, n)
-    joint, at = take_vector(at, n)
-    sums, at = take_vector(at, sums_size(nx, ny))
-    L, at = take_matrix(at, nx, nx)
-    spare, at = take_matrix(at, nx, nx)
-    S, at = take_matrix(at, ny, ny)
-    U, at = take_matrix(at, ny, ny)
-    nu, at = take_vector(at, ny)
-    reference, at = take_vector(at, nx)
-    strata, at = take_vector(at, blocks_of(n))
-    end = at + blocks_of(n) * block_at(0, nx, ny).end
-    return CloudScratch(w, ancestors, joint, sums, L, spare, S, U, nu, reference, strata, at, end)
+def block_size(nx, ny):
+    """Return the numbers of a block's scratch."""
+    return block_at(0, nx, ny).end // WORD
+
+
+CloudScratch, work_at = declare_layout(
+    "CloudScratch",
+    "nx, ny, n",
+    sums_size,
+    blocks_of,
+    block_size,
+    ancestors="int n",  # once particles are drawn by the weights
+    w="n = ancestors",  # weights
+    joint="n",  # joint log weights
+    sums="sums_size(nx, ny)",
+    L="nx, nx",  # a root
+    spare="nx, nx",  # scratch of a root
+    S="ny, ny",  # covariance of the predicted measurement
+    U="ny, ny",  # its factor
+    nu="ny",  # innovation
+    reference="nx",  # state from which deviations count
+    strata="blocks_of(n)",  # points at which the blocks' strata begin
+    blocks="blocks_of(n), block_size(nx, ny)",
+)
+"""Scratch that all blocks share, and a row for each block. A filter's own follows."""
 
 
 @jit
@@ -129,8 +114,7 @@ def work_of(context, work):
 @jit
 def block_of(context, shared, b):
     """Return the scratch of block b."""
-    nx, ny = context.nx, context.width
-    return block_at(shared.blocks + b * block_at(0, nx, ny).end, nx, ny)
+    return block_at(start_of(shared.blocks[b]), context.nx, context.width)
 
 
 def work_sized(
@@ -191,6 +175,15 @@ def add_up(context, work):
             sums[2] = own[2]
             sums[3] = own[3]
     return sums
+
+
+@jit
+def all_lost(context, state, work):
+    """Return whether a prediction lost all particles; its blocks' first sums are the numbers of those lost."""
+    lost = add_up(context, work)[0]
+    if lost > 0.0:
+        state[EQUAL] = 0.0
+    return lost >= count_of(context)
 
 
 @jit

@@ -11,7 +11,7 @@ from estimators.numerics.simd import exp_minus
 
 @njit
 def exp_of(x, shift, out):
-    exp_minus(x.size, x.ctypes.data, shift, out.ctypes.data)
+    exp_minus(x.size, x, shift, out)
 
 
 @pytest.mark.parametrize("n", [1, 2, 7, 8, 9, 16, 1000])
