@@ -2,6 +2,7 @@
 
 import importlib
 import os
+import pickle
 import sys
 
 import numpy as np
@@ -96,6 +97,18 @@ def test_helpers_of_one_source_that_enclose_other_values_are_told_apart():
     """Also where the machine code of the first is in the cache."""
     found = [jit(with_helpers(scaled(factor)))(10.0) for factor in (2.0, 3.0, 2.0)]
     assert found == [21.0, 31.0, 21.0]
+
+
+def test_helpers_sent_to_another_process_keep_the_values_they_enclose():
+    """Numba finds a function that it unpickles by its identifier, which must depend on enclosed values."""
+    two, three = (jit(with_helpers(scaled(factor))) for factor in (2.0, 3.0))
+    kept = [pickle.loads(pickle.dumps(helper_of(outer))) for outer in (two, three)]
+    assert [helper(10.0) for helper in kept] == [20.0, 30.0]
+
+
+def helper_of(outer):
+    [cell] = outer.py_func.__closure__
+    return cell.cell_contents
 
 
 def test_functions_without_helpers_are_left_as_they_are():

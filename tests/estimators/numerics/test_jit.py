@@ -4,6 +4,9 @@ import os
 import subprocess
 import sys
 
+import pytest
+
+from estimators.numerics.jit import by_address
 from tests.conftest import ROOT
 
 LOADED = """
@@ -49,3 +52,15 @@ def test_a_damaged_entry_is_discarded_and_compiled_again(tmp_path):
     (line,) = again.stderr.splitlines()
     assert line.endswith("damaged entries of the compile cache discarded; compiling them again")
     assert kf_code(tmp_path).stderr == ""
+
+
+def test_a_function_for_addresses_names_its_python_form_when_called():
+    """Without the wrapper a call from Python would end the process."""
+
+    def twice(a):
+        return 2.0 * a
+
+    made = by_address(twice)
+    with pytest.raises(TypeError, match="twice is called by compiled code only; call its `py_func`"):
+        made(1.0)
+    assert made.py_func(1.0) == 2.0
