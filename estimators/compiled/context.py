@@ -25,11 +25,11 @@ from ..numerics.jit import (
     F2,
     by_address,
     caller,
-    embedded,
     f64,
     flags,
     floats,
     i64,
+    inlined,
     ints,
     jit,
     matrix,
@@ -190,7 +190,7 @@ def expect_points(context, sensor, X, u, out):
     call_h_rows(h, X.ctypes.data, stride, rows, u.ctypes.data, context.p, out.ctypes.data, out.shape[1])
 
 
-@embedded
+@inlined
 def add_process_noise(context, x, u, dt, P, scratch):
     """Add Q(x, u, p, q, dt) to P (nx, nx), or q·dt on the diagonal where the model gives no Q."""
     if context.Q == 0:

@@ -6,7 +6,7 @@ from ..compiled.context import transition
 from ..compiled.jacobians import state_jacobian
 from ..estimator import Estimator, Options
 from ..model.state_space import StateSpaceModel
-from ..numerics.jit import by_address, embedded, floats
+from ..numerics.jit import by_address, floats, inlined
 from ..numerics.linalg import congruence
 from ..numerics.workspace import declare_layout, size_of, start_of
 from . import ekf
@@ -23,7 +23,7 @@ Kept, kept = declare_layout(
 """Workspace that keeps its numbers from step to step."""
 
 
-@embedded
+@inlined
 def kept_in(work, n):
     """Return the kept numbers, at the end of the scratch, where no step works."""
     return kept(start_of(work[work.size - (n * n + 1) :]), n)
@@ -34,7 +34,7 @@ def work_size(options: Options, nx: int, ny: int) -> int:
     return ekf.work_size(options, nx, ny) + size_of(kept, nx)
 
 
-@embedded
+@inlined
 def constant_jacobian(context, u, dt, kept, scratch):
     """Fill F for this dt, unless it has been computed for it.
 

@@ -12,7 +12,7 @@ from ..compiled.context import circular_rows, circular_states, shown_states
 from ..compiled.noise import has_correlated_rows, independent_rows
 from ..compiled.verdict import verdict_of
 from ..estimator import Options
-from ..numerics.jit import by_address, embedded, inlined, ints, part
+from ..numerics.jit import by_address, inlined, ints, part
 from ..numerics.linalg import EPSILON, cholesky, mirror, solve_transposed, solve_unit, solve_upper, wrap
 from ..numerics.simd_ir import padded
 from ..numerics.simd_rows import subtract_squares
@@ -26,7 +26,7 @@ def state_size(options: Options, nx: int) -> int:
     return nx + nx * nx
 
 
-@embedded
+@inlined
 def moments_of(state, n):
     """Return views of the mean x (n,) and the covariance P (n, n), or its factor, in a state."""
     x, at = take_vector(start_of(state), n)
@@ -70,7 +70,7 @@ def describe(context, state, mean, std, cross):
         cross[k] = P[pairs[2 * k], pairs[2 * k + 1]]
 
 
-@embedded
+@inlined
 def wrap_mean(context, x):
     """Bring the circular states back to ±π."""
     circular = circular_states(context)
@@ -79,7 +79,7 @@ def wrap_mean(context, x):
             x[i] = wrap(x[i])
 
 
-@embedded
+@inlined
 def move_to(context, forward, x):
     """x ← forward, its angles within ±π."""
     for i in range(x.size):
@@ -108,7 +108,7 @@ Reading, reading_of = declare_layout(
 """
 
 
-@embedded
+@inlined
 def compare(context, sensor, y, reading, H, P, innovation, innovation_std):
     """Compute the innovation ν = y - ŷ and its covariance S = S_ŷ + R over the finite rows of a measurement.
 
@@ -189,7 +189,7 @@ def make_independent(m, L, nu, S, C, H):
                 H[i, k] -= L[i, j] * H[j, k]
 
 
-@embedded
+@inlined
 def factor(S, U, m, n):
     """Factor S (m, m) = Uᵀ U; return False if S is not positive definite beyond rounding.
 
@@ -204,7 +204,7 @@ def factor(S, U, m, n):
     return True
 
 
-@embedded
+@inlined
 def judge(context, sensor, m, nu, U, score):
     """Return the verdict on an innovation with covariance Uᵀ U, and score it; nu (m,) becomes U⁻ᵀ nu.
 
