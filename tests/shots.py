@@ -1,8 +1,7 @@
-"""`python -m tests.shots [twin ...]`: makes the pictures of the README anew, from the running page, in Chromium.
+"""`python -m tests.shots [name ...]`: take the pictures of README and guides from the running page, in Chromium.
 
-Twins run from their own seeds and recordings, and stand still at a time of their own where their source can, so two
-pictures of one commit differ in little. Without names all are made, and the animated one: a swap of the filter and a
-drag of Q.
+Twins run from their own seeds and recordings and pause at a given time where their source can, so two pictures of one
+commit differ little. Without names all are taken, and the animation: a swap of the filter and a drag of Q.
 """
 
 import io
@@ -17,7 +16,7 @@ from PIL import Image, ImageDraw
 from playwright.sync_api import Browser, Page
 
 from app.cli.run import live_source
-from app.live.commands import Pause, SetEstimator
+from app.live.commands import InjectFault, Pause, SetEstimator, SetTunings
 from app.twin.twin import load_twin
 from app.web.session import Page as Served
 from app.web.session import Session
@@ -29,26 +28,53 @@ SMALL = {"width": 1200, "height": 750}
 COLORS = 200
 """Colours of a picture: enough for charts and scenes, and a third of the bytes."""
 
-PATIENCE = 240.0
-"""Seconds for a step, with filters that are to be compiled first."""
+STEP_TIMEOUT_S = 240.0
+"""For one step, with filters that are compiled first."""
 
-QUIET = 4.0
-"""Seconds in which charts and scene come to rest; a scene drawn without a graphics card takes that long."""
+SETTLING_S = 4.0
+"""Until charts and scene are drawn; a scene drawn without a graphics card takes that long."""
 
-ANIMATED, LARGEST = "swap_and_drag.webp", 2_000_000
+ANIMATED, MAX_ANIMATION_BYTES = "swap_and_drag.webp", 2_000_000
 POINTER = [(0, 0), (0, 17), (4, 13), (7, 20), (10, 19), (7, 12), (12, 12)]
 
 
 class Shot(NamedTuple):
-    """A twin, the second of its log at which it is taken, and how fast it comes there."""
+    """Twin, time in its log at which the picture is taken, and speed of the replay until then.
+
+    name: Of the picture; empty for the twin's. act: Done at that time, for example an edit. tab: Opened afterwards.
+    """
 
     twin: str
     second: float
     speed: float
-    clicks: tuple[str, ...] = ()
+    name: str = ""
+    act: Callable[[Session], None] | None = None
+    tab: str = ""
+
+    @property
+    def file(self) -> str:
+        """Name of the picture."""
+        return f"{self.name or self.twin}.png"
+
+
+def inject_bias(session: Session) -> None:
+    """Let the yoke read 6 °C too high for 15 s."""
+    begun = elapsed(session)
+    session.engine.submit(Pause(False))
+    session.engine.submit(InjectFault("bias", "yoke", 6.0))
+    until(lambda: elapsed(session) >= begun + 15.0)
+
+
+def lower_q(session: Session) -> None:
+    """Make the filter overconfident: divide the process noise by 100."""
+    session.engine.submit(SetTunings({"Q.temperature": 1e-4, "Q.rate": 1e-5}))
+    time.sleep(SETTLING_S)
 
 
 SHOTS = (
+    Shot("motor_can", 45, 1, "fault_detection", inject_bias),
+    Shot("motor_can", 45, 1, "what_if", tab="What if"),
+    Shot("motor_winding", 60, 4, "overconfident", lower_q),
     Shot("motor_can", 45, 1),
     Shot("road_car", 900, 60),
     Shot("battery_pack", 900, 60),
@@ -63,7 +89,7 @@ SHOTS = (
 )
 
 
-def until(condition: Callable[[], object], seconds: float = PATIENCE) -> None:
+def until(condition: Callable[[], object], seconds: float = STEP_TIMEOUT_S) -> None:
     """Wait for something.
 
     Raises:
@@ -93,11 +119,13 @@ def shown(browser: Browser, shot: Shot, size: dict[str, int]) -> Iterator[tuple[
         page = context.new_page()
         page.goto(session.url)
         until(lambda: elapsed(session) >= shot.second or session.engine.status().finished)
+        if shot.act is not None:
+            shot.act(session)
         session.engine.submit(Pause(True))
         until(lambda: page.evaluate("window.nisus?.drawn > 0"))
-        for name in shot.clicks:
-            page.get_by_role("tab", name=name, exact=True).click()
-        time.sleep(2 * QUIET)
+        if shot.tab:
+            page.get_by_role("tab", name=shot.tab, exact=True).click()
+        time.sleep(2 * SETTLING_S)
         yield session, page
     finally:
         context.close()
@@ -113,7 +141,7 @@ def take(browser: Browser, shot: Shot) -> None:
     """Make one picture."""
     with shown(browser, shot, SIZE) as (_, page):
         small = picture(page).quantize(COLORS, dither=Image.Dither.NONE)
-        small.save(PICTURES / f"{shot.twin}.png", optimize=True)
+        small.save(PICTURES / shot.file, optimize=True)
 
 
 class Film:
@@ -147,8 +175,8 @@ class Film:
         """
         first, *others = self.frames
         first.save(path, save_all=True, append_images=others, duration=self.times, loop=0, quality=62, method=6)
-        if path.stat().st_size > LARGEST:
-            raise ValueError(f"{path} has {path.stat().st_size} bytes; it should have {LARGEST} at most")
+        if path.stat().st_size > MAX_ANIMATION_BYTES:
+            raise ValueError(f"{path} has {path.stat().st_size} bytes; it should have {MAX_ANIMATION_BYTES} at most")
 
 
 def animate(browser: Browser) -> None:
@@ -160,7 +188,7 @@ def animate(browser: Browser) -> None:
 
         session.engine.submit(SetEstimator("ekf"))
         until(lambda: session.engine.status().estimator == "ekf" and settled())
-        time.sleep(QUIET)
+        time.sleep(SETTLING_S)
         film = Film(page)
         film.frame(1500)
         choice = page.get_by_label("Estimator", exact=True)
@@ -170,7 +198,7 @@ def animate(browser: Browser) -> None:
         choice.select_option("rbpf")
         film.frame(300)
         until(lambda: session.engine.status().estimator == "rbpf" and settled())
-        time.sleep(QUIET)
+        time.sleep(SETTLING_S)
         film.frame(1800)
         slider = page.locator('[data-key="Q.slip"] input[type=range]')
         box = slider.bounding_box()
@@ -192,12 +220,12 @@ def animate(browser: Browser) -> None:
 
 
 def main(names: list[str]) -> None:
-    """Make those that are named, or all."""
+    """Take the pictures with these names, or all."""
     with launched(find_chromium()) as browser:
         for shot in SHOTS:
-            if not names or shot.twin in names:
+            if not names or shot.file.removesuffix(".png") in names:
                 take(browser, shot)
-                print(shot.twin, flush=True)
+                print(shot.file, flush=True)
         if not names or ANIMATED in names:
             animate(browser)
             print(ANIMATED, flush=True)
