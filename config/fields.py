@@ -258,6 +258,23 @@ def _range(value: Any) -> Any:
 Range = Annotated[RangeSection, BeforeValidator(_range, json_schema_input_type=float | bool | RangeSection)]
 
 
+class ConditionSection(RangeSection):
+    """A range of values, its ends included, or texts of which a column must hold one."""
+
+    text: Texts | None = None
+    """Text, or a list of texts. Default: null, numbers."""
+
+
+def _condition(value: Any) -> Any:
+    return {"text": value} if isinstance(value, (str, list)) else _range(value)
+
+
+Condition = Annotated[
+    ConditionSection,
+    BeforeValidator(_condition, json_schema_input_type=float | bool | str | list[str] | ConditionSection),
+]
+
+
 Pair = tuple[Number | None, Number | None]
 
 

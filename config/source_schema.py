@@ -4,17 +4,20 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from typing import Annotated, Any, Literal
+from zoneinfo import ZoneInfo, ZoneInfoNotFoundError, available_timezones
 
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, model_validator
+
+from estimators.errors import nearest
 
 from .fields import (
     MAX_DURATION_S,
+    Condition,
     Count,
     LevelSection,
     Number,
     Numbers,
     Positive,
-    Range,
     Seconds,
     Section,
     SomeSeconds,
@@ -67,12 +70,12 @@ class ChannelSection(Section):
     """Factor applied after the unit is converted; -1 turns an axis round. A list gives one a value. Default: 1."""
     offset: Numbers = (0.0,)
     """Added after `scale`, in the model's unit. A list gives one a value. Default: 0."""
-    where: dict[str, Range] = {}
+    where: dict[str, Condition] = {}
     """Conditions {name: value} or {name: {min, max}} on other values of the same row or message; where one fails, the
-    measurement is missing. Default: none."""
-    only: dict[str, Range] = {}
-    """Conditions as in `where` that select the rows or frames of this channel: {anchor: 3}. Others are ignored, without
-    a missing measurement. Default: none."""
+    measurement is missing. Of a table also texts: {quality: Good} or {quality: [Good, Uncertain]}. Default: none."""
+    only: dict[str, Condition] = {}
+    """Conditions as in `where` that select the rows or frames of this channel: {anchor: 3}, {tag: TT101}. Others are
+    ignored, without a missing measurement. Default: none."""
     convert: Literal["east_north"] | None = None
     """east_north: the two values are latitude and longitude in degrees, and become metres east and north of `origin`.
     Default: null, no conversion."""
@@ -300,13 +303,25 @@ class CanLogSection(SignalMaps, RecordingSection):
     """can_log"""
 
 
+def _known_zone(name: str) -> str:
+    try:
+        ZoneInfo(name)
+    except (ZoneInfoNotFoundError, ValueError, OSError):
+        raise refused("value", f"is no time zone of this machine; {nearest(name, available_timezones())}") from None
+    return name
+
+
 class TimeColumnSection(Section):
     """The column that holds the time."""
 
     column: Text
     """Its name."""
-    unit: Literal["s", "ms", "us", "ns", "min", "h"] = "s"
-    """Its unit. Default: s."""
+    unit: Literal["s", "ms", "us", "ns", "min", "h", "excel", "matlab"] = "s"
+    """Its unit, if it holds numbers; excel and matlab count days, as serial dates do there. Default: s."""
+    format: Text | None = None
+    """Format of its dates, as in Python's strptime: "%m/%d/%Y %H:%M:%S". Default: null, detected."""
+    zone: Annotated[str, AfterValidator(_known_zone)] | None = None
+    """Time zone of dates without an offset: Europe/Berlin. Default: null, UTC."""
     shift: Time = 0.0
     """Seconds added to it: -0.2 if a row describes the 0.2 s before it, so that an input holds for these and not for
     the next. Default: 0."""

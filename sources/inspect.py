@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
+import csv
+from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -17,8 +19,10 @@ from .can.log import CanLog, check_log, frames_reader
 from .can.readers import EXTENDED, BusName, LogSummary, Raw
 from .formats import CAN_LOGS, suffix_of
 from .source import Channel
-from .tables.rows import TableRows, names_of, rows_of
-from .tables.text import UNREADABLE, csv_header
+from .tables.rows import TableRows, is_text, names_of, rows_of
+from .tables.text import UNREADABLE, csv_format, open_text
+from .tables.times import TimeColumn, TimeReader
+from .units import heading_unit
 
 MAX_FRAME_BYTES = 64  # Bytes of the longest frame, of CAN FD
 
@@ -26,8 +30,15 @@ MIN_GAP_S = 1.0
 MIN_GAP_INTERVALS = 20.0
 """Seconds, or median intervals if they are longer, from which on a pause is a gap."""
 
-TIME_NAMES = ("t", "time", "timestamp", "seconds", "time_s", "t_s", "date", "datetime", "unix_time", "elapsed")
-"""Usual names of a time column."""
+TIME_NAMES = (
+    "t", "time", "timestamp", "seconds", "time_s", "t_s", "date", "datetime", "unix_time", "elapsed", "zeit",
+    "zeitstempel", "datum", "horodatage", "fecha",
+)  # fmt: skip
+"""Usual names of a time column; otherwise the first column of dates is taken."""
+
+MAX_TEXTS = 50  # Different texts of a column that are counted
+
+SERIAL_DATES = (36_526, 73_051)  # Days of the years 2000 to 2100 in Excel's count
 
 
 @dataclass(frozen=True)
@@ -54,14 +65,18 @@ class Message:
 
 @dataclass
 class RecordingContents:
-    """Contents of recordings of one kind; `t` (ns) are the times of all records, in order."""
+    """Contents of recordings of one kind; `t` (ns) are the times of all records, in order.
+
+    `texts` counts the texts of the columns of a CSV that hold no number.
+    """
 
     files: list[Path]
     kind: str
     t: np.ndarray
     messages: list[Message] = field(default_factory=list)
     columns: list[SignalSeries] = field(default_factory=list)
-    time: str = ""
+    time: TimeColumn = TimeColumn("")
+    texts: dict[str, Counter[str]] = field(default_factory=dict)
     faults: list[str] = field(default_factory=list)
 
     @property
@@ -73,9 +88,9 @@ class RecordingContents:
 def holes(t: np.ndarray) -> list[tuple[int, int]]:
     """Return gaps between ordered times that are far longer than the median interval."""
     gaps = np.diff(t)
-    if not gaps.size:
+    if not gaps.any():
         return []
-    long = np.flatnonzero(gaps > max(MIN_GAP_S * 1e9, MIN_GAP_INTERVALS * float(np.median(gaps))))
+    long = np.flatnonzero(gaps > max(MIN_GAP_S * 1e9, MIN_GAP_INTERVALS * float(np.median(gaps[gaps > 0]))))
     return [(int(t[k]), int(t[k + 1])) for k in long]
 
 
@@ -85,19 +100,18 @@ def is_table(path: Path) -> bool:
         return True
     if suffix_of(path) != ".csv":
         return False
-    return csv_header(path)[0][:2] != ["timestamp", "arbitration_id"]
+    return csv_format(path).names[:2] != ["timestamp", "arbitration_id"]
 
 
 def inspect_recordings(
-    files: Sequence[Path], databases: Sequence[tuple[Path, BusName]] = (), time: str | None = None, unit: str = "s"
+    files: Sequence[Path], databases: Sequence[tuple[Path, BusName]] = (), time: TimeColumn | None = None
 ) -> RecordingContents:
     """Return the contents of recordings of one kind, CAN logs or tables.
 
     Args:
         files: In their order.
         databases: DBC files with the bus that each describes, None for every one.
-        time: Time column of a table; None searches for one.
-        unit: Its unit.
+        time: Time column of a table; None, or an empty name, searches for one.
 
     Raises:
         SourceError: If a file cannot be read, or the kinds are mixed.
@@ -113,7 +127,7 @@ def inspect_recordings(
     if any(kinds) != all(kinds):
         raise SourceError(f"{files[kinds.index(True)]} is a table and {files[kinds.index(False)]} a log; give one kind")
     if all(kinds):
-        return _tables(list(files), time, unit)
+        return _tables(list(files), time or TimeColumn(""))
     return _logs(list(files), list(databases))
 
 
@@ -213,13 +227,14 @@ def _series(name: str, unit: str, t: np.ndarray, values: np.ndarray) -> SignalSe
     return SignalSeries(name, unit, t[known], values[known], int(np.sum(~known)))
 
 
-def _tables(files: list[Path], time: str | None, unit: str) -> RecordingContents:
+def _tables(files: list[Path], time: TimeColumn) -> RecordingContents:
     names = names_of(files[0])
-    chosen = time if time is not None else _time_of(names)
+    chosen = time.name or _time_of(files[0], names, time)
     if chosen is None or chosen not in names:
         raise SourceError(
             f"{files[0]}: which column holds the time is not known; name it with --time, one of {', '.join(names[:12])}"
         )
+    time = time._replace(name=chosen)
     columns = [name for name in dict.fromkeys(names) if name != chosen]
     for path in files[1:]:
         missing = [name for name in (chosen, *columns) if name not in names_of(path)]
@@ -231,22 +246,30 @@ def _tables(files: list[Path], time: str | None, unit: str) -> RecordingContents
     faults: list[str] = []
     times, values = [], []
     for path in files:
-        for rows in _rows(path, chosen, unit, columns, faults):
+        for rows in _rows(path, time, columns, faults):
             times.append(rows.t[rows.known])
             values.append(rows.values[rows.known])
-    if not times:
-        raise SourceError("; ".join(faults) or f"{files[0]}: no row has a time in column {chosen}; give one that has")
+    if not any(part.size for part in times):
+        raise SourceError(
+            "; ".join(faults)
+            or f"{files[0]}: no row has a time in column {chosen}; give its unit (--time-unit) or format "
+            "(--time-format), or another column"
+        )
     t, v = np.concatenate(times), np.concatenate(values)
     order = np.argsort(t, kind="stable")
     t, v = t[order], v[order]
-    found = [_series(name, "", t, v[:, k]) for k, name in enumerate(columns)]
-    return RecordingContents(files, "table", t, columns=found, time=chosen, faults=faults)
+    found = [_series(name, heading_unit(name) or "", t, v[:, k]) for k, name in enumerate(columns)]
+    low, high = (end * 10**9 for end in SERIAL_DATES)
+    if time.unit == "s" and low <= t[0] and t[-1] <= high and t[-1] - t[0] < 0.5e9 * t.size:
+        faults.append(f"column {chosen} looks like Excel's serial dates: add --time-unit excel")
+    texts = _texts(files, [one.name for one in found if not one.t.size])
+    return RecordingContents(files, "table", t, columns=found, time=time, faults=faults, texts=texts)
 
 
-def _rows(path: Path, time: str, unit: str, columns: list[str], faults: list[str]) -> Iterator[TableRows]:
+def _rows(path: Path, time: TimeColumn, columns: list[str], faults: list[str]) -> Iterator[TableRows]:
     """Yield the rows of one table as far as it can be read."""
     try:
-        for rows in rows_of(path, time, unit, columns, lambda: 1.0):
+        for rows in rows_of(path, time, columns, lambda: 1.0):
             if rows is not None:
                 faults += [f"{path.name}:{line}: {text}" for key, line, text in rows.problems if key != UNREADABLE]
                 yield rows
@@ -254,7 +277,38 @@ def _rows(path: Path, time: str, unit: str, columns: list[str], faults: list[str
         faults.append(str(error))
 
 
-def _time_of(names: Sequence[str]) -> str | None:
-    """Return the time column, by its name."""
+def _cells(path: Path) -> Iterator[list[str]]:
+    """Yield the cells of the rows of a CSV."""
+    form = csv_format(path)
+    with open_text(path, form.encoding) as file:
+        for row in islice(csv.reader(file, delimiter=form.delimiter), 1, None):
+            if len(row) == len(form.names):
+                yield row
+
+
+def _time_of(path: Path, names: Sequence[str], time: TimeColumn) -> str | None:
+    """Return the time column, by its name or as the first one of dates."""
     last = {name.lower().rpartition(".")[2].partition("[")[0].strip(): name for name in reversed(names)}
-    return next((last[name] for name in TIME_NAMES if name in last), None)
+    named = next((last[name] for name in TIME_NAMES if name in last), None)
+    if named is not None or not is_text(path):
+        return named
+    row = next(_cells(path), [])
+    for name, cell in zip(names, row, strict=False):
+        if not cell.strip().replace(",", "").replace(".", "").lstrip("+-").isdigit():
+            reader = TimeReader(time._replace(name=name))
+            if reader.is_date(cell.strip()):
+                return name
+    return None
+
+
+def _texts(files: list[Path], names: list[str]) -> dict[str, Counter[str]]:
+    found: dict[str, Counter[str]] = {name: Counter() for name in names}
+    for path in files if names else ():
+        if is_text(path):
+            places = [(counts, names_of(path).index(name)) for name, counts in found.items()]
+            for row in _cells(path):
+                for counts, place in places:
+                    text = row[place].strip()
+                    if text and (text in counts or len(counts) < MAX_TEXTS):
+                        counts[text] += 1
+    return {name: counts for name, counts in found.items() if counts}

@@ -246,7 +246,7 @@ class ChannelMapping:
     def _report_losses(self, refused: np.ndarray, cut: np.ndarray, unreported: np.ndarray) -> None:
         for k, channel in enumerate(self._channels):
             name, own = channel.name, channel.accuracy
-            rule = " and ".join(f"{w.signal} in {w.low:g} to {w.high:g}" for w in channel.where)
+            rule = " and ".join(map(str, channel.where))
             reported = ", ".join(dict.fromkeys(own.signals)) if own is not None else ""
             what = "variance" if own is not None and own.squared else "standard deviation"
             ends = f"a frame of {channel.message} ends before {', '.join(channel.signals)}"

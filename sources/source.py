@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 if TYPE_CHECKING:
     from estimators.log import Events
@@ -78,11 +78,17 @@ def controls_of(source: Source) -> Paced | None:
 
 @dataclass(frozen=True)
 class Condition:
-    """Another value of the same row or frame must lie in [low, high], or the measurement is missing."""
+    """Another value of the same row or frame must lie in [low, high], or the measurement is missing.
 
-    signal: str
+    `signal` names it, or is a `TextMatch` of a table's column, which is 1 where the text is the wanted one.
+    """
+
+    signal: Any
     low: float
     high: float
+
+    def __str__(self) -> str:
+        return f"{self.signal} in {self.low:g} to {self.high:g}" if isinstance(self.signal, str) else str(self.signal)
 
 
 @dataclass(frozen=True)
@@ -143,7 +149,7 @@ class Channel:
             object.__setattr__(self, "accuracy", self.accuracy.spread(count))
 
     @property
-    def needed(self) -> tuple[str, ...]:
+    def needed(self) -> tuple[Any, ...]:
         """The signals, those of the conditions and of the accuracy, each once."""
         own = self.accuracy.signals if self.accuracy is not None else ()
         return tuple(dict.fromkeys((*self.signals, *(item.signal for item in (*self.where, *self.only)), *own)))

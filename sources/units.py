@@ -146,6 +146,25 @@ def conversion(given: str | None, wanted: str, where: str) -> tuple[float, float
     raise SourceError(f"{where}: {given!r} does not convert to the model's {wanted!r}; {remedy}")
 
 
+_HEADING = re.compile(r".+?\s*[\[(]([^\[\]()]+)[\])]\s*")
+
+
+def heading_unit(name: object) -> str | None:
+    """Return the unit in a column's heading, such as `Level [mm]` or `Level (mm)`; None if there is no known one."""
+    match = _HEADING.fullmatch(name) if isinstance(name, str) else None
+    if match is None or not re.search(r"[A-Za-z°%]", match[1]):
+        return None
+    text = match[1].strip()
+    normal = _normal(text)
+    for spelling in dict.fromkeys((normal, _OTHERWISE.get(normal, normal), normal.lower())):
+        try:
+            _unit(spelling)
+        except LookupError:
+            continue
+        return text
+    return None
+
+
 def spread_factor(given: str | None, wanted: str, where: str, *, squared: bool) -> float:
     """Return the factor from a standard deviation, or a variance if `squared`, in `given` to one in `wanted`.
 

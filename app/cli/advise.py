@@ -88,7 +88,7 @@ def _topics(twin: Twin, log: Log, advice: Advice) -> list[Topic]:
 
 def _draft(arguments: Arguments, files: tuple[Path, ...]) -> int:
     """Draft a twin from recordings."""
-    found = look(files, arguments.dbc, arguments.time, arguments.time_unit)
+    found = look(files, arguments)
     drafted, every = plan(found, names_of(arguments.signals)), signals(found)
     if arguments.json:
         print(to_json(_draft_json(every, drafted)))

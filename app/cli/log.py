@@ -5,14 +5,15 @@ from __future__ import annotations
 import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from zoneinfo import available_timezones
 
 import numpy as np
 
-from estimators.errors import ConfigError
+from estimators.errors import ConfigError, nearest
 from sources.can.decoder import shown_id
 from sources.can.readers import EXTENDED, BusName
 from sources.inspect import Message, RecordingContents, SignalSeries, inspect_recordings
-from sources.tables.rows import UNITS
+from sources.tables.times import SERIAL_DAYS, UNITS, TimeColumn
 
 from ..format_time import FIRST_DATED_NS, format_time
 from ..present.result import Cell, TableColumn, Topic, to_json, to_text
@@ -20,8 +21,11 @@ from ..terminal import complain
 
 if TYPE_CHECKING:
     from .arguments import LogCommand as Arguments
+    from .arguments import TableOptions
 
 MAX_LISTED = 5  # gaps and faults that are listed; the others are counted
+
+MAX_TEXTS_SHOWN = 8
 
 TIMES = (
     "number",
@@ -36,7 +40,7 @@ TIMES = (
 
 def show_log(arguments: Arguments) -> int:
     """Run the command."""
-    found = look(arguments.files, arguments.dbc, arguments.time, arguments.time_unit)
+    found = look(arguments.files, arguments)
     if arguments.json:
         print(to_json(_as_dict(found)))
         return 0
@@ -48,14 +52,8 @@ def show_log(arguments: Arguments) -> int:
     return 0
 
 
-def look(files: tuple[Path, ...], dbc: tuple[str, ...], time: str | None, unit: str) -> RecordingContents:
-    """Return the content of recordings.
-
-    Args:
-        files: CAN logs, or tables.
-        dbc: DBC files, FILE or FILE@BUS.
-        time: Time column of tables; None searches for one.
-        unit: Its unit.
+def look(files: tuple[Path, ...], options: TableOptions) -> RecordingContents:
+    """Return the content of recordings, CAN logs or tables.
 
     Raises:
         ConfigError: If an argument is wrong.
@@ -63,9 +61,15 @@ def look(files: tuple[Path, ...], dbc: tuple[str, ...], time: str | None, unit: 
     """
     if not files:
         raise ConfigError("no recording is named; give at least one")
-    if unit not in UNITS:
-        raise ConfigError(f"--time-unit {unit}: is no unit of time; choose from {', '.join(UNITS)}")
-    return inspect_recordings([file.expanduser() for file in files], [database_of(text) for text in dbc], time, unit)
+    units = [*UNITS, *SERIAL_DAYS]
+    if options.time_unit not in units:
+        raise ConfigError(f"--time-unit {options.time_unit}: is no unit of time; choose from {', '.join(units)}")
+    if options.time_zone is not None and options.time_zone not in available_timezones():
+        remedy = nearest(options.time_zone, available_timezones())
+        raise ConfigError(f"--time-zone {options.time_zone}: is no time zone of this machine; {remedy}")
+    time = TimeColumn(options.time or "", options.time_unit, options.time_format, options.time_zone)
+    databases = [database_of(text) for text in options.dbc]
+    return inspect_recordings([file.expanduser() for file in files], databases, time)
 
 
 def database_of(text: str) -> tuple[Path, BusName]:
@@ -87,7 +91,12 @@ def _topic(found: RecordingContents) -> Topic:
     sentences = [f"{len(found.holes)} gaps: {', '.join(gaps)}{more}" if gaps else "no gaps"]
     if found.kind == "table":
         rows = tuple((series.name, *_series_cells(series, start)) for series in found.columns)
-        return Topic(title, (*sentences, f"time: column {found.time}"), ("column", *TIMES), rows)
+        zone = f", local time of {found.time.zone}" if found.time.zone else ""
+        texts = [
+            f"{name}: text: " + ", ".join(f"{text} ({count:,})" for text, count in counts.most_common(MAX_TEXTS_SHOWN))
+            for name, counts in found.texts.items()
+        ]
+        return Topic(title, (*sentences, f"time: column {found.time.name}{zone}", *texts), ("column", *TIMES), rows)
     lines: list[tuple[Cell, ...]] = []
     for message in found.messages:
         bus = "" if message.bus is None else str(message.bus)
@@ -124,7 +133,7 @@ def _as_dict(found: RecordingContents) -> dict[str, Any]:
     content: dict[str, Any] = (
         {"messages": [_message(message) for message in found.messages]}
         if found.kind == "can_log"
-        else {"time": found.time, "columns": [_series(series) for series in found.columns]}
+        else {"time": found.time.name, "columns": [_series(series) for series in found.columns]}
     )
     return {
         "files": [str(path) for path in found.files],

@@ -156,7 +156,7 @@ def new_twin(arguments: Arguments) -> int:
         from .log import look
 
         check_new(arguments.name, arguments.folder)
-        found = look(arguments.log, arguments.dbc, arguments.time, arguments.time_unit)
+        found = look(arguments.log, arguments)
         drafted = plan(found, names_of(arguments.signals))
         paths = write_draft(arguments.name, arguments.folder, found, drafted, arguments)
     elif names_of(arguments.signals) or arguments.dbc:
@@ -181,7 +181,7 @@ def write_draft(
 
     check_new(name, folder)
     model, databases = model_of(name), [database_of(text) for text in options.dbc]
-    text = yaml_text(name, model, drafted, found, databases, options.time_unit, folder)
+    text = yaml_text(name, model, drafted, found, databases, folder)
     return write_pair(name, folder, text, python_text(name, model, drafted))
 
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from math import inf
 from typing import TYPE_CHECKING, Any
 
-from config.fields import RangeSection
+from config.fields import ConditionSection
 from config.loader import Loaded
 from config.source_schema import ChannelSection, FaultSection, SignalSection
 from config.yaml_files import Key
@@ -84,21 +84,32 @@ def _channel(
         model_units=tuple(unit for _, unit in rows),
         scale=_spread(item.scale, len(rows)),
         offset=_spread(item.offset, len(rows)),
-        where=_conditions(item.where),
-        only=_conditions(item.only),
+        where=_conditions(loaded, (*key, "where"), item, item.where),
+        only=_conditions(loaded, (*key, "only"), item, item.only),
         convert=item.convert,
         origin=item.origin,
         accuracy=None if own is None else Accuracy(own.names, own.std is None, own.units or (None,), own.scale),
     )
 
 
-def _conditions(given: Mapping[str, RangeSection]) -> tuple[Condition, ...]:
+def _conditions(
+    loaded: Loaded, key: Key, item: ChannelSection, given: Mapping[str, ConditionSection]
+) -> tuple[Condition, ...]:
     from sources.source import Condition
+    from sources.tables.text import TextMatch
 
-    return tuple(
-        Condition(signal, -inf if limits.min is None else limits.min, inf if limits.max is None else limits.max)
-        for signal, limits in given.items()
-    )
+    found = []
+    for signal, rule in given.items():
+        if rule.text is None:
+            low, high = -inf if rule.min is None else rule.min, inf if rule.max is None else rule.max
+            found.append(Condition(signal, low, high))
+        elif isinstance(item, SignalSection):
+            raise loaded.error(
+                (*key, signal), f"is {rule.text[0]!r}; signals of a bus are numbers: give the raw number"
+            )
+        else:
+            found.append(Condition(TextMatch(signal, rule.text), 1.0, 1.0))
+    return tuple(found)
 
 
 def _spread(values: tuple, count: int) -> tuple:

@@ -26,7 +26,7 @@ from estimators.errors import SourceError
 from ..formats import is_compressed, open_binary
 from ..source import TRUNCATED
 from ..worker_process import memory_error, memory_limit
-from .text import CHUNK_ROWS, Chunk, Problem, parse_numbers
+from .text import CHUNK_ROWS, Chunk, Problem, TextMatch, column_of, fill
 
 CHUNK_VALUES = 65_536
 """Values of a chunk of a NumPy archive; a row of a field has thousands."""
@@ -74,14 +74,16 @@ def parquet_names(path: Path) -> list[str]:
         return list(pyarrow.parquet.read_schema(_content(path)).names)
 
 
-def read_parquet(path: Path, time: str, columns: Sequence[str], problem: Problem) -> Generator[Chunk, None, None]:
+def read_parquet(
+    path: Path, time: str, columns: Sequence[str | TextMatch], problem: Problem
+) -> Generator[Chunk, None, None]:
     """Yield the rows of a Parquet file; null is blank, and text is read as in a CSV."""
     import pyarrow
     import pyarrow.parquet
 
     row = 1
     with pyarrow.parquet.ParquetFile(_content(path)) as file:
-        wanted = list(dict.fromkeys((time, *columns)))
+        wanted = list(dict.fromkeys((time, *map(column_of, columns))))
         for k in range(file.num_row_groups):
             group = file.metadata.row_group(k)
             chunks = [group.column(j) for j in range(group.num_columns)]
@@ -93,11 +95,13 @@ def read_parquet(path: Path, time: str, columns: Sequence[str], problem: Problem
             blank = np.zeros(values.shape, np.bool_)
             lines = list(range(row, row + n))
             for k, name in enumerate(columns):
-                column = batch.column(name)
+                column = batch.column(column_of(name))
+                if isinstance(name, TextMatch) or pyarrow.types.is_dictionary(column.type):
+                    column = column.cast(pyarrow.string())
                 blank[:, k] = column.is_null().to_numpy(zero_copy_only=False)
                 if pyarrow.types.is_string(column.type) or pyarrow.types.is_large_string(column.type):
                     cells = [item or "" for item in column.to_pylist()]
-                    parse_numbers(cells, name, lines, values[:, k], blank[:, k], problem)
+                    fill(name, cells, lines, values[:, k], blank[:, k], problem)
                 else:
                     numbers = column.cast(pyarrow.float64(), safe=False)
                     values[:, k] = numbers.to_numpy(zero_copy_only=False)
@@ -105,6 +109,14 @@ def read_parquet(path: Path, time: str, columns: Sequence[str], problem: Problem
             row += n
         if row - 1 != file.metadata.num_rows:
             problem(TRUNCATED, row, f"{row - 1} of {file.metadata.num_rows} rows are there")
+
+
+def _numeric(path: Path, columns: Sequence[str | TextMatch]) -> list[str]:
+    """Return the columns; raises SourceError if one is to be compared as text."""
+    for name in columns:
+        if isinstance(name, TextMatch):
+            raise SourceError(f"{path}: {name.column} holds numbers, not text such as {name.texts[0]!r}; give a number")
+    return [column_of(name) for name in columns]
 
 
 def mat_names(path: Path) -> list[str]:
@@ -140,16 +152,20 @@ def _collect(name: str, value: Any, found: dict[str, np.ndarray]) -> None:
         found[name] = value
 
 
-def read_mat(path: Path, time: str, columns: Sequence[str], problem: Problem) -> Generator[Chunk, None, None]:
+def read_mat(
+    path: Path, time: str, columns: Sequence[str | TextMatch], problem: Problem
+) -> Generator[Chunk, None, None]:
     """Yield the rows of the vectors; NaN is a missing value; raises SourceError if their lengths differ."""
     found = _vectors(path)
-    for name in columns:
+    for name in _numeric(path, columns):
         if found[name].size != found[time].size:
             raise SourceError(
                 f"{path}: {name} has {found[name].size} values and {time} has {found[time].size}; "
                 "take columns of one struct"
             )
-    yield from _chunks(found[time], {name: (found[name], [k], [0]) for k, name in enumerate(columns)}, CHUNK_ROWS)
+    yield from _chunks(
+        found[time], {name: (found[name], [k], [0]) for k, name in enumerate(_numeric(path, columns))}, CHUNK_ROWS
+    )
 
 
 def npz_names(path: Path) -> list[str]:
@@ -177,11 +193,13 @@ def _declared(path: Path) -> dict[str, tuple[tuple[int, ...], np.dtype]]:
     return found
 
 
-def read_npz(path: Path, time: str, columns: Sequence[str], problem: Problem) -> Generator[Chunk, None, None]:
+def read_npz(
+    path: Path, time: str, columns: Sequence[str | TextMatch], problem: Problem
+) -> Generator[Chunk, None, None]:
     """Yield the rows of the arrays; NaN is a missing value; raises SourceError if their lengths differ."""
     declared = _declared(path)
     picks: dict[str, tuple[list[int], list[int]]] = {}
-    for k, column in enumerate(columns):
+    for k, column in enumerate(_numeric(path, columns)):
         name, _, rest = column.partition("[")
         shape = declared[name][0]
         if shape[0] != declared[time][0][0]:

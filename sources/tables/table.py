@@ -14,9 +14,11 @@ from estimators.log import Events
 from ..formats import suffix_of
 from ..mapping import ABSENT, PRESENT, ChannelMapping
 from ..source import NEVER, TRUNCATED, Channel, Report, ignore
+from ..units import heading_unit
 from .order import Order
-from .rows import UNITS, TableRows, is_text, names_of, rows_of
-from .text import find_decimal_comma, has_rows
+from .rows import TableRows, names_of, rows_of
+from .text import TextMatch, column_of, has_rows
+from .times import SERIAL_DAYS, UNITS, TimeColumn
 
 
 class Table:
@@ -28,8 +30,10 @@ class Table:
 
     Args:
         files: Tables in their order.
-        time_column: The column that holds the time: numbers in `time_unit`, or dates in ISO 8601 (UTC without a zone).
-        time_unit: s, ms, us, ns, min or h.
+        time_column: The column that holds the time: numbers in `time_unit`, or dates.
+        time_unit: s, ms, us, ns, min or h; excel or matlab for the days of a serial date.
+        time_format: Of dates, as in `datetime.strptime`; None detects it.
+        time_zone: Of dates without an offset; None is UTC.
         time_shift: Seconds added to it.
         channels: What feeds the model.
         width: Value columns of an event.
@@ -49,6 +53,8 @@ class Table:
         *,
         time_column: str,
         time_unit: str,
+        time_format: str | None = None,
+        time_zone: str | None = None,
         time_shift: float = 0.0,
         channels: Iterable[Channel],
         width: int,
@@ -58,20 +64,22 @@ class Table:
         self._files = [Path(file) for file in files]
         if not self._files:
             raise SourceError("table: files is empty; name at least one recording")
-        if time_unit not in UNITS:
-            raise SourceError(f"table: the time unit is {time_unit!r}; choose from {', '.join(UNITS)}")
+        units = [*UNITS, *SERIAL_DAYS]
+        if time_unit not in units:
+            raise SourceError(f"table: the time unit is {time_unit!r}; choose from {', '.join(units)}")
         channels = list(channels)
-        self._time, self._unit, self._width, self._report = time_column, time_unit, width, report
+        self._time = TimeColumn(time_column, time_unit, time_format, time_zone)
+        self._width, self._report = width, report
         self._shift = round(time_shift * 1e9)
         self._columns = list(dict.fromkeys(name for channel in channels for name in channel.needed))
         for path in self._files:
-            _check(path, [time_column, *self._columns])
+            _check(path, [time_column, *map(column_of, self._columns)])
         self._channels = channels
-        self._valued: set[str] = set()
+        self._valued: set[str | TextMatch] = set()
         self._count = 0
         self._timeout = 0.0
         self._mapping = ChannelMapping(
-            [(channels, self._columns, [None] * len(self._columns))], width=width, report=report
+            [(channels, self._columns, [heading_unit(name) for name in self._columns])], width=width, report=report
         )
         self._order = Order(time_column, time_unit, None if horizon is None else round(horizon * 1e9), report)
         self._batches = self._all()
@@ -87,7 +95,7 @@ class Table:
     def _one(self, path: Path) -> Generator[Events, None, None]:
         before = self._count
         try:
-            for rows in rows_of(path, self._time, self._unit, self._columns, lambda: self._timeout):
+            for rows in rows_of(path, self._time, self._columns, lambda: self._timeout):
                 first = self._count == before
                 batch = Events.empty(self._width) if rows is None else self._events(path, rows, first)
                 if rows is None or len(batch):
@@ -106,7 +114,8 @@ class Table:
         for row in np.flatnonzero(~known):
             self._report(
                 "undated row",
-                f"{path.name}:{rows.line[row]}: {self._time} is not a time, or needs another unit; the row is left out",
+                f"{path.name}:{rows.line[row]}: {self._time.name} is not a time, or needs another unit or format; "
+                "the row is left out",
             )
         t, used = rows.t + self._shift, known.copy()
         if first:
@@ -114,16 +123,20 @@ class Table:
             used[np.flatnonzero(known)[:wrong]] = False
         self._count += rows.t.size
         if len(self._valued) < len(self._columns):
-            valued = np.flatnonzero(np.isfinite(rows.values).any(axis=0))
-            self._valued.update(self._columns[k] for k in valued)
+            matched = np.array([isinstance(name, TextMatch) for name in self._columns], np.bool_)
+            valued = np.any(np.where(matched, rows.values == 1.0, np.isfinite(rows.values)), axis=0)
+            self._valued.update(self._columns[k] for k in np.flatnonzero(valued))
         self._order.look(path.name, rows.line[used], t[used])
         state = np.where(rows.blank, ABSENT, PRESENT).astype(np.int8)
         plan = np.zeros(t.size, np.int64)
         return self._mapping.events(plan, t, t, rows.values, state, (~used).astype(np.int8))
 
-    def _never(self, name: str) -> str:
+    def _never(self, name: str | TextMatch) -> str:
         fed = ", ".join(channel.name for channel in self._channels if name in channel.needed)
         files = self._files[0].name + (f" and {len(self._files) - 1} more" if len(self._files) > 1 else "")
+        if isinstance(name, TextMatch):
+            wanted = " or ".join(map(repr, name.texts))
+            return f"{files}: column {name.column!r} is never {wanted} in {self._count} rows, so {fed} has no values"
         return f"{files}: column {name!r} has no value in {self._count} rows, so {fed} has no values"
 
     def read(self, timeout: float) -> Events | None:
@@ -160,13 +173,6 @@ def _check(path: Path, wanted: Sequence[str]) -> None:
             raise SourceError(f"{path}: there are {len(at)} columns {name!r}, {places}; give each its own name")
     if suffix_of(path) == ".csv" and not has_rows(path):
         raise SourceError(f"{path}: it has a header and no rows; record it again")
-    if is_text(path):
-        comma = find_decimal_comma(path, wanted)
-        if comma is not None:
-            line, name, cell, point = comma
-            raise SourceError(
-                f"{path}:{line}: {name} is {cell!r}, with a decimal comma; write numbers with a point, {point}"
-            )
 
 
 def _ordinal(k: int) -> str:

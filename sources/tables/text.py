@@ -7,7 +7,6 @@ import io
 import re
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import suppress
-from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple, TextIO
 
@@ -20,11 +19,30 @@ from ..source import TRUNCATED
 
 CHUNK_ROWS = 4096  # Rows of a chunk, at most
 MAX_LINE_LENGTH = 2**20  # Characters of a line; a longer one is read as several
-COMMA_CHECK_LINES = 100  # Lines in which a decimal comma is sought before a table is read
+HEAD_BYTES = 65_536  # Bytes from which the format of a CSV is detected
 UNREADABLE = "unreadable value"  # Key of values that are not numbers
 
 Problem = Callable[[str, int, str], None]
 """problem(key, line or row number, text)."""
+
+
+class TextMatch(NamedTuple):
+    """Column of a table that is 1 where the text of `column` is one of `texts`, and 0 elsewhere."""
+
+    column: str
+    texts: tuple[str, ...]
+
+    def __str__(self) -> str:
+        return f"{self.column} = {' or '.join(self.texts)}"
+
+
+class CsvFormat(NamedTuple):
+    """Columns of a CSV, the delimiter of its cells, the decimal sign of its numbers, and its encoding."""
+
+    names: list[str]
+    delimiter: str
+    decimal: str
+    encoding: str
 
 
 class Chunk(NamedTuple):
@@ -39,32 +57,47 @@ class Chunk(NamedTuple):
     blank: np.ndarray
 
 
-def open_text(path: Path) -> TextIO:
-    """Open a CSV; bytes that are not UTF-8 are replaced."""
-    return io.TextIOWrapper(open_binary(path), encoding="utf-8-sig", errors="replace", newline="")
+def open_text(path: Path, encoding: str = "utf-8-sig") -> TextIO:
+    """Open a CSV; bytes that are not of its encoding are replaced."""
+    return io.TextIOWrapper(open_binary(path), encoding=encoding, errors="replace", newline="")
 
 
-def csv_header(path: Path) -> tuple[list[str], str]:
-    """Return the names in the first line of a CSV, and its delimiter.
+def csv_format(path: Path) -> CsvFormat:
+    """Return the format of a CSV, detected from its first lines.
+
+    Files that are not UTF-8 are read as Windows-1252, or as UTF-16 if they begin with its mark. The decimal sign is a
+    comma if the delimiter is another sign and a number is written with one.
 
     Raises:
         SourceError: If the file begins with bytes that are not text, or cannot be decompressed.
     """
     try:
         with open_binary(path) as binary:
-            head = binary.read(4096)
-        if any(byte < 9 or 13 < byte < 32 for byte in head):
-            raise SourceError(
-                f"{path}:1: it begins with the bytes {head[:8].hex(' ')} and is not text; give a CSV in UTF-8, "
-                "or name the file by its format (.parquet, .mat, .npz)"
-            )
-        with open_text(path) as file:
-            first = file.readline(MAX_LINE_LENGTH)
+            head = binary.read(HEAD_BYTES)
     except OSError as error:
         raise SourceError(f"{path}: it cannot be read ({error.strerror or error}); check that it is complete") from None
-    delimiter = max(",;\t", key=first.count)
+    encoding = "utf-16" if head.startswith((b"\xff\xfe", b"\xfe\xff")) else _single_bytes(head)
+    if encoding != "utf-16" and any(byte < 9 or 13 < byte < 32 for byte in head[:4096]):
+        raise SourceError(
+            f"{path}:1: it begins with the bytes {head[:8].hex(' ')} and is not text; give a CSV in UTF-8, "
+            "or name the file by its format (.parquet, .mat, .npz)"
+        )
+    lines = head.decode(encoding, "replace").splitlines()
+    first = lines[0] if lines else ""
+    delimiter = max(",;\t|", key=first.count)
     names = next(csv.reader([first], delimiter=delimiter), [])
-    return [name.strip() for name in names], delimiter
+    cells = (cell for line in lines[1:-1] or lines[1:] for cell in line.split(delimiter))
+    comma = delimiter != "," and any(_COMMA.fullmatch(cell.strip()) for cell in cells)
+    return CsvFormat([name.strip() for name in names], delimiter, "," if comma else ".", encoding)
+
+
+def _single_bytes(head: bytes) -> str:
+    try:
+        head.decode("utf-8")
+    except UnicodeDecodeError as error:
+        if error.start < len(head) - 4:  # not merely cut within a character
+            return "cp1252"
+    return "utf-8-sig"
 
 
 def has_rows(path: Path) -> bool:
@@ -75,14 +108,16 @@ def has_rows(path: Path) -> bool:
     return True  # What is wrong with the file is reported when its rows are read.
 
 
-def read_csv(path: Path, time: str, columns: Sequence[str], problem: Problem) -> Generator[Chunk, None, None]:
+def read_csv(
+    path: Path, time: str, columns: Sequence[str | TextMatch], problem: Problem
+) -> Generator[Chunk, None, None]:
     """Yield the rows of a CSV; a value that is not a number is missing and reported, as is a row cut short."""
-    names, delimiter = csv_header(path)
+    names, delimiter, decimal, encoding = csv_format(path)
     at_time = names.index(time)
-    places = [names.index(name) for name in columns]
+    places = [names.index(column_of(name)) for name in columns]
     broken: tuple[int, int] | None = None
     raw: list[str] = []
-    with open_text(path) as file:
+    with open_text(path, encoding) as file:
         reader = csv.reader(_lines(file, raw), delimiter=delimiter)
         next(reader)
         ended = False
@@ -115,8 +150,12 @@ def read_csv(path: Path, time: str, columns: Sequence[str], problem: Problem) ->
                 values = np.empty((len(rows), len(columns)))
                 blank = np.zeros(values.shape, np.bool_)
                 for k, place in enumerate(places):
-                    parse_numbers([row[place] for row in rows], columns[k], lines, values[:, k], blank[:, k], problem)
-                yield Chunk(np.array(lines), [row[at_time].strip() for row in rows], values, blank)
+                    cells = [row[place] for row in rows]
+                    fill(columns[k], cells, lines, values[:, k], blank[:, k], problem, decimal)
+                times = [row[at_time].strip() for row in rows]
+                if decimal == ",":
+                    times = [_with_point(cell) or cell for cell in times]
+                yield Chunk(np.array(lines), times, values, blank)
     if broken is not None:
         problem(TRUNCATED, broken[0], f"the last line has {broken[1]} cells, not {len(names)}")
 
@@ -128,30 +167,34 @@ def _lines(file: TextIO, raw: list[str]) -> Iterator[str]:
         yield line
 
 
-_COMMA = re.compile(r"[+-]?\d*,\d+(?:[eE][+-]?\d+)?")
+_COMMA = re.compile(r"[+-]?(?:\d*|\d{1,3}(?:\.\d{3})+),\d+(?:[eE][+-]?\d+)?")
 
 
 def _with_point(cell: str) -> str | None:
     """Return a number that is written with a decimal comma as one with a point; None of anything else."""
     text = cell.strip()
-    return text.replace(",", ".") if _COMMA.fullmatch(text) else None
+    return text.replace(".", "").replace(",", ".") if _COMMA.fullmatch(text) else None
 
 
-def find_decimal_comma(path: Path, wanted: Sequence[str]) -> tuple[int, str, str, str] | None:
-    """Return line, column, cell, and the cell with a point, of the first decimal comma near the start of a CSV."""
-    names, delimiter = csv_header(path)
-    if delimiter == ",":
-        return None
-    places = {name: names.index(name) for name in wanted}
-    with open_text(path) as file:
-        reader = csv.reader(islice(_lines(file, []), COMMA_CHECK_LINES), delimiter=delimiter)
-        with suppress(csv.Error, OSError):
-            for row in islice(reader, 1, None):
-                for name, place in places.items():
-                    point = _with_point(row[place]) if place < len(row) else None
-                    if point is not None:
-                        return reader.line_num, name, row[place].strip(), point
-    return None
+def column_of(name: str | TextMatch) -> str:
+    """Return the column of the file that a column of the reader is made of."""
+    return name.column if isinstance(name, TextMatch) else name
+
+
+def fill(
+    name: str | TextMatch,
+    cells: list[str],
+    lines: list[int],
+    values: np.ndarray,
+    blank: np.ndarray,
+    problem: Problem,
+    decimal: str = ".",
+) -> None:
+    """Fill a column of values, and its mask of blank ones, from text."""
+    if isinstance(name, TextMatch):
+        values[:] = [cell.strip() in name.texts for cell in cells]
+    else:
+        parse_numbers(cells, name, lines, values, blank, problem, decimal)
 
 
 def _number(cell: str) -> float:
@@ -166,18 +209,27 @@ def _number(cell: str) -> float:
 
 
 def parse_numbers(
-    cells: list[str], name: str, lines: list[int], values: np.ndarray, blank: np.ndarray, problem: Problem
+    cells: list[str],
+    name: str,
+    lines: list[int],
+    values: np.ndarray,
+    blank: np.ndarray,
+    problem: Problem,
+    decimal: str = ".",
 ) -> None:
-    """Fill a column of values, and its mask of blank ones, from text."""
+    """Fill a column of values, and its mask of blank ones, from text; with a decimal comma, a point is an error."""
+    texts = cells
+    if decimal == ",":
+        texts = [_with_point(cell) or ("?" if "." in cell else cell) for cell in cells]
     try:
-        if "_" not in "".join(cells):
-            values[:] = [float(cell) for cell in cells]
+        if "_" not in "".join(texts):
+            values[:] = [float(cell) for cell in texts]
             return
     except ValueError:
         pass
     for k, cell in enumerate(cells):
         try:
-            values[k] = _number(cell)
+            values[k] = _number(texts[k])
         except ValueError:
             values[k] = np.nan
             if not cell.strip():
@@ -185,4 +237,6 @@ def parse_numbers(
             elif cell.strip().lower() not in ("na", "n/a", "null", "none"):
                 point = _with_point(cell)
                 why = "which is not a number" if point is None else f"with a decimal comma; write {point}"
+                if texts[k] == "?":
+                    why = "with a point in a table of decimal commas"
                 problem(UNREADABLE, lines[k], f"{name} is {quoted(cell.strip())}, {why}; the value is missing")

@@ -166,7 +166,6 @@ def yaml_text(
     plan: DraftPlan,
     found: RecordingContents,
     databases: Sequence[tuple[Path, BusName]],
-    unit: str,
     folder: Path,
 ) -> str:
     """The twin's YAML, with the recording as its source."""
@@ -181,7 +180,9 @@ def yaml_text(
             where = "" if bus is None else f", channel: {bus if isinstance(bus, int) else _text(bus)}"
             source.append(f"    - {{file: {_text(_from(path, folder))}{where}}}")
     else:
-        source.append(f"  time: {{column: {_text(found.time)}, unit: {unit}}}")
+        keys = {"column": _text(found.time.name), "unit": found.time.unit}
+        keys |= {key: _text(value) for key in ("format", "zone") if (value := getattr(found.time, key)) is not None}
+        source.append(f"  time: {{{', '.join(f'{key}: {value}' for key, value in keys.items())}}}")
     source += ["  sensors:", *(_channel(reads.name, reads.signal) for reads in read)]
     if plan.inputs:
         source += ["  inputs:", *(_channel(each, one) for each, one in plan.inputs)]

@@ -74,6 +74,8 @@ def _open_table(opening: Opening) -> Source:
             files,
             time_column=section.time.column,
             time_unit=section.time.unit,
+            time_format=section.time.format,
+            time_zone=section.time.zone,
             time_shift=section.time.shift,
             channels=channels,
             width=opening.model.width,
