@@ -115,6 +115,15 @@ class SignalSection(ChannelSection):
     signals: Texts
     """Its signal's name, or a list: one for each row of the sensor."""
 
+    @model_validator(mode="after")
+    def _numbers(self) -> SignalSection:
+        for key in ("where", "only"):
+            for name, rule in getattr(self, key).items():
+                if rule.text is not None:
+                    text = f"compares {name} with the text {rule.text[0]!r}; give the signal's raw number"
+                    raise refused("relation", text, key)
+        return self
+
     def names(self) -> tuple[str, ...]:
         """Return the signals, one a row."""
         return self.signals

@@ -84,17 +84,15 @@ def _channel(
         model_units=tuple(unit for _, unit in rows),
         scale=_spread(item.scale, len(rows)),
         offset=_spread(item.offset, len(rows)),
-        where=_conditions(loaded, (*key, "where"), item, item.where),
-        only=_conditions(loaded, (*key, "only"), item, item.only),
+        where=_conditions(item.where),
+        only=_conditions(item.only),
         convert=item.convert,
         origin=item.origin,
         accuracy=None if own is None else Accuracy(own.names, own.std is None, own.units or (None,), own.scale),
     )
 
 
-def _conditions(
-    loaded: Loaded, key: Key, item: ChannelSection, given: Mapping[str, ConditionSection]
-) -> tuple[Condition, ...]:
+def _conditions(given: Mapping[str, ConditionSection]) -> tuple[Condition, ...]:
     from sources.source import Condition
     from sources.tables.text import TextMatch
 
@@ -103,10 +101,6 @@ def _conditions(
         if rule.text is None:
             low, high = -inf if rule.min is None else rule.min, inf if rule.max is None else rule.max
             found.append(Condition(signal, low, high))
-        elif isinstance(item, SignalSection):
-            raise loaded.error(
-                (*key, signal), f"is {rule.text[0]!r}; signals of a bus are numbers: give the raw number"
-            )
         else:
             found.append(Condition(TextMatch(signal, rule.text), 1.0, 1.0))
     return tuple(found)

@@ -109,7 +109,8 @@ source:
         (
             "time: {column: t_utc}",
             "time: {column: t_utc, unit: sec}",
-            "car.yaml:26: source.parts[1].time.unit is 'sec'; it must be 's', 'ms', 'us', 'ns', 'min' or 'h'",
+            "car.yaml:26: source.parts[1].time.unit is 'sec'; it must be 's', 'ms', 'us', 'ns', 'min', 'h', 'excel' or "
+            "'matlab'",
         ),
         ("      time: {column: t_utc}\n", "", "car.yaml:24: source.parts[1].time is missing; add it"),
         ("    - type: table", "    - type: can", "car.yaml:24: source.parts[1].type is 'can'; did you mean can_log?"),
@@ -121,7 +122,8 @@ source:
         (
             "Temp: {max: 80}",
             "Temp: hot",
-            "car.yaml:17: source.parts[0].sensors.gyro.where.Temp is 'hot'; it must be a mapping of keys and values",
+            "car.yaml:17: source.parts[0].sensors.gyro.where compares Temp with the text 'hot'; give the signal's raw "
+            "number",
         ),
     ],
 )

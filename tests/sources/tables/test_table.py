@@ -2,14 +2,16 @@
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.csv as pacsv
 import pyarrow.parquet as pq
 import pytest
 
 from estimators.errors import SourceError
 from estimators.log import INPUT, READING, TRUTH
 from sources.source import Channel, Condition
-from sources.tables.rows import column_ns
 from sources.tables.table import Table
+from sources.tables.text import TextMatch
+from sources.tables.times import TimeColumn, TimeReader
 from tests.sources.can.can_tools import Reports, same
 from tests.support import read_all
 
@@ -106,7 +108,10 @@ def test_rows_without_a_time_or_with_missing_cells_are_left_out_and_counted(tmp_
     got = read_all(table(path, report=reports))
     assert set(got.t.tolist()) == {2 * 10**9}
     assert reports.counts == {"undated row": 1, "unreadable value": 1, "truncated file": 1}
-    assert reports.texts["undated row"] == "drive.csv:2: t is not a time, or needs another unit; the row is left out"
+    assert (
+        reports.texts["undated row"]
+        == "drive.csv:2: t is not a time, or needs another unit or format; the row is left out"
+    )
     assert reports.texts["unreadable value"] == "drive.csv:3: has 3 cells, not 7; the row is left out"
     assert reports.texts["truncated file"] == "drive.csv:5: the last line has 3 cells, not 7"
 
@@ -121,8 +126,8 @@ def test_a_header_without_rows_is_named(tmp_path, rest):
 
 @pytest.mark.parametrize(
     "content",
-    [b"\x89PNG\r\n\x1a\n" + bytes(range(256)) * 40, "t,x\n0,1\n".encode("utf-16"), b"t,\x1b[31mx\n0,1\n"],
-    ids=["picture", "utf-16", "colours"],
+    [b"\x89PNG\r\n\x1a\n" + bytes(range(256)) * 40, b"t,\x1b[31mx\n0,1\n"],
+    ids=["picture", "colours"],
 )
 def test_a_file_that_is_no_text_is_told_in_letters_and_briefly(tmp_path, content):
     path = tmp_path / "drive.csv"
@@ -183,7 +188,10 @@ def test_parquet_times(tmp_path, column, unit, expected):
     pq.write_table(pa.table({"t": column, "x": [1.0, 2.0, 3.0]}), tmp_path / "a.parquet")
     got = read_all(table(tmp_path / "a.parquet", unit=unit, channels=X, report=reports))
     assert got.t.tolist() == expected and got.value[:, 0].tolist() == [1.0, 3.0]
-    assert reports.texts["undated row"] == "a.parquet:2: t is not a time, or needs another unit; the row is left out"
+    assert (
+        reports.texts["undated row"]
+        == "a.parquet:2: t is not a time, or needs another unit or format; the row is left out"
+    )
 
 
 def test_parquet_and_csv_of_one_table_agree(tmp_path):
@@ -260,10 +268,10 @@ def test_a_shift_moves_the_clock(tmp_path):
 def test_times_beyond_any_clock_are_left_out():
     """Milliseconds that are read as seconds: 64 bits of nanoseconds end at 9.2e9 s."""
     for column in (["0", "1e10", "-1e10", "1e300", "2"], pa.array([0.0, 1e10, -1e10, 1e300, 2.0])):
-        time, known = column_ns(column, "s")
+        time, known = TimeReader(TimeColumn("t")).read(column)
         np.testing.assert_array_equal(known, [True, False, False, False, True])
         np.testing.assert_array_equal(time[known], [0, 2_000_000_000])
-    time, known = column_ns(pa.array([0, 10**10, 2]), "s")
+    time, known = TimeReader(TimeColumn("t")).read(pa.array([0, 10**10, 2]))
     np.testing.assert_array_equal(known, [True, False, True])
     np.testing.assert_array_equal(time[known], [0, 2_000_000_000])
 
@@ -308,15 +316,107 @@ def test_a_quote_that_is_closed_may_hold_lines(tmp_path):
     assert got.value[:, 0].tolist() == [1, 2] and not reports.counts
 
 
-def test_a_decimal_comma_is_refused_with_what_to_write(tmp_path):
-    path = write(tmp_path, "t;x\n0;1\n0,5;2,25\n")
-    with pytest.raises(SourceError) as caught:
-        read_all(table(path, channels=ONE))
-    assert str(caught.value) == f"{path}:3: t is '0,5', with a decimal comma; write numbers with a point, 0.5"
-    path = write(tmp_path, "t;x\n" + "".join(f"{k};{k}\n" for k in range(5000)) + "5000;2,5\n")
+def test_a_decimal_comma_is_read_if_the_table_uses_it(tmp_path):
+    path = write(tmp_path, "t;x\n0;1\n0,5;2,25\n1;1.234,5\n2;3.5\n")
+    got, reports = read_reports(path, ONE)
+    assert got.t.tolist() == [0, 500_000_000, 10**9, 2 * 10**9]
+    np.testing.assert_array_equal(got.value[:, 0], [1.0, 2.25, 1234.5, NAN])
+    assert f"{path.name}:5: x is '3.5', with a point in a table of decimal commas" in reports.texts["unreadable value"]
+    path = write(tmp_path, "t;x\n" + "".join(f"{k};{k}.5\n" for k in range(20_000)) + "20000;2,5\n")
     _, reports = read_reports(path, ONE)
     assert reports.counts == {"unreadable value": 1}
     assert "x is '2,5', with a decimal comma; write 2.5; the value is missing" in reports.texts["unreadable value"]
+
+
+def test_a_table_in_utf_16(tmp_path):
+    path = tmp_path / "drive.csv"
+    path.write_bytes("t;x\n0;1,5\n".encode("utf-16"))
+    assert read_reports(path, ONE)[0].value[:, 0].tolist() == [1.5]
+
+
+def test_text_of_another_encoding_and_units_in_headings(tmp_path):
+    """Latin letters of Windows; millimetres become the model's metres, and `units` in the YAML goes first."""
+    path = tmp_path / "werk.csv"
+    path.write_bytes("Zeit;Füllstand [mm];Zähler [raw]\n0;1500;7\n".encode("cp1252"))
+    channels = (
+        Channel(READING, 0, "level", ("Füllstand [mm]",), model_units=("m",)),
+        Channel(READING, 1, "count", ("Zähler [raw]",), model_units=("m",)),
+    )
+    got = read_all(Table([path], time_column="Zeit", time_unit="s", channels=channels, width=1))
+    assert got.value[:, 0].tolist() == [1.5, 7.0]
+    own = (Channel(READING, 0, "level", ("Füllstand [mm]",), units=("cm",), model_units=("m",)),)
+    assert read_all(Table([path], time_column="Zeit", time_unit="s", channels=own, width=1)).value.tolist() == [[15.0]]
+
+
+TAGS = "t,tag,x,quality\n0,TT101,20.5,Good\n0,PT200,1.5,Good\n1,TT101,99,Bad\n1,PT200,1.6,Good\n2,TT101,21,Uncertain\n"
+
+
+@pytest.mark.parametrize("ending", [".csv", ".parquet"])
+def test_tags_select_rows_and_quality_judges_them(tmp_path, ending):
+    """Rows of another tag are no measurement; one of bad quality is a missing one."""
+    path = write(tmp_path, TAGS)
+    if ending == ".parquet":
+        path = tmp_path / "drive.parquet"
+        pq.write_table(pacsv.read_csv(tmp_path / "drive.csv"), path)
+    good = (Condition(TextMatch("quality", ("Good", "Uncertain")), 1, 1),)
+    channels = tuple(
+        Channel(READING, k, name, ("x",), where=good, only=(Condition(TextMatch("tag", (tag,)), 1, 1),))
+        for k, (name, tag) in enumerate([("temperature", "TT101"), ("pressure", "PT200")])
+    )
+    got, reports = read_reports(path, channels)
+    assert got.channel.tolist() == [0, 1, 0, 1, 0]
+    np.testing.assert_array_equal(got.value[:, 0], [20.5, 1.5, NAN, 1.6, 21.0])
+    assert "it needs quality = Good or Uncertain" in reports.texts["condition temperature"]
+
+
+def test_a_tag_that_never_comes_is_reported(tmp_path):
+    channels = (Channel(READING, 0, "flow", ("x",), only=(Condition(TextMatch("tag", ("FT9",)), 1, 1),)),)
+    reports = Reports()
+    source = table(write(tmp_path, TAGS), channels=channels, report=reports)
+    assert source.read(0.0) is None
+    assert "column 'tag' is never 'FT9' in 5 rows, so flow has no values" in str(reports.texts)
+
+
+@pytest.mark.parametrize(
+    ("cells", "seconds"),
+    [
+        (["25.10.2020 01:00:00", "25.10.2020 01:00:00,25", "26.10.2020"], [0.0, 0.25, 82_800.0]),
+        (["10/25/2020 1:00:00 AM", "10/25/2020 1:00:00 PM"], [0.0, 43_200.0]),
+        (["25/10/2020 01:00", "01/11/2020 01:00"], [0.0, 7 * 86_400.0]),
+        (["25-Oct-2020 01:00:00.5"], [0.5]),
+        (["2020/10/25 01:00:00", "2020-10-25T03:00:00+02:00"], [0.0, 0.0]),
+    ],
+)
+def test_dates_are_recognised(cells, seconds):
+    """25 October 2020, 01:00 UTC is 1,603,587,600 s of Unix time (date -u +%s)."""
+    t, known = TimeReader(TimeColumn("t")).read(cells)
+    assert known.all() and ((t - 1_603_587_600 * 10**9) * 1e-9).tolist() == seconds
+
+
+def test_a_date_that_may_be_two_needs_a_format():
+    with pytest.raises(SourceError, match=r'"%d/%m/%Y %H:%M" or "%m/%d/%Y %H:%M"'):
+        TimeReader(TimeColumn("t")).read(["01/02/2020 10:00", "03/02/2020 10:00"])
+    t, known = TimeReader(TimeColumn("t", format="%m/%d/%Y")).read(["01/02/1970", "13/01/1970"])
+    assert known.tolist() == [True, False] and t[0] == 86_400 * 10**9
+
+
+@pytest.mark.parametrize(("unit", "day"), [("excel", 44_129.5), ("matlab", 738_089.5)])
+def test_serial_dates(unit, day):
+    """Noon of 25 October 2020: 44,129 days after 30 December 1899, datenum(2020, 10, 25) = 738,089."""
+    for cells in ([str(day)], pa.array([day])):
+        t, known = TimeReader(TimeColumn("t", unit)).read(cells)
+        assert known.all() and t.tolist() == [1_603_627_200 * 10**9]
+
+
+@pytest.mark.parametrize("kind", [list, pa.array])
+def test_local_times_go_on_when_the_clock_is_set_back(kind):
+    """On 25 October 2020 the hour from 02:00 came twice in Berlin, at UTC+2 and UTC+1."""
+    cells = [f"2020-10-25 {clock}:00" for clock in ("01:30", "02:30", "02:00", "02:30", "03:00")]
+    reader = TimeReader(TimeColumn("t", zone="Europe/Berlin"))
+    if kind is not list:
+        cells = pa.array(np.array(cells, "datetime64[ns]"))
+    t, known = reader.read(cells)
+    assert known.all() and (t // 10**9 - 1_603_582_200).tolist() == [0, 3600, 5400, 7200, 9000]
 
 
 def test_what_only_python_takes_for_a_number_is_none(tmp_path):
