@@ -88,7 +88,8 @@ def notices():
     found = set()
     for path in (ROOT / "app").rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_text())):
-            if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr == "report":
+            name = getattr(node, "func", None)
+            if isinstance(node, ast.Call) and "report" in (getattr(name, "attr", ""), getattr(name, "id", "")):
                 found |= {arg.value for arg in node.args[:1] if isinstance(arg, ast.Constant)}
     values = {}
     for path in (ROOT / "app/ingest.py", ROOT / "sources/source.py"):

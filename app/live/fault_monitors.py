@@ -68,7 +68,7 @@ class RootCause:
     def with_fault(self, episode: Episode) -> Episode:
         """Return the episode with the most likely fault in its text."""
         words = self.fault_behind(episode)
-        return episode._replace(text=f"{episode.text}; most likely off: {words}") if words else episode
+        return episode._replace(text=f"{episode.text}; most likely fault: {words}") if words else episode
 
     def primary(self, episode: Episode) -> Episode:
         """Return the open episode of the sensor that is most likely faulty in this one; this one if it is its own.
@@ -108,7 +108,7 @@ class RootCause:
             row = first.name if first.kind in (SENSOR, DRIFT) else ""
             self._found[episode.subject] = known._replace(words=words, row=row)
             if not known.words:
-                text = f"{episode.subject}: most likely off: {words}"
+                text = f"{episode.subject}: most likely fault: {words}"
                 self._notices.say(text, level="warn", t=int(taken.events.t[-1]))
 
 

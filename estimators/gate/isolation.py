@@ -258,23 +258,23 @@ def decision_text(
     wait: float, reopen: float, never_agreed: bool, added: np.ndarray,
 ) -> str:  # fmt: skip
     """Return one sentence with the rejections, the decision, its reason and its consequence."""
-    begun = f"{sensor}: {run} readings in a row refused {since}"
+    begun = f"{sensor}: {run} consecutive measurements rejected {since}"
     others = f"the other sensors, by exp({evidence.others:+.0f})"
     if outcome == AGREES:
         return f"{sensor}: passes the gate again"
     if outcome == ISOLATED:
         alone = evidence.own <= evidence.others
-        why = "its readings contradict one another" if alone else f"{others}, contradict it"
-        return f"{begun}; the sensor is wrong, {why}: it stays refused, asked again in {wait:g} s"
+        why = "its measurements contradict one another" if alone else f"{others}, contradict it"
+        return f"{begun}; the sensor is wrong, {why}: it stays rejected and is checked again in {wait:g} s"
     if outcome == DOUBTED:
-        return f"{begun}; it or the twin is wrong, without evidence which: it is believed {reopen:g} s after the first"
+        return f"{begun}; it or the twin is wrong, without evidence which: accepted {reopen:g} s after the first"
     most = np.argsort(-added, kind="stable")[:MAX_NAMED_STATES]
     units = {state.name: state.unit for state in model.shown_states}
     names = [model.state_names[j] for j in most if added[j] > 0.0]
     states = [f"{name} ± {added[j]:.3g} {units.get(name, '')}".rstrip() for name, j in zip(names, most, strict=False)]
-    wide = f"let in, widened by {', '.join(states)}" if states else "let in"
+    wide = f"accepted, widened by {', '.join(states)}" if states else "accepted"
     if outcome == REOPENED:
         return f"{begun}; the twin was wrong, {others}, agree with it: {wide}"
     if never_agreed:
-        return f"{begun}, from its first; nothing confirms where the twin began: {wide}"
-    return f"{begun}; no evidence for {reopen:g} s whether it or the twin is wrong: believed, {wide}"
+        return f"{begun}, from its first; no sensor confirms the prior: {wide}"
+    return f"{begun}; no evidence for {reopen:g} s whether it or the twin is wrong: {wide}"

@@ -132,24 +132,24 @@ class SensorFacts(EpisodeFacts):
             others = np.delete(observed, self.s, axis=0).any(axis=0)
             only = [model.state_names[int(j)] for j in np.flatnonzero(observed[self.s] & ~others)]
         if not only:
-            return "other sensors see the same states"
-        return f"{' and '.join(only[:4])} {'is' if len(only) == 1 else 'are'} measured by nothing else"
+            return "other sensors measure the same states"
+        return f"{' and '.join(only[:4])} {'is' if len(only) == 1 else 'are'} measured by no other sensor"
 
     @property
     def cross_check(self) -> str:
         """First step to find out whether the sensor or the twin is wrong."""
         if len(self.model.sensors) == 1:
-            return "look at the sensor, and Reset where that is right"
-        return f"hold {self.sensor} out to see whether the others agree"
+            return "check the sensor; if it is right, reset the twin"
+        return f"hold {self.sensor} out to see whether the other sensors agree"
 
     @property
     def dropout(self) -> str:
         """Description of a dropout."""
         if self.lasted is not None:
             if self.cause == "never heard":
-                return f"was heard for the first time after {self.lasted:.3g} s"
-            return f"was silent for {self.lasted:.3g} s {self.since}"
-        return "was never heard" if self.cause == "never heard" else f"is silent {self.since}"
+                return f"reported for the first time after {self.lasted:.3g} s"
+            return f"did not report for {self.lasted:.3g} s, {self.since}"
+        return "has never reported" if self.cause == "never heard" else f"has not reported {self.since}"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -172,17 +172,17 @@ class TwinFacts(EpisodeFacts):
         if not self.off:
             return ""
         names = ", ".join(self.off[:4]) + (", ..." if len(self.off) > 4 else "")
-        return f", and {names} {'contradict' if len(self.off) > 1 else 'contradicts'} it still"
+        return f", and {names} still {'contradict' if len(self.off) > 1 else 'contradicts'} it"
 
     @property
     def reset_advice(self) -> str:
-        """What to do before a reset: while a fault lasts, a reset starts from its measurements and believes them."""
+        """Step before a reset: while a fault lasts, a reset starts from its measurements."""
         if not self.off:
-            return "Reset starts again from the prior; then look at which sensor spoke first"
+            return "reset the twin to its prior, then check the sensor that was in alarm first"
         if self.sensors == 1:
-            return "look at the sensor, and Reset where that is right"
+            return "check the sensor; if it is right, reset the twin"
         first = "hold them out first, one by one," if len(self.off) > 1 else "hold it out first,"
-        return f"{first} and Reset when the rest agrees"
+        return f"{first} and reset the twin when the others agree"
 
 
 def return_text(cause: str, start: float) -> str:

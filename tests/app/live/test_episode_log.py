@@ -208,7 +208,7 @@ def test_a_refused_sensor_is_said_once_and_not_reading_by_reading(asset):
             told.append((known, any(text.startswith("winding: measurement rejected") for text in new)))
         watch(engine)
     assert refused > 3 and all(line != known for known, line in told)
-    assert sum("is refused by the gate" in text for text in said(engine)) == 1
+    assert sum("is rejected by the gate" in text for text in said(engine)) == 1
 
 
 def test_the_cause_is_that_of_a_sensor_that_is_lost_before_that_of_one_that_is_noisy():

@@ -163,9 +163,9 @@ def test_the_sensor_that_is_off_is_named_once_and_in_the_text(drive):
     cause.update(Job("test"))
     words = cause.fault_behind(yoke)
     assert words.startswith("sensor yoke +")
-    assert cause.with_fault(yoke).text == f"{yoke.text}; most likely off: {words}"
+    assert cause.with_fault(yoke).text == f"{yoke.text}; most likely fault: {words}"
     lines = [line.text for line in notices.since(0)]
-    assert lines == [f"yoke: most likely off: {words}"]
+    assert lines == [f"yoke: most likely fault: {words}"]
 
 
 def test_a_consequence_leads_to_the_sensor_that_is_behind_it(drive):

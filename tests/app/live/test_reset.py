@@ -62,10 +62,10 @@ def test_what_diverges_says_since_when_and_is_reset(name):
     assert status.health == DIVERGED and status.since == (first + 1) * SECOND
     assert f"diverged since {first:.1f} s" in status_html(status, SECOND)
     # What to do depends on what else is wrong, which the episode says.
-    remedy = "winding contradicts it still: look at the sensor, and Reset where that is right"
+    remedy = "winding still contradicts it: check the sensor; if it is right, reset the twin"
     assert status.cause.endswith(remedy) and remedy in status_html(status, SECOND)
     (line,) = [line for line in engine.notices.since(0) if "diverged" in line.text]
-    assert line.level == "error" and "Reset" in line.text and line.t == status.since
+    assert line.level == "error" and "reset the twin" in line.text and line.t == status.since
     stepped.submit(command_from_json({"command": "Reset"}, engine))
     stepped.put(readings(T[RESET_AT:], Y[RESET_AT:]))
     track, status = pull_all(engine).track, stepped.status()

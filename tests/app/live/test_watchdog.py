@@ -104,7 +104,8 @@ def test_a_run_whose_f_loops_says_so_and_ends_when_asked(name, estimator, loopin
     finally:
         child.process.kill()
     recorded = read_recording(path)
-    assert finished(path) and recorded.rows == 11
+    # Ten rows before the one that leads there; it is done too, unless it came in one batch with the next.
+    assert finished(path) and recorded.rows in (10, 11)
     assert any("has not returned" in text for _, _, text in recorded.notices)
 
 

@@ -165,7 +165,7 @@ def test_a_lost_filter_says_since_when_and_what_to_do(browser):
         engine.submit(Reset())
         page.get_by_text("tracking", exact=False).first.wait_for()
         assert engine.status().health == TRACKING
-        assert page.get_by_text("diverged since").count() == 0 and page.get_by_text("Reset where").count() == 0
+        assert page.get_by_text("diverged since").count() == 0 and page.get_by_text("reset the twin").count() == 0
     finally:
         context.close()
         view.stop()

@@ -84,61 +84,62 @@ SENSORS = {
         ("gauge", "σ", 0.4, 2.0),
         "reads 0.",
         "above the prediction since",
-        "the sensor, an input or a parameter; hold gauge out to see",
+        "the sensor, an input or a parameter is biased; hold gauge out to compare",
     ),
     "narrow": (
         {"gauge": lambda x, z, rng: x + 0.6 * z},
         ("gauge", "×", 1.8, 3.2),
         "bands of gauge are too narrow since",
-        "times as far as predicted; R.gauge too small, or it got noisier",
+        "times as large as predicted; increase R.gauge, or check the sensor for added noise",
     ),
     "wide": (
         {"gauge": lambda x, z, rng: x + 0.04 * z},
         ("gauge", "×", 0.1, 0.6),
         "bands of gauge are too wide since",
-        "times as far as predicted; R.gauge too large",
+        "times as large as predicted; reduce R.gauge",
     ),
     "correlated": (
         {"gauge": lambda x, z, rng: x + 0.2 * noise(rng, len(x), 0.7)[:, None]},
         ("gauge", "", 0.2, 0.8),
         "innovations of gauge are correlated (+0.",
-        "Q.level too small, or a missing state",
+        "increase Q.level, or add the missing state to the model",
     ),
     "alternating": (
         {"gauge": lambda x, z, rng: x + 0.2 * noise(rng, len(x), -0.7)[:, None]},
         ("gauge", "", -0.9, -0.4),
-        "innovations of gauge change sign (-0.",
-        "Q.level too large, so that the estimate follows the noise",
+        "innovations of gauge alternate in sign (-0.",
+        "reduce Q.level; the estimate follows the noise",
     ),
     "spiky": (
         {"gauge": spiked},
         ("gauge", "", 0.04, 0.09),
-        "gauge spikes since",
-        "% of its readings are outliers; set a gate, look at its wiring",
+        "gauge has spikes since",
+        "% of its measurements are outliers; set a gate, and check the wiring",
     ),
     "refused": (
         {"gauge": lambda x, z, rng: x + 5.0 + 0.2 * z, "gate": 0.9999},
         ("gauge", "", 0.99, 1.0),
-        "gauge is refused by the gate since",
-        "(100 % of its readings): the sensor is wrong, or the twin is; hold gauge out to see whether the others agree",
+        "gauge is rejected by the gate since",
+        "(100 % of its measurements): the sensor or the twin is wrong; hold gauge out to see whether the other sensors "
+        "agree",
     ),
     "stuck": (
         {"gauge": lambda x, z, rng: np.full_like(x, 0.125)},
         ("gauge", "m", 0.125, 0.125),
         "gauge is stuck at 0.125 m since",
-        "other sensors see the same states; hold it out until it is mended",
+        "other sensors measure the same states; hold it out until it is repaired",
     ),
     "disagreeing": (
         {"chain": lambda x, z, rng: x + 1.16 * z},
         ("chain", "×", 1.12, 1.2),
         "rows of chain contradict each other since",
-        "R.chain too small, or one of them is wrong",
+        "increase R.chain, or check which of them is wrong",
     ),
     "agreeing": (
         {"chain": lambda x, z, rng: x + 0.8 * z},
         ("chain", "×", 0.77, 0.83),
         "rows of chain are closer to the prediction than their noise since",
-        "R.chain too large",
+        "reduce R.chain",
     ),
 }
 FAR = 45
@@ -190,7 +191,7 @@ def test_silence():
     assert len(found) == 1
     assert (each.subject, each.start, each.end, each.unit) == ("gauge", BEGIN, END + 1.0, "s")
     assert each.size == END + 1 - BEGIN
-    said = f"gauge was silent for {END + 1 - BEGIN} s since {BEGIN}.0 s: other sensors see the same states; "
+    said = f"gauge did not report for {END + 1 - BEGIN} s, since {BEGIN}.0 s: other sensors measure the same states; "
     assert each.text == said + "check its wiring and its bus"
 
 
@@ -200,7 +201,7 @@ def test_a_sensor_that_should_speak_and_never_does():
     fold = advanced("kf", MODEL, as_log(kept), policy=POLICY, expected=np.array([1, 1]))
     (each,) = episodes(fold)
     assert (each.subject, each.cause, each.start, each.end) == ("gauge", "never heard", 1.0, None)
-    said = "gauge was never heard: other sensors see the same states; check its channel map and its bus"
+    said = "gauge has never reported: other sensors measure the same states; check its channel map and its bus"
     assert each.text == said
 
 
@@ -210,7 +211,7 @@ def test_a_twin_without_readings_is_stale():
     each = only(found, "stale")
     assert (each.subject, each.start, each.unit) == ("twin", BEGIN, "s")
     assert each.end == END + 1.0
-    said = f"no reading was used since {BEGIN}.0 s: the estimate is the model's alone; check the source"
+    said = f"no measurement was used since {BEGIN}.0 s: the estimate is a prediction of the model; check the source"
     assert each.text == said
 
 
@@ -223,7 +224,7 @@ def test_a_truth_that_is_missed():
     assert each.start == BEGIN + 1.0 and END <= each.end <= END + 10.0 * np.log((2.0 / std) ** 2 / 3.0**2) + 5.0
     assert each.low <= each.size <= each.high <= 3.0 / std
     assert each.text.startswith("level is ") and each.text.endswith(
-        "the estimate is wrong and its band does not show it; look at what else is in alarm"
+        "the estimate is wrong and its band does not show it; check the other alarms"
     )
 
 
@@ -234,8 +235,8 @@ def test_an_input_outside_its_range():
     assert (each.start, each.end, each.size, each.low, each.high) == (BEGIN + 1.0, END + 1.0, -1.5, -1.5, -1.5)
     assert each.unit == "m/s"
     assert each.text == (
-        f"feed is -1.5 m/s, outside -1 to 1 where the model was fitted, since {BEGIN + 1}.0 s: bands hold only inside; "
-        "use a model fitted there"
+        f"feed is -1.5 m/s, outside -1 to 1 where the model was fitted, since {BEGIN + 1}.0 s: bands are valid only inside; "
+        "fit the model there"
     )
     # The level sinks 1.5 m a second from about 0: beyond -20 after some 13 s.
     level = found["level", "outside"]
@@ -246,7 +247,7 @@ def test_a_gate_that_refuses_all_is_divergence():
     fault = {"gauge": lambda x, z, rng: x + 9.0, "chain": lambda x, z, rng: x + 9.0 + 0.1 * z, "gate": 0.9999}
     each = only(episodes(folded(**fault)), "diverged")
     assert each.subject == "twin" and BEGIN < each.start < BEGIN + 50 and each.end is not None
-    assert each.text.startswith("the estimate is lost since")
+    assert each.text.startswith("the estimate has diverged since")
 
 
 def test_an_impoverished_cloud():
@@ -259,7 +260,7 @@ def test_an_impoverished_cloud():
     t = judged.events.t * 1e-9
     assert (each.subject, each.cause, each.start, each.end) == ("twin", "impoverished", t[1000], t[2000])
     assert (each.low, each.size, each.high) == pytest.approx((1.05, 2.0, 2.95))
-    assert "2 particles count, and all descend from one particle" in each.text
+    assert "2 effective particles, all from one particle" in each.text
 
 
 # Runs of alarms
@@ -387,12 +388,12 @@ def test_a_reset_is_advised_only_when_no_sensor_is_off():
         part = judged._replace(events=judged.events.select(slice(0, n)), track=track.select(slice(0, n)))
         return only([item.episode for item in found_in(part)], "diverged").text
 
-    remedy = "and Reset when the rest agrees"
+    remedy = "and reset the twin when the others agree"
     assert text((GATED, GATED)).endswith(
-        f"and gauge, chain contradict it still: hold them out first, one by one, {remedy}"
+        f"and gauge, chain still contradict it: hold them out first, one by one, {remedy}"
     )
-    assert text((USED, GATED)).endswith(f"and chain contradicts it still: hold it out first, {remedy}")
-    assert text((USED, USED)).endswith("Reset starts again from the prior; then look at which sensor spoke first")
+    assert text((USED, GATED)).endswith(f"and chain still contradicts it: hold it out first, {remedy}")
+    assert text((USED, USED)).endswith("reset the twin to its prior, then check the sensor that was in alarm first")
 
 
 def test_a_sensor_that_moves_again_is_not_said_to_be_stuck_only():
