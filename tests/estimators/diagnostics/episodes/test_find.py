@@ -235,8 +235,8 @@ def test_an_input_outside_its_range():
     assert (each.start, each.end, each.size, each.low, each.high) == (BEGIN + 1.0, END + 1.0, -1.5, -1.5, -1.5)
     assert each.unit == "m/s"
     assert each.text == (
-        f"feed is -1.5 m/s, outside -1 to 1 where the model was fitted, since {BEGIN + 1}.0 s: bands are valid only inside; "
-        "fit the model there"
+        f"feed is -1.5 m/s, outside -1 to 1 where the model was fitted, since {BEGIN + 1}.0 s: bands are valid only "
+        "inside; fit the model there"
     )
     # The level sinks 1.5 m a second from about 0: beyond -20 after some 13 s.
     level = found["level", "outside"]
