@@ -262,7 +262,7 @@ class ConditionSection(RangeSection):
     """A range of values, its ends included, or texts of which a column must hold one."""
 
     text: Texts | None = None
-    """Text, or a list of texts. Default: null, numbers."""
+    """Text, or a list of texts. Default: null, the column holds numbers."""
 
 
 def _condition(value: Any) -> Any:

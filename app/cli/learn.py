@@ -89,7 +89,7 @@ def learn_correction(arguments: Arguments) -> int:
     own_noise, _ = noises_of(physics, trained, corrects)
 
     def text(net: Path | None, scores: Mapping[str, float] | None = None) -> str:
-        on = arguments.log or (f"{twin.name}, its own log",)
+        on = arguments.log or (f"{twin.name} (log of its YAML)",)
         return correction_text(twin, physics, trained, corrects, features, learned_on=on, net=net, scores=scores)
 
     with tempfile.TemporaryDirectory(prefix="nisus-") as folder:

@@ -131,7 +131,9 @@ def tune_windows(arguments: Arguments, wanted: Sequence[str], windows: str) -> i
     window = _seconds("--windows", windows)
     every = window if arguments.every is None else _seconds("--every", arguments.every)
     if arguments.aim not in (None, LIKELIHOOD):
-        raise ConfigError(f"--aim {arguments.aim}: windows are fitted by their likelihood; leave it out")
+        raise ConfigError(
+            f"--aim {arguments.aim}: cannot be used with --windows, which are fitted by likelihood; omit it"
+        )
     twin, given = _recordings(arguments)
     if any(item.weight != 1.0 for item in given):
         raise ConfigError("--log: with --windows each recording follows the one before; leave the weights out")

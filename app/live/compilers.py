@@ -20,7 +20,7 @@ MAX_COMPILERS = min(3, max(2, os.cpu_count() or 1))
 """Processes at most that compile what is asked for; more find no more pieces to compile at once."""
 
 COMPILE_TIMEOUT_S = 600.0
-"""Seconds after which a compiler is taken to hang."""
+"""Seconds after which a compiler counts as hung."""
 
 
 def first_compilers() -> list[Compiler]:

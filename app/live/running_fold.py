@@ -266,7 +266,7 @@ class Running(ABC):
 
     @abstractmethod
     def status(self) -> Status:
-        """Return the status, computed at most ten times a second; while the fold is at work, mostly the last one."""
+        """Return the status, computed at most ten times per second; during a refold usually the previous one."""
 
     @abstractmethod
     def episodes(self) -> list[Episode]:

@@ -92,7 +92,7 @@ def _posterior(checked: Checked) -> Answer:
     elif gate is None:
         remedy = "heavy tails need a gate, not particles: set gate: 0.99999"
     else:
-        remedy = "heavy tails: the gate takes the worst of them"
+        remedy = "heavy tails: the gate rejects the largest outliers"
     return PARTLY, figures, remedy
 
 

@@ -95,7 +95,7 @@ class ShownApplication:
         self.replaced = asyncio.Event()
         """Set in the server's thread when another application has taken its place."""
         self.disconnected = threading.Event()
-        """Set once it has no connection left either."""
+        """Set when the replaced application has no open connection left."""
         self._open = 0
 
     async def stream(self, scope: Scope, receive: Receive, send: Send) -> None:

@@ -45,7 +45,7 @@ MAX_ERROR = 5.0
 
 
 def correlation_time(values: np.ndarray) -> float:
-    """Return τ of a series (n,), at least 1: the number of values that carry the information of an independent one."""
+    """Return the autocorrelation time τ ≥ 1 of a series (n,): correlated values per independent value."""
     n = values.size
     if not n:
         return 1.0

@@ -96,7 +96,7 @@ def _marked(code: CodeType, mark: str) -> CodeType:
 
 
 def run_file(name: str, path: Path) -> ModuleType:
-    """Run a Python file as the module `name`, with its folder importable; files imported from there are run again.
+    """Run a Python file as the module `name`, with its folder importable; modules imported from there are reloaded.
 
     Numba caches machine code by a function's file and name, which do not change if an imported constant does. So a
     digest of the imported files becomes part of the functions' names.

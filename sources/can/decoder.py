@@ -293,7 +293,7 @@ def _nearest_match(item: Expected, seen: FrameCounts) -> str:
         return f"its id was received on bus {_list(other)}; check the DBC's channel"
     if any(key == item.key ^ EXTENDED for _, key in seen):
         kind = "standard" if item.key & EXTENDED else "extended"
-        return f"its id was received as {kind} one, {shown_id(item.key ^ EXTENDED)}; check the id in the DBC"
+        return f"its id was received as a {kind} one, {shown_id(item.key ^ EXTENDED)}; check the id in the DBC"
     ids = {key for _, key in seen}
     near = sorted(ids, key=lambda key: (abs(key - item.key), key))[:MAX_NAMED_IDS]
     there = f"there are {len(ids)} ids" if len(ids) > 1 else "there is one id"

@@ -151,7 +151,7 @@ class Faults:
 
     @property
     def can_change(self) -> bool:
-        """Whether the source is an asset whose true parameters can be changed."""
+        """Whether the source simulates an asset, so that parameter faults are possible."""
         return self._asset is not None
 
     def attach(self, source: object) -> None:

@@ -53,7 +53,7 @@ STATEMENTS = {
     ("linear", NO): "f or h is not linear",
     ("linear", UNTOLD): "whether f and h are linear could not be measured",
     ("steady", YES): "time-invariant, with regular measurements",
-    ("steady", NO): "one fixed gain does not suffice",
+    ("steady", NO): "the gain varies with time; a steady-state filter is not enough",
     ("steady", UNTOLD): "whether one gain suffices could not be measured",
     ("peaks", YES): "the posterior has several peaks",
     ("peaks", NO): "the posterior has one peak",

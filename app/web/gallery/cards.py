@@ -25,7 +25,7 @@ def picture_file(twin: Path) -> Path:
 
 
 KINDS = {"simulator": "simulated", "can": "CAN bus", "can_log": "recorded", "table": "recorded", "merged": "recorded"}
-"""Names of source types on a card."""
+"""Names of source types on a card; any other type is recorded."""
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ def _read(name: str, stamp: Stamp) -> tuple[Card, Loaded]:
         title=twin.title,
         question=config.question,
         teaches=config.teaches,
-        source=KINDS[config.source.type],
+        source=KINDS.get(config.source.type, "recorded"),
         states=twin.model.nx,
         rows=len(twin.model.row_names),
         estimator=twin.estimator,

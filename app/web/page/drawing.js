@@ -24,7 +24,7 @@ export function lightPalette() {
     for (const rule of sheet.cssRules)
       if (rule.selectorText === ":root" && rule.style.getPropertyValue("--estimate"))
         return new Map([...rule.style].filter((name) => name.startsWith("--")).map((name) => [name, rule.style.getPropertyValue(name).trim()]));
-  throw new Error("the page has no style");
+  throw new Error("the style sheet of the page was not loaded; reload the page");
 }
 
 // The context of a plot in which nothing leaves its frame, until it is restored.

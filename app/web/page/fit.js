@@ -257,7 +257,7 @@ export class Refit {
     const busy = fits[0]?.state === "fitting";
     setText(this.said, busy ? "fitting …" : due ? `next at ${at(due)}` : "");
     this.begin.disabled = busy;
-    const rule = section.adopt === "by hand" ? "what is better waits here for you" : "what is better is adopted, and said";
+    const rule = section.adopt === "by hand" ? "what is better waits here for you" : "a better fit is adopted and listed among the events";
     setText(this.about, `${section.entries.map(words).join(", ")}: fitted every ${span(section.every)} on the last ${span(section.window)}; ${rule}.`);
     const proposed = fits.find((fit) => fit.state === "proposed");
     const held = this.offer.contains(document.activeElement);

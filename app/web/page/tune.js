@@ -108,7 +108,7 @@ export class Tune {
     this.gate = element("select", { "aria-label": "Gate", title: "Probability that a good measurement passes", onchange: choose });
     this.kind = element(
       "select", { "aria-label": "Kind of gate", title: "Treatment of a measurement beyond the gate", onchange: () => this.turn("gate.kind", this.kind.value) },
-      element("option", { value: "hard" }, "refuse"), element("option", { value: "soft" }, "soften"),
+      element("option", { value: "hard" }, "reject"), element("option", { value: "soft" }, "soften"),
     );
     return section("Gate", "Readings that a good sensor would hardly give", true, element("div", { class: "pair" }, this.gate, this.kind));
   }

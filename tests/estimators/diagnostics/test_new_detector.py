@@ -13,10 +13,10 @@ ROOT = Path(__file__).parents[3]
 
 ROW = '''
     Detector(
-        "skewed",
-        "innovations of {0.name} are skewed {0.since}",
+        "rectified",
+        "innovations of {0.name} are rectified {0.since}",
         "look for a clipped or rectified signal at {0.sensor}",
-        alarms={"skewed": (Density(lambda e: np.log1p(np.clip(0.25 * (e**3 - 3.0 * e), -0.9, 4.0))),)},
+        alarms={"rectified": (Density(lambda e: np.log1p(np.clip(0.25 * (e**3 - 3.0 * e), -0.9, 4.0))),)},
         severity=3,
     ),
 )
@@ -58,11 +58,11 @@ leading = summary.leading({"gauge": state})
 about = dict(episodes=found, events=judged.events, track=judged.track, tuning=fold.tuning)
 print(json.dumps({
     "report": [list(row) for row in episode_topic(SimpleNamespace(**about)).rows],
-    "rows": int(np.sum(fold.track.alarms[:, 0] >> ALARM_NAMES.index("skewed") & 1)),
+    "rows": int(np.sum(fold.track.alarms[:, 0] >> ALARM_NAMES.index("rectified") & 1)),
     "episodes": [item._asdict() for item in found],
     "live": [item._asdict() for item in tracker.episodes],
     "state": state, "leading": leading.text, "sensor": summary.of_sensors(["gauge"], [state])["gauge"],
-    "help": detector_of("skewed").anchor, "json": episodes_json(SimpleNamespace(episodes=lambda: found)),
+    "help": detector_of("rectified").anchor, "json": episodes_json(SimpleNamespace(episodes=lambda: found)),
 }))
 """
 
@@ -87,25 +87,25 @@ def told(tmp_path_factory):
 
 
 def test_its_alarm_is_an_episode_of_its_own_with_its_own_numbers(told):
-    (episode,) = [item for item in told["episodes"] if item["cause"] == "skewed"]
+    (episode,) = [item for item in told["episodes"] if item["cause"] == "rectified"]
     assert told["rows"] > 1000 and abs(episode["start"] - 3000.0) < 200.0 and episode["end"] is None
     # Mean log Λ of the row's own test, with its interval.
     assert episode["unit"] == "nats" and 0.0 < episode["low"] < episode["size"] < episode["high"]
-    assert "skewed since" in episode["text"] and "rectified signal at gauge" in episode["text"]
+    assert "rectified since" in episode["text"] and "rectified signal at gauge" in episode["text"]
 
 
 def test_status_names_it_and_a_running_twin_finds_the_same(told):
-    (episode,) = [item for item in told["live"] if item["cause"] == "skewed"]
-    (once,) = [item for item in told["episodes"] if item["cause"] == "skewed"]
+    (episode,) = [item for item in told["live"] if item["cause"] == "rectified"]
+    (once,) = [item for item in told["episodes"] if item["cause"] == "rectified"]
     assert (episode["start"], episode["end"], episode["text"]) == (once["start"], None, once["text"])
     assert told["state"] == "suspect" and told["leading"] == once["text"] == told["sensor"][1]
 
 
 def test_the_report_has_its_cause_and_remedy(told):
-    (row,) = [row for row in told["report"] if "skewed" in row]
+    (row,) = [row for row in told["report"] if "rectified" in row]
     assert any("rectified signal" in cell for cell in row)
 
 
 def test_the_page_links_to_its_heading(told):
-    (help_link,) = {item["help"] for item in told["json"] if item["cause"] == "skewed"}
-    assert told["help"] == "skewed" and help_link.endswith("#skewed")
+    (help_link,) = {item["help"] for item in told["json"] if item["cause"] == "rectified"}
+    assert told["help"] == "rectified" and help_link.endswith("#rectified")
