@@ -341,6 +341,7 @@ def read_isolated(
 def _read(function: Callable[..., Iterator[Any]], path: Path, args: tuple[Any, ...]) -> Iterator[Any]:
     """In the worker: read a file with limited memory."""
     limit = memory_limit(path)
+    os.environ["ARROW_DEFAULT_MEMORY_POOL"] = "system"  # mimalloc would map 1 GiB at its first allocation
     _limit_memory(limit)
     try:
         yield from function(path, *args)

@@ -46,8 +46,14 @@ def _guard(function: Callable[..., Any]) -> Callable[..., Any]:
     return guarded
 
 
+OWN_PACKAGES = tuple(Path(__file__).resolve().parents[2] / name for name in ("estimators", "sources", "config", "app"))
+
+
 def imported_beside(path: Path) -> tuple[Path, ...]:
-    """Return the files in or below a Python file's folder that it imports, directly or indirectly, by name."""
+    """Return the files in or below a Python file's folder that it imports, directly or indirectly, by name.
+
+    Nisus itself is none of them: beside a model in the root of a checkout stand its packages.
+    """
     path, found = path.resolve(), set[Path]()
     waiting = [path]
     while waiting:
@@ -60,7 +66,8 @@ def imported_beside(path: Path) -> tuple[Path, ...]:
             place = base.joinpath(*name.split("."))
             packages = [base.joinpath(*name.split(".")[:k], "__init__.py") for k in range(1, name.count(".") + 2)]
             for item in (place.with_suffix(".py"), *packages):
-                if item.is_file() and item != path and item not in found:
+                own = any(item.is_relative_to(folder) for folder in OWN_PACKAGES)
+                if item.is_file() and item != path and item not in found and not own:
                     found.add(item)
                     waiting.append(item)
     return tuple(sorted(found))

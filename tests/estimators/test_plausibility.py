@@ -364,4 +364,4 @@ def test_a_sensor_whose_readings_all_break_their_limits_is_an_episode_of_its_own
     found = folded("kf", walk, log)
     each = next(episode for episode in episodes(found) if episode.cause == "screened")
     assert (each.start, each.end, each.size) == (400.0, None, 1.0)
-    assert "(range)" in each.text and "100 % of its readings are not used" in each.text
+    assert "(range)" in each.text and "100 % of its measurements are not used" in each.text

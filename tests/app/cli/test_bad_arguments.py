@@ -56,7 +56,7 @@ REFUSED = {
     f"{TUNE} --windows 0": "--windows 0: must be positive",
     f"{TUNE} --windows 60 --every -1": "--every -1: must be positive",
     f"{TUNE} --every 60": "--every: is the time between the ends of two --windows; give both",
-    f"{TUNE} --windows 60 --aim crps": "--aim crps: windows are fitted by their likelihood",
+    f"{TUNE} --windows 60 --aim crps": "--aim crps: cannot be used with --windows, which are fitted by likelihood",
     f"{TUNE} --windows 60 --fit R.wnding": "R.wnding is no entry that can be fitted; did you mean R.winding",
     "advise motor_winding --dbc car.dbc": "--dbc and --signals are for recordings",
     "advise motor_winding motor_can": "one twin at a time",

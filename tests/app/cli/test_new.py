@@ -1,16 +1,20 @@
 """`nisus new`: a pair of files that runs, and what it refuses."""
 
+import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.stats import chi2
 
+import estimators
 from app.cli.new import write_twin
 from app.twin.twin import load_twin
 from estimators.errors import ConfigError
 from estimators.fold import fold
 from estimators.log import READING, truth_of
+from estimators.model.state_space import StateSpaceModel
+from estimators.model.user_file import imported_beside, run_file
 from estimators.track import USED
 from tests.support import as_log, read_all
 
@@ -25,6 +29,19 @@ def test_the_pair_that_new_writes_loads_as_it_stands(tmp_path: Path) -> None:
     np.testing.assert_allclose(twin.tuning.r, [1e-4, 2.5e-7])
     np.testing.assert_allclose(twin.tuning.p, [0.5, 0.02])
     assert sorted(path.name for path in tmp_path.iterdir()) == ["my-pump.py", "my-pump.yaml"], "no leftovers"
+
+
+def test_a_twin_in_the_root_of_a_checkout_loads(tmp_path: Path) -> None:
+    """As the guide of the first hour has it: the packages of Nisus beside the model are not the user's files."""
+    _, written = write_twin("my-pump", tmp_path)
+    place = Path(estimators.__file__).resolve().parents[1] / "model_in_the_root.py"
+    try:
+        shutil.copy(written, place)
+        assert imported_beside(place) == ()
+        module = run_file("model_in_the_root", place)
+        assert any(isinstance(item, StateSpaceModel) for item in vars(module).values())
+    finally:
+        place.unlink()
 
 
 def refused(name: str, folder: Path) -> str:
