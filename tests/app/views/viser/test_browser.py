@@ -161,7 +161,7 @@ def test_a_lost_filter_says_since_when_and_what_to_do(browser):
         page.goto(f"http://127.0.0.1:{view.port}/")
         # The 26th refused reading is more than half of the last fifty.
         page.get_by_text(f"diverged since {JUMP + 25}.0 s").wait_for()
-        page.get_by_text("winding contradicts it still: look at the sensor, and Reset").wait_for()
+        page.get_by_text("winding still contradicts it: check the sensor; if it is right, reset the twin").wait_for()
         engine.submit(Reset())
         page.get_by_text("tracking", exact=False).first.wait_for()
         assert engine.status().health == TRACKING
