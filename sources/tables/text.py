@@ -181,22 +181,6 @@ def column_of(name: str | TextMatch) -> str:
     return name.column if isinstance(name, TextMatch) else name
 
 
-def fill(
-    name: str | TextMatch,
-    cells: list[str],
-    lines: list[int],
-    values: np.ndarray,
-    blank: np.ndarray,
-    problem: Problem,
-    decimal: str = ".",
-) -> None:
-    """Fill a column of values, and its mask of blank ones, from text."""
-    if isinstance(name, TextMatch):
-        values[:] = [cell.strip() in name.texts for cell in cells]
-    else:
-        parse_numbers(cells, name, lines, values, blank, problem, decimal)
-
-
 def _number(cell: str) -> float:
     """Return a cell as a number; `1_000` is one in Python only.
 
@@ -208,9 +192,9 @@ def _number(cell: str) -> float:
     return float(cell)
 
 
-def parse_numbers(
+def fill(
+    name: str | TextMatch,
     cells: list[str],
-    name: str,
     lines: list[int],
     values: np.ndarray,
     blank: np.ndarray,
@@ -218,6 +202,9 @@ def parse_numbers(
     decimal: str = ".",
 ) -> None:
     """Fill a column of values, and its mask of blank ones, from text; with a decimal comma, a point is an error."""
+    if isinstance(name, TextMatch):
+        values[:] = [cell.strip() in name.texts for cell in cells]
+        return
     texts = cells
     if decimal == ",":
         texts = [_with_point(cell) or ("?" if "." in cell else cell) for cell in cells]

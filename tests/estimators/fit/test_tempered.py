@@ -52,6 +52,12 @@ def test_a_model_that_is_right_is_believed():
     assert found.proposed and found.power >= POWERS[3]
 
 
+def test_what_is_not_proposed_is_told_of_the_whole_likelihood():
+    right = Tuning.of(MODEL).set("Q.level", 0.2).set("R.float", 0.5)
+    found = fit("kf", right, [Recording(log_of(simulated(0, 300)))])
+    assert not found.proposed and found.power == 1.0 and found.verdict.reasons
+
+
 @pytest.mark.parametrize("gained, said", [(1e-4, "negligible gain: 0.02 nats in total"), (0.1, None)])
 def test_a_little_of_a_gain_is_none(gained, said):
     """A small enough step towards what is better is surely better, and worth nothing: it is not proposed."""

@@ -11,7 +11,7 @@ from scipy.stats import chi2
 from estimators import MODELS, Log, fold, fold_many, mean_nees
 from estimators.errors import EventError, NisusError
 from estimators.fold import fold as fold_track
-from estimators.log import INPUT, READING, TRUTH, Events
+from estimators.log import INPUT, READING, TICK, TRUTH, Events
 from estimators.track import HELD_OUT, USED
 from estimators.tuning import Tuning
 from tests.support import SECOND, assert_same, folded
@@ -292,3 +292,10 @@ except AttributeError as error:
     assert "nothing" in str(error)
 """
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_ticks_are_asked_by_seconds():
+    log = Log.of(MOTOR, start=0.0)
+    log.add_ticks(np.arange(3.0))
+    track = fold("kf", MOTOR, log)
+    assert log.events.kind.tolist() == [TICK] * 3 and np.all(np.diff(track.std[:, 0]) > 0)
