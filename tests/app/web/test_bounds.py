@@ -198,6 +198,21 @@ def seekable(serve, tmp_path, monkeypatch):
     page.engine.recorder = None
 
 
+@pytest.mark.parametrize(
+    "path, says",
+    [
+        ("x" * 300 + ".rrd", "255"),
+        ("é" * 130 + ".rrd", "255"),
+        ("\ud800.rrd", "path"),
+        ("a\0b.rrd", "path"),
+        ("a\nb.rrd", "path"),
+    ],
+)
+def test_a_name_that_no_file_can_have_is_refused(seekable, path, says):
+    answer = seekable.client.post("/api/command", {"command": "Record", "path": path})
+    assert answer.status == 400 and says in said(answer)
+
+
 def test_no_command_is_answered_by_a_failure_of_ours(seekable):
     draw = random.Random(9)
     asked = [{"command": value} for value in NASTY] + [value for value in NASTY]

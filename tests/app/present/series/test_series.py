@@ -308,6 +308,20 @@ def test_few_points_of_a_pinned_run_that_goes_on_have_its_extremes(stepped):
     assert len(points) < 300 and np.nanmax(points) == pytest.approx(mean(FIRST, N + 300).max(), abs=2e-5)
 
 
+@pytest.mark.parametrize("run", ["0", "difference:0"])
+def test_a_pinned_run_is_folded_only_while_measurements_come_and_somebody_looks(stepped, monkeypatch, run):
+    engine, jobs = stepped.engine, []
+    begin = engine.jobs.run
+    monkeypatch.setattr(engine.jobs, "run", lambda *given, **options: jobs.append(begin(*given, **options)) or jobs[-1])
+    viewer = Viewer(Series(engine), MEAN, run=run, points=2000)
+    assert viewer.until(engine, lambda viewer: len(viewer.x)).size == N and not jobs
+    go_on(stepped, N + 10)
+    viewer.until(engine, lambda viewer: len(viewer.x) == N + 10)
+    assert [job.cancelled for job in jobs] == [False]
+    viewer.series.close(viewer.stream)
+    assert [job.cancelled for job in jobs] == [True] and not viewer.series.runs
+
+
 def caught_up(engine, pinned):
     """Let the fold of a pinned run take all events, and compare them with the engine's."""
     for _ in range(20):
