@@ -16,7 +16,7 @@ from .companion_schema import TuningSection, VersionSection
 from .problems import check_section
 from .yaml_files import Key, ValuePlaces, read_text, shown_path
 
-OWN = "own"  # Name of the values in the twin's own file
+OWN_VALUES = "own"  # Name of the values in the twin's own file
 
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,59}")
 
@@ -79,13 +79,13 @@ def find_version(twin: Path, reference: str) -> Version | None:
     Raises:
         ConfigError: If there is none, or its file is wrong.
     """
-    if reference == OWN:
+    if reference == OWN_VALUES:
         return None
     if os.sep in reference or reference.endswith((".yaml", ".yml")):
         return load_version(Path(reference).expanduser())
     files = version_files(twin)
     if reference not in files:
-        near = nearest(reference, [OWN, *files]).rstrip("?")
+        near = nearest(reference, [OWN_VALUES, *files]).rstrip("?")
         raise ConfigError(
             f"--tuning {reference}: {twin.stem} has no such version; {near}; see `nisus tunings {named(twin)}`"
         )
@@ -121,10 +121,10 @@ def check_name(name: str) -> str:
     Raises:
         ConfigError: If it is none.
     """
-    if not NAME.fullmatch(name) or name == OWN or name.endswith((".yaml", ".yml")):
+    if not NAME.fullmatch(name) or name == OWN_VALUES or name.endswith((".yaml", ".yml")):
         raise ConfigError(
             f"the version's name is {name!r}; use letters, digits, _, - and ., 60 at most, begin with a letter or "
-            f"digit, and neither `{OWN}` nor an ending"
+            f"digit, and neither `{OWN_VALUES}` nor an ending"
         )
     return name
 

@@ -22,7 +22,7 @@ class TwinOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class SetOption:
+class SettingsOption:
     """Option of a command that changes settings of a twin."""
 
     set: Repeated = ()
@@ -30,7 +30,7 @@ class SetOption:
 
 
 @dataclass(frozen=True, kw_only=True)
-class EstimatorOption(SetOption):
+class EstimatorOption(SettingsOption):
     """Option of a command that runs one estimator."""
 
     estimator: str | None = None
@@ -38,7 +38,7 @@ class EstimatorOption(SetOption):
 
 
 @dataclass(frozen=True, kw_only=True)
-class TuningOption(SetOption):
+class TuningOption(SettingsOption):
     """Option of a command that starts from a tuning version."""
 
     tuning: str | None = None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from config.tunings import OWN
+from config.tunings import OWN_VALUES
 from config.yaml_files import shown_path
 from estimators.diagnostics.score import score
 from estimators.errors import ConfigError, printable
@@ -52,7 +52,7 @@ def _save(arguments: Arguments, name: str) -> None:
 def _accept(arguments: Arguments, name: str) -> None:
     twin = load_twin(arguments.twin, overrides={"tuning": name})
     if twin.version is None:
-        raise ConfigError(f"--accept {OWN}: the twin's own file applies until a version is accepted")
+        raise ConfigError(f"--accept {OWN_VALUES}: the twin's own file applies until a version is accepted")
     accept(twin.version, printable(arguments.note))
     print(f"{shown_path(twin.version.path)}: accepted")
 
@@ -91,7 +91,7 @@ def _mean_coverage(scores: dict[str, float]) -> float | None:
 
 
 def _note(item: dict[str, Any]) -> str:
-    if item["name"] == OWN:
+    if item["name"] == OWN_VALUES:
         return "the twin's file"
     accepted = item["accepted"]
     notes = [item["note"], f"accepted: {accepted['note']}" if accepted and accepted["note"] else ""]

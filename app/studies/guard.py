@@ -18,7 +18,7 @@ import numpy as np
 from config.companion_schema import AcceptedSection, FigureSection, ReferenceSection
 from config.loader import find, shipped
 from config.source_schema import SimulatorSection
-from config.tunings import OWN, Version, accepted_version, folders, named, ships
+from config.tunings import OWN_VALUES, Version, accepted_version, folders, named, ships
 from config.yaml_files import shown_path
 from estimators.errors import ConfigError, NisusError, SourceError, printable
 from estimators.fold import Fold
@@ -195,7 +195,7 @@ def _folder_option(recording: Path) -> str:
 def twin_of(guarded: GuardedLog, overrides: dict[str, str] | None = None) -> Twin:
     """Return the twin with its accepted version; if the twin of a recording is gone, as recorded."""
     version = guarded.version
-    given = {**(overrides or {}), "tuning": OWN if version is None else str(version.path)}
+    given = {**(overrides or {}), "tuning": OWN_VALUES if version is None else str(version.path)}
     if guarded.recording is None:
         return load_twin(guarded.twin, overrides=given)
     recorded = read_recording(guarded.recording)

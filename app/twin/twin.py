@@ -16,7 +16,7 @@ from config.companion_schema import TuningSection
 from config.loader import Loaded, load, load_text
 from config.schema import TwinSection
 from config.source_schema import AssetSection
-from config.tunings import OWN, Version, find_version
+from config.tunings import OWN_VALUES, Version, find_version
 from config.yaml_files import parse
 from estimators.diagnostics.episodes.baseline import baseline_of, lost_from
 from estimators.diagnostics.health import HealthPolicy
@@ -46,7 +46,7 @@ class Twin:
     """A configured model, the first tuning, and the plan of its source.
 
     `pairs` (k, 2) holds the indices of the states whose ellipses are drawn. `overrides` are the command line's
-    changes to the YAML, which `text` holds as it was read. `recorded` says that tuning and estimator are a recording's.
+    changes to the YAML, which `text` holds as it was read. `recorded`: tuning and estimator come from a recording.
     """
 
     loaded: Loaded
@@ -262,7 +262,7 @@ def _assemble(loaded: Loaded, overrides: Mapping[str, str], log_files: Sequence[
     turned = {key: value for key, value in overrides.items() if key not in _of_yaml(overrides) and key != VERSION}
     for key, value in turned.items():
         tuning = _set(tuning, key, value)
-    name = OWN if loaded.version is None else loaded.version.name
+    name = OWN_VALUES if loaded.version is None else loaded.version.name
     changed = bool(turned) or any(key.split(".")[0] in TuningSection.model_fields for key in overrides)
     tuning = replace(tuning, name=name + (CHANGED_MARK if changed else ""))
     check_refit(loaded, first.name, tuning)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from config.companion_schema import AcceptedSection, EvidenceSection, MovedSection, VersionSection
-from config.tunings import OWN, Version, check_name, folders, load_version, version_files, version_of
+from config.tunings import OWN_VALUES, Version, check_name, folders, load_version, version_files, version_of
 from config.yaml_files import as_section, shown_path, writing
 from estimators.diagnostics.score import Score
 from estimators.errors import LARGEST, ConfigError
@@ -87,7 +87,9 @@ def listing(twin: Twin) -> list[dict[str, Any]]:
     versions.sort(key=lambda version: (version.head.saved, version.name))
     accepted = max((v.head.accepted.at for v in versions if v.head.accepted is not None), default=None)
     own = twin.loaded.without or twin.loaded
-    found: list[dict[str, Any]] = [{"name": OWN, "estimator": own.config.estimator.name, "holds": accepted is None}]
+    found: list[dict[str, Any]] = [
+        {"name": OWN_VALUES, "estimator": own.config.estimator.name, "holds": accepted is None}
+    ]
     for version in versions:
         estimator = version.section.estimator or own.config.estimator
         holds = version.head.accepted is not None and version.head.accepted.at == accepted

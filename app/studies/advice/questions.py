@@ -201,7 +201,7 @@ def sweep(measured: Measured, estimator: str) -> tuple[list[Claim], dict[str, fl
     options: dict[str, float] = {"members": MEMBERS[1]}
     claims = []
     if radii := _radii(measured, estimator):
-        claims.append(_best(measured, estimator, options, "radius", radii, "What is the localisation radius?"))
+        claims.append(_best(measured, estimator, options, "radius", radii, "Which localisation radius suits?"))
     if any(option.name == "inflation" for option in find_entry(estimator).options):
         question = "How much inflation does it need?"
         claims.append(_best(measured, estimator, options, "inflation", INFLATIONS, question))

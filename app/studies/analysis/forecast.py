@@ -24,7 +24,7 @@ DEFAULT_STEP_S = 1.0  # step after a single measurement
 SHARES = (0.1, 0.5, 0.9)  # probabilities of crossing a limit whose times are returned
 
 
-class Question(NamedTuple):
+class ForecastQuestion(NamedTuple):
     """Horizon (s), changes by input, and limits by state in its unit.
 
     The inputs in `repeated` repeat their values of the last seconds, as long as the horizon.
@@ -36,7 +36,7 @@ class Question(NamedTuple):
     repeated: tuple[str, ...] = ()
 
 
-def question_from_json(body: Any, model: StateSpaceModel) -> Question:
+def question_from_json(body: Any, model: StateSpaceModel) -> ForecastQuestion:
     """Parse `{"horizon": s, "inputs": {name: value | [[t, value], ...] | "repeat"}, "limits": {state: value}}`.
 
     Raises:
@@ -52,7 +52,7 @@ def question_from_json(body: Any, model: StateSpaceModel) -> Question:
     inputs = {name: _changes(f"inputs.{name}", value, horizon) for name, value in given.items() if name not in repeated}
     shown = [state.name for state in model.shown_states]
     limits = _named("limits", body.get("limits", {}), shown)
-    return Question(
+    return ForecastQuestion(
         horizon, inputs, {name: _number(f"limits.{name}", value) for name, value in limits.items()}, repeated
     )
 
@@ -78,7 +78,7 @@ class Forecasts:
             raise ConfigError("forecast: no reading has come yet, so there is no estimate to go on from")
         return here
 
-    def ask(self, question: Question) -> dict[str, Any]:
+    def ask(self, question: ForecastQuestion) -> dict[str, Any]:
         """Return the forecast, see `forecast_json`.
 
         Raises:

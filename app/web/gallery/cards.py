@@ -1,4 +1,4 @@
-"""Cards of the gallery: what each twin is, and where its picture is kept."""
+"""Cards of the gallery: title, source, error and picture of each twin."""
 
 from __future__ import annotations
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Protocol
 
 from config.loader import shipped, shown_path
-from config.tunings import OWN
+from config.tunings import OWN_VALUES
 from estimators.errors import ConfigError, NisusError, nearest, quoted
 
 from ...live.changes import obstacle
@@ -216,8 +216,8 @@ class SavedFiles:
         try:
             twin = again()
             self._watch(twin.files)
-            chosen = engine.twin.overrides.get(VERSION, OWN)
-            if chosen != twin.overrides.get(VERSION, OWN):
+            chosen = engine.twin.overrides.get(VERSION, OWN_VALUES)
+            if chosen != twin.overrides.get(VERSION, OWN_VALUES):
                 # Loaded on the page.
                 twin = with_version(twin, chosen)
             reason = obstacle(engine.twin, twin)
