@@ -14,6 +14,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import numba
 from numba import config
 from numba.core import caching
 
@@ -49,56 +50,51 @@ class ContentLocator(caching._SourceFileBackedLocatorMixin, caching._CacheLocato
         return self._stamp
 
 
-class VerifiedCacheFile(caching.IndexDataCacheFile):  # type: ignore[misc]
-    """Numba's index and data files, with a checksum before each."""
+class EntryFiles(caching.IndexDataCacheFile):  # type: ignore[misc]
+    """One file per entry, named by a digest of its key, which it holds too: a checksum, then the key and the code.
 
-    def _read(self, path: str) -> bytes | None:
-        """Content of a file, None if it is damaged, which is reported; such a file is deleted.
+    Numba numbers the files and keeps the numbers in an index. Of two processes that saved the code of two closures at
+    once, one lost its entry, or was given the machine code of the other.
+    """
 
-        Raises:
-            FileNotFoundError: If there is none.
-        """
-        content = Path(path).read_bytes()
-        if hashlib.sha256(content[DIGEST_SIZE:]).digest() == content[:DIGEST_SIZE]:
-            return content[DIGEST_SIZE:]
-        report_damage(config.CACHE_DIR)
-        Path(path).unlink(missing_ok=True)
-        return None
+    def __init__(self, cache_path: str, filename_base: str, source_stamp: str) -> None:
+        self._path_of = os.path.join(cache_path, f"{filename_base}.{{}}.nbc").format
+        self._valid = [numba.__version__, source_stamp]
 
-    def _write(self, path: str, content: bytes) -> None:
-        with self._open_for_write(path) as file:
+    def _path(self, key: Any) -> Path:
+        return Path(self._path_of(hashlib.sha256(repr(key).encode()).hexdigest()[:16]))
+
+    def save(self, key: Any, data: Any) -> None:
+        """Save compiled code; of two processes that compiled the same, the last."""
+        content = self._dump((*self._valid, key, data))
+        with self._open_for_write(str(self._path(key))) as file:
             file.write(hashlib.sha256(content).digest() + content)
 
-    def _load_index(self) -> dict[Any, str]:
+    def load(self, key: Any) -> Any:
+        """Return compiled code, None if there is none. A damaged file is reported and deleted."""
+        path = self._path(key)
         try:
-            content = self._read(self._index_path)
-        except FileNotFoundError:
-            return {}
-        if content is None:
-            return {}
-        version, stamp, overloads = caching.pickle.loads(content)
-        return overloads if (version, stamp) == (self._version, self._source_stamp) else {}
-
-    def _save_index(self, overloads: dict[Any, str]) -> None:
-        self._write(self._index_path, self._dump((self._version, self._source_stamp, overloads)))
-
-    def _load_data(self, name: str) -> Any:
-        content = self._read(self._data_path(name))
-        if content is None:
-            raise FileNotFoundError(name)
+            content = path.read_bytes()
+        except OSError:
+            return None
+        if hashlib.sha256(content[DIGEST_SIZE:]).digest() != content[:DIGEST_SIZE]:
+            report_damage(config.CACHE_DIR)
+            path.unlink(missing_ok=True)
+            return None
         try:
-            return caching.pickle.loads(content)
-        except ModuleNotFoundError as error:
+            *found, data = caching.pickle.loads(content[DIGEST_SIZE:])
+        except ModuleNotFoundError:
             # The same file was compiled under another module name, as `runpy` and `exec` do: compile it again.
-            raise FileNotFoundError(name) from error
+            return None
+        return data if found == [*self._valid, key] else None
 
-    def _save_data(self, name: str, data: Any) -> None:
-        self._write(self._data_path(name), self._dump(data))
+    def flush(self) -> None:
+        """Leave the files, which are replaced as the code is compiled again."""
 
 
 def use_entries() -> None:
     """Make Numba keep its cache in such entries, in this process."""
-    caching.IndexDataCacheFile = VerifiedCacheFile
+    caching.IndexDataCacheFile = EntryFiles
     # Numba's own locators serve functions that are in no file, as in a notebook.
     others = [found for found in caching.CompileResultCacheImpl._locator_classes if found is not ContentLocator]
     caching.CompileResultCacheImpl._locator_classes = [ContentLocator, *others]

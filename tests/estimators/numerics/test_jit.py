@@ -3,9 +3,11 @@
 import os
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
+from estimators.numerics.cache_entries import EntryFiles
 from estimators.numerics.jit import by_address
 from tests.conftest import ROOT
 
@@ -38,20 +40,31 @@ def kf_code(cache) -> subprocess.CompletedProcess[str]:
 
 
 def test_a_damaged_entry_is_discarded_and_compiled_again(tmp_path):
-    """Index files cut in half, and a machine code with one byte changed, which unpickling would not notice."""
+    """Files cut in half, and a machine code with one byte changed, which unpickling would not notice."""
     said = kf_code(tmp_path)
     assert said.stderr == ""
-    damaged = sorted(tmp_path.rglob("*.nbi"))
-    damaged += sorted(tmp_path.rglob("*gaussian/kf.predict*.nbc"))
-    for path in damaged:
+    paths = sorted(tmp_path.rglob("*.nbc"))
+    changed = [path for path in paths if "gaussian/kf.predict" in str(path)]
+    assert changed
+    assert len(changed) < len(paths)
+    for path in paths:
         content = bytearray(path.read_bytes())
         content[len(content) // 2] ^= 1
-        path.write_bytes(content[: len(content) // 2] if path.suffix == ".nbi" else content)
+        path.write_bytes(content if path in changed else content[: len(content) // 2])
     again = kf_code(tmp_path)
     assert again.stdout == said.stdout
     (line,) = again.stderr.splitlines()
     assert line.endswith("damaged entries of the compile cache discarded; compiling them again")
     assert kf_code(tmp_path).stderr == ""
+
+
+def test_entries_saved_at_once_are_kept_apart(tmp_path):
+    """Closures of one function differ in their key alone; processes that compile them save them at the same time."""
+    keys = [("float64", ("cpu", "features"), ("code", f"cell {i}")) for i in range(200)]
+    with ThreadPoolExecutor(8) as pool:
+        list(pool.map(lambda key: EntryFiles(str(tmp_path), "f-1", "stamp").save(key, f"code of {key}"), keys))
+    assert [EntryFiles(str(tmp_path), "f-1", "stamp").load(key) for key in keys] == [f"code of {key}" for key in keys]
+    assert EntryFiles(str(tmp_path), "f-1", "stamp of an edited file").load(keys[0]) is None
 
 
 def test_a_function_for_addresses_names_its_python_form_when_called():
