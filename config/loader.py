@@ -14,7 +14,7 @@ from pydantic import ValidationError
 from estimators.errors import ConfigError, nearest
 
 from .problems import report, shown
-from .schema import TwinSection
+from .schema import TwinSection, as_gate
 from .tunings import Version, find_version, keep_options, overlay
 from .yaml_files import Key, ValuePlaces, dotted, parse, read_text, shown_path
 
@@ -130,6 +130,8 @@ def _override(data: dict[str, Any], places: ValuePlaces, dotted_key: str, text: 
     parts = dotted_key.split(".")
     if parts[0] == "estimator" and len(parts) > 1 and isinstance(data.get("estimator"), str):
         data["estimator"] = {"name": data["estimator"]}
+    if parts[0] == "gate" and len(parts) > 1:
+        data["gate"] = as_gate(data.get("gate"))
     if parts in (["estimator"], ["estimator", "name"]):
         keep_options(data, places)
     if not all(parts):

@@ -1,4 +1,4 @@
-"""The errors that Nisus raises, each with one line that a user can act on, and how such a line shows names."""
+"""The errors that Nisus raises, each one line that a user can act on, and names and numbers in such a line."""
 
 from __future__ import annotations
 
@@ -50,6 +50,17 @@ def quoted(text: str) -> str:
 def shown_name(name: str) -> str:
     """A name from a file as a message shows it: as it is, unless it is empty, long or unprintable."""
     return name if 0 < len(name) <= MAX_QUOTED_CHARACTERS and name.isprintable() else quoted(name)
+
+
+def digits(value: float, sign: str = "") -> str:
+    """Format a number with three digits, with an exponent only where that is shorter: `2,280`, `0.0375`, `1.8e+10`.
+
+    `sign`: "+" shows that of a positive number too. Zero has none.
+    """
+    value = value or 0.0
+    if 1e3 <= abs(value) < 1e6:
+        return f"{float(f'{value:.3g}'):{sign},.0f}"
+    return f"{value:{sign if value else ''}.3g}"
 
 
 def nearest(name: str, names: Iterable[str]) -> str:

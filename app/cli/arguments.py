@@ -8,7 +8,8 @@ from typing import Annotated, Literal
 
 import tyro
 
-Twin = Annotated[str, tyro.conf.Positional]
+Twin = Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="TWIN")]
+OptionalTwin = Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="TWIN")]
 Repeated = Annotated[tuple[str, ...], tyro.conf.UseAppendAction]
 Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff]
 
@@ -60,7 +61,7 @@ class JsonOption:
     """Option of a command with a result for scripts."""
 
     json: Flag = False
-    """Print JSON."""
+    """Print one JSON document; its fields are in docs/reference.md."""
 
 
 @dataclass(frozen=True)
@@ -99,10 +100,17 @@ class PageOptions:
 
 
 @dataclass(frozen=True)
-class RunCommand(PageOptions, TuningOption, EstimatorOption):
-    """Run a twin and show it in the browser. Without a twin: the gallery of bundled twins."""
+class RunCommand(JsonOption, PageOptions, TuningOption, EstimatorOption):
+    """Run a twin and show it in the browser. Without a twin: the gallery of bundled twins.
 
-    twin: Annotated[str | None, tyro.conf.Positional] = None
+    Examples:
+      nisus run
+      nisus run motor_can
+      nisus run road_car --set estimator=ukf --speed 10
+      nisus run motor_can --headless --record drive.rrd
+    """
+
+    twin: OptionalTwin = None
     """Name of a bundled twin (see `nisus twins`), or path to a YAML file. Default: choose one in the gallery."""
     set: Repeated = ()
     """KEY=VALUE, repeatable: Q.temperature=0.02, R.winding=9, p.NAME, use.SENSOR=false, gate, or a dotted YAML key."""
@@ -115,12 +123,19 @@ class RunCommand(PageOptions, TuningOption, EstimatorOption):
     speed: float | None = None
     """Speed of replays and simulations, as a multiple of real time; inf is as fast as possible. Default: the twin's."""
     headless: Flag = False
-    """Run without a page."""
+    """Run without a page, to the end of the source, and print the counts of events (--json: as JSON)."""
 
 
 @dataclass(frozen=True)
 class FoldCommand(JsonOption, FoldOptions):
-    """Fold the log of a twin as fast as possible and print scores, calibration and fault episodes."""
+    """Fold the log of a twin as fast as possible and print scores, calibration and fault episodes.
+
+    Examples:
+      nisus fold motor_winding --duration 600
+      nisus fold motor_can --log drive.blf --html report.html
+      nisus fold battery_panasonic --blind --plot cell.pdf
+      nisus fold motor_can --set gate.kind=soft --json
+    """
 
     out: Path | None = None
     """Write the track to this .csv or .parquet file, or a recording to this .rrd file."""
@@ -128,6 +143,8 @@ class FoldCommand(JsonOption, FoldOptions):
     """Write a self-contained HTML report: scores, charts, checks, episodes, tuning."""
     plot: Path | None = None
     """Draw the states with their measurements, and the NIS, into this .png, .pdf or .svg (needs `nisus[plot]`)."""
+    blind: Flag = False
+    """Ignore all true states: of a simulator, a recording or a table. Nothing is then scored against them."""
     smooth: Flag = False
     """Also smooth: estimate each state from all measurements, before and after. Adds columns to --out."""
 
@@ -138,6 +155,10 @@ class CheckCommand(JsonOption, FoldOptions):
 
     Linearity, size, shape of the posterior, observability, the smallest visible fault of every sensor, input and
     parameter, protection levels, timing, health, and the prediction of every sensor held out in turn.
+
+    Examples:
+      nisus check motor_bench --duration 600
+      nisus check motor_can --html check.html
     """
 
     html: Path | None = None
@@ -150,6 +171,10 @@ class AdviseCommand(JsonOption, TableOptions, LogOptions, EstimatorOption):
 
     For a twin: the simplest estimator whose assumptions hold on the log, with the figure behind each claim and the
     lines for its YAML. For recordings: sample rates, gaps, noise, redundant signals, and drivers of each signal.
+
+    Examples:
+      nisus advise motor_can
+      nisus advise drive.csv --out drive.yaml
     """
 
     what: Annotated[tuple[str, ...], tyro.conf.Positional]
@@ -169,6 +194,10 @@ class CompareCommand(JsonOption, LogOptions, TuningOption):
 
     Filters that draw random members are folded with eight seeds; their figures are mean ± standard deviation of one
     fold. A step is one event of the log; its cost is the time on one processor.
+
+    Examples:
+      nisus compare lorenz63 --duration 30
+      nisus compare motor_can --estimators ekf ukf
     """
 
     twin: Twin
@@ -191,6 +220,10 @@ class TuneCommand(JsonOption, EstimatorOption, TwinOptions):
 
     Each recording is divided into blocks of time, and every third is held out to judge the fit. So are each sensor in
     turn and the true states where they are known. Exit status: 0 if a tuning is proposed, 1 if not.
+
+    Examples:
+      nisus tune motor_bench --fit Q,R --keep fitted
+      nisus tune motor_winding --fit scale --duration 300
     """
 
     fit: str = "Q,R"
@@ -232,6 +265,9 @@ class LearnCommand(JsonOption, EstimatorOption, TwinOptions):
 
     Each recording is divided into blocks of time; on every third the twin is judged with and without the correction.
     Exit status: 0 if the correction is better there, 1 if not; then nothing is written.
+
+    Examples:
+      nisus learn motor_bench --corrects magnet --features speed,i_d,i_q --kind ridge
     """
 
     corrects: str
@@ -258,12 +294,16 @@ class LearnCommand(JsonOption, EstimatorOption, TwinOptions):
 
 
 @dataclass(frozen=True)
-class GuardCommand:
+class GuardCommand(JsonOption):
     """Fold archived recordings with the accepted tunings of their twins and list figures that got worse.
 
     Without a name: the bundled twins with their bundled logs and those under NISUS_DATA. A figure is worse if it
     changed by more than chance and by more than is negligible. Exit status: 0 if nothing got worse, 1 if something
     did, 2 if a recording could not be folded. Missing recordings are reported; with CI=true they are errors.
+
+    Examples:
+      nisus guard
+      nisus guard motor_can --accept --note "new drive"
     """
 
     twins: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
@@ -288,6 +328,10 @@ class StressCommand(JsonOption, TuningOption):
 
     Tuning errors hold from the start. Sensor faults hold from one third to two thirds of the log, to show false alarms
     before them and recovery after them. Figures are medians over the seeds.
+
+    Examples:
+      nisus stress motor_winding --list
+      nisus stress motor_winding --only winding --seeds 1
     """
 
     twin: Twin
@@ -307,10 +351,14 @@ class StressCommand(JsonOption, TuningOption):
 
 
 @dataclass(frozen=True)
-class CommissionCommand(FoldOptions):
+class CommissionCommand(JsonOption, FoldOptions):
     """Record the normal innovations of a twin from fault-free data; later alarms then report changes from it.
 
     Prints the section `commissioned` for the twin's YAML, or writes it there.
+
+    Examples:
+      nisus commission motor_bench --duration 1800
+      nisus commission pump.yaml --write
     """
 
     force: Flag = False
@@ -320,8 +368,13 @@ class CommissionCommand(FoldOptions):
 
 
 @dataclass(frozen=True)
-class FiltersCommand:
-    """List the estimators: assumptions, options, cost, and when they fail."""
+class FiltersCommand(JsonOption):
+    """List the estimators: assumptions, options, cost, and when they fail.
+
+    Examples:
+      nisus filters
+      nisus filters --twin motor_can
+    """
 
     twin: str | None = None
     """Name of a bundled twin, or path to a YAML file: list which filters apply, their cost, and why others do not."""
@@ -329,15 +382,24 @@ class FiltersCommand:
 
 @dataclass(frozen=True)
 class ReviewCommand(PageOptions):
-    """Open a recording on the page, where its measurements can be folded again with other settings."""
+    """Open a recording on the page, where its measurements can be folded again with other settings.
+
+    Examples:
+      nisus review drive.rrd
+    """
 
     file: Annotated[Path, tyro.conf.Positional]
     """The .rrd file."""
 
 
 @dataclass(frozen=True)
-class BusCommand:
-    """Simulate the asset of a twin on a CAN bus."""
+class BusCommand(JsonOption):
+    """Simulate the asset of a twin on a CAN bus.
+
+    Examples:
+      nisus bus motor_can
+      nisus bus motor_can --interface virtual --record drive.blf --duration 60
+    """
 
     twin: Twin
     """Name of a bundled twin with a CAN source and an `asset`, or path to a YAML file."""
@@ -354,10 +416,15 @@ class BusCommand:
 
 
 @dataclass(frozen=True)
-class TwinsCommand:
-    """List the bundled twins, or describe one with the scores of every filter."""
+class TwinsCommand(JsonOption):
+    """List the bundled twins, or describe one with the scores of every filter.
 
-    name: Annotated[str | None, tyro.conf.Positional] = None
+    Examples:
+      nisus twins
+      nisus twins motor_can
+    """
+
+    name: OptionalTwin = None
     """Name of a bundled twin, or path to a YAML file."""
     picture: Flag = False
     """Draw the gallery picture of the twin, or of all: config/cards/NAME.svg, or NAME.svg beside the YAML."""
@@ -369,6 +436,11 @@ class TuningsCommand(JsonOption, FoldOptions):
 
     Versions are files FILE.tunings/NAME.yaml beside FILE.yaml; those of a bundled twin are in the user's data folder.
     `own` is the twin's file itself. --estimator, --set, --tuning, --log and --duration are for --save.
+
+    Examples:
+      nisus tunings motor_bench
+      nisus tunings motor_bench --save soft --set gate.kind=soft
+      nisus tunings motor_bench own soft
     """
 
     names: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
@@ -383,7 +455,11 @@ class TuningsCommand(JsonOption, FoldOptions):
 
 @dataclass(frozen=True)
 class SchemaCommand:
-    """Write the JSON Schema of a twin's YAML, for editors that complete and check."""
+    """Write the JSON Schema of a twin's YAML, for editors that complete and check.
+
+    Examples:
+      nisus schema --out twin.schema.json
+    """
 
     out: Path | None = None
     """File to write. Default: standard output."""
@@ -391,15 +467,25 @@ class SchemaCommand:
 
 @dataclass(frozen=True)
 class LogCommand(JsonOption, TableOptions):
-    """List the content of recordings: buses, messages, signals or columns, with rates, time spans and gaps."""
+    """List the content of recordings: buses, messages, signals or columns, with rates, time spans and gaps.
+
+    Examples:
+      nisus log drive.blf --dbc car.dbc
+      nisus log plant.csv --time Time --time-zone Europe/Berlin
+    """
 
     files: Annotated[tuple[Path, ...], tyro.conf.Positional]
     """CAN logs (MF4, BLF, ASC, TRC, candump, CSV, SQLite) or tables (CSV, Parquet, MATLAB, NumPy), in order."""
 
 
 @dataclass(frozen=True)
-class NewCommand(TableOptions):
-    """Write NAME.yaml and NAME.py, a runnable example (a pump) or a draft from the signals of a recording."""
+class NewCommand(JsonOption, TableOptions):
+    """Write NAME.yaml and NAME.py, a runnable example (a pump) or a draft from the signals of a recording.
+
+    Examples:
+      nisus new pump
+      nisus new drive --log drive.csv --signals speed,torque
+    """
 
     name: Annotated[str, tyro.conf.Positional]
     """Name of the twin."""
@@ -409,6 +495,22 @@ class NewCommand(TableOptions):
     """Recordings whose signals become sensors."""
     signals: str = ""
     """Signals (SIGNAL or MESSAGE.SIGNAL) or columns to use, separated by commas. Default: the six with most levels."""
+
+
+@dataclass(frozen=True)
+class CompletionCommand:
+    """Print the script that completes commands, options, twins and filters in a shell.
+
+    bash: add `source <(nisus completion bash)` to ~/.bashrc. zsh: add `source <(nisus completion zsh)` to ~/.zshrc,
+    after `compinit`. fish: nisus completion fish > ~/.config/fish/completions/nisus.fish
+
+    Examples:
+      nisus completion bash
+      nisus completion fish
+    """
+
+    shell: Annotated[Literal["bash", "zsh", "fish"], tyro.conf.Positional]
+    """Name of the shell."""
 
 
 COMMANDS: dict[type, str] = {
@@ -430,6 +532,7 @@ COMMANDS: dict[type, str] = {
     SchemaCommand: "new:write_schema",
     LogCommand: "log:show_log",
     NewCommand: "new:new_twin",
+    CompletionCommand: "completion:print_script",
 }
 """Module and function of every command, imported when the command runs."""
 

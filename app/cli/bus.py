@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from collections import Counter
 from pathlib import Path
@@ -9,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from estimators.errors import ConfigError
 
+from ..present.result import to_json
 from ..terminal import EndRequest, complain, restore, when_asked_to_end
 from ..twin.twin import Twin, load_twin
 from .options import settings
@@ -43,11 +45,14 @@ def play_bus(arguments: BusCommand) -> int:
         if arguments.record is not None:
             logger = _logger(arguments.record)
             player.listeners.append(logger)
-        print(f"Nisus plays the asset of {twin.name} on {arguments.interface} {channel}; Ctrl-C ends it.", flush=True)
+        out = sys.stderr if arguments.json else sys.stdout
+        started = f"Nisus plays the asset of {twin.name} on {arguments.interface} {channel}; Ctrl-C ends it."
+        print(started, file=out, flush=True)
         if arguments.interface != "virtual":
             print(
                 f"To listen: nisus run {arguments.twin} --set source.interface={arguments.interface} "
                 f"--set source.channel={channel}",
+                file=out,
                 flush=True,
             )
         _play(player, arguments.duration)
@@ -55,7 +60,10 @@ def play_bus(arguments: BusCommand) -> int:
         player.close()
         if logger is not None:
             logger.stop()
-    print(", ".join([f"{player.sent} frames sent", *(f"{key} {count}" for key, count in counts.items())]))
+    if arguments.json:
+        print(to_json({"twin": twin.name, "frames": player.sent, "counts": counts}))
+    else:
+        print(", ".join([f"{player.sent} frames sent", *(f"{key} {count}" for key, count in counts.items())]))
     return 0
 
 

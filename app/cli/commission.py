@@ -15,6 +15,7 @@ from estimators.track import DIVERGED, FAILED, GATED, SCREENED, STALE
 
 from ..live.tunings.versions import write_section
 from ..live.watchdog import interruptible
+from ..present.result import to_json
 from ..twin.log_reader import read_log
 from ..twin.twin import load_twin
 from .options import settings
@@ -43,13 +44,19 @@ def commission_twin(arguments: Arguments) -> int:
         raise ConfigError(
             f"{twin.name}: {broken}; commission on data on which everything was in order, or --force it to be normal"
         )
-    text = lines(commission(fold))
-    if not arguments.write:
-        print(text, end="")
-        return 0
+    normals = commission(fold)
+    text = lines(normals)
     path = twin.path if twin.version is None else twin.version.path
-    write_section(path, "commissioned", text)
-    print(f"{path}: commissioned on {log.n} events of {twin.name}, {twin.estimator}")
+    if arguments.write:
+        write_section(path, "commissioned", text)
+    if arguments.json:
+        written = str(path) if arguments.write else None
+        head = {"twin": twin.name, "estimator": twin.estimator, "events": log.n, "written": written}
+        print(to_json({**head, "commissioned": normals}))
+    elif arguments.write:
+        print(f"{path}: commissioned on {log.n} events of {twin.name}, {twin.estimator}")
+    else:
+        print(text, end="")
     return 0
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from config.loader import shipped
 from estimators.errors import ConfigError, SourceError
@@ -25,19 +25,25 @@ ALL = "all"  # name that stands for every bundled twin
 def compare_twin(arguments: Arguments) -> int:
     """Run the command."""
     if arguments.twin != ALL:
-        _compare(arguments, arguments.twin)
+        rows = _compare(arguments, arguments.twin)
+        if arguments.json:
+            print(to_json(rows))
         return 0
     failed = 0
+    found: dict[str, list[dict[str, Any]]] = {}
     for name in shipped():
         try:
-            _compare(arguments, name)
+            found[name] = _compare(arguments, name)
         except SourceError as error:  # the recording is missing
             complain(error)
             failed = 2
+    if arguments.json:
+        print(to_json(found))
     return failed
 
 
-def _compare(arguments: Arguments, name: str) -> None:
+def _compare(arguments: Arguments, name: str) -> list[dict[str, Any]]:
+    """Print the table of a twin, unless JSON is wanted, and return its rows for scripts."""
     overrides = settings(arguments.set, tuning=arguments.tuning)
     twin = load_twin(name, log_files=arguments.log or None, overrides=overrides)
     others = arguments.estimators, arguments.set, arguments.tuning, arguments.log, arguments.duration
@@ -53,9 +59,8 @@ def _compare(arguments: Arguments, name: str) -> None:
             advance()
     rows.sort(key=lambda row: names.index(row.estimator))
     lines = cells(rows, len(logs[0]), float(logs[0].t[-1] - logs[0].t[0]) * 1e-9)
-    if arguments.json:
-        print(to_json([row_json(row) for row in rows]))
-    else:
+    if not arguments.json:
         print("\n".join(printed(twin.path.stem, lines, len(logs))))
     if arguments.write:
         write_scores(twin.path, lines)
+    return [row_json(row) for row in rows]

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 from estimators.estimator import Option
 from estimators.log import READING
 from estimators.registry import ESTIMATORS, unfit
 
-from ..present.result import Figure, TableColumn, Topic, to_text
+from ..present.result import Figure, TableColumn, Topic, to_json, to_text
 from ..studies.advice.measured import bytes_text
 from ..twin.log_reader import read_log
 from ..twin.twin import Twin, load_twin
@@ -22,8 +23,18 @@ SAMPLE_S = 60.0  # seconds of a twin's source from which its rate is taken
 
 def show_filters(arguments: Arguments) -> int:
     """Run the command."""
-    print("\n".join(to_text(catalogue() if arguments.twin is None else [applicable_topic(load_twin(arguments.twin))])))
+    if arguments.twin is None:
+        print(to_json(catalogue_json()) if arguments.json else "\n".join(to_text(catalogue())))
+        return 0
+    found = applicable(load_twin(arguments.twin))
+    print(to_json(found) if arguments.json else "\n".join(to_text([applicable_topic(found)])))
     return 0
+
+
+def catalogue_json() -> list[dict[str, Any]]:
+    """Return every estimator for scripts."""
+    words = ("name", "family", "title", "assumes", "model_runs", "fails_when", "source", "options")
+    return [{word: getattr(entry, word) for word in words} for entry in ESTIMATORS.values()]
 
 
 def catalogue() -> list[Topic]:
@@ -49,22 +60,57 @@ def _option_text(option: Option) -> str:
     return f"{option.default:g}{unit} ({option.low:g} to {option.high:g}{whole}): {option.meaning}"
 
 
-def applicable_topic(twin: Twin) -> Topic:
+@dataclass(frozen=True)
+class Applicability:
+    """Whether an estimator applies to a twin, with bytes and model runs per second; `reason` why it does not."""
+
+    name: str
+    applies: bool
+    first: bool
+    bytes: int | None
+    model_runs_per_step: float | None
+    model_runs_per_second: float | None
+    reason: str | None
+
+
+@dataclass(frozen=True)
+class TwinFilters:
+    """Estimators for a twin; `rate` in measurements per second."""
+
+    twin: str
+    states: int
+    rate: float
+    filters: list[Applicability]
+
+
+def applicable(twin: Twin) -> TwinFilters:
     """Return which estimators apply to a twin, with their cost, and why the others do not."""
-    rate = _reading_rate(twin)
-    rows = []
+    rate, nx = _reading_rate(twin), twin.model.nx
+    found = []
     for name, entry in ESTIMATORS.items():
         reason = unfit(entry, twin.model)
         if reason is not None:
-            rows.append((name, "", "", f"no: {reason}"))
+            found.append(Applicability(name, False, False, None, None, None, reason))
             continue
         options = entry.complete(dict(twin.options_of(name)))
-        numbers = entry.state_size(options, twin.model.nx) + entry.memory(options, twin.model)
-        runs = entry.runs(options, twin.model.nx)
-        cost = f"{_count_text(runs)} × {rate:.3g} = {_count_text(runs * rate)}"
-        applies = "yes, and runs first" if name == twin.estimator else "yes"
-        rows.append((name, f"{numbers:,} × 8 B = {bytes_text(8 * numbers)}", cost, applies))
-    title = f"{twin.name}: {twin.model.nx:,} states, {rate:.3g} readings per second"
+        size = 8 * (entry.state_size(options, nx) + entry.memory(options, twin.model))
+        runs = float(entry.runs(options, nx))
+        found.append(Applicability(name, True, name == twin.estimator, size, runs, runs * rate, None))
+    return TwinFilters(twin.name, nx, rate, found)
+
+
+def applicable_topic(found: TwinFilters) -> Topic:
+    """Return which estimators apply as a table."""
+    rows = []
+    for one in found.filters:
+        if one.bytes is None or one.model_runs_per_step is None or one.model_runs_per_second is None:
+            rows.append((one.name, "", "", f"no: {one.reason}"))
+            continue
+        runs = one.model_runs_per_step
+        cost = f"{_count_text(runs)} × {found.rate:.3g} = {_count_text(one.model_runs_per_second)}"
+        applies = "yes, and runs first" if one.first else "yes"
+        rows.append((one.name, f"{one.bytes // 8:,} × 8 B = {bytes_text(one.bytes)}", cost, applies))
+    title = f"{found.twin}: {found.states:,} states, {found.rate:.3g} readings per second"
     columns = ("name", TableColumn("memory"), TableColumn("model runs per second"), "applies")
     return Topic(title, (), columns, tuple(rows))
 

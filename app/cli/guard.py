@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 from config.yaml_files import writing
 from estimators.errors import ConfigError, printable
 
-from ..present.result import to_text
-from ..studies.guard import chosen, guard_all, guard_topics, junit, keep_last
+from ..present.result import to_json, to_text
+from ..studies.guard import chosen, guard_all, guard_json, guard_topics, junit, keep_last
 from .options import check_output, settings
 from .prepare import progress
 
@@ -34,7 +34,7 @@ def guard(arguments: Arguments) -> int:
     if arguments.junit is not None:
         with writing(arguments.junit, "--junit"):
             arguments.junit.write_bytes(junit(found, absent_fails=absent_fails))
-    print("\n".join(to_text(guard_topics(found, absent_fails))))
+    print(to_json(guard_json(found)) if arguments.json else "\n".join(to_text(guard_topics(found, absent_fails))))
     if any(each.failure or (each.absent and absent_fails) for each in found):
         return 2
     return 0 if arguments.accept else int(any(figure.worse for each in found for figure in each.compared))

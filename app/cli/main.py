@@ -6,19 +6,25 @@ import contextlib
 import errno
 import functools
 import importlib
+import inspect
 import operator
 import os
 import sys
 from collections.abc import Sequence
+from importlib.metadata import version
 from typing import Annotated, Any
 
 import tyro
 
-from estimators.errors import NisusError
+from estimators.errors import ConfigError, NisusError, nearest, shown_name
 
 from ..terminal import complain
 from .arguments import COMMANDS, NAMES, RunCommand
-from .options import check_numbers
+from .options import check_options
+
+HEAD = """Keep a digital twin in step with its asset: fold, tune, check and watch it.
+
+`nisus COMMAND --help` describes a command, with examples. `nisus completion bash` (zsh, fish) completes words."""
 
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)  # errors of a device that takes no more output
 
@@ -31,48 +37,88 @@ def carry_out(command: Any) -> int:
         from ..live.compilers import first_compilers
 
         workers = (first_compilers(),)  # started before the imports of `run`, which take seconds
-    result = getattr(importlib.import_module(f".{module}", __package__), function)(command, *workers)
-    sys.stdout.flush()
-    return int(result)
+    return int(getattr(importlib.import_module(f".{module}", __package__), function)(command, *workers))
 
 
 def parse(arguments: Sequence[str]) -> Any:
-    """Return the command that the arguments name, or exit with tyro's explanation.
+    """Return the command that the arguments name, or exit with its help.
 
-    A known command is parsed alone, so that tyro suggests only its options.
+    Raises:
+        ConfigError: If the command or an option does not exist, or a value must be a number and is not.
     """
-    if arguments and arguments[0] in NAMES:
-        command = NAMES[arguments[0]]
-        check_numbers(command, arguments[1:])
-        return tyro.cli(command, args=arguments[1:], prog=f"nisus {arguments[0]}")
-    named: list[Any] = [Annotated[command, tyro.conf.subcommand(name)] for name, command in NAMES.items()]
-    return tyro.cli(functools.reduce(operator.or_, named), args=arguments, prog="nisus", description=__doc__)
+    name = arguments[0] if arguments else "--help"
+    if name in NAMES:
+        command = NAMES[name]
+        check_options(name, command, arguments[1:])
+        return tyro.cli(command, args=arguments[1:], prog=f"nisus {name}", description=described(command))
+    if name not in ("-h", "--help"):
+        kind = "option" if name.startswith("-") else "command"
+        names = ["--help", "--version"] if name.startswith("-") else list(NAMES)
+        raise ConfigError(f"{shown_name(name)}: there is no such {kind}; {nearest(name, names)}")
+    named: list[Any] = [
+        Annotated[command, tyro.conf.subcommand(name, description=described(command).split("\n")[0])]
+        for name, command in NAMES.items()
+    ]
+    return tyro.cli(functools.reduce(operator.or_, named), args=["--help"], prog="nisus", description=HEAD)
+
+
+def described(command: type) -> str:
+    """Return a command's docstring, whose paragraphs are one line each, with its examples line by line."""
+    text, _, examples = inspect.cleandoc(command.__doc__ or "").partition("\n\nExamples:\n")
+    return "\n\n".join([*(" ".join(part.split()) for part in text.split("\n\n")), f"Examples:\n{examples}"])
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Entry point: 0 if all went well, 2 with one line on standard error if not."""
+    given = sys.argv[1:] if arguments is None else arguments
     try:
-        return carry_out(parse(sys.argv[1:] if arguments is None else arguments))
+        try:
+            return _answered(given)
+        finally:
+            sys.stdout.flush()
+    except BrokenPipeError:
+        _drop_output()  # its reader has ended (`| head`), perhaps that of standard error too
+        return 0
+    except OSError as error:
+        complain(f"standard output: {error.strerror or error}")
+        _drop_output()
+        return 2
+
+
+def _answered(arguments: Sequence[str]) -> int:
+    """Run the command that the arguments name; an error is one line."""
+    try:
+        if arguments and arguments[0] == "--version":
+            print(f"nisus {version('nisus')}")
+            return 0
+        if arguments and arguments[0] == "--complete":
+            from .completion import candidates
+
+            print("".join(f"{word}\n" for word in candidates(arguments[1:])), end="")
+            return 0
+        return carry_out(parse(arguments))
     except NisusError as error:
         complain(error)
-        return 2
     except BrokenPipeError:
-        _drop_output()  # its reader has ended (`| head`)
-        return 0
+        raise
     except OSError as error:
         # Files that a command writes are named by `config.yaml_files.writing`.
         name = error.filename or ("standard output" if error.errno in FULL else "")
         complain(f"{name}: {error.strerror or error}".removeprefix(": "))
         _drop_output()
-        return 2
     except KeyboardInterrupt:
         return 130
+    return 2
 
 
 def _drop_output() -> None:
     """Discard what is left to print, so that Python's own flush at exit does not fail again."""
-    with contextlib.suppress(OSError, ValueError):
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    for stream in (sys.stdout, sys.stderr):
+        try:
+            stream.flush()
+        except (OSError, ValueError):
+            with contextlib.suppress(OSError, ValueError):
+                os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 if __name__ == "__main__":

@@ -10,6 +10,7 @@ from config.loader import shipped
 from config.yaml_files import writing
 from estimators.errors import ConfigError
 
+from ..present.result import to_json
 from .options import names_of
 
 if TYPE_CHECKING:
@@ -163,8 +164,7 @@ def new_twin(arguments: Arguments) -> int:
         raise ConfigError("--signals and --dbc are for recordings; name one with --log FILE")
     else:
         paths = write_twin(arguments.name, arguments.folder)
-    for path in paths:
-        print(path)
+    print(to_json({"written": [str(path) for path in paths]}) if arguments.json else "\n".join(map(str, paths)))
     return 0
 
 

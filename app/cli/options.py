@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import get_args, get_type_hints
+from typing import Any, get_args, get_type_hints
 
-from estimators.errors import ConfigError, quoted
+import tyro
+
+from estimators.errors import ConfigError, nearest, quoted
 
 
 def check_output(option: str, path: Path, *endings: str) -> None:
@@ -52,17 +55,33 @@ def settings(texts: Sequence[str], estimator: str | None = None, tuning: str | N
     return pairs
 
 
-def check_numbers(command: type, words: Sequence[str]) -> None:
-    """Refuse an option of a command whose value must be a number and is not, in one line.
+def options_of(command: type) -> dict[str, Any]:
+    """Return the types of a command's options, by field; positional arguments are left out."""
+    hints = get_type_hints(command, include_extras=True)
+    return {field.name: hints[field.name] for field in dataclasses.fields(command) if not is_positional(hints, field)}
+
+
+def is_positional(hints: dict[str, Any], field: dataclasses.Field[Any]) -> bool:
+    """Return whether a field of a command is a positional argument."""
+    return tyro.conf.Positional in getattr(hints[field.name], "__metadata__", ())
+
+
+def check_options(name: str, command: type, words: Sequence[str]) -> None:
+    """Refuse an option that a command does not have, or whose value must be a number and is not, in one line.
 
     Raises:
-        ConfigError: With the option and the value.
+        ConfigError: With the option, its value and the nearest option.
     """
     hints = get_type_hints(command)
+    known = {f"--{field.replace('_', '-')}": hints[field] for field in options_of(command)}
     for word, after in zip(words, [*words[1:], ""], strict=False):
         option, equals, own = word.partition("=")
+        if not option.startswith("--") or option == "--help":
+            continue
+        hint = known.get(option.replace("_", "-"))
+        if hint is None:
+            raise ConfigError(f"{quoted(option)}: `nisus {name}` has no such option; {nearest(option, known)}")
         value = own if equals else after
-        hint = hints.get(option.removeprefix("--").replace("-", "_")) if option.startswith("--") else None
         number = next((kind for kind in (hint, *get_args(hint)) if kind in (int, float)), None)
         if number is None or value in ("", "None") or value.startswith("--"):
             continue

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from estimators.errors import ConfigError
 
 from ..live.execute import MAX_SPEED
+from ..present.result import to_json
 from ..terminal import complain
 from ..views.recording.format import TAKEN
 from ..views.recording.rrd_file import NEVER, parse_split
@@ -44,6 +45,8 @@ def run_twin(arguments: RunCommand, workers: Sequence[Compiler] = ()) -> int:
         raise ConfigError(f"--record {arguments.record}: must end in .rrd")
     if arguments.record is not None and os.path.lexists(arguments.record):
         raise ConfigError(f"--record {arguments.record}: {TAKEN}")
+    if arguments.json and not arguments.headless:
+        raise ConfigError("--json: is the result of a run without a page; give --headless")
     split = NEVER if arguments.record_split is None else parse_split(arguments.record_split)
     page = None if arguments.headless else Page(arguments.port, not arguments.no_browser)
     opening, wanted, opener = None, None, FileOpener()
@@ -69,14 +72,17 @@ def run_twin(arguments: RunCommand, workers: Sequence[Compiler] = ()) -> int:
     session.run(record=arguments.record, duration=arguments.duration, until_finished=arguments.headless)
     if arguments.headless:
         status = session.engine.status()
-        print(", ".join(f"{name} {count}" for name, count in status.counts.items() if count or name == "readings"))
         lines = session.engine.notices.since(0)
         # A page would show that the source failed.
         failed = [line.text for line in lines if line.text.startswith("source failed")]
         failures = dict.fromkeys([*failed, *(line.text for line in lines if line.level == "error")])
+        refits = [line.text for line in lines if line.text.startswith("refit ")]
+        if arguments.json:
+            print(to_json({"counts": status.counts, "failures": list(failures), "refits": refits}))
+        else:
+            print(", ".join(f"{name} {count}" for name, count in status.counts.items() if count or name == "readings"))
         for text in list(failures)[:MAX_FAILURES]:
             complain(text)
-        refits = [line.text for line in lines if line.text.startswith("refit ")]
         for k, text in enumerate(refits):
             if "adopted" in text or k >= len(refits) - MAX_FAILURES:
                 complain(text)

@@ -39,7 +39,8 @@ def stress_twin(arguments: Arguments) -> int:
     if not mistakes:
         raise ConfigError(f"--only {' '.join(arguments.only)}: no mistake has that in its name; see --list")
     if arguments.list:
-        print("\n".join(item.name for item in mistakes))
+        names = [item.name for item in mistakes]
+        print(to_json(names) if arguments.json else "\n".join(names))
         return 0
     oracle = Oracle(twin, arguments.duration)
     trials: list[Trial] = []

@@ -46,7 +46,10 @@ def _save(arguments: Arguments, name: str) -> None:
     fold = fold_log(twin, log)
     scores = figures(score(fold.track, log.events, twin.model, pictures_of(fold), gate=twin.tuning.gate))
     given = Settings(twin.estimator, twin.tuning, printable(arguments.note), scores=scores)
-    print(f"{shown_path(keep(twin, name, version_text(twin, given)))}: kept")
+    path = keep(twin, name, version_text(twin, given))
+    print(
+        to_json({"name": name, "kept": str(path), "scores": scores}) if arguments.json else f"{shown_path(path)}: kept"
+    )
 
 
 def _accept(arguments: Arguments, name: str) -> None:
@@ -54,7 +57,8 @@ def _accept(arguments: Arguments, name: str) -> None:
     if twin.version is None:
         raise ConfigError(f"--accept {OWN_VALUES}: the twin's own file applies until a version is accepted")
     accept(twin.version, printable(arguments.note))
-    print(f"{shown_path(twin.version.path)}: accepted")
+    path = twin.version.path
+    print(to_json({"name": name, "accepted": str(path)}) if arguments.json else f"{shown_path(path)}: accepted")
 
 
 def _list(arguments: Arguments) -> None:

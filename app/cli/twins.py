@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from itertools import takewhile
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from config.loader import Loaded, find, load, shipped, shown_path
 from config.yaml_files import writing
 
+from ..present.result import to_json
 from ..studies.scores import printed, read_scores
 
 if TYPE_CHECKING:
@@ -17,16 +18,50 @@ if TYPE_CHECKING:
 def show_twins(arguments: Arguments) -> int:
     """Run the command."""
     if arguments.picture:
-        for name in shipped() if arguments.name is None else [arguments.name]:
-            print(_draw(name))
+        drawn = [_draw(name) for name in (shipped() if arguments.name is None else [arguments.name])]
+        print(to_json(drawn) if arguments.json else "\n".join(drawn))
         return 0
-    if arguments.name is None:
+    if arguments.name is not None:
+        loaded = load(arguments.name)
+        print(to_json(_json(loaded)) if arguments.json else "\n".join(described(loaded)))
+    elif arguments.json:
+        print(to_json([_head(load(name)) for name in shipped()]))
+    else:
         for name in shipped():
             print(f"{name:<16} {load(name).config.title or ''}")
-        return 0
-    loaded = load(arguments.name)
-    print("\n".join(described(loaded)))
     return 0
+
+
+def _head(loaded: Loaded) -> dict[str, Any]:
+    config = loaded.config
+    return {
+        "name": loaded.path.stem,
+        "title": config.title,
+        "model": config.model,
+        "estimator": config.estimator.name,
+        "source": config.source.type,
+        "path": str(loaded.path),
+    }
+
+
+def _json(loaded: Loaded) -> dict[str, Any]:
+    """Return head, leading comment of the YAML, and scores: figures as numbers, texts as they are."""
+    numbers = [{key: _number(cell) for key, cell in line.items()} for line in read_scores(loaded.path)]
+    return {**_head(loaded), "description": "\n".join(_prose(loaded)), "scores": numbers}
+
+
+def _number(cell: str) -> float | str | None:
+    """Return a cell of a scores file: a number where it is one, None where it is empty."""
+    try:
+        return float(cell) if cell else None
+    except ValueError:
+        return cell
+
+
+def _prose(loaded: Loaded) -> list[str]:
+    """Return the leading comment of the YAML."""
+    head = takewhile(lambda line: line.startswith("#"), loaded.text.splitlines())
+    return [line.removeprefix("#").removeprefix(" ") for line in head]
 
 
 def _draw(name: str) -> str:
@@ -53,9 +88,7 @@ def _draw(name: str) -> str:
 def described(loaded: Loaded) -> list[str]:
     """Return title, leading comment of the YAML, and scores as lines of text."""
     name = loaded.path.stem
-    head = takewhile(lambda line: line.startswith("#"), loaded.text.splitlines())
-    prose = [line.removeprefix("#").removeprefix(" ") for line in head]
     scores = read_scores(loaded.path)
     table = printed(name, scores) if scores else [f"No scores yet; to write them: nisus compare {name} --write"]
-    parts = [[f"{name}: {loaded.config.title}" if loaded.config.title else name], prose, table]
+    parts = [[f"{name}: {loaded.config.title}" if loaded.config.title else name], _prose(loaded), table]
     return [line for part in parts if part for line in (*part, "")][:-1]

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
-from estimators.diagnostics.sensitivity.responses import digits
+from estimators.errors import digits
 
 WORSE = "worse than no filter"
 """Text that HTML shows in red."""

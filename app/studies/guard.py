@@ -375,6 +375,32 @@ def guard_topics(found: Sequence[GuardVerdict], absent_fails: bool) -> list[Topi
     return topics
 
 
+def guard_json(found: Sequence[GuardVerdict]) -> list[dict[str, Any]]:
+    """Return the verdicts for scripts, one object per recording; `change` is for the worse if positive."""
+    return [
+        {
+            "recording": each.name,
+            "version": each.version,
+            "seconds": each.seconds,
+            "failure": each.failure,
+            "missing": each.absent,
+            "figures": [
+                {
+                    "figure": one.figure,
+                    "log": one.log,
+                    "before": one.before,
+                    "now": one.now,
+                    "change": one.change,
+                    "allowed": one.allowed,
+                    "verdict": "worse" if one.worse else "better" if one.better else "same",
+                }
+                for one in each.compared
+            ],
+        }
+        for each in found
+    ]
+
+
 def junit(found: Sequence[GuardVerdict], *, absent_fails: bool) -> bytes:
     """Return the verdicts as JUnit XML: a suite per recording, a case per figure.
 

@@ -34,6 +34,20 @@ def test_it_reaches_the_tuning():
 
 
 @pytest.mark.parametrize(
+    ("gate", "overrides", "expected"),
+    [
+        ("0.999", {"gate.kind": "soft"}, (0.999, "soft", 30.0)),
+        ("0.999", {"gate.reopen": "never", "gate": "0.99"}, (0.99, "hard", None)),
+        ("{probability: 0.9, kind: soft}", {"gate.probability": "0.95"}, (0.95, "soft", 30.0)),
+        ("null", {"gate.probability": "0.95", "gate.kind": "soft"}, (0.95, "soft", 30.0)),
+    ],
+)
+def test_a_part_of_a_gate_is_overridden_also_where_the_file_has_a_number(gate, overrides, expected):
+    found = load_text(TWIN + gate, Path("motor.yaml"), overrides).config.gate
+    assert (found.probability, found.kind, found.seconds) == expected
+
+
+@pytest.mark.parametrize(
     ("gate", "rule"),
     [
         ("2", "motor.yaml:3: gate is 2; it must be below 1"),

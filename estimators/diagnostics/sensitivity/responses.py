@@ -11,6 +11,7 @@ from typing import Any, NamedTuple, TypeVar
 import numba
 import numpy as np
 
+from ...errors import digits as digits
 from ...fold import Fold
 from ...log import INPUT, READING, Log
 from ...model.state_space import StateSpaceModel
@@ -259,17 +260,6 @@ def nudges_of(model: StateSpaceModel, tuning: Tuning, log: Log, kinds: Sequence[
         if low < high:
             found.append(Nudge(PARAMETER, parameter.name, parameter.unit, STEP * scale, low, high, scale, value))
     return [nudge for nudge in found if nudge.kind in kinds]
-
-
-def digits(value: float, sign: str = "") -> str:
-    """Format a number with three digits, with an exponent only where that is shorter: `2,280`, `0.0375`, `1.8e+10`.
-
-    `sign`: "+" shows that of a positive number too. Zero has none.
-    """
-    value = value or 0.0
-    if 1e3 <= abs(value) < 1e6:
-        return f"{float(f'{value:.3g}'):{sign},.0f}"
-    return f"{value:{sign if value else ''}.3g}"
 
 
 MAX_STATES = 64  # States up to which a model is refolded for each of its nudges

@@ -11,7 +11,6 @@ from pyarrow import csv as pa_csv
 
 import app.cli.compare
 import app.studies.compare
-from app.cli.main import main
 from app.studies.compare import fold_row, refold, tidy, within
 from app.studies.scores import (
     SCORES,
@@ -260,20 +259,6 @@ def test_all_twins_in_turn_and_those_without_a_recording_are_named(monkeypatch, 
     assert line["filter"] == "kf" and line["events"] == "21"
     assert good.read_text(encoding="utf-8") == text
     assert not scores_file(bad).exists()
-
-
-@pytest.mark.parametrize(
-    ("option", "near"),
-    [("--durations", "--duration"), ("--seeds", None)],  # `nisus run` has --speed, which is nearer to --seeds
-)
-def test_an_unknown_option_is_told_near_ones_of_the_same_command(option, near, capsys):
-    with pytest.raises(SystemExit):
-        main(["compare", "lorenz63", option, "2"])
-    said = capsys.readouterr().err
-    assert f"Unrecognized options: {option}, 2" in said and "nisus compare --help" in said
-    assert "--speed" not in said
-    assert ("Perhaps you meant" in said) == (near is not None)
-    assert near is None or f"    {near} " in said
 
 
 def test_filters_lists_all_and_says_why_not(nisus):

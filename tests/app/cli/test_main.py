@@ -1,13 +1,20 @@
 """The command line: lazy imports, and errors of writing that name what was written."""
 
+import json
+import re
+import shlex
 import subprocess
 import sys
+from importlib.metadata import version
 from pathlib import Path
 
 import pytest
 
 from app.cli.arguments import COMMANDS, NAMES
-from app.cli.main import main
+from app.cli.completion import SCRIPTS, candidates
+from app.cli.main import described, main, parse
+from config.loader import shipped
+from estimators.registry import ESTIMATORS
 
 FULL = Path("/dev/full")
 needs_full = pytest.mark.skipif(not FULL.exists(), reason="there is no /dev/full")
@@ -42,3 +49,140 @@ def test_a_full_standard_output_is_reported():
         command = [sys.executable, "-m", "app.cli.main", "twins"]
         done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
     assert (done.returncode, done.stderr) == (2, "nisus: standard output: No space left on device\n")
+
+
+def test_the_version_is_that_of_the_package(nisus):
+    assert nisus("--version").out == f"nisus {version('nisus')}\n"
+
+
+def examples(name):
+    return described(NAMES[name]).partition("Examples:\n")[2].splitlines()
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_examples_in_the_help_are_commands_of_bundled_twins(name, capsys):
+    lines = examples(name)
+    assert lines
+    for line in lines:
+        program, *words = shlex.split(line)
+        command = parse(words)
+        assert program == "nisus" and isinstance(command, NAMES[name])
+        named = getattr(command, "twin", None)
+        assert named is None or named in shipped() or named.endswith(".yaml")
+    with pytest.raises(SystemExit):
+        main([name, "--help"])
+    shown = capsys.readouterr().out
+    assert all(line in shown for line in lines)
+
+
+TO_FULL_PIPES = ["--help", "twins", "fold --help", "filters", "schema", "completion bash", "log nothing.csv", "fld"]
+
+
+@pytest.mark.parametrize("words", TO_FULL_PIPES)
+def test_a_closed_pipe_ends_a_command_quietly(words):
+    """Standard output and standard error go to a pipe that nobody reads, as with `2>&1 | head` once head has ended."""
+    code = f"""
+import os, sys
+from app.cli.main import main
+read, write = os.pipe()
+os.close(read)
+said = os.dup(2)
+os.dup2(write, 1)
+os.dup2(write, 2)
+try:
+    status = main({words.split()!r})
+except SystemExit as left:
+    status = left.code
+os.write(said, str(status).encode())
+sys.stdout.flush()
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert (done.stderr, done.returncode) == ("0", 0)
+
+
+COMPLETED = {
+    "": [*NAMES, "--help", "--version"],
+    "comp": ["compare", "completion"],
+    "fold uwb": ["uwb_rover_labyrinth", "uwb_rover_plaza"],
+    "fold motor_can --es": ["--estimator"],
+    "fold motor_can --estimator uk": ["ukf"],
+    "fold motor_can --estimator=uk": ["--estimator=ukf"],
+    "fold motor_can --estimator = uk": ["ukf"],
+    "fold motor_can --estimator =": list(ESTIMATORS),
+    "compare motor_can --estimators ekf uk": ["ukf"],
+    "tune motor_can --aim l": ["likelihood"],
+    "fold motor_winding --set R.": ["R.winding="],
+    "filters --twin lor": ["lorenz63", "lorenz96"],
+    "tunings motor_winding o": ["own"],
+    "completion ": ["bash", "zsh", "fish"],
+    "log ": [],
+    "fold motor_can --out ": [],
+    "no_command ": [],
+}
+
+
+@pytest.mark.parametrize("words", COMPLETED)
+def test_words_are_completed(words):
+    assert candidates(words.split(" ")) == COMPLETED[words]
+
+
+def test_the_script_for_bash_completes_words(tmp_path):
+    program = tmp_path / "nisus"
+    program.write_text(f'#!/bin/sh\nexec {sys.executable} -m app.cli.main "$@"\n')
+    program.chmod(0o755)
+    asked = "COMP_WORDS=(nisus fold lor); COMP_CWORD=2; _nisus; echo ${COMPREPLY[@]}"
+    script = f"PATH={tmp_path}:$PATH\n{SCRIPTS['bash']}\n{asked}"
+    assert subprocess.check_output(["bash", "-c", script], text=True) == "lorenz63 lorenz96\n"
+
+
+def documented():
+    """Fields of the JSON of each command by the guide."""
+    text = Path("docs/reference.md").read_text(encoding="utf-8").partition("## JSON of the commands")[2]
+    rows = re.findall(r"^\| `([a-z]+)[^|]*\|(.*)\|$", text, re.MULTILINE)
+    found = {}
+    for name, fields in rows:
+        found.setdefault(name, set()).update(re.findall(r"`(\w+)`", fields))
+    return found
+
+
+WITH_JSON = [name for name, command in NAMES.items() if "json" in command.__dataclass_fields__]
+RUNS = {
+    "twins": "twins",
+    "twins of one": "twins lorenz63",
+    "filters": "filters",
+    "filters of one": "filters --twin lorenz63 --json",
+    "tunings": "tunings lorenz63",
+    "tunings compared": "tunings lorenz63 own own",
+    "fold": "fold lorenz63 --duration 2",
+    "check": "check motor_winding --duration 60",
+    "advise": "advise motor_winding --duration 60",
+    "compare": "compare lorenz63 --duration 2 --estimators ekf",
+    "stress": "stress motor_winding --only 'winding +2' --seeds 1 --duration 60",
+    "commission": "commission motor_winding --duration 300",
+    "run": "run lorenz63 --headless --duration 0.2",
+    "bus": "bus motor_can --interface virtual --record drive.blf --duration 0.2",
+    "log": "log drive.csv",
+    "advise drafts": "advise drive.csv",
+    "new": "new pump",
+}
+
+
+def test_every_command_with_a_result_prints_json_that_the_guide_describes():
+    assert set(WITH_JSON) == set(documented()) >= {words.split()[0] for words in RUNS.values()}
+    without = set(NAMES) - set(WITH_JSON)
+    assert without == {"review", "schema", "completion"}  # a page, a JSON Schema, a script
+
+
+@pytest.mark.parametrize("case", RUNS)
+def test_json_is_one_document_of_documented_fields_without_nan(case, nisus, tmp_path, monkeypatch):
+    fields = documented()
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "drive.csv").write_text("t,a,b\n" + "".join(f"{k},{k % 7},{k % 5}\n" for k in range(200)))
+    words = shlex.split(RUNS[case])
+
+    def refuse(constant):
+        raise AssertionError(f"{constant} in the JSON of {words}")
+
+    document = json.loads(nisus(*words, "--json").out, parse_constant=refuse)
+    first = document[0] if isinstance(document, list) else document
+    assert set(first) <= fields[words[0]], set(first) - fields[words[0]]
