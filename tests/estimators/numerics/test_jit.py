@@ -64,7 +64,10 @@ def test_entries_saved_at_once_are_kept_apart(tmp_path):
     with ThreadPoolExecutor(8) as pool:
         list(pool.map(lambda key: EntryFiles(str(tmp_path), "f-1", "stamp").save(key, f"code of {key}"), keys))
     assert [EntryFiles(str(tmp_path), "f-1", "stamp").load(key) for key in keys] == [f"code of {key}" for key in keys]
-    assert EntryFiles(str(tmp_path), "f-1", "stamp of an edited file").load(keys[0]) is None
+    assert keys[0] in EntryFiles(str(tmp_path), "f-1", "stamp")
+    edited = EntryFiles(str(tmp_path), "f-1", "stamp of an edited file")
+    assert keys[0] not in edited
+    assert edited.load(keys[0]) is None
 
 
 def test_a_function_for_addresses_names_its_python_form_when_called():
