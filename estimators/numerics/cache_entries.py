@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import functools
 import hashlib
+import itertools
 import os
 import sys
 from pathlib import Path
@@ -16,10 +17,13 @@ from typing import Any
 
 import numba
 from numba import config
-from numba.core import caching
+from numba.core import bytecode, caching
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 """The folder of the packages; a file outside it, such as a user's model, is found by its path."""
+
+ENTRY_FORMAT = 2
+"""To be increased when entries that an earlier version wrote are not to be read."""
 
 DIGEST_SIZE = hashlib.sha256().digest_size
 
@@ -59,7 +63,7 @@ class EntryFiles(caching.IndexDataCacheFile):  # type: ignore[misc]
 
     def __init__(self, cache_path: str, filename_base: str, source_stamp: str) -> None:
         self._path_of = os.path.join(cache_path, f"{filename_base}.{{}}.nbc").format
-        self._valid = numba.__version__, source_stamp
+        self._valid = ENTRY_FORMAT, numba.__version__, source_stamp
 
     def _path(self, key: Any) -> Path:
         return Path(self._path_of(hashlib.sha256(repr(key).encode()).hexdigest()[:16]))
@@ -107,7 +111,13 @@ class EntryFiles(caching.IndexDataCacheFile):  # type: ignore[misc]
 
 
 def use_entries() -> None:
-    """Make Numba keep its cache in such entries, in this process."""
+    """Make Numba keep its cache in such entries, in this process.
+
+    Numba tells functions of one name apart by a number that it counts from 1 in every process. So the entries of two
+    closures that two processes compiled contain different functions under one symbol, and a process that loads both
+    uses the first for both. Counting from a random number makes the symbols different.
+    """
+    bytecode.FunctionIdentity._unique_ids = itertools.count(int.from_bytes(os.urandom(6), "big"))
     caching.IndexDataCacheFile = EntryFiles
     # Numba's own locators serve functions that are in no file, as in a notebook.
     others = [found for found in caching.CompileResultCacheImpl._locator_classes if found is not ContentLocator]

@@ -70,6 +70,44 @@ def test_entries_saved_at_once_are_kept_apart(tmp_path):
     assert edited.load(keys[0]) is None
 
 
+CLOSURES = """
+import math
+from estimators.model.wrapping import as_inner
+from estimators.numerics.jit import jit
+
+def made(power):
+    def sums(values):
+        total = 0.0
+        for i in range(values.size):
+            total += SUMMANDS
+        return total
+
+    inner = as_inner(sums)
+
+    @jit
+    def outer(values):
+        return inner(values) + inner(2.0 * values) + inner(values + 1.0)
+
+    return outer
+""".replace("SUMMANDS", " + ".join(f"math.sin({k}.0 * values[i]) / ({k}.0 + power)" for k in range(1, 60)))
+"""An inner function that is too long for LLVM to copy it into the outer one."""
+
+
+def test_closures_that_two_processes_compiled_are_told_apart_by_a_third(tmp_path):
+    """Their inner functions have the same name; the linker of a process keeps one function of a name."""
+    (tmp_path / "closures.py").write_text(CLOSURES)
+
+    def run(*powers: int) -> list[float]:
+        code = f"import numpy as np, closures; print(*[closures.made(k)(np.linspace(1, 2, 5)) for k in {powers}])"
+        environment = os.environ | {"PYTHONPATH": f"{ROOT}:{tmp_path}", "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+        made = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
+        return [float(value) for value in made.stdout.split()]
+
+    (one,), (two,) = run(2), run(4)
+    assert one != two
+    assert run(2, 4) == [one, two]
+
+
 def test_a_function_for_addresses_names_its_python_form_when_called():
     """Without the wrapper a call from Python would end the process."""
 
