@@ -27,6 +27,9 @@ from ..studies.fold_result import (
     explained,
     fold_json,
     fold_topics,
+    known_states,
+    nees_of,
+    pairs_with,
     smoothing_score,
 )
 from ..studies.scores import pictures_of
@@ -52,9 +55,10 @@ def fold_twin(arguments: Arguments) -> int:
     if arguments.smooth:
         check_smooth(find_estimator(twin.estimator, twin.model), twin.model, twin.tuning.options)
     prepare(twin)
-    log, counts = read_log(twin, arguments.duration)
+    log, counts = read_log(twin, arguments.duration, blind=arguments.blind)
+    known = known_states(twin, log.events)
     begun = time.perf_counter()
-    fold = fold_log(twin, log, picture=twin.picture if recorded else None)
+    fold = fold_log(twin, log, picture=twin.picture if recorded else None, pairs=pairs_with(twin, known))
     seconds = (time.perf_counter() - begun) / log.n
     pictures = pictures_of(fold)
     smoothed: Smoothed | None = attend(twin.model, lambda: smooth(fold), "smoothing") if arguments.smooth else None
@@ -67,6 +71,7 @@ def fold_twin(arguments: Arguments) -> int:
         calibration_of(twin, fold),
         explained(fold, [*dropped(counts, fold), *episodes(fold)]),
         smoothing_score(fold, smoothed) if smoothed is not None else None,
+        nees_of(fold, known),
     )
     if out is not None:
         _write(out, result, smoothed)

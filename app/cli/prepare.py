@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, TextIO
 
+import numpy as np
 from rich.console import Console
 from rich.progress import Progress
 
@@ -44,20 +45,21 @@ def prepared(arguments: Any) -> Twin:
     return twin
 
 
-def fold_log(twin: Twin, log: Log, *, picture: Any = None) -> Fold:
+def fold_log(twin: Twin, log: Log, *, picture: Any = None, pairs: np.ndarray | None = None) -> Fold:
     """Fold a log to its end, so that Ctrl-C ends even a model function that does not return.
 
     Args:
         twin: The twin.
         log: The log.
         picture: Function that takes pictures of the estimate for a recording.
+        pairs: Pairs of states whose covariance the track keeps, those of the twin's view first; None for these.
     """
     fold = Fold(
         twin.estimator,
         twin.model,
         twin.tuning,
         log,
-        pairs=twin.pairs,
+        pairs=twin.pairs if pairs is None else pairs,
         policy=twin.policy,
         picture=picture,
         expected=twin.expected,

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from estimators.diagnostics.calibration import BANDS, Calibration, calibrations, truth_calibration
+from estimators.diagnostics.consistency import nees
 from estimators.diagnostics.detectors import detector_of
 from estimators.diagnostics.episodes import Episode, episode_json
 from estimators.diagnostics.failure_cause import failures
@@ -20,8 +21,9 @@ from estimators.errors import NisusError
 from estimators.fold import Fold
 from estimators.fold_failures import cause_of
 from estimators.gate.isolation import softened
-from estimators.log import READING
+from estimators.log import READING, Events, truth_of
 from estimators.plausibility import reasons_by_sensor
+from estimators.registry import find_entry
 from estimators.smoothing.smooth import consistency
 from estimators.smoothing.walk import Smoothed
 from estimators.track import FAILED, HEALTH_NAMES, REASONS, USED, Track
@@ -35,6 +37,9 @@ from ..twin.twin import Twin
 MAX_DECISIONS = 10  # latest decisions on rejected sensors that are printed; JSON has all
 MAX_EPISODES = 10  # first episodes that are printed; JSON has all
 MAX_EXPLAINED = 3  # first episodes whose cause is searched for: each takes one fold per sensor, input and parameter
+GAUSSIAN = "Gaussian"
+MAX_SAMPLED_STATES = 12  # states whose covariances of members or particles cost little beside a step
+MAX_COVARIANCE_BYTES = 200_000_000
 MIN_DROPPED_SHARE = 0.05  # share of measurements missing from the log above which the result is degraded
 
 
@@ -52,6 +57,29 @@ class SmoothingScore(NamedTuple):
     consistency: Mapping[str, float]
 
 
+class TruthNees(NamedTuple):
+    """Mean NEES per degree of freedom with the bounds of a consistent filter, over `n` times with known `states`.
+
+    inside: share of the times whose own NEES lies in its 95 % bounds.
+    """
+
+    mean: float
+    low: float
+    high: float
+    inside: float
+    states: tuple[str, ...]
+    n: int
+
+    @property
+    def remark(self) -> str:
+        """Its position relative to the bounds."""
+        share = f"{100.0 * self.inside:.1f} % of {self.n:,} times inside their own"
+        if not np.isfinite(self.low):
+            return f"per degree of freedom; {share}"
+        place = "below" if self.mean < self.low else "above" if self.mean > self.high else "inside"
+        return f"per degree of freedom, {place} its 95 % bounds {self.low:.3g} to {self.high:.3g}; {share}"
+
+
 @dataclass(frozen=True)
 class FoldResult:
     """A finished fold with everything measured on it; `seconds` is the time per event."""
@@ -64,6 +92,38 @@ class FoldResult:
     calibration: list[Calibration]
     episodes: list[ExplainedEpisode]
     smoothing: SmoothingScore | None = None
+    nees: TruthNees | None = None
+
+
+def known_states(twin: Twin, events: Events) -> list[int]:
+    """Return the states whose NEES is computed: those with a known truth, except a discrete mode.
+
+    None where their covariances would slow the fold down or take too much memory: many states of a filter without P.
+    """
+    model = twin.model
+    found = [int(j) for j in model.shown if j != model.mode and truth_of(events, int(j))[0].size]
+    pairs = len(found) * (len(found) - 1) // 2
+    small = pairs * len(events) * 8 <= MAX_COVARIANCE_BYTES
+    keeps = find_entry(twin.estimator).family == GAUSSIAN or len(found) <= MAX_SAMPLED_STATES
+    return found if small and keeps else []
+
+
+def pairs_with(twin: Twin, states: Sequence[int]) -> np.ndarray:
+    """Return the pairs of the twin's view, then all pairs of these states."""
+    every = [(i, j) for k, i in enumerate(states) for j in states[k + 1 :]]
+    return np.array([*map(tuple, twin.pairs), *every], int).reshape(-1, 2)
+
+
+def nees_of(fold: Fold, states: Sequence[int]) -> TruthNees | None:
+    """Return the NEES over these states of a fold that kept their covariances; None without one."""
+    if not states:
+        return None
+    found = nees(fold.model, fold.log.events, fold.track, fold.pairs, states)
+    known = int(np.isfinite(found.value).sum())
+    if not known:
+        return None
+    names = tuple(fold.model.state_names[j] for j in states)
+    return TruthNees(found.mean, *found.mean_bounds, found.inside, names, known)
 
 
 def smoothing_score(fold: Fold, smoothed: Smoothed) -> SmoothingScore:
@@ -124,8 +184,9 @@ def fold_json(result: FoldResult) -> dict[str, Any]:
     counts rejections before the filter by sensor and reason, with these as `condition`. `late` and `degraded_after` are
     decisions on time, with reasons. `health` is the share of rows in each state. `log_likelihood` includes the price of
     rejected measurements, which `log_likelihood_used` leaves out; `refused` is their share. `calibration` has an entry
-    per sensor row and per state with known truth. `episodes` have start and end in seconds of the log (end null while
-    one lasts) and `suspects`. `smoothed` has `rmse`, `coverage` and `consistency` of the smoothed states.
+    per sensor row and per state with known truth. `nees` is null without truth (`TruthNees`). `episodes` have start
+    and end in seconds of the log (end null while one lasts) and `suspects`.
+    `smoothed` has `rmse`, `coverage` and `consistency` of the smoothed states.
     """
     twin, fold, scored, counts = result.twin, result.fold, result.score, result.counts
     smoothing = result.smoothing
@@ -137,6 +198,7 @@ def fold_json(result: FoldResult) -> dict[str, Any]:
         **({"field": {"rmse": scored.field.rmse, "coverage": scored.field.coverage}} if scored.field else {}),
         **_errors(scored.states),
         **({"smoothed": {**_errors(smoothing.states), "consistency": smoothing.consistency}} if smoothing else {}),
+        "nees": result.nees,
         "held_out": {
             name: {"rmse": fit.rmse, "bias": fit.bias, "coverage": fit.coverage}
             for name, fit in scored.held_out.items()
@@ -251,6 +313,9 @@ def _figures(result: FoldResult) -> list[Figure]:
         shown = [f"{name} {value:.2f}" for name, value in result.smoothing.consistency.items() if np.isfinite(value)]
         if shown:
             found.append(Figure("smoother against filter", ", ".join(shown), remark="1 where the model holds"))
+    if result.nees is not None:
+        title = "mean NEES" if len(result.nees.states) > 1 else f"mean NEES of {result.nees.states[0]}"
+        found.append(Figure(title, result.nees.mean, remark=result.nees.remark))
     if scored.nis_readings:
         nis = f"{scored.nis:.4f}" if abs(scored.nis) < 1e6 else f"{scored.nis:.4g}"
         found.append(Figure("mean NIS", nis, remark=f"{scored.nis_verdict.said}; {scored.nis_readings} readings"))

@@ -12,7 +12,7 @@ from config.source_schema import SimulatorSection
 from estimators.errors import ConfigError, SourceError
 from estimators.fold import Fold
 from estimators.late import inflated
-from estimators.log import Log
+from estimators.log import TRUTH, Log
 from sources.source import NEVER, TRUNCATED, WRONG_TIME, is_endless
 from sources.tables.order import REMARKS as ORDER
 
@@ -45,8 +45,13 @@ def remarking(report: Callable[[str, str], None]) -> Callable[[str, str], None]:
     return both
 
 
-def read_log(twin: Twin, duration: float | None) -> tuple[Log, Counter[str]]:
+def read_log(twin: Twin, duration: float | None, *, blind: bool = False) -> tuple[Log, Counter[str]]:
     """Return all events of the twin's source in order of time, and counts of dropped and corrected ones.
+
+    Args:
+        twin: The twin.
+        duration: Seconds to read; None for all.
+        blind: Leave the true states out, whatever source they come from.
 
     Raises:
         ConfigError: If `duration` is not positive.
@@ -60,11 +65,14 @@ def read_log(twin: Twin, duration: float | None) -> tuple[Log, Counter[str]]:
         counts[key] += 1
 
     def put(passed: Passed) -> None:
-        events = passed.events
+        events, settled = passed.events, passed.settled
+        if blind:
+            seen = events.kind != TRUTH
+            events, settled = events.select(seen), settled[seen]
         if beside is not None:
             events, late = inflated(events, beside, log.newest, horizon)
             counts["inflated"] += late
-        first, stale = log.extend(events, horizon, passed.settled)
+        first, stale = log.extend(events, horizon, settled)
         counts["stale"] += stale
         if beside is not None:
             beside.rewind(first)

@@ -55,7 +55,7 @@ def compare(filters=("ekf", "ukf", "enkf"), seeds=100):
     found = {}
     for name in filters:
         runs = fold_many(name, PENDULUM, logs, covariance=True)
-        found[name] = runs, mean_nees([run.nees() for run in runs])
+        found[name] = runs, mean_nees(runs)
     return found
 
 

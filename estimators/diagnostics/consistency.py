@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
-from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
 from ..errors import EstimatorError
-from ..events.batch import TRUTH, Events
+from ..events.batch import TRUTH, Events, truth_of
 from ..model.state_space import StateSpaceModel
 from ..numerics.quantiles import chi_square_quantile
+from ..track import Track
 from .health import PROBABILITY
+from .intervals import scale_interval
 from .references import wrapped
 
 
@@ -85,67 +86,129 @@ class Nees(NamedTuple):
         known = np.isfinite(self.value)
         return float(np.mean((self.low <= self.value)[known] & (self.value <= self.high)[known]))
 
+    @property
+    def mean_bounds(self) -> tuple[float, float]:
+        """Bounds of 95 % of the means of a consistent filter whose ε are as correlated in time as these.
 
-def nees(model: StateSpaceModel, events: Events, mean: np.ndarray, cov: np.ndarray) -> Nees:
-    """Return the NEES at the truth events.
+        NaN for fewer than 8 times.
+        """
+        known = np.isfinite(self.value)
+        found = scale_interval(self.value[known] / self.dof[known])
+        if not found.value > 0.0:
+            return np.nan, np.nan
+        return found.value / found.high, found.high / found.value
+
+
+def nees(
+    model: StateSpaceModel, events: Events, track: Track, pairs: np.ndarray, states: Sequence[int] | None = None
+) -> Nees:
+    """Return the NEES at the truth events of a track.
 
     Args:
         model: The model; errors of circular states wrap.
         events: The folded events, N of them.
-        mean: Estimates, (N, nx).
-        cov: Covariances, (N, nx, nx).
+        track: Their rows.
+        pairs: Pairs of states of the track's covariances, (k, 2); those of `states` are among them.
+        states: Indices of the states, which the track shows; None for all.
 
     Raises:
         EstimatorError: If no truth is known.
     """
-    times, values, dof = [], [], []
+    column = {int(j): k for k, j in enumerate(model.shown)}
+    place = {frozenset(map(int, pair)): k for k, pair in enumerate(pairs)}
+    chosen = [int(j) for j in (model.shown if states is None else states)]
     rows = np.flatnonzero(events.kind == TRUTH)
-    circular = model.circular.astype(bool)
     # Events of one time are one truth: their rows hold the same estimate.
-    for together in np.split(rows, 1 + np.flatnonzero(np.diff(events.t[rows]))):
-        truth = np.full(model.nx, np.nan)
-        for i in together:
-            first = int(events.channel[i])
-            block = events.value[i, : model.nx - first]
-            np.copyto(truth[first : first + block.size], block, where=np.isfinite(block))
-        known = np.isfinite(truth)
-        if not known.any():
-            continue
-        last = together[-1]
-        error = truth - mean[last]
-        error[circular] = wrapped(error[circular])
-        times.append(events.t[last] * 1e-9)
-        values.append(_square(error[known], cov[last][np.ix_(known, known)]))
-        dof.append(int(known.sum()))
-    if not times:
+    last = rows[np.flatnonzero(np.diff(events.t[rows], append=np.iinfo(np.int64).max))]
+    error = np.full((len(chosen), last.size), np.nan)
+    for k, j in enumerate(chosen):
+        told, values = truth_of(events, j)
+        error[k, np.searchsorted(last, told)] = values  # of two values for one time the later counts
+        error[k] -= track.mean[last, column[j]]
+        if model.circular[j]:
+            error[k] = wrapped(error[k])
+    known = np.isfinite(error)
+    dof = known.sum(axis=0)
+    if not dof.any():
         raise EstimatorError("NEES: no true state is known; give some by log.add_truth(seconds, state=values)")
-    return _bounded(np.array(times), np.array(values), np.array(dof), 1)
+    value = np.full(last.size, np.nan)
+    whole = known[:, :1], np.zeros(last.size, int)
+    patterns, pattern = whole if known.all() else np.unique(known, axis=1, return_inverse=True)
+    for number, mask in enumerate(patterns.T):
+        here, index = np.flatnonzero(pattern.reshape(-1) == number), np.flatnonzero(mask)
+        P = np.zeros((index.size, index.size, here.size))
+        for a, i in enumerate(index):
+            P[a, a] = track.std[last[here], column[chosen[i]]] ** 2
+            for b, j in enumerate(index[:a]):
+                P[a, b] = track.cross[last[here], place[frozenset((chosen[i], chosen[j]))]]
+        value[here] = _squares(error[np.ix_(index, here)], P)
+    some = dof > 0
+    return _bounded(events.t[last[some]] * 1e-9, value[some], dof[some], 1)
 
 
-def mean_nees(runs: Sequence[Nees]) -> Nees:
+def _squares(error: np.ndarray, P: np.ndarray) -> np.ndarray:
+    """Return squared errors in units of their covariances, (m,); NaN where a covariance has no inverse.
+
+    P = L Lᵀ,  L z = e,  ε = zᵀ z, for all m times at once.
+
+    Args:
+        error: Errors, (k, m).
+        P: Covariances, (k, k, m), of which the lower triangles count; becomes L.
+    """
+    k, m = error.shape
+    z = np.empty((k, m))
+    with np.errstate(all="ignore"):
+        for j in range(k):
+            square = P[j, j] - np.einsum("im,im->m", P[j, :j], P[j, :j])
+            root = np.sqrt(np.where((square > 0.0) & np.isfinite(square), square, np.nan))
+            P[j, j] = root
+            P[j + 1 :, j] = (P[j + 1 :, j] - np.einsum("pim,im->pm", P[j + 1 :, :j], P[j, :j])) / root
+            z[j] = (error[j] - np.einsum("im,im->m", P[j, :j], z[:j])) / root
+        return np.asarray(np.einsum("im,im->m", z, z))
+
+
+def mean_nees(runs: Sequence[Nees | SupportsNees] | Nees | SupportsNees) -> Nees:
     """Return the mean over independent runs (other truths, other noise) at each time, with its narrower bounds.
 
+    Args:
+        runs: Estimates of `fold(..., covariance=True)` or `fold_many`, or the NEES of each, `estimates.nees()`.
+
     Raises:
-        EstimatorError: If there is no run, or the runs have true values at different times.
+        EstimatorError: If there is no run, one is something else, or the runs have true values at different times.
     """
-    if not runs:
+    found = [_nees_of(run) for run in ([runs] if isinstance(runs, (Nees, SupportsNees)) else runs)]
+    if not found:
         raise EstimatorError("mean_nees: there is no run; give at least one")
-    first = runs[0]
-    for run in runs:
+    first = found[0]
+    for run in found:
         if not (np.array_equal(run.seconds, first.seconds) and np.array_equal(run.dof, first.dof)):
             raise EstimatorError("mean_nees: the runs know other states, or at other times; a mean needs the same ones")
-    return _bounded(first.seconds, np.mean([run.value for run in runs], axis=0), first.dof, len(runs))
+    return _bounded(first.seconds, np.mean([run.value for run in found], axis=0), first.dof, len(found))
 
 
-def _square(error: np.ndarray, P: np.ndarray) -> float:
-    """Return the squared error in units of its covariance; NaN if that has no inverse."""
-    try:
-        return float(error @ cho_solve(cho_factor(P), error))
-    except (LinAlgError, ValueError):
-        return np.nan
+@runtime_checkable
+class SupportsNees(Protocol):
+    """Estimates that know their NEES."""
+
+    def nees(self) -> Nees:
+        """Return it."""
+        ...
+
+
+def _nees_of(run: object) -> Nees:
+    """Return the NEES of a run."""
+    if isinstance(run, Nees):
+        return run
+    if isinstance(run, SupportsNees):
+        return run.nees()
+    raise EstimatorError(
+        f"mean_nees: a run is of type {type(run).__name__}; give what fold(..., covariance=True) returns, or the list "
+        "of fold_many(..., covariance=True)"
+    )
 
 
 def _bounded(seconds: np.ndarray, value: np.ndarray, dof: np.ndarray, runs: int) -> Nees:
     tail = 0.5 * (1.0 - PROBABILITY)
-    low, high = (chi_square_quantile(share, runs * dof) / runs for share in (tail, 1.0 - tail))
+    counts, which = np.unique(dof, return_inverse=True)
+    low, high = (chi_square_quantile(share, runs * counts)[which] / runs for share in (tail, 1.0 - tail))
     return Nees(seconds, value, dof, np.asarray(low, float), np.asarray(high, float), runs)

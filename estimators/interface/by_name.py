@@ -42,6 +42,8 @@ from .table import table_of
 
 __all__ = ["fold", "fold_many"]
 
+NO_COVARIANCES = "the covariances were not kept; fold with covariance=True"
+
 Prior = tuple[Any, Any]
 Values = Mapping[str, Any]
 
@@ -335,7 +337,7 @@ class Estimates:
             EstimatorError: If the fold did not keep them.
         """
         if not self.covariance:
-            raise EstimatorError("the covariances were not kept; fold with covariance=True")
+            raise EstimatorError(NO_COVARIANCES)
         n = self.model.nx
         cov = np.empty((len(self), n, n))
         cov[:, range(n), range(n)] = self.track.std**2
@@ -380,4 +382,6 @@ class Estimates:
         Raises:
             EstimatorError: If the fold did not keep the covariances, or no truth is known.
         """
-        return nees(self.model, self.events, self.mean, self.cov)
+        if not self.covariance:
+            raise EstimatorError(NO_COVARIANCES)
+        return nees(self.model, self.events, self.track, all_pairs(self.model))

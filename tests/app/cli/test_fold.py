@@ -17,6 +17,7 @@ from app.twin.log_reader import read_log
 from app.twin.twin import load_twin
 from estimators.diagnostics.episodes import Episode
 from estimators.fold import Fold as FoldOf
+from estimators.interface.by_name import fold as fold_by_name
 from estimators.log import Log
 from estimators.models import MODELS
 from estimators.track import HEALTH_NAMES
@@ -81,6 +82,63 @@ def test_a_clock_that_steps_back_is_bridged_or_named_and_never_called_tracking(
     assert health[1] == "tracking"
     (line,) = [line for line in said.err.splitlines() if "clock was set" in line]
     assert "winding" in line and "3600 s back" in line
+
+
+PARTS = """\
+model: motor_winding
+source:
+  type: merged
+  parts:
+    - {type: table, files: drive.csv, time: {column: t, unit: s}, sensors: {winding: {columns: y}}}
+    - type: table
+      files: drive.csv
+      time: {column: t, unit: s}
+      truth: {temperature: {columns: temperature}, rate: {columns: rate}}
+"""
+SIMULATED = """\
+model: motor_winding
+source: {type: simulator, seed: 3, step: 1, duration: 200, sensors: {winding: {every: 2}}}
+"""
+
+
+@pytest.mark.parametrize("text", [DRIVE, PARTS, SIMULATED], ids=["table", "merged", "simulator"])
+def test_a_blind_fold_ignores_the_truth_of_every_source(text: str, tmp_path: Path, nisus: CommandLine) -> None:
+    """The truth is 30 °C off, which an alarm and a figure report; without it nothing else changes."""
+    rng = np.random.default_rng(5)
+    rows = "".join(f"{k},{40 + rng.normal(0, 2)},{70 if k > 5 else ''},\n" for k in range(100))
+    path = drive(tmp_path, "t,y,temperature,rate\n" + rows, text)
+    tables = {}
+    for blind in ((), ("--blind",)):
+        out = tmp_path / "track.parquet"
+        found = nisus("fold", path, "--out", out, "--json", *blind).json
+        tables[blind] = pq.read_table(out).to_pandas()
+        assert bool(found["rmse"]) == bool(found["coverage"]) == (found["nees"] is not None) == (not blind)
+        assert any(entry["role"] == "truth" for entry in found["calibration"]) == (not blind)
+        if text is not SIMULATED:
+            assert any(episode["cause"] == "missed" for episode in found["episodes"]) == (not blind)
+    seen, blind_table = tables[()], tables["--blind",]
+    seen = seen[seen.event != "truth"].reset_index(drop=True)
+    assert (seen.event == "reading").sum() >= 100 and (blind_table.event == "truth").sum() == 0
+    for column in ("t_ns", "temperature", "temperature_std", "rate", "nis", "log_likelihood"):
+        np.testing.assert_array_equal(seen[column], blind_table[column])
+
+
+def test_the_nees_is_that_of_the_python_interface(tmp_path: Path, nisus: CommandLine) -> None:
+    path = tmp_path / "drive.yaml"
+    path.write_text(SIMULATED)
+    log, _ = read_log(load_twin(path), None)
+    expected = fold_by_name("kf", MODELS["motor_winding"], log, covariance=True).nees()
+    found = nisus("fold", path, "--estimator", "kf", "--json").json["nees"]
+    assert found["mean"] == pytest.approx(expected.mean, rel=1e-12)
+    assert (found["low"], found["high"]) == pytest.approx(expected.mean_bounds, rel=1e-9)
+    assert found["inside"] == expected.inside and found["n"] == expected.seconds.size == 200
+    assert found["states"] == ["temperature", "rate"]
+    assert found["low"] < found["mean"] < found["high"]
+    text = nisus("fold", path, "--estimator", "kf").out
+    assert re.search(rf"mean NEES +{found['mean']:.3g} +per degree of freedom, inside its 95 % bounds", text)
+    # With a hundredth of the sensor's noise declared, the filter is overconfident.
+    wrong = nisus("fold", path, "--estimator", "kf", "--set", "R.winding=0.09", "--json").json["nees"]
+    assert wrong["mean"] > 3.0 * wrong["high"] and wrong["inside"] < 0.5
 
 
 def stuck_drive(tmp_path: Path) -> Path:

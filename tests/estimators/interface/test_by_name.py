@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+import time
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -9,9 +10,11 @@ import pytest
 from scipy.stats import chi2
 
 from estimators import MODELS, Log, fold, fold_many, mean_nees
-from estimators.errors import EventError, NisusError
+from estimators.diagnostics.consistency import Nees
+from estimators.errors import EstimatorError, EventError, NisusError
 from estimators.fold import fold as fold_track
 from estimators.log import INPUT, READING, TICK, TRUTH, Events
+from estimators.models.uwb_rover import HEADING, YAW_RATE_BIAS
 from estimators.track import HELD_OUT, USED
 from estimators.tuning import Tuning
 from tests.support import SECOND, assert_same, folded
@@ -223,6 +226,94 @@ def test_nees_is_its_definition():
     twice = mean_nees([got, got._replace(value=3.0 * got.value)])
     np.testing.assert_allclose(twice.value, 2.0 * got.value)
     np.testing.assert_allclose(twice.high, chi2.ppf(0.975, [4, 2]) / 2, rtol=1e-9)
+
+
+def test_nees_of_many_times_is_a_plain_loop_with_solve():
+    """A rover with an angle, over times that know all, some or none of the states, and one that is known twice."""
+    model = MODELS["uwb_rover"]
+    rng = np.random.default_rng(3)
+    log = Log.of(model, start=0.0)
+    times = np.arange(1.0, 61.0)
+    log.add("range_1", times, 10.0 + rng.normal(0, 0.2, times.size))
+    truth = rng.normal(0.0, 3.0, (times.size, model.nx))
+    truth[rng.random(truth.shape) < 0.4] = np.nan
+    truth[:20] = rng.normal(0.0, 3.0, (20, model.nx))
+    truth[30] = np.nan
+    log.add_truth(times, **dict(zip(model.state_names, truth.T, strict=True)))
+    log.add_truth(7.0, heading=0.25)
+    truth[6, HEADING] = 0.25
+    # With a prior of deviation 0, P has no inverse at first.
+    prior = (model.prior_mean, np.diag([4.0, 4.0, 1.0, 0.0, 0.01, 0.1, 0.1, 0.1, 0.1]))
+    track = fold("ekf", model, log, covariance=True, prior=prior, Q={"yaw_rate_bias": 0.0})
+    got = track.nees()
+    expected, dof = [], []
+    for second, true in zip(times, truth, strict=True):
+        known = np.isfinite(true)
+        if not known.any():
+            continue
+        row = np.flatnonzero(track.events.t == round(second * SECOND))[-1]
+        e = true - track.mean[row]
+        e[HEADING] = np.arctan2(np.sin(e[HEADING]), np.cos(e[HEADING]))
+        P = track.cov[row][np.ix_(known, known)]
+        singular = bool(known[YAW_RATE_BIAS])
+        assert singular == (np.linalg.matrix_rank(P) < len(P))
+        expected.append(np.nan if singular else e[known] @ np.linalg.solve(P, e[known]))
+        dof.append(known.sum())
+    assert 10 < np.sum(np.isnan(expected)) < 50
+    # A condition of P up to 1e6 leaves ten digits.
+    np.testing.assert_allclose(got.value, expected, rtol=1e-9)
+    assert got.dof.tolist() == dof
+
+
+def test_nees_costs_less_than_the_filtering():
+    """Both are timed in turns, so that a loaded machine slows both; the share is 0.15."""
+    log = Log.of(MOTOR, start=0.0)
+    times = np.arange(1.0, 2001.0)
+    log.add("winding", times, np.full(times.size, 40.0))
+    log.add_truth(times, temperature=times, rate=times)
+
+    def seconds(work):
+        begun = time.perf_counter()
+        work()
+        return time.perf_counter() - begun
+
+    track = fold("kf", MOTOR, log, covariance=True)
+    pairs = [(seconds(lambda: fold("kf", MOTOR, log, covariance=True)), seconds(track.nees)) for _ in range(7)]
+    folding, scoring = np.median(pairs, axis=0)
+    assert scoring < folding
+
+
+def test_a_mean_nees_is_given_the_estimates_themselves():
+    logs = [simulated(seed) for seed in range(3)]
+    runs = fold_many("kf", MOTOR, logs, covariance=True)
+    right = mean_nees([run.nees() for run in runs])
+    for given in (runs, tuple(runs), [runs[0], runs[1].nees(), runs[2]]):
+        np.testing.assert_array_equal(mean_nees(given).value, right.value)
+    for one in (runs[0], runs[0].nees()):
+        np.testing.assert_array_equal(mean_nees(one).value, runs[0].nees().value)
+    with pytest.raises(EstimatorError, match="run is of type ndarray; give what fold.*covariance=True.* returns"):
+        mean_nees([run.mean for run in runs])
+    with pytest.raises(EstimatorError, match="fold with covariance=True"):
+        mean_nees(fold_many("kf", MOTOR, logs))
+
+
+def test_bounds_of_the_mean_nees_hold_95_of_100_means():
+    """1,000 runs of 2,000 correlated ε of 3 states: a mean over time inside its bounds, as often as they promise."""
+    rng = np.random.default_rng(5)
+    runs, n, phi = 1000, 2000, 0.8
+    e = rng.standard_normal((runs, 3))
+    values = np.empty((runs, n))
+    for k in range(n):
+        e = phi * e + np.sqrt(1 - phi**2) * rng.standard_normal((runs, 3))
+        values[:, k] = np.sum(e**2, axis=1)
+    inside, plain = 0, 0
+    for value in values:
+        run = Nees(np.arange(n), value, np.full(n, 3), np.zeros(n), np.ones(n))
+        low, high = run.mean_bounds
+        inside += low <= run.mean <= high
+        plain += chi2.ppf(0.025, 3 * n) / (3 * n) <= run.mean <= chi2.ppf(0.975, 3 * n) / (3 * n)
+    # Four standard errors of a share of 1,000 are 2.8 %; bounds of independent values would hold far fewer.
+    assert abs(inside / runs - 0.95) < 0.028 and plain / runs < 0.85
 
 
 def simulated(seed):
