@@ -142,7 +142,8 @@ class FoldCommand(JsonOption, FoldOptions):
     html: Path | None = None
     """Write a self-contained HTML report: scores, charts, checks, episodes, tuning."""
     plot: Path | None = None
-    """Draw the states with their measurements, and the NIS, into this .png, .pdf or .svg (needs `nisus[plot]`)."""
+    """Draw states with ± 2 σ and measurements, innovations and NIS into this .png, .pdf or .svg (needs
+    `nisus[plot]`)."""
     blind: Flag = False
     """Ignore all true states: of a simulator, a recording or a table. Nothing is then scored against them."""
     smooth: Flag = False

@@ -17,6 +17,7 @@ from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from importlib import import_module
 from multiprocessing import get_context
 from pickle import PicklingError
 from typing import Any
@@ -375,6 +376,17 @@ class Estimates:
     def score(self) -> Score:
         """Return NIS and its bounds, errors against the truth, and predictions of held-out sensors."""
         return score(self.track, self.events, self.model, gate=self.tuning.gate, baseline=self.tuning.baseline)
+
+    def plot(self, title: str = "") -> Any:
+        """Return a `matplotlib.figure.Figure` of states with ± 2 σ, innovations and NIS; `.savefig(path)` writes it.
+
+        Raises:
+            ConfigError: If Matplotlib is not installed.
+        """
+        # By name, as pandas loads its plotting backend: the numerics depend neither on the application nor Matplotlib.
+        draw = import_module("app.present.drawing.plot").plot_track
+        heading = title or f"{self.model.name}, {self.estimator}"
+        return draw(self.model, self.events, self.track, episodes=self.episodes(), title=heading)
 
     def nees(self) -> Nees:
         """Return the normalised estimation error squared at all events with a known truth.

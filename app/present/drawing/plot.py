@@ -5,6 +5,7 @@ from __future__ import annotations
 import textwrap
 from collections.abc import Sequence
 from functools import cached_property
+from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -17,7 +18,7 @@ from estimators.model.state_space import StateSpaceModel
 from estimators.track import Track
 
 from ..series.chart_stream import drawn
-from ..series.columns import columns_of, rows_of
+from ..series.columns import DOTS, columns_of, rows_of
 from ..series.levels_of_detail import grouped
 from .colors import LIGHT, RGB
 from .direct_readings import observed
@@ -29,6 +30,15 @@ if TYPE_CHECKING:
 FORMATS = (".png", ".pdf", ".svg")
 MAX_STATES = 8
 """States in one picture; those that no sensor measures come first."""
+
+MAX_INNOVATIONS = 6
+"""Sensor rows whose innovations are drawn; those with most measurements come first."""
+
+MAX_DOTS = 10_000
+"""Dots of a column; of more, a random sample and the extremes of 500 groups are drawn, a tenth of all."""
+
+MAX_GAP_STEPS = 20.0
+"""Usual intervals between measurements after which the band of innovations is interrupted."""
 
 MAX_GROUPS = 1500
 """Groups of rows into which a long log is cut; each is drawn as its two extremes."""
@@ -80,7 +90,16 @@ def new_figure(width: float, height: float) -> Figure:
         from matplotlib.figure import Figure
     except ImportError:
         raise ConfigError("pictures need Matplotlib: pip install 'nisus[plot]'") from None
-    return Figure(figsize=(width, height))
+
+    class FigureForNotebooks(Figure):
+        """Figure that a notebook shows as the value of a cell, without pyplot."""
+
+        def _repr_png_(self) -> bytes:
+            file = BytesIO()
+            self.savefig(file, format="png", dpi=100)
+            return file.getvalue()
+
+    return FigureForNotebooks(figsize=(width, height))
 
 
 def hex_color(color: RGB) -> str:
@@ -99,9 +118,22 @@ class TrackSeries:
     def __getitem__(self, name: str) -> tuple[np.ndarray, np.ndarray]:
         """Return seconds (n,) and values (n,) of a column, without its gaps in time."""
         values = self.raw(name)
+        if self._columns[name].kind == DOTS:
+            known = self._sampled(values)
+            return (self.events.t[known] - int(self.events.t[0])) * 1e-9, values[known]
         groups = grouped(self._size, 0, self.events.t, values[:, None])
         times, points = drawn(groups, np.array([self._columns[name].kind]))
         return (times - int(self.events.t[0])) * 1e-9, points[:, 0]
+
+    def _sampled(self, values: np.ndarray) -> np.ndarray:
+        """Return the indices of the dots that are drawn: all, or a random sample and the extremes of each group."""
+        known = np.flatnonzero(np.isfinite(values))
+        if known.size <= MAX_DOTS:
+            return known
+        parts = np.array_split(known, MAX_DOTS // 20)
+        extremes = [part[[np.argmin(values[part]), np.argmax(values[part])]] for part in parts]
+        sample = np.random.default_rng(0).choice(known, MAX_DOTS - 2 * len(parts), replace=False)
+        return np.unique(np.concatenate((*extremes, sample)))
 
     def raw(self, name: str) -> np.ndarray:
         """Return all values of a column, (rows,), NaN where there is none."""
@@ -173,6 +205,38 @@ def _wrapped(values: np.ndarray, turn: float) -> np.ndarray:
     return values - turn * np.round(values / turn) if np.isfinite(turn) else values.copy()
 
 
+def draw_innovation(axes: Axes, series: TrackSeries, name: str, unit: TimeUnit) -> None:
+    """Draw the innovations of a sensor row with their ± 2 σ; those beyond the chart are triangles at its edge."""
+    used, rejected, band = (hex_color(color) for color in (LIGHT.reading, LIGHT.refused, LIGHT.bound))
+    seconds, upper = series[f"innovation_upper:{name}"]
+    known = np.isfinite(upper)
+    seconds, upper = seconds[known], upper[known]
+    low, usual = series[f"innovation_lower:{name}"][1][known], float(np.median(upper))
+    steps = np.diff(seconds, prepend=seconds[:1])
+    upper[steps > MAX_GAP_STEPS * np.median(steps)] = np.nan  # a dropout has no band
+    axes.fill_between(seconds / unit.seconds, low, upper, color=band, alpha=0.3, lw=0, label="± 2 σ")
+    seconds, values = series[f"innovation:{name}"]
+    was_rejected = np.isin(seconds, series[f"refused:{name}"][0])
+    judged = np.abs(values[~was_rejected] if (~was_rejected).any() else values)
+    edge = 1.05 * max(float(np.quantile(judged, 0.995, method="higher")), 2.0 * usual)
+    beyond = np.abs(values) > edge
+    for mask, color, label in ((~was_rejected, used, "innovation"), (was_rejected, rejected, "rejected")):
+        style: dict[str, Any] = {"ls": "", "mew": 0, "color": color}
+        far = mask & beyond
+        for part, marker, text in (
+            (mask & ~beyond, "o", label),
+            (far & (values > 0.0), "^", f"{label}, off the chart"),
+            (far & (values < 0.0), "v", None if (far & (values > 0.0)).any() else f"{label}, off the chart"),
+        ):
+            if part.any():
+                shown = np.clip(values[part], -edge, edge)
+                size = 2.0 if marker == "o" else 4.0
+                axes.plot(seconds[part] / unit.seconds, shown, marker=marker, ms=size, label=text, **style)
+    axes.axhline(0.0, color=hex_color(LIGHT.previous), lw=0.6)
+    # Room for the legend above.
+    axes.set_ylim(-1.1 * edge, 1.6 * edge)
+
+
 def draw_nis(axes: Axes, series: TrackSeries, unit: TimeUnit) -> None:
     """Draw the NIS: its windowed mean with the 95 % bounds of a consistent filter, and that of each measurement."""
     seconds, low = series["nis_low"]
@@ -191,7 +255,7 @@ def draw_nis(axes: Axes, series: TrackSeries, unit: TimeUnit) -> None:
 def plot_track(
     model: StateSpaceModel, events: Events, track: Track, *, episodes: Sequence[Episode] = (), title: str = ""
 ) -> Figure:
-    """Draw a fold: a panel per state with its measurements, and the NIS.
+    """Draw a fold: a panel per state with its measurements, one per sensor row with its innovations, and the NIS.
 
     Args:
         model: Model of the fold.
@@ -208,16 +272,21 @@ def plot_track(
     """
     series = TrackSeries(model, events, track)
     states = sorted(model.shown_states, key=lambda state: state.name in series.measured_by)[:MAX_STATES]
-    figure = new_figure(PANEL_INCHES[0], PANEL_INCHES[1] * (len(states) + 1))
+    counts = {name: int(np.isfinite(series.raw(f"innovation:{name}")).sum()) for name, _, _ in rows_of(model)}
+    measured = [name for name in sorted(counts, key=lambda name: -counts[name])[:MAX_INNOVATIONS] if counts[name]]
+    measured = [name for name in counts if name in measured]
+    figure = new_figure(PANEL_INCHES[0], PANEL_INCHES[1] * (len(states) + len(measured) + 1))
     span = (events.t[-1] - events.t[0]) * 1e-9
     unit, first = time_unit(float(span)), int(events.t[0]) * 1e-9
-    panels = figure.subplots(len(states) + 1, 1, sharex=True, squeeze=False)[:, 0]
+    panels = figure.subplots(len(states) + len(measured) + 1, 1, sharex=True, squeeze=False)[:, 0]
     for axes, state in zip(panels, states, strict=False):
         draw_state(axes, series, state.name, unit=unit)
-        words = model.label(state.name).replace("_", " ")
-        label = words if state.unit in ("", "1") else f"{words} [{state.unit}]"
-        axes.set_ylabel(textwrap.fill(label, LABEL_WIDTH), fontsize=9)
+        _label(axes, model.label(state.name), state.unit)
         axes.set_ylim((-3.3, 5.0) if state.circular else _extent(series, state.name))
+    row_units = dict(zip(model.row_names, (row.unit for sensor in model.sensors for row in sensor.rows), strict=True))
+    for axes, name in zip(panels[len(states) :], measured, strict=False):
+        draw_innovation(axes, series, name, unit)
+        _label(axes, f"innovation of {name}", row_units[name])
     draw_nis(panels[-1], series, unit)
     panels[-1].set_ylabel("NIS", fontsize=9)
     panels[-1].set_xlabel(f"time [{unit.name}]")
@@ -227,15 +296,40 @@ def plot_track(
             artist.set_clip_on(True)
         axes.grid(color=hex_color(LIGHT.grid), lw=0.6)
         axes.tick_params(labelsize=8)
-        for item in episodes:
-            end = span if item.end is None else item.end - first
+        for start, end in _spans([(item.start - first, item.end and item.end - first) for item in episodes], span):
             shade = hex_color(LIGHT.health["suspect"])
-            axes.axvspan((item.start - first) / unit.seconds, end / unit.seconds, color=shade, alpha=0.12, lw=0)
+            axes.axvspan(start / unit.seconds, end / unit.seconds, color=shade, alpha=0.12, lw=0)
         axes.legend(fontsize=7, ncols=6, loc="upper left", framealpha=0.85, edgecolor="none", borderaxespad=0.2)
-    panels[0].set_title(title, fontsize=10, loc="left")
+    left_out = [
+        f"{len(names)} of {total} {what}"
+        for names, total, what in (
+            (states, len(model.shown_states), "states"),
+            (measured, sum(map(bool, counts.values())), "sensor rows"),
+        )
+        if len(names) < total
+    ]
+    panels[0].set_title(", ".join(filter(None, [title, *left_out])), fontsize=10, loc="left")
     figure.align_ylabels()
     figure.set_layout_engine("constrained")
     return figure
+
+
+def _spans(episodes: Sequence[tuple[float, float | None]], last: float) -> list[tuple[float, float]]:
+    """Return the times with at least one episode; an open one lasts to `last`."""
+    found: list[tuple[float, float]] = []
+    for start, end in sorted((start, last if end is None else end) for start, end in episodes):
+        if found and start <= found[-1][1]:
+            found[-1] = found[-1][0], max(found[-1][1], end)
+        else:
+            found.append((start, end))
+    return found
+
+
+def _label(axes: Axes, words: str, unit: str) -> None:
+    """Label a panel with a quantity and its unit."""
+    words = words.replace("_", " ")
+    text = words if unit in ("", "1") else f"{words} [{unit}]"
+    axes.set_ylabel(textwrap.fill(text, LABEL_WIDTH), fontsize=9)
 
 
 def _extent(series: TrackSeries, name: str) -> tuple[float, float]:

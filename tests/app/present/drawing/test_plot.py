@@ -9,6 +9,7 @@ from app.cli.main import main
 from app.present.drawing.plot import TrackSeries, check_plot, draw_state, new_figure, plot_track, time_unit
 from estimators import MODELS, Log, fold
 from estimators.errors import ConfigError
+from estimators.track import USED
 
 
 @pytest.fixture(scope="module")
@@ -23,7 +24,7 @@ def run():
 
 def test_a_plot_has_the_states_with_bands_and_measurements_and_the_nis(run):
     figure = plot_track(run.model, run.events, run.track, title="motor")
-    rate, temperature, nis = figure.axes
+    rate, temperature, innovation, nis = figure.axes
     lines = {line.get_label(): line for line in temperature.lines}
     np.testing.assert_array_equal(lines["estimate"].get_ydata(), run.mean[:, 0])
     assert lines["rejected"].get_ydata().tolist() == [200.0]
@@ -35,6 +36,57 @@ def test_a_plot_has_the_states_with_bands_and_measurements_and_the_nis(run):
     assert "measurement" not in {line.get_label() for line in rate.lines}
     mean = next(line for line in nis.lines if line.get_label() == "windowed mean").get_ydata()
     np.testing.assert_array_equal(mean, run.track.nis_mean)
+
+
+def test_innovations_are_drawn_one_by_one_with_their_band_and_those_off_the_chart_at_its_edge(run):
+    """The filter's own ν and ± 2 √S; the measurement of 200 °C was rejected, 160 °C above its prediction."""
+    axes = plot_track(run.model, run.events, run.track).axes[2]
+    assert "innovation" in axes.get_ylabel() and "°C" in axes.get_ylabel()
+    lines = {line.get_label(): line for line in axes.lines}
+    used = run.track.verdict == USED
+    np.testing.assert_array_equal(lines["innovation"].get_ydata(), run.track.innovation[used, 0])
+    assert used.sum() == 199
+    (edge,) = lines["rejected, off the chart"].get_ydata()
+    assert np.abs(run.track.innovation[used, 0]).max() < edge < 20.0 and edge < axes.get_ylim()[1]
+    band = axes.collections[0].get_paths()[0].vertices
+    at_end = band[band[:, 0] == band[:, 0].max(), 1]
+    np.testing.assert_allclose(np.unique(at_end), 2.0 * run.track.innovation_std[-1, 0] * np.array([-1, 1]), rtol=1e-12)
+
+
+def test_of_many_dots_a_sample_and_the_extremes_are_drawn():
+    """White noise of 40,000 measurements: the dots have its spread, which extremes alone would not, and its range."""
+    model, n = MODELS["motor_winding"], 40_000
+    log = Log.of(model)
+    values = 40.0 + np.random.default_rng(1).normal(0, 2, n)
+    log.add("winding", np.arange(1.0, n + 1.0), values)
+    run = fold("kf", model, log)
+    seconds, dots = TrackSeries(model, run.events, run.track)["innovation:winding"]
+    own = run.track.innovation[:, 0]
+    assert 8_000 < dots.size <= 10_000 and set(dots) <= set(own)
+    assert (dots.min(), dots.max()) == (own.min(), own.max())
+    # A tenth is extremes of 80 each, of mean square 6: √(0.9 + 0.1 · 6) = 1.22. Extremes alone would have 2.4.
+    assert own.std() < dots.std() < 1.3 * own.std()
+    middle = np.mean(np.abs(dots) < 0.5 * own.std()) / np.mean(np.abs(own) < 0.5 * own.std())
+    assert 0.85 < middle < 1.0
+
+
+def test_a_track_draws_itself_for_notebooks_and_papers(run, tmp_path):
+    figure = run.plot()
+    assert len(figure.axes) == 4 and figure.axes[0].get_title(loc="left") == "motor_winding, kf"
+    assert figure._repr_png_().startswith(b"\x89PNG")  # what IPython calls for the value of a cell
+    figure.savefig(tmp_path / "run.pdf")
+    assert (tmp_path / "run.pdf").read_bytes().startswith(b"%PDF")
+
+
+def test_a_figure_says_what_it_leaves_out():
+    model = MODELS["lorenz96"]
+    log = Log.of(model)
+    name = model.sensor_names[0]
+    rows = len(model.sensors[0].rows)
+    log.add(name, np.arange(1.0, 6.0) * 0.05, np.zeros((5, rows)))
+    figure = fold("ekf", model, log).plot("test")
+    assert figure.axes[0].get_title(loc="left") == f"test, 8 of 40 states, 6 of {rows} sensor rows"
+    assert len(figure.axes) == 8 + 6 + 1
 
 
 def test_the_line_of_an_angle_has_a_gap_where_it_leaves_the_chart():
