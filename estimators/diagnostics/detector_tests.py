@@ -81,7 +81,7 @@ CLEARING_SHARE = 0.85  # Share of the threshold above which an alarm lasts
 CALM_MEASUREMENTS, OUTLIER_FROM = 500, 3.5
 """Measurements without |e| beyond this after which earlier outliers are forgotten."""
 
-KNOWN_PERIOD = 16.0  # Measurements from which the period of a sensor is known; with fewer it may pause for longer
+KNOWN_PERIOD = 100.0  # Measurements from which the period of a sensor is known; with fewer it may pause for longer
 
 
 @inlined
