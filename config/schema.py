@@ -245,7 +245,10 @@ class ViewSection(Section):
     window: Seconds = 60.0
     """Initial time span of the charts, s. Default: 60."""
     speed: Annotated[float, Field(strict=True, gt=0, le=1e9)] = 1.0
-    """Initial speed of a replay or a simulation, times real time; --speed overrides it. Default: 1."""
+    """Speed of a simulation or of the replay of a recording, times real time. The page folds a recording to its end
+    first; --speed overrides both. Default: 1."""
+    at: Annotated[float, Field(strict=True, ge=0)] | None = None
+    """Moment at which the cursor stands when the page has folded a recording, s after its start. Default: the end."""
     cells: Annotated[tuple[Text, ...], Field(min_length=1)] | None = None
     """Cells of a large field whose estimate is kept at every event and charted. Default: 16 spread over it."""
     picture: Seconds | None = None

@@ -34,10 +34,11 @@ if TYPE_CHECKING:
 def live_source(twin: Twin, speed: float | None = None) -> Callable[[Callable[[str, str], None]], Source]:
     """How to open the twin's source so that it comes in its own time: a bus as it is, anything else paced.
 
-    The faults that were injected last when a bus is opened again. `speed` is that which the twin's YAML says unless it
-    is given.
+    The faults that were injected last when a bus is opened again. Unless `speed` is given, a recording is read to its
+    end at once, and a simulation runs at the speed of the twin's YAML.
     """
-    faults, times = twin.plan.faults(), twin.config.view.speed if speed is None else speed
+    usual = math.inf if twin.plan.recorded else twin.config.view.speed
+    faults, times = twin.plan.faults(), usual if speed is None else speed
     return lambda report: twin.open_source(remarking(report), speed=times, faults=faults)
 
 
@@ -109,13 +110,13 @@ class FileOpener:
         self._workers = workers
 
     def open(self, wanted: StartRequest) -> OpenedTwin:
-        """See `Opener`. A log is folded as fast as it can be: it is there to be looked at from its beginning."""
+        """See `Opener`."""
         if wanted.recording is not None:
             return opened_review(wanted.recording)
         name = wanted.twin or ""
         if name in self._given and not wanted.logs:
             return self._given[name]()
-        return opened_twin(name, logs=wanted.logs, speed=math.inf if wanted.logs else None)
+        return opened_twin(name, logs=wanted.logs)
 
     def made_ready(self, opening: OpenedTwin) -> OpenedTwin:
         """See `Opener`."""

@@ -48,6 +48,12 @@ class Plan:
         """Compiled functions of the source; see `sources/pieces.py`."""
         return SOURCES[self.loaded.config.source.type].kernels
 
+    @property
+    def recorded(self) -> bool:
+        """Whether it is read from files, and so is neither a bus nor a simulation."""
+        kind = self.loaded.config.source.type
+        return SOURCES[kind].takes_log and (kind != "can" or self.log_files is not None)
+
     def check_files(self) -> None:
         """Open the files of the source, and close them: it takes milliseconds, while its twin takes seconds to compile.
 

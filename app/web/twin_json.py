@@ -124,6 +124,9 @@ def model_json(engine: Running) -> dict[str, Any]:
         ],
         "commissioned": twin.tuning.baseline is not None,
         "window": twin.config.view.window,
+        "recorded": twin.recorded or twin.plan.recorded,
+        "speed": twin.config.view.speed,
+        "at": twin.config.view.at,
         "scene": twin.config.view.scene.kind,
         "columns": list(columns_of(model)),
     }

@@ -59,7 +59,7 @@ link.addEventListener("notices", (event) => {
   for (const notice of event.detail) notice.from = origin && notice.t ? (notice.t - Number(origin)) / 1e9 : null;
 });
 
-const view = new View(model.window);
+const view = new View(model.recorded ? null : model.window);
 const charts = new Charts($("charts"), model, link, view, kinds);
 window.nisus.charts = charts;
 window.nisus.view = view;
@@ -112,6 +112,13 @@ function begun() {
   window.addEventListener("hashchange", follow);
 }
 link.addEventListener("status", begun);
+// A recording is folded to its end at once: then the cursor goes to the moment that the twin names, unless the user was faster.
+function folded({ detail: status }) {
+  if (!status.finished) return;
+  link.removeEventListener("status", folded);
+  if (view.following && view.span === null && !location.hash) view.show(...transport.extent, model.at ?? transport.extent[1]);
+}
+if (model.recorded) link.addEventListener("status", folded);
 // Elsewhere, or following again: the address says no longer what is shown.
 view.addEventListener("change", () => location.hash && !arriving && history.replaceState(null, "", location.pathname));
 

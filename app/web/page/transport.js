@@ -18,7 +18,7 @@ export class Transport {
     this.canvas = $("timeline");
     const spans = [...new Set([...WINDOWS, model.window])].sort((a, b) => a - b);
     $("window").replaceChildren(...spans.map((s) => element("option", { value: s }, s < 60 ? `${s} s` : s < 3600 ? `${s / 60} min` : `${s / 3600} h`)), element("option", { value: "all" }, "all"));
-    $("window").value = String(model.window);
+    $("window").value = model.recorded ? "all" : String(model.window);
     $("window").addEventListener("change", () => view.follow($("window").value === "all" ? null : Number($("window").value)));
     $("speed").replaceChildren(...SPEEDS.map(([text, value]) => element("option", { value }, text)));
     $("speed").addEventListener("change", () => link.ask("Speed", { factor: $("speed").value === "inf" ? "inf" : Number($("speed").value) }));
@@ -47,18 +47,33 @@ export class Transport {
     return [Math.min(0, first), Math.max(last, typeof length === "number" ? length : last, first + 1)];
   }
 
-  // A replay is paused; of a live source only the charts are held.
+  // From the first event to the last one folded, s.
+  get extent() {
+    return [this.ends[0], (Number(this.status.t) - Number(this.status.origin)) / 1e9];
+  }
+
+  // A replay is paused, and what has ended is played again; of a live source only the charts are held.
   pause() {
-    if (this.status?.seekable) this.link.ask("Pause", { paused: !this.status.paused });
+    if (this.status?.seekable && this.status.finished) this.replay(this.view.at ?? this.extent[0]);
+    else if (this.status?.seekable) this.link.ask("Pause", { paused: !this.status.paused });
     else this.view.hold(this.charts.range);
+  }
+
+  // Play from a moment on: the same log and fold, at the pace of the asset. At the end, from the start.
+  async replay(from) {
+    const [start, end] = this.extent;
+    if (this.status.speed === "inf" || this.status.speed === null) await this.link.ask("Speed", { factor: this.model.speed });
+    if (this.status.paused) await this.link.ask("Pause", { paused: false });
+    await this.link.ask("Seek", { seconds: from < end ? from : start });
+    this.view.follow(this.model.window);
   }
 
   show(status) {
     this.status = status;
-    const held = status.seekable ? status.paused : !this.view.following;
+    const ended = status.finished && status.seekable;
+    const held = ended || (status.seekable ? status.paused : !this.view.following);
     setText($("pause"), held ? "▶" : "❚❚");
-    setAttribute($("pause"), "title", status.seekable ? (held ? "Continue (space)" : "Pause the replay (space)") : "Hold the charts (space)");
-    $("pause").disabled = status.finished && status.seekable;
+    setAttribute($("pause"), "title", ended ? "Replay from the cursor (space)" : status.seekable ? (held ? "Continue (space)" : "Pause the replay (space)") : "Hold the charts (space)");
     $("step").hidden = $("speed").hidden = !status.seekable;
     $("step").disabled = !status.paused;
     if (status.seekable && document.activeElement !== $("speed")) this.offerSpeed(String(status.speed ?? 1));

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -33,9 +34,11 @@ def until(page: Any, expression: str) -> None:
 
 
 @contextmanager
-def running(name: str, speed: float = float("inf"), **overrides: str) -> Iterator[Session]:
-    """A session of a twin with its page; played as fast as possible, it has ended."""
-    twin = load_twin(name, overrides=overrides)
+def running(
+    name: str, speed: float | None = float("inf"), *, log: Path | None = None, **overrides: str
+) -> Iterator[Session]:
+    """A session of a twin with its page, of a log in place of its source; played as fast as possible, it has ended."""
+    twin = load_twin(name, log_files=None if log is None else [log], overrides=overrides)
     session = Session(twin, live_source(twin, speed), page=Page(0, open_browser=False))
     session.start()
     try:

@@ -1,7 +1,9 @@
-"""One time: scrubbing in Rerun's viewer moves the page, and navigation on the page moves Rerun's cursor."""
+"""One time: Rerun and the page show the same moment; a recording opens folded, and is replayed from any moment."""
 
+import numpy as np
 import pytest
 
+from config.loader import TWINS
 from tests.app.scripted import pull_all, wait_for
 from tests.app.web.page.browsed import PATIENCE, running, until
 
@@ -88,3 +90,28 @@ def test_rerun_in_a_window_of_its_own_shares_the_time_of_the_page(visit, page, s
     until(alone, "document.getElementById('shared').textContent.startsWith('a time of its own')")
     alone.evaluate(SCRUB, [12.0, PAUSED])
     until(alone, "Math.abs(window.nisus.view.at - 12) < 1e-6")
+
+
+def test_a_recording_opens_folded_and_is_replayed_from_the_cursor(visit):
+    with running("motor_can", None, log=TWINS.parent / "logs" / "motor_can.blf", **{"view.at": "60"}) as session:
+        engine = session.engine
+        page = visit(session.url)
+        until(page, "window.nisus.view.at === 60")
+        track = pull_all(engine)
+        start, end = (float(time - track.events.t[0]) * 1e-9 for time in track.events.t[[0, -1]])
+        assert end > 170.0
+        since, last = page.evaluate("window.nisus.charts.range")
+        assert (since, last) == (start, pytest.approx(end, abs=1e-3))
+        assert not [item for item in engine.notices.since(0) if item.level == "warn"]
+
+        page.locator("#pause").click()
+        wait_for(lambda: engine.status().speed == 1.0 and not engine.status().finished, PATIENCE)
+        until(page, "window.nisus.view.following && window.nisus.charts.newest < 100")
+        replayed = pull_all(engine)
+        n = len(replayed.track.mean)
+        assert float(replayed.events.t[n - 1] - track.events.t[0]) * 1e-9 == pytest.approx(60.0, abs=30.0)
+        assert np.array_equal(replayed.track.mean, track.track.mean[:n])
+
+        page.locator("#speed").select_option("inf")
+        wait_for(lambda: engine.status().finished, PATIENCE)
+        assert np.array_equal(pull_all(engine).track.mean, track.track.mean)
