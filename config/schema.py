@@ -20,6 +20,7 @@ from .fields import (
     NoiseSection,
     NotNegative,
     Number,
+    Numbers,
     Option,
     Positive,
     Positives,
@@ -101,6 +102,9 @@ class SensorSection(SpreadSection):
     """When repeated equal measurements are no longer used. Default: never."""
     duplicates: DuplicatesSection | None = None
     """When a measurement of equal values is a copy, which counts once. Default: if its time is equal too."""
+    at: dict[Text, Numbers] | None = None
+    """Landmarks of a sensor whose model declares a `place`: their coordinates by id, {6: [1.9, -5.6], 7: [1.8, -2.4]}.
+    Each becomes a sensor SENSOR_ID with parameters such as SENSOR_6_east; all share this section. Default: none."""
     use: Flag = True
     """false holds the sensor out: the estimate ignores it, and its measurements are predicted and scored. Default:
     true."""
@@ -222,7 +226,7 @@ class SceneSection(Section):
     heading, in radians. Default: none."""
     beacons: dict[Text, tuple[Text, Text]] = {}
     """vehicle: sensors that measure the distance to a beacon, with the parameters or states that hold its position east
-    and north. Default: none."""
+    and north; * in them is the landmark of a sensor with landmarks. Default: none."""
 
     @model_validator(mode="after")
     def _complete(self) -> SceneSection:

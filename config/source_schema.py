@@ -76,6 +76,10 @@ class ChannelSection(Section):
     only: dict[str, Condition] = {}
     """Conditions as in `where` that select the rows or frames of this channel: {anchor: 3}, {tag: TT101}. Others are
     ignored, without a missing measurement. Default: none."""
+    by: Text | dict[Text, dict[Text, Condition]] | None = None
+    """Column or signal with the landmark of each row, for a sensor with landmarks: landmark_id. If its values are not
+    the ids of the sensors SENSOR_ID, also the value of each id: {node_id: {1: 0, 2: 1, 3: 5}}. Rows with other values
+    are ignored. Default: none."""
     convert: Literal["east_north"] | None = None
     """east_north: the two values are latitude and longitude in degrees, and become metres east and north of `origin`.
     Default: null, no conversion."""

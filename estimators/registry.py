@@ -21,6 +21,7 @@ from .gaussian.sr_kf import SR_KF
 from .gaussian.sr_ukf import SR_UKF
 from .gaussian.ukf import UKF
 from .interpreted.filterpy import FILTERPY_EKF, FILTERPY_ENKF, FILTERPY_KF, FILTERPY_UKF
+from .model.landmarks import missing
 from .model.state_space import LARGE, StateSpaceModel
 from .particle.apf import APF
 from .particle.pf import PF, PF_REG
@@ -53,6 +54,9 @@ def find_estimator(name: str, model: StateSpaceModel) -> Estimator:
         EstimatorError: If there is none, with similar names; or if it does not apply, with the reason.
     """
     entry = find_entry(name)
+    for sensor in model.sensors:
+        if sensor.place:
+            raise EstimatorError(missing(model, sensor))
     reason = unfit(entry, model)
     if reason:
         raise EstimatorError(f"estimator {name} does not apply: {reason}")

@@ -87,7 +87,7 @@ class Tuning:
         )
 
     def items(self) -> list[Item]:
-        """Return every numeric entry; the many rows of one sensor share an entry, their mean."""
+        """Return every numeric entry; many rows of one sensor, or the sensors of a family, share one, their mean."""
         model = self.model
         items = [
             Item(f"Q.{noise.name}", float(value), noise.unit, 0.0, np.inf)
@@ -96,7 +96,16 @@ class Tuning:
         for sensor, start in zip(model.sensors, model.row_start, strict=True):
             own = slice(start, start + len(sensor.rows))
             names, values, unit = model.row_names[own], self.r[own], squared(sensor.rows[0].unit)
-            if len(values) >= SHARED_ENTRY_ROWS and len({row.unit for row in sensor.rows}) == 1:
+            if sensor.family:
+                units = [squared(row.unit) for row in sensor.rows]
+                keys = [f"R.{sensor.family}{name.removeprefix(sensor.name)}" for name in names]
+                known = {item.key for item in items}
+                items += [
+                    Item(key, _mean(self.r[self._locate(key)[1]]), unit, 0.0, np.inf)
+                    for key, unit in zip(keys, units, strict=True)
+                    if key not in known
+                ]
+            elif len(values) >= SHARED_ENTRY_ROWS and len({row.unit for row in sensor.rows}) == 1:
                 items.append(Item(f"R.{sensor.name}", _mean(values), unit, 0.0, np.inf))
             else:
                 units = [squared(row.unit) for row in sensor.rows]
@@ -107,14 +116,17 @@ class Tuning:
         items += [
             Item(f"p.{parameter.name}", float(value), parameter.unit, parameter.low, parameter.high)
             for parameter, value in zip(model.parameters, self.p, strict=True)
+            if parameter.listed
         ]
         return items
 
     def keys(self) -> list[str]:
         """Return every key of `get` and `set`."""
         rows = [f"R.{name}" for name in self.model.row_names]
-        used = [f"use.{name}" for name in self.model.sensor_names]
-        return [*dict.fromkeys([item.key for item in self.items()] + rows), *used, *GATE_KEYS]
+        families = dict.fromkeys(sensor.family for sensor in self.model.sensors if sensor.family)
+        used = [f"use.{name}" for name in (*families, *self.model.sensor_names)]
+        parameters = [f"p.{parameter.name}" for parameter in self.model.parameters]
+        return [*dict.fromkeys([item.key for item in self.items()] + rows + parameters), *used, *GATE_KEYS]
 
     def get(self, key: str) -> float | bool | str | None:
         """Return the value of a key."""
@@ -122,10 +134,10 @@ class Tuning:
             value: float | str | None = getattr(self, GATE_KEYS[key])
             return value
         group, index = self._locate(key)
-        return bool(self.used[index]) if group == "used" else _mean(getattr(self, group)[index])
+        return bool(np.all(self.used[index])) if group == "used" else _mean(getattr(self, group)[index])
 
     def set(self, key: str, value: float | bool | str | None) -> Tuning:
-        """Return a new tuning with one entry changed; `R.<sensor>` sets all rows of the sensor.
+        """Return a new tuning with one entry changed; `R.<sensor>` sets all rows of the sensor, or of a family.
 
         Raises:
             ConfigError: If the key does not exist, or the value is out of range.
@@ -179,6 +191,14 @@ class Tuning:
         entry: dict[str, Any] = {group: changed}
         return self._changed(**entry)
 
+    def rows_of(self, key: str) -> np.ndarray:
+        """Return the indices of the rows that an entry `R...` sets.
+
+        Raises:
+            ConfigError: If there is no such entry.
+        """
+        return np.atleast_1d(np.arange(self.r.size)[self._locate(key)[1]])
+
     def with_options(self, options: Mapping[str, float]) -> Tuning:
         """Return a new tuning with other estimator options."""
         return self._changed(options=dict(options))
@@ -207,6 +227,20 @@ class Tuning:
         if prefix == "R" and name in model.sensor_names:
             k = model.sensor_names.index(name)
             return "r", slice(model.row_start[k], model.row_start[k] + len(model.sensors[k].rows))
+        members = [k for k, sensor in enumerate(model.sensors) if sensor.family and name.split(".")[0] == sensor.family]
+        if prefix == "use" and members and name == model.sensors[members[0]].family:
+            return "used", members
+        if prefix == "R" and members:
+            family, _, row = name.partition(".")
+            wanted = {f"{model.sensors[k].name}.{row}" if row else "" for k in members}
+            rows = [
+                model.row_start[k] + j
+                for k in members
+                for j in range(len(model.sensors[k].rows))
+                if not row or model.row_names[model.row_start[k] + j] in wanted
+            ]
+            if rows:
+                return "r", rows
         raise ConfigError(f"{shown_name(key)} is not a tuning key of {model.name}; {nearest(key, self.keys())}")
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from estimators.model.state_space import StateSpaceModel
 from estimators.registry import ESTIMATORS
-from estimators.tuning import GATE_KEYS, Tuning
+from estimators.tuning import GATE_KEYS, SHARED_ENTRY_ROWS, Tuning
 
 if TYPE_CHECKING:
     from ..twin.twin import Twin
@@ -60,11 +60,13 @@ def difference(estimator: str, tuning: Tuning, other_estimator: str, other: Tuni
         ]
     found += entries("Q", [noise.name for noise in model.noises], tuning.q, other.q)
     if tuning.r is not other.r:
-        shared = {item.key for item in tuning.items()} - {f"R.{name}" for name in model.row_names}
-        for sensor, start in zip(model.sensors, model.row_start, strict=True):
-            own, key = slice(start, start + len(sensor.rows)), f"R.{sensor.name}"
-            together = entry(key) if key in shared else []
-            found += together or entries("R", model.row_names[own], tuning.r[own], other.r[own])
+        for key in (item.key for item in tuning.items() if item.key.startswith("R.")):
+            own = tuning.rows_of(key)
+            before, after = tuning.r[own], other.r[own]
+            # Different values of a few rows are told one by one.
+            alike = own.size >= SHARED_ENTRY_ROWS or (np.ptp(before) == 0.0 and np.ptp(after) == 0.0)
+            together = entry(key) if own.size > 1 and alike else []
+            found += together or entries("R", [model.row_names[k] for k in own], before, after)
     found += entries("p", [parameter.name for parameter in model.parameters], tuning.p, other.p)
     used = np.flatnonzero(tuning.used != other.used)
     found += [SettingChange(f"use.{model.sensor_names[k]}", bool(tuning.used[k]), bool(other.used[k])) for k in used]

@@ -119,7 +119,8 @@ def retuned(command: REFOLDING, engine: Running) -> tuple[str, Tuning]:
     if isinstance(command, commands.SetOption):
         return estimator, _with_options(estimator, tuning, {command.name: command.value}, engine)
     if isinstance(command, commands.UseSensor):
-        names = engine.model.sensor_names
+        families = dict.fromkeys(sensor.family for sensor in engine.model.sensors if sensor.family)
+        names = [*families, *engine.model.sensor_names]
         if command.name not in names:
             near = nearest(command.name, names)
             raise ConfigError(f"UseSensor: name is {quoted(command.name)}, no sensor of {engine.model.name}; {near}")

@@ -362,17 +362,23 @@ def _rmse(name: str, fit: Fit, unit: str) -> Figure:
 
 
 def _held_out(result: FoldResult, units: Mapping[str, str]) -> list[Figure]:
-    """Return the errors of held-out rows; many rows of one sensor are one figure."""
+    """Return the errors of held-out rows; many rows of one sensor, or those of a family, are one figure."""
     model, fits = result.twin.model, dict(result.score.held_out)
-    found = []
+    groups: dict[str, list[str]] = {}
     for sensor, start in zip(model.sensors, model.row_start, strict=True):
         names = [name for name in model.row_names[start : start + len(sensor.rows)] if name in fits]
-        if len(names) >= SHARED_ENTRY_ROWS and len({row.unit for row in sensor.rows}) == 1:
-            own = [fits.pop(name) for name in names]
-            rmse = float(np.sqrt(np.mean([fit.rmse**2 for fit in own])))
-            share = 100 * float(np.mean([fit.coverage for fit in own]))
-            title = f"held out {sensor.name}, {len(names)} rows"
-            found.append(Figure(title, f"RMSE {rmse:.5g}", units[names[0]], f"in the 95 % band: {share:.1f} %"))
+        if sensor.family:
+            for name in names:
+                groups.setdefault(f"{sensor.family}{name.removeprefix(sensor.name)}", []).append(name)
+        elif len(names) >= SHARED_ENTRY_ROWS and len({row.unit for row in sensor.rows}) == 1:
+            groups[sensor.name] = names
+    found = []
+    for group, names in groups.items():
+        own = [fits.pop(name) for name in names]
+        rmse = float(np.sqrt(np.mean([fit.rmse**2 for fit in own])))
+        share = 100 * float(np.mean([fit.coverage for fit in own]))
+        title = f"held out {group}, {len(names)} rows"
+        found.append(Figure(title, f"RMSE {rmse:.5g}", units[names[0]], f"in the 95 % band: {share:.1f} %"))
     singles = [
         Figure(f"held out {name}", f"RMSE {fit.rmse:.5g}", units[name], f"in the 95 % band: {100 * fit.coverage:.1f} %")
         for name, fit in fits.items()

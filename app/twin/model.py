@@ -29,6 +29,7 @@ from estimators.plausibility import DAY, surprise
 
 from .checks import check_named, check_names, one_each
 from .defaults import sensor_period
+from .landmarks import expanded
 from .learned import load_learned
 
 
@@ -123,7 +124,8 @@ def configure(model: StateSpaceModel, loaded: Loaded) -> StateSpaceModel:
     known = (model.states.name,) if isinstance(model.states, Field) else model.state_names
     check_names(loaded, ("prior",), config.prior, known, "field" if field else "state", model)
     check_names(loaded, ("noise",), config.noise, [item.name for item in model.noises], "noise", model)
-    check_names(loaded, ("sensors",), config.sensors, model.sensor_names, "sensor", model)
+    families = dict.fromkeys(sensor.family for sensor in model.sensors if sensor.family)
+    check_names(loaded, ("sensors",), config.sensors, [*model.sensor_names, *families], "sensor", model)
     return replace(
         _with_noise(model, loaded),
         states=_states(model, loaded),
@@ -171,7 +173,7 @@ def _with_noise(model: StateSpaceModel, loaded: Loaded) -> StateSpaceModel:
 
 def physics_of(loaded: Loaded) -> StateSpaceModel:
     """Return the model with the YAML's parameters, before anything is appended."""
-    return with_parameters(find_model(loaded, ("model",), loaded.config.model), loaded)
+    return with_parameters(*expanded(find_model(loaded, ("model",), loaded.config.model), loaded))
 
 
 def with_parameters(model: StateSpaceModel, loaded: Loaded) -> StateSpaceModel:

@@ -29,6 +29,7 @@ from estimators.tuning import CHANGED_MARK, Tuning
 from ..ingest import Planned
 from .checks import check_named, check_refit, check_scene, commissioned
 from .defaults import DegradedAfter, Late, degraded_after, late_policy
+from .landmarks import expanded
 from .learned import correction_files
 from .model import configure, find_model, model_files
 from .source import Plan, plan_source
@@ -240,9 +241,11 @@ def _of_yaml(overrides: Mapping[str, str]) -> dict[str, str]:
 
 
 def _assemble(loaded: Loaded, overrides: Mapping[str, str], log_files: Sequence[str | os.PathLike[str]] | None) -> Twin:
-    config = loaded.config
-    found = find_model(loaded, ("model",), config.model)
+    found = find_model(loaded, ("model",), loaded.config.model)
     _check_version(loaded, found)
+    asset = None if loaded.without is None else expanded(found, loaded.without)
+    found, loaded = expanded(found, loaded)
+    config = loaded.config
     model = configure(found, loaded)
     for name, given in config.filters.items():
         _check_options(loaded, ("filters", name), name, given, model)
@@ -270,8 +273,7 @@ def _assemble(loaded: Loaded, overrides: Mapping[str, str], log_files: Sequence[
         check_named(loaded, ("maintenance", k, "states"), item.states, model)
         if len(set(item.states)) != len(item.states):
             raise loaded.error(("maintenance", k, "states"), "names a state twice; name each once")
-    asset = loaded.without
-    believed = (loaded, model) if asset is None else (asset, configure(found, asset))
+    believed = (loaded, model) if asset is None else (asset[1], configure(*asset))
     plan = plan_source(*believed, [Path(file) for file in log_files] if log_files else None)
     if plan.brings_variances:
         with _placed(loaded, ("estimator",)):

@@ -103,6 +103,7 @@ def model_json(engine: Running) -> dict[str, Any]:
         **charted_model(model),
         "field": model.grid is not None,
         "sensors": model.sensor_names,
+        "families": {sensor.name: sensor.family for sensor in model.sensors if sensor.family},
         "inputs": [{"name": item.name, "unit": item.unit, "value": item.default} for item in model.inputs],
         "parameters": [item.name for item in model.parameters],
         "pairs": [[model.shown_states[k].name for k in pair] for pair in engine.pairs],

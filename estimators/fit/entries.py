@@ -176,11 +176,8 @@ def with_values(tuning: Tuning, entries: Sequence[TuningEntry], values: Sequence
             _, state, what = item.key.split(".")
             (mean if what == "mean" else std)[tuning.model.state_names.index(state)] = number
         elif item.group == "R" and item.key.partition(".")[2] not in tuning.model.row_names:
-            s = tuning.model.sensor_names.index(item.key.partition(".")[2])
             r = tuning.r.copy()
-            r[tuning.model.row_start[s] : tuning.model.row_start[s] + len(tuning.model.sensors[s].rows)] *= (
-                number / item.start
-            )
+            r[tuning.rows_of(item.key)] *= number / item.start
             tuning = replace(tuning, r=r)
         else:
             tuning = tuning.set(item.key, number)
@@ -242,14 +239,10 @@ def _against(item: TuningEntry, tuning: Tuning, logs: Sequence[Log], references:
         return "is 0, and stays so: there is nothing to scale"
     if item.group != "R":
         return ""
-    model, name = tuning.model, item.key.partition(".")[2]
-    if name in model.sensor_names:
-        s = model.sensor_names.index(name)
-    else:
-        s = int(np.searchsorted(model.row_start, list(model.row_names).index(name), side="right")) - 1
-    if not tuning.used[s] and not references:
+    own = np.unique(np.searchsorted(tuning.model.row_start, tuning.rows_of(item.key), side="right") - 1)
+    if not tuning.used[own].any() and not references:
         return "belongs to a held-out sensor"
-    values = [log.value[: log.n][(log.kind[: log.n] == READING) & (log.channel[: log.n] == s)] for log in logs]
+    values = [log.value[: log.n][(log.kind[: log.n] == READING) & np.isin(log.channel[: log.n], own)] for log in logs]
     if not any(len(item) for item in values):
         return "belongs to a sensor without readings here"
     if all(np.all((item == item[:1]) | np.isnan(item)) for item in values):

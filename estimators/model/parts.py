@@ -322,6 +322,11 @@ class Sensor:
     covariance R, give the rows its diagonal and the sensor `correlation_of(R)`.
 
     `limits` bound what it can measure; measurements beyond are kept in the log and never used.
+
+    A sensor of many landmarks declares the names and units of their coordinates as its `place`, for example
+    (("east", "m"), ("north", "m")). Its h(x, u, p, place, out) also takes the coordinates of the measured landmark;
+    `with_landmarks` makes a sensor for each, whose `family` is the declared one. Members of a family share one entry
+    of the tuning.
     """
 
     name: str
@@ -331,6 +336,8 @@ class Sensor:
     log_likelihood: Callable | None = None
     correlation: Correlation | None = None
     limits: Limits | None = None
+    place: tuple[tuple[str, str], ...] = ()
+    family: str = ""
 
     def __post_init__(self) -> None:
         """Store a matrix as its rows, which can be hashed."""

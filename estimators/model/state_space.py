@@ -59,13 +59,14 @@ class Input:
 
 @dataclass(frozen=True)
 class Parameter:
-    """One entry of p, a constant of the model, with its admissible range."""
+    """One entry of p, a constant of the model, with its admissible range; if `listed`, panels and fits offer it."""
 
     name: str
     unit: str
     value: float
     low: float = -np.inf
     high: float = np.inf
+    listed: bool = True
 
 
 @dataclass(frozen=True)

@@ -110,7 +110,10 @@ def uwb_rover(anchors: int = 4) -> StateSpaceModel:
             Noise("range_scale", "1/s", variance=1e-8),
             Noise("bias", "m²/s", variance=0.01),
         ),
-        sensors=tuple(Sensor(f"range_{k}", (Row("range", "m", variance=0.04),), h=range_to(k - 1)) for k in numbers),
+        sensors=tuple(
+            Sensor(f"range_{k}", (Row("range", "m", variance=0.04),), h=range_to(k - 1), family="range")
+            for k in numbers
+        ),
         f=f,
         Q=Q,
         max_step=0.25,

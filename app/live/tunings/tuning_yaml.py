@@ -82,7 +82,10 @@ def _sensors(
     whole: bool,
 ) -> dict[str, Any]:
     """Return the section `sensors`, given the variances of coloured errors by sensor, and parameters by name."""
-    found = {}
+    landmarks = {name: section.at for name, section in config.sensors.items() if section.at is not None and whole}
+    found: dict[str, Any] = {
+        name: {"at": {key: list(at) for key, at in given.items()}} for name, given in landmarks.items()
+    }
     ranges = bounds_of(config, tuning.model)
     for sensor, start in zip(tuning.model.sensors, tuning.model.row_start, strict=True):
         given = config.sensors.get(sensor.name)

@@ -12,12 +12,12 @@ from estimators.tuning import SHARED_ENTRY_ROWS
 
 
 def calibration_lines(found: Sequence[Calibration], model: StateSpaceModel) -> list[str]:
-    """Return a line for each row or state; many rows of one sensor, or many states, share one."""
+    """Return a line for each row or state; many rows of a sensor, a family of sensors, or many states share one."""
     many = {
-        model.row_names[start + k]: sensor.name
+        model.row_names[start + k]: sensor.family or sensor.name
         for sensor, start in zip(model.sensors, model.row_start, strict=True)
         for k in range(len(sensor.rows))
-        if len(sensor.rows) >= SHARED_ENTRY_ROWS
+        if sensor.family or len(sensor.rows) >= SHARED_ENTRY_ROWS
     }
     lines: list[str] = []
     groups: dict[tuple[str, str], list[Calibration]] = {}

@@ -115,10 +115,16 @@ export class Tune {
 
   sensorSection() {
     this.sensors = new Map();
-    const rows = this.model.sensors.map((name) => {
+    // The sensors of a family, one for each landmark, share a row.
+    const members = new Map();
+    for (const name of this.model.sensors) {
+      const shared = this.model.families[name] ?? name;
+      members.set(shared, [...(members.get(shared) ?? []), name]);
+    }
+    const rows = [...members].map(([name, names]) => {
       const box = element("input", { type: "checkbox", onchange: () => this.use(name, box.checked) });
-      const row = element("label", { class: "sensor", title: "Off: held out (predicted and scored, but not used)" }, box, element("span", {}, words(name)), element("em", {}));
-      this.sensors.set(name, [box, row.lastChild]);
+      const row = element("label", { class: "sensor", title: "Off: held out (predicted and scored, but not used)" }, box, element("span", {}, names.length > 1 ? `${words(name)} (${names.length})` : words(name)), element("em", {}));
+      this.sensors.set(name, [box, row.lastChild, names]);
       return row;
     });
     return section("Sensors in use", "Off: held out (predicted and scored, but not used)", this.model.sensors.length <= MAX_OPEN_ENTRIES, ...rows);
@@ -136,10 +142,11 @@ export class Tune {
     }
     for (const [key, value] of Object.entries(status.tuning)) this.knobs.get(key)?.sync(value);
     this.syncGate(status);
-    for (const [name, [box, note]] of this.sensors) {
-      const used = status.used[name];
+    for (const [box, note, names] of this.sensors.values()) {
+      const used = names.every((name) => status.used[name]);
       if (document.activeElement !== box || box.checked === used) box.checked = used;
-      setText(note, status.sensors[name]?.state === "tracking" ? "" : (status.sensors[name]?.state ?? ""));
+      const states = [...new Set(names.map((name) => status.sensors[name]?.state ?? "tracking"))].filter((state) => state !== "tracking");
+      setText(note, states.join(", "));
     }
     const turned = Object.keys(status.turned).length;
     this.restoreButton.disabled = !turned;

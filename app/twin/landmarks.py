@@ -1,0 +1,128 @@
+"""Sensors of a family in a twin's YAML: what it says of the declared sensor, said of each of its members."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+from config.fields import ConditionSection
+from config.loader import Loaded
+from config.schema import SensorSection
+from config.source_schema import ChannelSection
+from config.yaml_files import Key
+from estimators.errors import ModelError
+from estimators.model.landmarks import missing, with_landmarks
+from estimators.model.state_space import StateSpaceModel
+
+
+def expanded(model: StateSpaceModel, loaded: Loaded) -> tuple[StateSpaceModel, Loaded]:
+    """Return a model with a sensor for each landmark, and the configuration of these.
+
+    Raises:
+        ConfigError: With file and line, if landmarks are missing or do not fit, or `by` is missing or misplaced.
+    """
+    given = {name: section.at for name, section in loaded.config.sensors.items() if section.at is not None}
+    for sensor in model.sensors:
+        if sensor.place and sensor.name not in given:
+            raise loaded.error(("sensors", sensor.name), missing(model, sensor).partition(f"{sensor.name} ")[2])
+    if given:
+        try:
+            model = with_landmarks(model, given)
+        except ModelError as error:
+            raise loaded.error(("sensors", next(iter(given)), "at"), f"does not fit: {error}") from None
+    members: dict[str, list[str]] = {}
+    for sensor in model.sensors:
+        if sensor.family:
+            members.setdefault(sensor.family, []).append(sensor.name)
+    config = loaded.config
+    sensors = dict(config.sensors)
+    for family, names in members.items():
+        if family in sensors:
+            section = sensors.pop(family)
+            common = section.model_copy(update={"at": None})
+            sensors |= {name: _merged(common, sensors.get(name)) for name in names}
+            if section.at is not None:  # stays for a YAML that is written from this one
+                sensors[family] = SensorSection(at=section.at)
+    source = _of_source(loaded, ("source",), config.source, members)
+    scene = config.view.scene
+    beacons = dict(scene.beacons)
+    for family in beacons.keys() & members:
+        east, north = beacons.pop(family)
+        for name in members[family]:
+            landmark = name.removeprefix(f"{family}_")
+            beacons[name] = (east.replace("*", landmark), north.replace("*", landmark))
+    view = config.view.model_copy(update={"scene": scene.model_copy(update={"beacons": beacons})})
+    return model, replace(loaded, config=config.model_copy(update={"sensors": sensors, "source": source, "view": view}))
+
+
+def _merged(common: SensorSection, own: SensorSection | None) -> SensorSection:
+    """Return the section of a member: its own entries in place of those of the family."""
+    if own is None:
+        return common
+    update: dict[str, Any] = {name: getattr(own, name) for name in own.model_fields_set}
+    if {"std", "variance"} & update.keys():
+        update = {"std": None, "variance": None} | update
+    return common.model_copy(update=update)
+
+
+def _of_source(loaded: Loaded, key: Key, section: Any, members: Mapping[str, list[str]]) -> Any:
+    """Return a section of the source, or of its parts or its asset, with channels or plans of the members."""
+    update: dict[str, Any] = {}
+    if getattr(section, "parts", None):
+        update["parts"] = tuple(
+            _of_source(loaded, (*key, "parts", k), part, members) for k, part in enumerate(section.parts)
+        )
+    if getattr(section, "asset", None) is not None:
+        update["asset"] = _of_source(loaded, (*key, "asset"), section.asset, members)
+    sensors = dict(getattr(section, "sensors", {}))
+    for name, item in list(sensors.items()):
+        place = (*key, "sensors", name)
+        by = getattr(item, "by", None)
+        if name not in members:
+            if by is not None:
+                raise loaded.error((*place, "by"), f"is for a sensor with landmarks, and {name} has none; use only")
+            continue
+        if isinstance(item, ChannelSection) and by is None:
+            raise loaded.error(place, "has landmarks; name the column that tells them apart, by: COLUMN")
+        del sensors[name]
+        sensors |= (
+            _members(loaded, place, item, name, members[name])
+            if by is not None
+            else {member: item for member in members[name]}
+        )
+    for group in ("inputs", "truth"):
+        channels = getattr(section, group, {})
+        for name, item in channels.items() if isinstance(channels, dict) else ():
+            if getattr(item, "by", None) is not None:
+                raise loaded.error((*key, group, name, "by"), "is for a sensor with landmarks; use only")
+    if sensors:
+        update["sensors"] = sensors
+    return section.model_copy(update=update)
+
+
+def _members(loaded: Loaded, place: Key, item: ChannelSection, family: str, names: list[str]) -> dict[str, Any]:
+    """Return the channels of the members, which select the rows of their landmark."""
+    ids = {name.removeprefix(f"{family}_"): name for name in names}
+    if isinstance(item.by, str):
+        column, rules = item.by, {landmark: _equals(landmark) for landmark in ids}
+    else:
+        if len(item.by or {}) != 1:
+            raise loaded.error((*place, "by"), f"names {len(item.by or {})} columns; name one")
+        ((column, rules),) = (item.by or {}).items()
+    unknown = [landmark for landmark in rules if landmark not in ids]
+    if unknown:
+        raise loaded.error((*place, "by"), f"names the landmark {unknown[0]!r}; {family} has {', '.join(ids)}")
+    return {
+        ids[landmark]: item.model_copy(update={"by": None, "only": {**item.only, column: rule}})
+        for landmark, rule in rules.items()
+    }
+
+
+def _equals(landmark: str) -> ConditionSection:
+    """Return the condition that a column holds an id, as a number if it is one."""
+    try:
+        number = float(landmark)
+    except ValueError:
+        return ConditionSection(text=(landmark,))
+    return ConditionSection(min=number, max=number)
