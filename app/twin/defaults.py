@@ -84,7 +84,8 @@ def bounds_of(config: TwinSection, model: StateSpaceModel) -> dict[str, tuple[fl
         section = config.sensors.get(sensor.name)
         if section is not None:
             rows = model.row_names[start : start + len(sensor.rows)]
-            found |= {f"R.{name}": section.bounds for name in (sensor.name, *rows)}
+            shared = [f"{sensor.family}{name.removeprefix(sensor.name)}" for name in rows if sensor.family]
+            found |= {f"R.{name}": section.bounds for name in (sensor.name, *rows, *shared)}
     return {key: bounds for key, bounds in found.items() if bounds is not None}
 
 

@@ -354,17 +354,14 @@ def doubts(found: Mapping[str, SensorNoise], level: float | None) -> dict[str, s
 
 def _by_key(tuning: Tuning, rows: Mapping[str, SensorNoise]) -> dict[str, SensorNoise]:
     """Return the estimates by the tuning's keys: of one row, or of all rows that share an entry."""
-    model, found = tuning.model, {}
-    for name in (item.key[2:] for item in tuning.items() if item.key.startswith("R.")):
-        names: Sequence[str] = (name,)
-        if name not in model.row_names:
-            k = model.sensor_names.index(name)
-            names = model.row_names[model.row_start[k] : model.row_start[k] + len(model.sensors[k].rows)]
+    found = {}
+    for key in (item.key for item in tuning.items() if item.key.startswith("R.")):
+        names = [tuning.model.row_names[k] for k in tuning.rows_of(key)]
         known = [rows[row] for row in names if row in rows]
         if known:
             variances, stds, counts, _, chances = (np.array(column, float) for column in zip(*known, strict=True))
             worst = int(np.argmin(chances))
-            found[f"R.{name}"] = SensorNoise(
+            found[key] = SensorNoise(
                 float(variances.mean()),
                 float(np.sqrt(np.sum(stds**2)) / len(known)),
                 int(counts.sum()),

@@ -92,7 +92,7 @@ def folder(tmp_path):
     """A robot on a circle that sees one or two landmarks at a time, and a robot that is none (id 3)."""
     rng = np.random.default_rng(2)
     lines, x = ["t,id,r,b,v,w"], np.zeros(3)
-    for k in range(120):
+    for k in range(600):
         x = x + 0.1 * np.array([np.cos(x[2]), np.sin(x[2]), 0.3])
         lines.append(f"{0.1 * k:.1f},,,,1,0.3")
         for name in rng.choice([*LANDMARKS, 3], rng.integers(0, 3), replace=False).tolist():
@@ -119,8 +119,8 @@ def test_the_estimate_is_that_of_a_sensor_for_each_landmark(folder):
     assert (by_id.track.verdict == by_hand.track.verdict).all() and np.isin(by_id.track.verdict, 1).sum() > 60
     for name in ("mean", "std", "innovation", "innovation_std", "nis", "log_likelihood"):
         np.testing.assert_array_equal(getattr(by_id.track, name), getattr(by_hand.track, name))
-    # The truth after 12 s at 0.3 rad/s; 0.1 rad are five deviations of one bearing.
-    np.testing.assert_allclose(by_id.track.mean[-1, 2], 3.6 - 2 * np.pi, atol=0.1)
+    # The truth after 60 s at 0.3 rad/s; 0.1 rad are five deviations of one bearing.
+    np.testing.assert_allclose(by_id.track.mean[-1, 2], 18.0 - 6 * np.pi, atol=0.1)
 
 
 def test_there_is_one_entry_for_all_landmarks_of_a_sensor(folder):
@@ -142,6 +142,17 @@ def test_the_section_of_one_landmark_goes_before_that_of_all(folder):
     twin = load_twin(folder / "one.yaml", overrides={"sensors.sighting_15": "{variance: [1, 2], use: false}"})
     assert twin.tuning.r.tolist() == pytest.approx([0.04, 0.0009] * 2 + [1.0, 2.0])
     assert twin.tuning.used.tolist() == [True, True, False]
+
+
+def test_a_fit_has_one_entry_for_all_landmarks(folder, nisus):
+    """The declared deviations are twice and one and a half times those of the recording, 0.1 m and 0.02 rad."""
+    found = nisus.run("tune", folder / "one.yaml", "--fit", "R", "--aim", "likelihood", "--json").json
+    entries = {entry["key"]: entry for entry in found["entries"]}
+    assert list(entries) == ["R.sighting.range", "R.sighting.bearing"]
+    for key, variance in (("R.sighting.range", 0.01), ("R.sighting.bearing", 0.0004)):
+        # A weak prior holds the fit back, but it ends nearer to the recording's value than to the declared one.
+        before, after = entries[key]["before"], entries[key]["after"]
+        assert abs(np.log(after / variance)) < abs(np.log(after / before)) and after < 0.7 * before
 
 
 def test_a_yaml_written_from_a_run_keeps_the_landmarks(folder):
