@@ -7,6 +7,7 @@ they reconnect and find the new one. Port, token and access rules stay.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import errno
 import os
 import secrets
@@ -15,6 +16,7 @@ import threading
 import time
 import uuid
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import h11
@@ -87,6 +89,38 @@ def check_port(port: int) -> None:
         listener.close()
 
 
+MAX_FORMER_SESSIONS = 8
+"""Earlier sessions at a port whose open pages return to the present one."""
+
+
+class FormerSessions:
+    """Digests of the cookies of earlier sessions at a port, in a file of this user."""
+
+    def __init__(self, port: int) -> None:
+        root = os.environ.get("XDG_RUNTIME_DIR") or os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+        self._file = Path(root) / "nisus" / f"sessions-{port}"
+
+    def digests(self) -> list[str]:
+        """Return those of the last sessions, the newest first; none from a file that others may write."""
+        try:
+            found = self._file.lstat()
+            if os.name == "posix" and (found.st_uid != os.getuid() or found.st_mode & 0o077):
+                return []
+            return [line for line in self._file.read_text("ascii").split() if len(line) == 64][:MAX_FORMER_SESSIONS]
+        except (OSError, ValueError):
+            return []
+
+    def keep(self, digests: Sequence[str]) -> None:
+        """Write them; without the file, a page opened before needs the new address."""
+        part = self._file.with_name(f"{self._file.name}.{secrets.token_hex(4)}")
+        with contextlib.suppress(OSError):
+            self._file.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+            # For this user only, from the start.
+            with os.fdopen(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as file:
+                file.write("\n".join(digests[:MAX_FORMER_SESSIONS]))
+            os.replace(part, self._file)
+
+
 class ShownApplication:
     """An application behind the door; `boot` distinguishes it from those before."""
 
@@ -145,7 +179,11 @@ class Door:
         self._own.router.default = self._behind
         self._own.router.redirect_slashes = False
         self._loop: asyncio.AbstractEventLoop | None = None
-        gate = Gate(with_security_headers(self._enter, self.port), self._token, self.port)
+        former = FormerSessions(port) if port else None  # a free port is another one next time
+        known = former.digests() if former is not None else []
+        gate = Gate(with_security_headers(self._enter, self.port), self._token, self.port, known)
+        if former is not None:
+            former.keep([gate.digest, *known])
         self.entered = gate.entered
         self.stage_pass = gate.stage_pass if localhost else None
         """Pass of the stage for a frame under `localhost`; None where that may be another program."""

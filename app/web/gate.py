@@ -14,6 +14,7 @@ import hashlib
 import hmac
 import re
 import threading
+from collections.abc import Collection
 
 from starlette.datastructures import Headers, MutableHeaders, QueryParams
 from starlette.responses import HTMLResponse, PlainTextResponse, RedirectResponse
@@ -40,12 +41,15 @@ COMMON_HEADERS = {
 class Gate:
     """Lets a request through to an application, or answers 403 with one line."""
 
-    def __init__(self, app: ASGIApp, token: str, port: int) -> None:
-        self._app, self._token = app, token
+    def __init__(self, app: ASGIApp, token: str, port: int, former: Collection[str] = ()) -> None:
+        """`former`: `digest` of sessions before at this port, whose open pages may return and get the new cookie."""
+        self._app, self._token, self._former = app, token, frozenset(former)
         self.entered = threading.Event()
         """Set once a browser has shown the token."""
         # The cookie is not the token, so that it does not reveal the address.
         self._cookie = f"nisus_{port}={self._derived(f'cookie {port}')}"
+        self.digest = _digest(self._cookie)
+        """Digest of the cookie, by which a later session recognises it."""
         self.stage_pass = self._derived(f"stage {port}")
         """Pass in the address of the stage, which the page frames."""
 
@@ -55,7 +59,9 @@ class Gate:
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Serve one request (ASGI)."""
         response = self._response(scope)
-        await (self._app if response is None else response)(scope, receive, send)
+        returns = response is None and scope["type"] == "http" and self._is_former(Headers(scope=scope))
+        answer = self._app if response is None else response
+        await answer(scope, receive, self._with_cookie(send) if returns else send)
 
     def _response(self, scope: Scope) -> ASGIApp | None:
         """Return the answer to a request that does not pass."""
@@ -77,7 +83,7 @@ class Gate:
             return _refusal(REFUSED_ORIGIN)
         if exchange:
             return self._exchange(same_site)
-        if shows_token or framed or self._is_known(headers):
+        if shows_token or framed or self._is_known(headers) or self._is_former(headers):
             return None
         return _refusal(REFUSED_TOKEN)
 
@@ -86,20 +92,46 @@ class Gate:
         kind, _, token = (_single(headers, "authorization") or "").partition(" ")
         if kind.lower() == "bearer" and _equals([token.strip()], self._token):
             return True
-        # Other programs at 127.0.0.1 may have set a cookie of the same name.
-        cookies = [part.strip() for line in headers.getlist("cookie") for part in line.split(";")]
-        return any(_equals([cookie], self._cookie) for cookie in cookies)
+        return any(_equals([cookie], self._cookie) for cookie in _cookies(headers))
+
+    def _is_former(self, headers: Headers) -> bool:
+        """Return whether a request has the cookie of a session before, and not yet that of this one."""
+        digests = {_digest(cookie) for cookie in _cookies(headers)} if self._former else set()
+        return bool(digests & self._former) and self.digest not in digests
+
+    def _with_cookie(self, send: Send) -> Send:
+        """Return `send` with the cookie of this session in the answer."""
+
+        async def send_more(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                MutableHeaders(scope=message).append("set-cookie", self._marked_cookie)
+            await send(message)
+
+        return send_more
+
+    @property
+    def _marked_cookie(self) -> str:
+        return f"{self._cookie}; Path=/; HttpOnly; SameSite=Strict"
 
     def _exchange(self, same_site: bool) -> ASGIApp:
         """Move the token from the address into a cookie."""
         self.entered.set()
         headers = {
-            "set-cookie": f"{self._cookie}; Path=/; HttpOnly; SameSite=Strict",
+            "set-cookie": self._marked_cookie,
             "cache-control": "no-store",
             "referrer-policy": "no-referrer",
         }
         # After a link on another page, the strict cookie would not be sent along a redirect.
         return RedirectResponse("/", 303, headers) if same_site else HTMLResponse(FORWARD, headers=headers)
+
+
+def _cookies(headers: Headers) -> list[str]:
+    # Other programs at 127.0.0.1 may have set a cookie of the same name.
+    return [part.strip() for line in headers.getlist("cookie") for part in line.split(";")]
+
+
+def _digest(cookie: str) -> str:
+    return hashlib.sha256(cookie.encode()).hexdigest()
 
 
 def _equals(given: list[str], secret: str) -> bool:

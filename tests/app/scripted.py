@@ -55,7 +55,7 @@ def twin(history=200_000, horizon=2.0, tick=1000.0, model=MODEL, estimator="kf")
         degraded=DegradedAfter(time.degraded_after, "scripted"),
         pairs=np.array([[0, 1]]),
         expected=None,
-        plan=SimpleNamespace(brings_variances=False),
+        plan=SimpleNamespace(brings_variances=False, recorded=False),
         config=config,
         policy=HealthPolicy(degraded_after=time.degraded_after, stale_after=time.stale_after),
     )

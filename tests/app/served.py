@@ -28,7 +28,7 @@ def shown_twin(**options):
     """The scripted twin with the section that views read."""
     made = twin(**options)
     scene = SimpleNamespace(kind="belief", axes=None, position=None, heading=None)
-    made.config.view = SimpleNamespace(window=60.0, pairs=None, scene=scene)
+    made.config.view = SimpleNamespace(window=60.0, speed=1.0, at=None, pairs=None, scene=scene)
     return made
 
 

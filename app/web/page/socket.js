@@ -1,6 +1,6 @@
 // WebSocket that is open while its page is visible, and opened again after a break.
 
-const MAX_DELAY = 8000; // ms between two attempts to connect
+const MAX_DELAY = 2000; // ms between two attempts to connect
 
 export class PageSocket {
   // address(): path with its query; taken(data, socket): a message; changed(state): "live", "waiting", "hidden",
@@ -31,7 +31,8 @@ export class PageSocket {
     };
   }
 
-  // A browser does not say why a socket was refused. Each session has a token of its own: another one refuses ours.
+  // A browser does not say why a socket was refused. A session at this port takes back the pages of those before it;
+  // if it was started by another user, or at a free port, it refuses them.
   async askWhy() {
     const answer = await fetch("/api/status").catch(() => null);
     if (answer?.status === 403) this.close("ended");

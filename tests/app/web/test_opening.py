@@ -18,13 +18,13 @@ import app.cli.run
 from app.cli.main import main
 from app.live.engine import Engine
 from app.web import session as session_module
-from app.web.door import check_port
+from app.web.door import FormerSessions, check_port
 from app.web.server import PageServer
 from app.web.session import BrowserPage
 from estimators.errors import ConfigError
 from tests.app.scripted import Scripted, wait_for
 from tests.app.served import SECRET, shown_twin
-from tests.app.web.page.browsed import PATIENCE
+from tests.app.web.page.browsed import DRAWN, PATIENCE, until
 
 posix = pytest.mark.skipif(os.name != "posix", reason="permissions and command lines as on POSIX")
 URL = 'http://127.0.0.1:9900/?token=a"b&c'
@@ -178,3 +178,40 @@ def test_the_file_opens_the_page_and_the_next_session_asks_for_its_own_address(b
         page.context.close()
         opening.close()
         server.stop()
+
+
+@pytest.mark.browser
+def test_an_open_page_returns_to_a_session_that_is_killed_and_started_again(browser, runtime):
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    words = program("run", "motor_winding", "--port", str(port), "--no-browser")
+
+    def begun():
+        run = subprocess.Popen(words, stdout=subprocess.PIPE, text=True)
+        return run, next(found[0] for line in run.stdout if (found := re.search(r"http://127\.0\.0\.1:\d+/\S+", line)))
+
+    page = browser.new_context().new_page()
+    page.set_default_timeout(PATIENCE * 1000)
+    run, address = begun()
+    try:
+        page.goto(address)
+        boots = []
+        for _ in range(2):
+            until(page, f"{DRAWN} && !{boots}.includes(document.body.dataset.settings)")
+            boots.append(page.evaluate("document.body.dataset.settings"))
+            run.kill()
+            run.wait()
+            page.get_by_text("Connection lost, trying again").wait_for()
+            run, _ = begun()
+        until(page, f"{DRAWN} && !{boots}.includes(document.body.dataset.settings)")
+        # Another port's cookie and a file that others may write open nothing.
+        kept = runtime / "nisus" / f"sessions-{port}"
+        assert len(kept.read_text().split()) == 3 and kept.stat().st_mode & 0o777 == 0o600
+        assert FormerSessions(port).digests() and not FormerSessions(port + 1).digests()
+        kept.chmod(0o666)
+        assert not FormerSessions(port).digests()
+    finally:
+        page.context.close()
+        run.kill()
+        run.wait()
