@@ -4,7 +4,9 @@ A `Stepped` twin has no threads: what a test puts in is folded, and what it subm
 returns. A test that needs threads starts an `Engine` and polls with `wait_for`.
 """
 
+import json
 import queue
+import struct
 from types import SimpleNamespace
 
 import numpy as np
@@ -174,3 +176,25 @@ def fresh_status(engine):
     """A status that is not the kept one."""
     engine._status = None
     return engine.status()
+
+
+def decoded(frame):
+    """Header of a frame of a chart stream, its times, s, and columns less their offsets; see `unpack` of stream.js."""
+    length = struct.unpack_from("<I", frame)[0]
+    head, at = json.loads(frame[4 : 4 + length]), 4 + length
+    n, each = head["points"], head["each"]
+    seconds, at = np.frombuffer(frame, "<f8", n, at), at + 8 * n
+    kept, lines = n // each * head["ends"], head["dots"].count(0)
+    edges = iter(np.frombuffer(frame, "<f4", kept * lines, at).reshape(lines, kept))
+    at, counts, block = at + 4 * kept * lines, iter(head["counts"]), np.full((len(head["dots"]), n), np.nan)
+    for column, dots in zip(block, head["dots"], strict=True):
+        if dots:
+            count = next(counts)
+            column[np.frombuffer(frame, "<u4", count, at)] = np.frombuffer(frame, "<f4", count, at + 4 * count)
+            at += 8 * count
+        elif each == 1:
+            column[:] = next(edges)
+        else:
+            column[::each], column[each - 1 :: each] = next(edges).reshape(-1, 2).T
+    assert at == len(frame)
+    return head, seconds, block

@@ -20,6 +20,9 @@ from .charted_run import ChartedRun
 from .columns import DOTS, LOWER, UPPER, Column
 from .levels_of_detail import FACTOR, FIRST, Groups
 
+MAX_DOT_ROWS = 20_000
+"""Rows up to which every dot is drawn; of more, a random sample of as many and the extremes of each group."""
+
 SLACK = 1.3
 """Factor by which the number of groups may leave its bounds before their size changes: charts would flicker."""
 
@@ -64,12 +67,13 @@ class ChartStream:
         self._kinds = np.array([columns[column].kind for column in query.columns])
         self.size = 0
         """Rows in a group."""
+        self._every_dot = False
         self._rows = (0, 0)
         """Rows that the query covers: the first, and the one after the last."""
         self._sent, self._end = (0, 0), 0
         """Groups that the browser has, from the first to before the second; the row after their last."""
         self._sent_as: object = None
-        """Run, generation and group size of those."""
+        """Run, generation, group size and choice of dots of those."""
         self._dirty = LAST_ROW
         """First row that has changed since the last frame."""
         self._offsets = np.full(len(query.columns), np.nan)
@@ -94,7 +98,9 @@ class ChartStream:
         # One more row on either side, so that lines leave the chart at its edges.
         start, stop = run.span(since, until + 1)
         self._rows = max(0, start - 1), stop + 1
-        self.size = self._sized(self._rows[1] - self._rows[0])
+        rows = self._rows[1] - self._rows[0]
+        self.size = self._sized(rows)
+        self._every_dot = rows <= MAX_DOT_ROWS * (SLACK if self._every_dot else 1.0)
 
     @property
     def levelled(self) -> tuple[str, ...]:
@@ -104,7 +110,7 @@ class ChartStream:
     def frame(self, run: ChartedRun, origin: int) -> bytes | None:
         """Return the changes since the last frame, or None; the levels of the run must be up to date."""
         (start, stop), size = self._rows, self.size
-        sent_as = (run, run.generation, size)
+        sent_as = (run, run.generation, size, self._every_dot)
         end = min(stop, run.end)
         if end > self._end:
             # Rows may have arrived after `look`.
@@ -117,10 +123,17 @@ class ChartStream:
         if not fresh and (at >= last or self._dirty >= run.end):
             return None
         groups = run.groups(size, at, last, list(self.query.columns))
+        samples = self._samples(run, groups)
         self._sent_as, self._dirty, self._end = sent_as, LAST_ROW, end
         # The last group may grow.
         self._sent = (first, groups.start + groups.n)
-        return self._packed(groups, origin, fresh, first, run.revision)
+        return self._packed(groups, samples, origin, fresh, first, run.revision)
+
+    def _samples(self, run: ChartedRun, groups: Groups) -> tuple[np.ndarray, np.ndarray] | None:
+        """Return times and values of the dots within each group; None if there are none beside its extremes."""
+        dots = [name for name, kind in zip(self.query.columns, self._kinds, strict=True) if kind == DOTS]
+        count = groups.size if self._every_dot else min(groups.size, MAX_DOT_ROWS // self.query.points)
+        return run.samples(groups, dots, count) if dots and groups.size > 1 and count else None
 
     def _sized(self, rows: int) -> int:
         """Return the size of groups: the smallest that the points allow, or the last one if that nearly does."""
@@ -133,14 +146,36 @@ class ChartStream:
             size *= FACTOR
         return size
 
-    def _packed(self, groups: Groups, origin: int, fresh: bool, first: int, revision: int) -> bytes:
+    def _packed(
+        self,
+        groups: Groups,
+        samples: tuple[np.ndarray, np.ndarray] | None,
+        origin: int,
+        fresh: bool,
+        first: int,
+        revision: int,
+    ) -> bytes:
         times, values = drawn(groups, self._kinds)
+        dots = self._kinds == DOTS
+        points = values[:, dots]
+        each = ends = 1 if groups.size == 1 else 2
+        if samples is not None:
+            # The rows lie between the two points of their group, which are its extremes unless all rows are there.
+            inner, between = samples
+            each = 2 + inner.shape[1]
+            edges = points.reshape(groups.n, 2, -1)
+            if inner.shape[1] == groups.size:
+                edges = np.full_like(edges, np.nan)
+            times = np.concatenate((groups.first[:, None], inner, groups.last[:, None]), axis=1).ravel()
+            points = np.concatenate((edges[:, :1], between, edges[:, 1:]), axis=1).reshape(times.size, -1)
         seconds = (times - origin) * 1e-9
         # Single precision around a value of each column: positions on the earth need more than it holds.
         unknown = np.isnan(self._offsets)
         self._offsets[unknown] = [_some(column) for column in values.T[unknown]]
         rebased = fresh or bool((unknown & ~np.isnan(self._offsets)).any())
         offsets = np.nan_to_num(self._offsets)
+        # A row is a measurement of one sensor: of dots only those that exist are sent.
+        found = [np.flatnonzero(np.isfinite(column)) for column in points.T]
         header = json.dumps(
             {
                 "stream": self.name,
@@ -149,17 +184,22 @@ class ChartStream:
                 "fresh": fresh,
                 "first": first,
                 "start": groups.start,
-                "each": 1 if groups.size == 1 else 2,
+                "each": each,
+                "ends": ends,
                 "size": groups.size,
                 "points": int(seconds.size),
                 "columns": list(self.query.columns) if fresh else None,
+                "dots": [int(is_dots) for is_dots in dots],
+                "counts": [len(rows) for rows in found],
                 "offsets": offsets.tolist() if rebased else None,
             },
             separators=(",", ":"),
         ).encode()
         header += b" " * (-(len(header) + 4) % 8)
-        block = (values - offsets).astype(np.float32).T
-        parts = (struct.pack("<I", len(header)), header, seconds.astype("<f8").tobytes(), block.tobytes())
+        parts = [struct.pack("<I", len(header)), header, seconds.astype("<f8").tobytes()]
+        parts.append((values - offsets)[:, ~dots].astype("<f4").T.tobytes())
+        for rows, column, offset in zip(found, points.T, offsets[dots], strict=True):
+            parts += [rows.astype("<u4").tobytes(), (column[rows] - offset).astype("<f4").tobytes()]
         return b"".join(parts)
 
 

@@ -139,6 +139,30 @@ class ChartedRun:
         picked = [self.levelled.index(name) for name in columns]
         return groups._replace(low=groups.low[:, picked], high=groups.high[:, picked], rising=groups.rising[:, picked])
 
+    def samples(self, groups: Groups, columns: list[str], count: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return `count` rows of each group: all of them, or one at random from each of as many parts of equal length.
+
+        Which row depends on its index alone, so a chart does not shimmer.
+
+        Returns:
+            Times (k, count), ns, those of a group's ends where it has no such row; values (k, count, columns).
+        """
+        parts = np.arange(groups.start * count, (groups.start + groups.n) * count)
+        begin, end = parts * groups.size // count, (parts + 1) * groups.size // count
+        wanted = begin + (_mixed(parts) % (end - begin).astype(np.uint64)).astype(np.int64)
+        times = np.repeat(groups.last, count)
+        times[::count] = groups.first
+        values = np.full((len(parts), len(columns)), np.nan)
+        for start in range(groups.start * groups.size, min((groups.start + groups.n) * groups.size, self.end), ROWS):
+            pull = self.source.rows(start, min(start + ROWS, self.end))
+            at = slice(*np.searchsorted(wanted, [pull.first, pull.first + len(pull.events)]))
+            rows = wanted[at] - pull.first
+            events, track = pull.events.select(rows), pull.track.select(rows)
+            times[at] = events.t
+            values[at] = self._values(replace(pull, events=events, track=track), columns)
+        shape = groups.n, count
+        return np.maximum.accumulate(times.reshape(shape), axis=1), values.reshape(*shape, len(columns))
+
     def _taken(self, pull: Pull) -> Pull:
         return pull if self._minus is None else less(pull, self._minus)
 
@@ -149,6 +173,14 @@ class ChartedRun:
         for k, name in enumerate(names):
             out[:, k] = self._columns[name].of(rows)
         return out
+
+
+def _mixed(index: np.ndarray) -> np.ndarray:
+    """Return a random number for each index (SplitMix64: Steele, Lea and Flood 2014)."""
+    z = (index.astype(np.uint64) + np.uint64(1)) * np.uint64(0x9E3779B97F4A7C15)
+    z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return z ^ (z >> np.uint64(31))
 
 
 def less(pull: Pull, engine: Running) -> Pull:

@@ -186,7 +186,7 @@ export class Chart {
   // The value of a column there, or the last one before it.
   at(name, index) {
     const values = this.data[name];
-    for (let k = index; k >= Math.max(0, index - 64); k--) if (typeof values?.[k] === "number") return values[k];
+    for (let k = index; k >= Math.max(0, index - 256); k--) if (typeof values?.[k] === "number") return values[k];
     return NaN;
   }
 

@@ -73,26 +73,18 @@ export function area(x, upper, lower) {
   return { x: [...rows, ...back].map((k) => x[k]), values: [...rows.map((k) => upper[k]), ...back.map((k) => lower[k])] };
 }
 
-// Of grouped rows only the extremes arrive: a faint box from one to the other stands for the points between, so that
-// noise does not look like two rows of marks.
-export const boxes = (stream, names) => names.map((name) => {
-  const column = stream.each === 2 ? stream.column(name) : [];
-  const found = { legend: "", tone: "reading", fill: 0.22, x: [], values: [] };
-  for (let k = 0; k + 1 < column.length; k += 2) {
-    if (typeof column[k] !== "number" || typeof column[k + 1] !== "number") continue;
-    const [since, until] = [stream.x[k], stream.x[k + 1]];
-    found.x.push(since, until, until, since, since);
-    found.values.push(column[k], column[k], column[k + 1], column[k + 1], null);
-  }
-  return found;
-});
-
 // An angle between -π and π; and a curve of such, which leaves the chart at one edge and comes back at the other.
 export const wrapped = (value) => (typeof value === "number" ? value - 2 * Math.PI * Math.round(value / (2 * Math.PI)) : value);
 
 export function unbroken(values) {
-  const angles = values.map(wrapped);
-  return angles.map((value, k) => (k && Math.abs(value - angles[k - 1]) > Math.PI ? null : value));
+  let before = NaN;
+  return values.map((given) => {
+    const value = wrapped(given);
+    if (typeof value !== "number") return value;
+    const leaves = Math.abs(value - before) > Math.PI;
+    before = value;
+    return leaves ? null : value;
+  });
 }
 
 // The edge of a band of an angle, about its wrapped mean.

@@ -14,6 +14,7 @@ export class Stream {
     this.revision = null;
     this.first = 0;
     this.each = 1; // points of a group of rows
+    this.ends = 1; // of these, those of a line: the first and the last
   }
 
   // Ask for {columns, run, since, until, span, points}; null for nothing. The same query again is not sent.
@@ -32,18 +33,28 @@ export class Stream {
       this.columns = Object.fromEntries(this.names.map((name) => [name, []]));
       this.first = header.start;
       this.each = header.each;
+      this.ends = header.ends;
     }
     if (header.offsets) this.offsets = header.offsets;
     this.revision = header.revision;
     const keep = Math.max(0, Math.min(this.x.length, (header.start - this.first) * this.each));
     const gone = Math.max(0, Math.min(keep, (header.first - this.first) * this.each));
-    this.x = [...this.x.slice(gone, keep), ...seconds];
+    this.x = this.x.slice(gone, keep).concat(Array.from(seconds));
     this.names.forEach((name, k) => {
-      const offset = this.offsets[k];
-      const fresh = Array.from(values[k] ?? [], (value) => (Number.isNaN(value) ? null : value + offset));
-      this.columns[name] = [...this.columns[name].slice(gone, keep), ...fresh];
+      this.columns[name] = this.columns[name].slice(gone, keep).concat(this.filled(values[k], this.offsets[k], header.points));
     });
     this.first = Math.min(header.start, Math.max(this.first, header.first));
+  }
+
+  // Values of a frame's points. Where a dot is not, there is null; where a line has no point of its own, undefined, so
+  // that it leads on.
+  filled({ at, values }, offset, points) {
+    const known = (k) => (Number.isNaN(values[k]) ? null : values[k] + offset);
+    if (!at && this.each === 1) return Array.from(values, (_, k) => known(k));
+    const column = new Array(points).fill(at ? null : undefined);
+    if (at) at.forEach((place, k) => (column[place] = known(k)));
+    else for (let k = 0; k < values.length; k++) column[this.each * (k >> 1) + (k & 1 ? this.each - 1 : 0)] = known(k);
+    return column;
   }
 
   column(name) {
@@ -52,20 +63,28 @@ export class Stream {
 
   // The newest finite value of a column.
   last(name) {
-    return this.columns[name]?.findLast((value) => value !== null) ?? NaN;
+    return this.columns[name]?.findLast((value) => typeof value === "number") ?? NaN;
   }
 }
 
-// A frame: the length of its header, the header, times in seconds, and each column around its offset.
+// A frame: the length of its header, the header, times in seconds; lines, each around its offset; and dots, the places of
+// those that exist and their values.
 export function unpack(buffer) {
   const length = new DataView(buffer).getUint32(0, true);
   const header = JSON.parse(new TextDecoder().decode(new Uint8Array(buffer, 4, length)));
-  const n = header.points;
   let at = 4 + length;
-  const seconds = new Float64Array(buffer, at, n);
-  at += 8 * n;
-  const columns = [];
-  for (let left = buffer.byteLength - at; left > 0 && n; left -= 4 * n, at += 4 * n)
-    columns.push(new Float32Array(buffer, at, n));
+  const take = (kind, count) => {
+    const found = new kind(buffer, at, count);
+    at += found.byteLength;
+    return found;
+  };
+  const seconds = take(Float64Array, header.points);
+  const lines = header.dots.map((dots) => (dots ? null : take(Float32Array, (header.points / header.each) * header.ends)));
+  const counts = header.counts.values();
+  const columns = lines.map((values) => {
+    if (values) return { values };
+    const count = counts.next().value;
+    return { at: take(Uint32Array, count), values: take(Float32Array, count) };
+  });
   return [header, seconds, columns];
 }

@@ -1,7 +1,7 @@
 // Innovations of each sensor row, with the band in which 95 % of them are expected.
 
 import { band, dots, line } from "../chart.js";
-import { boxes, marks } from "../drawing.js";
+import { marks } from "../drawing.js";
 import { bracketed, compact, spaced, words } from "../format.js";
 import { Range, shownExtent, within } from "../ranges.js";
 
@@ -27,7 +27,6 @@ export default (charts) => charts.model.rows.slice(0, MAX_CHARTS).map((row, k, r
     series: { upper: line("bound", { width: 1, spanGaps: true }), lower: line("bound", { width: 1, spanGaps: true }), value: dots("reading", 3) },
     bands: [band("bounds", "upper", "lower")],
     paint: (plot) => marks(plot, charts.episodes, charts.view.at),
-    curves: () => boxes(live, [own.value]),
     data: () => ({ x: live.x, ...Object.fromEntries(Object.entries(own).map(([kind, name]) => [kind, live.column(name)])) }),
     range: (data, span) => {
       const most = Math.max(...shownExtent({ bands: [[data.lower, data.upper]], dots: [data.value] }, ...within(data.x, span)).map(Math.abs));

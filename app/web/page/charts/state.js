@@ -1,7 +1,7 @@
 // Each state: estimate and band, truth, the sensors that measure it directly, and what other runs say.
 
 import { band, dots, edge, line } from "../chart.js";
-import { aboutMean, boxes, marks, unbroken, wrapped } from "../drawing.js";
+import { aboutMean, marks, unbroken, wrapped } from "../drawing.js";
 import { bracketed, compact, decimals, fixed, withDeviation } from "../format.js";
 import { Range, shownExtent, within } from "../ranges.js";
 import { groupsOf } from "./group.js";
@@ -29,7 +29,6 @@ function chartOf(charts, state) {
   const axisRange = new Range();
   const { live } = charts;
   const measured = state.rows.flatMap((row) => Object.keys(MEASURED).map((kind) => `${kind}:${row}`));
-  const between = state.circular ? [] : measured.filter((name) => name.startsWith("reading:"));
   const own = Object.fromEntries(["upper", "lower", "truth", "mean"].map((kind) => [kind, `${kind}:${state.name}`]));
   const level = () => charts.integrity?.[state.name]?.bound;
   return {
@@ -59,7 +58,6 @@ function chartOf(charts, state) {
       return { x: live.x, ...columns, ...Object.fromEntries(dotted) };
     },
     curves: () => [
-      ...boxes(live, between),
       ...charts.layers.flatMap((layer) => layer.curves(state)),
       ...protection(live.x, live.column(own.mean), level()),
     ],

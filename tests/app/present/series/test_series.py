@@ -1,7 +1,5 @@
 """Chart streams: a browser has the rows of the fold, however they arrived; runs are the folds that they name."""
 
-import json
-import struct
 from types import SimpleNamespace
 
 import numpy as np
@@ -11,7 +9,7 @@ from app.live import commands
 from app.live.jobs import Job, Jobs
 from app.live.notices import Notices
 from app.live.outputs import event_window
-from app.present.series.chart_stream import ChartQuery, ChartStream, drawn
+from app.present.series.chart_stream import MAX_DOT_ROWS, ChartQuery, ChartStream, drawn
 from app.present.series.levels_of_detail import grouped
 from app.present.series.pinned_fold import PinnedFold
 from app.present.series.series import SMOOTHED, Series
@@ -21,7 +19,7 @@ from estimators.events.maintenance import maintained
 from estimators.fold import Fold
 from estimators.log import TRUTH, Events, Log
 from estimators.tuning import Tuning
-from tests.app.scripted import MODEL, Replayed, Stepped, random_walk, readings, wait_for
+from tests.app.scripted import MODEL, Replayed, Stepped, decoded, random_walk, readings, wait_for
 from tests.support import SECOND
 
 ROW = MODEL.row_names[0]
@@ -48,20 +46,17 @@ class Viewer:
 
     def take(self, frame):
         self.bytes += len(frame)
-        length = struct.unpack_from("<I", frame)[0]
-        head, at = json.loads(frame[4 : 4 + length]), 4 + length
-        n = head["points"]
+        head, seconds, block = decoded(frame)
         if head["fresh"]:
             self.names, self.x, self.values = head["columns"], np.zeros(0), dict.fromkeys(head["columns"], np.zeros(0))
             self.first, self.each = head["start"], head["each"]
         if head["offsets"] is not None:
             self.offsets = head["offsets"]
-        block = np.frombuffer(frame, "<f4", n * len(self.names), at + 8 * n).reshape(len(self.names), n)
         keep = max(0, min(len(self.x), (head["start"] - self.first) * self.each))
         gone = max(0, min(keep, (head["first"] - self.first) * self.each))
-        self.x = np.concatenate((self.x[gone:keep], np.frombuffer(frame, "<f8", n, at)))
+        self.x = np.concatenate((self.x[gone:keep], seconds))
         for k, name in enumerate(self.names):
-            self.values[name] = np.concatenate((self.values[name][gone:keep], block[k].astype(float) + self.offsets[k]))
+            self.values[name] = np.concatenate((self.values[name][gone:keep], block[k] + self.offsets[k]))
         self.first = min(head["start"], max(self.first, head["first"]))
 
     def until(self, engine, holds):
@@ -173,6 +168,25 @@ def test_points_are_no_more_than_asked_for():
     engine = stepped_with(20_000).engine
     for points in (10, 100, 1000):
         assert points / 4 / 1.3 < len(shown(engine, MEAN, points=points).x) / 2 <= 1.3 * points + 2
+
+
+@pytest.mark.parametrize("rows", [9_000, 102_400])
+def test_noise_looks_like_noise_from_any_distance(rows):
+    """Up to `MAX_DOT_ROWS` all are drawn; of more, a sample with the quartiles of all, and the extremes."""
+    noise = np.random.default_rng(1).normal(size=rows)
+    stepped = Stepped(horizon=np.inf)
+    stepped.put(readings(np.arange(1.0, rows + 1.0), noise))
+    viewer = shown(stepped.engine, READING, points=400)
+    drawn = viewer.values[READING][np.isfinite(viewer.values[READING])]
+    assert drawn.max() == pytest.approx(noise.max(), abs=1e-6) and drawn.min() == pytest.approx(noise.min(), abs=1e-6)
+    if rows <= MAX_DOT_ROWS:
+        np.testing.assert_allclose(drawn, noise, atol=1e-6)
+        return
+    groups = -(-rows // viewer.stream.size)
+    assert drawn.size == groups * (MAX_DOT_ROWS // 400 + 2)
+    # The extremes of some hundred rows lie outside the quartiles.
+    within, sampled = np.sum(np.abs(drawn) < 0.6745), drawn.size - 2 * groups
+    assert within == pytest.approx(0.5 * sampled, abs=4.0 * np.sqrt(0.25 * sampled))
 
 
 def test_a_peak_of_one_row_is_seen_at_any_scale():
