@@ -57,6 +57,19 @@ export class Stream {
     return column;
   }
 
+  // Without the points of dots: the times of lines, and a line's values there.
+  get lineTimes() {
+    return this.atEnds(this.x);
+  }
+
+  lineColumn(name) {
+    return this.atEnds(this.column(name));
+  }
+
+  atEnds(values) {
+    return this.each === this.ends ? values : values.filter((_, k) => k % this.each === 0 || k % this.each === this.each - 1);
+  }
+
   column(name) {
     return this.columns[name] ?? new Array(this.x.length).fill(null);
   }

@@ -57,11 +57,11 @@ function lines(charts, group) {
     series: { ...Object.fromEntries(members.map((state) => [state.name, line("quiet", { width: 1 })])), furthest: line("estimate", { width: 2 }) },
     curves: () => (furthest === null ? [] : [{ legend: "± 2σ", tone: "band", fill: 1, ...area(strong.stream.x, ...strong.edges(furthest)) }]),
     data: () => {
-      const columns = Object.fromEntries(members.map((state) => [state.name, charts.live.column(`mean:${state.name}`)]));
+      const columns = Object.fromEntries(members.map((state) => [state.name, charts.live.lineColumn(`mean:${state.name}`)]));
       const place = outlier(Object.values(columns).map((column) => column.findLast((value) => typeof value === "number") ?? NaN));
       furthest = members[place]?.name ?? null;
       strong.choose(own.key, furthest);
-      return { x: charts.live.x, ...columns, furthest: columns[furthest] ?? [] };
+      return { x: charts.live.lineTimes, ...columns, furthest: columns[furthest] ?? [] };
     },
     range: (data, span) => {
       const [low, high] = shownExtent({ lines: members.map((state) => data[state.name]) }, ...within(data.x, span));
@@ -126,7 +126,7 @@ function picture(charts, group) {
     note: `rows: ${first} to ${members.at(-1).number}, the first at the bottom`,
     weight: 2.4,
     series: Object.fromEntries(names.map((name) => [name, edge()])),
-    data: () => ({ x: charts.live.x, ...Object.fromEntries(names.map((name) => [name, charts.live.column(`mean:${name}`)])) }),
+    data: () => ({ x: charts.live.lineTimes, ...Object.fromEntries(names.map((name) => [name, charts.live.lineColumn(`mean:${name}`)])) }),
     range: () => [first - 0.5, members.at(-1).number + 0.5],
     paint: (plot) => {
       const data = chart.data();
@@ -161,7 +161,7 @@ function spread(charts, group) {
     weight: 1,
     series: { highest: edge(), lowest: edge(), upper: edge(), lower: edge(), mean: line("estimate", { width: 1.75 }) },
     bands: [band("bounds", "highest", "lowest"), band("band", "upper", "lower")],
-    data: () => ({ x: charts.live.x, ...overall(own.columns.map((column) => charts.live.column(column)), uppers.map((column) => charts.live.column(column))) }),
+    data: () => ({ x: charts.live.lineTimes, ...overall(own.columns.map((column) => charts.live.lineColumn(column)), uppers.map((column) => charts.live.lineColumn(column))) }),
     range: ({ x, highest, lowest, upper, lower, mean }, span) =>
       range.fit(...shownExtent({ lines: [mean], bands: [[lowest, highest], [lower, upper]] }, ...within(x, span))),
     says: (value) => {

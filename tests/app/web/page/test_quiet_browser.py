@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from app.live.commands import Pin, SetTuning, UseSensor
+from estimators.log import READING
 from tests.app.scripted import pull_all, wait_for
-from tests.app.web.page.browsed import PATIENCE, running, until
+from tests.app.web.page.browsed import PATIENCE, running, settled, until
 from tests.support import SECOND
 
 pytestmark = pytest.mark.browser
@@ -40,28 +41,38 @@ def test_the_charts_go_to_another_moment_of_the_stretch_that_they_show(page, ses
     assert float(said.inner_text().split(" ± ")[0]) == pytest.approx(mean, abs=0.2 * std)
 
 
-TINTED = """() => {
-  const chart = window.nisus.charts.charts.find(({ what }) => what.key === "innovation:winding");
-  const { ctx, bbox } = chart.plot;
-  const y = chart.plot.valToPos(0, "y", true);
-  const { data } = ctx.getImageData(bbox.left, y, bbox.width, 1);
-  let tinted = 0;
-  for (let k = 0; k < data.length; k += 4) tinted += data[k] - data[k + 2] > 20;
-  return [window.nisus.charts.live.each, tinted / (data.length / 4), chart.what.curves()[0].x.length];
+DRAWN_DOTS = """() => {
+  const { live, charts } = window.nisus.charts;
+  const chart = charts.find(({ what }) => what.key.startsWith("innovation:"));
+  const { x, value } = chart.data;
+  return [live.each, x.flatMap((time, k) => (typeof value[k] === "number" ? [[time, value[k]]] : []))];
 }"""
 
 
-def test_between_the_extremes_of_many_readings_the_others_are_seen(page):
-    """Innovations of either sign: at zero all is tinted where groups of them are shown, and little where each is."""
-    until(page, "window.nisus.charts.live.x.length > 100")
+def test_every_innovation_is_drawn_from_afar_in_a_new_tab_and_after_an_edit(page, session):
+    """With the extremes of groups alone, white noise would look like two rows of marks."""
     page.evaluate("window.nisus.view.show(20, 280)")
-    until(page, "window.nisus.charts.live.each === 2 && window.nisus.charts.live.x[0] < 25")
-    wait_for(lambda: page.evaluate(TINTED)[1] > 0.8, PATIENCE)
-    assert page.evaluate(TINTED)[2] > 100
-    page.evaluate("window.nisus.view.show(50, 60)")
-    until(page, "window.nisus.charts.live.each === 1 && window.nisus.charts.live.x[0] > 45")
-    wait_for(lambda: page.evaluate(TINTED)[1] < 0.3, PATIENCE)
-    assert page.evaluate(TINTED)[2] == 0
+
+    def drawn_dots():
+        until(page, "window.nisus.charts.live.each > 2 && window.nisus.charts.live.x[0] < 25")
+        rows = pull_all(session.engine)
+        seconds = (rows.events.t - rows.events.t[0]) * 1e-9
+        innovation = rows.track.innovation[:, 0]
+        each, dots = page.evaluate(DRAWN_DOTS)
+        times, values = np.array(dots).T
+        mine = (rows.events.kind == READING) & (rows.events.channel == 0)
+        expected = innovation[mine & (seconds >= times[0]) & (seconds <= times[-1])]
+        return each, values, expected
+
+    settled_at = session.engine.revisions.runs[-1].number
+    for revision in (settled_at, settled_at + 1):
+        each, values, expected = drawn_dots()
+        assert each > 2 and values.size > 500
+        np.testing.assert_allclose(values, expected, atol=1e-5)
+        if revision == settled_at:
+            session.engine.submit(SetTuning("R.winding", 3.0))
+            settled(session.engine, settled_at + 1)
+            until(page, f"window.nisus.charts.live.revision === {settled_at + 1}")
 
 
 def test_dragging_across_a_part_of_a_chart_zooms_to_exactly_that_part(page):
