@@ -1,4 +1,4 @@
-"""Sensors of a family in a twin's YAML: what it says of the declared sensor, said of each of its members."""
+"""Expand the sections of a sensor with landmarks in a twin's YAML into sections of its members."""
 
 from __future__ import annotations
 
