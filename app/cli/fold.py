@@ -34,7 +34,7 @@ from ..studies.fold_result import (
 )
 from ..studies.scores import pictures_of
 from ..twin.log_reader import read_log
-from ..views.recording.format import TAKEN
+from ..views.recording.rrd_file import TAKEN
 from .prepare import attend, fold_log, opened, prepare
 
 if TYPE_CHECKING:

@@ -14,8 +14,6 @@ from config.loader import shipped
 
 from ..twin.log_reader import remarking
 from ..twin.twin import Twin, load_twin, restore_twin
-from ..views.recording.format import tuning_from_json
-from ..views.recording.reader import read_recording
 from ..views.recording.rrd_file import NEVER, Split
 from ..web.gallery.api import GalleryApi
 from ..web.gallery.gallery import Gallery, Opener, SavedFiles, StartRequest
@@ -63,6 +61,8 @@ def recorded_twin(recorded: Recorded) -> Twin:
 
     The baseline of the innovations is not part of the tuning and comes from the YAML.
     """
+    from ..views.recording.format import tuning_from_json
+
     twin = restore_twin(recorded.text, recorded.twin_path, recorded.overrides, recorded.version)
     tuning, estimator = tuning_from_json(recorded.tuning, twin.model)
     tuning = replace(tuning, baseline=twin.tuning.baseline)
@@ -75,6 +75,8 @@ def opened_review(path: Path) -> OpenedTwin:
     Raises:
         NisusError: If the recording cannot be read, or its model is not there.
     """
+    from ..views.recording.reader import read_recording
+
     recorded = read_recording(path)
 
     def open_source(report: Callable[[str, str], None]) -> Source:

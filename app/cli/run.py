@@ -13,8 +13,7 @@ from estimators.errors import ConfigError
 from ..live.execute import MAX_SPEED
 from ..present.result import to_json
 from ..terminal import complain
-from ..views.recording.format import TAKEN
-from ..views.recording.rrd_file import NEVER, parse_split
+from ..views.recording.rrd_file import NEVER, TAKEN, parse_split
 from ..web.door import check_port
 from ..web.gallery.gallery import StartRequest
 from ..web.session import Page, Session

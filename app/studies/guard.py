@@ -31,7 +31,6 @@ from ..live.tunings.versions import COVERAGE, RMSE, now
 from ..present.result import Topic
 from ..twin.log_reader import read_log
 from ..twin.twin import Twin, load_twin, restore_twin
-from ..views.recording.reader import read_recording
 from .baseline import (
     ComparedFigure,
     allowances,
@@ -123,6 +122,8 @@ def of_folder(folder: Path) -> list[GuardedLog]:
 def _of_recording(path: Path) -> GuardedLog:
     own = path.with_name(f"{path.stem}{SUFFIX}")
     try:
+        from ..views.recording.reader import read_recording
+
         twin = read_recording(path).twin_path
     except SourceError as error:
         return GuardedLog(path.stem, path, path, own, own, str(error))
@@ -198,6 +199,8 @@ def twin_of(guarded: GuardedLog, overrides: dict[str, str] | None = None) -> Twi
     given = {**(overrides or {}), "tuning": OWN_VALUES if version is None else str(version.path)}
     if guarded.recording is None:
         return load_twin(guarded.twin, overrides=given)
+    from ..views.recording.reader import read_recording
+
     recorded = read_recording(guarded.recording)
     own = {key: value for key, value in recorded.overrides.items() if key != "tuning"}
     if guarded.twin.is_file():
@@ -230,6 +233,8 @@ def logs_of(guarded: GuardedLog, twin: Twin, span: float | None) -> Iterator[tup
         SourceError: If a recording is missing or cannot be read.
     """
     if guarded.recording is not None:
+        from ..views.recording.reader import read_recording
+
         recorded = read_recording(guarded.recording)
         log = Log.of(twin.model, capacity=max(1, recorded.rows))
         log.extend(recorded.events)

@@ -15,7 +15,6 @@ from ..live.engine import Engine
 from ..live.runs.refits import Refits
 from ..views.recording.rrd_file import NEVER, Split
 from ..views.recording.writer import ALL_STRETCHES, Recorder
-from ..views.rerun.rows import RerunRows
 
 if TYPE_CHECKING:
     from estimators.snapshots import Base
@@ -23,6 +22,7 @@ if TYPE_CHECKING:
 
     from ..live.workshop import Workshop
     from ..twin.twin import Twin
+    from ..views.rerun.rows import RerunRows
     from .door import Door
 
 
@@ -93,12 +93,7 @@ class RunningTwin:
             self.engine.notices.restore(list(opening.said))
         for level, text in opening.remarks:
             self.engine.notices.say(text, level=level)
-        self.recorder = Recorder(
-            self.engine,
-            lambda stream: RerunRows(stream, self.engine, series=ALL_STRETCHES),
-            split,
-            recordings or Path(),
-        )
+        self.recorder = Recorder(self.engine, self._draw_into, split, recordings or Path())
         self.engine.recorder = self.recorder
         self.refits = Refits(self.engine)
         self.view: Any = None
@@ -124,6 +119,12 @@ class RunningTwin:
             except BaseException:
                 self.discard()
                 raise
+
+    def _draw_into(self, stream: Any) -> RerunRows:
+        """Return a function that logs the charts of a pull into a Rerun stream."""
+        from ..views.rerun.rows import RerunRows
+
+        return RerunRows(stream, self.engine, series=ALL_STRETCHES)
 
     def discard(self) -> None:
         """Discard a twin that was never started."""

@@ -29,7 +29,6 @@ from ..present.export.alarm_guide import alarms_text, as_html
 from ..present.series.series import Series
 from ..studies.analysis.diagnosis import Diagnosis
 from ..studies.analysis.forecast import Forecasts, question_from_json
-from ..views.rerun.feed import RerunFeed
 from .commands_json import command_from_json
 from .door import Door
 from .fit_api import FitApi
@@ -41,6 +40,8 @@ from .viewer_assets import FILES, viewer_assets, viewer_version
 from .viser_proxy import ViserProxy
 
 if TYPE_CHECKING:
+    from ..present.drawing.colors import Palette
+    from ..views.rerun.feed import RerunFeed
     from ..views.viser.stage import Choices
 
 COMPILE_POLL_PERIOD_S = 0.5
@@ -265,8 +266,14 @@ class PageServer:
         await browser.accept()
         layout = browser.query_params.get("layout", "1") == "1"
         palette = THEMES.get(browser.query_params.get("theme", ""), EITHER)
-        feed = await asyncio.to_thread(RerunFeed, self._engine, layout=layout, palette=palette)
+        feed = await asyncio.to_thread(self._rerun_feed, layout, palette)
         await feed_rerun(browser, feed, self._rerun_status)
+
+    def _rerun_feed(self, layout: bool, palette: Palette) -> RerunFeed:
+        """Return a feed of Explore; Rerun takes 50 MB, so it is imported with the first one."""
+        from ..views.rerun.feed import RerunFeed
+
+        return RerunFeed(self._engine, layout=layout, palette=palette)
 
     def _rerun_status(self) -> dict[str, Any]:
         origin = self.series.origin()

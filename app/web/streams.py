@@ -11,7 +11,7 @@ import json
 import time
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from starlette.websockets import WebSocket, WebSocketDisconnect
@@ -21,9 +21,11 @@ from estimators.errors import ConfigError, nearest
 from ..live.running_fold import Running
 from ..present.series.chart_stream import ChartQuery, ChartStream
 from ..present.series.series import Series
-from ..views.rerun.feed import RerunFeed
 from .http import MAX_BODY_BYTES, one_line, parse
 from .twin_json import episodes_json
+
+if TYPE_CHECKING:
+    from ..views.rerun.feed import RerunFeed
 
 FRAME_PERIOD_S = 0.1
 STATUS_PERIOD_S = 0.25

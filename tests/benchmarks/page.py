@@ -33,9 +33,6 @@ from .timing import BenchmarkRow, Bound, Section, run_sections
 
 MOVES = 20
 
-HISTORY = 20_000
-"""Events kept in a soak, which arrive in two minutes; after that memory must stay flat."""
-
 SLIDER = """async (value) => {
   const box = document.querySelector('.knob[data-key^="Q."] .field input');
   const before = window.nisus.revision, begun = performance.now();
@@ -84,6 +81,14 @@ class Running:
     def resident(self) -> float:
         """Return resident memory, MB."""
         return int(Path(f"/proc/{self._process.pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
+
+    def threads(self) -> int:
+        """Return the number of threads."""
+        return len(os.listdir(f"/proc/{self._process.pid}/task"))
+
+    def handles(self) -> int:
+        """Return the number of open file handles."""
+        return len(os.listdir(f"/proc/{self._process.pid}/fd"))
 
     def stop(self) -> None:
         """End it."""
@@ -223,28 +228,19 @@ def arrival(seconds: float = 15.0) -> Iterator[BenchmarkRow]:
     yield BenchmarkRow("motor_can", figures, (Bound("median [ms]", 5.0),))
 
 
-def soak(minutes: float = 10.0) -> Iterator[BenchmarkRow]:
-    """Memory of server and page at 200 readings per second with 10,000 particles and a history that is soon full."""
-    options = ("--estimator", "pf", "--set", 'filters.pf={"particles": 10000}', "--set", "source.asset.step=0.015",
-               "--set", f"history={HISTORY}")  # fmt: skip
-    with running("motor_can", *options) as run, opened(run) as (page, _):
-        session = page.context.new_cdp_session(page)
-        begun, before = time.monotonic(), run.readings
-        while (gone := time.monotonic() - begun) < 60.0 * minutes:
-            time.sleep(30.0)
-            session.send("HeapProfiler.collectGarbage")
-            heap = session.send("Runtime.getHeapUsage")["usedSize"] / 1e6
-            gone, status = time.monotonic() - begun, run.ask("/api/status")
-            figures = {
-                "readings per s": (status["counts"]["readings"] - before) / gone,
-                "server [MB]": run.resident(),
-                "heap [MB]": heap,
-                "p99 to row [ms]": status["latency_ms"],
-            }
-            yield BenchmarkRow(f"{gone / 60:.1f} min", figures)
+def memory(edits: int = 60) -> Iterator[BenchmarkRow]:
+    """Resident memory of the server process with a page open: after the start, and after edits, MB."""
+    with running("motor_can") as run, opened(run) as (page, _):
+        time.sleep(20.0)
+        begun = run.resident()
+        yield BenchmarkRow("after the start", {"RSS [MB]": begun}, (Bound("RSS [MB]", 350.0),))
+        for k in range(edits):
+            page.evaluate(SLIDER, 0.01 * (1.0 + k % 7))
+        more = {"RSS [MB]": run.resident(), "more [MB]": run.resident() - begun}
+        yield BenchmarkRow(f"after {edits} edits", more, (Bound("more [MB]", 50.0),))
 
 
-PARTS: dict[str, Section] = {part.__name__: part for part in (crowd, first, slider, share, arrival)}
+PARTS: dict[str, Section] = {part.__name__: part for part in (crowd, first, slider, share, arrival, memory)}
 
 
 def page() -> Iterator[BenchmarkRow]:
@@ -257,11 +253,11 @@ def page() -> Iterator[BenchmarkRow]:
 def main() -> None:
     """Run the parts that the command line names."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("parts", nargs="*", default=list(PARTS), help=f"among {', '.join(PARTS)} and soak")
+    parser.add_argument("parts", nargs="*", default=list(PARTS), help=f"among {', '.join(PARTS)}")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write all figures to this file")
     given = parser.parse_args()
     print(f"load {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores")
-    run_sections([{**PARTS, "soak": soak}[name] for name in given.parts], given.json)
+    run_sections([PARTS[name] for name in given.parts], given.json)
 
 
 if __name__ == "__main__":

@@ -1,8 +1,13 @@
-"""`python -m tests.benchmarks.soak`: an hour at 1 kHz of the worst mix of faults, as fast as possible.
+"""`python -m tests.benchmarks.soak`: does anything grow? It exits with 1 if anything does, or is wrong.
 
-The engine runs without a page on a simulated asset; every few seconds of the asset's time some faults of all kinds
-begin, which last for some seconds. At the end every event must be accounted for, memory must have stayed flat once the
-history was full, and what watches the twin must still be there. It exits with 1 if anything is wrong.
+With `--minutes 60`, an hour of `nisus run motor_can` with its page open in Chromium: an edit every 20 seconds, Explore
+shown and hidden, recordings started and stopped. A line a minute has memory, threads and file handles of the server
+process; the end has their slopes with standard errors.
+
+With `--seconds 3600`, the default: an hour at 1 kHz of the worst mix of faults, as fast as possible. The engine runs
+without a page on a simulated asset; every few seconds of the asset's time some faults of all kinds begin, which last
+for some seconds. At the end every event must be accounted for, memory must have stayed flat once the history was full,
+and what watches the twin must still be there.
 """
 
 from __future__ import annotations
@@ -10,9 +15,11 @@ from __future__ import annotations
 import argparse
 import resource
 import sys
+import tempfile
 import threading
 import time
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -25,6 +32,8 @@ from estimators.track import HEALTH_NAMES, SUSPECT, TRACKING, VERDICT_NAMES
 from sources.faults.kinds import Fault
 from sources.faults.layer import Faults
 from sources.source import WRONG_TIME
+
+from .page import SLIDER, Running, opened, running
 
 TWIN = "motor_can"
 STEP = 0.003  # Seconds between the asset's steps, each of three readings: a thousand a second
@@ -60,6 +69,112 @@ MIXES: tuple[tuple[dict[str, object], ...], ...] = (
 def resident() -> float:
     """Return resident memory of this process, MB."""
     return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize() / 1e6
+
+
+class Watched(NamedTuple):
+    """A figure of the server process, and by how much it may grow in an hour."""
+
+    name: str
+    unit: str
+    per_hour: float
+
+
+WATCHED = (Watched("memory", "MB", 15.0), Watched("threads", "", 1.0), Watched("handles", "", 2.0))
+"""Resident memory (RSS) of the server process alone, without browser and compilers."""
+
+EDIT_PERIOD_S, EXPLORE_PERIOD_S, RECORDING_PERIOD_S = 20.0, 120.0, 90.0
+SAMPLE_PERIOD_S = 1.0
+MINUTE_S = 60.0
+
+SETTLING_S = 240.0
+"""Start of the slopes: Explore was shown, a recording was closed and the history was folded again."""
+
+MIN_MINUTES = 10  # Of a slope; one of fewer minutes is printed but proves nothing
+
+
+def slope(minutes: np.ndarray, values: np.ndarray) -> tuple[float, float]:
+    """Return the slope per hour of a line through values a minute apart, and its standard error.
+
+    The error allows for residuals that are correlated from one minute to the next (an AR(1) process).
+    """
+    hours = minutes / 60.0
+    centred = hours - hours.mean()
+    rate = float(centred @ values / (centred @ centred))
+    left = values - values.mean() - rate * centred
+    spread = float(left @ left) / max(1, len(left) - 2)
+    lag = float(np.clip(left[1:] @ left[:-1] / (left @ left), 0.0, 0.9)) if spread > 0.0 else 0.0
+    return rate, float(np.sqrt(spread / (centred @ centred) * (1.0 + lag) / (1.0 - lag)))
+
+
+class PageSoak:
+    """A server with a page that is used: edits, Explore and recordings, each with a period of its own."""
+
+    def __init__(self, run: Running, page: Any, folder: Path) -> None:
+        self.run, self.page, self.folder = run, page, folder
+        self.samples: list[tuple[float, ...]] = []
+        self.edits = self.recordings = self.explored = 0
+
+    def figures(self) -> tuple[float, ...]:
+        """Return memory, threads and handles of the server."""
+        return self.run.resident(), self.run.threads(), self.run.handles()
+
+    def act(self, seconds: float) -> None:
+        """Do what is due by now, on the page."""
+        if seconds >= EDIT_PERIOD_S * (self.edits + 1):
+            self.edits += 1
+            self.page.evaluate(SLIDER, 0.01 * (1.0 + self.edits % 7))
+        if seconds >= EXPLORE_PERIOD_S * self.explored + 30.0:
+            self.explored += 1
+            self.page.click("[data-tab=explore]")
+        if seconds >= RECORDING_PERIOD_S * self.recordings + 45.0:
+            self.recordings += 1
+            self.page.click("#record")
+            for done in sorted(self.folder.glob("*.rrd"), key=lambda path: path.stat().st_mtime)[:-2]:
+                done.unlink()
+
+    def use(self, minutes: float) -> None:
+        """Use the page, and print a line a minute: the median of its seconds."""
+        begun, minute = time.monotonic(), list[tuple[float, ...]]()
+        print("  min  RSS [MB]  threads  handles  edits  Explore  recordings  rows kept")
+        while (seconds := time.monotonic() - begun) < 60.0 * minutes:
+            self.act(seconds)
+            minute.append(self.figures())
+            if seconds >= MINUTE_S * (len(self.samples) + 1):
+                self.samples.append(tuple(np.median(minute, axis=0)))
+                minute.clear()
+                memory, threads, handles = self.samples[-1]
+                rows = self.run.ask("/api/status")["counts"]["readings"]
+                print(
+                    f"  {len(self.samples):3d}  {memory:8.1f}  {threads:7.0f}  {handles:7.0f}  {self.edits:5d}  "
+                    f"{self.explored:7d}  {self.recordings:10d}  {rows:9,d}",
+                    flush=True,
+                )
+            time.sleep(SAMPLE_PERIOD_S)
+
+    def verdict(self) -> list[str]:
+        """Print the slopes, and return those that are not below their bounds by two standard errors."""
+        late = np.arange(len(self.samples)) >= SETTLING_S / MINUTE_S
+        minutes, wrong = np.flatnonzero(late).astype(float), list[str]()
+        if minutes.size < 3:
+            return [f"{len(self.samples)} minutes are too few for a slope"]
+        for item, values in zip(WATCHED, np.array(self.samples)[late].T, strict=True):
+            rate, error = slope(minutes, values)
+            unit = f"{item.unit}/h".lstrip()
+            print(f"{item.name}: {rate:+.2f} ± {error:.2f} {unit}, bound {item.per_hour:g}; last {values[-1]:.1f}")
+            if rate + 2.0 * error > item.per_hour:
+                wrong.append(f"{item.name} grows by {rate:.2f} ± {error:.2f} {unit}; {item.per_hour:g} is allowed")
+        if minutes.size < MIN_MINUTES:
+            wrong.append(f"{minutes.size} minutes after the start settled prove nothing; {MIN_MINUTES} are needed")
+        return wrong
+
+
+def soak_page(minutes: float) -> list[str]:
+    """Run it, and return what falls short."""
+    with tempfile.TemporaryDirectory() as name:
+        with running(TWIN, "--recordings", name) as run, opened(run) as (page, _):
+            soak = PageSoak(run, page, Path(name))
+            soak.use(minutes)
+            return soak.verdict()
 
 
 class Soaked:
@@ -190,10 +305,16 @@ class Soak:
 
 def main() -> int:
     """Run it; 0 if nothing is wrong."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--minutes", type=float, help="soak server and page for so long instead")
     parser.add_argument("--seconds", type=float, default=3600.0, help="of the asset")
     parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args()
+    if given.minutes is not None:
+        wrong = soak_page(given.minutes)
+        for text in wrong:
+            print(f"FALLS SHORT: {text}")
+        return 1 if wrong else 0
     soak = Soak(given.seconds, given.seed)
     soak.run()
     soak.account()

@@ -35,7 +35,7 @@ from estimators.tuning import Tuning
 from ...live.history_copy import copy_rows
 from ...live.outputs import Pull
 from ...live.running_fold import Running
-from .rrd_file import END_MESSAGE, MESSAGE_HEADER, STREAM_HEADER, messages
+from .rrd_file import END_MESSAGE, MESSAGE_HEADER, STREAM_HEADER, TAKEN, messages
 
 FORMAT = 2
 READABLE = (1, 2)  # Formats that can be read; the first also stored the track
@@ -122,8 +122,6 @@ def base_from_json(text: str) -> Base | None:
 
 
 FLUSH_TIMEOUT_S = 5.0
-
-TAKEN = "is there already; choose another name, or remove it"  # Message about a path that is taken
 
 
 class RecordingFile:

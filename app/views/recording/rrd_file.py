@@ -21,6 +21,8 @@ STREAM_HEADER, MESSAGE_HEADER = 12, struct.Struct("<QQ")
 
 END_MESSAGE = 0  # Kind of the message that closes a stream
 
+TAKEN = "is there already; choose another name, or remove it"  # Message about a path that is taken
+
 RESERVED_BYTES = 32 * 2**20
 """Free bytes at which a recording ends: enough to close it, and for other programs."""
 

@@ -21,9 +21,6 @@ from estimators.errors import NisusError, SourceError
 
 from ...live.notices import Notice
 from ...live.outputs import Cursor, Pull
-from ..rerun.rows import RerunRows
-from ..rerun.sink import free_closed_streams
-from .format import RecordingFile, summary, summary_of
 from .rrd_file import NEVER, Disk, Split, part_path
 
 if TYPE_CHECKING:
@@ -128,6 +125,8 @@ class Recorder:
                 self._taken = None
                 self._fail(self._reason(error))
             if self._closed:
+                from ..rerun.sink import free_closed_streams
+
                 self._closed = False
                 free_closed_streams()
             if self._asked:
@@ -177,10 +176,15 @@ class Recorder:
 
 
 class RecordingPart:
-    """File of a recording: cursors of its events and charts, and the base of its fold."""
+    """File of a recording: cursors of its events and charts, and the base of its fold.
+
+    Rerun takes 50 MB, so it is imported with the first file.
+    """
 
     def __init__(self, engine: Running, asked: Path, draw: Any, *, before: RecordingPart | None = None) -> None:
         """Start a recording at a path, or the part that continues another."""
+        from .format import RecordingFile
+
         twin = self._twin = engine.twin
         self._engine = engine
         self.asked = asked
@@ -300,6 +304,8 @@ class RecordingPart:
                 self.file.flush()
                 fresh = False
         if not short:
+            from .format import summary_of
+
             self.file.summary(summary_of(self._engine))
         self.file.close()
 
@@ -337,6 +343,10 @@ def write_recording(
     Raises:
         SourceError: If the file cannot be written.
     """
+    from ..rerun.rows import RerunRows
+    from ..rerun.sink import free_closed_streams
+    from .format import RecordingFile, summary
+
     lines = [
         Notice(k, round(episode.start * 1e9), "error" if episode.cause == "diverged" else "warn", episode.text)
         for k, episode in enumerate(episodes)

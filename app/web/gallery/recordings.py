@@ -10,13 +10,15 @@ import threading
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from estimators.errors import ConfigError, NisusError, quoted
 from sources.formats import CAN_LOGS, TABLES, is_recording
 
-from ...views.recording.reader import Facts, facts_of
 from ...views.recording.rrd_file import Disk
+
+if TYPE_CHECKING:
+    from ...views.recording.reader import Facts
 
 RECORDING = ".rrd"
 LOGS = tuple(dict.fromkeys((*CAN_LOGS, *TABLES)))
@@ -82,7 +84,7 @@ class Recordings:
                     "looking": known is None and not log,
                     "folder": None if path in inside else str(path.parent),
                 }
-                | (asdict(known) if isinstance(known, Facts) else NO_FACTS)
+                | (NO_FACTS if known is None or isinstance(known, str) else asdict(known))
             )
         self._look(unknown)
         return sorted(found, key=lambda entry: -entry["modified"])
@@ -94,6 +96,8 @@ class Recordings:
             self._looking = True
 
         def look() -> None:
+            from ...views.recording.reader import facts_of
+
             try:
                 for path, key in unknown:
                     try:
