@@ -71,6 +71,7 @@ def status_of(
         late: Counts of measurements whose time is late or in doubt, by key.
     """
     model, log, track = fold.model, fold.log, fold.track
+    judged, nis_dof = _judged(fold)
     last = fold.n - 1
     t = int(log.t[last]) if last >= 0 else None
     states = sensor_states(model, fold.tuning.used, fold.evidence, (t or 0) * 1e-9, fold.policy)
@@ -100,7 +101,8 @@ def status_of(
         nis=float(track.nis_mean[last]) if last >= 0 else np.nan,
         nis_low=float(track.nis_low[last]) if last >= 0 else np.nan,
         nis_high=float(track.nis_high[last]) if last >= 0 else np.nan,
-        nis_judged=_judged(fold),
+        nis_judged=judged,
+        nis_dof=nis_dof,
         latency_ms=watchers.latency.percentile(99.0),
         latency_p50_ms=watchers.latency.percentile(50.0),
         integrity=watchers.integrity.of(fields["revision"]),
@@ -108,17 +110,16 @@ def status_of(
     )
 
 
-def _judged(fold: Fold) -> float:
-    """Return the NIS of the last window relative to the baseline of a commissioned twin; NaN without a baseline."""
+def _judged(fold: Fold) -> tuple[float, float]:
+    """Return the NIS of the last window relative to the baseline, NaN without one, and the mean degrees of freedom."""
     baseline, n, window = fold.tuning.baseline, fold.n, fold.policy.window
-    if baseline is None:
-        return np.nan
     rows = slice(max(0, n - MAX_ROWS_PER_READING * window), n)
     resets = np.flatnonzero(fold.log.kind[rows] == RESET)
     begun = rows.start + (int(resets[-1]) + 1 if resets.size else 0)
     judged = begun + np.flatnonzero(np.isin(fold.track.verdict[begun:n], (USED, GATED, FAILED)))[-window:]
     events, track = fold.log.events.select(judged), fold.track.select(judged)
-    return nis_verdict(track, events, fold.model, baseline).judged
+    found = nis_verdict(track, events, fold.model, baseline)
+    return found.judged, found.dof
 
 
 def _cause_without_rows(fold: Fold, watchers: Watchers, fields: Mapping[str, Any]) -> str:

@@ -53,7 +53,8 @@ def _score(known: RunScore, units: dict[str, str]) -> dict[str, Any]:
     verdict = score.nis_verdict
     found = {name: getattr(known, name) for name in ("rows", "seconds", "log_likelihood_reading", "step_us")}
     found |= {
-        name: getattr(score, name) for name in ("nis", "nis_low", "nis_high", "log_likelihood", "readings", "refused")
+        name: getattr(score, name)
+        for name in ("nis", "nis_low", "nis_high", "nis_dof", "log_likelihood", "readings", "refused")
     }
     found |= {"nis_judged": verdict.measure, "nis_place": verdict.place, "nis_words": verdict.words}
     found["fits"] = [

@@ -203,7 +203,13 @@ def fold_json(result: FoldResult) -> dict[str, Any]:
             name: {"rmse": fit.rmse, "bias": fit.bias, "coverage": fit.coverage}
             for name, fit in scored.held_out.items()
         },
-        "nis": {"mean": scored.nis, "low": scored.nis_low, "high": scored.nis_high, "n": scored.nis_readings},
+        "nis": {
+            "mean": scored.nis,
+            "low": scored.nis_low,
+            "high": scored.nis_high,
+            "n": scored.nis_readings,
+            "dof": scored.nis_dof,
+        },
         "log_likelihood": scored.log_likelihood,
         "log_likelihood_used": scored.log_likelihood_used,
         "used": np.sum(fold.track.verdict == USED),
@@ -317,8 +323,9 @@ def _figures(result: FoldResult) -> list[Figure]:
         title = "mean NEES" if len(result.nees.states) > 1 else f"mean NEES of {result.nees.states[0]}"
         found.append(Figure(title, result.nees.mean, remark=result.nees.remark))
     if scored.nis_readings:
-        nis = f"{scored.nis:.4f}" if abs(scored.nis) < 1e6 else f"{scored.nis:.4g}"
-        found.append(Figure("mean NIS", nis, remark=f"{scored.nis_verdict.said}; {scored.nis_readings} readings"))
+        verdict = scored.nis_verdict
+        nis = f"{verdict.ratio:.4f}" if abs(verdict.ratio) < 1e6 else f"{verdict.ratio:.4g}"
+        found.append(Figure("mean NIS", nis, remark=f"{verdict.said}; {scored.nis_readings} readings"))
     without = f"without rejected measurements {scored.log_likelihood_used:.2f}" if scored.gated else ""
     found += [
         Figure("log-likelihood", f"{scored.log_likelihood:.2f}", remark=without),

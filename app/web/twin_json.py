@@ -19,8 +19,8 @@ from ..present.series.columns import columns_of
 
 STATUS_FIELDS = (
     "estimator", "options", "revision", "refolding", "awaited", "compiling", "t", "since", "cause", "episodes_open",
-    "lost", "nis", "nis_low", "nis_high", "model_version", "clock", "counts", "account", "paused", "finished", "speed",
-    "seekable", "latency_ms",
+    "lost", "nis", "nis_low", "nis_high", "nis_dof", "model_version", "clock", "counts", "account", "paused",
+    "finished", "speed", "seekable", "latency_ms",
 )  # fmt: skip
 """Fields of `Status` that JSON has under the same name."""
 
@@ -29,7 +29,8 @@ def status_json(engine: Running) -> dict[str, Any]:
     """Return the state of a running twin; infinity is "inf", NaN null."""
     status, twin, revisions = engine.status(), engine.twin, engine.revisions
     tuning, runs, levels = status.tuning, engine.revisions.runs, status.integrity
-    judged = NisVerdict(status.nis, status.nis_low, status.nis_high, tuning.baseline is not None, status.nis_judged)
+    commissioned = tuning.baseline is not None
+    judged = NisVerdict(status.nis, status.nis_low, status.nis_high, commissioned, status.nis_judged, status.nis_dof)
     found = {name: getattr(status, name) for name in STATUS_FIELDS} | {
         "twin": twin.name,
         "title": twin.title,

@@ -21,7 +21,8 @@ class NisVerdict(NamedTuple):
     """A mean NIS, its 95 % bounds, and whether these are those of the baseline (`commissioned`).
 
     A baseline is computed from used and rejected measurements, each row clipped at 6 σ; `judged` is the mean NIS of the
-    same, which is compared with the bounds; NaN where that is the NIS itself.
+    same, which is compared with the bounds; NaN where that is the NIS itself. All are per measurement; words give them
+    per degree of freedom, of which a measurement has `dof` on average.
     """
 
     nis: float
@@ -29,6 +30,12 @@ class NisVerdict(NamedTuple):
     high: float
     commissioned: bool
     judged: float = np.nan
+    dof: float = 1.0
+
+    @property
+    def ratio(self) -> float:
+        """Mean NIS per degree of freedom, 1 where the innovations are as large as predicted."""
+        return self.nis / self.dof
 
     @property
     def measure(self) -> float:
@@ -47,15 +54,15 @@ class NisVerdict(NamedTuple):
         """Its position relative to the bounds."""
         if not self.place:
             return "no reading to judge"
-        bounds = f"{self.place} its 95 % bounds {self.low:.3g} to {self.high:.3g}"
+        bounds = f"{self.place} its 95 % bounds {self.low / self.dof:.3g} to {self.high / self.dof:.3g}"
         own = abs(self.measure - self.nis) < 0.005 * self.nis
-        clipped = "" if own else f"{self.measure:.3g} with those refused and none beyond 6 σ, "
-        return clipped + bounds + (", as commissioned" if self.commissioned else "")
+        clipped = "" if own else f"{self.measure / self.dof:.3g} with those refused and none beyond 6 σ, "
+        return "per degree of freedom, " + clipped + bounds + (", as commissioned" if self.commissioned else "")
 
     @property
     def words(self) -> str:
         """All of it in one line."""
-        return f"mean NIS {self.nis:.3g}, {self.said}" if self.place else self.said
+        return f"mean NIS {self.ratio:.3g} {self.said}" if self.place else self.said
 
 
 class Nees(NamedTuple):

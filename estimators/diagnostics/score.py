@@ -43,7 +43,8 @@ class Score(NamedTuple):
 
     states: fits against the truth, by state; held_out: fits of held-out measurements, by sensor row; field: fit of all
     cells of a large field at the times of its true values, or None. commissioned: whether the bounds are those of the
-    baseline; nis_judged: the NIS to compare with these (consistency.py).
+    baseline; nis_judged: the NIS to compare with these (consistency.py). nis_dof: mean degrees of freedom of the used
+    measurements, by which the NIS and its bounds are divided where they are shown.
     """
 
     nis: float
@@ -61,11 +62,12 @@ class Score(NamedTuple):
     field: Fit | None = None
     commissioned: bool = False
     nis_judged: float = np.nan
+    nis_dof: float = 1.0
 
     @property
     def nis_verdict(self) -> NisVerdict:
         """Whether the mean NIS is within its bounds."""
-        return NisVerdict(self.nis, self.nis_low, self.nis_high, self.commissioned, self.nis_judged)
+        return NisVerdict(self.nis, self.nis_low, self.nis_high, self.commissioned, self.nis_judged, self.nis_dof)
 
 
 def score(
@@ -89,7 +91,7 @@ def score(
         baseline: Baseline of the tuning, by which the NIS is judged.
     """
     used = track.verdict == USED
-    nis, low, high, commissioned, judged = nis_verdict(track, events, model, baseline)
+    nis, low, high, commissioned, judged, nis_dof = nis_verdict(track, events, model, baseline)
     count, verdicts = int(used.sum()), np.bincount(track.verdict, minlength=len(VERDICT_NAMES))
     gated = int(verdicts[GATED])
     likelihood = float(track.log_likelihood[used].sum())
@@ -114,6 +116,7 @@ def score(
         field=_over_field(pictures),
         commissioned=commissioned,
         nis_judged=judged,
+        nis_dof=nis_dof,
     )
 
 
@@ -126,13 +129,14 @@ def nis_verdict(track: Track, events: Events, model: StateSpaceModel, baseline: 
     normal = None if baseline is None else normal_nis(model, baseline)
     nis = float(track.nis[used].mean()) if used.any() else np.nan
     low, high = nis_bounds(dof, count, normal)
+    each = float(track.dof[used].mean()) if used.any() else 1.0
     if baseline is None or not count:
-        return NisVerdict(nis, low, high, baseline is not None)
+        return NisVerdict(nis, low, high, baseline is not None, dof=each)
     with np.errstate(all="ignore"):
         e = track.innovation[rows] / track.innovation_std[rows]
     e = np.where(np.isfinite(track.whitened[rows]), track.whitened[rows], e)
     judged = float(np.nansum(np.clip(e, -BASELINE_CLIP_SIGMA, BASELINE_CLIP_SIGMA) ** 2)) / count
-    return NisVerdict(nis, low, high, True, judged)
+    return NisVerdict(nis, low, high, True, judged, each)
 
 
 def _over_field(pictures: Sequence[Picture]) -> Fit | None:

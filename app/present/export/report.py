@@ -68,7 +68,7 @@ def report(run: Reported) -> list[Topic]:
     topics = [_head(run), _scores(run, found), episode_topic(run), *_before(run), Topic("Charts", said, html=(charts,))]
     topics += [*_checks(run), _tuning(run)]
     if run.others:
-        head = ("run", "change", "mean NIS", "log L per measurement", "RMSE")
+        head = ("run", "change", "NIS / dof", "log L per measurement", "RMSE")
         topics.append(Topic("Runs of the session", (), head, run.others))
     return [_cut(topic) for topic in topics]
 
@@ -116,7 +116,7 @@ def _scores(run: Reported, found: Score) -> Topic:
     marks: list[str] = []
     if found.nis_readings:
         verdict = found.nis_verdict
-        rows.append(("mean NIS", digits(found.nis), verdict.said))
+        rows.append(("mean NIS", digits(verdict.ratio), verdict.said))
         marks.append("good" if verdict.place == "inside" else "bad")
     fits = [(f"RMSE of {name}", name, fit) for name, fit in found.states.items()]
     fits += [(f"RMSE of {name}, held out", name, fit) for name, fit in found.held_out.items()]

@@ -20,7 +20,7 @@ from estimators.diagnostics.sensitivity import Bound
 from estimators.log import Events
 from estimators.model.state_space import StateSpaceModel
 from estimators.smoothing.walk import Smoothed
-from estimators.track import Track
+from estimators.track import USED, Track
 from estimators.tuning import Tuning
 
 from ...live.outputs import Pull
@@ -65,6 +65,7 @@ def charts_html(
     kinds = sorted(path.name for path in (PAGE / "charts").glob("*.js"))
     data = {
         "model": charted_model(model) | {"commissioned": tuning.baseline is not None},
+        "nis_dof": float(track.dof[used].mean()) if (used := track.verdict == USED).any() else 1.0,
         "kinds": kinds,
         "streams": streams,
         "episodes": [

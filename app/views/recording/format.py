@@ -289,6 +289,7 @@ def summary(
         "nis": _finite(found.nis),
         "nis_low": _finite(found.nis_low),
         "nis_high": _finite(found.nis_high),
+        "nis_dof": found.nis_dof,
         "nis_words": found.nis_verdict.words,
         "error": _error(found, tuning.model),
     }

@@ -15,6 +15,7 @@ export class Charts {
     this.live = new Stream(link, "charts");
     this.overview = new Stream(); // of the time bar, which is always there
     this.episodes = [];
+    this.nisDof = 1; // mean degrees of freedom of a measurement
     this.visible = true;
     this.range = [0, model.window];
     const actions = {
@@ -90,6 +91,7 @@ export class Charts {
   update(status) {
     setText($("no-rows"), status.t === null ? status.cause || "waiting for the first measurement" : "");
     if (status.integrity) this.integrity = status.integrity;
+    if (status.nis_dof) this.nisDof = status.nis_dof;
   }
 
   draw() {

@@ -51,8 +51,9 @@ export class Recordings {
     const facts = [
       file.folder ? `in ${file.folder}` : null, file.twin, file.seconds ? span(file.seconds) : null, summary?.estimator ?? file.estimator, size(file.bytes),
     ].filter(Boolean).join(" · ");
+    const ratio = (value) => compact(value / (summary.nis_dof ?? 1), 3);
     const scores = [
-      summary?.nis ? `NIS ${compact(summary.nis, 3)} [${compact(summary.nis_low, 3)}, ${compact(summary.nis_high, 3)}]` : null,
+      summary?.nis ? `NIS / dof ${ratio(summary.nis)} [${ratio(summary.nis_low)}, ${ratio(summary.nis_high)}]` : null,
       error ? `RMSE ${error.name} ${compact(error.rmse, 3)}${spaced(error.unit)}${error.against === "truth" ? "" : `, ${error.against}`}${typeof error.coverage === "number" ? `, ${compact(100 * error.coverage, 3)} % in band` : ""}` : null,
     ].filter(Boolean).join(" · ");
     const confirm = element("div", { class: "confirm", hidden: true });

@@ -9,9 +9,9 @@ import { Stream, unpack } from "./stream.js";
 const HEIGHT = 190; // px of a chart of weight one
 const PAPER = [960, 300]; // px of a drawing
 
-const { model, kinds, streams, episodes, integrity } = JSON.parse(document.getElementById("chart-data").textContent);
+const { model, kinds, streams, episodes, integrity, nis_dof: nisDof } = JSON.parse(document.getElementById("chart-data").textContent);
 
-const context = { model, episodes, integrity, view: { at: null }, live: streamOf(streams.live), layers: [] };
+const context = { model, episodes, integrity, nisDof, view: { at: null }, live: streamOf(streams.live), layers: [] };
 const whole = [context.live.x[0], context.live.x.at(-1)];
 context.range = whole;
 context.strong = { stream: context.live, choose() {}, edges: (name) => ["upper", "lower"].map((side) => context.live.column(`${side}:${name}`)) };

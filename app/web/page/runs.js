@@ -74,7 +74,7 @@ export class Runs {
       : null;
     const cell = (title, ...text) => element("th", { scope: "col", title }, ...text);
     return element("thead", {}, element("tr", {},
-      cell("Mean NIS of used measurements (▲ above, ▼ below its 95 % bounds; bold: nearest to the bounds' middle)", "NIS"),
+      cell("Mean NIS per degree of freedom of used measurements (▲ above, ▼ below its 95 % bounds; bold: nearest to the bounds' middle)", "NIS / dof"),
       cell("Root mean square error against the truth, or of predictions of a held-out sensor", "RMSE ", select ?? "–"),
       cell("Share of errors inside their 95 % band", "in 95 %"),
       cell("Log-likelihood per measurement, with a penalty for rejected ones", "log L"),
@@ -87,7 +87,7 @@ export class Runs {
     const cell = (key, text, title) => element("td", { class: best[key] === number ? "best" : null, title: best[key] === number ? `Best. ${title ?? ""}` : title }, text);
     const scores = score
       ? element("tr", { class: "scores" },
-          cell("nis", `${compact(score.nis, 3)}${BEYOND[score.nis_place] ?? ""}`, `Of the whole run: ${score.nis_words}; ${score.readings} measurements in ${span(score.seconds)}, ${compact(100 * (score.refused ?? 0), 2)} % rejected`),
+          cell("nis", `${compact(score.nis / score.nis_dof, 3)}${BEYOND[score.nis_place] ?? ""}`, `Of the whole run: ${score.nis_words}; ${score.readings} measurements in ${span(score.seconds)}, ${compact(100 * (score.refused ?? 0), 2)} % rejected`),
           cell("rmse", fit ? compact(fit.rmse, 3) : "–", fit ? `${fit.name}, ${fit.against}: mean error ${compact(fit.bias, 2)}${spaced(fit.unit)}` : "Needs a known truth or a held-out sensor"),
           cell("coverage", fit ? `${compact(100 * fit.coverage, 3)} %` : "–"),
           cell("likelihood", compact(score.log_likelihood_reading, 4), `In all ${compact(score.log_likelihood, 6)}`),

@@ -69,10 +69,11 @@ export class Trust {
     setText($("latency"), latency);
   }
 
-  // NIS on a logarithmic scale of two decades about its bounds.
-  gauge({ nis, nis_judged: judged, nis_low: low, nis_high: high, nis_place: where, nis_words: said }) {
+  // NIS per degree of freedom on a logarithmic scale of two decades about its bounds. Its colour is that of the health:
+  // of a consistent filter, too, 5 % of the means lie outside the bounds.
+  gauge({ nis, nis_judged: judged, nis_low: low, nis_high: high, nis_dof: dof, nis_words: said }) {
     const known = [nis, judged, low, high].every((value) => typeof value === "number" && value > 0);
-    setText($("nis"), known ? compact(nis, 3) : "–");
+    setText($("nis"), known ? compact(nis / dof, 3) : "–");
     $("gauge").hidden = !known;
     if (!known) return;
     const middle = Math.log10(Math.sqrt(low * high));
@@ -80,7 +81,7 @@ export class Trust {
     $("gauge").style.setProperty("--low", place(low));
     $("gauge").style.setProperty("--high", place(high));
     $("gauge").style.setProperty("--nis", place(judged));
-    $("gauge").dataset.inside = String(where === "inside");
+    $("gauge").dataset.health = $("health").dataset.health;
     setAttribute($("gauge"), "title", `Latest measurements: ${said}`);
   }
 

@@ -67,13 +67,15 @@ def test_no_readings_have_no_bounds():
 @pytest.mark.parametrize(
     ("nis", "commissioned", "words"),
     [
-        (1.0, False, "mean NIS 1, inside its 95 % bounds 0.9 to 1.1"),
-        (1.2, False, "mean NIS 1.2, above its 95 % bounds 0.9 to 1.1"),
-        (0.571, True, "mean NIS 0.571, below its 95 % bounds 0.9 to 1.1, as commissioned"),
+        (1.0, False, "mean NIS 1 per degree of freedom, inside its 95 % bounds 0.9 to 1.1"),
+        (1.2, False, "mean NIS 1.2 per degree of freedom, above its 95 % bounds 0.9 to 1.1"),
+        (0.571, True, "mean NIS 0.571 per degree of freedom, below its 95 % bounds 0.9 to 1.1, as commissioned"),
     ],
 )
 def test_it_says_where_a_mean_lies_and_by_what(nis, commissioned, words):
     assert NisVerdict(nis, 0.9, 1.1, commissioned).words == words
+    # Of measurements of eight rows all three are eight times as large.
+    assert NisVerdict(8 * nis, 7.2, 8.8, commissioned, dof=8.0).words == words
 
 
 def test_of_a_commissioned_twin_the_same_readings_are_compared_as_were_taken_for_normal():
@@ -93,8 +95,8 @@ def test_of_a_commissioned_twin_the_same_readings_are_compared_as_were_taken_for
     assert found.nis == pytest.approx((e[: n + 5] ** 2).mean(), rel=1e-12) and found.nis > found.high
     assert found.judged == pytest.approx((clipped**2).mean(), rel=1e-12) and found.place == "inside"
     assert found.words == (
-        f"mean NIS {found.nis:.3g}, {found.judged:.3g} with those refused and none beyond 6 σ, inside its 95 % bounds "
-        f"{found.low:.3g} to {found.high:.3g}, as commissioned"
+        f"mean NIS {found.nis:.3g} per degree of freedom, {found.judged:.3g} with those refused and none beyond 6 σ, "
+        f"inside its 95 % bounds {found.low:.3g} to {found.high:.3g}, as commissioned"
     )
     white = nis_verdict(track, events, MODEL)
     assert white.place == "above" and np.isnan(white.judged)

@@ -57,7 +57,7 @@ def test_one_verdict_in_one_wording(engine):
     assert status["nis_judged"] == pytest.approx(run["nis_judged"], rel=1e-9) == pytest.approx(nis, rel=1e-9)
     place = "below" if nis < low else "above" if nis > high else "inside"
     commissioned = engine.twin.tuning.baseline is not None
-    expected = f"mean NIS {nis:.3g}, {place} its 95 % bounds {low:.3g} to {high:.3g}"
+    expected = f"mean NIS {nis:.3g} per degree of freedom, {place} its 95 % bounds {low:.3g} to {high:.3g}"
     expected += ", as commissioned" if commissioned else ""
     said = [status["nis_words"], run["nis_words"], Diagnosis(engine)._look()["nis"]]
     assert said == [expected] * 3
@@ -70,4 +70,4 @@ def test_the_report_says_the_same(engine):
     found = score(pull.track, pull.events, MODEL, gate=twin.tuning.gate, baseline=twin.tuning.baseline)
     reported = Reported(twin, "kf", twin.tuning, pull.events, pull.track, (), (), False)
     (row,) = [row for row in _scores(reported, found).rows if row[0] == "mean NIS"]
-    assert f"mean NIS {run['nis']:.3g}, {row[2]}" == run["nis_words"]
+    assert f"mean NIS {run['nis']:.3g} {row[2]}" == run["nis_words"]
