@@ -2,6 +2,8 @@
 
 A page, an API call or a test passes one to `engine.submit`, from any thread. The engine carries them out in order,
 between two events, so nothing else ever changes the estimate.
+
+Edits that have the same `gesture`, a text that the sender chooses, are one run and one undo: the values of one drag.
 """
 
 from __future__ import annotations
@@ -20,6 +22,7 @@ class SetEstimator:
 
     name: str
     options: Mapping[str, float] | None = None
+    gesture: str = ""
 
 
 @dataclass(frozen=True)
@@ -31,6 +34,7 @@ class SetTuning:
 
     key: str
     value: float | bool | str | None
+    gesture: str = ""
 
 
 @dataclass(frozen=True)
@@ -41,6 +45,7 @@ class SetTunings:
     """
 
     values: Mapping[str, float]
+    gesture: str = ""
 
 
 @dataclass(frozen=True)
@@ -49,6 +54,7 @@ class SetOption:
 
     name: str
     value: float | bool | str
+    gesture: str = ""
 
 
 @dataclass(frozen=True)
@@ -65,6 +71,16 @@ class Restore:
 
 
 @dataclass(frozen=True)
+class Undo:
+    """Take the last edit back, whoever made it."""
+
+
+@dataclass(frozen=True)
+class Redo:
+    """Make the edit again that was taken back last."""
+
+
+@dataclass(frozen=True)
 class Load:
     """Return to the estimator and tuning of an earlier run."""
 
@@ -73,14 +89,14 @@ class Load:
 
 @dataclass(frozen=True)
 class Pin:
-    """Keep the track of a run (the running or the previous one) for comparison; four at most."""
+    """Keep a run on the charts for comparison; four at most."""
 
     number: int
 
 
 @dataclass(frozen=True)
 class Unpin:
-    """Drop the track of a pinned run."""
+    """Take a pinned run off the charts."""
 
     number: int
 
@@ -170,7 +186,7 @@ class ClearFault:
 
 
 Command = (
-    SetEstimator | SetTuning | SetTunings | SetOption | UseSensor | Restore | Load | Pin | Unpin | Note | Reset
-    | Maintenance | Pause | Speed | Step | Seek | Record | InjectFault | ClearFault
+    SetEstimator | SetTuning | SetTunings | SetOption | UseSensor | Restore | Undo | Redo | Load | Pin | Unpin
+    | Note | Reset | Maintenance | Pause | Speed | Step | Seek | Record | InjectFault | ClearFault
 )  # fmt: skip
 """Any command."""

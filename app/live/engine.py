@@ -87,6 +87,8 @@ class Engine(Running):
         self._workshop = workshop or Workshop()
         super().__init__(twin, Watchdog(self._report_stalled), base, self._workshop.ready)
         self._awaited = self.estimator if self._fold.idle else None
+        self._gesture = ""
+        """Gesture of the edit that asked for the present settings."""
         section = twin.config.time
         allowed = section.horizon if horizon is None else horizon
         self._horizon = round(allowed * 1e9) if np.isfinite(allowed) else None
@@ -304,7 +306,7 @@ class Engine(Running):
     def _compiled(self, estimator: str) -> None:
         """The filter that was waited for can be had."""
         if estimator == self._awaited:
-            self.retune(self.estimator, self.tuning)
+            self.retune(self.estimator, self.tuning, self._gesture)
 
     def _finish(self) -> None:
         """The source has ended."""
@@ -316,7 +318,7 @@ class Engine(Running):
 
     def _restart(self) -> None:
         """The source began again, and so does the log. The fold is a new revision; a refold is requested again."""
-        wanted = (self.estimator, self.tuning) if self._requests.waiting else None
+        wanted = (self.estimator, self.tuning, self._gesture) if self._requests.waiting else None
         with self._moving():
             self._begin_again(self._first_base)
             self._begin_intake()
@@ -337,7 +339,12 @@ class Engine(Running):
         self.revisions.why = why
         # The options of the YAML count again.
         self._last_options = {}
-        self.retune(estimator, tuning)
+        if exact:
+            self.edit(estimator, tuning)
+        else:
+            # Undo would take back what the files changed too.
+            self.revisions.edits.forget()
+            self.retune(estimator, tuning)
 
     def insert(self, event: Events) -> None:
         """Put an event of the engine's own into the log."""
@@ -345,7 +352,12 @@ class Engine(Running):
             self._take(event)
         self._fold_on()
 
-    def retune(self, estimator: str, tuning: Tuning) -> None:
+    def edit(self, estimator: str, tuning: Tuning, gesture: str = "") -> None:
+        """Fold the history again with an edit, which `Undo` takes back."""
+        self.revisions.edits.add((self.estimator, self.tuning), (estimator, tuning), gesture)
+        self.retune(estimator, tuning, gesture)
+
+    def retune(self, estimator: str, tuning: Tuning, gesture: str = "") -> None:
         """Fold the history again beside the running fold, once the filter is compiled."""
         self._last_options[self.estimator] = self.tuning.options
         if tuning.model is not self.model:
@@ -353,7 +365,7 @@ class Engine(Running):
             tuning = replace(tuning, model=self.model)
         # First, so that nobody sees the new tuning without a refold that is waited for.
         ticket = self._requests.ask()
-        self.estimator, self.tuning = estimator, tuning
+        self.estimator, self.tuning, self._gesture = estimator, tuning, gesture
         self._awaited = None if self._workshop.ready(estimator) else estimator
         if (last := self._status) is not None:
             self._status = (-np.inf, last[1])
@@ -363,18 +375,18 @@ class Engine(Running):
         log, base = self._log.copy(), self._base
         self._refolds.run(
             "refold",
-            lambda job: self._refold(ticket, self._make_fold(estimator, tuning, log, base), job),
+            lambda job: self._refold(ticket, self._make_fold(estimator, tuning, log, base), gesture, job),
             stale=lambda: ticket != self._requests.newest,
             failed=lambda reason: self._inbox.put(partial(self._adopt, ticket, None, reason)),
         )
 
-    def _refold(self, ticket: int, fold: Fold, job: Job) -> None:
+    def _refold(self, ticket: int, fold: Fold, gesture: str, job: Job) -> None:
         """Advance a new fold to its end, in a job."""
         batches, self._refolding = BatchSizer(), ticket
         with self._refold_watchdog.watched(fold):
             while batches.advance(fold) and not job.cancelled:
                 pass
-        self._inbox.put(partial(self._adopt, ticket, fold))
+        self._inbox.put(partial(self._adopt, ticket, fold, gesture=gesture))
 
     def _give_up(self, text: str, level: str) -> None:
         """Leave a refold in a function that does not return; its answer, should it come, is no longer waited for."""
@@ -382,7 +394,7 @@ class Engine(Running):
             self._refolds.abandon()
             self._inbox.put(partial(self._adopt, self._refolding, None, text))
 
-    def _adopt(self, ticket: int, fold: Fold | None, error: str = "") -> None:
+    def _adopt(self, ticket: int, fold: Fold | None, error: str = "", gesture: str = "") -> None:
         """Replace the running fold by a finished refold, after that has caught up with the log."""
         wanted, changed_from = self._requests.look(ticket)
         again = False
@@ -397,7 +409,7 @@ class Engine(Running):
         # Answered under the lock, and last, so that nobody sees the old fold without a refold that is waited for.
         with self._moving():
             if row_counts is not None and fold is not None:
-                self._become(fold, row_counts)
+                self._become(fold, row_counts, gesture)
                 if self._finished:
                     fold.finish()
                 self._watchers.alerts.again()
@@ -410,4 +422,4 @@ class Engine(Running):
             self._requests.answer(ticket)
         if again and not self._stopping.is_set():
             # The log was cut meanwhile.
-            self.retune(self.estimator, self.tuning)
+            self.retune(self.estimator, self.tuning, self._gesture)

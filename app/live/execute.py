@@ -40,6 +40,8 @@ OPTION_PREFIX = "options."
 MAX_MAINTENANCE_TEXT = 200
 """Characters that describe a maintenance."""
 
+MAX_GESTURE_LENGTH = 64
+
 MAX_SEEK_S = 1e9
 """32 years; times are int64 nanoseconds."""
 
@@ -60,7 +62,14 @@ def prepared(command: commands.Command, engine: Running) -> Callable[[], Any]:
     """
     runs, model, (first, now) = engine.revisions, engine.model, engine.span()
     if isinstance(command, REFOLDING):
-        return partial(engine.retune, *retuned(command, engine))
+        gesture = getattr(command, "gesture", "")
+        if len(gesture) > MAX_GESTURE_LENGTH:
+            raise ConfigError(f"gesture has {len(gesture)} characters; it may have {MAX_GESTURE_LENGTH}")
+        return partial(engine.edit, *retuned(command, engine), gesture)
+    if isinstance(command, commands.Undo | commands.Redo):
+        again = isinstance(command, commands.Redo)
+        runs.edits.next(again=again)
+        return lambda: engine.retune(*runs.edits.step(again=again))
     if isinstance(command, commands.InjectFault | commands.ClearFault):
         act = prepared_fault(command, engine.source, model)
         return lambda: engine.notices.say(act())

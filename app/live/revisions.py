@@ -1,4 +1,4 @@
-"""Revisions of a running twin: settings and changes of each, and the whole track of a few.
+"""Revisions of a running twin: settings and changes of each, and the whole track of a few; undo and redo.
 
 The engine adds a revision when one fold replaces another; their scores are computed on request in
 app/live/runs/scores.py.
@@ -9,21 +9,22 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 from estimators.diagnostics.episodes import Episode
 from estimators.errors import ConfigError, printable
 from estimators.tuning import Tuning
 
-from .changes import SettingChange, difference
+from .changes import SettingChange, difference, in_words
 from .outputs import Pull
-
-DRAG_S = 2.0
-"""Seconds within which edits of one entry are one edit."""
 
 MAX_PINNED = 4
 
 MAX_REVISIONS = 200
-"""Revisions that are kept; beyond that the oldest ones without pin, name or note are dropped."""
+"""Revisions that are kept; beyond that the oldest ones without pin, name or note are dropped, but not the first."""
+
+MAX_UNDO = 100
+"""Edits that can be taken back."""
 
 MAX_NAME_LENGTH, MAX_NOTE_LENGTH = 60, 2000
 
@@ -34,8 +35,9 @@ class Revision:
 
     `began` is the time of its start, s since 1970, `changes` the differences from the one before. `loaded` is the
     number of the earlier revision whose tuning it took up again. `place` is one of the `MAX_PINNED` while it is
-    pinned. `why` names another reason than settings: a file that was saved. `track` has all its rows, of the newest
-    previous revision and of pinned ones. `episodes` are those at its end, which the settings of the next one may hide.
+    pinned. `why` names another reason than settings: a file that was saved. `first` is whether its settings are those
+    with which the session began, `gesture` that of its edits. `track` has all its rows, of the newest previous revision
+    and of pinned ones. `episodes` are those at its end, which the settings of the next one may hide.
     """
 
     number: int
@@ -48,12 +50,14 @@ class Revision:
     note: str = ""
     place: int | None = None
     why: str = ""
+    first: bool = False
+    gesture: str = ""
     track: Pull | None = None
     episodes: tuple[Episode, ...] = ()
 
     @property
     def pinned(self) -> bool:
-        """Whether its track is kept."""
+        """Whether it stays on the charts."""
         return self.place is not None
 
     @property
@@ -62,12 +66,73 @@ class Revision:
         return self.pinned or bool(self.name or self.note)
 
 
+EditedSettings = tuple[str, Tuning]
+"""An estimator and its tuning."""
+
+
+@dataclass(frozen=True)
+class SettingsEdit:
+    """One edit of a user, or all of one gesture: settings before and after it."""
+
+    before: EditedSettings
+    after: EditedSettings
+    gesture: str = ""
+
+    @cached_property
+    def words(self) -> str:
+        """The change in words."""
+        return in_words(difference(*self.before, *self.after))
+
+
+class EditHistory:
+    """Edits that can be taken back, and those that were; shared by all clients."""
+
+    def __init__(self) -> None:
+        # Replaced, never changed, so that a reader in another thread never sees half of it.
+        self.done: tuple[SettingsEdit, ...] = ()
+        self.undone: tuple[SettingsEdit, ...] = ()
+
+    def add(self, before: EditedSettings, after: EditedSettings, gesture: str = "") -> None:
+        """Add an edit; one of the same gesture as the last extends that."""
+        if gesture and self.done and self.done[-1].gesture == gesture:
+            edit, self.done = self.done[-1], self.done[:-1]
+            before = edit.before
+        self.done = (*self.done, SettingsEdit(before, after, gesture))[-MAX_UNDO:]
+        self.undone = ()
+
+    def next(self, *, again: bool) -> SettingsEdit:
+        """Return the edit that `step` would take back, or make again.
+
+        Raises:
+            ConfigError: If there is none.
+        """
+        edits = self.undone if again else self.done
+        if not edits:
+            raise ConfigError("Redo: no edit was taken back" if again else "Undo: there is no edit to take back")
+        return edits[-1]
+
+    def step(self, *, again: bool) -> EditedSettings:
+        """Take the last edit back, or make it again; return the settings to which that leads. Raises as `next`."""
+        edit = self.next(again=again)
+        if again:
+            # Another value of its gesture would be an edit of its own.
+            self.done, self.undone = (*self.done, replace(edit, gesture="")), self.undone[:-1]
+            return edit.after
+        self.done, self.undone = self.done[:-1], (*self.undone, edit)
+        return edit.before
+
+    def forget(self) -> None:
+        """Forget all edits: they belong to another twin."""
+        self.done = self.undone = ()
+
+
 class Revisions:
     """All revisions, oldest first; the last one runs. Changed by the engine's thread alone, read by any."""
 
     def __init__(self, estimator: str, tuning: Tuning, *, clock: Callable[[], float] = time.time) -> None:
         self._clock = clock
-        self.runs: tuple[Revision, ...] = (Revision(0, estimator, tuning, clock()),)
+        self.runs: tuple[Revision, ...] = (Revision(0, estimator, tuning, clock(), first=True),)
+        self.edits = EditHistory()
         self.version = 0
         """Incremented by every change, so that a page knows when to ask again."""
         self.why = ""
@@ -82,16 +147,17 @@ class Revisions:
         *earlier, running = self.runs
         self._become([*earlier, replace(running, estimator=estimator, tuning=tuning)])
 
-    def left(self, pull: Pull, estimator: str, tuning: Tuning) -> None:
+    def left(self, pull: Pull, estimator: str, tuning: Tuning, gesture: str = "") -> None:
         """Replace the running revision by the next.
 
-        Quick edits of one entry are one: those between the first and the last are dropped. A revision that is taken up
-        again (`Revision.loaded`) continues under the new number, with its name.
+        Edits of one gesture are one revision: the values on the way are dropped. A revision that is taken up again
+        (`Revision.loaded`) continues under the new number, with its name.
 
         Args:
             pull: All rows of the revision that ends.
             estimator: Estimator of the next one.
             tuning: Its tuning.
+            gesture: Gesture of the edit; empty for one of its own.
         """
         *earlier, running = self.runs
         now = self._clock()
@@ -101,20 +167,18 @@ class Revisions:
             return
         changes = difference(running.estimator, running.tuning, estimator, tuning)
         why, self.why = self.why, ""
-        # Both were edits of the same single entry, and the one between is not marked.
-        keys, before_keys = [change.key for change in changes], [change.key for change in running.changes]
-        same_entry = len(keys) == 1 and keys == before_keys and not running.marked
-        if earlier and not same and not why and now - running.began < DRAG_S and same_entry:
+        if earlier and not same and not why and gesture and gesture == running.gesture and not running.marked:
             before = earlier[-1]
             changes = difference(before.estimator, before.tuning, estimator, tuning)
         else:
             earlier = [*map(_without_track, earlier), replace(running, track=pull, episodes=self.said(running.number))]
-        begun = Revision(pull.revision + 1, estimator, tuning, now, changes, why=why)
+        begun = Revision(pull.revision + 1, estimator, tuning, now, changes, why=why, gesture=gesture)
         if same:
-            begun = replace(begun, loaded=same[0].number, name=same[-1].name, note=same[-1].note)
+            first = any(run.first for run in same)
+            begun = replace(begun, loaded=same[0].number, name=same[-1].name, note=same[-1].note, first=first)
             earlier = [run for run in earlier if run.pinned or all(run.number != other.number for other in same)]
         surplus = max(0, len(earlier) + 1 - MAX_REVISIONS)
-        forgotten = [run.number for run in earlier[:-1] if not run.marked][:surplus]
+        forgotten = [run.number for run in earlier[:-1] if not (run.marked or run.first)][:surplus]
         self._become([*(run for run in earlier if run.number not in forgotten), begun])
 
     def restarted(self, number: int, *, keep: bool = False) -> None:
@@ -148,13 +212,11 @@ class Revisions:
         """Return the place for pinning a revision: its own, or the first free one.
 
         Raises:
-            ConfigError: If it is not known, its track is gone, or no place is free.
+            ConfigError: If it is not known, or no place is free.
         """
         run = self.find(number)
         if run.place is not None:
             return run.place
-        if run.track is None and run is not self.runs[-1]:
-            raise ConfigError(f"run {number} cannot be pinned: its track is gone; load it, and it is folded again")
         taken = {other.place: other.number for other in self.runs if other.place is not None}
         if len(taken) == MAX_PINNED:
             names = ", ".join(map(str, sorted(taken.values())))
@@ -162,7 +224,7 @@ class Revisions:
         return min(set(range(MAX_PINNED)) - set(taken))
 
     def pin(self, number: int) -> None:
-        """Keep a revision's track; raises as `free_place`."""
+        """Keep a revision on the charts; a track that is gone is folded again. Raises as `free_place`."""
         self._change(number, place=self.free_place(number))
 
     def unpin(self, number: int) -> None:

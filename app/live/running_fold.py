@@ -277,7 +277,14 @@ class Running(ABC):
         """Return the options with which an estimator starts: its running ones, its last ones, or those of the YAML."""
 
     @abstractmethod
-    def retune(self, estimator: str, tuning: Tuning) -> None:
+    def edit(self, estimator: str, tuning: Tuning, gesture: str = "") -> None:
+        """Fold the history again with an edit, which `Undo` takes back; on the engine's thread.
+
+        Edits of one `gesture` are one revision.
+        """
+
+    @abstractmethod
+    def retune(self, estimator: str, tuning: Tuning, gesture: str = "") -> None:
         """Fold the history again beside the running fold, over a copy of the log; on the engine's thread."""
 
     @abstractmethod
@@ -371,8 +378,8 @@ class Running(ABC):
         self._count_up()
         self.revisions.restarted(self._revision)
 
-    def _become(self, fold: Fold, row_counts: RowCounts) -> None:
-        """Go on with another fold of the same log, a new revision."""
+    def _become(self, fold: Fold, row_counts: RowCounts, gesture: str) -> None:
+        """Go on with another fold of the same log, a new revision, or the same one while a gesture lasts."""
         old, log = self._fold, self._log
         self._batches.begin()
         if old.idle:  # the first
@@ -383,7 +390,7 @@ class Running(ABC):
         events = Events(*(column[: old.n].copy() for column in log.events))
         pictures = _since(old, -1, log.first + old.n)
         left = replace(self._copy(log.first, log.first), events=events, track=old.track, pictures=pictures)
-        self.revisions.left(left, fold.estimator.name, fold.tuning)
+        self.revisions.left(left, fold.estimator.name, fold.tuning, gesture)
         self._fold, self._row_counts = fold, row_counts
         self._count_up()
 

@@ -28,6 +28,7 @@ STATUS_FIELDS = (
 def status_json(engine: Running) -> dict[str, Any]:
     """Return the state of a running twin; infinity is "inf", NaN null."""
     status, twin, revisions = engine.status(), engine.twin, engine.revisions
+    edits = revisions.edits
     tuning, runs, levels = status.tuning, engine.revisions.runs, status.integrity
     commissioned = tuning.baseline is not None
     judged = NisVerdict(status.nis, status.nis_low, status.nis_high, commissioned, status.nis_judged, status.nis_dof)
@@ -53,6 +54,11 @@ def status_json(engine: Running) -> dict[str, Any]:
         "recording": None if status.recording is None else str(status.recording),
         "recording_folder": None if status.recording is None else str(status.recording.absolute().parent),
         "faults": faults.status_json(status.faults, engine.model),
+        # The edits that Undo and Redo would take back and make again, in words; null for none.
+        "edits": {
+            "undo": edits.done[-1].words if edits.done else None,
+            "redo": edits.undone[-1].words if edits.undone else None,
+        },
         # `version` tells when to ask /api/runs again; `kept` are the runs with a track.
         "runs": {
             "version": revisions.version,

@@ -100,12 +100,15 @@ class Series:
             previous = engine.previous()
             return None if previous is None else KeptRows(previous)
         run = next((run for run in engine.revisions.runs if run.pinned and str(run.number) == name), None)
-        if run is None or run.track is None:
+        if run is None or run is engine.revisions.runs[-1]:
             return None
-        if name not in self._pinned and engine.index_at(END_OF_TIME) > run.track.first + len(run.track.events):
+        kept, rows = run.track, engine.index_at(END_OF_TIME)
+        if name not in self._pinned and (kept is None or rows > kept.first + len(kept.events)):
             self._pinned[name] = PinnedFold(engine, run)
         fold = self._pinned.get(name)
-        return fold if fold is not None and fold.caught_up else KeptRows(run.track)
+        if fold is not None and fold.caught_up:
+            return fold
+        return None if kept is None else KeptRows(kept)
 
     def _prune(self) -> None:
         """Drop runs that no stream shows, and stop their folds."""

@@ -128,8 +128,7 @@ export class Fit {
   }
 
   async use(told) {
-    const before = Object.fromEntries(told.result.entries.filter((line) => line.key in told.values).map((line) => [line.key, line.before]));
-    this.say((await this.tune.edit(`fit ${told.number}`, "SetTunings", { values: told.values }, { values: before })) ?? "");
+    this.say((await this.tune.edit("SetTunings", { values: told.values })) ?? "");
   }
 }
 
@@ -355,12 +354,10 @@ export class Advice {
   }
 
   async apply(advice) {
-    const { estimator: name, options } = this.link.status;
-    this.say(await this.tune.edit(`estimator ${advice.estimator}`, "SetEstimator", { name: advice.estimator, options: advice.options }, { name, options: numbers(options) }));
+    this.say(await this.tune.edit("SetEstimator", { name: advice.estimator, options: advice.options }));
     // Its card is about to be another.
     this.measure.focus();
   }
 }
 
 // What a status gives as text is infinite: that is the option's own default.
-const numbers = (options) => Object.fromEntries(Object.entries(options).filter(([, value]) => typeof value === "number"));

@@ -8,14 +8,40 @@ const DECADES = 3; // powers of ten to either side of the configured value
 const STEPS = 1000;
 const EDIT_HOLD_MS = 2000; // ms after an edit in which the engine's older value does not snap the line back
 const TURN = 60; // ms between two values of a drag that are sent
+const BURST_MS = 1000; // ms between two keys of one gesture
+
+// Names of gestures: one from pointer-down to pointer-up, one for keys in quick succession.
+export class Gestures {
+  constructor() {
+    this.last = -Infinity;
+  }
+
+  begin() {
+    this.held = true;
+    this.name = crypto.randomUUID();
+  }
+
+  end() {
+    this.held = false;
+    this.last = -Infinity;
+  }
+
+  get next() {
+    const now = performance.now();
+    if (!this.held && now - this.last > BURST_MS) this.name = crypto.randomUUID();
+    this.last = now;
+    return this.name;
+  }
+}
 
 export class Knob {
-  // what: {label, unit, low, high, configured, logarithmic, whole, help}; send(value) resolves to a reason why not, or null
+  // what: {label, unit, low, high, configured, logarithmic, whole, help}; send(value, gesture) resolves to a reason why not, or null
   constructor(what, send) {
     this.what = what;
     this.send = send;
     this.value = what.configured;
     this.edited = 0;
+    this.gestures = new Gestures();
     this.logarithmic = what.logarithmic && what.configured > 0;
     this.slides = this.logarithmic || (Number.isFinite(what.low) && Number.isFinite(what.high) && what.high > what.low);
     const label = words(what.label);
@@ -24,6 +50,9 @@ export class Knob {
           type: "range", min: 0, max: STEPS, step: 1, "aria-label": label, title: what.help,
           oninput: () => this.turned(this.at(this.slider.valueAsNumber / STEPS)),
           onchange: () => this.flush(),
+          onpointerdown: () => this.gestures.begin(),
+          onpointerup: () => this.gestures.end(),
+          onpointercancel: () => this.gestures.end(),
         })
       : null;
     this.field = element("input", {
@@ -108,7 +137,7 @@ export class Knob {
   turned(value) {
     this.edited = performance.now();
     this.show(value);
-    this.wanted = value;
+    this.wanted = [value, this.gestures.next];
     this.timer ??= setTimeout(() => this.flush(), TURN);
   }
 
@@ -116,14 +145,14 @@ export class Knob {
     clearTimeout(this.timer);
     this.timer = null;
     if (this.wanted === undefined) return;
-    const value = this.wanted;
+    const wanted = this.wanted;
     this.wanted = undefined;
-    this.submit(value);
+    this.submit(...wanted);
   }
 
-  set(value) {
+  set(value, gesture) {
     this.expect(value);
-    this.submit(value);
+    this.submit(value, gesture);
   }
 
   // Another has asked for this value.
@@ -148,12 +177,12 @@ export class Knob {
       this.field.blur();
     } else if (step && this.logarithmic) {
       event.preventDefault();
-      this.set(Number((this.value * 10 ** (step * (event.shiftKey ? 1 : 0.1))).toPrecision(3)));
+      this.set(Number((this.value * 10 ** (step * (event.shiftKey ? 1 : 0.1))).toPrecision(3)), this.gestures.next);
     }
   }
 
-  async submit(value) {
-    this.complain(await this.send(value));
+  async submit(value, gesture) {
+    this.complain(await this.send(value, gesture));
   }
 
   complain(reason) {

@@ -3,7 +3,7 @@
 import { $, element, setAttribute, setText } from "./dom.js";
 import { Advice, Fit, Refit } from "./fit.js";
 import { words } from "./format.js";
-import { Around, Knob } from "./knob.js";
+import { Around, Gestures, Knob } from "./knob.js";
 
 const GROUPS = { Q: "Process noise Q", R: "Sensor noise R", p: "Parameters" };
 const HINTS = {
@@ -13,14 +13,12 @@ const HINTS = {
 };
 const GATES = [["off", null], ["95 %", 0.95], ["99 %", 0.99], ["99.73 %", 0.9973], ["99.99 %", 0.9999]];
 const MAX_OPEN_ENTRIES = 8; // entries from which on a group is closed at first
-const KEPT = 100; // edits that can be undone
 
 export class Tune {
   constructor(model, link) {
     Object.assign(this, { model, link });
     this.knobs = new Map();
-    this.undone = [];
-    this.done = [];
+    this.picks = new Gestures(); // of filters, with the keys of the list
     this.sections = element("div", { class: "sections" });
     $("tune").replaceChildren(this.head(), this.sections);
     this.sections.append(this.filterSection());
@@ -73,7 +71,7 @@ export class Tune {
           key: item.key, label: item.key.slice(2), unit: item.unit, low: item.low, high: item.high, configured: item.configured,
           logarithmic: prefix !== "p",
         },
-        (value) => this.turn(item.key, value),
+        (value, gesture) => this.turn(item.key, value, gesture),
       );
       this.knobs.set(item.key, knob);
       return knob.node;
@@ -92,15 +90,13 @@ export class Tune {
 
   // All of a group at once: one command, one revision, one undo. Their own curves are not what is looked for then.
   scale(prefix, factor) {
-    const before = {};
     const values = {};
     for (const [key, knob] of this.knobs) {
       if (!key.startsWith(`${prefix}.`)) continue;
-      before[key] = this.status.tuning[key];
       values[key] = Number((knob.value * factor).toPrecision(6));
       knob.expect(values[key]);
     }
-    return this.edit(`all of ${prefix}`, "SetTunings", { values }, { values: before });
+    return this.edit("SetTunings", { values });
   }
 
   gateSection() {
@@ -148,6 +144,7 @@ export class Tune {
       const states = [...new Set(names.map((name) => status.sensors[name]?.state ?? "tracking"))].filter((state) => state !== "tracking");
       setText(note, states.join(", "));
     }
+    this.offerUndo(status.edits);
     const turned = Object.keys(status.turned).length;
     this.restoreButton.disabled = !turned;
     setText(this.restoreButton, turned ? `Restore ${turned}` : "Restore");
@@ -185,7 +182,7 @@ export class Tune {
           key: `option.${option.name}`, label: option.name, unit: option.unit, low: option.low, high: option.high ?? Infinity,
           configured: option.configured, logarithmic: option.whole && option.configured > 20, whole: option.whole, help: option.meaning,
         },
-        (value) => this.option(option.name, option.whole ? Math.round(value) : value),
+        (value, gesture) => this.option(option.name, option.whole ? Math.round(value) : value, gesture),
       );
       this.optionKnobs.set(option.name, knob);
       return knob.node;
@@ -198,62 +195,46 @@ export class Tune {
     for (const item of items) this.knobs.get(item.key)?.configure(item.configured);
   }
 
-  // Edits. Each is kept with what undoes it.
+  // Edits. Those of one gesture are one run and one undo.
 
   choose(name) {
-    return this.edit(`estimator ${name}`, "SetEstimator", { name }, { name: this.status.estimator });
+    return this.edit("SetEstimator", { name, gesture: this.picks.next });
   }
 
-  turn(key, value) {
+  turn(key, value, gesture = "") {
     this.around.show(key);
-    const before = { gate: this.status.gate ?? null, "gate.kind": this.status.gate_kind }[key] ?? this.status.tuning[key] ?? null;
-    return this.edit(key, "SetTuning", { key, value }, { key, value: before });
+    return this.edit("SetTuning", { key, value, gesture });
   }
 
-  option(name, value) {
-    return this.edit(`option ${name}`, "SetOption", { name, value }, { name, value: this.status.options[name] });
+  option(name, value, gesture = "") {
+    return this.edit("SetOption", { name, value, gesture });
   }
 
   use(name, used) {
-    return this.edit(`use ${name}`, "UseSensor", { name, used }, { name, used: !used });
+    return this.edit("UseSensor", { name, used });
   }
 
-  async edit(what, command, fields, before) {
+  async edit(command, fields) {
     const reason = await this.link.ask(command, fields);
     setText(this.notice, reason ?? "");
     this.notice.hidden = !reason;
-    if (!reason) {
-      const last = this.done.at(-1);
-      // The values of one drag are one edit.
-      if (last?.what === what && performance.now() - last.when < 1500) Object.assign(last, { fields, when: performance.now() });
-      else this.done.push({ what, command, fields, before, when: performance.now() });
-      this.done.splice(0, Math.max(0, this.done.length - KEPT));
-      this.undone.length = 0;
-      this.enable();
-    }
     return reason;
   }
 
-  async undo() {
-    const last = this.done.pop();
-    if (!last) return;
-    await this.link.ask(last.command, last.before);
-    this.undone.push(last);
-    this.enable();
+  // Undo and redo are the session's, whichever browser made the edit.
+  undo() {
+    return this.status.edits.undo === null ? null : this.edit("Undo");
   }
 
-  async redo() {
-    const next = this.undone.pop();
-    if (!next) return;
-    await this.link.ask(next.command, next.fields);
-    this.done.push({ ...next, when: 0 });
-    this.enable();
+  redo() {
+    return this.status.edits.redo === null ? null : this.edit("Redo");
   }
 
-  enable() {
-    this.undoButton.disabled = !this.done.length;
-    this.redoButton.disabled = !this.undone.length;
-    setAttribute(this.undoButton, "title", this.done.length ? `Undo ${this.done.at(-1).what} (U)` : "Nothing to undo");
+  offerUndo({ undo, redo }) {
+    for (const [button, what, text, key] of [[this.undoButton, undo, "Undo", "U"], [this.redoButton, redo, "Redo", "Shift-U"]]) {
+      button.disabled = what === null;
+      setAttribute(button, "title", what === null ? `Nothing to ${text.toLowerCase()}` : `${text} ${what} (${key})`);
+    }
   }
 }
 

@@ -23,15 +23,15 @@ class Told:
         self.revisions = Revisions("kf", FIRST, clock=lambda: self.now)
         self.number = 0
 
-    def edit(self, estimator="kf", after=10.0, **fields):
+    def edit(self, estimator="kf", after=10.0, gesture="", **fields):
         key, value = next(iter(fields.items()), (None, None))
         tuning = self.runs[-1].tuning if key is None else self.runs[-1].tuning.set(key.replace("_", "."), value)
-        return self.become(estimator, tuning.with_options({}) if key is None else tuning, after)
+        return self.become(estimator, tuning.with_options({}) if key is None else tuning, after, gesture)
 
-    def become(self, estimator, tuning, after=10.0):
+    def become(self, estimator, tuning, after=10.0, gesture=""):
         self.now += after
         track = SimpleNamespace(revision=self.number)
-        self.revisions.left(track, estimator, tuning)
+        self.revisions.left(track, estimator, tuning, gesture)
         self.number += 1
         return track
 
@@ -69,11 +69,13 @@ def test_what_changed_is_said_in_words(told):
     assert said == [f"Q.rate {FIRST.get('Q.rate'):.6g} → 0.25", "kf → ukf", "gate off → 0.99", "winding held out"]
 
 
-def test_a_drag_is_one_revision_against_what_was_before_it(told):
+@pytest.mark.parametrize("after", [0.1, 60.0])
+def test_a_drag_is_one_revision_against_what_was_before_it(told, after):
     before = told.edit(R_winding=2.0)
-    first = told.edit(Q_rate=0.1)
-    for value in (0.2, 0.3, 0.4):
-        told.edit(Q_rate=value, after=0.1)
+    first = told.edit(Q_rate=0.1, gesture="drag")
+    # However slow the folds are, and though it passes where it began.
+    for value in (0.2, FIRST.get("Q.rate"), 0.4):
+        told.edit(Q_rate=value, after=after, gesture="drag")
     assert told.numbers == [0, 1, 5]
     (change,) = told.runs[-1].changes
     assert (change.key, change.before, change.after) == ("Q.rate", FIRST.get("Q.rate"), 0.4)
@@ -81,19 +83,43 @@ def test_a_drag_is_one_revision_against_what_was_before_it(told):
     assert told.kept == [1]
 
 
-@pytest.mark.parametrize("after, key", [(2.5, "Q_rate"), (0.1, "R_winding")])
-def test_a_later_edit_and_one_of_another_entry_are_their_own(told, after, key):
-    told.edit(Q_rate=0.1)
-    told.edit(after=after, **{key: 0.2})
+@pytest.mark.parametrize("gestures", [("", ""), ("one", "another"), ("one", "")])
+def test_edits_of_different_gestures_are_runs_of_their_own(told, gestures):
+    for gesture, value in zip(gestures, (0.1, 0.2), strict=True):
+        told.edit(Q_rate=value, after=0.0, gesture=gesture)
     assert told.numbers == [0, 1, 2]
 
 
+def test_the_first_run_outlasts_all_others(told, monkeypatch):
+    monkeypatch.setattr("app.live.revisions.MAX_REVISIONS", 4)
+    for value in (0.1, 0.2, 0.3, 0.4, 0.5):
+        told.edit(Q_rate=value)
+    assert told.numbers == [0, 3, 4, 5] and [run.first for run in told.runs] == [True, False, False, False]
+    told.become(told.runs[0].estimator, told.runs[0].tuning)
+    assert told.numbers == [3, 4, 5, 6] and told.runs[-1].first
+
+
+def test_edits_are_taken_back_and_made_again(told):
+    edits, values = told.revisions.edits, [("kf", FIRST.set("Q.rate", value)) for value in (0.1, 0.2, 0.3, 0.4)]
+    with pytest.raises(ConfigError, match="Undo: there is no edit to take back"):
+        edits.next(again=False)
+    edits.add(("kf", FIRST), values[0])
+    for before, after in zip(values, values[1:3], strict=False):
+        edits.add(before, after, "drag")
+    assert edits.done[-1].words == "Q.rate 0.1 → 0.3"
+    assert edits.step(again=False) is values[0] and edits.step(again=True) is values[2]
+    assert [edits.step(again=False) for _ in range(2)] == [values[0], ("kf", FIRST)]
+    edits.add(("kf", FIRST), values[3])
+    with pytest.raises(ConfigError, match="Redo: no edit was taken back"):
+        edits.step(again=True)
+
+
 def test_what_is_pinned_or_named_outlasts_a_drag_and_all_others(told):
-    told.edit(Q_rate=0.1)
+    told.edit(Q_rate=0.1, gesture="drag")
     told.revisions.pin(1)
-    track = told.edit(Q_rate=0.2, after=0.1)
+    track = told.edit(Q_rate=0.2, gesture="drag")
     told.revisions.describe(2, "  slow ", "why\nnot ")
-    told.edit(Q_rate=0.3, after=0.1)
+    told.edit(Q_rate=0.3, gesture="drag")
     told.edit(Q_rate=0.4)
     assert told.numbers == [0, 1, 2, 3, 4] and told.kept == [1, 3]
     assert told.runs[1].track is track and told.runs[1].pinned
@@ -115,15 +141,11 @@ def test_four_can_be_pinned_and_their_places_stay(told):
     assert told.runs[2].place == 2
 
 
-def test_what_has_no_track_or_is_not_known_cannot_be_pinned(told):
-    for value in (0.1, 0.2):
-        told.edit(Q_rate=value)
-    with pytest.raises(ConfigError, match="run 0 cannot be pinned: its track is gone; load it"):
-        told.revisions.pin(0)
+def test_what_is_not_known_cannot_be_pinned(told):
     with pytest.raises(ConfigError, match="run 7 is not known"):
         told.revisions.unpin(7)
     with pytest.raises(ConfigError, match="its name has 61 characters; it may have 60"):
-        told.revisions.describe(1, "n" * 61, "")
+        told.revisions.describe(0, "n" * 61, "")
 
 
 def test_a_and_b_stay_two_however_often_they_are_exchanged(told):

@@ -76,6 +76,47 @@ def test_pin_overlay_and_unpin(page, session):
     until(page, "Object.keys(window.nisus.link.streams).every(name => !/^(run|less) /.test(name))")
 
 
+def test_a_drag_is_one_run_and_its_undo_is_every_browsers(visit, session):
+    engine, page = session.engine, visit(session.url)
+    other = visit(session.url)
+    first, began = engine.revisions.runs[-1].number, engine.tuning.q[0]
+    slider = page.locator('[data-key^="Q."] input[type=range]').first
+    box = slider.bounding_box()
+    across = lambda share: page.mouse.move(box["x"] + share * box["width"], box["y"] + box["height"] / 2)  # noqa: E731
+    across(0.5)
+    page.mouse.down()
+    for step in range(1, 17):
+        # Each value is folded before the next: without a gesture they were 16 runs.
+        before = engine.status().revision
+        across(0.5 + 0.02 * step)
+        wait_for(lambda before=before: engine.status().revision > before, PATIENCE)
+    page.mouse.up()
+    until(page, "document.getElementById('undo').title.startsWith('Undo Q.')")
+    settled(engine)
+    last = engine.tuning.q[0]
+    assert last > 5 * began and len(engine.revisions.runs) == 2
+    (change,) = engine.revisions.runs[-1].changes
+    assert (change.before, change.after) == (began, last) and engine.status().revision >= first + 16
+
+    # Keys in quick succession are one run too.
+    slider.focus()
+    for _ in range(4):
+        slider.press("ArrowLeft")
+    until(page, f"window.nisus.link.status.edits.undo.includes(' {last:.6g} →')")
+    settled(engine)
+    assert len(engine.revisions.runs) == 3
+
+    # The other browser takes both back, and this one makes the first again.
+    until(other, "!document.getElementById('undo').disabled")
+    other.locator("body").press("u")
+    wait_for(lambda: engine.tuning.q[0] == last, PATIENCE)
+    other.locator("body").press("u")
+    wait_for(lambda: engine.tuning.q[0] == began, PATIENCE)
+    until(page, "document.getElementById('undo').disabled && !document.getElementById('redo').disabled")
+    page.locator("body").press("U")
+    wait_for(lambda: engine.tuning.q[0] == last, PATIENCE)
+
+
 def likelihood(track):
     used = track.verdict == USED
     assert not np.any(track.verdict == GATED)
