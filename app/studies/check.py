@@ -100,7 +100,7 @@ def check(twin: Twin, log: Log, counts: Counter[str]) -> Checked:
         tails=tails(model, log, fold.track, marginal=fold.marginal),
         gramian=measured.gramian,
         sensitivity=sensitivity(twin.estimator, model, tuning, log, false_alarm=twin.policy.false_alarm_every),
-        arrivals=tuple(item for item, fed in zip(arrivals(model, log), twin.expected, strict=True) if fed or item.n),
+        arrivals=tuple(item for s, item in enumerate(arrivals(model, log)) if s in twin.plan.fed or item.n),
         calibration=calibration_of(twin, fold),
         episodes=episodes(fold),
         held_out=held_out(twin.estimator, model, tuning, log),

@@ -131,8 +131,11 @@ class Twin:
 
     @property
     def expected(self) -> np.ndarray:
-        """Whether each sensor is expected to report, (sensors,): those that the source feeds."""
-        return np.isin(np.arange(len(self.model.sensors)), self.plan.fed)
+        """Whether a sensor without a measurement is an alarm, (sensors,): those that a bus or a simulation feeds.
+
+        In a recording a sensor may start later; a column without any value is reported at the end of the file.
+        """
+        return np.isin(np.arange(len(self.model.sensors)), () if self.plan.recorded else self.plan.fed)
 
     @property
     def tells_field(self) -> bool:

@@ -5,12 +5,13 @@ import pytest
 
 from app.twin.twin import load_twin
 from config.loader import TWINS, shipped
+from estimators.diagnostics.episodes import episodes
 from estimators.errors import SourceError
-from estimators.fold import fold
+from estimators.fold import Fold, fold
 from estimators.log import READING, Events, truth_of
 from estimators.track import GATED, USED, Track
 from tests.conftest import absent
-from tests.support import as_log, read_all
+from tests.support import SECOND, as_log, read_all
 
 
 def folded(name: str) -> tuple[Events, Track]:
@@ -51,6 +52,25 @@ def test_it_opens_and_folds(name: str) -> None:
     # Of a mode one may be certain.
     uncertain = np.delete(track.std, model.mode, axis=1) if (model := load_twin(name).model).jump else track.std
     assert np.isfinite(track.mean).all() and (uncertain > 0).all() and (track.std >= 0).all()
+
+
+@pytest.mark.parametrize("name", [name for name in shipped() if name not in HUGE])
+def test_no_sensor_drops_out_in_the_first_minute(name: str) -> None:
+    twin = load_twin(name)
+    try:
+        source = twin.open_source(lambda key, text: None, live=False)
+    except SourceError as error:
+        if "is not there" in str(error):
+            absent(str(error))
+        raise
+    events = read_all(source)
+    source.close()
+    log = as_log(events.select(events.t <= events.t[0] + 60 * SECOND))
+    judged = Fold(twin.estimator, twin.model, twin.tuning, log, policy=twin.policy, expected=twin.expected)
+    judged.advance()
+    injected = {fault.sensor for fault in twin.plan.scheduled}
+    causes = {item.cause for item in episodes(judged) if item.subject not in injected}
+    assert not causes & {"silent", "never heard", "stale", "diverged"}
 
 
 def test_the_motor_on_the_bus_finds_its_magnet() -> None:
