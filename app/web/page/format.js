@@ -40,6 +40,19 @@ export function clock(seconds, fraction = 0) {
   return hours ? `${sign}${hours}:${String(minutes).padStart(2, "0")}:${rest}` : `${sign}${minutes}:${rest}`;
 }
 
+const DAY = 86400; // s
+
+// A sentence with its "since 11:14:41 UTC" in the time of the charts, which count from `origin`, ns. Over more than a day
+// the time of day does not tell the moment, and stays.
+export function inChartTime(text, origin, newest) {
+  const start = Number(origin ?? NaN) * 1e-9;
+  if (!Number.isFinite(start) || newest * 1e-9 - start > DAY) return text;
+  const of = (hours, minutes, seconds) => (((3600 * hours + 60 * minutes + 1 * seconds - Math.floor(start)) % DAY) + DAY) % DAY;
+  return text
+    .replace(/since (\d\d):(\d\d):(\d\d) UTC/g, (_, ...parts) => `since ${clock(of(...parts))}`)
+    .replace(/since ([\d.]+) s\b/g, (_, seconds) => `since ${clock(Math.max(0, seconds - start), 1)}`);
+}
+
 // A length of time: 3.2 s, 4 min, 2.5 h.
 export function span(seconds) {
   if (seconds < 10) return `${Number(seconds.toPrecision(2))} s`;

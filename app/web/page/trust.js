@@ -1,7 +1,7 @@
 // The strip on top: which filter, may it be trusted and if not why, NIS in its bounds, a light for each sensor.
 
 import { $, element, setAttribute, setText } from "./dom.js";
-import { clock, compact, span, words } from "./format.js";
+import { clock, compact, inChartTime, span, words } from "./format.js";
 
 // Signs beside the colours, for users who cannot distinguish them.
 export const SIGNS = {
@@ -38,7 +38,7 @@ export class Trust {
     const name = lost ? "not a number" : status.health;
     setText($("health"), `${SIGNS[status.health] ?? "●"} ${name}${lasting ? ` ${span((status.t - since) / 1e9)}` : ""}`);
     $("health").dataset.health = lost ? "diverged" : status.health;
-    const cause = lost ? "The estimate is not a number. Reset it, or choose another filter." : status.cause;
+    const cause = lost ? "The estimate is not a number. Reset it, or choose another filter." : inChartTime(status.cause, status.origin, status.t);
     const first = status.episodes_open > 1 && cause ? `1 of ${status.episodes_open}: ` : ""; // ahead, as the end may be cut
     setText($("cause"), first + cause);
     setAttribute($("cause"), "title", first + cause);
@@ -183,7 +183,7 @@ export class Episodes {
     return element(
       "li", { class: "episode", dataset: { open: String(episode.end === null), severity: episode.severity ?? "" } },
       element("button", { type: "button", title: "Show in the charts", onclick: show }, element("time", {}, times), element("b", {}, `${words(episode.subject)}: ${episode.cause}`)),
-      element("p", {}, episode.text),
+      element("p", {}, inChartTime(episode.text, this.link.status.origin, this.link.status.t)),
       element("a", { href: `/alarms#${episode.help.split("#")[1]}`, target: "_blank" }, `more on ${episode.cause}`),
     );
   }

@@ -10,6 +10,7 @@ export const order = 2;
 
 const MAX_CHARTS = 24;
 const FEW_STATES = 6; // up to so many, those that nobody measures have more room
+const LASTING = 5; // rejected measurements in a row, from which they are in view: an offset lasts, a spike does not
 const UNBOUNDED = 100; // times the band, or the value itself, beyond which a protection level is shown as unbounded
 
 const MEASURED = {
@@ -65,7 +66,9 @@ function chartOf(charts, state) {
     range: (data, span) => {
       if (state.probability) return [-0.03, 1.03];
       const drawn = { lines: [data.truth, data.mean], bands: [[data.lower, data.upper]], dots: measured.map((name) => data[name]) };
-      const shown = shownExtent(drawn, ...within(data.x, span));
+      const place = within(data.x, span);
+      const offset = state.rows.map((row) => rejectedExtent(data[`refused:${row}`], data[`reading:${row}`], ...place));
+      const shown = [shownExtent(drawn, ...place), ...offset].reduce(([low, high], [under, over]) => [Math.min(low, under), Math.max(high, over)]);
       return axisRange.fit(...charts.layers.reduce((range, layer) => layer.widened?.(range, state, span) ?? range, shown));
     },
     says: (value) => {
@@ -78,6 +81,19 @@ function chartOf(charts, state) {
       return withDeviation(mean, deviation, state.unit) + known + off;
     },
   };
+}
+
+// Lowest and highest of the measurements that were rejected in a row.
+function rejectedExtent(rejected, used, from, to) {
+  let [low, high] = [Infinity, -Infinity];
+  let row = [];
+  for (let k = from; k <= to; k++) {
+    if (typeof rejected[k] === "number") row.push(rejected[k]);
+    else if (typeof used[k] === "number") row = [];
+    if (row.length === LASTING) [low, high] = [Math.min(low, ...row), Math.max(high, ...row)];
+    else if (row.length > LASTING) [low, high] = [Math.min(low, row.at(-1)), Math.max(high, row.at(-1))];
+  }
+  return [low, high];
 }
 
 // The protection level to either side of the estimate.

@@ -85,3 +85,21 @@ def test_what_an_axis_spans(page):
     assert found["step"] == [0, 7] and found["few"] == [0, 1e6] and found["flat"] == [0, 3]
     assert found["none"][0] > found["none"][1]
     assert found["part"] == pytest.approx([0.2, 0.3])
+
+
+def test_the_time_of_an_alarm_is_that_of_the_charts(page):
+    """Charts count from the first event, here at 23:59:50 UTC of a day; over more than a day the time of day stays."""
+    found = page.evaluate(
+        """async () => {
+          const { inChartTime } = await import("/page/format.js");
+          const [origin, text] = ["1700006390000000000", "yoke is rejected since 00:00:25 UTC (100 %)"];
+          const after = (seconds) => 1e9 * (1700006390 + seconds);
+          return [
+            inChartTime(text, origin, after(60)), inChartTime(text, origin, after(90000)),
+            inChartTime(text, null, null),
+            inChartTime("yoke is silent since 72.5 s", "10000000000", 80e9),
+          ];
+        }"""
+    )
+    text = "yoke is rejected since 00:00:25 UTC (100 %)"
+    assert found == ["yoke is rejected since 0:35 (100 %)", text, text, "yoke is silent since 1:02.5"]
