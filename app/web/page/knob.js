@@ -69,18 +69,33 @@ export class Knob {
     this.node = element(
       "div", { class: `knob${this.slides ? "" : " plain"}`, dataset: { key: what.key ?? what.label } },
       element("label", { title: what.help ? `${label}: ${what.help}` : label }, ...label.split(/(?<=\.)/).flatMap((part, k) => (k ? [element("wbr"), part] : [part]))),
-      this.slider ? element("span", { class: "track", style: `--tick:${100 * this.place(what.configured)}%` }, this.slider, this.said) : null,
       element("span", { class: "field" }, this.field, element("span", { class: "unit", title: what.unit }, what.unit && what.unit !== "1" ? what.unit : "")),
       this.logarithmic ? element("span", { class: "steps" }, step(0.1, "÷10"), step(10, "×10")) : null,
-      this.back, this.error, this.below,
+      this.back,
+      this.slider ? element("span", { class: "track" }, this.slider, this.scale = element("span", { class: "scale", "aria-hidden": "true" }), this.said) : null,
+      this.error, this.below,
     );
+    this.graduate();
     this.show(what.configured);
+  }
+
+  // Ticks below the slider: powers of ten, or both ends; and the configured value.
+  graduate() {
+    if (!this.slider) return;
+    const { configured, low, high } = this.what;
+    const middle = Math.log10(configured);
+    const first = Math.ceil(middle - DECADES - 1e-9);
+    const powers = Array.from({ length: Math.floor(middle + DECADES + 1e-9) - first + 1 || 0 }, (_, k) => Number(`1e${first + k}`));
+    const tick = (value, text, name) => element("i", { class: name, style: `--place:${this.place(value)}` }, text);
+    this.scale.replaceChildren(
+      ...(this.logarithmic ? powers : [low, high]).map((value) => tick(value, compact(value, 3))), tick(configured, "", "configured"));
   }
 
   // Another value is the configured one.
   configure(value) {
     this.what.configured = value;
     setAttribute(this.back, "title", `Back to the configured ${compact(value)}`);
+    this.graduate();
     this.edited = 0;
     this.show(this.value);
   }
