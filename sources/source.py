@@ -12,6 +12,7 @@ if TYPE_CHECKING:
 Report = Callable[[str, str], None]
 """report(key, text): counted under `key`, `text` shown among the events; called from the source's thread."""
 
+LOST_FRAMES = "frames lost"  # Key of frames that a bus's socket lost before they were read
 NEVER = "never seen"  # Key of messages, signals and columns that channels need and the source never provides
 WRONG_TIME = "wrong time"  # Key of events that are rejected for their time
 TRUNCATED = "truncated file"  # Key of incomplete files

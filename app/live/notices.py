@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections import Counter, deque
@@ -42,6 +43,7 @@ class Notices:
         self.revision = 0
         """Number of the revision that is shown."""
         self._last: dict[str, tuple[float, int]] = {}
+        self._number: dict[str, int] = {}
 
     def report(self, key: str, text: str, level: str = "warn", *, counted: bool = True, times: int = 1) -> None:
         """Count under `key`, and add a line unless one of that key came within the last second.
@@ -62,7 +64,16 @@ class Notices:
                 return
             more = self._counts[key] - at_count - times
             self._last[key] = (self._clock(), self._counts[key])
+            self._number[key] = self._next
             self._add(level, text if more < 1 else f"{text} ({more} more before)")
+
+    def latest(self, key: str, seconds: float) -> str | None:
+        """Return the last line under a key that was reported within some seconds; None if there is none."""
+        with self._lock:
+            when, number = self._last.get(key, (-math.inf, 0))[0], self._number.get(key, -1)
+            if self._clock() - when > seconds:
+                return None
+            return next((line.text for line in reversed(self._lines) if line.number == number), None)
 
     def say(self, text: str, level: str = "info", t: int | None = None, *, passage: int | None = None) -> None:
         """Add a line for now or the time `t`, unless it belongs to another `passage` than the present one."""

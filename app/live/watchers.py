@@ -13,7 +13,7 @@ import numpy as np
 from estimators.diagnostics.clock_fit import ClockFit, LeastDelays
 from estimators.log import INPUT, READING, Events
 from estimators.track import STALE, TRACKING, WAITING
-from sources.source import Source, controls_of
+from sources.source import LOST_FRAMES, Source, controls_of
 
 from .alerts import Alerts
 from .episode_log import EPISODES_PERIOD_S, EpisodeLog
@@ -24,13 +24,15 @@ from .running_fold import Running
 if TYPE_CHECKING:
     from estimators.diagnostics.episodes import Episode
 
+LOSS_CAUSE_S = 10.0  # Seconds for which frames that the bus lost are the cause of a poor health
+
 
 class Watchers:
     """The monitors of one engine."""
 
     def __init__(self, engine: Running) -> None:
         section, notices = engine.twin.config.time, engine.notices
-        self._jobs = engine.jobs
+        self._jobs, self._notices = engine.jobs, notices
         self.latency = Latency()
         self.clock = HostClock(notices, section.horizon)
         self.episode_log = EpisodeLog(engine)
@@ -64,9 +66,12 @@ class Watchers:
         return tuple(map(self.root_cause.with_fault, account.episodes)) if account.revision == revision else ()
 
     def cause(self, leading: Episode | None, health: int) -> str:
-        """Return the cause of the present health: the leading episode, or that of the sensor behind it."""
+        """Return the cause of the present health: frames that the bus loses, or the leading episode, or its cause."""
         if leading is None or health in (WAITING, TRACKING):
             return ""
+        losing = self._notices.latest(LOST_FRAMES, LOSS_CAUSE_S)
+        if losing is not None:
+            return losing
         return self.root_cause.with_fault(self.root_cause.primary(leading)).text
 
 

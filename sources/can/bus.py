@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import socket
+import struct
 import sys
 import threading
 import time
@@ -17,7 +18,7 @@ import can
 from estimators.errors import SourceError
 from estimators.log import Events
 
-from ..source import NEVER, Report, ignore
+from ..source import LOST_FRAMES, NEVER, Report, ignore
 from .decoder import Decoder, Expected, shown_id
 from .readers import EXTENDED, BusName
 
@@ -26,6 +27,11 @@ MAX_READ_FRAMES = 4096  # Frames of one read; those queued beyond come with the 
 IP_MULTICAST_ALL = (socket.IPPROTO_IP, 49)
 IPV6_MULTICAST_ALL = (socket.IPPROTO_IPV6, 29)
 """Socket options of Linux (linux/in.h, linux/in6.h), which Python does not name."""
+
+SO_MEMINFO, MEMINFO = 55, struct.Struct("=9I")
+"""Socket option of Linux with counters, the last of them the packets that did not fit into the socket's buffer."""
+
+LOSS_PERIOD_S = 2.0  # Seconds between two looks at the frames that the socket lost
 
 RECONNECT_WAITS_S = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0)
 """Seconds before each attempt to open a bus again; the last one repeats."""
@@ -101,13 +107,16 @@ class CanBus:
         self._decoder = decoder
         self._report = report
         self._clock = clock
-        self._connect = connect or (lambda: open_bus(interface, channel, bus_options or {}, decoder.filters))
+        # The kernel filters for SocketCAN; python-can would for multicast, and hide how many frames were received.
+        filters = None if interface == "udp_multicast" else decoder.filters
+        self._connect = connect or (lambda: open_bus(interface, channel, bus_options or {}, filters))
         self._closed = threading.Event()
         self._attempts = 0
         self._next_attempt = 0.0
         self._failed_before = False
         self._bus: Any = self._connect()
         self._monitor = MessageMonitor(f"CAN bus {self._name}", decoder, clock, report)
+        self._loss = SocketLoss(f"CAN bus {self._name}", clock, report)
 
     def read(self, timeout: float) -> Events | None:
         """Return the events of the queued frames; wait up to `timeout` seconds for the first. None once closed."""
@@ -131,6 +140,7 @@ class CanBus:
                 self._report("error frame", f"CAN bus {self._name}: error frame")
         batch = self._decoder.decode(self._decoder.gather(messages, arrivals))
         self._monitor.note(messages)
+        self._loss.note(self._bus, len(messages))
         return batch
 
     def _failed(self, error: Exception) -> None:
@@ -178,6 +188,51 @@ class CanBus:
         """Close the bus."""
         self._closed.set()
         self._shut()
+
+
+def dropped_frames(bus: Any) -> int | None:
+    """Return the frames that the bus's socket has lost since it was opened, as its buffer was full; None if unknown.
+
+    The kernel's counter is read as an option of the socket: with SO_RXQ_OVFL it would come with each frame, and
+    python-can (4.6) refuses frames with more than its own time stamp.
+    """
+    try:
+        with socket.socket(fileno=os.dup(bus.fileno())) as sock:
+            return int(MEMINFO.unpack(sock.getsockopt(socket.SOL_SOCKET, SO_MEMINFO, MEMINFO.size))[-1])
+    except (AttributeError, NotImplementedError, OSError, TypeError, struct.error):
+        return None  # A bus without a socket, or no Linux
+
+
+class SocketLoss:
+    """Reports frames that the socket of a bus lost: this process reads too slowly, and no sensor is to blame."""
+
+    def __init__(self, name: str, clock: Callable[[], float], report: Report) -> None:
+        """Start now; `name` begins each line, `clock` gives seconds."""
+        self._name, self._clock, self._report = name, clock, report
+        self._bus: Any = None
+        self._received, self._before, self._total, self._next = 0, 0, 0, 0.0
+
+    def note(self, bus: Any, received: int) -> None:
+        """Count frames received from a bus, and look at those it lost when their time has come."""
+        now = self._clock()
+        if bus is not self._bus:
+            self._bus, self._received, self._before, self._next = bus, 0, 0, now + LOSS_PERIOD_S
+        self._received += received
+        if now < self._next or bus is None:
+            return
+        count, self._next = dropped_frames(bus), now + LOSS_PERIOD_S
+        # The kernel counts in 32 bits.
+        lost = 0 if count is None else (count - self._before) % 2**32
+        if lost:
+            self._total += lost
+            share = 100.0 * lost / (lost + self._received)
+            self._report(
+                LOST_FRAMES,
+                f"{self._name}: {share:.2g} % of frames dropped by the socket ({lost:,} of {lost + self._received:,}; "
+                f"{self._total:,} in all): they arrive faster than this process reads them; raise the receive buffer "
+                "(sysctl net.core.rmem_default), or reduce the load of this machine or bus",
+            )
+        self._before, self._received = count or 0, 0
 
 
 if TYPE_CHECKING:

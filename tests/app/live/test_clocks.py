@@ -153,3 +153,15 @@ def test_planned_maintenance_comes_when_its_time_has_come():
     pull = pull_all(stepped.engine)
     assert np.flatnonzero(pull.events.kind == MAINTENANCE).tolist() == [150, 151]
     np.testing.assert_allclose(pull.track.std[151], MODEL.prior_std)
+
+
+def test_the_line_of_a_key_is_the_latest_for_so_many_seconds():
+    now = [100.0]
+    notices = Notices(lambda: 0, lambda: now[0])
+    assert notices.latest("frames lost", 10.0) is None
+    notices.report("frames lost", "78 % of frames")
+    notices.say("another line")
+    now[0] += 10.0
+    assert notices.latest("frames lost", 10.0) == "78 % of frames"
+    now[0] += 0.1
+    assert notices.latest("frames lost", 10.0) is None

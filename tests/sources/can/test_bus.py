@@ -1,5 +1,7 @@
 """Live buses: frames arrive decoded; a bus that fails is reported and opened again, and `read` never raises."""
 
+import os
+import socket
 import sys
 import time
 import uuid
@@ -9,7 +11,7 @@ import pytest
 
 from estimators.errors import SourceError
 from estimators.log import Events
-from sources.can.bus import RECONNECT_WAITS_S, CanBus, open_bus
+from sources.can.bus import LOSS_PERIOD_S, RECONNECT_WAITS_S, CanBus, open_bus
 from sources.can.decoder import Decoder
 from tests.sources.can.can_tools import DBC, Reports, dbc, frame, sensor
 
@@ -164,6 +166,29 @@ def test_multicast_stays_on_this_machine_and_arrives(decoder, multicast):
     sender.send(frame(256, DATA))
     assert sender._multicast.hop_limit == 0
     assert listen(source, 1).value[0, 0] == 10.0
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="a socket option of Linux")
+def test_frames_that_the_socket_drops_are_counted_and_named(decoder, multicast):
+    clock, reports, sent = Clock(), Reports(), 3000
+    listener, sender = multicast(GROUP), multicast(GROUP)
+    with socket.socket(fileno=os.dup(listener.fileno())) as sock:
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+    while listener.recv(0.0) is not None:  # the probes
+        pass
+    source = CanBus("udp_multicast", GROUP, decoder, report=reports, connect=lambda: listener, clock=clock)
+    assert len(source.read(0.0)) == 0
+    for _ in range(sent):
+        sender.send(frame(256, DATA))
+    clock.now += LOSS_PERIOD_S
+    received = len(source.read(0.0))
+    assert 0 < received < sent
+    lost = sent - received
+    expected = f"{100 * lost / sent:.2g} % of frames dropped by the socket ({lost:,} of {sent:,}; {lost:,} in all)"
+    assert expected in reports.texts["frames lost"]
+    clock.now += LOSS_PERIOD_S
+    source.read(0.0)
+    assert reports.counts == {"frames lost": 1}
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="a socket option of Linux")
