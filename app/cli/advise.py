@@ -12,6 +12,7 @@ from estimators.log import READING, Log
 from sources.inspect import RecordingContents
 
 from ..present.result import TableColumn, Topic, to_json, to_text
+from ..studies.advice.draft import write_draft
 from ..studies.advice.measured import Measured, digits, percent, seconds_text
 from ..studies.advice.plan import DraftPlan, Moves, plan
 from ..studies.advice.relations import Pair
@@ -20,9 +21,8 @@ from ..studies.advice.verdict import Advice, advice_json, apply, lasting_lines, 
 from ..studies.advice.verdict import advise as recommend
 from ..twin.log_reader import read_log
 from ..twin.twin import Twin, load_twin
-from .log import look
-from .new import write_draft
-from .options import names_of, settings
+from .log import databases_of, look
+from .options import roles_of, settings
 from .prepare import attend, prepare
 
 if TYPE_CHECKING:
@@ -49,8 +49,10 @@ def advise(arguments: Arguments) -> int:
         return _draft(arguments, tuple(Path(what) for what in arguments.what))
     if len(arguments.what) > 1:
         raise ConfigError(f"{arguments.what[1]}: one twin at a time; name its recordings with --log")
-    if arguments.dbc or arguments.signals:
-        raise ConfigError("--dbc and --signals are for recordings; a twin's YAML names its own")
+    if any((arguments.dbc, arguments.signals, arguments.sensors, arguments.inputs, arguments.hold_out)):
+        raise ConfigError(
+            "--dbc, --signals, --sensors, --inputs and --hold-out are for recordings; a twin's YAML names its own"
+        )
     return _of_twin(arguments, arguments.what[0])
 
 
@@ -89,7 +91,7 @@ def _topics(twin: Twin, log: Log, advice: Advice) -> list[Topic]:
 def _draft(arguments: Arguments, files: tuple[Path, ...]) -> int:
     """Draft a twin from recordings."""
     found = look(files, arguments)
-    drafted, every = plan(found, names_of(arguments.signals)), signals(found)
+    drafted, every = plan(found, roles_of(arguments)), signals(found)
     if arguments.json:
         print(to_json(_draft_json(every, drafted)))
     else:
@@ -105,7 +107,7 @@ def _write(arguments: Arguments, out: Path, found: RecordingContents, drafted: D
     """Write the two files of the draft, and print the next steps."""
     if out.suffix not in (".yaml", ".yml", ""):
         raise ConfigError(f"--out {out}: must end in .yaml")
-    written = write_draft(out.stem, out.parent, found, drafted, arguments)
+    written = write_draft(drafted, found, out.stem, out.parent, databases_of(arguments)).paths
     if not arguments.json:
         print("\nWritten: " + " and ".join(map(str, written)))
         print(f"Next: nisus advise {written[0]}    to check its filter and noises")

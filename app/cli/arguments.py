@@ -86,6 +86,20 @@ class TableOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
+class RoleOptions:
+    """Roles of signals in a draft: names (SIGNAL, MESSAGE.SIGNAL or a column) or globs, separated by commas."""
+
+    sensors: str = ""
+    """Signals that measure the states, for example "WHEEL_*,YAW_RATE"."""
+    inputs: str = ""
+    """Signals that drive the states and have no state of their own."""
+    hold_out: str = ""
+    """Sensors that are predicted and scored, never used."""
+    signals: str = ""
+    """Signals to use in the roles that the draft finds. Default, without --sensors: the six with most levels."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class PageOptions:
     """Options of a command that opens the page."""
 
@@ -167,7 +181,7 @@ class CheckCommand(JsonOption, FoldOptions):
 
 
 @dataclass(frozen=True)
-class AdviseCommand(JsonOption, TableOptions, LogOptions, EstimatorOption):
+class AdviseCommand(JsonOption, RoleOptions, TableOptions, LogOptions, EstimatorOption):
     """Recommend an estimator for a twin from its log, or draft a twin from recordings.
 
     For a twin: the simplest estimator whose assumptions hold on the log, with the figure behind each claim and the
@@ -175,13 +189,11 @@ class AdviseCommand(JsonOption, TableOptions, LogOptions, EstimatorOption):
 
     Examples:
       nisus advise motor_can
-      nisus advise drive.csv --out drive.yaml
+      nisus advise drive.csv --sensors "wheel_*" --out drive.yaml
     """
 
     what: Annotated[tuple[str, ...], tyro.conf.Positional]
     """Name of a bundled twin, path to a YAML file, or recordings."""
-    signals: str = ""
-    """Signals of the recordings to use, separated by commas; see `nisus new --help`."""
     apply: Flag = False
     """Write the lines into the twin's YAML; the previous file is kept beside it."""
     out: Path | None = None
@@ -480,12 +492,12 @@ class LogCommand(JsonOption, TableOptions):
 
 
 @dataclass(frozen=True)
-class NewCommand(JsonOption, TableOptions):
+class NewCommand(JsonOption, RoleOptions, TableOptions):
     """Write NAME.yaml and NAME.py, a runnable example (a pump) or a draft from the signals of a recording.
 
     Examples:
       nisus new pump
-      nisus new drive --log drive.csv --signals speed,torque
+      nisus new drive --log drive.csv --sensors "wheel_*,yaw_rate" --inputs torque --hold-out wheel_rr
     """
 
     name: Annotated[str, tyro.conf.Positional]
@@ -494,8 +506,6 @@ class NewCommand(JsonOption, TableOptions):
     """Folder to write to."""
     log: tuple[Path, ...] = ()
     """Recordings whose signals become sensors."""
-    signals: str = ""
-    """Signals (SIGNAL or MESSAGE.SIGNAL) or columns to use, separated by commas. Default: the six with most levels."""
 
 
 @dataclass(frozen=True)

@@ -68,8 +68,12 @@ def look(files: tuple[Path, ...], options: TableOptions) -> RecordingContents:
         remedy = nearest(options.time_zone, available_timezones())
         raise ConfigError(f"--time-zone {options.time_zone}: is no time zone of this machine; {remedy}")
     time = TimeColumn(options.time or "", options.time_unit, options.time_format, options.time_zone)
-    databases = [database_of(text) for text in options.dbc]
-    return inspect_recordings([file.expanduser() for file in files], databases, time)
+    return inspect_recordings([file.expanduser() for file in files], databases_of(options), time)
+
+
+def databases_of(options: TableOptions) -> list[tuple[Path, BusName]]:
+    """Return the files and buses of `--dbc`."""
+    return [database_of(text) for text in options.dbc]
 
 
 def database_of(text: str) -> tuple[Path, BusName]:

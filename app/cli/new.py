@@ -2,25 +2,18 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from config.loader import shipped
 from config.yaml_files import writing
 from estimators.errors import ConfigError
 
 from ..present.result import to_json
-from .options import names_of
+from .options import roles_of
 
 if TYPE_CHECKING:
-    from sources.inspect import RecordingContents
-
-    from ..studies.advice.plan import DraftPlan
     from .arguments import NewCommand as Arguments
-    from .arguments import SchemaCommand, TableOptions
-
-_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]*")
+    from .arguments import SchemaCommand
 
 _YAML = """\
 # {name}: a tank that a pump fills and a valve empties. Change it, and {name}.py beside it, into a twin of your own.
@@ -153,36 +146,23 @@ def new_twin(arguments: Arguments) -> int:
         SourceError: If a recording cannot be read.
     """
     if arguments.log:
-        from ..studies.advice.plan import plan
-        from .log import look
+        from ..studies.advice.draft import check_new, draft_twin
+        from .log import databases_of, look
 
         check_new(arguments.name, arguments.folder)
         found = look(arguments.log, arguments)
-        drafted = plan(found, names_of(arguments.signals))
-        paths = write_draft(arguments.name, arguments.folder, found, drafted, arguments)
-    elif names_of(arguments.signals) or arguments.dbc:
-        raise ConfigError("--signals and --dbc are for recordings; name one with --log FILE")
+        drafted = draft_twin(
+            found, arguments.name, arguments.folder, roles_of(arguments), databases=databases_of(arguments)
+        )
+        paths = drafted.paths
+    elif any((arguments.signals, arguments.sensors, arguments.inputs, arguments.hold_out, arguments.dbc)):
+        raise ConfigError(
+            "--signals, --sensors, --inputs, --hold-out and --dbc are for recordings; name one with --log FILE"
+        )
     else:
         paths = write_twin(arguments.name, arguments.folder)
     print(to_json({"written": [str(path) for path in paths]}) if arguments.json else "\n".join(map(str, paths)))
     return 0
-
-
-def write_draft(
-    name: str, folder: Path, found: RecordingContents, drafted: DraftPlan, options: TableOptions
-) -> tuple[Path, Path]:
-    """Write the two files of a draft from recordings.
-
-    Raises:
-        ConfigError: As `write_twin`.
-    """
-    from ..studies.advice.draft import python_text, yaml_text
-    from .log import database_of
-
-    check_new(name, folder)
-    model, databases = model_of(name), [database_of(text) for text in options.dbc]
-    text = yaml_text(name, model, drafted, found, databases, folder)
-    return write_pair(name, folder, text, python_text(name, model, drafted))
 
 
 def write_twin(name: str, folder: Path) -> tuple[Path, Path]:
@@ -198,43 +178,10 @@ def write_twin(name: str, folder: Path) -> tuple[Path, Path]:
     Raises:
         ConfigError: If the name or the folder will not do, or one of the files is there already.
     """
+    from ..studies.advice.draft import check_new, model_of, write_pair
+
     check_new(name, folder)
     model = model_of(name)
     return write_pair(
         name, folder, *(text.replace("{name}", name).replace("{model}", model) for text in (_YAML, _PYTHON))
     )
-
-
-def check_new(name: str, folder: Path) -> None:
-    """Refuse a twin that could not be written.
-
-    Raises:
-        ConfigError: If the name or the folder will not do, or one of the files is there already.
-    """
-    if not _NAME.fullmatch(name):
-        raise ConfigError(f"the name {name!r} is not valid; use letters, digits, _ and -, and begin with a letter")
-    if name in shipped():
-        raise ConfigError(f"the name {name!r} is that of a bundled twin; choose another")
-    if not folder.is_dir():
-        raise ConfigError(f"{folder}: there is no such folder; create it first")
-    for path in (folder / f"{name}.yaml", folder / f"{name}.py"):
-        if path.exists():
-            raise ConfigError(f"{path}: already exists and is not overwritten; choose another name")
-
-
-def model_of(name: str) -> str:
-    """The name of the model of a twin: MyPump of my-pump."""
-    return "".join(part[:1].upper() + part[1:] for part in re.split(r"[_-]+", name))
-
-
-def write_pair(name: str, folder: Path, yaml_text: str, python_text: str) -> tuple[Path, Path]:
-    """Write the two files of a twin.
-
-    Raises:
-        ConfigError: If the folder cannot be written to.
-    """
-    paths = folder / f"{name}.yaml", folder / f"{name}.py"
-    for path, text in zip(paths, (yaml_text, python_text), strict=True):
-        with writing(path), path.open("x", encoding="utf-8") as file:
-            file.write(text)
-    return paths

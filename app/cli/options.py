@@ -6,11 +6,15 @@ import dataclasses
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, get_args, get_type_hints
+from typing import TYPE_CHECKING, Any, get_args, get_type_hints
 
 import tyro
 
 from estimators.errors import ConfigError, nearest, quoted
+
+if TYPE_CHECKING:
+    from ..studies.advice.plan import Roles
+    from .arguments import RoleOptions
 
 
 def check_output(option: str, path: Path, *endings: str) -> None:
@@ -33,6 +37,13 @@ def check_output(option: str, path: Path, *endings: str) -> None:
 def names_of(text: str) -> tuple[str, ...]:
     """Return names that are separated by commas."""
     return tuple(name.strip() for name in text.split(",") if name.strip())
+
+
+def roles_of(options: RoleOptions) -> Roles:
+    """Return the roles of signals that options give."""
+    from ..studies.advice.plan import Roles
+
+    return Roles(*map(names_of, (options.sensors, options.inputs, options.hold_out, options.signals)))
 
 
 def settings(texts: Sequence[str], estimator: str | None = None, tuning: str | None = None) -> dict[str, str]:

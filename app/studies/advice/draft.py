@@ -4,16 +4,113 @@ from __future__ import annotations
 
 import math
 import os
+import re
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from config.loader import shipped
+from config.yaml_files import writing
+from estimators.errors import ConfigError
 from sources.can.readers import BusName
 from sources.inspect import RecordingContents
 
-from .plan import DraftPlan, Moves, Reads
+from .plan import DraftPlan, Moves, Reads, Roles, plan
 from .signals import Signal
+
+_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]*")
+
+
+@dataclass(frozen=True)
+class Draft:
+    """Files of a draft, and its plan."""
+
+    yaml_path: Path
+    python_path: Path
+    plan: DraftPlan
+
+    @property
+    def paths(self) -> tuple[Path, Path]:
+        """Both files."""
+        return self.yaml_path, self.python_path
+
+
+def draft_twin(
+    found: RecordingContents,
+    name: str,
+    folder: Path,
+    roles: Roles | None = None,
+    *,
+    databases: Sequence[tuple[Path, BusName]] = (),
+) -> Draft:
+    """Write NAME.yaml and NAME.py, a twin of a recording's signals that can be run as it stands.
+
+    To propose roles without writing anything, call `plan(found, roles).roles`: one `SignalRole` (signal, role, name,
+    reason) for every signal of the recording. To change one, name it in `Roles`.
+
+    Args:
+        found: Contents of the recording (`sources.inspect.inspect_recordings`).
+        name: Letters, digits, _ and -, beginning with a letter.
+        folder: An existing folder; the YAML names the recording relative to it where it lies within, else in full.
+        roles: Roles that the user gave; the draft finds those of other signals.
+        databases: DBC files of a CAN log and the bus of each, as given to `inspect_recordings`.
+
+    Raises:
+        ConfigError: If a role does not apply, or the files exist or cannot be written.
+    """
+    check_new(name, folder)
+    return write_draft(plan(found, roles or Roles()), found, name, folder, databases)
+
+
+def write_draft(
+    drafted: DraftPlan,
+    found: RecordingContents,
+    name: str,
+    folder: Path,
+    databases: Sequence[tuple[Path, BusName]] = (),
+) -> Draft:
+    """Write the two files of a plan; arguments as those of `draft_twin`."""
+    check_new(name, folder)
+    model = model_of(name)
+    text = yaml_text(name, model, drafted, found, databases, folder)
+    return Draft(*write_pair(name, folder, text, python_text(name, model, drafted)), drafted)
+
+
+def check_new(name: str, folder: Path) -> None:
+    """Refuse a twin that could not be written.
+
+    Raises:
+        ConfigError: If the name or the folder will not do, or one of the files is there already.
+    """
+    if not _NAME.fullmatch(name):
+        raise ConfigError(f"the name {name!r} is not valid; use letters, digits, _ and -, and begin with a letter")
+    if name in shipped():
+        raise ConfigError(f"the name {name!r} is that of a bundled twin; choose another")
+    if not folder.is_dir():
+        raise ConfigError(f"{folder}: there is no such folder; create it first")
+    for path in (folder / f"{name}.yaml", folder / f"{name}.py"):
+        if path.exists():
+            raise ConfigError(f"{path}: already exists and is not overwritten; choose another name")
+
+
+def model_of(name: str) -> str:
+    """The name of the model of a twin: MyPump of my-pump."""
+    return "".join(part[:1].upper() + part[1:] for part in re.split(r"[_-]+", name))
+
+
+def write_pair(name: str, folder: Path, yaml_text: str, python_text: str) -> tuple[Path, Path]:
+    """Write the two files of a twin.
+
+    Raises:
+        ConfigError: If the folder cannot be written to.
+    """
+    paths = folder / f"{name}.yaml", folder / f"{name}.py"
+    for path, text in zip(paths, (yaml_text, python_text), strict=True):
+        with writing(path), path.open("x", encoding="utf-8") as file:
+            file.write(text)
+    return paths
 
 
 def _number(value: float) -> str:
@@ -28,13 +125,13 @@ def _text(value: str) -> str:
     return '"' + value.replace("\\", "\\\\").replace('"', '\\"') + '"'
 
 
-def python_text(name: str, model: str, plan: DraftPlan) -> str:
+def python_text(name: str, model: str, drafted: DraftPlan) -> str:
     """The model's file: a random walk, a constant speed or a first-order lag for each state."""
     states, noises, sensors, steps, functions = [], [], [], [], []
     parameters: list[str] = []
     k = 0
-    inputs = [each for each, _ in plan.inputs]
-    for item in plan.states:
+    inputs = [each for each, _ in drafted.inputs]
+    for item in drafted.states:
         unit, first = item.signal.series.unit, _start(item)
         turns = ", circular=True" if item.signal.wraps else ""
         spread = max(float(np.std(item.signal.series.values)), 3 * math.sqrt(item.sensors[0].r))
@@ -59,7 +156,7 @@ def python_text(name: str, model: str, plan: DraftPlan) -> str:
     read = "\n\n".join(functions)
     given = [
         f"        Input({_text(each)}, {_text(one.series.unit)}, default={float(one.series.values[0]):.6g}),"
-        for each, one in plan.inputs
+        for each, one in drafted.inputs
     ]
     lines = "\n".join
     more = "".join(
@@ -90,7 +187,7 @@ def step(x, u, p, dt, out):
 
 {model} = StateSpaceModel(
     name={_text(name)},
-    title={_text(_title(plan))},
+    title={_text(_title(drafted))},
     states=(
 {lines(states)}
     ),
@@ -106,8 +203,8 @@ def step(x, u, p, dt, out):
 '''
 
 
-def _title(plan: DraftPlan) -> str:
-    number = len(plan.signals)
+def _title(drafted: DraftPlan) -> str:
+    number = len(drafted.signals)
     return f"{number} signal{'s' if number > 1 else ''} of a recording"
 
 
@@ -163,16 +260,19 @@ def _function(reads: Reads, k: int) -> str:
 def yaml_text(
     name: str,
     model: str,
-    plan: DraftPlan,
+    drafted: DraftPlan,
     found: RecordingContents,
     databases: Sequence[tuple[Path, BusName]],
     folder: Path,
 ) -> str:
     """The twin's YAML, with the recording as its source."""
     files = [_text(_from(path, folder)) for path in found.files]
-    noise = [f"  {item.second if item.smooth else item.name}: {{variance: {_number(item.q)}}}" for item in plan.states]
-    read = [reads for item in plan.states for reads in item.sensors]
-    sensors = [f"  {reads.name}: {{std: {_number(math.sqrt(reads.r))}}}" for reads in read]
+    noise = [
+        f"  {item.second if item.smooth else item.name}: {{variance: {_number(item.q)}}}" for item in drafted.states
+    ]
+    read = [reads for item in drafted.states for reads in item.sensors]
+    unused = {name: ", use: false" for name in drafted.held_out}
+    sensors = [f"  {reads.name}: {{std: {_number(math.sqrt(reads.r))}{unused.get(reads.name, '')}}}" for reads in read]
     source = [f"  type: {found.kind}", "  files:", *(f"    - {file}" for file in files)]
     if found.kind == "can_log":
         source.append("  dbc:")
@@ -184,11 +284,11 @@ def yaml_text(
         keys |= {key: _text(value) for key in ("format", "zone") if (value := getattr(found.time, key)) is not None}
         source.append(f"  time: {{{', '.join(f'{key}: {value}' for key, value in keys.items())}}}")
     source += ["  sensors:", *(_channel(reads.name, reads.signal) for reads in read)]
-    if plan.inputs:
-        source += ["  inputs:", *(_channel(each, one) for each, one in plan.inputs)]
-    first = next((f"[{item.name}, {item.second}]" for item in plan.states if item.smooth), None)
-    if first is None and len(plan.states) > 1:
-        first = f"[{plan.states[0].name}, {plan.states[1].name}]"
+    if drafted.inputs:
+        source += ["  inputs:", *(_channel(each, one) for each, one in drafted.inputs)]
+    first = next((f"[{item.name}, {item.second}]" for item in drafted.states if item.smooth), None)
+    if first is None and len(drafted.states) > 1:
+        first = f"[{drafted.states[0].name}, {drafted.states[1].name}]"
     slowest = max(1.0 / reads.signal.rate for reads in read if reads.signal.rate > 0.0)
     degraded, stale = max(3.0, 5.0 * slowest), max(15.0, 20.0 * slowest)
     text = "\n".join
@@ -199,7 +299,7 @@ def yaml_text(
 # Expect: a start. The noise below was taken from the differences of the data, and is an average
 # where a signal rests and moves; nisus tune fits it, nisus advise checks it.
 # Run it: nisus run {name}.yaml      Score it: nisus fold {name}.yaml      Every key: nisus schema
-title: {_text(_title(plan))}
+title: {_text(_title(drafted))}
 model: ./{name}.py:{model}       # file beside this one, and the name of the model in it
 
 noise:                           # model uncertainty, per second

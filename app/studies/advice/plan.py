@@ -6,6 +6,8 @@ import keyword
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from typing import NamedTuple
 
 from estimators.errors import ConfigError, nearest
 from sources.inspect import RecordingContents
@@ -14,6 +16,41 @@ from .relations import Driven, Pair, driven, pairs, simulated
 from .signals import MIN_VALUES, Signal, noise_of, signals, walk_of
 
 MAX_SIGNALS = 6  # signals that are taken where none are named
+
+
+@dataclass(frozen=True)
+class Roles:
+    """Roles that a user gives to signals, each a name or glob: SIGNAL, MESSAGE.SIGNAL or a column.
+
+    `sensors` measure states; `inputs` drive them and have none; `held_out` are sensors that are predicted and scored,
+    never used. `signals` may become sensors or inputs, as the draft finds. Without sensors and signals the draft takes
+    those that vary most finely.
+    """
+
+    sensors: tuple[str, ...] = ()
+    inputs: tuple[str, ...] = ()
+    held_out: tuple[str, ...] = ()
+    signals: tuple[str, ...] = ()
+
+
+OMISSIONS = {
+    "switch": "a switch: few different values",
+    "counter": "time, counter or status by its name",
+    "constant": "constant",
+    "short": f"fewer than {MIN_VALUES} values",
+}
+"""Reasons by kind of signal for which it is omitted."""
+
+SENSOR, INPUT, HELD_OUT, OMITTED = "sensor", "input", "held out", "omitted"
+
+
+class SignalRole(NamedTuple):
+    """Role of a signal in a draft, its name there (empty if omitted), and the reason in words."""
+
+    signal: Signal
+    role: str
+    name: str
+    reason: str
 
 
 @dataclass(frozen=True)
@@ -53,57 +90,118 @@ class Moves:
 
 @dataclass(frozen=True)
 class DraftPlan:
-    """A draft: its states, the inputs by their names, the pairs that were found among the signals, and these."""
+    """A draft: its states, the inputs by their names, the pairs that were found among the signals, and these.
+
+    `roles` has every signal of the recording, omitted ones too.
+    """
 
     states: tuple[Moves, ...]
     inputs: tuple[tuple[str, Signal], ...]
     signals: tuple[Signal, ...]
     pairs: tuple[Pair, ...]
+    roles: tuple[SignalRole, ...] = ()
+    held_out: frozenset[str] = frozenset()
 
 
-def plan(found: RecordingContents, wanted: Sequence[str]) -> DraftPlan:
-    """The signals that are named, or those that vary most finely, each in its role.
+def plan(found: RecordingContents, roles: Roles) -> DraftPlan:
+    """Return a draft in which every signal has the role that it was given, or one that the data suggest.
 
     Raises:
-        ConfigError: If one is not there, is named by several messages, or has too few values.
+        ConfigError: If a signal is not there, is named by several messages, has two roles, or has too few values.
     """
     every = signals(found)
     if not found.columns and not any(message.signals for message in found.messages):
         raise ConfigError(f"{found.files[0]}: no message of it is in a DBC; give one that describes it with --dbc")
-    picked = [_named(name, found, every) for name in wanted] if wanted else _finest(found, every)
-    for one in picked:
-        count = one.series.values.size
-        if count < MIN_VALUES:
-            raise ConfigError(
-                f"--signals {one.name}: has {count} values; its noise can be estimated from {MIN_VALUES} on"
-            )
+    given = _given(roles, found, every)
+    named = {id(one) for one, _ in given}
+    free = [] if roles.sensors or roles.signals else _finest(found, [one for one in every if id(one) not in named])
+    # Held-out signals come last: of several sensors of one quantity, the first is the state.
+    places = sorted([*given, *((one, "") for one in free)], key=lambda entry: entry[1] == HELD_OUT)
+    picked = [one for one, _ in places]
+    inputs = {k for k, (_, role) in enumerate(places) if role == INPUT}
+    sensors = {k for k, (_, role) in enumerate(places) if role in (SENSOR, HELD_OUT)}
     told = pairs(picked)
     taken: set[str] = set()
     names = [_identifier(one.name, taken) for one in picked]
     # Of signals that say the same the first one is the state.
-    leads = {k: k for k in range(len(picked))}
-    for pair in (pair for pair in told if pair.one):
+    leads = {k: k for k in range(len(picked)) if k not in inputs}
+    for pair in (pair for pair in told if pair.one and pair.first in leads and pair.second in leads):
         if leads[pair.second] == pair.second and leads[pair.first] == pair.first:
             leads[pair.second] = pair.first
-    lags = _lags(
-        picked, [k for k in leads if leads[k] == k and not any(pair.first == k and pair.rate for pair in told)]
-    )
-    used = sorted({k for lag in lags.values() for k in lag.drivers})
+    heads = [k for k in leads if leads[k] == k and not any(pair.first == k and pair.rate for pair in told)]
+    lags = _lags(picked, heads, sorted(inputs) or [k for k in heads if k not in sensors])
+    used = sorted({k for lag in lags.values() for k in lag.drivers} | inputs)
     states = []
     for k in range(len(picked)):
-        if leads[k] == k and k not in used:
-            others = [pair for pair in told if pair.one and leads[pair.second] == k and pair.first == k]
+        if leads.get(k) == k and k not in used:
+            others = [pair for pair in told if pair.one and leads.get(pair.second) == k and pair.first == k]
             states.append(_moves(k, picked, names, others, lags.get(k)))
-    return DraftPlan(tuple(states), tuple((names[k], picked[k]) for k in used), tuple(picked), tuple(told))
+    held_out = frozenset(names[k] for k, (_, role) in enumerate(places) if role == HELD_OUT)
+    for item in states:
+        if item.lag is None and all(reads.name in held_out for reads in item.sensors):
+            raise ConfigError(
+                f"--hold-out {item.signal.name}: nothing predicts it, as no sensor in use measures the same "
+                f"quantity and no input drives it; hold out a redundant sensor, or give its inputs with --inputs"
+            )
+    found_roles = [_role(one, picked, names, states, used, held_out) for one in every]
+    driving = tuple((names[k], picked[k]) for k in used)
+    return DraftPlan(tuple(states), driving, tuple(picked), tuple(told), tuple(found_roles), held_out)
 
 
-def _lags(picked: Sequence[Signal], leads: Sequence[int]) -> dict[int, Driven]:
-    """Who follows whom, those best explained first; what follows drives nobody, and what drives does not follow."""
+def _role(
+    one: Signal,
+    picked: Sequence[Signal],
+    names: Sequence[str],
+    states: Sequence[Moves],
+    used: Sequence[int],
+    held_out: frozenset[str],
+) -> SignalRole:
+    """Return the role of a signal, and why it has it."""
+    k = next((k for k, other in enumerate(picked) if other is one), None)
+    if k is None:
+        return SignalRole(
+            one, OMITTED, "", OMISSIONS.get(one.kind, f"not named, or not among the {MAX_SIGNALS} finest")
+        )
+    name = names[k]
+    if k in used:
+        driven_by = [item.name for item in states if name in item.inputs]
+        reason = f"drives {', '.join(driven_by)}" if driven_by else "given as an input; no state was found to follow it"
+        return SignalRole(one, INPUT, name, reason)
+    state = next(item for item in states if name in [reads.name for reads in item.sensors])
+    rate = next(reads.rate for reads in state.sensors if reads.name == name)
+    reason = f"measures {'the rate of ' if rate else ''}{state.name}"
+    return SignalRole(one, HELD_OUT if name in held_out else SENSOR, name, reason)
+
+
+def _given(roles: Roles, found: RecordingContents, every: Sequence[Signal]) -> list[tuple[Signal, str]]:
+    """Return the signals that are named, each once with its role, in the order of their names."""
+    given: dict[int, tuple[Signal, str]] = {}
+    groups = (
+        ("--hold-out", HELD_OUT, roles.held_out),
+        ("--inputs", INPUT, roles.inputs),
+        ("--sensors", SENSOR, roles.sensors),
+        ("--signals", "", roles.signals),
+    )
+    for option, role, names in groups:
+        for name in names:
+            for one in _named(option, name, found, every):
+                before = given.get(id(one))
+                if before is not None and {before[1], role} in ({HELD_OUT, INPUT}, {INPUT, SENSOR}):
+                    raise ConfigError(f"{option} {name}: {one.name} is {before[1]} as well; give each signal one role")
+                if before is None:
+                    given[id(one)] = one, role
+    order = {id(one): k for k, one in enumerate(every)}
+    return [given[key] for key in sorted(given, key=order.__getitem__)] if len(given) > 1 else list(given.values())
+
+
+def _lags(picked: Sequence[Signal], leads: Sequence[int], drivers: Sequence[int]) -> dict[int, Driven]:
+    """Return lags of signals behind drivers, best explained first; a follower drives none, a driver follows none."""
     found: dict[int, Driven] = {}
     while True:
         free = [k for k in leads if k not in found]
         busy = {k for lag in found.values() for k in lag.drivers}
-        tried = [driven(picked, k, [other for other in free if other != k]) for k in free if k not in busy]
+        able = [k for k in drivers if k not in found]
+        tried = [driven(picked, k, [other for other in able if other != k]) for k in free if k not in busy]
         best = max((one for one in tried if one is not None), key=lambda one: one.explained, default=None)
         if best is None:
             return found
@@ -148,19 +246,28 @@ def _finest(found: RecordingContents, every: Sequence[Signal]) -> list[Signal]:
     return [fine[k] for k in sorted(kept)]
 
 
-def _named(name: str, found: RecordingContents, every: Sequence[Signal]) -> Signal:
-    """SIGNAL or MESSAGE.SIGNAL, or a column."""
-    fits = [one for one in every if name in (one.name, f"{one.message}.{one.name}")]
+def _named(option: str, name: str, found: RecordingContents, every: Sequence[Signal]) -> list[Signal]:
+    """Return SIGNAL, MESSAGE.SIGNAL or a column, or all that match a glob and vary."""
+    spelt = {id(one): (one.name, f"{one.message}.{one.name}") for one in every}
+    fits = [one for one in every if name in spelt[id(one)]]
+    if not fits and any(mark in name for mark in "*?["):
+        fits = [one for one in every if any(fnmatchcase(text.lower(), name.lower()) for text in spelt[id(one)])]
+        fits = [one for one in fits if one.kind not in ("constant", "short")]
+        if fits:
+            return fits
     silent = [s for m in found.messages for s in m.signals if name in (s.name, f"{m.name}.{s.name}")]
     silent += [s for s in found.columns if s.name == name]
     if not fits and silent:
-        raise ConfigError(f"--signals {name}: has 0 values; its noise can be estimated from {MIN_VALUES} on")
+        raise ConfigError(f"{option} {name}: has 0 values; its noise can be estimated from {MIN_VALUES} on")
     if not fits:
-        raise ConfigError(f"--signals {name}: is not in the log; {nearest(name, [one.name for one in every])}")
+        raise ConfigError(f"{option} {name}: is not in the log; {nearest(name, [one.name for one in every])}")
     if len({one.message for one in fits}) > 1:
         several = " or ".join(f"{one.message}.{one.name}" for one in fits)
-        raise ConfigError(f"--signals {name}: is in several messages; write {several}")
-    return fits[0]
+        raise ConfigError(f"{option} {name}: is in several messages; write {several}")
+    count = fits[0].series.values.size
+    if count < MIN_VALUES:
+        raise ConfigError(f"{option} {name}: has {count} values; its noise can be estimated from {MIN_VALUES} on")
+    return fits[:1]
 
 
 def _identifier(name: str, taken: set[str]) -> str:

@@ -70,7 +70,7 @@ REFUSED = {
     f"{TUNE} --every 60": "--every: is the time between the ends of two --windows; give both",
     f"{TUNE} --windows 60 --aim crps": "--aim crps: cannot be used with --windows, which are fitted by likelihood",
     f"{TUNE} --windows 60 --fit R.wnding": "R.wnding is no entry that can be fitted; did you mean R.winding",
-    "advise motor_winding --dbc car.dbc": "--dbc and --signals are for recordings",
+    "advise motor_winding --dbc car.dbc": "--hold-out are for recordings",
     "advise motor_winding motor_can": "one twin at a time",
     "guard motor_winding --junit nowhere/a.xml": "there is no folder",
     "guard motor_winding --junit .": "is a folder; name a file in it",
@@ -78,7 +78,7 @@ REFUSED = {
     "guard motor_winding --jobs -3": "--jobs -3: must be 1 or more",
     "guard motor_winding --accept": "--accept: give the reason with --note TEXT",
     "guard nobody": "nobody",
-    "new pump --signals Temp": "--signals and --dbc are for recordings; name one with --log FILE",
+    "new pump --signals Temp": "--hold-out and --dbc are for recordings; name one with --log FILE",
     "twins lorenz": "no twin of that name ships",
 }
 

@@ -5,6 +5,7 @@ import pytest
 
 from app.studies.advice.relations import driven, pairs
 from app.studies.advice.signals import rough, signal
+from app.twin.twin import load_twin
 from sources.inspect import SignalSeries
 
 
@@ -120,5 +121,19 @@ def test_the_page_of_a_recording_says_what_was_found(table, nisus):
 
 def test_options_of_the_other_kind_are_refused(table, nisus):
     assert "are for a twin" in nisus.refuses("advise", str(table), "--apply")
-    assert "--dbc and --signals are for recordings" in nisus.refuses("advise", "motor_winding", "--dbc", "car.dbc")
+    assert "--inputs and --hold-out are for recordings" in nisus.refuses("advise", "motor_winding", "--dbc", "car.dbc")
     assert "one twin at a time" in nisus.refuses("advise", "motor_winding", "motor_can")
+
+
+def test_signals_have_the_roles_that_they_are_given(table, nisus):
+    out = table.with_name("boiler.yaml")
+    roles = ("--sensors", "tank,room*", "--inputs", "heater,fan", "--hold-out", "room_again")
+    nisus("new", "boiler", "--folder", str(table.parent), "--log", str(table), *roles)
+    found = load_twin(out)
+    assert found.model.input_names == ("heater", "fan")
+    used = dict(zip(found.model.sensor_names, found.tuning.used, strict=True))
+    assert used == {"tank": True, "room": True, "room_again": False}
+    assert "did you mean heater" in nisus.refuses("advise", str(table), "--inputs", "heatr")
+    assert "room is input as well" in nisus.refuses("advise", str(table), "--sensors", "room", "--inputs", "room")
+    # Nothing else measures the tank, and without an input nothing drives it.
+    assert "nothing predicts it" in nisus.refuses("advise", str(table), "--sensors", "room", "--hold-out", "tank")
