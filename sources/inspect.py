@@ -235,7 +235,14 @@ def _tables(files: list[Path], time: TimeColumn) -> RecordingContents:
             f"{files[0]}: which column holds the time is not known; name it with --time, one of {', '.join(names[:12])}"
         )
     time = time._replace(name=chosen)
-    columns = [name for name in dict.fromkeys(names) if name != chosen]
+    faults: list[str] = []
+    columns = [name for name in dict.fromkeys(names_of(files[0], chosen)) if name != chosen]
+    if other := [name for name in dict.fromkeys(names) if name != chosen and name not in columns]:
+        shown = ", ".join(other[:3]) + (", ..." if len(other) > 3 else "")
+        faults.append(
+            f"{len(other)} columns have another number of rows than {chosen} and are left out: {shown}; name their "
+            "own time column to read them"
+        )
     for path in files[1:]:
         missing = [name for name in (chosen, *columns) if name not in names_of(path)]
         if missing:
@@ -243,7 +250,6 @@ def _tables(files: list[Path], time: TimeColumn) -> RecordingContents:
                 f"{path}: it has no column {shown_name(missing[0])}, which {files[0]} has; "
                 "give tables with the same columns"
             )
-    faults: list[str] = []
     times, values = [], []
     for path in files:
         for rows in _rows(path, time, columns, faults):

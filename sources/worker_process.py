@@ -240,11 +240,18 @@ class IsolatedReader:
         path: The file; first argument of the function.
         args: Its further arguments.
         timeout: Seconds to wait for an item before the process is taken to hang; by default by the size of the file.
+        keep: Whether the process is kept for the next file; else it ends, and with it the memory that it took.
     """
 
     def __init__(
-        self, function: Callable[..., Iterator[Any]], path: Path, *args: Any, timeout: float | None = None
+        self,
+        function: Callable[..., Iterator[Any]],
+        path: Path,
+        *args: Any,
+        timeout: float | None = None,
+        keep: bool = True,
     ) -> None:
+        self._keep = keep
         size = path.stat().st_size if path.is_file() else 0
         self._timeout = ITEM_TIMEOUT_S + size / BYTES_A_SECOND if timeout is None else timeout
         self._waited = 0.0
@@ -286,7 +293,10 @@ class IsolatedReader:
         if kind == ITEM:
             return item
         self._worker = None
-        _dismiss(worker)
+        if self._keep:
+            _dismiss(worker)
+        else:
+            _end(worker)
         if kind == FAULT:
             raise item
         return None

@@ -66,7 +66,7 @@ def _check_size(path: Path, size: int) -> None:
         raise memory_error(path, f"it declares {size / 2**30:.1f} GiB to be read at once", limit)
 
 
-def parquet_names(path: Path) -> list[str]:
+def parquet_names(path: Path, time: str = "") -> list[str]:
     """Return the columns of a Parquet file; raises SourceError if it is none, or cut short."""
     import pyarrow.parquet
 
@@ -119,9 +119,14 @@ def _numeric(path: Path, columns: Sequence[str | TextMatch]) -> list[str]:
     return [column_of(name) for name in columns]
 
 
-def mat_names(path: Path) -> list[str]:
-    """Return the columns of a MATLAB file; raises SourceError if it is none, or of version 7.3, which is HDF5."""
-    return list(_vectors(path))
+def mat_names(path: Path, time: str = "") -> list[str]:
+    """Return the columns of a MATLAB file, or those as long as column `time`.
+
+    Raises:
+        SourceError: If it is none, or of version 7.3, which is HDF5.
+    """
+    found = _vectors(path)
+    return [name for name, values in found.items() if time not in found or values.size == found[time].size]
 
 
 def _vectors(path: Path) -> dict[str, np.ndarray]:
@@ -168,10 +173,13 @@ def read_mat(
     )
 
 
-def npz_names(path: Path) -> list[str]:
-    """Return the columns of a NumPy archive; raises SourceError if it is none."""
+def npz_names(path: Path, time: str = "") -> list[str]:
+    """Return the columns of a NumPy archive, or those of as many rows as column `time`; raises SourceError if none."""
     names: list[str] = []
-    for name, (shape, _) in _declared(path).items():
+    declared = _declared(path)
+    for name, (shape, _) in declared.items():
+        if time in declared and shape[0] != declared[time][0][0]:
+            continue
         if len(names) + math.prod(shape[1:]) > MAX_COLUMNS:
             raise SourceError(f"{path}: array {name} has the shape {shape}; save at most {MAX_COLUMNS:,} cells a row")
         cells = np.ndindex(shape[1:])

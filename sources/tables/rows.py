@@ -19,7 +19,7 @@ from .binary import mat_names, npz_names, parquet_names, read_mat, read_npz, rea
 from .text import Chunk, Problem, TextMatch, csv_format, read_csv
 from .times import TimeColumn, TimeReader
 
-_Names = Callable[[Path], list[str]]
+_Names = Callable[[Path, str], list[str]]
 _Read = Callable[[Path, str, Sequence[str | TextMatch], Problem], Generator[Chunk, None, None]]
 
 _BINARY: dict[str, tuple[_Names, _Read]] = {
@@ -50,12 +50,16 @@ def is_text(path: Path) -> bool:
     return suffix_of(path) not in _BINARY
 
 
-def names_of(path: Path) -> list[str]:
-    """Return the names of a table's columns; raises SourceError if the file cannot be read as its format."""
+def names_of(path: Path, time: str = "") -> list[str]:
+    """Return the names of a table's columns, or of those with as many rows as column `time`.
+
+    Raises:
+        SourceError: If the file cannot be read as its format.
+    """
     if is_text(path):
         return csv_format(path).names
     try:
-        found: list[str] = read_isolated(_names, path)[0]
+        found: list[str] = read_isolated(_names, path, time)[0]
     except SourceError as error:
         raise _about(path, error) from None
     return found
@@ -110,5 +114,5 @@ def read_rows(path: Path, time: TimeColumn, columns: Sequence[str | TextMatch]) 
         yield TableRows(none, none, none.astype(np.bool_), nothing, nothing.astype(np.bool_), taken())
 
 
-def _names(path: Path) -> Iterator[list[str]]:
-    yield _BINARY[suffix_of(path)][0](path)
+def _names(path: Path, time: str) -> Iterator[list[str]]:
+    yield _BINARY[suffix_of(path)][0](path, time)

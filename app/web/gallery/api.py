@@ -19,8 +19,9 @@ from estimators.errors import ConfigError, NisusError, quoted
 
 from ..http import PAGE, Json, TooLarge, bounded_body, get, one_line, page_file, post, refusal
 from .cards import picture_file, shelf
+from .dropped_logs import DroppedLogs, LogRequest
 from .gallery import Gallery, StartRequest
-from .recordings import RECORDING, Recordings
+from .recordings import DATABASE, RECORDING, Recordings
 
 COMPILING_SHOWN_AFTER_S = 1.0
 """Longer than loading a model from the cache."""
@@ -38,6 +39,7 @@ class GalleryApi:
         door = gallery.session.door
         assert door is not None, "a gallery needs a page"
         self._door = door
+        self._logs = DroppedLogs(recordings, gallery.names)
         routes = [
             get("/gallery", self._page),
             Mount("/page", StaticFiles(directory=PAGE)),
@@ -51,6 +53,8 @@ class GalleryApi:
             post("/api/gallery/recordings/delete", self._delete),
             Route("/api/gallery/recordings/drop", self._drop, methods=["POST"]),
             get("/recordings/{name}", self._download),
+            post("/api/gallery/log", self._log),
+            post("/api/gallery/log/curves", self._curves),
         ]
         door.add_gallery(routes, Starlette(routes=[get("/", self._page)]))
 
@@ -115,6 +119,8 @@ class GalleryApi:
     def _open(self, name: str, twin: str | None = None) -> Any:
         """Review a recording, or run a twin on a log."""
         path = self._idle(name)
+        if path.suffix.lower() == DATABASE:
+            raise ConfigError(f"{path.name} holds no frames; open a CAN log, which is read with it")
         if path.suffix.lower() == RECORDING:
             self._gallery.start(StartRequest(recording=path))
         elif twin is not None:
@@ -122,6 +128,29 @@ class GalleryApi:
         else:
             raise ConfigError(f"{path.name} is a log; name the twin that is to read it")
         return {"opening": path.name}
+
+    def _log(
+        self,
+        name: str,
+        dbc: tuple[str, ...] | None = None,
+        time: str | None = None,
+        unit: str = "s",
+        zone: str | None = None,
+    ) -> Any:
+        """Begin to read a log, and return what is known of it: signals, databases, twins that fit."""
+        return self._logs.state(LogRequest(name, dbc, time, unit, zone))
+
+    def _curves(
+        self,
+        name: str,
+        signals: tuple[int, ...],
+        dbc: tuple[str, ...] | None = None,
+        time: str | None = None,
+        unit: str = "s",
+        zone: str | None = None,
+    ) -> Any:
+        """Return decimated curves of signals of a log that was read."""
+        return {"curves": self._logs.curves(LogRequest(name, dbc, time, unit, zone), signals)}
 
     def _delete(self, name: str) -> Any:
         """Delete a recording or log."""

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 
 from config.loader import TWINS, Loaded, find, load, shipped
 from estimators.errors import NisusError
+from estimators.model.state_space import StateSpaceModel
 
 from ...twin.source import missing
 from ...twin.twin import load_twin
@@ -62,14 +64,21 @@ def card(name: str) -> Card:
         path = find(name)
         # A user's twin has a model of its own, which may change by itself.
         read = _read if name in shipped() else _read.__wrapped__
-        found, loaded = read(name, stamp_of((path,)))
+        found, loaded, _ = read(name, stamp_of((path,)))
     except (NisusError, OSError) as error:
         return Card(name, _title(name), error=str(error).splitlines()[0])
     return replace(found, picture=picture_file(path).is_file(), missing=missing(loaded))
 
 
+def readable_twins(names: Iterable[str]) -> Iterator[tuple[Card, Loaded, StateSpaceModel]]:
+    """Yield card, configuration and model of the twins whose files have no error."""
+    for name in names:
+        with suppress(NisusError, OSError):
+            yield _read(name, stamp_of((find(name),)))
+
+
 @lru_cache(maxsize=128)
-def _read(name: str, stamp: Stamp) -> tuple[Card, Loaded]:
+def _read(name: str, stamp: Stamp) -> tuple[Card, Loaded, StateSpaceModel]:
     """Read a twin's files, once for each time that they were saved."""
     twin = load_twin(name)
     config = twin.config
@@ -84,7 +93,7 @@ def _read(name: str, stamp: Stamp) -> tuple[Card, Loaded]:
         estimator=twin.estimator,
         log=config.source.type != "simulator",
     )
-    return found, twin.loaded
+    return found, twin.loaded, twin.model
 
 
 def _title(name: str) -> str:

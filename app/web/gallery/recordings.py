@@ -24,6 +24,9 @@ RECORDING = ".rrd"
 LOGS = tuple(dict.fromkeys((*CAN_LOGS, *TABLES)))
 """Suffixes of files that can replace a twin's own recording."""
 
+DATABASE = ".dbc"
+"""Suffix of a file that describes the frames of CAN logs."""
+
 PART = ".part"
 """Suffix of a file that is still arriving; its name begins with a dot, so that lists do not show it."""
 
@@ -63,7 +66,8 @@ class Recordings:
             log = path.suffix.lower() != RECORDING
             if path.is_symlink() or not path.is_file() or path.name.startswith("."):
                 continue
-            if log and not is_recording(path.name):
+            database = path.suffix.lower() == DATABASE
+            if log and not database and not is_recording(path.name):
                 continue
             stat = path.stat()
             key = (str(path), stat.st_mtime_ns, stat.st_size)
@@ -79,7 +83,8 @@ class Recordings:
                     "name": path.name,
                     "bytes": stat.st_size,
                     "modified": stat.st_mtime,
-                    "log": log,
+                    "log": log and not database,
+                    "database": database,
                     "error": known if isinstance(known, str) else None,
                     "looking": known is None and not log,
                     "folder": None if path in inside else str(path.parent),
@@ -149,8 +154,11 @@ class Recordings:
             ConfigError: If the name is invalid, a piece is missing, or the disk is full.
         """
         checked = _checked(name)
-        if Path(checked).suffix.lower() != RECORDING and not is_recording(checked):
-            raise ConfigError(f"{quoted(name)}: neither a recording (.rrd) nor a log ({', '.join(LOGS)})")
+        if Path(checked).suffix.lower() not in (RECORDING, DATABASE) and not is_recording(checked):
+            raise ConfigError(
+                f"{quoted(name)}: is neither a recording (.rrd), a log ({', '.join(LOGS)}, or .csv.gz) nor a "
+                "database (.dbc); export it as one of these"
+            )
         part = self.folder / f".{checked}{PART}"
         try:
             self.folder.mkdir(parents=True, exist_ok=True)

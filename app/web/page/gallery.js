@@ -1,9 +1,109 @@
-// The gallery: every twin with its picture, lesson and question; beside them the recordings.
+// The gallery: every twin with its picture, lesson and question; beside them the recordings. Of a log (#log=NAME) its
+// signals instead.
 
 import { keys } from "./controls.js";
 import { $, element, setText } from "./dom.js";
-import { drops, Recordings } from "./recordings.js";
+import { drops, LogView } from "./dropped_log.js";
+import { compact, spaced, span } from "./format.js";
 import { card, post, progress, Session } from "./session.js";
+
+const SUMMARY_POLL_MS = 1500; // while a file is being summarised
+const POLL_MS = 5000;
+
+// The list of recordings and logs: open, download, delete after a confirmation. `ask` has open(file), drop(files) and
+// say(text), which reports an error.
+class Recordings {
+  constructor(node, ask) {
+    Object.assign(this, { node, ask, key: null });
+    this.list = element("ol", { class: "files" });
+    this.where = element("p", { class: "faint where" });
+    this.choose = element("input", { type: "file", multiple: true, hidden: true, onchange: () => this.ask.drop([...this.choose.files]) });
+    this.node.replaceChildren(
+      element("header", { class: "panel-head" }, element("h2", {}, "Recordings"), element("span", { class: "space" }),
+        element("button", { type: "button", class: "go", onclick: () => this.choose.click(), title: "Add a recording (.rrd), a log or a DBC; or drop it on the page" }, "Add a file"), this.choose),
+      this.list, this.where,
+    );
+    document.addEventListener("visibilitychange", () => this.refresh());
+    this.refresh();
+  }
+
+  async refresh() {
+    clearTimeout(this.timer);
+    if (document.hidden) return;
+    const answer = await fetch("/api/gallery/recordings").catch(() => null);
+    if (answer?.ok) this.draw(await answer.json());
+    clearTimeout(this.timer);
+    this.timer = setTimeout(() => this.refresh(), this.looking ? SUMMARY_POLL_MS : POLL_MS);
+  }
+
+  draw({ folder, files }) {
+    this.looking = files.some((file) => file.looking);
+    const key = JSON.stringify(files);
+    if (key === this.key) return;
+    this.key = key;
+    setText(this.where, `Kept in ${folder}. Record one on a twin's page (R), or drop a recording, a log (CSV, Parquet, MF4, BLF, ASC, candump, MAT, NPZ) or a DBC here.`);
+    // What is asked of one file stays asked while the list is drawn anew.
+    const asked = this.list.querySelector("[data-asked]")?.dataset.name;
+    this.list.replaceChildren(...files.map((file) => this.item(file)));
+    if (asked) [...this.list.children].find((item) => item.dataset.name === asked)?.querySelector(".delete")?.click();
+    if (!files.length) this.list.replaceChildren(element("li", { class: "nothing" }, "None yet."));
+  }
+
+  item(file) {
+    const { summary } = file;
+    const error = summary?.error;
+    const facts = [
+      file.folder ? `in ${file.folder}` : null, file.twin, file.seconds ? span(file.seconds) : null, summary?.estimator ?? file.estimator, size(file.bytes),
+    ].filter(Boolean).join(" · ");
+    const ratio = (value) => compact(value / (summary.nis_dof ?? 1), 3);
+    const scores = [
+      summary?.nis ? `NIS / dof ${ratio(summary.nis)} [${ratio(summary.nis_low)}, ${ratio(summary.nis_high)}]` : null,
+      error ? `RMSE ${error.name} ${compact(error.rmse, 3)}${spaced(error.unit)}${error.against === "truth" ? "" : `, ${error.against}`}${typeof error.coverage === "number" ? `, ${compact(100 * error.coverage, 3)} % in band` : ""}` : null,
+    ].filter(Boolean).join(" · ");
+    const confirm = element("div", { class: "confirm", hidden: true });
+    const node = element(
+      "li", { class: "file", dataset: { name: file.name } },
+      element("div", { class: "row" },
+        element("button", { type: "button", class: "name", title: file.database ? `${file.name} describes CAN logs` : file.log ? `Signals of ${file.name}, and twins for it` : `Review ${file.name}`, disabled: file.database, onclick: () => this.ask.open(file) }, file.name),
+        element("a", { href: `/recordings/${encodeURIComponent(file.name)}`, download: file.name, title: "Download", "aria-label": `Download ${file.name}` }, "↓"),
+        element("button", { type: "button", class: "delete", title: "Delete", "aria-label": `Delete ${file.name}`, onclick: () => this.confirm(node, confirm, file.name) }, "✕")),
+      element("p", { class: "faint" }, `${when(file.modified)} · ${file.log ? "log · " : file.database ? "DBC · " : ""}${file.looking ? "looking …" : facts}`),
+      scores ? element("p", { class: "faint", title: summary.nis_words }, scores) : null,
+      file.error ? element("p", { class: "faint" }, file.error) : null,
+      confirm,
+    );
+    return node;
+  }
+
+  confirm(node, place, name) {
+    node.dataset.asked = "true";
+    const back = () => {
+      place.hidden = true;
+      delete node.dataset.asked;
+      node.querySelector(".delete").focus();
+    };
+    const remove = async () => {
+      const answer = await post("/api/gallery/recordings/delete", { name });
+      delete node.dataset.asked;
+      if (answer.error) this.ask.say(answer.error);
+      this.key = null;
+      this.refresh();
+    };
+    const yes = element("button", { type: "button", class: "go danger", onclick: remove }, "Delete for good");
+    place.replaceChildren(yes, element("button", { type: "button", class: "go", onclick: back }, "Keep"));
+    place.hidden = false;
+    yes.focus();
+  }
+}
+
+const size = (bytes) => (bytes < 1e6 ? `${Math.max(1, Math.round(bytes / 1e3))} kB` : bytes < 1e9 ? `${compact(bytes / 1e6, 3)} MB` : `${compact(bytes / 1e9, 3)} GB`);
+
+function when(seconds) {
+  const date = new Date(1000 * seconds);
+  const today = date.toDateString() === new Date().toDateString();
+  const time = date.toLocaleTimeString("en-GB", { hour: "2-digit", minute: "2-digit" });
+  return today ? `today ${time}` : `${date.toLocaleDateString("en-GB", { day: "numeric", month: "short", year: "numeric" })} ${time}`;
+}
 
 const settings = JSON.parse(document.body.dataset.settings);
 const session = new Session(settings.boot);
@@ -30,8 +130,30 @@ function say(text, wrong = false) {
   setText($("sending"), wrong ? "" : text);
   if (session.state) draw(session.state);
 }
-const files = drops({ twins: () => shown.filter((item) => item.log), say, follow: () => session.ask() });
-const recordings = new Recordings($("recordings"), { open: files.open, drop: files.take, say: (text) => say(text, true) });
+const showLog = (name) => {
+  if (location.hash === `#log=${encodeURIComponent(name)}`) view.open(name);
+  else location.hash = `log=${encodeURIComponent(name)}`;
+};
+const files = drops({ say, follow: () => session.ask(), show: showLog, described: (names) => view.describe(names) });
+const view = new LogView($("log"), {
+  drop: files.take,
+  run: (name, twin) => files.open(name, twin),
+  say,
+  session,
+});
+const recordings = new Recordings($("recordings"), { open: (file) => files.open(file.name), drop: files.take, say: (text) => say(text, true) });
+
+function route() {
+  const name = new URLSearchParams(location.hash.slice(1)).get("log");
+  document.body.dataset.view = name ? "log" : "shelf";
+  $("log").hidden = !name;
+  $("find").hidden = Boolean(name);
+  setText($("place"), name ? "Log" : "Gallery");
+  document.title = `${name ?? "Gallery"} · Nisus`;
+  if (name) view.open(name);
+  else view.close();
+}
+addEventListener("hashchange", route);
 
 function draw(state) {
   for (const item of shown) item.sync(state);
@@ -91,4 +213,5 @@ if (asked) {
   asked.node.querySelector(".start").focus();
 } else if (linked) say(`The link is of ${linked}; there is no such twin here that can be started`, true);
 if (location.hash === "#recordings") $("recordings").querySelector("button").focus();
-window.nisus = { session, cards: shown.length };
+route();
+window.nisus = { session, cards: shown.length, view };

@@ -1,7 +1,7 @@
 // State of the session: the running twin, a start under way, a start that failed. Polled while the page is visible.
 
 import { $, element, setAttribute, setText } from "./dom.js";
-import { drops } from "./recordings.js";
+import { drops } from "./dropped_log.js";
 
 const REST = 700; // ms
 const HASTE = 250; // while something is being started
@@ -143,19 +143,12 @@ export class Leave {
     for (const id of ["gallery", "others"]) setAttribute($(id), "href", "/gallery");
     this.boot = boot;
     this.model = model;
-    drops({ twins: () => this.twins(), say: (text, wrong) => this.say(text, wrong), follow: () => this.follow() });
+    drops({ say: (text, wrong) => this.say(text, wrong), follow: () => this.follow() });
     const go = (where) => location.assign(where);
     this.commands = [
       ["g", "gallery: another twin", () => go("/gallery")],
       ["", "recordings: open, download, delete", () => go("/gallery#recordings")],
     ];
-  }
-
-  // Those that could read a log, this one first.
-  async twins() {
-    const all = (await (await fetch("/api/gallery")).json()).filter((item) => item.log && !item.error);
-    const short = (name) => name.split(/[\\/]/).pop().replace(/\.ya?ml$/, "");
-    return all.map((item) => ({ ...item, short: short(item.name) })).sort((a, b) => (b.short === this.model.twin) - (a.short === this.model.twin));
   }
 
   // A link of another twin was opened: what runs goes on, unless that is started. The address stays, and with it the

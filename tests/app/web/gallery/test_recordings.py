@@ -91,7 +91,7 @@ def test_a_piece_that_is_missing_or_no_log_is_refused(folder):
     recordings.receive("new.csv", 0, b"t,x\n", last=False)
     with pytest.raises(ConfigError, match="a piece of it is missing"):
         recordings.receive("new.csv", 9, b"late", last=True)
-    with pytest.raises(ConfigError, match=r"neither a recording \(.rrd\) nor a log"):
+    with pytest.raises(ConfigError, match=r"is neither a recording \(.rrd\), a log \(.* nor a database \(.dbc\)"):
         recordings.receive("new.py", 0, b"import os", last=True)
     # Begun anew, it is whole.
     recordings.receive("new.csv", 0, b"t,x\n", last=False)

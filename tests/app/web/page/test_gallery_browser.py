@@ -168,12 +168,13 @@ def test_record_review_drop_and_delete(visit, tmp_path):
         assert "broken.rrd" in page.locator("#toast").inner_text()
         assert session.state()["running"]["title"] == kept.name
 
-        # A log asks which twin; one that is dropped on a card does not.
+        # A log opens with its signals; dropped on a card, it is read by that twin.
         page.keyboard.press("g")
         card(page, "motor_winding").wait_for()
-        drop(page, "drive.csv", b"t,T\n0,1\n")
-        page.get_by_role("dialog").get_by_role("button", name="motor_bench Traction").wait_for()
-        page.get_by_role("button", name="Cancel").click()
+        drop(page, "drive.csv", b"t,T\n0,1\n1,3\n2,2\n")
+        page.locator(".signal[data-signal=T][data-drawn]").wait_for()
+        page.get_by_role("link", name="All twins").click()
+        card(page, "motor_bench").wait_for()
         drop(page, "other.csv", b"t,T\n0,1\n", "[data-name=motor_bench] h2")
         page.locator("#failed").wait_for()
         wait_for(lambda: "other.csv" in page.locator("#failed").inner_text(), PATIENCE)
@@ -201,7 +202,7 @@ def test_a_link_of_another_twin_offers_to_start_it_and_goes_to_its_moment(visit,
         page.evaluate(f"location.hash = '{moment}'")
         page.get_by_role("button", name="Start motor_joint").click()
         shows(page, "motor_joint")
-        assert session.state()["running"]["name"] == "motor_joint"
+        assert session.settled()["running"]["name"] == "motor_joint"
         until(page, "window.nisus.charts.range[0] === 5 && window.nisus.charts.range[1] === 15")
         # One that is unknown here is no offer.
         page.evaluate("location.hash = '#twin=elsewhere&from=1970-01-01T00:00:05Z&span=10'")
