@@ -1,25 +1,27 @@
-"""Overview of a log for the page: its signals with figures and decimated curves, and the databases that describe it.
+"""Overview of a log for the page: its signals with figures, curves and proposed roles; and a draft of a twin from it.
 
-`overview` runs in a reader process, since it holds all values of the log.
+`overview` and `draft` run in a reader process, since they hold all values of the log.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from estimators.errors import SourceError
+from estimators.errors import ConfigError, SourceError
 from sources.can.decoder import load_database, shown_id
 from sources.can.readers import EXTENDED, BusName
 from sources.inspect import Message, RecordingContents, SignalSeries, inspect_recordings, is_table
 from sources.tables.rows import names_of
 from sources.tables.times import TimeColumn
 
+from .advice.draft import write_draft
+from .advice.plan import OMITTED, SENSOR, STATE, DraftPlan, Roles, SignalRole, plan
 from .advice.signals import signal
 
 CURVE_BUCKETS = 300
@@ -74,6 +76,7 @@ class DatabaseOverview:
 class LogOverview:
     """What a log holds; `curves` belong to `signals`. `choices` are columns that may hold the time of a table.
 
+    `roles` are those that a draft proposes, each with its reason; None until they are known.
     `needs` names what is missing before the log can be read: "time" or "database". `keys` are buses and ids of frames,
     `used` the databases that describe them.
     """
@@ -94,6 +97,7 @@ class LogOverview:
     time: str = ""
     choices: list[str] = field(default_factory=list)
     needs: str | None = None
+    roles: list[tuple[str, str]] | None = None
     keys: list[tuple[BusName, int]] = field(default_factory=list)
     curves: list[Curve] = field(default_factory=list)
 
@@ -121,7 +125,7 @@ def overview(
         SourceError: If the log cannot be read.
     """
     if is_table(path):
-        yield _of_table(path, time or TimeColumn(""))
+        yield from _of_table(path, time or TimeColumn(""))
         return
     found = inspect_recordings([path])
     ids = {message.key for message in found.messages}
@@ -134,11 +138,69 @@ def overview(
         used = [file for file in databases if str(file) not in broken]
     if used:
         found = inspect_recordings([path], [(file, None) for file in used])
-    yield _of(found, len(ids), known, [str(file) for file in used])
+    yield from _proposed(found, _of(found, len(ids), known, [str(file) for file in used]))
 
 
-def _of_table(path: Path, time: TimeColumn) -> LogOverview:
-    """Return the overview of a table; if its time is not known, its columns."""
+def _proposed(found: RecordingContents, described: LogOverview) -> Iterator[LogOverview]:
+    """Yield an overview, then with the roles that a draft proposes, which take longer."""
+    yield described
+    if described.signals:
+        try:
+            roles = [(proposed_role(one), one.reason) for one in plan(found, Roles()).roles]
+        except ConfigError as error:
+            roles = [("", str(error).removeprefix(f"{found.files[0]}: "))] * len(described.signals)
+        yield replace(described, roles=roles)
+
+
+def proposed_role(one: SignalRole) -> str:
+    """Return the role of a signal on the page: that of a sensor is "state" if it has a state of its own."""
+    if one.role == OMITTED:
+        return ""
+    return STATE if one.role == SENSOR and one.reason == f"measures {one.name}" else one.role
+
+
+@dataclass(frozen=True)
+class DraftStep:
+    """Progress of a draft: what is under way, and at the end the draft's file and its content in words."""
+
+    doing: str
+    file: str | None = None
+    summary: str = ""
+
+
+def draft(
+    path: Path, databases: Sequence[Path], time: TimeColumn, name: str, roles: Mapping[str, Sequence[str]]
+) -> Iterator[DraftStep]:
+    """Yield the steps of a draft, which is written beside the log; in a reader process.
+
+    Args:
+        path: The log.
+        databases: DBC files of a CAN log.
+        time: Time column of a table.
+        name: Name of the twin.
+        roles: Signals of each role, by the fields of `Roles`.
+
+    Raises:
+        ConfigError: If a role does not apply.
+        SourceError: If the log cannot be read.
+    """
+    yield DraftStep("reading the log")
+    buses: list[tuple[Path, BusName]] = [(file, None) for file in databases]
+    found = inspect_recordings([path], buses, time)
+    yield DraftStep("estimating noises, time constants and gains")
+    drafted = plan(found, Roles(**{role: tuple(names) for role, names in roles.items()}))
+    yield DraftStep("writing the twin")
+    written = write_draft(drafted, found, name, path.parent, buses)
+    yield DraftStep("", str(written.yaml_path), _summary(drafted))
+
+
+def _summary(drafted: DraftPlan) -> str:
+    sensors = sum(len(item.sensors) for item in drafted.states)
+    return f"{len(drafted.states)} states, {sensors} sensors, {len(drafted.inputs)} inputs"
+
+
+def _of_table(path: Path, time: TimeColumn) -> Iterator[LogOverview]:
+    """Yield the overview of a table; if its time is not known, its columns."""
     names = list(dict.fromkeys(names_of(path)))
     try:
         found = inspect_recordings([path], time=time)
@@ -146,8 +208,9 @@ def _of_table(path: Path, time: TimeColumn) -> LogOverview:
         if not names:
             raise
         text = str(error).removeprefix(f"{path}: ")
-        return LogOverview(str(path), "table", faults=[text], time=time.name, choices=names, needs="time")
-    return _of(found, choices=names)
+        yield LogOverview(str(path), "table", faults=[text], time=time.name, choices=names, needs="time")
+        return
+    yield from _proposed(found, _of(found, choices=names))
 
 
 def _database(file: Path, ids: set[int]) -> DatabaseOverview:

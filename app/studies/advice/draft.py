@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import os
 import re
@@ -121,8 +122,8 @@ def _number(value: float) -> str:
 
 
 def _text(value: str) -> str:
-    """A text in quotes, for YAML and Python alike."""
-    return '"' + value.replace("\\", "\\\\").replace('"', '\\"') + '"'
+    """A text in quotes, for YAML and Python alike; a name from a log may hold line ends."""
+    return json.dumps(value, ensure_ascii=False)
 
 
 def python_text(name: str, model: str, drafted: DraftPlan) -> str:

@@ -24,13 +24,14 @@ class Roles:
 
     `sensors` measure states; `inputs` drive them and have none; `held_out` are sensors that are predicted and scored,
     never used. `signals` may become sensors or inputs, as the draft finds. Without sensors and signals the draft takes
-    those that vary most finely.
+    those that vary most finely. `states` are sensors with a state of their own, also where another measures the same.
     """
 
     sensors: tuple[str, ...] = ()
     inputs: tuple[str, ...] = ()
     held_out: tuple[str, ...] = ()
     signals: tuple[str, ...] = ()
+    states: tuple[str, ...] = ()
 
 
 OMISSIONS = {
@@ -41,7 +42,7 @@ OMISSIONS = {
 }
 """Reasons by kind of signal for which it is omitted."""
 
-SENSOR, INPUT, HELD_OUT, OMITTED = "sensor", "input", "held out", "omitted"
+STATE, SENSOR, INPUT, HELD_OUT, OMITTED = "state", "sensor", "input", "held out", "omitted"
 
 
 class SignalRole(NamedTuple):
@@ -114,19 +115,25 @@ def plan(found: RecordingContents, roles: Roles) -> DraftPlan:
         raise ConfigError(f"{found.files[0]}: no message of it is in a DBC; give one that describes it with --dbc")
     given = _given(roles, found, every)
     named = {id(one) for one, _ in given}
-    free = [] if roles.sensors or roles.signals else _finest(found, [one for one in every if id(one) not in named])
-    # Held-out signals come last: of several sensors of one quantity, the first is the state.
-    places = sorted([*given, *((one, "") for one in free)], key=lambda entry: entry[1] == HELD_OUT)
+    free = (
+        []
+        if roles.sensors or roles.signals or roles.states
+        else _finest(found, [one for one in every if id(one) not in named])
+    )
+    # Of several sensors of one quantity the first is the state, so held-out signals come last.
+    order = {STATE: 0, HELD_OUT: 2}
+    places = sorted([*given, *((one, "") for one in free)], key=lambda entry: order.get(entry[1], 1))
     picked = [one for one, _ in places]
     inputs = {k for k, (_, role) in enumerate(places) if role == INPUT}
-    sensors = {k for k, (_, role) in enumerate(places) if role in (SENSOR, HELD_OUT)}
+    own = {k for k, (_, role) in enumerate(places) if role == STATE}
+    sensors = {k for k, (_, role) in enumerate(places) if role in (STATE, SENSOR, HELD_OUT)}
     told = pairs(picked)
     taken: set[str] = set()
     names = [_identifier(one.name, taken) for one in picked]
     # Of signals that say the same the first one is the state.
     leads = {k: k for k in range(len(picked)) if k not in inputs}
     for pair in (pair for pair in told if pair.one and pair.first in leads and pair.second in leads):
-        if leads[pair.second] == pair.second and leads[pair.first] == pair.first:
+        if pair.second not in own and leads[pair.second] == pair.second and leads[pair.first] == pair.first:
             leads[pair.second] = pair.first
     heads = [k for k in leads if leads[k] == k and not any(pair.first == k and pair.rate for pair in told)]
     lags = _lags(picked, heads, sorted(inputs) or [k for k in heads if k not in sensors])
@@ -179,6 +186,7 @@ def _given(roles: Roles, found: RecordingContents, every: Sequence[Signal]) -> l
     groups = (
         ("--hold-out", HELD_OUT, roles.held_out),
         ("--inputs", INPUT, roles.inputs),
+        ("--states", STATE, roles.states),
         ("--sensors", SENSOR, roles.sensors),
         ("--signals", "", roles.signals),
     )

@@ -39,7 +39,7 @@ class GalleryApi:
         door = gallery.session.door
         assert door is not None, "a gallery needs a page"
         self._door = door
-        self._logs = DroppedLogs(recordings, gallery.names)
+        self._logs = DroppedLogs(recordings, gallery.names, gallery.add)
         routes = [
             get("/gallery", self._page),
             Mount("/page", StaticFiles(directory=PAGE)),
@@ -55,6 +55,9 @@ class GalleryApi:
             get("/recordings/{name}", self._download),
             post("/api/gallery/log", self._log),
             post("/api/gallery/log/curves", self._curves),
+            get("/api/gallery/log/draft", self._logs.drafting),
+            post("/api/gallery/log/draft", self._draft, status=202),
+            post("/api/gallery/log/draft/stop", self._stop_draft),
         ]
         door.add_gallery(routes, Starlette(routes=[get("/", self._page)]))
 
@@ -151,6 +154,25 @@ class GalleryApi:
     ) -> Any:
         """Return decimated curves of signals of a log that was read."""
         return {"curves": self._logs.curves(LogRequest(name, dbc, time, unit, zone), signals)}
+
+    def _draft(
+        self,
+        name: str,
+        twin: str,
+        roles: dict[str, tuple[int, ...]],
+        dbc: tuple[str, ...] | None = None,
+        time: str | None = None,
+        unit: str = "s",
+        zone: str | None = None,
+    ) -> Any:
+        """Begin to draft a twin from a log, and run it."""
+        self._logs.draft(LogRequest(name, dbc, time, unit, zone), twin, roles)
+        return self._logs.drafting()
+
+    def _stop_draft(self) -> Any:
+        """Stop the draft."""
+        self._logs.stop_draft()
+        return self._logs.drafting()
 
     def _delete(self, name: str) -> Any:
         """Delete a recording or log."""

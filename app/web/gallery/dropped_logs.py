@@ -2,26 +2,39 @@
 
 from __future__ import annotations
 
+import re
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from config.source_schema import CanLogSection, CanSection
-from estimators.errors import ConfigError, NisusError, SourceError
+from estimators.errors import ConfigError, NisusError, SourceError, quoted
 from sources.tables.times import SERIAL_DAYS, UNITS, TimeColumn
 from sources.worker_process import IsolatedReader
 
-from ...studies.log_overview import LogOverview, overview
+from ...studies.advice.draft import check_new
+from ...studies.log_overview import DraftStep, LogOverview, draft, overview
 from ...twin.log_match import LogHeader, TwinMatch, match_log
 from ...twin.source import KEY, SOURCES
 from ...twin.sources.kind import find_databases
 from ..running import stamp_of
 from .cards import Card, readable_twins
 from .recordings import DATABASE, Recordings
+
+ROLES = ("states", "sensors", "inputs", "held_out")  # Fields of `app.studies.advice.plan.Roles`
+
+DRAFT_TIMEOUT_S = 600.0  # Longest time between two steps of a draft
+
+OPTION_WORDS = {
+    "--hold-out ": "held out: ", "--inputs ": "input: ", "--sensors ": "sensor: ", "--states ": "state: ",
+    "--signals ": "signal: ", " with --inputs": "", " with --dbc": "", " with --time": "", "(--time-unit)": "",
+    "add --time-unit excel": "choose Excel dates",
+}  # fmt: skip
+"""Options in messages of the command line, as the page has them."""
 
 MAX_CURVES = 200  # Curves of one answer
 
@@ -42,13 +55,30 @@ class LogRequest:
 class ReaderJob:
     """A generator of a reader process, run in a thread; `item` is what it yielded last."""
 
-    def __init__(self, function: Callable[..., Iterator[Any]], path: Path, *args: Any) -> None:
+    def __init__(
+        self,
+        function: Callable[..., Iterator[Any]],
+        path: Path,
+        *args: Any,
+        timeout: float | None = None,
+        then: Callable[[Any], None] = lambda item: None,
+    ) -> None:
+        """Begin.
+
+        Args:
+            function: A generator function, importable by name.
+            path: Its first argument.
+            args: Its further arguments.
+            timeout: See `IsolatedReader`.
+            then: Called with the last item, in the job's thread.
+        """
         self.item: Any = None
         self.answer: dict[str, Any] | None = None
         self.error: str | None = None
         self.state = "running"
         self._begun = time.monotonic()
         self._stopping = False
+        self._timeout, self._then = timeout, then
         self._thread = threading.Thread(target=self._run, args=(function, path, args), name="log", daemon=True)
         self._thread.start()
 
@@ -63,26 +93,34 @@ class ReaderJob:
 
     def _run(self, function: Callable[..., Iterator[Any]], path: Path, args: tuple[Any, ...]) -> None:
         try:
-            reader = IsolatedReader(function, path, *args, keep=False)
+            reader = IsolatedReader(function, path, *args, timeout=self._timeout, keep=False)
             try:
                 while not reader.ended and not self._stopping:
                     item = reader.take(0.2)
                     self.item = self.item if item is None else item
             finally:
                 reader.close()
+            if self._stopping:
+                self.state = "stopped"
+                return
+            self._then(self.item)
             self.state = "done"
         except (NisusError, OSError) as error:
             text = str(error)
             self.error = text if path.name in text else f"{path.name}: {text}"
+            self.state = "failed"
+        except Exception as error:  # noqa: BLE001  a file may hold anything; the page needs an answer
+            self.error = f"{path.name}: {type(error).__name__}: {error}"
             self.state = "failed"
 
 
 class DroppedLogs:
     """Reads one log at a time, and keeps the overviews of the last ones."""
 
-    def __init__(self, recordings: Recordings, names: Callable[[], Sequence[str]]) -> None:
-        """Take the folder of recordings, and the names of all twins."""
-        self._recordings, self._names = recordings, names
+    def __init__(self, recordings: Recordings, names: Callable[[], Sequence[str]], run: Callable[[str], None]) -> None:
+        """Take the folder of recordings, the names of all twins, and a function that runs a drafted twin."""
+        self._recordings, self._names, self._run = recordings, names, run
+        self._draft: tuple[str, ReaderJob] | None = None
         self._lock = threading.Lock()
         self._jobs: dict[Any, ReaderJob] = {}
 
@@ -118,9 +156,9 @@ class DroppedLogs:
             return {"name": path.name, "state": "reading", "seconds": job.seconds}
         if job.item is None:
             return {"name": path.name, "state": "failed", "error": _short(job.error or "", path)}
-        if job.answer is None:
+        if job.answer is None or job.answer["roles"] is None:
             job.answer = self._answer(path, job.item)
-        return job.answer
+        return {**job.answer, "proposing": job.state == "running"}
 
     def _answer(self, path: Path, found: LogOverview) -> dict[str, Any]:
         answer = found.as_json()
@@ -141,7 +179,70 @@ class DroppedLogs:
             found.time,
         )
         answer["twins"] = [] if found.needs == "time" else self.twins(header)
-        return {"name": path.name, "state": "ready", **answer}
+        return {"name": path.name, "state": "ready", "draft_name": self._free_name(path), **answer}
+
+    def draft(self, wanted: LogRequest, twin: str, roles: Mapping[str, Sequence[int]]) -> None:
+        """Begin to draft a twin from a log, which then runs.
+
+        Args:
+            wanted: The log.
+            twin: Name of the twin.
+            roles: Indices of signals for each of "states", "sensors", "inputs" and "held_out".
+
+        Raises:
+            ConfigError: If another draft is under way, or a name or role does not apply.
+        """
+        path, job = self.read(wanted)
+        found: LogOverview | None = job.item
+        if found is None or not found.signals:
+            raise ConfigError(f"{path.name}: no signals are known yet; wait until it is read")
+        if self._draft is not None and self._draft[1].state == "running":
+            raise ConfigError(f"{self._draft[0]} is being drafted; wait for it or stop it")
+        check_new(twin, path.parent)
+        unknown = [role for role in roles if role not in ROLES]
+        if unknown:
+            raise ConfigError(f"role {quoted(unknown[0])} is not known; choose from {', '.join(ROLES)}")
+        named = {}
+        for role, indices in roles.items():
+            if not all(0 <= k < len(found.signals) for k in indices):
+                raise ConfigError(f"{role}: give indices below {len(found.signals)}")
+            picked = [found.signals[k] for k in indices]
+            named[role] = [f"{one.group}.{one.name}" if found.kind == "can_log" else one.name for one in picked]
+        if not named.get("states") and not named.get("sensors"):
+            raise ConfigError("no signal is a state or a sensor; give at least one this role")
+        column = TimeColumn(found.time, wanted.unit, None, wanted.zone)
+        args = ([Path(file) for file in found.used], column, twin, named)
+        self._draft = (
+            twin,
+            ReaderJob(draft, path, *args, timeout=DRAFT_TIMEOUT_S, then=lambda step: self._run(step.file)),
+        )
+
+    def drafting(self) -> dict[str, Any]:
+        """Return the progress of the draft."""
+        if self._draft is None:
+            return {"state": "none"}
+        twin, job = self._draft
+        step: DraftStep | None = job.item
+        known = {"doing": step.doing if step else "starting", "summary": step.summary if step else ""}
+        folder = str(self._recordings.folder)
+        error = None if job.error is None else in_words(job.error.replace(f"{folder}/", ""))
+        return {"state": job.state, "twin": twin, "seconds": job.seconds, "error": error, **known}
+
+    def stop_draft(self) -> None:
+        """Stop the draft under way."""
+        if self._draft is not None:
+            self._draft[1].stop()
+
+    def _free_name(self, path: Path) -> str:
+        """Return a name for a twin of a log that is not taken."""
+        stem = re.sub(r"[^A-Za-z0-9_-]+", "_", path.name.partition(".")[0]).strip("_-") or "log"
+        stem = stem if stem[0].isalpha() else f"log_{stem}"
+        taken = {Path(name).stem for name in self._names()}
+        for k in range(1, 1000):
+            name = stem if k == 1 else f"{stem}-{k}"
+            if name not in taken and not any((path.parent / f"{name}{suffix}").exists() for suffix in (".yaml", ".py")):
+                break
+        return name
 
     def curves(self, wanted: LogRequest, signals: Sequence[int]) -> list[list[list[float]]]:
         """Return curves of signals by their index: seconds, lowest and highest values.
@@ -198,6 +299,13 @@ def _label(path: Path, folder: Path) -> str:
     return path.name if path.parent.absolute() == folder.absolute() else f"{path.parent.name}/{path.name}"
 
 
+def in_words(text: str) -> str:
+    """Return a message without options of the command line."""
+    for option, words in OPTION_WORDS.items():
+        text = text.replace(option, words)
+    return text
+
+
 def _short(text: str, path: Path) -> str:
     """Return a message with the file's name in place of its path."""
-    return text.replace(str(path.parent.absolute()) + "/", "").replace(f"{path.parent}/", "")
+    return in_words(text).replace(str(path.parent.absolute()) + "/", "").replace(f"{path.parent}/", "")

@@ -99,6 +99,15 @@ class Gallery:
             raise ConfigError(f"{quoted(wanted.twin)} is no twin of this gallery; {nearest(wanted.twin, self.names())}")
         self._begin(wanted)
 
+    def add(self, twin: str) -> None:
+        """Add a twin that was drafted here to the user's own, and begin to start it.
+
+        Raises:
+            ConfigError: If something is being started already.
+        """
+        self.own = (twin, *(name for name in self.own if name != twin))
+        self.start(StartRequest(twin))
+
     def again(self, remark: str) -> None:
         """Begin to start the running twin anew, with a notice of the reason.
 

@@ -85,14 +85,15 @@ const ROLES = [
   ["state", "State", "measured, with a state of its own"],
   ["sensor", "Sensor", "another measurement of a state"],
   ["input", "Input", "known quantity that drives the states"],
-  ["held_out", "Held out", "predicted and scored, never used"],
+  ["held out", "Held out", "predicted and scored, never used"],
   ["", "Ignore", "not in the twin"],
 ];
 
 const count = (number, word) => `${number.toLocaleString("en")} ${word}${number === 1 ? "" : "s"}`;
 const rate = (value) => (value === null ? "" : value >= 0.1 ? `${compact(value, 3)} Hz` : `every ${span(1 / value)}`);
 
-// The view of one log. `ask` has start(body): start a twin on it; say(text, wrong).
+// The view of one log. `ask` has run(log, twin), which starts a twin on it, drop(files), and follow(), which reports how a
+// twin starts.
 export class LogView {
   constructor(node, ask) {
     Object.assign(this, { node, ask, name: null, rows: new Map() });
@@ -106,7 +107,7 @@ export class LogView {
 
   open(name) {
     if (name === this.name) return;
-    Object.assign(this, { name, dbc: null, time: null, unit: "s", zone: null, log: null, roles: new Map(), shown: null });
+    Object.assign(this, { name, dbc: null, time: null, unit: "s", zone: null, log: null, roles: new Map(), shown: null, proposed: null, drafts: false });
     this.node.replaceChildren(element("p", { class: "faint reading", role: "status" }, `${name}: reading …`));
     this.read();
   }
@@ -126,7 +127,7 @@ export class LogView {
   }
 
   read(change = {}) {
-    Object.assign(this, change);
+    Object.assign(this, change, { roles: new Map(), proposed: null });
     clearTimeout(this.timer);
     this.poll();
   }
@@ -140,11 +141,11 @@ export class LogView {
       setText(note, `${this.name}: reading … ${Math.floor(answer.seconds)} s`);
       if (!note.isConnected) this.node.prepend(note);
     } else this.draw(answer.error ? { ...answer, name: this.name } : answer);
-    if (answer.state === "reading" || answer.proposing || answer.draft?.state === "running") this.timer = setTimeout(() => this.poll(), POLL_MS);
+    if (answer.state === "reading" || answer.proposing) this.timer = setTimeout(() => this.poll(), POLL_MS);
   }
 
   draw(log) {
-    const key = JSON.stringify({ ...log, draft: null, roles: null });
+    const key = JSON.stringify({ ...log, roles: null, proposing: null, draft_name: null });
     this.log = log;
     if (key !== this.shown) {
       this.shown = key;
@@ -379,13 +380,84 @@ export class LogView {
   // Draft
 
   drafting(log) {
-    if (!log.signals.length) return element("section", { class: "draft" }, element("h2", {}, "Draft a twin"), element("p", { class: "faint" }, log.needs === "time" ? "Name the time column first." : "Name a DBC first: a draft is made of signals."));
-    return element("section", { class: "draft" });
+    const head = element("h2", {}, "Draft a twin from this log");
+    if (!log.signals.length) return element("section", { class: "draft" }, head, element("p", { class: "faint" }, log.needs === "time" ? "Name the time column first." : "Give a DBC first: a draft is made of signals."));
+    this.twin = element("input", { type: "text", value: log.draft_name, "aria-label": "Name of the twin", spellcheck: "false" });
+    this.chosen = element("p", { class: "chosen", role: "status" }, "finding roles …");
+    this.start = element("button", { type: "button", class: "start", disabled: true, onclick: () => this.draft() }, "Draft and run");
+    this.stop = element("button", { type: "button", class: "go", hidden: true, onclick: () => post("/api/gallery/log/draft/stop", {}) }, "Stop");
+    this.progress = element("p", { role: "status", class: "faint" });
+    this.wrong = element("p", { class: "error", role: "alert" });
+    return element("section", { class: "draft", "aria-label": "Draft a twin" }, head,
+      element("p", { class: "faint" }, "A model of generic motions with noises estimated from the data. The role of each signal is proposed; change it beside its chart."),
+      this.chosen,
+      element("label", {}, "Name ", this.twin),
+      element("div", { class: "row" }, this.start, this.stop, this.progress), this.wrong);
   }
 
-  propose() {}
-  role() {}
-  choose() {}
+  // The roles that the server proposes, unless they were chosen already.
+  propose() {
+    if (!this.log.roles || this.proposed === this.name) return;
+    this.proposed = this.name;
+    this.log.roles.forEach(([role], index) => this.roles.has(index) || this.roles.set(index, role));
+    for (const row of this.rows.values()) this.role(row);
+    this.sum();
+  }
+
+  role(row) {
+    const role = this.roles.get(row.index) ?? "";
+    row.node.dataset.role = role;
+    row.select.value = role;
+    const [proposed, reason] = this.log.roles?.[row.index] ?? [];
+    if (reason) row.select.title = `Proposed: ${ROLES.find(([value]) => value === proposed)?.[1] ?? proposed}, ${reason}`;
+  }
+
+  choose(index, role) {
+    this.roles.set(index, role);
+    this.role(this.rows.get(index));
+    this.sum();
+  }
+
+  // What the draft will be made of; each name leads to its row.
+  sum() {
+    const lines = ROLES.slice(0, -1).map(([value, text]) => [text, this.members(value)]).filter(([, members]) => members.length);
+    const link = (index) => element("button", { type: "button", class: "signal-link", onclick: () => this.reveal(index) }, this.log.signals[index].name);
+    this.chosen.replaceChildren(...lines.flatMap(([text, members]) => [element("span", { class: "role" }, element("b", {}, `${text}: `), ...members.slice(0, 12).map(link), members.length > 12 ? ` and ${members.length - 12} more` : null)]));
+    const able = this.members("state").length + this.members("sensor").length > 0;
+    if (!able) setText(this.chosen, "Give at least one signal the role State or Sensor.");
+    this.start.disabled = !able || this.drafts;
+  }
+
+  members(role) {
+    return [...this.roles].filter(([, other]) => other === role).map(([index]) => index).sort((a, b) => a - b);
+  }
+
+  // Its row, whatever group it is in.
+  reveal(index) {
+    this.find.value = this.log.signals[index].name;
+    this.filter();
+    const group = this.groups.find((item) => item.matching.includes(index));
+    group.node.open = true;
+    if (!group.filled) this.fill(group);
+    this.rows.get(index)?.select.focus();
+  }
+
+  async draft() {
+    const roles = { states: this.members("state"), sensors: this.members("sensor"), inputs: this.members("input"), held_out: this.members("held out") };
+    this.follow(await post("/api/gallery/log/draft", { ...this.request, twin: this.twin.value.trim(), roles }));
+  }
+
+  // Progress of the draft, until the session starts the twin.
+  follow(answer) {
+    this.drafts = answer.state === "running";
+    const { doing, seconds, summary } = answer;
+    setText(this.progress, this.drafts ? `${doing} … ${Math.floor(seconds)} s` : answer.state === "done" ? `${summary}: starting` : answer.state === "stopped" ? "stopped" : "");
+    setText(this.wrong, answer.error ?? "");
+    this.stop.hidden = !this.drafts;
+    this.start.disabled = this.drafts;
+    if (answer.state === "done") this.ask.follow();
+    if (this.drafts) setTimeout(async () => this.name && this.follow(await (await fetch("/api/gallery/log/draft")).json()), POLL_MS);
+  }
 }
 
 // Index of the value nearest to x in an ordered array.

@@ -138,8 +138,7 @@ const files = drops({ say, follow: () => session.ask(), show: showLog, described
 const view = new LogView($("log"), {
   drop: files.take,
   run: (name, twin) => files.open(name, twin),
-  say,
-  session,
+  follow: () => session.ask(),
 });
 const recordings = new Recordings($("recordings"), { open: (file) => files.open(file.name), drop: files.take, say: (text) => say(text, true) });
 
