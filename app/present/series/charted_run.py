@@ -8,6 +8,7 @@ from typing import Protocol
 
 import numpy as np
 
+from estimators.log import READING
 from estimators.track import estimated_rows
 
 from ...live.outputs import Cursor, Pull
@@ -140,28 +141,34 @@ class ChartedRun:
         return groups._replace(low=groups.low[:, picked], high=groups.high[:, picked], rising=groups.rising[:, picked])
 
     def samples(self, groups: Groups, columns: list[str], count: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return `count` rows of each group: all of them, or one at random from each of as many parts of equal length.
+        """Return `count` measurements of each group at random, or all where there are no more.
 
-        Which row depends on its index alone, so a chart does not shimmer.
+        Which are taken depends on their indices alone, so a chart does not shimmer.
 
         Returns:
-            Times (k, count), ns, those of a group's ends where it has no such row; values (k, count, columns).
+            Times (k, count), ns, ascending; values (k, count, columns), NaN where a group has no such measurement.
         """
-        parts = np.arange(groups.start * count, (groups.start + groups.n) * count)
-        begin, end = parts * groups.size // count, (parts + 1) * groups.size // count
-        wanted = begin + (_mixed(parts) % (end - begin).astype(np.uint64)).astype(np.int64)
-        times = np.repeat(groups.last, count)
-        times[::count] = groups.first
-        values = np.full((len(parts), len(columns)), np.nan)
-        for start in range(groups.start * groups.size, min((groups.start + groups.n) * groups.size, self.end), ROWS):
-            pull = self.source.rows(start, min(start + ROWS, self.end))
-            at = slice(*np.searchsorted(wanted, [pull.first, pull.first + len(pull.events)]))
-            rows = wanted[at] - pull.first
+        part = min(groups.size, ROWS)
+        each = max(1, count * part // groups.size)
+        n = groups.n * (groups.size // part)
+        times, values = np.zeros((n, each), np.int64), np.full((n, each, len(columns)), np.nan)
+        origin = groups.start * groups.size
+        stop = min(origin + n * part, self.end)
+        for start in range(origin, stop, ROWS):
+            pull = self.source.rows(start, min(start + ROWS, stop))
+            rows = np.flatnonzero(pull.events.kind == READING)
+            index = pull.first + rows
+            of = (index - origin) // part
+            order = np.lexsort((_mixed(index), of))
+            kept = np.sort(order[_ranks(of) < each])
+            rows, of = rows[kept], of[kept]
             events, track = pull.events.select(rows), pull.track.select(rows)
-            times[at] = events.t
-            values[at] = self._values(replace(pull, events=events, track=track), columns)
-        shape = groups.n, count
-        return np.maximum.accumulate(times.reshape(shape), axis=1), values.reshape(*shape, len(columns))
+            place = of, _ranks(of)
+            times[place] = events.t
+            values[place] = self._values(replace(pull, events=events, track=track), columns)
+        times, values = times.reshape(groups.n, -1), values.reshape(groups.n, -1, len(columns))
+        times = np.maximum.accumulate(np.maximum(times, groups.first[:, None]), axis=1)
+        return times, values
 
     def _taken(self, pull: Pull) -> Pull:
         return pull if self._minus is None else less(pull, self._minus)
@@ -173,6 +180,11 @@ class ChartedRun:
         for k, name in enumerate(names):
             out[:, k] = self._columns[name].of(rows)
         return out
+
+
+def _ranks(ascending: np.ndarray) -> np.ndarray:
+    """Return of each value how many equal ones lie before it."""
+    return np.arange(ascending.size) - np.searchsorted(ascending, ascending)
 
 
 def _mixed(index: np.ndarray) -> np.ndarray:
