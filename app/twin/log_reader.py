@@ -13,7 +13,7 @@ from estimators.errors import ConfigError, SourceError
 from estimators.fold import Fold
 from estimators.late import inflated
 from estimators.log import TRUTH, Log
-from sources.source import NEVER, TRUNCATED, WRONG_TIME, is_endless
+from sources.source import LOST_FRAMES, NEVER, TRUNCATED, WRONG_TIME, is_endless
 from sources.tables.order import REMARKS as ORDER
 
 from ..ingest import CLOCK_MOVED, Ingest
@@ -25,8 +25,8 @@ if TYPE_CHECKING:
 
 REMARKS = (*ORDER, NEVER, TRUNCATED, CLOCK_MOVED)
 
-ONCE_PRINTED_KEYS = (WRONG_TIME,)
-"""Warnings printed once, since there may be one per row."""
+ONCE_PRINTED_KEYS = (WRONG_TIME, LOST_FRAMES)
+"""Warnings printed once, since there may be one per row, or one with another share every few seconds."""
 
 
 def remarking(report: Callable[[str, str], None]) -> Callable[[str, str], None]:

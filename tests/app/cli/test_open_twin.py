@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 
 from app.cli.open_twin import opened_twin, recorded_twin
-from app.twin.log_reader import read_log
+from app.twin.log_reader import read_log, remarking
 from app.twin.twin import load_twin
 from app.views.recording.reader import read_recording
 from app.views.recording.writer import write_recording
 from config.loader import load
 from estimators.diagnostics.episodes import episodes
 from estimators.errors import ConfigError
-from sources.source import controls_of
+from sources.source import LOST_FRAMES, controls_of
 from tests.support import assert_same, folded
 
 TWIN = (
@@ -93,3 +93,13 @@ def test_a_review_judges_as_the_run_did(overrides, tmp_path):
     if overrides or twin.tuning.baseline is not None:
         bare = load_twin(yaml, overrides={"commissioned": "{}"} if not overrides else {})
         assert judged(bare, log)[1] != told
+
+
+def test_the_terminal_states_lost_frames_once(capsys):
+    reported = []
+    report = remarking(lambda key, text: reported.append(text))
+    for share in ("78 %", "79 %"):
+        report(LOST_FRAMES, f"{share} of frames dropped by the socket")
+    said = capsys.readouterr().err
+    assert "78 % of frames dropped" in said and "79 %" not in said
+    assert len(reported) == 2
