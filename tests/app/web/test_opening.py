@@ -40,8 +40,8 @@ def taken():
 
 @pytest.mark.parametrize("command", ["run", "review"])
 def test_a_port_in_use_is_reported_before_anything_is_compiled(command, taken, monkeypatch, capsys):
-    for name in ("begin_to_compile", "read_recording"):
-        monkeypatch.setattr(app.cli.open_twin, name, lambda *_: pytest.fail("it went on"))
+    for place in ("app.cli.open_twin.begin_to_compile", "app.views.recording.reader.read_recording"):
+        monkeypatch.setattr(place, lambda *_: pytest.fail("it went on"))
     assert main([command, "motor_winding", "--port", str(taken), "--no-browser"]) == 2
     assert re.fullmatch(rf"nisus: port {taken}: .* in use; .*--port\n", capsys.readouterr().err)
 

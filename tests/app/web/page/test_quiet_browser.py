@@ -132,7 +132,8 @@ def test_all_of_q_is_one_command_one_revision_and_one_undo(page, session):
     page.locator("#redo").click()
     wait_for(lambda: engine.revisions.runs[-1].number == first + 3 and not engine.status().refolding, PATIENCE)
     assert engine.tuning.q[0] == pytest.approx(10 * before.q[0], rel=1e-5)
-    assert page.locator("#undo").is_enabled() and page.locator("#redo").is_disabled()
+    # What can be undone comes with the status.
+    wait_for(lambda: page.locator("#undo").is_enabled() and page.locator("#redo").is_disabled(), PATIENCE)
 
 
 def test_what_became_of_the_readings_is_told(page, session):

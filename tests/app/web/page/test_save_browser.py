@@ -91,7 +91,7 @@ def test_a_chart_as_svg_is_what_the_engine_says(page, session, tmp_path):
 def test_a_picture_is_as_large_as_it_says_and_light(page, tmp_path):
     from PIL import Image
 
-    path = saved(page, "Save the chart of NIS", "PNG", tmp_path)
+    path = saved(page, "Save the chart of NIS / dof", "PNG", tmp_path)
     picture = Image.open(path).convert("RGB")
     assert picture.size == (1920, 660) and picture.getpixel((3, 3)) == (255, 255, 255)
     assert np.sum(np.abs(np.asarray(picture).astype(int) - (11, 98, 196)).sum(axis=2) < 30) > 300
