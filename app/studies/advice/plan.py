@@ -174,7 +174,9 @@ def _role(
         driven_by = [item.name for item in states if name in item.inputs]
         reason = f"drives {', '.join(driven_by)}" if driven_by else "given as an input; no state was found to follow it"
         return SignalRole(one, INPUT, name, reason)
-    state = next(item for item in states if name in [reads.name for reads in item.sensors])
+    state = next((item for item in states if name in [reads.name for reads in item.sensors]), None)
+    if state is None:
+        return SignalRole(one, OMITTED, "", "measures the same quantity as an input")
     rate = next(reads.rate for reads in state.sensors if reads.name == name)
     reason = f"measures {'the rate of ' if rate else ''}{state.name}"
     return SignalRole(one, HELD_OUT if name in held_out else SENSOR, name, reason)
