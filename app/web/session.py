@@ -249,9 +249,10 @@ class Session:
         opening: BrowserPage | None = None
         previous = when_asked_to_end(done.set)
         try:
-            self.start()
             if record is not None:
+                # Before the first event: commands wait for the fold, and a fold may never return.
                 self.engine.submit(Record(record))
+            self.start()
             if self.url is not None:
                 shown = "the gallery" if self.running is None else self.engine.twin.name
                 print(f"Nisus shows {shown} at\n\n    {self.url}\n\nCtrl-C ends it.", flush=True)
