@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -73,8 +74,15 @@ def difference(estimator: str, tuning: Tuning, other_estimator: str, other: Tuni
     return (*found, *(change for key in GATE_KEYS for change in entry(key)))
 
 
-def in_words(changes: Sequence[SettingChange], most: int = 3) -> str:
-    """Return the first changes in one line: Q.winding 0.01 → 0.1, ekf → ukf, yoke held out."""
+def units_of(estimator: str, tuning: Tuning) -> dict[str, str]:
+    """Return the unit of each entry of a tuning and each option of its estimator, for `in_words`."""
+    units = {item.key: item.unit for item in tuning.items()}
+    units |= {f"options.{option.name}": option.unit for option in ESTIMATORS[estimator].options}
+    return {key: unit for key, unit in units.items() if unit not in ("", "1")}
+
+
+def in_words(changes: Sequence[SettingChange], most: int = 3, units: Mapping[str, str] = MappingProxyType({})) -> str:
+    """Return the first changes in one line: Q.winding 0.01 → 0.1 °C²/s, ekf → ukf, yoke held out."""
 
     def words(change: SettingChange) -> str:
         key, none = change.key, "never" if change.key == "gate.reopen" else "off"
@@ -84,7 +92,8 @@ def in_words(changes: Sequence[SettingChange], most: int = 3) -> str:
             none if value is None else f"{value:.6g}" if isinstance(value, float) else str(value)
             for value in (change.before, change.after)
         )
-        return f"{'' if key == 'estimator' else key.removeprefix('options.') + ' '}{before} → {after}"
+        name = "" if key == "estimator" else f"{key.removeprefix('options.')} "
+        return f"{name}{before} → {after} {units.get(key, '')}".rstrip()
 
     more = f" and {len(changes) - most} more" if len(changes) > most else ""
     return ", ".join(map(words, changes[:most])) + more

@@ -15,7 +15,7 @@ from estimators.diagnostics.episodes import Episode
 from estimators.errors import ConfigError, printable
 from estimators.tuning import Tuning
 
-from .changes import SettingChange, difference, in_words
+from .changes import SettingChange, difference, in_words, units_of
 from .outputs import Pull
 
 MAX_PINNED = 4
@@ -81,7 +81,7 @@ class SettingsEdit:
     @cached_property
     def words(self) -> str:
         """The change in words."""
-        return in_words(difference(*self.before, *self.after))
+        return in_words(difference(*self.before, *self.after), units=units_of(*self.after))
 
 
 class EditHistory:

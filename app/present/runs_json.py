@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from estimators.registry import ESTIMATORS
 
-from ..live.changes import SettingChange, in_words
+from ..live.changes import SettingChange, in_words, units_of
 from ..live.revisions import Revision
 from ..live.running_fold import Running
 from ..live.runs.scores import RunScore, RunScores
@@ -29,7 +29,7 @@ def runs_json(scores: RunScores, engine: Running) -> list[dict[str, Any]]:
     for run, known in found:
         running = run is found[-1][0]
         kept = running or run.track is not None
-        names = ("number", "estimator", "began", "loaded", "name", "note", "place")
+        names = ("number", "estimator", "began", "first", "loaded", "name", "note", "place")
         runs.append(
             {name: getattr(run, name) for name in names}
             | {
@@ -38,7 +38,7 @@ def runs_json(scores: RunScores, engine: Running) -> list[dict[str, Any]]:
                 "running": running,
                 "kept": kept,
                 "score": None if known is None else _score(known, units),
-                "unscored": "" if known else "no readings yet" if kept else "not scored: its track is gone",
+                "unscored": "" if known else "no measurements yet" if kept else "not scored: its track is gone",
             }
         )
     return runs
@@ -65,8 +65,9 @@ def _score(known: RunScore, units: dict[str, str]) -> dict[str, Any]:
 
 def what_changed(run: Revision) -> str:
     """Describe the changes of a run in words."""
-    said = ": ".join(part for part in (run.why, in_words(run.changes)) if part)
-    words = said or ("as it began" if run.loaded is None and not run.number else "as before")
+    changes = in_words(run.changes, units=units_of(run.estimator, run.tuning))
+    said = ": ".join(part for part in (run.why, changes) if part)
+    words = said or ("as it began" if run.first and run.loaded is None else "as before")
     return words if run.loaded is None else f"back to run {run.loaded}: {words}"
 
 

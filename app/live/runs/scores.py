@@ -1,4 +1,4 @@
-"""Scores of revisions, computed on request and never on the engine's thread."""
+"""Scores of revisions, computed in jobs and on request, never on the engine's thread."""
 
 from __future__ import annotations
 
@@ -47,7 +47,10 @@ class RunScore:
 
 
 class RunScores:
-    """Scores of all revisions of a twin, each computed once; that of the running one again as it grows."""
+    """Scores of all revisions of a twin, each computed once; that of the running one again as it grows.
+
+    A revision that ends is scored in a job, before its track is dropped, whether or not a client asks.
+    """
 
     def __init__(self, engine: Running) -> None:
         self._engine = engine
@@ -55,16 +58,32 @@ class RunScores:
         self._known: dict[int, RunScore] = {}
         self._final: set[int] = set()
         self._fresh_until = (-1, 0.0)
+        self._ended: dict[int, Revision] = {}
+        engine.revisions.watchers.add(self._changed)
+        self._changed()
+
+    def _changed(self) -> None:
+        """Queue the newest revision that has ended; in the engine's thread, which waits for no score."""
+        runs = self._engine.revisions.runs
+        run = runs[-2] if len(runs) > 1 else runs[-1]
+        if run.track is not None and run.number not in self._final and run.number not in self._ended:
+            self._ended[run.number] = run
+            self._engine.jobs.run("scores", lambda job: self._score_ended())
+
+    def _score_ended(self) -> None:
+        with self._lock:
+            while self._ended:
+                _, run = self._ended.popitem()
+                assert run.track is not None
+                self._known[run.number] = self._scored(run, run.track)
+                self._final.add(run.number)
 
     def all(self) -> list[tuple[Revision, RunScore | None]]:
-        """Return every revision with its score; None if its track was dropped before the first request."""
+        """Return every revision with its score; None without rows."""
+        self._score_ended()
         with self._lock:
             runs = self._engine.revisions.runs
-            *left, running = runs
-            for run in left:
-                if run.track is not None and run.number not in self._final:
-                    self._known[run.number] = self._scored(run, run.track)
-                    self._final.add(run.number)
+            *_, running = runs
             self._look(running)
             numbers = {run.number for run in runs}
             self._known = {number: known for number, known in self._known.items() if number in numbers}

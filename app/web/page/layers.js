@@ -3,7 +3,7 @@
 
 import { Chart } from "./chart.js";
 import { aboutMean, unbroken } from "./drawing.js";
-import { element, setText } from "./dom.js";
+import { $, element, setText } from "./dom.js";
 import { bracketed, compact } from "./format.js";
 import { Range, extent, within } from "./ranges.js";
 import { Stream } from "./stream.js";
@@ -148,6 +148,9 @@ export class Pins {
           element("button", { type: "button", title: `Unpin run ${pin.number}`, "aria-label": `Unpin run ${pin.number}`, onclick: () => this.link.ask("Unpin", { number: pin.number }) }, "×")),
       ),
     );
+    // First in the legend of the charts, where the last entries give way.
+    $("legend").querySelectorAll(".pinned").forEach((item) => item.remove());
+    $("legend").prepend(...this.pinned.filter((pin) => !pin.running).map((pin) => element("li", { class: "pinned" }, swatch(pin.place), `run ${pin.number}${pin.name ? `: ${pin.name}` : ""}`)));
     this.chart.node.hidden = !this.pinned.length;
     if (this.pinned.length && !this.chart.plot) {
       this.chart.span = this.charts.range;

@@ -86,7 +86,7 @@ const middle = new Tabs($("middle-tabs"), null, (shown) => {
 });
 window.nisus.panes = panes;
 const saving = new Save(model, link, view, charts);
-charts.saving = panes.whatif.saving = window.nisus.saving = saving;
+charts.saving = runs.saving = panes.whatif.saving = window.nisus.saving = saving;
 $("save").addEventListener("click", () => saving.run($("save")));
 $("copy-link").addEventListener("click", () => saving.copyLink());
 saving.said = (text) => {

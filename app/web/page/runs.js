@@ -1,14 +1,13 @@
-// Every revision with its change and its scores. Pinned ones stay on the charts; any can be named,
-// noted, loaded, saved as YAML, and compared with another.
+// A table of all runs, newest first: filter, scores and change of each. Pinned ones stay on the charts; the menu of a row
+// has everything else.
 
 import { element, setText } from "./dom.js";
-import { compact, spaced, span } from "./format.js";
+import { bracketed, compact, spaced, span } from "./format.js";
 import { swatch } from "./layers.js";
 import { gone } from "./save.js";
 
 const RUNS_POLL_MS = 300; // ms between two looks at whether there is something new
 const AGAIN = 5000; // ms between two looks at the scores while the log grows
-const COVERED = 0.95; // share of errors that their 95 % band should hold
 const BEYOND = { above: " ▲", below: " ▼" }; // of a mean NIS outside its bounds
 const ALIKE = 0.8; // share of the longest time from which on scores can be compared
 
@@ -34,6 +33,7 @@ export class Runs {
     const key = `${status.runs.version}/${status.revision}/${status.refolding}`;
     if (key === this.key && (status.finished || performance.now() - this.when < AGAIN)) return;
     if (this.node.contains(document.activeElement) && document.activeElement.matches("input, textarea")) return;
+    if (this.noted !== null || document.querySelector("#save-menu:popover-open")) return;
     this.asking = true;
     const answer = await fetch("/api/runs").catch(() => null);
     this.asking = false;
@@ -60,7 +60,7 @@ export class Runs {
   show() {
     const focused = this.node.contains(document.activeElement) ? document.activeElement.dataset.focus : null;
     const subjects = [...new Map(this.runs.flatMap((run) => run.score?.fits ?? []).map((fit) => [fit.name, fit])).values()];
-    if (!subjects.some((fit) => fit.name === this.subject)) this.subject = subjects.at(-1)?.name ?? null;
+    if (!subjects.some((fit) => fit.name === this.subject)) this.subject = (subjects.findLast((fit) => fit.against === "truth") ?? subjects.at(-1))?.name ?? null;
     const best = bests(this.runs, this.subject);
     this.table.replaceChildren(this.head(subjects), ...[...this.runs].reverse().map((run) => this.run(run, best)));
     if (focused) this.table.querySelector(`[data-focus="${focused}"]`)?.focus();
@@ -69,16 +69,17 @@ export class Runs {
 
   head(subjects) {
     const select = subjects.length
-      ? element("select", { "aria-label": "State of the RMSE", dataset: { focus: "subject" }, onchange: () => ((this.subject = select.value), this.show()) },
+      ? element("select", { "aria-label": "State or sensor of the error", dataset: { focus: "subject" }, onchange: () => ((this.subject = select.value), this.show()) },
           ...subjects.map((fit) => element("option", { value: fit.name, selected: fit.name === this.subject }, `${fit.name}${fit.against === "truth" ? "" : " (held out)"}`)))
       : null;
+    const unit = bracketed(subjects.find((fit) => fit.name === this.subject)?.unit);
     const cell = (title, ...text) => element("th", { scope: "col", title }, ...text);
     return element("thead", {}, element("tr", {},
-      cell("Mean NIS per degree of freedom of used measurements (▲ above, ▼ below its 95 % bounds; bold: nearest to the bounds' middle)", "NIS / dof"),
-      cell("Root mean square error against the truth, or of predictions of a held-out sensor", "RMSE ", select ?? "–"),
-      cell("Share of errors inside their 95 % band", "in 95 %"),
+      cell("Run; its circle pins it to the charts", "run"), cell("Estimator", "filter"),
+      cell("Mean NIS per degree of freedom of used measurements: 1 is consistent (▲ above, ▼ below its 95 % bounds)", "NIS / dof"),
+      cell("Root mean square error against the truth, or of predictions of a held-out sensor", `error ${unit}`.trim(), select),
       cell("Log-likelihood per measurement, with a penalty for rejected ones", "log L"),
-      cell("Time per event, µs", "µs/step")));
+      cell("Computing time per event", "time [µs]"), element("th", { "aria-label": "Menu" })));
   }
 
   run(run, best) {
@@ -86,69 +87,63 @@ export class Runs {
     const fit = score?.fits.find((item) => item.name === this.subject);
     const cell = (key, text, title) => element("td", { class: best[key] === number ? "best" : null, title: best[key] === number ? `Best. ${title ?? ""}` : title }, text);
     const scores = score
-      ? element("tr", { class: "scores" },
+      ? [
           cell("nis", `${compact(score.nis / score.nis_dof, 3)}${BEYOND[score.nis_place] ?? ""}`, `Of the whole run: ${score.nis_words}; ${score.readings} measurements in ${span(score.seconds)}, ${compact(100 * (score.refused ?? 0), 2)} % rejected`),
-          cell("rmse", fit ? compact(fit.rmse, 3) : "–", fit ? `${fit.name}, ${fit.against}: mean error ${compact(fit.bias, 2)}${spaced(fit.unit)}` : "Needs a known truth or a held-out sensor"),
-          cell("coverage", fit ? `${compact(100 * fit.coverage, 3)} %` : "–"),
-          cell("likelihood", compact(score.log_likelihood_reading, 4), `In all ${compact(score.log_likelihood, 6)}`),
-          cell("step", compact(score.step_us, 3)))
-      : element("tr", { class: "scores" }, element("td", { colspan: 5 }, run.unscored));
-    return element("tbody", { dataset: { number, running: run.running } },
-      element("tr", { class: "title" }, element("th", { scope: "rowgroup", colspan: 5 }, element("div", {}, this.pin(run), ...this.names(run), element("span", { class: "does" }, ...this.buttons(run))))),
-      element("tr", { class: "what" }, element("td", { colspan: 5, title: `${run.title}; since ${new Date(1000 * run.began).toLocaleTimeString()}` }, run.what, score ? element("span", { class: "over" }, `over ${span(score.seconds)}`) : null)),
-      this.noted === number || run.note ? this.note(run) : null,
-      scores);
+          cell("rmse", fit ? compact(fit.rmse, 3) : "–", fit ? `${fit.name}, ${fit.against}: mean error ${compact(fit.bias, 2)}${spaced(fit.unit)}, ${compact(100 * fit.coverage, 3)} % inside the 95 % band` : "Needs a known truth or a held-out sensor"),
+          cell("likelihood", compact(score.log_likelihood_reading, 3), `In all ${compact(score.log_likelihood, 6)}`),
+          cell("step", compact(score.step_us, 3)),
+        ]
+      : [element("td", { colspan: 4, class: "faint" }, run.unscored)];
+    const menu = element("button", { type: "button", class: "menu-button", title: `Menu of run ${number}`, "aria-label": `Menu of run ${number}`, "aria-haspopup": "menu", dataset: { focus: `menu${number}` }, onclick: () => this.saving.open(menu, this.items(run)) }, "⋯");
+    const what = [run.name ? element("b", {}, run.name) : null, element("span", {}, run.what), score ? element("span", { class: "over" }, `over ${span(score.seconds)}`) : null];
+    return element("tbody", { dataset: { number, running: run.running, first: run.first } },
+      element("tr", { class: "scores" },
+        element("th", { scope: "row", title: run.running ? "Running" : `Since ${new Date(1000 * run.began).toLocaleTimeString()}` }, element("div", {}, this.pin(run), `${number}${run.running ? " ▸" : ""}`)),
+        element("td", { title: run.title }, run.estimator), ...scores, element("td", {}, menu)),
+      element("tr", { class: "what" }, element("td", { colspan: 7 }, ...what)),
+      this.noted === number ? element("tr", { class: "note" }, element("td", { colspan: 7 }, this.form(run))) : run.note ? element("tr", { class: "note" }, element("td", { colspan: 7 }, run.note)) : null);
   }
 
   pin(run) {
     const pinned = run.place !== null;
-    const title = pinned ? "Unpin" : run.kept ? "Pin to the charts" : "Load it first: its track is gone";
     return element("button", {
-      type: "button", class: "pin", "aria-pressed": String(pinned), "aria-label": `Pin run ${run.number}`, title, disabled: !run.kept && !pinned,
+      type: "button", class: "pin", "aria-pressed": String(pinned), "aria-label": `Pin run ${run.number}`, title: pinned ? "Take off the charts" : "Show on the charts",
       dataset: { focus: `pin${run.number}` }, onclick: () => this.ask(pinned ? "Unpin" : "Pin", { number: run.number }),
     }, pinned ? swatch(run.place) : "○");
   }
 
-  names(run) {
-    const keep = () => this.ask("Note", { number: run.number, name: name.value, note: run.note });
-    const name = element("input", {
-      type: "text", class: "name", value: run.name, placeholder: run.estimator, maxlength: 60, "aria-label": `Name of run ${run.number}`,
-      onchange: keep, onkeydown: (event) => event.key === "Enter" && name.blur(),
-    });
-    return [element("b", { title: run.running ? "Running" : null }, run.running ? `${run.number} ▸` : String(run.number)), name];
-  }
-
-  buttons(run) {
+  // Entries of the menu: [text, title, click, reason why not].
+  items(run) {
     const { number } = run;
-    const button = (text, title, click, attributes = {}) => element("button", { type: "button", title, "aria-label": `${title}: run ${number}`, dataset: { focus: `${text}${number}` }, onclick: click, ...attributes }, text);
-    const choose = () => {
-      this.chosen = this.chosen.includes(number) ? this.chosen.filter((item) => item !== number) : [...this.chosen, number].slice(-2);
-      this.show();
-    };
+    const lost = run.kept ? null : gone(number);
+    const fetched = (address) => element("a", { href: address, download: "" }).click();
+    const others = this.runs.filter((other) => other.number !== number);
+    const other = others.find((item) => item.running) ?? others.at(-1);
+    const compare = () => ((this.chosen = other ? [other.number, number] : []), this.show());
+    const note = () => ((this.noted = number), this.show(), this.table.querySelector(`tbody[data-number="${number}"] .note input`)?.focus());
     return [
-      run.running ? null : button("load", "Load this filter and tuning", () => this.ask("Load", { number })),
-      button("note", "Write a note", () => ((this.noted = this.noted === number ? null : number), this.show(), this.table.querySelector(`tbody[data-number="${number}"] textarea`)?.focus())),
-      button("⇄", "Compare with another run", choose, { "aria-pressed": String(this.chosen.includes(number)) }),
-      this.download(run, "report", `/api/report.html?run=${number}`, "Save a report: scores, charts, checks, episodes and tuning in one file", `Save a report of run ${number}`),
-      this.download(run, "csv", `/api/track.csv?run=${number}`, "Save the track as CSV", `Save the track of run ${number}`),
-      button("keep", run.name ? `Keep as version ${run.name}, beside the twin` : "Keep as a version beside the twin, under the run's name: give it one", () => this.versions.keep(run), { disabled: !run.name }),
-      element("a", { href: `/api/runs/${number}.yaml`, download: "", title: "Save the tuning as YAML", "aria-label": `Save run ${number} as YAML` }, "yaml"),
+      ["Load", "Fold the history again with this filter and tuning", () => this.ask("Load", { number }), run.running ? "it is running" : null],
+      ["Name and note", "Name this run, and write a note", note],
+      [other ? `Compare with run ${other.number}` : "Compare", "List the entries in which two runs differ", compare, other ? null : "there is no other run"],
+      ["Report: HTML", "Scores, charts, episodes and tuning in one file", () => fetched(`/api/report.html?run=${number}`), lost],
+      ["Track: CSV", "One line per event", () => fetched(`/api/track.csv?run=${number}`), lost],
+      ["Tuning: YAML", "The twin's file with this tuning", () => fetched(`/api/runs/${number}.yaml`)],
+      ["Keep as a version", "Save beside the twin, under the run's name", () => this.versions.keep(run), run.name ? null : "give it a name first"],
     ];
   }
 
-  // Of a run whose track is gone there is nothing to save, and it says why.
-  download(run, text, href, title, label) {
-    if (run.kept) return element("a", { href, download: "", title, "aria-label": label }, text);
-    return element("button", { type: "button", class: "gone", disabled: true, title: gone(run.number), "aria-label": `${label}: ${gone(run.number)}` }, text);
-  }
-
-  note(run) {
-    const text = element("textarea", {
-      rows: 2, maxlength: 2000, "aria-label": `Note on run ${run.number}`, placeholder: "Note",
-      onchange: () => ((this.noted = null), this.ask("Note", { number: run.number, name: run.name, note: text.value })),
-    });
-    text.value = run.note;
-    return element("tr", { class: "note" }, element("td", { colspan: 5 }, text));
+  form(run) {
+    const name = element("input", { type: "text", value: run.name, placeholder: "name", maxlength: 60, "aria-label": `Name of run ${run.number}` });
+    const note = element("textarea", { rows: 2, maxlength: 2000, "aria-label": `Note on run ${run.number}`, placeholder: "note" });
+    note.value = run.note;
+    const done = () => {
+      this.noted = null;
+      this.ask("Note", { number: run.number, name: name.value, note: note.value });
+      this.show();
+    };
+    const cancel = () => ((this.noted = null), this.show());
+    return element("form", { onsubmit: (event) => (event.preventDefault(), done()), onkeydown: (event) => event.key === "Escape" && cancel() },
+      name, note, element("button", { type: "submit", class: "go" }, "Save"), element("button", { type: "button", onclick: cancel }, "Cancel"));
   }
 
   // The entries in which two differ.
@@ -182,7 +177,6 @@ function bests(runs, subject) {
   return {
     nis: least((score) => score.nis_judged > 0 && Math.abs(Math.log(score.nis_judged / Math.sqrt(score.nis_low * score.nis_high)))),
     rmse: least((score, fit) => fit?.rmse),
-    coverage: least((score, fit) => fit && Math.abs(fit.coverage - COVERED)),
     likelihood: least((score) => (score.log_likelihood_reading === null ? NaN : -score.log_likelihood_reading)),
     step: least((score) => score.step_us ?? NaN),
   };
@@ -202,7 +196,7 @@ class Versions {
     const keep = element("button", { type: "submit", class: "go", title: "Save the running tuning as a version" }, "keep");
     this.form = element("form", { onsubmit: (event) => (event.preventDefault(), this.keepRunning()) }, this.name, this.note, keep);
     this.guard = element("p", { class: "guard faint", hidden: true });
-    this.node = element("details", { class: "versions", open: true }, element("summary", { title: "Named filters and tunings, saved beside the twin" }, "Tuning versions"), this.table, this.guard, this.form, this.error);
+    this.node = element("details", { class: "versions" }, element("summary", { title: "Named filters and tunings, saved beside the twin" }, "Tuning versions"), this.table, this.guard, this.form, this.error);
   }
 
   // While the tab is shown; the focus stays where it is.
@@ -210,6 +204,9 @@ class Versions {
     const answer = await fetch("/api/tunings").catch(() => null);
     if (!answer?.ok) return;
     const { running, versions, guard } = await answer.json();
+    // Open from the start if there is something to choose.
+    if (this.listed === undefined) this.node.open = versions.length > 1 || guard.some((each) => each.failure || each.worse.length);
+    this.listed = versions.length;
     this.guard.hidden = !guard.length;
     this.guard.replaceChildren(...guard.map((each) => guarded(each, versions)));
     const differ = this.compared && (await this.difference(this.compared));

@@ -106,7 +106,7 @@ def test_edits_are_taken_back_and_made_again(told):
     edits.add(("kf", FIRST), values[0])
     for before, after in zip(values, values[1:3], strict=False):
         edits.add(before, after, "drag")
-    assert edits.done[-1].words == "Q.rate 0.1 → 0.3"
+    assert edits.done[-1].words == "Q.rate 0.1 → 0.3 °C²/s³"
     assert edits.step(again=False) is values[0] and edits.step(again=True) is values[2]
     assert [edits.step(again=False) for _ in range(2)] == [values[0], ("kf", FIRST)]
     edits.add(("kf", FIRST), values[3])

@@ -16,6 +16,7 @@ from estimators.tuning import Tuning
 from tests.app.scripted import MODEL, wait_for
 
 FIRST = Tuning.of(MODEL)
+UNIT = next(item.unit for item in FIRST.items() if item.key == "Q.rate")
 
 
 @pytest.fixture
@@ -28,10 +29,14 @@ def test_runs_are_listed_with_what_changed_and_scores(page):
     page.command("SetEstimator", name="ukf")
     listed = page.get("/api/runs")
     assert [run["number"] for run in listed] == [0, 1, 2]
-    assert [run["what"] for run in listed] == ["as it began", f"Q.rate {FIRST.get('Q.rate'):.6g} → 0.5", "kf → ukf"]
+    assert [run["what"] for run in listed] == [
+        "as it began",
+        f"Q.rate {FIRST.get('Q.rate'):.6g} → 0.5 {UNIT}",
+        "kf → ukf",
+    ]
     assert [run["running"] for run in listed] == [False, False, True]
-    assert listed[0]["score"] is None and listed[0]["unscored"] == "not scored: its track is gone"
-    for run in listed[1:]:
+    assert [run["kept"] for run in listed] == [False, True, True] and listed[0]["first"]
+    for run in listed:
         assert run["score"]["readings"] == 300
         assert run["score"]["log_likelihood_reading"] == pytest.approx(run["score"]["log_likelihood"] / 300)
     # On a linear model both filters are the same.
@@ -67,11 +72,11 @@ def test_edits_of_a_gesture_are_one_run_and_one_undo_for_every_browser(page):
     began = FIRST.get("Q.rate")
     for value in (0.2, 0.3, 0.4):
         assert page.command("SetTuning", key="Q.rate", value=value, gesture="a drag") is None
-    assert [run["what"] for run in page.get("/api/runs")] == ["as it began", f"Q.rate {began:.6g} → 0.4"]
-    assert page.get("/api/status")["edits"] == {"undo": f"Q.rate {began:.6g} → 0.4", "redo": None}
+    assert [run["what"] for run in page.get("/api/runs")] == ["as it began", f"Q.rate {began:.6g} → 0.4 {UNIT}"]
+    assert page.get("/api/status")["edits"] == {"undo": f"Q.rate {began:.6g} → 0.4 {UNIT}", "redo": None}
     assert page.command("Undo") is None
     wait_for(lambda: page.engine.status().tuning.get("Q.rate") == began)
-    assert page.get("/api/status")["edits"] == {"undo": None, "redo": f"Q.rate {began:.6g} → 0.4"}
+    assert page.get("/api/status")["edits"] == {"undo": None, "redo": f"Q.rate {began:.6g} → 0.4 {UNIT}"}
     assert page.command("Undo") == "Undo: there is no edit to take back"
     assert page.command("Redo") is None
     wait_for(lambda: page.engine.status().tuning.get("Q.rate") == 0.4)
@@ -113,7 +118,7 @@ def test_an_edit_of_a_drag_keeps_the_first_to_compare_with(page):
         page.engine.submit(SetTuning("Q.rate", float(value)))
     wait_for(lambda: page.engine.revisions.version > before and not page.engine.status().refolding)
     listed = page.get("/api/runs")
-    assert [run["what"] for run in listed] == ["as it began", f"Q.rate {FIRST.get('Q.rate'):.6g} → 1"]
+    assert [run["what"] for run in listed] == ["as it began", f"Q.rate {FIRST.get('Q.rate'):.6g} → 1 {UNIT}"]
     assert listed[0]["kept"] and listed[0]["score"] is not None
 
 

@@ -39,6 +39,19 @@ def test_scores_are_those_of_a_refold():
         assert known.step_us > 0.0
 
 
+def test_every_run_is_scored_though_nobody_asked_before_its_track_was_dropped():
+    twin = Stepped(300)
+    scores = RunScores(twin.engine)
+    for value in (0.05, 0.1, 0.2):
+        twin.submit(commands.SetTuning("Q.rate", value))
+    found = scores.all()
+    assert [run.track is None for run, _ in found] == [True, True, False, True]
+    for (run, known), value in zip(found, (FIRST.get("Q.rate"), 0.05, 0.1, 0.2), strict=True):
+        track, _ = by_hand("kf", FIRST.set("Q.rate", value), 300)
+        assert run.first is (value == FIRST.get("Q.rate"))
+        assert known.score.nis == pytest.approx(track.nis[track.verdict == USED].mean(), rel=1e-9)
+
+
 def test_a_sensor_held_out_is_scored_by_its_predictions():
     twin = Stepped(300)
     twin.submit(commands.UseSensor("winding", False))

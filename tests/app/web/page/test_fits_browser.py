@@ -59,7 +59,7 @@ def test_nothing_is_wider_than_its_column(name, visit):
                 page.get_by_role("tab", name=tab, exact=True).click()
                 if tab == "Runs":
                     wait_for(
-                        lambda: page.locator(".runs .title").count() == len(session.engine.revisions.runs), PATIENCE
+                        lambda: page.locator(".runs .scores").count() == len(session.engine.revisions.runs), PATIENCE
                     )
                 if tab in FILLED:
                     until(page, FILLED[tab])

@@ -36,6 +36,8 @@ def test_pin_overlay_and_unpin(page, session):
     wait_for(lambda: engine.revisions.find(first).pinned, PATIENCE)
     wait_for(lambda: coloured(page, "#charts") == 0, PATIENCE)
 
+    page.get_by_role("button", name=f"Menu of run {first}", exact=True).click()
+    page.get_by_role("menuitem", name="Name and note").click()
     name = page.get_by_role("textbox", name=f"Name of run {first}")
     name.fill("as it was")
     name.press("Enter")
@@ -55,10 +57,14 @@ def test_pin_overlay_and_unpin(page, session):
     difference.filter(has_text=re.compile(r"\d")).wait_for()
     wait_for(lambda: float(difference.inner_text()) == pytest.approx(kept - now, rel=0.05), PATIENCE)
 
-    # The table has a score for both, and marks the better one.
+    # The table has a score for both, and marks the better one; the change has its values and their unit.
     row = page.locator(f'tbody[data-number="{first}"]')
-    wait_for(lambda: row.locator(".scores td").count() == 5, PATIENCE)
+    wait_for(lambda: row.locator(".scores td").count() == 6, PATIENCE)
     page.locator(".runs .best").first.wait_for()
+    changed = page.locator(f'tbody[data-number="{first + 1}"] .what').inner_text()
+    unit = next(item.unit for item in engine.tuning.items() if item.key == "Q.temperature")
+    assert changed.startswith(f"Q.temperature 0.01 → 100 {unit}")
+    assert page.locator("#legend li").first.inner_text() == f"run {first}: as it was"
 
     # B goes back to it, and B again to the other.
     page.locator("body").press("b")
