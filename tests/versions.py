@@ -18,7 +18,7 @@ ROOT = Path(__file__).resolve().parent.parent
 MINORS = range(11, 15)
 """Of Python 3, that are looked for."""
 
-SECONDS = 900
+SECONDS = 1800
 """That one of the two may take at most."""
 
 FOLDERS = ("config", "sources")
