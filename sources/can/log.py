@@ -94,7 +94,7 @@ class CanLog:
         count = self.frames - before
         if fault or not count:
             fault = fault or "it holds none"
-            self._report(TRUNCATED, f"{path.name}: the file is damaged after {count} frames ({fault})")
+            self._report(TRUNCATED, f"{path.name}: the file is damaged ({fault}); {count} frames were read")
 
     def read(self, timeout: float) -> Events | None:
         """Return the events of the next frames; none if none come within `timeout` seconds; None at the end."""

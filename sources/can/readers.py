@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import logging
 import os
+import re
 import sqlite3
+import struct
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import suppress
+from io import TextIOWrapper
 from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,6 +24,7 @@ from ..units import second_ns
 
 FIRST_CHUNK_FRAMES = 256  # Frames of the first chunk, so that it arrives at once
 MAX_TIME_S = 2.0**62 / 1e9  # Distance of a valid time from 1970, s
+MAX_BAD_LINES = 100  # Lines of a text log that cannot be read, one after the other, after which the rest is left
 
 
 def open_reader(path: Path) -> Any:
@@ -47,13 +52,19 @@ def read_messages(path: Path, wanted: frozenset[int] | None, longest: int) -> It
     Raises:
         SourceError: If nothing can be read.
     """
+    _correct_readers()
+    warned = _Warnings()
+    logging.getLogger("can").handlers = [warned]
     reader = open_reader(path)
+    lines = _Lines(reader.file) if isinstance(getattr(reader, "file", None), TextIOWrapper) else None
+    if lines is not None:
+        reader.file = lines
     seen: Counter[tuple[BusName, int]] = Counter()
     buses: dict[BusName, int] = {}
     count = errors = broken = 0
     fault = ""
     try:
-        messages = iter(reader)
+        messages = iter(reader) if lines is None else _by_lines(path, reader, lines)
         size = FIRST_CHUNK_FRAMES
         while True:
             chunk: list[Any] = []
@@ -61,6 +72,8 @@ def read_messages(path: Path, wanted: frozenset[int] | None, longest: int) -> It
                 # One by one, so that frames before the fault are kept.
                 for message in islice(messages, size):
                     chunk.append(message)
+            except SourceError:
+                raise
             except Exception as error:  # noqa: BLE001  as above
                 fault = " ".join(str(error).split())[:160] or type(error).__name__
             count += len(chunk)
@@ -71,7 +84,7 @@ def read_messages(path: Path, wanted: frozenset[int] | None, longest: int) -> It
             if fault or len(chunk) < size:
                 break
             size = CHUNK_FRAMES
-        fault = fault or _missing_end(path, reader)
+        fault = fault or (lines.fault if lines is not None else "") or warned.fault or _missing_end(path, reader)
         if broken:
             fault = fault or f"{broken} frames hold no numbers"
     finally:
@@ -81,6 +94,140 @@ def read_messages(path: Path, wanted: frozenset[int] | None, longest: int) -> It
     if fault and not count:
         raise unreadable(path, fault)
     yield LogSummary(dict(seen), errors, fault)
+
+
+def _correct_readers() -> None:
+    """Correct faults of python-can's readers, in this process.
+
+    Times before the start of a BLF log are negative, but are read as unsigned (hardbyte/python-can#2101). A CAN FD
+    frame of which a BLF log holds fewer bytes than it counts is filled with zeros, or with the next frame
+    (hardbyte/python-can#1905). Lines of an ASC log before its start are skipped (hardbyte/python-can#1595).
+    """
+    from can.io import asc, blf
+
+    blf.OBJ_HEADER_V1_STRUCT = struct.Struct("<LHHq")
+    blf.OBJ_HEADER_V2_STRUCT = struct.Struct("<LBxHq8x")
+    if isinstance(blf.CAN_FD_MSG_STRUCT, struct.Struct):
+        blf.CAN_FD_MSG_STRUCT = _StoredBytes(blf.CAN_FD_MSG_STRUCT, 20, 7, None)  # type: ignore[misc, assignment]
+        blf.CAN_FD_MSG_64_STRUCT = _StoredBytes(  # type: ignore[misc, assignment]
+            blf.CAN_FD_MSG_64_STRUCT, blf.CAN_FD_MSG_64_STRUCT.size, 2, 13
+        )
+    asc.ASC_MESSAGE_REGEX = re.compile(  # type: ignore[misc]
+        r"-?\d+\.\d+\s+(\d+\s+(\w+\s+(Tx|Rx)|ErrorFrame)|CANFD)", re.ASCII | re.IGNORECASE
+    )
+
+
+class _StoredBytes:
+    """Layout of a CAN FD object of a BLF log, whose count of bytes is limited to those that the object holds.
+
+    Args:
+        layout: python-can's own.
+        head: Bytes of the object between its header and the data.
+        count: Place of the count of bytes among the fields.
+        end: Place of the field that gives the end of the data; None if there is none, 0 is the end of the object.
+    """
+
+    def __init__(self, layout: struct.Struct, head: int, count: int, end: int | None) -> None:
+        self.size, self.pack = layout.size, layout.pack
+        self._layout, self._head, self._count, self._end = layout, head, count, end
+
+    def unpack_from(self, data: bytes, at: int) -> tuple[Any, ...]:
+        """Return the fields of an object whose header ends at a place."""
+        fields = list(self._layout.unpack(data[at : at + self.size].ljust(self.size, b"\0")))
+        header = 32 if data[at - 32 : at - 28] == b"LOBJ" else 40
+        _, _, _, size, _ = _OBJECT_HEADER.unpack_from(data, at - header)
+        stored = (fields[self._end] if self._end is not None else 0) or size
+        fields[self._count] = min(fields[self._count], max(0, stored - header - self._head))
+        return tuple(fields)
+
+
+_OBJECT_HEADER = struct.Struct("<4sHHLL")
+
+
+class _Lines:
+    """Lines of a text log, which can be read on after one that python-can cannot read.
+
+    python-can's readers begin with the header each time, for which `go_on` gives an empty line.
+    """
+
+    def __init__(self, file: TextIOWrapper) -> None:
+        file.reconfigure(encoding="utf-8", errors="replace")  # comments may have any encoding
+        self._file, self._empty = file, False
+        self.number = 0
+        """Number of the last line."""
+        self.bad = 0
+        """Lines that could not be read."""
+        self.fault = ""
+
+    def __iter__(self) -> _Lines:
+        return self
+
+    def __next__(self) -> str:
+        if self._empty:
+            self._empty = False
+            return "\n"
+        line = next(self._file)
+        self.number += 1
+        return line
+
+    def refuse(self, error: object) -> None:
+        """Count the last line as unreadable."""
+        self.bad += 1
+        self._empty = True
+        first = self.fault.partition(", the first")[2] or f" line {self.number}: {' '.join(str(error).split())[:100]}"
+        self.fault = f"{self.bad} line{'s' if self.bad > 1 else ''} cannot be read, the first{first}"
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+
+def _by_lines(path: Path, reader: Any, lines: _Lines) -> Iterator[Any]:
+    """Yield the messages of a text log; a line that cannot be read is counted and skipped.
+
+    Raises:
+        SourceError: If the times cannot be used.
+    """
+    in_a_row = 0
+    while in_a_row < MAX_BAD_LINES:
+        try:
+            for message in reader:
+                if getattr(reader, "timestamps_format", None) == "relative":
+                    raise SourceError(
+                        f"{path}: its times count from one event to the next (timestamps relative); export it with "
+                        "absolute times"
+                    )
+                if suffix_of(path) == ".log" and len(message.data) > message.dlc:
+                    lines.refuse("it ends within a byte")
+                    continue
+                in_a_row = 0
+                yield message
+            return
+        except SourceError:
+            raise
+        except Exception as error:  # noqa: BLE001  as above
+            lines.refuse(error)
+            in_a_row += 1
+    lines.fault += f"; {MAX_BAD_LINES} in a row, so the rest is left out"
+
+
+class _Warnings(logging.Handler):
+    """Warnings of python-can's readers, of parts that they skip; they would fill the terminal."""
+
+    def __init__(self) -> None:
+        super().__init__(logging.WARNING)
+        self._count, self._first = 0, ""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Count a warning; the ASC reader's are of frames that it reads, and an empty line is one of `_Lines`."""
+        if record.name != "can.io.asc" and record.args != ("",):
+            self._first = self._first or " ".join(record.getMessage().split())[:120]
+            self._count += 1
+
+    @property
+    def fault(self) -> str:
+        """The first warning, and how many there were; empty if there was none."""
+        return f"{self._count} × {self._first}" if self._count > 1 else self._first
 
 
 def _columns(
@@ -134,7 +281,9 @@ def _missing_end(path: Path, reader: Any) -> str:
 
     if isinstance(reader, can.BLFReader):
         size = path.stat().st_size
-        return f"{size} of {reader.file_size} bytes are there" if reader.file_size > size else ""
+        if reader.file_size > size:
+            return f"{size} of {reader.file_size} bytes are there"
+        return "its last frame is incomplete" if reader._tail.strip(b"\0") else ""
     if path.suffix.lower() == ".db":
         # SQLite silently reads the missing part of a cut last page as zeros.
         with path.open("rb") as file:

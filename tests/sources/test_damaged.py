@@ -175,7 +175,7 @@ def test_a_reader_that_dies_leaves_what_it_gave(tmp_path, messages, monkeypatch)
     assert len(got) == sum(k % 3 != 2 for k in range(256)) and log.frames == 256
     assert reports.counts["truncated file"] == 1
     assert reports.texts["truncated file"] == (
-        "a.blf: the file is damaged after 256 frames (its reader was ended by SIGABRT)"
+        "a.blf: the file is damaged (its reader was ended by SIGABRT); 256 frames were read"
     )
     monkeypatch.setattr(can_log, "read_messages", readers_that_fail.abort_at_once)
     with pytest.raises(SourceError, match=r"a\.blf: it cannot be read as BLF \(its reader was ended by SIGABRT\)"):
@@ -188,7 +188,7 @@ def test_a_log_without_a_frame_says_so(tmp_path, messages):  # noqa: F811
     reports = Reports()
     got = read_all(CanLog([tmp_path / "a.blf", tmp_path / "b.blf"], decoder_of(tmp_path), report=reports))
     assert len(got) == 667
-    assert reports.texts == {"truncated file": "a.blf: the file is damaged after 0 frames (it holds none)"}
+    assert reports.texts == {"truncated file": "a.blf: the file is damaged (it holds none); 0 frames were read"}
 
 
 def test_what_never_comes_is_named_with_what_does(tmp_path, messages):  # noqa: F811
