@@ -8,8 +8,8 @@ from config.loader import shipped
 from estimators.errors import ConfigError, SourceError
 
 from ..present.result import to_json
-from ..studies.compare import applicable, compare, without_marks
-from ..studies.scores import cells, printed, row_json, write_scores
+from ..studies.compare import applicable, best_text, compare, without_marks
+from ..studies.scores import FilterScore, cells, printed, row_json, write_scores
 from ..terminal import complain
 from ..twin.log_reader import read_logs
 from ..twin.twin import load_twin
@@ -52,15 +52,24 @@ def _compare(arguments: Arguments, name: str) -> list[dict[str, Any]]:
     names = applicable(twin, arguments.estimators)
     prepare(twin)
     logs = [without_marks(log.events) for log in read_logs(twin, name, overrides, arguments.logs, arguments.duration)]
-    rows = []
+    rows: list[FilterScore] = []
+    ended = False
     with progress(f"{twin.name}, {len(logs[0])} events", len(names), "filters") as advance:
-        for row in compare(name, overrides, names, logs, arguments.jobs, arguments.budget):
-            rows.append(row)
-            advance()
+        try:
+            for row in compare(name, overrides, names, logs, arguments.jobs, arguments.budget):
+                rows.append(row)
+                advance(best_text(rows))
+        except KeyboardInterrupt:
+            if not rows:
+                raise
+            ended = True
+            complain(f"interrupted after {len(rows)} of {len(names)} filters")
     rows.sort(key=lambda row: names.index(row.estimator))
     lines = cells(rows, len(logs[0]), float(logs[0].t[-1] - logs[0].t[0]) * 1e-9)
     if not arguments.json:
         print("\n".join(printed(twin.path.stem, lines, len(logs))))
+    if ended:
+        raise KeyboardInterrupt
     if arguments.write:
         write_scores(twin.path, lines)
     return [row_json(row) for row in rows]

@@ -7,11 +7,10 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any, TextIO
+from typing import Any
 
 import numpy as np
 from rich.console import Console
-from rich.progress import Progress
 
 from estimators.fold import Fold
 from estimators.log import Log
@@ -22,6 +21,7 @@ from sources.pieces import make, pieces_of
 from ..live.compilers import Compiler
 from ..live.watchdog import CallWatch, interruptible
 from ..live.workshop import Workshop
+from ..terminal import complain
 from ..twin.twin import Twin, load_twin
 from .options import settings
 
@@ -127,7 +127,15 @@ def prepare_model(twin: Twin, workshop: Workshop) -> None:
     attend(twin.model, work, "compiling the model, once", "compiled the model, once")
 
 
-def attend(model: StateSpaceModel, work: Callable[[], Any], doing: str, done: str | None = None) -> Any:
+def attend(
+    model: StateSpaceModel,
+    work: Callable[[], Any],
+    doing: str,
+    done: str | None = None,
+    *,
+    text: Callable[[], str] = str,
+    stop: Callable[[], Any] | None = None,
+) -> Any:
     """Do work that runs a model, in a thread that may be left behind, so that Ctrl-C ends even a call without end.
 
     Args:
@@ -135,6 +143,8 @@ def attend(model: StateSpaceModel, work: Callable[[], Any], doing: str, done: st
         work: Function to call.
         doing: Status shown while it runs long.
         done: Message printed when it has finished.
+        text: Progress, appended to the status.
+        stop: Called on the first Ctrl-C, after which the work returns what it has found; the second one ends it.
 
     Returns:
         The result of the work.
@@ -144,84 +154,113 @@ def attend(model: StateSpaceModel, work: Callable[[], Any], doing: str, done: st
     """
     result: list[Any] = []
     failure: list[BaseException] = []
+    # Python 3.11 takes a thread whose `join` was interrupted for ended.
+    over = threading.Event()
 
     def run() -> None:
         try:
             result.append(work())
         except BaseException as error:  # noqa: BLE001  raised again below, in the caller's thread
             failure.append(error)
+        finally:
+            over.set()
 
     begun = time.monotonic()
-    thread = threading.Thread(target=run, name="compile", daemon=True)
-    thread.start()
-    thread.join(STATUS_DELAY_S)
-    if thread.is_alive():
-        console = Console(file=sys.stderr)
-        watch = CallWatch(model)
-        if not console.is_terminal:  # where the status below shows nothing
-            console.print(f"{doing} ...", highlight=False, soft_wrap=True)
-        with console.status(doing) as status:
-            while thread.is_alive():
-                thread.join(0.5)
-                line = watch.look()
-                if line is not None:
-                    console.print(line, highlight=False, soft_wrap=True)
-                status.update(f"{doing}: {time.monotonic() - begun:.0f} s")
-        if done is not None:
-            console.print(f"{done}: {time.monotonic() - begun:.0f} s", highlight=False)
+
+    def status() -> str:
+        return f"{doing}: {time.monotonic() - begun:.0f} s{text() and ', '}{text()}"
+
+    threading.Thread(target=run, name="compile", daemon=True).start()
+    while not over.is_set():
+        try:
+            if not over.wait(STATUS_DELAY_S):
+                _watch(over, CallWatch(model), status, f"{doing} ...")
+                if done is not None:
+                    _console().print(f"{done}: {time.monotonic() - begun:.0f} s", highlight=False)
+        except KeyboardInterrupt:
+            if stop is None:
+                raise
+            stop()
+            stop = None
+            complain("interrupted; the best result so far follows. Press Ctrl-C again to end at once.")
     if failure:
         raise failure[0]
     return result[0]
 
 
-LINE_PERIOD_S = 10.0  # seconds between two lines
+def _watch(over: threading.Event, watch: CallWatch, text: Callable[[], str], first: str) -> None:
+    """Show what a thread does until it is over, and name a function of the model that does not return."""
+    console = _console()
+    with _shown(text, console, first):
+        while not over.wait(0.5):
+            line = watch.look()
+            if line is not None:
+                console.print(line, highlight=False, soft_wrap=True)
+
+
+LINE_PERIOD_S = 5.0  # seconds between two lines where output is no terminal
+
+
+def _console() -> Console:
+    return Console(file=sys.stderr)
 
 
 @contextmanager
-def progress(title: str, total: int, unit: str) -> Iterator[Callable[[], None]]:
-    """Show how many of `total` units are done; yields the function to call after each."""
-    console = Console(stderr=True)
+def _shown(text: Callable[[], str], console: Console, first: str = "") -> Iterator[None]:
+    """Show a text that changes: as a status line in a terminal, as a line every `LINE_PERIOD_S` elsewhere."""
     if not console.is_terminal:
-        with progress_lines(title, total, unit) as advance:
-            yield advance
+        if first:
+            console.print(first, highlight=False, soft_wrap=True)
+        with _every(LINE_PERIOD_S, lambda: print(text(), file=sys.stderr, flush=True)):
+            yield
         return
-    with Progress(console=console, transient=True) as bar:
-        task = bar.add_task(title, total=total)
-        yield lambda: bar.advance(task)
+    with console.status(text()) as status, _every(0.5, lambda: status.update(text())):
+        yield
 
 
 @contextmanager
-def progress_lines(
-    title: str,
-    total: int,
-    unit: str,
-    *,
-    every: float = LINE_PERIOD_S,
-    clock: Callable[[], float] = time.monotonic,
-    file: TextIO | None = None,
-) -> Iterator[Callable[[], None]]:
-    """Print plain lines, one every `every` seconds."""
+def _every(seconds: float, call: Callable[[], Any]) -> Iterator[None]:
+    """Call a function at intervals, in a thread of its own."""
     ended = threading.Event()
-    done = [0]
-    begun = clock()
 
-    def say() -> None:
-        while not ended.wait(every):
-            print(progress_text(title, done[0], total, unit, clock() - begun), file=file or sys.stderr, flush=True)
+    def run() -> None:
+        while not ended.wait(seconds):
+            call()
 
-    def advance() -> None:
-        done[0] += 1
-
-    thread = threading.Thread(target=say, name="progress", daemon=True)
+    thread = threading.Thread(target=run, name="progress", daemon=True)
     thread.start()
     try:
-        yield advance
+        yield
     finally:
         ended.set()
         thread.join()
 
 
+@contextmanager
+def progress(
+    title: str, total: int, unit: str, *, clock: Callable[[], float] = time.monotonic
+) -> Iterator[Callable[..., None]]:
+    """Show how many of `total` units are done; yields the function to call after each, with the best result so far."""
+    done, best, begun = 0, "", clock()
+
+    def advance(result: str = "") -> None:
+        nonlocal done, best
+        done, best = done + 1, result
+
+    def text() -> str:
+        return progress_text(title, done, total, unit, clock() - begun) + (f"; {best}" if best else "")
+
+    with _shown(text, _console()):
+        yield advance
+
+
 def progress_text(title: str, done: int, total: int, unit: str, seconds: float) -> str:
     """`lorenz63: 3 of 12 filters after 30 s, about 90 s left`, if those to come take as long as those done."""
     text = f"{title}: {done} of {total} {unit} after {seconds:.0f} s"
-    return f"{text}, about {seconds / done * (total - done):.0f} s left" if done else text
+    return f"{text}, about {left_text(done, total, seconds)} left" if done else text
+
+
+def left_text(done: int, total: int, seconds: float) -> str:
+    """Return the time that the rest takes at the rate so far."""
+    left = seconds / done * (total - done)
+    return f"{left:.0f} s" if left < 100.0 else f"{left / 60.0:.0f} min"

@@ -46,17 +46,24 @@ def stress_twin(arguments: Arguments) -> int:
     trials: list[Trial] = []
     failed: list[str] = []
     title = f"{twin.name}, {len(mistakes)} mistakes"
-    with progress(title, len(mistakes) * len(names) * arguments.seeds, "folds") as advance:
-        for seed in range(arguments.seeds):
-            bench = first if seed == 0 else Bench(twin, seed, arguments.duration)
-            for name in names:
-                for mistake in mistakes:
-                    try:
-                        trials.append(make(bench, mistake, name, oracle.foretell(bench, mistake, name)))
-                    except NisusError as error:
-                        failed.append(f"{mistake.name}, {name}, seed {seed}: {error}")
-                    advance()
+    folds = len(mistakes) * len(names) * arguments.seeds
+    with progress(title, folds, "folds") as advance:
+        try:
+            for seed in range(arguments.seeds):
+                bench = first if seed == 0 else Bench(twin, seed, arguments.duration)
+                for name in names:
+                    for mistake in mistakes:
+                        try:
+                            trials.append(make(bench, mistake, name, oracle.foretell(bench, mistake, name)))
+                        except NisusError as error:
+                            failed.append(f"{mistake.name}, {name}, seed {seed}: {error}")
+                        advance()
+        except KeyboardInterrupt:
+            if not trials:
+                raise
+            failed.append(f"interrupted after {len(trials)} of {folds} folds")
+            mistakes = [item for item in mistakes if any(trial.mistake == item.name for trial in trials)]
     for text in failed:
         complain(text)
     print(to_json(trials) if arguments.json else "\n".join(to_text(stress_topics(title, trials, mistakes))))
-    return 0
+    return 130 if len(trials) < folds and failed and failed[-1].startswith("interrupted") else 0

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from pydantic_core import PydanticCustomError
 
@@ -16,13 +17,14 @@ from estimators.errors import ConfigError, printable
 from estimators.fit.aims import CRPS, ERROR, LIKELIHOOD
 from estimators.fit.dual import WindowFit, walk
 from estimators.fit.fit import Fitted, fit
+from estimators.fit.objective import FitProgress
 from estimators.fit.recording import Recording
 
 from ..live.tunings.tuning_yaml import tuning_yaml
 from ..live.tunings.versions import check_free, keep, settings_of, version_text
 from ..present.result import to_text
 from ..present.runs_json import fit_json
-from ..studies.tune import heading, sections, window_json, window_topics, windows_verdict
+from ..studies.tune import fit_text, heading, sections, window_json, window_topics, windows_verdict
 from ..terminal import complain
 from ..twin.defaults import bounds_of, natural_aim
 from ..twin.log_reader import read_log, read_logs
@@ -56,6 +58,8 @@ def tune_twin(arguments: Arguments) -> int:
     twin, recordings = _recordings(arguments)
     aim = arguments.aim or natural_aim(twin.config)
 
+    state = FitProgress()
+
     def work() -> Fitted:
         return fit(
             twin.estimator,
@@ -66,9 +70,10 @@ def tune_twin(arguments: Arguments) -> int:
             blocks=arguments.blocks,
             aim=aim,
             predict=arguments.predict,
+            progress=state,
         )
 
-    found: Fitted = attend(twin.model, work, "fitting")
+    found: Fitted = _attend_fit(twin, work, state, "fitting")
     if arguments.json:
         print(json.dumps({"twin": twin.name, **fit_json(found)}, allow_nan=False))
     else:
@@ -77,6 +82,18 @@ def tune_twin(arguments: Arguments) -> int:
         return 1
     _save(arguments, twin, found, arguments.log or (f"{twin.name}, its own log",))
     return 0
+
+
+def _attend_fit(
+    twin: Twin, work: Callable[[], Any], state: FitProgress, doing: str, text: Callable[[], str] = str
+) -> Any:
+    """Run a fit with its progress; Ctrl-C ends it with the best values so far."""
+
+    def stop() -> None:
+        state.stop = True
+
+    begun = time.monotonic()
+    return attend(twin.model, work, doing, text=lambda: text() + fit_text(state, time.monotonic() - begun), stop=stop)
 
 
 def _save(arguments: Arguments, twin: Twin, found: Fitted, fitted_on: Sequence[str]) -> None:
@@ -138,8 +155,11 @@ def tune_windows(arguments: Arguments, wanted: Sequence[str], windows: str) -> i
     if any(item.weight != 1.0 for item in given):
         raise ConfigError("--log: with --windows each recording follows the one before; leave the weights out")
 
-    def work() -> list[tuple[int, WindowFit]]:
-        found, tuning = [], twin.tuning
+    state = FitProgress()
+    found: list[tuple[int, WindowFit]] = []
+
+    def work() -> None:
+        tuning = twin.tuning
         for k, item in enumerate(given):
             for refit in walk(
                 twin.estimator,
@@ -150,19 +170,21 @@ def tune_windows(arguments: Arguments, wanted: Sequence[str], windows: str) -> i
                 every=every,
                 bounds=bounds_of(twin.config, twin.model),
                 blocks=arguments.blocks,
+                progress=state,
             ):
                 # Its rows are many and not needed here.
                 found.append((k, refit._replace(lived=refit.lived.select(slice(0, 0)).copy())))
                 if refit.fitted is not None and refit.proposed:
                     tuning = refit.fitted.setting.tuning
-        return found
+            if state.stop:
+                return
 
-    found = attend(twin.model, work, "fitting window after window")
+    _attend_fit(twin, work, state, "fitting window after window", lambda: f"window {len(found) + 1}: ")
     origins = [int(item.log.t[0]) for item in given]
     ends = [int(item.log.t[item.log.n - 1]) for item in given]
     if arguments.json:
-        told = [window_json(k, refit, origins[k]) for k, refit in found]
-        print(json.dumps({"twin": twin.name, "window": window, "every": every, "windows": told}, allow_nan=False))
+        listed = [window_json(k, refit, origins[k]) for k, refit in found]
+        print(json.dumps({"twin": twin.name, "window": window, "every": every, "windows": listed}, allow_nan=False))
     else:
         print("\n".join(to_text([*window_topics(found, origins), windows_verdict(twin, found, origins, ends)])))
     adopted = [refit.fitted for _, refit in found if refit.fitted is not None and refit.proposed]

@@ -111,7 +111,7 @@ def fit_json(fitted: Fitted) -> dict[str, Any]:
     # Half a second of imports, which a twin without a fit need not wait for.
     from estimators.fit.dual import shift
 
-    names = ("estimator", "proposed", "power", "skipped", "left_out", "folds")
+    names = ("estimator", "proposed", "power", "skipped", "left_out", "folds", "stopped")
     verdict = fitted.verdict
     found = {name: getattr(fitted, name) for name in names} | {
         "verdict": {"gain": verdict.gain, "error": verdict.error, "reasons": verdict.reasons},

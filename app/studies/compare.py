@@ -178,6 +178,17 @@ def row_of(
     )
 
 
+def best_text(rows: Sequence[FilterScore]) -> str:
+    """Return the filter with the smallest error over the whole log so far; empty if no error is known."""
+    unit = next((unit for row in rows for unit in row.rmse), "")
+    errors = {row.estimator: row.rmse[unit].value for row in rows if unit in row.rmse and row.span is None}
+    errors = {name: value for name, value in errors.items() if np.isfinite(value)}
+    if not errors:
+        return ""
+    name = min(errors, key=lambda name: errors[name])
+    return f"best so far {name}, RMSE {errors[name]:.3g} {unit}".rstrip()
+
+
 def _spread(values: Sequence[float]) -> Spread:
     return Spread(float(np.mean(values)), float(np.std(values, ddof=1)) if len(values) > 1 else np.nan)
 

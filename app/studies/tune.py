@@ -7,15 +7,19 @@ from typing import Any
 
 import numpy as np
 
+from config.tunings import named
 from estimators.diagnostics.sensitivity.responses import digits
 from estimators.fit.dual import WindowFit, against, shift
 from estimators.fit.fit import EntryFit, Fitted
 from estimators.fit.judge import PartScore, PredictionScore, Worth
+from estimators.fit.objective import FitProgress
 
 from ..present.result import Topic
 from ..present.runs_json import correlated, fit_json
 from ..twin.twin import Twin
 
+MOVES_SHOWN = 2  # entries in a line of progress
+MINUTES_FROM_S = 100.0  # remaining time from which it is given in minutes
 MIN_UNFITTED_SHARE = 0.05  # share of a window above which an unfitted end of a log is reported
 
 
@@ -102,13 +106,37 @@ def windows_verdict(
 ALONE = "not identifiable: unchanged"
 BOUND = "only an upper bound: indistinguishable from zero"
 EDGE = "at the edge of its range: the optimum may lie beyond"
+STOPPED = "The search was ended early: better values may exist."
+WELL_TUNED = 0.2  # logarithm of the NIS per degree of freedom within which the values suit
 TEMPERED = "The likelihood of the fitted blocks has weight {:.2g}; more does not improve held-out predictions."
+
+
+def fit_text(progress: FitProgress, seconds: float) -> str:
+    """Return the progress of a fit in words: folds, remaining time, and the best values so far."""
+    if not progress.folds:
+        return ""
+    text = f"{progress.folds} of about {progress.expected} folds"
+    if progress.expected > progress.folds:
+        left = seconds / progress.folds * (progress.expected - progress.folds)
+        text += f", about {left:.0f} s left" if left < MINUTES_FROM_S else f", about {left / 60.0:.0f} min left"
+    if not progress.gain > 0.0:
+        return text
+    moves = sorted(progress.values.items(), key=lambda item: -abs(_move(*item[1])))[:MOVES_SHOWN]
+    moved = ", ".join(f"{key} {digits(before)} -> {digits(after)}" for key, (before, after) in moves)
+    return f"{text}; best so far {progress.gain:+.3g} on the fitted blocks ({moved})"
+
+
+def _move(before: float, after: float) -> float:
+    """Return the size of a change: its logarithm, or relative to the value."""
+    if before > 0.0 and after > 0.0:
+        return float(np.log(after / before))
+    return (after - before) / (abs(before) or 1.0)
 
 
 def sections(twin: Twin, fitted: Fitted) -> list[Topic]:
     """From top to bottom."""
     held_out = _held_out(fitted)
-    return [_entries(twin, fitted), _scores(fitted), *([held_out] if held_out.rows else []), _verdict(fitted)]
+    return [_entries(twin, fitted), _scores(fitted), *([held_out] if held_out.rows else []), _verdict(twin, fitted)]
 
 
 def heading(twin: Twin, fitted: Fitted) -> str:
@@ -199,9 +227,35 @@ def _gained(fitted: Fitted) -> str:
     return f"{fitted.verdict.gain:+.3g} ± {fitted.verdict.error:.2g} nats {fitted.verdict.each}"
 
 
-def _verdict(fitted: Fitted) -> Topic:
+def _verdict(twin: Twin, fitted: Fitted) -> Topic:
     verdict = fitted.verdict
+    early = [STOPPED] if fitted.stopped else []
     if verdict.proposed:
         said = f"Proposed: {_gained(fitted)} on the blocks held out."
-        return Topic("Verdict", (said, *([] if fitted.power == 1.0 else [TEMPERED.format(fitted.power)])))
-    return Topic("Verdict", ("Not proposed:", *verdict.reasons))
+        return Topic("Verdict", (said, *early, *([] if fitted.power == 1.0 else [TEMPERED.format(fitted.power)])))
+    return Topic("Verdict", ("Not proposed:", *verdict.reasons, *early, f"Next: {next_step(twin, fitted)}"))
+
+
+def next_step(twin: Twin, fitted: Fitted) -> str:
+    """Return what to try after a fit that is not proposed."""
+    name, verdict = named(twin.path), fitted.verdict
+    if fitted.stopped:
+        return f"run it to its end: nisus tune {name}."
+    if not fitted.before.held_out.n:
+        return "hold blocks out with --blocks 9, so that the fit can be judged."
+    if all(line.alone for line in fitted.lines):
+        return (
+            "fit fewer entries (--fit scale is one factor for Q and R), or give a longer or livelier recording with "
+            "--log; the values of the twin stay."
+        )
+    if any(line.edge and line.told for line in fitted.lines):
+        edges = ", ".join(line.key for line in fitted.lines if line.edge and line.told)
+        return f"widen the bounds of {edges} if that is physically possible, or look for a missing state."
+    if not verdict.harmless:
+        return (
+            f"the noises of the twin compensate for a model error: fit its parameters too (--fit Q,R,p), look at "
+            f"nisus check {name}, or give the error a correlation time (nisus advise {name} tests it)."
+        )
+    if fitted.before.held_out.nis > 0.0 and abs(np.log(fitted.before.held_out.nis)) < WELL_TUNED:
+        return "nothing: the twin's values already predict the held-out blocks as well."
+    return f"give more recordings with --log, or fit other entries, such as --fit Q,R,p; nisus advise {name} helps."

@@ -25,7 +25,7 @@ from ..track import Track
 from ..tuning import Tuning
 from .entries import check_key
 from .fit import EntryFit, Fitted, fit
-from .objective import Go
+from .objective import FitProgress, Go
 from .recording import BLOCKS, Recording
 from .uncertainty import Z
 
@@ -63,6 +63,7 @@ def walk(
     bounds: Mapping[str, tuple[float, float]] | None = None,
     blocks: int = BLOCKS,
     go: Go = lambda folds: True,
+    progress: FitProgress | None = None,
 ) -> Iterator[WindowFit]:
     """Go through a log window after window, as a running twin does that adopts every proposal.
 
@@ -79,6 +80,7 @@ def walk(
         bounds: Range by key.
         blocks: As `fit`.
         go: As `fit`.
+        progress: As `fit`, of the present window; with its `stop` set, that window is the last.
 
     Yields:
         Each window; the next one is folded with its proposal.
@@ -111,12 +113,21 @@ def walk(
         fitted, reason = None, ""
         try:
             fitted = fit(
-                estimator, tuning, [Recording(part, base=base)], wanted=wanted, bounds=bounds, blocks=blocks, go=go
+                estimator,
+                tuning,
+                [Recording(part, base=base)],
+                wanted=wanted,
+                bounds=bounds,
+                blocks=blocks,
+                go=go,
+                progress=progress,
             )
         except NisusError as error:
             reason = str(error)
         found = WindowFit(int(part.t[0]), int(part.t[part.n - 1]), part.n, tuning, fitted, reason, lived)
         yield found
+        if progress is not None and progress.stop:
+            return
         if fitted is not None and found.proposed:
             tuning = fitted.setting.tuning
             fold = Fold(estimator, tuning.model, tuning, log)

@@ -18,18 +18,19 @@ from ..errors import EstimatorError
 from ..log import READING
 from ..registry import find_estimator
 from ..tuning import Tuning
-from .aims import LIKELIHOOD, WITNESSES, aim_of
+from .aims import LIKELIHOOD, WITNESSES, aim_of, sensors_in_turn
 from .entries import Setting, Skipped, TuningEntry, entries_of, with_values
 from .judge import POWERS, FitVerdict, Tempered, Worth, tempered, worths
-from .objective import ALONE, Go, Objective, maximise, search
-from .recording import BLOCKS, Recording, held_out_rows, without_queries, without_stuck
-from .uncertainty import LikelihoodCurvature, Z, curvature, intervals
+from .objective import ALONE, SEARCH_FOLDS, FitProgress, Go, Objective, maximise, search
+from .recording import BLOCKS, Recording, held_out_rows, until_last_fitted, without_queries, without_stuck
+from .uncertainty import LikelihoodCurvature, Z, curvature, curvature_points, intervals
 
 MAX_DEVIATION = 0.25
 """Deviation of an identified entry, in deviations of its weak prior: for a variance a factor of 3 in its standard
 deviation."""
 
 MAX_COST = 2.0  # Nats that it may cost to reset an entry that is not identified: the size of chance
+EXPECTED_STEPS = 30  # Steps of a maximisation, for the estimate of the folds to come
 MAX_RESETS = 3  # Times that entries are reset and the others fitted again
 
 
@@ -62,7 +63,7 @@ class Fitted:
 
     `setting` is the fitted tuning (and the prior, where it was fitted); `verdict` is whether it is proposed. `power` is
     that of the likelihood. correlation (k, k) is that of the estimates of `lines`, NaN for reset entries. `left_out` is
-    the number of readings of stuck sensors, by sensor.
+    the number of readings of stuck sensors, by sensor. `stopped` is whether the search was ended early.
     """
 
     estimator: str
@@ -76,6 +77,7 @@ class Fitted:
     verdict: FitVerdict
     power: float
     folds: int
+    stopped: bool = False
 
     @property
     def proposed(self) -> bool:
@@ -94,6 +96,7 @@ def fit(
     aim: str = LIKELIHOOD,
     predict: Sequence[str] = (),
     go: Go = lambda folds: True,
+    progress: FitProgress | None = None,
 ) -> Fitted:
     """Fit entries of a tuning to recordings.
 
@@ -108,17 +111,19 @@ def fit(
         aim: Aim of the fit, see aims.py.
         predict: Sensors to hold out, for an aim that does; each in turn by default.
         go: Called from any thread with the number of folds done since; returns whether to continue.
+        progress: Kept up to date from any thread; with its `stop` set, the best point so far is judged and returned.
 
     Raises:
         Cancelled: If `go` returns False.
         ConfigError: If none of the wanted entries can be fitted.
         EstimatorError: As `Fold`; if there is nothing to fit to, or no such aim.
     """
-    folds = 0
+    progress = progress or FitProgress()
+    progress.folds, progress.gain, progress.values = 0, 0.0, {}
 
     def count(done: int) -> bool:
-        nonlocal folds
-        folds += done
+        progress.folds += done
+        progress.expected = max(progress.expected, progress.folds)
         return go(done)
 
     for item in recordings:
@@ -136,22 +141,40 @@ def fit(
         left_out.update(repetitions)
         for into, part in ((whole, log), (lean, without_queries(log, truth=references))):
             into.append(item._replace(log=part, held_out=held_out_rows(part, blocks)))
+    lean = [until_last_fitted(item) for item in lean]
     aimed = aim_of(aim, estimator, Setting(tuning, None), lean, tuple(predict))
-    objective = Objective(estimator, tuning, tuple(entries), tuple(lean), aim=aimed, go=count)
-    optimise = search if find_estimator(estimator, tuning.model).family in ALONE else maximise
+    objective = Objective(estimator, tuning, tuple(entries), tuple(lean), aim=aimed, go=count, progress=progress)
+    alone = find_estimator(estimator, tuning.model).family in ALONE
+    judging = len(recordings) * (2 if not blocks else 1 + len(POWERS))
+    judging *= 1 + len(sensors_in_turn(Setting(tuning, None), whole))
+
+    def expect(k: int, steps: int) -> None:
+        """Estimate the folds to come: a maximisation over k entries, its curvature, and the judgement."""
+        points = SEARCH_FOLDS * k // 2 if alone else (steps + 1) * (k + 1)
+        points = points if steps else 0
+        progress.expect(len(recordings) * aimed.folds * (points + curvature_points(k)) + judging)
+
+    optimise = search if alone else maximise
+    expect(len(entries), EXPECTED_STEPS)
     kept, x, value = objective, *optimise(objective, objective.start)
+    expect(x.size, 0)
     shape = curvature(kept, x)
     identified = _identified(kept, shape)
     for _ in range(MAX_RESETS):
+        if progress.stop:
+            break
         reset = _resettable(kept, x, value, shape, identified)
         if not reset:
             break
         if len(reset) == x.size:
             kept, x = kept.pinned(reset, kept.start), np.zeros(0)
             break
+        progress.values |= {kept.entries[i].key: (kept.entries[i].start, kept.entries[i].start) for i in reset}
         start = np.where(np.isin(np.arange(x.size), reset), kept.start, x)
         kept = kept.pinned(reset, start)
+        expect(len(kept.entries), EXPECTED_STEPS // 3)
         x, value = optimise(kept, np.delete(start, reset))
+        expect(x.size, 0)
         shape = curvature(kept, x)
         identified = _identified(kept, shape)
 
@@ -159,6 +182,7 @@ def fit(
         values = [item.written(value) for item, value in zip(kept.entries, point.tolist(), strict=True)]
         return with_values(tuning, kept.entries, values)
 
+    progress.expect(judging)
     chosen = tempered(
         kept, x, shape, setting_at, lambda settings: worths(estimator, settings, whole, count, aimed), aim=aimed,
         powers=POWERS if blocks and x.size else (1.0,),
@@ -175,7 +199,8 @@ def fit(
         after=chosen.after,
         verdict=chosen.verdict,
         power=chosen.power,
-        folds=folds,
+        folds=progress.folds,
+        stopped=progress.stop,
     )
 
 
@@ -217,8 +242,11 @@ def _lines(
         deviation = np.sqrt(np.diag(chosen.cov))
         low, high = np.array(kept.limits).T[:, :, None]
         ends = np.clip(np.stack([chosen.x - Z * deviation, chosen.x + Z * deviation], axis=1), low, high)
-    elif x.size:
+    elif x.size and not kept.progress.stop:
         ends, profiled = intervals(kept, x, value, shape)
+    elif x.size:
+        low, high = np.array(kept.limits).T[:, :, None]
+        ends = np.clip(np.stack([x - Z * deviation, x + Z * deviation], axis=1), low, high)
     place = {item.key: i for i, item in enumerate(kept.entries)} if x.size else {}
     lines = []
     for item in entries:

@@ -22,7 +22,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, replace
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.optimize import minimize
@@ -54,6 +55,29 @@ class Cancelled(Exception):
     """The fit was cancelled."""
 
 
+@dataclass
+class FitProgress:
+    """Progress of a fit, for another thread to read.
+
+    Attributes:
+        folds: Folds done.
+        expected: Folds in all, estimated.
+        gain: Gain on the fitted blocks so far, in the unit of the aim (nats for likelihoods).
+        values: Entries at the best point so far, before and after, by key.
+        stop: Set it to end the search: the best point so far is judged and returned.
+    """
+
+    folds: int = 0
+    expected: int = 0
+    gain: float = 0.0
+    values: dict[str, tuple[float, float]] = field(default_factory=dict)
+    stop: bool = False
+
+    def expect(self, more: int) -> None:
+        """Estimate the folds to come."""
+        self.expected = self.folds + more
+
+
 @dataclass(frozen=True)
 class Objective:
     """Objective over the entries, about the tuning, over the recordings; `fixed` are held at their values `at`."""
@@ -66,6 +90,7 @@ class Objective:
     at: tuple[float, ...] = ()
     aim: Aim = Aim()
     go: Go = lambda folds: True
+    progress: FitProgress = field(default_factory=FitProgress)
     executor: Executor | str | None = "threads"
 
     @property
@@ -82,6 +107,11 @@ class Objective:
     def precision(self) -> np.ndarray:
         """Precision of the weak prior, (k,)."""
         return np.array([item.deviation**-2 for item in self.entries])
+
+    @property
+    def folds(self) -> int:
+        """Folds per point."""
+        return self.aim.folds * len(self.recordings)
 
     def penalty(self, x: np.ndarray) -> float:
         """Return ½ Σ ((θ - θ_0) / d)²."""
@@ -141,42 +171,83 @@ class Objective:
         return float(here.sum()) - self.penalty(x), slopes.sum(axis=1) - self.precision * (x - self.start)
 
 
+class _StopSearch(Exception):
+    """The search was ended early."""
+
+
+class _BestPoint:
+    """Best point of a search so far, reported as it improves."""
+
+    def __init__(self, objective: Objective, x: np.ndarray) -> None:
+        self.objective, self.x, self.value = objective, x, -np.inf
+
+    def add(self, x: np.ndarray, value: float) -> None:
+        """Keep a point if it is the best one.
+
+        Raises:
+            _StopSearch: If the search is to end.
+        """
+        progress = self.objective.progress
+        if value > self.value:
+            if np.isfinite(self.value):
+                progress.gain += value - self.value
+                pairs = zip(self.objective.entries, x, strict=True)
+                progress.values |= {item.key: (item.start, item.outward(v)) for item, v in pairs}
+            self.x, self.value = x, value
+        if progress.stop:
+            raise _StopSearch
+
+
 def maximise(objective: Objective, x: np.ndarray, *, rounds: int = MAX_ROUNDS) -> tuple[np.ndarray, float]:
     """Return the point (k,) of the maximum nearest to x, and the value there."""
     low, high = np.array(objective.limits).T
-    value = -np.inf
+    value, best = -np.inf, _BestPoint(objective, x)
     for _ in range(rounds):
         _, slopes = objective.slopes(x)
         unit = 1.0 / np.sqrt(np.sum(slopes**2, axis=1) + objective.precision)
 
         def loss(z: np.ndarray, x: np.ndarray = x, unit: np.ndarray = unit) -> tuple[float, np.ndarray]:
-            found, gradient = objective.gradient(np.clip(x + unit * z, low, high))
+            point = np.clip(x + unit * z, low, high)
+            found, gradient = objective.gradient(point)
+            best.add(point, found)
             return -found, -gradient * unit
 
-        found = minimize(
-            loss,
-            np.zeros_like(x),
-            jac=True,
-            method="L-BFGS-B",
-            bounds=list(zip((low - x) / unit, (high - x) / unit, strict=True)),
-            options={"maxiter": ROUND_STEPS, "maxfun": 2 * ROUND_STEPS, "gtol": GRADIENT, "ftol": 1e-12},
-        )
+        try:
+            found = minimize(
+                loss,
+                np.zeros_like(x),
+                jac=True,
+                method="L-BFGS-B",
+                bounds=list(zip((low - x) / unit, (high - x) / unit, strict=True)),
+                options={"maxiter": ROUND_STEPS, "maxfun": 2 * ROUND_STEPS, "gtol": GRADIENT, "ftol": 1e-12},
+            )
+        except _StopSearch:
+            break
         gained, value = -found.fun - value, float(-found.fun)
         x = np.clip(x + unit * found.x, low, high)
         if gained < MIN_GAIN or found.status == 0:
             break
-    return x, value
+    return best.x, best.value
 
 
 def search(objective: Objective, x: np.ndarray) -> tuple[np.ndarray, float]:
     """Return the same without derivatives, for a filter that draws; the first step is one logarithm or deviation."""
     low, high = np.array(objective.limits).T
     unit = np.array([1.0 if item.log else item.deviation for item in objective.entries])
-    found = minimize(
-        lambda z: -objective.value(np.clip(x + unit * z, low, high)),
-        np.zeros_like(x),
-        method="COBYQA",
-        bounds=list(zip((low - x) / unit, (high - x) / unit, strict=True)),
-        options={"maxfev": SEARCH_FOLDS * x.size, "final_tr_radius": 0.02},
-    )
-    return np.clip(x + unit * found.x, low, high), float(-found.fun)
+    best = _BestPoint(objective, x)
+
+    def loss(z: np.ndarray) -> float:
+        point = np.clip(x + unit * z, low, high)
+        value = objective.value(point)
+        best.add(point, value)
+        return -value
+
+    with suppress(_StopSearch):
+        minimize(
+            loss,
+            np.zeros_like(x),
+            method="COBYQA",
+            bounds=list(zip((low - x) / unit, (high - x) / unit, strict=True)),
+            options={"maxfev": SEARCH_FOLDS * x.size, "final_tr_radius": 0.02},
+        )
+    return best.x, best.value

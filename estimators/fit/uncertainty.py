@@ -71,12 +71,20 @@ class LikelihoodCurvature(NamedTuple):
         return found
 
 
+def curvature_points(k: int) -> int:
+    """Return the number of points that the curvature of k entries takes."""
+    return 2 + 3 * k + k * (k - 1)
+
+
 def curvature(objective: Objective, x: np.ndarray) -> LikelihoodCurvature:
     """Return the curvature at a maximum x (k,)."""
     k = x.size
     _, scores = objective.slopes(x)
     precision = objective.precision
     outer = scores @ scores.T + np.diag(precision)
+    if objective.progress.stop:
+        rough: np.ndarray = np.linalg.inv(outer)
+        return LikelihoodCurvature(rough, _widened(rough, scores, precision))
     low, high = np.array(objective.limits).T
     # The points stay within the range: at its edge they are about a point inside.
     steps = np.minimum(1.0 / np.sqrt(np.diag(outer)), (high - low) / 4.0)
@@ -149,8 +157,11 @@ def intervals(
         if abs(root - Z) > MAX_MISFIT * Z or not low[i] < found[i, side] < high[i]:
             profiled[i] = loose[i]
     H = np.linalg.inv(shape.cov)
+    # Two points of each profile on either side, with six gradients each.
+    objective.progress.expect(int(profiled.sum()) * 24 * x.size * objective.folds)
     for i in np.flatnonzero(profiled).tolist():
-        for side in (0, 1):
+        profiled[i] = not objective.progress.stop
+        for side in (0, 1) if profiled[i] else ():
             found[i, side] = _profile_end(objective, x, value, shape, H, i, found[i, side])
     return np.clip(found, low[:, None], high[:, None]), profiled
 

@@ -1,9 +1,13 @@
 """Where standard error is no terminal, work that takes long says now and then how far it has got."""
 
 import io
+import signal
+import sys
 import threading
 
-from app.cli.prepare import progress, progress_lines, progress_text
+import app.cli.prepare
+from app.cli.prepare import attend, progress, progress_text
+from tests.app.cli.test_prepare import MODEL
 
 
 class Heard(io.StringIO):
@@ -17,20 +21,38 @@ class Heard(io.StringIO):
         self.written.set()
 
 
-def test_lines_come_while_nothing_is_done_and_count_what_is():
+def test_lines_come_while_nothing_is_done_and_count_what_is(monkeypatch):
     now = 100.0
     heard = Heard()
-    with progress_lines("pump", 12, "filters", every=1e-3, clock=lambda: now, file=heard) as advance:
+    monkeypatch.setattr(sys, "stderr", heard)
+    monkeypatch.setattr(app.cli.prepare, "LINE_PERIOD_S", 1e-3)
+    with progress("pump", 12, "filters", clock=lambda: now) as advance:
         assert heard.written.wait(10.0)
         assert heard.getvalue().startswith("pump: 0 of 12 filters after 0 s\n")
         now = 130.0
         for _ in range(3):
-            advance()
+            advance("best so far ekf")
         for _ in range(2):  # the first may have begun before they were done
             heard.written.clear()
             assert heard.written.wait(10.0)
-    assert heard.getvalue().endswith("pump: 3 of 12 filters after 30 s, about 90 s left\n")
+    assert heard.getvalue().endswith("pump: 3 of 12 filters after 30 s, about 90 s left; best so far ekf\n")
     assert not any(thread.name == "progress" for thread in threading.enumerate())
+
+
+def test_the_first_interrupt_ends_attended_work_with_its_best_result(monkeypatch):
+    heard, stopped = Heard(), threading.Event()
+    monkeypatch.setattr(sys, "stderr", heard)
+    monkeypatch.setattr(app.cli.prepare, "LINE_PERIOD_S", 1e-3)
+    monkeypatch.setattr(app.cli.prepare, "STATUS_DELAY_S", 0.0)
+
+    def work():
+        while "half done" not in heard.getvalue():
+            heard.written.wait(10.0)
+        signal.pthread_kill(threading.main_thread().ident, signal.SIGINT)
+        return "best so far" if stopped.wait(10.0) else "not interrupted"
+
+    assert attend(MODEL, work, "fitting", text=lambda: "half done", stop=stopped.set) == "best so far"
+    assert "fitting: 0 s, half done\n" in heard.getvalue() and "interrupted; " in heard.getvalue()
 
 
 def test_the_rest_takes_as_long_as_what_is_done():

@@ -34,6 +34,7 @@ def test_a_right_noise_is_not_replaced(nisus, tmp_path):
     file = tmp_path / "found.yaml"
     done = nisus.run(*TUNE, "--fit", "R", *SHORT, "--save", file)
     assert done.status == 1 and "Not proposed:" in done.out and not file.exists()
+    assert "Next: " in done.out
 
 
 def test_json_has_all_of_it(nisus):

@@ -11,7 +11,7 @@ from scipy.optimize import brentq, minimize
 from estimators.errors import ConfigError
 from estimators.fit.entries import entries_of
 from estimators.fit.fit import fit
-from estimators.fit.objective import Cancelled, Objective
+from estimators.fit.objective import Cancelled, FitProgress, Objective
 from estimators.fit.recording import Recording, held_out_rows, without_queries
 from estimators.log import READING, Log
 from estimators.model.state_space import Noise, Parameter, Row, Sensor, State, StateSpaceModel
@@ -183,6 +183,31 @@ def test_a_fit_can_be_cancelled(ys):
         fit("kf", Tuning.of(MODEL), [Recording(log_of(ys))], go=go)
     # Those under way on other threads may still say so.
     assert len(told) < 15
+
+
+def test_progress_counts_every_fold_and_the_gain_of_the_search(ys, fitted):
+    told = FitProgress()
+    found = fit("kf", Tuning.of(MODEL), [Recording(log_of(ys))], wanted=("Q", "R"), blocks=0, progress=told)
+    assert found.folds == told.folds == told.expected
+    start, after = (penalised(ys, np.log([values[k] for values in told.values.values()])) for k in (0, 1))
+    assert told.gain == pytest.approx(after - start, abs=1e-6)
+
+
+def test_a_stopped_fit_judges_the_best_point_so_far(ys):
+    wrong = Tuning.of(MODEL).set("Q.level", 0.005).set("R.float", 8.0)
+    told = FitProgress()
+
+    def stop(folds: int) -> bool:
+        told.stop = told.gain > 0.0
+        return True
+
+    found = fit("kf", wrong, [Recording(log_of(simulated(2, 600)))], go=stop, progress=told)
+    assert found.stopped and found.proposed
+    # Three gradients of three folds each, the scores there, and ten settings to judge.
+    assert found.folds < 30
+    assert told.values["R.float"][0] == 8.0 and told.values["R.float"][1] < 8.0
+    assert found.lines[1].after < 8.0
+    assert all(line.low < line.after < line.high for line in found.lines)
 
 
 def test_blocks_are_of_one_length_and_the_last_is_held_out(ys):
