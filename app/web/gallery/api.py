@@ -86,7 +86,7 @@ class GalleryApi:
                 "seconds": round(time.monotonic() - starting[1], 1),
                 "doing": "compiling" if compiling else "",
             },
-            "failed": failed and {"title": failed[0].name, "text": one_line(failed[1])},
+            "failed": failed and {"title": failed[0].name, "text": self._recordings.shortened(one_line(failed[1]))},
         }
 
     def _cards(self) -> Any:

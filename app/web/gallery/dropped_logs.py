@@ -152,13 +152,15 @@ class DroppedLogs:
     def state(self, wanted: LogRequest) -> dict[str, Any]:
         """Return how far the log has been read, its signals, and the twins by how well they fit."""
         path, job = self.read(wanted)
-        if job.state == "running" and job.item is None:
+        running = job.state == "running"  # asked before its item, which is the last one once it has ended
+        if running and job.item is None:
             return {"name": path.name, "state": "reading", "seconds": job.seconds}
         if job.item is None:
-            return {"name": path.name, "state": "failed", "error": _short(job.error or "", path)}
+            return {"name": path.name, "state": "failed", "error": self._words(job.error or "")}
         if job.answer is None or job.answer["roles"] is None:
             job.answer = self._answer(path, job.item)
-        return {**job.answer, "proposing": job.state == "running"}
+        unproposed = None if job.error is None else self._words(job.error)
+        return {**job.answer, "proposing": running, "unproposed": unproposed}
 
     def _answer(self, path: Path, found: LogOverview) -> dict[str, Any]:
         answer = found.as_json()
@@ -170,7 +172,7 @@ class DroppedLogs:
         ]
         for one in answer["databases"]:
             one["used"] = one["file"] in found.used
-        answer["faults"] = [_short(text, path) for text in found.faults]
+        answer["faults"] = [self._words(text) for text in found.faults]
         header = LogHeader(
             found.kind,
             frozenset(found.keys),
@@ -224,14 +226,20 @@ class DroppedLogs:
         twin, job = self._draft
         step: DraftStep | None = job.item
         known = {"doing": step.doing if step else "starting", "summary": step.summary if step else ""}
-        folder = str(self._recordings.folder)
-        error = None if job.error is None else in_words(job.error.replace(f"{folder}/", ""))
+        error = None if job.error is None else self._words(job.error)
         return {"state": job.state, "twin": twin, "seconds": job.seconds, "error": error, **known}
 
     def stop_draft(self) -> None:
         """Stop the draft under way."""
         if self._draft is not None:
             self._draft[1].stop()
+
+    def _words(self, text: str) -> str:
+        """Return a message without paths and options of the command line."""
+        text = self._recordings.shortened(text)
+        for option, words in OPTION_WORDS.items():
+            text = text.replace(option, words)
+        return text
 
     def _free_name(self, path: Path) -> str:
         """Return a name for a twin of a log that is not taken."""
@@ -297,15 +305,3 @@ def _twin_json(match: TwinMatch, card: Card) -> dict[str, Any]:
 def _label(path: Path, folder: Path) -> str:
     """Return the name of a DBC on the page; one outside the folder of recordings has its own folder before it."""
     return path.name if path.parent.absolute() == folder.absolute() else f"{path.parent.name}/{path.name}"
-
-
-def in_words(text: str) -> str:
-    """Return a message without options of the command line."""
-    for option, words in OPTION_WORDS.items():
-        text = text.replace(option, words)
-    return text
-
-
-def _short(text: str, path: Path) -> str:
-    """Return a message with the file's name in place of its path."""
-    return in_words(text).replace(str(path.parent.absolute()) + "/", "").replace(f"{path.parent}/", "")

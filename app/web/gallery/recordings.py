@@ -132,6 +132,12 @@ class Recordings:
             raise ConfigError(f"{quoted(name)}: there is no such recording")
         return path
 
+    def shortened(self, text: str) -> str:
+        """Return a message with names of files in place of their paths in the folder."""
+        for folder in {str(self.folder.absolute()), str(self.folder)} - {"."}:
+            text = text.replace(f"{folder}{os.sep}", "")
+        return text
+
     def delete(self, name: Any) -> None:
         """Remove a file for good.
 

@@ -145,7 +145,7 @@ export class LogView {
   }
 
   draw(log) {
-    const key = JSON.stringify({ ...log, roles: null, proposing: null, draft_name: null });
+    const key = JSON.stringify({ ...log, roles: null, proposing: null, unproposed: null, draft_name: null });
     this.log = log;
     if (key !== this.shown) {
       this.shown = key;
@@ -158,7 +158,7 @@ export class LogView {
 
   head(log) {
     const facts = log.error ? "" : [
-      log.kind === "can_log" ? `CAN log, ${count(log.number, "frame")}` : `table, ${count(log.number, "row")}`,
+      log.kind === "can_log" ? `CAN log, ${count(log.number, "frame")}` : log.number ? `table, ${count(log.number, "row")}` : `table, ${count(log.choices.length, "column")}`,
       log.seconds ? span(log.seconds) : null, log.start > 1e8 ? `from ${new Date(1000 * log.start).toISOString().slice(0, 19).replace("T", " ")} UTC` : null,
       log.gaps ? count(log.gaps, "gap") : null, log.kind === "can_log" ? count(log.ids, "id") : null, log.time ? `time: ${log.time}` : null,
     ].filter(Boolean).join(" · ");
@@ -211,14 +211,14 @@ export class LogView {
     const option = (value, text, chosen) => element("option", { value, selected: chosen }, text);
     const column = element("select", { "aria-label": "Time column" }, ...(log.time ? [] : [option("", "choose", true)]), ...log.choices.map((name) => option(name, name, name === log.time)));
     const units = [["s", "seconds"], ["ms", "milliseconds"], ["us", "microseconds"], ["ns", "nanoseconds"], ["min", "minutes"], ["h", "hours"], ["excel", "Excel dates"], ["matlab", "MATLAB datenum"]];
-    const unit = element("select", { "aria-label": "Unit of numbers in the time column" }, ...units.map(([value, text]) => option(value, text, value === this.unit)));
+    const unit = element("select", { "aria-label": "Unit of the time" }, ...units.map(([value, text]) => option(value, text, value === this.unit)));
     const change = () => column.value && this.read({ time: column.value, unit: unit.value });
     column.addEventListener("change", change);
     unit.addEventListener("change", change);
     const needed = log.needs === "time";
     return element("section", { class: "needs", dataset: { needed: String(needed) } },
       element("h2", {}, needed ? "Which column holds the time?" : "Time"),
-      needed && log.time ? element("p", {}, log.faults.join("; ")) : null,
+      needed ? element("p", {}, log.time ? `${log.faults.join("; ")}.` : `No column of ${log.name} has a usual name of a time, or dates. Choose the one with the time of each row; if there is none, add it to the file and drop it again.`) : null,
       element("p", {}, "Column ", column, " numbers in ", unit, element("span", { class: "faint" }, " (dates are recognised)")));
   }
 
@@ -366,7 +366,8 @@ export class LogView {
     const share = (twin) => (twin.missing.length ? `${twin.found.length} of ${count(twin.found.length + twin.missing.length, "channel")}` : `all ${count(twin.found.length, "channel")}`);
     return [
       element("section", { "aria-label": "Twins that fit" },
-        element("h2", {}, fitting.length ? "Twins that fit" : "No twin fits this log"),
+        element("h2", {}, fitting.length ? "Twins that fit" : log.twins.length ? "No twin here fits this log" : "Twins that fit"),
+        log.twins.length ? null : element("p", { class: "faint" }, "They are compared once the log can be read."),
         element("ol", { class: "fits" }, ...fitting.map((twin) => element("li", { dataset: { twin: twin.short } },
           element("div", { class: "row" }, element("h3", {}, twin.short), element("span", { class: "faint" }, share(twin)), element("span", { class: "space" }), start(twin)),
           element("p", { class: "faint" }, twin.title), element("details", {}, element("summary", {}, "Channels"), ...lines(twin)))))),
@@ -397,9 +398,10 @@ export class LogView {
 
   // The roles that the server proposes, unless they were chosen already.
   propose() {
-    if (!this.log.roles || this.proposed === this.name) return;
+    const { roles, proposing } = this.log;
+    if (!this.log.signals?.length || this.proposed === this.name || (!roles && proposing)) return;
     this.proposed = this.name;
-    this.log.roles.forEach(([role], index) => this.roles.has(index) || this.roles.set(index, role));
+    (roles ?? []).forEach(([role], index) => this.roles.has(index) || this.roles.set(index, role));
     for (const row of this.rows.values()) this.role(row);
     this.sum();
   }
@@ -424,7 +426,7 @@ export class LogView {
     const link = (index) => element("button", { type: "button", class: "signal-link", onclick: () => this.reveal(index) }, this.log.signals[index].name);
     this.chosen.replaceChildren(...lines.flatMap(([text, members]) => [element("span", { class: "role" }, element("b", {}, `${text}: `), ...members.slice(0, 12).map(link), members.length > 12 ? ` and ${members.length - 12} more` : null)]));
     const able = this.members("state").length + this.members("sensor").length > 0;
-    if (!able) setText(this.chosen, "Give at least one signal the role State or Sensor.");
+    if (!able) setText(this.chosen, `${this.log.unproposed ? `No roles could be proposed (${this.log.unproposed}). ` : ""}Give at least one signal the role State or Sensor.`);
     this.start.disabled = !able || this.drafts;
   }
 
