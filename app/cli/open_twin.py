@@ -95,6 +95,7 @@ def opened_review(path: Path) -> OpenedTwin:
         horizon=np.inf,
         review=path,
         said=recorded.notices,
+        annotations=recorded.annotations,
         remarks=remarks,
     )
 

@@ -111,6 +111,25 @@ class Note:
 
 
 @dataclass(frozen=True)
+class Annotate:
+    """Write a note at a moment, or change the one of that `number`.
+
+    `at` is in seconds of the log, as `start` of an episode; None is the newest measurement, or where the note is.
+    """
+
+    text: str
+    at: float | None = None
+    number: int | None = None
+
+
+@dataclass(frozen=True)
+class DeleteAnnotation:
+    """Delete the note of that number."""
+
+    number: int
+
+
+@dataclass(frozen=True)
 class Reset:
     """Reset the estimate to the model's prior at the present time."""
 
@@ -187,6 +206,7 @@ class ClearFault:
 
 Command = (
     SetEstimator | SetTuning | SetTunings | SetOption | UseSensor | Restore | Undo | Redo | Load | Pin | Unpin
-    | Note | Reset | Maintenance | Pause | Speed | Step | Seek | Record | InjectFault | ClearFault
+    | Note | Annotate | DeleteAnnotation | Reset | Maintenance | Pause | Speed | Step | Seek | Record | InjectFault
+    | ClearFault
 )  # fmt: skip
 """Any command."""

@@ -91,6 +91,15 @@ def prepared(command: commands.Command, engine: Running) -> Callable[[], Any]:
         case commands.Note(number, name, note):
             runs.check_words(number, name, note)
             return partial(runs.describe, number, name, note)
+        case commands.Annotate(text, at, number):
+            if not now:
+                raise ConfigError("Annotate: no measurement has arrived yet; wait for the first")
+            engine.annotations.check(text, at, number, span_of(engine.source) or (first, now))
+            t = None if at is None else round(at * 1e9)
+            return partial(engine.annotations.put, text, t, number, now)
+        case commands.DeleteAnnotation(number):
+            engine.annotations.find(number)
+            return partial(engine.annotations.delete, number)
         case commands.Reset():
             if not now:
                 raise ConfigError("Reset: nothing to reset; no measurement has arrived yet")

@@ -1,4 +1,4 @@
-"""Counters and messages about the running twin; the number of messages is bounded."""
+"""Counters and messages about the running twin, and notes of users at moments; the number of both is bounded."""
 
 from __future__ import annotations
 
@@ -9,10 +9,17 @@ from collections import Counter, deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
+from estimators.errors import ConfigError, printable, quoted
+
 LINE_PERIOD_S = 1.0
 """Seconds between two lines under one key; those in between are only counted, so that a flood stays readable."""
 
 MAX_LINES = 1000
+
+MAX_ANNOTATIONS, MAX_ANNOTATION_LENGTH = 1000, 500
+
+SPAN_MARGIN_S = 1e-3
+"""By which a moment may lie outside the log: as a float64, a time of today is rounded to a quarter of a microsecond."""
 
 
 @dataclass(frozen=True)
@@ -107,3 +114,82 @@ class Notices:
         """Return the counters."""
         with self._lock:
             return {key: count for key, count in self._counts.items() if key not in self._elsewhere}
+
+
+@dataclass(frozen=True)
+class Annotation:
+    """Note of a user at a moment `t` of the log, ns."""
+
+    number: int
+    t: int
+    text: str
+
+
+class Annotations:
+    """Notes of users, by time; changed by the engine's thread alone, read by any. They outlast a restart of the log."""
+
+    def __init__(self) -> None:
+        # Replaced, never changed, so that a reader in another thread never sees half of it.
+        self.notes: tuple[Annotation, ...] = ()
+        self._next = 1
+
+    def check(self, text: str, at: float | None, number: int | None, span: tuple[int, int]) -> None:
+        """Reject a note that cannot be kept; `span` has the times of the log's first and last event, ns.
+
+        Raises:
+            ConfigError: If the text is empty or too long, the moment lies outside the log, there is no note of that
+                number to change, or there are too many.
+        """
+        length = len(_on_one_line(text))
+        if not 0 < length <= MAX_ANNOTATION_LENGTH:
+            raise ConfigError(
+                f"Annotate: text is {quoted(text)}, of {length} characters; write 1 to {MAX_ANNOTATION_LENGTH}"
+            )
+        if number is not None:
+            self.find(number)
+        elif len(self.notes) >= MAX_ANNOTATIONS:
+            raise ConfigError(f"Annotate: there are {MAX_ANNOTATIONS} notes; delete one first")
+        first, last = (t * 1e-9 for t in span)
+        if at is not None and not first - SPAN_MARGIN_S <= at <= last + SPAN_MARGIN_S:
+            raise ConfigError(
+                f"Annotate: at is {at:.12g} s; it must lie within the log, {first:.12g} to {last:.12g} s (times as in "
+                "/api/episodes)"
+            )
+
+    def put(self, text: str, t: int | None, number: int | None, now: int) -> None:
+        """Add a note at `t` (ns), by default `now`, or change the one of that number, which by default stays there."""
+        if number is None:
+            number, t = self._next, now if t is None else t
+        elif t is None:
+            t = self.find(number).t
+        self._become([*self._without(number), Annotation(number, t, _on_one_line(text))])
+
+    def find(self, number: int) -> Annotation:
+        """Return the note of that number.
+
+        Raises:
+            ConfigError: If there is none.
+        """
+        for note in self.notes:
+            if note.number == number:
+                return note
+        raise ConfigError(f"there is no note {number}; /api/annotations lists those there are")
+
+    def delete(self, number: int) -> None:
+        """Delete the note of that number, if it is still there."""
+        self._become(self._without(number))
+
+    def restore(self, notes: Iterable[Annotation]) -> None:
+        """Take over the notes of an earlier session."""
+        self._become([*notes])
+
+    def _without(self, number: int) -> list[Annotation]:
+        return [note for note in self.notes if note.number != number]
+
+    def _become(self, notes: list[Annotation]) -> None:
+        self._next = max([self._next, *(note.number + 1 for note in notes)])
+        self.notes = tuple(sorted(notes, key=lambda note: (note.t, note.number)))
+
+
+def _on_one_line(text: str) -> str:
+    return " ".join(printable(text).split())

@@ -26,7 +26,7 @@ from .batches import BatchSizer, FairLock, Requests
 from .commands import Command
 from .counts import RowCounts
 from .jobs import Jobs
-from .notices import Notices
+from .notices import Annotations, Notices
 from .outputs import Belief, Cursor, EventWindow, Here, Pull, Status, event_window
 from .revisions import Revisions
 from .watchdog import Watchdog
@@ -96,6 +96,7 @@ class Running(ABC):
         self._logs = 0
         self._clear(base)
         self.notices = Notices(lambda: self._log.newest if self._log.n else 0)
+        self.annotations = Annotations()
 
     @contextmanager
     def _reading(self, timeout: float = np.inf) -> Iterator[bool]:

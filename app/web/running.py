@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from estimators.snapshots import Base
     from sources.source import Source
 
+    from ..live.notices import Annotation
     from ..live.workshop import Workshop
     from ..twin.twin import Twin
     from ..views.rerun.rows import RerunRows
@@ -47,8 +48,9 @@ class OpenedTwin:
     """A twin and its source, ready to run, or a recording of one.
 
     `open_source`, `base` and `horizon` are those of `Engine`; `review` is the reviewed recording, `said` the notices of
-    its session, `remarks` new notices, (level, text). `files` are the twin's files, `stamp` their state when read, and
-    `again` reads them once more; a recording has none. `workshop` compiles its filters, and stops with the engine.
+    its session, `annotations` its notes of users, `remarks` new notices, (level, text). `files` are the twin's files,
+    `stamp` their state when read, and `again` reads them once more; a recording has none. `workshop` compiles its
+    filters, and stops with the engine.
     """
 
     twin: Twin
@@ -57,6 +59,7 @@ class OpenedTwin:
     horizon: float | None = None
     review: Path | None = None
     said: Sequence[tuple[int, str, str]] = ()
+    annotations: Sequence[Annotation] = ()
     remarks: Sequence[tuple[str, str]] = ()
     files: tuple[Path, ...] = ()
     stamp: Stamp = ()
@@ -91,6 +94,7 @@ class RunningTwin:
         )
         if opening.said:
             self.engine.notices.restore(list(opening.said))
+        self.engine.annotations.restore(opening.annotations)
         for level, text in opening.remarks:
             self.engine.notices.say(text, level=level)
         self.recorder = Recorder(self.engine, self._draw_into, split, recordings or Path())

@@ -148,6 +148,7 @@ class RunsApi:
         reported = Reported(
             engine.twin, found.estimator, found.tuning, pull.events, pull.track, pull.pictures, episodes,
             rows.marginal, tuple(about), bounds, _scored(self.scores), self._earlier(found, episodes),
+            annotations=engine.annotations.notes,
         )  # fmt: skip
         text = to_html(f"{engine.twin.name}, run {found.number}", report(reported))
         return HTMLResponse(text, headers=self._attachment(found.number, ".html"))

@@ -35,7 +35,7 @@ from .fit_api import FitApi
 from .http import PAGE, OneAtATime, get, page_file, post
 from .runs_api import RunsApi
 from .streams import PageStream, feed_rerun
-from .twin_json import episodes_json, model_json, status_json
+from .twin_json import annotations_json, episodes_json, model_json, status_json
 from .viewer_assets import FILES, viewer_assets, viewer_version
 from .viser_proxy import ViserProxy
 
@@ -136,6 +136,7 @@ class PageServer:
             get("/api/status", self._status),
             get("/api/model", self._model),
             get("/api/episodes", self._episodes),
+            get("/api/annotations", self._annotations),
             get("/api/faults", self._faults),
             *self._runs.routes(),
             *self._fit.routes(),
@@ -198,6 +199,10 @@ class PageServer:
     def _episodes(self) -> list[dict[str, Any]]:
         """Return all episodes by their start."""
         return episodes_json(self._engine)
+
+    def _annotations(self) -> list[dict[str, Any]]:
+        """Return all notes of users by time."""
+        return annotations_json(self._engine)
 
     def _faults(self) -> dict[str, Any]:
         """Return the faults that can be injected into the source."""

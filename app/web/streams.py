@@ -22,9 +22,10 @@ from ..live.running_fold import Running
 from ..present.series.chart_stream import ChartQuery, ChartStream
 from ..present.series.series import Series
 from .http import MAX_BODY_BYTES, one_line, parse
-from .twin_json import episodes_json
+from .twin_json import annotations_json, episodes_json
 
 if TYPE_CHECKING:
+    from ..live.notices import Annotation
     from ..views.rerun.feed import RerunFeed
 
 FRAME_PERIOD_S = 0.1
@@ -92,6 +93,7 @@ class PageStream:
         self._sent: dict[str, Any] = {}
         self._boot = boot
         self._episodes: list[dict[str, Any]] | None = None
+        self._notes: tuple[Annotation, ...] | None = None
         self._notice = 0
         self._pair: tuple[int, ...] | None = None
         self._estimated: tuple[int, int] | None = None
@@ -164,7 +166,7 @@ class PageStream:
             self._series.close(stream)
 
     async def _tell(self) -> None:
-        """Send changes of status, episodes and notices."""
+        """Send changes of status, episodes, notes of users and notices."""
         while True:
             begun = time.monotonic()
             status, episodes, origin = await in_thread(
@@ -176,6 +178,9 @@ class PageStream:
             message: dict[str, Any] = {"status": news} if news else {}
             if episodes != self._episodes:
                 message["episodes"] = self._episodes = episodes
+            if self._engine.annotations.notes is not self._notes:
+                self._notes = self._engine.annotations.notes
+                message["annotations"] = annotations_json(self._engine)
             notices = self._engine.notices.since(self._notice)
             if notices:
                 self._notice = notices[-1].number + 1

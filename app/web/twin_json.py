@@ -92,6 +92,11 @@ def episodes_json(engine: Running) -> list[dict[str, Any]]:
     ]
 
 
+def annotations_json(engine: Running) -> list[dict[str, Any]]:
+    """Return all notes of users by time, in seconds of the log."""
+    return [{"number": note.number, "at": note.t * 1e-9, "text": note.text} for note in engine.annotations.notes]
+
+
 def model_json(engine: Running) -> dict[str, Any]:
     """Return names, units and configured values of a twin, and every estimator with its options or why it is unfit."""
     model, twin = engine.model, engine.twin

@@ -22,6 +22,7 @@ from estimators.tuning import GATE_KEYS, Tuning
 
 from ...format_time import format_time
 from ...live.changes import difference, in_words
+from ...live.notices import Annotation
 from ...twin.twin import Twin
 from ..result import Bar, Topic
 from .alarm_guide import advice
@@ -37,7 +38,7 @@ class Reported(NamedTuple):
 
     `about` are further lines of the head, by name; `bounds` the protection levels of states, where known; `others` all
     runs of the session: number, change, scores; `before` the episodes of earlier runs, by number and change; `smoothed`
-    the smoothed states, if requested.
+    the smoothed states, if requested; `annotations` the notes of users.
     """
 
     twin: Twin
@@ -53,20 +54,21 @@ class Reported(NamedTuple):
     others: tuple[tuple[str, ...], ...] = ()
     before: tuple[tuple[str, Sequence[Episode]], ...] = ()
     smoothed: Smoothed | None = None
+    annotations: Sequence[Annotation] = ()
 
 
 def report(run: Reported) -> list[Topic]:
     """Return the topics of the report, from top to bottom."""
     model = run.twin.model
     found = score(run.track, run.events, model, run.pictures, gate=run.tuning.gate, baseline=run.tuning.baseline)
-    charts = charts_html(run.tuning, run.events, run.track, run.episodes, run.bounds, run.smoothed)
+    charts = charts_html(run.tuning, run.events, run.track, run.episodes, run.bounds, run.smoothed, run.annotations)
     said: tuple[str, ...] = (
-        "Time counts from the first event. Red strips mark episodes. Drag to zoom, double-click for all.",
+        "Time counts from the first event. Red strips mark episodes, flags notes. Drag to zoom, double-click for all.",
     )
     if run.smoothed is not None:
         said += ("Dark lines: smoothed states, which also use later measurements, with ± 2σ.",)
-    topics = [_head(run), _scores(run, found), episode_topic(run), *_before(run), Topic("Charts", said, html=(charts,))]
-    topics += [*_checks(run), _tuning(run)]
+    topics = [_head(run), _scores(run, found), episode_topic(run), *_before(run), *_notes(run)]
+    topics += [Topic("Charts", said, html=(charts,)), *_checks(run), _tuning(run)]
     if run.others:
         head = ("run", "change", "NIS / dof", "log L per measurement", "RMSE")
         topics.append(Topic("Runs of the session", (), head, run.others))
@@ -171,6 +173,13 @@ def _before(run: Reported) -> list[Topic]:
         return []
     said = "Over the same log with earlier settings; a later setting may hide them."
     return [Topic("Episodes of earlier runs", (said,), ("run", "time", "subject", "cause", "text"), tuple(rows))]
+
+
+def _notes(run: Reported) -> list[Topic]:
+    """Return the notes of users by time."""
+    start = int(run.events.t[0])
+    rows = [(clock(round((note.t - start) * 1e-9, 1)), note.text) for note in run.annotations]
+    return [Topic("Notes", (), ("time", "text"), tuple(rows))] if rows else []
 
 
 def _checks(run: Reported) -> list[Topic]:

@@ -23,6 +23,7 @@ from estimators.smoothing.walk import Smoothed
 from estimators.track import USED, Track
 from estimators.tuning import Tuning
 
+from ...live.notices import Annotation
 from ...live.outputs import Pull
 from ..drawing.direct_readings import observed
 from ..series.chart_stream import ChartQuery, ChartStream
@@ -55,6 +56,7 @@ def charts_html(
     episodes: Sequence[Episode],
     bounds: Mapping[str, Bound] | None,
     smoothed: Smoothed | None,
+    annotations: Sequence[Annotation] = (),
 ) -> str:
     """Return the charts of a run as HTML that loads nothing; times count from the first event."""
     model = tuning.model
@@ -71,6 +73,7 @@ def charts_html(
         "episodes": [
             {"from": item.start - start, "to": None if item.end is None else item.end - start} for item in episodes
         ],
+        "annotations": [{"from": (note.t - int(events.t[0])) * 1e-9, "text": note.text} for note in annotations],
         "integrity": {
             name: {"bound": float(item.bound)} for name, item in (bounds or {}).items() if np.isfinite(item.bound)
         },

@@ -2,7 +2,8 @@
 
 Besides the charts, the file keeps plain columns under /nisus: `twin` (YAML, tuning version, overrides, base), `tuning`
 (each with the event from which it applied), `events` (the log), `base` (start of a fold of them, if it has moved),
-`notices` and `summary` (scores of the session, for lists). The track is not stored: log and tuning give it again. Rows
+`notices`, `annotations` (notes of users; the last row of a number counts, one without text is a note that was deleted)
+and `summary` (scores of the session, for lists). The track is not stored: log and tuning give it again. Rows
 have absolute indices; after a late measurement the events are written again from its index on.
 """
 
@@ -14,6 +15,7 @@ import math
 import os
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +35,7 @@ from estimators.track import Track
 from estimators.tuning import Tuning
 
 from ...live.history_copy import copy_rows
+from ...live.notices import Annotation
 from ...live.outputs import Pull
 from ...live.running_fold import Running
 from .rrd_file import END_MESSAGE, MESSAGE_HEADER, STREAM_HEADER, TAKEN, messages
@@ -168,6 +171,8 @@ class RecordingFile:
             raise SourceError(f"recording {path}: {error.strerror}; choose another folder") from None
         self._bytes = self.stream.binary_stream()
         self.rows = 0
+        self._annotations: tuple[Annotation, ...] = ()
+        self._changes = 0
         self._header = {"name": name, "path": str(twin_path), "base": base_to_json(base)}
         self.twin(text, overrides or {}, version)
 
@@ -193,6 +198,25 @@ class RecordingFile:
     def summary(self, found: Mapping[str, Any]) -> None:
         """Write the scores of the session, for lists."""
         self.stream.log("/nisus/summary", rr.AnyValues(json=json.dumps(dict(found))), static=True)
+
+    def annotations(self, notes: tuple[Annotation, ...]) -> None:
+        """Write the notes that were added, changed or deleted since the last call."""
+        if notes is self._annotations:
+            return
+        before, numbers = {note.number: note for note in self._annotations}, {note.number for note in notes}
+        rows = [note for note in notes if note != before.get(note.number)]
+        rows += [replace(note, text="") for number, note in before.items() if number not in numbers]
+        if rows:
+            self.stream.send_columns(
+                "/nisus/annotations",
+                indexes=[rr.TimeColumn("change", sequence=np.arange(self._changes, self._changes + len(rows)))],
+                columns=rr.AnyValues.columns(
+                    number=np.array([note.number for note in rows], np.int64),
+                    t=np.array([note.t for note in rows], np.int64),
+                    text=[note.text for note in rows],
+                ),
+            )
+        self._annotations, self._changes = notes, self._changes + len(rows)
 
     def write(self, pull: Pull) -> None:
         """Write events and notices."""

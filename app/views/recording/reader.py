@@ -23,6 +23,7 @@ from estimators.log import Events
 from estimators.snapshots import Base
 
 from ...live.history_copy import last_written
+from ...live.notices import Annotation
 from .format import FORMAT, PREFIX, READABLE, TIMELINE, base_from_json, version_from_json
 from .rrd_file import MAGIC, MESSAGE_HEADER, STREAM_HEADER, complete_until
 
@@ -33,8 +34,8 @@ class Recorded:
 
     `text` is the twin's YAML, `version` its tuning version, `overrides` the keys that the command line changed (older
     recordings have none). `tuning` is the last of `tunings`. A fold of `events` starts at `base` (None: the prior);
-    `first` is the index of the first event in the session, `rows` their number. `notices` are (t, level, text), and
-    `closed` is whether the recording was finished when it ended.
+    `first` is the index of the first event in the session, `rows` their number. `notices` are (t, level, text),
+    `annotations` the notes of users by time, and `closed` is whether the recording was finished when it ended.
     """
 
     path: Path
@@ -48,6 +49,7 @@ class Recorded:
     tunings: int
     events: Events
     notices: list[tuple[int, str, str]]
+    annotations: list[Annotation]
     first: int
     rows: int
     closed: bool
@@ -99,6 +101,7 @@ def read_recording(path: Path) -> Recorded:
         tunings=len(tunings),
         events=events,
         notices=content.notices,
+        annotations=[note for note in content.annotations.values() if note.text],
         first=start,
         rows=len(events),
         closed=finished(path),
@@ -144,6 +147,7 @@ class _Content:
         self.summary: dict[str, Any] = {}
         self.tunings: list[str] = []
         self.notices: list[tuple[int, str, str]] = []
+        self.annotations: dict[int, Annotation] = {}
         self.events: list[tuple[np.ndarray, dict[str, np.ndarray]]] = []
         self.bases: list[tuple[int, str]] = []
 
@@ -169,6 +173,9 @@ class _Content:
                 self.summary = json.loads(columns["json"][-1])
             elif part == "notices":
                 self.notices += zip(*(columns[name].tolist() for name in ("t", "level", "text")), strict=True)
+            elif part == "annotations":
+                for number, t, text in zip(*(columns[name].tolist() for name in ("number", "t", "text")), strict=True):
+                    self.annotations[number] = Annotation(number, t, text)
             elif part == "tuning":
                 self.tunings += columns["json"].tolist()
             elif part in ("base", "events"):

@@ -228,6 +228,7 @@ class RecordingPart:
     def write(self, *, last: bool = False) -> None:
         """Write all new events; the charts too if they are due or this is the last time."""
         self._write_events()
+        self.file.annotations(self._engine.annotations.notes)
         if self._turned is not None and (last or time.monotonic() - self._turned >= EDIT_REST_S):
             self._turned = None
             self._move(self._start)

@@ -17,8 +17,8 @@
 //   further                            hidden at first
 //   sync                               charts of one name share their cursor
 
-import { element, setText } from "./dom.js";
-import { colour, drawOutsiders, trace } from "./drawing.js";
+import { element, setAttribute, setText } from "./dom.js";
+import { colour, drawNotes, drawOutsiders, trace, writeNotes } from "./drawing.js";
 import { bracketed, clock, compact } from "./format.js";
 import { within } from "./ranges.js";
 import { drawnOn, svgFile } from "./svg.js";
@@ -26,6 +26,7 @@ import { drawnOn, svgFile } from "./svg.js";
 const LABELS = 52; // px for the labels of the value axis
 const TIME = 22; // px for those of the time axis
 const FILE = [960, 330]; // px of a file
+const NEAR_NOTE = 6; // px from a note at which its text is shown
 
 const NAMES = {
   estimate: "estimate", truth: "truth", reading: "measurement", "reading ring": "held out", refused: "rejected",
@@ -53,8 +54,8 @@ export const heading = (what) => `${what.title} ${bracketed(what.unit.replace(/^
 export const declared = (kinds, context) => kinds.toSorted((a, b) => a.order - b.order).flatMap((kind) => kind.default(context));
 
 export class Chart {
-  // select(since, until), home(), wheel(event, plot), save(chart, button): on gestures
-  constructor(what, { select, home, wheel, save } = {}) {
+  // select(since, until), home(), wheel(event, plot), save(chart, button), note(seconds, there): on gestures
+  constructor(what, { select, home, wheel, save, note } = {}) {
     this.what = what;
     this.names = Object.keys(what.series);
     this.reading = element("output", { class: "reading", title: what.help });
@@ -68,7 +69,8 @@ export class Chart {
     this.canvas = element("div", { class: "plot" });
     this.node = element("article", { class: "chart", style: `--weight:${what.weight}`, "aria-label": `Chart of ${what.title}` }, this.head, this.canvas);
     this.data = { x: [], ...Object.fromEntries(this.names.map((name) => [name, []])) };
-    this.actions = { select, home, wheel };
+    this.actions = { select, home, wheel, note };
+    this.notes = []; // notes of users, [{from, text}] by time
     this.visible = true;
     this.empty = true;
   }
@@ -96,6 +98,7 @@ export class Chart {
       this.canvas,
     );
     if (this.actions.wheel) this.plot.over.addEventListener("wheel", (event) => this.actions.wheel(event, this.plot), { passive: false });
+    if (this.actions.note) this.plot.over.addEventListener("click", (event) => event.altKey && this.actions.note(this.plot.posToVal(event.offsetX, "x"), this.notesAt(event.offsetX)[0]));
     this.sized = new ResizeObserver(() => {
       const { clientWidth: width, clientHeight: height } = this.canvas;
       if (width > 0 && height > 0 && (width !== this.plot.width || height !== this.plot.height)) this.plot.setSize({ width, height });
@@ -136,7 +139,9 @@ export class Chart {
         draw: [
           (self) => draw(self, true),
           (self) => what.over?.(self),
+          (self) => drawNotes(self, this.notes),
           (self) => (this.outsiders = drawOutsiders(self, Object.values(what.series), (value) => this.amount(value))),
+          (self) => (this.written = this.naming ? writeNotes(self, this.notes, this.moment ?? null, this.outsiders.some((mark) => mark.above && mark.furthest)) : []),
         ],
       },
     };
@@ -147,9 +152,9 @@ export class Chart {
     return [x, ...this.names.map((name) => this.data[name] ?? new Array(x.length).fill(null))];
   }
 
-  // span: seconds at both ends of the axis; moment: that which is looked at, or null.
-  show(data, span, moment = null) {
-    Object.assign(this, { data, span, moment });
+  // span: seconds at both ends of the axis; moment: that which is looked at, or null; naming: with the texts of notes.
+  show(data, span, moment = null, notes = [], naming = false) {
+    Object.assign(this, { data, span, moment, notes, naming });
     if (this.visible) this.draw();
     else this.waiting = true;
   }
@@ -181,6 +186,12 @@ export class Chart {
     const here = this.moment === null || this.moment === undefined ? x.length - 1 : within(x, [-Infinity, this.moment])[1];
     const at = left >= 0 && idx !== null && idx !== undefined ? idx : here;
     setText(this.reading, at < 0 ? "" : this.what.says((name) => this.at(name, at)));
+    setAttribute(self.over, "title", this.notesAt(left).map((note) => `${clock(note.from, 1)} ${note.text}`).join("\n") || null);
+  }
+
+  // Notes at a place, px from the left.
+  notesAt(left) {
+    return left < 0 ? [] : this.notes.filter(({ from }) => Math.abs(this.plot.valToPos(from, "x") - left) < NEAR_NOTE);
   }
 
   // The value of a column there, or the last one before it.
@@ -195,9 +206,11 @@ export class Chart {
     return this.what.amount?.(value) ?? `${compact(value, 3)} ${this.what.unit.replace(/^\[|\]$/g, "")}`.trim();
   }
 
-  // The chart as the text of an SVG file, as it is shown now.
+  // The chart as the text of an SVG file, as it is shown now, with the texts of notes.
   svg(lines, size = FILE) {
-    return svgFile(size, lines, this.legend, (context, width, height) => {
+    const { naming } = this;
+    this.naming = true;
+    const text = svgFile(size, lines, this.legend, (context, width, height) => {
       const options = this.options(width, height, true);
       const { min, max } = this.plot.scales.y;
       options.scales.y.range = () => [min, max];
@@ -205,6 +218,8 @@ export class Chart {
       plot.batch(() => plot.setScale("x", { min: this.span[0], max: this.span[1] }));
       plot.destroy();
     });
+    this.naming = naming;
+    return text;
   }
 
   // Legend of a file: [[text, style]] of everything that has values.

@@ -15,6 +15,8 @@ export class Charts {
     this.live = new Stream(link, "charts");
     this.overview = new Stream(); // of the time bar, which is always there
     this.episodes = [];
+    this.notes = []; // of users, by time
+    this.draft = null; // the one that is being written
     this.nisDof = 1; // mean degrees of freedom of a measurement
     this.visible = true;
     this.range = [0, model.window];
@@ -23,6 +25,7 @@ export class Charts {
       home: () => view.follow(view.configured),
       wheel: (event, plot) => this.wheel(event, plot),
       save: (chart, button) => this.saving.chart(chart, button),
+      note: (...place) => this.noting(...place),
     };
     this.strong = new Strong(this, link);
     this.layers = [];
@@ -46,6 +49,10 @@ export class Charts {
       // Of a twin that has ended, no frame follows.
       if (performance.now() - this.drawnAt > REDRAW_AFTER_MS) this.draw();
       else this.marking = setTimeout(() => this.draw(), REDRAW_AFTER_MS);
+    });
+    link.addEventListener("annotations", (event) => {
+      this.notes = event.detail;
+      this.draw();
     });
     link.addEventListener("status", (event) => this.update(event.detail));
     new ResizeObserver(() => this.ask()).observe(node);
@@ -99,8 +106,10 @@ export class Charts {
     if (!this.view.following) this.range = [this.view.since, this.view.until];
     else if (x.length) this.range = followed(x[0], x.at(-1), this.view.span);
     if (!this.visible || !x.length) return;
-    for (const chart of this.charts) if (!chart.node.hidden) chart.show(chart.what.data(), this.range, this.view.at);
-    this.pins.show(this.range);
+    const notes = this.draft ? [...this.notes.filter((note) => note.number !== this.draft.number), this.draft] : this.notes;
+    const [[first]] = [...this.layout.shown(), []];
+    for (const chart of this.charts) if (!chart.node.hidden) chart.show(chart.what.data(), this.range, this.view.at, notes, chart.what.key === first);
+    this.pins.show(this.range, notes);
     this.axis.show(this.range);
     this.drawnAt = performance.now();
     window.nisus.drawn = (window.nisus.drawn ?? 0) + 1;
@@ -114,6 +123,18 @@ export class Charts {
     const at = plot.posToVal(event.offsetX, "x");
     if (event.shiftKey) this.view.pan(((event.deltaY || event.deltaX) / 600) * (this.range[1] - this.range[0]), this.range);
     else this.view.zoom(event.deltaY > 0 ? 1.25 : 0.8, at, this.range);
+  }
+
+  // Px from the left edge of the window to a moment.
+  placeOf(seconds) {
+    const { plot } = this.charts.find((chart) => !chart.node.hidden);
+    return plot.over.getBoundingClientRect().left + plot.valToPos(seconds, "x");
+  }
+
+  // Where the pointer is, else the moment that is looked at, else the newest row, s.
+  get pointed() {
+    const plot = this.charts.find((chart) => !chart.node.hidden)?.plot;
+    return plot?.cursor.left >= 0 ? plot.posToVal(plot.cursor.left, "x") : (this.view.at ?? this.newest);
   }
 
   get newest() {

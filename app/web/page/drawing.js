@@ -134,6 +134,91 @@ export function marks(plot, episodes, at = null) {
   ctx.restore();
 }
 
+// Notes at moments
+
+const FLAG = 7; // px
+const NOTE_ROW = 15; // px of the line of texts
+
+// notes: [{from, text}] by time: those that are shown, with their places.
+function flags(plot, notes) {
+  const { min, max } = plot.scales.x;
+  return notes.filter(({ from }) => min <= from && from <= max).map((note) => ({ ...note, left: Math.round(plot.valToPos(note.from, "x", true)) + devicePixelRatio / 2 }));
+}
+
+// A dotted line with a flag for each.
+export function drawNotes(plot, notes) {
+  const { ctx, bbox } = plot;
+  const scale = devicePixelRatio;
+  const size = FLAG * scale;
+  ctx.save();
+  ctx.fillStyle = ctx.strokeStyle = colour("ink");
+  ctx.lineWidth = scale;
+  ctx.setLineDash([scale, 3 * scale]);
+  for (const { left } of flags(plot, notes)) {
+    ctx.beginPath();
+    ctx.moveTo(left, bbox.top);
+    ctx.lineTo(left, bbox.top + bbox.height);
+    ctx.stroke();
+    ctx.beginPath();
+    ctx.moveTo(left, bbox.top);
+    ctx.lineTo(left + size, bbox.top + size / 2);
+    ctx.lineTo(left, bbox.top + size);
+    ctx.fill();
+  }
+  ctx.restore();
+}
+
+// Their texts as far as there is room to the next one; that at the moment which is looked at, `at`, in full. `lower`: the
+// first line is taken. Returns the texts as they are written.
+export function writeNotes(plot, notes, at, lower) {
+  const { ctx, bbox } = plot;
+  const scale = devicePixelRatio;
+  const top = bbox.top + (lower ? NOTE_ROW * scale : 0);
+  ctx.save();
+  ctx.font = `${11 * scale}px system-ui, sans-serif`;
+  ctx.textBaseline = "top";
+  ctx.textAlign = "left";
+  const found = placed(plot, flags(plot, notes), at);
+  for (const { text, start, width } of found) {
+    ctx.fillStyle = colour("panel");
+    ctx.fillRect(start - 2 * scale, top, width + 4 * scale, (NOTE_ROW - 1) * scale);
+    ctx.fillStyle = colour("ink");
+    ctx.fillText(text, start, top + 2 * scale);
+  }
+  ctx.restore();
+  return found.map(({ text }) => text);
+}
+
+// [{text, start, width}] of the notes whose text has a place: to the right of its flag, or the last one to the left.
+function placed({ ctx, bbox, scales: { x } }, shown, at) {
+  const scale = devicePixelRatio;
+  const [gap, right] = [(FLAG + 4) * scale, bbox.left + bbox.width - 4 * scale];
+  const near = (1.5 * (x.max - x.min)) / bbox.width; // s in one and a half px
+  const found = [];
+  let end = bbox.left; // of the text before
+  shown.forEach(({ from, text, left }, k) => {
+    const full = ctx.measureText(text).width;
+    const looked = at !== null && Math.abs(from - at) <= near;
+    const until = looked ? right : Math.min(right, (shown[k + 1]?.left ?? Infinity) - 6 * scale);
+    const [after, before] = [until - left - gap, left - 6 * scale - (looked ? bbox.left : end)];
+    const flipped = after < full && before > after && (looked || k === shown.length - 1);
+    const cut = fitted(ctx, text, full, flipped ? before : after);
+    if (!cut) return;
+    const width = Math.min(full, ctx.measureText(cut).width);
+    const start = flipped ? left - 6 * scale - width : left + gap;
+    end = start + width;
+    found.push({ text: cut, start, width, looked });
+  });
+  return found.sort((a, b) => a.looked - b.looked);
+}
+
+// A text cut to a width, with its end marked; "" where not even a few letters have room.
+function fitted(ctx, text, full, room) {
+  if (full <= room) return text;
+  const letters = Math.floor((text.length * room) / full) - 2;
+  return letters < 3 ? "" : `${text.slice(0, letters).trimEnd()}…`;
+}
+
 // Values beyond the axis. The axis does not follow every outlier (ranges.js); each is marked at the edge of the chart,
 // and the furthest with its value.
 

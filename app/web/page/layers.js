@@ -176,8 +176,8 @@ export class Pins {
     }
   }
 
-  show(range) {
-    if (this.pinned.length) this.chart.show({ x: range }, range);
+  show(range, notes) {
+    if (this.pinned.length) this.chart.show({ x: range }, range, null, notes);
   }
 
   curves(state) {

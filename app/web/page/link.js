@@ -6,13 +6,14 @@ import { unpack } from "./stream.js";
 const STATUS_REPEAT_MS = 1000; // ms without news after which the last status is told again
 const SETTLED_AFTER_MS = 700; // ms after the last edit or revision
 
-// Events: "status", "episodes", "notices", "frames", "connection"; each with `detail`.
+// Events: "status", "episodes", "annotations", "notices", "frames", "connection"; each with `detail`.
 export class Link extends EventTarget {
   constructor(boot) {
     super();
     this.boot = boot;
     this.status = {};
     this.episodes = [];
+    this.annotations = []; // notes of users
     this.streams = {}; // queries by name, to ask again after a break
     this.takers = {}; // by stream: take(header, seconds, columns)
     this.turned = -Infinity; // when something was edited, or folded anew
@@ -79,6 +80,7 @@ export class Link extends EventTarget {
       this.tell("status", this.status);
     }
     if (message.episodes) this.tell("episodes", (this.episodes = message.episodes));
+    if (message.annotations) this.tell("annotations", (this.annotations = message.annotations));
     if (message.notices) this.tell("notices", message.notices);
     if (message.belief) this.tell("belief", message.belief);
     if (message.error) console.error(message.error);

@@ -13,7 +13,7 @@ import { Save } from "./save.js";
 import { Leave } from "./session.js";
 import { Stage } from "./stage.js";
 import { Transport } from "./transport.js";
-import { Episodes, Trust } from "./trust.js";
+import { Episodes, Trust, UserNotes } from "./trust.js";
 import { Tune } from "./tune.js";
 import { goTo, SharedTime, twinOf, View } from "./view.js";
 import { WhatIf } from "./whatif.js";
@@ -38,22 +38,24 @@ window.nisus = { model, drawn: 0, revision: null };
 const link = new Link(settings.boot);
 window.nisus.link = link;
 
-// Times of episodes and events as the charts count them.
+// Times of episodes, notes and events as the charts count them.
 link.addEventListener("status", () => {
   const origin = link.status.origin;
   if (origin !== link.origin) {
     link.origin = origin;
-    place(link.episodes);
+    place();
   }
 });
-function place(episodes) {
+function place() {
   const origin = Number(link.status.origin ?? 0) / 1e9;
-  for (const episode of episodes) {
+  for (const episode of link.episodes) {
     episode.from = episode.start - origin;
     episode.to = episode.end === null ? null : episode.end - origin;
   }
+  for (const note of link.annotations) note.from = note.at - origin;
 }
-link.addEventListener("episodes", (event) => place(event.detail));
+link.addEventListener("episodes", place);
+link.addEventListener("annotations", place);
 link.addEventListener("notices", (event) => {
   const origin = link.status.origin;
   for (const notice of event.detail) notice.from = origin && notice.t ? (notice.t - Number(origin)) / 1e9 : null;
@@ -68,7 +70,8 @@ const side = new Tabs($("side-tabs"), "nisus.side");
 new Trust(model, link, (tab) => side.show(tab));
 const tune = (window.nisus.tune = new Tune(model, link));
 new Faults($("faults"), model, link);
-new Episodes($("episodes"), link, view, charts);
+const notes = new UserNotes(link, view, charts);
+new Episodes($("episodes"), link, view, charts, notes.node);
 const runs = new Runs($("runs"), link);
 new SharedTime(settings.boot, view, charts);
 const transport = new Transport(model, link, view, charts);
@@ -178,6 +181,7 @@ keys([
   ["ArrowRight", "move charts forward", () => view.pan(0.1 * (charts.range[1] - charts.range[0]), charts.range)],
   ["f", "follow the newest data", () => view.follow()],
   ["0", "default width of the charts", () => view.follow(view.configured)],
+  ["n", "note at the cursor (Alt-click in a chart)", () => (middle.show("charts-panel"), notes.write())],
   ["r", "start or stop recording", record],
   ["u", "undo the last edit", () => tune.undo()],
   ["U", "redo", () => tune.redo()],

@@ -9,7 +9,7 @@ import { Stream, unpack } from "./stream.js";
 const HEIGHT = 190; // px of a chart of weight one
 const PAPER = [960, 300]; // px of a drawing
 
-const { model, kinds, streams, episodes, integrity, nis_dof: nisDof } = JSON.parse(document.getElementById("chart-data").textContent);
+const { model, kinds, streams, episodes, annotations, integrity, nis_dof: nisDof } = JSON.parse(document.getElementById("chart-data").textContent);
 
 const context = { model, episodes, integrity, nisDof, view: { at: null }, live: streamOf(streams.live), layers: [] };
 const whole = [context.live.x[0], context.live.x.at(-1)];
@@ -45,5 +45,5 @@ for (const chart of charts) {
 
 function show(range) {
   context.range = range;
-  for (const chart of charts) chart.show(chart.what.data(), range);
+  charts.forEach((chart, k) => chart.show(chart.what.data(), range, null, annotations, k === 0));
 }

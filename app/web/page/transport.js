@@ -9,6 +9,7 @@ const HEALTH = ["waiting", "tracking", "suspect", "degraded", "diverged", "stale
 const SPEEDS = [["0.1×", 0.1], ["0.25×", 0.25], ["0.5×", 0.5], ["1×", 1], ["2×", 2], ["5×", 5], ["10×", 10], ["max", "inf"]];
 const WINDOWS = [10, 30, 60, 120, 300, 900, 3600];
 const POINTS = 400;
+const NEAR = 6; // px from a note
 
 export class Transport {
   constructor(model, link, view, charts) {
@@ -34,6 +35,7 @@ export class Transport {
       this.episodes = event.detail;
       this.draw();
     });
+    link.addEventListener("annotations", () => this.draw());
     link.addEventListener("status", (event) => this.show(event.detail));
     view.addEventListener("change", () => this.draw());
     new ResizeObserver(() => this.draw()).observe(this.canvas);
@@ -126,6 +128,15 @@ export class Transport {
     ctx.textAlign = "center";
     ctx.fillStyle = tone("ink");
     for (const episode of this.episodes) ctx.fillText("▾", Math.min(width - 5, Math.max(5, place(episode.from))), 12);
+    // Notes of users: flags below the track.
+    for (const { from } of this.charts.notes) {
+      const left = Math.min(width - 5, Math.max(0, place(from)));
+      ctx.beginPath();
+      ctx.moveTo(left, 26);
+      ctx.lineTo(left + 6, 29);
+      ctx.lineTo(left, 32);
+      ctx.fill();
+    }
     // What the charts show.
     const [since, until] = this.charts.range;
     ctx.strokeStyle = tone("ink");
@@ -160,7 +171,9 @@ export class Transport {
     const time = this.time(event);
     const near = this.episodes.filter((episode) => episode.from <= time && time <= (episode.to ?? Infinity));
     const future = time > this.now ? (this.status?.seekable ? ": click to play on from here" : "") : "";
-    setAttribute(this.canvas, "title", [clock(time, 1) + future, ...near.map((episode) => `${SIGNS.suspect} ${episode.text}`)].join("\n"));
+    const [start, end] = this.ends;
+    const notes = this.charts.notes.filter(({ from }) => Math.abs(from - time) * this.canvas.clientWidth < NEAR * (end - start));
+    setAttribute(this.canvas, "title", [clock(time, 1) + future, ...notes.map((note) => `⚑ ${note.text}`), ...near.map((episode) => `${SIGNS.suspect} ${episode.text}`)].join("\n"));
   }
 
   keyed(event) {

@@ -115,11 +115,14 @@ const KINDS = [
 const grouped = (n) => n.toLocaleString("en");
 
 export class Episodes {
-  constructor(node, link, view, charts) {
+  // notes: the list of notes of users
+  constructor(node, link, view, charts, notes) {
     Object.assign(this, { node, link, view, charts });
+    this.body = element("div", {});
     this.notices = [];
     this.held = []; // offsets of held-out sensors, in words
     this.counts = element("dl", { class: "counts", "aria-label": "Measurement counts" });
+    node.replaceChildren(this.counts, notes, this.body);
     link.addEventListener("episodes", (event) => this.show(event.detail));
     link.addEventListener("notices", (event) => {
       // After a reconnection all arrive again.
@@ -160,8 +163,7 @@ export class Episodes {
     const open = episodes.filter((episode) => episode.end === null).reverse();
     const over = episodes.filter((episode) => episode.end !== null).reverse();
     const list = (items, entry) => element("ol", {}, ...items.map(entry));
-    this.node.replaceChildren(
-      this.counts,
+    this.body.replaceChildren(
       element("h3", {}, open.length ? `Now (${open.length})` : `Now: no faults${this.held.length ? " in the sensors in use" : ""}`),
       list(open, (item) => this.entry(item)),
       this.held.length ? element("h3", {}, "Held out") : "",
@@ -193,5 +195,80 @@ export class Episodes {
     const when = notice.from === null ? "" : clock(notice.from);
     const line = element("li", { class: "event", dataset: { level: notice.level } }, element("time", {}, when), element("span", {}, notice.text));
     return after && after.run !== notice.run ? [element("li", { class: "run-before" }, `run ${notice.run}`), line] : [line];
+  }
+}
+
+// Notes of users at moments: a list with the episodes, and a field that opens in the charts.
+
+const MAX_NOTE = 500; // characters
+
+export class UserNotes {
+  constructor(link, view, charts) {
+    Object.assign(this, { link, view, charts });
+    this.title = element("h3", {}, "Notes");
+    this.list = element("ol", {});
+    const add = element("button", { type: "button", class: "go", title: "Note at the cursor (N, or Alt-click in a chart)", onclick: () => this.write() }, "Add");
+    this.node = element("section", { class: "notes", "aria-label": "Notes" }, element("header", {}, this.title, add), this.list);
+    this.when = element("time", {});
+    this.field = element("input", { type: "text", maxlength: MAX_NOTE, "aria-label": "Note", placeholder: "Note" });
+    this.error = element("p", { class: "error", role: "alert", hidden: true });
+    this.form = element(
+      "form", { id: "note", popover: "manual", "aria-label": "Note at a moment", onsubmit: (event) => (event.preventDefault(), this.save()), onkeydown: (event) => event.key === "Escape" && this.close() },
+      this.when, this.field, element("button", { type: "submit", class: "go" }, "Save"), element("button", { type: "button", onclick: () => this.close() }, "Cancel"), this.error,
+    );
+    document.body.append(this.form);
+    charts.noting = (seconds, there) => this.write(seconds, there);
+    link.addEventListener("annotations", () => this.show());
+    this.show();
+  }
+
+  show() {
+    const { annotations } = this.link;
+    setText(this.title, annotations.length ? `Notes (${annotations.length})` : "Notes");
+    this.list.replaceChildren(...annotations.map((note) => this.entry(note)));
+  }
+
+  entry(note) {
+    const at = clock(note.from, 1);
+    const go = () => this.view.goTo(note.from, this.charts.range, this.charts.newest);
+    const edit = () => (go(), this.write(note.from, note));
+    const remove = () => this.link.ask("DeleteAnnotation", { number: note.number });
+    return element("li", { dataset: { number: note.number } },
+      element("button", { type: "button", class: "at", title: "Show in the charts", onclick: go }, element("time", {}, at), element("span", {}, note.text)),
+      element("button", { type: "button", title: "Edit", "aria-label": `Edit the note at ${at}`, onclick: edit }, "✎"),
+      element("button", { type: "button", title: "Delete", "aria-label": `Delete the note at ${at}`, onclick: remove }, "×"));
+  }
+
+  // Open the field for a new note at a moment, or for a note of the list.
+  write(seconds = this.charts.pointed, note = null) {
+    const { charts } = this;
+    if (!Number.isFinite(charts.newest)) return; // no measurement has arrived yet
+    const from = note?.from ?? Math.min(charts.newest, Math.max(0, seconds));
+    this.draft = charts.draft = { number: note?.number, from, text: note?.text ?? "" };
+    setText(this.when, clock(from, 1));
+    this.field.value = this.draft.text;
+    this.error.hidden = true;
+    this.form.showPopover();
+    const box = charts.node.getBoundingClientRect();
+    const left = charts.placeOf(from);
+    this.form.style.left = `${Math.max(4, Math.min(box.right - this.form.offsetWidth - 4, left + 10))}px`;
+    this.form.style.top = `${box.top + 24}px`;
+    this.field.focus();
+    charts.draw();
+  }
+
+  close() {
+    this.charts.draft = null;
+    this.form.hidePopover();
+    this.charts.draw();
+  }
+
+  async save() {
+    const { number, from } = this.draft;
+    const at = number === undefined ? { at: Number(this.link.status.origin) / 1e9 + from } : { number };
+    const reason = await this.link.ask("Annotate", { text: this.field.value, ...at });
+    setText(this.error, reason ?? "");
+    this.error.hidden = !reason;
+    if (!reason) this.close();
   }
 }

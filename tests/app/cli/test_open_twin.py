@@ -1,18 +1,25 @@
-"""How `run` and `review` open a twin: its first speed, the gallery, and a review that judges as the run did."""
+"""How `run` and `review` open a twin: its speed, the gallery, and a review with the verdicts and notes of a run."""
+
+import subprocess
+import sys
 
 import numpy as np
 import pytest
 
-from app.cli.open_twin import opened_twin, recorded_twin
+from app.cli.open_twin import opened_review, opened_twin, recorded_twin
+from app.live.notices import Annotation
 from app.twin.log_reader import read_log, remarking
 from app.twin.twin import load_twin
 from app.views.recording.reader import read_recording
 from app.views.recording.writer import write_recording
+from app.web.session import Session
 from config.loader import load
 from estimators.diagnostics.episodes import episodes
-from estimators.errors import ConfigError
+from estimators.errors import ConfigError, SourceError
 from sources.source import LOST_FRAMES, controls_of
-from tests.support import assert_same, folded
+from tests.app.scripted import wait_for
+from tests.conftest import ROOT
+from tests.support import SECOND, assert_same, folded
 
 TWIN = (
     "title: tank\nmodel: motor_winding\nestimator: kf\nsource:\n  type: simulator\n  seed: 1\n  step: 1\n"
@@ -103,3 +110,61 @@ def test_the_terminal_states_lost_frames_once(capsys):
     said = capsys.readouterr().err
     assert "78 % of frames dropped" in said and "79 %" not in said
     assert len(reported) == 2
+
+
+RECORDED = """
+import sys, time
+sys.path.insert(0, {root!r})
+from pathlib import Path
+from app.cli.run import live_source
+from app.live.commands import Annotate, DeleteAnnotation, Record
+from app.twin.twin import load_twin
+from app.web.session import Session
+twin = load_twin({twin!r})
+session = Session(twin, live_source(twin, float("inf")), page=None)
+session.engine.submit(Record(Path({path!r})))
+session.start()
+while not session.engine.status().finished:
+    time.sleep(0.01)
+first = session.engine.span()[0] * 1e-9
+for text in ("pump off", "a slip", "door open"):
+    session.engine.submit(Annotate(text, first + 12.5))
+while len(session.engine.annotations.notes) < 3:
+    time.sleep(0.01)
+print("noted", flush=True)
+sys.stdin.readline()
+session.engine.submit(Annotate("door shut", number=3))
+session.engine.submit(DeleteAnnotation(2))
+print("corrected", flush=True)
+time.sleep(600)
+"""
+
+
+def test_a_review_has_the_notes_of_a_session_that_was_killed(tmp_path):
+    yaml, path = tmp_path / "tank.yaml", tmp_path / "run.rrd"
+    yaml.write_text(TWIN)
+    code = RECORDED.format(root=str(ROOT), twin=str(yaml), path=str(path))
+    child = subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    try:
+        assert child.stdout.readline() == "noted\n"
+        # Written with the log, which happens some times a second; then only changes are.
+        wait_for(lambda: [note.text for note in notes_in(path)] == ["pump off", "a slip", "door open"])
+        child.stdin.write("\n")
+        child.stdin.flush()
+        assert child.stdout.readline() == "corrected\n"
+        wait_for(lambda: [note.text for note in notes_in(path)] == ["pump off", "door shut"])
+    finally:
+        child.kill()
+        child.wait()
+    session = Session(opened_review(path), page=None)
+    assert not read_recording(path).closed
+    t = read_recording(path).events.t[0] + round(12.5 * SECOND)
+    assert session.engine.annotations.notes == (Annotation(1, t, "pump off"), Annotation(3, t, "door shut"))
+
+
+def notes_in(path):
+    """The notes of a recording that is being written; none while it has no content."""
+    try:
+        return read_recording(path).annotations
+    except SourceError:
+        return []

@@ -57,6 +57,8 @@ def answer(engine, body):
         ({"command": "SetTuning", "key": "", "value": 1}, "'' is not a tuning key of motor_drive; choose from"),
         ({"command": "SetOption", "name": "jozeph", "value": 1}, "no option 'jozeph'; did you mean joseph?"),
         ({"command": "UseSensor", "name": "yok", "used": False}, "UseSensor: name is 'yok', no sensor of motor_drive"),
+        ({"command": "Annotate", "text": "x"}, "Annotate: no measurement has arrived yet; wait for the first"),
+        ({"command": "Annotate", "text": 1}, "Annotate: text is 1; it must be a text"),
         ({"command": "Pause", "paused": None}, "Pause: paused is null; it must be true or false"),
         ({"command": "Reset", "now": 1}, "Reset: now is not known; it takes no field"),
         ({"command": "InjectFault", "kind": "bias", "target": "parameter.x", "size": 1}, "target is 'parameter.x', no"),
@@ -74,7 +76,8 @@ def test_a_command_that_cannot_be_says_why(engine, body, line):
 def bodies():
     """Every field of every command, and every key of a tuning, with what does not belong there."""
     usual = {"key": "gate", "name": "yoke", "value": 0.5, "used": True, "what": "x", "states": ["yoke"], "paused": True,
-             "factor": 1.0, "seconds": 1.0, "path": None, "kind": "bias", "target": "yoke", "size": 1.0}  # fmt: skip
+             "factor": 1.0, "seconds": 1.0, "path": None, "kind": "bias", "target": "yoke", "size": 1.0,
+             "text": "x"}  # fmt: skip
     for kind in KINDS:
         fields = dataclasses.fields(kind)
         for field in fields:

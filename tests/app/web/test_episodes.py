@@ -1,4 +1,4 @@
-"""Health in the API: episodes with their section of docs/alarms.md, the cause, and the state of each sensor."""
+"""Health in the API: episodes with their section of docs/alarms.md, causes, states of sensors; and notes of users."""
 
 import json
 import re
@@ -10,7 +10,7 @@ import pytest
 from app.live.engine import Engine
 from app.web.twin_json import episodes_json, status_json
 from tests.app.scripted import Scripted, readings
-from tests.app.served import shown_twin
+from tests.app.served import PATIENCE, shown_twin
 
 ROOT = Path(__file__).parents[3]
 
@@ -44,3 +44,26 @@ def test_a_stuck_sensor_in_the_api(engine):
     said = strict(status_json(engine))
     assert said["health"] == "degraded" and said["cause"] == episode["text"] and said["episodes_open"] == 1
     assert said["sensors"] == {"winding": {"state": "degraded", "text": episode["text"]}}
+
+
+def test_every_browser_gets_the_notes_of_users(serve):
+    page = serve(20)
+
+    def told(browser):
+        """The next list of notes that a browser gets."""
+        while "annotations" not in (message := json.loads(browser.recv(timeout=PATIENCE))):
+            pass
+        return message["annotations"]
+
+    with page.connect("/api/stream") as one, page.connect("/api/stream") as other:
+        assert told(one) == told(other) == []
+        assert page.post("/api/command", command="Annotate", text="pump off", at=1.5)[0] == 202
+        (note,) = told(one)
+        assert note == {"number": 1, "at": pytest.approx(1.5, abs=1e-9), "text": "pump off"}
+        assert told(other) == page.get("/api/annotations") == [note]
+        page.post("/api/command", command="Annotate", number=1, text="pump on")
+        assert told(one) == told(other) == [note | {"text": "pump on"}]
+        page.post("/api/command", command="DeleteAnnotation", number=1)
+        assert told(one) == told(other) == page.get("/api/annotations") == []
+    status, answer = page.post("/api/command", command="Annotate", text="x", at=99.0)
+    assert status == 400 and answer["error"].startswith("Annotate: at is 99 s; it must lie within the log, 0.1 to 2 s")
