@@ -192,7 +192,12 @@ class FieldSurfaceScene(FieldView):
             at, reach = self._bars_at, 2 * std[pick].ravel()[self._bars_at]
             ends = [np.column_stack((self._x[at], self._y[at], self._height(values[at] + s))) for s in (-reach, reach)]
             put_points(self._bars, np.stack(ends, axis=1))
-        self._title.text = f"{self._name} [{self._unit}]; colour: {self._kind.title}"
+        colors = (
+            ""
+            if scale is upright
+            else f"; colour: {self._kind.title}, {scale.low:.3g} to {scale.high:.3g} {self._unit}"
+        )
+        self._title.text = f"{self._name} [{self._unit}]{colors}"
         left, front = -0.5 * self._size
         draw_ticks(self._labels, upright, lambda share: (left - 0.03, front, (share - 0.5) * SURFACE_HEIGHT))
 

@@ -14,6 +14,7 @@
 //   axis, amount(value)                labels of the value axis, a value as text; where the axis is not a plain one
 //   filled()                           whether it shows something without data of its own
 //   names                              {tone: legend text} of a file, where it differs from NAMES; "" for none
+//   ramp()                             colour bar of a picture in its head: {colors, low, high}
 //   further                            hidden at first
 //   sync                               charts of one name share their cursor
 
@@ -59,10 +60,12 @@ export class Chart {
     this.what = what;
     this.names = Object.keys(what.series);
     this.reading = element("output", { class: "reading", title: what.help });
+    this.ramp = what.ramp && element("span", { class: "ramp", role: "img" }, element("span"), element("i", { style: `background: linear-gradient(to right, ${what.ramp().colors.join()})` }), element("span"));
     this.head = element(
       "header", {},
-      element("b", {}, what.title), element("span", { class: "unit" }, what.unit ?? ""),
+      element("h3", {}, what.title), element("span", { class: "unit" }, what.unit ?? ""),
       what.note ? element("span", { class: "note" }, what.note) : null,
+      this.ramp ?? null,
       element("span", { class: "space" }), this.reading,
       save ? element("button", { type: "button", class: "save", title: "Save this chart", "aria-label": `Save the chart of ${what.title}`, "aria-haspopup": "menu", onclick: (event) => save(this, event.currentTarget) }, "⤓") : null,
     );
@@ -168,6 +171,16 @@ export class Chart {
       this.plot.setScale("x", { min: this.span[0], max: this.span[1] });
     });
     this.pointed(this.plot);
+    if (this.ramp) this.scale();
+  }
+
+  // Both ends of the colour bar, with the unit.
+  scale() {
+    const { low, high } = this.what.ramp();
+    setText(this.ramp.firstChild, Number.isFinite(low) ? compact(low, 3) : "");
+    setText(this.ramp.lastChild, Number.isFinite(high) ? this.amount(high) : "");
+    setAttribute(this.ramp, "aria-label", `Colours of ${heading(this.what)}: ${this.ramp.firstChild.textContent} to ${this.ramp.lastChild.textContent}`);
+    setAttribute(this.ramp, "title", this.ramp.ariaLabel);
   }
 
   // uPlot fires this hook for every chart that shares the cursor; only the dragged one has a pointer event.
@@ -232,6 +245,7 @@ export class Chart {
     for (const { tone, edges } of what.bands ?? []) if (shown(edges[0])) add(named(tone), { tone, mark: "area" });
     for (const [name, style] of Object.entries(what.series)) if (style.mark && shown(name)) add(named(style.ring ? `${style.tone} ring` : style.tone), style);
     for (const curve of what.curves?.() ?? []) if (curve.x.length) add(curve.legend, { ...curve, mark: curve.fill ? "area" : "line" });
+    if (this.ramp) add(`${this.ramp.firstChild.textContent} to ${this.ramp.lastChild.textContent}`, { mark: "ramp", colors: what.ramp().colors });
     return [...found];
   }
 

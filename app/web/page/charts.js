@@ -1,13 +1,32 @@
 // The stack of charts: one time axis, one cursor. The kinds of charts are the files of the folder charts.
 
 import { Chart, declared, TimeAxis } from "./chart.js";
-import { $, element, setText } from "./dom.js";
+import { $, element, setAttribute, setText } from "./dom.js";
 import { Pins, Previous, Smoothed, Strong } from "./layers.js";
 import { Stream } from "./stream.js";
 
 const DENSITY = 1.6; // px to a group of rows
 const REDRAW_AFTER_MS = 500; // ms without a frame
 const MAX_HALVINGS = 4; // of the window, while there is less than that to show
+const LEGEND_DELAY_MS = 400; // ms after a drawing
+
+// Marks in the order of the legend: text, where the charts differ, and tooltip.
+const LEGEND = {
+  estimate: ["estimate", "Estimate of the filter"],
+  band: ["± 2σ", "Estimate ± 2 standard deviations"],
+  integrity: [null, "Protection level: the largest error that one undetected fault can cause"],
+  truth: [null, "Known true value, for comparison only"],
+  reading: [null, "Measurement that the filter used"],
+  "reading ring": [null, "Measurement of a held-out sensor: predicted and scored, not used"],
+  refused: [null, "Measurement rejected by the gate"],
+  "refused ring": [null, "Measurement outside its plausible range or rate"],
+  smoothed: [null, "Estimate that also uses later measurements"],
+  previous: [null, "Estimate of the run before"],
+  quiet: ["single value", "NIS of one measurement, or one state of a group"],
+  bounds: ["95 % range", "Range in which a consistent filter has 95 % of these values"],
+  "episode-strip": [null, "Time of a fault episode: see Episodes"],
+  outside: [null, "Value beyond the axis; the furthest has its value beside it"],
+};
 
 export class Charts {
   constructor(node, model, link, view, kinds) {
@@ -112,9 +131,27 @@ export class Charts {
     this.pins.show(this.range, notes);
     this.axis.show(this.range);
     this.drawnAt = performance.now();
+    this.explaining ??= setTimeout(() => ((this.explaining = null), this.explain()), LEGEND_DELAY_MS);
     window.nisus.drawn = (window.nisus.drawn ?? 0) + 1;
     window.nisus.revision = this.live.revision;
     this.node.dataset.revision = this.live.revision;
+  }
+
+  // Legend of the shown charts, each mark once. Pinned runs are added where they are drawn (layers.js).
+  explain() {
+    const shown = this.charts.filter((chart) => !chart.node.hidden);
+    const found = new Map();
+    const add = (key, text, style) => key in LEGEND && !found.has(key) && found.set(key, [LEGEND[key][0] ?? text, style]);
+    for (const chart of shown) for (const [text, style] of chart.legend) add(style.ring ? `${style.tone} ring` : style.tone, text, style);
+    const [since, until] = this.range;
+    if (this.episodes.some(({ from, to }) => from < until && (to ?? until) > since)) add("episode-strip", "fault episode", { mark: "line", tone: "episode-strip", width: 2.5 });
+    if (shown.some((chart) => chart.outsiders?.length)) add("outside", "off scale", { mark: "triangle", tone: "faint" });
+    const items = Object.keys(LEGEND).flatMap((key) => (found.has(key) ? [[key, ...found.get(key)]] : []));
+    const written = items.map(([, text]) => text).join();
+    if (written === this.explained) return;
+    this.explained = written;
+    $("legend").querySelectorAll("li:not(.pinned)").forEach((item) => item.remove());
+    $("legend").append(...items.map(([key, text, style]) => element("li", { title: LEGEND[key][1], dataset: { key } }, sample(style), text)));
   }
 
   wheel(event, plot) {
@@ -140,6 +177,13 @@ export class Charts {
   get newest() {
     return (this.visible ? this.live : this.overview).x.at(-1) ?? Infinity;
   }
+}
+
+// A mark as the legend shows it.
+function sample({ mark, tone, ring, dash = [], width = 1.5 }) {
+  const kind = { area: "box", dots: ring ? "ring" : "dot", triangle: "triangle" }[mark] ?? "line";
+  const stroke = dash[0] > 3 ? "dashed" : dash.length ? "dotted" : "solid";
+  return element("i", { class: kind, "aria-hidden": "true", style: `color: var(--${tone})${kind === "line" ? `; border-top: ${Math.max(1.5, width)}px ${stroke}` : ""}` });
 }
 
 // The last seconds; while there are fewer, a part of the window that they fill from the left.
@@ -170,7 +214,7 @@ class Layout {
   }
 
   prepare(chart) {
-    const grip = element("div", { class: "grip", role: "separator", "aria-orientation": "horizontal", "aria-label": `Height of ${chart.what.title}`, tabindex: 0, title: "Drag to change the height, double-click to reset it" });
+    const grip = element("div", { class: "grip", role: "separator", "aria-orientation": "horizontal", "aria-valuemin": LOWEST, "aria-valuemax": HIGHEST, "aria-label": `Height of ${chart.what.title}`, tabindex: 0, title: "Drag to change the height, double-click to reset it" });
     let from = null;
     grip.addEventListener("pointerdown", (event) => {
       grip.setPointerCapture(event.pointerId);
@@ -224,6 +268,7 @@ class Layout {
       chart.node.hidden = hidden.has(chart.what.key);
       const height = this.kept.heights?.[chart.what.key];
       chart.node.style.flex = height ? `0 0 ${height}px` : "";
+      setAttribute(chart.node.querySelector(".grip"), "aria-valuenow", chart.node.clientHeight);
     });
     this.told();
   }

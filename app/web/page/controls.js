@@ -1,28 +1,59 @@
-// Tabs: buttons that say with data-tab which element they show. The choice is kept.
+// Tabs: buttons that name with data-tab the panel they show. The choice is kept.
 
 import { $, element } from "./dom.js";
 
 export class Tabs {
   constructor(node, key, shown = () => {}) {
-    Object.assign(this, { key, shown });
-    this.buttons = [...node.querySelectorAll("[data-tab]")];
-    for (const button of this.buttons) {
-      button.setAttribute("role", "tab");
+    Object.assign(this, { node, key, shown });
+    this.own = this.buttons;
+    for (const button of this.own) {
+      const panel = $(button.dataset.tab);
+      const attributes = { role: "tab", id: `tab-${panel.id}`, "aria-controls": panel.id };
+      for (const [name, value] of Object.entries(attributes)) button.setAttribute(name, value);
+      panel.setAttribute("aria-labelledby", button.id);
+      panel.before(element("h2", { class: "unseen" }, button.textContent));
       button.addEventListener("click", () => this.show(button.dataset.tab));
       button.addEventListener("keydown", (event) => {
         const step = { ArrowLeft: -1, ArrowRight: 1 }[event.key];
         if (!step) return;
-        const next = this.buttons[(this.buttons.indexOf(button) + step + this.buttons.length) % this.buttons.length];
+        const buttons = (this.into ?? this).buttons.filter((item) => item.checkVisibility());
+        const next = buttons[(buttons.indexOf(button) + step + buttons.length) % buttons.length];
         next.focus();
         this.show(next.dataset.tab);
         event.stopPropagation();
       });
     }
     const kept = key && localStorage.getItem(key);
-    this.chosen = this.buttons.some((button) => button.dataset.tab === kept) ? kept : null;
+    this.chosen = this.own.some((button) => button.dataset.tab === kept) ? kept : null;
+  }
+
+  get buttons() {
+    return [...this.node.querySelectorAll("[data-tab]")];
+  }
+
+  // The tab that is shown, of this list or of the one it has joined.
+  get current() {
+    return (this.into ?? this).chosen;
+  }
+
+  // Move tabs and panels behind those of another list; null moves them back.
+  join(into) {
+    const from = this.into;
+    if (into === (from ?? null)) return;
+    this.into = into;
+    const list = into ?? this;
+    (into ? into.own.at(-1) : null)?.after(...this.own);
+    if (!into) this.node.append(...this.own);
+    for (const { dataset } of this.own) list.node.parentElement.append($(dataset.tab).previousElementSibling, $(dataset.tab));
+    if (into) return into.show(into.chosen);
+    const mine = this.own.some((button) => button.dataset.tab === from.chosen);
+    if (mine) this.chosen = from.chosen;
+    from.show(mine ? from.own[0].dataset.tab : from.chosen);
+    this.show(this.chosen);
   }
 
   show(name) {
+    if (this.into) return this.into.show(name);
     this.chosen = name;
     if (this.key) localStorage.setItem(this.key, name);
     for (const button of this.buttons) {

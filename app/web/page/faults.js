@@ -14,7 +14,7 @@ export class Faults {
     const answer = await fetch("/api/faults");
     if (!answer.ok) return;
     this.catalogue = await answer.json();
-    this.node.append(this.faultSection(), this.maintenanceSection());
+    this.node.append(element("h2", { class: "unseen" }, "Faults and maintenance"), this.faultSection(), this.maintenanceSection());
     this.link.addEventListener("status", (event) => this.show(event.detail));
     this.show(this.link.status);
   }

@@ -28,7 +28,9 @@ export const spaced = (unit) => (unit && unit !== "1" ? ` ${unit}` : "");
 
 export const bracketed = (unit) => (unit && unit !== "1" ? `[${unit}]` : "");
 
-// Seconds of the log as a clock: 0:07.3, 12:31, 3:05:00.
+const MAX_HOURS = 48; // from which on a clock counts days
+
+// Seconds of the log as a clock: 0:07.3, 12:31, 3:05:00, 2 d 07:30.
 export function clock(seconds, fraction = 0) {
   if (!Number.isFinite(seconds)) return "–";
   const sign = seconds < 0 ? "-" : "";
@@ -37,6 +39,7 @@ export function clock(seconds, fraction = 0) {
   const hours = Math.floor(all / 3600);
   const minutes = Math.floor((all % 3600) / 60);
   const rest = (all % 60).toFixed(fraction).padStart(fraction ? 3 + fraction : 2, "0");
+  if (hours >= MAX_HOURS) return `${sign}${Math.floor(hours / 24)} d ${String(hours % 24).padStart(2, "0")}:${String(minutes).padStart(2, "0")}`;
   return hours ? `${sign}${hours}:${String(minutes).padStart(2, "0")}:${rest}` : `${sign}${minutes}:${rest}`;
 }
 
@@ -55,6 +58,7 @@ export function inChartTime(text, origin, newest) {
 
 // A length of time: 3.2 s, 4 min, 2.5 h.
 export function span(seconds) {
+  if (seconds > 0 && seconds < 0.1) return `${Number((1000 * seconds).toPrecision(2))} ms`;
   if (seconds < 10) return `${Number(seconds.toPrecision(2))} s`;
   if (seconds < 120) return `${Math.round(seconds)} s`;
   if (seconds < 7200) return `${Math.round(seconds / 60)} min`;

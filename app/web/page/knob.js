@@ -302,6 +302,7 @@ export class Around {
   }
 
   mark() {
+    this.tune.marks.hidden = false;
     for (const [key, knob] of this.tune.knobs) knob.say(key[1] === "." && key[0] !== "p" ? this.saying(key) : null);
     for (const curve of this.open.values()) curve.write();
     const doubt = this.said.Q?.doubt;
@@ -309,7 +310,8 @@ export class Around {
     const scale = $("scale-Q");
     if (!scale) return;
     scale.disabled = !level;
-    setText(scale, level ? `data ×${compact(level, 2)}` : "data –");
+    setText(scale, level ? `◆ ×${compact(level, 2)}` : "◇ none");
+    setAttribute(scale, "aria-label", `All of Q as the data suggest: ${level ? `×${compact(level, 2)}` : "no factor"}`);
     setAttribute(scale, "title", level
       ? `All of Q ×${compact(level, 3)}: there the innovations are as large as the filter says. Take it`
       : doubt ? `Not to be taken: ${doubt}` : this.said.Q?.done ? "Between ×0.1 and ×10 no level of Q makes the innovations as large as the filter says" : "Being folded in the background …");
@@ -401,7 +403,7 @@ class Curve {
       button.hidden = !offers[k];
       if (!offers[k]) continue;
       const [value, title] = offers[k];
-      setText(button, `${k || !best || best.factor === 1 ? "data say" : "take"} ${compact(value, 3)}`);
+      setText(button, `${k || !best || best.factor === 1 ? "◆ take" : "take"} ${compact(value, 3)}`);
       setAttribute(button, "title", `Take it: ${title}`);
     }
     setText(this.why, said && !said.value ? said.text : "");

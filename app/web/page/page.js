@@ -84,8 +84,9 @@ const middle = new Tabs($("middle-tabs"), null, (shown) => {
   for (const [name, pane] of Object.entries(panes)) if (name !== shown) pane.hide();
   panes[shown]?.show();
   charts.show(shown === "charts-panel");
-  $("layout").hidden = shown !== "charts-panel";
-  $("legend").hidden = shown === "diagnose" || shown === "explore";
+  $("layout").hidden = $("smoothed").hidden = shown !== "charts-panel";
+  $("legend").hidden = shown !== "charts-panel" && shown !== "whatif";
+  if (side.into) side.shown(shown);
 });
 window.nisus.panes = panes;
 const saving = new Save(model, link, view, charts);
@@ -135,8 +136,13 @@ side.shown = (name) => {
   if (stages) stage.visible(name === "scene");
 };
 side.show(side.chosen ?? "scene");
+// Where there is no room for three columns, one list of tabs has all panels; see style.css.
+const narrow = matchMedia("(max-width: 1100px)");
+const arrange = () => side.join(narrow.matches ? middle : null);
+narrow.addEventListener("change", arrange);
+arrange();
 // The scene once the charts stand: its three.js keeps the page busy while it starts.
-link.addEventListener("frames", () => setTimeout(() => ((stages = true), side.shown(side.chosen)), 300), { once: true });
+link.addEventListener("frames", () => setTimeout(() => ((stages = true), side.shown(side.current)), 300), { once: true });
 
 async function record() {
   if (link.status.recording) await link.ask("Record", { path: null });
@@ -188,7 +194,7 @@ keys([
   ["b", "switch to the previous run and back", () => runs.swap()],
   ["e", "episodes", () => side.show("episodes")],
   ["y", "state over state (XY)", () => side.show("xy")],
-  ["s", "scene; again: enlarge or shrink", () => (side.chosen === "scene" ? stage.enlarge() : side.show("scene"))],
+  ["s", "scene; again: enlarge or shrink", () => (side.current === "scene" ? stage.enlarge() : side.show("scene"))],
   ["x", "explore in Rerun", () => turn("explore")],
   ["w", "what if", () => turn("whatif")],
   ["d", "diagnose", () => turn("diagnose")],

@@ -137,7 +137,7 @@ class SvgContext {
 const HEAD_PX = 50; // px for title, smaller line and legend
 
 // The text of an SVG file. draw(ctx, width, height) draws below the lines [title, smaller line] and the legend:
-// [[text, {tone, mark, ring, dash, width}]]. Paths that uPlot makes meanwhile record as well. Drawings are in pixels of
+// [[text, {tone, mark, ring, dash, width, colors}]]. Paths that uPlot makes meanwhile record as well. Drawings are in pixels of
 // the screen, `scale` of which are one of the file.
 export function svgFile([width, height], [title, about], legend, draw, scale = devicePixelRatio) {
   return inLight(() => {
@@ -162,13 +162,14 @@ export function svgFile([width, height], [title, about], legend, draw, scale = d
 
 function legendText(legend, width, colour) {
   let at = width - 16;
-  const parts = legend.toReversed().map(([name, { tone, mark, ring, dash = [], width: thick = 1.5 }]) => {
+  const parts = legend.toReversed().map(([name, { tone, mark, ring, colors = [], dash = [], width: thick = 1.5 }]) => {
     at -= Math.round(6.6 * name.length) + 4;
     const text = `<text x="${at}" y="0" font-size="12" fill="${colour("faint")}">${escaped(name)}</text>`;
-    at -= 20;
+    at -= mark === "ramp" ? 9 * colors.length + 5 : 20;
     const stroke = `fill="none" stroke="${colour(tone)}" stroke-width="${thick}"`;
     const sample = {
       dots: `<circle cx="${at + 9}" cy="-4" r="3" ${ring ? stroke : `fill="${colour(tone)}"`}/>`,
+      ramp: colors.map((color, k) => `<rect x="${at + 9 * k}" y="-9" width="9" height="10" fill="${color}"/>`).join(""),
       area: `<rect x="${at}" y="-8" width="15" height="8" fill="${colour(tone)}"/>`,
     }[mark] ?? `<path d="M${at} -4h15" ${stroke}${dash.length ? ` stroke-dasharray="${dash.join(" ")}"` : ""}/>`;
     at -= 10;

@@ -97,8 +97,12 @@ export class Transport {
 
   draw() {
     $("follow").hidden = this.view.following;
-    setText($("at"), this.view.at === null ? "" : `at ${clock(Math.min(this.view.at, this.now), 1)}`);
+    setText($("at"), this.view.at === null || this.now - this.view.at < 0.05 ? "" : `at ${clock(Math.min(this.view.at, this.now), 1)}`);
     const { canvas } = this;
+    const [from, to] = this.ends;
+    const seconds = Math.min(this.view.at ?? Infinity, Number.isFinite(this.now) ? this.now : from);
+    const values = { "aria-valuemin": Math.floor(from), "aria-valuemax": Math.ceil(to), "aria-valuenow": Math.round(seconds), "aria-valuetext": clock(seconds) };
+    for (const [name, value] of Object.entries(values)) setAttribute(canvas, name, value);
     const [width, height] = [canvas.clientWidth, canvas.clientHeight];
     const ratio = devicePixelRatio;
     if (canvas.width !== Math.round(width * ratio) || canvas.height !== Math.round(height * ratio)) {
@@ -177,7 +181,11 @@ export class Transport {
   }
 
   keyed(event) {
-    const step = { ArrowLeft: -0.1, ArrowRight: 0.1 }[event.key];
+    const step = { ArrowLeft: -0.1, ArrowRight: 0.1, PageDown: -1, PageUp: 1 }[event.key];
     if (step) this.view.pan(step * (this.charts.range[1] - this.charts.range[0]), this.charts.range);
+    else if (event.key === "Home") this.view.goTo(this.ends[0], this.charts.range);
+    else if (event.key === "End") this.view.follow();
+    else return;
+    event.preventDefault();
   }
 }

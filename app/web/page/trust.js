@@ -65,7 +65,7 @@ export class Trust {
     $("recording").hidden = !file;
     setText($("recording"), file);
     setAttribute($("recording"), "title", where);
-    const latency = typeof status.latency_ms === "number" ? `${compact(status.latency_ms, 2)} ms` : "";
+    const latency = typeof status.latency_ms === "number" ? `latency ${span(status.latency_ms / 1000)}` : "";
     setText($("latency"), latency);
   }
 

@@ -21,7 +21,8 @@ export class Tune {
     this.picks = new Gestures(); // of filters, with the keys of the list
     this.sections = element("div", { class: "sections" });
     $("tune").replaceChildren(this.head(), this.sections);
-    this.sections.append(this.filterSection());
+    this.marks = element("p", { class: "faint marks", hidden: true }, "◆ suggested by the data · ◇ no suggestion");
+    this.sections.append(this.filterSection(), this.marks);
     for (const [prefix, title] of Object.entries(GROUPS)) {
       const items = model.tuning.filter((item) => item.key.startsWith(`${prefix}.`));
       if (items.length) this.sections.append(this.group(prefix, title, items));
@@ -83,7 +84,7 @@ export class Tune {
   together(prefix, title) {
     const button = (text, factor) => element("button", { type: "button", title: `All of ${title} ${text}`, onclick: () => this.scale(prefix, factor) }, text);
     const data = prefix === "Q"
-      ? element("button", { type: "button", id: "scale-Q", disabled: true, onclick: () => this.scale("Q", Number(data.dataset.level)) }, "data –")
+      ? element("button", { type: "button", id: "scale-Q", disabled: true, onclick: () => this.scale("Q", Number(data.dataset.level)) }, "◇ none")
       : null;
     return element("div", { class: "together" }, element("span", {}, "all"), button("÷10", 0.1), button("÷2", 0.5), button("×2", 2), button("×10", 10), data);
   }
@@ -131,6 +132,7 @@ export class Tune {
     if (document.activeElement !== this.estimator) this.estimator.value = status.estimator;
     for (const [name, option] of this.choices) setText(option, option.dataset.title + unready(status.compiling, name));
     const entry = this.model.estimators.find((item) => item.name === status.estimator);
+    setAttribute($("estimator-place"), "data-title", entry.title);
     if (this.entry !== entry) this.build(entry);
     for (const [name, knob] of this.optionKnobs) {
       if (knob instanceof Knob) knob.sync(status.options[name]);

@@ -19,8 +19,9 @@ if (new URLSearchParams(location.search).has("darkMode")) {
   const AFTER = 500; // ms, in which pictures, labels and the ground come
   const LONGEST = 4000; // ms, after which it is shown whatever there is
   const hidden = document.createElement("style");
-  const panel = new URLSearchParams(location.search).has("darkMode") ? "#131a23" : "#ffffff"; // of style.css
-  hidden.textContent = `:root, body { background: ${panel} !important; } body { opacity: 0; }`;
+  const dark = new URLSearchParams(location.search).has("darkMode");
+  const [panel, faint] = dark ? ["#131a23", "#94a3b5"] : ["#ffffff", "#5b6a7d"]; // of chart.css
+  hidden.textContent = `:root, body { background: ${panel} !important; } body { opacity: 0; } :root::after { content: "Loading the scene …"; position: fixed; inset: 46% 0 auto; text-align: center; font: 13px system-ui, sans-serif; color: ${faint}; }`;
   document.head.append(hidden);
   const drawing = WebGL2RenderingContext.prototype;
   const given = Object.fromEntries(["drawElements", "drawArrays", "drawElementsInstanced", "drawArraysInstanced"].map((name) => [name, drawing[name]]));

@@ -3,7 +3,7 @@
 
 import { band, edge, line } from "../chart.js";
 import { area, clipped, marks } from "../drawing.js";
-import { bracketed, compact, spaced, words } from "../format.js";
+import { bracketed, compact, decimals, fixed, spaced, words } from "../format.js";
 import { Range, bandExtent, extent, shownExtent, within } from "../ranges.js";
 
 export const order = 1;
@@ -72,7 +72,8 @@ function lines(charts, group) {
       const known = members.map((state) => [value(state.name), words(state.label)]).filter(([number]) => Number.isFinite(number)).sort(([a], [b]) => a - b);
       if (!known.length) return "";
       const [[low, lowest], [high, highest]] = [known[0], known.at(-1)];
-      return `${lowest} ${compact(low, 4)} lowest · median ${compact(median(known.map(([number]) => number)), 4)} · ${highest} ${compact(high, 4)}${spaced(unit)} highest`;
+      const figure = (number) => (high > low ? fixed(number, decimals(high - low)) : compact(number));
+      return `lowest ${figure(low)} (${lowest}) · median ${figure(median(known.map(([number]) => number)))} · highest ${figure(high)}${spaced(unit)} (${highest})`;
     },
   };
 }
@@ -123,11 +124,12 @@ function picture(charts, group) {
   };
   const chart = {
     ...own,
-    note: `rows: ${first} to ${members.at(-1).number}, the first at the bottom`,
+    note: `rows ${first} to ${members.at(-1).number}, upwards`,
     weight: 2.4,
     series: Object.fromEntries(names.map((name) => [name, edge()])),
     data: () => ({ x: charts.live.lineTimes, ...Object.fromEntries(names.map((name) => [name, charts.live.lineColumn(`mean:${name}`)])) }),
     range: () => [first - 0.5, members.at(-1).number + 0.5],
+    ramp: () => ({ colors: WARM, low, high }),
     paint: (plot) => {
       const data = chart.data();
       const [from, to] = within(data.x, charts.range);
@@ -139,7 +141,7 @@ function picture(charts, group) {
     },
     says: (value) => {
       const known = names.map(value).filter(Number.isFinite);
-      return known.length ? `${compact(Math.min(...known), 3)} to ${compact(Math.max(...known), 3)}${spaced(unit)}; dark ${compact(low, 2)}, light ${compact(high, 2)}` : "";
+      return known.length ? `${compact(Math.min(...known), 3)} to ${compact(Math.max(...known), 3)}${spaced(unit)}` : "";
     },
   };
   return chart;

@@ -2,13 +2,16 @@
 
 import { band, dots, line } from "../chart.js";
 import { marks } from "../drawing.js";
-import { bracketed, compact, spaced, words } from "../format.js";
+import { bracketed, compact, decimals, fixed, spaced, words } from "../format.js";
 import { Range, shownExtent, within } from "../ranges.js";
 
 export const order = 4;
 
 const MAX_CHARTS = 24;
 const FEW_ROWS = 6; // shown at first
+
+// To the digits that its expected size justifies.
+const figure = (value, size) => (size > 0 ? fixed(value, decimals(size)) : compact(value, 3));
 
 export default (charts) => charts.model.rows.slice(0, MAX_CHARTS).map((row, k, rows) => {
   const axisRange = new Range();
@@ -32,6 +35,6 @@ export default (charts) => charts.model.rows.slice(0, MAX_CHARTS).map((row, k, r
       const most = Math.max(...shownExtent({ bands: [[data.lower, data.upper]], dots: [data.value] }, ...within(data.x, span)).map(Math.abs));
       return axisRange.fit(-most, most);
     },
-    says: (value) => (Number.isFinite(value("value")) ? `${compact(value("value"), 3)}${spaced(row.unit)}  ± ${compact(value("upper"), 3)} expected` : "no measurement"),
+    says: (value) => (Number.isFinite(value("value")) ? `${figure(value("value"), value("upper"))}${spaced(row.unit)}  ± ${compact(value("upper"), 2)} expected` : "no measurement"),
   };
 });

@@ -53,6 +53,7 @@ def test_a_part_in_doubt_is_striped_and_one_that_is_known_is_not(server):
     assert places == sorted(places) and places[0] < 30
     assert magnet[1] == yoke[0]
     assert scene._bar._texts[2].text == "magnet  40.0 ± 16.0 °C"
+    assert scene._bar.title.text == "temperature [°C]"
     scene.draw(None, belief(np.full(model.nx, np.nan), std))
     assert {tuple(handle.color) for handles in scene._parts for handle in handles} == {(205, 205, 210)}
     assert scene._bar._texts[2].text == "magnet  –"
@@ -71,7 +72,7 @@ def test_cells_are_as_full_as_they_are_charged(server):
     # From 97 % up to full, and no further.
     assert doubt.position[2] - doubt.scale[2] / 2 == pytest.approx(0.97 * HEIGHT)
     assert doubt.position[2] + doubt.scale[2] / 2 == pytest.approx(HEIGHT)
-    assert scene._texts[0].text == "99 ± 2 %"
+    assert scene._texts[0].text == "99.0 ± 2.0 %" and scene._bar.title.text == "temperature [°C]"
     scene.draw(None, belief(np.full(model.nx, np.nan), std))
     assert not fill.visible and not doubt.visible and scene._texts[0].text == "–"
     scene.root.remove()

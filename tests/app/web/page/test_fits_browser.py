@@ -41,6 +41,12 @@ WIDER = """() => {
 }"""  # noqa: E501
 
 
+@pytest.fixture(scope="module")
+def session():
+    with running("motor_winding") as session:
+        yield session
+
+
 @pytest.mark.parametrize("name", ["motor_can", "agv_corridor", "battery_pack", "lorenz96"])
 def test_nothing_is_wider_than_its_column(name, visit):
     with running(name, 4.0) as session:
@@ -70,3 +76,101 @@ def test_nothing_is_wider_than_its_column(name, visit):
                 page.get_by_role("button", name="Tune").first.click()
                 assert page.evaluate(WIDER) == [], (width, "Tune")
                 page.get_by_role("button", name="Tune").first.click()
+
+
+SIDE = {"Scene": "scene", "XY": "xy", "Runs": "runs", "Episodes": "episodes"}
+
+
+def test_below_1100_px_the_right_column_becomes_tabs(visit, session):
+    page = visit(session.url, size=(1440, 900))
+    assert page.locator("#side-tabs [role=tab]").count() == len(SIDE)
+    wide = page.locator("#charts").bounding_box()["width"]
+    page.get_by_role("tab", name="Episodes").click()
+    page.set_viewport_size({"width": 1000, "height": 800})
+    page.locator("#middle-tabs #tab-episodes").wait_for()
+    assert page.locator("#side-tabs [role=tab]").count() == 0 and page.locator("#charts").is_visible()
+    assert page.locator("#charts").bounding_box()["width"] == 1000 > wide
+    for name, panel in SIDE.items():
+        page.get_by_role("tab", name=name, exact=True).click()
+        shown = page.locator("#middle > [role=tabpanel]:visible")
+        assert shown.count() == 1 and shown.get_attribute("id") == panel
+        assert shown.bounding_box()["width"] > 650 and page.locator("#middle-tabs [aria-selected=true]").count() == 1
+    # From the strip too, and by the arrows; back in a wide window, the tab that was shown stays.
+    page.locator("#health").click()
+    assert page.locator("#episodes").is_visible()
+    page.keyboard.press("y")
+    page.locator("#tab-xy").focus()
+    page.keyboard.press("ArrowRight")
+    assert page.locator("#runs").is_visible()
+    page.set_viewport_size({"width": 1440, "height": 900})
+    page.locator("#side-tabs #tab-runs").wait_for()
+    assert page.locator("#right #runs").is_visible() and page.locator("#charts").is_visible()
+    until(page, "window.nisus.charts.visible")
+
+
+@pytest.mark.parametrize("name", ["gripper_contact", "motor_can", "uwb_rover_plaza"])
+def test_a_phone_shows_health_cause_and_charts_without_controls(name, visit):
+    """At 390 px nothing leaves the screen, and no control changes the session."""
+    with running(name, 4.0) as session:
+        page = visit(session.url, size=(390, 844), ready="window.nisus?.drawn > 3")
+        for tab in ("Charts", "Diagnose", "Scene", "XY", "Episodes"):
+            page.get_by_role("tab", name=tab, exact=True).click()
+            if tab in FILLED:
+                until(page, FILLED[tab])
+            page.evaluate("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
+            assert page.evaluate(WIDER) == [], tab
+        page.get_by_role("tab", name="Charts").click()
+        assert page.locator("#health").is_visible() and page.locator("#lights").is_visible()
+        for control in ("#tune", "#faults", "#estimator", "#record", "#pause", "#speed", "#tab-runs", "#tab-whatif"):
+            assert page.locator(control).is_hidden(), control
+        boxes = [box for item in page.locator("#charts .chart:visible").all() if (box := item.bounding_box())]
+        assert len(boxes) > 2 and all(box["width"] == 390 and box["height"] >= 130 for box in boxes)
+        assert all(a["y"] + a["height"] <= b["y"] + 1 for a, b in zip(boxes, boxes[1:], strict=False))
+        # The cause is read in full.
+        cause = "yoke reads 6.1 °C above its prediction since 1:02: check the wiring of the sensor or hold it out"
+        page.evaluate("(text) => (document.getElementById('cause').textContent = text)", cause)
+        assert page.locator("#cause").evaluate("(node) => node.scrollHeight - node.clientHeight") <= 1
+
+
+LEGEND = """() => {
+  const { charts } = window.nisus.charts, nodes = [...document.querySelectorAll("#legend li")];
+  const seen = nodes.filter((node) => {
+    const box = node.getBoundingClientRect(), frame = node.closest("nav").getBoundingClientRect();
+    return box.width && box.left >= frame.left && box.right <= frame.right + 1 && box.bottom <= frame.bottom + 1;
+  });
+  const key = ([, style]) => (style.ring ? `${style.tone} ring` : style.tone);
+  const drawn = new Set(charts.filter((chart) => !chart.node.hidden).flatMap((chart) => chart.legend.map(key)));
+  drawn.delete("bound");
+  const explained = nodes.every((node) => node.textContent && node.title);
+  return [[...drawn], seen.map((node) => node.dataset.key), explained];
+}"""
+
+
+@pytest.mark.parametrize("width", [1000, 1440, 1920])
+def test_the_legend_has_every_mark_of_the_charts_and_no_other(visit, width):
+    with running("motor_can", 4.0, **{"gate.probability": "0.9"}) as session:
+        page = visit(session.url, size=(width, 900), ready="window.nisus?.drawn > 3")
+        page.evaluate("window.nisus.link.ask('UseSensor', {name: 'yoke', used: false})")
+        marks = {"estimate", "band", "truth", "reading", "reading ring", "refused", "previous", "quiet", "bounds"}
+
+        def complete():
+            drawn, seen, explained = page.evaluate(LEGEND)
+            extra = set(seen) - {"episode-strip", "outside"}
+            return marks <= set(drawn) and set(drawn) == extra and explained
+
+        wait_for(complete, PATIENCE)
+
+
+def test_a_picture_has_a_colour_bar_with_its_ends(visit):
+    """The bar's ends enclose all that is drawn, and are not far beyond it; a file has the bar too."""
+    with running("lorenz96", 4.0) as session:
+        page = visit(session.url, ready="window.nisus?.drawn > 5")
+        picture = "window.nisus.charts.charts.find((chart) => chart.what.ramp)"
+        low, high, least, most, legend = page.evaluate(f"""(() => {{
+          const chart = {picture}, values = chart.names.flatMap((name) => chart.data[name]).filter((v) => typeof v === "number");
+          const [low, , high] = [...chart.ramp.children].map((node) => parseFloat(node.textContent));
+          return [low, high, Math.min(...values), Math.max(...values), chart.legend.map(([text]) => text)];
+        }})()""")  # noqa: E501
+        assert low <= least < most <= high and high - low < 2 * (most - least)
+        assert page.locator(".ramp i").first.bounding_box()["width"] > 80
+        assert len(legend) == 1 and [float(part) for part in legend[0].split(" to ")] == [low, high]

@@ -114,6 +114,52 @@ def test_every_control_is_reached_by_tab_and_has_a_name(visit, session, show):
         wait_for(lambda: not session.engine.status().paused, PATIENCE)
 
 
+OUTLINE = """() => {
+  const seen = (node) => node.checkVisibility({ visibilityProperty: true });
+  const headings = [...document.querySelectorAll("h1, h2, h3, h4, h5, h6")].filter(seen);
+  const panels = [...document.querySelectorAll("#tune, #faults, [role=tabpanel]")].filter(seen);
+  const before = (panel) => panel.previousElementSibling?.matches("h2") || panel.querySelector("h2");
+  const numbers = ["aria-valuemin", "aria-valuemax", "aria-valuenow"];
+  const sliders = [...document.querySelectorAll("[role=slider], [role=separator][tabindex]")].filter(seen);
+  return {
+    levels: headings.map((node) => Number(node.localName[1])),
+    untitled: panels.filter((panel) => !before(panel)).map((panel) => panel.id),
+    sliders: sliders.map((node) => numbers.map((name) => parseFloat(node.getAttribute(name)))),
+    unnamed: [...document.querySelectorAll("[role=tabpanel]")].filter((panel) => !document.getElementById(panel.getAttribute("aria-labelledby"))).map((panel) => panel.id),
+  };
+}"""  # noqa: E501
+
+
+@pytest.mark.parametrize("tabs", [["XY"], ["Runs", "What if"], ["Episodes", "Diagnose"]])
+@pytest.mark.parametrize("width", [1000, 1440])
+def test_headings_form_an_outline_and_sliders_have_values(visit, session, tabs, width):
+    page = visit(session.url, size=(width, 900))
+    page.locator("#faults details").first.wait_for(state="attached")
+    for tab in tabs:
+        page.get_by_role("tab", name=tab, exact=True).click()
+    wait_for(
+        lambda: page.locator("#diagnose h2, #diagnose article, #whatif article, #xy canvas, #charts").count() > 0,
+        PATIENCE,
+    )
+    found = page.evaluate(OUTLINE)
+    levels = found["levels"]
+    assert levels[0] == 1 and levels.count(1) == 1
+    assert all(after <= level + 1 for level, after in zip(levels, levels[1:], strict=False))
+    assert found["untitled"] == [] and found["unnamed"] == []
+    assert found["sliders"] and all(low <= now <= high for low, high, now in found["sliders"])
+
+
+def test_the_time_slider_is_moved_by_keys(visit, session):
+    page = opened(visit, session)
+    track = page.get_by_role("slider", name="Time: health and events")
+    until(page, "window.nisus.charts.newest > 2")
+    track.focus()
+    page.keyboard.press("Home")
+    until(page, "window.nisus.view.at !== null && document.getElementById('timeline').ariaValueNow === '0'")
+    page.keyboard.press("End")
+    until(page, "window.nisus.view.following")
+
+
 def color(text):
     """Parse a computed colour: rgb(a), or color(srgb …) of a mixture."""
     numbers = [float(part) for part in re.findall(r"-?\d+\.?\d*(?:e-?\d+)?", text.removeprefix("color(srgb"))]
