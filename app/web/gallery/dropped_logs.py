@@ -27,7 +27,7 @@ from .recordings import DATABASE, Recordings
 
 ROLES = ("states", "sensors", "inputs", "held_out")  # Fields of `app.studies.advice.plan.Roles`
 
-DRAFT_TIMEOUT_S = 600.0  # Longest time between two steps of a draft
+JOB_TIMEOUT_S = 600.0  # Longest time between two items of a job; the page shows how long it has taken
 
 OPTION_WORDS = {
     "--hold-out ": "held out: ", "--inputs ": "input: ", "--sensors ": "sensor: ", "--states ": "state: ",
@@ -60,7 +60,7 @@ class ReaderJob:
         function: Callable[..., Iterator[Any]],
         path: Path,
         *args: Any,
-        timeout: float | None = None,
+        timeout: float,
         then: Callable[[Any], None] = lambda item: None,
     ) -> None:
         """Begin.
@@ -146,7 +146,7 @@ class DroppedLogs:
                     job.stop()
                 done = [(other, job) for other, job in self._jobs.items() if job.state == "done"]
                 self._jobs = dict(done[1 - MAX_KEPT_LOGS :])
-                self._jobs[key] = ReaderJob(overview, path, *args)
+                self._jobs[key] = ReaderJob(overview, path, *args, timeout=JOB_TIMEOUT_S)
             return path, self._jobs[key]
 
     def state(self, wanted: LogRequest) -> dict[str, Any]:
@@ -216,7 +216,7 @@ class DroppedLogs:
         args = ([Path(file) for file in found.used], column, twin, named)
         self._draft = (
             twin,
-            ReaderJob(draft, path, *args, timeout=DRAFT_TIMEOUT_S, then=lambda step: self._run(step.file)),
+            ReaderJob(draft, path, *args, timeout=JOB_TIMEOUT_S, then=lambda step: self._run(step.file)),
         )
 
     def drafting(self) -> dict[str, Any]:
