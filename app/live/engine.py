@@ -33,7 +33,7 @@ from .feeder import Feeder
 from .jobs import Job, Jobs
 from .outputs import Status
 from .running_fold import Records, Running
-from .status import busy_status, known_fields, status_of
+from .status import busy_status, known_fields, past_status, status_of
 from .watchdog import Watchdog
 from .watchers import IdleTicks, Watchers
 from .workshop import Workshop
@@ -179,6 +179,10 @@ class Engine(Running):
     def episodes(self) -> list[Episode]:
         """Return all episodes in the order of their start."""
         return self._watchers.episodes()
+
+    def status_at(self, t: int) -> Status:
+        """See `Running`."""
+        return past_status(self, self._watchers, t)
 
     def status(self) -> Status:
         """Return the status."""

@@ -50,13 +50,23 @@ LOST_SEVERITY, DEFAULT_SEVERITY = detector_of("silent").severity, detector_of(""
 class EpisodeSummary(NamedTuple):
     """Episodes of one moment in the order of their start, those that last, and offsets of held-out sensors.
 
-    `revision` is that of the rows.
+    `revision` is that of the rows, `entries` are the episodes with their keys.
     """
 
     episodes: tuple[Episode, ...] = ()
     lasting: tuple[TrackedEpisode, ...] = ()
     offsets: tuple[Offset, ...] = ()
     revision: int = -1
+    entries: tuple[TrackedEpisode, ...] = ()
+
+    def at(self, seconds: float) -> EpisodeSummary:
+        """Return the summary of an earlier time, s: of the episodes that lasted then."""
+
+        def lasted(episode: Episode) -> bool:
+            return episode.start <= seconds and (episode.end is None or episode.end > seconds)
+
+        lasting = tuple(entry for entry in self.entries if lasted(entry.episode))
+        return self._replace(lasting=lasting, offsets=())
 
     def leading(self, states: Mapping[str, str]) -> Episode | None:
         """Return the most severe of those that last, the newest of several.
@@ -162,6 +172,7 @@ class EpisodeLog:
                 tuple(entry for entry in entries if entry.episode.end is None),
                 tuple(offsets(tracker.events, tracker.track, tracker.tuning)),
                 self._cursor.revision,
+                tuple(entries),
             )
             self._report(before, again, passage)
 

@@ -119,15 +119,21 @@ class EventWindow(NamedTuple):
         """The events as a log of their own."""
         return Log.resume(self.tuning.model, self.base, self.events)
 
-    def fold(self, estimator: str = "", tuning: Tuning | None = None, policy: HealthPolicy | None = None) -> Fold:
+    def fold(
+        self,
+        estimator: str = "",
+        tuning: Tuning | None = None,
+        policy: HealthPolicy | None = None,
+        expected: np.ndarray | None = None,
+    ) -> Fold:
         """A fold over these events, by default with their own settings; nothing is folded yet."""
         tuning = tuning or self.tuning
-        model = tuning.model
-        return Fold(estimator or self.estimator, model, tuning, self.log(), policy=policy, base=self.base)
+        base, model = self.base, tuning.model
+        return Fold(estimator or self.estimator, model, tuning, self.log(), policy=policy, base=base, expected=expected)
 
 
 def event_window(
-    fold: Fold, revision: int, limit: int, *, origin: Base | None = None, rows: bool = False
+    fold: Fold, revision: int, limit: int, *, origin: Base | None = None, rows: bool = False, stop: int | None = None
 ) -> EventWindow | None:
     """Copy the last events of a fold from a snapshot on; None while there are none. Takes about a millisecond.
 
@@ -137,16 +143,18 @@ def event_window(
         limit: Events; a few more, since the window begins at a snapshot.
         origin: Where the fold itself started; None for the prior.
         rows: Whether to copy the track too, and to begin where all revisions have a snapshot.
+        stop: Row after the last event; None for the end.
     """
     if not fold.n:
         return None
-    index = max(0, fold.n - limit)
+    stop = fold.n if stop is None else stop
+    index = max(0, stop - limit)
     if rows:
         first = fold.log.first
         index = -(-(first + index) // PERMANENT_SPACING) * PERMANENT_SPACING - first
     at, base = fold.base_at(index)
-    events = Events(*(column[at : fold.n].copy() for column in fold.log.events))
-    track = fold.track.select(slice(at, fold.n) if rows else slice(0, 0)).copy()
+    events = Events(*(column[at:stop].copy() for column in fold.log.events))
+    track = fold.track.select(slice(at, stop) if rows else slice(0, 0)).copy()
     return EventWindow(fold.estimator.name, fold.tuning, events, track, base if at else origin, revision)
 
 

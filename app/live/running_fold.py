@@ -6,7 +6,7 @@ import threading
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
@@ -159,11 +159,15 @@ class Running(ABC):
         return self._log.first + int(np.searchsorted(self._log.t[:n], self._log.t[n - 1] - span))
 
     def rows(self, start: int, stop: int) -> Pull:
-        """Copy the rows with these absolute indices, as far as they exist; no cursor moves."""
+        """Copy the rows with these absolute indices, as far as they exist, and the pictures until then.
+
+        No cursor moves.
+        """
         with self._reading():
             end = self._log.first + self._fold.n
             start = min(max(start, self._log.first), end)
-            return self._copy(start, max(start, min(stop, end)))
+            stop = max(start, min(stop, end))
+            return self._copy(start, stop, pictures=_since(self._fold, -1, stop))
 
     def _copy(self, start: int, stop: int, *, fresh: bool = False, **fields: Any) -> Pull:
         log, fold, rows = self._log, self._fold, slice(start - self._log.first, stop - self._log.first)
@@ -206,15 +210,35 @@ class Running(ABC):
         """Return all rows of the previous revision (before a drag that goes on); its arrays never change."""
         return self.revisions.previous()
 
-    def belief(self) -> Belief:
-        """Return the present estimate."""
-        with self._reading():
-            mean, cov = self._fold.moments()
-            points, clock = self._fold.points(), self._fold.clock
-            model, several = self._fold.model, self._fold.estimator.peaks is not None
+    def belief(self, t: int | None = None) -> Belief:
+        """Return the estimate after the last event at or before a time, ns; None is the present one.
+
+        An earlier one is folded again from the snapshot before it, beside the running fold.
+        """
+        past = None if t is None else self.fold_until(t)
+        with self._reading() if past is None else nullcontext():
+            fold = self._fold if past is None else past
+            mean, cov = fold.moments()
+            points, clock = fold.points(), fold.clock
         # Clustering takes milliseconds, which the engine's thread must not wait for.
-        peaks = peaks_of(points, model.circular) if several else []
+        peaks = peaks_of(points, fold.model.circular) if fold.estimator.peaks is not None else []
         return Belief(clock, mean, cov, points, tuple(peaks) if len(peaks) > 1 else ())
+
+    def fold_until(self, t: int) -> Fold | None:
+        """Return a fold of its own, from the snapshot before the last event at or before a time, ns, up to that event.
+
+        None while there are none, or none are folded.
+        """
+        with self._reading():
+            if self._fold.idle:
+                return None
+            stop = max(1, int(np.searchsorted(self._log.t[: self._fold.n], t, side="right")))
+            window = event_window(self._fold, self._revision, 1, origin=self._base, stop=stop)
+        if window is None:
+            return None
+        fold = window.fold(policy=self.policy, expected=self.twin.expected)
+        fold.advance()
+        return fold
 
     def here(self) -> Here | None:
         """Return the state of the filter, to fold on from; None before the first event. Copies nothing else."""
@@ -268,6 +292,10 @@ class Running(ABC):
     @abstractmethod
     def status(self) -> Status:
         """Return the status, computed at most ten times per second; during a refold usually the previous one."""
+
+    @abstractmethod
+    def status_at(self, t: int) -> Status:
+        """Return the status with health, sensors, episodes and NIS as they were at a time, ns."""
 
     @abstractmethod
     def episodes(self) -> list[Episode]:

@@ -12,19 +12,22 @@ from estimators.diagnostics.detector_state import sensor_states
 from estimators.diagnostics.health import MAX_ROWS_PER_READING
 from estimators.diagnostics.score import nis_verdict
 from estimators.fold import Fold
-from estimators.log import RESET, model_version_at
+from estimators.log import RESET, Events, model_version_at
 from estimators.model.state_space import StateSpaceModel
 from estimators.registry import find_estimator
-from estimators.track import FAILED, GATED, USED
+from estimators.track import FAILED, GATED, USED, Track, estimated_rows
 from sources.source import Source, controls_of, span_of
 
 from .counts import RowCounts, last_run
 from .faults import Faulty
 from .outputs import Status
+from .running_fold import Running
 from .watchers import Watchers
 
 FOLDING_CAUSE = "the measurements so far are being folded"
 """Cause of a twin without a row yet."""
+
+SINCE_ROWS = 4096  # Rows copied at once in search of the beginning of a health
 
 
 def known_fields(model: StateSpaceModel, source: Source, **fields: Any) -> dict[str, Any]:
@@ -71,7 +74,8 @@ def status_of(
         late: Counts of measurements whose time is late or in doubt, by key.
     """
     model, log, track = fold.model, fold.log, fold.track
-    judged, nis_dof = _judged(fold)
+    recent = slice(max(0, fold.n - MAX_ROWS_PER_READING * fold.policy.window), fold.n)
+    judged, nis_dof = _judged(fold, log.events.select(recent), track.select(recent))
     last = fold.n - 1
     t = int(log.t[last]) if last >= 0 else None
     states = sensor_states(model, fold.tuning.used, fold.evidence, (t or 0) * 1e-9, fold.policy)
@@ -110,15 +114,56 @@ def status_of(
     )
 
 
-def _judged(fold: Fold) -> tuple[float, float]:
-    """Return the NIS of the last window relative to the baseline, NaN without one, and the mean degrees of freedom."""
-    baseline, n, window = fold.tuning.baseline, fold.n, fold.policy.window
-    rows = slice(max(0, n - MAX_ROWS_PER_READING * window), n)
-    resets = np.flatnonzero(fold.log.kind[rows] == RESET)
-    begun = rows.start + (int(resets[-1]) + 1 if resets.size else 0)
-    judged = begun + np.flatnonzero(np.isin(fold.track.verdict[begun:n], (USED, GATED, FAILED)))[-window:]
-    events, track = fold.log.events.select(judged), fold.track.select(judged)
-    found = nis_verdict(track, events, fold.model, baseline)
+def past_status(engine: Running, watchers: Watchers, t: int) -> Status:
+    """Return the status with health, sensors, episodes and NIS after the last event at or before a time, ns.
+
+    What does not belong to a time (counts, tuning, recording) is the present one.
+    """
+    status, fold = engine.status(), engine.fold_until(t)
+    if fold is None:
+        return status
+    end, now = fold.log.first + fold.n, int(fold.log.t[fold.n - 1])
+    # A fold from a snapshot lacks the earlier rows of its window.
+    pull = engine.rows(end - MAX_ROWS_PER_READING * fold.policy.window, end)
+    track, health = pull.track, int(pull.track.health[-1])
+    judged, nis_dof = _judged(fold, pull.events, track)
+    states = sensor_states(fold.model, fold.tuning.used, fold.evidence, now * 1e-9, fold.policy)
+    since = now
+    while len(pull.events) and int(pull.track.health[-1]) == health:
+        begun = last_run(pull.track.health)
+        since = int(pull.events.t[begun])
+        pull = engine.rows(pull.first - SINCE_ROWS, pull.first if not begun else 0)
+    account = watchers.episode_log.summary.at(now * 1e-9)
+    leading = account.leading(dict(zip(fold.model.sensor_names, states, strict=True)))
+    return replace(
+        status,
+        t=now,
+        health=health,
+        since=since,
+        cause=watchers.cause(leading, health, past=True),
+        sensors=account.of_sensors(fold.model.sensor_names, states),
+        episodes_open=len(account.lasting),
+        lost=None if estimated_rows(track.select(slice(-1, None)))[0] else now,
+        nis=float(track.nis_mean[-1]),
+        nis_low=float(track.nis_low[-1]),
+        nis_high=float(track.nis_high[-1]),
+        nis_judged=judged,
+        nis_dof=nis_dof,
+    )
+
+
+def _judged(fold: Fold, events: Events, track: Track) -> tuple[float, float]:
+    """Return the NIS of the last window relative to the baseline, NaN without one, and the mean degrees of freedom.
+
+    Args:
+        fold: The fold whose settings hold.
+        events: The last events, at least those of the window.
+        track: Their rows.
+    """
+    resets = np.flatnonzero(events.kind == RESET)
+    begun = int(resets[-1]) + 1 if resets.size else 0
+    judged = begun + np.flatnonzero(np.isin(track.verdict[begun:], (USED, GATED, FAILED)))[-fold.policy.window :]
+    found = nis_verdict(track.select(judged), events.select(judged), fold.model, fold.tuning.baseline)
     return found.judged, found.dof
 
 

@@ -65,11 +65,11 @@ class Watchers:
         account = self.episode_log.summary
         return tuple(map(self.root_cause.with_fault, account.episodes)) if account.revision == revision else ()
 
-    def cause(self, leading: Episode | None, health: int) -> str:
-        """Return the cause of the present health: frames that the bus loses, or the leading episode, or its cause."""
+    def cause(self, leading: Episode | None, health: int, *, past: bool = False) -> str:
+        """Return the cause of a health: frames that the bus loses at present, or the leading episode, or its cause."""
         if leading is None or health in (WAITING, TRACKING):
             return ""
-        losing = self._notices.latest(LOST_FRAMES, LOSS_CAUSE_S)
+        losing = None if past else self._notices.latest(LOST_FRAMES, LOSS_CAUSE_S)
         if losing is not None:
             return losing
         return self.root_cause.with_fault(self.root_cause.primary(leading)).text

@@ -187,6 +187,7 @@ class PageServer:
         return status_json(self._engine) | {
             "recordings": sorted(self._recordings()),
             "scene": [] if self._choices is None else self._choices.json(),
+            "scene_at": None if self._choices is None else self._choices.at,
             "unread": self.unread,
             "reloads": getattr(self._engine, "reloads", 0),
             "refit": self._fit.brief(),
@@ -265,7 +266,7 @@ class PageServer:
         return FileResponse(path, media_type="application/octet-stream", filename=path.name)
 
     async def _page_stream(self, browser: WebSocket) -> None:
-        await PageStream(browser, self._engine, self.series, self._status, self._boot).run()
+        await PageStream(browser, self._engine, self.series, self._status, self._boot, self._choices).run()
 
     async def _rerun_stream(self, browser: WebSocket) -> None:
         await browser.accept()

@@ -37,9 +37,13 @@ if TYPE_CHECKING:
 DISCONNECT_TIMEOUT_S = 3.0
 """Longest wait for browsers that keep connections to a stopped twin."""
 
-MALLOC_OPTIONS = ((-8, 2), (-3, 1 << 20), (-1, 1 << 20))
-"""Of glibc: M_ARENA_MAX, M_MMAP_THRESHOLD, M_TRIM_THRESHOLD. By default each thread has a heap, and large arrays go
-there once one was freed, so edits scatter free memory: after 60 edits motor_can held 608 MB, with these options 479."""
+MALLOC_OPTIONS = ((-8, 2), (-3, 1 << 17), (-1, 1 << 17))
+"""Of glibc: M_ARENA_MAX, M_MMAP_THRESHOLD, M_TRIM_THRESHOLD.
+
+By default each thread has a heap, and large arrays go there once one was freed, so edits scatter free memory: after 60
+edits motor_can held 608 MB, with few heaps 479. Columns of a pull have 128 KiB or more; with a threshold of 1 MiB the
+gaps that they left in the heaps grew by 60 MB in ten minutes of edits.
+"""
 
 SWITCH_INTERVAL_S = 0.0005
 """Time after which Python lets another thread run; the default of 5 ms is the time budget of a measurement."""

@@ -19,14 +19,15 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 from estimators.errors import ConfigError, nearest
 
 from ..live.running_fold import Running
-from ..present.series.chart_stream import ChartQuery, ChartStream
+from ..present.series.chart_stream import ChartQuery, ChartStream, Seconds
 from ..present.series.series import Series
 from .http import MAX_BODY_BYTES, one_line, parse
-from .twin_json import annotations_json, episodes_json
+from .twin_json import annotations_json, episodes_json, moment_json
 
 if TYPE_CHECKING:
     from ..live.notices import Annotation
     from ..views.rerun.feed import RerunFeed
+    from ..views.viser.stage import Choices
 
 FRAME_PERIOD_S = 0.1
 STATUS_PERIOD_S = 0.25
@@ -73,9 +74,13 @@ async def in_thread(work: Callable[..., Any], *arguments: Any) -> Any:
 
 @dataclass(frozen=True)
 class PageMessage:
-    """Message of a page: it has drawn the last frames; the pair of states to show; chart streams, null to close one."""
+    """Message of a page: it has drawn the last frames; the pair of states to show; chart streams, null to close one.
+
+    `at` is the time that it shows, seconds since the first event, null for the newest row.
+    """
 
     drawn: bool = False
+    at: Seconds | None = None
     pair: tuple[str, str] | None = None
     streams: dict[str, ChartQuery | None] = field(default_factory=dict)
 
@@ -84,11 +89,12 @@ class PageStream:
     """Serves one page: JSON in text messages, frames of its chart streams in binary ones."""
 
     def __init__(
-        self, browser: WebSocket, engine: Running, series: Series, status: Callable[[], dict[str, Any]], boot: str
-    ) -> None:
+        self, browser: WebSocket, engine: Running, series: Series, status: Callable[[], dict[str, Any]], boot: str,
+        choices: Choices | None = None,
+    ) -> None:  # fmt: skip
         self._browser, self._engine, self._series, self._status = browser, engine, series, status
         self._streams: dict[str, ChartStream] = {}
-        self._drawn, self._asked = asyncio.Event(), asyncio.Event()
+        self._drawn, self._asked, self._pointed = asyncio.Event(), asyncio.Event(), asyncio.Event()
         self._drawn.set()
         self._sent: dict[str, Any] = {}
         self._boot = boot
@@ -97,6 +103,11 @@ class PageStream:
         self._notice = 0
         self._pair: tuple[int, ...] | None = None
         self._estimated: tuple[int, int] | None = None
+        self._choices = choices
+        self._at: int | None = None
+        """Time that the page shows, ns; None is the newest row."""
+        self._moment: tuple[Any, dict[str, Any]] | None = None
+        """Trust at that time, after what it was computed from."""
 
     async def run(self) -> None:
         """Serve until either side ends it."""
@@ -116,6 +127,8 @@ class PageStream:
                 self._engine.notices.report("page error", text, "error")
         finally:
             watchers.discard(refolded)
+            if self._choices is not None:
+                self._choices.leave(self)
             await asyncio.to_thread(self._exchange, list(self._streams.values()), [])
 
     async def _listen(self) -> None:
@@ -142,6 +155,11 @@ class PageStream:
                     raise ConfigError(f"pair: state {name!r} does not exist; {nearest(name, known)}")
             self._pair = None if wanted.pair is None else tuple(known.index(name) for name in wanted.pair)
             self._estimated = None
+        if "at" in message and (origin := self._series.origin()) is not None:
+            self._at = None if wanted.at is None else origin + round(wanted.at * 1e9)
+            if self._choices is not None:
+                self._choices.look(self, self._at)
+            self._pointed.set()
         if not wanted.streams:
             return
         # All are checked before any is changed.
@@ -169,10 +187,12 @@ class PageStream:
         """Send changes of status, episodes, notes of users and notices."""
         while True:
             begun = time.monotonic()
+            self._pointed.clear()
             status, episodes, origin = await in_thread(
                 lambda: (self._status(), episodes_json(self._engine), self._series.origin())
             )
             status["origin"] = None if origin is None else str(origin)
+            status["moment"] = await in_thread(self._trust_then, self._at, episodes)
             news = {key: value for key, value in status.items() if key not in self._sent or self._sent[key] != value}
             self._sent = status
             message: dict[str, Any] = {"status": news} if news else {}
@@ -190,7 +210,18 @@ class PageStream:
                 ]
             if message:
                 await self._send(message)
-            await asyncio.sleep(max(0.001, STATUS_PERIOD_S - (time.monotonic() - begun)))
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(max(0.001, STATUS_PERIOD_S - (time.monotonic() - begun))):
+                    await self._pointed.wait()
+
+    def _trust_then(self, at: int | None, episodes: list[dict[str, Any]]) -> dict[str, Any] | None:
+        """Return health, sensors, NIS and cause at the time that the page shows; None for the newest row."""
+        if at is None:
+            return None
+        known = at, self._engine.index_at(at + 1), self._engine.revisions.runs[-1].number, len(episodes)
+        if self._moment is None or self._moment[0] != known:
+            self._moment = known, moment_json(self._engine, at)
+        return self._moment[1]
 
     async def _draw(self) -> None:
         """Send chart points, once the page has drawn the last ones."""
@@ -217,18 +248,22 @@ class PageStream:
         """Send the joint estimate of the two states that the page shows, if it has changed."""
         if self._pair is None or self._sent.get("t") is None:
             return
-        now = (self._sent["revision"], self._sent["t"])
+        at = self._at
+        now = (self._sent["revision"], self._sent["t"] if at is None else at)
         if now != self._estimated:
             self._estimated = now
-            await self._send({"belief": await in_thread(belief_json, self._engine, list(self._pair))})
+            await self._send({"belief": await in_thread(belief_json, self._engine, list(self._pair), at)})
 
     async def _send(self, message: dict[str, Any]) -> None:
         await self._browser.send_text(json.dumps(message, allow_nan=False, separators=(",", ":")))
 
 
-def belief_json(engine: Running, pair: list[int]) -> dict[str, Any] | None:
-    """Return mean (2), covariance [a, b, c] of [[a, b], [b, c]] and particles (k, 2); None while not finite."""
-    belief = engine.belief()
+def belief_json(engine: Running, pair: list[int], at: int | None = None) -> dict[str, Any] | None:
+    """Return mean (2), covariance [a, b, c] of [[a, b], [b, c]] and particles (k, 2); None while not finite.
+
+    `at` is a time, ns; None is the present.
+    """
+    belief = engine.belief(at)
     mean, cov = belief.mean[pair], belief.cov[np.ix_(pair, pair)]
     if not (np.isfinite(mean).all() and np.isfinite(cov).all()):
         return None

@@ -12,6 +12,7 @@ from estimators.track import HEALTH_NAMES
 
 from ..live import faults
 from ..live.changes import began_as, turned
+from ..live.outputs import Status
 from ..live.running_fold import Running
 from ..present.export.report_charts import charted_model
 from ..present.result import plain
@@ -25,9 +26,22 @@ STATUS_FIELDS = (
 """Fields of `Status` that JSON has under the same name."""
 
 
-def status_json(engine: Running) -> dict[str, Any]:
-    """Return the state of a running twin; infinity is "inf", NaN null."""
-    status, twin, revisions = engine.status(), engine.twin, engine.revisions
+TRUST_FIELDS = (
+    "t", "health", "since", "cause", "sensors", "episodes_open", "lost", "nis", "nis_low", "nis_high", "nis_dof",
+    "nis_judged", "nis_place", "nis_words",
+)  # fmt: skip
+"""Fields of a status that belong to its time."""
+
+
+def moment_json(engine: Running, t: int) -> dict[str, Any]:
+    """Return the `TRUST_FIELDS` of the status at a time, ns."""
+    found = status_json(engine, engine.status_at(t))
+    return {name: found[name] for name in TRUST_FIELDS}
+
+
+def status_json(engine: Running, status: Status | None = None) -> dict[str, Any]:
+    """Return the state of a running twin, or the given one; infinity is "inf", NaN null."""
+    status, twin, revisions = status or engine.status(), engine.twin, engine.revisions
     edits = revisions.edits
     tuning, runs, levels = status.tuning, engine.revisions.runs, status.integrity
     commissioned = tuning.baseline is not None

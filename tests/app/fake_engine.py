@@ -123,8 +123,12 @@ class FakeEngine:
 
     peaks = ()
 
-    def belief(self):
+    def belief(self, t=None):
+        """The present one; of an earlier time, which is a row, mean and variances of that row."""
         mean, cov = self.fold.moments()
+        if t is not None:
+            row = self.fold.track.select(self.index_at(t + 1) - 1)
+            mean, cov = row.mean, np.diag(row.std**2)
         return SimpleNamespace(t=self.state.t, mean=mean, cov=cov, points=self.fold.points(), peaks=self.peaks)
 
     def _pull(self, first, fresh, stop=None):

@@ -2,7 +2,8 @@
 
 With `--minutes 60`, an hour of `nisus run motor_can` with its page open in Chromium: an edit every 20 seconds, Explore
 shown and hidden, recordings started and stopped. A line a minute has memory, threads and file handles of the server
-process; the end has their slopes with standard errors.
+process; the end has their slopes with standard errors, from the minute in which the history is full: until then each
+event adds its row to the log, the track and what shows them. `--history` is its length in events.
 
 With `--seconds 3600`, the default: an hour at 1 kHz of the worst mix of faults, as fast as possible. The engine runs
 without a page on a simulated asset; every few seconds of the asset's time some faults of all kinds begin, which last
@@ -28,6 +29,7 @@ from app.live.episode_log import MAX_EPISODES_PERIOD_S
 from app.studies.stress.scenario import asset_of
 from app.twin.twin import Twin, load_twin
 from estimators.log import MARK, Events
+from estimators.snapshots import PERMANENT_SPACING
 from estimators.track import HEALTH_NAMES, SUSPECT, TRACKING, VERDICT_NAMES
 from sources.faults.kinds import Fault
 from sources.faults.layer import Faults
@@ -82,12 +84,19 @@ class Watched(NamedTuple):
 WATCHED = (Watched("memory", "MB", 15.0), Watched("threads", "", 1.0), Watched("handles", "", 2.0))
 """Resident memory (RSS) of the server process alone, without browser and compilers."""
 
+EVENTS_PER_READING = 2.33
+"""Measurements, inputs and true states of motor_can, per measurement (12,953 to 5,550 in config/logs/motor_can.blf)."""
+
 EDIT_PERIOD_S, EXPLORE_PERIOD_S, RECORDING_PERIOD_S = 20.0, 120.0, 90.0
 SAMPLE_PERIOD_S = 1.0
+ACTION_TIMEOUT_MS = 600_000  # of a click, on a busy machine without a graphics card
 MINUTE_S = 60.0
 
 SETTLING_S = 240.0
-"""Start of the slopes: Explore was shown, a recording was closed and the history was folded again."""
+"""Earliest start of the slopes: Explore was shown, a recording was closed and the history was folded again."""
+
+HISTORY_EVENTS = 20_000
+"""Events that the soaked twin keeps: motor_can has that many after five minutes, 200,000 after fifty."""
 
 MIN_MINUTES = 10  # Of a slope; one of fewer minutes is printed but proves nothing
 
@@ -109,8 +118,10 @@ def slope(minutes: np.ndarray, values: np.ndarray) -> tuple[float, float]:
 class PageSoak:
     """A server with a page that is used: edits, Explore and recordings, each with a period of its own."""
 
-    def __init__(self, run: Running, page: Any, folder: Path) -> None:
-        self.run, self.page, self.folder = run, page, folder
+    def __init__(self, run: Running, page: Any, folder: Path, history: int) -> None:
+        self.run, self.page, self.folder, self.history = run, page, folder, history
+        self.full: int | None = None
+        """Minute in which the history was full."""
         self.samples: list[tuple[float, ...]] = []
         self.edits = self.recordings = self.explored = 0
 
@@ -144,6 +155,8 @@ class PageSoak:
                 minute.clear()
                 memory, threads, handles = self.samples[-1]
                 rows = self.run.ask("/api/status")["counts"]["readings"]
+                if self.full is None and rows * EVENTS_PER_READING > self.history + 4 * PERMANENT_SPACING:
+                    self.full = len(self.samples)
                 print(
                     f"  {len(self.samples):3d}  {memory:8.1f}  {threads:7.0f}  {handles:7.0f}  {self.edits:5d}  "
                     f"{self.explored:7d}  {self.recordings:10d}  {rows:9,d}",
@@ -153,7 +166,10 @@ class PageSoak:
 
     def verdict(self) -> list[str]:
         """Print the slopes, and return those that are not below their bounds by two standard errors."""
-        late = np.arange(len(self.samples)) >= SETTLING_S / MINUTE_S
+        if self.full is None:
+            return [f"the history of {self.history:,} events is not full; soak for longer, or with a shorter --history"]
+        late = np.arange(len(self.samples)) >= max(self.full, SETTLING_S / MINUTE_S)
+        print(f"slopes from minute {int(np.argmax(late)) + 1} on; the history was full in minute {self.full}")
         minutes, wrong = np.flatnonzero(late).astype(float), list[str]()
         if minutes.size < 3:
             return [f"{len(self.samples)} minutes are too few for a slope"]
@@ -168,11 +184,12 @@ class PageSoak:
         return wrong
 
 
-def soak_page(minutes: float) -> list[str]:
+def soak_page(minutes: float, history: int) -> list[str]:
     """Run it, and return what falls short."""
     with tempfile.TemporaryDirectory() as name:
-        with running(TWIN, "--recordings", name) as run, opened(run) as (page, _):
-            soak = PageSoak(run, page, Path(name))
+        with running(TWIN, "--recordings", name, "--set", f"history={history}") as run, opened(run) as (page, _):
+            page.set_default_timeout(ACTION_TIMEOUT_MS)
+            soak = PageSoak(run, page, Path(name), history)
             soak.use(minutes)
             return soak.verdict()
 
@@ -309,9 +326,10 @@ def main() -> int:
     parser.add_argument("--minutes", type=float, help="soak server and page for so long instead")
     parser.add_argument("--seconds", type=float, default=3600.0, help="of the asset")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--history", type=int, default=HISTORY_EVENTS, help="events that the twin with a page keeps")
     given = parser.parse_args()
     if given.minutes is not None:
-        wrong = soak_page(given.minutes)
+        wrong = soak_page(given.minutes, given.history)
         for text in wrong:
             print(f"FALLS SHORT: {text}")
         return 1 if wrong else 0

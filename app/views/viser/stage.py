@@ -97,8 +97,13 @@ class Stage:
         """Return whether to draw without new rows; a field decides itself."""
         return self._late or isinstance(self.scene, FIELD_SCENES)
 
-    def draw(self, history: History) -> None:
-        """Send changes."""
+    def draw(self, history: History, at: int | None = None) -> None:
+        """Send changes.
+
+        Args:
+            history: The rows until then.
+            at: Time to show, ns; None is the newest row.
+        """
         assert self.scene is not None
         now = time.monotonic()
         heavy = now - self._heavy >= HEAVY_PERIOD_S
@@ -106,7 +111,7 @@ class Stage:
         if heavy:
             self._heavy = now
         # The moments of a large field are expensive, and its pictures come with the rows.
-        belief = self._engine.belief() if self.model.grid is None else None
+        belief = self._engine.belief(at) if self.model.grid is None else None
         if isinstance(self.scene, VehicleScene):
             self.scene.tuning = self._engine.tuning
         self.scene.draw(history, belief, heavy)  # type: ignore[arg-type]
@@ -178,12 +183,30 @@ class Choice:
 
 
 class Choices:
-    """The choices and their values. Thread-safe."""
+    """The choices and their values, and the time that is shown. Thread-safe.
+
+    All browsers share one scene, so the page that pointed to a time last decides.
+    """
 
     def __init__(self, choices: Iterable[Choice]) -> None:
         self._choices = {choice.key: choice for choice in choices}
         self._values = {choice.key: choice.first for choice in self._choices.values()}
         self._lock = threading.Lock()
+        self._at: tuple[object, int | None] = (None, None)
+
+    @property
+    def at(self) -> int | None:
+        """Time that the scene shows, ns; None is the newest row."""
+        return self._at[1]
+
+    def look(self, page: object, at: int | None) -> None:
+        """Show a time, ns, for a page; None is the newest row."""
+        self._at = page, at
+
+    def leave(self, page: object) -> None:
+        """Show the newest row again if a page that is gone had pointed to a time."""
+        if self._at[0] is page:
+            self._at = None, None
 
     def values(self) -> dict[str, str]:
         """Return the values by key."""

@@ -51,6 +51,8 @@ class ViserView:
         self._series = Series(engine)
         self._rows = min(MAX_PULL_ROWS, limit)
         self._cursor: Any = None
+        self._past: tuple[int, int] | None = None
+        """Last event of the past that the history has, and its revision; None while it follows the newest row."""
         self._tuning, self._turned, self._drawn = engine.tuning, -EDIT_REST_S, -MAX_EDIT_WAIT_S
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="viser view", daemon=True)
@@ -71,25 +73,37 @@ class ViserView:
     def frame(self, *, panel: bool = True) -> None:
         """Update the scene, and the panel if a browser shows it, to the engine's present state."""
         with self.server.atomic():
-            if self.stage.prepare() or self._cursor is None:
-                self._begin()
-            changed = self._pull() or self.stage.due
+            at = self.stage.choices.at
+            if self.stage.prepare() or (self._cursor is None) != (at is not None):
+                self._rest()
+            if at is None and self._cursor is None:
+                self._cursor = self.engine.cursor(span=self.history.span)
+            changed = (self._pull() if at is None else self._look_back(at)) or self.stage.due
             if changed:
-                self.stage.draw(self.history)
+                self.stage.draw(self.history, at)
             if panel:
                 self.panel.sync(self._series.origin())
 
-    def _begin(self) -> None:
-        """Start pulling, from the start of the window."""
-        self._rest()
-        self._cursor = self.engine.cursor(span=self.history.span)
-
     def _rest(self) -> None:
+        """Forget all rows, and the cursor."""
         if self._cursor is not None:
             self.engine.release(self._cursor)
             self._cursor = None
-            self.history.clear()
             self.panel.nis.close()
+        self._past = None
+        self.history.clear()
+
+    def _look_back(self, at: int) -> bool:
+        """Take the rows of the window before a time, ns; return whether they are others than before."""
+        engine, span = self.engine, self.history.span or 0
+        wanted = engine.index_at(at + 1), engine.revisions.runs[-1].number
+        if wanted == self._past:
+            return False
+        self._past = wanted
+        self.history.clear()
+        for start in range(engine.index_at(at - span), wanted[0], self._rows):
+            self._take(engine.rows(start, min(start + self._rows, wanted[0])))
+        return True
 
     def _pull(self) -> bool:
         """Take new rows; return whether there were any."""
@@ -97,12 +111,15 @@ class ViserView:
         while True:
             pull = self.engine.pull(self._cursor, self._rows)
             changed |= bool(len(pull.events)) or pull.fresh
-            if isinstance(self.stage.scene, FIELD_SCENES):
-                self.stage.scene.take(pull)
-            self.history.take(pull)
-            self.history.trim()
+            self._take(pull)
             if len(pull.events) < self._rows:
                 return changed
+
+    def _take(self, pull: Any) -> None:
+        if isinstance(self.stage.scene, FIELD_SCENES):
+            self.stage.scene.take(pull)
+        self.history.take(pull)
+        self.history.trim()
 
     def _waits(self, now: float, there: Sequence[str]) -> bool:
         """Return whether the scene waits for the charts beside it, until the edited slider rests."""

@@ -5,6 +5,7 @@ import { unpack } from "./stream.js";
 
 const STATUS_REPEAT_MS = 1000; // ms without news after which the last status is told again
 const SETTLED_AFTER_MS = 700; // ms after the last edit or revision
+const POINT_PERIOD_MS = 100; // ms between two times that are sent while the cursor is dragged
 
 // Events: "status", "episodes", "annotations", "notices", "frames", "connection"; each with `detail`.
 export class Link extends EventTarget {
@@ -22,7 +23,7 @@ export class Link extends EventTarget {
       taken: (data) => this.take(data),
       changed: (state) => {
         this.tell("connection", state);
-        if (state === "live") this.say({ streams: this.streams, pair: this.pair ?? null });
+        if (state === "live") this.say({ streams: this.streams, pair: this.pair ?? null, at: this.at ?? null });
       },
     });
     // A twin whose source has ended has no news, but ages and answers that are waited for go on.
@@ -64,6 +65,16 @@ export class Link extends EventTarget {
   watch(pair) {
     this.pair = pair;
     this.say({ pair });
+  }
+
+  // The time that the page shows, s; null is the newest row. Status ("moment"), belief and scene are those of that time.
+  point(at) {
+    if (at === (this.at ?? null)) return;
+    this.at = at;
+    this.pointing ??= setTimeout(() => {
+      this.pointing = null;
+      this.say({ at: this.at });
+    }, POINT_PERIOD_MS);
   }
 
   take(data) {

@@ -74,9 +74,10 @@ const notes = new UserNotes(link, view, charts);
 new Episodes($("episodes"), link, view, charts, notes.node);
 const runs = new Runs($("runs"), link);
 new SharedTime(settings.boot, view, charts);
+view.addEventListener("change", () => link.point(view.at));
 const transport = new Transport(model, link, view, charts);
 const explore = new Explore(settings.viewer, theme, { link, view, charts });
-const stage = new Stage(settings.viser ? { pass: settings.stage_pass } : null, theme, link, view, charts);
+const stage = new Stage(settings.viser ? { pass: settings.stage_pass } : null, theme, link, view);
 
 // What is hidden neither computes nor asks.
 const panes = { explore, whatif: new WhatIf($("whatif"), model, link), diagnose: new Diagnose($("diagnose"), link, (...plot) => saving.plot(...plot)) };

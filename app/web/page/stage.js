@@ -2,13 +2,13 @@
 // page has all that.
 
 import { $, element, setAttribute, setText } from "./dom.js";
-import { span } from "./format.js";
+import { clock, span } from "./format.js";
 
-const MAX_LEAD_S = 1; // s by which the scene may be ahead of the charts without a word
+const MAX_LEAD_S = 1; // s by which the scene may differ from the charts without a word
 const LARGE = "nisus.stage.large";
 
 export class Stage {
-  constructor(there, theme, link, view, charts) {
+  constructor(there, theme, link, view) {
     Object.assign(this, { there, theme, link });
     this.frame = $("stage");
     this.choices = {};
@@ -16,10 +16,14 @@ export class Stage {
     $("stage-large").addEventListener("click", () => this.enlarge());
     this.enlarge(localStorage.getItem(LARGE) === "1");
     link.addEventListener("status", () => this.offer(link.status.scene ?? []));
-    // The scene shows the newest row; the charts may be held elsewhere.
+    // All windows share the scene: it shows the time to which one of them pointed last.
     const place = () => {
-      const ahead = view.following ? 0 : charts.newest - view.at;
-      setText($("stage-time"), ahead > MAX_LEAD_S && Number.isFinite(ahead) ? `${span(ahead)} later than the charts` : "");
+      const { scene_at: pointed, origin, t } = link.status;
+      const newest = (t - Number(origin)) / 1e9;
+      const shown = pointed == null ? newest : Math.min(newest, (pointed - Number(origin)) / 1e9);
+      const ahead = shown - Math.min(newest, view.at ?? newest);
+      const apart = Math.abs(ahead) > MAX_LEAD_S ? `, ${span(Math.abs(ahead))} ${ahead > 0 ? "later" : "earlier"} than the charts` : "";
+      setText($("stage-time"), Number.isFinite(shown) && (pointed != null || apart) ? `at ${clock(shown, 1)}${apart}` : "");
     };
     link.addEventListener("status", place);
     view.addEventListener("change", place);

@@ -25,7 +25,7 @@ export class Transport {
     $("speed").addEventListener("change", () => link.ask("Speed", { factor: $("speed").value === "inf" ? "inf" : Number($("speed").value) }));
     $("pause").addEventListener("click", () => this.pause());
     $("step").addEventListener("click", () => link.ask("Step"));
-    $("follow").addEventListener("click", () => view.hold(charts.range));
+    $("follow").addEventListener("click", () => (this.ended ? view.show(...this.extent, view.at) : view.hold(charts.range)));
     this.canvas.addEventListener("pointerdown", (event) => this.press(event));
     this.canvas.addEventListener("pointermove", (event) => this.hover(event));
     this.canvas.addEventListener("keydown", (event) => this.keyed(event));
@@ -54,9 +54,19 @@ export class Transport {
     return [this.ends[0], (Number(this.status.t) - Number(this.status.origin)) / 1e9];
   }
 
+  // A recording that is folded has no newest row to follow.
+  get ended() {
+    return Boolean(this.status?.seekable && this.status.finished);
+  }
+
+  // Whether the charts show all of it.
+  get whole() {
+    return this.ended && this.charts.range[0] <= this.extent[0] && this.extent[1] <= this.charts.range[1];
+  }
+
   // A replay is paused, and what has ended is played again; of a live source only the charts are held.
   pause() {
-    if (this.status?.seekable && this.status.finished) this.replay(this.view.at ?? this.extent[0]);
+    if (this.ended) this.replay(this.view.at ?? this.extent[0]);
     else if (this.status?.seekable) this.link.ask("Pause", { paused: !this.status.paused });
     else this.view.hold(this.charts.range);
   }
@@ -72,7 +82,7 @@ export class Transport {
 
   show(status) {
     this.status = status;
-    const ended = status.finished && status.seekable;
+    const { ended } = this;
     const held = ended || (status.seekable ? status.paused : !this.view.following);
     setText($("pause"), held ? "▶" : "❚❚");
     setAttribute($("pause"), "title", ended ? "Replay from the cursor (space)" : status.seekable ? (held ? "Continue (space)" : "Pause the replay (space)") : "Hold the charts (space)");
@@ -96,7 +106,9 @@ export class Transport {
   }
 
   draw() {
-    $("follow").hidden = this.view.following;
+    $("follow").hidden = this.view.following || this.whole;
+    setText($("follow"), this.ended ? "all" : "follow ▸");
+    setAttribute($("follow"), "title", this.ended ? "Show the whole recording" : "Follow the newest data (F)");
     setText($("at"), this.view.at === null || this.now - this.view.at < 0.05 ? "" : `at ${clock(Math.min(this.view.at, this.now), 1)}`);
     const { canvas } = this;
     const [from, to] = this.ends;

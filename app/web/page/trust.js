@@ -26,7 +26,9 @@ export class Trust {
     link.addEventListener("connection", (event) => this.connection(event.detail));
   }
 
-  show(status) {
+  // Health, cause, NIS and lights are those of the time that the page shows.
+  show(present) {
+    const status = { ...present, ...present.moment };
     document.title = `${SIGNS[status.health] ?? ""} ${status.twin} · Nisus`;
     setText($("twin"), status.twin);
     setAttribute($("twin"), "title", status.title);

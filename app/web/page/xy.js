@@ -76,7 +76,7 @@ export class XY {
     const ctx = canvas.getContext("2d");
     ctx.scale(devicePixelRatio, devicePixelRatio);
     const belief = this.paint(ctx, width, height);
-    this.text.textContent = belief ? `correlation ${compact(belief.cov[1] / Math.sqrt(belief.cov[0] * belief.cov[2]), 2)}` : "Ellipses show the newest estimate; press follow to see them.";
+    this.text.textContent = belief ? `correlation ${compact(belief.cov[1] / Math.sqrt(belief.cov[0] * belief.cov[2]), 2)}` : "";
   }
 
   // As a file.
@@ -88,7 +88,7 @@ export class XY {
   paint(ctx, width, height) {
     const [from, to] = within(this.stream.x, this.charts.range);
     const [mx, tx, my, ty] = this.pair.flatMap((name) => [this.stream.column(`mean:${name}`), this.stream.column(`truth:${name}`)]);
-    const belief = this.view.following ? this.belief : null;
+    const { belief } = this;
     const places = [];
     for (let k = from; k <= to; k++) if (typeof mx[k] === "number" && typeof my[k] === "number") places.push([mx[k], my[k]]);
     const truth = [];

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from config.loader import TWINS
+from estimators.track import HEALTH_NAMES
 from tests.app.scripted import pull_all, wait_for
 from tests.app.web.page.browsed import PATIENCE, running, until
 
@@ -51,7 +52,7 @@ def test_page_and_rerun_show_one_time(page, session):
     box = page.locator("#timeline").bounding_box()
     page.mouse.click(box["x"] + 0.75 * box["width"], box["y"] + 20)
     cursor_is(page, 0.75 * end, PAUSED)
-    page.locator("#follow").click()
+    page.locator("body").press("f")
     cursor_is(page, end, FOLLOWING)
 
     # Scrubbed in Rerun: the page is held there, and says so; what follows there follows here.
@@ -115,3 +116,63 @@ def test_a_recording_opens_folded_and_is_replayed_from_the_cursor(visit):
         page.locator("#speed").select_option("inf")
         wait_for(lambda: engine.status().finished, PATIENCE)
         assert np.array_equal(pull_all(engine).track.mean, track.track.mean)
+
+
+STRIP = """() => ["health", "nis", "cause", "stage-time"].map((id) => document.getElementById(id).textContent)"""
+
+
+def strip_of(status):
+    """Health, NIS per degree of freedom and cause, as the strip shows them."""
+    ratio = status.nis / status.nis_dof
+    return HEALTH_NAMES[status.health], float(f"{ratio:.3g}"), status.cause
+
+
+def shows(page, status, caption):
+    def there():
+        health, nis, cause, time = page.evaluate(STRIP)
+        name, ratio, text = strip_of(status)
+        return (
+            health.split()[1] == name
+            and float(nis) == pytest.approx(ratio, rel=0.006)
+            and bool(cause) == bool(text)
+            and time == caption
+        )
+
+    wait_for(there, PATIENCE)
+
+
+def test_strip_and_scene_show_the_moment_of_the_cursor(visit, page, session):
+    """Each page has its own strip; the scene is one, and says which moment it shows."""
+    engine, view = session.engine, session.view
+    end = float(pull_all(engine).events.t[-1]) * 1e-9
+    origin = engine.span()[0]
+    page.evaluate("window.nisus.view.follow()")
+    wait_for(lambda: view.history.n > 0 and view.history.column("t")[-1] == engine.span()[1], PATIENCE)
+    shows(page, engine.status(), "")
+
+    page.evaluate("window.nisus.view.show(20, 60, 41.03)")
+    at = origin + round(41.03e9)
+    then = engine.status_at(at)
+    assert strip_of(then) != strip_of(engine.status()), "the test needs another NIS than at the end"
+    shows(page, then, "at 0:41.0")
+    wait_for(lambda: view.history.n and view.history.column("t")[-1] == then.t, PATIENCE)
+    # The charts' window before that moment, and nothing after it.
+    assert view.history.column("t")[0] <= max(origin, then.t - view.history.span) + 10**9
+
+    # Another window points elsewhere: the scene follows it, and the first window says so; its strip stays.
+    other = visit(session.url, beside=page)
+    other.evaluate("window.nisus.view.show(0, 60, 11)")
+    shows(other, engine.status_at(origin + 11 * 10**9), "at 0:11.0")
+    shows(page, then, "at 0:11.0, 30 s earlier than the charts")
+    other.close()
+    wait_for(lambda: view.stage.choices.at is None, PATIENCE)
+    shows(page, then, f"at {int(end // 60)}:{end % 60:04.1f}, {round(end - 41.03)} s later than the charts")
+
+    # Back at the newest row; a folded recording offers the whole of it, and no newest row.
+    page.evaluate("window.nisus.view.show(20, 60, 41.03)")
+    assert page.locator("#follow").inner_text() == "all"
+    page.locator("#follow").click()
+    until(page, f"window.nisus.charts.range[1] >= {end - 0.01} && window.nisus.view.at === 41.03")
+    assert not page.locator("#follow").is_visible()
+    page.locator("body").press("f")
+    shows(page, engine.status(), "")
