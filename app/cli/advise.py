@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,11 +14,11 @@ from sources.inspect import RecordingContents
 
 from ..present.result import TableColumn, Topic, to_json, to_text
 from ..studies.advice.draft import write_draft
-from ..studies.advice.measured import Measured, digits, percent, seconds_text
+from ..studies.advice.measured import AdviceProgress, Measured, digits, percent, seconds_text, without_faults
 from ..studies.advice.plan import DraftPlan, Moves, plan
 from ..studies.advice.relations import Pair
 from ..studies.advice.signals import Signal, signals
-from ..studies.advice.verdict import Advice, advice_json, apply, lasting_lines, lines
+from ..studies.advice.verdict import Advice, advice_json, apply, details, exclusion_text, finding, lasting_lines, lines
 from ..studies.advice.verdict import advise as recommend
 from ..twin.log_reader import read_log
 from ..twin.twin import Twin, load_twin
@@ -60,7 +61,17 @@ def _of_twin(arguments: Arguments, name: str) -> int:
     twin = load_twin(name, log_files=arguments.log or None, overrides=settings(arguments.set, arguments.estimator))
     prepare(twin)
     log, _ = read_log(twin, arguments.duration)
-    advice: Advice = attend(twin.model, lambda: recommend(Measured(twin, log)), "measuring")
+    progress, begun = AdviceProgress(), time.monotonic()
+
+    def work() -> Advice:
+        clean, excluded = without_faults(twin, log)
+        return recommend(Measured(twin, clean, excluded, progress))
+
+    def text() -> str:
+        left = progress.left(time.monotonic() - begun)
+        return progress.question + ("" if left is None else f" About {left:.0f} s left")
+
+    advice: Advice = attend(twin.model, work, "measuring", text=text)
     print(to_json(advice_json(twin, log, advice)) if arguments.json else "\n".join(to_text(_topics(twin, log, advice))))
     if arguments.apply or arguments.out is not None:
         kept = apply(twin.path, lines(advice), arguments.out, advice.sections)
@@ -78,11 +89,13 @@ def _topics(twin: Twin, log: Log, advice: Advice) -> list[Topic]:
     title = advice.title if advice.title.startswith(("Kalman", "Rao")) else advice.title[0].lower() + advice.title[1:]
     claims = []
     for claim in advice.claims:
-        claims += [f"{claim.question} {claim.answer}{' *' * (claim.key in advice.because)}", f"    {claim.reason}"]
+        claims += [f"{finding(claim)}{' *' * (claim.key in advice.because)}", f"    {details(claim)}"]
+    excluded = [exclusion_text(item) for item in advice.excluded]
     topics = [
         Topic(f"{twin.name}: {twin.title}", (f"measured on {seconds:.4g} s of its log, {readings:,} readings",)),
-        Topic(f"Use {advice.estimator}, {title} ({same})", tuple(f"because {reason}" for reason in advice.reasons)),
-        Topic("Why (* decided)", tuple(claims)),
+        Topic(f"Use {advice.estimator}, {title} ({same})", tuple(advice.reasons)),
+        *([Topic("Excluded: faults of sensors", tuple(excluded))] if excluded else []),
+        Topic("Findings (* decided), with their figures", tuple(claims)),
         Topic(f"Lines for {twin.path.name}", tuple((lines(advice) + lasting_lines(advice)).splitlines())),
     ]
     return topics + ([Topic("Also", tuple(f"- {text}" for text in advice.remedies))] if advice.remedies else [])

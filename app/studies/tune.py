@@ -121,9 +121,13 @@ def fit_text(progress: FitProgress, seconds: float) -> str:
         text += f", about {left:.0f} s left" if left < MINUTES_FROM_S else f", about {left / 60.0:.0f} min left"
     if not progress.gain > 0.0:
         return text
+    return f"{text}; best so far {progress.gain:+.3g} on the fitted blocks ({moves_text(progress)})"
+
+
+def moves_text(progress: FitProgress) -> str:
+    """Return the entries that have changed most so far, with their values."""
     moves = sorted(progress.values.items(), key=lambda item: -abs(_move(*item[1])))[:MOVES_SHOWN]
-    moved = ", ".join(f"{key} {digits(before)} -> {digits(after)}" for key, (before, after) in moves)
-    return f"{text}; best so far {progress.gain:+.3g} on the fitted blocks ({moved})"
+    return ", ".join(f"{key} {digits(before)} -> {digits(after)}" for key, (before, after) in moves)
 
 
 def _move(before: float, after: float) -> float:

@@ -10,9 +10,8 @@ from starlette.routing import Route
 from estimators.errors import ConfigError
 
 from ..live.history_copy import END_OF_TIME
-from ..live.jobs import DONE
 from ..live.running_fold import Running
-from ..live.runs.refits import FITTING, FitAttempt, Fitting, LiveRefit, Refits
+from ..live.runs.refits import FITTING, STOPPING, FitAttempt, Fitting, LiveRefit, Refits
 from ..live.tunings.versions import keep, settings_of, version_text
 from ..studies.advice.advising import Advising
 from .http import get, one_line, post
@@ -39,6 +38,7 @@ class FitApi:
             post("/api/fit/keep", self._keep),
             get("/api/advice", self._advice),
             post("/api/advice", self._advise, status=202),
+            get("/api/advice", self._cancel_advice, method="DELETE"),
             get("/api/refit", self._refit),
             post("/api/refit", self._refit_now, status=202),
             post("/api/refit/accept", self._accept),
@@ -61,7 +61,7 @@ class FitApi:
         return self._fit()
 
     def _cancel(self) -> Any:
-        """Cancel the fit under way."""
+        """End the search of the fit under way; its best values so far are the result."""
         self.fitting.cancel()
         return self._fit()
 
@@ -81,11 +81,16 @@ class FitApi:
         found = self._advising
         current = found.revision == self._engine.revisions.runs[-1].number
         state = {"state": found.state, "revision": found.revision, "current": current, "reason": one_line(found.reason)}
-        return state | ({"advice": found.advice} if found.state == DONE else {})
+        return state | {"progress": found.progress()} | ({"advice": found.advice} if found.advice else {})
 
     def _advise(self) -> Any:
         """Begin to search the estimator that suits the log."""
         self._advising.begin()
+        return self._advice()
+
+    def _cancel_advice(self) -> Any:
+        """Cancel the search; the advice before it stays."""
+        self._advising.cancel()
         return self._advice()
 
     # Dual estimation
@@ -124,7 +129,8 @@ class FitApi:
 def _attempt_json(attempt: FitAttempt) -> dict[str, Any]:
     """Return a fit as JSON; `values` are the proposed values of its entries, by key."""
     found = _progress_json(attempt) | {"reason": one_line(attempt.job.reason)}
-    found |= {name: getattr(attempt, name) for name in ("number", "wanted", "estimator")} | {"state": attempt.job.state}
+    state = STOPPING if attempt.stopping else attempt.job.state
+    found |= {name: getattr(attempt, name) for name in ("number", "wanted", "estimator")} | {"state": state}
     if attempt.fitted is not None:
         found |= _result_json(attempt.fitted)
         found["values"] = {line.key: line.after for line in attempt.fitted.lines if not line.alone}
@@ -141,7 +147,15 @@ def _refit_json(refit: LiveRefit) -> dict[str, Any]:
 
 def _progress_json(attempt: FitAttempt) -> dict[str, Any]:
     found = {name: getattr(attempt, name) for name in ("revision", "events", "seconds", "folds")}
-    return found | {"elapsed": attempt.job.elapsed}
+    progress, elapsed = attempt.progress, attempt.job.elapsed
+    found |= {"elapsed": elapsed, "expected": None, "left": None, "gain": 0.0, "best": ""}
+    if progress is not None and progress.folds:
+        from ..studies.tune import moves_text  # which imports SciPy's optimisers too
+
+        expected = max(progress.expected, progress.folds)
+        left = elapsed / progress.folds * (expected - progress.folds)
+        found |= {"expected": expected, "left": left, "gain": progress.gain, "best": moves_text(progress)}
+    return found
 
 
 def _result_json(fitted: Fitted) -> dict[str, Any]:

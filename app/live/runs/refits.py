@@ -28,12 +28,13 @@ from estimators.tuning import Tuning
 from ...format_time import format_time
 from ...twin.defaults import bounds_of, natural_aim
 from ..history_copy import END_OF_TIME, copy_log
-from ..jobs import DONE, FAILED, Job, JobCancelled
+from ..jobs import DONE, FAILED, RUNNING, Job, JobCancelled
 from ..running_fold import Running
 from ..tunings.versions import keep, load_into, settings_of, version_text
 
 if TYPE_CHECKING:
     from estimators.fit.fit import Fitted
+    from estimators.fit.objective import FitProgress
 
 CLOCK_PERIOD_S = 0.5
 """Seconds between two looks at the log's clock."""
@@ -46,12 +47,16 @@ FITTING, OFFERED, ADOPTED, DISMISSED, OUTDATED, NOTHING, BROKEN = (
 )  # fmt: skip
 
 
+STOPPING = "stopping"
+"""State of a fit whose search was ended, while its best values are judged."""
+
+
 @dataclass
 class FitAttempt:
     """One fit: its request, progress and job, whose result is the `Fitted`.
 
     `revision` is the run from which it starts, `events` how many are folded each time, over `seconds` of the log;
-    `folds` are done by now.
+    `folds` are done by now; `progress` has the folds to come and the best values so far, once the search has begun.
     """
 
     number: int
@@ -62,7 +67,13 @@ class FitAttempt:
     events: int = 0
     seconds: float = 0.0
     folds: int = 0
+    progress: FitProgress | None = None
     job: Job = field(default_factory=lambda: Job("fit"))
+
+    @property
+    def stopping(self) -> bool:
+        """Whether the search was ended, and its best point is being judged."""
+        return self.progress is not None and self.progress.stop and self.job.state == RUNNING
 
     @property
     def fitted(self) -> Fitted | None:
@@ -109,9 +120,18 @@ class Fitting:
         return attempt
 
     def cancel(self) -> None:
-        """Cancel the fit that is under way; it ends after its current folds."""
-        if self.latest is not None:
-            self.latest.job.cancel()
+        """End the search of the fit that is under way: its best values so far are judged and become the result.
+
+        Without a better point than the start, or if the search was ended before, the fit ends without a result.
+        """
+        attempt = self.latest
+        if attempt is None:
+            return
+        progress = attempt.progress
+        if progress is not None and progress.gain > 0.0 and not progress.stop:
+            progress.stop = True
+        else:
+            attempt.job.cancel()
 
     def _fit(self, attempt: FitAttempt, most: int | None, since: int | None, job: Job) -> Fitted:
         # Half a second of imports, which a twin that nobody fits need not wait for.
@@ -124,6 +144,7 @@ class Fitting:
             return job.wanted
 
         log, base = self._log(attempt, most, since, job)
+        attempt.progress = objective.FitProgress()
         attempt.events, attempt.seconds = log.n, float(log.t[log.n - 1] - log.t[0]) * 1e-9
         config = self._engine.twin.config
         try:
@@ -135,6 +156,7 @@ class Fitting:
                 bounds=bounds_of(config, self._engine.model),
                 aim=natural_aim(config),
                 go=go,
+                progress=attempt.progress,
             )
         except objective.Cancelled:
             raise JobCancelled from None

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
+from estimators.diagnostics.detectors import detector_of
+from estimators.diagnostics.episodes import Episode, episodes
 from estimators.diagnostics.score import score
 from estimators.diagnostics.sensitivity import Gramian, gramian
 from estimators.diagnostics.sensitivity.checklist import MIN_DIFFERENCE, Linearity, linearity
@@ -24,6 +27,7 @@ from ...twin.twin import Twin
 
 BUDGET_S = 20.0  # seconds of one processor for a fold; of a log that takes longer the first part is folded
 TRIED = 64  # events folded at first, to know how long one takes
+MAX_EXCLUDED_SHARE = 0.5  # of a sensor's readings in faults: with more, not the sensor is wrong but the twin
 
 
 @dataclass(frozen=True)
@@ -34,12 +38,83 @@ class TimedFold:
     seconds: float
 
 
+class Exclusion(NamedTuple):
+    """Readings of a sensor from `start` to `end`, s, that are left out because of a fault."""
+
+    sensor: str
+    cause: str
+    start: float
+    end: float
+    readings: int
+
+
+def without_faults(twin: Twin, log: Log, known: Sequence[Episode] | None = None) -> tuple[Log, tuple[Exclusion, ...]]:
+    """Return the log without the readings of sensors in fault episodes, and what was left out.
+
+    A fault is an alarm for which the sensor, not the tuning, is examined: biased, rejected, stuck, beyond its limits. A
+    sensor that is in fault for most of the log keeps its readings: they are what the twin has to explain.
+
+    Args:
+        twin: The twin.
+        log: Its log.
+        known: Episodes; None to find them by folding the log with the twin's estimator.
+    """
+    if known is None:
+        measured = Measured(twin, log)
+        known = episodes(measured.folded(twin.estimator).fold)
+    model, t = twin.model, log.t[: log.n] * 1e-9
+    sensor_of = {row.name: sensor.name for sensor in model.sensors for row in sensor.rows}
+    sensor_of |= {sensor.name: sensor.name for sensor in model.sensors}
+    reading = log.kind[: log.n] == READING
+    found: list[Exclusion] = []
+    left_out = np.zeros(log.n, bool)
+    for k, sensor in enumerate(model.sensors):
+        own = reading & (log.channel[: log.n] == k)
+        mine, listed = np.zeros(log.n, bool), []
+        for item in known:
+            detector = detector_of(item.cause)
+            if sensor_of.get(item.subject) != sensor.name or not (detector.sensor_lost or detector.isolate):
+                continue
+            end = float(t[-1]) if item.end is None else item.end
+            rows = own & (t >= item.start) & (t <= end)
+            if rows.any():
+                mine |= rows
+                listed.append(Exclusion(sensor.name, item.cause, item.start, end, int(rows.sum())))
+        if listed and mine.sum() <= MAX_EXCLUDED_SHARE * own.sum():
+            left_out |= mine
+            found += listed
+    if not found:
+        return log, ()
+    clean = log.copy()
+    clean.value[: log.n][left_out, : log.width] = np.nan
+    return clean, tuple(sorted(found, key=lambda item: (item.start, item.sensor)))
+
+
+@dataclass
+class AdviceProgress:
+    """Progress of an advice, for another thread to read.
+
+    `question` is being answered; `done` of about `expected` units of work are over, one for each fold of the log.
+    """
+
+    question: str = ""
+    done: float = 0.0
+    expected: float = 0.0
+    check: Callable[[], object] = lambda: None
+
+    def left(self, seconds: float) -> float | None:
+        """Return the seconds to come at the rate so far; None before the first answer."""
+        return seconds * (self.expected - self.done) / self.done if self.done else None
+
+
 @dataclass
 class Measured:
-    """A twin with a log, and its cached measurements."""
+    """A twin with a log, and its cached measurements; `excluded` readings of the recording are missing in the log."""
 
     twin: Twin
     log: Log
+    excluded: tuple[Exclusion, ...] = ()
+    progress: AdviceProgress = field(default_factory=AdviceProgress)
     _folds: dict[tuple[str, tuple[tuple[str, float], ...]], TimedFold] = field(default_factory=dict)
 
     @cached_property
@@ -97,6 +172,7 @@ class Measured:
         begun = time.process_time()
         limit, spent = TRIED, 0.0
         while fold.n < log.n and spent < budget and fold.advance(limit):
+            self.progress.check()
             spent = time.process_time() - begun
             left = budget / max(spent, 1e-9) - 1.0
             limit = int(min(log.n, max(1.0, fold.n * min(left, 4.0))))

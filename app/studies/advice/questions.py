@@ -108,6 +108,7 @@ PEAKS = Question(
 TAILS = Question("tails", "Are the innovations heavy-tailed?", HEAVY_KURTOSIS, "excess kurtosis of the innovations")
 SIZE = Question("size", "Does the state dimension suit a full covariance at this rate?", float(LARGE), "states")
 COST = Question("cost", "Is it fast enough for the asset?", MAX_PROCESSOR_SHARE, "of one processor")
+QUESTIONS = (CONSISTENT, CURVATURE, OBSERVED, LINEAR, REGULAR, PEAKS, TAILS, SIZE, COST)
 
 
 def used_rows(fold: Fold) -> list[Calibration]:

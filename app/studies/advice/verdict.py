@@ -14,24 +14,28 @@ from __future__ import annotations
 
 import re
 import shutil
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from config.tunings import SPREADS
 from config.yaml_files import as_flow, parse, writing
+from estimators.diagnostics.calibration import LIMITS
 from estimators.errors import ConfigError, NisusError
 from estimators.fit.objective import ALONE
 from estimators.log import Log
 from estimators.registry import find_entry, unfit
 
+from ...format_time import format_time
 from ...present.result import plain
 from ...twin.twin import Twin
-from .coloured_noise import lasting
-from .measured import NO, UNTOLD, YES, Claim, Measured, digits
+from .coloured_noise import COLOURED, lasting
+from .measured import NO, UNTOLD, YES, Claim, Exclusion, Measured, digits
 from .questions import (
     PREFERRED,
+    QUESTIONS,
     STEADY,
     affordable,
     consistent,
@@ -46,24 +50,68 @@ from .questions import (
     with_weights,
 )
 
-STATEMENTS = {
-    ("size", NO): "the state is too large for a covariance",
-    ("observed", NO): "no filter recovers an unobservable state",
-    ("linear", YES): "f and h are linear",
-    ("linear", NO): "f or h is not linear",
-    ("linear", UNTOLD): "whether f and h are linear could not be measured",
-    ("steady", YES): "time-invariant, with regular measurements",
-    ("steady", NO): "the gain varies with time; a steady-state filter is not enough",
-    ("steady", UNTOLD): "whether one gain suffices could not be measured",
-    ("peaks", YES): "the posterior has several peaks",
-    ("peaks", NO): "the posterior has one peak",
-    ("peaks", UNTOLD): "no evidence of several peaks",
-    ("curvature", YES): "they curve over the spread of the estimate",
-    ("curvature", NO): "they are nearly straight over the spread of the estimate",
-    ("curvature", UNTOLD): "their curvature could not be measured",
-    ("tails", YES): "the innovations are heavy-tailed",
+FINDINGS = {
+    ("size", YES): "The state is small enough for a full covariance",
+    ("size", NO): "Too many states for a full covariance; use an ensemble filter",
+    ("observed", YES): "All states are observable",
+    ("observed", NO): "Some states are not observable; no filter can recover them",
+    ("observed", UNTOLD): "Observability could not be measured",
+    ("linear", YES): "The model is linear; a Kalman filter is exact",
+    ("linear", NO): "The model is nonlinear",
+    ("linear", UNTOLD): "Linearity could not be measured",
+    ("steady", YES): "Time-invariant with regular measurements; a fixed gain is sufficient",
+    ("steady", NO): "The gain varies with time; a fixed gain is not sufficient",
+    ("steady", UNTOLD): "Too few measurements to judge a fixed gain",
+    ("peaks", YES): "Several hypotheses at once; use a particle filter",
+    ("peaks", NO): "One hypothesis at a time; no particle filter is needed",
+    ("peaks", UNTOLD): "No evidence of several hypotheses",
+    ("curvature", YES): "Nonlinear within the uncertainty of the estimate; UKF is more accurate than EKF",
+    ("curvature", NO): "Effectively linear; EKF is sufficient",
+    ("curvature", UNTOLD): "The effect of the nonlinearity could not be measured",
+    ("tails", YES): "The measurements have outliers; robust weights are recommended",
+    ("tails", NO): "No robust weights are needed",
+    ("tails", UNTOLD): "Too few measurements to judge outliers",
+    ("consistent", YES): "The filter is consistent; noises and bands are right",
+    ("consistent", NO): "The filter is not consistent; noises or model need work",
+    ("consistent", UNTOLD): "Too few measurements to judge consistency",
+    ("lasting", YES): "Coloured noise explains the correlated innovations",
+    ("lasting", NO): "Coloured noise does not explain the correlated innovations",
+    ("lasting", UNTOLD): "Coloured noise could not be tested",
+    ("cost", YES): "Fast enough for this measurement rate",
+    ("cost", NO): "Too slow for this measurement rate",
 }
-"""Statement of each deciding answer."""
+"""Answer of each question, in a sentence for engineers; the figures are details."""
+
+QUESTION_TEXTS = {question.key: question.text for question in (*QUESTIONS, COLOURED)}
+
+UNITS_OF_WORK = {
+    "size": 0.1, "linear": 4.0, "peaks": 8.0, "observed": 3.0, "steady": 2.0, "curvature": 2.0, "tails": 1.0,
+    "consistent": 1.0, "lasting": 10.0, "cost": 0.1,
+}  # fmt: skip
+"""Folds that each question takes, about, for the remaining time."""
+
+
+def finding(claim: Claim) -> str:
+    """Return the answer of a claim in a sentence."""
+    if claim.key == "linear" and claim.answer == NO and claim.figure is not None and claim.figure <= LIMITS.bias:
+        return "Nonlinear, with a negligible effect on the estimate"
+    if claim.figure is not None and claim.key in ("radius", "inflation", "members"):
+        return f"Use {claim.key} {digits(claim.figure)}"
+    return FINDINGS.get((claim.key, claim.answer), f"{claim.question} {claim.answer}")
+
+
+def details(claim: Claim) -> str:
+    """Return the figures of a claim, its limit and the arithmetic."""
+    figures = ""
+    if claim.figure is not None and claim.threshold is not None:
+        figures = f"{digits(claim.figure)} {claim.of}, limit {digits(claim.threshold)}; "
+    return figures + claim.reason
+
+
+def exclusion_text(item: Exclusion) -> str:
+    """Return what was left out: `yoke, 12.0 s to 31.5 s: stuck (195 readings)`."""
+    at = [format_time(round(seconds * 1e9)) for seconds in (item.start, item.end)]
+    return f"{item.sensor}, {at[0]} to {at[1]}: {item.cause} ({item.readings:,} readings)"
 
 
 @dataclass
@@ -71,7 +119,8 @@ class Advice:
     """A recommendation: filter and options, the claims in the order in which they were asked, and which decided.
 
     `because` are the keys of the claims that led to this filter and not to the one before it in the tree. `remedies`
-    are other actions; `sections` are entries of the YAML, by key, that declare coloured noise.
+    are other actions; `sections` are entries of the YAML, by key, that declare coloured noise; `excluded` are the
+    readings in faults, on which nothing is based.
     """
 
     estimator: str = ""
@@ -79,6 +128,7 @@ class Advice:
     claims: list[Claim] = field(default_factory=list)
     because: tuple[str, ...] = ()
     sections: Mapping[str, dict[str, object]] = field(default_factory=dict)
+    excluded: tuple[Exclusion, ...] = ()
 
     def claim(self, key: str) -> Claim | None:
         """The claim of that key, if it was asked."""
@@ -91,14 +141,8 @@ class Advice:
 
     @property
     def reasons(self) -> list[str]:
-        """Deciding answers, each with its figure and limit."""
-        found = []
-        for claim in (claim for claim in self.claims if claim.key in self.because):
-            text = STATEMENTS[claim.key, claim.answer]
-            if claim.figure is not None and claim.threshold is not None:
-                text += f": {digits(claim.figure)} {claim.of}, limit {digits(claim.threshold)}"
-            found.append(text)
-        return found
+        """Deciding answers, in words."""
+        return [finding(claim) for claim in self.claims if claim.key in self.because]
 
     @property
     def remedies(self) -> list[str]:
@@ -112,31 +156,45 @@ def advise(measured: Measured) -> Advice:
     Raises:
         NisusError: If no filter applies, or none runs.
     """
-    told = Advice()
-    size = _ask(told, small(measured))
+    told = Advice(excluded=measured.excluded)
+    measured.progress.expected = sum(UNITS_OF_WORK.values())
+    size = _ask(told, measured, "size", small)
     if size.answer == NO:
         _of_ensemble(told, measured)
     else:
         _of_small(told, measured)
     _consistency(told, measured, ensemble=size.answer == NO)
-    _ask(told, affordable(measured, told.estimator, told.options))
+    _ask(told, measured, "cost", lambda _: affordable(measured, told.estimator, told.options))
     return told
 
 
 def _consistency(told: Advice, measured: Measured, *, ensemble: bool) -> None:
     """Check the chosen filter for consistency; if its innovations are correlated, try coloured noise."""
-    claim = consistent(measured, told.estimator, told.options)
-    _ask(told, claim)
+    claim = _ask(told, measured, "consistent", lambda _: consistent(measured, told.estimator, told.options))
     # A filter that draws is too slow to be fitted here, and has no likelihood that is smooth.
     if claim.answer != NO or ensemble or find_entry(told.estimator).family in ALONE:
         return
-    found = lasting(measured, told.estimator, told.options)
+    with _asking(measured, "lasting"):
+        found = lasting(measured, told.estimator, told.options)
     if found is not None:
         told.sections = found[1].sections
-        _ask(told, found[0])
+        told.claims.append(found[0])
 
 
-def _ask(told: Advice, claim: Claim) -> Claim:
+@contextmanager
+def _asking(measured: Measured, key: str) -> Iterator[None]:
+    """Report that a question is being answered, and then that it and all before it are over."""
+    progress = measured.progress
+    progress.check()
+    progress.question = QUESTION_TEXTS[key]
+    yield
+    keys = list(UNITS_OF_WORK)
+    progress.done = sum(UNITS_OF_WORK[before] for before in keys[: keys.index(key) + 1])
+
+
+def _ask(told: Advice, measured: Measured, key: str, answer: Callable[[Measured], Claim]) -> Claim:
+    with _asking(measured, key):
+        claim = answer(measured)
     told.claims.append(claim)
     return claim
 
@@ -160,18 +218,18 @@ def _of_ensemble(told: Advice, measured: Measured) -> None:
 
 
 def _of_small(told: Advice, measured: Measured) -> None:
-    straight = _ask(told, linear(measured)).answer
-    if _ask(told, several(measured)).answer == YES:
+    straight = _ask(told, measured, "linear", linear).answer
+    if _ask(told, measured, "peaks", several).answer == YES:
         # What the readings tell is asked of a filter with one peak, so it is not asked here.
         _choose(told, measured, ("rbpf", "pf"), ("linear", "peaks"))
         return
-    if _ask(told, observed(measured)).answer == NO:
+    if _ask(told, measured, "observed", observed).answer == NO:
         told.because = ("observed",)
     if straight == YES and measured.twin.model.linear:
         _of_linear(told, measured)
     elif straight == YES:
         _choose(told, measured, ("ekf", "sr-ukf", "ukf", "enkf"), ("linear", "peaks"))
-    elif _ask(told, curvature(measured)).answer == YES:
+    elif _ask(told, measured, "curvature", curvature).answer == YES:
         _choose(told, measured, ("sr-ukf", "ukf", "enkf"), ("linear", "peaks", "curvature"))
     else:
         _choose(told, measured, ("ekf", "sr-ukf", "enkf"), ("linear", "peaks", "curvature"))
@@ -183,8 +241,10 @@ def _of_linear(told: Advice, measured: Measured) -> None:
         # What nothing tells of has no steady state.
         _choose(told, measured, ("kf",), ("linear",))
         return
-    claim, period = steady(measured)
-    if _ask(told, claim).answer == YES:
+    with _asking(measured, "steady"):
+        claim, period = steady(measured)
+    told.claims.append(claim)
+    if claim.answer == YES:
         _choose(told, measured, (STEADY,), ("linear", "steady"))
         told.options = {"period": period}
     else:
@@ -193,8 +253,10 @@ def _of_linear(told: Advice, measured: Measured) -> None:
 
 def _of_tails(told: Advice, measured: Measured) -> None:
     """Student's t where tails are heavy."""
-    claim, dof = heavy(measured, told.estimator, told.options)
-    if _ask(told, claim).answer == YES:
+    with _asking(measured, "tails"):
+        claim, dof = heavy(measured, told.estimator, told.options)
+    told.claims.append(claim)
+    if claim.answer == YES:
         name, weighted = with_weights(told.estimator, dof)
         if weighted:
             told.estimator, told.options, told.because = name, weighted, (*told.because, "tails")
@@ -210,7 +272,8 @@ def advice_json(twin: Twin, log: Log, told: Advice) -> dict[str, Any]:
         "options": told.options,
         "because": list(told.because),
         "reasons": told.reasons,
-        "claims": [plain(claim) for claim in told.claims],
+        "claims": [{**plain(claim), "finding": finding(claim), "details": details(claim)} for claim in told.claims],
+        "excluded": [{**plain(item), "text": exclusion_text(item)} for item in told.excluded],
         "lines": lines(told) + lasting_lines(told),
         "remedies": told.remedies,
     }

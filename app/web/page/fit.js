@@ -9,7 +9,7 @@ const FIT_PERIOD = 300; // ms between two progress queries
 const GROUPS = { Q: "Q", R: "R", p: "parameters", options: "options" };
 const FIRST = ["Q", "R"]; // ticked at first
 const LAST = [100_000, 20_000, 5_000]; // of so many events, where there are more
-const BUSY = ["running", "cancelling"];
+const BUSY = ["running", "stopping", "cancelling"];
 
 export class Fit {
   // tune: its head has the button, and it applies results
@@ -28,7 +28,10 @@ export class Fit {
     this.box = new Panel(this.button, "fit-panel", "Fit to the log", opened, this.form, this.progress, this.error, this.result);
     this.panel = this.box.node;
     this.count = element("output", {});
-    this.progress.append(element("progress", { "aria-label": "Folding" }), this.count, this.cancelButton = element("button", { type: "button", id: "fit-cancel", class: "go", onclick: () => this.ask("DELETE") }, "Cancel"));
+    this.best = element("p", { class: "about" });
+    this.bar = element("progress", { max: 1, "aria-label": "Share of the fit done" });
+    this.cancelButton = element("button", { type: "button", id: "fit-cancel", class: "go", title: "End the search and keep the best values so far", onclick: () => this.ask("DELETE") }, "Stop");
+    this.progress.append(this.bar, this.count, this.cancelButton, this.best);
     link.addEventListener("status", ({ detail }) => {
       if (this.estimator !== detail.estimator && this.box.open) this.offer();
       if (this.told?.result && this.revision !== detail.revision) this.ask("GET");
@@ -83,9 +86,14 @@ export class Fit {
     this.progress.hidden = !busy;
     for (const item of this.form.querySelectorAll("input, select, button")) item.disabled = busy;
     this.cancelButton.disabled = told.state === "cancelling";
-    setText(this.button, busy ? "Fitting…" : "Fit…");
+    setText(this.cancelButton, told.state === "running" ? "Stop" : "Discard");
+    setText(this.button, busy ? (told.left === null ? "Fitting…" : `Fitting ${span(told.left)}…`) : "Fit…");
     if (busy) {
-      setText(this.count, `${told.state === "cancelling" ? "ending … " : ""}${told.folds} folds of ${told.events.toLocaleString("en")} events, ${span(told.elapsed)}`);
+      const share = told.expected ? told.folds / told.expected : null;
+      bar(this.bar, share);
+      setText(this.count, told.state === "stopping" ? "Judging the best values so far …" : told.state === "cancelling" ? "ending …" : left(told.left, told.elapsed));
+      this.count.title = `${told.folds} of about ${told.expected ?? "?"} folds of ${told.events.toLocaleString("en")} events`;
+      setText(this.best, told.gain > 0 ? `Best so far: +${compact(told.gain, 3)} on the fitted blocks (${told.best})` : "No better values yet.");
       this.timer = setTimeout(() => this.ask("GET"), FIT_PERIOD);
     }
     if (told.state === "failed") this.say(told.reason);
@@ -132,6 +140,14 @@ export class Fit {
   }
 }
 
+// A bar without a value moves to and fro.
+function bar(node, share) {
+  if (share === null) node.removeAttribute("value");
+  else node.value = Math.min(1, share);
+}
+
+const left = (seconds, elapsed) => (seconds === null ? `${span(elapsed)} so far` : `about ${span(seconds)} left, ${span(elapsed)} so far`);
+
 function group(prefix, title, keys) {
   if (!keys.length) return null;
   const chosen = FIRST.includes(prefix);
@@ -156,7 +172,7 @@ const BOUND = "only a bound: not distinguishable from zero";
 // told: the answer of /api/fit; offers: buttons
 function fitted(told, offers) {
   const { result } = told;
-  return [verdict(result), element("div", { class: "offers" }, ...offers), entries(result), scores(result), about(told)];
+  return [result.stopped ? element("p", { class: "faint" }, "Ended early: these are the best values so far; better ones may exist.") : "", verdict(result), element("div", { class: "offers" }, ...offers), entries(result), scores(result), about(told)];
 }
 
 function verdict({ proposed, verdict: { gain, error, reasons } }) {
@@ -291,8 +307,8 @@ export class Refit {
   }
 }
 
-// Advice on the estimator, as cards: one for the recommendation, with a button that applies it, and one per claim with its
-// figure; a card about wrong noise opens the fit.
+// Advice on the estimator, as cards: one for the recommendation, with a button that applies it, and one per finding with its
+// figures behind a line; a card about wrong noise opens the fit.
 
 const ADVICE_PERIOD = 500; // ms between two looks at whether it is there
 
@@ -302,11 +318,13 @@ export class Advice {
     this.button = element("button", { type: "button", id: "advise", title: "Recommended estimator for this log, with reasons" }, "Advice…");
     tune.restoreButton.before(this.button);
     this.measure = element("button", { type: "button", id: "advice-begin", class: "go", onclick: () => this.ask("POST") }, "Measure");
+    this.stop = element("button", { type: "button", id: "advice-cancel", class: "go", hidden: true, onclick: () => this.ask("DELETE") }, "Cancel");
+    this.bar = element("progress", { max: 1, hidden: true, "aria-label": "Share of the questions answered" });
     this.said = element("span", { class: "faint", role: "status" });
     this.error = element("p", { class: "error", role: "alert", hidden: true });
     this.cards = element("div", { class: "claims" });
     this.panel = new Panel(this.button, "advice-panel", "Which estimator, and why", () => this.ask("GET"),
-      element("div", { class: "progress" }, this.measure, this.said), this.error, this.cards);
+      element("div", { class: "progress" }, this.measure, this.bar, this.said, this.stop), this.error, this.cards);
     link.addEventListener("status", ({ detail }) => {
       if (this.told?.advice && this.revision !== detail.revision && this.panel.open) this.ask("GET");
       this.revision = detail.revision;
@@ -319,15 +337,20 @@ export class Advice {
     const told = answer?.headers.get("content-type")?.includes("json") ? await answer.json() : { error: "no answer from the twin" };
     this.say(told.error ?? told.reason);
     if (told.error) return;
-    const busy = told.state === "running";
-    if (busy && this.panel.open) this.timer = setTimeout(() => this.ask("GET"), ADVICE_PERIOD);
-    this.measure.disabled = busy;
-    setText(this.said, busy ? "folding the log by one filter after another …" : told.advice && !told.current ? `of run ${told.revision}; another runs now` : told.advice ? "" : "nothing measured yet: it folds the log by one filter after another");
+    const busy = BUSY.includes(told.state);
+    if (busy) this.timer = setTimeout(() => this.ask("GET"), ADVICE_PERIOD);
+    this.measure.hidden = busy;
+    this.bar.hidden = this.stop.hidden = !busy;
+    this.stop.disabled = told.state === "cancelling";
+    bar(this.bar, told.progress.share);
+    setText(this.button, busy ? "Measuring…" : "Advice…");
+    const idle = told.advice ? (told.current ? "" : `of run ${told.revision}; another runs now`) : told.state === "cancelled" ? "Cancelled." : "nothing measured yet: it folds the log by one filter after another";
+    setText(this.said, told.state === "cancelling" ? "ending …" : busy ? `${told.progress.question} ${left(told.progress.left, told.progress.elapsed)}` : idle);
     const key = `${told.state}/${told.revision}/${told.current}`;
     if (key === this.key) return;
     this.key = key;
     this.told = told;
-    this.cards.replaceChildren(...(told.advice ? [this.recommended(told), ...told.advice.claims.map((claim) => this.claim(claim, told.advice.because))] : []));
+    this.cards.replaceChildren(...(told.advice ? [this.recommended(told), this.excluded(told.advice), ...told.advice.claims.map((claim) => this.claim(claim, told.advice.because))].filter(Boolean) : []));
   }
 
   say(reason) {
@@ -342,15 +365,20 @@ export class Advice {
     return element("article", { class: "first" },
       element("header", {}, element("h3", {}, has ? `${title}: as it is` : title), element("span", { class: "space" }),
         has ? null : element("button", { type: "button", id: "advice-apply", class: "go first", title: "Apply as one edit (U to undo)", onclick: () => this.apply(advice) }, "Apply")),
-      options ? element("p", {}, options) : null, ...advice.reasons.map((reason) => element("p", {}, `because ${reason}`)));
+      options ? element("p", {}, options) : null, ...advice.reasons.map((reason) => element("p", {}, `${reason}.`)));
+  }
+
+  // Readings of sensors in known faults: no finding rests on them.
+  excluded({ excluded }) {
+    if (!excluded.length) return null;
+    return element("article", { class: "excluded" }, element("h3", {}, "Excluded: faults of sensors"), element("ul", {}, ...excluded.map((item) => element("li", {}, item.text))));
   }
 
   claim(claim, because) {
-    const figure = claim.figure === null || claim.threshold === null ? null : element("p", { class: "faint" }, `${compact(claim.figure, 3)} ${claim.of}, limit ${compact(claim.threshold, 3)}`);
     const fit = claim.key === "consistent" && claim.answer === "no" ? element("button", { type: "button", class: "go", onclick: () => this.tune.fit.box.toggle(true) }, "Fit…") : null;
-    return element("article", { dataset: { decides: because.includes(claim.key) } },
-      element("header", {}, element("h3", {}, claim.question), element("span", { class: "space" }), element("b", {}, claim.answer)),
-      figure, element("p", {}, claim.reason), claim.remedy ? element("p", { class: "remedy" }, claim.remedy) : null, fit);
+    return element("article", { dataset: { decides: because.includes(claim.key), key: claim.key } },
+      element("h3", {}, `${claim.finding}.`), claim.remedy ? element("p", { class: "remedy" }, claim.remedy) : null, fit,
+      element("details", {}, element("summary", {}, "details"), element("p", {}, `${claim.question} ${claim.answer}: ${claim.details}`)));
   }
 
   async apply(advice) {

@@ -1,8 +1,12 @@
 """Served engines that the tests of the API share."""
 
+import threading
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
+from estimators.fit.objective import Objective
 from tests.app.scripted import readings, wait_for
 from tests.app.served import ServedEngine
 
@@ -35,3 +39,20 @@ def page(serve, tmp_path):
     recording.write_bytes(b"RRF2 and so on")
     (tmp_path / "private.rrd").write_bytes(b"nobody's business")
     return serve(review=recording)
+
+
+@pytest.fixture
+def halted(monkeypatch):
+    """Fits halt at their first gain: `reached` is set then, and they go on once `released` is set."""
+    reached, released = threading.Event(), threading.Event()
+    terms = Objective.terms
+
+    def waiting(self, x):
+        if self.progress.gain > 0.0:
+            reached.set()
+            assert released.wait(300.0)
+        return terms(self, x)
+
+    monkeypatch.setattr(Objective, "terms", waiting)
+    yield SimpleNamespace(reached=reached, released=released)
+    released.set()

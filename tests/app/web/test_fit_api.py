@@ -41,12 +41,28 @@ def test_a_fit_is_begun_told_and_put_in_at_once(page):
     assert look(page)["current"] is False
 
 
+def test_a_stopped_fit_keeps_its_best_values(page, halted):
+    page.client.post("/api/fit", {"wanted": ["Q", "R"]})
+    assert halted.reached.wait(60.0)
+    told = look(page)
+    assert told["state"] == "running" and 0 < told["folds"] <= told["expected"]
+    assert told["left"] == pytest.approx(told["elapsed"] * (told["expected"] / told["folds"] - 1.0), rel=0.5)
+    assert told["gain"] > 0.0 and " -> " in told["best"]
+    headers = [("Host", page.client.host), ("Cookie", page.client.cookie), ("Origin", page.client.origin)]
+    assert json.loads(page.client.raw("DELETE", "/api/fit", headers).text)["state"] == "stopping"
+    halted.released.set()
+    wait_for(lambda: look(page)["state"] in DONE)
+    told = look(page)
+    assert told["state"] == "done" and told["result"]["stopped"] and told["values"]
+
+
 def test_given_up_and_nothing_to_give_up(page):
     headers = [("Host", page.client.host), ("Cookie", page.client.cookie), ("Origin", page.client.origin)]
     answer = page.client.raw("DELETE", "/api/fit", headers)
     assert json.loads(answer.text) == {"state": "none", "available": 600}
     page.client.post("/api/fit", {"wanted": ["Q", "R"]})
     page.client.raw("DELETE", "/api/fit", headers)
+    page.client.raw("DELETE", "/api/fit", headers)  # the first one may have found a better point, which is kept
     wait_for(lambda: look(page)["state"] in DONE)
     assert "result" not in look(page) and look(page)["state"] == "cancelled"
 

@@ -21,10 +21,10 @@ N = 600
 """Readings, one a second."""
 
 
-def cart(rng: np.random.Generator) -> np.ndarray:
+def cart(rng: np.random.Generator, n: int = N) -> np.ndarray:
     """Places of a cart whose speed is a random walk."""
     place, speed, places = 0.0, 0.0, []
-    for _ in range(N):
+    for _ in range(n):
         place, speed = place + speed + rng.normal(0, 0.001**0.5), speed + rng.normal(0, 0.1)
         places.append(place)
     return np.array(places)
@@ -38,6 +38,17 @@ def tails(rng):
     """One reading in fifteen is an outlier of ten times the noise."""
     wild = np.where(rng.random(N) < 1 / 15, 10.0, 1.0)
     return {"rail": cart(rng) + wild * rng.normal(0, 1, N)}, {}
+
+
+STUCK = slice(200, 260)
+"""Readings of the rail that repeat the first of them."""
+
+
+def stuck(rng):
+    """As `linear`, twice as long, with a sensor that is stuck for a minute."""
+    values = cart(rng, 2 * N) + rng.normal(0, 1, 2 * N)
+    values[STUCK] = values[STUCK.start]
+    return {"rail": values}, {}
 
 
 def mild(rng):

@@ -1,11 +1,13 @@
 """The advice on eight assets of which the right answer is known, as it is known how they were made."""
 
+import numpy as np
 import pytest
 
-from app.studies.advice.measured import UNTOLD, Measured
-from app.studies.advice.verdict import Advice, advise, apply, lines
+from app.studies.advice.measured import UNTOLD, Exclusion, Measured, without_faults
+from app.studies.advice.verdict import Advice, advise, apply, details, finding, lines
 from app.twin.log_reader import read_log
 from app.twin.twin import load_twin
+from estimators.diagnostics.episodes import Episode
 from estimators.log import READING
 from estimators.registry import find_entry
 from tests.app.studies.advice import recordings
@@ -39,6 +41,12 @@ def test_mildly_nonlinear_takes_the_ekf(told):
     assert (found.estimator, found.because) == ("ekf", ("linear", "peaks", "curvature"))
     claim = found.claim("curvature")
     assert claim.answer == "no" and 1e-9 < claim.figure < claim.threshold == 0.25
+    # In words for engineers; the figures are details.
+    assert finding(claim) == "Effectively linear; EKF is sufficient"
+    assert finding(found.claim("linear")) == "Nonlinear, with a negligible effect on the estimate"
+    assert found.reasons == [finding(found.claim(key)) for key in ("linear", "peaks", "curvature")]
+    assert not any(letter.isdigit() for text in found.reasons for letter in text)
+    assert details(claim).startswith(f"{claim.figure:.3g} σ between ekf and ukf (95th percentile), limit 0.25; ")
 
 
 def test_strongly_nonlinear_takes_the_ukf(told):
@@ -120,3 +128,30 @@ def test_of_few_readings_nothing_is_said_of_the_innovations(tmp_path, number):
     assert int((log.kind[: log.n] == READING).sum()) == number
     found = advise(Measured(twin, log)).claim("consistent")
     assert found.answer == UNTOLD and found.remedy == ""
+
+
+def test_faults_of_a_sensor_are_left_out(tmp_path, nisus):
+    path = write(tmp_path, "stuck", "LINEAR", "kf", recordings.stuck, "rail")
+    twin = load_twin(path)
+    log = read_log(twin, None)[0]
+    clean, excluded = without_faults(twin, log)
+    begin, end = recordings.STUCK.start, recordings.STUCK.stop
+    assert excluded == (Exclusion("rail", "stuck", begin, end - 1, end - begin),)
+    assert np.flatnonzero(np.isnan(clean.value[: clean.n, 0])).tolist() == list(range(begin, end))
+    page = nisus("advise", path).words
+    assert "Excluded: faults of sensors rail, 200 s to 259 s: stuck (60 readings)" in page
+    assert "The filter is consistent; noises and bands are right" in page
+
+
+def test_what_lasts_for_most_of_the_log_is_no_fault(tmp_path):
+    twin = load_twin(write(tmp_path, "linear", "LINEAR", "kf", recordings.linear, "rail"))
+    log = read_log(twin, None)[0]
+
+    def shifted(start, end):
+        return Episode(start, end, "rail", "shifted", 2.0, 1.5, 2.5, "σ", "")
+
+    clean, excluded = without_faults(twin, log, [shifted(100.0, 109.0), shifted(400.0, None)])
+    assert [item.readings for item in excluded] == [10, recordings.N - 400]
+    assert np.isnan(clean.value[: clean.n, 0]).sum() == 10 + recordings.N - 400
+    whole, excluded = without_faults(twin, log, [shifted(100.0, None)])
+    assert excluded == () and whole is log

@@ -24,11 +24,16 @@ def test_a_linear_model_is_told_its_filter_which_applies_itself(page, session):
     wait_for(lambda: apply.count() == 1, PATIENCE)
     card = page.locator("#advice-panel article.first")
     assert card.locator("h3").inner_text().startswith("Kalman filter")
-    assert "because f and h are linear" in card.inner_text()
-    # A card a claim; those that decided are marked, and each has its answer.
-    claims = page.locator("#advice-panel article:not(.first)")
+    assert "The model is linear; a Kalman filter is exact." in card.inner_text()
+    # A card a finding, in words; those that decided are marked, and the figures are behind a line.
+    claims = page.locator("#advice-panel article[data-key]")
     assert claims.count() >= 4
-    assert "linear" in claims.locator("h3").all_inner_texts()[0] + claims.locator("h3").all_inner_texts()[1]
+    linear = page.locator('#advice-panel [data-key="linear"]')
+    assert linear.locator("h3").inner_text() == "The model is linear; a Kalman filter is exact."
+    figures = linear.locator("details p")
+    assert figures.is_hidden()
+    linear.locator("summary").click()
+    assert figures.inner_text().startswith("Are f and h linear? yes: ") and "limit 1e-9" in figures.inner_text()
     assert page.locator('#advice-panel [data-decides="true"]').count() >= 1
 
     apply.click()

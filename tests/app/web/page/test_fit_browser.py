@@ -91,6 +91,26 @@ def test_what_is_wrong_is_found_put_in_and_taken_back(page, session):
     assert engine.tuning.get("R.winding") == WRONG
 
 
+def test_a_fit_shows_its_progress_while_the_page_is_used_and_stops_with_its_best_values(page, session, halted):
+    page.locator("#fit").click()
+    page.locator("#fit-begin").click()
+    assert halted.reached.wait(PATIENCE)
+    progress = page.locator("#fit-panel .progress")
+    wait_for(lambda: "Best so far: +" in progress.inner_text(), PATIENCE)
+    assert " left, " in progress.locator("output").inner_text() and "R.winding 100 -> " in progress.inner_text()
+    assert 0.0 < page.evaluate("document.querySelector('#fit-panel progress').value") < 1.0
+    assert page.locator("#fit").inner_text().startswith("Fitting ")
+    # An edit meanwhile is folded at once.
+    assert page.evaluate("window.nisus.link.ask('SetTuning', {key: 'R.winding', value: 9})") is None
+    settled(session.engine, 1)
+
+    page.locator("#fit-cancel").click()
+    halted.released.set()
+    wait_for(lambda: progress.is_hidden() and verdict(page) is not None, PATIENCE)
+    result = page.locator("#fit-panel .result").inner_text()
+    assert "Ended early: these are the best values so far" in result and "R.winding" in result
+
+
 def test_single_entries_are_fitted_alone(page, session):
     page.locator("#fit").click()
     page.locator("#fit-panel .groups label", has_text="Q").locator("input").uncheck()
