@@ -131,7 +131,7 @@ export class Chart {
         y: { range: () => what.range(this.data, this.span) },
       },
       axes: [
-        withTime ? timeAxis() : { ...axis(), size: 3, values: (self, splits) => splits.map(() => null) },
+        withTime ? timeAxis() : { ...axis(), size: 6, values: (self, splits) => splits.map(() => null) },
         { ...axis(), size: LABELS, splits, values: (self, values) => (this.empty ? [] : values.map((value) => compact(value, 7))), ...(what.axis ?? {}) },
       ],
       series: [{}, ...Object.values(what.series)],

@@ -131,20 +131,19 @@ export class Charts {
     this.pins.show(this.range, notes);
     this.axis.show(this.range);
     this.drawnAt = performance.now();
-    this.explaining ??= setTimeout(() => ((this.explaining = null), this.explain()), LEGEND_DELAY_MS);
+    this.explaining ??= setTimeout(() => ((this.explaining = null), this.visible && this.explain()), LEGEND_DELAY_MS);
     window.nisus.drawn = (window.nisus.drawn ?? 0) + 1;
     window.nisus.revision = this.live.revision;
     this.node.dataset.revision = this.live.revision;
   }
 
   // Legend of the shown charts, each mark once. Pinned runs are added where they are drawn (layers.js).
-  explain() {
-    const shown = this.charts.filter((chart) => !chart.node.hidden);
+  explain(shown = this.charts.filter((chart) => !chart.node.hidden)) {
     const found = new Map();
     const add = (key, text, style) => key in LEGEND && !found.has(key) && found.set(key, [LEGEND[key][0] ?? text, style]);
     for (const chart of shown) for (const [text, style] of chart.legend) add(style.ring ? `${style.tone} ring` : style.tone, text, style);
     const [since, until] = this.range;
-    if (this.episodes.some(({ from, to }) => from < until && (to ?? until) > since)) add("episode-strip", "fault episode", { mark: "line", tone: "episode-strip", width: 2.5 });
+    if (this.visible && this.episodes.some(({ from, to }) => from < until && (to ?? until) > since)) add("episode-strip", "fault episode", { mark: "line", tone: "episode-strip", width: 2.5 });
     if (shown.some((chart) => chart.outsiders?.length)) add("outside", "off scale", { mark: "triangle", tone: "faint" });
     const items = Object.keys(LEGEND).flatMap((key) => (found.has(key) ? [[key, ...found.get(key)]] : []));
     const written = items.map(([, text]) => text).join();

@@ -2,7 +2,7 @@
 // wrong unnoticed. Small multiples with one sentence each; nothing is asked while this is hidden.
 
 import { element, setText } from "./dom.js";
-import { compact, spaced, span, words } from "./format.js";
+import { compact, inChartTime, spaced, span, words } from "./format.js";
 
 const AGAIN = 3000; // ms between two looks
 const MAX_OPEN_ROWS = 6; // rows that are all open
@@ -57,7 +57,7 @@ export class Diagnose {
     const cost = found.cost === null ? "" : ` ${compact(found.cost, 3)} µs per event.`;
     this.node.replaceChildren(
       element("p", { class: "summary" }, element("b", {}, `${good} of ${found.rows.length} sensor rows${left} are consistent${but}. `), `Last ${found.events.toLocaleString("en")} events, ${span(found.span)}, ${found.estimator}: ${found.nis}.${cost}`),
-      ...rows.map((row) => rowCard(row, found.marginal, open(row), (now) => this.turned.set(row.name, now))),
+      ...rows.map((row) => rowCard({ ...row, verdict: inChartTime(row.verdict, this.link.status.origin, this.link.status.t) }, found.marginal, open(row), (now) => this.turned.set(row.name, now))),
       element("div", { class: "cards" }, ...[ranksCard(found), particlesCard(found), correlationCard(found), ...unseenCards(found)].filter(Boolean)),
     );
     this.savable(found.events);

@@ -163,7 +163,7 @@ export class LogView {
       log.gaps ? count(log.gaps, "gap") : null, log.kind === "can_log" ? count(log.ids, "id") : null, log.time ? `time: ${log.time}` : null,
     ].filter(Boolean).join(" · ");
     return element("header", { class: "log-head" },
-      element("a", { href: "/gallery", class: "go" }, "← All twins"), element("h1", {}, log.name), element("p", { class: "faint" }, facts));
+      element("a", { href: "/gallery", class: "go" }, "← All twins"), element("h2", {}, log.name), element("p", { class: "faint" }, facts));
   }
 
   // Never a dead end: the file stays, and another reading of it, or another file, is one step away.

@@ -85,11 +85,13 @@ const middle = new Tabs($("middle-tabs"), null, (shown) => {
   for (const [name, pane] of Object.entries(panes)) if (name !== shown) pane.hide();
   panes[shown]?.show();
   charts.show(shown === "charts-panel");
+  if (shown === "charts-panel") charts.explain();
   $("layout").hidden = $("smoothed").hidden = shown !== "charts-panel";
   $("legend").hidden = shown !== "charts-panel" && shown !== "whatif";
   if (side.into) side.shown(shown);
 });
 window.nisus.panes = panes;
+panes.whatif.explain = (parts) => charts.explain(parts);
 const saving = new Save(model, link, view, charts);
 charts.saving = runs.saving = panes.whatif.saving = window.nisus.saving = saving;
 $("save").addEventListener("click", () => saving.run($("save")));

@@ -4,7 +4,7 @@
 import { Chart, TimeAxis, band, dots, edge, line } from "./chart.js";
 import { element, setText } from "./dom.js";
 import { aboutMean, unbroken, wrapped } from "./drawing.js";
-import { bracketed, compact, spaced, span } from "./format.js";
+import { bracketed, compact, spaced, span, withDeviation } from "./format.js";
 import { Range, shownExtent, within } from "./ranges.js";
 import { Stream } from "./stream.js";
 import { inputChart, inputRow, levels, probability, profile } from "./whatif_inputs.js";
@@ -61,7 +61,7 @@ export class WhatIf {
     );
     this.charts = element("div", { class: "fans" });
     const axis = element("div", { class: "axis", "aria-hidden": "true" });
-    this.node.replaceChildren(asked, this.problem, this.charts, axis, element("p", { class: "faint foot" }, "Prediction of the running filter without measurements. Bands ± 1σ, ± 2σ. ", this.method, this.state));
+    this.node.replaceChildren(asked, this.problem, this.charts, axis, element("p", { class: "faint foot" }, "Dashed: prediction of the running filter without measurements. Bands ± 1σ, ± 2σ. ", this.method, this.state));
     const { states } = this;
     const actions = (this.actions = { select: () => {}, home: () => {}, wheel: () => {}, save: (chart, button) => this.saving.chart(chart, button) });
     this.parts = states.map((state) => new Chart(fan(this, state), actions));
@@ -191,6 +191,7 @@ export class WhatIf {
     const inputs = [...this.rows.values()].flatMap((row) => row.chart ?? []);
     for (const chart of [...this.parts, ...inputs]) chart.show(chart.what.data(), range);
     this.axis.show(range);
+    this.explain(this.parts);
   }
 }
 
@@ -286,8 +287,7 @@ function fan(whatif, state) {
       const [x, upper, lower, mean] = ["x", "upper2", "lower2", "forecast"].map(value);
       const now = whatif.times?.[0] ?? 0;
       if (!(x >= now)) return "";
-      const around = Number.isFinite(upper) ? ` ± ${compact((upper - lower) / 2, 2)}` : "";
-      return `in ${span(x - now)} ${compact(mean, 4)}${around}${spaced(state.unit)}`;
+      return `in ${span(x - now)} ${withDeviation(mean, (upper - lower) / 2, state.unit)}`;
     },
   };
 }

@@ -32,7 +32,7 @@ export function inputRow(whatif, input) {
   const later = element("label", { class: "later", hidden: true }, element("span", {}), after, " s");
   const node = element(
     "div", { class: "profile" },
-    element("div", { class: "choice" }, element("span", { title: label }, name), slider, field, element("span", { class: "unit" }, input.unit), back),
+    element("div", { class: "choice" }, element("span", { title: label }, name), field, element("span", { class: "unit" }, input.unit), back, slider),
     element("div", { class: "kind" }, kinds, later),
   );
   const row = { node, input, now: NaN, chart: null, show };
