@@ -163,8 +163,8 @@ export class Charts {
 
   // Px from the left edge of the window to a moment.
   placeOf(seconds) {
-    const { plot } = this.charts.find((chart) => !chart.node.hidden);
-    return plot.over.getBoundingClientRect().left + plot.valToPos(seconds, "x");
+    const plot = this.charts.find((chart) => !chart.node.hidden)?.plot;
+    return plot ? plot.over.getBoundingClientRect().left + plot.valToPos(seconds, "x") : 0;
   }
 
   // Where the pointer is, else the moment that is looked at, else the newest row, s.

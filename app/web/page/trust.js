@@ -227,7 +227,8 @@ export class UserNotes {
   show() {
     const { annotations } = this.link;
     setText(this.title, annotations.length ? `Notes (${annotations.length})` : "Notes");
-    this.list.replaceChildren(...annotations.map((note) => this.entry(note)));
+    const hint = element("li", { class: "faint" }, "N, or Alt-click in a chart, adds one.");
+    this.list.replaceChildren(...(annotations.length ? annotations.map((note) => this.entry(note)) : [hint]));
   }
 
   entry(note) {
@@ -253,7 +254,9 @@ export class UserNotes {
     this.form.showPopover();
     const box = charts.node.getBoundingClientRect();
     const left = charts.placeOf(from);
-    this.form.style.left = `${Math.max(4, Math.min(box.right - this.form.offsetWidth - 4, left + 10))}px`;
+    // Beside its flag.
+    const width = this.form.offsetWidth + 10;
+    this.form.style.left = `${left + width < box.right ? left + 10 : Math.max(4, left - width)}px`;
     this.form.style.top = `${box.top + 24}px`;
     this.field.focus();
     charts.draw();

@@ -175,6 +175,24 @@ def test_parts_fold_by_themselves_to_the_same_bits(estimator, start, tmp_path):
     assert reached == COUNT and seen is last
 
 
+def test_every_part_has_the_notes_of_users_so_far(start, tmp_path):
+    source, engine, _ = start(split=Split(size=50_000))
+    feed(source, engine, 0, 200)
+    engine.submit(commands.Annotate("before the recording"))
+    wait_for(lambda: engine.annotations.notes)
+    engine.submit(commands.Record(tmp_path / "run.rrd"))
+    feed(source, engine, 200, 3000)
+    wait_for(lambda: engine.recorder.finished)
+    engine.submit(commands.Annotate("in the second part or later"))
+    feed(source, engine, 3000, COUNT)
+    stop_recording(engine)
+    first, *_, last = [[note.text for note in read_recording(part).annotations] for part in engine.recorder.finished]
+    assert first == ["before the recording"]
+    assert last == ["before the recording", "in the second part or later"]
+    # Once in a file, not with every write of the log.
+    assert written(engine.recorder.finished[0], "/nisus/annotations") == 1
+
+
 def test_an_edit_while_a_part_is_begun_reviews_to_the_same_bits(start, tmp_path):
     """Where the part starts was copied from the revision before, which is gone when its rows are written."""
     source, engine, drawn = start(split=Split(size=50_000))
