@@ -215,10 +215,13 @@ def test_of_a_run_whose_track_is_gone_nothing_is_offered_and_it_says_why(page, s
         wait_for(lambda n=revision: engine.status().revision == n and not engine.status().refolding, PATIENCE)
     reason = f"the track of run {first} is gone: load it, and it is folded again"
     page.get_by_role("tab", name="Runs").click()
-    for what in ("a report of", "the track of"):
-        button = page.get_by_role("button", name=f"Save {what} run {first}: {reason}")
-        button.wait_for()
-        assert button.is_disabled() and button.get_attribute("title") == reason
+    page.locator(f'tbody[data-number="{first + 2}"]').wait_for()
+    page.get_by_role("button", name=f"Menu of run {first}", exact=True).click()
+    for what in ("Report: HTML", "Track: CSV"):
+        item = page.get_by_role("menuitem", name=what)
+        item.wait_for()
+        assert item.get_attribute("aria-disabled") == "true" and item.get_attribute("title") == reason
+    page.keyboard.press("Escape")
     # The menu was opened while the run was there, and what is chosen there is no broken download.
     page.evaluate(f"window.nisus.saving.fetched({first}, '/api/track.csv?run={first}')")
     page.get_by_text(f"{reason}; nothing is saved").wait_for()
