@@ -41,9 +41,10 @@ def channels(loaded: Loaded, section: Any, key: Key, model: StateSpaceModel) -> 
             read = {name for _, item in found for name in item.signals}
             found += _cells(loaded, (*key, group, field.name), given.pop(field.name), field, read)
         check_names(loaded, (*key, group), given, list(known), word, model)
+        index = {name: k for k, name in enumerate(known)}
         for name, item in given.items():
             place = (*key, group, name)
-            found.append((place, _channel(loaded, place, item, kind, list(known).index(name), name, known[name])))
+            found.append((place, _channel(loaded, place, item, kind, index[name], name, known[name])))
     return found
 
 

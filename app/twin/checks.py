@@ -10,6 +10,7 @@ from estimators.diagnostics.detectors import ALARM_NAMES
 from estimators.diagnostics.episodes.baseline import Normal
 from estimators.errors import ConfigError, nearest
 from estimators.fit.entries import check_key
+from estimators.model.parts import CellNames
 from estimators.model.state_space import StateSpaceModel
 from estimators.tuning import Tuning
 
@@ -83,8 +84,9 @@ def check_names(loaded: Loaded, key: Key, given: Any, known: Any, kind: str, mod
     Raises:
         ConfigError: With file and line, and the near names.
     """
+    names = known if isinstance(known, CellNames) else frozenset(known)
     for name in given:
-        if name not in known:
+        if name not in names:
             raise loaded.error((*key, name), f"is no {kind} of {model.name}; {nearest(name, known)}")
 
 

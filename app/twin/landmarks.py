@@ -9,7 +9,7 @@ from typing import Any
 from config.fields import ConditionSection
 from config.loader import Loaded
 from config.schema import SensorSection
-from config.source_schema import ChannelSection
+from config.source_schema import ChannelSection, SignalSection
 from config.yaml_files import Key
 from estimators.errors import ModelError
 from estimators.model.landmarks import missing, with_landmarks
@@ -83,14 +83,17 @@ def _of_source(loaded: Loaded, key: Key, section: Any, members: Mapping[str, lis
             if by is not None:
                 raise loaded.error((*place, "by"), f"is for a sensor with landmarks, and {name} has none; use only")
             continue
-        if isinstance(item, ChannelSection) and by is None:
-            raise loaded.error(place, "has landmarks; name the column that tells them apart, by: COLUMN")
+        apart = isinstance(item, ChannelSection) and all("*" in column for column in item.names())
+        if isinstance(item, ChannelSection) and by is None and not apart:
+            rule = "name the column that tells them apart, by: COLUMN, or columns of their own with * for the id"
+            raise loaded.error(place, f"has landmarks; {rule}")
         del sensors[name]
-        sensors |= (
-            _members(loaded, place, item, name, members[name])
-            if by is not None
-            else {member: item for member in members[name]}
-        )
+        if by is not None:
+            sensors |= _members(loaded, place, item, name, members[name])
+        else:
+            sensors |= {
+                member: _with_id(item, member.removeprefix(f"{name}_")) if apart else item for member in members[name]
+            }
     for group in ("inputs", "truth"):
         channels = getattr(section, group, {})
         for name, item in channels.items() if isinstance(channels, dict) else ():
@@ -117,6 +120,15 @@ def _members(loaded: Loaded, place: Key, item: ChannelSection, family: str, name
         ids[landmark]: item.model_copy(update={"by": None, "only": {**item.only, column: rule}})
         for landmark, rule in rules.items()
     }
+
+
+def _with_id(item: ChannelSection, landmark: str) -> ChannelSection:
+    """Return the channel of a member, whose columns or signals have its id in place of *."""
+    named = "signals" if isinstance(item, SignalSection) else "columns"
+    update: dict[str, Any] = {named: tuple(name.replace("*", landmark) for name in item.names())}
+    if isinstance(item, SignalSection):
+        update["message"] = item.message.replace("*", landmark)
+    return item.model_copy(update=update)
 
 
 def _equals(landmark: str) -> ConditionSection:

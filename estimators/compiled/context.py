@@ -300,14 +300,29 @@ def _h_rows(x, stride, n, u, p, out, out_stride):
         )
 
 
+def _h_rows_shared(x, stride, n, u, p, out, out_stride, more):
+    for i in range(n):
+        function(
+            floats(x + 8 * i * stride, NX),
+            floats(u, NU),
+            floats(p, PARAMETERS),
+            floats(out + 8 * i * out_stride, NY),
+            *more,
+        )
+
+
 def looped_f(f: Any, nx: int, nu: int, parameters: int) -> Any:
     """Return a dispatcher of f_rows(x, stride, n, u, p, dt, out, out_stride): f of n rows, `stride` numbers apart."""
     return _looped(_f_rows, f, {"NX": nx, "NU": nu, "PARAMETERS": parameters})
 
 
-def looped_h(h: Any, nx: int, nu: int, parameters: int, ny: int) -> Any:
-    """Return a dispatcher of h_rows(x, stride, n, u, p, out, out_stride): h of n rows, `stride` numbers apart."""
-    return _looped(_h_rows, h, {"NX": nx, "NU": nu, "PARAMETERS": parameters, "NY": ny})
+def looped_h(h: Any, nx: int, nu: int, parameters: int, ny: int, *, shared: bool = False) -> Any:
+    """Return a dispatcher of h_rows(x, stride, n, u, p, out, out_stride): h of n rows, `stride` numbers apart.
+
+    With `shared` it takes one more argument, a tuple of further arguments of h.
+    """
+    template = _h_rows_shared if shared else _h_rows
+    return _looped(template, h, {"NX": nx, "NU": nu, "PARAMETERS": parameters, "NY": ny})
 
 
 def _looped(template: Callable, dispatcher: Any, sizes: dict[str, int]) -> Any:

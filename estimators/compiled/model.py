@@ -6,17 +6,16 @@ declaration: shapes, finite values at the prior, and derivatives.
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import lru_cache, partial
 from typing import Any
 
-import numba
 import numpy as np
+from numba import types
 
 from ..errors import ModelError
-from ..model.check import check_parts, probe, probe_angles, probe_likelihoods, uncompilable
+from ..model.check import check_parts, probe, probe_angles, probe_likelihoods
 from ..model.state_space import LARGE, Field, StateSpaceModel
 from ..numerics.helpers import with_helpers
 from ..numerics.jit import address, jit, plain
@@ -37,6 +36,7 @@ from .context import (
     shape_signature,
 )
 from .jacobians import ANALYTIC, CENTRAL, COMPLEX_STEP, complex_step_f, complex_step_h, scratch_size
+from .model_code import ModelCode, SharedCode, call_h, call_h_block
 
 
 @dataclass(frozen=True)
@@ -87,66 +87,31 @@ def compile_model(model: StateSpaceModel) -> CompiledModel:
 
 @lru_cache(maxsize=32)
 def _compile(model: StateSpaceModel) -> CompiledModel:
-    kept: list[Any] = []
-
-    def code(function: Callable | None, signature: Any, what: str) -> int:
-        if function is None:
-            return 0
-        try:
-            dispatcher = jit(with_helpers(plain(function)))
-            kept.append(dispatcher)
-            return address(dispatcher, signature)
-        except numba.core.errors.NumbaError as error:
-            raise uncompilable(model, what, function, error) from None
-
-    def rows_code(dispatcher: Any, signature: Any) -> int:
-        kept.append(dispatcher)
-        return address(dispatcher, signature)
-
-    def complex_code(function: Callable, signature: Any) -> int:
-        """Return the function over complex numbers, or 0 if it is not analytic (comparisons, abs, atan2)."""
-        try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")
-                dispatcher = jit(with_helpers(plain(function)))
-                kept.append(dispatcher)
-                return address(dispatcher, signature)
-        except Exception as error:  # noqa: BLE001  Numba raises many kinds; each means the same here
-            del error
-            return 0
-
+    made = ModelCode(model)
     probe(model)
     probe_likelihoods(model)
     box = BlackBox(model) if model.black_box else None
     if box is not None:
         box.probe()
     sizes = (model.nx, model.nu, len(model.parameters) + (ANSWER if box else 0))
-    code(answered_f if box else model.f, f_signature, "f")
-    f = rows_code(looped_f(kept[-1], *sizes), f_rows_signature)
-    f_dispatcher = box.f_of_one if box else kept[-2]
-    F = code(model.F, F_signature, "F")
+    f_one = made.compiled(answered_f if box else model.f, f_signature, "f")
+    f = made.address(looped_f(f_one, *sizes), f_rows_signature)
+    F = made.of(model.F, F_signature, "F")
     diagonal = model.shape is not None or model.nx > LARGE
     model_Q = _each_cell if isinstance(model.states, Field) and not model.Q and not diagonal else model.Q
-    Q = code(model_Q, Q_signature, "Q")
-    Q_dispatcher = kept[-1] if model_Q else None
-    shape = code(model.shape, shape_signature, "shape")
-    shape_dispatcher = kept[-1] if model.shape else None
-    h, H, h_dispatchers, likelihoods = [], [], [], []
-    for k, sensor in enumerate(model.sensors):
-        code(answered_h if box else sensor.h, h_signature, f"h of sensor {sensor.name}")
-        h_dispatchers.append(partial(box.h_of_one, k) if box else kept[-1])
-        h.append(rows_code(looped_h(kept[-1], *sizes, len(sensor.rows)), h_rows_signature))
-        H.append(code(sensor.H, H_signature, f"H of sensor {sensor.name}"))
-        what = f"log_likelihood of sensor {sensor.name}"
-        likelihoods.append(code(sensor.log_likelihood, log_likelihood_signature, what))
+    Q_dispatcher = made.compiled(model_Q, Q_signature, "Q") if model_Q else None
+    shape_dispatcher = made.compiled(model.shape, shape_signature, "shape") if model.shape else None
     derivable = model.nx <= LARGE and box is None
-    f_complex = 0 if model.F or not derivable else complex_code(model.f, f_complex_signature)
-    h_complex = [
-        0 if sensor.H or not derivable else complex_code(sensor.h, h_complex_signature) for sensor in model.sensors
-    ]
+    f_complex = (
+        0 if model.F or not derivable else made.over_complex(jit(with_helpers(plain(model.f))), f_complex_signature)
+    )
+    h, h_calls = _h_of_sensors(made, model, sizes, box)
+    H = _of_sensors(made, model, "H", H_signature)
+    likelihoods = _of_sensors(made, model, "log_likelihood", log_likelihood_signature)
+    h_complex = _h_over_complex(made, model) if derivable else [0] * len(model.sensors)
 
     correlations = [np.array(sensor.correlation) if sensor.correlation else None for sensor in model.sensors]
-    kept.append(correlations)
+    made.kept.append(correlations)
 
     acts_on = [model.acts_on(noise.name) for noise in model.noises] if model.Q is None else []
 
@@ -167,10 +132,10 @@ def _compile(model: StateSpaceModel) -> CompiledModel:
 
     compiled = CompiledModel(
         model=model,
-        f=f_dispatcher,
-        h=tuple(h_dispatchers),
+        f=box.f_of_one if box else f_one,
+        h=h_calls,
         Q=q_function,
-        keep_alive=tuple(kept),
+        keep_alive=tuple(made.kept),
         draw=draw if diagonal else None,
         box=box,
         static={
@@ -178,8 +143,8 @@ def _compile(model: StateSpaceModel) -> CompiledModel:
             "f_complex": f_complex,
             "F": F,
             "F_mode": ANALYTIC if F else COMPLEX_STEP if f_complex else CENTRAL,
-            "Q": Q,
-            "shape": shape,
+            "Q": address(Q_dispatcher, Q_signature) if Q_dispatcher is not None else 0,
+            "shape": address(shape_dispatcher, shape_signature) if shape_dispatcher is not None else 0,
             "each_state": int(model.Q is None),
             "Q_varies": int(_varies(model)),
             "h": np.array(h, np.int64),
@@ -204,7 +169,7 @@ def _compile(model: StateSpaceModel) -> CompiledModel:
             "n_linear": len(model.linear_states),
             "sampled_states": _sampled(model),
             "n_sampled": _sampled(model).size,
-            "jump": code(model.jump.chances, f_signature, "jump.chances") if model.jump else 0,
+            "jump": made.of(model.jump.chances, f_signature, "jump.chances") if model.jump else 0,
             "mode": model.mode,
             "n_modes": len(model.jump.modes) if model.jump else 0,
             "prior_rows": 1 if diagonal else model.nx,
@@ -216,6 +181,61 @@ def _compile(model: StateSpaceModel) -> CompiledModel:
         _check_derivatives(compiled)
     check_parts(model, compiled.f, compiled.h)
     return compiled
+
+
+Sizes = tuple[int, int, int]
+"""Numbers of states, inputs and parameters."""
+
+
+def _h_of_sensors(
+    made: ModelCode, model: StateSpaceModel, sizes: Sizes, box: BlackBox | None
+) -> tuple[list[int], tuple[Callable, ...]]:
+    """Return the address of the loop over rows of each sensor's h, and its h as a function of one state for Python."""
+    calls: dict[int, Callable] = {}
+
+    def own(k: int) -> int:
+        sensor = model.sensors[k]
+        h = made.compiled(answered_h if box else sensor.h, h_signature, f"h of sensor {sensor.name}")
+        target = made.address(looped_h(h, *sizes, len(sensor.rows)), h_rows_signature)
+        calls[target] = h
+        return target
+
+    def common(shared: SharedCode) -> int:
+        loop = looped_h(shared.dispatcher, *sizes, len(model.sensors[shared.members[0]].rows), shared=True)
+        more = types.BaseTuple.from_types(shared.types)
+        return made.address(loop, types.void(*h_rows_signature.args, more))
+
+    functions = [answered_h if box else sensor.h for sensor in model.sensors]
+    targets = made.of_sensors(functions, h_rows_signature, own, common)
+    if box is not None:
+        return targets, tuple(partial(box.h_of_one, k) for k in range(len(targets)))
+    return targets, tuple(calls.get(target) or partial(_call_h, target) for target in targets)
+
+
+def _call_h(target: int, x: np.ndarray, u: np.ndarray, p: np.ndarray, out: np.ndarray) -> None:
+    """out = h(x, u, p) of the loop over rows at an address, from Python."""
+    call_h(target, *(np.ascontiguousarray(item, float) for item in (x, u, p)), out)
+
+
+def _of_sensors(made: ModelCode, model: StateSpaceModel, field: str, signature: Any) -> list[int]:
+    """Return the addresses of an optional function of the sensors."""
+
+    def own(k: int) -> int:
+        return made.of(getattr(model.sensors[k], field), signature, f"{field} of sensor {model.sensors[k].name}")
+
+    functions = [getattr(sensor, field) for sensor in model.sensors]
+    return made.of_sensors(functions, signature, own, lambda shared: made.address(*shared.with_own(signature)))
+
+
+def _h_over_complex(made: ModelCode, model: StateSpaceModel) -> list[int]:
+    """Return the addresses of h over complex numbers; 0 with an analytic Jacobian, or if h is not analytic."""
+
+    def own(k: int) -> int:
+        return made.over_complex(model.sensors[k].h, h_complex_signature)
+
+    functions = [None if sensor.H else sensor.h for sensor in model.sensors]
+    signature = h_complex_signature
+    return made.of_sensors(functions, signature, own, lambda shared: made.over_complex(*shared.with_own(signature)))
 
 
 def _sampled(model: StateSpaceModel) -> np.ndarray:
@@ -268,35 +288,32 @@ def _check_derivatives(compiled: CompiledModel) -> None:
     dt = min(0.1, model.max_step)
     scratch = np.empty(scratch_size(model.nx, model.width))
 
-    def differences(function: Callable, x: np.ndarray, rows: int) -> np.ndarray:
-        J = np.empty((rows, x.size))
-        for j in range(x.size):
-            step = 1e-5 * max(abs(x[j]), std[j], 1e-3)
-            high, low = x.copy(), x.copy()
-            high[j] += step
-            low[j] -= step
-            a, b = np.empty(rows), np.empty(rows)
-            function(high, a)
-            function(low, b)
-            J[:, j] = (a - b) / (high[j] - low[j])
-        return J
+    def differences(block: Callable, x: np.ndarray, rows: int) -> np.ndarray:
+        """Return central differences of block(X, out), which fills each row of `out` from that of X."""
+        steps = 1e-5 * np.maximum(np.maximum(np.abs(x), std), 1e-3)
+        X = np.concatenate([x + np.diag(steps), x - np.diag(steps)])
+        out = np.empty((len(X), rows))
+        block(X, out)
+        n = x.size
+        return ((out[:n] - out[n:]) / (X[:n] - X[n:]).diagonal()[:, None]).T
 
     points = [static["prior_mean"] + 0.3 * std * rng.standard_normal(model.nx) for _ in range(3)]
 
-    def disagree(jacobian: Callable, function: Callable, rows: int) -> float:
+    def disagree(jacobian: Callable, block: Callable, rows: int) -> float:
         """Return the largest difference relative to the size of the Jacobian, over points with finite values."""
         worst = 0.0
         for x in points:
             J = np.zeros((rows, model.nx))
             jacobian(x, J)
-            D = differences(function, x, rows)
+            D = differences(block, x, rows)
             if np.all(np.isfinite(D)):
                 error = np.max(np.abs(J - D)) / max(1e-9, np.max(np.abs(D)))
                 worst = max(worst, error if np.isfinite(error) else np.inf)
         return worst
 
-    def f(x, out):  # noqa: ANN001, ANN202
-        compiled.f(x, u, p, dt, out)
+    def f(X, out):  # noqa: ANN001, ANN202
+        for x, row in zip(X, out, strict=True):
+            compiled.f(x, u, p, dt, row)
 
     tolerance = 1e-4  # central differences with a step of 1e-5 are good to about 1e-8; a wrong formula is off by more
     if static["F_mode"] == ANALYTIC:
@@ -308,8 +325,8 @@ def _check_derivatives(compiled: CompiledModel) -> None:
             static["F_mode"] = CENTRAL
     for k, sensor in enumerate(model.sensors):
 
-        def h(x, out, k=k):  # noqa: ANN001, ANN202
-            compiled.h[k](x, u, p, out)
+        def h(X, out, target=int(static["h"][k])):  # noqa: ANN001, ANN202
+            call_h_block(target, X, u, p, out)
 
         rows = len(sensor.rows)
         mode = static["H_mode"][k]

@@ -134,24 +134,19 @@ def sensor_states(
         now: Time of the last event, s.
         policy: Limits of the twin's health.
     """
-    sensors, masks = _sensors(model, state), _rows(model, state)[:, MASK].astype(int)
-    found = []
-    for s, sensor in enumerate(model.sensors):
-        own, start = sensors[s], model.row_start[s]
-        alarms = int(np.bitwise_or.reduce(masks[start : start + len(sensor.rows)], initial=int(own[JOINT_MASK])))
-        if not used[s]:
-            word = "held out"
-        elif own[SILENT] > 0.0:
-            never_stale = own[COUNT] == 0.0 or now - own[LAST] <= policy.stale_after
-            word = "degraded" if never_stale else "stale"
-        elif own[COUNT] == 0.0:
-            word = "waiting"
-        elif alarms & LOST:
-            word = "degraded"
-        else:
-            word = "suspect" if alarms else "tracking"
-        found.append(word)
-    return found
+    own = _sensors(model, state)
+    masks = np.bitwise_or.reduceat(_rows(model, state)[:, MASK].astype(int), model.row_start)
+    alarms = masks | own[:, JOINT_MASK].astype(int)
+    silent, heard = own[:, SILENT] > 0.0, own[:, COUNT] > 0.0
+    cases = {
+        "held out": ~used,
+        "stale": silent & heard & (now - own[:, LAST] > policy.stale_after),
+        "degraded": silent | heard & (alarms & LOST != 0),
+        "waiting": ~heard,
+        "suspect": alarms != 0,
+    }
+    words = np.select(list(cases.values()), list(cases), "tracking")
+    return [str(word) for word in words]
 
 
 def sensor_states_over_time(events: Events, track: Track, s: int) -> tuple[np.ndarray, np.ndarray]:

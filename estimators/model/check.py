@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from types import CodeType
+from types import CellType, CodeType, FunctionType
 from typing import Any
 
 import numpy as np
@@ -136,6 +136,19 @@ def _near_prior(model: StateSpaceModel, values: Values) -> Iterator[Values]:
         yield values | away
 
 
+def interpreted(function: Any) -> Any:
+    """Return a function in plain Python, with those that it encloses.
+
+    Called from Python, a wrapper of this package would have the function inside compiled, for each of many sensors.
+    """
+    python = plain(function)
+    inside = [cell.cell_contents for cell in getattr(python, "__closure__", None) or ()]
+    if all(plain(item) is item for item in inside):
+        return python
+    cells = tuple(CellType(interpreted(item) if callable(item) else item) for item in inside)
+    return FunctionType(python.__code__, python.__globals__, python.__name__, python.__defaults__, cells)
+
+
 def refuse_writing(
     model: StateSpaceModel, what: str, function: Callable, takes: str, *out: np.ndarray, more: Values | None = None
 ) -> None:
@@ -148,12 +161,13 @@ def refuse_writing(
         ModelError: With the function's file and line.
     """
     prior = prior_values(model) | (more or {})
+    python = interpreted(function)
     for values in (prior, *_near_prior(model, prior)):
         names = takes.split(", ")
         given = [values[name] for name in names]
         copies = [item.copy() if isinstance(item, np.ndarray) else item for item in given]
         with suppress(Exception), np.errstate(all="ignore"):
-            plain(function)(*copies, *(item.copy() for item in out))
+            python(*copies, *(item.copy() for item in out))
         for name, copy, item in zip(names, copies, given, strict=True):
             if not np.array_equal(copy, item, equal_nan=isinstance(item, np.ndarray)):
                 raise ModelError(
@@ -173,7 +187,7 @@ def _call(
     given = [item.copy() if isinstance(item, np.ndarray) else item for item in map(values.get, takes.split(", "))]
     try:
         with np.errstate(all="ignore"):
-            result = plain(function)(*given, *out)
+            result = interpreted(function)(*given, *out)
             return result if out else float(result)
     except Exception as error:  # noqa: BLE001  the user's own function may raise anything
         at = f"x = {numbers(values['x'])}, u = {numbers(values['u'])}, p = {numbers(values['p'])}"
@@ -188,6 +202,7 @@ def _call(
 def probe(model: StateSpaceModel) -> None:
     """Run the plain functions with arrays of the declared sizes, so that an index out of range is an error."""
     values, n = prior_values(model), model.nx
+    known: set[Any] = set()  # code that writes to no argument, which many sensors may share
     calls: list[tuple[str, Callable | None, str, tuple[int, ...]]] = [
         ("f", model.f, "x, u, p, dt", (n,)),
         ("F", model.F, "x, u, p, dt", (n, n)),
@@ -204,7 +219,9 @@ def probe(model: StateSpaceModel) -> None:
         out = np.full(shape, 0.0 if what == "Q" else np.nan)
         sizes = f"{n} states, {model.nu} inputs and {len(model.parameters)} parameters, out of shape {shape}"
         _call(model, what, function, takes, values, out, sizes=sizes)
-        refuse_writing(model, what, function, takes, np.zeros(shape))
+        if (_code(function), shape) not in known:
+            refuse_writing(model, what, function, takes, np.zeros(shape))
+            known.add((_code(function), shape))
         named = f"{place(function)}model {model.name}: {what}"
         bad = np.argwhere(~np.isfinite(out))
         if bad.size:

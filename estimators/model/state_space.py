@@ -9,6 +9,7 @@ that every filter calls.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
@@ -122,7 +123,7 @@ class EventLayout:
 
 def _twice(what: str, names: Sequence[str]) -> Iterator[str]:
     """Yield the first name that occurs twice, as a flaw."""
-    for name in sorted({name for name in names if names.count(name) > 1})[:1]:
+    for name in sorted(name for name, count in Counter(names).items() if count > 1)[:1]:
         yield f"{what} {name!r} twice; every name must differ"
 
 

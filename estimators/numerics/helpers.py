@@ -43,7 +43,7 @@ def _with_helpers(function: Any, known: dict[Any, Any]) -> Any:
     closure = tuple(CellType(item) for item in cells) if cells else None
     made = FunctionType(function.__code__, world, function.__name__, function.__defaults__, closure)
     made.__kwdefaults__, made.__module__ = function.__kwdefaults__, function.__module__
-    made.__qualname__ = f"{function.__qualname__}_{_digest([*helpers.values(), *inner])[:12]}"
+    made.__qualname__ = f"{function.__qualname__}_{source_digest([*helpers.values(), *inner])[:12]}"
     for name, item in helpers.items():
         world[name] = _compiled(item, known)
     for cell, item in zip(closure or (), cells, strict=True):
@@ -59,7 +59,7 @@ def _compiled(helper: Any, known: dict[Any, Any]) -> Any:
         known[helper] = jit(_with_helpers(helper, known))
         # Numba tells closures apart by what they hold, a compiled function by an identifier that is random by default:
         # one made from the source finds the code that another process compiled.
-        known[helper]._set_uuid(str(UUID(_digest([helper])[:32])))
+        known[helper]._set_uuid(str(UUID(source_digest([helper])[:32])))
     return known[helper]
 
 
@@ -75,7 +75,7 @@ def _names(code: CodeType) -> Iterator[str]:
             yield from _names(item)
 
 
-def _digest(helpers: list[Any]) -> str:
+def source_digest(helpers: list[Any]) -> str:
     """Return a digest of helpers and all their callees: their sources, enclosed values and defaults."""
     digest = hashlib.sha256()
     seen: list[Any] = []
