@@ -29,7 +29,6 @@ from app.live.episode_log import MAX_EPISODES_PERIOD_S
 from app.studies.stress.scenario import asset_of
 from app.twin.twin import Twin, load_twin
 from estimators.log import MARK, Events
-from estimators.snapshots import PERMANENT_SPACING
 from estimators.track import HEALTH_NAMES, SUSPECT, TRACKING, VERDICT_NAMES
 from sources.faults.kinds import Fault
 from sources.faults.layer import Faults
@@ -84,9 +83,6 @@ class Watched(NamedTuple):
 WATCHED = (Watched("memory", "MB", 15.0), Watched("threads", "", 1.0), Watched("handles", "", 2.0))
 """Resident memory (RSS) of the server process alone, without browser and compilers."""
 
-EVENTS_PER_READING = 2.33
-"""Measurements, inputs and true states of motor_can, per measurement (12,953 to 5,550 in config/logs/motor_can.blf)."""
-
 EDIT_PERIOD_S, EXPLORE_PERIOD_S, RECORDING_PERIOD_S = 20.0, 120.0, 90.0
 SAMPLE_PERIOD_S = 1.0
 ACTION_TIMEOUT_MS = 600_000  # of a click, on a busy machine without a graphics card
@@ -121,7 +117,7 @@ class PageSoak:
     def __init__(self, run: Running, page: Any, folder: Path, history: int) -> None:
         self.run, self.page, self.folder, self.history = run, page, folder, history
         self.full: int | None = None
-        """Minute in which the history was full."""
+        """Minute by which the history was full."""
         self.samples: list[tuple[float, ...]] = []
         self.edits = self.recordings = self.explored = 0
 
@@ -145,7 +141,7 @@ class PageSoak:
 
     def use(self, minutes: float) -> None:
         """Use the page, and print a line a minute: the median of its seconds."""
-        begun, minute = time.monotonic(), list[tuple[float, ...]]()
+        begun, minute, kept = time.monotonic(), list[tuple[float, ...]](), 0
         print("  min  RSS [MB]  threads  handles  edits  Explore  recordings  rows kept")
         while (seconds := time.monotonic() - begun) < 60.0 * minutes:
             self.act(seconds)
@@ -155,8 +151,9 @@ class PageSoak:
                 minute.clear()
                 memory, threads, handles = self.samples[-1]
                 rows = self.run.ask("/api/status")["counts"]["readings"]
-                if self.full is None and rows * EVENTS_PER_READING > self.history + 4 * PERMANENT_SPACING:
-                    self.full = len(self.samples)
+                if self.full is None and rows < kept:
+                    self.full = len(self.samples)  # the oldest have been dropped
+                kept = rows
                 print(
                     f"  {len(self.samples):3d}  {memory:8.1f}  {threads:7.0f}  {handles:7.0f}  {self.edits:5d}  "
                     f"{self.explored:7d}  {self.recordings:10d}  {rows:9,d}",
@@ -169,7 +166,7 @@ class PageSoak:
         if self.full is None:
             return [f"the history of {self.history:,} events is not full; soak for longer, or with a shorter --history"]
         late = np.arange(len(self.samples)) >= max(self.full, SETTLING_S / MINUTE_S)
-        print(f"slopes from minute {int(np.argmax(late)) + 1} on; the history was full in minute {self.full}")
+        print(f"slopes from minute {int(np.argmax(late)) + 1} on; the history was full by minute {self.full}")
         minutes, wrong = np.flatnonzero(late).astype(float), list[str]()
         if minutes.size < 3:
             return [f"{len(self.samples)} minutes are too few for a slope"]
