@@ -26,7 +26,6 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.optimize import minimize
 
 from ..diagnostics.sensitivity.responses import each
 from ..errors import NisusError
@@ -200,6 +199,8 @@ class _BestPoint:
 
 def maximise(objective: Objective, x: np.ndarray, *, rounds: int = MAX_ROUNDS) -> tuple[np.ndarray, float]:
     """Return the point (k,) of the maximum nearest to x, and the value there."""
+    from scipy.optimize import minimize  # 15 MB, imported with the first fit
+
     low, high = np.array(objective.limits).T
     value, best = -np.inf, _BestPoint(objective, x)
     for _ in range(rounds):
@@ -232,6 +233,8 @@ def maximise(objective: Objective, x: np.ndarray, *, rounds: int = MAX_ROUNDS) -
 
 def search(objective: Objective, x: np.ndarray) -> tuple[np.ndarray, float]:
     """Return the same without derivatives, for a filter that draws; the first step is one logarithm or deviation."""
+    from scipy.optimize import minimize  # 15 MB, imported with the first fit
+
     low, high = np.array(objective.limits).T
     unit = np.array([1.0 if item.log else item.deviation for item in objective.entries])
     best = _BestPoint(objective, x)

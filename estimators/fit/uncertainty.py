@@ -19,7 +19,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import minimize
 
 from .objective import Objective
 
@@ -203,6 +202,8 @@ def _profile(objective: Objective, x: np.ndarray, H: np.ndarray, i: int, t: floa
     def loss(z: np.ndarray) -> tuple[float, np.ndarray]:
         found, gradient = rest.gradient(np.clip(start + root @ z, low, high))
         return -found, -root.T @ gradient
+
+    from scipy.optimize import minimize  # 15 MB, imported with the first fit
 
     found = minimize(
         loss,

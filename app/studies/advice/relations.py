@@ -7,8 +7,6 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import minimize_scalar
-from scipy.signal import lfilter
 
 from sources.inspect import SignalSeries
 
@@ -69,6 +67,8 @@ def driven(found: Sequence[Signal], target: int, candidates: Sequence[int]) -> D
     if best.explained < MIN_EXPLAINED:
         return None
     own = u[:, [list(candidates).index(k) for k in best.drivers]]
+    from scipy.optimize import minimize_scalar  # 15 MB, which a running twin may never need; with scipy.signal 50 MB
+
     fine = minimize_scalar(
         lambda log_tau: _lag(t, y, own, half, float(np.exp(log_tau)))[0],
         bounds=np.log([best.tau / 3.0, best.tau * 3.0]),
@@ -127,6 +127,8 @@ def _lag(t: np.ndarray, y: np.ndarray, u: np.ndarray, half: int, tau: float) -> 
 
 def _columns(t: np.ndarray, u: np.ndarray, tau: float) -> np.ndarray:
     """Return the regressors of a lag: offset, start, and each input, held between its times and lagged."""
+    from scipy.signal import lfilter
+
     a = np.exp(-float(t[1] - t[0]) / tau)
     lagged = lfilter([0.0, 1.0 - a], [1.0, -a], u, axis=0, zi=u[:1])[0]
     return np.column_stack([np.ones(t.size), np.exp(-t / tau), lagged])
