@@ -72,10 +72,9 @@ def _settle(gone: threading.Event | None = None, before: Callable[[], Engine | N
         time.sleep(0.05)
         gc.collect()
     gc.freeze()
-    if gone is not None:
-        # glibc keeps free memory in the arenas of ended threads unless asked.
-        with suppress(OSError, AttributeError):
-            ctypes.CDLL(None).malloc_trim(0)
+    # glibc keeps what imports and ended threads have freed unless asked.
+    with suppress(OSError, AttributeError):
+        ctypes.CDLL(None).malloc_trim(0)
 
 
 class SessionThread(Protocol):
