@@ -17,7 +17,8 @@ if (new URLSearchParams(location.search).has("darkMode")) {
 {
   const SCENE = 5; // drawings in one picture, at least: an empty scene has up to four
   const AFTER = 500; // ms, in which pictures, labels and the ground come
-  const LONGEST = 4000; // ms, after which it is shown whatever there is
+  const LONGEST = 4000; // ms, after which an empty scene is shown; a canvas without any drawing is black
+  const UNDRAWN = 20000; // ms, after which it is shown whatever there is
   const hidden = document.createElement("style");
   const dark = new URLSearchParams(location.search).has("darkMode");
   const [panel, faint] = dark ? ["#131a23", "#94a3b5"] : ["#ffffff", "#5b6a7d"]; // of chart.css
@@ -29,12 +30,15 @@ if (new URLSearchParams(location.search).has("darkMode")) {
     hidden.remove();
     Object.assign(drawing, given);
   };
-  setTimeout(shown, LONGEST);
-  let drawn = 0;
+  let [drawn, ever, late] = [0, false, false];
+  setTimeout(() => ((late = true), ever && shown()), LONGEST);
+  setTimeout(shown, UNDRAWN);
   for (const [name, draw] of Object.entries(given))
     drawing[name] = function (...place) {
       if (drawn === 0) requestAnimationFrame(() => (drawn = 0));
       drawn += 1;
+      if (late && !ever) setTimeout(shown, AFTER);
+      ever = true;
       if (drawn === SCENE) setTimeout(shown, AFTER);
       return draw.apply(this, place);
     };

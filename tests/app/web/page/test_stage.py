@@ -97,27 +97,30 @@ def counted(page):
     return "[native code]" not in page.evaluate("WebGL2RenderingContext.prototype.drawArrays.toString()")
 
 
-@pytest.mark.parametrize("scene", [True, False], ids=["drawn", "never drawn"])
+@pytest.mark.parametrize("scene", ["drawn", "empty", "late", "never drawn"])
 def test_the_scene_is_hidden_until_it_is_drawn(browser, scene):
-    """By a clock of the test's own: an empty scene's four drawings do not show it, a fifth does, and 4 s do alone."""
+    """By a clock of the test's own: five drawings in a picture show it, or any drawing after 4 s, or 20 s alone."""
     page = browser.new_page()
     page.clock.install(time=0)
     page.clock.pause_at(1000)
     page.set_content("<p>axes</p>")
     page.add_script_tag(path=PAGE / "viser_frame.js")
     assert opacity(page) == "0" and counted(page)
-    draw(page, 4)
+    assert "Loading the scene" in page.evaluate("getComputedStyle(document.documentElement, '::after').content")
+    if scene in ("drawn", "empty"):
+        draw(page, 4)
     page.clock.run_for(1000)
     assert opacity(page) == "0"
-    if scene:
+    wait = {"drawn": 400, "empty": 2900, "late": 4000, "never drawn": 18_900}[scene]
+    if scene == "drawn":
         draw(page, 5)
+    page.clock.run_for(wait)
+    assert opacity(page) == "0"
+    if scene == "late":
+        draw(page, 1)
         page.clock.run_for(400)
         assert opacity(page) == "0"
-        page.clock.run_for(200)
-    else:
-        page.clock.run_for(2900)
-        assert opacity(page) == "0"
-        page.clock.run_for(200)
+    page.clock.run_for(200)
     assert opacity(page) == "1" and not counted(page)
     page.close()
 
