@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from itertools import count
 from typing import Any, NamedTuple
 
@@ -88,7 +89,12 @@ class Tuning:
 
     def items(self) -> list[Item]:
         """Return every numeric entry; many rows of one sensor, or the sensors of a family, share one, their mean."""
+        return list(self._items)
+
+    @cached_property
+    def _items(self) -> list[Item]:
         model = self.model
+        known: set[str] = set()  # entries of families
         items = [
             Item(f"Q.{noise.name}", float(value), noise.unit, 0.0, np.inf)
             for noise, value in zip(model.noises, self.q, strict=True)
@@ -97,14 +103,11 @@ class Tuning:
             own = slice(start, start + len(sensor.rows))
             names, values, unit = model.row_names[own], self.r[own], squared(sensor.rows[0].unit)
             if sensor.family:
-                units = [squared(row.unit) for row in sensor.rows]
-                keys = [f"R.{sensor.family}{name.removeprefix(sensor.name)}" for name in names]
-                known = {item.key for item in items}
-                items += [
-                    Item(key, _mean(self.r[self._locate(key)[1]]), unit, 0.0, np.inf)
-                    for key, unit in zip(keys, units, strict=True)
-                    if key not in known
-                ]
+                for name, row in zip(names, sensor.rows, strict=True):
+                    key = f"R.{sensor.family}{name.removeprefix(sensor.name)}"
+                    if key not in known:
+                        known.add(key)
+                        items.append(Item(key, _mean(self.r[self._locate(key)[1]]), squared(row.unit), 0.0, np.inf))
             elif len(values) >= SHARED_ENTRY_ROWS and len({row.unit for row in sensor.rows}) == 1:
                 items.append(Item(f"R.{sensor.name}", _mean(values), unit, 0.0, np.inf))
             else:
@@ -212,18 +215,23 @@ class Tuning:
         declared = np.array([row.variance for sensor in self.model.sensors for row in sensor.rows])
         return not np.any(declared[rows])
 
-    def _locate(self, key: str) -> tuple[str, Any]:
+    @cached_property
+    def _places(self) -> dict[str, tuple[str, int]]:
+        """Array and index of each single entry."""
         model = self.model
         groups = {
             "Q": ("q", [noise.name for noise in model.noises]),
-            "R": ("r", list(model.row_names)),
+            "R": ("r", model.row_names),
             "p": ("p", [parameter.name for parameter in model.parameters]),
-            "use": ("used", list(model.sensor_names)),
+            "use": ("used", model.sensor_names),
         }
+        return {f"{key}.{name}": (of, k) for key, (of, names) in groups.items() for k, name in enumerate(names)}
+
+    def _locate(self, key: str) -> tuple[str, Any]:
+        model = self.model
+        if key in self._places:
+            return self._places[key]
         prefix, _, name = key.partition(".")
-        if prefix in groups and name in groups[prefix][1]:
-            group, names = groups[prefix]
-            return group, names.index(name)
         if prefix == "R" and name in model.sensor_names:
             k = model.sensor_names.index(name)
             return "r", slice(model.row_start[k], model.row_start[k] + len(model.sensors[k].rows))

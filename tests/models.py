@@ -1,7 +1,10 @@
-"""Small models that tests of several packages share: a level that wanders, read by any number of sensors."""
+"""Models that tests of several packages share: a level read by any number of sensors, a plant of many channels."""
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
 
@@ -63,3 +66,73 @@ def many_states(count: int) -> StateSpaceModel:
 
 FLOAT_AND_SONAR = level_model({"float": 1.0, "sonar": {"near": 1.0, "far": 1.0}}, 0.1)
 """A level read by a sensor with one row and one with two."""
+
+
+PLANT = """\
+from estimators.model import Noise, Row, Sensor, State, StateSpaceModel
+
+ZONES = {zones}
+CHANNELS = {channels}
+
+def exchange(x, u, p, dt, out):
+    for k in range(ZONES):
+        out[k] = x[k] + 0.01 * dt * (x[max(k - 1, 0)] - 2.0 * x[k] + x[min(k + 1, ZONES - 1)])
+
+def thermometer(zone, gain, offset):
+    def h(x, u, p, out):
+        out[0] = gain * x[zone] + offset
+    return h
+
+def placed_thermometer(x, u, p, place, out):
+    out[0] = place[1] * x[int(place[0])] + place[2]
+
+def plant(sensors):
+    return StateSpaceModel(
+        name="plant", title="Zones that exchange heat", f=exchange, linear=True, sensors=sensors,
+        states=tuple(State(f"zone_{{k}}", "degC", mean=50.0, std=5.0) for k in range(ZONES)),
+        noises=tuple(Noise(f"zone_{{k}}", "degC²/s", 0.01) for k in range(ZONES)),
+    )
+
+ROWS = (Row("temperature", "degC", 0.25),)
+Each = plant(tuple(Sensor(f"TT{{k:04d}}", ROWS, h=thermometer(*channel)) for k, channel in enumerate(CHANNELS)))
+Family = plant((Sensor("TT", ROWS, h=placed_thermometer, place=(("zone", "1"), ("gain", "1"), ("offset", "degC"))),))
+"""
+
+
+def write_plant(folder: Path, count: int, *, family: bool, seconds: int = 20, biased: int | None = None) -> Path:
+    """Write a twin of 40 zones with a column for each of `count` thermometers; return its YAML.
+
+    Args:
+        folder: Where to write the YAML, the model and the table.
+        count: Thermometers, each with a gain and an offset.
+        family: Whether they are landmarks of one sensor, declared at once, or a sensor each.
+        seconds: Length of the table, a row each second.
+        biased: Thermometer that reads 5 °C too much in the second half.
+    """
+    zones = 40
+    rng = np.random.default_rng(0)
+    zone, gain, offset = np.arange(count) * zones // count, rng.uniform(0.9, 1.1, count), rng.normal(0.0, 1.0, count)
+    channels = [(int(z), float(g), float(o)) for z, g, o in zip(zone, gain, offset, strict=True)]
+    temperature = rng.normal(50.0, 5.0, (seconds, zones))
+    for before, now in zip(temperature, temperature[1:], strict=False):
+        wide = np.pad(before, 1, mode="edge")
+        now[:] = before + 0.01 * (wide[:-2] - 2.0 * before + wide[2:]) + rng.normal(0.0, 0.1, zones)
+    values = gain * temperature[:, zone] + offset + rng.normal(0.0, 0.5, (seconds, count))
+    if biased is not None:
+        values[seconds // 2 :, biased] += 5.0
+    names = [f"{k:04d}" for k in range(count)]
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "plant.py").write_text(PLANT.format(zones=zones, channels=channels))
+    table = [f"{t}," + ",".join(f"{value:.3f}" for value in row) for t, row in enumerate(values)]
+    (folder / "plant.csv").write_text("\n".join(["t," + ",".join(f"TT{name}" for name in names), *table]) + "\n")
+    lines = [f"model: ./plant.py:{'Family' if family else 'Each'}", "estimator: kf", "gate: 0.9999", "sensors:"]
+    if family:
+        lines += ["  TT:", "    std: 0.5", "    at:"]
+        lines += [f"      {name}: [{z}, {g}, {o}]" for name, (z, g, o) in zip(names, channels, strict=True)]
+    else:
+        lines += [f"  TT{name}: {{std: 0.5}}" for name in names]
+    lines += ["source:", "  type: table", "  files: plant.csv", "  time: {column: t, unit: s}", "  sensors:"]
+    lines += ["    TT: {columns: TT*}"] if family else [f"    TT{name}: {{columns: TT{name}}}" for name in names]
+    path = folder / "plant.yaml"
+    path.write_text("\n".join(lines) + "\n")
+    return path

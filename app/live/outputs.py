@@ -189,7 +189,8 @@ class Status:
     row. `faults` are the injected ones that are active or planned. `integrity` has the protection levels; None until
     they are known. `compiling` are the filters that are not compiled yet: seconds since each was begun, None for one
     that waits; `awaited` is the one for which a refold waits. `nis_judged` is the NIS relative to the baseline of a
-    commissioned twin (diagnostics/consistency.py), `nis_dof` the mean degrees of freedom of its measurements.
+    commissioned twin (diagnostics/consistency.py), `nis_dof` the mean degrees of freedom of its measurements,
+    `sensor_nis` (sensors,) the mean NIS per degree of freedom of each sensor's recent measurements.
     """
 
     estimator: str
@@ -225,3 +226,4 @@ class Status:
     compiling: Mapping[str, float | None] = field(default_factory=dict)
     nis_judged: float = np.nan
     nis_dof: float = 1.0
+    sensor_nis: np.ndarray = field(default_factory=lambda: np.zeros(0))

@@ -107,11 +107,25 @@ def status_of(
         nis_high=float(track.nis_high[last]) if last >= 0 else np.nan,
         nis_judged=judged,
         nis_dof=nis_dof,
+        sensor_nis=_nis_of_sensors(log.events.select(slice(0, fold.n)), track, len(model.sensors)),
         latency_ms=watchers.latency.percentile(99.0),
         latency_p50_ms=watchers.latency.percentile(50.0),
         integrity=watchers.integrity.of(fields["revision"]),
         faults=layer.status() if layer is not None else (),
     )
+
+
+RECENT_READINGS = 8
+"""Measurements of each sensor, on average, of which its NIS is the mean."""
+
+
+def _nis_of_sensors(events: Events, track: Track, sensors: int) -> np.ndarray:
+    """Return the mean NIS per degree of freedom of each sensor's last measurements among these, NaN without any."""
+    rows = slice(max(0, len(events) - RECENT_READINGS * sensors), len(events))
+    nis, dof, channel = track.nis[rows], track.dof[rows], events.channel[rows]
+    judged = np.flatnonzero(np.isin(track.verdict[rows], (USED, GATED, FAILED)) & np.isfinite(nis))
+    total, degrees = (np.bincount(channel[judged], of[judged], sensors) for of in (nis, dof))
+    return np.divide(total, degrees, out=np.full(sensors, np.nan), where=degrees > 0)
 
 
 def past_status(engine: Running, watchers: Watchers, t: int) -> Status:
@@ -124,7 +138,9 @@ def past_status(engine: Running, watchers: Watchers, t: int) -> Status:
         return status
     end, now = fold.log.first + fold.n, int(fold.log.t[fold.n - 1])
     # A fold from a snapshot lacks the earlier rows of its window.
-    pull = engine.rows(end - MAX_ROWS_PER_READING * fold.policy.window, end)
+    sensors = len(fold.model.sensors)
+    pull = engine.rows(end - max(MAX_ROWS_PER_READING * fold.policy.window, RECENT_READINGS * sensors), end)
+    sensor_nis = _nis_of_sensors(pull.events, pull.track, sensors)
     track, health = pull.track, int(pull.track.health[-1])
     judged, nis_dof = _judged(fold, pull.events, track)
     states = sensor_states(fold.model, fold.tuning.used, fold.evidence, now * 1e-9, fold.policy)
@@ -149,6 +165,7 @@ def past_status(engine: Running, watchers: Watchers, t: int) -> Status:
         nis_high=float(track.nis_high[-1]),
         nis_judged=judged,
         nis_dof=nis_dof,
+        sensor_nis=sensor_nis,
     )
 
 

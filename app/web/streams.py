@@ -38,6 +38,9 @@ RERUN_STATUS_PERIOD_S = 0.5
 MAX_STREAMS = 24
 """Chart streams of one page."""
 
+MANY_ENTRIES = 32
+"""Entries of a field of the status from which on only the changed ones are sent."""
+
 MAX_PARTICLES = 400
 """Particles in the chart of one state over another; a larger cloud is thinned."""
 
@@ -193,9 +196,8 @@ class PageStream:
             )
             status["origin"] = None if origin is None else str(origin)
             status["moment"] = await in_thread(self._trust_then, self._at, episodes)
-            news = {key: value for key, value in status.items() if key not in self._sent or self._sent[key] != value}
+            message = changes(self._sent, status)
             self._sent = status
-            message: dict[str, Any] = {"status": news} if news else {}
             if episodes != self._episodes:
                 message["episodes"] = self._episodes = episodes
             if self._engine.annotations.notes is not self._notes:
@@ -256,6 +258,26 @@ class PageStream:
 
     async def _send(self, message: dict[str, Any]) -> None:
         await self._browser.send_text(json.dumps(message, allow_nan=False, separators=(",", ":")))
+
+
+def changes(before: dict[str, Any], now: dict[str, Any]) -> dict[str, Any]:
+    """Return the message with the changed fields of a status; of a field with many entries only the changed ones.
+
+    `status` has fields, `entries` entries by field. A field that has lost an entry is sent whole.
+    """
+    news = {key: value for key, value in now.items() if key not in before or before[key] != value}
+    entries = {}
+    for key, value in list(news.items()):
+        old = before.get(key)
+        if (
+            isinstance(value, dict)
+            and isinstance(old, dict)
+            and len(value) >= MANY_ENTRIES
+            and old.keys() <= value.keys()
+        ):
+            entries[key] = {name: item for name, item in value.items() if name not in old or old[name] != item}
+            del news[key]
+    return ({"status": news} if news or entries else {}) | ({"entries": entries} if entries else {})
 
 
 def belief_json(engine: Running, pair: list[int], at: int | None = None) -> dict[str, Any] | None:

@@ -16,6 +16,7 @@ from ..live.outputs import Status
 from ..live.running_fold import Running
 from ..present.export.report_charts import charted_model
 from ..present.result import plain
+from ..present.sensor_groups import groups_json, sensor_groups
 from ..present.series.columns import columns_of
 
 STATUS_FIELDS = (
@@ -28,7 +29,7 @@ STATUS_FIELDS = (
 
 TRUST_FIELDS = (
     "t", "health", "since", "cause", "sensors", "episodes_open", "lost", "nis", "nis_low", "nis_high", "nis_dof",
-    "nis_judged", "nis_place", "nis_words",
+    "nis_judged", "nis_place", "nis_words", "groups",
 )  # fmt: skip
 """Fields of a status that belong to its time."""
 
@@ -54,11 +55,9 @@ def status_json(engine: Running, status: Status | None = None) -> dict[str, Any]
         "gate": tuning.gate,
         "gate_kind": tuning.gate_kind,
         "gate_reopen": tuning.reopen,
-        "used": {name: bool(tuning.get(f"use.{name}")) for name in engine.model.sensor_names},
         "began_as": began_as(twin),
         "turned": turned(twin, status.estimator, tuning),
         "health": HEALTH_NAMES[status.health],
-        "sensors": {name: {"state": state, "text": text} for name, (state, text) in status.sensors.items()},
         "nis_judged": judged.measure,
         "nis_place": judged.place,
         "nis_words": judged.words,
@@ -94,7 +93,13 @@ def status_json(engine: Running, status: Status | None = None) -> dict[str, Any]
         "integrity_age": None if levels is None else levels.age(status.t),
         "integrity_note": "not computed yet" if levels is None else levels.reason,
     }
-    return dict(plain(found, infinity_text=True))
+    # Plain already: thousands of entries if there are as many sensors.
+    of_sensors = {
+        "used": dict(zip(engine.model.sensor_names, tuning.used.tolist(), strict=True)),
+        "sensors": {name: {"state": state, "text": text} for name, (state, text) in status.sensors.items()},
+        "groups": groups_json(sensor_groups(engine.model), status.sensors, status.sensor_nis),
+    }
+    return plain(found, infinity_text=True) | of_sensors  # type: ignore[no-any-return]
 
 
 def episodes_json(engine: Running) -> list[dict[str, Any]]:

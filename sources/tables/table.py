@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections import Counter
 from collections.abc import Generator, Iterable, Sequence
 from pathlib import Path
 
@@ -164,11 +165,12 @@ def _check(path: Path, wanted: Sequence[str]) -> None:
     if path.stat().st_size == 0:
         raise SourceError(f"{path}: the file is empty; record it again")
     names = names_of(path)
+    found = Counter(names)
     for name in wanted:
-        if name not in names:
+        if name not in found:
             raise SourceError(f"{path}: there is no column {name!r}; {nearest(name, names)}")
-        at = [k for k, other in enumerate(names, start=1) if other == name]
-        if len(at) > 1:
+        if found[name] > 1:
+            at = [k for k, other in enumerate(names, start=1) if other == name]
             places = " and ".join(f"the {_ordinal(k)}" for k in at[:2])
             raise SourceError(f"{path}: there are {len(at)} columns {name!r}, {places}; give each its own name")
     if suffix_of(path) == ".csv" and not has_rows(path):

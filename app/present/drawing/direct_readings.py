@@ -40,7 +40,9 @@ def observed(model: StateSpaceModel) -> list[Observed]:
     share = np.array([SCALE_TOLERANCE, OFFSET_TOLERANCE, OFFSET_TOLERANCE])
     moves = np.concatenate((np.zeros((1, model.nx)), rng.uniform(0.3, 0.9, (2, model.nx))))
     points = model.prior_mean + moves * model.prior_std
-    charted = list(zip(model.shown.tolist(), model.shown_states, strict=True))
+    charted, places = model.shown.tolist(), points[:, model.shown]
+    units = np.array([state.unit for state in model.shown_states])
+    sizes = np.array([state.std or 1.0 for state in model.shown_states])  # of one that is certain at first, in its unit
     u = np.array([item.default for item in model.inputs])
     p = np.array([parameter.value for parameter in model.parameters])
     found = []
@@ -48,25 +50,21 @@ def observed(model: StateSpaceModel) -> list[Observed]:
         values, there = np.full((len(points), len(sensor.rows)), np.nan), np.zeros(len(sensor.rows))
         for x, out in zip(points, values, strict=True):
             _expect(model, sensor, x, u, p, out)
-        slopes = np.zeros((len(sensor.rows), len(charted)))
-        for column, (j, state) in enumerate(charted):
-            moved = points[0].copy()
-            step = STEP * (state.std or 1.0)  # of a state that is certain at first, in its unit
-            moved[j] += step
-            _expect(model, sensor, moved, u, p, there)
-            slopes[:, column] = (there - values[0]) / step
+        slopes: dict[int, np.ndarray] = {}  # by state, of those that the rows are near
         for r, row in enumerate(sensor.rows):
             # A distance to a wall grows as the vehicle moves, but is not where the vehicle is; and a sum of two states
             # may be one of them by chance, as long as the other is zero.
-            likely = [
-                j
-                for column, (j, state) in enumerate(charted)
-                if state.unit == row.unit
-                and abs(slopes[r, column] - 1.0) < SCALE_TOLERANCE
-                and np.all(
-                    np.abs(values[:, r] - points[:, j]) < share * np.maximum(np.abs(points[:, j]), state.std or 1.0)
-                )
-            ]
+            near = np.all(np.abs(values[:, [r]] - places) < share[:, None] * np.maximum(np.abs(places), sizes), axis=0)
+            likely = []
+            for column in np.flatnonzero(near & (units == row.unit)):
+                j = charted[column]
+                if j not in slopes:
+                    moved = points[0].copy()
+                    moved[j] += STEP * sizes[column]
+                    _expect(model, sensor, moved, u, p, there)
+                    slopes[j] = (there - values[0]) / (STEP * sizes[column])
+                if abs(slopes[j][r] - 1.0) < SCALE_TOLERANCE:
+                    likely.append(j)
             likely.sort(key=lambda j: model.state_names[j] not in (row.name, sensor.name))
             if likely:
                 found.append(Observed(k, r, likely[0]))

@@ -26,6 +26,7 @@ from estimators.tuning import Tuning
 from ...live.notices import Annotation
 from ...live.outputs import Pull
 from ..drawing.direct_readings import observed
+from ..sensor_groups import sensor_groups
 from ..series.chart_stream import ChartQuery, ChartStream
 from ..series.charted_run import ChartedRun, KeptRows
 from ..series.columns import columns_of, rows_of
@@ -136,6 +137,10 @@ def charted_model(model: StateSpaceModel) -> dict[str, Any]:
         if name in readers:
             readers[name].append(names[dot.sensor, dot.row])
     return {
+        "groups": [
+            {"name": group.name, "sensors": [model.sensor_names[k] for k in group.members], "declared": group.declared}
+            for group in sensor_groups(model)
+        ],
         "states": [
             {
                 "name": state.name,

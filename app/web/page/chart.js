@@ -2,6 +2,7 @@
 // by an object, with columns by name; the page, its SVG files and the HTML report draw it by this file.
 //
 //   key, title, unit, note, help       help: tooltip of the values
+//   control                            element in its head
 //   weight                             share of the height
 //   columns                            columns of the main stream that it needs
 //   series                             {name: line() | dots() | edge()}, drawn in this order
@@ -65,7 +66,7 @@ export class Chart {
       "header", {},
       element("h3", {}, what.title), element("span", { class: "unit" }, what.unit ?? ""),
       what.note ? element("span", { class: "note" }, what.note) : null,
-      this.ramp ?? null,
+      what.control ?? null, this.ramp ?? null,
       element("span", { class: "space" }), this.reading,
       save ? element("button", { type: "button", class: "save", title: "Save this chart", "aria-label": `Save the chart of ${what.title}`, "aria-haspopup": "menu", onclick: (event) => save(this, event.currentTarget) }, "⤓") : null,
     );

@@ -88,6 +88,8 @@ export class Link extends EventTarget {
     if (message.status) {
       if ("revision" in message.status) this.turned = performance.now();
       Object.assign(this.status, message.status);
+      // Of fields with many entries only the changed ones come.
+      for (const [field, entries] of Object.entries(message.entries ?? {})) Object.assign(this.status[field], entries);
       this.tell("status", this.status);
     }
     if (message.episodes) this.tell("episodes", (this.episodes = message.episodes));

@@ -8,18 +8,34 @@ export const SIGNS = {
   waiting: "○", tracking: "●", suspect: "◐", degraded: "▲", diverged: "✖", stale: "◌", "held out": "–", screened: "⊘",
 };
 const MOST_LIGHTS = 8;
+const CALM = ["tracking", "held out", "waiting"];
+
+// What is shown as one: groups of sensors, and those in none, in the order of their first sensors: {name, sensors, declared}.
+export function unitsOf({ sensors, groups }) {
+  const grouped = new Map(groups.flatMap((group) => group.sensors.map((name) => [name, group])));
+  return [...new Set(sensors.map((name) => grouped.get(name) ?? name))].map((item) => (typeof item === "string" ? { name: item, sensors: [item], declared: true } : item));
+}
+
+// A group's numbers in one sentence; `group` is its summary in the status.
+export function groupText({ name, sensors }, group) {
+  const states = Object.entries(group.states).map(([state, count]) => `${grouped(count)} ${state}`).join(", ");
+  const [worst, most] = group.worst[0] ?? [];
+  const nis = group.nis === null ? "" : `. NIS / dof ${compact(group.nis, 3)}; largest ${compact(most, 3)} (${words(worst)})`;
+  return `${words(name)}, ${grouped(sensors.length)} sensors: ${states}${nis}`;
+}
 
 export class Trust {
   constructor(model, link, open) {
     this.model = model;
     this.lights = new Map();
-    const names = model.sensors.slice(0, MOST_LIGHTS);
-    for (const name of names) {
-      const light = element("button", { type: "button", class: "light", onclick: () => open("episodes") }, element("i", {}, "○"), element("span", {}, words(name)));
+    this.units = unitsOf(model);
+    for (const { name, sensors } of this.units.slice(0, MOST_LIGHTS)) {
+      const shown = () => (sensors.length > 1 ? link.dispatchEvent(new CustomEvent("group", { detail: name })) : open("episodes"));
+      const light = element("button", { type: "button", class: "light", onclick: shown }, element("i", {}, "○"), element("span", {}, words(name)));
       this.lights.set(name, light);
     }
     $("lights").replaceChildren(...this.lights.values());
-    if (model.sensors.length > names.length) $("lights").append(element("span", { class: "more", id: "more-lights" }));
+    if (this.units.length > MOST_LIGHTS) $("lights").append(element("span", { class: "more", id: "more-lights" }));
     $("health").addEventListener("click", () => open("episodes"));
     $("cause").addEventListener("click", () => open("episodes"));
     link.addEventListener("status", (event) => this.show(event.detail));
@@ -47,17 +63,18 @@ export class Trust {
     this.gauge(status);
     // A cause needs the room: healthy sensors show their light without a name.
     $("lights").dataset.brief = String(Boolean(cause));
-    for (const [sensor, light] of this.lights) {
-      const { state, text } = status.sensors[sensor] ?? { state: "waiting", text: "" };
+    const known = this.units.map((unit) => stateOf(unit, status));
+    this.units.slice(0, MOST_LIGHTS).forEach(({ name, sensors }, k) => {
+      const [light, { state, text, faults }] = [this.lights.get(name), known[k]];
       light.dataset.health = state;
       setText(light.firstChild, SIGNS[state] ?? "●");
-      setAttribute(light, "title", `${words(sensor)}: ${state}${text ? `. ${text}` : ""}`);
-    }
-    const rest = Object.entries(status.sensors).filter(([sensor]) => !this.lights.has(sensor));
-    const bad = rest.filter(([, item]) => !["tracking", "held out", "waiting"].includes(item.state));
+      if (sensors.length > 1) setText(light.lastChild, `${words(name)} ${faults ? `${grouped(faults)} of ` : ""}${grouped(sensors.length)}`);
+      setAttribute(light, "title", text);
+    });
     if ($("more-lights")) {
-      setText($("more-lights"), `+${rest.length}${bad.length ? `, ${bad.length} with faults` : ""}`);
-      setAttribute($("more-lights"), "title", bad.map(([sensor, item]) => `${words(sensor)}: ${item.state}`).join("\n"));
+      const bad = known.slice(MOST_LIGHTS).filter(({ state }) => !CALM.includes(state));
+      setText($("more-lights"), `+${known.length - MOST_LIGHTS}${bad.length ? `, ${bad.length} with faults` : ""}`);
+      setAttribute($("more-lights"), "title", bad.map(({ text }) => text).join("\n"));
     }
     setText($("folding"), refolding(status));
     setAttribute($("record"), "aria-pressed", String(status.recording !== null));
@@ -96,6 +113,14 @@ export class Trust {
     $("connection").hidden = !text;
     $("connection").dataset.state = state;
   }
+}
+
+// State of a sensor or a group: {state, text, faults}; the state of a group is that of its worst member.
+function stateOf(unit, status) {
+  const group = unit.sensors.length > 1 && status.groups[unit.name];
+  if (group) return { state: group.state, text: groupText(unit, group), faults: group.alarms };
+  const { state, text } = status.sensors[unit.name] ?? { state: "waiting", text: "" };
+  return { state, text: `${words(unit.name)}: ${state}${text ? `. ${text}` : ""}`, faults: 0 };
 }
 
 // The filter being compiled, the refold under way, or the revision.

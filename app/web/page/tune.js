@@ -2,8 +2,9 @@
 
 import { $, element, setAttribute, setText } from "./dom.js";
 import { Advice, Fit, Refit } from "./fit.js";
-import { words } from "./format.js";
+import { compact, words } from "./format.js";
 import { Around, Gestures, Knob } from "./knob.js";
+import { groupText, SIGNS, unitsOf } from "./trust.js";
 
 const GROUPS = { Q: "Process noise Q", R: "Sensor noise R", p: "Parameters" };
 const HINTS = {
@@ -13,6 +14,8 @@ const HINTS = {
 };
 const GATES = [["off", null], ["95 %", 0.95], ["99 %", 0.99], ["99.73 %", 0.9973], ["99.99 %", 0.9999]];
 const MAX_OPEN_ENTRIES = 8; // entries from which on a group is closed at first
+const MAX_LISTED = 24; // entries or sensors of a group that are listed at once; the others are found by name
+const WORST = ["stale", "degraded", "suspect", "waiting", "held out", "tracking"];
 
 export class Tune {
   constructor(model, link) {
@@ -66,7 +69,8 @@ export class Tune {
 
   group(prefix, title, items) {
     const all = prefix === "p" || items.length < 2 ? null : this.together(prefix, title);
-    const knobs = items.map((item) => {
+    const knobOf = (item) => {
+      if (this.knobs.has(item.key)) return this.knobs.get(item.key).node;
       const knob = new Knob(
         {
           key: item.key, label: item.key.slice(2), unit: item.unit, low: item.low, high: item.high, configured: item.configured,
@@ -75,9 +79,25 @@ export class Tune {
         (value, gesture) => this.turn(item.key, value, gesture),
       );
       this.knobs.set(item.key, knob);
+      if (this.status) knob.sync(this.status.tuning[item.key]);
       return knob.node;
-    });
-    return section(title, HINTS[prefix], items.length <= MAX_OPEN_ENTRIES, all, ...knobs);
+    };
+    const body = items.length <= MAX_LISTED ? items.map(knobOf) : [this.found(title, items, (item) => item.key.slice(2), knobOf)];
+    return section(title, HINTS[prefix], items.length <= MAX_OPEN_ENTRIES, all, ...body);
+  }
+
+  // A search field, and the first of what it finds.
+  found(title, items, nameOf, nodeOf) {
+    const list = element("div", {});
+    const left = element("p", { class: "about" });
+    const fill = () => {
+      const matching = matches(items, nameOf, field.value);
+      list.replaceChildren(...matching.slice(0, MAX_LISTED).map(nodeOf));
+      setText(left, matching.length > MAX_LISTED ? `${matching.length - MAX_LISTED} more` : "");
+    };
+    const field = element("input", { type: "text", class: "find", placeholder: `Find among ${items.length}`, "aria-label": `Find in ${title}`, oninput: fill });
+    fill();
+    return element("div", {}, field, list, left);
   }
 
   // One line that scales all of a group.
@@ -92,10 +112,11 @@ export class Tune {
   // All of a group at once: one command, one revision, one undo. Their own curves are not what is looked for then.
   scale(prefix, factor) {
     const values = {};
-    for (const [key, knob] of this.knobs) {
+    for (const { key } of this.model.tuning) {
       if (!key.startsWith(`${prefix}.`)) continue;
-      values[key] = Number((knob.value * factor).toPrecision(6));
-      knob.expect(values[key]);
+      const knob = this.knobs.get(key);
+      values[key] = Number(((knob?.value ?? this.status.tuning[key]) * factor).toPrecision(6));
+      knob?.expect(values[key]);
     }
     return this.edit("SetTunings", { values });
   }
@@ -111,20 +132,84 @@ export class Tune {
   }
 
   sensorSection() {
-    this.sensors = new Map();
-    // The sensors of a family, one for each landmark, share a row.
-    const members = new Map();
-    for (const name of this.model.sensors) {
-      const shared = this.model.families[name] ?? name;
-      members.set(shared, [...(members.get(shared) ?? []), name]);
-    }
-    const rows = [...members].map(([name, names]) => {
-      const box = element("input", { type: "checkbox", onchange: () => this.use(name, box.checked) });
-      const row = element("label", { class: "sensor", title: "Off: held out (predicted and scored, but not used)" }, box, element("span", {}, names.length > 1 ? `${words(name)} (${names.length})` : words(name)), element("em", {}));
-      this.sensors.set(name, [box, row.lastChild, names]);
-      return row;
+    this.sensors = []; // lines: [box or null, note, names], of groups also their summary and list
+    this.units = unitsOf(this.model);
+    const rows = this.units.map((unit) => (unit.sensors.length > 1 ? this.sensorGroup(unit) : this.sensorLine(unit.name, unit.sensors, true)));
+    const many = this.model.sensors.length > MAX_LISTED;
+    const search = element("input", { type: "text", class: "find", placeholder: `Find among ${this.model.sensors.length} sensors`, "aria-label": "Find a sensor", oninput: () => this.find(search.value) });
+    const made = section("Sensors in use", "Off: held out (predicted and scored, but not used)", this.units.length <= MAX_OPEN_ENTRIES, many ? search : null, ...rows);
+    this.link.addEventListener("group", ({ detail }) => {
+      const { node } = this.sensors.find((line) => line.unit?.name === detail);
+      made.open = node.open = true;
+      node.scrollIntoView({ block: "nearest" });
+      node.querySelector("summary").focus();
     });
-    return section("Sensors in use", "Off: held out (predicted and scored, but not used)", this.model.sensors.length <= MAX_OPEN_ENTRIES, ...rows);
+    return made;
+  }
+
+  sensorLine(name, names, kept) {
+    const box = element("input", { type: "checkbox", onchange: () => this.use(name, box.checked) });
+    const note = element("em", {});
+    const node = element("label", { class: "sensor", title: "Off: held out (predicted and scored, but not used)" }, box, element("span", {}, words(name)), note);
+    const line = { node, box, note, names };
+    if (kept) this.sensors.push(line);
+    return kept ? node : line;
+  }
+
+  // A closed line with the number of sensors and the state of the worst; opened, it lists members, those in alarm first.
+  sensorGroup(unit) {
+    const { name, sensors, declared } = unit;
+    const box = declared ? element("input", { type: "checkbox", "aria-label": `Use ${words(name)}`, onclick: (event) => event.stopPropagation(), onchange: () => this.use(name, box.checked) }) : null;
+    const [light, note, list, left] = [element("i", {}, "○"), element("em", {}), element("div", {}), element("p", { class: "about" })];
+    const label = element("label", { class: "sensor" }, box, light, element("span", {}, `${words(name)} (${sensors.length})`), note);
+    const node = element("details", { class: "sensor-group", dataset: { group: name } }, element("summary", {}, label), list, left);
+    const line = { node, box, note, names: sensors, unit, light, list, left, members: [], text: "" };
+    // A label would pass the click on to its box.
+    label.addEventListener("click", (event) => event.target !== box && (event.preventDefault(), (node.open = !node.open)));
+    node.addEventListener("toggle", () => this.list(line));
+    this.sensors.push(line);
+    return node;
+  }
+
+  // The list of an open group: those whose names match, in alarm first, then by NIS. It keeps its order while it is open.
+  list(line) {
+    const { unit, node, list, left, text } = line;
+    if (!node.open || !this.status) {
+      list.replaceChildren();
+      line.members = [];
+      return setText(left, "");
+    }
+    const worst = new Map(this.status.groups[unit.name].worst.map(([name], k) => [name, k]));
+    const place = (name) => WORST.indexOf(this.status.sensors[name]?.state ?? "tracking") * MAX_LISTED + (worst.get(name) ?? MAX_LISTED - 1);
+    const matching = matches(unit.sensors, String, text).map((name) => [place(name), name]).sort(([a], [b]) => a - b);
+    line.members = matching.slice(0, MAX_LISTED).map(([, name]) => this.sensorLine(name, [name], false));
+    for (const { node: row, names: [name] } of line.members) {
+      row.append(element("button", { type: "button", title: `Chart the innovation of ${words(name)}`, "aria-label": `Chart ${words(name)}`, onclick: (event) => (event.preventDefault(), this.link.dispatchEvent(new CustomEvent("member", { detail: name }))) }, "chart"));
+    }
+    list.replaceChildren(...line.members.map((member) => member.node));
+    setText(left, matching.length > MAX_LISTED ? `${matching.length - MAX_LISTED} more: type a name above` : "");
+    for (const member of line.members) this.state(member, this.status);
+  }
+
+  find(text) {
+    for (const line of this.sensors) {
+      const matching = matches(line.names, String, text).length > 0;
+      line.node.hidden = !matching;
+      if (!line.unit) continue;
+      line.text = text;
+      line.node.open = Boolean(text) && matching;
+      this.list(line);
+    }
+  }
+
+  // `nis` of one whose NIS is among the largest of its group.
+  state({ box, note, names }, status, nis) {
+    if (box) {
+      const used = names.every((name) => status.used[name]);
+      if (document.activeElement !== box || box.checked === used) box.checked = used;
+    }
+    const states = [...new Set(names.map((name) => status.sensors[name]?.state ?? "tracking"))].filter((state) => state !== "tracking");
+    setText(note, [...states, ...(nis ? [`NIS ${compact(nis, 2)}`] : [])].join(", "));
   }
 
   sync(status) {
@@ -138,13 +223,18 @@ export class Tune {
       if (knob instanceof Knob) knob.sync(status.options[name]);
       else if (document.activeElement !== knob) knob.value = String(Math.round(status.options[name]));
     }
-    for (const [key, value] of Object.entries(status.tuning)) this.knobs.get(key)?.sync(value);
+    for (const [key, knob] of this.knobs) knob.sync(status.tuning[key]);
     this.syncGate(status);
-    for (const [box, note, names] of this.sensors.values()) {
-      const used = names.every((name) => status.used[name]);
-      if (document.activeElement !== box || box.checked === used) box.checked = used;
-      const states = [...new Set(names.map((name) => status.sensors[name]?.state ?? "tracking"))].filter((state) => state !== "tracking");
-      setText(note, states.join(", "));
+    for (const line of this.sensors) {
+      this.state(line, status);
+      const group = line.unit && status.groups[line.unit.name];
+      if (!group) continue;
+      line.light.dataset.health = group.state;
+      setText(line.light, SIGNS[group.state]);
+      setText(line.note, `${group.alarms ? `${group.alarms} in alarm` : group.state === "tracking" ? "" : group.state}${group.nis === null ? "" : ` NIS ${compact(group.nis, 2)}`}`.trim());
+      setAttribute(line.node, "title", groupText(line.unit, group));
+      const worst = new Map(group.worst);
+      for (const member of line.members) this.state(member, status, worst.get(member.names[0]));
     }
     this.offerUndo(status.edits);
     const turned = Object.keys(status.turned).length;
@@ -239,6 +329,9 @@ export class Tune {
     }
   }
 }
+
+// Those whose name contains the text.
+const matches = (items, nameOf, text) => items.filter((item) => nameOf(item).toLowerCase().includes(text.trim().toLowerCase()));
 
 export function section(title, hint, open, ...children) {
   return element("details", { class: "section", open }, element("summary", { title: hint }, title), ...children);

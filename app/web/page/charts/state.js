@@ -9,6 +9,7 @@ import { groupsOf } from "./group.js";
 export const order = 2;
 
 const MAX_CHARTS = 24;
+const MAX_SENSORS = 8; // whose measurements are drawn over one state
 const FEW_STATES = 6; // up to so many, those that nobody measures have more room
 const LASTING = 5; // rejected measurements in a row, from which they are in view: an offset lasts, a spike does not
 const UNBOUNDED = 100; // times the band, or the value itself, beyond which a protection level is shown as unbounded
@@ -29,14 +30,15 @@ export default function (charts) {
 function chartOf(charts, state) {
   const axisRange = new Range();
   const { live } = charts;
-  const measured = state.rows.flatMap((row) => Object.keys(MEASURED).map((kind) => `${kind}:${row}`));
+  const drawn = state.rows.slice(0, MAX_SENSORS);
+  const measured = drawn.flatMap((row) => Object.keys(MEASURED).map((kind) => `${kind}:${row}`));
   const own = Object.fromEntries(["upper", "lower", "truth", "mean"].map((kind) => [kind, `${kind}:${state.name}`]));
   const level = () => charts.integrity?.[state.name]?.bound;
   return {
     key: `state:${state.name}`,
     title: state.label,
     unit: bracketed(state.unit),
-    note: state.rows.length ? null : "not measured",
+    note: !state.rows.length ? "not measured" : state.rows.length > drawn.length ? `measurements of ${drawn.length} of ${state.rows.length} sensors` : null,
     help: "Estimate ± 2σ; in brackets the protection level: the largest error that one undetected fault can cause",
     weight: state.rows.length || charts.model.states.length > FEW_STATES ? 1 : 1.5,
     columns: [...Object.values(own), ...measured],
@@ -65,10 +67,10 @@ function chartOf(charts, state) {
     paint: (plot) => marks(plot, charts.episodes, charts.view.at),
     range: (data, span) => {
       if (state.probability) return [-0.03, 1.03];
-      const drawn = { lines: [data.truth, data.mean], bands: [[data.lower, data.upper]], dots: measured.map((name) => data[name]) };
+      const all = { lines: [data.truth, data.mean], bands: [[data.lower, data.upper]], dots: measured.map((name) => data[name]) };
       const place = within(data.x, span);
-      const offset = state.rows.map((row) => rejectedExtent(data[`refused:${row}`], data[`reading:${row}`], ...place));
-      const shown = [shownExtent(drawn, ...place), ...offset].reduce(([low, high], [under, over]) => [Math.min(low, under), Math.max(high, over)]);
+      const offset = drawn.map((row) => rejectedExtent(data[`refused:${row}`], data[`reading:${row}`], ...place));
+      const shown = [shownExtent(all, ...place), ...offset].reduce(([low, high], [under, over]) => [Math.min(low, under), Math.max(high, over)]);
       return axisRange.fit(...charts.layers.reduce((range, layer) => layer.widened?.(range, state, span) ?? range, shown));
     },
     says: (value) => {
