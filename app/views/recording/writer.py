@@ -307,6 +307,10 @@ class RecordingPart:
         if not short:
             from .format import summary_of
 
+            # Among the events of the charts as they are now: what is drawn cannot be changed.
+            notes = self._engine.annotations.notes
+            lines = [Notice(note.number, note.t, "info", f"note: {note.text}") for note in notes]
+            self._drawing(replace(self._engine.rows(0, 0), notices=lines))
             self.file.summary(summary_of(self._engine))
         self.file.close()
 

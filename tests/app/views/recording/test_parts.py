@@ -176,7 +176,7 @@ def test_parts_fold_by_themselves_to_the_same_bits(estimator, start, tmp_path):
 
 
 def test_every_part_has_the_notes_of_users_so_far(start, tmp_path):
-    source, engine, _ = start(split=Split(size=50_000))
+    source, engine, drawn = start(split=Split(size=50_000))
     feed(source, engine, 0, 200)
     engine.submit(commands.Annotate("before the recording"))
     wait_for(lambda: engine.annotations.notes)
@@ -189,6 +189,11 @@ def test_every_part_has_the_notes_of_users_so_far(start, tmp_path):
     first, *_, last = [[note.text for note in read_recording(part).annotations] for part in engine.recorder.finished]
     assert first == ["before the recording"]
     assert last == ["before the recording", "in the second part or later"]
+    # For a viewer of the charts they are events, in their last words.
+    assert [line.text for line in drawn[-1].notices] == [
+        "note: before the recording",
+        "note: in the second part or later",
+    ]
     # Once in a file, not with every write of the log.
     assert written(engine.recorder.finished[0], "/nisus/annotations") == 1
 
