@@ -82,7 +82,7 @@ def _list(arguments: Arguments) -> None:
         if "error" not in item
     )
     inside = TableColumn("in 95 % band [%]", 1, 100.0)
-    columns = ("version", "saved", "filter", "NIS", TableColumn("log L"), inside, "fitted on", "note")
+    columns = ("version", "saved", "filter", "NIS / dof", TableColumn("log L"), inside, "fitted on", "note")
     topics = [Topic(f"Tuning versions of {twin.name}", ("* accepted: `nisus guard` folds with it.",), columns, rows)]
     if broken := tuple(item["error"] for item in listed if "error" in item):
         topics.append(Topic("Cannot be read", broken))
@@ -112,9 +112,8 @@ def _compare(arguments: Arguments) -> None:
         print(to_json({"names": arguments.names, "entries": entries, "scores": scores}))
         return
     names = tuple(arguments.names)
-    dof = float(sum(len(sensor.rows) for sensor in first.model.sensors)) / len(first.model.sensors)
     rows = tuple(
-        (name, f"{before:.6g}", f"{scores[1][name]:.6g}", _verdict(name, before, scores[1][name], dof))
+        (name, f"{before:.6g}", f"{scores[1][name]:.6g}", _verdict(name, before, scores[1][name]))
         for name, before in scores[0].items()
         if name in scores[1]
     )
@@ -124,10 +123,9 @@ def _compare(arguments: Arguments) -> None:
     print("\n".join(to_text([differing, scored])))
 
 
-def _verdict(name: str, before: float, after: float, dof: float) -> str:
-    """Return whether a score got better or worse, as `nisus guard` counts; a mean NIS is taken per `dof`."""
-    scale = dof if name == "nis" else 1.0
-    change = badness(name, after / scale) - badness(name, before / scale)
+def _verdict(name: str, before: float, after: float) -> str:
+    """Return whether a score got better or worse, as `nisus guard` counts."""
+    change = badness(name, after) - badness(name, before)
     return "worse" if change > 0.0 else "better" if change < 0.0 else ""
 
 

@@ -41,7 +41,7 @@ from estimators.errors import ConfigError
 from estimators.events.batch import truth_of
 from estimators.fold import Fold
 from estimators.log import Log
-from estimators.track import DIVERGED, HELD_OUT, USED
+from estimators.track import DIVERGED, HELD_OUT
 
 from ..live.tunings.versions import COVERAGE, LIKELIHOOD, NIS, REFUSED, RMSE, figures
 from .scores import pictures_of
@@ -68,9 +68,6 @@ def fold_figures(fold: Fold, rows: np.ndarray | None = None) -> dict[str, float]
     # A picture shows the field before its event.
     pictures = [one for one in pictures_of(fold) if 0 < one.before <= rows.size and rows[one.before - 1]]
     found = figures(score(track, events, fold.model, pictures, gate=fold.tuning.gate))
-    used = track.verdict == USED
-    if NIS in found:
-        found[NIS] /= float(track.dof[used].mean())
     found.pop(REFUSED, None)
     found[LOST] = float(np.mean(track.health == DIVERGED)) if len(track) else 0.0
     return found

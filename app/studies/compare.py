@@ -39,6 +39,7 @@ class Outcome(NamedTuple):
     since: float
     lost: float
     refused: float
+    nis_dof: float = 1.0
 
 
 def draws(entry: Estimator) -> bool:
@@ -153,6 +154,7 @@ def outcome_of(fold: Fold, events: Events, seconds: float) -> Outcome:
         since=float((events.t[lost[0]] - events.t[0]) * 1e-9) if lost.size else np.nan,
         lost=lost.size / len(track),
         refused=result.refused if result.gated else 0.0,
+        nis_dof=result.nis_dof,
     )
 
 
@@ -169,6 +171,7 @@ def row_of(
         coverage=_spread([outcome.coverage for outcome in outcomes]),
         seconds_per_step=min(outcome.seconds_per_step for outcome in outcomes),
         options=options,
+        nis_dof=float(np.mean([outcome.nis_dof for outcome in outcomes])),
         seeds=len(outcomes),
         span=span,
         diverged=len(since),

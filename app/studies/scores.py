@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 GAP = "  "  # between printed columns; no cell holds two spaces
 
 NIS, BAND, COST = "mean NIS", "in band [%]", "cost [µs/step]"
+DOF = "NIS dof"  # mean degrees of freedom of a measurement, by which printed tables divide the NIS
+NIS_PER_DOF = "NIS / dof"
 SPAN, EVENTS, LENGTH = "span [s]", "events", "log [s]"
 LOST = "diverged [% of events]"
 REFUSED = "refused [%]"
@@ -38,10 +40,11 @@ class FilterScore:
     """Scores of one filter on a log.
 
     `rmse` by unit: the root mean square over the states of that unit whose truth is known, or, where no truth is,
-    over the sensors held out. `coverage` is the share of those errors inside their 95 % band. `span` is the part of
-    the log that was folded, s, or None for all of it. `diverged` is how many of the `seeds` folds did, `since` when
-    the first of them did (s from the log's start), `lost` the share of all events. `refused` is the share of the
-    readings that the gate refused, which are in no other figure. `failure` says why there are no numbers.
+    over the sensors held out. `nis` and its bounds are per measurement, of `nis_dof` degrees of freedom. `coverage` is
+    the share of those errors inside their 95 % band. `span` is the part of the log that was folded, s, or None for all
+    of it. `diverged` is how many of the `seeds` folds did, `since` when the first of them did (s from the log's start),
+    `lost` the share of all events. `refused` is the share of the readings that the gate refused, which are in no other
+    figure. `failure` says why there are no numbers.
     """
 
     estimator: str
@@ -51,6 +54,7 @@ class FilterScore:
     coverage: Spread
     seconds_per_step: float
     options: Mapping[str, float]
+    nis_dof: float = 1.0
     seeds: int = 1
     span: float | None = None
     diverged: int = 0
@@ -98,7 +102,8 @@ def cells(rows: Sequence[FilterScore], events: int, seconds: float) -> list[dict
             line |= _figure(f"RMSE [{unit}]", row.rmse.get(unit, Spread(np.nan)))
         line |= _figure(NIS, row.nis)
         low, high = row.nis_bounds
-        line |= {"NIS low": _number(low, ".3f"), "NIS high": _number(high, ".3f")}
+        dof = "" if row.failure else f"{row.nis_dof:.6g}"
+        line |= {"NIS low": _number(low, ".3f"), "NIS high": _number(high, ".3f"), DOF: dof}
         line |= _figure(BAND, Spread(100.0 * row.coverage.value, 100.0 * row.coverage.spread), decimals=1)
         line |= {
             COST: _text(Spread(1e6 * row.seconds_per_step), digits=3),
@@ -144,7 +149,7 @@ def _text(figure: Spread, digits: int = 4, decimals: int | None = None) -> str:
 
 
 def printed(name: str, lines: Sequence[Mapping[str, str]], logs: int = 1) -> list[str]:
-    """Return caption (log, and bounds of the mean NIS) and table as lines of text.
+    """Return caption (log, and bounds of the NIS per degree of freedom) and table as lines of text.
 
     Args:
         name: Of the twin.
@@ -153,18 +158,31 @@ def printed(name: str, lines: Sequence[Mapping[str, str]], logs: int = 1) -> lis
     """
     over = f"{logs} logs" if logs > 1 else f"{max((int(line['seeds']) for line in lines), default=1)} seeds"
     whole = next((line for line in lines if not line[SPAN] and not line["failure"]), None)
-    low, high = (whole["NIS low"], whole["NIS high"]) if whole else ("nan", "nan")
+    low, high = (_per_dof(whole, f"NIS {end}") for end in ("low", "high")) if whole else ("nan", "nan")
     first = lines[0]
-    caption = f"{name}: {first[EVENTS]} events in {first[LENGTH]} s; NIS if consistent {low} to {high}; ± one of {over}"
+    consistent = f"{NIS_PER_DOF} if consistent {low} to {high}"
+    caption = f"{name}: {first[EVENTS]} events in {first[LENGTH]} s; {consistent}; ± one of {over}"
     figures = [title for title in first if title.startswith("RMSE [")] + [NIS, BAND]
-    table = [["filter", *figures, "µs/step", "notes"]]
+    table = [["filter", *(NIS_PER_DOF if title == NIS else title for title in figures), "µs/step", "notes"]]
     for line in lines:
-        shown = [
-            f"{line[title]}±{line[spread(title)]}" if line[spread(title)] else line[title] or "-" for title in figures
-        ]
+        shown = [_per_dof(line, title) if title == NIS else _with_spread(line, title) for title in figures]
         table.append([line["filter"], *shown, line[COST] or "-", _notes(line)])
     widths = [max(len(line[k]) for line in table) for k in range(len(table[0]))]
     return [caption] + [GAP.join(f"{cell:<{widths[k]}}" for k, cell in enumerate(line)).rstrip() for line in table]
+
+
+def _with_spread(line: Mapping[str, str], title: str) -> str:
+    return f"{line[title]}±{line[spread(title)]}" if line[spread(title)] else line[title] or "-"
+
+
+def _per_dof(line: Mapping[str, str], title: str) -> str:
+    """Return the NIS of a row, or one of its bounds, per degree of freedom."""
+    dof = float(line.get(DOF) or 1.0)
+    if dof == 1.0 or not line[title]:
+        return _with_spread(line, title) if title == NIS else line[title]
+    if title != NIS:
+        return f"{float(line[title]) / dof:.3f}"
+    return _text(Spread(float(line[title]) / dof, float(line[spread(title)] or "nan") / dof))
 
 
 def _notes(line: Mapping[str, str]) -> str:

@@ -102,14 +102,14 @@ def figures(found: Score) -> dict[str, float]:
     """Return the finite figures of a score; without truth or a held-out sensor there is no RMSE.
 
     Returns:
-        `nis`, `log_likelihood` per measurement, `refused` (a share), and for each state whose truth is known and each
-        sensor row held out `rmse.NAME` in its unit and `coverage.NAME` as a share; `rmse.field` for all cells of a
-        large field.
+        `nis` per degree of freedom, `log_likelihood` per measurement, `refused` (a share), and for each state whose
+        truth is known and each sensor row held out `rmse.NAME` in its unit and `coverage.NAME` as a share; `rmse.field`
+        for all cells of a large field.
     """
     judged = found.nis_readings + found.gated
     fits = {**found.states, **found.held_out, **({"field": found.field} if found.field is not None else {})}
     known = {
-        NIS: found.nis,
+        NIS: found.nis / found.nis_dof,
         LIKELIHOOD: found.log_likelihood / judged if judged else np.nan,
         REFUSED: found.refused,
         **{f"{RMSE}.{name}": fit.rmse for name, fit in fits.items()},

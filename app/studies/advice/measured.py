@@ -27,7 +27,7 @@ from ...twin.twin import Twin
 
 BUDGET_S = 20.0  # seconds of one processor for a fold; of a log that takes longer the first part is folded
 TRIED = 64  # events folded at first, to know how long one takes
-MAX_EXCLUDED_SHARE = 0.5  # of a sensor's readings in faults: with more, not the sensor is wrong but the twin
+MAX_EXCLUDED_SHARE = 0.5  # of a row's readings in faults: with more, not the sensor is wrong but the twin
 
 
 @dataclass(frozen=True)
@@ -39,9 +39,9 @@ class TimedFold:
 
 
 class Exclusion(NamedTuple):
-    """Readings of a sensor from `start` to `end`, s, that are left out because of a fault."""
+    """Readings of a sensor row from `start` to `end`, s, that are left out because of a fault."""
 
-    sensor: str
+    row: str
     cause: str
     start: float
     end: float
@@ -52,7 +52,7 @@ def without_faults(twin: Twin, log: Log, known: Sequence[Episode] | None = None)
     """Return the log without the readings of sensors in fault episodes, and what was left out.
 
     A fault is an alarm for which the sensor, not the tuning, is examined: biased, rejected, stuck, beyond its limits. A
-    sensor that is in fault for most of the log keeps its readings: they are what the twin has to explain.
+    row that is in fault for most of the log keeps its readings: they are what the twin has to explain.
 
     Args:
         twin: The twin.
@@ -60,34 +60,27 @@ def without_faults(twin: Twin, log: Log, known: Sequence[Episode] | None = None)
         known: Episodes; None to find them by folding the log with the twin's estimator.
     """
     if known is None:
-        measured = Measured(twin, log)
-        known = episodes(measured.folded(twin.estimator).fold)
-    model, t = twin.model, log.t[: log.n] * 1e-9
-    sensor_of = {row.name: sensor.name for sensor in model.sensors for row in sensor.rows}
-    sensor_of |= {sensor.name: sensor.name for sensor in model.sensors}
-    reading = log.kind[: log.n] == READING
+        known = episodes(Measured(twin, log).folded(twin.estimator).fold)
+    t, clean = log.t[: log.n] * 1e-9, log.copy()
     found: list[Exclusion] = []
-    left_out = np.zeros(log.n, bool)
-    for k, sensor in enumerate(model.sensors):
-        own = reading & (log.channel[: log.n] == k)
-        mine, listed = np.zeros(log.n, bool), []
-        for item in known:
-            detector = detector_of(item.cause)
-            if sensor_of.get(item.subject) != sensor.name or not (detector.sensor_lost or detector.isolate):
-                continue
-            end = float(t[-1]) if item.end is None else item.end
-            rows = own & (t >= item.start) & (t <= end)
-            if rows.any():
-                mine |= rows
-                listed.append(Exclusion(sensor.name, item.cause, item.start, end, int(rows.sum())))
-        if listed and mine.sum() <= MAX_EXCLUDED_SHARE * own.sum():
-            left_out |= mine
-            found += listed
-    if not found:
-        return log, ()
-    clean = log.copy()
-    clean.value[: log.n][left_out, : log.width] = np.nan
-    return clean, tuple(sorted(found, key=lambda item: (item.start, item.sensor)))
+    for k, sensor in enumerate(twin.model.sensors):
+        own = (log.kind[: log.n] == READING) & (log.channel[: log.n] == k)
+        for column, row in enumerate(sensor.rows):
+            readings = own & np.isfinite(log.value[: log.n, column])
+            left_out, listed = np.zeros(log.n, bool), []
+            for item in known:
+                detector = detector_of(item.cause)
+                if item.subject not in (row.name, sensor.name) or not (detector.sensor_lost or detector.isolate):
+                    continue
+                end = float(t[-1]) if item.end is None else item.end
+                rows = readings & (t >= item.start) & (t <= end)
+                if rows.any():
+                    left_out |= rows
+                    listed.append(Exclusion(row.name, item.cause, item.start, end, int(rows.sum())))
+            if listed and left_out.sum() <= MAX_EXCLUDED_SHARE * readings.sum():
+                clean.value[: log.n, column][left_out] = np.nan
+                found += listed
+    return (clean, tuple(sorted(found, key=lambda item: (item.start, item.row)))) if found else (log, ())
 
 
 @dataclass

@@ -111,7 +111,7 @@ def details(claim: Claim) -> str:
 def exclusion_text(item: Exclusion) -> str:
     """Return what was left out: `yoke, 12.0 s to 31.5 s: stuck (195 readings)`."""
     at = [format_time(round(seconds * 1e9)) for seconds in (item.start, item.end)]
-    return f"{item.sensor}, {at[0]} to {at[1]}: {item.cause} ({item.readings:,} readings)"
+    return f"{item.row}, {at[0]} to {at[1]}: {item.cause} ({item.readings:,} readings)"
 
 
 @dataclass

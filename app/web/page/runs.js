@@ -211,7 +211,7 @@ class Versions {
     this.guard.replaceChildren(...guard.map((each) => guarded(each, versions)));
     const differ = this.compared && (await this.difference(this.compared));
     const focused = this.table.contains(document.activeElement) ? document.activeElement.dataset.focus : null;
-    const head = element("tr", {}, element("th", { scope: "col" }, "version"), element("th", { scope: "col", title: "Mean NIS when it was saved" }, "NIS"), element("th", { scope: "col", title: "Log-likelihood per measurement when it was saved" }, "log L"), element("th", {}));
+    const head = element("tr", {}, element("th", { scope: "col" }, "version"), element("th", { scope: "col", title: "NIS per degree of freedom when it was saved: 1 where the filter is consistent" }, "NIS / dof"), element("th", { scope: "col", title: "Log-likelihood per measurement when it was saved" }, "log L"), element("th", {}));
     this.table.replaceChildren(element("thead", {}, head), ...versions.map((item) => this.version(item, running, differ)));
     if (focused) this.table.querySelector(`[data-focus="${focused}"]`)?.focus();
   }

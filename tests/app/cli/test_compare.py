@@ -100,13 +100,14 @@ def test_figures_are_printed_to_the_digits_that_mean_something():
     kf, pf, ukf = LINES
     assert kf == {
         "filter": "kf", "RMSE [°C]": "1.043", "RMSE spread [°C]": "", "RMSE [V]": "0.01000", "RMSE spread [V]": "",
-        "mean NIS": "0.8230", "mean NIS spread": "", "NIS low": "0.700", "NIS high": "1.300", "in band [%]": "89.2",
-        "in band spread [%]": "", "cost [µs/step]": "1.26", "seeds": "1", "diverged": "0", "diverged at [s]": "",
-        "diverged [% of events]": "", "span [s]": "", "options": "", "failure": "", "events": "241", "log [s]": "120",
+        "mean NIS": "0.8230", "mean NIS spread": "", "NIS low": "0.700", "NIS high": "1.300", "NIS dof": "1",
+        "in band [%]": "89.2", "in band spread [%]": "", "cost [µs/step]": "1.26", "seeds": "1", "diverged": "0",
+        "diverged at [s]": "", "diverged [% of events]": "", "span [s]": "", "options": "", "failure": "",
+        "events": "241", "log [s]": "120",
     }  # fmt: skip
     assert pf | {"events": "", "log [s]": ""} == {
         "filter": "pf", "RMSE [°C]": "1.043", "RMSE spread [°C]": "0.012", "RMSE [V]": "123", "RMSE spread [V]": "57",
-        "mean NIS": "0.8231", "mean NIS spread": "0.0001", "NIS low": "0.700", "NIS high": "1.300",
+        "mean NIS": "0.8231", "mean NIS spread": "0.0001", "NIS low": "0.700", "NIS high": "1.300", "NIS dof": "1",
         "in band [%]": "89.2", "in band spread [%]": "2.1", "cost [µs/step]": "126", "seeds": "8", "diverged": "2",
         "diverged at [s]": "12.5", "diverged [% of events]": "25", "span [s]": "20", "options": "particles=4000",
         "failure": "", "events": "", "log [s]": "",
@@ -120,17 +121,21 @@ def test_figures_are_printed_to_the_digits_that_mean_something():
 
 def test_the_printed_table_says_what_the_cells_say():
     caption, *table = printed("pump", LINES)
-    assert caption == "pump: 241 events in 120 s; NIS if consistent 0.700 to 1.300; ± one of 8 seeds"
+    assert caption == "pump: 241 events in 120 s; NIS / dof if consistent 0.700 to 1.300; ± one of 8 seeds"
     assert [re.split(r"\s{2,}", line) for line in table] == [
-        ["filter", "RMSE [°C]", "RMSE [V]", "mean NIS", "in band [%]", "µs/step", "notes"],
+        ["filter", "RMSE [°C]", "RMSE [V]", "NIS / dof", "in band [%]", "µs/step", "notes"],
         ["kf", "1.043", "0.01000", "0.8230", "89.2", "1.26"],
         ["pf", "1.043±0.012", "123±57", "0.8231±0.0001", "89.2±2.1", "126",
          "diverged in 2 of 8 at 12.5 s, 25 % of events, first 20 s, particles 4000"],
         ["ukf", "-", "-", "-", "-", "-", "no factor"],
     ]  # fmt: skip
     assert printed("pump", LINES, logs=20)[0].endswith("± one of 20 logs")
+    # Of measurements with four rows: 1 is right for every twin.
+    wide = cells([replace(ROWS[0], nis=Spread(3.292), nis_bounds=(2.8, 5.2), nis_dof=4.0)], 241, 120.0)
+    caption, _, line = printed("pump", wide)
+    assert "NIS / dof if consistent 0.700 to 1.300" in caption and re.split(r"\s{2,}", line)[3] == "0.8230"
     head, first, second, _ = table
-    assert head.index("mean NIS") == second.index("0.8231") and head.index("µs/step") == first.index("1.26")
+    assert head.index("NIS / dof") == second.index("0.8231") and head.index("µs/step") == first.index("1.26")
 
 
 def test_what_the_gate_refuses_is_told_where_it_refuses_anything():

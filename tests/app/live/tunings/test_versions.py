@@ -188,7 +188,7 @@ def test_kept_listed_compared_accepted(own, capsys):
     told = json.loads(capsys.readouterr().out)
     assert told["tuning"] == "quiet"
     scores = listed["quiet"]["scores"]
-    assert scores["nis"] == pytest.approx(told["nis"]["mean"], rel=1e-7)
+    assert scores["nis"] == pytest.approx(told["nis"]["mean"] / told["nis"]["dof"], rel=1e-7)
     assert scores["rmse.temperature"] == pytest.approx(told["rmse"]["temperature"], rel=1e-7)
     assert scores["coverage.rate"] == pytest.approx(told["coverage"]["rate"], rel=1e-7)
     assert scores["log_likelihood"] * told["nis"]["n"] == pytest.approx(told["log_likelihood"], rel=1e-7)

@@ -33,7 +33,7 @@ def test_a_linear_model_is_told_its_filter_which_applies_itself(page, session):
     figures = linear.locator("details p")
     assert figures.is_hidden()
     linear.locator("summary").click()
-    assert figures.inner_text().startswith("Are f and h linear? yes: ") and "limit 1e-9" in figures.inner_text()
+    assert figures.inner_text().startswith("Are f and h linear? yes: ") and "limit 1e-09" in figures.inner_text()
     assert page.locator('#advice-panel [data-decides="true"]').count() >= 1
 
     apply.click()
