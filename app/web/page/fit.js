@@ -87,7 +87,7 @@ export class Fit {
     for (const item of this.form.querySelectorAll("input, select, button")) item.disabled = busy;
     this.cancelButton.disabled = told.state === "cancelling";
     setText(this.cancelButton, told.state === "running" ? "Stop" : "Discard");
-    setText(this.button, busy ? (told.left === null ? "Fitting…" : `Fitting ${span(told.left)}…`) : "Fit…");
+    setText(this.button, busy ? `Fit ${percent(told.expected ? told.folds / told.expected : 0)}` : "Fit…");
     if (busy) {
       const share = told.expected ? told.folds / told.expected : null;
       bar(this.bar, share);
@@ -146,6 +146,7 @@ function bar(node, share) {
   else node.value = Math.min(1, share);
 }
 
+const percent = (share) => `${Math.round(100 * Math.min(1, share))} %`;
 const left = (seconds, elapsed) => (seconds === null ? `${span(elapsed)} so far` : `about ${span(seconds)} left, ${span(elapsed)} so far`);
 
 function group(prefix, title, keys) {
@@ -343,7 +344,7 @@ export class Advice {
     this.bar.hidden = this.stop.hidden = !busy;
     this.stop.disabled = told.state === "cancelling";
     bar(this.bar, told.progress.share);
-    setText(this.button, busy ? "Measuring…" : "Advice…");
+    setText(this.button, busy ? `Advice ${percent(told.progress.share ?? 0)}` : "Advice…");
     const idle = told.advice ? (told.current ? "" : `of run ${told.revision}; another runs now`) : told.state === "cancelled" ? "Cancelled." : "nothing measured yet: it folds the log by one filter after another";
     setText(this.said, told.state === "cancelling" ? "ending …" : busy ? `${told.progress.question} ${left(told.progress.left, told.progress.elapsed)}` : idle);
     const key = `${told.state}/${told.revision}/${told.current}`;
