@@ -46,6 +46,7 @@ MAX_ROUNDS = 8  # Most rounds of the optimiser, each with a new scale
 ROUND_STEPS = 15  # Steps of the optimiser per round
 GRADIENT = 0.02  # Gradient at the maximum, in deviations of an estimate: half its square is the remaining gain, in nats
 MIN_GAIN = 0.01  # Nats that a round must gain to be followed by another
+RECENT_POINTS = 2  # Last points whose derivatives are kept
 SEARCH_FOLDS = 60  # Most folds per entry of a search without derivatives
 Go = Callable[[int], bool]  # Callback with the number of folds done since the last call; returns whether to continue
 
@@ -91,6 +92,7 @@ class Objective:
     go: Go = lambda folds: True
     progress: FitProgress = field(default_factory=FitProgress)
     executor: Executor | str | None = "threads"
+    recent: dict[bytes, tuple[np.ndarray, np.ndarray]] = field(default_factory=dict, repr=False, compare=False)
 
     @property
     def start(self) -> np.ndarray:
@@ -124,6 +126,7 @@ class Objective:
             entries=tuple(self.entries[i] for i in rest),
             fixed=(*self.fixed, *(self.entries[i] for i in fixed)),
             at=(*self.at, *(float(x[i]) for i in fixed)),
+            recent={},
         )
 
     def setting(self, x: np.ndarray) -> Setting:
@@ -155,14 +158,24 @@ class Objective:
         return float(self.terms(x).sum()) - self.penalty(x)
 
     def slopes(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the terms (n,) at a point, and their derivatives (k, n), by differences into the ranges."""
+        """Return the terms (n,) at a point, and their derivatives (k, n), by differences into the ranges.
+
+        Those of the last points are kept: a round begins, and the curvature is taken, where the round before ended.
+        """
+        known = self.recent.get(x.tobytes())
+        if known is not None:
+            return known
         steps = np.array([STEP * (1.0 if item.log else item.deviation) for item in self.entries])
         for k, (_, high) in enumerate(self.limits):
             if x[k] + steps[k] > high:
                 steps[k] = -steps[k]
         points = [x, *(x + step * unit for step, unit in zip(steps, np.eye(x.size), strict=True))]
         here, *moved = self.all_terms(points)
-        return here, np.array([(there - here) / step for there, step in zip(moved, steps, strict=True)])
+        found = here, np.array([(there - here) / step for there, step in zip(moved, steps, strict=True)])
+        while len(self.recent) >= RECENT_POINTS:
+            del self.recent[next(iter(self.recent))]
+        self.recent[x.tobytes()] = found
+        return found
 
     def gradient(self, x: np.ndarray) -> tuple[float, np.ndarray]:
         """Return the objective and its gradient (k,)."""

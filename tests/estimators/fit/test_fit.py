@@ -193,6 +193,26 @@ def test_progress_counts_every_fold_and_the_gain_of_the_search(ys, fitted):
     assert told.gain == pytest.approx(after - start, abs=1e-6)
 
 
+def test_derivatives_at_the_last_points_are_not_folded_again(ys):
+    tuning = Tuning.of(MODEL)
+    log = log_of(ys)
+    entries, _ = entries_of("kf", tuning, [log], ("Q", "R"))
+    folds = []
+
+    def count(done: int) -> bool:
+        folds.append(done)
+        return True
+
+    whole = Recording(log, 1.0, np.zeros(log.n, bool))
+    objective = Objective("kf", tuning, tuple(entries), (whole,), go=count)
+    here, there = objective.start, objective.start + 0.1
+    before = [objective.slopes(point) for point in (here, there, here, there)]
+    assert sum(folds) == 2 * 3
+    # An objective with an entry fixed is another one.
+    assert objective.pinned([0], here).slopes(here[1:])[1].shape[0] == 1 and sum(folds) == 2 * 3 + 2
+    assert before[0] is before[2] and before[1] is before[3] and not np.array_equal(before[0][1], before[1][1])
+
+
 def test_a_stopped_fit_judges_the_best_point_so_far(ys):
     wrong = Tuning.of(MODEL).set("Q.level", 0.005).set("R.float", 8.0)
     told = FitProgress()
