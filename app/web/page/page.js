@@ -70,7 +70,7 @@ const side = new Tabs($("side-tabs"), "nisus.side");
 new Trust(model, link, (tab) => side.show(tab));
 const tune = (window.nisus.tune = new Tune(model, link));
 new Faults($("faults"), model, link);
-const notes = new UserNotes(link, view, charts);
+const notes = new UserNotes(link, view, charts, () => middle.show("charts-panel"));
 new Episodes($("episodes"), link, view, charts, notes.node);
 const runs = new Runs($("runs"), link);
 new SharedTime(settings.boot, view, charts);
@@ -190,7 +190,7 @@ keys([
   ["ArrowRight", "move charts forward", () => view.pan(0.1 * (charts.range[1] - charts.range[0]), charts.range)],
   ["f", "follow the newest data", () => view.follow()],
   ["0", "default width of the charts", () => view.follow(view.configured)],
-  ["n", "note at the cursor (Alt-click in a chart)", () => (middle.show("charts-panel"), notes.write())],
+  ["n", "note at the cursor (Alt-click in a chart)", () => notes.write()],
   ["r", "start or stop recording", record],
   ["u", "undo the last edit", () => tune.undo()],
   ["U", "redo", () => tune.redo()],

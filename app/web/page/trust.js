@@ -230,8 +230,9 @@ export class Episodes {
 const MAX_NOTE = 500; // characters
 
 export class UserNotes {
-  constructor(link, view, charts) {
-    Object.assign(this, { link, view, charts });
+  // reveal(): shows the charts, where they are behind another tab
+  constructor(link, view, charts, reveal) {
+    Object.assign(this, { link, view, charts, reveal });
     this.title = element("h3", {}, "Notes");
     this.list = element("ol", {});
     const add = element("button", { type: "button", class: "go", title: "Note at the cursor (N, or Alt-click in a chart)", onclick: () => this.write() }, "Add");
@@ -258,7 +259,7 @@ export class UserNotes {
 
   entry(note) {
     const at = clock(note.from, 1);
-    const go = () => this.view.goTo(note.from, this.charts.range, this.charts.newest);
+    const go = () => (this.reveal(), this.view.goTo(note.from, this.charts.range, this.charts.newest));
     const edit = () => (go(), this.write(note.from, note));
     const remove = () => this.link.ask("DeleteAnnotation", { number: note.number });
     return element("li", { dataset: { number: note.number } },
@@ -276,6 +277,7 @@ export class UserNotes {
     setText(this.when, clock(from, 1));
     this.field.value = this.draft.text;
     this.error.hidden = true;
+    this.reveal();
     this.form.showPopover();
     const box = charts.node.getBoundingClientRect();
     const left = charts.placeOf(from);
