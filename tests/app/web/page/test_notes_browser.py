@@ -33,7 +33,7 @@ def dotted(page, left):
 
 def texts(page):
     """Texts of the notes as the panel lists them."""
-    return [entry.inner_text() for entry in page.locator(".notes li .at span").all()]
+    return page.locator(".notes li .at span").all_inner_texts()
 
 
 def test_a_note_is_written_at_a_moment_and_every_browser_has_it(visit, session):
