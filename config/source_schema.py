@@ -117,7 +117,7 @@ class SignalSection(ChannelSection):
     message: Text
     """The message's name in the DBC."""
     signals: Texts
-    """Its signal's name, or a list: one for each row of the sensor."""
+    """Its signal's name, or a list: one for each row of the sensor. For a sensor with landmarks * is the id."""
 
     @model_validator(mode="after")
     def _numbers(self) -> SignalSection:
@@ -137,7 +137,8 @@ class ColumnSection(ChannelSection):
     """Values from the columns of a table."""
 
     columns: Texts
-    """The column's name, or a list: one for each row of the sensor."""
+    """The column's name, or a list: one for each row of the sensor. For a sensor with landmarks TT* names a column of
+    each: TT followed by its id."""
 
     def names(self) -> tuple[str, ...]:
         """Return the columns, one a row."""

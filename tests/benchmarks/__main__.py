@@ -50,6 +50,7 @@ def main() -> None:
         recovery.tuning,
         folds.defences,
         folds.blf,
+        folds.channels,
         false_alarms.false_alarms,
         page.page,
     ]

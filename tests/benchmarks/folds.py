@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import json
+import subprocess
+import sys
+import tempfile
 from collections.abc import Callable, Iterator
 from functools import lru_cache, partial
+from pathlib import Path
 from types import FunctionType
 from typing import Any
 
@@ -27,6 +32,7 @@ from sources.source import Channel
 
 from ..conftest import data_folder
 from ..estimators.smoothing.test_textbook import CAR
+from ..models import write_plant
 from ..support import SECOND
 from .filters import STEPS, noisy_log
 from .timing import BenchmarkRow, Bound, both, medians, seconds
@@ -196,6 +202,48 @@ def defences() -> Iterator[BenchmarkRow]:
         least = times[1:].min(axis=0) / log.n * 1e6
         figures = {"all [µs]": least[0], "bare [µs]": least[1], "ratio": least[0] / least[1]}
         yield BenchmarkRow(f"{name} {estimator}", figures, (Bound("ratio", 2.0),))
+
+
+CHANNELS = (100, 1_000, 4_000)
+
+LOADING = """
+import json, sys, time
+from app.cli.prepare import fold_log, prepare
+from app.twin.log_reader import read_log
+from app.twin.twin import load_twin
+laps = [time.process_time()]
+twin = load_twin(sys.argv[1]); laps.append(time.process_time())
+prepare(twin); laps.append(time.process_time())
+log, _ = read_log(twin, None); laps.append(time.process_time())
+fold_log(twin, log); laps.append(time.process_time())
+print(json.dumps([laps, log.n]))
+"""
+"""A program that loads a twin and folds its log: processor seconds after each step, and the number of events."""
+
+
+def channels() -> Iterator[BenchmarkRow]:
+    """A plant of 40 zones with a column for each thermometer: processor seconds until it runs, µs per event.
+
+    Each case is loaded in two processes: cold without machine code of the model, then with it. The filter is compiled.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        warm_up = write_plant(Path(folder) / "first", 2, family=False)
+        subprocess.run([sys.executable, "-c", LOADING, str(warm_up)], check=True, capture_output=True)
+        for count in CHANNELS:
+            for family in (False, True):
+                path = write_plant(Path(folder) / f"{count}{family}", count, family=family)
+                found = []
+                for _ in range(2):
+                    run = subprocess.run([sys.executable, "-c", LOADING, str(path)], check=True, capture_output=True)
+                    found.append(json.loads(run.stdout))
+                (cold, _), (warm, events) = found
+                imports, load, model, log, fold = np.diff([0.0, *warm])
+                figures = {
+                    "imports [s]": imports, "YAML [s]": load, "model [s]": model, "log [s]": log,
+                    "all [s]": warm[-2], "cold [s]": cold[-2], "fold [µs]": fold / events * 1e6,
+                }  # fmt: skip
+                bounds = (Bound("all [s]", 10.0), Bound("cold [s]", 27.0)) if count == max(CHANNELS) else ()
+                yield BenchmarkRow(f"{count:,} {'of one family' if family else 'sensors'}", figures, bounds)
 
 
 def wheels() -> list[Channel]:

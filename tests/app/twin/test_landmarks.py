@@ -13,10 +13,11 @@ from app.studies.fold_result import calibration_of
 from app.twin.log_reader import read_log
 from app.twin.twin import load_twin
 from estimators import Log, fold
-from estimators.errors import ConfigError, EstimatorError, ModelError
+from estimators.errors import EstimatorError, ModelError, NisusError
 from estimators.model.landmarks import with_landmarks
 from estimators.model.state_space import Parameter
 from estimators.models import MODELS
+from tests.models import write_plant
 
 LANDMARKS = {6: (4.0, 1.0), 7: (-3.0, 5.0), 15: (1.0, -6.0)}
 MODEL = """\
@@ -164,6 +165,23 @@ def test_a_yaml_written_from_a_run_keeps_the_landmarks(folder):
     np.testing.assert_array_equal(again.tuning.p, twin.tuning.p)
 
 
+def test_one_line_names_a_column_for_each_member(tmp_path):
+    """20 thermometers: a line each, landmarks of one sensor, and sensors of the model with a family and a name each."""
+    each, run = folded(write_plant(tmp_path / "each", 20, family=False))
+    placed, landmarks = folded(write_plant(tmp_path / "placed", 20, family=True))
+    assert placed.model.sensor_names == tuple(f"TT_{k:04d}" for k in range(20))
+    path = write_plant(tmp_path / "own", 20, family=False)
+    model, text = path.with_suffix(".py").read_text(), path.read_text()
+    path.with_suffix(".py").write_text(model.replace("(*channel))", "(*channel), family='thermometer')"))
+    lines = "sensors: {thermometer: {std: 0.5}}\n" + text[text.index("source:") : text.index("    TT0000:")]
+    path.write_text(text[: text.index("sensors:")] + lines + '    thermometer: {columns: "*"}\n')
+    own, families = folded(path)
+    assert own.model.sensor_names == each.model.sensor_names and run.n == 20 * 20
+    for name in ("mean", "std", "innovation", "nis"):
+        np.testing.assert_array_equal(getattr(families.track, name), getattr(run.track, name))
+        np.testing.assert_array_equal(getattr(landmarks.track, name), getattr(run.track, name))
+
+
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
@@ -171,14 +189,16 @@ def test_a_yaml_written_from_a_run_keeps_the_landmarks(folder):
         ({"sensors.sighting.at": "{6: [1, 2, 3]}"}, "sighting_6: has 3 coordinates; sighting takes east, north"),
         ({"sensors.sighting.at": "{a b: [1, 2]}"}, "the landmark 'a b' must consist of letters, digits and _"),
         ({"source.sensors.sighting.by": "null"}, "has landmarks; name the column that tells them apart, by: COLUMN"),
+        ({"source.sensors.sighting": "{columns: ['r_*', b]}"}, "or columns of their own with * for the id"),
+        ({"source.sensors.sighting": "{columns: ['r_*', 'b_*']}"}, "there is no column 'r_6'"),
         ({"source.sensors.sighting.by": "{id: {8: 3}}"}, "names the landmark '8'; sighting has 6, 7, 15"),
         ({"source.inputs.speed.by": "id"}, "source.inputs.speed.by is for a sensor with landmarks"),
         ({"use.sightin": "false"}, "did you mean use.sighting"),
     ],
 )
 def test_a_wrong_landmark_is_one_clear_line(folder, overrides, message):
-    with pytest.raises(ConfigError, match="^[^\n]*$") as error:
-        load_twin(folder / "one.yaml", overrides=overrides)
+    with pytest.raises(NisusError, match="^[^\n]*$") as error:
+        load_twin(folder / "one.yaml", overrides=overrides).check_files()
     assert message in str(error.value)
 
 
