@@ -144,7 +144,7 @@ def test_it_draws_the_page_s_charts_without_a_network(browser, made, tmp_path, m
     page.on("request", lambda request: request.url.startswith(("file:", "data:")) or wrong.append(request.url))
     page.goto(path.as_uri())
     page.locator(".paper").nth(4).wait_for(state="attached")
-    titles = page.locator("#charts article > header b").all_inner_texts()
+    titles = page.locator("#charts article > header h3").all_inner_texts()
     assert titles == ["a chart of one file", "rate", "temperature", "NIS / dof", "winding"]
     blue = """[...document.querySelectorAll("#charts canvas")].map((canvas) => {
         const { data } = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height);
