@@ -10,10 +10,9 @@ from typing import TYPE_CHECKING, Any
 from config.loader import shipped
 from estimators.errors import ConfigError
 from estimators.log import READING, Log
-from sources.inspect import RecordingContents
 
 from ..present.result import TableColumn, Topic, to_json, to_text
-from ..studies.advice.draft import write_draft
+from ..studies.advice.draft import check_new, write_draft
 from ..studies.advice.measured import AdviceProgress, Measured, digits, percent, seconds_text, without_faults
 from ..studies.advice.plan import DraftPlan, Moves, plan
 from ..studies.advice.relations import Pair
@@ -23,6 +22,7 @@ from ..studies.advice.verdict import advise as recommend
 from ..twin.log_reader import read_log
 from ..twin.twin import Twin, load_twin
 from .log import databases_of, look
+from .new import fit_draft, report_draft, roles_json
 from .options import roles_of, settings
 from .prepare import attend, prepare
 
@@ -105,26 +105,23 @@ def _draft(arguments: Arguments, files: tuple[Path, ...]) -> int:
     """Draft a twin from recordings."""
     found = look(files, arguments)
     drafted, every = plan(found, roles_of(arguments)), signals(found)
+    if arguments.out is not None:
+        if arguments.out.suffix not in (".yaml", ".yml", ""):
+            raise ConfigError(f"--out {arguments.out}: must end in .yaml")
+        check_new(arguments.out.stem, arguments.out.parent)
+        drafted = fit_draft(drafted)
     if arguments.json:
         print(to_json(_draft_json(every, drafted)))
     else:
         print("\n".join(to_text([_signals_topic(every), *_plan_topics(drafted)])))
     if arguments.out is not None:
-        _write(arguments, arguments.out, found, drafted)
+        written = write_draft(drafted, found, arguments.out.stem, arguments.out.parent, databases_of(arguments))
+        if not arguments.json:
+            print()
+            report_draft(written, False)
     elif not arguments.json:
-        print("\nWrite the draft with --out NAME.yaml; use other signals with --signals A,B.")
+        print("\nWrite the draft with --out NAME.yaml, which fits its noises and checks it.")
     return 0
-
-
-def _write(arguments: Arguments, out: Path, found: RecordingContents, drafted: DraftPlan) -> None:
-    """Write the two files of the draft, and print the next steps."""
-    if out.suffix not in (".yaml", ".yml", ""):
-        raise ConfigError(f"--out {out}: must end in .yaml")
-    written = write_draft(drafted, found, out.stem, out.parent, databases_of(arguments)).paths
-    if not arguments.json:
-        print("\nWritten: " + " and ".join(map(str, written)))
-        print(f"Next: nisus advise {written[0]}    to check its filter and noises")
-        print(f"      nisus run {written[0]}       to view it")
 
 
 def _signals_topic(every: list[Signal]) -> Topic:
@@ -226,4 +223,5 @@ def _draft_json(every: list[Signal], drafted: DraftPlan) -> dict[str, Any]:
             for item in drafted.states
         ],
         "inputs": [name for name, _ in drafted.inputs],
+        **roles_json(drafted),
     }

@@ -197,8 +197,8 @@ class AdviseCommand(JsonOption, RoleOptions, TableOptions, LogOptions, Estimator
     apply: Flag = False
     """Write the lines into the twin's YAML; the previous file is kept beside it."""
     out: Path | None = None
-    """Write the changed YAML to this file (same folder if it names other files). Recordings: write the draft,
-    NAME.yaml and NAME.py."""
+    """Write the changed YAML to this file (same folder if it names other files). Recordings: fit the draft,
+    check it, and write NAME.yaml and NAME.py."""
 
 
 @dataclass(frozen=True)
@@ -494,6 +494,8 @@ class LogCommand(JsonOption, TableOptions):
 @dataclass(frozen=True)
 class NewCommand(JsonOption, RoleOptions, TableOptions):
     """Write NAME.yaml and NAME.py, a runnable example (a pump) or a draft from the signals of a recording.
+
+    A draft is fitted to the first half of the recording and checked on the second. Ctrl-C keeps what has been fitted.
 
     Examples:
       nisus new pump

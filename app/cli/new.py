@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from textwrap import shorten
+from typing import TYPE_CHECKING, Any
 
 from config.yaml_files import writing
 from estimators.errors import ConfigError
@@ -12,8 +13,12 @@ from ..present.result import to_json
 from .options import roles_of
 
 if TYPE_CHECKING:
+    from ..studies.advice.draft import Draft
+    from ..studies.advice.plan import DraftPlan
     from .arguments import NewCommand as Arguments
     from .arguments import SchemaCommand
+
+MAX_OMISSION_TEXT = 200  # characters of a line of omitted signals
 
 _YAML = """\
 # {name}: a tank that a pump fills and a valve empties. Change it, and {name}.py beside it, into a twin of your own.
@@ -146,23 +151,81 @@ def new_twin(arguments: Arguments) -> int:
         SourceError: If a recording cannot be read.
     """
     if arguments.log:
-        from ..studies.advice.draft import check_new, draft_twin
+        from ..studies.advice.draft import check_new, write_draft
+        from ..studies.advice.plan import plan
         from .log import databases_of, look
 
         check_new(arguments.name, arguments.folder)
         found = look(arguments.log, arguments)
-        drafted = draft_twin(
-            found, arguments.name, arguments.folder, roles_of(arguments), databases=databases_of(arguments)
-        )
-        paths = drafted.paths
-    elif any((arguments.signals, arguments.sensors, arguments.inputs, arguments.hold_out, arguments.dbc)):
+        drafted = fit_draft(plan(found, roles_of(arguments)))
+        written = write_draft(drafted, found, arguments.name, arguments.folder, databases_of(arguments))
+        report_draft(written, arguments.json)
+        return 0
+    if any((arguments.signals, arguments.sensors, arguments.inputs, arguments.hold_out, arguments.dbc)):
         raise ConfigError(
             "--signals, --sensors, --inputs, --hold-out and --dbc are for recordings; name one with --log FILE"
         )
-    else:
-        paths = write_twin(arguments.name, arguments.folder)
+    paths = write_twin(arguments.name, arguments.folder)
     print(to_json({"written": [str(path) for path in paths]}) if arguments.json else "\n".join(map(str, paths)))
     return 0
+
+
+def fit_draft(drafted: DraftPlan) -> DraftPlan:
+    """Fit a draft and check it, with progress; Ctrl-C keeps what has been fitted, and checks that."""
+    from estimators.fit.objective import FitProgress
+
+    from ..studies.advice.draft_fit import fit_all
+    from .prepare import attend
+
+    state, steps = FitProgress(), [""]
+
+    def stop() -> None:
+        state.stop = True
+
+    found: DraftPlan = attend(
+        None,
+        lambda: fit_all(drafted, steps.append, state),
+        "drafting",
+        text=lambda: f"{steps[-1]}, {state.folds:,} folds",
+        stop=stop,
+    )
+    return found
+
+
+def roles_json(drafted: DraftPlan) -> dict[str, Any]:
+    """Return the role of every signal, and the check of a fitted draft, for scripts."""
+    check = drafted.check
+    sensors = [one._asdict() | {"correlation": one.correlation.value} for one in check.sensors] if check else []
+    return {
+        "check": {**check._asdict(), "sensors": sensors, "consistent": not check.reason} if check else None,
+        "roles": [
+            {"signal": one.signal.name, "role": one.role, "name": one.name, "reason": one.reason}
+            for one in drafted.roles
+        ],
+    }
+
+
+def report_draft(draft: Draft, json: bool) -> None:
+    """Print the files of a draft, its check, and the next step."""
+    from ..studies.advice.draft import check_lines, omission_lines
+
+    check = draft.plan.check
+    written = [str(path) for path in draft.paths]
+    if json:
+        print(to_json({"written": written, **roles_json(draft.plan)}))
+        return
+    print("\n".join(written))
+    if check is None:
+        print("\nNot checked: the filter fails on this recording; choose other signals with --sensors.")
+    else:
+        print(f"\nFitted to the first {check.start:.4g} s, checked on the other {check.end - check.start:.4g} s:")
+        print("\n".join([check.words, *(f"  {line}" for line in check_lines(check))]))
+    if omitted := omission_lines(draft.plan):
+        print(
+            "\n"
+            + "\n".join(shorten(line, MAX_OMISSION_TEXT, placeholder=" ... (the YAML lists all)") for line in omitted)
+        )
+    print(f"\nNext: nisus run {written[0]}")
 
 
 def write_twin(name: str, folder: Path) -> tuple[Path, Path]:

@@ -128,7 +128,7 @@ def prepare_model(twin: Twin, workshop: Workshop) -> None:
 
 
 def attend(
-    model: StateSpaceModel,
+    model: StateSpaceModel | None,
     work: Callable[[], Any],
     doing: str,
     done: str | None = None,
@@ -139,7 +139,7 @@ def attend(
     """Do work that runs a model, in a thread that may be left behind, so that Ctrl-C ends even a call without end.
 
     Args:
-        model: Whose function is named on standard error if it does not return.
+        model: Whose function is named on standard error if it does not return; None for a model of Nisus itself.
         work: Function to call.
         doing: Status shown while it runs long.
         done: Message printed when it has finished.
@@ -174,7 +174,7 @@ def attend(
     while not over.is_set():
         try:
             if not over.wait(STATUS_DELAY_S):
-                _watch(over, CallWatch(model), status, f"{doing} ...")
+                _watch(over, None if model is None else CallWatch(model), status, f"{doing} ...")
                 if done is not None:
                     _console().print(f"{done}: {time.monotonic() - begun:.0f} s", highlight=False)
         except KeyboardInterrupt:
@@ -188,12 +188,12 @@ def attend(
     return result[0]
 
 
-def _watch(over: threading.Event, watch: CallWatch, text: Callable[[], str], first: str) -> None:
+def _watch(over: threading.Event, watch: CallWatch | None, text: Callable[[], str], first: str) -> None:
     """Show what a thread does until it is over, and name a function of the model that does not return."""
     console = _console()
     with _shown(text, console, first):
         while not over.wait(0.5):
-            line = watch.look()
+            line = None if watch is None else watch.look()
             if line is not None:
                 console.print(line, highlight=False, soft_wrap=True)
 

@@ -21,6 +21,7 @@ from sources.tables.rows import names_of
 from sources.tables.times import TimeColumn
 
 from .advice.draft import write_draft
+from .advice.draft_fit import fit_plan
 from .advice.plan import OMITTED, SENSOR, STATE, DraftPlan, Roles, SignalRole, plan
 from .advice.signals import signal
 
@@ -189,6 +190,10 @@ def draft(
     found = inspect_recordings([path], buses, time)
     yield DraftStep("estimating noises, time constants and gains")
     drafted = plan(found, Roles(**{role: tuple(names) for role, names in roles.items()}))
+    for step in fit_plan(drafted):
+        if step.doing:
+            yield DraftStep(step.doing)
+        drafted = step.plan or drafted
     yield DraftStep("writing the twin")
     written = write_draft(drafted, found, name, path.parent, buses)
     yield DraftStep("", str(written.yaml_path), _summary(drafted))
@@ -196,7 +201,8 @@ def draft(
 
 def _summary(drafted: DraftPlan) -> str:
     sensors = sum(len(item.sensors) for item in drafted.states)
-    return f"{len(drafted.states)} states, {sensors} sensors, {len(drafted.inputs)} inputs"
+    counted = f"{len(drafted.states)} states, {sensors} sensors, {len(drafted.inputs)} inputs"
+    return counted if drafted.check is None else f"{counted}; {drafted.check.words}"
 
 
 def _of_table(path: Path, time: TimeColumn) -> Iterator[LogOverview]:

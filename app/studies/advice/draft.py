@@ -6,6 +6,7 @@ import json
 import math
 import os
 import re
+import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +19,7 @@ from estimators.errors import ConfigError
 from sources.can.readers import BusName
 from sources.inspect import RecordingContents
 
-from .plan import DraftPlan, Moves, Reads, Roles, plan
+from .plan import OMITTED, DraftCheck, DraftPlan, Moves, Reads
 from .signals import Signal
 
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]*")
@@ -38,12 +39,11 @@ class Draft:
         return self.yaml_path, self.python_path
 
 
-def draft_twin(
+def write_draft(
+    drafted: DraftPlan,
     found: RecordingContents,
     name: str,
     folder: Path,
-    roles: Roles | None = None,
-    *,
     databases: Sequence[tuple[Path, BusName]] = (),
 ) -> Draft:
     """Write NAME.yaml and NAME.py, a twin of a recording's signals that can be run as it stands.
@@ -52,27 +52,15 @@ def draft_twin(
     reason) for every signal of the recording. To change one, name it in `Roles`.
 
     Args:
+        drafted: The plan (`plan`), fitted (`draft_fit.fit_all`).
         found: Contents of the recording (`sources.inspect.inspect_recordings`).
         name: Letters, digits, _ and -, beginning with a letter.
         folder: An existing folder; the YAML names the recording relative to it where it lies within, else in full.
-        roles: Roles that the user gave; the draft finds those of other signals.
         databases: DBC files of a CAN log and the bus of each, as given to `inspect_recordings`.
 
     Raises:
-        ConfigError: If a role does not apply, or the files exist or cannot be written.
+        ConfigError: If the files exist or cannot be written.
     """
-    check_new(name, folder)
-    return write_draft(plan(found, roles or Roles()), found, name, folder, databases)
-
-
-def write_draft(
-    drafted: DraftPlan,
-    found: RecordingContents,
-    name: str,
-    folder: Path,
-    databases: Sequence[tuple[Path, BusName]] = (),
-) -> Draft:
-    """Write the two files of a plan; arguments as those of `draft_twin`."""
     check_new(name, folder)
     model = model_of(name)
     text = yaml_text(name, model, drafted, found, databases, folder)
@@ -119,6 +107,11 @@ def _number(value: float) -> str:
     text = f"{value:.3g}"
     mantissa, e, exponent = text.partition("e")
     return f"{mantissa if '.' in mantissa else mantissa + '.0'}e{exponent}" if e else text
+
+
+def rounded(value: float) -> float:
+    """Return a value as the draft's YAML has it."""
+    return float(f"{value:.3g}")
 
 
 def _text(value: str) -> str:
@@ -268,12 +261,24 @@ def yaml_text(
 ) -> str:
     """The twin's YAML, with the recording as its source."""
     files = [_text(_from(path, folder)) for path in found.files]
-    noise = [
-        f"  {item.second if item.smooth else item.name}: {{variance: {_number(item.q)}}}" for item in drafted.states
-    ]
+    noise, sensors = [], []
+    for item in drafted.states:
+        unit = item.signal.series.unit or "1"
+        over = f", over: {rounded(item.over):g} s" if item.over else ""
+        what = f"({unit})²/s" + ("³, of its speed" if item.smooth else "")
+        noise.append(
+            f"  {item.second if item.smooth else item.name}: {{variance: {_number(item.q)}{over}}}  # {_line(what)}"
+        )
+        for reads in item.sensors:
+            fields = f"std: {_number(math.sqrt(reads.r))}"
+            if reads.error is not None:
+                size, time = _number(rounded(reads.error[0])), rounded(reads.error[1])
+                fields += f", error: {{variance: {size}, over: {time:g} s}}"
+            fields += ", use: false" if reads.name in drafted.held_out else ""
+            what = "the rate of " if reads.rate else ""
+            unit = reads.signal.series.unit or "1"
+            sensors.append(f"  {reads.name}: {{{fields}}}  # {_line(unit)}; measures {what}{item.name}")
     read = [reads for item in drafted.states for reads in item.sensors]
-    unused = {name: ", use: false" for name in drafted.held_out}
-    sensors = [f"  {reads.name}: {{std: {_number(math.sqrt(reads.r))}{unused.get(reads.name, '')}}}" for reads in read]
     source = [f"  type: {found.kind}", "  files:", *(f"    - {file}" for file in files)]
     if found.kind == "can_log":
         source.append("  dbc:")
@@ -297,19 +302,18 @@ def yaml_text(
 # {name}: signals of a recording, each with its own motion. Change it, and {name}.py beside it, into your own twin.
 #
 # Source: {", ".join(path.name for path in found.files[:3])}{", ..." if len(found.files) > 3 else ""}
-# Expect: a start. The noise below was taken from the differences of the data, and is an average
-# where a signal rests and moves; nisus tune fits it, nisus advise checks it.
+{text(_comments(drafted))}
 # Run it: nisus run {name}.yaml      Score it: nisus fold {name}.yaml      Every key: nisus schema
 title: {_text(_title(drafted))}
 model: ./{name}.py:{model}       # file beside this one, and the name of the model in it
 
-noise:                           # model uncertainty, per second
+noise:  # model uncertainty, per second; over: how long a disturbance lasts
 {text(noise)}
 
-sensors:                         # sensor noise
+sensors:  # std: white noise, at least the resolution; error: noise with memory; use: false holds a sensor out
 {text(sensors)}
 
-estimator: kf                    # nisus filters --twin {name}.yaml lists those that fit
+{_estimator(drafted, name)}
 gate: null                       # null uses every measurement; 0.9999 rejects one good measurement in 10,000
 
 time:                            # the slowest sensor reports every {slowest:.3g} s
@@ -323,7 +327,76 @@ source:
 view:
   pairs: [{first or ""}]
   window: {max(120.0, 200.0 * slowest):.0f}                    # s that the charts show
+
+# Next: nisus run {name}.yaml
 """
+
+
+LINE_LENGTH = 112  # of comments in the YAML
+
+
+def _line(value: str) -> str:
+    """Return text of a recording as part of a comment."""
+    return " ".join(value.split())
+
+
+def _estimator(drafted: DraftPlan, name: str) -> str:
+    """Return the section of the filter."""
+    if not drafted.options:
+        return f"estimator: kf                    # nisus filters --twin {name}.yaml lists those that fit"
+    options = ", ".join(
+        f"{key}: {value if isinstance(value, str) else format(value, 'g')}" for key, value in drafted.options.items()
+    )
+    why = "# adapt: Q scales the model uncertainty with the activity of the asset"
+    return f"estimator: {{name: kf, options: {{{options}}}}}  {why}"
+
+
+def _comments(drafted: DraftPlan) -> list[str]:
+    """Return the states in words, the check and the omitted signals, as comments."""
+    lines = []
+    for item in drafted.states:
+        if item.lag is not None:
+            moves = f"follows {', '.join(item.inputs)} with a time constant of {item.lag.tau:.3g} s"
+        else:
+            moves = "has a speed that varies" if item.smooth else "is a random walk"
+        others = [reads.name for reads in item.sensors[1:]]
+        more = f"; also measured by {', '.join(others)}" if others else ""
+        lines.append(f"# State {item.name} {moves}{more}.")
+    if drafted.check is not None:
+        check = drafted.check
+        lines += [
+            f"# Fitted to the first {check.start:.4g} s by maximum likelihood. Predictions of the other "
+            f"{check.end - check.start:.4g} s:",
+            f"# {check.words}.",
+            *(f"#   {text}" for text in check_lines(check)),
+        ]
+    for line in omission_lines(drafted):
+        lines += [f"# {text}" for text in textwrap.wrap(line, LINE_LENGTH, subsequent_indent="  ")]
+    return lines
+
+
+def omission_lines(drafted: DraftPlan) -> list[str]:
+    """Return the omitted signals by the reason, a line each."""
+    reasons: dict[str, list[str]] = {}
+    for one in drafted.roles:
+        if one.role == OMITTED:
+            reasons.setdefault(one.reason, []).append(_line(one.signal.name))
+    return [f"Omitted {len(names)} ({reason}): {', '.join(names)}" for reason, names in reasons.items()]
+
+
+def check_lines(check: DraftCheck) -> list[str]:
+    """Return the coverage of each sensor in words."""
+    lines = []
+    for one in check.sensors:
+        if not one.n:
+            lines.append(f"{one.name}: no measurement in the second half")
+            continue
+        held_out = f", {100 * one.held_out:.1f} % when held out" if math.isfinite(one.held_out) else ""
+        lines.append(
+            f"{one.name}: {100 * one.coverage:.1f} % of {one.n:,} measurements in the 95 % band{held_out}, "
+            f"correlation of successive innovations {one.correlation.value:+.2f}"
+        )
+    return lines
 
 
 def _channel(name: str, one: Signal) -> str:

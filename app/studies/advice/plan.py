@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import keyword
 import re
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
 from typing import NamedTuple
 
+import numpy as np
+
+from estimators.diagnostics.intervals import Interval
 from estimators.errors import ConfigError, nearest
 from sources.inspect import RecordingContents
 
@@ -42,6 +45,11 @@ OMISSIONS = {
 }
 """Reasons by kind of signal for which it is omitted."""
 
+TAG = re.compile(r"(^|_)(id|tag|node|anchor|beacon|channel)s?$", re.IGNORECASE)
+"""Names of columns that name the source of a row."""
+
+MIN_ALTERNATION = 0.2  # share of the rows at which such a column changes, from which on the rows are of several sources
+
 STATE, SENSOR, INPUT, HELD_OUT, OMITTED = "state", "sensor", "input", "held out", "omitted"
 
 
@@ -56,7 +64,10 @@ class SignalRole(NamedTuple):
 
 @dataclass(frozen=True)
 class Reads:
-    """A sensor, `name` in the draft: offset + gain · state, or of its rate, with noise of variance `r`."""
+    """A sensor, `name` in the draft: offset + gain · state, or of its rate, with noise of variance `r`.
+
+    `error` is the variance and the correlation time, s, of a coloured error beside the white noise.
+    """
 
     name: str
     signal: Signal
@@ -64,6 +75,7 @@ class Reads:
     gain: float = 1.0
     offset: float = 0.0
     rate: bool = False
+    error: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True)
@@ -72,7 +84,8 @@ class Moves:
 
     `smooth`: with a speed of its own, which is a second state. With `lag` it follows inputs, whose names are `inputs`,
     and the speed is what they leave unexplained.
-    `q` is the variance that the noise adds in one second, to the speed if there is one.
+    `q` is the variance that the noise adds in one second, to the speed if there is one; `over` is its correlation time,
+    s, None for white noise.
     """
 
     name: str
@@ -82,6 +95,7 @@ class Moves:
     sensors: tuple[Reads, ...]
     lag: Driven | None = None
     inputs: tuple[str, ...] = ()
+    over: float | None = None
 
     @property
     def second(self) -> str:
@@ -89,11 +103,55 @@ class Moves:
         return f"{self.name}_{'rate' if self.lag is None else 'drift'}"
 
 
+MIN_COVERAGE, MAX_COVERAGE = 0.90, 0.98  # of the 95 % band of a consistent draft
+
+
+class SensorCheck(NamedTuple):
+    """Predictions of one sensor on the second half of the recording.
+
+    `coverage` is the share of the n measurements in the 95 % band of their prediction, `correlation` that of successive
+    innovations. `held_out` is the coverage of its predictions from all other sensors alone, NaN if none measures the
+    same state.
+    """
+
+    name: str
+    n: int
+    coverage: float
+    correlation: Interval
+    held_out: float
+
+
+class DraftCheck(NamedTuple):
+    """Check of a draft on data that took no part in the fit: from `start` to `end`, s after the first measurement.
+
+    `nis` is the mean NIS per degree of freedom; `low` and `high` bound 95 % of such means of a consistent filter, with
+    the correlation and the tails of these. `reason` says why it is not consistent; empty if it is.
+    """
+
+    start: float
+    end: float
+    nis: float
+    low: float
+    high: float
+    sensors: tuple[SensorCheck, ...]
+    reason: str
+
+    @property
+    def words(self) -> str:
+        """The verdict in one line."""
+        figures = f"NIS {self.nis:.2f} per degree of freedom, 95 % bounds {self.low:.2f} to {self.high:.2f}"
+        if not self.reason:
+            return f"consistent: {figures}"
+        wide = self.nis < self.low and all(one.coverage >= MIN_COVERAGE for one in self.sensors if one.n)
+        return f"{'conservative' if wide else 'not consistent'}: {figures}; {self.reason}"
+
+
 @dataclass(frozen=True)
 class DraftPlan:
     """A draft: its states, the inputs by their names, the pairs that were found among the signals, and these.
 
-    `roles` has every signal of the recording, omitted ones too.
+    `roles` has every signal of the recording, omitted ones too. `options` are those of the filter, and `check` is how
+    well it predicts the second half of the recording, once its noises were fitted to the first (draft_fit.py).
     """
 
     states: tuple[Moves, ...]
@@ -102,6 +160,8 @@ class DraftPlan:
     pairs: tuple[Pair, ...]
     roles: tuple[SignalRole, ...] = ()
     held_out: frozenset[str] = frozenset()
+    options: Mapping[str, str | float] = field(default_factory=dict)
+    check: DraftCheck | None = None
 
 
 def plan(found: RecordingContents, roles: Roles) -> DraftPlan:
@@ -130,18 +190,22 @@ def plan(found: RecordingContents, roles: Roles) -> DraftPlan:
     told = pairs(picked)
     taken: set[str] = set()
     names = [_identifier(one.name, taken) for one in picked]
-    # Of signals that say the same the first one is the state.
+    # Of sensors of one quantity the first one is the state.
     leads = {k: k for k in range(len(picked)) if k not in inputs}
-    for pair in (pair for pair in told if pair.one and pair.first in leads and pair.second in leads):
-        if pair.second not in own and leads[pair.second] == pair.second and leads[pair.first] == pair.first:
-            leads[pair.second] = pair.first
-    heads = [k for k in leads if leads[k] == k and not any(pair.first == k and pair.rate for pair in told)]
-    lags = _lags(picked, heads, sorted(inputs) or [k for k in heads if k not in sensors])
+    one_state = [pair for pair in told if pair.one or redundant(pair, picked)]
+    for pair in one_state:
+        first, second = pair.first, pair.second
+        alone = second not in own and list(leads.values()).count(second) == 1
+        if alone and leads.get(first) == first and leads.get(second) == second:
+            leads[second] = first
+    groups = {k: [other for other in leads if leads[other] == k and other != k] for k in leads if leads[k] == k}
+    heads = [k for k in groups if not any(pair.first == k and pair.rate for pair in told)]
+    lags = _lags(picked, heads, sorted(inputs) or [k for k in heads if k not in sensors and not groups[k]])
     used = sorted({k for lag in lags.values() for k in lag.drivers} | inputs)
     states = []
-    for k in range(len(picked)):
-        if leads.get(k) == k and k not in used:
-            others = [pair for pair in told if pair.one and leads.get(pair.second) == k and pair.first == k]
+    for k in groups:
+        if k not in used:
+            others = [pair for pair in one_state if pair.first == k and pair.second in groups[k]]
             states.append(_moves(k, picked, names, others, lags.get(k)))
     held_out = frozenset(names[k] for k, (_, role) in enumerate(places) if role == HELD_OUT)
     for item in states:
@@ -150,9 +214,25 @@ def plan(found: RecordingContents, roles: Roles) -> DraftPlan:
                 f"--hold-out {item.signal.name}: nothing predicts it, as no sensor in use measures the same "
                 f"quantity and no input drives it; hold out a redundant sensor, or give its inputs with --inputs"
             )
-    found_roles = [_role(one, picked, names, states, used, held_out) for one in every]
+    rest = "has no role" if not free else f"not among the {MAX_SIGNALS} signals with most different values"
+    found_roles = [_role(one, picked, names, states, used, held_out, rest) for one in every]
     driving = tuple((names[k], picked[k]) for k in used)
     return DraftPlan(tuple(states), driving, tuple(picked), tuple(told), tuple(found_roles), held_out)
+
+
+REDUNDANT_GAIN = 0.05  # by how much the scales of two sensors of one quantity may differ
+REDUNDANT_EXPLAINED = 0.995  # share of the variance that the one explains of the other
+
+
+def redundant(pair: Pair, picked: Sequence[Signal]) -> bool:
+    """Return whether two signals are the same quantity up to a small bias, scale and noise, which may be coloured.
+
+    The speeds of two wheels are: in a curve they differ for seconds, so their difference is no white noise.
+    """
+    same_unit = picked[pair.first].series.unit == picked[pair.second].series.unit
+    alike = abs(pair.gain - 1.0) <= REDUNDANT_GAIN and pair.explained >= REDUNDANT_EXPLAINED
+    interval = max(1.0 / picked[k].rate for k in (pair.first, pair.second))
+    return same_unit and alike and not pair.rate and abs(pair.lag) <= 1.5 * interval
 
 
 def _role(
@@ -162,13 +242,17 @@ def _role(
     states: Sequence[Moves],
     used: Sequence[int],
     held_out: frozenset[str],
+    rest: str,
 ) -> SignalRole:
-    """Return the role of a signal, and why it has it."""
+    """Return the role of a signal, and why it has it; `rest` is why signals that vary were not picked."""
     k = next((k for k, other in enumerate(picked) if other is one), None)
     if k is None:
-        return SignalRole(
-            one, OMITTED, "", OMISSIONS.get(one.kind, f"not named, or not among the {MAX_SIGNALS} finest")
-        )
+        reason = OMISSIONS.get(one.kind, rest)
+        if one.kind == "switch" and TAG.search(one.name) and np.mean(np.diff(one.series.values) != 0) > MIN_ALTERNATION:
+            reason += (
+                f"; it alternates, so the columns beside it mix sources: give each its own file or `only: {one.name}`"
+            )
+        return SignalRole(one, OMITTED, "", reason)
     name = names[k]
     if k in used:
         driven_by = [item.name for item in states if name in item.inputs]
@@ -230,12 +314,12 @@ def _moves(k: int, picked: Sequence[Signal], names: Sequence[str], others: Seque
         smooth, q = True, walk_of(picked[rated[0].second].series) * rated[0].gain ** 2
         r = max(one.noise, one.resolution / 12.0**0.5) ** 2
     own = Reads(names[k], one, r)
-    more = tuple(_reads(names[pair.second], one, picked[pair.second], pair) for pair in others)
+    more = tuple(reads_of(names[pair.second], one, picked[pair.second], pair) for pair in others)
     inputs = tuple(names[j] for j in lag.drivers) if lag is not None else ()
     return Moves(names[k], one, smooth, q, (own, *more), lag, inputs)
 
 
-def _reads(name: str, lead: Signal, one: Signal, pair: Pair) -> Reads:
+def reads_of(name: str, lead: Signal, one: Signal, pair: Pair) -> Reads:
     """Another sensor of the same state, or of its rate."""
     if pair.rate:
         r = max(noise_of(one.series)[2], one.resolution**2 / 12.0)

@@ -13,7 +13,9 @@ from sources.inspect import SignalSeries
 from .signals import Signal, common
 
 TRIED_TIME_CONSTANTS = 24
-"""Time constants that are tried, from one interval to the length of the log, evenly by their logarithm."""
+"""Time constants that are tried, from one interval to a third of the recording, evenly by their logarithm."""
+
+MAX_TIME_SHARE = 1.0 / 3.0  # of the length of the recording: of a longer lag it does not show the end
 
 MAX_DRIVERS = 4  # drivers of a signal
 ERROR_FACTOR = 0.8  # factor by which more drivers must lower the error on the second half to be worth it
@@ -71,7 +73,7 @@ def driven(found: Sequence[Signal], target: int, candidates: Sequence[int]) -> D
 
     fine = minimize_scalar(
         lambda log_tau: _lag(t, y, own, half, float(np.exp(log_tau)))[0],
-        bounds=np.log([best.tau / 3.0, best.tau * 3.0]),
+        bounds=np.log([best.tau / 3.0, min(best.tau * 3.0, MAX_TIME_SHARE * float(t[-1] - t[0]))]),
         method="bounded",
     )
     tau = float(np.exp(fine.x))
@@ -107,7 +109,7 @@ def _held(values: np.ndarray) -> np.ndarray:
 def _fitted(t: np.ndarray, y: np.ndarray, u: np.ndarray, half: int) -> tuple[float, float, np.ndarray]:
     """Mean square error on the second half, time constant, and weights: offset, start, gains."""
     step = float(t[1] - t[0])
-    times = np.geomspace(step, max(2.0 * step, t[-1] - t[0]), TRIED_TIME_CONSTANTS).tolist()
+    times = np.geomspace(step, max(2.0 * step, MAX_TIME_SHARE * (t[-1] - t[0])), TRIED_TIME_CONSTANTS).tolist()
     tried = [(*_lag(t, y, u, half, tau), tau) for tau in times]
     # The first half alone chooses the time constant.
     _, error, weights, tau = min(tried, key=lambda entry: entry[0])

@@ -128,13 +128,14 @@ MIN_STANDARD_ERRORS = 3.0
 WALK_INTERVALS = 20  # intervals over which a slow walk is looked for
 
 
-def noise_of(series: SignalSeries) -> tuple[bool, float, float]:
+def noise_of(series: SignalSeries, smooth: bool | None = None) -> tuple[bool, float, float]:
     """Whether a signal moves smoothly, its process noise in one second, and the variance of its readings.
 
     Of a random walk with noisy readings, y = x + v, the differences d have E d² = q dt + 2 r and E d_k d_(k+1) = -r. Of
     one whose speed is a random walk, the second differences e have E e² = ⅔ q dt³ + 6 r and
     E e_k e_(k+1) = q dt³/6 - 4 r. It moves smoothly if its differences follow one another, with a correlation above ½,
-    which noise alone makes negative. A variance r is at least that of the resolution, step²/12.
+    which noise alone makes negative; `smooth` decides that in advance. A variance r is at least that of the
+    resolution, step²/12.
 
     Source: the covariances of the differences, from the definitions; e is the integral of the noise of the speed
     with a triangle of width 2 dt and height dt.
@@ -148,7 +149,7 @@ def noise_of(series: SignalSeries) -> tuple[bool, float, float]:
     power = float(np.mean(d[steady] ** 2)) if steady.size else float(np.mean(d**2))
     follow = float(np.mean(d[both] * d[both + 1])) if both.size else 0.0
     power = max(power, floor)
-    if follow <= 0.5 * power:
+    if not (follow > 0.5 * power if smooth is None else smooth):
         r = max(min(-follow, 0.5 * power), floor)
         q = max(power - 2 * r, 0.01 * power) / dt
         if q * dt < MIN_STANDARD_ERRORS * power * np.sqrt(8.0 / max(1, both.size)):

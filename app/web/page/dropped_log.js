@@ -390,7 +390,7 @@ export class LogView {
     this.progress = element("p", { role: "status", class: "faint" });
     this.wrong = element("p", { class: "error", role: "alert" });
     return element("section", { class: "draft", "aria-label": "Draft a twin" }, head,
-      element("p", { class: "faint" }, "A model of generic motions with noises estimated from the data. The role of each signal is proposed; change it beside its chart."),
+      element("p", { class: "faint" }, "A model of generic motions, fitted to the first half of the log and checked on the second. The role of each signal is proposed; change it beside its chart."),
       this.chosen,
       element("label", {}, "Name ", this.twin),
       element("div", { class: "row" }, this.start, this.stop, this.progress), this.wrong);
@@ -458,7 +458,13 @@ export class LogView {
     this.stop.hidden = !this.drafts;
     this.start.disabled = this.drafts;
     if (answer.state === "done") this.ask.follow();
-    if (this.drafts) setTimeout(async () => this.name && this.follow(await (await fetch("/api/gallery/log/draft")).json()), POLL_MS);
+    if (this.drafts) setTimeout(() => this.name && this.progressed(answer), POLL_MS);
+  }
+
+  // The next answer; while the session cannot be reached, the last one.
+  async progressed(last) {
+    const found = await fetch("/api/gallery/log/draft").then((response) => response.json()).catch(() => last);
+    if (this.name) this.follow(found);
   }
 }
 

@@ -24,6 +24,9 @@ from tests.sources.can.can_tools import dbc
 
 pytestmark = pytest.mark.browser
 
+DRAFT_PATIENCE = 600.0
+"""Seconds for a draft: hundreds of folds, where a page takes one."""
+
 BY_ASAMMDF = """
 import json, sys, asammdf, numpy
 file = asammdf.MDF(sys.argv[1])
@@ -94,6 +97,9 @@ def drafted(page, session, name):
     page.get_by_label("Name of the twin").fill(name)
     page.get_by_role("button", name="Draft and run").click()
     page.locator(".draft .row").get_by_text("…").first.wait_for()
+    progress = "/api/gallery/log/draft"
+    wait_for(lambda: session.get(progress)["state"] != "running", DRAFT_PATIENCE)
+    assert session.get(progress)["error"] is None and "95 % bounds" in session.get(progress)["summary"]
     until(page, f"window.nisus?.model?.twin === '{name}' && window.nisus.drawn > 0")
     wait_for(lambda: session.engine.status().finished, PATIENCE)
     return pull_all(session.engine)

@@ -1,0 +1,224 @@
+"""Check of a fitted draft on the second half of its recording: NIS, coverage of each sensor, cause and remedy."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from estimators.diagnostics.intervals import correlation_interval, scale_interval, share_interval
+from estimators.fold import Fold
+from estimators.log import READING, Log
+from estimators.model.coloured import ColouredError, coloured
+from estimators.model.state_space import StateSpaceModel
+from estimators.model.user_file import run_file
+from estimators.registry import find_entry
+from estimators.track import USED
+from estimators.tuning import Tuning
+
+from .draft import python_text, rounded
+from .plan import MAX_COVERAGE, MIN_COVERAGE, DraftCheck, DraftPlan, Moves, Reads, SensorCheck
+from .signals import Signal
+
+BAND_SIGMA = 1.959963984540054  # half width of the 95 % band
+MAX_NIS_FACTOR = 1.5625  # by which a mean NIS may differ from 1: bands a quarter too narrow or too wide
+MIN_CHECKED = 60  # measurements that a check takes
+MAX_CORRELATION = 0.2  # of successive innovations, as in the claims of `nisus advise`
+MAX_FLOOR_FACTOR = 1.1  # of the variance of a resolution, up to which a noise is that resolution alone
+FAR_SIGMA, MAX_FAR_SHARE = 4.0, 0.01  # innovations that are jumps, and their share from which on these are the cause
+
+
+def with_options(tuning: Tuning, options: Mapping[str, str | float]) -> Tuning:
+    """Return a tuning with options of the Kalman filter by name."""
+    if not options:
+        return tuning
+    complete = find_entry("kf").complete(options)
+    return tuning.with_options({key: complete[key] for key in options})
+
+
+def middle_of(drafted: DraftPlan) -> int:
+    """Return the time, ns, before which half of all readings of the sensors lie."""
+    times = [reads.signal.series.t for item in drafted.states for reads in item.sensors]
+    return int(np.median(np.concatenate(times)))
+
+
+def log_of(
+    model: StateSpaceModel,
+    sensors: Iterable[Reads],
+    inputs: Sequence[tuple[str, Signal]],
+    begin: int,
+    end: int,
+    zero: int,
+) -> Log:
+    """Return the readings of sensors and the inputs between two times, ns; seconds count from `zero`."""
+    log = Log.of(model, start=(begin - zero) * 1e-9)
+    for name, one in inputs:
+        t = one.series.t
+        # The value that holds at the begin is an event of the window as well.
+        first = max(0, int(np.searchsorted(t, begin, side="right")) - 1)
+        part = slice(first, int(np.searchsorted(t, end)))
+        log.add_inputs(np.maximum(t[part] - zero, begin - zero) * 1e-9, **{name: one.series.values[part]})
+    for reads in sensors:
+        t = reads.signal.series.t
+        part = slice(*np.searchsorted(t, (begin, end)))
+        if part.stop > part.start:
+            log.add(reads.name, (t[part] - zero) * 1e-9, reads.signal.series.values[part])
+    return log
+
+
+def model_with(
+    states: Sequence[Moves], inputs: Sequence[tuple[str, Signal]], folder: Path, name: str
+) -> StateSpaceModel:
+    """Return the model of some states, as the draft's Python file has it, which is written to `folder`."""
+    drafted = DraftPlan(tuple(states), tuple(inputs), tuple(item.signal for item in states), ())
+    path = folder / f"{name}.py"
+    path.write_text(python_text(path.stem, "DraftState", drafted), encoding="utf-8")
+    model: StateSpaceModel = run_file(path.stem, path).DraftState
+    return model
+
+
+class DraftFold:
+    """Fold of a whole draft, as its YAML has it, over its recording, or over the first half alone."""
+
+    def __init__(self, drafted: DraftPlan, model: StateSpaceModel, middle: int, *, first_half: bool = False) -> None:
+        self.drafted = drafted
+        self._sensors = [reads for item in drafted.states for reads in item.sensors]
+        zero = min(int(reads.signal.series.t[0]) for reads in self._sensors)
+        self._middle = middle - zero
+        noises = {item.second if item.smooth else item.name: rounded(item.over) for item in drafted.states if item.over}
+        errors = {
+            reads.name: ColouredError((rounded(reads.error[0]),), rounded(reads.error[1]))
+            for reads in self._sensors
+            if reads.error
+        }
+        larger = coloured(model, noises, errors)
+        used = np.array([name not in drafted.held_out for name in larger.sensor_names])
+        self._tuning = replace(with_options(Tuning.of(larger), drafted.options), used=used)
+        end = middle if first_half else np.iinfo(np.int64).max
+        self._log = log_of(larger, self._sensors, drafted.inputs, zero, end, zero)
+        self._fold = self._folded(self._tuning)
+
+    @property
+    def log_likelihood(self) -> float:
+        """Log-likelihood of the measurements."""
+        return float(np.nansum(self._fold.track.log_likelihood))
+
+    @property
+    def memory(self) -> float:
+        """Measurements over which the noise adapts; infinite if it does not."""
+        return float(self.drafted.options.get("memory", np.inf))
+
+    def _folded(self, tuning: Tuning) -> Fold:
+        fold = Fold("kf", tuning.model, tuning, self._log.copy())
+        fold.advance()
+        if fold.failure is not None:
+            raise fold.failure
+        return fold
+
+    def _innovations(self, fold: Fold, k: int, *, late: bool = True) -> np.ndarray:
+        """Return the innovations of sensor k on the second half, or the first, in σ."""
+        log = self._log
+        rows = (log.kind[: log.n] == READING) & (log.channel[: log.n] == k)
+        rows &= (log.t[: log.n] >= self._middle) == late
+        with np.errstate(all="ignore"):
+            e: np.ndarray = fold.track.innovation[rows, 0] / fold.track.innovation_std[rows, 0]
+        return e[np.isfinite(e)]
+
+    def check(self, span: float) -> DraftCheck:
+        """Return the check on the second half; `span` is the length of the recording, s."""
+        found, late, alone, ratios = [], {}, {}, {}
+        for k, reads in enumerate(self._sensors):
+            e = late[reads.name] = self._innovations(self._fold, k)
+            before = self._innovations(self._fold, k, late=False)
+            ratios[reads.name] = _power(e) / max(_power(before), 1e-300)
+            item = next(item for item in self.drafted.states if reads in item.sensors)
+            others = [one for one in item.sensors if one.name not in self.drafted.held_out and one is not reads]
+            if reads.name in self.drafted.held_out:
+                alone[reads.name] = e
+            elif others and not reads.rate and not all(one.rate for one in others):
+                without = replace(self._tuning, used=self._tuning.used & (np.arange(len(self._sensors)) != k))
+                alone[reads.name] = self._innovations(self._folded(without), k)
+            held_out = _coverage(alone.get(reads.name, e[:0]))
+            found.append(SensorCheck(reads.name, e.size, _coverage(e), correlation_interval(e), held_out))
+        rows = self._fold.track.verdict == USED
+        nis, times = self._fold.track.nis[rows] / self._fold.track.dof[rows], self._log.t[: self._log.n][rows]
+        interval = scale_interval(nis[times >= self._middle])
+        fitted = scale_interval(nis[times < self._middle])
+        # The noises were fitted to the first half, so a ratio of two means deviates. An interval that allows for
+        # anything is no bound.
+        with np.errstate(all="ignore"):
+            half = float(np.hypot(np.log(interval.high / interval.value), np.log(fitted.high / fitted.value)))
+        factor = min(float(np.exp(half)), MAX_NIS_FACTOR) if half > 0.0 else np.nan
+        reason = _reason(interval.value, factor, self._sensors, found, late, alone, ratios)
+        return DraftCheck(self._middle * 1e-9, span, interval.value, 1.0 / factor, factor, tuple(found), reason)
+
+
+def _coverage(e: np.ndarray) -> float:
+    return float(np.mean(np.abs(e) <= BAND_SIGMA)) if e.size else np.nan
+
+
+def _power(e: np.ndarray) -> float:
+    return float(np.mean(e**2)) if e.size else np.nan
+
+
+def _reason(
+    nis: float,
+    factor: float,
+    sensors: Sequence[Reads],
+    checks: Sequence[SensorCheck],
+    late: Mapping[str, np.ndarray],
+    alone: Mapping[str, np.ndarray],
+    ratios: Mapping[str, float],
+) -> str:
+    """Return why a draft is not consistent, and the next step; empty if it is.
+
+    Args:
+        nis: Mean NIS per degree of freedom.
+        factor: Factor by which it may differ from 1.
+        sensors: Sensors.
+        checks: Their checks.
+        late: Their innovations on the second half, σ.
+        alone: The same of those that were held out.
+        ratios: Power of these over that on the first half.
+    """
+    known = [one for one in checks if one.n]
+    if sum(one.n for one in known) < MIN_CHECKED or not np.isfinite(factor):
+        return f"the second half has fewer than {MIN_CHECKED} measurements; record a longer log"
+    shares = {one.name: share_interval(np.abs(late[one.name]) <= BAND_SIGMA, late[one.name]) for one in known}
+    narrow, wide = min(known, key=lambda one: one.coverage), max(known, key=lambda one: -_power(late[one.name]))
+    if nis > factor or shares[narrow.name].high < MIN_COVERAGE:
+        far = {one.name: float(np.mean(np.abs(late[one.name]) > FAR_SIGMA)) for one in known}
+        worst = max(far, key=lambda name: far[name])
+        if ratios[narrow.name] > MAX_NIS_FACTOR:
+            return f"{narrow.name} moves more in the second half than in the first; fit all of the log with nisus tune"
+        if far[worst] > MAX_FAR_SHARE:
+            return (
+                f"{100 * far[worst]:.1f} % of the innovations of {worst} exceed {FAR_SIGMA:g} σ, so it jumps; give the "
+                f"cause with --inputs, or omit {worst}"
+            )
+        if narrow.correlation.low > MAX_CORRELATION:
+            return (
+                f"successive innovations of {narrow.name} are correlated ({narrow.correlation.value:+.2f}), so a cause "
+                f"of its motion is missing; name it with --inputs"
+            )
+        return f"the noise of {narrow.name} varies; nisus advise with the YAML recommends a filter"
+    if nis < 1.0 / factor or any(one.low > MAX_COVERAGE for one in shares.values()):
+        reads = next(one for one in sensors if one.name == wide.name)
+        if reads.r <= MAX_FLOOR_FACTOR * reads.signal.resolution**2 / 12.0:
+            return (
+                f"{wide.name} varies less than its resolution of {reads.signal.resolution:.3g} "
+                f"{reads.signal.series.unit or 'units'}, so its bands are wider than needed; they are valid"
+            )
+        if ratios[wide.name] * MAX_NIS_FACTOR < 1.0:
+            return f"{wide.name} moves less in the second half than in the first; fit all of the log with nisus tune"
+        return f"the noise of {wide.name} varies; nisus advise with the YAML recommends a filter"
+    for name, e in alone.items():
+        share = share_interval(np.abs(e) <= BAND_SIGMA, e)
+        if share.high < MIN_COVERAGE:
+            return (
+                f"predicted from the other sensors alone, {100 * share.value:.1f} % of {name} is in the 95 % band, so "
+                f"its scale or offset changes; omit it"
+            )
+    return ""

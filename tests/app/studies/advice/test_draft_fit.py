@@ -1,0 +1,101 @@
+"""A draft is fitted to the first half of a recording; its check is what a fold of its YAML gives on the second half."""
+
+import numpy as np
+import pytest
+
+from app.studies.advice.draft_fit import fit_all
+from app.studies.advice.plan import OMITTED, Roles, plan
+from app.studies.advice.relations import driven
+from app.studies.advice.signals import signal
+from app.twin.log_reader import read_log
+from app.twin.twin import load_twin
+from estimators.fit.objective import FitProgress
+from estimators.fold import Fold
+from estimators.log import READING
+from sources.inspect import SignalSeries, inspect_recordings
+
+N = 3000
+"""Rows, one a second. Of the 1,500 in the second half a share of 95 % has a standard deviation of 0.6 %."""
+
+
+def write(path, **columns):
+    table = {"t": np.arange(N) * 1.0, **columns}
+    np.savetxt(path, np.column_stack(list(table.values())), delimiter=",", header=",".join(table), comments="")
+    return path
+
+
+def second_half(twin, log):
+    """Return the innovations in σ of each sensor from the median time of measurements on, by a fold of the YAML."""
+    fold = Fold(twin.estimator, twin.model, twin.tuning, log)
+    fold.advance()
+    rows = log.kind[: log.n] == READING
+    late = log.t[: log.n] >= np.median(log.t[: log.n][rows])
+    e = fold.track.innovation[:, 0] / fold.track.innovation_std[:, 0]
+    return {name: e[rows & late & (log.channel[: log.n] == k)] for k, name in enumerate(twin.model.sensor_names)}
+
+
+def test_three_wheels_are_sensors_of_one_speed_and_the_check_is_a_fold_of_the_yaml(tmp_path, nisus):
+    rng = np.random.default_rng(7)
+    speed = 60.0 + np.cumsum(rng.normal(0, 0.4, N))
+    wheels = {f"wheel_{k}": gain * speed + rng.normal(0, 0.2, N) for k, gain in enumerate((1.0, 1.01, 0.995))}
+    log = write(tmp_path / "drive.csv", **wheels, pressure=np.full(N, 2.5), gear=np.arange(N) // 500 % 3)
+    told = nisus("new", "drive", "--folder", str(tmp_path), "--log", str(log), "--json").json
+    assert [one["role"] for one in told["roles"]] == ["sensor", "sensor", "sensor", "omitted", "omitted"]
+    text = (tmp_path / "drive.yaml").read_text()
+    assert "# Omitted 1 (constant): pressure" in text and "few different values): gear" in text
+    check = told["check"]
+    assert check["consistent"] and check["low"] < check["nis"] < check["high"]
+    twin = load_twin(tmp_path / "drive.yaml")
+    late = second_half(twin, read_log(twin, None)[0])
+    # The YAML has three digits of each standard deviation: half a per cent of a NIS.
+    assert check["nis"] == pytest.approx(np.mean([np.mean(e**2) for e in late.values()]), rel=0.02)
+    for one in check["sensors"]:
+        assert one["n"] == late[one["name"]].size == N // 2
+        assert one["coverage"] == pytest.approx(np.mean(np.abs(late[one["name"]]) <= 1.96), abs=0.003)
+        assert 0.93 < one["coverage"] < 0.97
+        without = load_twin(tmp_path / "drive.yaml", overrides={f"sensors.{one['name']}.use": "false"})
+        e = second_half(without, read_log(without, None)[0])[one["name"]]
+        assert one["held_out"] == pytest.approx(np.mean(np.abs(e) <= 1.96), abs=0.003)
+        assert 0.90 < one["held_out"] < 0.98
+
+
+def test_a_sensor_that_worsens_in_the_second_half_is_named_with_the_next_step(tmp_path):
+    rng = np.random.default_rng(8)
+    noise = np.where(np.arange(N) < N // 2, 0.3, 3.0)
+    level = np.cumsum(rng.normal(0, 0.05, N)) + noise * rng.normal(0, 1, N)
+    found = inspect_recordings([write(tmp_path / "tank.csv", level=level)])
+    check = fit_all(plan(found, Roles())).check
+    assert "level moves more in the second half than in the first; fit all of the log with nisus tune" == check.reason
+    assert check.sensors[0].coverage < 0.9 and check.words.startswith("not consistent")
+
+
+def test_a_fit_that_is_stopped_keeps_the_draft_and_checks_it(tmp_path):
+    rng = np.random.default_rng(9)
+    found = inspect_recordings([write(tmp_path / "tank.csv", level=np.cumsum(rng.normal(0, 1, N)))])
+    begun = plan(found, Roles())
+    progress = FitProgress(stop=True)
+    stopped = fit_all(begun, progress=progress)
+    assert [item.q for item in stopped.states] == [item.q for item in begun.states]
+    assert progress.folds == 1 and stopped.check.sensors[0].n == N // 2
+
+
+def test_every_signal_of_a_recording_has_a_role_or_a_reason(tmp_path):
+    rng = np.random.default_rng(10)
+    walks = {f"x{k}": np.cumsum(rng.normal(0, 1, N)) for k in range(8)}
+    found = inspect_recordings([write(tmp_path / "many.csv", **walks, counter=np.arange(N))])
+    roles = plan(found, Roles()).roles
+    assert [one.signal.name for one in roles] == [*walks, "counter"]
+    omitted = {one.signal.name: one.reason for one in roles if one.role == OMITTED}
+    assert len(omitted) == 3 and omitted.pop("counter") == "time, counter or status by its name"
+    assert set(omitted.values()) == {"not among the 6 signals with most different values"}
+
+
+def test_no_time_constant_is_beyond_the_recording():
+    """A tank that warms with 3,590 s is recorded for 1,147 s: the recording does not show where it ends."""
+    t = np.arange(1147)
+    rng = np.random.default_rng(11)
+    heater = np.where(t < 50, 0.0, 1.0) + rng.normal(0, 0.01, t.size)
+    tank = 20.0 + 60.0 * (1.0 - np.exp(-np.maximum(t - 50, 0) / 3590.0)) + rng.normal(0, 0.02, t.size)
+    found = [signal(None, SignalSeries(name, "", t * 10**9, x)) for name, x in (("tank", tank), ("heater", heater))]
+    lag = driven(found, 0, [1])
+    assert lag is None or lag.tau <= 1147 / 3
