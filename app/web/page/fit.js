@@ -372,7 +372,9 @@ export class Advice {
   // Readings of sensors in known faults: no finding rests on them.
   excluded({ excluded }) {
     if (!excluded.length) return null;
-    return element("article", { class: "excluded" }, element("h3", {}, "Excluded: faults of sensors"), element("ul", {}, ...excluded.map((item) => element("li", {}, item.text))));
+    const at = (seconds) => clock(seconds - Number(this.link.status.origin ?? 0) / 1e9);
+    const text = (item) => `${words(item.row)}, ${at(item.start)} to ${at(item.end)}: ${item.cause} (${item.readings.toLocaleString("en")} readings)`;
+    return element("article", { class: "excluded" }, element("h3", {}, "Excluded: faults of sensors"), element("ul", {}, ...excluded.map((item) => element("li", { title: item.text }, text(item)))));
   }
 
   claim(claim, because) {
