@@ -16,7 +16,7 @@ if (new URLSearchParams(location.search).has("darkMode")) {
 
 {
   const SCENE = 5; // drawings in one picture, at least: an empty scene has up to four
-  const AFTER = 500; // ms, in which pictures, labels and the ground come
+  const AFTER = 500; // ms without one more drawing in a picture: labels and the ground come one by one
   const LONGEST = 4000; // ms, after which an empty scene is shown; a canvas without any drawing is black
   const UNDRAWN = 20000; // ms, after which it is shown whatever there is
   const hidden = document.createElement("style");
@@ -30,16 +30,21 @@ if (new URLSearchParams(location.search).has("darkMode")) {
     hidden.remove();
     Object.assign(drawing, given);
   };
-  let [drawn, ever, late] = [0, false, false];
-  setTimeout(() => ((late = true), ever && shown()), LONGEST);
+  let [drawn, most, late, settled] = [0, 0, false, null];
+  setTimeout(() => {
+    late = true;
+    if (most > 0 && most < SCENE) shown();
+  }, LONGEST);
   setTimeout(shown, UNDRAWN);
   for (const [name, draw] of Object.entries(given))
     drawing[name] = function (...place) {
       if (drawn === 0) requestAnimationFrame(() => (drawn = 0));
       drawn += 1;
-      if (late && !ever) setTimeout(shown, AFTER);
-      ever = true;
-      if (drawn === SCENE) setTimeout(shown, AFTER);
+      if (drawn > most) {
+        most = drawn;
+        clearTimeout(settled);
+        if (late || most >= SCENE) settled = setTimeout(shown, AFTER);
+      }
       return draw.apply(this, place);
     };
 }
