@@ -198,8 +198,10 @@ export class Chart {
     const { left, idx } = self.cursor;
     const { x } = this.data;
     const here = this.moment === null || this.moment === undefined ? x.length - 1 : within(x, [-Infinity, this.moment])[1];
-    const at = left >= 0 && idx !== null && idx !== undefined ? idx : here;
-    setText(this.reading, at < 0 ? "" : this.what.says((name) => this.at(name, at)));
+    const hovered = left >= 0 && idx !== null && idx !== undefined;
+    const at = hovered ? idx : here;
+    const text = hovered ? null : (this.exact?.() ?? null);
+    setText(this.reading, text ?? (at < 0 ? "" : this.what.says((name) => this.at(name, at))));
     setAttribute(self.over, "title", this.notesAt(left).map((note) => `${clock(note.from, 1)} ${note.text}`).join("\n") || null);
   }
 
@@ -209,8 +211,8 @@ export class Chart {
   }
 
   // The value of a column there, or the last one before it.
-  at(name, index) {
-    const values = this.data[name];
+  at(name, index, data = this.data) {
+    const values = data[name];
     for (let k = index; k >= Math.max(0, index - 256); k--) if (typeof values?.[k] === "number") return values[k];
     return NaN;
   }

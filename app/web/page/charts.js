@@ -9,6 +9,9 @@ const DENSITY = 1.6; // px to a group of rows
 const REDRAW_AFTER_MS = 500; // ms without a frame
 const MAX_HALVINGS = 4; // of the window, while there is less than that to show
 const LEGEND_DELAY_MS = 400; // ms after a drawing
+const MOMENT_GROUPS = 4; // groups of rows in which the row of a moment is looked for
+const MOMENT_POINTS = 4000;
+const EQUAL_S = 1e-6; // s
 
 // Marks in the order of the legend: text, where the charts differ, and tooltip.
 const LEGEND = {
@@ -50,10 +53,15 @@ export class Charts {
     this.layers = [];
     this.charts = declared(kinds, this).map((what) => new Chart(what, actions));
     node.replaceChildren(...this.charts.map((chart) => chart.node));
-    for (const chart of this.charts) {
+    // Charts draw both extremes of a group of rows; the values of a moment are those of its row.
+    this.moment = new Stream(link, "moment");
+    const strong = { choose() {}, stream: this.moment, edges: () => [[], []] };
+    const exact = declared(kinds, Object.create(this, { live: { value: this.moment }, strong: { value: strong } }));
+    this.charts.forEach((chart, k) => {
       chart.span = this.range;
       chart.begin();
-    }
+      chart.exact = () => this.exactly(chart, exact[k]);
+    });
     this.axis = new TimeAxis($("axis"));
     this.pins = new Pins(this, link, actions);
     this.smoothed = new Smoothed(this, link);
@@ -110,8 +118,21 @@ export class Charts {
       this.live.ask(place && { ...place, columns });
       for (const layer of [...this.layers, this.strong]) layer.ask(place);
     }
+    const { at } = this.view;
+    this.reach = (MOMENT_GROUPS * (this.range[1] - this.range[0])) / points;
+    this.moment.ask(place && at !== null ? { since: at - this.reach, until: at + EQUAL_S, points: MOMENT_POINTS, columns } : null);
     // What is there already is drawn until the new points come; of the same stretch another moment may be looked at.
     if (!this.visible || !this.view.following) this.draw();
+  }
+
+  // The text of a chart at the moment that is looked at, or null while its row is not there.
+  exactly(chart, what) {
+    const { at } = this.view;
+    const { x } = this.moment;
+    const row = at === null ? -1 : x.findLastIndex((time) => time <= at + EQUAL_S);
+    if (row < 0 || x[row] < at - this.reach) return null;
+    const data = what.data();
+    return what.says((name) => chart.at(name, row, data));
   }
 
   update(status) {

@@ -176,3 +176,24 @@ def test_strip_and_scene_show_the_moment_of_the_cursor(visit, page, session):
     assert not page.locator("#follow").is_visible()
     page.locator("body").press("f")
     shows(page, engine.status(), "")
+
+
+@pytest.mark.parametrize("width", [390, 1440])
+def test_charts_show_the_values_of_the_row_at_the_moment(visit, width):
+    """Drawn are the extremes of groups of rows; the text beside a chart is of the last row at the moment."""
+    with running("battery_dmegc") as session:
+        page = visit(session.url, size=(width, 900))
+        pull = pull_all(session.engine)
+        seconds = (pull.events.t - pull.events.t[0]) * 1e-9
+        assert len(seconds) > 1000  # more than are drawn
+        names = [state.name for state in session.engine.model.shown_states]
+        for moment in (700.25, 1400.25, 3200.25):
+            page.evaluate("(at) => window.nisus.view.show(0, window.nisus.charts.newest, at)", moment)
+            row = int(np.flatnonzero(seconds <= moment)[-1])
+            for name in ("v1", "r0"):
+                k = names.index(name)
+                mean, half = pull.track.mean[row, k], 2.0 * pull.track.std[row, k]
+                decimals = max(0, 1 - int(np.floor(np.log10(half))))
+                wanted = f"{mean:.{decimals}f} ± {half:.{decimals}f}"
+                reading = page.locator(f"[aria-label='Chart of {name}'] .reading")
+                wait_for(lambda reading=reading, wanted=wanted: reading.inner_text().startswith(wanted), 20.0)
