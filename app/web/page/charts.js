@@ -56,11 +56,11 @@ export class Charts {
     // Charts draw both extremes of a group of rows; the values of a moment are those of its row.
     this.moment = new Stream(link, "moment");
     const strong = { choose() {}, stream: this.moment, edges: () => [[], []] };
-    const exact = declared(kinds, Object.create(this, { live: { value: this.moment }, strong: { value: strong } }));
+    const exact = declared(kinds, Object.create(this, { live: { value: this.moment }, strong: { value: strong }, ask: { value: () => {} } }));
     this.charts.forEach((chart, k) => {
       chart.span = this.range;
       chart.begin();
-      chart.exact = () => this.exactly(chart, exact[k]);
+      if (!chart.what.control) chart.exact = () => this.exactly(chart, exact[k]);
     });
     this.axis = new TimeAxis($("axis"));
     this.pins = new Pins(this, link, actions);

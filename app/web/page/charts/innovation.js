@@ -4,7 +4,7 @@
 import { band, dots, line } from "../chart.js";
 import { element } from "../dom.js";
 import { marks } from "../drawing.js";
-import { bracketed, compact, spaced, words } from "../format.js";
+import { bracketed, compact, decimals, fixed, spaced, words } from "../format.js";
 import { Range, shownExtent, within } from "../ranges.js";
 
 export const order = 4;
@@ -70,6 +70,9 @@ class Member {
   }
 }
 
+// To the digits that its expected size justifies.
+const figure = (value, size) => (size > 0 ? fixed(value, decimals(size)) : compact(value, 3));
+
 function chartOf(charts, { key, unit, member, rows }, further) {
   const axisRange = new Range();
   const { live } = charts;
@@ -98,6 +101,6 @@ function chartOf(charts, { key, unit, member, rows }, further) {
       const most = Math.max(...shownExtent({ bands: [[data.lower, data.upper]], dots: [data.value] }, ...within(data.x, span)).map(Math.abs));
       return axisRange.fit(-most, most);
     },
-    says: (value) => (Number.isFinite(value("value")) ? `${compact(value("value"), 3)}${spaced(unit)}  ± ${compact(value("upper"), 3)} expected` : "no measurement"),
+    says: (value) => (Number.isFinite(value("value")) ? `${figure(value("value"), value("upper"))}${spaced(unit)}  ± ${compact(value("upper"), 2)} expected` : "no measurement"),
   };
 }
