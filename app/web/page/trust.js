@@ -68,7 +68,7 @@ export class Trust {
       const [light, { state, text, faults }] = [this.lights.get(name), known[k]];
       light.dataset.health = state;
       setText(light.firstChild, SIGNS[state] ?? "●");
-      if (sensors.length > 1) setText(light.lastChild, `${words(name)} ${faults ? `${grouped(faults)} of ` : ""}${grouped(sensors.length)}`);
+      if (sensors.length > 1) setText(light.lastChild, `${words(name)} (${faults ? `${grouped(faults)} of ` : ""}${grouped(sensors.length)})`);
       setAttribute(light, "title", text);
     });
     if ($("more-lights")) {

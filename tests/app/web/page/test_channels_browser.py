@@ -29,7 +29,7 @@ def test_a_group_opens_to_its_members(tmp_path, visit, family):
         states = {key: state for key, (state, _) in session.engine.status().sensors.items() if state != "tracking"}
         # The one that is biased by ten standard deviations stays rejected; among 400 no other is in alarm.
         assert list(states) == [name.format(BIASED)]
-        assert count(".light").count() == 1 and count(".light").inner_text().split("\n")[-1] == f"TT 1 of {COUNT}"
+        assert count(".light").count() == 1 and count(".light").inner_text().split("\n")[-1] == f"TT (1 of {COUNT})"
         assert count(".light").get_attribute("data-health") == states[name.format(BIASED)]
         # One line and one chart for all; nothing is hidden in the document.
         assert count(".sensor").count() == 1 and count(".sensor-group em").inner_text().startswith("1 in alarm")
