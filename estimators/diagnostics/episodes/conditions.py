@@ -20,6 +20,7 @@ from ..detectors import (
     STUCK,
     detector_of,
 )
+from ..health import HealthPolicy
 from ..references import wrapped
 from .episode import JOINED, AlarmRun, Episode, FoundEpisode, JudgedRows, runs
 from .wording import SensorFacts, TwinFacts
@@ -38,15 +39,18 @@ def _found(
 
 
 def dropouts(judged: JudgedRows) -> Iterator[FoundEpisode]:
-    """Yield the dropouts of the sensors that have a bit of their own."""
+    """Yield the dropouts of the sensors; those that share the last bit are told apart by their own gaps."""
     events, model, flags = judged.events, judged.model, judged.track.flags
     t = events.t
     if not flags.any():
         return
-    for s, sensor in enumerate(model.sensors[:SENSOR_FLAGS]):
+    own_bits = len(model.sensors) if len(model.sensors) <= SENSOR_FLAGS else SENSOR_FLAGS - 1
+    shared = flags >> (SENSOR_FLAGS - 1) & 1 != 0
+    last_sensor = len(model.sensors) if shared.any() else own_bits
+    for s, sensor in enumerate(model.sensors[:last_sensor]):
         heard = np.flatnonzero((events.kind == READING) & (events.channel == s))
         earlier = 0 if judged.last_heard is None else int(judged.last_heard[s])
-        for run in runs(flags >> s & 1 != 0):
+        for run in runs(flags >> s & 1 != 0 if s < own_bits else shared & _in_gap(t, heard)):
             before = heard[heard < run.begin]
             last = int(t[before[-1]]) if before.size else earlier
             cause = "silent" if last else "never heard"
@@ -59,6 +63,21 @@ def dropouts(judged: JudgedRows) -> Iterator[FoundEpisode]:
             episode = Episode(start, over, sensor.name, cause, size, np.nan, np.nan, "s", text)
             at, until = int(t[run.begin]), int(t[run.end - 1])
             yield FoundEpisode(("silence", sensor.name), run.begin, at, until, episode)
+
+
+def _in_gap(t: np.ndarray, heard: np.ndarray) -> np.ndarray:
+    """Return whether a sensor with measurements in the rows `heard` has dropped out, for each row; see `note_time`."""
+    found = np.zeros(t.size, bool)
+    if heard.size < 3:
+        return found
+    gaps = np.diff(t[heard])
+    count = np.arange(2, heard.size)  # gaps before each measurement from the third on
+    usual = HealthPolicy().silent_periods * np.cumsum(gaps)[1:] / count
+    due = t[heard[2:]] + np.maximum(usual, 2.0 * np.maximum.accumulate(gaps)[1:])
+    ends = np.append(heard[3:], t.size)
+    for k in np.flatnonzero(t[ends - 1] > due):
+        found[np.searchsorted(t, due[k], side="right") : ends[k]] = True
+    return found
 
 
 def missed_truths(judged: JudgedRows) -> Iterator[FoundEpisode]:
