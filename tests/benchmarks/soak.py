@@ -94,7 +94,10 @@ SETTLING_S = 240.0
 HISTORY_EVENTS = 20_000
 """Events that the soaked twin keeps: motor_can has that many after five minutes, 200,000 after fifty."""
 
-MIN_MINUTES = 10  # Of a slope; one of fewer minutes is printed but proves nothing
+CYCLE_MINUTES = round(2.0 * EXPLORE_PERIOD_S / MINUTE_S)
+"""Explore is shown for half of these, with threads of its own: slopes are of means over whole cycles."""
+
+MIN_MINUTES = 3 * CYCLE_MINUTES  # Of a slope
 
 
 def slope(minutes: np.ndarray, values: np.ndarray) -> tuple[float, float]:
@@ -168,16 +171,16 @@ class PageSoak:
         late = np.arange(len(self.samples)) >= max(self.full, SETTLING_S / MINUTE_S)
         print(f"slopes from minute {int(np.argmax(late)) + 1} on; the history was full by minute {self.full}")
         minutes, wrong = np.flatnonzero(late).astype(float), list[str]()
-        if minutes.size < 3:
-            return [f"{len(self.samples)} minutes are too few for a slope"]
+        if minutes.size < MIN_MINUTES:
+            return [f"{minutes.size} minutes after the start settled are too few for a slope; {MIN_MINUTES} are needed"]
+        whole = minutes.size // CYCLE_MINUTES * CYCLE_MINUTES
         for item, values in zip(WATCHED, np.array(self.samples)[late].T, strict=True):
-            rate, error = slope(minutes, values)
+            cycles = (column[:whole].reshape(-1, CYCLE_MINUTES).mean(axis=1) for column in (minutes, values))
+            rate, error = slope(*cycles)
             unit = f"{item.unit}/h".lstrip()
             print(f"{item.name}: {rate:+.2f} ± {error:.2f} {unit}, bound {item.per_hour:g}; last {values[-1]:.1f}")
             if rate + 2.0 * error > item.per_hour:
                 wrong.append(f"{item.name} grows by {rate:.2f} ± {error:.2f} {unit}; {item.per_hour:g} is allowed")
-        if minutes.size < MIN_MINUTES:
-            wrong.append(f"{minutes.size} minutes after the start settled prove nothing; {MIN_MINUTES} are needed")
         return wrong
 
 
