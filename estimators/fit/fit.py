@@ -21,7 +21,7 @@ from ..tuning import Tuning
 from .aims import LIKELIHOOD, WITNESSES, aim_of, sensors_in_turn
 from .entries import Setting, Skipped, TuningEntry, entries_of, with_values
 from .judge import POWERS, FitVerdict, Tempered, Worth, tempered, worths
-from .objective import ALONE, SEARCH_FOLDS, FitProgress, Go, Objective, maximise, search
+from .objective import ALONE, SEARCH_FOLDS, SHARES, FitProgress, Go, Objective, maximise, search
 from .recording import BLOCKS, Recording, held_out_rows, until_last_fitted, without_queries, without_stuck
 from .uncertainty import LikelihoodCurvature, Z, curvature, curvature_points, intervals
 
@@ -30,7 +30,7 @@ MAX_DEVIATION = 0.25
 deviation."""
 
 MAX_COST = 2.0  # Nats that it may cost to reset an entry that is not identified: the size of chance
-EXPECTED_STEPS = 30  # Steps of a maximisation, for the estimate of the folds to come
+EXPECTED_STEPS = 15  # Steps of a maximisation, for the estimate of the folds to come
 MAX_RESETS = 3  # Times that entries are reset and the others fitted again
 
 
@@ -150,13 +150,12 @@ def fit(
 
     def expect(k: int, steps: int) -> None:
         """Estimate the folds to come: a maximisation over k entries, its curvature, and the judgement."""
-        points = SEARCH_FOLDS * k // 2 if alone else (steps + 1) * (k + 1)
+        points = SEARCH_FOLDS * k // 2 if alone else (steps + 1) * (k + 1) + steps * len(SHARES)
         points = points if steps else 0
         progress.expect(len(recordings) * aimed.folds * (points + curvature_points(k)) + judging)
 
-    optimise = search if alone else maximise
     expect(len(entries), EXPECTED_STEPS)
-    kept, x, value = objective, *optimise(objective, objective.start)
+    kept, x, value = objective, *(search if alone else maximise)(objective, objective.start)
     expect(x.size, 0)
     shape = curvature(kept, x)
     identified = _identified(kept, shape)
@@ -173,7 +172,10 @@ def fit(
         start = np.where(np.isin(np.arange(x.size), reset), kept.start, x)
         kept = kept.pinned(reset, start)
         expect(len(kept.entries), EXPECTED_STEPS // 3)
-        x, value = optimise(kept, np.delete(start, reset))
+        rest = np.delete(np.arange(start.size), reset)
+        # With some entries at fixed values, the curvature of the others is a part of the one before.
+        H = np.linalg.inv(shape.cov)[np.ix_(rest, rest)]
+        x, value = search(kept, start[rest]) if alone else maximise(kept, start[rest], H)
         expect(x.size, 0)
         shape = curvature(kept, x)
         identified = _identified(kept, shape)

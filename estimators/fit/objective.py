@@ -9,13 +9,22 @@ density (diagnostics/score.py). A failed measurement and a failed fold cost more
 back there. A filter that draws uses the tuning's seed at every point: common random numbers, without which a difference
 of two points is mostly chance.
 
-The gradient comes from concurrent refolds, which also give Σ s sᵀ of the scores s of single measurements, whose
-diagonal scales the entries (Berndt, Hall, Hall & Hausman 1974, Annals of Economic and Social Measurement 3, 653);
-without it a noise with little information needs hundreds of folds. The scale is renewed every few steps, since the
-information of a noise far from its optimum does not tell where that is. The objective of a filter that draws is not
-smooth where it resamples; there the search is by trust regions without derivatives (COBYQA, Ragonneau & Zhang 2023).
+Folds are the cost. A gradient takes one per entry, so the steps are those of a quasi-Newton method: its curvature
+starts as Σ s sᵀ of the scores s of single measurements (Berndt, Hall, Hall & Hausman 1974, Annals of Economic and
+Social Measurement 3, 653) and has a damped BFGS update after each step. A step goes to the maximum of the parabola
+within the ranges. Several shares of it are tried at once, a fold each, since the curvature far from the optimum does
+not tell how far it holds, and rejected measurements make the objective rough. Where a step gains nothing the curvature
+is taken from the scores again. They end where the parabola promises less than `PRECISION`, or where two steps in a row
+gain nothing.
 
-Sources: Schweppe (1965), doi:10.1109/TIT.1965.1053737; Glasserman & Yao (1992), doi:10.1287/mnsc.38.6.884.
+Parameters bend the objective: along their curved valleys these steps end too early, so a search with parameters is by
+L-BFGS-B, in rounds of a few steps whose units are the deviations by the scores.
+
+The objective of a filter that draws is not smooth where it resamples; there the search is by trust regions without
+derivatives (COBYQA, Ragonneau & Zhang 2023).
+
+Sources: Schweppe (1965), doi:10.1109/TIT.1965.1053737; Glasserman & Yao (1992), doi:10.1287/mnsc.38.6.884; Nocedal &
+Wright, Numerical Optimization (2006), procedure 18.2, for the damped update.
 """
 
 from __future__ import annotations
@@ -42,10 +51,18 @@ STEP = 1e-4
 is far below the deviation of an estimate, and rounding even more."""
 
 ALONE = ("particle", "ensemble")  # Families whose folds run one after the other: each of them uses all processors
-MAX_ROUNDS = 8  # Most rounds of the optimiser, each with a new scale
-ROUND_STEPS = 15  # Steps of the optimiser per round
+MAX_STEPS = 200  # Most quasi-Newton steps
+MAX_ROUNDS = 8  # Most rounds of L-BFGS-B, each with a new scale
+ROUND_STEPS = 15  # Steps per round
 GRADIENT = 0.02  # Gradient at the maximum, in deviations of an estimate: half its square is the remaining gain, in nats
 MIN_GAIN = 0.01  # Nats that a round must gain to be followed by another
+RESOLUTION = 0.05  # Nats of gain below which a step that falls short of its promise counts as failed
+MIN_SHARE = 0.25  # Share of the promised gain of which a step falls short then
+PRECISION = 1e-3  # Nats of promised gain below which it ends: a twentieth of a deviation of one entry
+MAX_CHANGE = 2.0  # Largest change of an entry in one step, in logarithms or deviations
+SHARES = (2.0, 1.0, 0.3, 0.08)  # Shares of a step that are tried at once
+DAMPING = 0.2  # Least share of the present curvature that an update leaves along its step
+MIN_EIGENVALUE = 1e-10  # Share of the largest eigenvalue of a scaled curvature below which it counts as that share
 RECENT_POINTS = 2  # Last points whose derivatives are kept
 SEARCH_FOLDS = 60  # Most folds per entry of a search without derivatives
 Go = Callable[[int], bool]  # Callback with the number of folds done since the last call; returns whether to continue
@@ -148,6 +165,12 @@ class Objective:
             raise Cancelled
         return np.concatenate(found)
 
+    def report(self, x: np.ndarray, gained: float) -> None:
+        """Report a better point and its gain over the last one."""
+        progress = self.progress
+        progress.gain += gained
+        progress.values |= {item.key: (item.start, item.outward(v)) for item, v in zip(self.entries, x, strict=True)}
+
     def all_terms(self, points: Sequence[np.ndarray]) -> list[np.ndarray]:
         """Return the terms at several points, computed concurrently."""
         alone = find_estimator(self.estimator, self.tuning.model).family in ALONE
@@ -179,8 +202,13 @@ class Objective:
 
     def gradient(self, x: np.ndarray) -> tuple[float, np.ndarray]:
         """Return the objective and its gradient (k,)."""
-        here, slopes = self.slopes(x)
-        return float(here.sum()) - self.penalty(x), slopes.sum(axis=1) - self.precision * (x - self.start)
+        return self.slope_and_scores(x)[:2]
+
+    def slope_and_scores(self, x: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+        """Return the objective, its gradient (k,), and the derivatives of its terms (k, n)."""
+        here, scores = self.slopes(x)
+        slope = scores.sum(axis=1) - self.precision * (x - self.start)
+        return float(here.sum()) - self.penalty(x), slope, scores
 
 
 class _StopSearch(Exception):
@@ -202,16 +230,26 @@ class _BestPoint:
         progress = self.objective.progress
         if value > self.value:
             if np.isfinite(self.value):
-                progress.gain += value - self.value
-                pairs = zip(self.objective.entries, x, strict=True)
-                progress.values |= {item.key: (item.start, item.outward(v)) for item, v in pairs}
+                self.objective.report(x, value - self.value)
             self.x, self.value = x, value
         if progress.stop:
             raise _StopSearch
 
 
-def maximise(objective: Objective, x: np.ndarray, *, rounds: int = MAX_ROUNDS) -> tuple[np.ndarray, float]:
-    """Return the point (k,) of the maximum nearest to x, and the value there."""
+def maximise(objective: Objective, x: np.ndarray, H: np.ndarray | None = None) -> tuple[np.ndarray, float]:
+    """Return the point (k,) of the maximum nearest to x, and the value there.
+
+    Args:
+        objective: The objective.
+        x: Start (k,).
+        H: Curvature there, minus the second derivatives (k, k), where it is known; else it is taken from the scores.
+    """
+    noises = all(item.key.startswith(("Q.", "R.")) for item in objective.entries)
+    return quasi_newton(objective, x, H) if noises else scaled_rounds(objective, x)
+
+
+def scaled_rounds(objective: Objective, x: np.ndarray, *, rounds: int = MAX_ROUNDS) -> tuple[np.ndarray, float]:
+    """Return the same by rounds of L-BFGS-B, each with deviations by the scores as units."""
     from scipy.optimize import minimize  # 15 MB, imported with the first fit
 
     low, high = np.array(objective.limits).T
@@ -242,6 +280,89 @@ def maximise(objective: Objective, x: np.ndarray, *, rounds: int = MAX_ROUNDS) -
         if gained < MIN_GAIN or found.status == 0:
             break
     return best.x, best.value
+
+
+def quasi_newton(
+    objective: Objective, x: np.ndarray, H: np.ndarray | None = None, *, steps: int = MAX_STEPS
+) -> tuple[np.ndarray, float]:
+    """Return the point (k,) that a number of quasi-Newton steps reach, and the value there; args as `maximise`."""
+    if not x.size:
+        return x, objective.value(x)
+    value, slope, scores = objective.slope_and_scores(x)
+    fresh = H is None  # whether the curvature is that of the scores here
+    if H is None:
+        H = _outer(objective, scores)
+    unit = np.array([1.0 if item.log else item.deviation for item in objective.entries])
+    low, high = np.array(objective.limits).T
+    ended, scale = 0, 1.0
+    for _ in range(steps):
+        if objective.progress.stop:
+            break
+        step = _step(H, slope, np.maximum(low - x, -MAX_CHANGE * unit), np.minimum(high - x, MAX_CHANGE * unit))
+        promised = float(slope @ step - 0.5 * step @ H @ step)
+        gained, best = 0.0, 0
+        if promised >= PRECISION:
+            points = [np.clip(x + scale * share * step, low, high) for share in SHARES]
+            found = [
+                float(terms.sum()) - objective.penalty(point)
+                for point, terms in zip(points, objective.all_terms(points), strict=True)
+            ]
+            best = int(np.argmax(found))
+            gained = found[best] - value
+            if gained <= 0.0 and scale == 1.0:
+                scale = SHARES[-1] ** 2
+                continue
+        scale = 1.0
+        if gained > 0.0:
+            moved, before = points[best] - x, slope
+            x = points[best]
+            objective.report(x, gained)
+            value, slope, scores = objective.slope_and_scores(x)
+            H = _updated(H, moved, before - slope)
+        ended = ended + 1 if gained < min(RESOLUTION, MIN_SHARE * promised) or promised < PRECISION else 0
+        if ended == 2 or (ended and fresh):
+            break
+        fresh = ended > 0
+        if fresh:
+            H = _outer(objective, scores)
+    return x, value
+
+
+def _outer(objective: Objective, scores: np.ndarray) -> np.ndarray:
+    """Return the curvature (k, k) by the scores (k, n)."""
+    found: np.ndarray = scores @ scores.T + np.diag(objective.precision)
+    return found
+
+
+def _step(H: np.ndarray, slope: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """Return the step (k,) within a box to the maximum of slope · d - ½ d · H d."""
+    from scipy.optimize import lsq_linear  # 15 MB, imported with the first fit
+
+    scale = 1.0 / np.sqrt(np.diag(H))
+    values, vectors = np.linalg.eigh(H * np.outer(scale, scale))
+    root = np.sqrt(np.maximum(values, MIN_EIGENVALUE * values[-1]))
+    free: np.ndarray = scale * (vectors @ (vectors.T @ (slope * scale) / root**2))
+    if np.all(low <= free) and np.all(free <= high):
+        return free
+    # An entry at the end of its range has no room.
+    room = high > low
+    found = np.zeros_like(slope)
+    parabola = ((vectors * root).T / scale)[:, room]
+    solved = lsq_linear(parabola, vectors.T @ (slope * scale) / root, (low[room], high[room]), method="bvls")
+    found[room] = np.clip(solved.x, low[room], high[room])
+    return found
+
+
+def _updated(H: np.ndarray, step: np.ndarray, change: np.ndarray) -> np.ndarray:
+    """Return the curvature (k, k) after a step over which the slope fell by `change`; it stays positive definite."""
+    along = H @ step
+    present, seen = float(step @ along), float(step @ change)
+    if not present > 0.0 or not np.all(np.isfinite(change)):
+        return H
+    weight = 1.0 if seen >= DAMPING * present else (1.0 - DAMPING) * present / (present - seen)
+    change = weight * change + (1.0 - weight) * along
+    updated: np.ndarray = H - np.outer(along, along) / present + np.outer(change, change) / float(step @ change)
+    return updated
 
 
 def search(objective: Objective, x: np.ndarray) -> tuple[np.ndarray, float]:

@@ -17,7 +17,7 @@ import numpy as np
 from estimators.diagnostics.calibration import LIMITS, Calibration
 from estimators.errors import ModelError, NisusError
 from estimators.fit.entries import entries_of
-from estimators.fit.objective import Cancelled, Objective, maximise
+from estimators.fit.objective import Cancelled, Objective, scaled_rounds
 from estimators.fit.recording import Recording, without_queries
 from estimators.fold import Fold
 from estimators.log import READING, Log
@@ -201,7 +201,7 @@ def _tried(
         objective = Objective(
             estimator, tuning, tuple(entries), (recording,), go=lambda _: time.thread_time() < end, executor=None
         )
-        x, _ = maximise(objective, objective.start, rounds=1)
+        x, _ = scaled_rounds(objective, objective.start, rounds=1)
         tuning = objective.setting(x).tuning
         fold = Fold(estimator, larger, tuning, whole)
         fold.advance()

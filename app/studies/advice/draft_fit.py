@@ -19,7 +19,7 @@ import numpy as np
 
 from estimators.errors import NisusError
 from estimators.fit.entries import entries_of
-from estimators.fit.objective import FitProgress, Objective, maximise
+from estimators.fit.objective import FitProgress, Objective, scaled_rounds
 from estimators.fit.recording import Recording
 from estimators.model.coloured import ColouredError, coloured, disturbance_time, error_time, errors_of
 from estimators.model.state_space import StateSpaceModel
@@ -153,7 +153,7 @@ def _fit(
         entries, _ = entries_of("kf", tuning, logs, keys, bounds)
         recordings = tuple(Recording(log, 1.0, np.zeros(log.n, bool)) for log in logs)
         objective = Objective("kf", tuning, tuple(entries), recordings, go=counted, progress=progress)
-        x, value = maximise(objective, objective.start, rounds=ROUNDS)
+        x, value = scaled_rounds(objective, objective.start, rounds=ROUNDS)
     except NisusError:
         return None
     setting = objective.setting(x).tuning
