@@ -176,9 +176,10 @@ def test_a_link_goes_to_the_moment_and_holds_it(visit, page, session):
     other.locator("#follow").click()
     wait_for(lambda: other.evaluate("location.hash") == "")
 
+    before = other.evaluate("window.nisus.charts.range")
     other.evaluate("location.hash = '#twin=elsewhere&from=1970-01-01T00:00:12Z&span=3'")
     other.get_by_text("the link is of elsewhere").wait_for()
-    assert other.evaluate("window.nisus.view.following")
+    assert other.evaluate("window.nisus.charts.range") == before
 
 
 def test_a_plot_of_diagnose_as_a_drawing_of_its_own(page, session, tmp_path):
