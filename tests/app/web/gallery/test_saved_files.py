@@ -86,7 +86,7 @@ def test_a_saved_tuning_is_a_revision_over_the_same_readings(pump):
         assert told(session)["tuning"]["R.winding"] == 9.0 and told(session)["turned"] == {"R.winding": 4.0}
         save(pump.with_name("both.yaml"), YAML.replace("0.01", "0.5").replace("variance: 4", "variance: 9"))
         np.testing.assert_array_equal(after.track.mean, mean(pump.with_name("both.yaml"), after.events))
-        assert "pump.yaml saved: Q.temperature 0.01 → 0.5" in [run["what"] for run in session.get("/api/runs")]
+        assert "pump.yaml saved: Q.temperature 0.01 → 0.5 °C²/s" in [run["what"] for run in session.get("/api/runs")]
         model = session.get("/api/model")
         assert {item["key"]: item["configured"] for item in model["tuning"]}["Q.temperature"] == 0.5
 
