@@ -60,14 +60,18 @@ class FaultTests(NamedTuple):
         return noncentrality(float(self.h.max()), self.z)
 
     def optimal_multiple(self, whitened: np.ndarray) -> float:
-        """Return the multiple of S^-1/2 Δν (N, ny) that the optimal test detects; infinite if nothing changes."""
-        size = float(np.sqrt(np.nansum(whitened[self.used] ** 2)))
+        """Return the multiple of S^-1/2 Δν (N, ny) that the optimal test detects; infinite if nothing changes.
+
+        It is 0 if the change is beyond what a float64 can hold, as of a fold that has diverged.
+        """
+        with np.errstate(over="ignore"):
+            size = float(np.sqrt(np.nansum(whitened[self.used] ** 2)))
         return float(np.sqrt(self.noncentrality)) / size if size > 0.0 else np.inf
 
     def multiple(self, whitened: np.ndarray, standardised: np.ndarray) -> float:
         """Return the detectable multiple of a change S^-1/2 Δν and, for the detectors, Δν over σ, both (N, ny)."""
         least = self.optimal_multiple(whitened)
-        if not self.bank or not np.isfinite(least):
+        if not self.bank or not 0.0 < least < np.inf:
             return least
         rows = self._of_rows(standardised)
         low = high = least

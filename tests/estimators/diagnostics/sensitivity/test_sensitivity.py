@@ -159,6 +159,8 @@ def test_the_bank_sees_a_shift_of_a_white_row_with_the_probability_asked_for():
     size = tests.multiple(row, row)
     # The best test has no lower bound for how small a lasting shift may be; the bank's smallest is 0.2, half of it too.
     assert max(0.1, tests.optimal_multiple(row)) < size < 2.0 * tests.optimal_multiple(row)
+    # Of a change that a float64 cannot square, as that of a diverged fold, any share is detected.
+    assert tests.multiple(1e200 * row, 1e200 * row) == 0.0
     e = np.random.default_rng(29).normal(size=(runs, n)) + size
     seen = np.zeros(runs, bool)
     for shift in RATIOS[RATIOS[:, 3] != 0.0, 3]:
