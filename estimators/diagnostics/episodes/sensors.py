@@ -146,8 +146,8 @@ def _episode(judged: JudgedRows, s: int, rows: np.ndarray, run: AlarmRun, shown:
     )
 
 
-def _shown(judged: JudgedRows, s: int, rows: np.ndarray, masks: np.ndarray, run: AlarmRun) -> RunEffect:
-    """Return the effect that explains a run best: a loss of the sensor, else that of the innovations."""
+def _shown(judged: JudgedRows, s: int, rows: np.ndarray, masks: np.ndarray, run: AlarmRun) -> RunEffect | None:
+    """Return the effect that explains a run best: a loss of the sensor, else that of the innovations, if known."""
     lost = _lost(judged, s, rows, masks, run)
     if lost is not None:
         return lost
@@ -201,15 +201,16 @@ def _stuck(values: np.ndarray, masks: np.ndarray, k: int, run: AlarmRun) -> RunE
 
 def _best_effect(
     judged: JudgedRows, s: int, rows: np.ndarray, masks: np.ndarray, said: np.ndarray, run: AlarmRun
-) -> RunEffect:
-    """Return the effect with the highest likelihood ratio over the rows in alarm, `said`.
+) -> RunEffect | None:
+    """Return the effect with the highest likelihood ratio over the rows in alarm, `said`; None of less than two values.
 
-    Innovations that wander have no mean over the whole run: their shifted part is more informative.
+    Innovations that wander have no mean over the whole run: their shifted part is more informative. Where no test in
+    alarm explains them, as that of outliers where these are side by side, the effect is one of another kind.
     """
     first = _earliest(judged, rows, masks, run)
     unknown = [InnovationEffect("narrow", np.nan, np.nan, np.nan, -np.inf)]
     best = int(said[0]) if said.size else 0, run.begin, run.end, unknown, np.zeros(0)
-    shifted = best
+    shifted = other = best
     for k in said:
         e = standardised(judged, rows[first : run.end], int(k))
         known = np.flatnonzero(np.isfinite(e))
@@ -222,14 +223,18 @@ def _best_effect(
             begun, over = _likeliest(e, alarm, cause)
             ranked = effects(e[begun : min(over, begun + MAX_MEASUREMENTS)])
             ranked.sort(key=lambda item: item.cause not in kinds)
-            if ranked[0].cause != cause:
-                continue
             found = int(k), first + int(known[begun]), first + int(known[over - 1]) + 1, ranked, e[over:]
+            if ranked[0].cause != cause:
+                other = found if ranked[0].ratio > other[3][0].ratio else other
+                continue
             if ranked[0].ratio > best[3][0].ratio:
                 best = found
             if cause == "shifted" and ranked[0].ratio > shifted[3][0].ratio:
                 shifted = found
+    best = other if best[3] is unknown else best
     ranked = best[3]
+    if ranked is unknown:
+        return None
     if ranked[0].cause == "narrow" and any(
         item.cause == "correlated" and item.size >= WANDERING_CORRELATION for item in ranked
     ):

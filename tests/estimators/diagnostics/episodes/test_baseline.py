@@ -7,6 +7,7 @@ import pytest
 
 from estimators.diagnostics.detector_state import no_baseline
 from estimators.diagnostics.detectors import ALARM_NAMES, BITS, NARROW
+from estimators.diagnostics.episodes import episodes
 from estimators.diagnostics.episodes.baseline import (
     BASELINE_MARGIN,
     MIN_MEASUREMENTS,
@@ -93,6 +94,16 @@ def test_a_change_is_heard(normals, change, cause, within):
     gauge = track.alarms[::2, 0]
     assert not gauge[:1500].any()
     assert np.bitwise_or.reduce(gauge[1500 : 1500 + within]) >> ALARM_NAMES.index(cause) & 1
+
+
+def test_outliers_side_by_side_are_another_effect(normals):
+    """Only the test for outliers is in alarm; two side by side are none, and nothing was said of their size."""
+    added = np.zeros(1530)
+    added[1500:1502] = 2.0
+    fold = folded(asset(1, n=1530, change=added), baseline_of(MODEL, normals))
+    (found,) = (item for item in episodes(fold) if item.subject == "gauge")
+    assert (found.cause, found.start) == ("narrow", 1501.0)
+    assert 1.0 < found.low < found.size < found.high and "nan" not in found.text
 
 
 def test_the_baseline_is_what_was_normal(normals):
