@@ -165,6 +165,8 @@ def advise(measured: Measured) -> Advice:
         _of_small(told, measured)
     _consistency(told, measured, ensemble=size.answer == NO)
     _ask(told, measured, "cost", lambda _: affordable(measured, told.estimator, told.options))
+    # The claims hold for the filter with the options that the twin has for it.
+    told.options = {**measured.twin.options_of(told.estimator), **told.options}
     return told
 
 

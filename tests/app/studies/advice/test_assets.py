@@ -94,6 +94,16 @@ def test_what_nothing_tells_of_is_named(told):
     assert claim.remedy in found.remedies
 
 
+def test_options_of_the_twin_are_kept(tmp_path):
+    """With which everything was measured; the lines took them away, and the twin was no longer consistent."""
+    adaptive = "{name: kf, options: {adapt: Q, memory: 300}}"
+    twin = load_twin(path := write(tmp_path, "varying", "VARYING", adaptive, recordings.varying, "probe"))
+    found = advise(Measured(twin, read_log(twin, None)[0]))
+    assert found.options == twin.options_of("kf") == {"adapt": 2.0, "memory": 300.0}
+    apply(path, lines(found), None)
+    assert load_twin(path).options_of("kf") == found.options
+
+
 def test_time_varying_takes_a_gain_that_follows(told):
     found = told("varying", "VARYING", recordings.varying, "probe")
     assert (found.estimator, found.because) == ("kf", ("linear", "steady"))
