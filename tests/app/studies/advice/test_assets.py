@@ -150,7 +150,7 @@ def test_faults_of_a_sensor_are_left_out(tmp_path, nisus):
     assert np.flatnonzero(np.isnan(clean.value[: clean.n, 0])).tolist() == list(range(begin, end))
     page = nisus("advise", path).words
     assert "Excluded: faults of sensors rail, 200 s to 259 s: stuck (60 readings)" in page
-    assert "The filter is consistent; noises and bands are right" in page
+    assert "Bands are right within a quarter, and innovations are hardly correlated" in page
 
 
 def test_what_lasts_for_most_of_the_log_is_no_fault(tmp_path):
