@@ -72,7 +72,7 @@ FINDINGS = {
     ("tails", NO): "No robust weights are needed",
     ("tails", UNTOLD): "Too few measurements to judge outliers",
     ("consistent", YES): "Bands are right within a quarter, and innovations are hardly correlated",
-    ("consistent", NO): "Bands are off by more than a quarter, or innovations are correlated; noises or model need work",
+    ("consistent", NO): "Bands are off by more than a quarter, or innovations are correlated; noise or model need work",
     ("consistent", UNTOLD): "Too few measurements to judge consistency",
     ("lasting", YES): "Coloured noise explains the correlated innovations",
     ("lasting", NO): "Coloured noise does not explain the correlated innovations",
