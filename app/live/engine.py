@@ -20,7 +20,9 @@ import numpy as np
 from estimators.errors import NisusError
 from estimators.late import inflated
 from estimators.log import TICK, Events
+from estimators.registry import find_estimator
 from estimators.snapshots import PERMANENT_SPACING, Base
+from sources.source import controls_of, span_of
 
 from ..concurrency import run_all
 from ..ingest import Ingest
@@ -33,7 +35,7 @@ from .feeder import Feeder
 from .jobs import Job, Jobs
 from .outputs import Status
 from .running_fold import Records, Running
-from .status import busy_status, known_fields, past_status, status_of
+from .status import busy_status, past_status, status_of
 from .watchdog import Watchdog
 from .watchers import IdleTicks, Watchers
 from .workshop import Workshop
@@ -206,18 +208,25 @@ class Engine(Running):
         return status_of(self._fold, self._row_counts, self._watchers, self.source, fields, *counts)
 
     def _known_fields(self, refolding: bool) -> dict[str, Any]:
-        """Return the fields of a status that are known without the fold; see `known_fields`."""
-        return known_fields(
-            self.model,
-            self.source,
-            estimator=self.estimator,
-            tuning=self.tuning,
-            refolding=refolding,
-            finished=self._finished,
-            recording=self.recorder.path if self.recorder is not None else None,
-            awaited=self._awaited,
-            compiling=self._workshop.states(),
-        )
+        """Return the fields of a status that are known without the fold.
+
+        Estimator and tuning are the requested ones, which differ from the fold's while a refold is waited for.
+        """
+        paced = controls_of(self.source)
+        return {
+            "estimator": self.estimator,
+            "tuning": self.tuning,
+            "options": find_estimator(self.estimator, self.model).complete(dict(self.tuning.options)),
+            "refolding": refolding,
+            "finished": self._finished,
+            "recording": self.recorder.path if self.recorder is not None else None,
+            "awaited": self._awaited,
+            "compiling": self._workshop.states(),
+            "paused": paced is not None and paced.paused,
+            "speed": paced.speed if paced is not None else None,
+            "seekable": paced is not None,
+            "span": span_of(self.source),
+        }
 
     # On the engine's own thread
 

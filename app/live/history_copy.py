@@ -16,9 +16,6 @@ from estimators.tuning import Tuning
 from .outputs import Cursor, Pull
 from .running_fold import Running
 
-END_OF_TIME = 2**62
-"""Later than every event, ns."""
-
 COPY_EVENTS = 4096
 """Events that are copied at once."""
 
@@ -37,7 +34,7 @@ def copy_log(
     Raises:
         ConfigError: If another tuning took over meanwhile, or no reading has come.
     """
-    end = engine.index_at(END_OF_TIME)
+    end = engine.end()
     at, base = engine.origin(0 if most is None else max(0, end - most))
     pieces = []
     for start in range(at, end, COPY_EVENTS):

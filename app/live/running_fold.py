@@ -183,6 +183,11 @@ class Running(ABC):
         with self._reading():
             return self._log.first + int(np.searchsorted(self._log.t[: self._fold.n], t))
 
+    def end(self) -> int:
+        """Return the absolute index after the last folded event."""
+        with self._reading():
+            return self._log.first + self._fold.n
+
     def span(self) -> tuple[int, int]:
         """Return the times of the first and the last event, ns; zeros while there is none. Never waits."""
         return self._span

@@ -13,10 +13,8 @@ from estimators.diagnostics.health import MAX_ROWS_PER_READING
 from estimators.diagnostics.score import nis_verdict
 from estimators.fold import Fold
 from estimators.log import RESET, Events, model_version_at
-from estimators.model.state_space import StateSpaceModel
-from estimators.registry import find_estimator
 from estimators.track import FAILED, GATED, USED, Track, estimated_rows
-from sources.source import Source, controls_of, span_of
+from sources.source import Source
 
 from .counts import RowCounts, last_run
 from .faults import Faulty
@@ -28,22 +26,6 @@ FOLDING_CAUSE = "the measurements so far are being folded"
 """Cause of a twin without a row yet."""
 
 SINCE_ROWS = 4096  # Rows copied at once in search of the beginning of a health
-
-
-def known_fields(model: StateSpaceModel, source: Source, **fields: Any) -> dict[str, Any]:
-    """Return the fields of a status that are known without the fold, of which the engine gives those that it holds.
-
-    `estimator` and `tuning` are the requested ones, which differ from the fold's while a refold is waited for.
-    """
-    paced = controls_of(source)
-    return {
-        **fields,
-        "options": find_estimator(fields["estimator"], model).complete(dict(fields["tuning"].options)),
-        "paused": paced is not None and paced.paused,
-        "speed": paced.speed if paced is not None else None,
-        "seekable": paced is not None,
-        "span": span_of(source),
-    }
 
 
 def busy_status(last: Status, fields: Mapping[str, Any], busy: float) -> Status:

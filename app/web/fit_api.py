@@ -9,7 +9,6 @@ from starlette.routing import Route
 
 from estimators.errors import ConfigError
 
-from ..live.history_copy import END_OF_TIME
 from ..live.running_fold import Running
 from ..live.runs.refits import FITTING, STOPPING, FitAttempt, Fitting, LiveRefit, Refits
 from ..live.tunings.versions import keep, settings_of, version_text
@@ -48,7 +47,7 @@ class FitApi:
     def _fit(self) -> Any:
         """Return the last fit; `available` events could be fitted, `current` says whether its tuning still runs."""
         engine, attempt = self._engine, self.fitting.latest
-        available = {"available": engine.index_at(END_OF_TIME) - engine.rows(0, 0).first}
+        available = {"available": engine.end() - engine.rows(0, 0).first}
         if attempt is None:
             return {"state": "none"} | available
         return _attempt_json(attempt) | available | {"current": engine.folded_with()[0] is attempt.tuning}

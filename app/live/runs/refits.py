@@ -27,7 +27,7 @@ from estimators.tuning import Tuning
 
 from ...format_time import format_time
 from ...twin.defaults import bounds_of, natural_aim
-from ..history_copy import END_OF_TIME, copy_log
+from ..history_copy import copy_log
 from ..jobs import DONE, FAILED, RUNNING, Job, JobCancelled
 from ..running_fold import Running
 from ..tunings.versions import keep, load_into, settings_of, version_text
@@ -167,7 +167,7 @@ class Fitting:
 
         engine = self._engine
         if since is not None:
-            most = engine.index_at(END_OF_TIME) - engine.index_at(since)
+            most = engine.end() - engine.index_at(since)
         log, base = copy_log(engine, attempt.tuning, most, job.check)
         if since is None:
             return log, base

@@ -17,7 +17,6 @@ from estimators.errors import ConfigError, NisusError
 from estimators.track import FAILED, Track
 from estimators.tuning import Tuning
 
-from ..history_copy import END_OF_TIME
 from ..jobs import Job, JobCancelled
 from ..outputs import EventWindow
 from ..running_fold import Running
@@ -128,7 +127,7 @@ class Sweeps:
         if known is None or known.revision != revision:
             known = Swept(key, revision, value, 0)
             self._want(key)
-        elif known.done and known.events < min(MAX_SWEEP_EVENTS - MIN_SWEEP_EVENTS, self._events() / STALE_GROWTH):
+        elif known.done and known.events < min(MAX_SWEEP_EVENTS - MIN_SWEEP_EVENTS, self._engine.end() / STALE_GROWTH):
             # Return the previous sweep until the new one is ready.
             self._want(key)
         return known
@@ -140,12 +139,9 @@ class Sweeps:
         """
         revision, events, rows = self._matched
         current = revision == self._engine.revisions.runs[-1].number
-        if not current or events < self._events() / STALE_GROWTH < MAX_SWEEP_EVENTS:
+        if not current or events < self._engine.end() / STALE_GROWTH < MAX_SWEEP_EVENTS:
             self._want(MATCHED_R_KEY)
         return rows if current else None
-
-    def _events(self) -> int:
-        return self._engine.index_at(END_OF_TIME)
 
     def _want(self, key: str) -> None:
         with self._lock:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cached_property, partial
+from typing import NamedTuple
 
 import numpy as np
 
@@ -38,13 +39,12 @@ class Rows:
 Values = Callable[[Rows], np.ndarray]
 
 
-class Column:
+class Column(NamedTuple):
     """Chart column: name, kind of drawing, and function from n rows to values (n,)."""
 
-    __slots__ = ("kind", "name", "of")
-
-    def __init__(self, name: str, kind: str, of: Values) -> None:
-        self.name, self.kind, self.of = name, kind, of
+    name: str
+    kind: str
+    of: Values
 
     def values(self, events: Events, track: Track) -> np.ndarray:
         """Return the values of these rows."""

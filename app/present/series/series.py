@@ -14,9 +14,6 @@ from .smoothed import Smoother
 
 LIVE, PREVIOUS, SMOOTHED = "live", "previous", "smoothed"
 
-END_OF_TIME = 2**62
-"""Later than every event, ns."""
-
 DIFFERENCE = "difference:"
 """Before the number of a pinned run: its means less those of the running fold."""
 
@@ -102,7 +99,7 @@ class Series:
         run = next((run for run in engine.revisions.runs if run.pinned and str(run.number) == name), None)
         if run is None or run is engine.revisions.runs[-1]:
             return None
-        kept, rows = run.track, engine.index_at(END_OF_TIME)
+        kept, rows = run.track, engine.end()
         if name not in self._pinned and (kept is None or rows > kept.first + len(kept.events)):
             self._pinned[name] = PinnedFold(engine, run)
         fold = self._pinned.get(name)

@@ -148,7 +148,7 @@ def last_rows(engine: Running, most: int) -> tuple[int, Events, Track]:
 
     Copied in chunks, so that the engine never waits for long; a late measurement in between may show in one only.
     """
-    end = engine.index_at(2**62)
+    end = engine.end()
     pieces = [engine.rows(end - most, end - most)]
     for start in range(max(0, end - most), end, COPY_ROWS):
         piece = engine.rows(start, min(start + COPY_ROWS, end))

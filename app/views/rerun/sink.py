@@ -12,10 +12,8 @@ import rerun_bindings
 
 from estimators.model.state_space import StateSpaceModel
 
+from ...format_time import FIRST_DATED_NS
 from ...present.drawing.colors import RGB, Palette, mixed
-
-FIRST_DATE_NS = 10**18
-"""Times (ns) from here on are dates, the first of them in 2001; smaller ones are durations."""
 
 
 def send_blueprint(stream: rr.RecordingStream, layout: rrb.Blueprint) -> None:
@@ -58,7 +56,7 @@ class Sink:
     def started(self, t: int) -> None:
         """Decide by the first time (ns) whether all are dates or durations."""
         if self._calendar is None:
-            self._calendar = t >= FIRST_DATE_NS
+            self._calendar = t >= FIRST_DATED_NS
 
     def times(self, t: np.ndarray) -> rr.TimeColumn:
         """Return times (ns) as a column of the timeline."""

@@ -9,6 +9,7 @@ import pyarrow as pa
 import pytest
 from rerun.chunk import RrdReader
 
+from app.format_time import FIRST_DATED_NS
 from app.live import commands
 from app.live.engine import Engine
 from app.views.recording.reader import read_recording
@@ -18,7 +19,7 @@ from app.views.rerun.feed import FIRST_WINDOWS, RerunFeed
 from app.views.rerun.layout import blueprint
 from app.views.rerun.pictures import LABEL_HALF_WIDTH, LABEL_HEIGHT, PICTURE_RATIO, anchors, axis_scales, ellipse_points
 from app.views.rerun.rows import RerunRows
-from app.views.rerun.sink import FIRST_DATE_NS, last_of_each_time, pair_name, thin
+from app.views.rerun.sink import last_of_each_time, pair_name, thin
 from estimators.log import READING, TRUTH, Events
 from estimators.track import HEALTH_NAMES
 from tests.app.scripted import Replayed, pull_all, readings, twin, wait_for
@@ -274,7 +275,7 @@ def test_a_reset_at_the_time_of_the_last_reading_is_seen_in_the_picture(fed):
 
 
 def test_dates_are_dates_and_seconds_are_durations(fed):
-    batch = readings(np.array([1.0, 2.0]) + FIRST_DATE_NS * 1e-9, [40.0, 41.0])
+    batch = readings(np.array([1.0, 2.0]) + FIRST_DATED_NS * 1e-9, [40.0, 41.0])
     fed.put(batch)
     fed.next()
     kinds = {
