@@ -108,7 +108,8 @@ class Estimator:
       these, and so can run on a black box (interpreted/).
 
     `fixed_r`: the gain is for one R, so that measurements cannot have their own. `needs_factor`: the filter needs the
-    Cholesky factor of its initial covariance. `singular`: P and R may be singular.
+    Cholesky factor of its initial covariance. `singular`: P and R may be singular. `considers`: a model may have
+    considered states.
     """
 
     name: str
@@ -138,6 +139,7 @@ class Estimator:
     needs_factor: bool = False
     blocks: Callable[[Options, np.ndarray, int], np.ndarray] | None = None
     singular: bool = False
+    considers: bool = False
 
     def complete(self, options: Mapping[str, float | str]) -> dict[str, float]:
         """Return the given options and the defaults of the others; a choice may be given as its word.

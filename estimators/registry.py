@@ -90,6 +90,11 @@ def unfit(entry: Estimator, model: StateSpaceModel) -> str | None:
             f"in {model.name} {model.certain}, and {entry.name} takes no singular covariance; give it a small "
             f"variance, or use {', '.join(e.name for e in ESTIMATORS.values() if e.singular)}"
         )
+    if model.considered and not entry.considers:
+        return (
+            f"{model.name} has parameters to consider, which {entry.name} cannot; hold or estimate them, or use "
+            f"{', '.join(e.name for e in ESTIMATORS.values() if e.considers)}"
+        )
     if entry.family == "ensemble":
         return entry.applies(model)
     if model.nx > LARGE:

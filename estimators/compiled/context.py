@@ -60,8 +60,8 @@ _FIELDS = """
     nx nu n_parameters n_noises f f_complex F F_mode Q Q_varies each_state shape h h_complex H H_mode
     log_likelihood n_sensors row_start row_count n_rows circular_x circular_y correlation
     noise_state noise_states max_step
-    prior_mean prior_cov prior_rows linear_states n_linear sampled_states n_sampled jump mode n_modes p q r used
-    gate width options n_options pairs n_pairs shown n_shown prepared n_prepared seed
+    prior_mean prior_cov prior_rows n_considered linear_states n_linear sampled_states n_sampled jump mode n_modes
+    p q r used gate width options n_options pairs n_pairs shown n_shown prepared n_prepared seed
     baseline n_baseline normal ranges fitted column expected chances marginal n_tests limits limited duplicates
 """.split()
 
@@ -122,6 +122,12 @@ def parameters(context):
 def process_variances(context):
     """Return q (nw,), the variance that each process noise adds per second."""
     return floats(context.q, context.n_noises)
+
+
+@inlined
+def estimated(context):
+    """Return the number of states that measurements correct: all but the last, considered ones."""
+    return context.nx - context.n_considered
 
 
 @part

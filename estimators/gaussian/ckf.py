@@ -47,4 +47,5 @@ CKF = Estimator(
     needs_factor=True,
     tune=tune,
     memory=memory,
+    considers=True,
 )

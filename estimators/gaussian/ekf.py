@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..compiled.context import expect, options, row_count, transition
+from ..compiled.context import estimated, expect, options, row_count, transition
 from ..compiled.jacobians import scratch_size, sensor_jacobian, state_jacobian
 from ..estimator import Estimator, Options
 from ..model.state_space import StateSpaceModel
@@ -124,12 +124,12 @@ def correct(context, m, own, x, P):
     reading = own.reading
     C, chol_S = reading.C, reading.chol_S
     if options(context)[JOSEPH] != 0.0:
-        gain(m, C, chol_S, own.K)
-        move_mean(m, C, chol_S, reading.nu, x)
+        gain(m, C, chol_S, estimated(context), own.K)
+        move_mean(m, C, chol_S, reading.nu, estimated(context), x)
         joseph(m, reading.d, C, own.H, own.K, P, own.N)
     else:
-        move_mean(m, C, chol_S, reading.nu, x)
-        downdate(m, C, chol_S, P, reading.W)
+        move_mean(m, C, chol_S, reading.nu, estimated(context), x)
+        downdate(m, C, chol_S, estimated(context), P, reading.W)
     wrap_mean(context, x)
 
 
@@ -169,7 +169,7 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
         if verdict != USED:
             break
         if iteration < iterations - 1:
-            move_mean(m, reading.C, reading.chol_S, reading.nu, x)
+            move_mean(m, reading.C, reading.chol_S, reading.nu, estimated(context), x)
             nu, nu_std = reading.z[: reading.r.size], reading.z[reading.r.size :]
     if verdict == USED:
         correct(context, m, own, x, P)
@@ -205,5 +205,6 @@ EKF = Estimator(
     options=(JOSEPH_OPTION, *OPTIONS),
     tune=tune,
     memory=memory,
+    considers=True,
     singular=True,
 )

@@ -33,5 +33,6 @@ IEKF = Estimator(
     ),
     tune=tune,
     memory=memory,
+    considers=True,
     singular=True,
 )

@@ -148,7 +148,7 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     if m == ny:
         K = found.K
     else:
-        gain(m, reading.C, reading.chol_S, K)
+        gain(m, reading.C, reading.chol_S, n, K)
     for i in range(n):
         for k in range(m):
             x[i] += K[i, k] * reading.raw[k]

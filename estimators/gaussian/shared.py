@@ -246,20 +246,20 @@ def admit_weighted(context, sensor, m, reading, score):
 
 
 @inlined
-def gain(m, C, U, K):
-    """K = C S⁻¹ for the leading m columns, with S = Uᵀ U."""
+def gain(m, C, U, estimated, K):
+    """K = C S⁻¹ for the leading m columns, with S = Uᵀ U; zero beyond the `estimated` rows."""
     for i in range(C.shape[0]):
         for j in range(m):
-            K[i, j] = C[i, j]
+            K[i, j] = C[i, j] if i < estimated else 0.0
         solve_transposed(U, m, K[i])
         solve_upper(U, m, K[i])
 
 
 @inlined
-def move_mean(m, C, U, nu, x):
-    """x += C U⁻¹ ν̃, where ν̃ = U⁻ᵀ ν is the whitened innovation."""
+def move_mean(m, C, U, nu, estimated, x):
+    """x += C U⁻¹ ν̃, where ν̃ = U⁻ᵀ ν is the whitened innovation; considered states stay."""
     solve_upper(U, m, nu)
-    for i in range(x.size):
+    for i in range(estimated):
         for j in range(m):
             x[i] += C[i, j] * nu[j]
 
@@ -302,8 +302,14 @@ def joseph(m, d, C, H, K, P, N):
 
 
 @part
-def downdate(m, C, U, P, W):
-    """P ← P - K S Kᵀ, as P - Wᵀ W with W = U⁻ᵀ Cᵀ, in scratch of (m or more, nx in whole vectors)."""
+def downdate(m, C, U, estimated, P, W):
+    """P ← P - K S Kᵀ, as P - Wᵀ W with W = U⁻ᵀ Cᵀ, in scratch of (m or more, nx in whole vectors).
+
+    The covariance of the considered states stays. That of the estimated ones, and of both, is then that of Schmidt's
+    filter: for a gain that is the optimal one in the estimated rows, P - K S Kᵀ is the optimal covariance there.
+    Sources: Schmidt (1966), Application of state-space methods to navigation problems; Jazwinski (1970), Stochastic
+    Processes and Filtering Theory, 8.4.
+    """
     n = P.shape[0]
     for k in range(m):
         inverse = 1.0 / U[k, k]
@@ -312,4 +318,7 @@ def downdate(m, C, U, P, W):
             for j in range(k):
                 s -= U[j, k] * W[j, i]
             W[k, i] = s * inverse
-    subtract_squares(W, m, P)
+    subtract_squares(W, m, estimated, P)
+    for i in range(estimated, n):
+        for j in range(estimated):
+            P[i, j] = P[j, i]

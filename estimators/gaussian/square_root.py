@@ -9,11 +9,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..compiled.context import add_process_noise, circular_rows, options, shown_states
+from ..compiled.context import add_process_noise, circular_rows, estimated, options, shown_states
 from ..compiled.noise import has_correlated_rows, independent_rows
 from ..estimator import Options
 from ..numerics.jit import by_address, embedded, inlined, ints, part
-from ..numerics.linalg import EPSILON, remove, root, solve_transposed, solve_unit, triangularise, wrap
+from ..numerics.linalg import EPSILON, add_square, remove, root, solve_transposed, solve_unit, triangularise, wrap
 from ..numerics.workspace import declare_layout, start_of, take_matrix
 from ..track import FAILED, MISSING, USED
 from . import robust
@@ -234,7 +234,7 @@ def condition(context, sensor, y, state, expected, Y, lost, own, innovation, inn
     if verdict == USED and is_robust(context) and not reweigh_joint(context, m, nu, own, Y, U, gone, A):
         verdict = FAILED
     if verdict == USED:
-        take_over(m, nu, A, x, U)
+        take_over(m, nu, A, estimated(context), x, U)
         wrap_mean(context, x)
         if is_adaptive(context):
             adapt(context, sensor, y, state, innovation, innovation_std, score)
@@ -242,16 +242,26 @@ def condition(context, sensor, y, state, expected, Y, lost, own, innovation, inn
 
 
 @inlined
-def take_over(m, nu, A, x, U):
-    """x ← x + Wᵀ ν̃ with the whitened ν̃, U ← U⁺, from the joint factor A."""
+def take_over(m, nu, A, estimated, x, U):
+    """x ← x + Wᵀ ν̃ with the whitened ν̃, U ← U⁺, from the joint factor A, of which the rows of W are lost.
+
+    Considered states stay, and so does their covariance: what U⁺ lacks of it, W_cᵀ W_c, is added again. Source:
+    Bierman (1977), Factorization Methods for Discrete Sequential Estimation, chapter 8.
+    """
     n = x.size
     for i in range(m):
         a = nu[i]
-        for j in range(n):
+        for j in range(estimated):
             x[j] += a * A[i, m + j]
     for i in range(n):
         for j in range(i, n):
             U[i, j] = A[m + i, m + j]
+    if estimated < n:
+        for i in range(m):
+            lost = A[i, m:]
+            for j in range(estimated):
+                lost[j] = 0.0
+            add_square(U, n, lost)
 
 
 @part

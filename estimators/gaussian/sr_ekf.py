@@ -114,5 +114,6 @@ SR_EKF = Estimator(
     options=OPTIONS,
     tune=tune,
     memory=memory,
+    considers=True,
     singular=True,
 )

@@ -154,6 +154,7 @@ SR_UKF = Estimator(
     options=UKF.options,
     tune=tune,
     memory=memory,
+    considers=True,
     refuses=UKF.refuses,
     singular=True,
 )

@@ -13,7 +13,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..compiled.context import circular_rows, circular_states, expect_points, options, row_count, transition_points
+from ..compiled.context import (
+    circular_rows,
+    circular_states,
+    estimated,
+    expect_points,
+    options,
+    row_count,
+    transition_points,
+)
 from ..estimator import Estimator, Option, Options
 from ..model.state_space import StateSpaceModel
 from ..numerics.jit import by_address, inlined, jit
@@ -169,9 +177,9 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     m = compare(context, sensor, y, reading, own.no_H, P, innovation, innovation_std)
     verdict = FAILED if drowned else admit_weighted(context, sensor, m, reading, score)
     if verdict == USED:
-        move_mean(m, reading.C, reading.chol_S, reading.nu, x)
+        move_mean(m, reading.C, reading.chol_S, reading.nu, estimated(context), x)
         wrap_mean(context, x)
-        downdate(m, reading.C, reading.chol_S, P, reading.W)
+        downdate(m, reading.C, reading.chol_S, estimated(context), P, reading.W)
         if is_adaptive(context):
             adapt(context, sensor, y, state, innovation, innovation_std, score)
     return verdict
@@ -200,6 +208,7 @@ UKF = Estimator(
     needs_factor=True,
     tune=tune,
     memory=memory,
+    considers=True,
     refuses=refuses,
 )
 

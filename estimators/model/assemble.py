@@ -93,14 +93,19 @@ def _blamed(kind: str, name: str) -> Iterator[None]:
 
 
 class JointParameter(NamedTuple):
-    """A parameter to estimate: `std` of the prior about its value, and `drift`, the std that a second adds to it."""
+    """A parameter to estimate or to consider.
+
+    `std` is that of its prior about its value, `drift` the std that a second adds to it. A considered one keeps its
+    value whatever is measured, and the state's covariance accounts for what it may be.
+    """
 
     std: float
     drift: float = 0.0
+    considered: bool = False
 
 
 def joint(model: StateSpaceModel, estimated: Mapping[str, JointParameter]) -> StateSpaceModel:
-    """Return the model with these parameters as its last states, in the order of the model's parameters.
+    """Return the model with these parameters as its last states, in the order of the model's, considered ones last.
 
     Raises:
         ModelError: If it has no such parameter, or has a state of that name.
@@ -119,6 +124,7 @@ def joint(model: StateSpaceModel, estimated: Mapping[str, JointParameter]) -> St
                 "uncertain: give a positive std"
             )
     moved = [item for item in model.parameters if item.name in estimated]
+    moved.sort(key=lambda item: estimated[item.name].considered)
     kept = [item for item in model.parameters if item.name not in estimated]
     # Where each of the model's parameters comes from: θ[k], or -1 - k for p[k] of those that stay.
     place = tuple(moved.index(item) if item in moved else -1 - kept.index(item) for item in model.parameters)
@@ -136,6 +142,7 @@ def joint(model: StateSpaceModel, estimated: Mapping[str, JointParameter]) -> St
         sensors=tuple(replace(sensor, h=_sensor(sensor.h, *layout), H=None) for sensor in model.sensors),
         jump=None if model.jump is None else replace(model.jump, chances=_chances(model.jump.chances, *layout)),
         linear=False,
+        considered=sum(item.considered for item in estimated.values()),
     )
 
 

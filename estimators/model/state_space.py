@@ -141,7 +141,8 @@ class StateSpaceModel:
 
     A `jump` makes one state a discrete mode. `conditionally_linear` names states in which f and h are
     linear once the other states are known, with noise that does not depend on them: `rbpf` carries these by a Kalman
-    filter.
+    filter. The last `considered` states are not estimated: their uncertainty widens P and lowers the gain, and no
+    measurement changes them (Schmidt's filter).
 
     Steps longer than `max_step` seconds are split, so that f may use a simple integration scheme.
 
@@ -170,6 +171,7 @@ class StateSpaceModel:
     executor: Executor | str | None = None
     jump: Jump | None = None
     conditionally_linear: tuple[str, ...] = ()
+    considered: int = 0
 
     def __post_init__(self) -> None:
         """Refuse models that no filter could run: nothing to estimate, duplicate names, numbers out of range."""

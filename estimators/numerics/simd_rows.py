@@ -98,13 +98,16 @@ def cross_covariance(v, U, across, w, C):
 
 
 @vector_code()
-def subtract_squares(v, W, m, P):
-    """P (n, n) -= Wᵀ W, of the leading m rows of W (m or more, padded n); a symmetric P stays so, bit by bit."""
+def subtract_squares(v, W, m, rows, P):
+    """Leading rows of P (n, n) -= those of Wᵀ W, of the leading m rows of W (m or more, padded n).
+
+    A symmetric P stays so, bit by bit, if these are all of its rows.
+    """
     builder, w, n, width = v.builder, W.data, sizes(v.builder, P)[0], sizes(v.builder, W)[1]
     left = v.variable()
     with steps(builder, 0, width, LANES) as at:
         own = v.first(builder.sub(n, at))
-        with cgutils.for_range(builder, n) as loop:
+        with cgutils.for_range(builder, rows) as loop:
             to = builder.gep(P.data, [builder.mul(loop.index, n)])
             builder.store(v.load_first(to, at, own), left)
             with cgutils.for_range(builder, m) as inner:

@@ -1,0 +1,142 @@
+"""Schmidt's filter: what is considered keeps value and variance, and widens the covariance of what is estimated."""
+
+import numpy as np
+import pytest
+
+from estimators.fold import Fold
+from estimators.log import READING, Events, Log
+from estimators.model.assemble import JointParameter, joint
+from estimators.model.state_space import Input, Noise, Parameter, Row, Sensor, State, StateSpaceModel
+from estimators.registry import ESTIMATORS
+from estimators.tuning import Tuning
+from tests.support import SECOND
+
+CONSIDERING = [name for name, entry in ESTIMATORS.items() if entry.considers]
+CONSIDERED = {"offset": JointParameter(0.3, considered=True), "loss": JointParameter(0.02, considered=True)}
+ESTIMATED = {"heat": JointParameter(0.5, drift=0.01)}
+STEP = 0.5
+
+
+def f(x, u, p, dt, out):
+    loss, heat = p[1], p[2]
+    out[0] = x[0] + dt * (u[0] * heat - loss - 0.1 * x[0] + 0.05 * x[1])
+    out[1] = x[1] + dt * (0.05 * x[0] - 0.08 * x[1])
+
+
+def bilinear(x, u, p, dt, out):
+    loss, heat = p[1], p[2]
+    out[0] = x[0] + dt * (u[0] * heat - loss * x[0] + 0.05 * x[1])
+    out[1] = x[1] + dt * (0.05 * x[0] - 0.08 * x[1])
+
+
+def first(x, u, p, out):
+    out[0] = x[0] + p[0]
+
+
+def both(x, u, p, out):
+    out[0] = x[0] - x[1]
+    out[1] = x[1] + 0.5 * p[0]
+
+
+def physics(f):
+    return StateSpaceModel(
+        name="considering",
+        title="two temperatures",
+        states=(State("a", "K", mean=2.0, std=1.0), State("b", "K", mean=1.0, std=2.0)),
+        noises=(Noise("a", "K²/s", variance=0.01), Noise("b", "K²/s", variance=0.02)),
+        sensors=(
+            Sensor("first", (Row("first", "K", variance=0.04),), h=first),
+            Sensor("both", (Row("difference", "K", variance=0.09), Row("b", "K", variance=0.01)), h=both),
+        ),
+        f=f,
+        inputs=(Input("power", "W", default=0.5),),
+        parameters=(Parameter("offset", "K", 0.1), Parameter("loss", "1/s", 0.1), Parameter("heat", "K/J", 1.0)),
+    )
+
+
+def log_of(steps=40):
+    rng = np.random.default_rng(3)
+    log = Log(2)
+    for k in range(steps):
+        channel = k % 2
+        value = np.full((1, 2), np.nan)
+        value[0, : channel + 1] = rng.normal(2.0, 0.5, channel + 1)
+        if k == 11:
+            value[0, 0] = np.nan  # one row of two is missing
+        t = np.array([int(k * STEP * SECOND)])
+        log.extend(Events(t, t.copy(), np.array([READING], np.int8), np.array([channel], np.int32), value))
+    return log
+
+
+def schmidt(model, log, u):
+    """Mean (nx,) and covariance after each event, by the equations in blocks, with NumPy and complex steps.
+
+    Source: Jazwinski (1970), Stochastic Processes and Filtering Theory, 8.4.
+    """
+    nc = model.considered
+    n = model.nx - nc
+    p = model.default_parameters
+    z, C = model.prior_mean.copy(), np.diag(model.prior_std[n:] ** 2)
+    Pxx, Pxc = np.diag(model.prior_std[:n] ** 2), np.zeros((n, nc))
+    q = np.zeros(model.nx)
+    for noise in model.noises:
+        q[model.state_names.index(noise.name)] += noise.variance
+
+    def jacobian(function, rows):
+        J = np.empty((rows, model.nx))
+        for j in range(model.nx):
+            out = np.zeros(rows, complex)
+            function(z + 1e-30j * np.eye(model.nx)[j], out)
+            J[:, j] = out.imag / 1e-30
+        return J
+
+    for k in range(log.n):
+        if k > 0:
+
+            def step(x, out):
+                model.f(x, u, p, STEP, out)
+
+            F = jacobian(step, model.nx)
+            A, B = F[:n, :n], F[:n, n:]
+            forward = np.empty(model.nx)
+            step(z, forward)
+            z = forward
+            Pxx = A @ Pxx @ A.T + A @ Pxc @ B.T + B @ Pxc.T @ A.T + B @ C @ B.T + STEP * np.diag(q[:n])
+            Pxc = A @ Pxc + B @ C
+        sensor = model.sensors[log.events.channel[k]]
+        rows = len(sensor.rows)
+        H = jacobian(lambda x, out, h=sensor.h: h(x, u, p, out), rows)
+        expected = np.empty(rows)
+        sensor.h(z, u, p, expected)
+        nu = log.events.value[k, :rows] - expected
+        seen = np.isfinite(nu)
+        Hx, Hc, nu = H[seen, :n], H[seen, n:], nu[seen]
+        R = np.diag([row.variance for row in sensor.rows])[np.ix_(seen, seen)]
+        S = Hx @ Pxx @ Hx.T + Hx @ Pxc @ Hc.T + Hc @ Pxc.T @ Hx.T + Hc @ C @ Hc.T + R
+        K = (Pxx @ Hx.T + Pxc @ Hc.T) @ np.linalg.inv(S)
+        z[:n] += K @ nu
+        Pxx = Pxx - K @ S @ K.T
+        Pxc = Pxc - K @ (Hx @ Pxc + Hc @ C)
+        yield z.copy(), np.block([[Pxx, Pxc], [Pxc.T, C]]), nu @ np.linalg.inv(S) @ nu
+
+
+# Sigma points are exact where f and h are linear; elsewhere tangents are those of the equations.
+@pytest.mark.parametrize(
+    ("estimator", "f", "options"),
+    [
+        *((name, f, {}) for name in CONSIDERING),
+        *((name, bilinear, {}) for name in ("ekf", "sr-ekf")),
+        ("ekf", bilinear, {"joseph": "on"}),
+    ],
+)
+def test_it_equals_the_equations_in_blocks(estimator, f, options):
+    model = joint(physics(f), CONSIDERED | ESTIMATED)
+    assert model.state_names == ("a", "b", "heat", "offset", "loss") and model.considered == 2
+    log = log_of()
+    fold = Fold(estimator, model, Tuning.of(model).with_options(options), log)
+    for mean, cov, nis in schmidt(model, log, model.default_inputs):
+        fold.advance(1)
+        actual, P = fold.moments()
+        np.testing.assert_allclose(actual, mean, rtol=0, atol=1e-9 * np.max(np.abs(mean)))
+        np.testing.assert_allclose(P, cov, rtol=0, atol=1e-9 * np.max(np.abs(cov)))
+        assert fold.track.nis[fold.n - 1] == pytest.approx(nis, rel=1e-8)
