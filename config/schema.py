@@ -38,6 +38,9 @@ from .fields import (
 )
 from .source_schema import FaultSection, SourceSection
 
+Percent = Annotated[str, Field(pattern=r"^[0-9.]*[1-9][0-9.]* ?%$")]
+"""A share above zero, as in 10 %."""
+
 GateProbability = Annotated[float, Field(strict=True, ge=0.5, lt=1)]
 
 
@@ -49,6 +52,41 @@ class PriorSection(Section):
     std: NotNegative | None = None
     """Standard deviation of the prior, in the state's unit. 0 is a state that is known exactly: kf, ekf, iekf and the
     square-root filters accept it, a field does not. Default: the model's."""
+
+
+class ParameterSection(Section):
+    """Value of a parameter of the model, and how uncertain it is."""
+
+    value: Number | None = None
+    """Its value, in its unit. Default: the model's."""
+    std: Positive | Percent | None = None
+    """Standard deviation of its true value about this one, in its unit, or in percent of the value, as in 10 %.
+    Default: none, it is certain."""
+    drift: NotNegative = 0.0
+    """Random walk of an estimated one: standard deviation that one second adds, in its unit. Default: 0."""
+    use: Literal["held", "considered", "estimated"] = "considered"
+    """held: the filter takes it for certain. considered: no measurement changes it, and its uncertainty is part of the
+    bands (Schmidt's filter). estimated: it becomes a state, as with `estimate`. Default: considered, if it has a
+    std."""
+
+    @model_validator(mode="after")
+    def _complete(self) -> ParameterSection:
+        if self.use == "estimated" and self.std is None:
+            raise refused("absent", "an estimated parameter needs the standard deviation of its prior", "std")
+        if self.use != "estimated" and self.drift:
+            raise refused("relation", "is for a parameter with `use: estimated`; leave it out", "drift")
+        return self
+
+    def spread(self, value: float) -> float | None:
+        """Return the standard deviation of a parameter of this value; None if it is held."""
+        if self.use == "held" or self.std is None:
+            return None
+        return abs(value) * float(self.std.rstrip(" %")) / 100.0 if isinstance(self.std, str) else self.std
+
+
+def as_parameter(value: Any) -> Any:
+    """Return a number as the value of a parameter."""
+    return value if isinstance(value, (dict, ParameterSection)) else {"value": value}
 
 
 class EstimateSection(Section):
@@ -285,8 +323,12 @@ class TwinSection(Section):
     model: Text
     """The model's name in the catalogue (motor_winding), or a Python file beside this one and the name of a model, or
     of a function that returns one, in it (./pump.py:Pump)."""
-    parameters: dict[str, Number] = {}
-    """The model's parameters by name, in their units. Default: the model's values."""
+    parameters: dict[
+        str,
+        Annotated[ParameterSection, BeforeValidator(as_parameter, json_schema_input_type=Number | ParameterSection)],
+    ] = {}
+    """The model's parameters by name: their values, in their units, or {value, std, use}. Default: the model's values,
+    held."""
     learned: Text | None = None
     """File of a learned correction, beside this one, as `nisus learn` writes it: a correction of the model's rates,
     with a noise NAME_learned for each corrected state. Default: none, the model alone."""

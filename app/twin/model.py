@@ -152,6 +152,13 @@ def _assembled(model: StateSpaceModel, loaded: Loaded) -> StateSpaceModel:
     parameters = [*(item.name for item in model.parameters), *times]
     check_names(loaded, ("estimate",), config.estimate, parameters, "parameter", model)
     estimated = {name: JointParameter(section.std, section.drift) for name, section in config.estimate.items()}
+    for item in model.parameters:
+        section = config.parameters.get(item.name)
+        std = section.spread(item.value) if section is not None else None
+        if section is not None and std is not None:
+            if item.name in config.estimate:
+                raise loaded.error(("estimate", item.name), "has a std in `parameters` too; give it in one place")
+            estimated[item.name] = JointParameter(std, section.drift, considered=section.use == "considered")
     try:
         return assemble(model, learned=learned, noises=noises, errors=errors, estimated=estimated)
     except AppendError as error:
@@ -181,14 +188,15 @@ def with_parameters(model: StateSpaceModel, loaded: Loaded) -> StateSpaceModel:
     config = loaded.config
     names = [item.name for item in model.parameters]
     check_names(loaded, ("parameters",), config.parameters, names, "parameter", model)
+    values = {name: section.value for name, section in config.parameters.items() if section.value is not None}
     for item in model.parameters:
-        value = config.parameters.get(item.name, item.value)
+        value = values.get(item.name, item.value)
         if not item.low <= value <= item.high:
             raise loaded.error(
                 ("parameters", item.name),
                 f"is {value:g} {item.unit}; it must lie between {item.low:g} and {item.high:g}",
             )
-    parameters = tuple(replace(p, value=config.parameters.get(p.name, p.value)) for p in model.parameters)
+    parameters = tuple(replace(p, value=values.get(p.name, p.value)) for p in model.parameters)
     return replace(model, parameters=parameters)
 
 

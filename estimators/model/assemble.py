@@ -4,17 +4,19 @@ The order is fixed, and each step wraps the model of the step before:
 
 1. `hybrid`: a learned correction beside f, with a noise for each corrected state.
 2. `coloured`: states for process noise and sensor errors with a correlation time; correlation times are parameters.
-3. `joint`: parameters, those of step 2 included, as the last states.
+3. `joint`: parameters, those of step 2 included, as the last states; then what considered ones may be off by.
 
-So the physics keeps its states first, in their order: x = (physics, disturbances, sensor errors, parameters).
+So the physics keeps its states first, in their order: x = (physics, disturbances, sensor errors, parameters, deviations
+of considered parameters).
 
 Joint estimation moves parameters into the state:
 
     x⁺ = (x, θ),   x' = f(x, u, p(θ), dt) + w,   θ' = θ + w_θ,   y = h(x, u, p(θ)) + v
 
-A moved parameter drifts as a random walk; with a drift of zero it is an unknown constant. It acts on the model only
-within its range, so that an estimate outside cannot make a divisor zero. Derivatives are by complex step, since the
-model's own do not include θ.
+A moved parameter drifts as a random walk; with a drift of zero it is an unknown constant. A considered parameter stays
+one, and its deviation δ is a state that no measurement changes: f and h take p + δ. Both act on the model only within
+the parameter's range, so that an estimate outside cannot make a divisor zero. Derivatives are by complex step, since
+the model's own do not include θ.
 
 Source: Ljung (1979), Asymptotic behavior of the extended Kalman filter as a parameter estimator for linear systems,
 doi:10.1109/TAC.1979.1101943, for the method and its limits: θ can be biased where Q and R are wrong.
@@ -93,10 +95,9 @@ def _blamed(kind: str, name: str) -> Iterator[None]:
 
 
 class JointParameter(NamedTuple):
-    """A parameter to estimate or to consider.
+    """A parameter to estimate or to consider: `std` is that of its prior about its value, `drift` what a second adds.
 
-    `std` is that of its prior about its value, `drift` the std that a second adds to it. A considered one keeps its
-    value whatever is measured, and the state's covariance accounts for what it may be.
+    A considered one keeps its value whatever is measured, and the covariance of the states accounts for its `std`.
     """
 
     std: float
@@ -116,50 +117,67 @@ def joint(model: StateSpaceModel, estimated: Mapping[str, JointParameter]) -> St
     for name, given in estimated.items():
         if name not in names:
             raise ModelError(f"model {model.name} has no parameter {name!r} to estimate; it has {', '.join(names)}")
-        if name in model.state_names:
-            raise ModelError(f"model {model.name} has a state {name!r}; a parameter of that name cannot become one")
+        if (state := deviation(name) if given.considered else name) in model.state_names:
+            raise ModelError(f"model {model.name} has a state {state!r}; {name} cannot get another of that name")
         if not given.std > 0.0:
             raise ModelError(
-                f"model {model.name}: the prior of {name} has std {given.std:g}; an estimated parameter must be "
-                "uncertain: give a positive std"
+                f"model {model.name}: the prior of {name} has std {given.std:g}; an estimated or considered parameter "
+                "must be uncertain: give a positive std"
             )
-    moved = [item for item in model.parameters if item.name in estimated]
-    moved.sort(key=lambda item: estimated[item.name].considered)
-    kept = [item for item in model.parameters if item.name not in estimated]
-    # Where each of the model's parameters comes from: θ[k], or -1 - k for p[k] of those that stay.
-    place = tuple(moved.index(item) if item in moved else -1 - kept.index(item) for item in model.parameters)
-    low, high = (tuple(float(getattr(item, end)) for item in moved) for end in ("low", "high"))
+        if given.considered and given.drift:
+            raise ModelError(f"model {model.name}: {name} is considered, so it cannot drift; leave the drift out")
+    considered = [item for item in model.parameters if item.name in estimated and estimated[item.name].considered]
+    moved = [item for item in model.parameters if item.name in estimated and item not in considered]
+    kept = [item for item in model.parameters if item not in moved]
+    added = [*moved, *considered]
+    # Of each of the model's parameters: its index in θ and δ, and in p; -1 where it is not.
+    place = tuple(
+        (added.index(item) if item in added else -1, kept.index(item) if item in kept else -1)
+        for item in model.parameters
+    )
+    low, high = (tuple(float(getattr(item, end)) for item in model.parameters) for end in ("low", "high"))
     layout = (model.nx, place, low, high)
     noises = tuple(Noise(item.name, f"{squared(item.unit)}/s", estimated[item.name].drift ** 2) for item in moved)
     return replace(
         model,
-        states=(*model.states, *(State(m.name, m.unit, m.value, estimated[m.name].std) for m in moved)),
+        states=(
+            *model.states,
+            *(State(m.name, m.unit, m.value, estimated[m.name].std) for m in moved),
+            *(State(deviation(m.name), m.unit, 0.0, estimated[m.name].std) for m in considered),
+        ),
         parameters=tuple(kept),
         noises=(*model.noises, *noises),
         f=_step(model.f, *layout),
         F=None,
-        Q=None if model.Q is None else _noise(model.Q, len(model.noises), *layout),
+        Q=None if model.Q is None else _noise(model.Q, len(model.noises), len(moved), *layout),
         sensors=tuple(replace(sensor, h=_sensor(sensor.h, *layout), H=None) for sensor in model.sensors),
         jump=None if model.jump is None else replace(model.jump, chances=_chances(model.jump.chances, *layout)),
         linear=False,
-        considered=sum(item.considered for item in estimated.values()),
+        considered=len(considered),
     )
+
+
+def deviation(parameter: str) -> str:
+    """Return the name of the state that a considered parameter's deviation becomes."""
+    return f"{parameter}_deviation"
 
 
 @jit
 def _parameters(theta, p, place, low, high):
-    """Return p(θ): the model's own parameters, the moved ones held within their ranges."""
+    """Return p(θ, δ): the model's own parameters, with moved and considered ones held within their ranges."""
     full = np.empty(len(place), theta.dtype)
     for k in range(len(place)):
-        j = place[k]
+        j, own = place[k]
         if j < 0:
-            full[k] = p[-1 - j]
-        elif theta[j].real < low[j]:
-            full[k] = low[j]
-        elif theta[j].real > high[j]:
-            full[k] = high[j]
+            full[k] = p[own]
+            continue
+        value = theta[j] if own < 0 else p[own] + theta[j]
+        if value.real < low[k]:
+            full[k] = low[k]
+        elif value.real > high[k]:
+            full[k] = high[k]
         else:
-            full[k] = theta[j]
+            full[k] = value
     return full
 
 
@@ -196,12 +214,12 @@ def _sensor(function: Callable, n: int, place: tuple, low: tuple, high: tuple) -
 
 
 @lru_cache(maxsize=64)
-def _noise(function: Callable, nw: int, n: int, place: tuple, low: tuple, high: tuple) -> Callable:
+def _noise(function: Callable, nw: int, moved: int, n: int, place: tuple, low: tuple, high: tuple) -> Callable:
     inner = as_inner(function)
 
     def Q(x, u, p, q, dt, out):  # noqa: ANN001, ANN202
         inner(x[:n], u, _parameters(x[n:], p, place, low, high), q[:nw], dt, out[:n, :n])
-        for j in range(n, x.size):
-            out[j, j] = q[nw + j - n] * dt
+        for j in range(moved):
+            out[n + j, n + j] = q[nw + j] * dt
 
     return Q

@@ -344,16 +344,17 @@ class StateSpaceModel:
 
     @cached_property
     def shown(self) -> np.ndarray:
-        """Indices of the states with a column in the track: all, or those that a field names."""
+        """Indices of the states with a column in the track: all that are estimated, or those that a field names."""
         if isinstance(self.states, Field) and self.states.shown:
             return np.array(self.states.shown, np.int64)
-        if self.nx <= SHOWN:
-            return np.arange(self.nx)
+        estimated = self.nx - self.considered
+        if estimated <= SHOWN:
+            return np.arange(estimated)
         if isinstance(self.states, Field):
             axes = [np.unique(np.linspace(0, n - 1, 6).round().astype(int)[1:-1]) for n in self.states.shape]
             cells = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(axes))
             return np.ravel_multi_index(cells.T, self.states.shape)[:SHOWN].astype(np.int64)
-        return np.unique(np.linspace(0, self.nx - 1, SHOWN).round().astype(np.int64))
+        return np.unique(np.linspace(0, estimated - 1, SHOWN).round().astype(np.int64))
 
     @cached_property
     def shown_states(self) -> tuple[State, ...]:

@@ -53,8 +53,12 @@ def tuning_yaml(
     erring = [sensor for sensor in model.sensors if sensor.name in config.sensors and config.sensors[sensor.name].error]
     times = {*map(disturbance_time, lasting), *(error_time(sensor.name) for sensor in erring)}
     turned = {name: value for name, value in values.items() if name in config.parameters or value != known[name]}
-    turned = {**config.parameters, **turned} if whole else values
-    lines += as_section("parameters", {name: value for name, value in turned.items() if name not in times})
+    given = {name: section.model_dump(mode="json", exclude_unset=True) for name, section in config.parameters.items()}
+    parameters: dict[str, Any] = given if whole else {}
+    for name, value in (turned if whole else values).items():
+        parameters[name] = {**parameters.get(name, {}), "value": value}
+    parameters = {name: item["value"] if list(item) == ["value"] else item for name, item in parameters.items()}
+    lines += as_section("parameters", {name: item for name, item in parameters.items() if name not in times})
     if prior is not None:
         beliefs = zip(model.state_names, prior[0].tolist(), np.sqrt(np.diag(prior[1])).tolist(), strict=True)
         lines += as_section("prior", {name: {"mean": mean, "std": std} for name, mean, std in beliefs})

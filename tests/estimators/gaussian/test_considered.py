@@ -131,7 +131,7 @@ def schmidt(model, log, u):
 )
 def test_it_equals_the_equations_in_blocks(estimator, f, options):
     model = joint(physics(f), CONSIDERED | ESTIMATED)
-    assert model.state_names == ("a", "b", "heat", "offset", "loss") and model.considered == 2
+    assert model.state_names == ("a", "b", "heat", "offset_deviation", "loss_deviation") and model.considered == 2
     log = log_of()
     fold = Fold(estimator, model, Tuning.of(model).with_options(options), log)
     for mean, cov, nis in schmidt(model, log, model.default_inputs):
