@@ -57,6 +57,17 @@ class LogOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
+class PartOptions:
+    """Options of a command that scores a part of the log; the filter still runs from the start."""
+
+    since: str | None = None
+    """Score only from here: a share of the measurements (50%), a time after the start (600, 10min), or a date
+    (2024-05-01T14:00, UTC)."""
+    until: str | None = None
+    """Score only up to here, given as --since."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class JsonOption:
     """Option of a command with a result for scripts."""
 
@@ -141,7 +152,7 @@ class RunCommand(JsonOption, PageOptions, TuningOption, EstimatorOption):
 
 
 @dataclass(frozen=True)
-class FoldCommand(JsonOption, FoldOptions):
+class FoldCommand(JsonOption, PartOptions, FoldOptions):
     """Fold the log of a twin as fast as possible and print scores, calibration and fault episodes.
 
     Examples:
@@ -149,6 +160,7 @@ class FoldCommand(JsonOption, FoldOptions):
       nisus fold motor_can --log drive.blf --html report.html
       nisus fold battery_panasonic --blind --plot cell.pdf
       nisus fold motor_can --set gate.kind=soft --json
+      nisus fold drive.yaml --since 50%
     """
 
     out: Path | None = None
@@ -202,7 +214,7 @@ class AdviseCommand(JsonOption, RoleOptions, TableOptions, LogOptions, Estimator
 
 
 @dataclass(frozen=True)
-class CompareCommand(JsonOption, LogOptions, TuningOption):
+class CompareCommand(JsonOption, PartOptions, LogOptions, TuningOption):
     """Fold every applicable filter over the same log, in parallel, and print a table of scores.
 
     Filters that draw random members are folded with eight seeds; their figures are mean ± standard deviation of one

@@ -13,7 +13,7 @@ from ..studies.scores import FilterScore, cells, printed, row_json, write_scores
 from ..terminal import complain
 from ..twin.log_reader import read_logs
 from ..twin.twin import load_twin
-from .options import settings
+from .options import settings, span_of
 from .prepare import prepare, progress
 
 if TYPE_CHECKING:
@@ -46,17 +46,21 @@ def _compare(arguments: Arguments, name: str) -> list[dict[str, Any]]:
     """Print the table of a twin, unless JSON is wanted, and return its rows for scripts."""
     overrides = settings(arguments.set, tuning=arguments.tuning)
     twin = load_twin(name, log_files=arguments.log or None, overrides=overrides)
-    others = arguments.estimators, arguments.set, arguments.tuning, arguments.log, arguments.duration
+    others = (
+        *(arguments.estimators, arguments.set, arguments.tuning, arguments.log),
+        *(arguments.duration, arguments.since, arguments.until),
+    )
     if arguments.write and (any(others) or arguments.logs > 1):
         raise ConfigError("--write: saves the scores of all filters over the twin's own log; leave other options out")
     names = applicable(twin, arguments.estimators)
     prepare(twin)
     logs = [without_marks(log.events) for log in read_logs(twin, name, overrides, arguments.logs, arguments.duration)]
+    scored = span_of(arguments, logs[0])
     rows: list[FilterScore] = []
     ended = False
     with progress(f"{twin.name}, {len(logs[0])} events", len(names), "filters") as advance:
         try:
-            for row in compare(name, overrides, names, logs, arguments.jobs, arguments.budget):
+            for row in compare(name, overrides, names, logs, arguments.jobs, arguments.budget, scored):
                 rows.append(row)
                 advance(best_text(rows))
         except KeyboardInterrupt:

@@ -30,11 +30,14 @@ from ..studies.fold_result import (
     known_states,
     nees_of,
     pairs_with,
+    rows_of,
     smoothing_score,
+    within,
 )
 from ..studies.scores import pictures_of
 from ..twin.log_reader import read_log
 from ..views.recording.rrd_file import TAKEN
+from .options import span_of
 from .prepare import attend, fold_log, opened, prepare
 
 if TYPE_CHECKING:
@@ -60,32 +63,36 @@ def fold_twin(arguments: Arguments) -> int:
     begun = time.perf_counter()
     fold = fold_log(twin, log, picture=twin.picture if recorded else None, pairs=pairs_with(twin, known))
     seconds = (time.perf_counter() - begun) / log.n
-    pictures = pictures_of(fold)
+    part = rows_of(log, span_of(arguments, log.events))
+    events, track = log.events.select(part), fold.track.select(part)
+    pictures = [one for one in pictures_of(fold) if part.start < one.before <= part.stop]
     smoothed: Smoothed | None = attend(twin.model, lambda: smooth(fold), "smoothing") if arguments.smooth else None
     result = FoldResult(
         twin,
         fold,
         counts,
         seconds,
-        score(fold.track, log.events, twin.model, pictures, gate=twin.tuning.gate, baseline=twin.tuning.baseline),
-        calibration_of(twin, fold),
-        explained(fold, [*dropped(counts, fold), *episodes(fold)]),
-        smoothing_score(fold, smoothed) if smoothed is not None else None,
-        nees_of(fold, known),
+        score(track, events, twin.model, pictures, gate=twin.tuning.gate, baseline=twin.tuning.baseline),
+        calibration_of(fold, events, track),
+        explained(fold, [*dropped(counts, fold), *within(episodes(fold), events)]),
+        part,
+        smoothing_score(fold, smoothed, part) if smoothed is not None else None,
+        nees_of(fold, known, part),
     )
     if out is not None:
         _write(out, result, smoothed)
     if arguments.html is not None:
         run = Reported(
-            twin, twin.estimator, twin.tuning, log.events, fold.track, pictures,
-            [item.episode for item in result.episodes], fold.marginal, smoothed=smoothed,
+            twin, twin.estimator, twin.tuning, events, track, pictures,
+            [item.episode for item in result.episodes], fold.marginal,
+            smoothed=smoothed and smoothed.select(part),
         )  # fmt: skip
         with writing(arguments.html, "--html"):
             arguments.html.write_text(to_html(f"{twin.name}, {twin.estimator}", report(run)), encoding="utf-8")
     if arguments.plot is not None:
         with writing(arguments.plot, "--plot"):
             found, title = [item.episode for item in result.episodes], f"{twin.name}, {twin.estimator}"
-            figure = plot_track(twin.model, log.events, fold.track, episodes=found, title=title)
+            figure = plot_track(twin.model, events, track, episodes=found, title=title)
             figure.savefig(arguments.plot, dpi=150)
     print(to_json(fold_json(result)) if arguments.json else "\n".join(to_text(fold_topics(result))))
     return 0

@@ -13,8 +13,10 @@ import tyro
 from estimators.errors import ConfigError, nearest, quoted
 
 if TYPE_CHECKING:
+    from estimators.log import Events
+
     from ..studies.advice.plan import Roles
-    from .arguments import RoleOptions
+    from .arguments import PartOptions, RoleOptions
 
 
 def check_output(option: str, path: Path, *endings: str) -> None:
@@ -64,6 +66,84 @@ def settings(texts: Sequence[str], estimator: str | None = None, tuning: str | N
     if tuning is not None:
         pairs["tuning"] = tuning
     return pairs
+
+
+def seconds_of(option: str, text: str) -> float:
+    """Return the seconds of an option, given as a number or with a unit: 600, 10min.
+
+    Raises:
+        ConfigError: If it is neither, or not positive.
+    """
+    from pydantic_core import PydanticCustomError
+
+    from config.fields import as_seconds
+
+    try:
+        value = as_seconds(text)
+    except PydanticCustomError:
+        try:
+            value = float(text)
+        except ValueError:
+            raise ConfigError(f"{option} {text}: give seconds, or a number with its unit, as in 10min") from None
+    if not 0.0 < value < float("inf"):
+        raise ConfigError(f"{option} {text}: must be positive")
+    return float(value)
+
+
+def span_of(options: PartOptions, events: Events) -> tuple[int, int] | None:
+    """Return begin and end, ns, of the part of a log that `--since` and `--until` select; None for all.
+
+    Raises:
+        ConfigError: If one is no time, or no measurement lies between them.
+    """
+    from estimators.log import READING
+
+    from ..format_time import format_time
+
+    if options.since is None and options.until is None:
+        return None
+    begin = int(events.t[0]) if options.since is None else _moment("--since", options.since, events)
+    end = int(events.t[-1]) + 1 if options.until is None else _moment("--until", options.until, events)
+    if not ((events.kind == READING) & (events.t >= begin) & (events.t < end)).any():
+        given = " ".join(
+            f"{name} {text}" for name, text in (("--since", options.since), ("--until", options.until)) if text
+        )
+        raise ConfigError(
+            f"{given}: there is no measurement in this part; the log is from {format_time(int(events.t[0]))} to "
+            f"{format_time(int(events.t[-1]))}"
+        )
+    return begin, end
+
+
+def _moment(option: str, text: str, events: Events) -> int:
+    """Return a moment of a log, ns: a share of the measurements, a time after the start, or a date."""
+    from datetime import UTC, datetime
+
+    import numpy as np
+
+    from estimators.log import READING
+
+    from ..format_time import FIRST_DATED_NS
+
+    share, percent, _ = text.rpartition("%")
+    if percent:
+        try:
+            return int(np.quantile(events.t[events.kind == READING], float(share) / 100.0))
+        except ValueError:
+            raise ConfigError(f"{option} {text}: give a share from 0% to 100%") from None
+    try:
+        when = datetime.fromisoformat(text) if "-" in text[1:] and "e-" not in text else None
+    except ValueError:
+        raise ConfigError(f"{option} {text}: is no date; write for example 2024-05-01T14:00 (UTC)") from None
+    if when is None:
+        try:
+            return int(events.t[0]) + round(seconds_of(option, text) * 1e9)
+        except ConfigError:
+            rule = "give a share (50%), a time after the start (600, 10min) or a date (2024-05-01T14:00)"
+            raise ConfigError(f"{option} {text}: {rule}") from None
+    if events.t[0] < FIRST_DATED_NS:
+        raise ConfigError(f"{option} {text}: the times of this log have no date; give seconds after its start")
+    return round((when if when.tzinfo else when.replace(tzinfo=UTC)).timestamp()) * 10**9
 
 
 def options_of(command: type) -> dict[str, Any]:

@@ -8,9 +8,6 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pydantic_core import PydanticCustomError
-
-from config.fields import as_seconds
 from config.loader import find
 from config.yaml_files import shown_path, writing
 from estimators.errors import ConfigError, printable
@@ -29,7 +26,7 @@ from ..terminal import complain
 from ..twin.defaults import bounds_of, natural_aim
 from ..twin.log_reader import read_log, read_logs
 from ..twin.twin import Twin, load_twin
-from .options import check_output, names_of, settings
+from .options import check_output, names_of, seconds_of, settings
 from .prepare import attend, prepare
 
 if TYPE_CHECKING:
@@ -145,8 +142,8 @@ def _named(text: str) -> tuple[list[Path], float]:
 
 def tune_windows(arguments: Arguments, wanted: Sequence[str], windows: str) -> int:
     """Fit window after window; return 0 if something was adopted, else 1."""
-    window = _seconds("--windows", windows)
-    every = window if arguments.every is None else _seconds("--every", arguments.every)
+    window = seconds_of("--windows", windows)
+    every = window if arguments.every is None else seconds_of("--every", arguments.every)
     if arguments.aim not in (None, LIKELIHOOD):
         raise ConfigError(
             f"--aim {arguments.aim}: cannot be used with --windows, which are fitted by likelihood; omit it"
@@ -193,16 +190,3 @@ def tune_windows(arguments: Arguments, wanted: Sequence[str], windows: str) -> i
     names = ", ".join(arguments.log or (f"{twin.name}, its own log",))
     _save(arguments, twin, adopted[-1], [f"{names}: windows of {window:g} s"])
     return 0
-
-
-def _seconds(option: str, text: str) -> float:
-    try:
-        value = as_seconds(text)
-    except PydanticCustomError:
-        try:
-            value = float(text)
-        except ValueError:
-            raise ConfigError(f"{option} {text}: give seconds, or a number with its unit, as in 10min") from None
-    if not 0.0 < value < float("inf"):
-        raise ConfigError(f"{option} {text}: must be positive")
-    return float(value)

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from estimators.diagnostics.clock_fit import ClockFit
+from estimators.diagnostics.consistency import NisVerdict
 from estimators.diagnostics.field_pictures import Picture
 from estimators.diagnostics.health import HealthPolicy
 from estimators.diagnostics.sensitivity import Bound, Smallest
@@ -188,9 +189,8 @@ class Status:
     filter's own figures (see `Fold.account`). `latency_ms` is the 99th percentile from a measurement's arrival to its
     row. `faults` are the injected ones that are active or planned. `integrity` has the protection levels; None until
     they are known. `compiling` are the filters that are not compiled yet: seconds since each was begun, None for one
-    that waits; `awaited` is the one for which a refold waits. `nis_judged` is the NIS relative to the baseline of a
-    commissioned twin (diagnostics/consistency.py), `nis_dof` the mean degrees of freedom of its measurements,
-    `sensor_nis` (sensors,) the mean NIS per degree of freedom of each sensor's recent measurements.
+    that waits; `awaited` is the one for which a refold waits. `nis` is the verdict on the last window, `sensor_nis`
+    (sensors,) the mean NIS per degree of freedom of each sensor's recent measurements.
     """
 
     estimator: str
@@ -209,9 +209,7 @@ class Status:
     clock: ClockFit | None
     counts: dict[str, int]
     account: dict[str, float | list[float]]
-    nis: float
-    nis_low: float
-    nis_high: float
+    nis: NisVerdict
     paused: bool
     speed: float | None
     seekable: bool
@@ -224,6 +222,4 @@ class Status:
     integrity: ProtectionLevels | None = None
     awaited: str | None = None
     compiling: Mapping[str, float | None] = field(default_factory=dict)
-    nis_judged: float = np.nan
-    nis_dof: float = 1.0
     sensor_nis: np.ndarray = field(default_factory=lambda: np.zeros(0))

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from estimators.diagnostics.consistency import NisVerdict
 from estimators.diagnostics.detector_state import sensor_states
 from estimators.diagnostics.health import MAX_ROWS_PER_READING
 from estimators.diagnostics.score import nis_verdict
@@ -57,7 +58,7 @@ def status_of(
     """
     model, log, track = fold.model, fold.log, fold.track
     recent = slice(max(0, fold.n - MAX_ROWS_PER_READING * fold.policy.window), fold.n)
-    judged, nis_dof = _judged(fold, log.events.select(recent), track.select(recent))
+    nis = _nis_of_window(fold, log.events.select(recent), track.select(recent))
     last = fold.n - 1
     t = int(log.t[last]) if last >= 0 else None
     states = sensor_states(model, fold.tuning.used, fold.evidence, (t or 0) * 1e-9, fold.policy)
@@ -84,11 +85,7 @@ def status_of(
             **({"silenced": layer.lost} if layer is not None and layer.lost else {}),
         },
         account=fold.account(),
-        nis=float(track.nis_mean[last]) if last >= 0 else np.nan,
-        nis_low=float(track.nis_low[last]) if last >= 0 else np.nan,
-        nis_high=float(track.nis_high[last]) if last >= 0 else np.nan,
-        nis_judged=judged,
-        nis_dof=nis_dof,
+        nis=nis,
         sensor_nis=_nis_of_sensors(log.events.select(slice(0, fold.n)), track, len(model.sensors)),
         latency_ms=watchers.latency.percentile(99.0),
         latency_p50_ms=watchers.latency.percentile(50.0),
@@ -124,7 +121,7 @@ def past_status(engine: Running, watchers: Watchers, t: int) -> Status:
     pull = engine.rows(end - max(MAX_ROWS_PER_READING * fold.policy.window, RECENT_READINGS * sensors), end)
     sensor_nis = _nis_of_sensors(pull.events, pull.track, sensors)
     track, health = pull.track, int(pull.track.health[-1])
-    judged, nis_dof = _judged(fold, pull.events, track)
+    nis = _nis_of_window(fold, pull.events, track)
     states = sensor_states(fold.model, fold.tuning.used, fold.evidence, now * 1e-9, fold.policy)
     since = now
     while len(pull.events) and int(pull.track.health[-1]) == health:
@@ -142,17 +139,13 @@ def past_status(engine: Running, watchers: Watchers, t: int) -> Status:
         sensors=account.of_sensors(fold.model.sensor_names, states),
         episodes_open=len(account.lasting),
         lost=None if estimated_rows(track.select(slice(-1, None)))[0] else now,
-        nis=float(track.nis_mean[-1]),
-        nis_low=float(track.nis_low[-1]),
-        nis_high=float(track.nis_high[-1]),
-        nis_judged=judged,
-        nis_dof=nis_dof,
+        nis=nis,
         sensor_nis=sensor_nis,
     )
 
 
-def _judged(fold: Fold, events: Events, track: Track) -> tuple[float, float]:
-    """Return the NIS of the last window relative to the baseline, NaN without one, and the mean degrees of freedom.
+def _nis_of_window(fold: Fold, events: Events, track: Track) -> NisVerdict:
+    """Return the verdict on the mean NIS of the last window.
 
     Args:
         fold: The fold whose settings hold.
@@ -162,8 +155,7 @@ def _judged(fold: Fold, events: Events, track: Track) -> tuple[float, float]:
     resets = np.flatnonzero(events.kind == RESET)
     begun = int(resets[-1]) + 1 if resets.size else 0
     judged = begun + np.flatnonzero(np.isin(track.verdict[begun:], (USED, GATED, FAILED)))[-fold.policy.window :]
-    found = nis_verdict(track.select(judged), events.select(judged), fold.model, fold.tuning.baseline)
-    return found.judged, found.dof
+    return nis_verdict(track.select(judged), events.select(judged), fold.model, fold.tuning.baseline)
 
 
 def _cause_without_rows(fold: Fold, watchers: Watchers, fields: Mapping[str, Any]) -> str:

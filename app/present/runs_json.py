@@ -15,6 +15,7 @@ from ..live.runs.sweep import NoiseEstimates, Swept
 from .result import plain
 
 if TYPE_CHECKING:
+    from estimators.diagnostics.consistency import NisVerdict
     from estimators.fit.fit import Fitted
     from estimators.fit.judge import PartScore, PredictionScore
 
@@ -50,17 +51,26 @@ def _score(known: RunScore, units: dict[str, str]) -> dict[str, Any]:
     fits += [(name, "held out", fit) for name, fit in score.held_out.items()]
     if score.field is not None:
         fits.append(("all cells", "truth", score.field))
-    verdict = score.nis_verdict
     found = {name: getattr(known, name) for name in ("rows", "seconds", "log_likelihood_reading", "step_us")}
-    found |= {
-        name: getattr(score, name)
-        for name in ("nis", "nis_low", "nis_high", "nis_dof", "log_likelihood", "readings", "refused")
-    }
-    found |= {"nis_judged": verdict.measure, "nis_place": verdict.place, "nis_words": verdict.words}
+    found |= {name: getattr(score, name) for name in ("log_likelihood", "readings", "refused")}
+    found |= nis_json(score.nis_verdict)
     found["fits"] = [
         {"name": name, "against": against, "unit": units.get(name, "")} | fit._asdict() for name, against, fit in fits
     ]
     return dict(plain(found))
+
+
+def nis_json(found: NisVerdict) -> dict[str, Any]:
+    """Return a verdict on a mean NIS: numbers per measurement, position and words."""
+    return {
+        "nis": found.nis,
+        "nis_low": found.low,
+        "nis_high": found.high,
+        "nis_dof": found.dof,
+        "nis_judged": found.measure,
+        "nis_place": found.place,
+        "nis_words": found.words,
+    }
 
 
 def what_changed(run: Revision) -> str:

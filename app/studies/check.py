@@ -12,6 +12,7 @@ import numpy as np
 from config.source_schema import CanLogSection, CanSection, MergedSection
 from estimators.diagnostics.calibration import BANDS, Calibration
 from estimators.diagnostics.episodes import Episode, episode_json, episodes
+from estimators.diagnostics.score import health_of
 from estimators.diagnostics.sensitivity import Gramian, GramianView, Sensitivity, bounds_of, sensitivity
 from estimators.diagnostics.sensitivity.checklist import Arrivals, Dimension, Linearity, arrivals, dimension
 from estimators.diagnostics.sensitivity.gramian import directions
@@ -20,14 +21,13 @@ from estimators.diagnostics.sensitivity.posterior import Peaks, Tail, tails
 from estimators.diagnostics.sensitivity.responses import digits
 from estimators.fold import Fold
 from estimators.log import READING, Log
-from estimators.track import Track
 
-from ..present.export.calibration_lines import calibration_lines
+from ..present.export.calibration_lines import calibration_lines, health_shares
 from ..present.result import WORSE, Bar, Cell, Topic, plain
 from ..twin.twin import Twin
 from .advice.measured import Measured
 from .compare import timed
-from .fold_result import calibration_json, calibration_of, health_of
+from .fold_result import calibration_json, calibration_of
 
 BUDGET_S = 20.0  # seconds of one processor for the folds with held-out sensors, which limit the part of the log
 MAX_CORRELATION = 0.9  # correlation beyond which two faults are hardly distinguishable
@@ -70,6 +70,11 @@ class Checked:
     episodes: list[Episode]
     held_out: HeldOut
 
+    @property
+    def health(self) -> dict[str, float]:
+        """Share of time in each state of health."""
+        return health_of(self.fold.log.events, self.fold.track, self.fold.policy)
+
 
 def check(twin: Twin, log: Log, counts: Counter[str]) -> Checked:
     """Compute all measures of a twin over a log.
@@ -101,7 +106,7 @@ def check(twin: Twin, log: Log, counts: Counter[str]) -> Checked:
         gramian=measured.gramian,
         sensitivity=sensitivity(twin.estimator, model, tuning, log, false_alarm=twin.policy.false_alarm_every),
         arrivals=tuple(item for s, item in enumerate(arrivals(model, log)) if s in twin.plan.fed or item.n),
-        calibration=calibration_of(twin, fold),
+        calibration=calibration_of(fold, fold.log.events, fold.track),
         episodes=episodes(fold),
         held_out=held_out(twin.estimator, model, tuning, log),
     )
@@ -128,19 +133,6 @@ def stamps(twin: Twin) -> str:
     if kinds & {CanSection, CanLogSection}:
         return "frames are stamped where they are received, not at the sensor"
     return "every reading has the time at which it was measured"
-
-
-def health_shares(track: Track) -> str:
-    """Return the share of the track in each state of health, the largest first."""
-    shares = sorted(health_of(track).items(), key=lambda pair: -pair[1])
-    return ", ".join(f"{name} {_percent(share)}" for name, share in shares if share)
-
-
-def _percent(share: float) -> str:
-    """Format a share, as 0 % or 100 % only where it is exact."""
-    if 0.0 < share < 0.0005:
-        return "less than 0.1 %"
-    return "more than 99.9 %" if 0.9995 <= share < 1.0 else f"{100 * share:.3g} %"
 
 
 def figures(checked: Checked, checklist: Sequence[ChecklistLine]) -> dict[str, Any]:
@@ -245,7 +237,7 @@ def figures(checked: Checked, checklist: Sequence[ChecklistLine]) -> dict[str, A
             },
             "dimension": checked.dimension,
             "health": {
-                "share": health_of(checked.fold.track),
+                "share": checked.health,
                 "false_alarm_every": policy.false_alarm_every,
                 "episodes": [episode_json(episode) for episode in checked.episodes],
             },
@@ -262,7 +254,7 @@ def topics(checked: Checked, checklist: Sequence[ChecklistLine]) -> list[Topic]:
     head = f"{twin.estimator} over {part} {seconds:.4g} s of its log, {log.n:,} events, {checked.dimension.nx:,} states"
     lines = tuple((line.question, line.answer, line.figures, line.remedy) for line in checklist)
     columns = ("question", "answer", "figures", "remedy")
-    health = [f"{health_shares(checked.fold.track)}.", *(episode.text for episode in checked.episodes[:MAX_ROWS])]
+    health = [f"{health_shares(checked.health)}.", *(episode.text for episode in checked.episodes[:MAX_ROWS])]
     if len(checked.episodes) > MAX_ROWS:
         health.append(f"... and {len(checked.episodes) - MAX_ROWS} more episodes.")
     health += calibration_lines(checked.calibration, twin.model)[: 2 * MAX_ROWS]

@@ -10,8 +10,9 @@ from estimators.diagnostics.sensitivity.posterior import FREQUENT_SHARE
 from estimators.diagnostics.sensitivity.responses import digits
 from estimators.log import MAINTENANCE
 
+from ..present.export.calibration_lines import health_shares
 from .advice.measured import bytes_text, seconds_text
-from .check import Checked, ChecklistLine, confounded, health_shares, stamps
+from .check import Checked, ChecklistLine, confounded, stamps
 from .scores import scores_file
 
 YES, PARTLY, NO, NONE = "yes", "partly", "no", "not told"
@@ -160,7 +161,7 @@ def _health(checked: Checked) -> Answer:
     seconds = checked.twin.policy.false_alarm_every
     figures = (
         f"at most one false alarm {'a day' if seconds == 86400.0 else f'in {seconds:g} s'}; "
-        f"{health_shares(checked.fold.track)}; {len(found)} episode(s); "
+        f"{health_shares(checked.health)}; {len(found)} episode(s); "
         f"calibration off in {len(wrong)} of {len(checked.calibration)} rows and states"
     )
     return YES, figures, found[0].text if found else wrong[0].words[0] if wrong else ""

@@ -12,7 +12,7 @@ import numba
 import numpy as np
 
 from estimators.diagnostics.score import Fit, score
-from estimators.errors import NisusError
+from estimators.errors import EstimatorError, NisusError
 from estimators.estimator import Estimator
 from estimators.fold import Fold
 from estimators.log import MARK, Events, Log
@@ -47,11 +47,17 @@ def draws(entry: Estimator) -> bool:
     return any(option.name in ("particles", "members") for option in entry.options)
 
 
-def fold_row(twin: Twin, estimator: str, logs: Sequence[Events], budget: float = BUDGET_S) -> FilterScore:
+def fold_row(
+    twin: Twin,
+    estimator: str,
+    logs: Sequence[Events],
+    budget: float = BUDGET_S,
+    scored: tuple[int, int] | None = None,
+) -> FilterScore:
     """Fold one filter over each of the logs, or, if it draws and there is one log, over that with several seeds.
 
     A filter that takes more than `budget` seconds of one processor folds a shorter span of the log; but the one that
-    the twin runs first folds all of it, whatever that takes.
+    the twin runs first folds all of it, whatever that takes. `scored` are the times, ns, between which it is scored.
     """
     entry = find_estimator(estimator, twin.model)
     options = dict(twin.options_of(estimator))
@@ -68,7 +74,7 @@ def fold_row(twin: Twin, estimator: str, logs: Sequence[Events], budget: float =
             if fold.n < len(events):
                 span = tidy((events.t[fold.n - 1] - events.t[0]) * 1e-9)
                 events = within(events, span)
-            outcomes.append(outcome_of(fold, events, seconds))
+            outcomes.append(outcome_of(fold, events, seconds, scored))
     except NisusError as error:
         nothing = Spread(np.nan)
         return FilterScore(estimator, {}, nothing, (np.nan, np.nan), nothing, np.nan, options, failure=str(error))
@@ -125,12 +131,19 @@ def timed(
     return fold, min(took) / fold.n
 
 
-def outcome_of(fold: Fold, events: Events, seconds: float) -> Outcome:
-    """Return the scores of a fold over its first events."""
-    model, track = fold.model, fold.track.select(slice(0, len(events)))
+def outcome_of(fold: Fold, events: Events, seconds: float, scored: tuple[int, int] | None = None) -> Outcome:
+    """Return the scores of a fold over its first events, or over those between two times, ns.
+
+    Raises:
+        NisusError: If it ended before them.
+    """
+    part = slice(*(map(int, np.searchsorted(events.t, scored)) if scored else (0, len(events))))
+    if part.start >= part.stop:
+        raise EstimatorError("its budget ends before the scored part; raise --budget")
     fold.finish()
-    pictures = [one for one in pictures_of(fold) if one.before <= len(events)]
-    result = score(track, events, model, pictures, gate=fold.tuning.gate)
+    pictures = [one for one in pictures_of(fold) if part.start < one.before <= part.stop]
+    model, track, events = fold.model, fold.track.select(part), events.select(part)
+    result = score(track, events, model, pictures, gate=fold.tuning.gate, baseline=fold.tuning.baseline)
     fits, units = result.states, {state.name: state.unit for state in model.shown_states}
     if result.field is not None and model.grid is not None:
         fits, units = {model.grid.name: result.field}, {model.grid.name: model.grid.unit}
@@ -167,7 +180,7 @@ def row_of(
         estimator=estimator,
         rmse={unit: _spread([outcome.rmse[unit] for outcome in outcomes]) for unit in outcomes[0].rmse},
         nis=_spread([outcome.nis for outcome in outcomes]),
-        nis_bounds=outcomes[0].nis_bounds,
+        nis_bounds=tuple(np.mean([outcome.nis_bounds for outcome in outcomes], axis=0).tolist()),  # type: ignore[arg-type]
         coverage=_spread([outcome.coverage for outcome in outcomes]),
         seconds_per_step=min(outcome.seconds_per_step for outcome in outcomes),
         options=options,
@@ -223,6 +236,7 @@ def compare(
     logs: Sequence[Events],
     jobs: int | None = None,
     budget: float = BUDGET_S,
+    scored: tuple[int, int] | None = None,
 ) -> Iterator[FilterScore]:
     """Fold each filter over the logs, in processes of their own; rows come as they are done.
 
@@ -233,6 +247,7 @@ def compare(
         logs: The events; see `fold_row`.
         jobs: Processes; None for one a processor.
         budget: Seconds for a filter; see `fold_row`.
+        scored: Times between which they are scored; see `fold_row`.
     """
     jobs = jobs_of(jobs, len(names))
     if jobs == 1:
@@ -240,13 +255,13 @@ def compare(
         threads = numba.get_num_threads()
         numba.set_num_threads(1)
         try:
-            yield from (fold_row(ready, name, logs, budget) for name in names)
+            yield from (fold_row(ready, name, logs, budget, scored) for name in names)
         finally:
             numba.set_num_threads(threads)
         return
     given = (twin, dict(overrides), [tuple(log) for log in logs])
     # The last filters of the catalogue are the slow ones.
-    with beside(_fold, [(name, budget) for name in reversed(names)], jobs, _share, given) as futures:
+    with beside(_fold, [(name, budget, scored) for name in reversed(names)], jobs, _share, given) as futures:
         for future in as_completed(futures):
             yield future.result()
 
@@ -257,5 +272,5 @@ def _share(name: str, overrides: dict[str, str], logs: list[tuple[np.ndarray, ..
     numba.set_num_threads(1)  # the processors have a filter each, and a step costs what it costs one
 
 
-def _fold(estimator: str, budget: float) -> FilterScore:
-    return fold_row(_shared["twin"], estimator, _shared["logs"], budget)
+def _fold(estimator: str, budget: float, scored: tuple[int, int] | None) -> FilterScore:
+    return fold_row(_shared["twin"], estimator, _shared["logs"], budget, scored)

@@ -15,13 +15,13 @@ from estimators.diagnostics.consistency import nees
 from estimators.diagnostics.detectors import detector_of
 from estimators.diagnostics.episodes import Episode, episode_json
 from estimators.diagnostics.failure_cause import failures
-from estimators.diagnostics.score import Fit, Score, score
+from estimators.diagnostics.score import Fit, Score, health_of, score
 from estimators.diagnostics.sensitivity.suspects import Suspect, in_words, likeliest, suspects
 from estimators.errors import NisusError
 from estimators.fold import Fold
 from estimators.fold_failures import cause_of
 from estimators.gate.isolation import softened
-from estimators.log import READING, Events, truth_of
+from estimators.log import READING, Events, Log, truth_of
 from estimators.plausibility import reasons_by_sensor
 from estimators.registry import find_entry
 from estimators.smoothing.smooth import consistency
@@ -30,7 +30,8 @@ from estimators.track import FAILED, HEALTH_NAMES, REASONS, USED, Track
 from estimators.tuning import SHARED_ENTRY_ROWS
 from sources.source import WRONG_TIME
 
-from ..present.export.calibration_lines import calibration_lines
+from ..format_time import format_time
+from ..present.export.calibration_lines import calibration_lines, health_shares
 from ..present.result import Figure, Topic, plain
 from ..twin.twin import Twin
 
@@ -82,7 +83,7 @@ class TruthNees(NamedTuple):
 
 @dataclass(frozen=True)
 class FoldResult:
-    """A finished fold with everything measured on it; `seconds` is the time per event."""
+    """A finished fold with everything measured on it; `seconds` is the time per event, `part` the scored rows."""
 
     twin: Twin
     fold: Fold
@@ -91,8 +92,30 @@ class FoldResult:
     score: Score
     calibration: list[Calibration]
     episodes: list[ExplainedEpisode]
+    part: slice
     smoothing: SmoothingScore | None = None
     nees: TruthNees | None = None
+
+    @property
+    def events(self) -> Events:
+        """The scored events."""
+        return self.fold.log.events.select(self.part)
+
+    @property
+    def track(self) -> Track:
+        """Their rows."""
+        return self.fold.track.select(self.part)
+
+
+def rows_of(log: Log, span: tuple[int, int] | None) -> slice:
+    """Return the rows of a log between two times, ns; all without."""
+    return slice(*(map(int, np.searchsorted(log.t[: log.n], span)) if span else (0, log.n)))
+
+
+def within(episodes: Sequence[Episode], events: Events) -> list[Episode]:
+    """Return the episodes that overlap the time of some events."""
+    first, last = float(events.t[0]) * 1e-9, float(events.t[-1]) * 1e-9
+    return [item for item in episodes if item.start <= last and (item.end is None or item.end >= first)]
 
 
 def known_states(twin: Twin, events: Events) -> list[int]:
@@ -114,11 +137,12 @@ def pairs_with(twin: Twin, states: Sequence[int]) -> np.ndarray:
     return np.array([*map(tuple, twin.pairs), *every], int).reshape(-1, 2)
 
 
-def nees_of(fold: Fold, states: Sequence[int]) -> TruthNees | None:
-    """Return the NEES over these states of a fold that kept their covariances; None without one."""
-    if not states:
+def nees_of(fold: Fold, states: Sequence[int], part: slice) -> TruthNees | None:
+    """Return the NEES over these states in some rows of a fold that kept their covariances; None without one."""
+    events = fold.log.events.select(part)
+    if not any(truth_of(events, j)[0].size for j in states):
         return None
-    found = nees(fold.model, fold.log.events, fold.track, fold.pairs, states)
+    found = nees(fold.model, events, fold.track.select(part), fold.pairs, states)
     known = int(np.isfinite(found.value).sum())
     if not known:
         return None
@@ -126,23 +150,17 @@ def nees_of(fold: Fold, states: Sequence[int]) -> TruthNees | None:
     return TruthNees(found.mean, *found.mean_bounds, found.inside, names, known)
 
 
-def smoothing_score(fold: Fold, smoothed: Smoothed) -> SmoothingScore:
-    """Score the smoothed states of a fold."""
-    fits = score(smoothed.instead_of(fold.track), fold.log.events, fold.model, gate=fold.tuning.gate).states
-    return SmoothingScore(fits, consistency(fold.track, smoothed, fold.model))
+def smoothing_score(fold: Fold, smoothed: Smoothed, part: slice) -> SmoothingScore:
+    """Score the smoothed states in some rows of a fold."""
+    events, track, own = fold.log.events.select(part), fold.track.select(part), smoothed.select(part)
+    fits = score(own.instead_of(track), events, fold.model, gate=fold.tuning.gate).states
+    return SmoothingScore(fits, consistency(track, own, fold.model))
 
 
-def calibration_of(twin: Twin, fold: Fold) -> list[Calibration]:
-    """Return the calibration of every sensor row, and of every state whose truth is known."""
-    events, track = fold.log.events, fold.track
-    rows = calibrations(twin.model, events, track, gate=twin.tuning.gate, marginal=fold.marginal)
-    return rows + truth_calibration(twin.model, events, track)
-
-
-def health_of(track: Track) -> dict[str, float]:
-    """Return the share of rows in each state of health."""
-    share = np.bincount(track.health, minlength=len(HEALTH_NAMES)) / max(1, len(track))
-    return dict(zip(HEALTH_NAMES, share.tolist(), strict=True))
+def calibration_of(fold: Fold, events: Events, track: Track) -> list[Calibration]:
+    """Return the calibration of every sensor row, and of every state whose truth is known, in rows of a fold."""
+    rows = calibrations(fold.model, events, track, gate=fold.tuning.gate, marginal=fold.marginal)
+    return rows + truth_calibration(fold.model, events, track)
 
 
 def dropped(counts: Mapping[str, int], fold: Fold) -> list[Episode]:
@@ -182,11 +200,11 @@ def fold_json(result: FoldResult) -> dict[str, Any]:
     `stale` counts measurements that came too late and are not in `readings`, `wrong_time` events with impossible times,
     `inflated` late ones used on arrival, `conditioned` those rejected by a condition of the source's map. `screened`
     counts rejections before the filter by sensor and reason, with these as `condition`. `late` and `degraded_after` are
-    decisions on time, with reasons. `health` is the share of rows in each state. `log_likelihood` includes the price of
-    rejected measurements, which `log_likelihood_used` leaves out; `refused` is their share. `calibration` has an entry
-    per sensor row and per state with known truth. `nees` is null without truth (`TruthNees`). `episodes` have start
-    and end in seconds of the log (end null while one lasts) and `suspects`.
-    `smoothed` has `rmse`, `coverage` and `consistency` of the smoothed states.
+    decisions on time, with reasons. `health` is the share of time in each state; `start` and `end` bound the scored
+    part, s. `log_likelihood` includes the price of rejected measurements, which `log_likelihood_used` leaves out;
+    `refused` is their share. `calibration` has an entry per sensor row and per state with known truth. `nees` is null
+    without truth (`TruthNees`). `episodes` have start and end in seconds of the log (end null while one lasts) and
+    `suspects`. `smoothed` has `rmse`, `coverage` and `consistency` of the smoothed states.
     """
     twin, fold, scored, counts = result.twin, result.fold, result.score, result.counts
     smoothing = result.smoothing
@@ -194,6 +212,8 @@ def fold_json(result: FoldResult) -> dict[str, Any]:
         "twin": twin.name,
         "estimator": twin.estimator,
         "tuning": twin.tuning.name,
+        "start": float(result.events.t[0]) * 1e-9,
+        "end": float(result.events.t[-1]) * 1e-9,
         "readings": scored.readings,
         **({"field": {"rmse": scored.field.rmse, "coverage": scored.field.coverage}} if scored.field else {}),
         **_errors(scored.states),
@@ -209,10 +229,13 @@ def fold_json(result: FoldResult) -> dict[str, Any]:
             "high": scored.nis_high,
             "n": scored.nis_readings,
             "dof": scored.nis_dof,
+            "place": scored.nis_verdict.place,
+            "white_low": scored.nis_white[0],
+            "white_high": scored.nis_white[1],
         },
         "log_likelihood": scored.log_likelihood,
         "log_likelihood_used": scored.log_likelihood_used,
-        "used": np.sum(fold.track.verdict == USED),
+        "used": np.sum(result.track.verdict == USED),
         "stale": counts["stale"],
         "wrong_time": counts[WRONG_TIME],
         "inflated": counts["inflated"],
@@ -220,15 +243,15 @@ def fold_json(result: FoldResult) -> dict[str, Any]:
         "degraded_after": twin.degraded,
         "conditioned": sum(count for key, count in counts.items() if key.startswith("condition ")),
         "gated": scored.gated,
-        "softened": _softened(fold),
+        "softened": _softened(result),
         "gate": fold.decisions,
         "refused": scored.refused,
         "missing": scored.missing,
-        "failed": np.sum(fold.track.verdict == FAILED),
+        "failed": np.sum(result.track.verdict == FAILED),
         "screened": _screened(result),
         "failure": _failure_cause(fold),
         "account": fold.account(),
-        "health": health_of(fold.track),
+        "health": health_of(result.events, result.track, fold.policy),
         "calibration": [calibration_json(entry) for entry in result.calibration],
         "episodes": [_episode_json(item) for item in result.episodes],
         "seconds_per_event": result.seconds,
@@ -264,15 +287,15 @@ def _episode_json(item: ExplainedEpisode) -> dict[str, Any]:
     return {**episode_json(item.episode), "suspects": named}
 
 
-def _softened(fold: Fold) -> int:
+def _softened(result: FoldResult) -> int:
     """Return how many measurements beyond a soft gate were used with inflated noise."""
-    return int(np.sum(softened(fold.track, fold.gate_limits)))
+    return int(np.sum(softened(result.track, result.fold.gate_limits)))
 
 
 def _screened(result: FoldResult) -> dict[str, dict[str, int]]:
     """Return how many measurements were rejected before the filter, by sensor and reason."""
-    fold, names = result.fold, result.twin.model.sensor_names
-    table = reasons_by_sensor(len(names), fold.log.channel[: fold.n], fold.track.screened)
+    names = result.twin.model.sensor_names
+    table = reasons_by_sensor(len(names), result.events.channel, result.track.screened)
     found = {
         name: {**dict(zip(REASONS, row.tolist(), strict=True)), "condition": result.counts[f"condition {name}"]}
         for name, row in zip(names, table, strict=True)
@@ -298,14 +321,13 @@ def fold_topics(result: FoldResult) -> list[Topic]:
 
 def _figures(result: FoldResult) -> list[Figure]:
     twin, fold, scored, counts = result.twin, result.fold, result.score, result.counts
-    model, track = twin.model, fold.track
+    model, events, track = twin.model, result.events, result.track
     units = {state.name: state.unit for state in model.shown_states}
     units |= dict(zip(model.row_names, (row.unit for sensor in model.sensors for row in sensor.rows), strict=True))
-    found = [
-        Figure("estimator", twin.estimator),
-        Figure("tuning", twin.tuning.name),
-        Figure("readings", f"{scored.readings}"),
-    ]
+    found = [Figure("estimator", twin.estimator), Figure("tuning", twin.tuning.name)]
+    if len(events) < fold.n:
+        found.append(Figure("scored", f"{format_time(int(events.t[0]))} to {format_time(int(events.t[-1]))}"))
+    found.append(Figure("readings", f"{scored.readings}"))
     if scored.field is not None and model.grid is not None:
         found.append(_rmse(f"RMSE {model.grid.name}, all cells with known truth", scored.field, model.grid.unit))
     for k, (name, fit) in enumerate(scored.states.items()):
@@ -324,13 +346,13 @@ def _figures(result: FoldResult) -> list[Figure]:
         found.append(Figure(title, result.nees.mean, remark=result.nees.remark))
     if scored.nis_readings:
         verdict = scored.nis_verdict
-        nis = f"{verdict.ratio:.4f}" if abs(verdict.ratio) < 1e6 else f"{verdict.ratio:.4g}"
-        found.append(Figure("mean NIS", nis, remark=f"{verdict.said}; {scored.nis_readings} readings"))
+        said = f"{verdict.said}; {scored.nis_readings} readings"
+        found.append(Figure("mean NIS", verdict.ratio_text, remark=said))
     without = f"without rejected measurements {scored.log_likelihood_used:.2f}" if scored.gated else ""
     found += [
         Figure("log-likelihood", f"{scored.log_likelihood:.2f}", remark=without),
         Figure("gated", f"{scored.gated}", remark=f"{100 * scored.refused:.2g} % of the readings" * bool(scored.gated)),
-        *([Figure("softened", f"{_softened(fold)}")] if fold.tuning.gate_kind == "soft" else []),
+        *([Figure("softened", f"{_softened(result)}")] if fold.tuning.gate_kind == "soft" else []),
         Figure("missing", f"{scored.missing}"),
     ]
     failed = int(np.sum(track.verdict == FAILED))
@@ -360,6 +382,7 @@ def _figures(result: FoldResult) -> list[Figure]:
             if lost
             else HEALTH_NAMES[int(track.health[-1])],
         ),
+        Figure("health, share of time", health_shares(health_of(events, track, fold.policy))),
         Figure("time per event", f"{1e6 * result.seconds:.2f} µs"),
     ]
 

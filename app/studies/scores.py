@@ -149,7 +149,7 @@ def _text(figure: Spread, digits: int = 4, decimals: int | None = None) -> str:
 
 
 def printed(name: str, lines: Sequence[Mapping[str, str]], logs: int = 1) -> list[str]:
-    """Return caption (log, and bounds of the NIS per degree of freedom) and table as lines of text.
+    """Return caption and table as lines of text; each filter has the 95 % bounds of its NIS.
 
     Args:
         name: Of the twin.
@@ -157,15 +157,13 @@ def printed(name: str, lines: Sequence[Mapping[str, str]], logs: int = 1) -> lis
         logs: How many were folded; with one, spreads are over seeds.
     """
     over = f"{logs} logs" if logs > 1 else f"{max((int(line['seeds']) for line in lines), default=1)} seeds"
-    whole = next((line for line in lines if not line[SPAN] and not line["failure"]), None)
-    low, high = (_per_dof(whole, f"NIS {end}") for end in ("low", "high")) if whole else ("nan", "nan")
     first = lines[0]
-    consistent = f"{NIS_PER_DOF} if consistent {low} to {high}"
-    caption = f"{name}: {first[EVENTS]} events in {first[LENGTH]} s; {consistent}; ± one of {over}"
-    figures = [title for title in first if title.startswith("RMSE [")] + [NIS, BAND]
-    table = [["filter", *(NIS_PER_DOF if title == NIS else title for title in figures), "µs/step", "notes"]]
+    caption = f"{name}: {first[EVENTS]} events in {first[LENGTH]} s; ± one of {over}"
+    errors = [title for title in first if title.startswith("RMSE [")]
+    table = [["filter", *errors, NIS_PER_DOF, "if consistent", BAND, "µs/step", "notes"]]
     for line in lines:
-        shown = [_per_dof(line, title) if title == NIS else _with_spread(line, title) for title in figures]
+        shown = [_with_spread(line, title) for title in errors]
+        shown += [_per_dof(line, NIS), _bounds(line), _with_spread(line, BAND)]
         table.append([line["filter"], *shown, line[COST] or "-", _notes(line)])
     widths = [max(len(line[k]) for line in table) for k in range(len(table[0]))]
     return [caption] + [GAP.join(f"{cell:<{widths[k]}}" for k, cell in enumerate(line)).rstrip() for line in table]
@@ -183,6 +181,12 @@ def _per_dof(line: Mapping[str, str], title: str) -> str:
     if title != NIS:
         return f"{float(line[title]) / dof:.3f}"
     return _text(Spread(float(line[title]) / dof, float(line[spread(title)] or "nan") / dof))
+
+
+def _bounds(line: Mapping[str, str]) -> str:
+    """Return the 95 % bounds of the NIS of a row per degree of freedom."""
+    low, high = (_per_dof(line, f"NIS {end}") for end in ("low", "high"))
+    return f"{low} to {high}" if low and high else "-"
 
 
 def _notes(line: Mapping[str, str]) -> str:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-from estimators.diagnostics.consistency import NisVerdict
 from estimators.diagnostics.detectors import detector_of
 from estimators.diagnostics.episodes import episode_json
 from estimators.registry import ESTIMATORS, unfit
@@ -16,12 +15,13 @@ from ..live.outputs import Status
 from ..live.running_fold import Running
 from ..present.export.report_charts import charted_model
 from ..present.result import plain
+from ..present.runs_json import nis_json
 from ..present.sensor_groups import groups_json, sensor_groups
 from ..present.series.columns import columns_of
 
 STATUS_FIELDS = (
     "estimator", "options", "revision", "refolding", "awaited", "compiling", "t", "since", "cause", "episodes_open",
-    "lost", "nis", "nis_low", "nis_high", "nis_dof", "model_version", "clock", "counts", "account", "paused",
+    "lost", "model_version", "clock", "counts", "account", "paused",
     "finished", "speed", "seekable", "latency_ms",
 )  # fmt: skip
 """Fields of `Status` that JSON has under the same name."""
@@ -45,8 +45,6 @@ def status_json(engine: Running, status: Status | None = None) -> dict[str, Any]
     status, twin, revisions = status or engine.status(), engine.twin, engine.revisions
     edits = revisions.edits
     tuning, runs, levels = status.tuning, engine.revisions.runs, status.integrity
-    commissioned = tuning.baseline is not None
-    judged = NisVerdict(status.nis, status.nis_low, status.nis_high, commissioned, status.nis_judged, status.nis_dof)
     found = {name: getattr(status, name) for name in STATUS_FIELDS} | {
         "twin": twin.name,
         "title": twin.title,
@@ -58,9 +56,7 @@ def status_json(engine: Running, status: Status | None = None) -> dict[str, Any]
         "began_as": began_as(twin),
         "turned": turned(twin, status.estimator, tuning),
         "health": HEALTH_NAMES[status.health],
-        "nis_judged": judged.measure,
-        "nis_place": judged.place,
-        "nis_words": judged.words,
+        **nis_json(status.nis),
         "late": {"inflate": twin.late.inflate, "reason": twin.late.reason},
         "degraded_after": {"seconds": twin.degraded.seconds, "reason": twin.degraded.reason},
         "length": None if status.span is None else (status.span[1] - status.span[0]) * 1e-9,

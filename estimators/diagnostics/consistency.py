@@ -1,4 +1,4 @@
-"""Verdict on a mean NIS against its expected value and bounds (`health.normal_nis`), in words."""
+"""Verdict on a mean NIS against its bounds (`score.nis_verdict`), in words; NEES."""
 
 from __future__ import annotations
 
@@ -16,13 +16,17 @@ from .health import PROBABILITY
 from .intervals import scale_interval
 from .references import wrapped
 
+MIN_DECIMALS, MAX_DECIMALS = 2, 7  # decimals of a NIS per degree of freedom in words
+MAX_DECIMAL_NIS = 1e6  # NIS per degree of freedom from which on it is written with an exponent
+
 
 class NisVerdict(NamedTuple):
     """A mean NIS, its 95 % bounds, and whether these are those of the baseline (`commissioned`).
 
     A baseline is computed from used and rejected measurements, each row clipped at 6 σ; `judged` is the mean NIS of the
-    same, which is compared with the bounds; NaN where that is the NIS itself. All are per measurement; words give them
-    per degree of freedom, of which a measurement has `dof` on average.
+    same, which is compared with the bounds; NaN where that is the NIS itself. `white_low` and `white_high` are the
+    bounds of white Gaussian innovations, NaN where these are the bounds. All are per measurement; words give them per
+    degree of freedom, of which a measurement has `dof` on average.
     """
 
     nis: float
@@ -31,6 +35,8 @@ class NisVerdict(NamedTuple):
     commissioned: bool
     judged: float = np.nan
     dof: float = 1.0
+    white_low: float = np.nan
+    white_high: float = np.nan
 
     @property
     def ratio(self) -> float:
@@ -45,24 +51,59 @@ class NisVerdict(NamedTuple):
     @property
     def place(self) -> str:
         """`inside`, `above` or `below` the bounds; empty without a NIS."""
-        if not np.isfinite(self.measure + self.low + self.high):
-            return ""
-        return "below" if self.measure < self.low else "above" if self.measure > self.high else "inside"
+        return _place(self.measure, self.low, self.high)
+
+    @property
+    def ratio_text(self) -> str:
+        """Mean NIS per degree of freedom, with the digits of the bounds."""
+        return self._texts()[0]
 
     @property
     def said(self) -> str:
         """Its position relative to the bounds."""
         if not self.place:
             return "no reading to judge"
-        bounds = f"{self.place} its 95 % bounds {self.low / self.dof:.3g} to {self.high / self.dof:.3g}"
+        _, measure, low, high, white_low, white_high = self._texts()
         own = abs(self.measure - self.nis) < 0.005 * self.nis
-        clipped = "" if own else f"{self.measure / self.dof:.3g} with those refused and none beyond 6 σ, "
-        return "per degree of freedom, " + clipped + bounds + (", as commissioned" if self.commissioned else "")
+        limited = "" if own else f"{measure} with rejected measurements included and outliers limited to 6 σ, "
+        of = " of the commissioned baseline" if self.commissioned else ""
+        bounds = f"{self.place} {'the' if of else 'its'} 95 % bounds {low} to {high}{of}"
+        white = f" ({white_low} to {white_high} for white Gaussian innovations)" if self._differs else ""
+        return f"per degree of freedom, {limited}{bounds}{white}"
 
     @property
     def words(self) -> str:
         """All of it in one line."""
-        return f"mean NIS {self.ratio:.3g} {self.said}" if self.place else self.said
+        return f"mean NIS {self.ratio_text} {self.said}" if self.place else self.said
+
+    @property
+    def _differs(self) -> bool:
+        """Whether the bounds of white Gaussian innovations lead to another verdict."""
+        return _place(self.measure, self.white_low, self.white_high) not in ("", self.place)
+
+    def _texts(self) -> list[str]:
+        """Return NIS, the compared NIS, bounds and white bounds per degree of freedom, with equal decimals.
+
+        These are two, or more where the compared NIS would read as a bound from which it differs.
+        """
+        numbers = (self.nis, self.measure, self.low, self.high, self.white_low, self.white_high)
+        values = [value / self.dof for value in numbers]
+        if not abs(values[0]) < MAX_DECIMAL_NIS:
+            return [f"{value:.3g}" for value in values]
+        measure, *bounds = values[1:] if self._differs else values[1:4]
+        decimals = MIN_DECIMALS
+        while decimals < MAX_DECIMALS and any(
+            bound != measure and f"{bound:.{decimals}f}" == f"{measure:.{decimals}f}" for bound in bounds
+        ):
+            decimals += 1
+        return [f"{value:.{decimals}f}" for value in values]
+
+
+def _place(value: float, low: float, high: float) -> str:
+    """Return `inside`, `above` or `below`; empty where a number is missing."""
+    if not np.isfinite(value + low + high):
+        return ""
+    return "below" if value < low else "above" if value > high else "inside"
 
 
 class Nees(NamedTuple):

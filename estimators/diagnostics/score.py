@@ -14,13 +14,28 @@ from scipy.special import betainc, gammaln
 from ..log import READING, Events
 from ..model.state_space import StateSpaceModel
 from ..numerics.quantiles import chi_square_quantile, normal_quantile
-from ..track import GATED, MISSING, USED, VERDICT_NAMES, Track
+from ..track import (
+    DEGRADED,
+    DIVERGED,
+    GATED,
+    HEALTH_NAMES,
+    MISSING,
+    STALE,
+    SUSPECT,
+    TRACKING,
+    USED,
+    VERDICT_NAMES,
+    Track,
+)
+from .calibration import LIMITS
 from .consistency import NisVerdict
 from .field_pictures import Picture
-from .health import MAX_ROWS_PER_READING, PROBABILITY, nis_bounds, normal_nis
+from .health import MAX_ROWS_PER_READING, MEAN, PROBABILITY, HealthPolicy, nis_bounds, normal_nis
+from .intervals import scale_interval
 from .references import held_out_references, true_states
 
 BASELINE_CLIP_SIGMA = 6.0  # σ at which the innovations of a row are clipped in a baseline (episodes/baseline.py)
+MAX_NIS_FACTOR = (1.0 + LIMITS.width) ** 2  # bands that are wrong by as much as the calibration reports
 
 
 class Fit(NamedTuple):
@@ -44,7 +59,8 @@ class Score(NamedTuple):
     states: fits against the truth, by state; held_out: fits of held-out measurements, by sensor row; field: fit of all
     cells of a large field at the times of its true values, or None. commissioned: whether the bounds are those of the
     baseline; nis_judged: the NIS to compare with these (consistency.py). nis_dof: mean degrees of freedom of the used
-    measurements, by which the NIS and its bounds are divided where they are shown.
+    measurements, by which the NIS and its bounds are divided where they are shown. nis_white: bounds of white Gaussian
+    innovations.
     """
 
     nis: float
@@ -63,11 +79,13 @@ class Score(NamedTuple):
     commissioned: bool = False
     nis_judged: float = np.nan
     nis_dof: float = 1.0
+    nis_white: tuple[float, float] = (np.nan, np.nan)
 
     @property
     def nis_verdict(self) -> NisVerdict:
         """Whether the mean NIS is within its bounds."""
-        return NisVerdict(self.nis, self.nis_low, self.nis_high, self.commissioned, self.nis_judged, self.nis_dof)
+        bounds = self.nis_low, self.nis_high
+        return NisVerdict(self.nis, *bounds, self.commissioned, self.nis_judged, self.nis_dof, *self.nis_white)
 
 
 def score(
@@ -91,7 +109,7 @@ def score(
         baseline: Baseline of the tuning, by which the NIS is judged.
     """
     used = track.verdict == USED
-    nis, low, high, commissioned, judged, nis_dof = nis_verdict(track, events, model, baseline)
+    verdict = nis_verdict(track, events, model, baseline)
     count, verdicts = int(used.sum()), np.bincount(track.verdict, minlength=len(VERDICT_NAMES))
     gated = int(verdicts[GATED])
     likelihood = float(track.log_likelihood[used].sum())
@@ -101,9 +119,9 @@ def score(
         if finite.any():
             held_out[item.name] = _fit(-item.error[finite], item.std[finite])
     return Score(
-        nis=nis,
-        nis_low=low,
-        nis_high=high,
+        nis=verdict.nis,
+        nis_low=verdict.low,
+        nis_high=verdict.high,
         nis_readings=count,
         log_likelihood=likelihood + float(log_density(track.select(track.verdict == GATED), gate).sum()),
         log_likelihood_used=likelihood,
@@ -114,29 +132,67 @@ def score(
         states={item.name: _fit(-item.error, item.std) for item in true_states(model, events, track)},
         held_out=held_out,
         field=_over_field(pictures),
-        commissioned=commissioned,
-        nis_judged=judged,
-        nis_dof=nis_dof,
+        commissioned=verdict.commissioned,
+        nis_judged=verdict.judged,
+        nis_dof=verdict.dof,
+        nis_white=(verdict.white_low, verdict.white_high),
     )
 
 
 def nis_verdict(track: Track, events: Events, model: StateSpaceModel, baseline: np.ndarray | None = None) -> NisVerdict:
-    """Return the verdict on the mean NIS of the used measurements of a track; args as of `score`."""
+    """Return the verdict on the mean NIS of the used measurements of a track; args as of `score`.
+
+    All commands, the page and the report take bounds and verdict from here. With m_t degrees of freedom of measurement
+    t and E its expected NIS (m_t, or what the baseline says), the mean NIS divided by the mean of E is r, and
+
+        r ± t(B) √(Ω / n),   Ω: long-run variance of (NIS_t - r E_t) / mean E,
+
+    is its interval (`intervals.scale_interval`). The bounds are those r for which the interval contains 1. If the
+    innovations are white and Gaussian, Ω = 2 / mean E, and the bounds are those of chi-square. Those are wrong for
+    innovations that are correlated or have outliers, as the variance of their mean is larger: of a filter with the
+    right covariance they then reject more than 5 %. So the bounds are the wider of both. Correlation itself is
+    reported with the calibration. The bounds never exceed an error of the band width that the calibration reports, as
+    a few large outliers would allow for any NIS.
+
+    Sources: Bar-Shalom, Li & Kirubarajan (2001), 5.4.2, for chi-square; Lazarus, Lewis, Stock & Watson (2018),
+    doi:10.1080/07350015.2018.1506926, for the interval.
+    """
     used = track.verdict == USED
     rows = used if baseline is None else used | (track.verdict == GATED)
     count = int(rows.sum())
-    dof = np.bincount(events.channel[rows], track.dof[rows], len(model.sensors))
+    if not count:
+        return NisVerdict(np.nan, np.nan, np.nan, baseline is not None)
+    channel, free = events.channel[rows], track.dof[rows]
+    dof = np.bincount(channel, free, len(model.sensors))
     normal = None if baseline is None else normal_nis(model, baseline)
-    nis = float(track.nis[used].mean()) if used.any() else np.nan
-    low, high = nis_bounds(dof, count, normal)
-    each = float(track.dof[used].mean()) if used.any() else 1.0
-    if baseline is None or not count:
-        return NisVerdict(nis, low, high, baseline is not None, dof=each)
+    nis, each = (float(column[used].mean()) if used.any() else np.nan for column in (track.nis, track.dof))
+    expected = free if normal is None else free * normal[channel, MEAN]
+    squares, judged = track.nis[rows], np.nan
+    if baseline is not None:
+        with np.errstate(all="ignore"):
+            e = track.innovation[rows] / track.innovation_std[rows]
+        e = np.where(np.isfinite(track.whitened[rows]), track.whitened[rows], e)
+        squares = np.nansum(np.clip(e, -BASELINE_CLIP_SIGMA, BASELINE_CLIP_SIGMA) ** 2, axis=1)
+        judged = float(squares.mean())
+    white = nis_bounds(dof, count, normal)
+    factor, middle = _correlated_factor(squares, expected), float(expected.mean())
+    low, high = min(white[0], middle / factor), max(white[1], middle * factor)
+    return NisVerdict(nis, low, high, baseline is not None, judged, each if used.any() else 1.0, *white)
+
+
+def _correlated_factor(squares: np.ndarray, expected: np.ndarray) -> float:
+    """Return by which factor the mean of squares may differ from the expected mean by chance, at least 1.
+
+    Args:
+        squares: NIS of each measurement, (n,).
+        expected: Their expected values.
+    """
+    middle = float(expected.mean())
     with np.errstate(all="ignore"):
-        e = track.innovation[rows] / track.innovation_std[rows]
-    e = np.where(np.isfinite(track.whitened[rows]), track.whitened[rows], e)
-    judged = float(np.nansum(np.clip(e, -BASELINE_CLIP_SIGMA, BASELINE_CLIP_SIGMA) ** 2)) / count
-    return NisVerdict(nis, low, high, True, judged, each)
+        r = squares.mean() / middle
+        found = scale_interval((squares - r * expected) / middle + r)
+        factor = np.divide(found.high, found.value)
+    return float(min(factor, MAX_NIS_FACTOR)) if factor > 1.0 else 1.0
 
 
 def _over_field(pictures: Sequence[Picture]) -> Fit | None:
@@ -191,3 +247,26 @@ def spread_ratio(track: Track, window: int) -> float:
     e = e[np.isfinite(e)]
     square = float(np.mean(e * e)) if e.size else np.nan
     return 1.0 / square if square > 0.0 else np.nan
+
+
+def health_of(events: Events, track: Track, policy: HealthPolicy) -> dict[str, float]:
+    """Return the share of time in each state of health.
+
+    A state holds until the next event. Where that is long after the last measurement, the twin is degraded and then
+    stale from the times of its policy on, as a running one is; a recording has no event then.
+    """
+    held = np.diff(events.t, append=events.t[-1:]) * 1e-9
+    if not held.any():
+        held = np.ones(len(events))
+    seconds = np.bincount(track.health, held, len(HEALTH_NAMES))
+    later = held
+    for limit, code, better in (
+        (policy.stale_after, STALE, (TRACKING, SUSPECT, DEGRADED, DIVERGED)),
+        (policy.degraded_after, DEGRADED, (TRACKING, SUSPECT)),
+    ):
+        # Of the time that a row holds, that beyond the limit; what is stale is not degraded as well.
+        beyond = np.clip(track.age + later - limit, 0.0, later) * np.isin(track.health, better)
+        seconds -= np.bincount(track.health, beyond, len(HEALTH_NAMES))
+        seconds[code] += beyond.sum()
+        later = later - beyond
+    return dict(zip(HEALTH_NAMES, (np.maximum(seconds, 0.0) / held.sum()).tolist(), strict=True))

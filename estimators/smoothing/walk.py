@@ -178,6 +178,10 @@ class Smoothed(NamedTuple):
         shape = fold.n, len(fold.model.shown)
         return Smoothed(np.empty(shape), np.empty(shape), np.empty((fold.n, len(fold.pairs))))
 
+    def select(self, part: slice) -> Smoothed:
+        """Return the moments of some rows."""
+        return Smoothed(*(column[part] for column in self))
+
     def instead_of(self, track: Track) -> Track:
         """Return the fold's track with these moments in place of its own."""
         return track._replace(mean=self.mean, std=self.std, cross=self.cross)

@@ -180,8 +180,9 @@ def recover(case: Case, count: int) -> Recovered:
         fold = Fold(twin.estimator, twin.model, fitted.setting.tuning, other)
         fold.advance()
         result = score(fold.track, other.events, twin.model, gate=twin.tuning.gate)
-        off = abs(result.nis - 0.5 * (result.nis_high + result.nis_low))
-        chance = 0.5 * (result.nis_high - result.nis_low) / Z
+        low, high = result.nis_white
+        off = abs(result.nis - 0.5 * (high + low))
+        chance = 0.5 * (high - low) / Z
         spread = float(np.hypot(chance, of_the_fit(twin, fitted, other)))
         # Bounds of 99 %: they are asked 50 times.
         found.consistent += off <= Z99 * spread

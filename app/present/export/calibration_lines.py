@@ -1,8 +1,8 @@
-"""Calibration of confidence bands, in lines of text."""
+"""Calibration of confidence bands and shares of health, in lines of text."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -51,3 +51,16 @@ def _figures(entry: Calibration) -> str:
     if np.isfinite(entry.correlation.value):
         said.insert(2, f"correlation {entry.correlation.value:+.2f}")
     return ", ".join(said)
+
+
+def health_shares(shares: Mapping[str, float]) -> str:
+    """Return shares of time by state of health in words, the largest first."""
+    largest = sorted(shares, key=lambda name: -shares[name])
+    return ", ".join(f"{name} {_percent(shares[name])}" for name in largest if shares[name])
+
+
+def _percent(share: float) -> str:
+    """Format a share, as 0 % or 100 % only where it is exact."""
+    if 0.0 < share < 0.0005:
+        return "less than 0.1 %"
+    return "more than 99.9 %" if 0.9995 <= share < 1.0 else f"{100 * share:.3g} %"

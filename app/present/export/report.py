@@ -11,7 +11,7 @@ from estimators.diagnostics.calibration import calibrations, truth_calibration
 from estimators.diagnostics.episodes import Episode
 from estimators.diagnostics.field_pictures import Picture
 from estimators.diagnostics.held_out import offsets
-from estimators.diagnostics.score import Score, score
+from estimators.diagnostics.score import Score, health_of, score
 from estimators.diagnostics.sensitivity import Bound
 from estimators.diagnostics.sensitivity.responses import digits
 from estimators.log import READING, Events
@@ -26,7 +26,7 @@ from ...live.notices import Annotation
 from ...twin.twin import Twin
 from ..result import Bar, Topic
 from .alarm_guide import advice
-from .calibration_lines import calibration_lines
+from .calibration_lines import calibration_lines, health_shares
 from .report_charts import charts_html
 
 MAX_ROWS = 60
@@ -118,7 +118,7 @@ def _scores(run: Reported, found: Score) -> Topic:
     marks: list[str] = []
     if found.nis_readings:
         verdict = found.nis_verdict
-        rows.append(("mean NIS", digits(verdict.ratio), verdict.said))
+        rows.append(("mean NIS", verdict.ratio_text, verdict.said))
         marks.append("good" if verdict.place == "inside" else "bad")
     fits = [(f"RMSE of {name}", name, fit) for name, fit in found.states.items()]
     fits += [(f"RMSE of {name}, held out", name, fit) for name, fit in found.held_out.items()]
@@ -135,9 +135,8 @@ def _scores(run: Reported, found: Score) -> Topic:
         f"{name} {count:,}" for name, count in zip(VERDICT_NAMES[1:], counts[1:].tolist(), strict=True) if count
     ]
     rows.append(("measurements", f"{int(counts.sum()):,}", ", ".join(verdicts)))
-    shares = np.bincount(track.health, minlength=len(HEALTH_NAMES)) / max(1, len(track))
-    worst = [f"{HEALTH_NAMES[k]} {100 * shares[k]:.3g} %" for k in np.argsort(-shares, kind="stable") if shares[k]]
-    rows.append(("health at the end", HEALTH_NAMES[int(track.health[-1])], ", ".join(worst)))
+    shares = health_shares(health_of(run.events, track, run.twin.policy))
+    rows.append(("health at the end", HEALTH_NAMES[int(track.health[-1])], f"share of time: {shares}"))
     marks += [""] * (len(rows) - len(marks))
     return Topic("Scores", (), ("", "", ""), tuple(rows), marks=tuple(marks))
 

@@ -8,14 +8,15 @@ from pathlib import Path
 
 import numpy as np
 
-from estimators.diagnostics.intervals import correlation_interval, scale_interval, share_interval
+from estimators.diagnostics.consistency import NisVerdict
+from estimators.diagnostics.intervals import correlation_interval, share_interval
+from estimators.diagnostics.score import MAX_NIS_FACTOR, nis_verdict
 from estimators.fold import Fold
 from estimators.log import READING, Log
 from estimators.model.coloured import ColouredError, coloured
 from estimators.model.state_space import StateSpaceModel
 from estimators.model.user_file import run_file
 from estimators.registry import find_entry
-from estimators.track import USED
 from estimators.tuning import Tuning
 
 from .draft import python_text, rounded
@@ -23,7 +24,6 @@ from .plan import MAX_COVERAGE, MIN_COVERAGE, DraftCheck, DraftPlan, Moves, Read
 from .signals import Signal
 
 BAND_SIGMA = 1.959963984540054  # half width of the 95 % band
-MAX_NIS_FACTOR = 1.5625  # by which a mean NIS may differ from 1: bands a quarter too narrow or too wide
 MIN_CHECKED = 60  # measurements that a check takes
 MAX_CORRELATION = 0.2  # of successive innovations, as in the claims of `nisus advise`
 MAX_FLOOR_FACTOR = 1.1  # of the variance of a resolution, up to which a noise is that resolution alone
@@ -142,17 +142,15 @@ class DraftFold:
                 alone[reads.name] = self._innovations(self._folded(without), k)
             held_out = _coverage(alone.get(reads.name, e[:0]))
             found.append(SensorCheck(reads.name, e.size, _coverage(e), correlation_interval(e), held_out))
-        rows = self._fold.track.verdict == USED
-        nis, times = self._fold.track.nis[rows] / self._fold.track.dof[rows], self._log.t[: self._log.n][rows]
-        interval = scale_interval(nis[times >= self._middle])
-        fitted = scale_interval(nis[times < self._middle])
-        # The noises were fitted to the first half, so a ratio of two means deviates. An interval that allows for
-        # anything is no bound.
-        with np.errstate(all="ignore"):
-            half = float(np.hypot(np.log(interval.high / interval.value), np.log(fitted.high / fitted.value)))
-        factor = min(float(np.exp(half)), MAX_NIS_FACTOR) if half > 0.0 else np.nan
-        reason = _reason(interval.value, factor, self._sensors, found, late, alone, ratios)
-        return DraftCheck(self._middle * 1e-9, span, interval.value, 1.0 / factor, factor, tuple(found), reason)
+        halves = np.searchsorted(self._log.t[: self._log.n], self._middle)
+        fitted, nis = (self._verdict(part) for part in (slice(0, halves), slice(halves, self._log.n)))
+        reason = _reason(nis, fitted, self._sensors, found, late, alone, ratios)
+        start = self._middle * 1e-9
+        return DraftCheck(start, span, nis.ratio, nis.low, nis.high, tuple(found), reason, nis.words)
+
+    def _verdict(self, part: slice) -> NisVerdict:
+        """Return the verdict on the mean NIS of some events, as `nisus fold` gives it."""
+        return nis_verdict(self._fold.track.select(part), self._log.events.select(part), self._fold.model)
 
 
 def _coverage(e: np.ndarray) -> float:
@@ -163,9 +161,18 @@ def _power(e: np.ndarray) -> float:
     return float(np.mean(e**2)) if e.size else np.nan
 
 
+def _within_fit_error(nis: NisVerdict, fitted: NisVerdict) -> bool:
+    """Return whether a NIS is outside its bounds because the noises were fitted to few measurements.
+
+    The variances of both means add, as the fit makes that of the first half 1.
+    """
+    half = float(np.hypot(np.log(nis.high), np.log(fitted.high)))
+    return abs(np.log(nis.ratio)) <= min(half, np.log(MAX_NIS_FACTOR))
+
+
 def _reason(
-    nis: float,
-    factor: float,
+    nis: NisVerdict,
+    fitted: NisVerdict,
     sensors: Sequence[Reads],
     checks: Sequence[SensorCheck],
     late: Mapping[str, np.ndarray],
@@ -175,8 +182,8 @@ def _reason(
     """Return why a draft is not consistent, and the next step; empty if it is.
 
     Args:
-        nis: Mean NIS per degree of freedom.
-        factor: Factor by which it may differ from 1.
+        nis: Verdict on the NIS of the second half.
+        fitted: The same of the first half, to which the noises were fitted.
         sensors: Sensors.
         checks: Their checks.
         late: Their innovations on the second half, σ.
@@ -184,11 +191,13 @@ def _reason(
         ratios: Power of these over that on the first half.
     """
     known = [one for one in checks if one.n]
-    if sum(one.n for one in known) < MIN_CHECKED or not np.isfinite(factor):
+    if sum(one.n for one in known) < MIN_CHECKED or not nis.place:
         return f"the second half has fewer than {MIN_CHECKED} measurements; record a longer log"
     shares = {one.name: share_interval(np.abs(late[one.name]) <= BAND_SIGMA, late[one.name]) for one in known}
     narrow, wide = min(known, key=lambda one: one.coverage), max(known, key=lambda one: -_power(late[one.name]))
-    if nis > factor or shares[narrow.name].high < MIN_COVERAGE:
+    good = shares[narrow.name].high >= MIN_COVERAGE
+    place = "inside" if _within_fit_error(nis, fitted) else nis.place
+    if place == "above" or not good:
         far = {one.name: float(np.mean(np.abs(late[one.name]) > FAR_SIGMA)) for one in known}
         worst = max(far, key=lambda name: far[name])
         if ratios[narrow.name] > MAX_NIS_FACTOR:
@@ -204,7 +213,7 @@ def _reason(
                 f"of its motion is missing; name it with --inputs"
             )
         return f"the noise of {narrow.name} varies; nisus advise with the YAML recommends a filter"
-    if nis < 1.0 / factor or any(one.low > MAX_COVERAGE for one in shares.values()):
+    if place == "below" or any(one.low > MAX_COVERAGE for one in shares.values()):
         reads = next(one for one in sensors if one.name == wide.name)
         if reads.r <= MAX_FLOOR_FACTOR * reads.signal.resolution**2 / 12.0:
             return (

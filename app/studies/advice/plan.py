@@ -124,8 +124,8 @@ class SensorCheck(NamedTuple):
 class DraftCheck(NamedTuple):
     """Check of a draft on data that took no part in the fit: from `start` to `end`, s after the first measurement.
 
-    `nis` is the mean NIS per degree of freedom; `low` and `high` bound 95 % of such means of a consistent filter, with
-    the correlation and the tails of these. `reason` says why it is not consistent; empty if it is.
+    `nis` is the mean NIS per degree of freedom, with the bounds `low` and `high` of `nisus fold`. `reason` says why it
+    is not consistent; empty if it is. `said` is the NIS and its position in words.
     """
 
     start: float
@@ -135,15 +135,16 @@ class DraftCheck(NamedTuple):
     high: float
     sensors: tuple[SensorCheck, ...]
     reason: str
+    said: str
 
     @property
     def words(self) -> str:
         """The verdict in one line."""
-        figures = f"NIS {self.nis:.2f} per degree of freedom, 95 % bounds {self.low:.2f} to {self.high:.2f}"
         if not self.reason:
-            return f"consistent: {figures}"
+            fit = "" if self.low <= self.nis <= self.high else " within the error of a fit to one half"
+            return f"consistent{fit}: {self.said}"
         wide = self.nis < self.low and all(one.coverage >= MIN_COVERAGE for one in self.sensors if one.n)
-        return f"{'conservative' if wide else 'not consistent'}: {figures}; {self.reason}"
+        return f"{'conservative' if wide else 'not consistent'}: {self.said}; {self.reason}"
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ import numpy as np
 
 from config.tunings import named
 from estimators.diagnostics.calibration import LIMITS, Calibration, calibrations
-from estimators.diagnostics.innovations import mean_nis
+from estimators.diagnostics.score import nis_verdict
 from estimators.diagnostics.sensitivity.checklist import DIFFERENCE_QUANTILE, Linearity
 from estimators.diagnostics.sensitivity.posterior import FAR_SIGMA, FREQUENT_SHARE, HEAVY_KURTOSIS, MOST_STATES
 from estimators.diagnostics.sensitivity.posterior import tails as measure_tails
@@ -127,7 +127,8 @@ def correlated_rows(rows: Sequence[Calibration]) -> list[Calibration]:
 def consistent(measured: Measured, estimator: str, options: Options = None) -> Claim:
     """Check the chosen filter by mean NIS, and by scale and correlation of each row with their intervals."""
     fold = measured.folded(estimator, options).fold
-    nis = mean_nis(fold.track, fold.tuning.gate)
+    verdict = nis_verdict(fold.track, fold.log.events, fold.model, fold.tuning.baseline)
+    nis = verdict.ratio
     if not np.isfinite(nis):
         return CONSISTENT.claim(UNTOLD, None, "no reading was used")
     rows = [entry for entry in used_rows(fold) if np.isfinite(entry.scale.high)]
@@ -135,7 +136,7 @@ def consistent(measured: Measured, estimator: str, options: Options = None) -> C
         return CONSISTENT.claim(UNTOLD, nis, "no row has enough readings for an interval")
     wide = 1.0 + LIMITS.width
     size, related = [entry for entry in rows if entry.scale.beyond(1.0 / wide, wide)], correlated_rows(rows)
-    reason = f"{estimator}: mean NIS {digits(nis)} per degree of freedom"
+    reason = f"{estimator}: {verdict.words}"
     if not size and not related:
         reason += f"; every band is right within a quarter, and no correlation is beyond {LIMITS.correlation:g}"
         return CONSISTENT.claim(YES, nis, f"{reason} ({_counted(len(rows), 'row')})")

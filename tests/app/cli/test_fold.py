@@ -293,9 +293,16 @@ def test_the_json_says_what_a_script_needs(tmp_path: Path, nisus: CommandLine) -
     assert told["conditioned"] == told["missing"] == np.sum(~good) > 20
     assert told["used"] == np.sum(good) == np.sum(table.verdict == "used")
     assert tuple(told["health"]) == HEALTH_NAMES
-    for name, share in told["health"].items():
-        assert share == np.mean(table.health == name)
-    assert told["health"]["tracking"] > 0.5 and sum(told["health"].values()) == pytest.approx(1.0)
+    # All rows are tracking, but none falls into the gap, in which a running twin degrades and goes stale.
+    policy = load_twin(tmp_path / "drive.yaml").policy
+    heard = table[(table.verdict == "used") & (table.seconds < 400)].seconds.max()
+    assert set(table.health) == {"tracking"} and heard + policy.stale_after < 460
+    shares = {"degraded": policy.stale_after - policy.degraded_after, "stale": 460 - heard - policy.stale_after}
+    shares["tracking"] = 460 - sum(shares.values())
+    assert told["health"] == pytest.approx({name: shares.get(name, 0.0) / 460 for name in HEALTH_NAMES}, abs=1e-9)
+    (tmp_path / "drive.yaml").write_text(yaml)
+    shown = nisus("fold", tmp_path / "drive.yaml").out
+    assert re.search(r"health, share of time +tracking \d+\.?\d* %, stale", shown)
     assert told["held_out"] == {}
     # The one that was refused lay at 160 °C, 50 deviations off: it costs at least log(1e4) beside its density.
     assert told["refused"] == pytest.approx(1 / (1 + told["used"]))
@@ -397,3 +404,50 @@ def test_what_is_smoothed_is_drawn_in_recording_and_report(tmp_path: Path, nisus
     nisus("fold", name, "--html", html)
     text = html.read_text()
     assert set(data_of(text)[0]["streams"]) == {"live"} and "smoothed states" not in text
+
+
+def test_a_part_of_the_log_is_scored_by_the_filter_that_ran_from_the_start(tmp_path: Path, nisus: CommandLine) -> None:
+    """Scores, counts, episodes, report and their times are of the part; the oracle is the table of all rows."""
+    rng = np.random.default_rng(4)
+    t = np.arange(400.0)
+    read = 40.0 + 0.02 * t + 3.0 * rng.standard_normal(t.size)
+    read[250:] += 9.0 * rng.standard_normal(150)  # noise that is three times as large as said
+    truth = 40.0 + 0.02 * t
+    lines = [f"{a},{b},{c},0.02" for a, b, c in zip(t, read, truth, strict=True)]
+    twin = drive(tmp_path, "\n".join(["t,y,temperature,rate", *lines]), DRIVE + "sensors: {winding: {std: 3}}\n")
+    out = tmp_path / "track.parquet"
+    nisus("fold", twin, "--out", out)
+    table = pq.read_table(out).to_pandas()
+    for since, until, begin, end in (("200", "250", 200, 250), (None, "50%", 0, 199.5), ("62.5%", None, 249.4, 400)):
+        options = [text for name, text in (("--since", since), ("--until", until)) if text for text in (name, text)]
+        told = nisus("fold", twin, *options, "--json").json
+        part = table[(table.seconds >= begin) & (table.seconds < end)]
+        used = part[part.verdict == "used"]
+        assert told["readings"] == told["used"] == told["nis"]["n"] == len(used)
+        assert (told["start"], told["end"]) == (part.seconds.min(), part.seconds.max())
+        assert told["nis"]["mean"] == pytest.approx(used.nis.mean(), rel=1e-12)
+        assert told["log_likelihood"] == pytest.approx(used.log_likelihood.sum(), rel=1e-9)
+        known = part[part.event == "truth"]
+        error = known.temperature - known.temperature_true
+        assert told["rmse"]["temperature"] == pytest.approx(np.sqrt(np.mean(error**2)), rel=1e-9)
+        assert told["calibration"][0]["n"] == len(used) and told["nees"]["n"] == len(known)
+        assert told["nis"]["place"] == ("above" if begin > 200 else "inside")
+        assert any(item["cause"] == "narrow" for item in told["episodes"]) == (begin > 200)
+    shown = nisus("fold", twin, "--since", "200", "--until", "250").out
+    assert "scored" not in nisus("fold", twin).out and re.search(r"scored +200 s to 249 s", shown)
+    (row,) = nisus("compare", twin, "--estimators", "kf", "--since", "200", "--until", "250", "--json").json
+    told = nisus("fold", twin, "--since", "200", "--until", "250", "--json").json
+    assert [row["nis"], *row["nis_bounds"]] == pytest.approx([told["nis"][key] for key in ("mean", "low", "high")])
+
+
+@pytest.mark.parametrize(
+    ("option", "text"),
+    [
+        ("--since noon", "--since noon: give a share (50%), a time after the start (600, 10min) or a date"),
+        ("--since 2024-05-01", "--since 2024-05-01: the times of this log have no date; give seconds after its start"),
+        ("--until 130%", "--until 130%: give a share from 0% to 100%"),
+        ("--since 10min", "--since 10min: there is no measurement in this part; the log is from 0 s to 2 s"),
+    ],
+)
+def test_a_part_without_measurements_is_one_line(option, text, tmp_path: Path, nisus: CommandLine) -> None:
+    assert text in nisus.refuses("fold", drive(tmp_path), *option.split())

@@ -2,7 +2,8 @@
 
 import numpy as np
 import pytest
-from scipy.stats import chi2
+from scipy.signal import lfilter
+from scipy.stats import chi2, norm
 
 from estimators.diagnostics.consistency import NisVerdict
 from estimators.diagnostics.health import JUDGED_MEAN, MEAN, VARIANCE, nis_bounds, normal_nis
@@ -67,9 +68,16 @@ def test_no_readings_have_no_bounds():
 @pytest.mark.parametrize(
     ("nis", "commissioned", "words"),
     [
-        (1.0, False, "mean NIS 1 per degree of freedom, inside its 95 % bounds 0.9 to 1.1"),
-        (1.2, False, "mean NIS 1.2 per degree of freedom, above its 95 % bounds 0.9 to 1.1"),
-        (0.571, True, "mean NIS 0.571 per degree of freedom, below its 95 % bounds 0.9 to 1.1, as commissioned"),
+        (1.0, False, "mean NIS 1.00 per degree of freedom, inside its 95 % bounds 0.90 to 1.10"),
+        (1.2, False, "mean NIS 1.20 per degree of freedom, above its 95 % bounds 0.90 to 1.10"),
+        (
+            0.57,
+            True,
+            "mean NIS 0.57 per degree of freedom, below the 95 % bounds 0.90 to 1.10 of the commissioned baseline",
+        ),
+        # Numbers that differ read differently, with the same decimals.
+        (1.1004, False, "mean NIS 1.1004 per degree of freedom, above its 95 % bounds 0.9000 to 1.1000"),
+        (0.897, False, "mean NIS 0.897 per degree of freedom, below its 95 % bounds 0.900 to 1.100"),
     ],
 )
 def test_it_says_where_a_mean_lies_and_by_what(nis, commissioned, words):
@@ -95,8 +103,39 @@ def test_of_a_commissioned_twin_the_same_readings_are_compared_as_were_taken_for
     assert found.nis == pytest.approx((e[: n + 5] ** 2).mean(), rel=1e-12) and found.nis > found.high
     assert found.judged == pytest.approx((clipped**2).mean(), rel=1e-12) and found.place == "inside"
     assert found.words == (
-        f"mean NIS {found.nis:.3g} per degree of freedom, {found.judged:.3g} with those refused and none beyond 6 σ, "
-        f"inside its 95 % bounds {found.low:.3g} to {found.high:.3g}, as commissioned"
+        f"mean NIS {found.nis:.2f} per degree of freedom, {found.judged:.2f} with rejected measurements included and "
+        f"outliers limited to 6 σ, inside the 95 % bounds {found.low:.2f} to {found.high:.2f} of the commissioned "
+        "baseline"
     )
-    white = nis_verdict(track, events, MODEL)
-    assert white.place == "above" and np.isnan(white.judged)
+    # Outliers of 30 σ allow for any mean, but not for bands that are off by more than a quarter.
+    own = nis_verdict(track, events, MODEL)
+    assert own.place == "above" and np.isnan(own.judged) and own.high == pytest.approx(1.25**2, rel=1e-12)
+
+
+@pytest.mark.parametrize("phi", [0.0, 0.9, -0.9])
+def test_a_filter_whose_innovations_have_the_right_size_is_inside_nineteen_times_in_twenty(phi):
+    """AR(1) innovations of variance 1: chi-square's bounds hold fewer of the means, whose variance is larger."""
+    runs, n = 400, 2000
+    rng = np.random.default_rng(6)
+    t = np.arange(n, dtype=np.int64)
+    track = Track.allocate(n, 1, 0, 2)
+    track.verdict[:], track.dof[:] = USED, 1
+    events = Events(t, t, np.full(n, READING, np.int8), np.zeros(n, np.int32), np.zeros((n, 2)))
+    inside, white = 0, 0
+    for _ in range(runs):
+        e = lfilter([1.0], [1.0, -phi], np.sqrt(1 - phi**2) * rng.standard_normal(n + 200))[200:]
+        track.nis[:] = e**2
+        found = nis_verdict(track, events, MODEL)
+        inside += found.place == "inside"
+        white += found.white_low <= found.nis <= found.white_high
+        assert (found.white_low, found.white_high) == pytest.approx(
+            [chi2.ppf(q, n) / n for q in (0.025, 0.975)], rel=1e-9
+        )
+        assert found.low <= found.white_low and found.white_high <= found.high
+    # Four deviations of a share of 400 below 95 %; the mean of n squares has the variance 2 (1 + φ²) / (1 - φ²) / n.
+    assert inside / runs > 0.95 - 4 * np.sqrt(0.95 * 0.05 / runs)
+    expected = 2 * norm.cdf(1.96 * np.sqrt((1 - phi**2) / (1 + phi**2))) - 1
+    assert white / runs == pytest.approx(expected, abs=4 * np.sqrt(0.25 / runs))
+    # A covariance that is too small by a factor of two is found with any correlation.
+    track.nis[:] = 2 * e**2
+    assert nis_verdict(track, events, MODEL).place == "above"

@@ -13,6 +13,7 @@ from app.present.runs_json import runs_json
 from app.studies.analysis.diagnosis import Diagnosis
 from app.web.twin_json import status_json
 from estimators.diagnostics.detector_state import no_baseline
+from estimators.diagnostics.intervals import scale_interval
 from estimators.diagnostics.score import score
 from tests.app.scripted import MODEL, Scripted, pull_all, readings
 from tests.app.served import shown_twin
@@ -35,7 +36,18 @@ def engine(request):
 
 
 def by_hand(engine):
-    """Mean NIS and bounds: chi-square, or as wide as a sum of squares of such an AR(1) series is on average."""
+    """Mean NIS and bounds: chi-square, or as wide as a sum of squares of such an AR(1) series is on average.
+
+    Wider where the NIS vary by more: E / f to E f for an interval of the mean by the factor f, at most 1.25².
+    """
+    nis = pull_all(engine).track.nis
+    mean = 1.0 if engine.twin.tuning.baseline is None else BIAS**2 + SCALE**2
+    factor = min(scale_interval(nis).high / nis.mean(), 1.25**2)
+    nis, low, high = white_by_hand(engine)
+    return nis, min(low, mean / factor), max(high, mean * factor)
+
+
+def white_by_hand(engine):
     nis = pull_all(engine).track.nis.mean()
     if engine.twin.tuning.baseline is None:
         return nis, *chi2.ppf([0.025, 0.975], READINGS) / READINGS
@@ -51,14 +63,13 @@ def test_one_verdict_in_one_wording(engine):
     status = status_json(engine)
     run = runs_json(RunScores(engine), engine)[0]["score"]
     nis, low, high = by_hand(engine)
-    # The strip's quantiles are between those of whole degrees of freedom, which curve little.
-    assert (status["nis"], status["nis_low"], status["nis_high"]) == pytest.approx((nis, low, high), rel=2e-3)
+    assert (status["nis"], status["nis_low"], status["nis_high"]) == pytest.approx((nis, low, high), rel=1e-6)
     assert (run["nis"], run["nis_low"], run["nis_high"]) == pytest.approx((nis, low, high), rel=1e-6)
     assert status["nis_judged"] == pytest.approx(run["nis_judged"], rel=1e-9) == pytest.approx(nis, rel=1e-9)
     place = "below" if nis < low else "above" if nis > high else "inside"
     commissioned = engine.twin.tuning.baseline is not None
-    expected = f"mean NIS {nis:.3g} per degree of freedom, {place} its 95 % bounds {low:.3g} to {high:.3g}"
-    expected += ", as commissioned" if commissioned else ""
+    which, of = ("the", " of the commissioned baseline") if commissioned else ("its", "")
+    expected = f"mean NIS {nis:.2f} per degree of freedom, {place} {which} 95 % bounds {low:.2f} to {high:.2f}{of}"
     said = [status["nis_words"], run["nis_words"], Diagnosis(engine)._look()["nis"]]
     assert said == [expected] * 3
     assert status["nis_place"] == run["nis_place"] == place == ("above" if commissioned else "inside")
@@ -70,4 +81,4 @@ def test_the_report_says_the_same(engine):
     found = score(pull.track, pull.events, MODEL, gate=twin.tuning.gate, baseline=twin.tuning.baseline)
     reported = Reported(twin, "kf", twin.tuning, pull.events, pull.track, (), (), False)
     (row,) = [row for row in _scores(reported, found).rows if row[0] == "mean NIS"]
-    assert f"mean NIS {run['nis']:.3g} {row[2]}" == run["nis_words"]
+    assert f"mean NIS {row[1]} {row[2]}" == run["nis_words"]

@@ -123,7 +123,7 @@ STRIP = """() => ["health", "nis", "cause", "stage-time"].map((id) => document.g
 
 def strip_of(status):
     """Health, NIS per degree of freedom and cause, as the strip shows them."""
-    ratio = status.nis / status.nis_dof
+    ratio = status.nis.ratio
     return HEALTH_NAMES[status.health], float(f"{ratio:.3g}"), status.cause
 
 
