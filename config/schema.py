@@ -278,8 +278,26 @@ class SceneSection(Section):
         return self
 
 
+class GridAxis(Section):
+    """Positions along one index of a field."""
+
+    first: Number = 0.0
+    """Position of cell 0. Default: 0."""
+    step: Number
+    """From one cell to the next, in the same unit; negative where positions fall."""
+    unit: Text
+    """m, for example; "° N" and "° E" for latitudes and longitudes, which are shown as ° S and ° W where negative."""
+
+
 class ViewSection(Section):
     """Contents of the page."""
+
+    labels: dict[Text, Text] = {}
+    """Labels on the page by names of states, sensors and parameters, for example {v1: polarisation voltage}. That of a
+    field is also its cells', that of v1 also of v1_1, v1_2 and so on. Default: the names."""
+    grid: tuple[GridAxis, ...] | None = None
+    """Positions of a field's cells, shown in place of their indices: {first, step, unit} for each index. Default: the
+    indices."""
 
     pairs: tuple[tuple[Text, Text], ...] | None = None
     """Pairs of states whose joint covariance is drawn as an ellipse. Default: the first two states; of a large field

@@ -127,7 +127,7 @@ def model_json(engine: Running) -> dict[str, Any]:
         "twin": twin.name,
         "title": twin.title,
         "model": model.name,
-        **charted_model(model),
+        **charted_model(model, twin.config.view),
         "field": model.grid is not None,
         "sensors": model.sensor_names,
         "families": {sensor.name: sensor.family for sensor in model.sensors if sensor.family},

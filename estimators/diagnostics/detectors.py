@@ -120,11 +120,10 @@ CALENDAR_FROM_S = 1e8
 
 
 def since(seconds: float) -> str:
-    """Return "since ..." with a time of day, or with seconds of the log."""
+    """Return "since ..." with date and time of day, or with seconds of the log."""
     if seconds < CALENDAR_FROM_S:
         return f"since {seconds:.1f} s"
-    of_day = int(seconds) % 86400
-    return f"since {of_day // 3600:02}:{of_day // 60 % 60:02}:{of_day % 60:02} UTC"
+    return f"since {str(np.datetime64(int(seconds), 's')).replace('T', ' ')} UTC"
 
 
 DETECTORS = (

@@ -61,7 +61,8 @@ def report(run: Reported) -> list[Topic]:
     """Return the topics of the report, from top to bottom."""
     model = run.twin.model
     found = score(run.track, run.events, model, run.pictures, gate=run.tuning.gate, baseline=run.tuning.baseline)
-    charts = charts_html(run.tuning, run.events, run.track, run.episodes, run.bounds, run.smoothed, run.annotations)
+    shown = (run.tuning, run.events, run.track, run.episodes, run.bounds, run.smoothed, run.annotations)
+    charts = charts_html(*shown, run.twin.config.view)
     said: tuple[str, ...] = (
         "Time counts from the first event. Red strips mark episodes, flags notes. Drag to zoom, double-click for all.",
     )

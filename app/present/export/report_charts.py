@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from config.schema import GridAxis, ViewSection
 from estimators.diagnostics.episodes import Episode
 from estimators.diagnostics.sensitivity import Bound
 from estimators.log import Events
@@ -58,6 +59,7 @@ def charts_html(
     bounds: Mapping[str, Bound] | None,
     smoothed: Smoothed | None,
     annotations: Sequence[Annotation] = (),
+    view: ViewSection | None = None,
 ) -> str:
     """Return the charts of a run as HTML that loads nothing; times count from the first event."""
     model = tuning.model
@@ -67,12 +69,17 @@ def charts_html(
     start = float(events.t[0]) * 1e-9
     kinds = sorted(path.name for path in (PAGE / "charts").glob("*.js"))
     data = {
-        "model": charted_model(model) | {"commissioned": tuning.baseline is not None},
+        "model": charted_model(model, view or ViewSection()) | {"commissioned": tuning.baseline is not None},
         "nis_dof": float(track.dof[used].mean()) if (used := track.verdict == USED).any() else 1.0,
         "kinds": kinds,
         "streams": streams,
         "episodes": [
-            {"from": item.start - start, "to": None if item.end is None else item.end - start} for item in episodes
+            {
+                "subject": item.subject,
+                "from": item.start - start,
+                "to": None if item.end is None else item.end - start,
+            }
+            for item in episodes
         ],
         "annotations": [{"from": (note.t - int(events.t[0])) * 1e-9, "text": note.text} for note in annotations],
         "integrity": {
@@ -127,9 +134,51 @@ def _script(value: Any) -> str:
     return json.dumps(value, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
 
 
-def charted_model(model: StateSpaceModel) -> dict[str, Any]:
-    """Return states and sensor rows as charts need them: names, units, and which rows measure which state."""
-    rows = rows_of(model)
+NUMBERED = re.compile(r"(.+?)(?:_(\d+)|\[([\d,]+)\])$")
+"""Numbered states ("v1_3") and cells of a field ("t2m[13,20]")."""
+
+
+def page_labels(model: StateSpaceModel, view: ViewSection) -> dict[str, str]:
+    """Return the labels of states, sensors, rows and parameters by name, as far as they are not the names."""
+    found, field = dict(view.labels), model.grid
+    grid = view.grid if field is not None and view.grid and len(view.grid) == len(field.shape) else None
+
+    def named(name: str) -> str:
+        return found.get(name, name.replace("_", " "))
+
+    for state in model.shown_states:
+        base, number, cell = part.groups() if (part := NUMBERED.match(state.name)) else (state.name, None, None)
+        if grid is not None and cell:
+            found[state.name] = f"{named(base)} {_position(grid, [int(index) for index in cell.split(',')])}"
+        elif (number or cell) and base in view.labels:
+            found.setdefault(state.name, f"{named(base)} {number or cell}")
+    for name, sensor, row in rows_of(model):
+        of, position = model.sensors[sensor], model.sensors[sensor].rows[row].position
+        if grid is not None and field is not None and position is not None:
+            cells = [place / step for place, step in zip(position, field.steps, strict=True)]
+            found.setdefault(name, f"{named(of.name)} {_position(grid, cells)}")
+        elif of.name in view.labels and name != of.name:
+            found.setdefault(name, f"{named(of.name)} {of.rows[row].name.replace('_', ' ')}")
+    return found
+
+
+OPPOSITE = {"° N": "° S", "° E": "° W"}
+"""Units of positions below zero."""
+
+
+def _position(grid: Sequence[GridAxis], cell: Sequence[float]) -> str:
+    """Return the position of a cell in words: "54.75° N 5° W"."""
+    places = []
+    for axis, index in zip(grid, cell, strict=True):
+        value, below = round(axis.first + index * axis.step, 6), OPPOSITE.get(axis.unit)
+        text = f"{abs(value):g}{below}" if value < 0 and below else f"{value:g}{axis.unit}"
+        places.append(text if "°" in axis.unit else f"{value:g} {axis.unit}")
+    return " ".join(places) if any("°" in axis.unit for axis in grid) else f"at {', '.join(places)}"
+
+
+def charted_model(model: StateSpaceModel, view: ViewSection) -> dict[str, Any]:
+    """Return states and sensor rows as charts need them: names, labels, units, and which rows measure which state."""
+    rows, labels = rows_of(model), page_labels(model, view)
     names = {(sensor, row): name for name, sensor, row in rows}
     readers: dict[str, list[str]] = {state.name: [] for state in model.shown_states}
     for dot in observed(model):
@@ -137,6 +186,7 @@ def charted_model(model: StateSpaceModel) -> dict[str, Any]:
         if name in readers:
             readers[name].append(names[dot.sensor, dot.row])
     return {
+        "labels": labels,
         "groups": [
             {"name": group.name, "sensors": [model.sensor_names[k] for k in group.members], "declared": group.declared}
             for group in sensor_groups(model)
@@ -144,7 +194,7 @@ def charted_model(model: StateSpaceModel) -> dict[str, Any]:
         "states": [
             {
                 "name": state.name,
-                "label": model.label(state.name).replace("_", " "),
+                "label": labels.get(state.name) or model.label(state.name).replace("_", " "),
                 "unit": state.unit,
                 "circular": bool(getattr(state, "circular", False)),
                 "probability": j == model.mode,

@@ -41,9 +41,9 @@ SURFACE_HEIGHT = 0.6  # Height of the highest value above the lowest; the longer
 class FieldView:
     """The latest pictures of a field, the kind that is chosen, and its scale; scenes draw them."""
 
-    def __init__(self, api: viser.SceneApi, model: StateSpaceModel, *, truth: bool) -> None:
+    def __init__(self, api: viser.SceneApi, model: StateSpaceModel, name: str, *, truth: bool) -> None:
         assert model.grid is not None
-        self._unit, self._name = model.grid.unit, model.grid.name.replace("_", " ")
+        self._unit, self._name = model.grid.unit, name
         self._frame = Frame.of(model.grid)
         self._kinds = {kind.title: kind for kind in kinds(truth)}
         self._kind = ESTIMATE
@@ -85,8 +85,8 @@ class FieldView:
 class FieldScene(FieldView):
     """Plane seen from above with one picture of the field, its scale, the sensors and the charted cells."""
 
-    def __init__(self, api: viser.SceneApi, model: StateSpaceModel, theme: Palette, *, truth: bool) -> None:
-        super().__init__(api, model, truth=truth)
+    def __init__(self, api: viser.SceneApi, model: StateSpaceModel, theme: Palette, name: str, *, truth: bool) -> None:
+        super().__init__(api, model, name, truth=truth)
         frame, size = self._frame, self._size
         places, self._which = positioned(model)
         self._normalised = np.full(len(places), np.nan)
@@ -148,8 +148,8 @@ class FieldSurfaceScene(FieldView):
     Bars above and below it reach 2 σ to either side of the estimate.
     """
 
-    def __init__(self, api: viser.SceneApi, model: StateSpaceModel, theme: Palette, *, truth: bool) -> None:
-        super().__init__(api, model, truth=truth)
+    def __init__(self, api: viser.SceneApi, model: StateSpaceModel, theme: Palette, name: str, *, truth: bool) -> None:
+        super().__init__(api, model, name, truth=truth)
         frame, half = self._frame, 0.5 * self._size
         sampled = np.linspace(0, 254, SURFACE_COLORS).round().astype(int)
         self._palettes = {name: colors[sampled] for name, colors in self._palettes.items()}

@@ -118,10 +118,10 @@ class Stage:
 
     def _build(self, show: str, values: dict[str, str]) -> Scene:
         api, model, section = self._server.scene, self.model, self._view.scene
-        if show == FIELD:
-            return FieldScene(api, model, self.palette, truth=self._truth)  # type: ignore[return-value]
-        if show == SURFACE:
-            return FieldSurfaceScene(api, model, self.palette, truth=self._truth)  # type: ignore[return-value]
+        if show in (FIELD, SURFACE) and model.grid is not None:
+            kind = FieldScene if show == FIELD else FieldSurfaceScene
+            name = self._view.labels.get(model.grid.name, model.grid.name.replace("_", " "))
+            return kind(api, model, self.palette, name, truth=self._truth)  # type: ignore[return-value]
         if show == VEHICLE:
             return VehicleScene(api, model, section, self.palette)
         if show == MOTOR:

@@ -41,11 +41,37 @@ export const line = (tone, options = {}) => ({
 
 export const edge = () => ({ stroke: () => "transparent", width: 0, points: { show: false } });
 
+// Where there are many, they are drawn smaller and see-through (`sparse`), so that the band beneath stays visible.
 export const dots = (tone, size = 4, ring = false) => ({
-  mark: "dots", tone, ring, stroke: () => colour(tone),
+  mark: "dots", tone, ring, size, sparse: 1, stroke: () => colour(tone),
   paths: () => null,
-  points: { show: true, size, width: ring ? 1.5 : 0, stroke: () => colour(tone), fill: () => (ring ? "transparent" : colour(tone)) },
+  points: {
+    show: true, size, width: ring ? 1.5 : 0, stroke: () => colour(tone),
+    fill: (self, k) => (ring ? "transparent" : faded(colour(tone), self.series[k].sparse)),
+  },
 });
+
+const DENSE = 0.25; // dots a px of width, from which on they are drawn smaller
+const SMALLEST = 2; // px
+const FAINTEST = 0.55; // opacity
+
+const faded = (tone, sparse) => (sparse < 1 && /^#.{6}$/.test(tone) ? tone + Math.round(255 * Math.max(FAINTEST, sparse)).toString(16).padStart(2, "0") : tone);
+
+// Sizes of the dots of a plot for their number in view.
+function thin(self) {
+  const { min, max } = self.scales.x;
+  const [x] = self.data;
+  if (!x.length) return;
+  const [from, to] = within(x, [min, max]);
+  const width = self.over.clientWidth || self.bbox.width / devicePixelRatio;
+  self.series.forEach((series, k) => {
+    if (series.mark !== "dots") return;
+    let count = 0;
+    for (let i = from; i <= to; i++) if (typeof self.data[k]?.[i] === "number") count += 1;
+    series.sparse = Math.min(1, Math.sqrt((DENSE * width) / Math.max(1, count)));
+    series.points.size = Math.max(Math.min(SMALLEST, series.size), series.size * series.sparse);
+  });
+}
 
 export const band = (tone, upper, lower) => ({ tone, edges: [upper, lower] });
 
@@ -56,8 +82,8 @@ export const heading = (what) => `${what.title} ${bracketed(what.unit.replace(/^
 export const declared = (kinds, context) => kinds.toSorted((a, b) => a.order - b.order).flatMap((kind) => kind.default(context));
 
 export class Chart {
-  // select(since, until), home(), wheel(event, plot), save(chart, button), note(seconds, there): on gestures
-  constructor(what, { select, home, wheel, save, note } = {}) {
+  // select(since, until), home(), wheel(event, plot), save(chart, button), note(seconds, there), hover(seconds): on gestures
+  constructor(what, { select, home, wheel, save, note, hover } = {}) {
     this.what = what;
     this.names = Object.keys(what.series);
     this.reading = element("output", { class: "reading", title: what.help });
@@ -73,7 +99,7 @@ export class Chart {
     this.canvas = element("div", { class: "plot" });
     this.node = element("article", { class: "chart", style: `--weight:${what.weight}`, "aria-label": `Chart of ${what.title}` }, this.head, this.canvas);
     this.data = { x: [], ...Object.fromEntries(this.names.map((name) => [name, []])) };
-    this.actions = { select, home, wheel, note };
+    this.actions = { select, home, wheel, note, hover };
     this.notes = []; // notes of users, [{from, text}] by time
     this.visible = true;
     this.empty = true;
@@ -95,7 +121,7 @@ export class Chart {
         hooks: {
           ...options.hooks,
           setSelect: [(self) => this.selected(self)],
-          setCursor: [(self) => this.pointed(self)],
+          setCursor: [(self) => (this.actions.hover?.(hoveredTime(self)), this.pointed(self))],
         },
       },
       this.table,
@@ -138,6 +164,7 @@ export class Chart {
       series: [{}, ...Object.values(what.series)],
       bands: bands.map(({ tone, edges }) => ({ series: edges.map(index), fill: () => colour(tone) })),
       hooks: {
+        drawClear: [thin],
         drawAxes: [(self) => what.paint?.(self), (self) => ((curves = what.curves?.() ?? []), last || draw(self, false))],
         drawSeries: [(self, series) => series === last && draw(self, false)],
         draw: [
@@ -193,15 +220,17 @@ export class Chart {
     this.actions.select?.(...ends);
   }
 
-  // Show the values at the cursor, else at the moment that is looked at, else the newest ones.
+  // Show the values at the cursor, else at the moment that is looked at, else the newest ones. Where points are extremes
+  // of groups of rows, `exact()` gives those of the row as text, null while it is not there; undefined: points are rows.
   pointed(self) {
     const { left, idx } = self.cursor;
     const { x } = this.data;
-    const here = this.moment === null || this.moment === undefined ? x.length - 1 : within(x, [-Infinity, this.moment])[1];
-    const hovered = left >= 0 && idx !== null && idx !== undefined;
-    const at = hovered ? idx : here;
-    const text = hovered ? null : (this.exact?.() ?? null);
-    setText(this.reading, text ?? (at < 0 ? "" : this.what.says((name) => this.at(name, at))));
+    const exact = this.exact?.();
+    if (exact !== null) {
+      const here = this.moment === null || this.moment === undefined ? x.length - 1 : within(x, [-Infinity, this.moment])[1];
+      const at = hoveredTime(self) === null ? here : idx;
+      setText(this.reading, exact ?? (at < 0 ? "" : this.what.says((name) => this.at(name, at))));
+    }
     setAttribute(self.over, "title", this.notesAt(left).map((note) => `${clock(note.from, 1)} ${note.text}`).join("\n") || null);
   }
 
@@ -259,6 +288,9 @@ export class Chart {
     this.node.remove();
   }
 }
+
+// Time at the pointer, s; null where it is elsewhere.
+const hoveredTime = ({ cursor, posToVal }) => (cursor.left >= 0 && cursor.idx !== null && cursor.idx !== undefined ? posToVal(cursor.left, "x") : null);
 
 // Value axis
 

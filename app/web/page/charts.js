@@ -9,8 +9,9 @@ const DENSITY = 1.6; // px to a group of rows
 const REDRAW_AFTER_MS = 500; // ms without a frame
 const MAX_HALVINGS = 4; // of the window, while there is less than that to show
 const LEGEND_DELAY_MS = 400; // ms after a drawing
-const MOMENT_GROUPS = 4; // groups of rows in which the row of a moment is looked for
-const MOMENT_POINTS = 4000;
+const MOMENT_ROWS = 400; // rows before a moment, in which the last value of each column is looked for (chart.js)
+const MOMENT_POINTS = 1000; // rows of these, at most
+const HOVER_PERIOD_MS = 60; // ms between two questions for the row at the pointer
 const EQUAL_S = 1e-6; // s
 
 // Marks in the order of the legend: text, where the charts differ, and tooltip.
@@ -48,19 +49,22 @@ export class Charts {
       wheel: (event, plot) => this.wheel(event, plot),
       save: (chart, button) => this.saving.chart(chart, button),
       note: (...place) => this.noting(...place),
+      hover: (seconds) => this.hover(seconds),
     };
     this.strong = new Strong(this, link);
     this.layers = [];
     this.charts = declared(kinds, this).map((what) => new Chart(what, actions));
     node.replaceChildren(...this.charts.map((chart) => chart.node));
-    // Charts draw both extremes of a group of rows; the values of a moment are those of its row.
+    // Charts draw both extremes of a group of rows; the values at the pointer, or at a moment, are those of its row.
     this.moment = new Stream(link, "moment");
+    this.hovered = null; // time at the pointer, s
+    this.fewer = 1; // share of the stretch before a moment that has no more rows than are sent
     const strong = { choose() {}, stream: this.moment, edges: () => [[], []] };
     const exact = declared(kinds, Object.create(this, { live: { value: this.moment }, strong: { value: strong }, ask: { value: () => {} } }));
     this.charts.forEach((chart, k) => {
       chart.span = this.range;
       chart.begin();
-      if (!chart.what.control) chart.exact = () => this.exactly(chart, exact[k]);
+      chart.exact = () => this.exactly(chart, exact[k]);
     });
     this.axis = new TimeAxis($("axis"));
     this.pins = new Pins(this, link, actions);
@@ -69,7 +73,13 @@ export class Charts {
     $("layout").after(this.smoothed.button);
     this.layout = new Layout(this.charts, node, $("layout"), model.twin, () => this.ask());
     view.addEventListener("change", () => this.ask());
-    link.addEventListener("frames", () => this.draw());
+    link.addEventListener("frames", ({ detail: arrived }) => {
+      const read = arrived.has("moment") && arrived.size === 1;
+      if (arrived.has("moment")) this.narrow();
+      if (read) return this.read();
+      this.draw();
+      this.askMoment();
+    });
     link.addEventListener("episodes", (event) => {
       this.episodes = event.detail;
       clearTimeout(this.marking);
@@ -115,22 +125,63 @@ export class Charts {
     const changed = asked !== this.asked;
     this.asked = asked;
     if (changed) {
+      this.fewer = 1;
       this.live.ask(place && { ...place, columns });
       for (const layer of [...this.layers, this.strong]) layer.ask(place);
     }
-    const { at } = this.view;
-    this.reach = (MOMENT_GROUPS * (this.range[1] - this.range[0])) / points;
-    this.moment.ask(place && at !== null ? { since: at - this.reach, until: at + EQUAL_S, points: MOMENT_POINTS, columns } : null);
+    this.askMoment();
     // What is there already is drawn until the new points come; of the same stretch another moment may be looked at.
     if (!this.visible || !this.view.following) this.draw();
   }
 
-  // The text of a chart at the moment that is looked at, or null while its row is not there.
+  // The time whose values are shown: at the pointer, else the moment that is looked at; null is the newest row.
+  get looked() {
+    return this.hovered ?? this.view.at;
+  }
+
+  hover(seconds) {
+    if (seconds === this.hovered) return;
+    this.hovered = seconds;
+    this.hovering ??= setTimeout(() => {
+      this.hovering = null;
+      this.askMoment();
+      this.read();
+    }, HOVER_PERIOD_MS);
+  }
+
+  // Request the rows before that time. None where the points of the charts are rows themselves.
+  askMoment() {
+    const { looked } = this;
+    const { size } = this.live;
+    const groups = (MOMENT_ROWS / size) * this.fewer;
+    // Of one digit: the same question while the charts follow.
+    this.reach = Number(((groups * (this.range[1] - this.range[0]) * DENSITY) / Math.max(1, this.node.clientWidth - 60)).toPrecision(1));
+    const grouped = this.visible && (size > 1 || this.live.each > 1);
+    const stretch = looked === null ? { span: this.reach } : { since: looked - this.reach, until: looked + EQUAL_S };
+    this.moment.ask(grouped ? { ...stretch, points: MOMENT_POINTS, columns: this.columns } : null);
+  }
+
+  // Rows lie closer there than elsewhere.
+  narrow() {
+    const { size } = this.moment;
+    if (size === 1) return;
+    this.fewer /= size;
+    this.askMoment();
+  }
+
+  // Show the values of all charts again.
+  read() {
+    for (const chart of this.charts) if (!chart.node.hidden && chart.plot) chart.pointed(chart.plot);
+  }
+
+  // The text of a chart at the time that is looked at, null while its row is not there; undefined if the points of the
+  // charts are rows.
   exactly(chart, what) {
-    const { at } = this.view;
-    const { x } = this.moment;
-    const row = at === null ? -1 : x.findLastIndex((time) => time <= at + EQUAL_S);
-    if (row < 0 || x[row] < at - this.reach) return null;
+    if (this.live.size === 1 && this.live.each === 1) return undefined;
+    const { x, size } = this.moment;
+    const { looked } = this;
+    const row = size > 1 ? -1 : looked === null ? x.length - 1 : x.findLastIndex((time) => time <= looked + EQUAL_S);
+    if (row < 0 || (looked !== null && x[row] < looked - this.reach)) return null;
     const data = what.data();
     return what.says((name) => chart.at(name, row, data));
   }
@@ -163,8 +214,7 @@ export class Charts {
     const found = new Map();
     const add = (key, text, style) => key in LEGEND && !found.has(key) && found.set(key, [LEGEND[key][0] ?? text, style]);
     for (const chart of shown) for (const [text, style] of chart.legend) add(style.ring ? `${style.tone} ring` : style.tone, text, style);
-    const [since, until] = this.range;
-    if (this.visible && this.episodes.some(({ from, to }) => from < until && (to ?? until) > since)) add("episode-strip", "fault episode", { mark: "line", tone: "episode-strip", width: 2.5 });
+    if (shown.some((chart) => chart.plot?.marked)) add("episode-strip", "fault episode", { mark: "line", tone: "episode-strip", width: 2.5 });
     if (shown.some((chart) => chart.outsiders?.length)) add("outside", "off scale", { mark: "triangle", tone: "faint" });
     const items = Object.keys(LEGEND).flatMap((key) => (found.has(key) ? [[key, ...found.get(key)]] : []));
     const written = items.map(([, text]) => text).join();

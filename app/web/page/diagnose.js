@@ -57,7 +57,7 @@ export class Diagnose {
     const cost = found.cost === null ? "" : ` ${compact(found.cost, 3)} µs per event.`;
     this.node.replaceChildren(
       element("p", { class: "summary" }, element("b", {}, `${good} of ${found.rows.length} sensor rows${left} are consistent${but}. `), `Last ${found.events.toLocaleString("en")} events, ${span(found.span)}, ${found.estimator}: ${found.nis}.${cost}`),
-      ...rows.map((row) => rowCard({ ...row, verdict: inChartTime(row.verdict, this.link.status.origin, this.link.status.t) }, found.marginal, open(row), (now) => this.turned.set(row.name, now))),
+      ...rows.map((row) => rowCard({ ...row, verdict: inChartTime(row.verdict, this.link.status.origin) }, found.marginal, open(row), (now) => this.turned.set(row.name, now))),
       element("div", { class: "cards" }, ...[ranksCard(found), particlesCard(found), correlationCard(found), ...unseenCards(found)].filter(Boolean)),
     );
     this.savable(found.events);
@@ -267,7 +267,8 @@ function stems({ r, bound }, label, step) {
 function quantiles(pairs, label) {
   const most = Math.max(3, ...pairs.flat().map((value) => Math.min(8, Math.abs(value))));
   const ends = [-most, most];
-  const { node, x, y } = frame(ends, ends, label, { xs: [[-2, "−2σ"], [0, "0"], [2, "2σ"]], ys: [[-2], [0], [2]] });
+  const mark = Math.floor(0.8 * most); // where the labels of both axes have room
+  const { node, x, y } = frame(ends, ends, label, { xs: [[-mark, `−${mark}σ`], [0, "0"], [mark, `${mark}σ`]], ys: [[-mark], [0], [mark]] });
   node.append(svg("line", { class: "expected", x1: x(-most), y1: y(-most), x2: x(most), y2: y(most) }));
   for (const [normal, own] of pairs) node.append(svg("circle", { class: "dot", r: 1.8, cx: x(normal), cy: y(Math.max(-most, Math.min(most, own))) }));
   return node;

@@ -111,11 +111,14 @@ function stretches(episodes, [low, high]) {
   return { found, strength: Math.min(1, (MAX_TINTED_SHARE * (high - low)) / (covered || 1e-9)) };
 }
 
-// Behind the curves of a chart: episodes, and the moment that is looked at.
-export function marks(plot, episodes, at = null) {
+// Behind the curves of a chart: episodes that concern it, and the moment that is looked at. `subjects`: names of its
+// states and rows; an episode of a sensor concerns its rows ("scan", "scan.left"). The time bar has all episodes.
+export function marks(plot, { episodes, view: { at } }, subjects) {
   const { ctx, bbox } = plot;
+  const concerns = ({ subject }) => subjects.some((name) => name === subject || name.startsWith(`${subject}.`));
   const [low, high] = [plot.scales.x.min, plot.scales.x.max];
-  const { found, strength } = stretches(episodes, [low, high]);
+  const { found, strength } = stretches(episodes.filter(concerns), [low, high]);
+  plot.marked = found.length > 0;
   ctx.save();
   for (const [from, to] of found) {
     const left = plot.valToPos(from, "x", true);

@@ -43,16 +43,15 @@ export function clock(seconds, fraction = 0) {
   return hours ? `${sign}${hours}:${String(minutes).padStart(2, "0")}:${rest}` : `${sign}${minutes}:${rest}`;
 }
 
-const DAY = 86400; // s
+const NAMES = /(?<![\w.[])[A-Za-z]\w*(?:\.\w+)?(?:\[[\d,]+\])?(?![\w[]|\.\w)/g; // of states and rows; not after "R." or "Q."
 
-// A sentence with its "since 11:14:41 UTC" in the time of the charts, which count from `origin`, ns. Over more than a day
-// the time of day does not tell the moment, and stays.
-export function inChartTime(text, origin, newest) {
+// A sentence with the labels of its names, and its "since 2019-03-01 11:14:41 UTC" in the time of the charts, which count from `origin`, ns.
+export function inChartTime(text, origin) {
   const start = Number(origin ?? NaN) * 1e-9;
-  if (!Number.isFinite(start) || newest * 1e-9 - start > DAY) return text;
-  const of = (hours, minutes, seconds) => (((3600 * hours + 60 * minutes + 1 * seconds - Math.floor(start)) % DAY) + DAY) % DAY;
+  if (!Number.isFinite(start)) return text;
   return text
-    .replace(/since (\d\d):(\d\d):(\d\d) UTC/g, (_, ...parts) => `since ${clock(of(...parts))}`)
+    .replace(NAMES, (name) => (Object.hasOwn(labels, name) ? words(name) : name))
+    .replace(/since (\d{4}-\d\d-\d\d) (\d\d:\d\d:\d\d) UTC/g, (_, day, time) => `since ${clock(Math.max(0, Date.parse(`${day}T${time}Z`) / 1000 - Math.floor(start)))}`)
     .replace(/since ([\d.]+) s\b/g, (_, seconds) => `since ${clock(Math.max(0, seconds - start), 1)}`);
 }
 
@@ -65,5 +64,10 @@ export function span(seconds) {
   return `${Number((seconds / 3600).toPrecision(2))} h`;
 }
 
-export const words = (name) => name.replaceAll("_", " ");
+let labels = {}; // of the twin, by name
+
+// Take the labels of a twin: {name: label} of states, sensors, rows and parameters.
+export const setLabels = (known) => (labels = known ?? {});
+
+export const words = (name) => (Object.hasOwn(labels, name) ? labels[name] : name.replaceAll("_", " "));
 

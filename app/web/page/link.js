@@ -17,6 +17,7 @@ export class Link extends EventTarget {
     this.annotations = []; // notes of users
     this.streams = {}; // queries by name, to ask again after a break
     this.takers = {}; // by stream: take(header, seconds, columns)
+    this.arrived = new Set(); // streams of the frames that are not drawn yet
     this.turned = -Infinity; // when something was edited, or folded anew
     this.line = new PageSocket({
       address: () => "/api/stream",
@@ -81,6 +82,7 @@ export class Link extends EventTarget {
     if (typeof data !== "string") {
       const [header, seconds, columns] = unpack(data);
       this.takers[header.stream]?.(header, seconds, columns);
+      this.arrived.add(header.stream);
       return;
     }
     const message = JSON.parse(data);
@@ -98,7 +100,8 @@ export class Link extends EventTarget {
     if (message.belief) this.tell("belief", message.belief);
     if (message.error) console.error(message.error);
     if (message.frames) {
-      this.tell("frames", null);
+      this.tell("frames", this.arrived);
+      this.arrived.clear();
       // The next ones when these are on the screen.
       requestAnimationFrame(() => this.say({ drawn: true }));
     }

@@ -6,7 +6,7 @@ import { Diagnose } from "./diagnose.js";
 import { $, element, setAttribute, setText } from "./dom.js";
 import { Explore } from "./explore.js";
 import { Faults } from "./faults.js";
-import { clock } from "./format.js";
+import { clock, setLabels } from "./format.js";
 import { Link } from "./link.js";
 import { Runs } from "./runs.js";
 import { Save } from "./save.js";
@@ -31,6 +31,7 @@ $("theme").addEventListener("click", () => {
 const answer = await fetch("/api/model");
 if (!answer.ok) throw new Error(await answer.text());
 const model = await answer.json();
+setLabels(model.labels);
 const kinds = await Promise.all(settings.charts.map((name) => import(`/page/charts/${name}`)));
 window.nisus = { model, drawn: 0, revision: null };
 

@@ -2,7 +2,7 @@
 // page has all that.
 
 import { $, element, setAttribute, setText } from "./dom.js";
-import { clock, span } from "./format.js";
+import { clock, span, words } from "./format.js";
 
 const MAX_LEAD_S = 1; // s by which the scene may differ from the charts without a word
 const LARGE = "nisus.stage.large";
@@ -71,7 +71,7 @@ export class Stage {
 
   select({ key, label, options, value }) {
     const select = element("select", { "aria-label": `Scene: ${label}` });
-    select.append(...options.map((option) => element("option", { value: option }, option.replaceAll("_", " "))));
+    select.append(...options.map((option) => element("option", { value: option }, words(option))));
     select.value = value;
     select.addEventListener("change", async () => {
       const answer = await fetch("/api/scene", {

@@ -15,6 +15,7 @@ export class Stream {
     this.first = 0;
     this.each = 1; // points of a group of rows
     this.ends = 1; // of these, those of a line: the first and the last
+    this.size = 1; // rows in a group
   }
 
   // Ask for {columns, run, since, until, span, points}; null for nothing. The same query again is not sent.
@@ -34,6 +35,7 @@ export class Stream {
       this.first = header.start;
       this.each = header.each;
       this.ends = header.ends;
+      this.size = header.size;
     }
     if (header.offsets) this.offsets = header.offsets;
     this.revision = header.revision;

@@ -56,7 +56,7 @@ export class Trust {
     const name = lost ? "not a number" : status.health;
     setText($("health"), `${SIGNS[status.health] ?? "●"} ${name}${lasting ? ` ${span((status.t - since) / 1e9)}` : ""}`);
     $("health").dataset.health = lost ? "diverged" : status.health;
-    const cause = lost ? "The estimate is not a number. Reset it, or choose another filter." : inChartTime(status.cause, status.origin, status.t);
+    const cause = lost ? "The estimate is not a number. Reset it, or choose another filter." : inChartTime(status.cause, status.origin);
     const first = status.episodes_open > 1 && cause ? `1 of ${status.episodes_open}: ` : ""; // ahead, as the end may be cut
     setText($("cause"), first + cause);
     setAttribute($("cause"), "title", first + cause);
@@ -212,7 +212,7 @@ export class Episodes {
     return element(
       "li", { class: "episode", dataset: { open: String(episode.end === null), severity: episode.severity ?? "" } },
       element("button", { type: "button", title: "Show in the charts", onclick: show }, element("time", {}, times), element("b", {}, `${words(episode.subject)}: ${episode.cause}`)),
-      element("p", {}, inChartTime(episode.text, this.link.status.origin, this.link.status.t)),
+      element("p", {}, inChartTime(episode.text, this.link.status.origin)),
       element("a", { href: `/alarms#${episode.help.split("#")[1]}`, target: "_blank" }, `more on ${episode.cause}`),
     );
   }

@@ -39,7 +39,7 @@ function common(charts, { name, unit, members }) {
     title: words(name),
     unit: bracketed(unit),
     columns: members.map((state) => `mean:${state.name}`),
-    paint: (plot) => marks(plot, charts.episodes, charts.view.at),
+    paint: (plot) => marks(plot, charts, members.flatMap((state) => [state.name, ...state.rows])),
   };
 }
 
@@ -69,7 +69,7 @@ function lines(charts, group) {
       return range.fit(Math.min(low, under), Math.max(high, over));
     },
     says: (value) => {
-      const known = members.map((state) => [value(state.name), words(state.label)]).filter(([number]) => Number.isFinite(number)).sort(([a], [b]) => a - b);
+      const known = members.map((state) => [value(state.name), state.number]).filter(([number]) => Number.isFinite(number)).sort(([a], [b]) => a - b);
       if (!known.length) return "";
       const [[low, lowest], [high, highest]] = [known[0], known.at(-1)];
       const figure = (number) => (high > low ? fixed(number, decimals(high - low)) : compact(number));

@@ -17,7 +17,7 @@ export default (charts) => {
   // A report has no link: there each row has its own chart.
   const groups = charts.link ? charts.model.groups : [];
   const grouped = new Map(groups.flatMap((group) => group.sensors.map((name) => [name, group])));
-  const members = new Map(groups.map((group) => [group, new Member(charts, group)]));
+  const members = (charts.members ??= new Map(groups.map((group) => [group, new Member(charts, group)])));
   const kinds = new Map(); // rows of one name of the members of a group
   for (const row of charts.model.rows) {
     const group = grouped.get(row.sensor);
@@ -93,9 +93,9 @@ function chartOf(charts, { key, unit, member, rows }, further) {
     get columns() {
       return Object.values(own());
     },
-    series: { upper: line("bound", { width: 1, spanGaps: true }), lower: line("bound", { width: 1, spanGaps: true }), value: dots("reading", 3) },
+    series: { value: dots("reading", 3), upper: line("bound", { width: 1, spanGaps: true }), lower: line("bound", { width: 1, spanGaps: true }) },
     bands: [band("bounds", "upper", "lower")],
-    paint: (plot) => marks(plot, charts.episodes, charts.view.at),
+    paint: (plot) => marks(plot, charts, [member ? rows.get(member.name) : key]),
     data: () => ({ x: live.x, ...Object.fromEntries(Object.entries(own()).map(([kind, name]) => [kind, live.column(name)])) }),
     range: (data, span) => {
       const most = Math.max(...shownExtent({ bands: [[data.lower, data.upper]], dots: [data.value] }, ...within(data.x, span)).map(Math.abs));

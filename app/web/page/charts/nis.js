@@ -21,14 +21,14 @@ export default (charts) => {
     names: { estimate: "mean", bound: "" },
     weight: 1,
     columns: ["nis", "nis_mean", "nis_low", "nis_high"],
-    series: { high: line("bound", { width: 1 }), low: line("bound", { width: 1 }), nis: dots("quiet", 2.5), mean: line("estimate", { width: 1.75 }) },
+    series: { nis: dots("quiet", 2.5), high: line("bound", { width: 1 }), low: line("bound", { width: 1 }), mean: line("estimate", { width: 1.75 }) },
     bands: [band("bounds", "high", "low")],
     axis: {
       // One first, then as many of the others as have room.
       splits: (self, axis, low, high) => apart(TICKS.map(Math.log10).filter((v) => low <= v && v <= high), self, "y"),
       values: (self, splits) => splits.map((v) => compact(10 ** v, 1)),
     },
-    paint: (plot) => marks(plot, charts.episodes, charts.view.at),
+    paint: (plot) => marks(plot, charts, ["twin"]),
     data: () => {
       const [low] = rangeOf(live, charts.range, log);
       // Measurements that fit are of no interest.

@@ -33,6 +33,7 @@ function chartOf(charts, state) {
   const drawn = state.rows.slice(0, MAX_SENSORS);
   const measured = drawn.flatMap((row) => Object.keys(MEASURED).map((kind) => `${kind}:${row}`));
   const own = Object.fromEntries(["upper", "lower", "truth", "mean"].map((kind) => [kind, `${kind}:${state.name}`]));
+  const marked = (kinds) => Object.fromEntries(measured.filter((name) => kinds.includes(name.split(":")[0])).map((name) => [name, MEASURED[name.split(":")[0]]()]));
   const level = () => charts.integrity?.[state.name]?.bound;
   return {
     key: `state:${state.name}`,
@@ -42,11 +43,12 @@ function chartOf(charts, state) {
     help: "Estimate ± 2σ; in brackets the protection level: the largest error that one undetected fault can cause",
     weight: state.rows.length || charts.model.states.length > FEW_STATES ? 1 : 1.5,
     columns: [...Object.values(own), ...measured],
-    // What matters most lies on top.
+    // What matters most lies on top: the band over the measurements that are as expected.
     series: {
+      ...marked(["reading", "held"]),
       upper: edge(),
       lower: edge(),
-      ...Object.fromEntries(measured.map((name) => [name, MEASURED[name.split(":")[0]]()])),
+      ...marked(["refused", "screened"]),
       truth: line("truth", { dash: [5, 3], spanGaps: true }),
       mean: line("estimate", { width: 1.75 }),
     },
@@ -64,7 +66,7 @@ function chartOf(charts, state) {
       ...charts.layers.flatMap((layer) => layer.curves(state)),
       ...protection(live.x, live.column(own.mean), level()),
     ],
-    paint: (plot) => marks(plot, charts.episodes, charts.view.at),
+    paint: (plot) => marks(plot, charts, [state.name, ...state.rows]),
     range: (data, span) => {
       if (state.probability) return [-0.03, 1.03];
       const all = { lines: [data.truth, data.mean], bands: [[data.lower, data.upper]], dots: measured.map((name) => data[name]) };

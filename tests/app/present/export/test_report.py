@@ -12,7 +12,8 @@ import pytest
 from app.cli.main import main
 from app.present.export import report_charts
 from app.present.export.alarm_guide import advice
-from app.present.export.report_charts import charts_html
+from app.present.export.report_charts import charts_html, page_labels
+from app.twin.twin import load_twin
 from estimators.diagnostics.detectors import CAUSES
 from estimators.fold import fold
 from estimators.log import Log
@@ -162,3 +163,21 @@ def test_it_draws_the_page_s_charts_without_a_network(browser, made, tmp_path, m
 @pytest.mark.parametrize("cause", sorted(set(CAUSES) - {"stale", "diverged"}))
 def test_every_cause_has_its_response(cause):
     assert len(advice(cause, "Response")) > 20 and "**" not in advice(cause, "Usual cause")
+
+
+@pytest.mark.parametrize(
+    ("twin", "labels"),
+    [
+        ("field_era5", {"t2m": "air temperature", "t2m[13,20]": "air temperature 54.75° N 5° W",
+                        "t2m[5,44]": "air temperature 56.75° N 1° E", "stations.s29_45": "stations 50.75° N 1.25° E"}),
+        ("thermal_field", {"temperature[160,100]": "temperature at 1.6 m, 1 m",
+                           "thermocouples.t50_150": "thermocouples at 0.5 m, 1.5 m"}),
+        ("battery_pack", {"soc_5": "state of charge 5", "v1_1": "polarisation voltage 1"}),
+        ("motor_bench", {}),
+    ],
+)  # fmt: skip
+def test_labels_are_those_of_the_twin_and_positions_on_its_grid(twin, labels):
+    """By hand: row 13 of a grid from 58° N southwards in steps of a quarter of a degree is 54.75° N."""
+    loaded = load_twin(twin)
+    found = page_labels(loaded.model, loaded.config.view)
+    assert {name: found.get(name) for name in labels} == labels and bool(found) == bool(labels)

@@ -171,7 +171,7 @@ def test_a_surface_is_as_high_as_the_field_and_as_doubtful(server):
     i, j = np.mgrid[0:tall, 0:wide]
     mean = 20.0 + 10.0 * j / (wide - 1)  # rises to the east, from 20 to 30
     std = np.where(i < tall / 2, 0.5, 1.0)  # the south is in doubt
-    scene = FieldSurfaceScene(server.scene, model, LIGHT, truth=False)
+    scene = FieldSurfaceScene(server.scene, model, LIGHT, "temperature", truth=False)
     scene.take(SimpleNamespace(pictures=[picture(mean, std)]))
     scene.draw(None, None)
     shown = [mesh for mesh in scene._meshes if mesh.visible]

@@ -89,7 +89,7 @@ def test_many_states_of_a_kind_are_one_chart_in_which_the_odd_one_stands_out(sho
     assert lowest == "soc_5"  # the weak cell
     text = page.locator("#charts article").first.locator(".reading").inner_text()
     low, median, high = (float(number) for number in re.findall(r"(?<=[ ])(\d\.\d+)", text))
-    names = [name.replace("_", " ") for name in (lowest, highest)]
+    names = [name.removeprefix("soc_") for name in (lowest, highest)]
     assert re.search(rf"^lowest \S+ \({names[0]}\) .* highest \S+ \({names[1]}\)$", text)
     # To three decimals, two digits of their spread.
     assert (low, median, high) == pytest.approx(
@@ -122,7 +122,7 @@ def test_many_states_of_a_kind_are_one_chart_in_which_the_odd_one_stands_out(sho
     assert blue[0] > blue[1] + 15
     # Each of them can be had.
     page.get_by_text("Shown", exact=True).click()
-    page.locator("#layout li").filter(has_text="soc 5").first.get_by_role("checkbox").check()
+    page.locator("#layout li").filter(has_text="state of charge 5").first.get_by_role("checkbox").check()
     wait_for(lambda: "upper:soc_5" in streams(session)["charts"], PATIENCE)
 
 

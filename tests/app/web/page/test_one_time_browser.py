@@ -180,20 +180,33 @@ def test_strip_and_scene_show_the_moment_of_the_cursor(visit, page, session):
 
 @pytest.mark.parametrize("width", [390, 1440])
 def test_charts_show_the_values_of_the_row_at_the_moment(visit, width):
-    """Drawn are the extremes of groups of rows; the text beside a chart is of the last row at the moment."""
+    """Drawn are the extremes of groups of rows; the text beside a chart is of the last row then, or at the pointer."""
     with running("battery_dmegc") as session:
         page = visit(session.url, size=(width, 900))
         pull = pull_all(session.engine)
         seconds = (pull.events.t - pull.events.t[0]) * 1e-9
         assert len(seconds) > 1000  # more than are drawn
         names = [state.name for state in session.engine.model.shown_states]
-        for moment in (700.25, 1400.25, 3200.25):
-            page.evaluate("(at) => window.nisus.view.show(0, window.nisus.charts.newest, at)", moment)
+        labels = {"v1": "polarisation voltage", "r0": "series resistance"}
+
+        def shown(moment):
             row = int(np.flatnonzero(seconds <= moment)[-1])
-            for name in ("v1", "r0"):
+            for name, label in labels.items():
                 k = names.index(name)
                 mean, half = pull.track.mean[row, k], 2.0 * pull.track.std[row, k]
                 decimals = max(0, 1 - int(np.floor(np.log10(half))))
                 wanted = f"{mean:.{decimals}f} ± {half:.{decimals}f}"
-                reading = page.locator(f"[aria-label='Chart of {name}'] .reading")
+                reading = page.locator(f"[aria-label='Chart of {label}'] .reading")
                 wait_for(lambda reading=reading, wanted=wanted: reading.inner_text().startswith(wanted), 20.0)
+
+        for moment in (700.25, 1400.25, 3200.25):
+            page.evaluate("(at) => window.nisus.view.show(0, window.nisus.charts.newest, at)", moment)
+            shown(moment)
+        assert page.evaluate("window.nisus.charts.live.size") > 1
+        box = page.locator("[aria-label='Chart of polarisation voltage'] .u-over").bounding_box()
+        for share in (0.31, 0.62):
+            page.mouse.move(box["x"] + share * box["width"], box["y"] + box["height"] / 2)
+            until(page, "window.nisus.charts.hovered !== null")
+            shown(page.evaluate("window.nisus.charts.hovered"))
+        page.mouse.move(5, 5)
+        shown(3200.25)

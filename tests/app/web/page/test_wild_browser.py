@@ -5,7 +5,7 @@ import pytest
 
 from estimators.log import READING
 from tests.app.scripted import pull_all, wait_for
-from tests.app.web.page.browsed import PATIENCE, running
+from tests.app.web.page.browsed import PATIENCE, running, until
 
 pytestmark = pytest.mark.browser
 
@@ -87,19 +87,55 @@ def test_what_an_axis_spans(page):
     assert found["part"] == pytest.approx([0.2, 0.3])
 
 
+def test_a_fault_is_marked_on_the_charts_that_it_concerns(page):
+    """A sensor's at its rows and the states that they measure, the twin's at NIS; an input has no chart."""
+    found = page.evaluate(
+        """() => {
+          const { charts } = window.nisus;
+          const marked = (subject) => {
+            charts.episodes = [{ subject, from: 1, to: null }];
+            charts.draw();
+            return charts.charts.filter(({ plot }) => plot.marked).map(({ what }) => what.key);
+          };
+          return ["winding", "temperature", "twin", "current"].map(marked);
+        }"""
+    )
+    assert found == [["state:temperature", "innovation:winding"], ["state:temperature"], ["nis"], []]
+
+
+def test_dots_that_are_many_are_small_and_see_through(page):
+    """In half a minute there is room for all; in ten minutes the bounds of innovations stay visible beneath 1,200."""
+    sizes = {}
+    for seconds in (30, 600):
+        page.evaluate("(until) => window.nisus.view.show(0, until)", seconds)
+        until(page, f"window.nisus.charts.live.x.at(-1) >= {0.95 * seconds} && window.nisus.charts.live.x.length")
+        sizes[seconds] = page.evaluate(
+            """() => {
+              const { plot } = window.nisus.charts.charts.find(({ what }) => what.key === "innovation:winding");
+              return [plot.series[1].points.size, plot.series[1].points.fill(plot, 1)];
+            }"""
+        )
+    (few, opaque), (many, clear) = sizes[30], sizes[600]
+    assert few == 3 and many < few
+    assert len(opaque) == 7 and clear[:7] == opaque and 0.5 < int(clear[7:], 16) / 255 < 1
+
+
 def test_the_time_of_an_alarm_is_that_of_the_charts(page):
-    """Charts count from the first event, here at 23:59:50 UTC of a day; over more than a day the time of day stays."""
+    """Charts count from the first event, here at 23:59:50 UTC of a day; an alarm of a later day has its day."""
     found = page.evaluate(
         """async () => {
           const { inChartTime } = await import("/page/format.js");
-          const [origin, text] = ["1700006390000000000", "yoke is rejected since 00:00:25 UTC (100 %)"];
-          const after = (seconds) => 1e9 * (1700006390 + seconds);
+          const origin = "1700006390000000000";
+          const text = (day) => `yoke is rejected since 2023-11-${day} 00:00:25 UTC (100 %)`;
           return [
-            inChartTime(text, origin, after(60)), inChartTime(text, origin, after(90000)),
-            inChartTime(text, null, null),
-            inChartTime("yoke is silent since 72.5 s", "10000000000", 80e9),
+            inChartTime(text("15"), origin), inChartTime(text("18"), origin), inChartTime(text("15"), null),
+            inChartTime("yoke is silent since 72.5 s", "10000000000"),
           ];
         }"""
     )
-    text = "yoke is rejected since 00:00:25 UTC (100 %)"
-    assert found == ["yoke is rejected since 0:35 (100 %)", text, text, "yoke is silent since 1:02.5"]
+    assert found == [
+        "yoke is rejected since 0:35 (100 %)",
+        "yoke is rejected since 3 d 00:00 (100 %)",
+        "yoke is rejected since 2023-11-15 00:00:25 UTC (100 %)",
+        "yoke is silent since 1:02.5",
+    ]
