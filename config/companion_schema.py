@@ -24,11 +24,21 @@ from .fields import (
     SpreadSection,
     Text,
     Texts,
+    Validity,
     as_list,
     refused,
 )
 from .problems import check_section
-from .schema import EstimatorSection, GateProbability, GateSection, NormalSection, PriorSection, as_estimator, as_gate
+from .schema import (
+    EstimatorSection,
+    GateProbability,
+    GateSection,
+    NormalSection,
+    Parameters,
+    PriorSection,
+    as_estimator,
+    as_gate,
+)
 from .yaml_files import ValuePlaces, read_text
 
 Table = Annotated[tuple[Annotated[tuple[Number, ...], Field(min_length=1)], ...], Field(min_length=2)]
@@ -194,8 +204,10 @@ class TuningSection(Section):
     """The filter, with all of its options that are not the catalogue's."""
     filters: dict[str, dict[str, Option]] = {}
     """Options of other filters, by name."""
-    parameters: dict[str, Number] = {}
-    """Parameters of the model."""
+    parameters: Parameters = {}
+    """Parameters of the model, with the covariance that the fit gives them: std and correlation."""
+    valid: dict[str, Validity] = {}
+    """Range of the fitted recordings, by state or input, outside which parameters widen."""
     prior: dict[str, PriorSection] = {}
     """Prior before the first measurement."""
     noise: dict[str, NoiseSection] = {}

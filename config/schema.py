@@ -54,6 +54,20 @@ class PriorSection(Section):
     square-root filters accept it, a field does not. Default: the model's."""
 
 
+def as_width(value: float, given: float | str) -> float:
+    """Return a width in the unit of a value, of which it may be a percentage."""
+    return abs(value) * float(given.rstrip(" %")) / 100.0 if isinstance(given, str) else given
+
+
+class WidenSection(Section):
+    """Growth of a parameter's uncertainty outside the range of a state or an input in which it was fitted."""
+
+    per: Positive = 1.0
+    """Distance from that range, in its unit, that adds `by`. Default: 1."""
+    by: Positive | Percent
+    """Standard deviation that it adds, in the parameter's unit, or in percent of the parameter's value, as in 50 %."""
+
+
 class ParameterSection(Section):
     """Value of a parameter of the model, and how uncertain it is."""
 
@@ -64,10 +78,16 @@ class ParameterSection(Section):
     Default: none, it is certain."""
     drift: NotNegative = 0.0
     """Random walk of an estimated one: standard deviation that one second adds, in its unit. Default: 0."""
+    correlation: dict[str, Annotated[float, Field(strict=True, gt=-1, lt=1)]] = {}
+    """Correlation of its deviation with those of other considered parameters, by name; a pair is given once, under
+    either. Default: 0."""
+    widen: dict[str, WidenSection] = {}
+    """Growth of its uncertainty outside the fitted range (`valid`) of states and inputs, by their names, as in
+    {temperature: {per: 10, by: 50 %}}. Default: none."""
     use: Literal["held", "considered", "estimated"] = "considered"
     """held: the filter takes it for certain. considered: no measurement changes it, and its uncertainty is part of the
     bands (Schmidt's filter). estimated: it becomes a state, as with `estimate`. Default: considered, if it has a
-    std."""
+    std or widens."""
 
     @model_validator(mode="after")
     def _complete(self) -> ParameterSection:
@@ -75,18 +95,29 @@ class ParameterSection(Section):
             raise refused("absent", "an estimated parameter needs the standard deviation of its prior", "std")
         if self.use != "estimated" and self.drift:
             raise refused("relation", "is for a parameter with `use: estimated`; leave it out", "drift")
+        if self.use == "estimated" and self.widen:
+            raise refused("relation", "is for a considered parameter; the width of an estimated one evolves", "widen")
         return self
 
     def spread(self, value: float) -> float | None:
         """Return the standard deviation of a parameter of this value; None if it is held."""
-        if self.use == "held" or self.std is None:
+        if self.use == "held" or (self.std is None and not self.widen):
             return None
-        return abs(value) * float(self.std.rstrip(" %")) / 100.0 if isinstance(self.std, str) else self.std
+        return 0.0 if self.std is None else as_width(value, self.std)
+
+    def widened(self, value: float) -> dict[str, float]:
+        """Return the standard deviation that a unit of distance adds to a parameter of this value, by place."""
+        return {name: as_width(value, section.by) / section.per for name, section in self.widen.items()}
 
 
 def as_parameter(value: Any) -> Any:
     """Return a number as the value of a parameter."""
     return value if isinstance(value, (dict, ParameterSection)) else {"value": value}
+
+
+Parameters = dict[
+    str, Annotated[ParameterSection, BeforeValidator(as_parameter, json_schema_input_type=Number | ParameterSection)]
+]
 
 
 class EstimateSection(Section):
@@ -341,12 +372,9 @@ class TwinSection(Section):
     model: Text
     """The model's name in the catalogue (motor_winding), or a Python file beside this one and the name of a model, or
     of a function that returns one, in it (./pump.py:Pump)."""
-    parameters: dict[
-        str,
-        Annotated[ParameterSection, BeforeValidator(as_parameter, json_schema_input_type=Number | ParameterSection)],
-    ] = {}
-    """The model's parameters by name: their values, in their units, or {value, std, use}. Default: the model's values,
-    held."""
+    parameters: Parameters = {}
+    """The model's parameters by name: their values, in their units, or {value, std, correlation, widen, use}. Default:
+    the model's values, held."""
     learned: Text | None = None
     """File of a learned correction, beside this one, as `nisus learn` writes it: a correction of the model's rates,
     with a noise NAME_learned for each corrected state. Default: none, the model alone."""
@@ -364,7 +392,8 @@ class TwinSection(Section):
     """Sensor noise R, limits and use by sensor. Default: the model's."""
     valid: dict[str, Validity] = {}
     """Range over which the model was fitted or validated, by state or input, in its unit, for example
-    {temperature: {min: 20, max: 38}}. Outside it health is suspect. Default: the model's."""
+    {temperature: {min: 20, max: 38}}. Outside it health is suspect, and parameters `widen`. A fitted tuning version has
+    the range of its recordings. Default: the model's."""
     estimator: Annotated[
         EstimatorSection, BeforeValidator(as_estimator, json_schema_input_type=str | EstimatorSection)
     ] = EstimatorSection(name="ekf")

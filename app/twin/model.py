@@ -129,7 +129,7 @@ def configure(model: StateSpaceModel, loaded: Loaded) -> StateSpaceModel:
     return replace(
         _with_noise(model, loaded),
         states=_states(model, loaded),
-        inputs=tuple(_in_range(item, loaded) for item in model.inputs),
+        inputs=_ranged(model.inputs, loaded),
         sensors=tuple(_sensor(sensor, loaded) for sensor in model.sensors),
     )
 
@@ -158,14 +158,30 @@ def _assembled(model: StateSpaceModel, loaded: Loaded) -> StateSpaceModel:
         if section is not None and std is not None:
             if item.name in config.estimate:
                 raise loaded.error(("estimate", item.name), "has a std in `parameters` too; give it in one place")
-            estimated[item.name] = JointParameter(std, section.drift, considered=section.use == "considered")
+            considered, widened = section.use == "considered", section.widened(item.value)
+            estimated[item.name] = JointParameter(std, section.drift, considered, widened)
+    held = {name for name, section in config.parameters.items() if section.use != "considered"}
+    correlations = {
+        (name, other): value
+        for name, section in config.parameters.items()
+        for other, value in section.correlation.items()
+        if not held & {name, other}
+    }
+    model = replace(model, states=_ranged(model.states, loaded), inputs=_ranged(model.inputs, loaded))
     try:
-        return assemble(model, learned=learned, noises=noises, errors=errors, estimated=estimated)
+        return assemble(
+            model, learned=learned, noises=noises, errors=errors, estimated=estimated, correlations=correlations
+        )
     except AppendError as error:
         kind, name = error.part
         if kind == "learned":
             raise ConfigError(f"{learned_place}: {error}") from None
-        keys = {"noise": ("noise", name, "over"), "error": ("sensors", name, "error"), "estimate": ("estimate", name)}
+        keys = {
+            "noise": ("noise", name, "over"),
+            "error": ("sensors", name, "error"),
+            "estimate": ("estimate", name) if name in config.estimate else ("parameters", name),
+            "correlation": ("parameters",),
+        }
         raise ConfigError(f"{loaded.places.at(keys[kind])}: {dotted(keys[kind])}: {error}") from None
 
 
@@ -226,15 +242,19 @@ def _states(model: StateSpaceModel, loaded: Loaded) -> Sequence[State]:
     for state in states:
         prior = given.get(state.name)
         mean, std = (prior.mean, prior.std) if prior else (None, None)
-        state = replace(state, mean=state.mean if mean is None else mean, std=state.std if std is None else std)
-        found.append(_in_range(state, loaded))
-    return tuple(found)
+        found.append(replace(state, mean=state.mean if mean is None else mean, std=state.std if std is None else std))
+    return _ranged(tuple(found), loaded)
 
 
-def _in_range(item: Any, loaded: Loaded) -> Any:
-    """Return a state or an input with the YAML's range of validity."""
-    given = loaded.config.valid.get(item.name)
-    return item if given is None else replace(item, fitted=bounds((given.min, given.max)))
+def _ranged(items: Any, loaded: Loaded) -> Any:
+    """Return states or inputs with the YAML's ranges of validity; a field stays."""
+    given = loaded.config.valid
+    if isinstance(items, Field):
+        return items
+    return tuple(
+        replace(item, fitted=bounds((given[item.name].min, given[item.name].max))) if item.name in given else item
+        for item in items
+    )
 
 
 def _sensor(sensor: Any, loaded: Loaded) -> Any:

@@ -164,7 +164,7 @@ def _compile(model: StateSpaceModel) -> CompiledModel:
             "noise_state": np.array([states.start for states in acts_on], np.int64),
             "noise_states": np.array([len(states) for states in acts_on], np.int64),
             "prior_mean": model.prior_mean,
-            "prior_cov": model.prior_std[None] ** 2 if diagonal else np.diag(model.prior_std**2),
+            "prior_cov": model.prior_std[None] ** 2 if diagonal else model.prior_cov,
             "n_considered": model.considered,
             "linear_states": model.linear_states,
             "n_linear": len(model.linear_states),

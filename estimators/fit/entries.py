@@ -185,7 +185,11 @@ def with_values(tuning: Tuning, entries: Sequence[TuningEntry], values: Sequence
         tuning = replace(tuning, q=factor * tuning.q, r=factor * tuning.r)
     if options != dict(tuning.options):
         tuning = tuning.with_options(options)
-    return Setting(tuning, None if mean is None else (mean, np.diag(std**2)))
+    if mean is None:
+        return Setting(tuning, None)
+    own = tuning.model.prior_std
+    scale = np.divide(std, own, out=np.ones_like(std), where=own > 0.0)
+    return Setting(tuning, (mean, tuning.model.prior_cov * np.outer(scale, scale)))
 
 
 def _all(entry: Estimator, tuning: Tuning) -> dict[str, TuningEntry]:

@@ -14,9 +14,16 @@ Joint estimation moves parameters into the state:
     x⁺ = (x, θ),   x' = f(x, u, p(θ), dt) + w,   θ' = θ + w_θ,   y = h(x, u, p(θ)) + v
 
 A moved parameter drifts as a random walk; with a drift of zero it is an unknown constant. A considered parameter stays
-one, and its deviation δ is a state that no measurement changes: f and h take p + δ. Both act on the model only within
-the parameter's range, so that an estimate outside cannot make a divisor zero. Derivatives are by complex step, since
-the model's own do not include θ.
+one, and its deviation δ is a state that no measurement changes: f and h take p + δ. Deviations may be correlated, as a
+fit leaves them. What a fit says ends where its data end: a widened parameter has a second such state η ~ N(0, 1),
+
+    p_eff = p + δ + η Σ_k w_k d_k(x, u),   d_k = max(0, low_k - z_k, z_k - high_k)
+
+with z_k a state or input whose range of validity is [low_k, high_k] and w_k the standard deviation that a unit of
+distance from it adds. η is independent of δ: a correlation that data in the range established need not hold outside.
+
+All act on the model only within the parameter's range, so that an estimate outside cannot make a divisor zero.
+Derivatives are by complex step, since the model's own do not include θ.
 
 Source: Ljung (1979), Asymptotic behavior of the extended Kalman filter as a parameter estimator for linear systems,
 doi:10.1109/TAC.1979.1101943, for the method and its limits: θ can be biased where Q and R are wrong.
@@ -24,24 +31,28 @@ doi:10.1109/TAC.1979.1101943, for the method and its limits: θ can be biased wh
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import lru_cache
-from typing import NamedTuple
+from types import MappingProxyType
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..errors import ModelError
+from ..errors import ModelError, nearest
 from ..numerics.jit import jit
 from .coloured import ColouredError, coloured
-from .hybrid import LearnedCorrection, hybrid
-from .state_space import Noise, State, StateSpaceModel, squared
+from .hybrid import LearnedCorrection, hybrid, places
+from .state_space import Noise, Parameter, State, StateSpaceModel, squared
 from .wrapping import as_inner
 
 
 class AppendError(ModelError):
-    """An addition that the model cannot have; `part` is its kind (learned, noise, error, estimate) and its name."""
+    """An addition that the model cannot have.
+
+    `part` is its kind (learned, noise, error, estimate, correlation) and its name.
+    """
 
     def __init__(self, part: tuple[str, str], message: str) -> None:
         super().__init__(message)
@@ -55,6 +66,7 @@ def assemble(
     noises: Mapping[str, float] | None = None,
     errors: Mapping[str, ColouredError] | None = None,
     estimated: Mapping[str, JointParameter] | None = None,
+    correlations: Mapping[tuple[str, str], float] | None = None,
 ) -> StateSpaceModel:
     """Return the model with everything appended.
 
@@ -63,7 +75,8 @@ def assemble(
         learned: A correction of its f.
         noises: Correlation time in seconds, by process noise.
         errors: Coloured errors, by sensor.
-        estimated: Parameters to estimate, by name.
+        estimated: Parameters to estimate or to consider, by name.
+        correlations: See `joint`.
 
     Raises:
         AppendError: If something cannot be appended, with the part at fault.
@@ -83,7 +96,8 @@ def assemble(
     for name, parameter in estimated.items():
         with _blamed("estimate", name):
             joint(model, {name: parameter})
-    return joint(model, estimated)
+    with _blamed("correlation", ""):
+        return joint(model, estimated, correlations)
 
 
 @contextmanager
@@ -98,18 +112,30 @@ class JointParameter(NamedTuple):
     """A parameter to estimate or to consider: `std` is that of its prior about its value, `drift` what a second adds.
 
     A considered one keeps its value whatever is measured, and the covariance of the states accounts for its `std`.
+    `widened` is the standard deviation that a unit of distance outside the fitted range of a state or an input adds to
+    a considered one, by their names; with it `std` may be 0.
     """
 
     std: float
     drift: float = 0.0
     considered: bool = False
+    widened: Mapping[str, float] = MappingProxyType({})
 
 
-def joint(model: StateSpaceModel, estimated: Mapping[str, JointParameter]) -> StateSpaceModel:
+def joint(
+    model: StateSpaceModel,
+    estimated: Mapping[str, JointParameter],
+    correlations: Mapping[tuple[str, str], float] | None = None,
+) -> StateSpaceModel:
     """Return the model with these parameters as its last states, in the order of the model's, considered ones last.
 
+    Args:
+        model: The model.
+        estimated: Parameters by name.
+        correlations: Correlation of the deviations of two considered parameters, by their names. Default: 0.
+
     Raises:
-        ModelError: If it has no such parameter, or has a state of that name.
+        ModelError: If it has no such parameter, or has a state of that name; if the correlations are impossible.
     """
     if not estimated:
         return model
@@ -119,31 +145,40 @@ def joint(model: StateSpaceModel, estimated: Mapping[str, JointParameter]) -> St
             raise ModelError(f"model {model.name} has no parameter {name!r} to estimate; it has {', '.join(names)}")
         if (state := deviation(name) if given.considered else name) in model.state_names:
             raise ModelError(f"model {model.name} has a state {state!r}; {name} cannot get another of that name")
-        if not given.std > 0.0:
+        if not (given.std > 0.0 or (given.std == 0.0 and given.widened)):
             raise ModelError(
                 f"model {model.name}: the prior of {name} has std {given.std:g}; an estimated or considered parameter "
                 "must be uncertain: give a positive std"
             )
         if given.considered and given.drift:
             raise ModelError(f"model {model.name}: {name} is considered, so it cannot drift; leave the drift out")
-    considered = [item for item in model.parameters if item.name in estimated and estimated[item.name].considered]
-    moved = [item for item in model.parameters if item.name in estimated and item not in considered]
+        if given.widened and not given.considered:
+            raise ModelError(f"model {model.name}: {name} is estimated, so its width is the filter's; leave widen out")
+    marked = [item for item in model.parameters if item.name in estimated and estimated[item.name].considered]
+    considered = [item for item in marked if estimated[item.name].std > 0.0]
+    widened = [item for item in marked if estimated[item.name].widened]
+    moved = [item for item in model.parameters if item.name in estimated and item not in marked]
     kept = [item for item in model.parameters if item not in moved]
     added = [*moved, *considered]
-    # Of each of the model's parameters: its index in θ and δ, and in p; -1 where it is not.
+    # Of each of the model's parameters: its index in θ and δ, in p, and in η; -1 where it is not.
     place = tuple(
-        (added.index(item) if item in added else -1, kept.index(item) if item in kept else -1)
+        (
+            added.index(item) if item in added else -1,
+            kept.index(item) if item in kept else -1,
+            len(added) + widened.index(item) if item in widened else -1,
+        )
         for item in model.parameters
     )
     low, high = (tuple(float(getattr(item, end)) for item in model.parameters) for end in ("low", "high"))
-    layout = (model.nx, place, low, high)
+    layout = (model.nx, place, low, high, _distances(model, widened, estimated))
     noises = tuple(Noise(item.name, f"{squared(item.unit)}/s", estimated[item.name].drift ** 2) for item in moved)
-    return replace(
+    found = replace(
         model,
         states=(
             *model.states,
             *(State(m.name, m.unit, m.value, estimated[m.name].std) for m in moved),
             *(State(deviation(m.name), m.unit, 0.0, estimated[m.name].std) for m in considered),
+            *(State(outside(m.name), "1", 0.0, 1.0) for m in widened),
         ),
         parameters=tuple(kept),
         noises=(*model.noises, *noises),
@@ -153,8 +188,9 @@ def joint(model: StateSpaceModel, estimated: Mapping[str, JointParameter]) -> St
         sensors=tuple(replace(sensor, h=_sensor(sensor.h, *layout), H=None) for sensor in model.sensors),
         jump=None if model.jump is None else replace(model.jump, chances=_chances(model.jump.chances, *layout)),
         linear=False,
-        considered=len(considered),
+        considered=len(considered) + len(widened),
     )
+    return _correlated(found, [item.name for item in considered], correlations or {})
 
 
 def deviation(parameter: str) -> str:
@@ -162,16 +198,86 @@ def deviation(parameter: str) -> str:
     return f"{parameter}_deviation"
 
 
+def outside(parameter: str) -> str:
+    """Return the name of the state that widens a considered parameter outside the range of its fit."""
+    return f"{parameter}_outside"
+
+
+Distances = tuple[tuple[int, int, float, float, float], ...]
+"""Parameter, place of a state or input (index in x, or -1 less that in u), low and high end of its range, and the
+standard deviation that a unit of distance adds."""
+
+
+def _distances(model: StateSpaceModel, widened: Sequence[Parameter], given: Mapping[str, JointParameter]) -> Distances:
+    names = [item.name for item in model.parameters]
+    found = []
+    for item in widened:
+        for name, width in given[item.name].widened.items():
+            known = (*model.state_names, *model.input_names)
+            if name not in known:
+                raise ModelError(f"model {model.name} has no state or input {name!r}; {nearest(name, known)}")
+            at = places(model, [name])[0]
+            limits = (model.states[at] if at >= 0 else model.inputs[-1 - at]).fitted
+            if limits is None:
+                raise ModelError(
+                    f"model {model.name}: {item.name} is to widen outside the range of {name}, which has none; give it "
+                    f"under `valid: {{{name}: {{min: ..., max: ...}}}}`"
+                )
+            found.append((names.index(item.name), int(at), float(limits[0]), float(limits[1]), float(width)))
+    return tuple(found)
+
+
+MIN_EIGENVALUE = -1e-3
+"""Eigenvalue of a matrix of correlations below which it is none; those between it and zero are of rounded digits."""
+
+
+def _correlated(
+    model: StateSpaceModel, names: Sequence[str], given: Mapping[tuple[str, str], float]
+) -> StateSpaceModel:
+    """Return the model with correlated deviations of considered parameters."""
+    if not given:
+        return model
+    R = np.eye(len(names))
+    for (one, other), value in given.items():
+        for name in (one, other):
+            if name not in names:
+                raise ModelError(
+                    f"model {model.name}: the correlation of {one} and {other} needs both to be considered, and "
+                    f"{name} is not; give it a std"
+                )
+        i, j = names.index(one), names.index(other)
+        R[i, j] = R[j, i] = value
+    values, vectors = np.linalg.eigh(R)
+    if values[0] < MIN_EIGENVALUE:
+        raise ModelError(
+            f"model {model.name}: the correlations of {', '.join(names)} contradict each other (smallest eigenvalue "
+            f"{values[0]:.2g}, which must not be negative); take them from one fit"
+        )
+    whole = np.eye(model.nx)
+    begin = model.nx - model.considered
+    own = slice(begin, begin + len(names))
+    whole[own, own] = R if values[0] > 0.0 else (vectors * np.maximum(values, 1e-12)) @ vectors.T
+    return replace(model, prior_correlation=tuple(map(tuple, whole.tolist())))
+
+
 @jit
-def _parameters(theta, p, place, low, high):
-    """Return p(θ, δ): the model's own parameters, with moved and considered ones held within their ranges."""
-    full = np.empty(len(place), theta.dtype)
+def _parameters(x, u, p, n, place, low, high, distances):
+    """Return p(θ, δ, η): the model's own parameters, with moved and considered ones held within their ranges."""
+    full = np.empty(len(place), x.dtype)
     for k in range(len(place)):
-        j, own = place[k]
-        if j < 0:
+        j, own, out = place[k]
+        if j < 0 and out < 0:
             full[k] = p[own]
             continue
-        value = theta[j] if own < 0 else p[own] + theta[j]
+        value = x[n + j] if own < 0 else p[own] + x[n + j] if j >= 0 else p[own] + 0.0 * x[n]
+        if out >= 0:
+            width = 0.0
+            for i in range(len(distances)):
+                if distances[i, 0] == k:
+                    at = int(distances[i, 1])
+                    z = x[at].real if at >= 0 else u[-1 - at]
+                    width += distances[i, 4] * max(0.0, distances[i, 2] - z, z - distances[i, 3])
+            value = value + width * x[n + out]
         if value.real < low[k]:
             full[k] = low[k]
         elif value.real > high[k]:
@@ -181,12 +287,16 @@ def _parameters(theta, p, place, low, high):
     return full
 
 
+def _constant(distances: Distances) -> np.ndarray:
+    return np.array(distances, float).reshape(-1, 5)
+
+
 @lru_cache(maxsize=64)
-def _step(function: Callable, n: int, place: tuple, low: tuple, high: tuple) -> Callable:
-    inner = as_inner(function)
+def _step(function: Callable, n: int, place: Any, low: Any, high: Any, distances: Distances) -> Callable:
+    inner, reach = as_inner(function), _constant(distances)
 
     def f(x, u, p, dt, out):  # noqa: ANN001, ANN202
-        inner(x[:n], u, _parameters(x[n:], p, place, low, high), dt, out[:n])
+        inner(x[:n], u, _parameters(x, u, p, n, place, low, high, reach), dt, out[:n])
         for j in range(n, x.size):
             out[j] = x[j]
 
@@ -194,31 +304,33 @@ def _step(function: Callable, n: int, place: tuple, low: tuple, high: tuple) -> 
 
 
 @lru_cache(maxsize=64)
-def _chances(function: Callable, n: int, place: tuple, low: tuple, high: tuple) -> Callable:
-    inner = as_inner(function)
+def _chances(function: Callable, n: int, place: Any, low: Any, high: Any, distances: Distances) -> Callable:
+    inner, reach = as_inner(function), _constant(distances)
 
     def chances(x, u, p, dt, out):  # noqa: ANN001, ANN202
-        inner(x[:n], u, _parameters(x[n:], p, place, low, high), dt, out)
+        inner(x[:n], u, _parameters(x, u, p, n, place, low, high, reach), dt, out)
 
     return chances
 
 
 @lru_cache(maxsize=256)
-def _sensor(function: Callable, n: int, place: tuple, low: tuple, high: tuple) -> Callable:
-    inner = as_inner(function)
+def _sensor(function: Callable, n: int, place: Any, low: Any, high: Any, distances: Distances) -> Callable:
+    inner, reach = as_inner(function), _constant(distances)
 
     def h(x, u, p, out):  # noqa: ANN001, ANN202
-        inner(x[:n], u, _parameters(x[n:], p, place, low, high), out)
+        inner(x[:n], u, _parameters(x, u, p, n, place, low, high, reach), out)
 
     return h
 
 
 @lru_cache(maxsize=64)
-def _noise(function: Callable, nw: int, moved: int, n: int, place: tuple, low: tuple, high: tuple) -> Callable:
-    inner = as_inner(function)
+def _noise(
+    function: Callable, nw: int, moved: int, n: int, place: Any, low: Any, high: Any, distances: Distances
+) -> Callable:
+    inner, reach = as_inner(function), _constant(distances)
 
     def Q(x, u, p, q, dt, out):  # noqa: ANN001, ANN202
-        inner(x[:n], u, _parameters(x[n:], p, place, low, high), q[:nw], dt, out[:n, :n])
+        inner(x[:n], u, _parameters(x, u, p, n, place, low, high, reach), q[:nw], dt, out[:n, :n])
         for j in range(moved):
             out[n + j, n + j] = q[nw + j] * dt
 

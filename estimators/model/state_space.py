@@ -142,7 +142,8 @@ class StateSpaceModel:
     A `jump` makes one state a discrete mode. `conditionally_linear` names states in which f and h are
     linear once the other states are known, with noise that does not depend on them: `rbpf` carries these by a Kalman
     filter. The last `considered` states are not estimated: their uncertainty widens P and lowers the gain, and no
-    measurement changes them (Schmidt's filter).
+    measurement changes them (Schmidt's filter). `prior_correlation` (nx, nx) is that of the prior; empty for
+    independent states.
 
     Steps longer than `max_step` seconds are split, so that f may use a simple integration scheme.
 
@@ -172,6 +173,7 @@ class StateSpaceModel:
     jump: Jump | None = None
     conditionally_linear: tuple[str, ...] = ()
     considered: int = 0
+    prior_correlation: tuple[tuple[float, ...], ...] = ()
 
     def __post_init__(self) -> None:
         """Refuse models that no filter could run: nothing to estimate, duplicate names, numbers out of range."""
@@ -329,6 +331,13 @@ class StateSpaceModel:
         if isinstance(self.states, Field):
             return np.full(self.nx, float(self.states.std))
         return np.array([state.std for state in self.states], float)
+
+    @cached_property
+    def prior_cov(self) -> np.ndarray:
+        """Prior covariance (nx, nx), of a model that is no large field."""
+        if not self.prior_correlation:
+            return np.diag(self.prior_std**2)
+        return np.array(self.prior_correlation) * np.outer(self.prior_std, self.prior_std)
 
     @cached_property
     def circular(self) -> np.ndarray:

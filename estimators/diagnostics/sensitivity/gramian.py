@@ -113,7 +113,7 @@ def gramian(
     for k in begins:
         fold.advance(k - fold.n)
         mean, _ = fold.moments()
-        bases.append(Base(mean, np.diag(model.prior_std**2), fold.clock, fold.u))
+        bases.append(Base(mean, model.prior_cov, fold.clock, fold.u))
     reason = astray(estimator, name, fold.track.select(slice(0, fold.n)))
     if reason:
         return Gramian(name, reason, note, None, ())

@@ -1,8 +1,11 @@
 """Schmidt's filter: what is considered keeps value and variance, and widens the covariance of what is estimated."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from estimators.errors import ModelError
 from estimators.fold import Fold
 from estimators.log import READING, Events, Log
 from estimators.model.assemble import JointParameter, joint
@@ -76,7 +79,7 @@ def schmidt(model, log, u):
     nc = model.considered
     n = model.nx - nc
     p = model.default_parameters
-    z, C = model.prior_mean.copy(), np.diag(model.prior_std[n:] ** 2)
+    z, C = model.prior_mean.copy(), model.prior_cov[n:, n:]
     Pxx, Pxc = np.diag(model.prior_std[:n] ** 2), np.zeros((n, nc))
     q = np.zeros(model.nx)
     for noise in model.noises:
@@ -140,3 +143,66 @@ def test_it_equals_the_equations_in_blocks(estimator, f, options):
         np.testing.assert_allclose(actual, mean, rtol=0, atol=1e-9 * np.max(np.abs(mean)))
         np.testing.assert_allclose(P, cov, rtol=0, atol=1e-9 * np.max(np.abs(cov)))
         assert fold.track.nis[fold.n - 1] == pytest.approx(nis, rel=1e-8)
+
+
+# Two correlated deviations of a fit, and parameters that widen with a state and an input outside their ranges.
+FITTED = {
+    "offset": JointParameter(0.3, considered=True),
+    "loss": JointParameter(0.02, considered=True, widened={"a": 0.05, "power": 0.4}),
+    "heat": JointParameter(0.0, considered=True, widened={"power": 0.7}),
+}
+
+
+def ranged():
+    """The model, fitted for a below 1.9 K and powers below 0.25 W: the default of 0.5 W lies outside."""
+    model = physics(f)
+    states = (replace(model.states[0], fitted=(-np.inf, 1.9)), model.states[1])
+    return replace(model, states=states, inputs=(replace(model.inputs[0], fitted=(0.0, 0.25)),))
+
+
+def by_hand(model):
+    """The same with p + δ + η Σ w d written out, on states (a, b, δ_offset, δ_loss, η_loss, η_heat)."""
+
+    def effective(x, u, p):
+        a, b = np.maximum(0.0, x[0].real - 1.9), np.maximum(0.0, u[0] - 0.25)
+        return [p[0] + x[2], p[1] + x[3] + (0.05 * a + 0.4 * b) * x[4], p[2] + 0.7 * b * x[5]]
+
+    def forward(x, u, p, dt, out):
+        f(x, u, effective(x, u, p), dt, out)
+        out[2:] = x[2:]
+
+    sensors = tuple(
+        replace(sensor, h=lambda x, u, p, out, h=sensor.h: h(x, u, effective(x, u, p), out))
+        for sensor in physics(f).sensors
+    )
+    return replace(model, f=forward, sensors=sensors)
+
+
+@pytest.mark.parametrize("estimator", ["ekf", "sr-ekf"])
+def test_correlated_and_widened_parameters_equal_the_equations_in_blocks(estimator):
+    model = joint(ranged(), FITTED, {("loss", "offset"): -0.8})
+    assert model.state_names[2:] == ("offset_deviation", "loss_deviation", "loss_outside", "heat_outside")
+    assert model.prior_cov[2, 3] == pytest.approx(-0.8 * 0.3 * 0.02)
+    log = log_of()
+    fold = Fold(estimator, model, Tuning.of(model), log)
+    for mean, cov, _ in schmidt(by_hand(model), log, model.default_inputs):
+        fold.advance(1)
+        actual, P = fold.moments()
+        np.testing.assert_allclose(actual, mean, rtol=0, atol=1e-9 * np.max(np.abs(mean)))
+        np.testing.assert_allclose(P, cov, rtol=0, atol=1e-9 * np.max(np.abs(cov)))
+
+
+@pytest.mark.parametrize(
+    ("estimated", "correlations", "rule"),
+    [
+        (FITTED, {("offset", "heat"): 0.1}, "heat is not; give it a std"),
+        (FITTED | {"heat": JointParameter(1.0, considered=True)},
+         {("offset", "heat"): 0.9, ("offset", "loss"): 0.9, ("heat", "loss"): -0.9}, "contradict each other"),
+        ({"loss": JointParameter(0.0, considered=True, widened={"b": 1.0})}, {}, "range of b, which has none"),
+        ({"loss": JointParameter(0.0, considered=True, widened={"c": 1.0})}, {}, "no state or input 'c'"),
+        ({"loss": JointParameter(0.1, widened={"a": 1.0})}, {}, "leave widen out"),
+    ],
+)  # fmt: skip
+def test_impossible_widths_are_refused(estimated, correlations, rule):
+    with pytest.raises(ModelError, match=rule):
+        joint(ranged(), estimated, correlations)
