@@ -1,35 +1,40 @@
-"""Check the order of a table's times, and report wrong sorting, a wrong unit or a wrong column once."""
+"""Check the order of a table's times: sort rows that are out of order, and report a wrong unit or column once."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from estimators.errors import SourceError
-from estimators.log import BEFORE
+from estimators.events.clocks import nearest_zone
+from estimators.log import BEFORE, INPUT, Events
 
 from ..source import WRONG_TIME, Report
 
 MAX_EQUAL_TIMES = 100_000  # Consecutive rows of equal time from which on the time column is reported
-BACKWARDS, STANDING = REMARKS = ("times run backwards", "time stands still")  # Keys under which it is reported
+BACKWARDS, SORTED, STANDING = REMARKS = ("times run backwards", "rows sorted", "time stands still")
+"""Keys under which it is reported."""
 
 MIN_ORDERED_TIMES = 3
-"""Ordered times that must follow before a first time is reported as wrong, or rows as reversed."""
+"""Ordered times that must follow before a first time is reported as wrong; fewer, far from all others, are wrong."""
+
+MAX_GAP_INTERVALS = 20.0  # Median intervals, beyond which times are far from each other
 
 
 class Order:
-    """Checks the times of the rows as they are read.
+    """Checks the times of the rows as they are read, and sorts what they gave once all are known.
 
-    A row that is older than one before it by more than the horizon is dropped as stale by the log, unless the guard of
-    times finds a lone wrong time or a clock that was set (estimators/events/clocks.py); the first of them is reported
-    with its line. Late rows within the horizon are as recorded, and put where they belong.
+    Late rows within the horizon are as recorded, and put where they belong. Rows that are older than one before them by
+    more than the horizon would be dropped as stale by the log. A recording is finite, so they are sorted, unless they
+    show a lone wrong time or a clock that was set, which the guard of times corrects (estimators/events/clocks.py). The
+    first of them is reported with its line.
     """
 
     def __init__(self, column: str, unit: str, horizon: int | None, report: Report) -> None:
         """Look at the times of `column`, in `unit`; `horizon` in ns, None for none."""
         self._column, self._unit, self._horizon, self._report = column, unit, horizon, report
         self._newest, self._newest_at = BEFORE, ""
+        self._late = ""
         self._run, self._run_at, self._run_length = BEFORE, "", 0
-        self._reported: set[str] = set()
+        self._stands = False
 
     def first(self, file: str, line: np.ndarray, t: np.ndarray) -> int:
         """Return how many of a file's first rows to leave out: those of one time, ahead of all that follow.
@@ -38,21 +43,12 @@ class Order:
             file: Its name.
             line: Lines of its first rows (n,).
             t: Their times (n,), ns.
-
-        Raises:
-            SourceError: If the newest row comes first and the oldest last: nearly all would be too late.
         """
         if self._horizon is None or not t.size:
             return 0
         change = np.flatnonzero(np.diff(t)) + 1
         if change.size < MIN_ORDERED_TIMES:
             return 0
-        if np.all(np.diff(t) <= 0) and t[0] - t[-1] > self._horizon:
-            back = (t[0] - t[change[0]]) * 1e-9
-            raise SourceError(
-                f"{file}:{line[change[0]]}: {self._column} is {back:.6g} s before that of the row above, and so it "
-                f"goes on; a recording must begin with its oldest row: sort the rows by {self._column}"
-            )
         begin = int(change[0])
         rest = t[begin:]
         alone = t[0] - self._horizon > rest.max() and np.all(np.diff(t[change[:MIN_ORDERED_TIMES]]) > 0)
@@ -71,25 +67,37 @@ class Order:
             self._backwards(file, line, t)
             self._standing(file, line, t)
 
-    def _report_once(self, key: str, text: str) -> None:
-        if key not in self._reported:
-            self._reported.add(key)
-            self._report(key, text)
+    def arranged(self, events: Events) -> Events:
+        """Return all events of the recording in the order in which they enter the log, and report wrong sorting."""
+        if not self._late or self._horizon is None:
+            return events
+        key = np.where(events.kind == INPUT, np.argmax(np.isfinite(events.value), axis=1), events.channel)
+        order = time_order(events.t, 4 * key.astype(np.int64) + events.kind, self._horizon)
+        self.report_late(order is not None)
+        return events if order is None else events.select(order)
+
+    def report_late(self, sorted_rows: bool) -> None:
+        """Report the first row that is too late, if there is one, and whether the rows were sorted."""
+        if self._late and sorted_rows:
+            self._report(SORTED, f"{self._late}; the rows are out of order and were sorted by {self._column}")
+        elif self._late and self._horizon is not None:
+            self._report(
+                BACKWARDS,
+                f"{self._late}, more than time.horizon ({self._horizon * 1e-9:g} s); the rows around them show a lone "
+                f"wrong time or a clock that was set, so they are not sorted: correct {self._column}, or raise "
+                "time.horizon",
+            )
 
     def _backwards(self, file: str, line: np.ndarray, t: np.ndarray) -> None:
         if self._horizon is None:
             return
         newest = np.maximum.accumulate(np.concatenate(([self._newest], t)))
         late = np.flatnonzero(t < newest[:-1] - self._horizon)
-        if late.size:
+        if late.size and not self._late:
             k = int(late[0])
             at = f"{file}:{line[int(np.argmax(t[:k]))]}" if k and np.max(t[:k]) > self._newest else self._newest_at
-            self._report_once(
-                BACKWARDS,
-                f"{file}:{line[k]}: {self._column} is {(newest[k] - t[k]) * 1e-9:.6g} s before that of {at}, more than "
-                f"time.horizon ({self._horizon * 1e-9:g} s), and such rows are dropped as stale, unless that was a "
-                f"lone wrong time or a clock that was set; sort the rows by {self._column}, or raise time.horizon",
-            )
+            back = (newest[k] - t[k]) * 1e-9
+            self._late = f"{file}:{line[k]}: {self._column} is {back:.6g} s before that of {at}"
         if newest[-1] > self._newest:
             self._newest, self._newest_at = int(newest[-1]), f"{file}:{line[int(np.argmax(t))]}"
 
@@ -100,9 +108,10 @@ class Order:
         lengths[0] += carried
         if not carried:
             self._run_at = f"{file}:{line[0]}"
-        for k in np.flatnonzero(lengths >= MAX_EQUAL_TIMES):
+        for k in np.flatnonzero(lengths >= MAX_EQUAL_TIMES)[: not self._stands]:
+            self._stands = True
             at = self._run_at if k == 0 else f"{file}:{line[edges[k]]}"
-            self._report_once(
+            self._report(
                 STANDING,
                 f"{at}: {self._column} stays {t[edges[k]] * 1e-9:g} s for {MAX_EQUAL_TIMES} rows and more; check that "
                 f"it is the column of the time (time.column), and its unit (time.unit, {self._unit})",
@@ -110,3 +119,80 @@ class Order:
         if lengths.size > 1:
             self._run_at = f"{file}:{line[edges[-2]]}"
         self._run, self._run_length = int(t[-1]), int(lengths[-1])
+
+
+def time_order(t: np.ndarray, key: np.ndarray, horizon: int) -> np.ndarray | None:
+    """Return the order in which to read the rows of a recording; None if they stay as recorded.
+
+    Rows stay as recorded if none is late, if only lone wrong times are, or if late rows repeat, at their usual pace,
+    times that were read before: their clock was set back (see `_was_set`). A lone wrong time stays behind the row
+    before it.
+
+    Args:
+        t: Times (n,), ns, in the order of the recording.
+        key: Channel of each row (n,); rows of different channels may have the same times.
+        horizon: Time by which a row may be late, ns.
+    """
+    if not np.any(t < np.maximum.accumulate(t) - horizon):
+        return None
+    place = np.arange(t.size)
+    lone = np.zeros(t.size, np.bool_)
+    for one in np.unique(key):
+        rows = np.flatnonzero(key == one)
+        wrong = _lone(t[rows], horizon)
+        lone[rows[wrong]] = True
+        rows = rows[~wrong]
+        behind = t[rows] < np.maximum.accumulate(t[rows]) - horizon
+        if _was_set(t[rows], behind, horizon):
+            return None
+    kept = t[~lone]
+    if not np.any(kept < np.maximum.accumulate(kept) - horizon):
+        return None
+    before = np.maximum.accumulate(np.where(lone, -1, place))
+    at = np.where(before < 0, BEFORE, t[before])
+    return np.lexsort((place, at))
+
+
+def _usual(ordered: np.ndarray) -> float:
+    apart = np.diff(ordered)
+    return float(np.median(apart[apart > 0])) if np.any(apart > 0) else 0.0
+
+
+def _lone(t: np.ndarray, horizon: int) -> np.ndarray:
+    """Return which times are out of order, and with fewer than `MIN_ORDERED_TIMES` far from all others."""
+    order = np.argsort(t, kind="stable")
+    far = np.diff(t[order]) > max(horizon, MAX_GAP_INTERVALS * _usual(t[order]))
+    group = np.concatenate(([0], np.cumsum(far)))
+    few = np.bincount(group)[group] < MIN_ORDERED_TIMES
+    found = np.zeros(t.size, np.bool_)
+    found[order] = few
+    later = np.minimum.accumulate(t[::-1])[::-1]
+    return found & ((t < np.maximum.accumulate(t) - horizon) | (t > later + horizon))
+
+
+def _was_set(t: np.ndarray, behind: np.ndarray, horizon: int) -> bool:
+    """Return whether most late times are in stretches that show a clock that was set.
+
+    Such a stretch is in order. It repeats times that were read before, or it begins whole quarter hours earlier, as
+    after a change of time zone, and does not end where the times before it begin.
+    """
+    edges = np.flatnonzero(np.diff(np.concatenate(([False], behind, [False])).astype(np.int8)))
+    usual = _usual(np.sort(t))
+    repeated = 0
+    for begin, end in edges.reshape(-1, 2):
+        stretch = t[begin:end]
+        low, high = stretch.min(), stretch.max()
+        if stretch.size < MIN_ORDERED_TIMES or high - low > 3.0 * usual * (stretch.size - 1):
+            continue
+        if np.mean(stretch < np.maximum.accumulate(stretch) - horizon) > 0.5:
+            continue
+        before = t[:begin]
+        step = int(before[-1] + usual - stretch[0])
+        zone = nearest_zone(step)
+        near = zone > 0 and abs(zone - step) <= max(horizon, usual)
+        apart = (
+            np.min(before[before > high], initial=np.iinfo(np.int64).max) - high > horizon + MAX_GAP_INTERVALS * usual
+        )
+        if 2 * np.count_nonzero((before >= low) & (before <= high)) >= stretch.size or (near and apart):
+            repeated += stretch.size
+    return bool(2 * repeated > np.count_nonzero(behind))

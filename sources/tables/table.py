@@ -21,6 +21,8 @@ from .rows import TableRows, names_of, rows_of
 from .text import TextMatch, column_of, has_rows
 from .times import SERIAL_DAYS, UNITS, TimeColumn
 
+BATCH_EVENTS = 4096  # Events that are returned at once
+
 
 class Table:
     """Reads tables of the same columns one after the other, as one recording.
@@ -38,9 +40,9 @@ class Table:
         time_shift: Seconds added to it.
         channels: What feeds the model.
         width: Value columns of an event.
-        report: Called for rows without a time and values that are not numbers, with file and line; and once of times
-            that run backwards or stand still.
-        horizon: Seconds by which a row may be older than one before it; None for any.
+        report: Called for rows without a time and values that are not numbers, with file and line; and once of rows
+            that were sorted, and of times that run backwards or stand still.
+        horizon: Seconds by which a row may be older than one before it without being sorted; None for any.
 
     Raises:
         SourceError: If a file or column is missing, or a unit does not convert.
@@ -86,8 +88,15 @@ class Table:
         self._batches = self._all()
 
     def _all(self) -> Generator[Events, None, None]:
+        read: list[Events] = []
         for path in self._files:
-            yield from self._one(path)
+            for batch in self._one(path):
+                read.append(batch)
+                # Rows that come later may belong before these; meanwhile the reader may be stopped.
+                yield Events.empty(self._width)
+        events = self._order.arranged(Events.concat(read, self._width))
+        for first in range(0, len(events), BATCH_EVENTS):
+            yield events.select(slice(first, first + BATCH_EVENTS))
         if self._count:
             for name in self._columns:
                 if name not in self._valued:
@@ -99,8 +108,7 @@ class Table:
             for rows in rows_of(path, self._time, self._columns, lambda: self._timeout):
                 first = self._count == before
                 batch = Events.empty(self._width) if rows is None else self._events(path, rows, first)
-                if rows is None or len(batch):
-                    yield batch
+                yield batch
         except SourceError as error:
             if self._count == before:
                 raise

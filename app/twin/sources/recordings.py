@@ -7,12 +7,19 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from config.source_schema import CanLogSection, MergedSection, TableSection
 from config.yaml_files import Key
 from estimators.errors import SourceError
+from estimators.events.clocks import Passed
+from estimators.log import BEFORE, Events
 from sources.formats import TABLES, suffix_of
+from sources.merged import MemorySource, Merged
 from sources.pieces import VALUES
+from sources.source import span_of
 
+from ...ingest import Ingest
 from .can import CAN_LOG
 from .kind import Kind, Opening, blamed, closed, find_recording
 
@@ -21,8 +28,6 @@ if TYPE_CHECKING:
 
 
 def _open(opening: Opening) -> Source:
-    from sources.merged import Merged
-
     section: MergedSection = opening.section
     shares: list[list[Path] | None] = [None] * len(section.parts)
     if opening.log_files is not None:
@@ -32,7 +37,50 @@ def _open(opening: Opening) -> Source:
         for k, (part, share) in enumerate(zip(section.parts, shares, strict=True))
         if share != []
     ]
-    return Merged(parts)
+    horizon = round(opening.loaded.config.time.horizon * 1e9)
+    return Merged([OwnClock(part, Ingest(opening.model, horizon, opening.report)) for part in parts])
+
+
+class OwnClock:
+    """Recording with a clock of its own, which is checked and corrected before its events meet those of others.
+
+    A clock that was set is known only some events later, so the recording is read to its end first.
+    """
+
+    live = False
+
+    def __init__(self, source: Source, intake: Ingest) -> None:
+        self._source, self._intake = source, intake
+        self._passed: list[Passed] = []
+        self._checked: MemorySource | None = None
+
+    @property
+    def span(self) -> tuple[int, int] | None:
+        """First and last time of the source, ns."""
+        return span_of(self._source)
+
+    def read(self, timeout: float) -> Events | None:
+        """Return the next events; none while the source is read; None at the end."""
+        if self._checked is not None:
+            return self._checked.read(timeout)
+        batch = self._source.read(timeout)
+        passed = self._intake.finish() if batch is None else self._intake.take(batch)
+        self._passed.append(passed)
+        if batch is None:
+            events = Events.concat([passed.events for passed in self._passed], 0)
+            # Events that were held come late; all others stay in the order in which they were recorded.
+            held = np.concatenate([passed.settled for passed in self._passed])
+            at = np.where(held, events.t, np.maximum.accumulate(np.where(held, BEFORE, events.t)))
+            self._checked, self._passed = MemorySource(events.select(np.argsort(at, kind="stable"))), []
+        return passed.events.select(slice(0, 0))
+
+    def now(self) -> int | None:
+        """Return None: a recording has no clock."""
+        return None
+
+    def close(self) -> None:
+        """Close the source."""
+        self._source.close()
 
 
 def _shares(opening: Opening) -> list[list[Path] | None]:

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from app.twin.log_reader import read_log
 from app.twin.twin import Twin
 from estimators.errors import ConfigError, NisusError, SourceError
 from estimators.log import INPUT, READING, TRUTH, Events
@@ -385,3 +386,44 @@ def test_every_type_of_the_schema_has_its_line_in_the_registry():
 
     types = [get_args(section.model_fields["type"].annotation)[0] for section in get_args(get_args(SourceSection)[0])]
     assert sorted(types) == sorted(SOURCES)
+
+
+THREE = """\
+model: motor_drive
+source:
+  type: merged
+  parts:
+""" + "".join(
+    f"    - {{type: table, files: {name}.csv, time: {{column: t}}, sensors: {{{name}: {{columns: y}}}}}}\n"
+    for name in ("winding", "tooth", "yoke")
+)
+
+
+def stepped(seconds: np.ndarray, how: str) -> np.ndarray:
+    """Times of a recording whose rows are out of order, or whose clock was set."""
+    late = seconds >= 200.0
+    return {
+        "blocks": np.concatenate((seconds[:200], seconds[328:500], seconds[200:328], seconds[500:])),
+        "newest first": seconds[::-1],
+        "set back": seconds - 64.0 * late,
+        "set back an hour": seconds - 3600.0 * late,
+        "set ahead for a while": seconds + 64.0 * (late & (seconds < 300.0)),
+    }[how]
+
+
+@pytest.mark.parametrize("how", ["blocks", "newest first", "set back", "set back an hour", "set ahead for a while"])
+def test_disorder_in_one_file_of_a_merged_source_alters_no_other(how: str) -> None:
+    """The oracle is the recording itself: all rows of the other files at their times, and none of its own lost."""
+    seconds = np.arange(0.0, 600.0, 0.5)
+    for name in ("winding", "tooth", "yoke"):
+        t = stepped(seconds, how) if name == "tooth" else seconds + 0.1
+        Path(f"{name}.csv").write_text("t,y\n" + "".join(f"{s:.3f},{k}\n" for k, s in enumerate(t)))
+    log, counts = read_log(twin_of(THREE), None)
+    assert counts["stale"] == 0 and log.n == 3 * seconds.size
+    for k, name in enumerate(("winding", "tooth", "yoke")):
+        own = log.channel[: log.n] == k
+        if name != "tooth":
+            assert log.value[: log.n][own, 0].tolist() == list(range(seconds.size))
+            np.testing.assert_array_equal(log.t[: log.n][own], np.round((seconds + 0.1) * 1e3).astype(np.int64) * 10**6)
+        elif how != "set ahead for a while":  # which its file alone does not distinguish from a gap
+            np.testing.assert_allclose(log.t[: log.n][own] * 1e-9, seconds, atol=0.5 if "set" in how else 0.0)
