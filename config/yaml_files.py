@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator, Mapping
+import shutil
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -251,3 +253,55 @@ def writing(path: Path, option: str = "") -> Iterator[None]:
         raise ConfigError(
             f"{name}: cannot be written: {error.strerror or error}; check free space and permissions"
         ) from None
+
+
+def rewrite(path: Path, change: Callable[[str], str], out: Path | None = None) -> Path | None:
+    """Write the changed text of a YAML file to `out`, or over itself.
+
+    Returns:
+        The copy of the file as it was, beside it; None where `out` was written.
+
+    Raises:
+        ConfigError: If it cannot be written.
+    """
+    with writing(out or path):
+        with path.open(encoding="utf-8", newline="") as file:
+            text = file.read()
+        end = "\r\n" if "\r\n" in text else "\n"
+        changed = change(text.replace("\r\n", "\n")).replace("\n", end)
+        kept = None
+        if out is None:
+            numbers = (path.with_name(f"{path.name}.{k}.bak") for k in count(1))
+            kept = next(copy for copy in numbers if not copy.exists())
+            shutil.copy2(path, kept)
+        (out or path).write_text(changed, encoding="utf-8", newline="")
+    return kept
+
+
+def with_section(text: str, key: str, section: str) -> str:
+    """Return a YAML text in which the section `key` has these lines; without one, they are appended."""
+    # The key and the lines under it, to the last that is indented; a comment after that belongs to what follows.
+    pattern = re.compile(
+        rf"^{re.escape(key)}:.*(?:\n|\Z)(?:(?:[ \t]*(?:#.*)?\n)*[ \t]+[^\s#].*(?:\n|\Z))*", re.MULTILINE
+    )
+    kept, found = pattern.subn(lambda _: section, text, count=1)
+    return kept if found else text.rstrip("\n") + "\n\n" + section
+
+
+def with_values(text: str, values: Mapping[Key, Any]) -> tuple[str, list[Key]]:
+    """Return a YAML text with other values at some keys, and the keys that it does not have; comments stay."""
+    root = _composed(text)
+    edits: list[tuple[int, int, str]] = []
+    missing: list[Key] = []
+    for key, value in values.items():
+        node = root
+        for part in key:
+            items = node.value if isinstance(node, yaml.MappingNode) else ()
+            node = next((item for name, item in items if name.value == part), None)
+        if isinstance(node, yaml.SequenceNode if isinstance(value, list) else yaml.ScalarNode):
+            edits.append((node.start_mark.index, node.end_mark.index, as_flow(value)))
+        else:
+            missing.append(key)
+    for begin, end, value in sorted(edits, reverse=True):
+        text = text[:begin] + value + text[end:]
+    return text, missing

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from config.loader import shipped
+from config.yaml_files import rewrite
 from estimators.errors import ConfigError
 from estimators.log import READING, Log
 
@@ -17,7 +18,16 @@ from ..studies.advice.measured import AdviceProgress, Measured, digits, percent,
 from ..studies.advice.plan import DraftPlan, Moves, plan
 from ..studies.advice.relations import Pair
 from ..studies.advice.signals import Signal, signals
-from ..studies.advice.verdict import Advice, advice_json, apply, details, exclusion_text, finding, lasting_lines, lines
+from ..studies.advice.verdict import (
+    Advice,
+    advice_json,
+    changed,
+    details,
+    exclusion_text,
+    finding,
+    lasting_lines,
+    lines,
+)
 from ..studies.advice.verdict import advise as recommend
 from ..twin.log_reader import read_log
 from ..twin.twin import Twin, load_twin
@@ -74,7 +84,7 @@ def _of_twin(arguments: Arguments, name: str) -> int:
     advice: Advice = attend(twin.model, work, "measuring", text=text)
     print(to_json(advice_json(twin, log, advice)) if arguments.json else "\n".join(to_text(_topics(twin, log, advice))))
     if arguments.apply or arguments.out is not None:
-        kept = apply(twin.path, lines(advice), arguments.out, advice.sections)
+        kept = rewrite(twin.path, lambda text: changed(text, lines(advice), advice.sections), arguments.out)
         if not arguments.json:
             before = f"; the previous file is {kept}" if kept else ""
             print(f"\n{arguments.out or twin.path}: its estimator is {advice.estimator}{before}")

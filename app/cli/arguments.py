@@ -248,6 +248,7 @@ class TuneCommand(JsonOption, EstimatorOption, TwinOptions):
 
     Examples:
       nisus tune motor_bench --fit Q,R --keep fitted
+      nisus tune pump.yaml --apply
       nisus tune motor_winding --fit scale --duration 300
     """
 
@@ -276,6 +277,10 @@ class TuneCommand(JsonOption, EstimatorOption, TwinOptions):
     does, and print every parameter over time. A shorter log is one window."""
     every: str | None = None
     """Time between the ends of two windows. Default: the length of the windows."""
+    apply: Flag = False
+    """Write the proposed values into the twin's YAML; comments stay, and the previous file is kept beside it."""
+    out: Path | None = None
+    """Write a copy of the twin's YAML with the proposed values to this file (same folder if it names other files)."""
     save: Path | None = None
     """Write the proposed tuning to this .yaml file, as sections that replace the twin's own."""
     keep: str | None = None
@@ -474,6 +479,8 @@ class TuningsCommand(JsonOption, FoldOptions):
     """Save the twin with --tuning, --estimator and --set as a version of this name, with its scores."""
     accept: str | None = None
     """Accept the version of this name: `nisus guard` then folds with it."""
+    apply: str | None = None
+    """Write the values of the version of this name into the twin's YAML; the previous file is kept beside it."""
     note: str = ""
     """Note for --save and --accept."""
 

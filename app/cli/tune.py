@@ -18,7 +18,7 @@ from estimators.fit.objective import FitProgress
 from estimators.fit.recording import Recording
 
 from ..live.tunings.tuning_yaml import tuning_yaml
-from ..live.tunings.versions import check_free, keep, settings_of, version_text
+from ..live.tunings.versions import apply_tuning, check_free, keep, settings_of, version_text
 from ..present.result import to_text
 from ..present.runs_json import fit_json
 from ..studies.tune import fit_text, heading, sections, window_json, window_topics, windows_verdict
@@ -46,6 +46,8 @@ def tune_twin(arguments: Arguments) -> int:
         raise ConfigError("--predict: is for --aim crps and --aim error; the likelihood is that of every sensor")
     if arguments.save is not None:
         check_output("--save", arguments.save, ".yaml", ".yml")
+    if arguments.out is not None:
+        check_output("--out", arguments.out, ".yaml", ".yml")
     if arguments.keep is not None:
         check_free(find(arguments.twin), arguments.keep)
     if arguments.windows is not None:
@@ -74,7 +76,8 @@ def tune_twin(arguments: Arguments) -> int:
     if arguments.json:
         print(json.dumps({"twin": twin.name, **fit_json(found)}, allow_nan=False))
     else:
-        print("\n".join(to_text(sections(twin, found))))
+        written = arguments.apply or any((arguments.out, arguments.save, arguments.keep))
+        print("\n".join(to_text(sections(twin, found, aim, written=written))))
     if not found.proposed:
         return 1
     _save(arguments, twin, found, arguments.log or (f"{twin.name}, its own log",))
@@ -94,7 +97,9 @@ def _attend_fit(
 
 
 def _save(arguments: Arguments, twin: Twin, found: Fitted, fitted_on: Sequence[str]) -> None:
-    """Write a proposed tuning to the file of `--save` and to the version of `--keep`."""
+    """Write a proposed tuning to the twin's YAML, to the file of `--save` and to the version of `--keep`."""
+    if arguments.apply or arguments.out is not None:
+        complain(apply_tuning(load_twin(arguments.twin), found.estimator, *found.setting, out=arguments.out))
     if arguments.save is not None:
         text = heading(twin, found) + tuning_yaml(twin.config, twin.estimator, *found.setting)
         with writing(arguments.save, "--save"):

@@ -4,13 +4,24 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from config.tunings import OWN_VALUES
 from config.yaml_files import shown_path
 from estimators.diagnostics.score import score
 from estimators.errors import ConfigError, printable
 
 from ..live.changes import difference
-from ..live.tunings.versions import COVERAGE, Settings, accept, figures, keep, listing, version_text
+from ..live.tunings.versions import (
+    COVERAGE,
+    Settings,
+    accept,
+    apply_tuning,
+    figures,
+    keep,
+    listing,
+    version_text,
+)
 from ..present.result import TableColumn, Topic, to_json, to_text
 from ..studies.baseline import badness
 from ..studies.scores import pictures_of
@@ -24,14 +35,16 @@ if TYPE_CHECKING:
 
 def tunings_of(arguments: Arguments) -> int:
     """Run the command."""
-    if arguments.save is not None and arguments.accept is not None:
-        raise ConfigError("--save and --accept: give one; a version is judged before it is accepted")
+    if sum(name is not None for name in (arguments.save, arguments.accept, arguments.apply)) > 1:
+        raise ConfigError("--save, --accept and --apply: give one; a version is judged before it is accepted")
     if len(arguments.names) not in (0, 2):
         raise ConfigError(f"tunings: {len(arguments.names)} names; give two versions to compare, or none to list them")
     if arguments.save is not None:
         _save(arguments, arguments.save)
     elif arguments.accept is not None:
         _accept(arguments, arguments.accept)
+    elif arguments.apply is not None:
+        _apply(arguments, arguments.apply)
     elif arguments.names:
         _compare(arguments)
     else:
@@ -59,6 +72,16 @@ def _accept(arguments: Arguments, name: str) -> None:
     accept(twin.version, printable(arguments.note))
     path = twin.version.path
     print(to_json({"name": name, "accepted": str(path)}) if arguments.json else f"{shown_path(path)}: accepted")
+
+
+def _apply(arguments: Arguments, name: str) -> None:
+    twin = load_twin(arguments.twin, overrides={"tuning": name})
+    if twin.version is None:
+        raise ConfigError(f"--apply {OWN_VALUES}: these are the values of the twin's file")
+    model = twin.model
+    prior = (model.prior_mean, np.diag(model.prior_std**2)) if twin.version.section.prior else None
+    text = apply_tuning(load_twin(arguments.twin), twin.estimator, twin.tuning, prior)
+    print(to_json({"name": name, "applied": str(twin.path)}) if arguments.json else text)
 
 
 def _list(arguments: Arguments) -> None:

@@ -9,6 +9,7 @@ import numpy as np
 
 from config.tunings import named
 from estimators.diagnostics.sensitivity.responses import digits
+from estimators.fit.aims import WITNESSES
 from estimators.fit.dual import WindowFit, against, shift
 from estimators.fit.fit import EntryFit, Fitted
 from estimators.fit.judge import PartScore, PredictionScore, Worth
@@ -107,6 +108,8 @@ ALONE = "not identifiable: unchanged"
 BOUND = "only an upper bound: indistinguishable from zero"
 EDGE = "at the edge of its range: the optimum may lie beyond"
 STOPPED = "The search was ended early: better values may exist."
+BY_LIKELIHOOD = "--aim likelihood fits to all measurements, and leaves true states and held-out sensors as a check"
+NOT_WRITTEN = "Nothing is written. --apply writes the values into {}, --out FILE into a copy, --keep NAME as a version."
 WELL_TUNED = 0.2  # logarithm of the NIS per degree of freedom within which the values suit
 TEMPERED = "The likelihood of the fitted blocks has weight {:.2g}; more does not improve held-out predictions."
 
@@ -137,10 +140,11 @@ def _move(before: float, after: float) -> float:
     return (after - before) / (abs(before) or 1.0)
 
 
-def sections(twin: Twin, fitted: Fitted) -> list[Topic]:
-    """From top to bottom."""
+def sections(twin: Twin, fitted: Fitted, aim: str, *, written: bool) -> list[Topic]:
+    """Return the result of a fit by an aim, from top to bottom; `written` is whether a file was requested."""
     held_out = _held_out(fitted)
-    return [_entries(twin, fitted), _scores(fitted), *([held_out] if held_out.rows else []), _verdict(twin, fitted)]
+    verdict = _verdict(twin, fitted, aim, written=written)
+    return [_entries(twin, fitted), _scores(fitted), *([held_out] if held_out.rows else []), verdict]
 
 
 def heading(twin: Twin, fitted: Fitted) -> str:
@@ -231,23 +235,30 @@ def _gained(fitted: Fitted) -> str:
     return f"{fitted.verdict.gain:+.3g} ± {fitted.verdict.error:.2g} nats {fitted.verdict.each}"
 
 
-def _verdict(twin: Twin, fitted: Fitted) -> Topic:
+def _verdict(twin: Twin, fitted: Fitted, aim: str, *, written: bool) -> Topic:
     verdict = fitted.verdict
     early = [STOPPED] if fitted.stopped else []
-    if verdict.proposed:
-        said = f"Proposed: {_gained(fitted)} on the blocks held out."
-        return Topic("Verdict", (said, *early, *([] if fitted.power == 1.0 else [TEMPERED.format(fitted.power)])))
-    return Topic("Verdict", ("Not proposed:", *verdict.reasons, *early, f"Next: {next_step(twin, fitted)}"))
+    if not verdict.proposed:
+        return Topic("Verdict", ("Not proposed:", *verdict.reasons, *early, f"Next: {next_step(twin, fitted, aim)}"))
+    said = [f"Proposed: {_gained(fitted)} on the blocks held out.", *early]
+    said += [] if fitted.power == 1.0 else [TEMPERED.format(fitted.power)]
+    if aim == WITNESSES and any(line.alone for line in fitted.lines):
+        said.append(f"Next, for the entries that are not identifiable: {BY_LIKELIHOOD}.")
+    if not written:
+        said.append(NOT_WRITTEN.format(twin.path.name))
+    return Topic("Verdict", tuple(said))
 
 
-def next_step(twin: Twin, fitted: Fitted) -> str:
-    """Return what to try after a fit that is not proposed."""
+def next_step(twin: Twin, fitted: Fitted, aim: str) -> str:
+    """Return what to try after a fit by an aim that is not proposed."""
     name, verdict = named(twin.path), fitted.verdict
     if fitted.stopped:
         return f"run it to its end: nisus tune {name}."
     if not fitted.before.held_out.n:
         return "hold blocks out with --blocks 9, so that the fit can be judged."
     if all(line.alone for line in fitted.lines):
+        if aim == WITNESSES:
+            return f"{BY_LIKELIHOOD}: nisus tune {name} --aim likelihood."
         return (
             "fit fewer entries (--fit scale is one factor for Q and R), or give a longer or livelier recording with "
             "--log; the values of the twin stay."

@@ -214,7 +214,12 @@ def verdict(before: Worth, after: Worth, aim: Aim, *, changed: bool = True) -> F
     """Judge by the held-out part: the aim of the fit must be better there, and nothing else worse."""
     one, other = before.held_out, after.held_out
     if not changed:
-        few = f": the references have {aim.independent:.0f} independent errors" if aim.weights else ""
+        few = (
+            f": the true states and held-out sensors that --aim {aim.kind} weighs have {aim.independent:.0f} "
+            "independent errors, and the measurements count no more"
+            if aim.weights
+            else ""
+        )
         return FitVerdict(False, 0.0, 0.0, (f"the data identify none of the entries{few}",))
     if not one.n:
         return FitVerdict(False, np.nan, np.nan, ("no data were held out to judge the fit",))

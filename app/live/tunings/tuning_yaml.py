@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import re
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
 
 from config.schema import TwinSection
-from config.yaml_files import as_flow, as_section
+from config.yaml_files import Key, as_flow, as_section, parse, with_section, with_values
 from estimators.errors import LARGEST
 from estimators.estimator import Estimator
 from estimators.model.coloured import disturbance_time, error_time, errors_of
@@ -124,3 +125,48 @@ def _option(entry: Estimator, name: str, value: float) -> float | str:
     """Return an option's value, a choice by its name."""
     choices = next((option.choices for option in entry.options if option.name == name), ())
     return choices[round(value)] if choices else float(value)
+
+
+def with_tuning(text: str, before: str, after: str) -> str:
+    """Return a twin's YAML with the values in which its tuning `after` differs from that `before`.
+
+    Values stand where the file has them, a variance as `std` where that is given, and comments stay. A section without
+    a place for one is replaced as a whole.
+
+    Args:
+        text: The twin's file.
+        before: Its own settings, see `tuning_yaml`.
+        after: The settings to apply.
+    """
+    old, new = (dict(_leaves(parse(part, "the tuning")[0], ())) for part in (before, after))
+    data = parse(text, "the YAML")[0]
+    values = dict(_placed(data, key, value) for key, value in new.items() if old.get(key) != value)
+    text, missing = with_values(text, values)
+    for section in dict.fromkeys(str(key[0]) for key in missing):
+        found = re.search(rf"^{section}:.*\n(?:[ ].*\n)*", after, re.MULTILINE)
+        text = with_section(text, section, found.group() if found else "")
+    return text
+
+
+def _leaves(value: Any, key: Key) -> Iterator[tuple[Key, Any]]:
+    """Return the values of a section by their keys; a list is a value."""
+    if not isinstance(value, Mapping):
+        yield key, value
+        return
+    for name, item in value.items():
+        yield from _leaves(item, (*key, name))
+
+
+def _placed(data: Any, key: Key, value: Any) -> tuple[Key, Any]:
+    """Return the key under which a file has a value, with the value as it stands there."""
+    found: list[str | int] = []
+    for name in key:
+        if name == "variance" and isinstance(data, Mapping) and "variance" not in data and "std" in data:
+            name = "std"
+            roots = np.sqrt(value).tolist()
+            value = [float(f"{root:.6g}") for root in roots] if isinstance(roots, list) else float(f"{roots:.6g}")
+        found.append(name)
+        data = data.get(name) if isinstance(data, Mapping) else None
+    if isinstance(data, Mapping) and "value" in data:
+        found.append("value")
+    return tuple(found), value

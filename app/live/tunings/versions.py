@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -13,7 +12,7 @@ import numpy as np
 
 from config.companion_schema import AcceptedSection, EvidenceSection, MovedSection, VersionSection
 from config.tunings import OWN_VALUES, Version, check_name, folders, load_version, version_files, version_of
-from config.yaml_files import as_section, shown_path, writing
+from config.yaml_files import as_section, rewrite, shown_path, with_section, writing
 from estimators.diagnostics.score import Score
 from estimators.errors import LARGEST, ConfigError
 from estimators.fold import Fold
@@ -23,7 +22,7 @@ from estimators.tuning import Tuning
 from ...twin.twin import Twin, with_version
 from ..changes import obstacle
 from ..running_fold import Running
-from .tuning_yaml import tuning_yaml
+from .tuning_yaml import tuning_yaml, with_tuning
 
 if TYPE_CHECKING:
     from estimators.fit.fit import Fitted
@@ -58,17 +57,7 @@ def write_section(path: Path, key: str, section: str) -> None:
     Raises:
         ConfigError: If the file cannot be written.
     """
-    # The key and the lines under it, to the last that is indented; a comment after that belongs to what follows.
-    pattern = re.compile(
-        rf"^{re.escape(key)}:.*(?:\n|\Z)(?:(?:[ \t]*(?:#.*)?\r?\n)*[ \t]+[^\s#].*(?:\n|\Z))*", re.MULTILINE
-    )
-    with writing(path):
-        with path.open(encoding="utf-8", newline="") as file:
-            text = file.read()
-        end = "\r\n" if "\r\n" in text else "\n"
-        section = section.replace("\n", end)
-        kept, found = pattern.subn(lambda _: section, text, count=1)
-        path.write_text(kept if found else text.rstrip("\r\n") + 2 * end + section, encoding="utf-8", newline="")
+    rewrite(path, lambda text: with_section(text, key, section), path)
 
 
 def listing(twin: Twin) -> list[dict[str, Any]]:
@@ -177,6 +166,36 @@ def keep(twin: Twin, name: str, text: str) -> Path:
         except FileExistsError:
             raise _taken(path) from None
     return path
+
+
+def apply_tuning(
+    twin: Twin,
+    estimator: str,
+    tuning: Tuning,
+    prior: tuple[np.ndarray, np.ndarray] | None = None,
+    *,
+    out: Path | None = None,
+) -> str:
+    """Write a tuning into the YAML of a twin, or into a copy.
+
+    Args:
+        twin: The twin as its file has it.
+        estimator: Filter of the tuning.
+        tuning: The tuning.
+        prior: Mean and covariance, if fitted.
+        out: File of the copy.
+
+    Returns:
+        What was written, in words.
+
+    Raises:
+        ConfigError: If it cannot be written.
+    """
+    before = tuning_yaml(twin.config, twin.estimator, twin.tuning)
+    after = tuning_yaml(twin.config, estimator, tuning, prior)
+    kept = rewrite(twin.path, lambda text: with_tuning(text, before, after), out)
+    words = f"{shown_path(out or twin.path)}: has the values"
+    return words if kept is None else f"{words}; the previous file is {shown_path(kept)}"
 
 
 def accept(version: Version, note: str) -> None:

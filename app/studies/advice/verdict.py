@@ -13,15 +13,13 @@ enough, at the end.
 from __future__ import annotations
 
 import re
-import shutil
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 from config.tunings import SPREADS
-from config.yaml_files import as_flow, parse, writing
+from config.yaml_files import as_flow, parse
 from estimators.diagnostics.calibration import LIMITS
 from estimators.errors import ConfigError, NisusError
 from estimators.fit.objective import ALONE
@@ -340,43 +338,10 @@ def with_entry(text: str, key: str, entry: Mapping[str, Any]) -> str:
 
 def changed(text: str, section: str, entries: Mapping[str, Mapping[str, Any]] | None = None) -> str:
     """Return a YAML text with the section `estimator` replaced or added, and with other entries."""
-    end = "\r\n" if "\r\n" in text else "\n"
-    plain = text.replace("\r\n", "\n")
-    if plain and not plain.endswith("\n"):
-        plain += "\n"
-    found, count = ESTIMATOR.subn(lambda _: section, plain, count=1)
-    plain = found if count else plain + "\n" + section
+    if text and not text.endswith("\n"):
+        text += "\n"
+    found, count = ESTIMATOR.subn(lambda _: section, text, count=1)
+    text = found if count else text + "\n" + section
     for key, entry in (entries or {}).items():
-        plain = with_entry(plain, key, entry)
-    return plain.replace("\n", end)
-
-
-def apply(
-    path: Path, section: str, out: Path | None = None, entries: Mapping[str, Mapping[str, Any]] | None = None
-) -> Path | None:
-    """Write the YAML with that section, and these entries, to `out`, or over itself.
-
-    Returns:
-        The copy of the file as it was, beside it; None where `out` was written.
-
-    Raises:
-        ConfigError: If it cannot be written.
-    """
-    with writing(out or path):
-        with path.open(encoding="utf-8", newline="") as file:
-            text = changed(file.read(), section, entries)
-        if out is None:
-            kept = _free(path)
-            shutil.copy2(path, kept)
-        else:
-            kept = None
-        (out or path).write_text(text, encoding="utf-8", newline="")
-    return kept
-
-
-def _free(path: Path) -> Path:
-    """A name beside a file that no other has: pump.1.yaml.bak."""
-    k = 1
-    while (copy := path.with_name(f"{path.name}.{k}.bak")).exists():
-        k += 1
-    return copy
+        text = with_entry(text, key, entry)
+    return text

@@ -16,7 +16,7 @@ WRONG_LONG = "--set", "R.winding=0.5", "--set", "source.duration=600", "--fit", 
 def test_a_wrong_noise_is_found_and_proposed(nisus, tmp_path):
     file = tmp_path / "found.yaml"
     out = nisus(*TUNE, *WRONG, "--logs", 2, "--fit", "R", "--save", file).out
-    assert "Proposed: +" in out and "R.winding  0.2" in out
+    assert "Proposed: +" in out and "R.winding  0.2" in out and "Nothing is written." not in out
     text = file.read_text(encoding="utf-8")
     found = pasted_text(load_twin("motor_winding"), text).tuning
     # 4 made the logs; of some 560 readings R has a deviation of 6 %.
@@ -66,6 +66,21 @@ def test_a_proposal_is_kept_as_a_version(nisus, winding):
     assert head.scores["log_likelihood"] == pytest.approx(done.json["after"]["held_out"]["log_density"], rel=1e-6)
     assert head.scores["rmse.temperature"] > 0.0
     assert twin.tuning.r[0] == done.json["entries"][0]["after"]
+
+
+def test_a_proposal_is_applied_to_the_file_in_one_step(nisus, winding, tmp_path):
+    """In place, into a copy, and later from a version; the comments stay."""
+    before, copy = winding.read_text(), tmp_path / "copy.yaml"
+    done = nisus("tune", winding, *WRONG, "--fit", "R", "--keep", "fitted", "--out", copy, "--json")
+    fitted = done.json["entries"][0]["after"]
+    assert winding.read_text() == before and "copy.yaml: has the values" in done.err
+    assert load_twin(copy).tuning.r[0] == pytest.approx(fitted, rel=1e-5)
+    said = nisus("tunings", winding, "--apply", "fitted").out
+    kept = winding.with_name("winding.yaml.1.bak")
+    assert kept.name in said and kept.read_text() == before
+    assert winding.read_text() == copy.read_text()
+    changed = [(a, b) for a, b in zip(before.splitlines(), copy.read_text().splitlines(), strict=True) if a != b]
+    assert len(changed) == 1 and "# °C²" in changed[0][1]
 
 
 def test_a_taken_name_is_refused_before_the_fit(nisus, winding, monkeypatch):

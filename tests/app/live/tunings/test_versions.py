@@ -16,7 +16,7 @@ from app.cli.fold import fold_twin
 from app.cli.main import main
 from app.cli.open_twin import recorded_twin
 from app.cli.tunings import tunings_of
-from app.live.tunings.tuning_yaml import tuning_yaml
+from app.live.tunings.tuning_yaml import tuning_yaml, with_tuning
 from app.live.tunings.versions import Settings, accept, keep, version_text
 from app.twin.log_reader import read_log
 from app.twin.twin import load_twin, restore_twin
@@ -90,6 +90,36 @@ def test_what_was_turned_comes_back(back_of):
     same(back.tuning, tuning)
     assert entry.complete(dict(back.tuning.options)) == entry.complete(dict(tuning.options))
     assert back_of(twin, "ekf", twin.tuning.set("gate", None)).tuning.gate is None
+
+
+@pytest.mark.parametrize("name", shipped())
+def test_changed_values_take_their_places_in_the_file_and_comments_stay(name):
+    """Standard deviations are written to six digits; a family of sensors has one place for all its members."""
+    twin = load_twin(name)
+    tuning = replace(twin.tuning, q=2.0 * twin.tuning.q, r=3.0 * twin.tuning.r).set("gate", 0.97)
+    before, after = (tuning_yaml(twin.config, twin.estimator, each) for each in (twin.tuning, tuning))
+    text = with_tuning(twin.text, before, after)
+    back = restore_twin(text, twin.path)
+    for key in ("q", "r", "p", "used"):
+        np.testing.assert_allclose(getattr(back.tuning, key), getattr(tuning, key), rtol=1e-5)
+    assert back.tuning.gate == 0.97 and back.estimator == twin.estimator
+    assert back.config == twin.config.model_copy(update={key: getattr(back.config, key) for key in SECTIONS})
+    assert with_tuning(twin.text, before, before) == twin.text
+
+
+def test_values_without_a_place_replace_their_section():
+    text = "# mine\nmodel: motor_winding\nnoise: {temperature: {std: 0.1}}  # by hand\nsensors:\n" + (
+        "  winding:\n    std: {value: 2, from: 1, to: 9}  # data sheet\n# last\nsource: {type: can}\n"
+    )
+    before, after = (
+        f"estimator: {name}\nnoise:\n  temperature: {{variance: {q}}}\n  rate: {{variance: 1}}\n"
+        f"sensors:\n  winding: {{variance: {{value: {r}, from: 1, to: 81}}}}\n"
+        for name, q, r in (("kf", 0.01, 4), ("ekf", 0.04, 16))
+    )
+    found = with_tuning(text, before, after)
+    assert found == text.replace("std: 0.1", "std: 0.2").replace("value: 2,", "value: 4,") + "\nestimator: ekf\n"
+    found = with_tuning(text, before, after.replace("rate: {variance: 1}", "rate: {variance: 2}"))
+    assert "noise:\n  temperature: {variance: 0.04}\n  rate: {variance: 2}\n" in found and "# data sheet" in found
 
 
 def test_words_stand_for_choices():

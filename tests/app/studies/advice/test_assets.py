@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 from app.studies.advice.measured import UNTOLD, Exclusion, Measured, without_faults
-from app.studies.advice.verdict import Advice, advise, apply, details, finding, lines
+from app.studies.advice.verdict import Advice, advise, changed, details, finding, lines
 from app.twin.log_reader import read_log
 from app.twin.twin import load_twin
+from config.yaml_files import rewrite
 from estimators.diagnostics.episodes import Episode
 from estimators.log import READING
 from estimators.registry import find_entry
@@ -100,7 +101,7 @@ def test_options_of_the_twin_are_kept(tmp_path):
     twin = load_twin(path := write(tmp_path, "varying", "VARYING", adaptive, recordings.varying, "probe"))
     found = advise(Measured(twin, read_log(twin, None)[0]))
     assert found.options == twin.options_of("kf") == {"adapt": 2.0, "memory": 300.0}
-    apply(path, lines(found), None)
+    rewrite(path, lambda text: changed(text, lines(found)))
     assert load_twin(path).options_of("kf") == found.options
 
 
@@ -123,7 +124,7 @@ def test_an_error_that_lasts_is_found_with_its_size_and_time(told, tmp_path):
     assert entry["variance"] == pytest.approx(recordings.WHITE**2, rel=0.3)
     # The lines as they are put in make a twin that is consistent.
     path = write(tmp_path, "erring", "STILL", "kf", recordings.erring, "float")
-    assert apply(path, lines(found), None, found.sections) is not None
+    assert rewrite(path, lambda text: changed(text, lines(found), found.sections)) is not None
     twin = load_twin(path)
     assert "float_error" in twin.model.state_names
     again = advise(Measured(twin, read_log(twin, None)[0]))

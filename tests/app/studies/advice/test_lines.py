@@ -2,8 +2,8 @@
 
 import pytest
 
-from app.studies.advice.verdict import Advice, apply, changed, lines, with_entry
-from config.yaml_files import parse
+from app.studies.advice.verdict import Advice, changed, lines, with_entry
+from config.yaml_files import parse, rewrite
 from estimators.errors import ConfigError
 
 BEFORE = """\
@@ -19,9 +19,11 @@ gate: null
 
 
 @pytest.mark.parametrize("end", ["\n", "\r\n"])
-def test_the_section_gives_way_and_nothing_else(end):
+def test_the_section_gives_way_and_nothing_else(end, tmp_path):
     told = Advice(estimator="kf", options={"robust": 2.0, "dof": 7.0}, because=("linear", "tails"))
-    text = changed(BEFORE.replace("\n", end), lines(told))
+    (tmp_path / "a.yaml").write_text(BEFORE, newline=end)
+    rewrite(tmp_path / "a.yaml", lambda text: changed(text, lines(told)))
+    text = (tmp_path / "a.yaml").read_bytes().decode()
     assert text.count(end) == text.count("\n")
     data, _ = parse(text, "x")
     assert data["estimator"] == {"name": "kf", "options": {"robust": "student-t", "dof": 7}}
@@ -60,9 +62,9 @@ def test_a_file_without_the_section_gets_it():
 def test_what_was_there_is_kept(tmp_path):
     path = tmp_path / "a.yaml"
     path.write_text(BEFORE)
-    kept = [apply(path, "estimator: kf\n"), apply(path, "estimator: ekf\n")]
+    kept = [rewrite(path, lambda text, name=name: changed(text, f"estimator: {name}\n")) for name in ("kf", "ekf")]
     assert kept[0] != kept[1] and kept[0].read_text() == BEFORE and "estimator: kf" in kept[1].read_text()
-    assert apply(path, "estimator: ukf\n", tmp_path / "b.yaml") is None
+    assert rewrite(path, lambda text: changed(text, "estimator: ukf\n"), tmp_path / "b.yaml") is None
     assert "estimator: ekf" in path.read_text() and "estimator: ukf" in (tmp_path / "b.yaml").read_text()
 
 
