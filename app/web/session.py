@@ -14,7 +14,7 @@ import weakref
 import webbrowser
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from sources.source import Source
 
     from ..live.engine import Engine
+    from ..live.notices import Annotation
     from ..twin.twin import Twin
     from ..views.recording.writer import Recorder
 
@@ -75,6 +76,11 @@ def _settle(gone: threading.Event | None = None, before: Callable[[], Engine | N
     # glibc keeps what imports and ended threads have freed unless asked.
     with suppress(OSError, AttributeError):
         ctypes.CDLL(None).malloc_trim(0)
+
+
+def _log_of(opening: OpenedTwin) -> object:
+    """Return what identifies a twin and its log: notes at moments of one log mean nothing in another."""
+    return opening.twin.path, opening.review, opening.files, repr(opening.twin.config.source)
 
 
 class SessionThread(Protocol):
@@ -123,6 +129,8 @@ class Session:
         self.running: RunningTwin | None = None
         self._changing = threading.RLock()
         self._recorded: list[Path] = []
+        self._notes: dict[object, tuple[Annotation, ...]] = {}
+        """Notes of users on the twins that ran before, by twin and log."""
         self.threads: list[SessionThread] = []
         if page is not None:
             self.door = Door(page.port)
@@ -178,7 +186,15 @@ class Session:
         Raises:
             NisusError: If its source cannot be opened.
         """
+        self._keep_notes()
+        if not opening.annotations:
+            opening = replace(opening, annotations=self._notes.get(_log_of(opening), ()))
         return RunningTwin(opening, door=self.door, split=self._split, recordings=self._recordings)
+
+    def _keep_notes(self) -> None:
+        """Keep the notes of the running twin for its next start in this session."""
+        if self.running is not None:
+            self._notes[_log_of(self.running.opening)] = self.running.engine.annotations.notes
 
     def change(self, make: Callable[[], RunningTwin] | None, *, stop_first: bool = False) -> None:
         """Replace the running twin by another, or by none; from any thread.
@@ -199,6 +215,7 @@ class Session:
                 if before is not None:
                     left = weakref.ref(before.engine)
                     before.stop()
+                    self._keep_notes()
                     self._recorded += before.recorder.written
                 stopped = True
                 if make is not None and stop_first:

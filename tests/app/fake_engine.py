@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import threading
+from functools import wraps
 from types import SimpleNamespace
 
 import numpy as np
@@ -19,8 +21,20 @@ from estimators.track import TRACKING
 from estimators.tuning import Tuning
 
 
+def atomic(method):
+    """The method, of which no other thread sees half: views read while a test puts rows in."""
+
+    @wraps(method)
+    def call(self, *arguments, **options):
+        with self.lock:
+            return method(self, *arguments, **options)
+
+    return call
+
+
 class FakeEngine:
     def __init__(self, model, estimator="ekf", view=None, carry_out=True):
+        self.lock = threading.RLock()
         self.model = model
         tuning = Tuning.of(model)
         config = SimpleNamespace(view=view or ViewSection())
@@ -50,6 +64,7 @@ class FakeEngine:
         self.notices = []
         self.jobs = Jobs(Notices(lambda: 0))
 
+    @atomic
     def put(self, readings):
         index, _ = self.log.extend(readings)
         self.fold.rewind(index)
@@ -58,6 +73,7 @@ class FakeEngine:
         self.state.counts["readings"] = self.log.n
         self.changed = min(index, getattr(self, "changed", index))
 
+    @atomic
     def submit(self, command):
         self.commands.append(command)
         if not self.carry_out:
@@ -96,15 +112,19 @@ class FakeEngine:
     def cursor(self, *, span=None):
         return SimpleNamespace(n=0, revision=None, told=0)
 
+    @atomic
     def span(self):
         return (int(self.log.t[0]), int(self.log.t[self.log.n - 1])) if self.log.n else (0, 0)
 
+    @atomic
     def index_at(self, t):
         return int(np.searchsorted(self.log.t[: self.log.n], t))
 
+    @atomic
     def rows(self, start, stop):
         return self._pull(start, False, stop)
 
+    @atomic
     def pull(self, cursor, limit=None, *, align=1):
         fresh = cursor.revision != self.state.revision
         changed = 0 if fresh else min(cursor.n, getattr(self, "changed", cursor.n))
@@ -115,6 +135,7 @@ class FakeEngine:
         cursor.n, cursor.revision, cursor.told = self.log.n, self.state.revision, len(self.notices)
         return pull
 
+    @atomic
     def episodes(self):
         return episodes(self.fold)
 
@@ -123,6 +144,7 @@ class FakeEngine:
 
     peaks = ()
 
+    @atomic
     def belief(self, t=None):
         """The present one; of an earlier time, which is a row, mean and variances of that row."""
         mean, cov = self.fold.moments()

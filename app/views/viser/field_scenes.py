@@ -96,9 +96,11 @@ class FieldScene(FieldView):
         blank = np.full((frame.height, frame.width, 3), 240, np.uint8)
         at = (self._left + 0.5 * size[0], 0.0, 0.0)
         shapes = self._shapes
-        self._image = shapes.body("image", "field", blank, *size, format="png", wxyz=turn, position=at)
+        # Hidden until its first picture: grey is no temperature.
+        hidden = {"format": "png", "wxyz": turn, "visible": False}
+        self._image = shapes.body("image", "field", blank, *size, position=at, **hidden)
         at = (right + 0.11, 0.0, 0.0)
-        self._bar = shapes.body("image", "scale", blank[:, :1], 0.06, size[1], format="png", wxyz=turn, position=at)
+        self._bar = shapes.body("image", "scale", blank[:, :1], 0.06, size[1], position=at, **hidden)
         self._labels = [shapes.label(f"ticks/{k}", anchor="center-left", visible=False) for k in range(MAX_TICKS)]
         self._tick_x = right + 0.17
         at = (self._left, 0.5 * size[1] + 0.05, 0.0)
@@ -136,6 +138,7 @@ class FieldScene(FieldView):
         self._image.image = colors[self._frame.enlarge(scale.indices(image))]
         column = np.linspace(254, 0, self._frame.height).round().astype(int)
         self._bar.image = np.repeat(colors[column][:, None], 4, axis=1)
+        self._image.visible = self._bar.visible = True
         self._title.text = f"{self._name}: {self._kind.title} [{self._unit}]"
         draw_ticks(self._labels, scale, lambda share: (self._tick_x, (share - 0.5) * self._size[1], 0.0))
         if self._points is not None:

@@ -51,10 +51,11 @@ MAX_FILLED_ELLIPSE = 2.5
 """Multiple of the view's radius from which an ellipse is drawn as an outline only."""
 
 MAX_FRAMES = 4096  # Frames that a trail of peaks keeps
-FADING_S = 10.0  # Seconds over which a range ring pales; then it is gone
+FADING_S = 10.0  # Seconds over which the arc of a range pales; then it is gone
+RANGE_ARC = 0.4  # Half of its angle, radians: whole rings are larger than the view, and hide the vehicle among them
 MAX_AGE_S = 3.0  # Age in seconds from which the measurement of a beam is no longer drawn
 
-RING_SIDES = 180
+ARC_SIDES = 40
 BEAM_HEIGHT = 0.12
 
 
@@ -155,7 +156,7 @@ class VehicleScene:
             cloud = belief.points[:, self._plane] if known and len(belief.points) else np.zeros((0, 2))
             put_points(self._cloud, _raised(cloud, 0.2))
             if self._beacons is not None:
-                self._beacons.draw(history, belief.mean, self.tuning.p)
+                self._beacons.draw(history, belief.mean, peak.mean[self._plane], self.tuning.p)
         if known:
             self._draw_vehicle(plane, peak)
         else:
@@ -323,7 +324,7 @@ class BeaconPositions:
 
 
 class Beacons:
-    """A diamond for each beacon, and a ring for its recent range."""
+    """A diamond for each beacon, and an arc for its recent range, on the side of the vehicle."""
 
     def __init__(
         self, shapes: Shapes, model: StateSpaceModel, beacons: Mapping[str, tuple[str, str]], palette: Palette, *,
@@ -334,30 +335,31 @@ class Beacons:
         self._places = BeaconPositions(model, beacons.values())
         nowhere = np.zeros((len(beacons), 3), np.float32)
         self._marks = shapes.dots("places", palette.ink, size, nowhere, shape="diamond")
-        self._rings = [
-            shapes.lines(f"{sensor}/ring", palette.reading, 2, circle(RING_SIDES), visible=False) for sensor in beacons
-        ]
+        angle = np.linspace(-RANGE_ARC, RANGE_ARC, ARC_SIDES)
+        arc = segments(np.stack((np.cos(angle), np.sin(angle), np.zeros(ARC_SIDES)), axis=1))
+        self._arcs = [shapes.lines(f"{sensor}/arc", palette.reading, 2, arc, visible=False) for sensor in beacons]
         self._texts = [
             shapes.label(f"{sensor}/name", sensor.replace("_", " "), anchor="bottom-center") for sensor in beacons
         ]
 
-    def draw(self, history: History, mean: np.ndarray, p: np.ndarray) -> None:
-        """Send the positions of the beacons, and their recent ranges."""
+    def draw(self, history: History, mean: np.ndarray, here: np.ndarray, p: np.ndarray) -> None:
+        """Send the positions of the beacons, and their recent ranges towards the vehicle, which is `here` (2,)."""
         places = self._places.at(mean, p)
         points = _raised(places, 0.2 * self._size).astype(np.float32)
         if not np.array_equal(points, self._marks.points):
             self._marks.points = points
             for text, place in zip(self._texts, points, strict=True):
                 text.position = place + [0.0, 0.6 * self._size, 0.0]
-        for ring, sensor, place in zip(self._rings, self._sensors, places, strict=True):
+        for arc, sensor, place in zip(self._arcs, self._sensors, places, strict=True):
             values, age, refused = last_reading(history, sensor)
-            ring.visible = bool(age < FADING_S and values[0] > 0)
-            if ring.visible:
+            arc.visible = bool(age < FADING_S and values[0] > 0 and np.isfinite(here).all())
+            if arc.visible:
                 color = self._palette.refused if refused else self._palette.reading
                 color = mixed(color, self._palette.panel, 0.2 * round(4 * age / FADING_S))
-                if tuple(ring.colors) != color:
-                    ring.colors = np.array(color, np.uint8)
-                ring.position, ring.scale = (*place, 0.03), (values[0], values[0], 1.0)
+                if tuple(arc.colors) != color:
+                    arc.colors = np.array(color, np.uint8)
+                arc.position, arc.scale = (*place, 0.03), (values[0], values[0], 1.0)
+                arc.wxyz = about_z(float(np.arctan2(*(here - place)[::-1])))
 
 
 class Beams:

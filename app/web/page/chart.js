@@ -28,6 +28,7 @@ import { drawnOn, svgFile } from "./svg.js";
 const LABELS = 52; // px for the labels of the value axis
 const TIME = 22; // px for those of the time axis
 const FILE = [960, 330]; // px of a file
+const MIN_DRAG = 4; // px, from which a click is a drag
 const NEAR_NOTE = 6; // px from a note at which its text is shown
 
 const NAMES = {
@@ -128,7 +129,11 @@ export class Chart {
       this.canvas,
     );
     if (this.actions.wheel) this.plot.over.addEventListener("wheel", (event) => this.actions.wheel(event, this.plot), { passive: false });
-    if (this.actions.note) this.plot.over.addEventListener("click", (event) => event.altKey && this.actions.note(this.plot.posToVal(event.offsetX, "x"), this.notesAt(event.offsetX)[0]));
+    if (this.actions.note) {
+      let pressed = 0; // px; what is dragged zooms, and is no click
+      this.plot.over.addEventListener("pointerdown", (event) => (pressed = event.clientX));
+      this.plot.over.addEventListener("click", (event) => event.altKey && Math.abs(event.clientX - pressed) < MIN_DRAG && this.actions.note(this.plot.posToVal(event.offsetX, "x"), this.notesAt(event.offsetX)[0]));
+    }
     this.sized = new ResizeObserver(() => {
       const { clientWidth: width, clientHeight: height } = this.canvas;
       if (width > 0 && height > 0 && (width !== this.plot.width || height !== this.plot.height)) this.plot.setSize({ width, height });
@@ -216,7 +221,7 @@ export class Chart {
     const { left, width } = self.select;
     const ends = [self.posToVal(left, "x"), self.posToVal(left + width, "x")];
     self.setSelect({ left: 0, top: 0, width: 0, height: 0 }, false);
-    if (width < 4 || !self.cursor.event) return;
+    if (width < MIN_DRAG || !self.cursor.event) return;
     this.actions.select?.(...ends);
   }
 

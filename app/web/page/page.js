@@ -67,6 +67,9 @@ const charts = new Charts($("charts"), model, link, view, kinds);
 window.nisus.charts = charts;
 window.nisus.view = view;
 
+// Scenes about as wide as high; one of many cells is not.
+const square = model.field || ["belief", "gripper"].includes(model.scene) || (model.scene === "battery" && model.states.length < 8);
+setAttribute($("right"), "data-square", String(square));
 const side = new Tabs($("side-tabs"), "nisus.side");
 new Trust(model, link, (tab) => side.show(tab));
 const tune = (window.nisus.tune = new Tune(model, link));

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from app.cli.run import live_source
-from app.live.commands import SetTuning
+from app.live.commands import Annotate, SetTuning
 from app.present.export.report import Reported, report
 from app.present.export.track_file import rows_of_run
 from app.twin.twin import load_twin
+from app.web.running import OpenedTwin
 from app.web.session import Page, Session
 from estimators.log import READING
 from tests.app.cli.test_check import ParsedHtml
@@ -63,3 +64,29 @@ def test_the_report_of_the_first_run_has_nothing_from_before(session):
     taken = rows_of_run(session.engine)
     said = Reported(session.engine.twin, "ekf", taken.run.tuning, taken.pull.events, taken.pull.track, (), (), False)
     assert not [part for part in report(said) if "earlier runs" in part.title]
+
+
+def test_notes_are_there_again_when_the_twin_is_started_again():
+    """Another twin that runs meanwhile has none of them, nor has the same twin with another log."""
+
+    def opening(name, seconds):
+        twin = load_twin(name, overrides={"source.duration": seconds})
+        return OpenedTwin(twin, live_source(twin, np.inf))
+
+    session = Session(opening("motor_winding", "20"), page=None)
+    session.start()
+    try:
+        wait_for(lambda: session.engine.status().finished)
+        session.engine.submit(Annotate("fan off", 10.0))
+        wait_for(lambda: session.engine.annotations.notes)
+        before = session.engine.annotations.notes
+        assert [(note.t, note.text) for note in before] == [(10 * 10**9, "fan off")]
+        for name, seconds, kept in (
+            ("lorenz63", "5", ()),
+            ("motor_winding", "30", ()),
+            ("motor_winding", "20", before),
+        ):
+            session.change(lambda name=name, seconds=seconds: session.prepared(opening(name, seconds)))
+            assert session.engine.annotations.notes == kept
+    finally:
+        session.stop()

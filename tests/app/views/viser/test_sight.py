@@ -8,7 +8,7 @@ import pytest
 from app.present.drawing.colors import LIGHT
 from app.views.viser.field_scenes import SURFACE_HEIGHT, FieldSurfaceScene
 from app.views.viser.machine_scenes import FINGER, PAD, PART_WIDTH, GripperScene
-from app.views.viser.scene import History, Shapes
+from app.views.viser.scene import History, Shapes, about_z
 from app.views.viser.vehicle_scene import FADING_S, MAX_AGE_S, Beacons, Beams, PeakTrail, VehicleScene
 from config.schema import SceneSection
 from estimators.diagnostics.field_pictures import Picture
@@ -124,7 +124,7 @@ def test_beams_end_at_walls_and_at_what_was_read(server):
     assert not used.visible and not refused.visible and beams._expected.visible
 
 
-def test_a_ring_is_as_wide_as_its_beacon_reads(server):
+def test_an_arc_is_as_far_as_its_beacon_reads_on_the_side_of_the_vehicle(server):
     names = {f"range_{k}": (f"anchor_{k}_east", f"anchor_{k}_north") for k in (1, 2, 3)}
     beacons = Beacons(Shapes(server.scene, "/beacons"), ROVER, names, LIGHT, size=1.0)
     tuning = Tuning.of(ROVER).set("p.anchor_2_east", 7.0).set("p.anchor_2_north", -3.0)
@@ -132,14 +132,17 @@ def test_a_ring_is_as_wide_as_its_beacon_reads(server):
         ROVER,
         [(0.0, READING, 0, [4.0], 0), (FADING_S - 1.0, READING, 1, [5.0], GATED), (FADING_S + 0.5, TRUTH, 0, [0], 0)],
     )
-    beacons.draw(told, ROVER.prior_mean, tuning.p)
-    first, second, third = beacons._rings
+    beacons.draw(told, ROVER.prior_mean, np.array([7.0, 2.0]), tuning.p)
+    first, second, third = beacons._arcs
     # The first was heard too long ago, the third never.
-    assert [ring.visible for ring in (first, second, third)] == [False, True, False]
+    assert [arc.visible for arc in (first, second, third)] == [False, True, False]
     np.testing.assert_allclose(second.position[:2], [7.0, -3.0])
     assert tuple(second.scale)[:2] == (5.0, 5.0)
     points = np.asarray(second.points)[..., :2]
     np.testing.assert_allclose(np.hypot(*points.reshape(-1, 2).T), 1.0, rtol=1e-6)
+    # The vehicle is to the north of it.
+    np.testing.assert_allclose(second.wxyz, about_z(np.pi / 2), atol=1e-12)
+    np.testing.assert_allclose(points.mean(axis=(0, 1))[1], 0.0, atol=1e-6)
     np.testing.assert_allclose(beacons._marks.points[1, :2], [7.0, -3.0])
     # Refused, and somewhat pale.
     assert np.abs(np.subtract(second.colors, LIGHT.refused, dtype=int)).max() < 60
