@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import csv
+import re
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import islice
 from pathlib import Path
 
 import numpy as np
 
-from estimators.errors import SourceError, shown_name
+from estimators.errors import SourceError
 from estimators.log import READING
 
 from .can.decoder import Decoder, load_database, same_bus
@@ -19,10 +20,11 @@ from .can.log import CanLog, check_log, frames_reader
 from .can.readers import EXTENDED, BusName, LogSummary, Raw
 from .formats import CAN_LOGS, suffix_of
 from .source import Channel
+from .tables.order import Order, time_order
 from .tables.rows import TableRows, is_text, names_of, rows_of
-from .tables.text import UNREADABLE, csv_format, open_text
+from .tables.text import UNREADABLE, TextMatch, csv_format, open_text
 from .tables.times import TimeColumn, TimeReader
-from .units import heading_unit
+from .units import heading_unit, suffix_unit
 
 MAX_FRAME_BYTES = 64  # Bytes of the longest frame, of CAN FD
 
@@ -34,22 +36,45 @@ TIME_NAMES = (
     "t", "time", "timestamp", "seconds", "time_s", "t_s", "date", "datetime", "unix_time", "elapsed", "zeit",
     "zeitstempel", "datum", "horodatage", "fecha",
 )  # fmt: skip
-"""Usual names of a time column; otherwise the first column of dates is taken."""
+"""Usual names of a time column; otherwise the first one of dates is taken, or the first that is named like one."""
+
+TIME_NAME = re.compile(r"^t[_ ]|time|epoch|zeit|datum", re.IGNORECASE)
 
 MAX_TEXTS = 50  # Different texts of a column that are counted
+
+TAG = re.compile(
+    r"(^|[\W_])(id|ids|tag|tags|node|anchor|beacon|channel|sensor|point|signal|variable|item|metric|name|messstelle|"
+    r"kanal)$|[a-z](Id|ID|Tag|Name)$|(tag|sensor|point)_?name$",
+    re.IGNORECASE,
+)
+"""Names of columns that name the source of a row."""
+
+MIN_ALTERNATION = 0.2  # Share of the rows at which such a column changes, from which on the rows are of several sources
+
+MIN_SOURCE_VALUES = 20  # Rows of a source that is listed by itself
+
+MAX_LEVELS = 8  # Different values up to which a column describes the source, and is no signal of it
+
+HORIZON_NS = 2_000_000_000  # By which a row may be late in a twin, unless its YAML gives another time.horizon
 
 SERIAL_DATES = (36_526, 73_051)  # Days of the years 2000 to 2100 in Excel's count
 
 
 @dataclass(frozen=True)
 class SignalSeries:
-    """Values of one signal or column: times (ns) and finite values, (n,); `missing` counts the others."""
+    """Values of one signal or column: times (ns) and finite values, (n,); `missing` counts the others.
+
+    Of a table whose rows are of several sources, `column` is the column, and `only` the column that names the source of
+    a row, with its name there.
+    """
 
     name: str
     unit: str
     t: np.ndarray
     values: np.ndarray
     missing: int = 0
+    column: str = ""
+    only: tuple[str, str] | None = None
 
 
 @dataclass(frozen=True)
@@ -65,9 +90,10 @@ class Message:
 
 @dataclass
 class RecordingContents:
-    """Contents of recordings of one kind; `t` (ns) are the times of all records, in order.
+    """Contents of recordings; `t` (ns) are the times of all records, in order.
 
-    `texts` counts the texts of the columns of a CSV that hold no number.
+    `kind` is "can_log", "table", or "merged" of several of these, its `parts`. `texts` counts the texts of the columns
+    of a CSV that hold no number. `by` is the column that names the source of each row.
     """
 
     files: list[Path]
@@ -78,6 +104,8 @@ class RecordingContents:
     time: TimeColumn = TimeColumn("")
     texts: dict[str, Counter[str]] = field(default_factory=dict)
     faults: list[str] = field(default_factory=list)
+    by: str = ""
+    parts: tuple[RecordingContents, ...] = ()
 
     @property
     def holes(self) -> list[tuple[int, int]]:
@@ -106,7 +134,7 @@ def is_table(path: Path) -> bool:
 def inspect_recordings(
     files: Sequence[Path], databases: Sequence[tuple[Path, BusName]] = (), time: TimeColumn | None = None
 ) -> RecordingContents:
-    """Return the contents of recordings of one kind, CAN logs or tables.
+    """Return the contents of recordings, CAN logs or tables.
 
     Args:
         files: In their order.
@@ -114,7 +142,7 @@ def inspect_recordings(
         time: Time column of a table; None, or an empty name, searches for one.
 
     Raises:
-        SourceError: If a file cannot be read, or the kinds are mixed.
+        SourceError: If a file cannot be read.
     """
     for path in files:
         if path.is_dir():
@@ -123,12 +151,36 @@ def inspect_recordings(
             raise SourceError(f"{path}: there is no such file; check the path")
         if not path.stat().st_size:
             raise SourceError(f"{path}: the file is empty; record it again")
-    kinds = [is_table(path) for path in files]
-    if any(kinds) != all(kinds):
-        raise SourceError(f"{files[kinds.index(True)]} is a table and {files[kinds.index(False)]} a log; give one kind")
-    if all(kinds):
-        return _tables(list(files), time or TimeColumn(""))
-    return _logs(list(files), list(databases))
+    groups: dict[tuple[str, ...], list[Path]] = {}
+    for path in files:
+        groups.setdefault(("table", *sorted(set(names_of(path)))) if is_table(path) else ("log",), []).append(path)
+    found = [
+        _logs(group, list(databases)) if kind == "log" else _tables(group, time or TimeColumn(""))
+        for (kind, *_), group in groups.items()
+    ]
+    return found[0] if len(found) == 1 else _merged(found)
+
+
+def _merged(parts: list[RecordingContents]) -> RecordingContents:
+    """Return the contents of recordings of several kinds, or of tables with different columns."""
+    faults = [text for part in parts for text in part.faults]
+    first, last = max(parts, key=lambda part: part.t[0]), min(parts, key=lambda part: part.t[-1])
+    if first.t[0] > last.t[-1]:
+        apart = (first.t[0] - last.t[-1]) * 1e-9
+        faults.append(
+            f"{first.files[0].name} begins {apart:.4g} s after the end of {last.files[0].name}; if they were recorded "
+            "together, their clocks differ: give their times the same unit and zone, or shift one (time.shift)"
+        )
+    return RecordingContents(
+        [path for part in parts for path in part.files],
+        "merged",
+        np.sort(np.concatenate([part.t for part in parts])),
+        [message for part in parts for message in part.messages],
+        [one for part in parts for one in part.columns],
+        faults=faults,
+        texts={name: counts for part in parts for name, counts in part.texts.items()},
+        parts=tuple(parts),
+    )
 
 
 def _logs(files: list[Path], databases: list[tuple[Path, BusName]]) -> RecordingContents:
@@ -243,18 +295,13 @@ def _tables(files: list[Path], time: TimeColumn) -> RecordingContents:
             f"{len(other)} columns have another number of rows than {chosen} and are left out: {shown}; name their "
             "own time column to read them"
         )
-    for path in files[1:]:
-        missing = [name for name in (chosen, *columns) if name not in names_of(path)]
-        if missing:
-            raise SourceError(
-                f"{path}: it has no column {shown_name(missing[0])}, which {files[0]} has; "
-                "give tables with the same columns"
-            )
     times, values = [], []
+    order = Order(chosen, time.unit, HORIZON_NS, lambda key, text: faults.append(text))
     for path in files:
         for rows in _rows(path, time, columns, faults):
             times.append(rows.t[rows.known])
             values.append(rows.values[rows.known])
+            order.look(path.name, rows.line[rows.known], times[-1])
     if not any(part.size for part in times):
         raise SourceError(
             "; ".join(faults)
@@ -262,14 +309,64 @@ def _tables(files: list[Path], time: TimeColumn) -> RecordingContents:
             "(--time-format), or another column"
         )
     t, v = np.concatenate(times), np.concatenate(values)
-    order = np.argsort(t, kind="stable")
-    t, v = t[order], v[order]
-    found = [_series(name, heading_unit(name) or "", t, v[:, k]) for k, name in enumerate(columns)]
+    texts = _texts(files, [name for name, column in zip(columns, v.T, strict=True) if not np.isfinite(column).any()])
+    by, labels, source = _source_of(files, time, dict(zip(columns, v.T, strict=True)), texts, t)
+    order.report_late(time_order(t, source, HORIZON_NS) is not None)
+    rank = np.argsort(t, kind="stable")
+    t, v, source = t[rank], v[rank], source[rank]
+    found = []
+    for name, column in zip(columns, v.T, strict=True):
+        one = _series(name, heading_unit(name) or suffix_unit(name), t, column)
+        split = name != by and labels and np.unique(one.values).size > MAX_LEVELS
+        found += _split(one, by, labels, t, column, source) if split else [one]
     low, high = (end * 10**9 for end in SERIAL_DATES)
     if time.unit == "s" and low <= t[0] and t[-1] <= high and t[-1] - t[0] < 0.5e9 * t.size:
         faults.append(f"column {chosen} looks like Excel's serial dates: add --time-unit excel")
-    texts = _texts(files, [one.name for one in found if not one.t.size])
-    return RecordingContents(files, "table", t, columns=found, time=time, faults=faults, texts=texts)
+    return RecordingContents(files, "table", t, columns=found, time=time, faults=faults, texts=texts, by=by)
+
+
+def _source_of(
+    files: list[Path], time: TimeColumn, columns: dict[str, np.ndarray], texts: dict[str, Counter[str]], t: np.ndarray
+) -> tuple[str, list[str], np.ndarray]:
+    """Return the column that names the source of each row, the names, and the source of each row by its number.
+
+    Without such a column all rows have the source 0.
+    """
+    rank = np.argsort(t, kind="stable")
+    best: tuple[str, list[str], np.ndarray] = "", [], np.zeros(t.size, np.int64)
+
+    def consider(name: str, labels: list[str], source: np.ndarray) -> None:
+        nonlocal best
+        if len(best[1]) < len(labels) <= MAX_TEXTS and np.mean(np.diff(source[rank]) != 0) > MIN_ALTERNATION:
+            best = name, labels, source
+
+    for name, column in columns.items():
+        if TAG.search(name) and np.isfinite(column).all() and np.all(column == np.round(column)):
+            ids, source = np.unique(column, return_inverse=True)
+            if ids.size > 1:
+                consider(name, [f"{value:.0f}" for value in ids], source)
+    for name, counts in texts.items():
+        if 1 < len(counts) < MAX_TEXTS and TAG.search(name):
+            labels = sorted(counts)
+            matches = [TextMatch(name, (label,)) for label in labels]
+            rows = [rows for path in files for rows in rows_of(path, time, matches, lambda: 1.0) if rows is not None]
+            found = np.concatenate([part.values[part.known] for part in rows])
+            if found.shape[0] == t.size and np.all(np.nansum(found, axis=1) == 1.0):
+                consider(name, labels, np.argmax(found, axis=1))
+    return best
+
+
+def _split(
+    one: SignalSeries, by: str, labels: list[str], t: np.ndarray, values: np.ndarray, source: np.ndarray
+) -> list[SignalSeries]:
+    """Return the series of each source that has enough values."""
+    parts = []
+    for k, label in enumerate(labels):
+        rows = source == k
+        part = _series(f"{one.name}_{label}", one.unit, t[rows], values[rows])
+        if part.values.size >= MIN_SOURCE_VALUES:
+            parts.append(replace(part, column=one.name, only=(by, label)))
+    return parts
 
 
 def _rows(path: Path, time: TimeColumn, columns: list[str], faults: list[str]) -> Iterator[TableRows]:
@@ -296,15 +393,16 @@ def _time_of(path: Path, names: Sequence[str], time: TimeColumn) -> str | None:
     """Return the time column, by its name or as the first one of dates."""
     last = {name.lower().rpartition(".")[2].partition("[")[0].strip(): name for name in reversed(names)}
     named = next((last[name] for name in TIME_NAMES if name in last), None)
+    like = next((name for name in names if TIME_NAME.search(name)), None)
     if named is not None or not is_text(path):
-        return named
+        return named or like
     row = next(_cells(path), [])
     for name, cell in zip(names, row, strict=False):
         if not cell.strip().replace(",", "").replace(".", "").lstrip("+-").isdigit():
             reader = TimeReader(time._replace(name=name))
             if reader.is_date(cell.strip()):
                 return name
-    return None
+    return like
 
 
 def _texts(files: list[Path], names: list[str]) -> dict[str, Counter[str]]:

@@ -165,6 +165,30 @@ def heading_unit(name: object) -> str | None:
     return None
 
 
+_SUFFIXES = {
+    "mps": "m/s", "kmh": "km/h", "kph": "km/h", "mph": "mph", "rpm": "rpm", "rad": "rad", "deg": "deg", "degC": "degC",
+    "degF": "degF", "kPa": "kPa", "hPa": "hPa", "mbar": "mbar", "bar": "bar", "psi": "psi", "mV": "mV", "mA": "mA",
+    "kW": "kW", "Hz": "Hz", "mm": "mm", "cm": "cm", "km": "km", "m": "m",
+}  # fmt: skip
+"""Units by the last word of a heading, such as speed_kmh."""
+
+
+def suffix_unit(name: str) -> str:
+    """Return the unit in the last word of a heading, such as `speed_kmh`; empty if there is none."""
+    word = name.rpartition("_")[2] if "_" in name else ""
+    return _SUFFIXES.get(word) or next((unit for key, unit in _SUFFIXES.items() if key.lower() == word.lower()), "")
+
+
+def unit_scale(given: str, wanted: str) -> float | None:
+    """Return the factor from one unit to another; None if one is not known, or they measure different things."""
+    if not given.strip() or not wanted.strip():
+        return None
+    try:
+        return conversion(given, wanted, "")[0]
+    except SourceError:
+        return None
+
+
 def spread_factor(given: str | None, wanted: str, where: str, *, squared: bool) -> float:
     """Return the factor from a standard deviation, or a variance if `squared`, in `given` to one in `wanted`.
 

@@ -13,9 +13,9 @@ from estimators.errors import ConfigError
 from estimators.log import READING, Log
 
 from ..present.result import TableColumn, Topic, to_json, to_text
-from ..studies.advice.draft import check_new, write_draft
+from ..studies.advice.draft import check_new, hint_lines, write_draft
 from ..studies.advice.measured import AdviceProgress, Measured, digits, percent, seconds_text, without_faults
-from ..studies.advice.plan import DraftPlan, Moves, plan
+from ..studies.advice.plan import DraftPlan, Moves, plan, redundant, unit_ratio
 from ..studies.advice.relations import Pair
 from ..studies.advice.signals import Signal, signals
 from ..studies.advice.verdict import (
@@ -165,8 +165,12 @@ def _plan_topics(drafted: DraftPlan) -> list[Topic]:
     """Return related signals, states and inputs in words."""
     pairs = tuple(_pair_text(drafted, pair) for pair in drafted.pairs) or ("no two of these signals are related",)
     topics = [Topic("Related signals", pairs), Topic("States", tuple(_state_text(item) for item in drafted.states))]
-    inputs = tuple(f"{name}: drives a state, and follows none" for name, _ in drafted.inputs)
-    return topics + ([Topic("Inputs", inputs)] if inputs else [])
+    inputs = tuple(
+        f"{name}: drives {', '.join(item.name for item in drafted.states if name in item.inputs) or 'no state'}"
+        for name, _ in drafted.inputs
+    )
+    topics += [Topic("Inputs", inputs)] if inputs else []
+    return topics + ([Topic("Hints", tuple(hints))] if (hints := hint_lines(drafted)) else [])
 
 
 def _pair_text(drafted: DraftPlan, pair: Pair) -> str:
@@ -177,7 +181,14 @@ def _pair_text(drafted: DraftPlan, pair: Pair) -> str:
         return f"{one}' = {line} {other} {share} of the changes: one state with a speed, two sensors"
     behind = f", {digits(pair.lag)} s later" if pair.lag else ""
     residual = f"residuals of {digits(pair.left)} are correlated by {pair.related:+.2f}"
-    kind = "noise, so two sensors of one state" if pair.one else "more than noise, so two states"
+    if pair.one or redundant(pair, drafted.signals):
+        ratio = unit_ratio(drafted.signals[pair.first], drafted.signals[pair.second], pair.gain)
+        units = [drafted.signals[k].series.unit for k in (pair.first, pair.second)]
+        scaled = f", of which {digits(ratio)} is the unit ({units[1]} per {units[0]})" if all(units) and ratio else ""
+        noise = "noise, so " if pair.one else "so "
+        kind = f"{noise}two sensors of one state{scaled if units[0] != units[1] else ''}"
+    else:
+        kind = "more than noise, so two states"
     return f"{other} = {line} {one}{behind} {share}; {residual}: {kind}"
 
 

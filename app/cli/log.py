@@ -48,7 +48,7 @@ def show_log(arguments: Arguments) -> int:
         complain(text)
     if len(found.faults) > MAX_LISTED:
         complain(f"and {len(found.faults) - MAX_LISTED} more faults")
-    print("\n".join(to_text([_topic(found)])))
+    print("\n".join(to_text([_topic(part) for part in found.parts or (found,)])))
     return 0
 
 
@@ -100,6 +100,8 @@ def _topic(found: RecordingContents) -> Topic:
             f"{name}: text: " + ", ".join(f"{text} ({count:,})" for text, count in counts.most_common(MAX_TEXTS_SHOWN))
             for name, counts in found.texts.items()
         ]
+        if found.by:
+            texts.append(f"{found.by} names the source of each row; a twin reads them with by: {found.by}")
         return Topic(title, (*sentences, f"time: column {found.time.name}{zone}", *texts), ("column", *TIMES), rows)
     lines: list[tuple[Cell, ...]] = []
     for message in found.messages:
@@ -134,6 +136,8 @@ def _rate(t: np.ndarray) -> float:
 
 
 def _as_dict(found: RecordingContents) -> dict[str, Any]:
+    if found.parts:
+        return {"kind": found.kind, "parts": [_as_dict(part) for part in found.parts]}
     content: dict[str, Any] = (
         {"messages": [_message(message) for message in found.messages]}
         if found.kind == "can_log"

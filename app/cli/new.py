@@ -207,7 +207,7 @@ def roles_json(drafted: DraftPlan) -> dict[str, Any]:
 
 def report_draft(draft: Draft, json: bool) -> None:
     """Print the files of a draft, its check, and the next step."""
-    from ..studies.advice.draft import check_lines, omission_lines
+    from ..studies.advice.draft import check_lines, hint_lines, omission_lines
 
     check = draft.plan.check
     written = [str(path) for path in draft.paths]
@@ -220,6 +220,8 @@ def report_draft(draft: Draft, json: bool) -> None:
     else:
         print(f"\nFitted to the first {check.start:.4g} s, checked on the other {check.end - check.start:.4g} s:")
         print("\n".join([check.words, *(f"  {line}" for line in check_lines(check))]))
+    for line in hint_lines(draft.plan):
+        print(f"\n{line}")
     if omitted := omission_lines(draft.plan):
         print(
             "\n"

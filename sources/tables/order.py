@@ -79,13 +79,16 @@ class Order:
     def report_late(self, sorted_rows: bool) -> None:
         """Report the first row that is too late, if there is one, and whether the rows were sorted."""
         if self._late and sorted_rows:
-            self._report(SORTED, f"{self._late}; the rows are out of order and were sorted by {self._column}")
+            self._report(
+                SORTED,
+                f"{self._late}; the rows are out of order and were sorted by {self._column}; if its clock was set "
+                "there, correct it",
+            )
         elif self._late and self._horizon is not None:
             self._report(
                 BACKWARDS,
-                f"{self._late}, more than time.horizon ({self._horizon * 1e-9:g} s); the rows around them show a lone "
-                f"wrong time or a clock that was set, so they are not sorted: correct {self._column}, or raise "
-                "time.horizon",
+                f"{self._late}, more than time.horizon ({self._horizon * 1e-9:g} s), which is a lone wrong time or a "
+                f"change of time zone, so the rows are not sorted: correct {self._column}, or give its time.zone",
             )
 
     def _backwards(self, file: str, line: np.ndarray, t: np.ndarray) -> None:
@@ -124,9 +127,8 @@ class Order:
 def time_order(t: np.ndarray, key: np.ndarray, horizon: int) -> np.ndarray | None:
     """Return the order in which to read the rows of a recording; None if they stay as recorded.
 
-    Rows stay as recorded if none is late, if only lone wrong times are, or if late rows repeat, at their usual pace,
-    times that were read before: their clock was set back (see `_was_set`). A lone wrong time stays behind the row
-    before it.
+    Rows stay as recorded if none is late, if only lone wrong times are, or if a clock was set back by a change of time
+    zone. A lone wrong time stays behind the row before it.
 
     Args:
         t: Times (n,), ns, in the order of the recording.
@@ -171,28 +173,21 @@ def _lone(t: np.ndarray, horizon: int) -> np.ndarray:
 
 
 def _was_set(t: np.ndarray, behind: np.ndarray, horizon: int) -> bool:
-    """Return whether most late times are in stretches that show a clock that was set.
+    """Return whether most late times are in stretches that begin whole quarter hours earlier.
 
-    Such a stretch is in order. It repeats times that were read before, or it begins whole quarter hours earlier, as
-    after a change of time zone, and does not end where the times before it begin.
+    That is a change of time zone or daylight saving time, unless the stretch ends where the times before it begin:
+    these are files in the wrong order.
     """
     edges = np.flatnonzero(np.diff(np.concatenate(([False], behind, [False])).astype(np.int8)))
     usual = _usual(np.sort(t))
-    repeated = 0
+    moved = 0
     for begin, end in edges.reshape(-1, 2):
-        stretch = t[begin:end]
-        low, high = stretch.min(), stretch.max()
-        if stretch.size < MIN_ORDERED_TIMES or high - low > 3.0 * usual * (stretch.size - 1):
-            continue
-        if np.mean(stretch < np.maximum.accumulate(stretch) - horizon) > 0.5:
-            continue
-        before = t[:begin]
+        stretch, before = t[begin:end], t[:begin]
         step = int(before[-1] + usual - stretch[0])
         zone = nearest_zone(step)
-        near = zone > 0 and abs(zone - step) <= max(horizon, usual)
-        apart = (
-            np.min(before[before > high], initial=np.iinfo(np.int64).max) - high > horizon + MAX_GAP_INTERVALS * usual
-        )
-        if 2 * np.count_nonzero((before >= low) & (before <= high)) >= stretch.size or (near and apart):
-            repeated += stretch.size
-    return bool(2 * repeated > np.count_nonzero(behind))
+        after = np.min(before[before > stretch.max()], initial=np.iinfo(np.int64).max)
+        apart = after - stretch.max() > horizon + MAX_GAP_INTERVALS * usual
+        repeats = np.any((before >= stretch.min()) & (before <= stretch.max()))
+        if stretch.size >= MIN_ORDERED_TIMES and zone > 0 and abs(zone - step) <= max(horizon, usual):
+            moved += stretch.size * bool(repeats or apart)
+    return bool(2 * moved > np.count_nonzero(behind))

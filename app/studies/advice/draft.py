@@ -10,6 +10,7 @@ import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,6 +19,7 @@ from config.yaml_files import writing
 from estimators.errors import ConfigError
 from sources.can.readers import BusName
 from sources.inspect import RecordingContents
+from sources.units import heading_unit
 
 from .plan import OMITTED, DraftCheck, DraftPlan, Moves, Reads
 from .signals import Signal
@@ -123,6 +125,7 @@ def python_text(name: str, model: str, drafted: DraftPlan) -> str:
     """The model's file: a random walk, a constant speed or a first-order lag for each state."""
     states, noises, sensors, steps, functions = [], [], [], [], []
     parameters: list[str] = []
+    families = _families(drafted)
     k = 0
     inputs = [each for each, _ in drafted.inputs]
     for item in drafted.states:
@@ -145,7 +148,9 @@ def python_text(name: str, model: str, drafted: DraftPlan) -> str:
             circular = "" if reads.rate else turns
             unit = _text(reads.signal.series.unit)
             row = f"Row({_text(reads.name)}, {unit}, variance={reads.r:.3g}{circular})"
-            sensors.append(f"        Sensor({_text(reads.name)}, ({row},), h=read_{reads.name}),")
+            family = families.get(reads.name)
+            member = f", family={_text(family.name)}" if family else ""
+            sensors.append(f"        Sensor({_text(reads.name)}, ({row},), h=read_{reads.name}{member}),")
         k += 2 if item.smooth else 1
     read = "\n\n".join(functions)
     given = [
@@ -260,7 +265,6 @@ def yaml_text(
     folder: Path,
 ) -> str:
     """The twin's YAML, with the recording as its source."""
-    files = [_text(_from(path, folder)) for path in found.files]
     noise, sensors = [], []
     for item in drafted.states:
         unit = item.signal.series.unit or "1"
@@ -279,19 +283,7 @@ def yaml_text(
             unit = reads.signal.series.unit or "1"
             sensors.append(f"  {reads.name}: {{{fields}}}  # {_line(unit)}; measures {what}{item.name}")
     read = [reads for item in drafted.states for reads in item.sensors]
-    source = [f"  type: {found.kind}", "  files:", *(f"    - {file}" for file in files)]
-    if found.kind == "can_log":
-        source.append("  dbc:")
-        for path, bus in databases:
-            where = "" if bus is None else f", channel: {bus if isinstance(bus, int) else _text(bus)}"
-            source.append(f"    - {{file: {_text(_from(path, folder))}{where}}}")
-    else:
-        keys = {"column": _text(found.time.name), "unit": found.time.unit}
-        keys |= {key: _text(value) for key in ("format", "zone") if (value := getattr(found.time, key)) is not None}
-        source.append(f"  time: {{{', '.join(f'{key}: {value}' for key, value in keys.items())}}}")
-    source += ["  sensors:", *(_channel(reads.name, reads.signal) for reads in read)]
-    if drafted.inputs:
-        source += ["  inputs:", *(_channel(each, one) for each, one in drafted.inputs)]
+    source = _source(drafted, found, databases, folder)
     first = next((f"[{item.name}, {item.second}]" for item in drafted.states if item.smooth), None)
     if first is None and len(drafted.states) > 1:
         first = f"[{drafted.states[0].name}, {drafted.states[1].name}]"
@@ -332,6 +324,76 @@ view:
 """
 
 
+def _source(
+    drafted: DraftPlan, found: RecordingContents, databases: Sequence[tuple[Path, BusName]], folder: Path
+) -> list[str]:
+    """Return the lines of the source: one recording, or a part for each that feeds a sensor or input."""
+    read = [reads for item in drafted.states for reads in item.sensors]
+    families = _families(drafted)
+
+    def of(part: RecordingContents, k: int) -> list[str]:
+        lines = [f"type: {part.kind}", "files:", *(f"  - {_text(_from(path, folder))}" for path in part.files)]
+        if part.kind == "can_log":
+            lines.append("dbc:")
+            for path, bus in databases:
+                where = "" if bus is None else f", channel: {bus if isinstance(bus, int) else _text(bus)}"
+                lines.append(f"  - {{file: {_text(_from(path, folder))}{where}}}")
+        else:
+            keys = {"column": _text(part.time.name), "unit": part.time.unit}
+            keys |= {key: _text(value) for key in ("format", "zone") if (value := getattr(part.time, key)) is not None}
+            lines.append(f"time: {{{', '.join(f'{key}: {value}' for key, value in keys.items())}}}")
+        channels = [
+            _channel(family.name, reads.signal, family) if family else _channel(reads.name, reads.signal)
+            for reads in read
+            if reads.signal.part == k
+            for family in (families.get(reads.name),)
+            if not family or family.first == reads.name
+        ]
+        inputs = [_channel(each, one) for each, one in drafted.inputs if one.part == k]
+        if channels:
+            lines += ["sensors:", *channels]
+        if inputs:
+            lines += ["inputs:", *inputs]
+        return lines if channels or inputs else []
+
+    if not found.parts:
+        return [f"  {line}" for line in of(found, 0)]
+    lines = ["  type: merged", "  parts:"]
+    for k, part in enumerate(found.parts):
+        lines += [f"    {'  ' if n else '- '}{line}" for n, line in enumerate(of(part, k))]
+    return lines
+
+
+class Family(NamedTuple):
+    """Sensors that read one column, each the rows of one source: name, column of the sources, and its first sensor.
+
+    `ids` are the names of the sources by those in the names of the sensors, where these differ.
+    """
+
+    name: str
+    by: str
+    first: str
+    ids: dict[str, str]
+
+
+def _families(drafted: DraftPlan) -> dict[str, Family]:
+    """Return the family of each sensor that has one."""
+    groups: dict[tuple[int, str], list[Reads]] = {}
+    for reads in (reads for item in drafted.states for reads in item.sensors):
+        if reads.signal.series.only is not None:
+            groups.setdefault((reads.signal.part, reads.signal.series.column), []).append(reads)
+    found: dict[str, Family] = {}
+    for members in groups.values():
+        name = os.path.commonprefix([reads.name for reads in members]).rpartition("_")[0]
+        if len(members) > 1 and name:
+            only = [reads.signal.series.only or ("", "") for reads in members]
+            ids = {reads.name.removeprefix(f"{name}_"): label for reads, (_, label) in zip(members, only, strict=True)}
+            same = all(key == label for key, label in ids.items())
+            family = Family(name, only[0][0], members[0].name, {} if same else ids)
+            found |= {reads.name: family for reads in members}
+    return found
+
+
 LINE_LENGTH = 112  # of comments in the YAML
 
 
@@ -370,9 +432,37 @@ def _comments(drafted: DraftPlan) -> list[str]:
             f"# {check.words}.",
             *(f"#   {text}" for text in check_lines(check)),
         ]
-    for line in omission_lines(drafted):
+    for line in (*hint_lines(drafted), *omission_lines(drafted)):
         lines += [f"# {text}" for text in textwrap.wrap(line, LINE_LENGTH, subsequent_indent="  ")]
     return lines
+
+
+def hint_lines(drafted: DraftPlan) -> list[str]:
+    """Return what the draft does not use of its signals, with the next step, a line each."""
+    lines = []
+    for name, _ in drafted.inputs:
+        if not any(name in item.inputs for item in drafted.states):
+            lines.append(
+                f"Input {name} is not used: no first-order lag behind it explains half of the variance of a state. "
+                "Write its effect into step(), or omit it."
+            )
+    for item in drafted.states:
+        if item.cycle is not None:
+            period, amplitude = item.cycle
+            size = f"{amplitude:.3g} {item.signal.series.unit}".rstrip()
+            lines.append(
+                f"{item.name} repeats every {_duration(period)} (amplitude {size}), which the draft does not know. For "
+                "forecasts add a cycle to the model: docs/twins.md, Cycles."
+            )
+    return lines
+
+
+def _duration(seconds: float) -> str:
+    """Return a time in the largest unit of which there are two."""
+    size, unit = next(
+        (entry for entry in ((86400.0, "days"), (3600.0, "h"), (60.0, "min")) if seconds >= 1.9 * entry[0]), (1.0, "s")
+    )
+    return f"{seconds / size:.3g} {unit}"
 
 
 def omission_lines(drafted: DraftPlan) -> list[str]:
@@ -399,12 +489,28 @@ def check_lines(check: DraftCheck) -> list[str]:
     return lines
 
 
-def _channel(name: str, one: Signal) -> str:
-    """Where the values of a sensor or input are found."""
-    signal = _text(one.series.name)
-    if one.message is None:
-        return f"    {name}: {{columns: {signal}}}"
-    return f"    {name}: {{message: {_text(one.message)}, signals: {signal}}}"
+def _channel(name: str, one: Signal, family: Family | None = None) -> str:
+    """Where the values of a sensor or input are found, or those of a family."""
+    column = one.series.column or one.series.name
+    fields = {"columns": _text(column)} if one.message is None else {"message": _text(one.message)}
+    if one.message is not None:
+        fields["signals"] = _text(column)
+    elif one.unit != one.series.unit and not heading_unit(column):
+        fields["units"] = _text(one.unit)
+    if one.valid:
+        fields["where"] = f"{{{_text(one.valid)}: 1}}"
+    if family is not None:
+        ids = ", ".join(f"{_text(key)}: {_id(label)}" for key, label in family.ids.items())
+        fields["by"] = f"{{{_text(family.by)}: {{{ids}}}}}" if ids else _text(family.by)
+    elif one.series.only is not None:
+        by, label = one.series.only
+        fields["only"] = f"{{{_text(by)}: {_id(label)}}}"
+    return f"  {name}: {{{', '.join(f'{key}: {value}' for key, value in fields.items())}}}"
+
+
+def _id(label: str) -> str:
+    """Return the name of a source as YAML: a number as it is, text in quotes."""
+    return label if re.fullmatch(r"-?\d+", label) else _text(label)
 
 
 def _from(path: Path, folder: Path) -> str:

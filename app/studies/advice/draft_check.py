@@ -208,11 +208,8 @@ def _reason(
                 f"cause with --inputs, or omit {worst}"
             )
         if narrow.correlation.low > MAX_CORRELATION:
-            return (
-                f"successive innovations of {narrow.name} are correlated ({narrow.correlation.value:+.2f}), so a cause "
-                f"of its motion is missing; name it with --inputs"
-            )
-        return f"the noise of {narrow.name} varies; nisus advise with the YAML recommends a filter"
+            return _missing_cause(narrow)
+        return _varies(narrow.name)
     if place == "below" or any(one.low > MAX_COVERAGE for one in shares.values()):
         reads = next(one for one in sensors if one.name == wide.name)
         if reads.r <= MAX_FLOOR_FACTOR * reads.signal.resolution**2 / 12.0:
@@ -222,7 +219,19 @@ def _reason(
             )
         if ratios[wide.name] * MAX_NIS_FACTOR < 1.0:
             return f"{wide.name} moves less in the second half than in the first; fit all of the log with nisus tune"
-        return f"the noise of {wide.name} varies; nisus advise with the YAML recommends a filter"
+        return _varies(wide.name)
+    lasting, contrary = (
+        max(known, key=lambda one: one.correlation.low),
+        min(known, key=lambda one: one.correlation.high),
+    )
+    if lasting.correlation.low > MAX_CORRELATION:
+        return _missing_cause(lasting)
+    if contrary.correlation.high < -MAX_CORRELATION:
+        return (
+            f"successive innovations of {contrary.name} alternate ({contrary.correlation.value:+.2f}): its rows are of "
+            f"several sources, or its noise is larger than fitted; give each source its rows by `only`, or raise "
+            f"R.{contrary.name} with nisus tune NAME.yaml"
+        )
     for name, e in alone.items():
         share = share_interval(np.abs(e) <= BAND_SIGMA, e)
         if share.high < MIN_COVERAGE:
@@ -231,3 +240,16 @@ def _reason(
                 f"its scale or offset changes; omit it"
             )
     return ""
+
+
+def _missing_cause(one: SensorCheck) -> str:
+    return (
+        f"successive innovations of {one.name} are correlated ({one.correlation.value:+.2f}), so a cause of its motion "
+        "is missing; name it with --inputs"
+    )
+
+
+def _varies(name: str) -> str:
+    return (
+        f"the noise of {name} varies; nisus advise NAME.yaml --apply compares filters that follow it, and sets the best"
+    )

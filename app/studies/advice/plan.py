@@ -14,9 +14,10 @@ import numpy as np
 from estimators.diagnostics.intervals import Interval
 from estimators.errors import ConfigError, nearest
 from sources.inspect import RecordingContents
+from sources.units import unit_scale
 
 from .relations import Driven, Pair, driven, pairs, simulated
-from .signals import MIN_VALUES, Signal, noise_of, signals, walk_of
+from .signals import MIN_VALUES, Signal, cycle_of, noise_of, signals, walk_of
 
 MAX_SIGNALS = 6  # signals that are taken where none are named
 
@@ -44,11 +45,6 @@ OMISSIONS = {
     "short": f"fewer than {MIN_VALUES} values",
 }
 """Reasons by kind of signal for which it is omitted."""
-
-TAG = re.compile(r"(^|_)(id|tag|node|anchor|beacon|channel)s?$", re.IGNORECASE)
-"""Names of columns that name the source of a row."""
-
-MIN_ALTERNATION = 0.2  # share of the rows at which such a column changes, from which on the rows are of several sources
 
 STATE, SENSOR, INPUT, HELD_OUT, OMITTED = "state", "sensor", "input", "held out", "omitted"
 
@@ -85,7 +81,7 @@ class Moves:
     `smooth`: with a speed of its own, which is a second state. With `lag` it follows inputs, whose names are `inputs`,
     and the speed is what they leave unexplained.
     `q` is the variance that the noise adds in one second, to the speed if there is one; `over` is its correlation time,
-    s, None for white noise.
+    s, None for white noise. `cycle` is the period, s, and the amplitude of a cycle that the draft does not have.
     """
 
     name: str
@@ -96,6 +92,7 @@ class Moves:
     lag: Driven | None = None
     inputs: tuple[str, ...] = ()
     over: float | None = None
+    cycle: tuple[float, float] | None = None
 
     @property
     def second(self) -> str:
@@ -188,12 +185,16 @@ def plan(found: RecordingContents, roles: Roles) -> DraftPlan:
     inputs = {k for k, (_, role) in enumerate(places) if role == INPUT}
     own = {k for k, (_, role) in enumerate(places) if role == STATE}
     sensors = {k for k, (_, role) in enumerate(places) if role in (STATE, SENSOR, HELD_OUT)}
+    if free:
+        more = [one for one in every if id(one) not in named and not any(one is other for other in picked)]
+        picked += _same_quantity(more, [one for k, one in enumerate(picked) if k not in inputs])
     told = pairs(picked)
+    told += _chained(told, picked)
     taken: set[str] = set()
-    names = [_identifier(one.name, taken) for one in picked]
+    names = [_identifier(one, taken) for one in picked]
     # Of sensors of one quantity the first one is the state.
     leads = {k: k for k in range(len(picked)) if k not in inputs}
-    one_state = [pair for pair in told if pair.one or redundant(pair, picked)]
+    one_state = [pair for pair in told if (pair.one and _comparable(pair, picked)) or redundant(pair, picked)]
     for pair in one_state:
         first, second = pair.first, pair.second
         alone = second not in own and list(leads.values()).count(second) == 1
@@ -223,17 +224,72 @@ def plan(found: RecordingContents, roles: Roles) -> DraftPlan:
 
 REDUNDANT_GAIN = 0.05  # by how much the scales of two sensors of one quantity may differ
 REDUNDANT_EXPLAINED = 0.995  # share of the variance that the one explains of the other
+CONVERTED_EXPLAINED = 0.98  # the same where their known units differ, and the scale is that of the units
+
+SCALES = tuple(
+    factor**sign for factor in (1.0, 3.6, 2.236936, 9.549297, 57.29578, 60.0, 100.0, 1000.0) for sign in (1.0, -1.0)
+)
+"""Usual ratios of two units of one quantity: km/h and mph in m/s, rpm in rad/s, degrees, minutes, per cent, kilo."""
+
+
+def unit_ratio(one: Signal, other: Signal, gain: float) -> float | None:
+    """Return the factor from the unit of one signal to that of another; None if they measure different things.
+
+    Of signals without known units it is the usual ratio of units next to the gain, if their names share a word.
+    """
+    if one.series.unit and other.series.unit:
+        same = one.series.unit == other.series.unit
+        return 1.0 if same else unit_scale(one.series.unit, other.series.unit)
+    if not one.series.unit and not other.series.unit and abs(gain - 1.0) <= REDUNDANT_GAIN:
+        return 1.0
+    spaced = [re.sub(r"([a-z])([A-Z])", r"\1 \2", signal.name).lower() for signal in (one, other)]
+    words = [set(re.findall(r"[a-z]{4,}", text)) for text in spaced]
+    near = min(SCALES, key=lambda scale: abs(np.log(max(abs(gain), 1e-300) / scale)))
+    return near if words[0] & words[1] else None
 
 
 def redundant(pair: Pair, picked: Sequence[Signal]) -> bool:
-    """Return whether two signals are the same quantity up to a small bias, scale and noise, which may be coloured.
+    """Return whether two signals are the same quantity up to its unit and a small bias, scale and noise.
 
-    The speeds of two wheels are: in a curve they differ for seconds, so their difference is no white noise.
+    The noise may be coloured. The speeds of two wheels are such: in a curve they differ for seconds.
     """
-    same_unit = picked[pair.first].series.unit == picked[pair.second].series.unit
-    alike = abs(pair.gain - 1.0) <= REDUNDANT_GAIN and pair.explained >= REDUNDANT_EXPLAINED
+    ratio = unit_ratio(picked[pair.first], picked[pair.second], pair.gain)
+    alike = ratio is not None and abs(pair.gain / ratio - 1.0) <= REDUNDANT_GAIN
     interval = max(1.0 / picked[k].rate for k in (pair.first, pair.second))
-    return same_unit and alike and not pair.rate and abs(pair.lag) <= 1.5 * interval
+    units = {picked[k].series.unit for k in (pair.first, pair.second)}
+    least = CONVERTED_EXPLAINED if len(units) > 1 and "" not in units else REDUNDANT_EXPLAINED
+    return alike and pair.explained >= least and not pair.rate and abs(pair.lag) <= 1.5 * interval
+
+
+def _comparable(pair: Pair, picked: Sequence[Signal]) -> bool:
+    """Return whether two signals may be one quantity by their units, where both are known."""
+    units = [picked[k].series.unit for k in (pair.first, pair.second)]
+    return pair.rate or not all(units) or units[0] == units[1] or unit_scale(*units) is not None
+
+
+def _same_quantity(others: Sequence[Signal], picked: Sequence[Signal]) -> list[Signal]:
+    """Return the signals that measure the quantity of a picked one in another unit."""
+    found = []
+    for one in others:
+        for lead in picked if one.kind == "signal" else ():
+            if one.series.unit != lead.series.unit and unit_scale(lead.series.unit, one.series.unit) is not None:
+                if any(redundant(pair, (lead, one)) for pair in pairs((lead, one))):
+                    found.append(one)
+                    break
+    return found
+
+
+def _chained(told: Sequence[Pair], picked: Sequence[Signal]) -> list[Pair]:
+    """Return that a signal measures the rate of a state, of those that measure the same as one that does."""
+    found = []
+    for rate in (pair for pair in told if pair.rate):
+        for pair in told:
+            known = any({one.first, one.second} == {rate.first, pair.second} for one in told)
+            if pair.first == rate.second and not pair.rate and not known and redundant(pair, picked):
+                gain = rate.gain / pair.gain
+                offset = rate.offset - gain * pair.offset
+                found.append(rate._replace(second=pair.second, gain=gain, offset=offset))
+    return found
 
 
 def _role(
@@ -248,12 +304,7 @@ def _role(
     """Return the role of a signal, and why it has it; `rest` is why signals that vary were not picked."""
     k = next((k for k, other in enumerate(picked) if other is one), None)
     if k is None:
-        reason = OMISSIONS.get(one.kind, rest)
-        if one.kind == "switch" and TAG.search(one.name) and np.mean(np.diff(one.series.values) != 0) > MIN_ALTERNATION:
-            reason += (
-                f"; it alternates, so the columns beside it mix sources: give each its own file or `only: {one.name}`"
-            )
-        return SignalRole(one, OMITTED, "", reason)
+        return SignalRole(one, OMITTED, "", OMISSIONS.get(one.kind, rest))
     name = names[k]
     if k in used:
         driven_by = [item.name for item in states if name in item.inputs]
@@ -317,7 +368,7 @@ def _moves(k: int, picked: Sequence[Signal], names: Sequence[str], others: Seque
     own = Reads(names[k], one, r)
     more = tuple(reads_of(names[pair.second], one, picked[pair.second], pair) for pair in others)
     inputs = tuple(names[j] for j in lag.drivers) if lag is not None else ()
-    return Moves(names[k], one, smooth, q, (own, *more), lag, inputs)
+    return Moves(names[k], one, smooth, q, (own, *more), lag, inputs, cycle=cycle_of(series))
 
 
 def reads_of(name: str, lead: Signal, one: Signal, pair: Pair) -> Reads:
@@ -343,8 +394,11 @@ def _finest(found: RecordingContents, every: Sequence[Signal]) -> list[Signal]:
 
 def _named(option: str, name: str, found: RecordingContents, every: Sequence[Signal]) -> list[Signal]:
     """Return SIGNAL, MESSAGE.SIGNAL or a column, or all that match a glob and vary."""
-    spelt = {id(one): (one.name, f"{one.message}.{one.name}") for one in every}
+    stem = {k: part.files[0].stem for k, part in enumerate(found.parts)}
+    spelt = {id(one): (one.name, f"{one.message or stem.get(one.part)}.{one.name}") for one in every}
     fits = [one for one in every if name in spelt[id(one)]]
+    if not fits and (of_sources := [one for one in every if one.series.column == name]):
+        return of_sources
     if not fits and any(mark in name for mark in "*?["):
         fits = [one for one in every if any(fnmatchcase(text.lower(), name.lower()) for text in spelt[id(one)])]
         fits = [one for one in fits if one.kind not in ("constant", "short")]
@@ -356,20 +410,22 @@ def _named(option: str, name: str, found: RecordingContents, every: Sequence[Sig
         raise ConfigError(f"{option} {name}: has 0 values; its noise can be estimated from {MIN_VALUES} on")
     if not fits:
         raise ConfigError(f"{option} {name}: is not in the log; {nearest(name, [one.name for one in every])}")
-    if len({one.message for one in fits}) > 1:
-        several = " or ".join(f"{one.message}.{one.name}" for one in fits)
-        raise ConfigError(f"{option} {name}: is in several messages; write {several}")
+    if len({(one.part, one.message) for one in fits}) > 1:
+        several = " or ".join(spelt[id(one)][1] for one in fits)
+        raise ConfigError(f"{option} {name}: is in several {'files' if found.parts else 'messages'}; write {several}")
     count = fits[0].series.values.size
     if count < MIN_VALUES:
         raise ConfigError(f"{option} {name}: has {count} values; its noise can be estimated from {MIN_VALUES} on")
     return fits[:1]
 
 
-def _identifier(name: str, taken: set[str]) -> str:
-    """A name for Python and YAML, of its own."""
-    text = re.sub(r"\W+", "_", name, flags=re.ASCII).strip("_").lower() or "value"
+def _identifier(one: Signal, taken: set[str]) -> str:
+    """A name for Python and YAML, of its own; of a source of rows COLUMN_ID, as `by` names it."""
+    text = re.sub(r"\W+", "_", one.series.column or one.name, flags=re.ASCII).strip("_").lower() or "value"
     if text[0].isdigit() or keyword.iskeyword(text) or text in ("on", "off", "yes", "no", "null", "true", "false"):
         text = f"s_{text}"
+    if one.series.only is not None:
+        text += "_" + (re.sub(r"\W+", "_", one.series.only[1], flags=re.ASCII).strip("_") or "source")
     base, k = text, 2
     while {text, f"{text}_rate", f"{text}_drift"} & taken:
         text, k = f"{base}_{k}", k + 1

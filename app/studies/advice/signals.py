@@ -30,7 +30,8 @@ class Signal(NamedTuple):
     `longest` the longest, s. `resolution` is the smallest step between two values, `levels` how many values there are.
     `noise` is the standard deviation of its roughness, in its unit, at least that of its resolution.
     `kind` is "signal", "switch", "counter", "constant", or "short". `wraps`: an angle in degrees that jumps by a turn;
-    its series is in radians, and goes on where the angle jumps.
+    its series is in radians, and goes on where the angle jumps. `unit` is that of the recording. `valid` is a flag of
+    the same message or table; the series has the values where it is 1. `part` counts the recordings of a merged one.
     """
 
     name: str
@@ -44,17 +45,49 @@ class Signal(NamedTuple):
     noise: float
     kind: str
     wraps: bool = False
+    unit: str = ""
+    valid: str = ""
+    part: int = 0
+
+
+VALID = re.compile(r"valid$|^valid", re.IGNORECASE)
+"""Names of flags that are 1 where the values beside them can be used."""
 
 
 def signals(found: RecordingContents) -> list[Signal]:
-    """All signals with values, in the order of the recording."""
-    offers: list[tuple[str | None, SignalSeries]] = [(m.name, series) for m in found.messages for series in m.signals]
-    offers += [(None, series) for series in found.columns]
-    return [signal(message, series) for message, series in offers if series.values.size]
+    """All signals with values, in the order of the recording; those beside a flag of validity where it is 1."""
+    every: list[Signal] = []
+    for k, part in enumerate(found.parts or (found,)):
+        for name, group in [*((m.name, list(m.signals)) for m in part.messages), (None, part.columns)]:
+            flags = [one for one in group if VALID.search(one.name) and set(np.unique(one.values)) == {0.0, 1.0}]
+            for series in group:
+                flag = _flag_of(series, flags, whole=name is not None)
+                good = series if flag is None else _where(series, flag)
+                used = good if good.values.size else series
+                if used.values.size:
+                    valid = flag.name if flag is not None and used is not series else ""
+                    every.append(signal(name, used)._replace(valid=valid, part=k))
+    return every
+
+
+def _flag_of(series: SignalSeries, flags: Sequence[SignalSeries], *, whole: bool) -> SignalSeries | None:
+    """Return the flag of a signal: that with its name, or the only one of its message."""
+    if any(one is series for one in flags):
+        return None
+    stems = {VALID.sub("", one.name).strip("_").lower(): one for one in flags}
+    own = next((one for stem, one in stems.items() if stem and series.name.lower().startswith(stem)), None)
+    return own or (flags[0] if whole and len(flags) == 1 else stems.get(""))
+
+
+def _where(series: SignalSeries, flag: SignalSeries) -> SignalSeries:
+    """Return the values at the times at which a flag is 1."""
+    good = np.isin(series.t, flag.t[flag.values == 1.0])
+    return replace(series, t=series.t[good], values=series.values[good])
 
 
 def signal(message: str | None, series: SignalSeries) -> Signal:
     """Describe one series."""
+    unit = series.unit
     wraps = series.unit in DEGREES and bool(np.any(np.abs(np.diff(series.values)) > 300.0))
     if wraps:
         series = replace(series, unit="rad", values=np.unwrap(np.radians(series.values)))
@@ -76,6 +109,7 @@ def signal(message: str | None, series: SignalSeries) -> Signal:
         noise,
         _kind(series, levels),
         wraps,
+        unit,
     )
 
 
@@ -215,3 +249,39 @@ def _mean(series: SignalSeries, edges: np.ndarray, middles: np.ndarray, gap: flo
     after = np.clip(np.searchsorted(series.t, middles), 1, series.t.size - 1)
     line[series.t[after] - series.t[after - 1] > gap] = np.nan
     return np.where(count > 0, mean, line)
+
+
+MIN_CYCLES = 5  # cycles in a recording, from which on they are one
+MIN_LINE = 25.0  # power of a spectral line over its surroundings, which noise reaches once in e^25 frequencies
+LINE_BINS, NEAR_BINS = 2, 20  # frequencies on each side that belong to a line, and its surroundings
+
+
+def cycle_of(series: SignalSeries) -> tuple[float, float] | None:
+    """Return period (s) and amplitude of a cycle that a signal repeats all the time, as of days; None without one.
+
+    The periodogram of the differences, whose spectrum is nearly flat where that of a wandering signal is not, has a
+    line there. Periods below 8 intervals are no cycle of the asset.
+    """
+    t, values = common([series])
+    known = np.isfinite(values[:, 0]) if t.size else np.zeros(0, np.bool_)
+    if known.sum() < 2 * NEAR_BINS * MIN_CYCLES:
+        return None
+    y = np.interp(t, t[known], values[known, 0])
+    d = np.diff(y)
+    power = np.abs(np.fft.rfft((d - d.mean()) * np.hanning(d.size))) ** 2
+    best, place = 0.0, 0
+    for k in range(MIN_CYCLES, power.size // 4):
+        around = np.concatenate(
+            (power[max(1, k - NEAR_BINS) : max(1, k - LINE_BINS)], power[k + LINE_BINS + 1 : k + NEAR_BINS + 1])
+        )
+        # The median of a periodogram of noise is ln 2 of its mean.
+        line = power[k] / max(float(np.median(around)) / np.log(2.0), 1e-300)
+        if line > best:
+            best, place = line, k
+    if best < MIN_LINE:
+        return None
+    period = (t[-1] - t[0]) / place * (1.0 + 1.0 / t.size)
+    turn = 2.0 * np.pi * t / period
+    wave = np.column_stack((np.cos(turn), np.sin(turn), np.ones(t.size), t))[known]
+    weights = np.linalg.lstsq(wave, y[known], rcond=None)[0]
+    return float(period), float(np.hypot(weights[0], weights[1]))

@@ -176,7 +176,7 @@ class DroppedLogs:
         header = LogHeader(
             found.kind,
             frozenset(found.keys),
-            {one.name: one.unit for one in found.signals},
+            dict.fromkeys(found.choices, "") | {one.name: one.unit for one in found.signals},
             {name: [text.rpartition(" (")[0] for text in texts] for name, texts in found.texts.items()},
             found.time,
         )

@@ -149,12 +149,15 @@ def test_the_noise_of_a_signal_is_found_in_its_differences():
     assert smooth and q == pytest.approx(9.0, rel=0.15) and r == pytest.approx(1e-4, rel=0.3)
 
 
-@pytest.mark.parametrize("command", ["log", "advise"])
-def test_tables_of_other_columns_are_one_line(tmp_path, nisus, command):
+def test_tables_of_other_columns_are_listed_one_after_the_other(tmp_path, nisus):
     (tmp_path / "one.csv").write_text("time,a\n0,1\n1,2\n")
-    (tmp_path / "two.csv").write_text("seconds,a\n2,1\n3,2\n")
-    said = nisus.refuses(command, str(tmp_path / "one.csv"), str(tmp_path / "two.csv"))
-    assert "two.csv: it has no column time, which " in said
+    (tmp_path / "two.csv").write_text("seconds,b\n2,1\n3,2\n")
+    said = nisus("log", str(tmp_path / "one.csv"), str(tmp_path / "two.csv"))
+    assert "one.csv: 2 rows in 1.0 s" in said.out and "two.csv: 2 rows in 1.0 s" in said.out
+    parts = nisus("log", str(tmp_path / "one.csv"), str(tmp_path / "two.csv"), "--json").json["parts"]
+    assert [[column["name"] for column in part["columns"]] for part in parts] == [["a"], ["b"]]
+    # Their times do not overlap, which is said with the remedy.
+    assert "two.csv begins 1 s after the end of one.csv; " in said.err and "time.shift" in said.err
 
 
 @pytest.mark.parametrize("command", ["log", "advise"])

@@ -3,10 +3,14 @@
 import numpy as np
 import pytest
 
+from app.studies.advice.draft import hint_lines, write_draft
+from app.studies.advice.plan import Roles, plan
 from app.studies.advice.relations import driven, pairs
 from app.studies.advice.signals import rough, signal
+from app.twin.log_reader import read_log
 from app.twin.twin import load_twin
-from sources.inspect import SignalSeries
+from estimators.log import READING
+from sources.inspect import SignalSeries, inspect_recordings
 
 
 def series(name, values, dt=0.1, start=0.0):
@@ -137,3 +141,111 @@ def test_signals_have_the_roles_that_they_are_given(table, nisus):
     assert "room is input as well" in nisus.refuses("advise", str(table), "--sensors", "room", "--inputs", "room")
     # Nothing else measures the tank, and without an input nothing drives it.
     assert "nothing predicts it" in nisus.refuses("advise", str(table), "--sensors", "room", "--hold-out", "tank")
+
+
+def drafted(path, *files, **roles):
+    """The twin of a draft that was not fitted, its log, and the plan."""
+    found = inspect_recordings(files)
+    planned = plan(found, Roles(**roles))
+    twin = load_twin(write_draft(planned, found, "own", path).yaml_path)
+    return twin, read_log(twin, None)[0], planned
+
+
+def of_sensor(log, twin, name):
+    rows = (log.kind[: log.n] == READING) & (log.channel[: log.n] == twin.model.sensor_names.index(name))
+    return log.t[: log.n][rows], log.value[: log.n][rows, 0]
+
+
+def csv(path, **columns):
+    rows = zip(*columns.values(), strict=True)
+    path.write_text(",".join(columns) + "\n" + "".join(",".join(map(str, row)) + "\n" for row in rows))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("heading", "count"), [("wheel_kmh", 1), ("wheel_speed", 1), ("Wheel [km/h]", 1), ("Wheel [kPa]", 2)]
+)
+def test_one_speed_in_two_units_is_one_state_with_two_sensors(tmp_path, heading, count):
+    """GNSS in m/s and a wheel in whole km/h, 0.6 % larger: by the unit, or by a usual ratio and a word in common."""
+    rng = np.random.default_rng(4)
+    t = np.arange(1200.0)
+    speed = 15.0 + np.cumsum(rng.normal(0, 0.3, t.size))
+    wheel = np.round(3.6 * 1.006 * speed + np.convolve(rng.normal(0, 0.3, t.size + 2), np.ones(3), "valid"))
+    gnss = np.round(speed + rng.normal(0, 0.05, t.size), 3)
+    log = csv(
+        tmp_path / "drive.csv", t=t, **{"gnss_speed_mps" if "_" in heading else "gnss [m/s]": gnss, heading: wheel}
+    )
+    planned = plan(inspect_recordings([log]), Roles(sensors=("*",)))
+    assert len(planned.states) == count
+    if count == 1:
+        _, other = planned.states[0].sensors
+        assert other.gain == pytest.approx(3.6 * 1.006, rel=0.005)
+
+
+@pytest.mark.parametrize(("name", "ids"), [("anchor_id", ("3", "17")), ("Tag", ("TT101", "PT-2"))])
+@pytest.mark.parametrize("sorted_by", ["time", "source"])
+def test_rows_of_several_sources_are_sensors_that_by_tells_apart(tmp_path, name, ids, sorted_by):
+    rng = np.random.default_rng(6)
+    values = np.round(np.cumsum(rng.normal(0, 1, (2, 200)), axis=1) + [[20.0], [500.0]], 3)
+    rows = [(t, ids[k], values[k, t]) for t in range(200) for k in range(2)]
+    if sorted_by == "source":
+        rows.sort(key=lambda row: row[1])
+    log = csv(tmp_path / "plant.csv", **dict(zip(("t", name, "value"), zip(*rows, strict=True), strict=True)))
+    twin, read, _ = drafted(tmp_path, log, sensors=("value",))
+    assert 'value: {columns: "value", by: ' in twin.path.read_text()
+    for k, sensor in enumerate(sorted(twin.model.sensor_names, key=lambda sensor: not sensor.endswith(("3", "101")))):
+        t, found = of_sensor(read, twin, sensor)
+        assert t.tolist() == [s * 10**9 for s in range(200)] and found.tolist() == values[k].tolist()
+
+
+def test_files_with_different_columns_become_the_parts_of_a_merged_source(tmp_path):
+    rng = np.random.default_rng(7)
+    one, other = (np.round(np.cumsum(rng.normal(0, 1, 300)), 3) for _ in range(2))
+    files = (
+        csv(tmp_path / "odometry.csv", t_s=np.arange(300) * 0.1, speed=one),
+        csv(tmp_path / "gnss.csv", time=np.arange(300) * 0.1 + 0.03, north=other, Fix=np.ones(300)),
+    )
+    twin, log, _ = drafted(tmp_path, *files)
+    assert twin.loaded.config.source.type == "merged"
+    for name, values, shift in (("speed", one, 0.0), ("north", other, 0.03)):
+        t, found = of_sensor(log, twin, name)
+        np.testing.assert_allclose(t * 1e-9, np.arange(300) * 0.1 + shift, atol=1e-9)
+        assert found.tolist() == values.tolist()
+
+
+def test_values_beside_a_flag_of_validity_are_used_where_it_is_set(tmp_path):
+    """A receiver without a fix reports zero, which would hide that two sensors measure the same."""
+    rng = np.random.default_rng(8)
+    speed = np.round(20.0 + np.cumsum(rng.normal(0, 0.2, 500)), 3)
+    valid = (np.arange(500) > 80).astype(int)
+    log = csv(tmp_path / "drive.csv", t=np.arange(500), speed_gnss=np.where(valid, speed, 0.0), speed_valid=valid)
+    twin, read, planned = drafted(tmp_path, log)
+    _, found = of_sensor(read, twin, "speed_gnss")
+    np.testing.assert_array_equal(found, np.where(valid, speed, np.nan))
+    assert planned.states[0].signal.series.values.tolist() == speed[81:].tolist()
+
+
+@pytest.mark.parametrize("size", [0.0, 3.0])
+def test_a_cycle_of_days_is_found_and_a_random_walk_has_none(tmp_path, size):
+    rng = np.random.default_rng(9)
+    hours = np.arange(24 * 60.0)
+    value = 20.0 + np.cumsum(rng.normal(0, 0.3, hours.size)) + size * np.sin(2 * np.pi * hours / 24 + 1.0)
+    log = csv(tmp_path / "room.csv", t=hours * 3600, value=np.round(value, 3))
+    planned = plan(inspect_recordings([log]), Roles())
+    (item,) = planned.states
+    if not size:
+        assert item.cycle is None and not hint_lines(planned)
+        return
+    # A line of 60 cycles is known to 1/60 of its period at worst; the walk hides a few per cent of the amplitude.
+    assert item.cycle == (pytest.approx(86400, rel=1 / 60), pytest.approx(size, rel=0.1))
+    assert hint_lines(planned)[0].startswith("value repeats every 24 h (amplitude ")
+
+
+def test_an_input_that_explains_nothing_is_said_to_be_unused(tmp_path):
+    rng = np.random.default_rng(10)
+    walks = {name: np.round(np.cumsum(rng.normal(0, 1, 400)), 3) for name in ("level", "valve")}
+    planned = plan(inspect_recordings([csv(tmp_path / "t.csv", t=np.arange(400), **walks)]), Roles(inputs=("valve",)))
+    assert hint_lines(planned) == [
+        "Input valve is not used: no first-order lag behind it explains half of the variance of a state. Write its "
+        "effect into step(), or omit it."
+    ]
