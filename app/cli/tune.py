@@ -18,14 +18,14 @@ from estimators.fit.objective import FitProgress
 from estimators.fit.recording import Recording
 
 from ..live.tunings.tuning_yaml import tuning_yaml
-from ..live.tunings.versions import apply_tuning, check_free, keep, settings_of, version_text
+from ..live.tunings.versions import apply_tuning, check_free, keep, settings_of, version_text, widths_of
 from ..present.result import to_text
 from ..present.runs_json import fit_json
 from ..studies.tune import fit_text, heading, sections, window_json, window_topics, windows_verdict
 from ..terminal import complain
-from ..twin.defaults import bounds_of, natural_aim
+from ..twin.defaults import bounds_of, natural_aim, width_priors
 from ..twin.log_reader import read_log, read_logs
-from ..twin.twin import Twin, load_twin
+from ..twin.twin import Twin, load_twin, with_held
 from .options import check_output, names_of, seconds_of, settings
 from .prepare import attend, prepare
 
@@ -56,19 +56,22 @@ def tune_twin(arguments: Arguments) -> int:
         raise ConfigError("--every: is the time between the ends of two --windows; give both")
     twin, recordings = _recordings(arguments)
     aim = arguments.aim or natural_aim(twin.config)
+    held = with_held(twin)
+    prepare(held)
 
     state = FitProgress()
 
     def work() -> Fitted:
         return fit(
             twin.estimator,
-            twin.tuning,
+            held.tuning,
             recordings,
             wanted=wanted,
-            bounds=bounds_of(twin.config, twin.model),
+            bounds=bounds_of(twin.config, held.model),
             blocks=arguments.blocks,
             aim=aim,
             predict=arguments.predict,
+            considered=width_priors(twin.config, held.model, wanted),
             progress=state,
         )
 
@@ -99,13 +102,15 @@ def _attend_fit(
 def _save(arguments: Arguments, twin: Twin, found: Fitted, fitted_on: Sequence[str]) -> None:
     """Write a proposed tuning to the twin's YAML, to the file of `--save` and to the version of `--keep`."""
     if arguments.apply or arguments.out is not None:
-        complain(apply_tuning(load_twin(arguments.twin), found.estimator, *found.setting, out=arguments.out))
+        own, widths = load_twin(arguments.twin), widths_of(twin, found)
+        complain(apply_tuning(own, found.estimator, *found.setting, widths=widths, out=arguments.out))
     if arguments.save is not None:
-        text = heading(twin, found) + tuning_yaml(twin.config, twin.estimator, *found.setting)
+        text = heading(twin, found)
+        text += tuning_yaml(twin.config, twin.estimator, *found.setting, widths=widths_of(twin, found))
         with writing(arguments.save, "--save"):
             arguments.save.write_text(text, encoding="utf-8")
     if arguments.keep is not None:
-        settings = settings_of(found, list(fitted_on), printable(arguments.note))
+        settings = settings_of(twin, found, list(fitted_on), printable(arguments.note))
         complain(f"{shown_path(keep(twin, arguments.keep, version_text(twin, settings)))}: kept")
 
 

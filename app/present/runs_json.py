@@ -116,7 +116,8 @@ def fit_json(fitted: Fitted) -> dict[str, Any]:
     sensors. `before` and `after` have scores of the fitted and the held-out part: log density per measurement, mean
     NIS per degree of freedom, coverage of the 95 % bands; `sensors` held out in turn, those `withheld`, which the twin
     never uses, and true `states`. `verdict` says whether the fit is proposed, its gain in nats on the held-out blocks,
-    and the reasons against it.
+    and the reasons against it. `widths` has the standard deviation of each parameter to consider after the fit and
+    without data, the factor by which correlated errors discount the information, and the range of the fitted data.
     """
     # Half a second of imports, which a twin without a fit need not wait for.
     from estimators.fit.dual import shift
@@ -128,6 +129,13 @@ def fit_json(fitted: Fitted) -> dict[str, Any]:
         "entries": [line._asdict() | {"sigma": shift(line)} for line in fitted.lines],
         "correlated": correlated(fitted),
     }
+    if (widths := fitted.widths) is not None:
+        stds = zip(widths.names, widths.std.tolist(), widths.prior.tolist(), strict=True)
+        found["widths"] = {
+            "parameters": {name: {"std": std, "prior": prior} for name, std, prior in stds},
+            "inflation": widths.inflation,
+            "envelope": {name: {"min": low, "max": high} for name, (low, high) in widths.envelope.items()},
+        }
     for name, score in (("before", fitted.before), ("after", fitted.after)):
         found[name] = {"fitted": part_json(score.fitted), "held_out": part_json(score.held_out)}
     return dict(plain(found))

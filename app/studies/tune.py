@@ -14,6 +14,7 @@ from estimators.fit.dual import WindowFit, against, shift
 from estimators.fit.fit import EntryFit, Fitted
 from estimators.fit.judge import PartScore, PredictionScore, Worth
 from estimators.fit.objective import FitProgress
+from estimators.registry import find_estimator
 
 from ..present.result import Topic
 from ..present.runs_json import correlated, fit_json
@@ -143,8 +144,9 @@ def _move(before: float, after: float) -> float:
 def sections(twin: Twin, fitted: Fitted, aim: str, *, written: bool) -> list[Topic]:
     """Return the result of a fit by an aim, from top to bottom; `written` is whether a file was requested."""
     held_out = _held_out(fitted)
-    verdict = _verdict(twin, fitted, aim, written=written)
-    return [_entries(twin, fitted), _scores(fitted), *([held_out] if held_out.rows else []), verdict]
+    more = [held_out] if held_out.rows else []
+    more += [_widths(twin, fitted)] if fitted.widths is not None else []
+    return [_entries(twin, fitted), _scores(fitted), *more, _verdict(twin, fitted, aim, written=written)]
 
 
 def heading(twin: Twin, fitted: Fitted) -> str:
@@ -229,6 +231,20 @@ def _rows(kind: str, group: str, before: Worth, after: Worth) -> list[tuple[str,
     names = dict.fromkeys(name for part in parts for name in getattr(part[0], group))
     units = {name: item.unit for part in parts for name, item in getattr(part[0], group).items()}
     return [(kind, name, units[name], *pair(name, parts[0]), *pair(name, parts[1])) for name in names]
+
+
+def _widths(twin: Twin, fitted: Fitted) -> Topic:
+    """Return the uncertainty of each parameter that a kept version considers."""
+    widths = fitted.widths
+    assert widths is not None
+    units = {item.name: item.unit for item in twin.model.parameters}
+    columns = zip(widths.names, widths.std.tolist(), widths.prior.tolist(), strict=True)
+    rows = [(name, _number(std), _number(prior), units[name], f"{std / prior:.0%}") for name, std, prior in columns]
+    said = f"Errors that last leave 1/{widths.inflation:.3g} of the information. A kept version considers these widths."
+    if not find_estimator(fitted.estimator, twin.model).considers:
+        said = f"{fitted.estimator} cannot consider parameters: a kept version leaves these widths out."
+    head = ("parameter", "std", "without data", "unit", "left")
+    return Topic("Uncertainty of the parameters", (said,), head, tuple(rows))
 
 
 def _gained(fitted: Fitted) -> str:

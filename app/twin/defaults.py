@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from config.schema import TwinSection
+from config.schema import ParameterSection, TwinSection, as_width
 from config.source_schema import AssetSection, SimulatorSection
 from estimators.diagnostics.time_constants import MAX_STATES, jacobian, time_constants
 from estimators.errors import EstimatorError, ModelError
 from estimators.estimator import Estimator
 from estimators.fold_checks import check_variances
 from estimators.late import EVENT_S_PER_NUMBER, rewind_seconds
+from estimators.model.coloured import disturbance_time, error_time
 from estimators.model.state_space import StateSpaceModel
 from estimators.snapshots import Snapshots
 from estimators.tuning import Tuning
@@ -87,6 +89,32 @@ def bounds_of(config: TwinSection, model: StateSpaceModel) -> dict[str, tuple[fl
             shared = [f"{sensor.family}{name.removeprefix(sensor.name)}" for name in rows if sensor.family]
             found |= {f"R.{name}": section.bounds for name in (sensor.name, *rows, *shared)}
     return {key: bounds for key, bounds in found.items() if bounds is not None}
+
+
+TOLERANCE = 0.1  # Deviation of a fitted parameter without data and without a `std`, as a share of its value
+
+
+def width_priors(config: TwinSection, model: StateSpaceModel, wanted: Sequence[str]) -> dict[str, float]:
+    """Return the deviation without data of each parameter that a fit of `wanted` leaves uncertain, in its unit.
+
+    They are those with a `std` in the YAML, its data-sheet width, and fitted ones, with `TOLERANCE` of their value.
+
+    Args:
+        config: The YAML.
+        model: Its model, which considers none.
+        wanted: Keys and groups of the fit.
+    """
+    times = {disturbance_time(noise.name) for noise in model.noises} | set(map(error_time, model.sensor_names))
+    found = {}
+    for item in model.parameters:
+        section = config.parameters.get(item.name, ParameterSection())
+        if item.name in times or section.use != "considered" or "use" in section.model_fields_set and not section.std:
+            continue
+        if section.std is not None:
+            found[item.name] = as_width(item.value, section.std)
+        elif {"p", f"p.{item.name}"} & set(wanted) and item.value:
+            found[item.name] = TOLERANCE * abs(item.value)
+    return found
 
 
 def natural_aim(config: TwinSection) -> str:

@@ -238,6 +238,20 @@ def with_version(twin: Twin, reference: str) -> Twin:
     return _assemble(load_text(twin.text, twin.path, kept, version), kept | named, twin.plan.log_files)
 
 
+def with_held(twin: Twin) -> Twin:
+    """Return the twin with every considered parameter held, as a fit needs it: its data are to say the widths."""
+    if not twin.model.considered:
+        return twin
+    parameters = {
+        name: section.model_copy(update={"use": "held"}) if section.use == "considered" else section
+        for name, section in twin.config.parameters.items()
+    }
+    loaded = replace(twin.loaded, config=twin.config.model_copy(update={"parameters": parameters}))
+    found, loaded = expanded(find_model(loaded, ("model",), loaded.config.model), loaded)
+    model = configure(found, loaded)
+    return replace(twin, loaded=loaded, model=model, tuning=replace(twin.tuning, model=model))
+
+
 def _of_yaml(overrides: Mapping[str, str]) -> dict[str, str]:
     """Return the overrides that change the YAML; the others are keys of the tuning."""
     return {key: value for key, value in overrides.items() if key.split(".")[0] in TwinSection.model_fields}

@@ -70,7 +70,7 @@ class FitApi:
         if attempt is None or attempt.fitted is None:
             raise ConfigError("fit: there is no result to keep; fit first")
         fitted_on = [f"{attempt.events} events over {attempt.seconds:.4g} s, from run {attempt.revision}"]
-        settings = settings_of(attempt.fitted, fitted_on, checked_note(note))
+        settings = settings_of(twin, attempt.fitted, fitted_on, checked_note(note))
         settings = replace(settings, model_version=self._engine.status().model_version)
         keep(twin, name, version_text(twin, settings))
         return {"name": name}

@@ -44,12 +44,15 @@ MAX_ERROR = 5.0
 """Error in root mean squares at which errors are clipped for the correlation time: one peak must not dominate it."""
 
 
-def correlation_time(values: np.ndarray) -> float:
-    """Return the autocorrelation time τ ≥ 1 of a series (n,): correlated values per independent value."""
+def correlation_time(values: np.ndarray, *, about_mean: bool = True) -> float:
+    """Return the autocorrelation time τ ≥ 1 of a series (n,): correlated values per independent value.
+
+    About zero instead of its mean a bias counts as what lasts.
+    """
     n = values.size
     if not n:
         return 1.0
-    power = np.abs(np.fft.rfft(values - values.mean(), 2 * n)) ** 2
+    power = np.abs(np.fft.rfft(values - values.mean() if about_mean else values, 2 * n)) ** 2
     covariance = np.fft.irfft(power)[:n]
     if not covariance[0] > 0.0:
         return 1.0

@@ -23,7 +23,15 @@ from .entries import Setting, Skipped, TuningEntry, entries_of, with_values
 from .judge import POWERS, FitVerdict, Tempered, Worth, tempered, worths
 from .objective import ALONE, SEARCH_FOLDS, SHARES, FitProgress, Go, Objective, maximise, search
 from .recording import BLOCKS, Recording, held_out_rows, until_last_fitted, without_queries, without_stuck
-from .uncertainty import LikelihoodCurvature, Z, curvature, curvature_points, intervals
+from .uncertainty import (
+    LikelihoodCurvature,
+    ParameterWidths,
+    Z,
+    curvature,
+    curvature_points,
+    intervals,
+    parameter_widths,
+)
 
 MAX_DEVIATION = 0.25
 """Deviation of an identified entry, in deviations of its weak prior: for a variance a factor of 3 in its standard
@@ -63,7 +71,8 @@ class Fitted:
 
     `setting` is the fitted tuning (and the prior, where it was fitted); `verdict` is whether it is proposed. `power` is
     that of the likelihood. correlation (k, k) is that of the estimates of `lines`, NaN for reset entries. `left_out` is
-    the number of readings of stuck sensors, by sensor. `stopped` is whether the search was ended early.
+    the number of readings of stuck sensors, by sensor. `stopped` is whether the search was ended early. `widths` is the
+    uncertainty of the parameters to consider, None if there are none.
     """
 
     estimator: str
@@ -78,6 +87,7 @@ class Fitted:
     power: float
     folds: int
     stopped: bool = False
+    widths: ParameterWidths | None = None
 
     @property
     def proposed(self) -> bool:
@@ -95,6 +105,7 @@ def fit(
     blocks: int = BLOCKS,
     aim: str = LIKELIHOOD,
     predict: Sequence[str] = (),
+    considered: Mapping[str, float] | None = None,
     go: Go = lambda folds: True,
     progress: FitProgress | None = None,
 ) -> Fitted:
@@ -110,6 +121,7 @@ def fit(
             nothing proposed.
         aim: Aim of the fit, see aims.py.
         predict: Sensors to hold out, for an aim that does; each in turn by default.
+        considered: Parameters whose uncertainty is wanted, with their deviations without data, in their units.
         go: Called from any thread with the number of folds done since; returns whether to continue.
         progress: Kept up to date from any thread; with its `stop` set, the best point so far is judged and returned.
 
@@ -189,6 +201,10 @@ def fit(
         kept, x, shape, setting_at, lambda settings: worths(estimator, settings, whole, count, aimed), aim=aimed,
         powers=POWERS if blocks and x.size else (1.0,),
     )  # fmt: skip
+    widths = None
+    if considered:
+        progress.expect(len(recordings) * (1 + 2 * len(considered)))
+        widths = parameter_widths(estimator, setting_at(chosen.x), lean, considered, aim=aimed, go=count)
     lines, correlation = _lines(objective.entries, kept, x, value, shape, chosen, identified)
     return Fitted(
         estimator=estimator,
@@ -203,6 +219,7 @@ def fit(
         power=chosen.power,
         folds=progress.folds,
         stopped=progress.stop,
+        widths=widths,
     )
 
 

@@ -6,21 +6,45 @@ interval, undisturbed by the gate or by random draws. H⁻¹ is right if the mod
 the likelihood counts their information too often, and the covariance is H⁻¹ J H⁻¹ with J that of the score, from sums
 over batches of time. The wider of the two is used.
 
+`parameter_widths` says how uncertain parameters are, fitted or not, for filters that consider them. Near p the
+standardised innovations and errors of references z_t (one per row) move by z_t + Z_t δ. Weighted by w = 1 / τ_row, with
+the correlation time of each row, least squares have the information G = Σ w Z_tᵀ Z_t and the score Σ s_t with
+s_t = - w Z_tᵀ z_t, and the covariance of their minimum is G⁻¹ J G⁻¹ with J = Var Σ s_t (Godambe). J is estimated by
+sums over batches of time, so that errors may last. A parameter that the recording excites once has hardly more than one
+batch, and its own fit explains that away; so J is taken as no less than its mean inflation τ ≥ 1 in units of G:
+
+    J = G^½ max(τ I, B) G^½,   B = G^-½ (Σ_batches s sᵀ) G^-½,   τ = max(1, tr B / k)
+
+With the prior N(0, D²), that of the data sheet, the covariance is (G J⁻¹ G + D⁻²)⁻¹: directions that the data do not
+determine keep their prior width. If p is not the minimum, the step to it, d = (G / τ + D⁻²)⁻¹ Σ s_t / τ, adds d dᵀ.
+
 The profile likelihood of entry i, 2 (l(θ̂) - max over all others of l(θ_i = t)) = z², has one solution on either side,
 or none where the data do not identify the entry; then the interval ends at the range. The signed root of the left side
 is nearly linear in t, so a few secant steps find it.
 
 Sources: Abramowitz & Stegun (1964), 25.3.27, for the differences; White (1982), doi:10.2307/1912526, for H⁻¹ J H⁻¹;
-Venzon & Moolgavkar (1988), doi:10.2307/2347496, for the profile.
+Godambe (1960), doi:10.1214/aoms/1177705693, for G J⁻¹ G; Newey & West (1987), doi:10.2307/1913610, for J of correlated
+scores, and Carlstein (1986), doi:10.1214/aos/1176350057, for sums over batches; Ledoit & Wolf (2004),
+doi:10.1016/S0047-259X(03)00096-4, for shrinkage of such a matrix; Venzon & Moolgavkar (1988),
+doi:10.2307/2347496, for the profile.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from .objective import Objective, quasi_newton
+from ..diagnostics.references import references
+from ..diagnostics.sensitivity.responses import each
+from ..log import INPUT
+from ..registry import find_estimator
+from ..track import USED, Track
+from .aims import MAX_ERROR, WITNESSES, Aim, correlation_time, track_of
+from .entries import Setting
+from .objective import ALONE, Cancelled, Go, Objective, quasi_newton
+from .recording import Recording
 
 Z = 1.959963984540054  # Half-width of a 95 % interval, in deviations
 SCORE_BATCHES = 40  # Batches of time whose scores are summed
@@ -197,3 +221,172 @@ def _profile(objective: Objective, x: np.ndarray, H: np.ndarray, i: int, t: floa
     across = H[np.ix_(others, others)]
     start = np.clip(x[others] - np.linalg.solve(across, H[others, i]) * (t - x[i]), low, high)
     return quasi_newton(rest, start, across, steps=PROFILE_STEPS)[1] - penalty
+
+
+WIDTH_STEP = 0.05  # Step of the differences, in deviations of the prior
+WIDTH_BATCHES = (8, 20, 50)  # Numbers of batches of time; the one with the largest inflation counts
+MIN_INFORMATION = 1e-9  # Share of the largest eigenvalue of G, in units of the prior, below which there is none
+
+
+class ParameterWidths(NamedTuple):
+    """Uncertainty of parameters after a fit, and where the data of that fit lie.
+
+    `std` (k,) and `correlation` (k, k) are those of the parameters `names`, in their units; `prior` (k,) their
+    deviations without data; `inflation` the factor τ by which correlated errors discount the information. `envelope`
+    has the range of each input and shown state over the fitted events.
+    """
+
+    names: tuple[str, ...]
+    std: np.ndarray
+    correlation: np.ndarray
+    prior: np.ndarray
+    inflation: float
+    envelope: Mapping[str, tuple[float, float]]
+
+
+def parameter_widths(
+    estimator: str,
+    setting: Setting,
+    recordings: Sequence[Recording],
+    prior: Mapping[str, float],
+    *,
+    aim: Aim | None = None,
+    go: Go = lambda folds: True,
+) -> ParameterWidths:
+    """Return the uncertainty of parameters of a tuning by recordings, 2 k + 1 folds of each.
+
+    Args:
+        estimator: The filter.
+        setting: Tuning and prior of the state; the model considers no parameter.
+        recordings: Recordings; held-out events take no part.
+        prior: Standard deviation of each parameter without data, in its unit.
+        aim: Aim of the fit: with `WITNESSES` the references take part.
+        go: Callback, see `Go`.
+
+    Raises:
+        Cancelled: If `go` returns False.
+    """
+    aim = aim or Aim()
+    model, names = setting.tuning.model, tuple(prior)
+    known = {item.name: item for item in model.parameters}
+    D = np.array([prior[name] for name in names])
+    centre = np.array([float(setting.tuning.get(f"p.{name}") or 0.0) for name in names])
+    ends = np.array([(known[name].low, known[name].high) for name in names], float).reshape(-1, 2)
+    below, above = (np.clip(centre + sign * WIDTH_STEP * D, *ends.T) for sign in (-1.0, 1.0))
+    points = [(name, value) for name, pair in zip(names, zip(below, above, strict=True), strict=True) for value in pair]
+    jobs = [(record, point) for record in recordings for point in (None, *points)]
+
+    def run(job: tuple[Recording, tuple[str, float] | None]) -> Track:
+        record, point = job
+        tuning = setting.tuning if point is None else setting.tuning.set(f"p.{point[0]}", float(point[1]))
+        track = track_of(estimator, setting._replace(tuning=tuning), record)
+        if not go(1):
+            raise Cancelled
+        return track
+
+    alone = find_estimator(estimator, model).family in ALONE
+    tracks = iter(each(run, jobs, None if alone else "threads"))
+    values, slopes = [], []
+    envelope: dict[str, tuple[float, float]] = {}
+    for record in recordings:
+        own, *moved = (next(tracks) for _ in range(1 + len(points)))
+        z, scale = _residuals(setting, record, own, aim)
+        others = [_residuals(setting, record, track, aim)[0] for track in moved]
+        columns = [(up - low) / (b - a) for low, up, a, b in zip(others[::2], others[1::2], below, above, strict=True)]
+        Z = np.stack(columns, axis=-1) * D / scale[..., None] if names else np.zeros((*z.shape, 0))
+        z = z / scale
+        kept = np.isfinite(z) & np.all(np.isfinite(Z), axis=-1)
+        root = np.sqrt(record.weight * _weights(z))
+        values.append(np.where(kept, root * z, 0.0))
+        slopes.append(np.where(kept[..., None], root[:, None] * Z, 0.0))
+        _extend(envelope, record, own, setting)
+    G, information, score, inflation = _godambe(values, slopes)
+    cov = np.linalg.inv(information + np.eye(len(names)))
+    step = np.linalg.solve(G / inflation + np.eye(len(names)), score / inflation)
+    cov = D[:, None] * (cov + np.outer(step, step)) * D
+    std = np.sqrt(np.diag(cov))
+    return ParameterWidths(names, std, cov / np.outer(std, std), D, inflation, envelope)
+
+
+def _residuals(setting: Setting, record: Recording, track: Track, aim: Aim) -> tuple[np.ndarray, np.ndarray]:
+    """Return the errors of predictions at each event (n, rows), NaN where there is none, and their deviations.
+
+    The columns are the rows of each sensor, then the references.
+    """
+    held = record.held_out if record.held_out.size else np.zeros(record.log.n, bool)
+    model, log = setting.tuning.model, record.log
+    errors, stds = [], []
+    for s, sensor in enumerate(model.sensors):
+        own = (track.verdict == USED) & ~held & (log.channel[: log.n] == s)
+        rows = slice(0, len(sensor.rows))
+        errors.append(np.where(own[:, None], track.innovation[:, rows], np.nan))
+        stds.append(track.innovation_std[:, rows])
+    for item in references(model, log.events, track) if aim.kind == WITNESSES else ():
+        error, std = np.full((2, log.n, 1), np.nan)
+        error[item.rows, 0], std[item.rows, 0] = item.error, item.std
+        error[held] = np.nan
+        errors.append(error)
+        stds.append(std)
+    return np.concatenate(errors, axis=1), np.concatenate(stds, axis=1)
+
+
+def _weights(z: np.ndarray) -> np.ndarray:
+    """Return the weight of each column of errors z (n, rows): independent ones per error.
+
+    Scores are linear in the errors, so it is their own correlation that counts, and a bias is one error that lasts.
+    """
+    found = np.ones(z.shape[1])
+    for k, column in enumerate(z.T):
+        errors = column[np.isfinite(column)]
+        if errors.size:
+            most = MAX_ERROR * np.sqrt(np.mean(errors**2))
+            found[k] = 1.0 / correlation_time(np.clip(errors, -most, most), about_mean=False)
+    return found
+
+
+def _extend(envelope: dict[str, tuple[float, float]], record: Recording, track: Track, setting: Setting) -> None:
+    """Extend the range of each shown state and input by the fitted events of a recording."""
+    held = record.held_out if record.held_out.size else np.zeros(record.log.n, bool)
+    model, log = setting.tuning.model, record.log
+    series = {state.name: track.mean[~held, k] for k, state in enumerate(model.shown_states)}
+    inputs = log.value[: log.n][(log.kind[: log.n] == INPUT) & ~held]
+    series |= {item.name: inputs[:, k] for k, item in enumerate(model.inputs)}
+    for name, column in series.items():
+        column = column[np.isfinite(column)]
+        if column.size:
+            low, high = envelope.get(name, (np.inf, -np.inf))
+            envelope[name] = min(low, float(column.min())), max(high, float(column.max()))
+
+
+def _godambe(
+    values: Sequence[np.ndarray], slopes: Sequence[np.ndarray]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+    """Return G, G J⁻¹ G (k, k), the score (k,) and the inflation τ, in units of the prior."""
+    G = sum(np.einsum("nri,nrj->ij", Z, Z) for Z in slopes)
+    each_score = [-np.einsum("nri,nr->ni", Z, z) for z, Z in zip(values, slopes, strict=True)]
+    found, vectors = np.linalg.eigh(G)
+    told = found > MIN_INFORMATION * max(float(found[-1]), 1.0) if found.size else np.zeros(0, bool)
+    score = np.sum([s.sum(axis=0) for s in each_score], axis=0)
+    if not told.any():
+        return G, np.zeros_like(G), np.zeros_like(score), 1.0
+    root = vectors[:, told] * np.sqrt(found[told])
+    white = vectors[:, told] / np.sqrt(found[told])
+    B, inflation = np.eye(int(told.sum())), 1.0
+    for batches in WIDTH_BATCHES:
+        sums = np.concatenate([_batched(s, batches) for s in each_score]) @ white
+        outer = sums.T @ sums * len(sums) / max(1, len(sums) - 1)
+        if np.trace(outer) / len(outer) > inflation:
+            B, inflation = outer, float(np.trace(outer) / len(outer))
+    sizes, axes = np.linalg.eigh(B)
+    B = (axes * np.maximum(sizes, inflation)) @ axes.T
+    return G, root @ np.linalg.inv(B) @ root.T, score, inflation
+
+
+def _batched(scores: np.ndarray, batches: int) -> np.ndarray:
+    """Return sums of scores (n, k) over batches of time, less their mean, (batches, k)."""
+    scored = scores[np.any(scores != 0.0, axis=1)]
+    if len(scored) < 2 * batches:
+        return np.zeros((1, scores.shape[1]))
+    edges = np.linspace(0, len(scored), batches, endpoint=False).astype(int)
+    sums: np.ndarray = np.add.reduceat(scored, edges, axis=0)
+    return sums - sums.mean(axis=0)

@@ -433,7 +433,7 @@ class StateSpaceModel:
 
         A block holds the whole state of a small model, and `TRUTH_BLOCK` states of a large one.
         """
-        return max(min(self.nx, TRUTH_BLOCK), self.nu, self.ny)
+        return max(min(self.nx - self.considered, TRUTH_BLOCK), self.nu, self.ny)
 
 
 def squared(unit: str) -> str:

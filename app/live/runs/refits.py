@@ -26,7 +26,8 @@ from estimators.snapshots import Base
 from estimators.tuning import Tuning
 
 from ...format_time import format_time
-from ...twin.defaults import bounds_of, natural_aim
+from ...twin.defaults import bounds_of, natural_aim, width_priors
+from ...twin.twin import with_held
 from ..history_copy import copy_log
 from ..jobs import DONE, FAILED, RUNNING, Job, JobCancelled
 from ..running_fold import Running
@@ -148,13 +149,18 @@ class Fitting:
         attempt.events, attempt.seconds = log.n, float(log.t[log.n - 1] - log.t[0]) * 1e-9
         config = self._engine.twin.config
         try:
+            # Data say the widths of parameters that the filter considers, so the fit holds them.
+            model = with_held(self._engine.twin).model
+            if base is not None:
+                base = base._replace(mean=base.mean[: model.nx], cov=base.cov[: model.nx, : model.nx])
             return fit(
                 attempt.estimator,
-                attempt.tuning,
+                replace(attempt.tuning, model=model),
                 [Recording(log, base=base)],
                 wanted=attempt.wanted,
-                bounds=bounds_of(config, self._engine.model),
+                bounds=bounds_of(config, model),
                 aim=natural_aim(config),
+                considered=width_priors(config, model, attempt.wanted),
                 go=go,
                 progress=attempt.progress,
             )
@@ -255,7 +261,7 @@ class Refits:
             name = next(name for k in range(1, len(taken) + 2) if (name := f"refit-{k}") not in taken)
             fitted_on = [f"{attempt.events} events over {attempt.seconds:.4g} s, to {format_time(refit.end)}"]
             given = settings_of(
-                attempt.fitted, fitted_on, f"dual estimation, fit {number}, adopted {why}: {refit.text}"
+                twin, attempt.fitted, fitted_on, f"dual estimation, fit {number}, adopted {why}: {refit.text}"
             )
             given = replace(given, model_version=engine.status().model_version)
             keep(twin, name, version_text(twin, given))

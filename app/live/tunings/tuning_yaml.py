@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -13,10 +13,14 @@ from config.yaml_files import Key, as_flow, as_section, parse, with_section, wit
 from estimators.errors import LARGEST
 from estimators.estimator import Estimator
 from estimators.model.coloured import disturbance_time, error_time, errors_of
+from estimators.model.state_space import Field, Input, State, StateSpaceModel
 from estimators.registry import find_entry
 from estimators.tuning import REOPEN_S, Tuning
 
 from ...twin.defaults import bounds_of
+
+if TYPE_CHECKING:
+    from estimators.fit.uncertainty import ParameterWidths
 
 
 def tuning_yaml(
@@ -26,8 +30,9 @@ def tuning_yaml(
     prior: tuple[np.ndarray, np.ndarray] | None = None,
     *,
     whole: bool = True,
+    widths: ParameterWidths | None = None,
 ) -> str:
-    """Return the sections `estimator`, `filters`, `parameters`, `noise`, `sensors` and `gate`.
+    """Return the sections `estimator`, `filters`, `parameters`, `valid`, `noise`, `sensors` and `gate`.
 
     A twin whose file has these in place of its own starts with the same settings.
 
@@ -38,6 +43,8 @@ def tuning_yaml(
         prior: Mean (nx,) and covariance (nx, nx), diagonal, if they are not the file's; adds a section `prior`.
         whole: Whether other content of these sections (limits of a sensor, options of other filters) is kept, without
             its comments. If not, they have the tuned entries only, with every parameter.
+        widths: Covariance that a fit gives the parameters, and the range of its data, which become the range of
+            validity of what has one, or widens a parameter.
     """
     entry, first = find_entry(estimator), config.estimator
     options = {name: _option(entry, name, value) for name, value in tuning.options.items()}
@@ -58,8 +65,12 @@ def tuning_yaml(
     parameters: dict[str, Any] = given if whole else {}
     for name, value in (turned if whole else values).items():
         parameters[name] = {**parameters.get(name, {}), "value": value}
+    if widths is not None:
+        parameters = _with_widths(parameters, widths)
     parameters = {name: item["value"] if list(item) == ["value"] else item for name, item in parameters.items()}
     lines += as_section("parameters", {name: item for name, item in parameters.items() if name not in times})
+    if widths is not None:
+        lines += as_section("valid", _fitted_ranges(config, model, widths, whole))
     if prior is not None:
         beliefs = zip(model.state_names, prior[0].tolist(), np.sqrt(np.diag(prior[1])).tolist(), strict=True)
         lines += as_section("prior", {name: {"mean": mean, "std": std} for name, mean, std in beliefs})
@@ -77,6 +88,38 @@ def tuning_yaml(
         gate = {"probability": gate, "kind": tuning.gate_kind, "reopen": reopen}
     lines.append(f"gate: {as_flow(gate)}")
     return "\n".join(lines) + "\n"
+
+
+CORRELATION_DIGITS = 8
+"""A direction that the data determine well has a small share of each deviation: few digits would blur it."""
+
+
+def _with_widths(parameters: Mapping[str, Any], widths: ParameterWidths) -> dict[str, Any]:
+    """Return the section `parameters` with the widths of a fit."""
+    found = {name: dict(item) for name, item in parameters.items()}
+    for i, name in enumerate(widths.names):
+        pairs = zip(widths.names[:i], widths.correlation[i, :i].tolist(), strict=True)
+        own = found.setdefault(name, {})
+        own |= {"std": float(f"{widths.std[i]:.4g}")}
+        own |= {"correlation": {other: float(f"{value:.{CORRELATION_DIGITS}g}") for other, value in pairs}}
+    return found
+
+
+def _fitted_ranges(
+    config: TwinSection, model: StateSpaceModel, widths: ParameterWidths, whole: bool
+) -> dict[str, dict[str, float]]:
+    """Return the section `valid`: the range of the fit, of each state and input that has one or widens a parameter."""
+    items: tuple[State | Input, ...] = (
+        model.inputs if isinstance(model.states, Field) else (*model.states, *model.inputs)
+    )
+    limited = {item.name for item in items if item.fitted is not None}
+    limited |= {place for section in config.parameters.values() for place in section.widen}
+    found = {name: section.model_dump(mode="json", exclude_unset=True) for name, section in config.valid.items()}
+    found = found if whole else {}
+    for name in sorted(limited & set(widths.envelope)):
+        low, high = widths.envelope[name]
+        found[name] = {"min": float(f"{low:.4g}"), "max": float(f"{high:.4g}")}
+    return found
 
 
 def _sensors(

@@ -17,6 +17,7 @@ from estimators.diagnostics.score import Score
 from estimators.errors import LARGEST, ConfigError
 from estimators.fold import Fold
 from estimators.log import Log
+from estimators.registry import find_estimator
 from estimators.tuning import Tuning
 
 from ...twin.twin import Twin, with_version
@@ -27,6 +28,7 @@ from .tuning_yaml import tuning_yaml, with_tuning
 if TYPE_CHECKING:
     from estimators.fit.fit import Fitted
     from estimators.fit.judge import PartScore
+    from estimators.fit.uncertainty import ParameterWidths
 
 NIS, LIKELIHOOD, RMSE, COVERAGE, REFUSED = "nis", "log_likelihood", "rmse", "coverage", "refused"
 
@@ -38,7 +40,8 @@ DIGITS = 8
 class Settings:
     """Filter, tuning, scores and evidence of a version.
 
-    `prior` has mean and std by state if it was fitted; `scores` are those of `figures`; `evidence` is that of a fit.
+    `prior` has mean and std by state if it was fitted; `scores` are those of `figures`; `evidence` and
+    `widths` are those of a fit.
     """
 
     estimator: str
@@ -49,6 +52,7 @@ class Settings:
     prior: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     model_version: int = 1
     evidence: EvidenceSection | None = None
+    widths: ParameterWidths | None = None
 
 
 def write_section(path: Path, key: str, section: str) -> None:
@@ -127,7 +131,7 @@ def version_text(twin: Twin, given: Settings) -> str:
             for name, section in twin.config.commissioned.items()
         }
     more = [*as_section("prior", given.prior), *as_section("commissioned", normal)]
-    values = tuning_yaml(twin.config, given.estimator, given.tuning, whole=False)
+    values = tuning_yaml(twin.config, given.estimator, given.tuning, whole=False, widths=given.widths)
     return heading + _header(head) + values + "".join(f"{line}\n" for line in more)
 
 
@@ -174,6 +178,7 @@ def apply_tuning(
     tuning: Tuning,
     prior: tuple[np.ndarray, np.ndarray] | None = None,
     *,
+    widths: ParameterWidths | None = None,
     out: Path | None = None,
 ) -> str:
     """Write a tuning into the YAML of a twin, or into a copy.
@@ -183,6 +188,7 @@ def apply_tuning(
         estimator: Filter of the tuning.
         tuning: The tuning.
         prior: Mean and covariance, if fitted.
+        widths: Covariance of the parameters, if fitted.
         out: File of the copy.
 
     Returns:
@@ -192,7 +198,7 @@ def apply_tuning(
         ConfigError: If it cannot be written.
     """
     before = tuning_yaml(twin.config, twin.estimator, twin.tuning)
-    after = tuning_yaml(twin.config, estimator, tuning, prior)
+    after = tuning_yaml(twin.config, estimator, tuning, prior, widths=widths)
     kept = rewrite(twin.path, lambda text: with_tuning(text, before, after), out)
     words = f"{shown_path(out or twin.path)}: has the values"
     return words if kept is None else f"{words}; the previous file is {shown_path(kept)}"
@@ -235,10 +241,16 @@ def load_into(engine: Running, name: str, why: str | None = None) -> None:
     engine.reload(twin, f"version {name}" if why is None else why, exact=True)
 
 
-def settings_of(found: Fitted, fitted_on: Sequence[str], note: str = "") -> Settings:
-    """Return filter, tuning and held-out scores of a fit.
+def widths_of(twin: Twin, found: Fitted) -> ParameterWidths | None:
+    """Return the widths of the parameters of a fit; None if its filter cannot consider them."""
+    return found.widths if find_estimator(found.estimator, twin.model).considers else None
+
+
+def settings_of(twin: Twin, found: Fitted, fitted_on: Sequence[str], note: str = "") -> Settings:
+    """Return filter, tuning, widths and held-out scores of a fit.
 
     Args:
+        twin: The twin.
         found: Result of the fit.
         fitted_on: Names of the recordings.
         note: Note of the version.
@@ -259,6 +271,7 @@ def settings_of(found: Fitted, fitted_on: Sequence[str], note: str = "") -> Sett
         _scores(found.after.held_out),
         beliefs,
         evidence=_evidence(found) if found.proposed else None,
+        widths=widths_of(twin, found),
     )
 
 

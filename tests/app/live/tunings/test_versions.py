@@ -19,11 +19,12 @@ from app.cli.tunings import tunings_of
 from app.live.tunings.tuning_yaml import tuning_yaml, with_tuning
 from app.live.tunings.versions import Settings, accept, keep, version_text
 from app.twin.log_reader import read_log
-from app.twin.twin import load_twin, restore_twin
+from app.twin.twin import load_twin, restore_twin, with_held
 from app.views.recording.reader import read_recording
 from config.loader import TWINS, shipped
 from config.tunings import accepted_version, find_version, folders, load_version, version_files
 from estimators.errors import ConfigError
+from estimators.fit.uncertainty import ParameterWidths
 from estimators.registry import ESTIMATORS
 
 
@@ -65,6 +66,35 @@ def applied(twin, estimator, tuning, **more):
 
 
 either = pytest.mark.parametrize("back_of", [pasted, applied])
+
+
+@pytest.mark.parametrize("back_of", ["pasted", "applied"])
+def test_the_covariance_of_a_fit_and_its_range_come_back_and_are_considered(back_of, tmp_path):
+    path = tmp_path / "motor.yaml"
+    text = (TWINS / "motor_can.yaml").read_text(encoding="utf-8")
+    own = yaml.safe_load(text)
+    own["valid"] = {"coolant": {"min": 0, "max": 50}}
+    own["parameters"] = (own.get("parameters") or {}) | {
+        "magnet_ambient": {"value": 0.4, "widen": {"coolant": {"per": 10, "by": "20 %"}}}
+    }
+    path.write_text(yaml.safe_dump(own), encoding="utf-8")
+    twin = load_twin(path)
+    names = ("winding_tooth", "yoke_coolant", "magnet_ambient")
+    R = np.array([[1.0, 0.123456789, 0.0], [0.123456789, 1.0, -0.99999], [0.0, -0.99999, 1.0]])
+    R[0, 1:] = R[1:, 0] = 0.123456789, -0.123456
+    std, ends = np.array([0.001, 0.002, 0.04]), {"coolant": (20.0, 61.5), "speed": (0.0, 300.0)}
+    widths = ParameterWidths(names, std, R, 10.0 * std, 4.0, ends)
+    if back_of == "applied":
+        found = applied(twin, "ekf", twin.tuning, widths=widths)
+    else:
+        given = yaml.safe_load(tuning_yaml(twin.config, "ekf", twin.tuning, widths=widths))
+        found = restore_twin(yaml.safe_dump(own | given), twin.path)
+    held = with_held(found).model
+    assert held.considered == 0
+    assert found.model.state_names[held.nx :] == (*(f"{name}_deviation" for name in names), "magnet_ambient_outside")
+    np.testing.assert_allclose(found.model.prior_cov[held.nx : -1, held.nx : -1], R * np.outer(std, std), rtol=1e-7)
+    ranges = {item.name: item.fitted for item in found.model.inputs}
+    assert ranges["coolant"] == (20.0, 61.5) and ranges["speed"] is None
 
 
 @either
