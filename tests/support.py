@@ -59,3 +59,19 @@ def assert_same(a: Iterable[Any], b: Iterable[Any]) -> None:
     """The same bits in every column of two tracks or logs; NaN equals NaN."""
     for name, left, right in zip(a._fields, a, b, strict=True):  # type: ignore[attr-defined]
         np.testing.assert_array_equal(left, right, err_msg=name)
+
+
+def arrive(growing: Fold, parts: Iterable[Events], rng: np.random.Generator | None = None) -> int:
+    """Fold parts of a log in their order of arrival, some of them in pieces if `rng` is given.
+
+    Returns:
+        How many parts took back rows that were folded.
+    """
+    late = 0
+    for part in parts:
+        changed, _ = growing.log.extend(part)
+        late += changed < growing.n
+        growing.rewind(changed)
+        growing.advance(int(rng.integers(1, 6)) if rng is not None and rng.random() < 0.3 else None)
+    growing.advance()
+    return late

@@ -15,7 +15,7 @@ from app.ingest import Ingest
 from estimators.diagnostics.health import HealthPolicy
 from estimators.fold import Fold
 from estimators.log import MAINTENANCE, MARK, READING, RESET, TICK, TRUTH, Events, Log, sorted_order
-from estimators.model.parts import Limits
+from estimators.model.parts import Limits, Stuck
 from estimators.tuning import Tuning
 from sources.source import WRONG_TIME
 from tests.estimators.test_plausibility import model
@@ -25,7 +25,10 @@ BEAT = SECOND // 4
 HORIZON = 8
 """Beats."""
 
-MODEL = model(a=Limits(range=((-50.0, 50.0),), rate=(100.0,)), b=Limits(duplicates=0.5))
+MODEL = model(
+    a=Limits(range=((-50.0, 50.0),), rate=(100.0,), stuck=Stuck(readings=3)),
+    b=Limits(duplicates=0.5, saturation=((-55.0, 55.0),)),
+)
 
 FILTERS = {
     "kf": {},
@@ -34,6 +37,7 @@ FILTERS = {
     "sr-ukf": {},
     "pf": {"particles": 48},
     "enkf": {"members": 16},
+    "filterpy-kf": {},
 }
 GATES = {"off": (None, "hard"), "hard": (0.99, "hard"), "soft": (0.99, "soft")}
 

@@ -26,6 +26,7 @@ from estimators.models.thermal_field import thermal_field
 from estimators.snapshots import Base
 from estimators.track import USED
 from estimators.tuning import Tuning
+from tests.models import first_state
 
 from ..support import SECOND
 from .timing import BenchmarkRow, Bound, both, compare
@@ -39,15 +40,11 @@ def _f(x, u, p, dt, out):  # noqa: ANN001, ANN202
         out[k] = 0.9 * x[k] + 0.1 * x[(k + 1) % 3] / (1.0 + x[k] * x[k])
 
 
-def _h(x, u, p, out):  # noqa: ANN001, ANN202
-    out[0] = x[0]
-
-
 MODEL = StateSpaceModel(
     name="three",
     title="three coupled states, the first seen",
     states=tuple(State(f"x{k}", "1") for k in range(3)),
-    sensors=(Sensor("y", (Row("y", "1", 0.25),), h=_h),),
+    sensors=(Sensor("y", (Row("y", "1", 0.25),), h=first_state),),
     noises=tuple(Noise(f"x{k}", "1/s", 0.09) for k in range(3)),
     f=_f,
 )

@@ -3,10 +3,15 @@ from pathlib import Path
 from typing import Annotated
 
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
+from app.twin.twin import restore_twin
 from config.loader import find, load, load_text, shipped
 from config.source_schema import CanSection, SimulatorSection
+from config.yaml_files import as_flow, as_section, parse
 from estimators.errors import ConfigError
+from estimators.tuning import REOPEN_S
 
 MOTOR = """\
 model: motor_winding
@@ -272,3 +277,78 @@ def test_every_twin_that_ships_loads_by_name() -> None:
         assert loaded.config.name == name
         assert find(name).name == f"{name}.yaml"
         assert loaded.text.startswith("#"), f"{name} must open with its source and what to expect"
+
+
+TWIN = "model: motor_winding\nsource: {type: simulator}\ngate: "
+
+
+def loaded(gate):
+    return load_text(TWIN + gate, Path("motor.yaml")).config.gate
+
+
+def test_a_number_is_a_hard_gate_that_reopens():
+    assert loaded("null") is None
+    assert loaded("0.99") == loaded("{probability: 0.99}")
+    assert (loaded("0.99").kind, loaded("0.99").seconds) == ("hard", REOPEN_S)
+
+
+def test_all_that_a_gate_may_be():
+    gate = loaded("{probability: 0.999, kind: soft, reopen: 5}")
+    assert (gate.probability, gate.kind, gate.seconds) == (0.999, "soft", 5.0)
+    assert loaded("{probability: 0.999, reopen: never}").seconds is None
+
+
+def test_it_reaches_the_tuning():
+    tuning = restore_twin(TWIN + "{probability: 0.999, kind: soft, reopen: never}", "motor.yaml").tuning
+    assert [tuning.get(key) for key in ("gate", "gate.kind", "gate.reopen")] == [0.999, "soft", None]
+
+
+@pytest.mark.parametrize(
+    ("gate", "overrides", "expected"),
+    [
+        ("0.999", {"gate.kind": "soft"}, (0.999, "soft", 30.0)),
+        ("0.999", {"gate.reopen": "never", "gate": "0.99"}, (0.99, "hard", None)),
+        ("{probability: 0.9, kind: soft}", {"gate.probability": "0.95"}, (0.95, "soft", 30.0)),
+        ("null", {"gate.probability": "0.95", "gate.kind": "soft"}, (0.95, "soft", 30.0)),
+    ],
+)
+def test_a_part_of_a_gate_is_overridden_also_where_the_file_has_a_number(gate, overrides, expected):
+    found = load_text(TWIN + gate, Path("motor.yaml"), overrides).config.gate
+    assert (found.probability, found.kind, found.seconds) == expected
+
+
+@pytest.mark.parametrize(
+    ("gate", "rule"),
+    [
+        ("2", "motor.yaml:3: gate is 2; it must be below 1"),
+        ("{probability: 2}", "motor.yaml:3: gate.probability is 2; it must be below 1"),
+        ("{kind: soft}", "motor.yaml:3: gate.probability is missing; add it"),
+        ("{probability: 0.9, kind: mild}", "motor.yaml:3: gate.kind is 'mild'; it must be 'hard' or 'soft'"),
+        ("{probability: 0.9, open: 3}", "motor.yaml:3: gate.open is not known"),
+    ],
+)
+def test_one_clear_line(gate, rule):
+    with pytest.raises(ConfigError) as caught:
+        loaded(gate)
+    assert str(caught.value).startswith(rule)
+
+
+NAMES = st.text(st.characters(codec="utf-8", categories=("L", "N", "P", "S", "Zs")), min_size=1, max_size=12)
+NUMBERS = st.integers(-(10**12), 10**12) | st.floats(allow_nan=False, allow_infinity=False)
+LEAVES = st.none() | st.booleans() | NUMBERS | NAMES
+VALUES = st.recursive(LEAVES, lambda inner: st.lists(inner, max_size=4) | st.dictionaries(NAMES, inner, max_size=4))
+
+
+@settings(deadline=None)
+@given(VALUES)
+def test_a_value_is_read_back_as_it_was_written(value):
+    data, _ = parse(as_flow(value), "a.yaml")
+    assert data == value
+
+
+@settings(deadline=None)
+@given(st.dictionaries(NAMES, NUMBERS, min_size=1, max_size=6))
+def test_a_section_has_a_line_for_each_entry(items):
+    data, places = parse("\n".join(as_section("noise", items)), "a.yaml")
+    assert data == {"noise": items}
+    assert [places.at(("noise", name)) for name in items] == [f"a.yaml:{k + 2}" for k in range(len(items))]

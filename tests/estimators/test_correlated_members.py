@@ -1,18 +1,21 @@
-"""Correlated rows of a sensor in particle and ensemble filters, against the dense Gaussian solution."""
+"""Sensors of several rows: correlated ones against the dense Gaussian solution, and more of them than a byte counts."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
 from estimators.errors import EstimatorError
 from estimators.fold import Fold, fold
-from estimators.log import READING, Log
+from estimators.gate.isolation import degrees
+from estimators.log import READING, Events, Log
 from estimators.model.parts import covariance_of
 from estimators.models.lorenz import LORENZ96
 from estimators.registry import ESTIMATORS, checked
 from estimators.tuning import Tuning
 from tests.estimators.linear_models import random_linear
+from tests.models import level_model
 from tests.support import log_of
 
 C = ((1.0, 0.8, -0.5), (0.8, 1.0, -0.2), (-0.5, -0.2, 1.0))
@@ -78,17 +81,6 @@ def test_perturbations_are_correlated():
 
 
 @pytest.mark.parametrize("there", THERE)
-def test_rbpf_with_nothing_to_sample_is_the_kalman_filter(there):
-    track = fold("rbpf", MODEL, Tuning.of(MODEL).with_options({"particles": 2}), rows_there(there))
-    mean, P, nis, log_likelihood, std = update(MATRICES.mean, np.diag(MATRICES.std**2), there)
-    np.testing.assert_allclose(track.mean[0], mean, rtol=0, atol=1e-9)
-    np.testing.assert_allclose(track.std[0], np.sqrt(np.diag(P)), rtol=1e-9)
-    assert track.nis[0] == pytest.approx(nis, rel=1e-9)
-    assert track.log_likelihood[0] == pytest.approx(log_likelihood, rel=1e-9)
-    np.testing.assert_allclose(track.innovation_std[0, there], std, rtol=1e-9)
-
-
-@pytest.mark.parametrize("there", THERE)
 @pytest.mark.parametrize("name", ["pf", "pf-ekf", "apf"])
 def test_particles_are_weighed_by_the_whole_r(name, there):
     """The mean of 40 clouds is right to its standard error, but for a bias of 1/N of the posterior's spread.
@@ -120,3 +112,27 @@ def test_correlated_rows_cannot_be_localised():
             checked(ESTIMATORS[name], model, {"radius": 4.0})
         with pytest.raises(EstimatorError, match="are correlated: made independent, none of them has a place"):
             Fold(name, model, Tuning.of(model).with_options({"radius": 4.0}), Log(model.width))
+
+
+ROWS = 200
+READINGS = 30
+
+
+GAUGES = level_model({"gauges": {f"g{k}": 0.25 for k in range(ROWS)}}, 1e-4, state="x", linear=True)
+
+
+@pytest.mark.parametrize("missing", [0, 60, 150])
+def test_a_sensor_of_200_rows_has_200_degrees_of_freedom(missing):
+    """NIS over the readings is χ² with as many degrees as there were rows: its bounds, and the figure itself."""
+    y = np.random.default_rng(2).normal(0.0, 0.5, (READINGS, ROWS))
+    y[:, :missing] = np.nan
+    log = Log.of(GAUGES)
+    t = np.arange(READINGS) * 10**9
+    log.extend(Events(t, t, np.full(READINGS, READING, np.int8), np.zeros(READINGS, np.int32), y))
+    track = fold("kf", GAUGES, Tuning.of(GAUGES), log)
+    m = ROWS - missing
+    assert track.dof.tolist() == [m] * READINGS == degrees(track).tolist()
+    low, high = chi2.ppf([0.025, 0.975], m * READINGS) / READINGS
+    np.testing.assert_allclose([track.nis_low[-1], track.nis_high[-1]], [low, high], rtol=1e-9)
+    # Four deviations of the mean of χ²: the prior is wider than the truth by a level that all rows share.
+    assert abs(track.nis_mean[-1] - m) < 4.0 * np.sqrt(2.0 * m / READINGS) + 1.0

@@ -86,39 +86,6 @@ def test_pieces_do_not_matter(estimator, seed):
     assert_same(growing.track, whole)
 
 
-@pytest.mark.parametrize("seed", range(4))
-def test_order_of_arrival_does_not_matter(estimator, seed):
-    """Late events: each extends the log, rewinds the fold to where it belongs, and is folded again."""
-    rng = np.random.default_rng(seed)
-    events = everything(rng, 300)
-    # Distinct times: events of equal time keep their order of arrival, which here is to be shuffled.
-    events = events.select(np.unique(events.t, return_index=True)[1])
-    whole = fold(estimator, MODEL, Tuning.of(MODEL), as_log(events))
-    order = np.argsort(np.arange(len(events)) + rng.exponential(12, len(events)))
-    log = Log(MODEL.width, capacity=1)
-    # Anchored by the first event, as a live twin is; what is older than it never comes.
-    order = np.concatenate(([0], order[order != 0]))
-    growing = Fold(estimator, MODEL, Tuning.of(MODEL), log)
-    late = 0
-    for part in np.array_split(order, 120):
-        changed, _ = log.extend(events.select(part))
-        late += changed < growing.n
-        growing.rewind(changed)
-        growing.advance()
-    assert late > 30
-    assert_same(growing.track, whole)
-
-
-def test_a_reading_older_than_the_first_event(estimator):
-    events = random_log(np.random.default_rng(4), MATRICES, 50).events
-    log = as_log(events)
-    growing = folded(estimator, MODEL, log)
-    changed, _ = log.extend(reading(int(events.t[0]) - SECOND, 1, [0.3, -0.4]))
-    growing.rewind(changed)
-    growing.advance()
-    assert_same(growing.track, fold(estimator, MODEL, Tuning.of(MODEL), log.copy()))
-
-
 @QUICK
 def test_rewind_far_behind_the_recent_snapshots(estimator):
     events = random_log(np.random.default_rng(5), MATRICES, 2 * RECENT_EVENTS + 500).events
@@ -425,14 +392,6 @@ def test_inputs_that_are_nan_stay(estimator):
     np.testing.assert_array_equal(growing.u, u)
     expected = MATRICES.mean + MATRICES.A @ MATRICES.mean + MATRICES.B @ u
     np.testing.assert_allclose(growing.track.mean[1], expected, rtol=1e-13, atol=1e-13)
-
-
-def test_seed_and_version_do_not_change_a_filter_without_randomness(estimator):
-    events = random_log(np.random.default_rng(12), MATRICES, 100).events
-    assert_same(
-        fold(estimator, MODEL, Tuning.of(MODEL), as_log(events)),
-        fold(estimator, MODEL, Tuning.of(MODEL), as_log(events)),
-    )
 
 
 @QUICK

@@ -7,31 +7,15 @@ from scipy.stats import norm
 from estimators.errors import EstimatorError
 from estimators.forecast import SIGMAS, first_time, forecast
 from estimators.log import INPUT, READING, Events, Log
-from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
 from tests.estimators.linear_models import random_linear, random_log
+from tests.models import level_model
 from tests.support import SECOND, assert_same, folded, log_of
 
 SURE = 4.5
 """Standard errors that a test by chance may be off: once in 150,000 looks."""
 
 
-def walk(x, u, p, dt, out):
-    out[0] = x[0]
-
-
-def itself(x, u, p, out):
-    out[0] = x[0]
-
-
-WALK = StateSpaceModel(
-    name="walk",
-    title="",
-    states=(State("s", "m", 1.0, 0.5),),
-    noises=(Noise("s", "m²/s", 0.3),),
-    f=walk,
-    linear=True,
-    sensors=(Sensor("y", (Row("y", "m", 0.04),), h=itself),),
-)
+WALK = level_model({"y": 0.04}, 0.3, state="s", mean=1.0, std=0.5, linear=True)
 
 
 def ahead(made, horizon, step, **more):

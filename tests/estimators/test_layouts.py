@@ -14,6 +14,7 @@ from estimators.numerics.workspace import declare_layout, size_of
 from estimators.registry import ESTIMATORS
 from estimators.tuning import Tuning
 from tests.estimators.linear_models import random_linear
+from tests.models import unchanged
 from tests.support import SECOND, folded
 
 GUARD = 16_384
@@ -22,11 +23,6 @@ GUARD = 16_384
 PARTICLE = [name for name, entry in ESTIMATORS.items() if entry.family == "particle"]
 ENSEMBLE = [name for name, entry in ESTIMATORS.items() if entry.family == "ensemble"]
 C = ((1.0, 0.6, -0.3), (0.6, 1.0, 0.2), (-0.3, 0.2, 1.0))
-
-
-def stay(x, u, p, dt, out):
-    for i in range(x.size):
-        out[i] = x[i]
 
 
 def some(x, u, p, out):
@@ -49,7 +45,7 @@ def ring(n, rows):
         states=Field("x", "1", (n,), spacing=0.5, periodic=(True,), std=2.0),
         noises=(Noise("x", "1/s", 0.1),),
         sensors=(Sensor("some", tuple(Row(f"r{k}", "1", 0.5, position=(0.5 * k,)) for k in range(rows)), h=some),),
-        f=stay,
+        f=unchanged,
     )
 
 

@@ -5,15 +5,13 @@ import pytest
 
 from estimators.compiled.model import compile_model
 from estimators.events.maintenance import maintained, model_versions
-from estimators.fold import Fold, fold
+from estimators.fold import fold
 from estimators.log import INPUT, MAINTENANCE, READING, TICK, Events, Log, last_maintenance, model_version_at
 from estimators.models import MODELS
-from estimators.registry import ESTIMATORS
 from estimators.tuning import Tuning
-from tests.support import SECOND, assert_same, folded
+from tests.support import SECOND, folded
 
 MODEL = MODELS["motor_winding"]
-INTERPRETED = next(name for name, entry in ESTIMATORS.items() if entry.interpreted)
 PAIR = np.array([[0, 1]])
 HALF = SECOND // 2
 
@@ -101,24 +99,6 @@ def test_members_are_drawn_from_the_same(estimator, count):
     (row,) = np.flatnonzero(log.events.kind == MAINTENANCE)
     # The deviation of a sample's standard deviation is 1/sqrt(2 n) of it; four of them.
     np.testing.assert_allclose(track.std[row, 1], MODEL.prior_std[1], rtol=4 / np.sqrt(2 * count))
-
-
-@pytest.mark.parametrize("estimator", ["kf", "pf", "enkf", INTERPRETED])
-def test_pieces_and_late_readings_change_nothing(estimator):
-    events = stream(states=(0, 1))
-    tuning = Tuning.of(MODEL)
-    whole = fold(estimator, MODEL, tuning, log_of(events), pairs=PAIR)
-    rng = np.random.default_rng(5)
-    log = Log.of(MODEL)
-    growing = Fold(estimator, MODEL, tuning, log, pairs=PAIR)
-    # Each comes up to 70 s late.
-    order = np.argsort(events.t + rng.uniform(0, 70 * SECOND, len(events)), kind="stable")
-    for piece in np.array_split(order, 60):
-        index, _ = log.extend(events.select(piece))
-        growing.rewind(index)
-        while growing.n < log.n:
-            growing.advance(int(rng.integers(1, 9)))
-    assert_same(growing.track, whole)
 
 
 def test_versions_count_times_not_states():

@@ -18,18 +18,11 @@ from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceMo
 from estimators.models import MODELS
 from estimators.track import DUPLICATE, MISSING, RANGE, RATE, REPEATED, SATURATED, SCREENED, SUSPECT, USED
 from estimators.tuning import Tuning
-from tests.support import SECOND, assert_same, folded
+from tests.models import first_state, unchanged
+from tests.support import SECOND, folded
 
 BEAT = SECOND // 4
 """Times are multiples of a quarter of a second and values of a quarter of a unit: sums of these are exact."""
-
-
-def f(x, u, p, dt, out):
-    out[:] = x
-
-
-def one(x, u, p, out):
-    out[0] = x[0]
 
 
 def two(x, u, p, out):
@@ -45,10 +38,10 @@ def model(a: Limits | None = None, b: Limits | None = None) -> StateSpaceModel:
         states=(State("x", "m", std=10.0), State("y", "m", std=10.0)),
         noises=(Noise("x", "m²/s", 0.01), Noise("y", "m²/s", 0.01)),
         sensors=(
-            Sensor("a", (Row("a", "m", 1 / 16),), h=one, limits=a),
+            Sensor("a", (Row("a", "m", 1 / 16),), h=first_state, limits=a),
             Sensor("b", (Row("x", "m", 1 / 16), Row("y", "m", 1 / 16)), h=two, limits=b),
         ),
-        f=f,
+        f=unchanged,
         linear=True,
     )
 
@@ -204,24 +197,6 @@ def test_a_screened_row_is_to_the_filter_a_row_that_is_missing(name) -> None:
     assert np.array_equal(found.verdict == SCREENED, (lost > 0) & (lost == rows))
     assert np.array_equal(expected.verdict == MISSING, (found.verdict == SCREENED) | (found.verdict == MISSING))
     assert np.any((lost > 0) & (found.verdict == USED))
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_late_readings_and_pieces_give_the_same_bits(seed) -> None:
-    rng = np.random.default_rng(seed)
-    walk = model(STRICT, STRICT)
-    whole = stream(rng, walk, 700)
-    log = Log.of(walk)
-    log.extend(whole)
-    expected = fold("kf", walk, Tuning.of(walk), log)
-    grown = Log.of(walk)
-    growing = Fold("kf", walk, Tuning.of(walk), grown)
-    arrival = whole.t + rng.integers(0, 20 * SECOND, len(whole))
-    for part in np.array_split(np.argsort(arrival), 60):
-        growing.rewind(grown.extend(whole.select(part))[0])
-        growing.advance(int(rng.integers(1, 40)))
-    growing.advance()
-    assert_same(growing.track, expected)
 
 
 def test_a_fold_from_a_base_knows_what_came_before_it() -> None:

@@ -33,24 +33,6 @@ def test_entries_are_complete(name):
 
 
 @pytest.mark.parametrize("name", list(ESTIMATORS))
-def test_sizes_are_enough(name):
-    """The state and scratch that an entry asks for hold what its functions write; what follows stays as it was."""
-    entry = ESTIMATORS[name]
-    model = ANYBODYS
-    log = Log(1)
-    for k in range(5):
-        log.extend(Events.one(k * 10**9, 0, READING, 0, 36.0 + k, 1))
-    fold = Fold(name, model, Tuning.of(model), log)
-    work = entry.work_size(fold.options, model.nx, model.width)
-    from_end = name in ("kf", "sr-kf", "kf-steady")  # these find their F from the end
-    fold._machine.work = fold._machine.work if from_end else np.full(work + 64, np.pi)
-    fold.advance()
-    if not from_end:
-        assert np.all(fold._machine.work[work:] == np.pi)
-    assert fold._now.state.size == entry.state_size(fold.options, model.nx)
-
-
-@pytest.mark.parametrize("name", list(ESTIMATORS))
 def test_options_are_checked(name):
     entry = ESTIMATORS[name]
     assert entry.complete({}) == {option.name: option.default for option in entry.options}

@@ -1,33 +1,17 @@
-"""Lines of the calibration: one for a row, one for the many rows of a sensor."""
+"""What `nisus fold` prints: a line of calibration for the many rows of a sensor, and the probability of a mode."""
 
+from app.cli.arguments import FoldCommand
+from app.cli.fold import fold_twin
 from app.present.export.calibration_lines import calibration_lines
+from app.twin.twin import load_twin
 from estimators.diagnostics.calibration import Calibration
 from estimators.diagnostics.intervals import UNKNOWN, Interval
-from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
+from tests.models import level_model
 
 RIGHT = Interval(1.0, 0.95, 1.05)
 
 
-def still(x, u, p, dt, out):
-    out[0] = x[0]
-
-
-def same(x, u, p, out):
-    for k in range(out.size):
-        out[k] = x[0]
-
-
-MODEL = StateSpaceModel(
-    name="oven",
-    title="oven",
-    states=(State("air", "°C", 0.0, 1.0),),
-    noises=(Noise("air", "°C²/s", 0.1),),
-    sensors=(
-        Sensor("wall", (Row("wall", "°C", 1.0),), h=same),
-        Sensor("grid", tuple(Row(f"g{k}", "°C", 1.0) for k in range(16)), h=same),
-    ),
-    f=still,
-)
+MODEL = level_model({"wall": 1.0, "grid": {f"g{k}": 1.0 for k in range(16)}}, 0.1, state="air")
 
 
 def entry(subject: str, role: str, share: float, words: tuple[str, ...] = ()) -> Calibration:
@@ -55,3 +39,18 @@ def test_many_rows_of_one_sensor_are_one_line():
     assert calibration_lines([entry("air", "truth", 0.95)], MODEL) == [
         "air, truth: scale 1.00 (0.95 to 1.05), bias +0.00 σ, 50, 90, 95 % in the 50, 90, 95 % bands"
     ]
+
+
+def test_fold_prints_the_probability_and_its_brier_score(capsys) -> None:
+    assert fold_twin(FoldCommand("gripper_contact", duration=0.5)) == 0
+    lines = capsys.readouterr().out.splitlines()
+    (line,) = [line for line in lines if "probability of contact" in line]
+    # Nothing is touched in the first half second, and the filter knows.
+    assert "0.000 at the end" in line and "Brier score" in line
+    assert not any("RMSE contact" in line for line in lines)
+
+
+def test_only_a_mode_of_two_values_is_a_probability() -> None:
+    model = load_twin("gripper_contact").model
+    assert [model.label(name) for name in model.state_names[:2]] == ["probability of contact", "depth"]
+    assert load_twin("motor_winding").model.label("temperature") == "temperature"

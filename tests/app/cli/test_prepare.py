@@ -10,7 +10,7 @@ import pytest
 import app.cli.prepare
 from app.cli.prepare import attend
 from app.live.watchdog import CALL_TIMEOUT_S, CallWatch
-from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
+from tests.models import level_model
 
 ENTERED, LEAVE = threading.Event(), threading.Event()
 
@@ -20,18 +20,7 @@ def waits(x, u, p, dt, out):
     LEAVE.wait()
 
 
-def h(x, u, p, out):
-    out[0] = x[0]
-
-
-MODEL = StateSpaceModel(
-    name="slow",
-    title="A model whose f waits",
-    states=(State("x", "1"),),
-    noises=(Noise("x", "1", 1.0),),
-    sensors=(Sensor("s", (Row("r", "1", 1.0),), h),),
-    f=waits,
-)
+MODEL = level_model({"s": {"r": 1.0}}, 1.0, state="x", name="slow", f=waits)
 
 
 def call():

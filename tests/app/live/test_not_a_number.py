@@ -182,6 +182,7 @@ def test_it_is_said_since_when_and_what_mends_it():
     first = int(engine._log.t[lost_rows(engine._fold.track)[0]])
     status = fresh_status(engine)
     assert status.health == DIVERGED and status.lost == status_json(engine)["lost"] == first
+    assert "nan" not in str(status_json(engine)).lower()
     text = status_html(status, SECOND)
     assert f"not a number since {first / SECOND - 1:.1f} s" in text and "reset it" in text and "filter" in text
     assert "contradict" not in text

@@ -1,4 +1,4 @@
-"""Results as text, HTML and JSON from one description."""
+"""Results as text, HTML and JSON from one description; times of a log in words."""
 
 import json
 from dataclasses import dataclass
@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
+from app.format_time import format_time
 from app.present.result import (
     MAX_TABLE_WIDTH,
     WIDTH,
@@ -88,3 +89,11 @@ def test_json_has_objects_for_named_tuples_and_null_for_what_is_no_number():
         "a": {"name": "x", "pair": {"low": None, "high": 2.0}, "values": [1.0, None]},
         "3": [True, 4, None],
     }
+
+
+@pytest.mark.parametrize(
+    ("t", "said"),
+    [(61 * 10**9, "61 s"), (1_795_358_420_700_000_000, "2026-11-22 14:40:20 UTC"), (10**18 - 10**9, "1e+09 s")],
+)
+def test_a_time_has_a_date_where_its_clock_counts_from_1970(t, said):
+    assert format_time(t) == said

@@ -4,15 +4,12 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import viser
 
 from app.cli.main import main
 from app.live import commands
 from app.live.execute import playback
 from app.twin.twin import load_twin, restore_twin
-from app.views.viser.view import ViserView
 from app.web.commands_json import command_from_json
-from app.web.twin_json import status_json
 from estimators.compiled.model import compile_model
 from estimators.errors import ConfigError, ModelError, NisusError
 from estimators.fold import fold
@@ -20,7 +17,7 @@ from estimators.log import READING, Events, Log
 from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
 from estimators.models import MODELS
 from estimators.registry import ESTIMATORS, unfit
-from estimators.track import DIVERGED, FAILED, GATED, USED
+from estimators.track import FAILED, GATED, USED
 from estimators.tuning import Tuning
 from tests.app.scripted import Replayed, Stepped, pull_all
 from tests.conftest import ROOT
@@ -180,31 +177,6 @@ def test_particles_that_all_weigh_nothing_recover_and_it_is_said(name):
     assert (counts["recovered"], counts["failed"]) == (1, 1)
     text = f"{name}: no particle explained a reading; the cloud was widened, 1 time(s) so far"
     assert text in stepped.notices()
-
-
-@pytest.mark.parametrize("twin", ["lorenz63", "road_car"])
-def test_an_estimate_that_is_no_number_stays_off_the_page(twin):
-    stepped = Stepped(of=load_twin(twin, overrides={"estimator": "ekf", "gate": "null"}))
-    engine = stepped.engine
-    values = engine.model.prior_mean[: len(engine.model.sensors[0].rows)]
-    stepped.put(reading(engine.model, 1.0, values))
-    engine._fold._now.state[:] = np.nan
-    stepped.put(reading(engine.model, 1.1, values))
-    view = ViserView(engine, secret="s3cret")
-    try:
-        view.frame()
-        status = stepped.status()
-        assert (status.health, status.since) == (DIVERGED, int(1.1 * SECOND))
-        for text in (view.panel.status.content, str(status_json(engine))):
-            assert "nan" not in text.lower()
-        assert "diverged since 0.1 s" in view.panel.status.content
-        for node in vars(view.stage.scene).values():
-            if isinstance(node, viser.SceneNodeHandle):
-                assert np.isfinite([*node.position, *node.wxyz]).all()
-        stepped.submit(commands.Reset())
-        assert np.isfinite(pull_all(engine).track.mean[2]).all()
-    finally:
-        view.stop()
 
 
 @pytest.mark.parametrize("seconds", [1e300, -1e300, np.inf])

@@ -54,6 +54,8 @@ def answer(engine, body):
         ({"command": "SetTuning", "key": "gate.reopen", "value": "x"}, "gate.reopen is 'x'; it must be a positive"),
         ({"command": "SetTuning", "key": "Q.yoke", "value": "x"}, "Q.yoke is 'x'; it must be a finite number"),
         ({"command": "SetTuning", "key": "use.yoke", "value": "no"}, "use.yoke is 'no'; it must be true or false"),
+        ({"command": "SetTuning", "key": "gate", "value": None, "gesture": "g" * 65}, "gesture has 65 charac"
+         "ters; it may have 64"),
         ({"command": "SetTuning", "key": "", "value": 1}, "'' is not a tuning key of motor_drive; choose from"),
         ({"command": "SetOption", "name": "jozeph", "value": 1}, "no option 'jozeph'; did you mean joseph?"),
         ({"command": "UseSensor", "name": "yok", "used": False}, "UseSensor: name is 'yok', no sensor of motor_drive"),

@@ -56,17 +56,6 @@ def test_a_stopped_fit_keeps_its_best_values(page, halted):
     assert told["state"] == "done" and told["result"]["stopped"] and told["values"]
 
 
-def test_given_up_and_nothing_to_give_up(page):
-    headers = [("Host", page.client.host), ("Cookie", page.client.cookie), ("Origin", page.client.origin)]
-    answer = page.client.raw("DELETE", "/api/fit", headers)
-    assert json.loads(answer.text) == {"state": "none", "available": 600}
-    page.client.post("/api/fit", {"wanted": ["Q", "R"]})
-    page.client.raw("DELETE", "/api/fit", headers)
-    page.client.raw("DELETE", "/api/fit", headers)  # the first one may have found a better point, which is kept
-    wait_for(lambda: look(page)["state"] in DONE)
-    assert "result" not in look(page) and look(page)["state"] == "cancelled"
-
-
 @pytest.mark.parametrize(
     ("path", "body", "reason"),
     [
@@ -149,13 +138,6 @@ def test_a_window_s_fit_is_adopted_and_named_in_every_row(twin_page):
     versions = twin_page.get("/api/tunings")
     assert versions["running"] == "refit-1"
     assert versions["versions"][1]["evidence"]["entries"]["R.winding"]["after"] == entry["after"]
-
-
-def test_a_window_s_fit_is_dismissed(twin_page):
-    proposed(twin_page)
-    status, told = twin_page.post("/api/refit/dismiss", number=1)
-    assert status == 200 and told["fits"][0]["state"] == "dismissed"
-    assert brief(twin_page)["proposed"] is None and twin_page.engine.folded_with()[0].name == "own*"
 
 
 def test_a_window_is_fitted_at_once(twin_page):

@@ -68,24 +68,6 @@ def test_what_cannot_be_is_one_line(page):
     assert "must be a whole number" in page.command("Pin", number="0")
 
 
-def test_edits_of_a_gesture_are_one_run_and_one_undo_for_every_browser(page):
-    began = FIRST.get("Q.rate")
-    for value in (0.2, 0.3, 0.4):
-        assert page.command("SetTuning", key="Q.rate", value=value, gesture="a drag") is None
-    assert [run["what"] for run in page.get("/api/runs")] == ["as it began", f"Q.rate {began:.6g} → 0.4 {UNIT}"]
-    assert page.get("/api/status")["edits"] == {"undo": f"Q.rate {began:.6g} → 0.4 {UNIT}", "redo": None}
-    assert page.command("Undo") is None
-    wait_for(lambda: page.engine.status().tuning.get("Q.rate") == began)
-    assert page.get("/api/status")["edits"] == {"undo": None, "redo": f"Q.rate {began:.6g} → 0.4 {UNIT}"}
-    assert page.command("Undo") == "Undo: there is no edit to take back"
-    assert page.command("Redo") is None
-    wait_for(lambda: page.engine.status().tuning.get("Q.rate") == 0.4)
-    assert len(page.get("/api/runs")) == 2
-    assert page.command("SetTuning", key="Q.rate", value=1.0, gesture="g" * 65) == (
-        "gesture has 65 characters; it may have 64"
-    )
-
-
 def test_two_runs_are_compared(page):
     page.command("SetTuning", key="Q.rate", value=0.5)
     page.command("SetTuning", key="gate", value=0.99)
@@ -110,16 +92,6 @@ def test_what_the_data_say_is_folded_when_asked(page):
     assert noise["R"]["R.winding"]["n"] == 300 and noise["Q"]["key"] == "Q"
     refused = page.client.get("/api/around?key=gate")
     assert refused.status == 400 and "cannot be swept" in refused.text
-
-
-def test_an_edit_of_a_drag_keeps_the_first_to_compare_with(page):
-    before = page.engine.revisions.version
-    for value in np.geomspace(0.1, 1.0, 10):
-        page.engine.submit(SetTuning("Q.rate", float(value)))
-    wait_for(lambda: page.engine.revisions.version > before and not page.engine.status().refolding)
-    listed = page.get("/api/runs")
-    assert [run["what"] for run in listed] == ["as it began", f"Q.rate {FIRST.get('Q.rate'):.6g} → 1 {UNIT}"]
-    assert listed[0]["kept"] and listed[0]["score"] is not None
 
 
 def test_yaml_of_a_run_is_text_to_save(page, monkeypatch):

@@ -86,8 +86,9 @@ def appended(plant):
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("wrapped", [False, True])
-def test_the_predictions_are_those_of_plain_python(kind, wrapped):
-    plant = appended(model(20, kind)) if wrapped else model(20, kind)
+def test_the_predictions_are_those_of_plain_python(kind, wrapped, monkeypatch):
+    monkeypatch.setattr(model_code, "MIN_SHARED", 4)
+    plant = appended(model(6, kind)) if wrapped else model(6, kind)
     compiled = compile_model(plant)
     x, p = 0.3 + np.arange(float(plant.nx)), plant.default_parameters
     shared, own = np.empty(1), np.empty(1)

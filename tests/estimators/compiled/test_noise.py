@@ -1,17 +1,25 @@
-"""Roots of covariances, the singular ones too."""
+"""Process and sensor noise: roots of covariances, noise that depends on the state, and steps in which it adds up."""
+
+from dataclasses import replace
+from fractions import Fraction
 
 import numpy as np
 import pytest
 
+from estimators import registry
+from estimators.compiled.context import SLACK, steps_of
 from estimators.compiled.noise import add_noise, belief_root, has_correlated_rows, independent_rows, semidefinite_root
 from estimators.errors import ModelError
-from estimators.fold import Fold
-from estimators.log import READING, Log
+from estimators.fold import Fold, fold
+from estimators.log import READING, TICK, Events, Log
 from estimators.model.parts import correlation_of, covariance_of
 from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
 from estimators.tuning import Tuning
 from sources.simulator import Simulator
-from tests.support import read_all
+from tests.estimators.linear_models import random_linear
+from tests.estimators.test_fold import in_python
+from tests.models import first_state, level_model, unchanged
+from tests.support import SECOND, as_log, read_all
 
 
 def root(A):
@@ -84,14 +92,6 @@ def test_noise_is_added_through_the_whole_lower_triangle():
 C = ((1.0, 0.6, -0.3), (0.6, 1.0, 0.2), (-0.3, 0.2, 1.0))
 
 
-def f(x, u, p, dt, out):
-    out[0] = x[0]
-
-
-def alone(x, u, p, out):
-    out[0] = x[0]
-
-
 def thrice(x, u, p, out):
     out[0] = x[0]
     out[1] = 2.0 * x[0]
@@ -106,10 +106,10 @@ def model(correlation):
         states=(State("x", "m", mean=0.0, std=1.0),),
         noises=(Noise("x", "m²/s", 1e-3),),
         sensors=(
-            Sensor("one", (Row("one", "m", 1.0),), h=alone),
+            Sensor("one", (Row("one", "m", 1.0),), h=first_state),
             Sensor("three", rows, h=thrice, correlation=correlation),
         ),
-        f=f,
+        f=unchanged,
         linear=True,
     )
 
@@ -183,3 +183,68 @@ def test_the_simulator_draws_correlated_noise():
     # A sample covariance of N draws has the standard deviation √((R_ii R_jj + R_ij²) / N).
     spread = np.sqrt((np.outer(np.diag(R), np.diag(R)) + R**2) / len(y))
     assert np.all(np.abs(np.cov(y.T) - R) < 4.0 * spread)
+
+
+def double(x, u, p, dt, out):
+    out[0] = 2.0 * x[0]
+
+
+def relative(x, u, p, q, dt, out):
+    out[0, 0] = q[0] * dt * x[0] * x[0]
+
+
+@pytest.mark.parametrize("estimator", ["ekf", "iekf", "ukf", "ckf", "sr-ekf", "sr-ukf", "filterpy-ekf", "filterpy-ukf"])
+def test_noise_is_that_of_the_state_before_the_step(estimator):
+    """x = 3 ± 0.5 doubles in 1 s with Q = 0.1 x²: P = 4·0.25 + 0.1·9, not 0.1·36."""
+    model = level_model({"y": 1.0}, 0.1, state="x", mean=3.0, std=0.5, f=double, Q=relative)
+    log = Log(1)
+    for t in (0, 1_000_000_000):
+        log.extend(Events.one(t, 0, TICK, 0, [], 1))
+    track = fold(estimator, model, Tuning.of(model), log)
+    np.testing.assert_allclose(track.mean[1, 0], 6.0, rtol=1e-14)
+    np.testing.assert_allclose(track.std[1, 0] ** 2, 1.9, rtol=1e-13)
+
+
+@pytest.mark.parametrize("exponent", range(-9, 10))
+def test_whole_multiples_at_all_magnitudes(exponent):
+    """k steps of d·10^e seconds take k steps: by ceil of the quotient, one in ten took one more."""
+    for digit in (1, 2, 3, 5, 6, 7, 9):
+        step = float(Fraction(digit) * Fraction(10) ** exponent)
+        for k in (1, 2, 3, 6, 7, 11, 13, 100, 999, 10_000):
+            assert steps_of(float(Fraction(k) * Fraction(digit) * Fraction(10) ** exponent), step) == k
+            assert steps_of(k * step, step) == k
+    assert steps_of(0.3, 0.1) == 3
+
+
+def test_timestamps_in_whole_nanoseconds():
+    for hertz in (3, 7, 30, 60, 1000 / 3, 30_000):
+        for k in (1, 2, 3, 50):
+            for begun in (0.0, 1.7e9):
+                first = round(begun * 1e9)
+                last = first + round(k * 1e9 / hertz)
+                assert steps_of((last - first) * 1e-9, 1.0 / hertz) == k
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_no_step_is_longer_than_allowed_and_none_is_wasted(seed):
+    rng = np.random.default_rng(seed)
+    for _ in range(2000):
+        step = float(10 ** rng.uniform(-6, 6))
+        dt = step * float(10 ** rng.uniform(-3, 4))
+        n = steps_of(dt, step)
+        assert dt / n <= step * (1 + SLACK) and (n == 1 or dt > step * (n - 1))
+    assert steps_of(5.0, np.inf) == 1 and steps_of(0.0, 1.0) == 1
+
+
+@pytest.mark.parametrize("name", ["ekf", "ekf-python"])
+def test_the_fold_crosses_a_gap_in_as_many_steps(name, monkeypatch):
+    """x' = x + A x dt is Euler's rule, so the number of steps shows in the mean: (1 + A dt/3)³."""
+    monkeypatch.setitem(registry.ESTIMATORS, "ekf-python", in_python("ekf"))
+    matrices = random_linear(np.random.default_rng(1), 3, 2)
+    model = replace(matrices.model, max_step=0.1)
+    ticks = [Events.one(t, 0, TICK, 0, (), model.width) for t in (0, 3 * SECOND // 10)]
+    track = fold(name, model, Tuning.of(model), as_log(Events.concat(ticks, model.width)))
+    x = matrices.mean
+    for _ in range(3):
+        x = x + 0.1 * (matrices.A @ x + matrices.B @ matrices.u)
+    np.testing.assert_allclose(track.mean[1], x, rtol=1e-13)

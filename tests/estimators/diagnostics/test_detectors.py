@@ -31,16 +31,13 @@ from estimators.track import (
     WAITING,
 )
 from estimators.tuning import Tuning
+from tests.models import first_state
 from tests.support import SECOND, as_log, assert_same, folded
 
 
 def f(x, u, p, dt, out):
     out[0] = x[0] + dt * (u[0] - 0.2 * x[0])
     out[1] = x[1] + dt * (0.5 * x[0] - 0.3 * x[1])
-
-
-def one(x, u, p, out):
-    out[0] = x[0]
 
 
 def two(x, u, p, out):
@@ -59,7 +56,7 @@ MODEL = StateSpaceModel(
     inputs=(Input("feed", "m/s", fitted=(-1.0, 1.0)),),
     noises=(Noise("a", "m²/s", 0.04), Noise("b", "m²/s", 0.04)),
     sensors=(
-        Sensor("one", (Row("one", "m", 0.25),), h=one, limits=Limits(range=((-9.0, 9.0),))),
+        Sensor("one", (Row("one", "m", 0.25),), h=first_state, limits=Limits(range=((-9.0, 9.0),))),
         Sensor("two", (Row("low", "m", 0.09), Row("high", "m", 0.36)), h=two, limits=Limits(range=((-9.0, 9.0),) * 2)),
         Sensor("other", (Row("other", "m", 0.25),), h=other),
     ),

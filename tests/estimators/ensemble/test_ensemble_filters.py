@@ -8,16 +8,15 @@ import pytest
 from estimators.compiled.model import compile_model
 from estimators.ensemble import analysis, localisation, shared
 from estimators.ensemble.localisation import gaspari_cohn
-from estimators.errors import EstimatorError
 from estimators.fold import Fold
 from estimators.log import READING, TICK, Events, Log
 from estimators.model.state_space import Field, Noise, Row, Sensor, State, StateSpaceModel
 from estimators.models.lorenz import LORENZ96
-from estimators.models.motor_drive import MOTOR_WINDING
 from estimators.numerics.random import key_of, normal
 from estimators.snapshots import Base
 from estimators.tuning import Tuning
 from tests.estimators.linear_models import ROWS, JointGaussian, random_linear, random_log
+from tests.models import first_state, level_model, unchanged
 from tests.support import folded, log_of
 
 NAMES = ["enkf", "etkf", "ensrf", "letkf"]
@@ -133,14 +132,7 @@ def test_enkf_has_kalmans_spread_on_average_however_few_its_members(members):
     2 K⁴ / (N - 1) + 4 K² (1 - K)² (P / R) / (N - 1); perturbations too large by N / (N - 1) would be off by 9 σ.
     """
     r, runs = 0.5, 400
-    model = StateSpaceModel(
-        name="level",
-        title="level",
-        states=(State("x", "m", std=5.0),),
-        noises=(Noise("x", "m²/s", 0.0),),
-        sensors=(Sensor("y", (Row("y", "m", r),), h=first_of),),
-        f=stay,
-    )
+    model = level_model({"y": r}, 0.0, state="x", std=5.0)
     off, variance = 0.0, 0.0
     for seed in range(runs):
         before, after, _ = analysed("enkf", model, {"members": members}, 0, [0.3], seed=seed)
@@ -217,22 +209,13 @@ def some(x, u, p, out):
         out[k] = x[READ[k]]
 
 
-def stay(x, u, p, dt, out):
-    for i in range(x.size):
-        out[i] = x[i]
-
-
-def first_of(x, u, p, out):
-    out[0] = x[0]
-
-
 RING = StateSpaceModel(
     name="ring",
     title="ring",
     states=Field("x", "1", (40,), spacing=0.5, periodic=(True,), std=2.0),
     noises=(Noise("x", "1/s", 0.1),),
     sensors=(Sensor("some", tuple(Row(f"r{k}", "1", 0.5, position=(0.5 * k,)) for k in READ), h=some),),
-    f=stay,
+    f=unchanged,
 )
 Y = np.array([1.0, 2.0, -1.0, np.nan, 3.0, 0.5, -2.0, np.nan, 1.5])
 SEEN = np.flatnonzero(np.isfinite(Y))
@@ -349,21 +332,6 @@ def test_gaspari_cohn_is_their_function():
     assert np.linalg.eigvalsh(gaspari_cohn(distance, 2.0)).min() > -1e-12
 
 
-@pytest.mark.parametrize("name", LOCAL)
-def test_a_radius_without_positions_is_refused(name):
-    tuning = Tuning.of(MOTOR_WINDING).with_options({"radius": 3.0})
-    with pytest.raises(EstimatorError, match="radius is 3, but model motor_winding does not say where its states are"):
-        Fold(name, MOTOR_WINDING, tuning, Log(1))
-
-
-@pytest.mark.parametrize("name", NAMES)
-@pytest.mark.parametrize("members", [0, 1])
-def test_fewer_than_two_members_are_refused(name, members):
-    tuning = Tuning.of(MOTOR_WINDING).with_options({"members": members})
-    with pytest.raises(EstimatorError, match=f"members is {members}; it must lie between 2 and 10000"):
-        Fold(name, MOTOR_WINDING, tuning, Log(1))
-
-
 @pytest.mark.parametrize("name", NAMES)
 def test_bits_are_the_same_on_any_number_of_threads(name, monkeypatch):
     rng = np.random.default_rng(2)
@@ -385,17 +353,13 @@ def test_bits_are_the_same_on_any_number_of_threads(name, monkeypatch):
 # Angles: an angle near the seam, read by a sensor of which the row is an angle too.
 
 
-def bearing(x, u, p, out):
-    out[0] = x[0]
-
-
 COMPASS = StateSpaceModel(
     name="compass",
     title="compass",
     states=(State("heading", "rad", mean=3.1, std=0.2, circular=True),),
     noises=(Noise("heading", "rad²/s", 1e-4),),
-    sensors=(Sensor("bearing", (Row("bearing", "rad", 0.04, circular=True),), h=bearing),),
-    f=stay,
+    sensors=(Sensor("bearing", (Row("bearing", "rad", 0.04, circular=True),), h=first_state),),
+    f=unchanged,
 )
 
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy.linalg import solve_triangular
 from scipy.optimize import brentq, minimize
+from scipy.stats import binom
 
 from estimators.errors import ConfigError
 from estimators.fit.entries import entries_of
@@ -16,6 +17,7 @@ from estimators.fit.recording import Recording, held_out_rows, without_queries
 from estimators.log import READING, Log
 from estimators.model.state_space import Noise, Parameter, Row, Sensor, State, StateSpaceModel
 from estimators.tuning import Tuning
+from tests.benchmarks.recovery import CASES, recover
 
 DECADES = 2.0 * np.log(10.0)
 """Deviation of the weak belief in a variance."""
@@ -249,3 +251,25 @@ def test_queries_are_no_part_of_what_is_folded_again(ys):
 def test_an_entry_that_is_none_is_refused(ys):
     with pytest.raises(ConfigError, match="R.flot is no entry that can be fitted; did you mean R.float"):
         fit("kf", Tuning.of(MODEL), [Recording(log_of(ys))], wanted=("R.flot",))
+
+
+LOGS = 6
+
+
+def test_true_noises_lie_in_their_intervals():
+    found = recover(next(case for case in CASES if case.twin == "motor_winding"), LOGS)
+    told = sum(found.told.values())
+    # All three are told by 1500 readings. Fewer inside than this would come by chance once in a thousand.
+    assert told == 3 * LOGS
+    assert sum(found.inside.values()) >= binom.ppf(1e-3, told, 0.95)
+    # NIS on a log that was not fitted: 99 % bounds.
+    assert found.consistent >= LOGS - 1
+
+
+def test_a_fit_makes_the_nis_of_another_log_as_uncertain_as_its_readings_do():
+    """With the information I of a fit, ∂(mean NIS)/∂θ is -(2 / N) I e along the scale e of all noises, so gᵀ I⁻¹ g is
+    2 / N: the variance of a chi-square's mean once more, whatever the model, if all Q and R are fitted."""
+    case = next(case for case in CASES if case.twin == "motor_winding")
+    found = recover(case, 3)
+    # The belief takes from it, the sandwich adds, by a few percent each.
+    np.testing.assert_allclose(found.wider, np.sqrt(2.0), rtol=0.15)

@@ -10,9 +10,9 @@ from app.twin.log_reader import read_log
 from app.twin.twin import load_twin
 from estimators.fold import Fold
 from estimators.log import READING, Events, Log
-from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
 from estimators.track import GATED
 from estimators.tuning import Tuning
+from tests.models import level_model
 from tests.support import as_log, folded
 
 JUMP = 300.0
@@ -95,24 +95,8 @@ def test_a_twin_begun_300_m_off_believes_its_first_fixes(drive):
     assert np.max(error[drive.seconds[begin:] > JUMP + 60.0]) < 10.0
 
 
-def _stay(x, u, p, dt, out):
-    out[0] = x[0]
-
-
-def _air(x, u, p, out):
-    out[0] = x[0]
-
-
-OFFICE = StateSpaceModel(
-    name="office",
-    title="Temperature of an office, hourly",
-    states=(State("temperature", "°F", mean=69.9, std=5.0),),
-    noises=(Noise("temperature", "°F²/s", variance=0.02 / 3600.0),),
-    sensors=(Sensor("air", (Row("air", "°F", variance=0.25),), h=_air),),
-    f=_stay,
-    max_step=3600.0,
-    linear=True,
-    source="a random walk",
+OFFICE = level_model(
+    {"air": 0.25}, 0.02 / 3600.0, state="temperature", mean=69.9, std=5.0, max_step=3600.0, linear=True
 )
 
 

@@ -8,7 +8,7 @@ from estimators.gate.isolation import MIN_VARIANCE_SHARE, ReopeningEvidence, cos
 from estimators.gate.rejection_runs import MIN_RUN, RUN_PROBABILITY, rule_of
 from estimators.log import READING, RESET, Events, Log
 from estimators.track import GATED, USED
-from tests.support import SECOND, as_log, assert_same
+from tests.support import SECOND, arrive, as_log, assert_same
 
 from .two_sensors import JUMP, MODEL, TUNING, series
 
@@ -120,14 +120,7 @@ def test_pieces_and_order_of_arrival_do_not_matter(name, story, kind):
     order = np.concatenate(([0], order[order != 0]))
     log = Log(MODEL.width, capacity=1)
     growing = Fold(name, MODEL, tuning, log)
-    rewound = 0
-    for part in np.array_split(order, 150):
-        changed, _ = log.extend(events.select(part))
-        rewound += changed < growing.n and bool(growing.decisions)
-        growing.rewind(changed)
-        growing.advance(int(rng.integers(1, 6)) if rng.random() < 0.3 else None)
-    growing.advance()
-    assert rewound > 10
+    assert arrive(growing, [events.select(part) for part in np.array_split(order, 150)], rng) > 10
     assert_same(growing.track, whole.track)
     assert [tuple(d) for d in growing.decisions] == [tuple(d) for d in whole.decisions]
 

@@ -3,30 +3,11 @@
 import numpy as np
 
 from estimators.log import TICK, Events, Log
-from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
 from estimators.tuning import Tuning
+from tests.models import level_model
 from tests.support import SECOND, as_log
 
-
-def _same(x, u, p, dt, out):
-    out[0] = x[0]
-
-
-def _level(x, u, p, out):
-    out[0] = x[0]
-
-
-MODEL = StateSpaceModel(
-    name="level",
-    title="A level and two sensors",
-    states=(State("level", "m", std=1.0),),
-    noises=(Noise("level", "m²/s", variance=1e-4),),
-    sensors=tuple(Sensor(name, (Row(name, "m", variance=0.01),), h=_level) for name in ("a", "b")),
-    f=_same,
-    max_step=1.0,
-    linear=True,
-    source="the random walk",
-)
+MODEL = level_model({"a": 0.01, "b": 0.01}, 1e-4, max_step=1.0, linear=True)
 
 TUNING = Tuning.of(MODEL).set("gate", 0.9999)
 

@@ -6,11 +6,11 @@ import pytest
 from estimators.errors import ConfigError, EstimatorError
 from estimators.fold import Fold
 from estimators.log import READING, Events, Log
-from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
 from estimators.registry import ESTIMATORS, find_estimator
 from estimators.track import FAILED, USED
 from estimators.tuning import Tuning
 from tests.estimators.linear_models import JointGaussian, random_linear, random_log
+from tests.models import level_model
 from tests.support import SECOND, folded
 
 SINGULAR = [name for name, entry in ESTIMATORS.items() if entry.singular]
@@ -46,24 +46,8 @@ def test_what_is_certain_equals_the_joint_gaussian(estimator, nx, seed, correlat
     assert likelihood == pytest.approx(joint.log_likelihood(used), rel=1e-9)
 
 
-def stay(x, u, p, dt, out):
-    out[0] = x[0]
-
-
-def itself(x, u, p, out):
-    out[0] = x[0]
-
-
 def model(*, std=1.0, variance=0.0):
-    return StateSpaceModel(
-        name="exact",
-        title="a state that is read without noise",
-        states=(State("x", "m", std=std),),
-        noises=(Noise("x", "m²/s", variance=0.5),),
-        sensors=(Sensor("y", (Row("y", "m", variance=variance),), h=itself),),
-        f=stay,
-        linear=True,
-    )
+    return level_model({"y": variance}, 0.5, name="exact", state="x", std=std, linear=True)
 
 
 @pytest.mark.parametrize("estimator", SINGULAR)

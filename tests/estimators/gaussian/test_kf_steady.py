@@ -14,6 +14,7 @@ from estimators.track import USED
 from estimators.tuning import Tuning
 from tests.estimators.interpreted.test_filterpy import PENDULUM
 from tests.estimators.linear_models import random_linear
+from tests.models import first_state
 from tests.support import SECOND
 
 MOTOR = MODELS["motor_winding"]
@@ -161,11 +162,7 @@ def second(x, u, p, out):
     out[0] = x[1]
 
 
-def itself(x, u, p, out):
-    out[0] = x[0]
-
-
-def linear(f, h=itself, *, inputs=()):
+def linear(f, h=first_state, *, inputs=()):
     return StateSpaceModel(
         name=f.__name__,
         title=f.__name__,

@@ -11,6 +11,7 @@ from estimators.models import MODELS
 from estimators.registry import ESTIMATORS
 from estimators.track import MISSING, USED
 from estimators.tuning import Tuning
+from tests.models import first_state, unchanged
 from tests.support import SECOND, log_of
 
 # The gain of the first readings of kf-steady is another.
@@ -22,18 +23,9 @@ def growth(x, u, p, dt, out):
     out[0] = x[0] + dt * x[0]
 
 
-def still(x, u, p, dt, out):
-    for i in range(x.size):
-        out[i] = x[i]
-
-
 def drift(x, u, p, dt, out):
     out[0] = x[0] + dt * x[1]
     out[1] = x[1]
-
-
-def itself(x, u, p, out):
-    out[0] = x[0]
 
 
 def bearing(x, u, p, out):
@@ -45,7 +37,7 @@ def guarded(x, u, p, dt, out):
     out[0] = 0.9 ** (dt / 3.0) * x[0] if x[0] > -1e300 else 0.0
 
 
-def model(f, h=itself, *, states=1, std=0.5, mean=0.0, q=0.02, r=0.0025, circular=(), linear=True, max_step=np.inf):
+def model(f, h=first_state, *, states=1, std=0.5, mean=0.0, q=0.02, r=0.0025, circular=(), linear=True, **fields):
     return StateSpaceModel(
         name=f.__name__,
         title=f.__name__,
@@ -57,7 +49,7 @@ def model(f, h=itself, *, states=1, std=0.5, mean=0.0, q=0.02, r=0.0025, circula
         sensors=(Sensor("y", (Row("y", "rad", variance=r, circular="y" in circular),), h=h),),
         f=f,
         linear=linear,
-        max_step=max_step,
+        **fields,
     )
 
 
@@ -100,7 +92,7 @@ def test_long_steps_are_split(estimator, dt, steps):
 @pytest.mark.parametrize("estimator", NAMES)
 def test_heading_takes_the_short_way_over_pi(estimator):
     """Prior 3.1 ± 0.1, reading -3.1 with R = 0.0025: gain 0.8, innovation 2π - 6.2, not -6.2."""
-    compass = model(still, mean=3.1, std=0.1, circular=("x0", "y"))
+    compass = model(unchanged, mean=3.1, std=0.1, circular=("x0", "y"))
     folded = run(estimator, compass, (0, READING, -3.1))
     innovation = 2 * np.pi - 6.2
     np.testing.assert_allclose(folded.track.innovation[0, 0], innovation, rtol=1e-13)
@@ -126,7 +118,7 @@ def test_turning_for_many_rounds(estimator):
 
 @pytest.mark.parametrize("estimator", NAMES)
 def test_a_state_that_is_not_circular_does_not_wrap(estimator):
-    folded = run(estimator, model(still, mean=3.1, std=0.1), (0, READING, 3.3))
+    folded = run(estimator, model(unchanged, mean=3.1, std=0.1), (0, READING, 3.3))
     np.testing.assert_allclose(folded.track.mean[0, 0], 3.26, rtol=1e-14)
 
 
@@ -137,7 +129,7 @@ def test_bearing_where_atan2_jumps(estimator, side):
 
     At (-2, 0) the bearing's Jacobian is (0, -1/2): the reading -π + 0.1 has the innovation 0.1.
     """
-    west = model(still, bearing, states=2, mean=(-2.0, side), std=0.01, r=1e-6, circular=("y",), linear=False)
+    west = model(unchanged, bearing, states=2, mean=(-2.0, side), std=0.01, r=1e-6, circular=("y",), linear=False)
     folded = run(estimator, west, (0, READING, -np.pi + 0.001))
     S = 0.25e-4 + 1e-6
     gain = -0.5e-4 / S

@@ -15,6 +15,7 @@ from estimators.model.state_space import Noise, Parameter, Row, Sensor, State, S
 from estimators.track import FAILED, USED
 from estimators.tuning import Tuning
 from tests.estimators.interpreted.test_filterpy import PENDULUM, log  # noqa: F401  the fixture
+from tests.models import level_model, unchanged
 from tests.support import SECOND
 
 FILTERPY = ["filterpy-kf", "filterpy-ekf", "filterpy-ukf"]
@@ -78,20 +79,8 @@ def squared(x, u, p, out):
     out[0] = 0.5 * x[0] * x[0]
 
 
-def keep(x, u, p, dt, out):
-    for i in range(x.size):
-        out[i] = x[i]
-
-
 def one(f, h, q):
-    return StateSpaceModel(
-        name="parabola",
-        title="parabola",
-        states=(State("a", "1", std=1.0),),
-        noises=(Noise("a", "1", variance=q),),
-        sensors=(Sensor("y", (Row("y", "1", variance=1e-6),), h=h),),
-        f=f,
-    )
+    return level_model({"y": 1e-6}, q, state="a", f=f, h=h)
 
 
 @pytest.mark.parametrize("estimator", ["ukf", "sr-ukf"])
@@ -101,7 +90,7 @@ def test_a_negative_weight_that_outweighs_the_others_fails_visibly(estimator):
     The mean is 0.05·10 = 0.5, so D₀ = -0.5, D± = -0.45: S = -9·0.25 + 10·0.2025 = -0.225 < 0.
     """
     values = {"alpha": 1.0, "beta": 0.0, "kappa": -0.9}
-    model = one(keep, squared, 1e-9)
+    model = one(unchanged, squared, 1e-9)
     readings = Log(1)
     readings.extend(Events.one(0, 0, READING, 0, 0.3, 1))
     fold = Fold(estimator, model, Tuning.of(model).with_options(values), readings)
@@ -116,32 +105,6 @@ def test_a_negative_weight_that_outweighs_the_others_fails_visibly(estimator):
     fold.advance()
     assert fold.track.verdict[1] == FAILED
     assert np.isnan(fold.track.std[1, 0])  # the health of such a row is `diverged`
-
-
-def itself(x, u, p, out):
-    out[0] = x[0]
-
-
-COMPASS = StateSpaceModel(
-    name="compass",
-    title="compass",
-    states=(State("heading", "rad", mean=3.1, std=0.2, circular=True),),
-    noises=(Noise("heading", "rad²/s", 1e-4),),
-    sensors=(Sensor("bearing", (Row("bearing", "rad", 0.01, circular=True),), h=itself),),
-    f=keep,
-)
-
-
-@pytest.mark.parametrize("estimator", ["ekf", "iekf", "ukf", "ckf", "sr-ekf", "sr-ukf"])
-def test_an_angle_is_corrected_across_the_seam(estimator):
-    """3.1 ± 0.2 and the reading -3.1 ± 0.1, which is 3.183: 4/5 of the way, beyond π."""
-    readings = Log(1)
-    readings.extend(Events.one(0, 0, READING, 0, -3.1, 1))
-    fold = Fold(estimator, COMPASS, Tuning.of(COMPASS), readings)
-    fold.advance()
-    gap = 2 * np.pi - 6.2
-    np.testing.assert_allclose(fold.track.innovation[0, 0], gap, rtol=1e-12)
-    np.testing.assert_allclose(fold.track.mean[0, 0], 3.1 + 0.8 * gap - 2 * np.pi, rtol=1e-12)
 
 
 def twins(x, u, p, out):
@@ -171,7 +134,7 @@ TWINS = StateSpaceModel(
         Sensor("first", rows("y"), h=first_twin),
         Sensor("second", rows("y"), h=second_twin),
     ),
-    f=keep,
+    f=unchanged,
     linear=True,
 )
 Y = np.array([0.3 - 0.5 + 0.7, 0.3 - 0.5 + 0.7 * (1.0 + 1e-9)])
@@ -216,12 +179,12 @@ def test_a_reading_beyond_the_digits_of_the_plain_forms(estimator, readings):
 
 
 @pytest.mark.parametrize("options", [{"joseph": 0}, {"joseph": 1}, {}])
-@pytest.mark.parametrize("estimator", ["kf", "ekf", "iekf", "ukf", "ckf"])
+@pytest.mark.parametrize("estimator", ["kf", "ekf", "iekf", "ukf", "ckf", *FILTERPY])
 def test_the_plain_forms_refuse_it_and_say_so(estimator, options):
     try:
         fold = folded(estimator, TWINS, at_once(), options)
     except EstimatorError:
-        assert "joseph" in options and estimator in ("ukf", "ckf")
+        assert "joseph" in options and estimator in ("ukf", "ckf", *FILTERPY)
         return
     assert fold.track.verdict[0] == FAILED
     np.testing.assert_array_equal(fold.moments()[0], np.zeros(3))
@@ -244,7 +207,7 @@ def test_a_pivot_that_rounding_could_have_made_is_refused(estimator, apart, verd
         parameters=(Parameter("apart", "1", apart),),
         noises=TWINS.noises,
         sensors=(Sensor("both", rows("y1", "y2"), h=near_twins),),
-        f=keep,
+        f=unchanged,
         linear=True,
     )
     fold = folded(estimator, model, at_once())
@@ -262,19 +225,12 @@ def test_square_roots_refuse_what_their_own_digits_cannot_tell(estimator):
         parameters=(Parameter("apart", "1", 0.0),),
         noises=TWINS.noises,
         sensors=(Sensor("both", twice, h=near_twins),),
-        f=keep,
+        f=unchanged,
         linear=True,
     )
     fold = folded(estimator, model, at_once())
     assert fold.track.verdict[0] == FAILED
     np.testing.assert_array_equal(fold.track.mean[0], 0.0)
-
-
-@pytest.mark.parametrize("estimator", FILTERPY)
-def test_filterpys_forms_refuse_it_and_say_so(estimator):
-    fold = folded(estimator, TWINS, at_once())
-    assert fold.track.verdict[0] == FAILED
-    np.testing.assert_array_equal(fold.moments()[0], np.zeros(3))
 
 
 @pytest.mark.parametrize("estimator", ["kf", "ekf", "iekf", "ukf", "ckf", *FILTERPY])

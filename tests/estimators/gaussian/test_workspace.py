@@ -5,12 +5,10 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
-from estimators.compiled.jacobians import scratch_size
 from estimators.fold import Fold
 from estimators.log import READING, Events, Log
 from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
 from estimators.numerics.jit import inlined, jit
-from estimators.numerics.simd_ir import padded
 from estimators.numerics.workspace import layout, size_of, start_of, take_matrix, take_vector
 from estimators.registry import ESTIMATORS
 from estimators.tuning import Tuning
@@ -102,40 +100,6 @@ def test_nothing_is_written_beyond_the_scratch(name, n, m):
             assert np.all(np.isfinite(fold.track.mean)), options
             # What is in the scratch at first is of no matter.
             np.testing.assert_array_equal(fold.track.mean, plain.track.mean)
-
-
-def old_sizes(n, m):
-    """What each of these filters asked for when each layout was written twice."""
-    shared = 2 * m + 2 * m * m + n * m + m * padded(n) + m * m + 4 * m
-    ekf = max(n + 3 * n * n, shared + 2 * n * m + n * n) + scratch_size(n, m)
-    rows = 2 * n + 1
-    ukf = shared + n * padded(n) + rows * (padded(n) + max(padded(n), padded(m))) + max(padded(n), padded(m))
-
-    def conditioning(extra):
-        return (n + extra + m) * (n + m) + 2 * n + 3 * m + m * m + m * m + 4 * m
-
-    sr_ekf = max(n + 4 * n * n, m + 2 * n * m + conditioning(0)) + scratch_size(n, m)
-    predicting = rows * padded(n) + padded(n) + n + (3 * n + 1) * n + n * n
-    sr_ukf = rows * padded(n) + max(predicting, rows * padded(m) + padded(m) + m + rows * m + conditioning(n + 1))
-    kept = n * n + 1
-    return {
-        "kf": ekf + kept,
-        "kf-steady": ekf + kept,
-        "ekf": ekf,
-        "iekf": ekf + n + 2 * m,
-        "ukf": ukf,
-        "ckf": ukf,
-        "sr-kf": sr_ekf + kept,
-        "sr-ekf": sr_ekf,
-        "sr-ukf": sr_ukf,
-    }
-
-
-@pytest.mark.parametrize("name", old_sizes(1, 1))
-def test_the_scratch_is_no_larger_than_it_was(name):
-    for n in (1, 2, 3, 7, 8, 9, 24, 100):
-        for m in (1, 2, 5, 8, 9, 40):
-            assert ESTIMATORS[name].work_size({}, n, m) <= old_sizes(n, m)[name], (n, m)
 
 
 class Views(NamedTuple):

@@ -15,7 +15,7 @@ from tests.estimators.test_fold import MODEL, everything, in_python
 from tests.support import SECOND, as_log, assert_same
 
 
-@pytest.mark.parametrize("name", ["kf", "ekf", "ukf", "sr-ekf", "enkf", "pf"])
+@pytest.mark.parametrize("name", ["ekf", "pf"])
 def test_the_python_loop_gives_the_bits_of_the_kernel(name, monkeypatch):
     monkeypatch.setitem(registry.ESTIMATORS, f"{name}-python", in_python(name))
     events = everything(np.random.default_rng(3), 400)

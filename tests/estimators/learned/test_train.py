@@ -10,16 +10,13 @@ from estimators.learned.train import GP, NET, RIDGE, drift, train
 from estimators.learned.windows import Windows, known_states, windows
 from estimators.log import Log
 from estimators.model.state_space import Input, Noise, Parameter, Row, Sensor, State, StateSpaceModel
+from tests.models import first_state
 from tests.support import folded as advanced
 
 
 def f(x, u, p, dt, out):
     out[0] = x[0] + dt * p[0] * (u[0] - x[0])
     out[1] = x[1]
-
-
-def h(x, u, p, out):
-    out[0] = x[0]
 
 
 PHYSICS = StateSpaceModel(
@@ -29,7 +26,7 @@ PHYSICS = StateSpaceModel(
     inputs=(Input("drive", "m"),),
     parameters=(Parameter("speed", "1/s", 0.1),),
     noises=(Noise("lag", "m²/s", 0.01), Noise("level", "m²/s", 0.01)),
-    sensors=(Sensor("gauge", (Row("gauge", "m", 1e-6),), h=h),),
+    sensors=(Sensor("gauge", (Row("gauge", "m", 1e-6),), h=first_state),),
     f=f,
     max_step=0.5,
 )

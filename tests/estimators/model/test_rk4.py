@@ -7,6 +7,7 @@ from scipy.linalg import expm
 from estimators import rk4
 from estimators.compiled.model import compile_model
 from estimators.model.state_space import Input, Noise, Parameter, Row, Sensor, State, StateSpaceModel
+from tests.models import first_state
 
 A = np.array([[0.0, 1.0], [-4.0, -0.4]])
 """A damped oscillator: x'' = -p0 x - p1 x' + u."""
@@ -31,10 +32,6 @@ def of_terms(x, force, stiffness, damping):
     return x[1], force - stiffness * x[0] - damping * x[1]
 
 
-def position(x, u, p, out):
-    out[0] = x[0]
-
-
 STEPS = {"returned": rk4(returned), "filled": rk4(filled), "constants": rk4(of_terms, terms)}
 
 
@@ -46,7 +43,7 @@ def model(f):
         inputs=(Input("force", "m/s²"),),
         parameters=(Parameter("stiffness", "1/s²", 4.0), Parameter("damping", "1/s", 0.4)),
         noises=(Noise("v", "m²/s³", 0.1),),
-        sensors=(Sensor("x", (Row("x", "m", 0.1),), h=position),),
+        sensors=(Sensor("x", (Row("x", "m", 0.1),), h=first_state),),
         f=f,
     )
 

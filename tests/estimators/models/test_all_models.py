@@ -21,6 +21,7 @@ from estimators.models import MODELS
 from estimators.models.motor_drive import COPPER, MOTOR_DRIVE
 from estimators.models.road_car import ROAD_CAR
 from estimators.track import HELD_OUT, Track
+from tests.models import first_state
 from tests.support import as_log, read_all
 
 P = {item.name: k for k, item in enumerate(MOTOR_DRIVE.parameters)}
@@ -376,7 +377,7 @@ def test_an_angle_read_by_a_row_that_does_not_wrap_is_refused(reads, row_circula
     def f(x, u, p, dt, out):
         out[0] = x[0]
 
-    h = {"angle": plain_angle, "sine": sine_of_angle, "twice": twice_the_angle, "half": half_the_angle}[reads]
+    h = {"angle": first_state, "sine": sine_of_angle, "twice": twice_the_angle, "half": half_the_angle}[reads]
     model = StateSpaceModel(
         name="vane", title="", f=f, states=(State("angle", "rad", 0.0, 0.5, circular=True),),
         noises=(Noise("angle", "rad²/s", 0.1),),
@@ -387,10 +388,6 @@ def test_an_angle_read_by_a_row_that_does_not_wrap_is_refused(reads, row_circula
     else:
         with pytest.raises(ModelError, match="with a full turn of angle, which is circular; declare the row circular"):
             compile_model(model)
-
-
-def plain_angle(x, u, p, out):
-    out[0] = x[0]
 
 
 def sine_of_angle(x, u, p, out):

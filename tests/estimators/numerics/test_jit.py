@@ -25,9 +25,9 @@ def test_code_from_the_cache_finds_the_threads_that_it_may_call():
     assert run.stdout.split() == ["True", "True"]
 
 
-def kf_code(cache) -> subprocess.CompletedProcess[str]:
-    """Load the functions of one filter in another process, with a cache of its own."""
-    code = "from estimators.registry import ESTIMATORS; print(len(ESTIMATORS['kf'].code()))"
+def drawn(cache) -> subprocess.CompletedProcess[str]:
+    """Call two compiled functions in another process, with a cache of its own."""
+    code = "from estimators.numerics.random import key_of, uniform; print(key_of(1, 2, 3), uniform(1, 2, 3))"
     environment = {key: value for key, value in os.environ.items() if key != "NUMBA_CACHE_DIR"}
     return subprocess.run(
         [sys.executable, "-c", code],
@@ -41,21 +41,21 @@ def kf_code(cache) -> subprocess.CompletedProcess[str]:
 
 def test_a_damaged_entry_is_discarded_and_compiled_again(tmp_path):
     """Files cut in half, and a machine code with one byte changed, which unpickling would not notice."""
-    said = kf_code(tmp_path)
+    said = drawn(tmp_path)
     assert said.stderr == ""
     paths = sorted(tmp_path.rglob("*.nbc"))
-    changed = [path for path in paths if "gaussian/kf.predict" in str(path)]
+    changed = [path for path in paths if "numerics/random.uniform" in str(path)]
     assert changed
     assert len(changed) < len(paths)
     for path in paths:
         content = bytearray(path.read_bytes())
         content[len(content) // 2] ^= 1
         path.write_bytes(content if path in changed else content[: len(content) // 2])
-    again = kf_code(tmp_path)
+    again = drawn(tmp_path)
     assert again.stdout == said.stdout
     (line,) = again.stderr.splitlines()
     assert line.endswith("damaged entries of the compile cache discarded; compiling them again")
-    assert kf_code(tmp_path).stderr == ""
+    assert drawn(tmp_path).stderr == ""
 
 
 def test_entries_saved_at_once_are_kept_apart(tmp_path):

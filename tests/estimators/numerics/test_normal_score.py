@@ -1,12 +1,13 @@
-"""Normal scores against SciPy's distributions."""
+"""Normal scores and quantiles against SciPy's distributions."""
 
 import numpy as np
 import pytest
 from numba import njit
 from scipy.special import ndtr, ndtri
-from scipy.stats import norm, t
+from scipy.stats import chi2, norm, t
 
 from estimators.numerics import normal_score as scores
+from estimators.numerics.quantiles import chi_square_quantile, normal_quantile
 
 
 @njit(error_model="numpy")
@@ -84,3 +85,11 @@ def test_students_score_of_many_degrees_is_the_number_itself():
         assert scores.student_score(x, np.inf) == x
     assert scores.student_score(1e9, np.inf) == scores.FURTHEST
     assert np.isnan(scores.student_score(np.nan, 9.0))
+
+
+@pytest.mark.parametrize("probability", [0.001, 0.025, 0.5, 0.975, 0.999, 0.99999])
+def test_quantiles_are_those_of_scipy_stats(probability):
+    dof = np.array([1, 2, 3, 10, 100, 5000])
+    # Both are inversions of the same function, good to a few units in the twelfth digit.
+    np.testing.assert_allclose(chi_square_quantile(probability, dof), chi2.ppf(probability, dof), rtol=1e-11)
+    np.testing.assert_allclose(normal_quantile(probability), norm.ppf(probability), rtol=1e-12, atol=1e-15)

@@ -14,8 +14,9 @@ from estimators.particle.cloud import weights_of
 from estimators.track import GATED, HELD_OUT, USED
 from estimators.tuning import Tuning
 from tests.estimators.linear_models import ROWS, random_linear
-from tests.estimators.particle.test_particle_filters import itself, scalar, square, still, within_half
+from tests.estimators.particle.test_particle_filters import scalar, within_half
 from tests.estimators.particle.test_rbpf import R, biased, jump_model
+from tests.models import first_state, first_state_squared, unchanged
 from tests.support import folded, log_of
 
 MATRICES = random_linear(np.random.default_rng(8), 3, 1)
@@ -91,7 +92,7 @@ def test_angles_count_the_shorter_way():
     def scores(middle, y):
         turned = scalar(
             states=(State("s", "rad", middle, 0.3, circular=True),), noises=(Noise("s", "rad²/s", 0.01),),
-            sensors=(Sensor("y", (Row("y", "rad", 0.01, circular=True),), h=itself),),
+            sensors=(Sensor("y", (Row("y", "rad", 0.01, circular=True),), h=first_state),),
         )  # fmt: skip
         track = fold("pf", turned, Tuning.of(turned), log_of(1, (0.0, READING, (y + np.pi) % (2 * np.pi) - np.pi)))
         return track.whitened[0, 0]
@@ -125,7 +126,9 @@ def squared(seed, readings=2000, variance=0.04):
     """Scores of a walk of which only the square is seen: a cloud of two peaks, a prediction that is not Gaussian."""
     rng = np.random.default_rng(seed)
     model = scalar(
-        sensors=(Sensor("y", (Row("y", "m", 0.04),), h=square),), f=damped, states=(State("s", "m", 0.0, 1.0),)
+        sensors=(Sensor("y", (Row("y", "m", 0.04),), h=first_state_squared),),
+        f=damped,
+        states=(State("s", "m", 0.0, 1.0),),
     )
     x, events = rng.normal(0.0, 1.0), []
     for k in range(readings):
@@ -162,7 +165,7 @@ def test_a_refused_reading_has_a_score():
 
 
 def test_a_likelihood_of_its_own_has_no_score_and_raises_no_alarm():
-    model = scalar(sensors=(Sensor("y", (Row("y", "m", 1e-4),), h=itself, log_likelihood=within_half),))
+    model = scalar(sensors=(Sensor("y", (Row("y", "m", 1e-4),), h=first_state, log_likelihood=within_half),))
     rng = np.random.default_rng(0)
     readings = [(0.1 * k, READING, 2.0 + 0.3 * rng.random()) for k in range(300)]
     track = fold("pf", model, replace(Tuning.of(model), gate=None), log_of(1, *readings))
@@ -176,12 +179,8 @@ def walk_and_constant():
     """A walk that is seen, and a constant that is not: its values tell from which particle one descends."""
     return StateSpaceModel(
         name="traced", title="", states=(State("s", "m", 0.0, 1.0), State("c", "m", 0.0, 1.0)),
-        noises=(Noise("s", "m²/s", 0.3),), f=both_still, sensors=(Sensor("y", (Row("y", "m", 2.0),), h=itself),),
+        noises=(Noise("s", "m²/s", 0.3),), f=unchanged, sensors=(Sensor("y", (Row("y", "m", 2.0),), h=first_state),),
     )  # fmt: skip
-
-
-def both_still(x, u, p, dt, out):
-    out[0], out[1] = x[0], x[1]
 
 
 @pytest.mark.parametrize("name", ["pf", "pf-ekf", "apf"])
@@ -201,7 +200,7 @@ def test_ancestors_are_those_that_a_constant_tells(name):
 
 def test_effective_sample_size_before_resampling():
     """1 / Σ w² of w p(y | x), the particles from before the second of two readings at one time."""
-    pair = tuple(Sensor(name, (Row("y", "m", 0.04),), h=itself) for name in ("y", "z"))
+    pair = tuple(Sensor(name, (Row("y", "m", 0.04),), h=first_state) for name in ("y", "z"))
     model = scalar(sensors=pair)
     growing = Fold(
         "pf", model, Tuning.of(model).with_options({"particles": 300}),
@@ -224,7 +223,7 @@ def test_a_poor_cloud_is_told():
 
     rng = np.random.default_rng(5)
     for variance, poor in ((1e-6, True), (0.3, False)):
-        model = scalar(sensors=(Sensor("y", (Row("y", "m", variance),), h=itself),), f=still)
+        model = scalar(sensors=(Sensor("y", (Row("y", "m", variance),), h=first_state),), f=unchanged)
         values = 2.0 + np.cumsum(rng.normal(0, np.sqrt(0.3), 100)) + rng.normal(0, np.sqrt(variance), 100)
         tuning = replace(Tuning.of(model).with_options({"particles": 300}), gate=None)
         log = log_of(1, *((1.0 * k, READING, value) for k, value in enumerate(values)))

@@ -7,7 +7,6 @@ import numba
 import numpy as np
 import pytest
 
-from estimators.errors import EstimatorError
 from estimators.fold import Fold, fold
 from estimators.log import READING, TICK, Events, Log
 from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
@@ -15,7 +14,8 @@ from estimators.particle.cloud import RECOVERIES, block, members
 from estimators.track import FAILED, GATED, HELD_OUT, MISSING, USED
 from estimators.tuning import Tuning
 from tests.estimators.linear_models import JointGaussian, random_linear, random_log
-from tests.support import SECOND, folded, log_of
+from tests.models import first_state, first_state_squared, unchanged
+from tests.support import SECOND, assert_same, folded, log_of
 
 NAMES = ("pf", "pf-reg", "pf-ekf", "apf")
 EXACT = ("pf", "pf-ekf", "apf")
@@ -47,22 +47,10 @@ def tracks(name, n, seeds, **options):
 
 def scalar(**changes):
     parts = dict(
-        name="walk", title="", states=(State("s", "m", 2.0, 0.5),), noises=(Noise("s", "m²/s", 0.3),), f=still,
-        sensors=(Sensor("y", (Row("y", "m", 0.04),), h=itself),),
+        name="walk", title="", states=(State("s", "m", 2.0, 0.5),), noises=(Noise("s", "m²/s", 0.3),), f=unchanged,
+        sensors=(Sensor("y", (Row("y", "m", 0.04),), h=first_state),),
     )  # fmt: skip
     return StateSpaceModel(**(parts | changes))
-
-
-def still(x, u, p, dt, out):
-    out[0] = x[0]
-
-
-def itself(x, u, p, out):
-    out[0] = x[0]
-
-
-def square(x, u, p, out):
-    out[0] = x[0] * x[0]
 
 
 def root(x, u, p, out):
@@ -128,28 +116,31 @@ def test_every_scheme_gives_the_posterior(scheme):
     assert np.all(np.abs(means.mean(axis=0) - mean) < 5 * error + 20 / 1000 * np.sqrt(np.diag(cov)))
 
 
+def same_in_pieces_and_on_any_threads(name, model, tuning, log):
+    """Fold at once, in pieces on one thread, and again on all threads; return the track, which is the same."""
+    whole = fold(name, model, tuning, log)
+    threads = numba.get_num_threads()
+    pieces = Fold(name, model, tuning, log)
+    try:
+        numba.set_num_threads(1)
+        while pieces.advance(3):
+            pass
+        assert_same(pieces.track, whole)
+        numba.set_num_threads(threads)
+        pieces.rewind(0)
+        pieces.advance()
+        assert_same(pieces.track, whole)
+    finally:
+        numba.set_num_threads(threads)
+    return whole
+
+
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("n", [500, 20_000])
 def test_any_pieces_and_any_threads_give_the_same_bits(name, n):
     matrices, log, _ = problem()
     tuning = Tuning.of(matrices.model).with_options({"particles": n})
-    whole = fold(name, matrices.model, tuning, log)
-    threads = numba.get_num_threads()
-    try:
-        numba.set_num_threads(1)
-        pieces = Fold(name, matrices.model, tuning, log)
-        while pieces.advance(3):
-            pass
-        assert pieces.n == log.n
-        for a, b in zip(whole, pieces.track, strict=True):
-            assert np.array_equal(a, b, equal_nan=True)
-        numba.set_num_threads(threads)
-        pieces.rewind(0)
-        pieces.advance()
-        for a, b in zip(whole, pieces.track, strict=True):
-            assert np.array_equal(a, b, equal_nan=True)
-    finally:
-        numba.set_num_threads(threads)
+    whole = same_in_pieces_and_on_any_threads(name, matrices.model, tuning, log)
     other = fold(name, matrices.model, replace(tuning, seed=1), log)
     assert not np.array_equal(whole.mean, other.mean)
 
@@ -202,7 +193,7 @@ def test_two_peaks_stay_alive_and_are_reported(name):
     rng = np.random.default_rng(0)
     model = scalar(
         states=(State("s", "m", 0.0, 2.0),), noises=(Noise("s", "m²/s", 1e-3),),
-        sensors=(Sensor("y", (Row("y", "m²", 0.3),), h=square),),
+        sensors=(Sensor("y", (Row("y", "m²", 0.3),), h=first_state_squared),),
     )  # fmt: skip
     log = log_of(1, *((k, READING, 4.0 + 0.5 * rng.standard_normal()) for k in range(20)))
     run = folded(name, model, log, options={"particles": 20_000})
@@ -215,7 +206,7 @@ def test_two_peaks_stay_alive_and_are_reported(name):
 
 @pytest.mark.parametrize("name", ["pf", "pf-reg", "apf"])
 def test_a_sensor_may_have_a_likelihood_of_its_own(name):
-    model = scalar(sensors=(Sensor("y", (Row("y", "m", 0.04),), h=itself, log_likelihood=within_half),))
+    model = scalar(sensors=(Sensor("y", (Row("y", "m", 0.04),), h=first_state, log_likelihood=within_half),))
     track = fold(name, model, Tuning.of(model).with_options({"particles": 1e5}), log_of(1, (0, READING, 2.2)))
     from scipy.stats import norm, truncnorm
 
@@ -230,7 +221,7 @@ def test_a_sensor_may_have_a_likelihood_of_its_own(name):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_cloud_that_explains_nothing_fails_visibly_and_recovers(name):
-    model = scalar(sensors=(Sensor("y", (Row("y", "m", 0.04),), h=itself, log_likelihood=within_half),))
+    model = scalar(sensors=(Sensor("y", (Row("y", "m", 0.04),), h=first_state, log_likelihood=within_half),))
     log = log_of(1, *((0.01 * k, READING, 30.0) for k in range(40)))
     run = folded(name, model, log, options={"particles": 2000})
     verdict = run.track.verdict
@@ -275,7 +266,7 @@ def test_a_reading_that_is_not_used_moves_no_particle(name, key, value, verdict)
 
 def test_every_child_of_the_auxiliary_filter_is_a_copy_of_its_parent():
     """Of two particles one explains the reading, by far: both are that one then, as no noise moves them apart."""
-    quiet = Sensor("y", (Row("y", "m", 1e-6),), h=itself)
+    quiet = Sensor("y", (Row("y", "m", 1e-6),), h=first_state)
     model = scalar(sensors=(quiet,), noises=(Noise("s", "m²/s", 0.0),))
     for seed in range(5):
         tuning = replace(Tuning.of(model).with_options({"particles": 2}), seed=seed)
@@ -294,7 +285,7 @@ def test_the_likelihood_of_a_bent_sensor_is_that_of_quadrature(name):
     What apf's first stage foresees by that, its second must make up for. The mean of 100 clouds of 5000 is right to
     its standard error, under 1.5 %.
     """
-    model = scalar(sensors=(Sensor("y", (Row("y", "m²", 0.3),), h=square),))
+    model = scalar(sensors=(Sensor("y", (Row("y", "m²", 0.3),), h=first_state_squared),))
     log = log_of(1, (0, TICK, 0), (1, READING, 0.0))
     tuning = Tuning.of(model).with_options({"particles": 5000})
     runs = [fold(name, model, replace(tuning, seed=seed), log) for seed in range(100)]
@@ -328,7 +319,7 @@ def test_particles_where_the_sensor_says_no_number_are_out(name):
 
 def test_copies_of_one_particle_widen_too():
     """No spread is left to double, nor process noise to bring it back; it takes the seed 23 doublings to reach 0.5."""
-    sharp = Sensor("y", (Row("y", "m", 0.04),), h=itself, log_likelihood=within_half)
+    sharp = Sensor("y", (Row("y", "m", 0.04),), h=first_state, log_likelihood=within_half)
     model = scalar(sensors=(sharp,), noises=(Noise("s", "m²/s", 0.0),))
     log = log_of(1, *((0.01 * k, READING, 2.0 if k == 0 else 4.0) for k in range(60)))
     run = folded("pf", model, log, options={"particles": 20}, stop=1)
@@ -337,12 +328,6 @@ def test_copies_of_one_particle_widen_too():
     failed = int((run.track.verdict == FAILED).sum())
     assert 10 < failed < 40 and np.all(run.track.verdict[1 + failed :] == USED)
     assert abs(run.track.mean[-1, 0] - 4.0) < 0.5
-
-
-def test_no_particles_are_refused():
-    matrices, log, _ = problem()
-    with pytest.raises(EstimatorError, match="particles is 0; it must lie between 2 and 1e"):
-        fold("pf", matrices.model, Tuning.of(matrices.model).with_options({"particles": 0}), log)
 
 
 def test_snapshots_of_large_states_keep_to_their_memory(monkeypatch):

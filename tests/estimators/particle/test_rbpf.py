@@ -3,7 +3,6 @@
 from dataclasses import replace
 from itertools import product
 
-import numba
 import numpy as np
 import pytest
 
@@ -15,6 +14,7 @@ from estimators.particle.cloud import RECOVERIES
 from estimators.track import FAILED, USED
 from estimators.tuning import Tuning
 from tests.estimators.linear_models import random_linear, random_log
+from tests.estimators.particle.test_particle_filters import same_in_pieces_and_on_any_threads
 from tests.support import SECOND, folded, log_of
 
 # A jump-Markov linear system: a walk that drifts in mode 1, seen by a sensor that is biased there.
@@ -94,10 +94,10 @@ def runs(model, n, seeds, log, name="rbpf", **options):
     return [fold(name, model, replace(tuning, seed=seed), log) for seed in range(seeds)]
 
 
-@pytest.mark.parametrize("nx", [1, 3])
-def test_with_nothing_to_sample_it_is_the_kalman_filter(nx):
+@pytest.mark.parametrize(("nx", "correlated"), [(1, False), (3, False), (3, True)])
+def test_with_nothing_to_sample_it_is_the_kalman_filter(nx, correlated):
     rng = np.random.default_rng(nx)
-    matrices = random_linear(rng, nx, 1)
+    matrices = random_linear(rng, nx, 1, correlated=correlated)
     log = random_log(rng, matrices, 40)
     model = replace(matrices.model, conditionally_linear=matrices.model.state_names)
     exact = folded("kf", model, log)
@@ -192,22 +192,7 @@ def test_what_the_sampled_state_did_tells_of_the_linear_one():
 def test_any_pieces_and_any_threads_give_the_same_bits(n):
     model, log = jump_model(), after_prior(*READINGS, *READINGS)
     tuning = Tuning.of(model).with_options({"particles": n})
-    whole = fold("rbpf", model, tuning, log)
-    threads = numba.get_num_threads()
-    try:
-        numba.set_num_threads(1)
-        pieces = Fold("rbpf", model, tuning, log)
-        while pieces.advance(3):
-            pass
-        for a, b in zip(whole, pieces.track, strict=True):
-            assert np.array_equal(a, b, equal_nan=True)
-        numba.set_num_threads(threads)
-        pieces.rewind(0)
-        pieces.advance()
-        for a, b in zip(whole, pieces.track, strict=True):
-            assert np.array_equal(a, b, equal_nan=True)
-    finally:
-        numba.set_num_threads(threads)
+    same_in_pieces_and_on_any_threads("rbpf", model, tuning, log)
 
 
 @pytest.mark.parametrize("name", ["pf", "pf-reg", "pf-ekf", "apf"])

@@ -20,6 +20,7 @@ from estimators.smoothing.smooth import KINDS, smooth
 from estimators.track import GATED
 from estimators.tuning import Tuning
 from tests.estimators.linear_models import JointGaussian, random_linear, random_log
+from tests.models import first_state
 from tests.support import SECOND, folded
 
 GAUSSIAN = [name for name in KINDS if ESTIMATORS[name].family == "Gaussian" and name != "kf-steady"]
@@ -105,17 +106,13 @@ def Q(x, u, p, q, dt, out):
     out[1, 1] = q[0] * dt
 
 
-def h(x, u, p, out):
-    out[0] = x[0]
-
-
 VARIANCE, START = 0.25, (np.array([1.0, -0.5]), np.diag([4.0, 1.0]))
 BODY = StateSpaceModel(
     name="body",
     title="a body whose speed wanders",
     states=(State("place", "m", mean=1.0, std=2.0), State("speed", "m/s", mean=-0.5, std=1.0)),
     noises=(Noise("push", "m²/s³", variance=0.3),),
-    sensors=(Sensor("place", (Row("place", "m", variance=VARIANCE),), h=h),),
+    sensors=(Sensor("place", (Row("place", "m", variance=VARIANCE),), h=first_state),),
     f=f,
     Q=Q,
     linear=True,

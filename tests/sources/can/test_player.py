@@ -14,6 +14,7 @@ from sources.can.decoder import Decoder
 from sources.can.player import Encoder, Player
 from sources.simulator import SensorPlan, Simulator, stepped_input
 from sources.source import Channel
+from tests.models import first_state
 from tests.sources.can.can_tools import Reports, dbc
 from tests.support import read_all
 
@@ -37,10 +38,6 @@ def f(x, u, p, dt, out):
     out[1] = x[1]
 
 
-def temp(x, u, p, out):
-    out[0] = x[0]
-
-
 def flow(x, u, p, out):
     out[0] = x[1]
 
@@ -52,7 +49,7 @@ MODEL = StateSpaceModel(
     noises=(Noise("temp", "", 0.01), Noise("flow", "", 0.01)),
     inputs=(Input("power", "W", 3.0),),
     sensors=(
-        Sensor("temp", (Row("temp", "°C", 0.04),), temp),
+        Sensor("temp", (Row("temp", "°C", 0.04),), first_state),
         Sensor("flow", (Row("flow", "m/s", 0.04),), flow),
     ),
     f=f,

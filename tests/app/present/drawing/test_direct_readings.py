@@ -9,6 +9,7 @@ from app.present.drawing.direct_readings import observed
 from app.twin.twin import load_twin
 from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
 from estimators.models import MODELS
+from tests.models import unchanged
 
 
 @pytest.mark.parametrize(
@@ -44,10 +45,6 @@ def test_position_readings_with_an_error_of_their_own_are_drawn(twin):
     assert {("gnss_position", "east"), ("gnss_position", "north"), ("gnss_heading", "heading")} <= read
 
 
-def f(x, u, p, dt, out):
-    out[:] = x
-
-
 def h(x, u, p, out):
     out[0] = x[1]
     out[1] = x[0] + x[1]
@@ -57,7 +54,7 @@ def h(x, u, p, out):
 
 def test_a_row_that_only_looks_like_a_state_at_the_prior_mean_is_not_one():
     model = StateSpaceModel(
-        name="m", title="m", states=(State("a", "m"), State("b", "m")), noises=(Noise("a", "m²/s", 1.0),), f=f,
+        name="m", title="m", states=(State("a", "m"), State("b", "m")), noises=(Noise("a", "m²/s", 1.0),), f=unchanged,
         sensors=(Sensor("s", tuple(Row(f"r{k}", "m", 1.0) for k in range(4)), h),),
     )  # fmt: skip
     # At the mean, zero, a + b is a and b, with a slope of one; r2 has a scale and a lever like a real sensor.
@@ -88,7 +85,7 @@ def test_a_black_box_is_asked_for_blocks():
 def test_a_sensor_that_raises_near_the_prior_has_no_dots(capsys):
     """Machine code gives NaN there, and the twin runs."""
     model = StateSpaceModel(
-        name="m", title="m", states=(State("a", "m"),), noises=(Noise("a", "m²/s", 1.0),), f=f,
+        name="m", title="m", states=(State("a", "m"),), noises=(Noise("a", "m²/s", 1.0),), f=unchanged,
         sensors=(Sensor("s", (Row("a", "m", 1.0), Row("b", "m", 1.0)), raises_beyond_the_mean),),
     )  # fmt: skip
     assert observed(model) == []
@@ -102,7 +99,7 @@ def test_a_sensor_that_fails_otherwise_is_named_once(black_box, capsys):
 
     model = StateSpaceModel(
         name="m", title="m", states=(State("a", "m"),), noises=(Noise("a", "m²/s", 1.0),),
-        f=identity_of_a_block if black_box else f, sensors=(Sensor("gauge", (Row("a", "m", 1.0),), h),),
+        f=identity_of_a_block if black_box else unchanged, sensors=(Sensor("gauge", (Row("a", "m", 1.0),), h),),
         black_box=black_box,
     )  # fmt: skip
     assert observed(model) == observed(model) == []

@@ -3,18 +3,14 @@
 import numpy as np
 import pytest
 
-from app.live.commands import Reset, SetEstimator, SetTuning
-from app.live.engine import Engine
+from app.live.commands import SetEstimator, SetTuning
 from app.views.viser.guarded_server import HEADER
 from app.views.viser.scene import place
 from app.views.viser.view import ViserView
 from estimators.log import READING, TRUTH, Events
 from estimators.models import MODELS
-from estimators.track import TRACKING
 from tests.app.fake_engine import FakeEngine, events
-from tests.app.live.test_reset import JUMP, RESET_AT, T, Y, stubborn_twin
-from tests.app.scripted import Scripted, readings, wait_for
-from tests.app.served import shown_twin
+from tests.app.scripted import wait_for
 
 pytestmark = pytest.mark.browser
 
@@ -143,30 +139,3 @@ def test_two_browsers_show_the_same(page, browser, view, engine):
         wait_for(lambda one=one: abs(sliders(one)[at] - decades) < 0.01)
     other.close()
     assert engine.commands == [SetTuning("R.winding", 0.25)]
-
-
-def test_a_lost_filter_says_since_when_and_what_to_do(browser):
-    made, plain = stubborn_twin("kf"), shown_twin()
-    made.config = plain.config
-    source = Scripted()
-    engine = Engine(made, lambda report: source)
-    view = ViserView(engine, secret="s3cret")
-    engine.start()
-    view.start()
-    context = browser.new_context(viewport={"width": 900, "height": 1000}, extra_http_headers={HEADER: "s3cret"})
-    try:
-        source.put(readings(T[:RESET_AT], Y[:RESET_AT]))
-        page = context.new_page()
-        page.set_default_timeout(60_000)
-        page.goto(f"http://127.0.0.1:{view.port}/")
-        # The 26th refused reading is more than half of the last fifty.
-        page.get_by_text(f"diverged since {JUMP + 25}.0 s").wait_for()
-        page.get_by_text("winding still contradicts it: check the sensor; if it is right, reset the twin").wait_for()
-        engine.submit(Reset())
-        page.get_by_text("tracking", exact=False).first.wait_for()
-        assert engine.status().health == TRACKING
-        assert page.get_by_text("diverged since").count() == 0 and page.get_by_text("reset the twin").count() == 0
-    finally:
-        context.close()
-        view.stop()
-        engine.stop()
