@@ -13,6 +13,7 @@ import numpy as np
 
 from app.live.engine import Engine
 from app.twin.defaults import DegradedAfter, Late
+from config.schema import ViewSection
 from estimators.diagnostics.health import HealthPolicy
 from estimators.log import READING, Events
 from estimators.models import MODELS
@@ -31,6 +32,16 @@ def readings(times_s, values):
     )
 
 
+def events(model, kind, channel, times, values):
+    """Events of one channel at times in seconds; `values` (n,) or (n, k)."""
+    times = np.asarray(times, float)
+    values = np.asarray(values, float).reshape(times.size, -1)
+    padded = np.full((times.size, model.width), np.nan)
+    padded[:, : values.shape[1]] = values
+    t = np.round(times * SECOND).astype(np.int64)
+    return Events(t, t, np.full(t.size, kind, np.int8), np.full(t.size, channel, np.int32), padded)
+
+
 def random_walk(n, seed=1, step=0.1):
     """Times (s) and values of n measurements of a random walk at 10 Hz with noise of variance 1."""
     rng = np.random.default_rng(seed)
@@ -39,7 +50,8 @@ def random_walk(n, seed=1, step=0.1):
 
 def twin(history=200_000, horizon=2.0, tick=1000.0, model=MODEL, estimator="kf"):
     time = SimpleNamespace(horizon=horizon, degraded_after=5.0, stale_after=30.0, tick=tick)
-    config = SimpleNamespace(time=time, history=history, noise={}, sensors={}, source=None, refit=None)
+    parts = {"noise": {}, "sensors": {}, "source": None, "refit": None, "view": ViewSection()}
+    config = SimpleNamespace(time=time, history=history, **parts)
     return SimpleNamespace(
         options_of=lambda estimator: {},
         name="scripted",
@@ -147,6 +159,23 @@ class Stepped:
     def notices(self):
         """Texts of all notices."""
         return [line.text for line in self.engine.notices.since(0)]
+
+
+def viewed(model, estimator="kf", view=None):
+    """An engine without threads for views: `put` folds, and what is submitted is kept in `commands` and carried out."""
+    made = twin(model=model, estimator=estimator, horizon=np.inf)
+    made.config.view = view or made.config.view
+    stepped = Stepped(of=made)
+    engine, submit = stepped.engine, stepped.engine.submit
+    engine.put, engine.commands = stepped.put, []
+
+    def carry_out(command):
+        engine.commands.append(command)
+        submit(command)
+        engine.settle()
+
+    engine.submit = carry_out
+    return engine
 
 
 def wait_for(condition, seconds=60.0):

@@ -6,7 +6,6 @@ import io
 import json
 import socket
 import threading
-from types import SimpleNamespace
 from urllib.parse import parse_qs, urlsplit
 
 from websockets.datastructures import Headers
@@ -18,18 +17,11 @@ from app.live.engine import Engine
 from app.views.viser.guarded_server import HEADER
 from app.views.viser.stage import Choice, Choices
 from app.web.server import PageServer
-from tests.app.scripted import Scripted, twin, wait_for
+from tests.app.scripted import Scripted, wait_for
+from tests.app.scripted import twin as scripted_twin
 
 SECRET = "the secret between the servers"
 PATIENCE = 60.0
-
-
-def shown_twin(**options):
-    """The scripted twin with the section that views read."""
-    made = twin(**options)
-    scene = SimpleNamespace(kind="belief", axes=None, position=None, heading=None)
-    made.config.view = SimpleNamespace(window=60.0, speed=1.0, at=None, pairs=None, scene=scene)
-    return made
 
 
 class FakeViser:
@@ -135,7 +127,7 @@ class ServedEngine:
 
     def __init__(self, twin=None, review=None, behind=lambda source: source, source=None):
         self.source = source or Scripted()
-        self.engine = Engine(shown_twin() if twin is None else twin, lambda report: behind(self.source))
+        self.engine = Engine(scripted_twin() if twin is None else twin, lambda report: behind(self.source))
         self.viser = FakeViser()
         self.choices = Choices([Choice("x", "x", ("temperature", "rate"), "temperature")])
         self.server = PageServer(

@@ -52,22 +52,6 @@ def lately(rng, n):
 
 
 @any_seed
-def test_order_is_a_stable_sort_whatever_the_pieces(seed):
-    rng = np.random.default_rng(seed)
-    events = batch(lately(rng, 200))
-    expected = events.select(np.array(sorted(range(200), key=lambda i: (events.t[i], i))))
-    log = Log(2, capacity=1)
-    for piece in pieces(rng, events):
-        before = Events(*(column.copy() for column in log.events))
-        start, stale = log.extend(piece)
-        assert stale == 0
-        assert start <= len(before)
-        # Nothing before `start` has changed; so a fold need not look there.
-        same(log.events.select(slice(0, start)), before.select(slice(0, start)))
-    same(log.events, expected)
-
-
-@any_seed
 def test_stale_is_judged_event_by_event(seed):
     """An event is stale against the newest that arrived before it, not against its batch."""
     rng = np.random.default_rng(seed)

@@ -98,13 +98,11 @@ def test_a_table_is_listed(tmp_path, nisus, ending):
     )
 
 
-@pytest.mark.parametrize(("suffix", "arguments"), [("", []), ("_two", ["--signals", "Rpm,ENGINE.Temp"])])
-def test_a_twin_of_a_recording_folds_as_it_stands(drive, suffix, arguments, nisus):
-    name = f"pump{suffix}"
-    given = ["--log", str(drive / "drive.blf"), "--dbc", str(drive / "car.dbc"), *arguments]
-    path = drive / f"{name}.yaml"
-    yaml, python, *checked = nisus("new", name, "--folder", drive, *given).out.splitlines()
-    assert (yaml, python) == (str(path), str(drive / f"{name}.py"))
+def test_a_twin_of_a_recording_folds_as_it_stands(drive, nisus):
+    given = ["--log", str(drive / "drive.blf"), "--dbc", str(drive / "car.dbc"), "--signals", "Rpm,ENGINE.Temp"]
+    path = drive / "pump.yaml"
+    yaml, python, *checked = nisus("new", "pump", "--folder", drive, *given).out.splitlines()
+    assert (yaml, python) == (str(path), str(drive / "pump.py"))
     assert checked[2].startswith("consistent: NIS 1.09 per degree of freedom")
     assert checked[-1] == f"Next: nisus run {path}"
     twin = load_twin(path)

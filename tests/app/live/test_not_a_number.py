@@ -28,8 +28,7 @@ from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceMo
 from estimators.models import MODELS
 from estimators.track import DIVERGED
 from estimators.tuning import Tuning
-from tests.app.fake_engine import FakeEngine, events
-from tests.app.scripted import Scripted, Stepped, fresh_status, readings, twin
+from tests.app.scripted import Scripted, Stepped, events, fresh_status, readings, twin, viewed
 from tests.support import SECOND
 
 RESET_AT, END = 20, 24
@@ -103,7 +102,7 @@ def lost_rows(track):
 @pytest.fixture(params=["belief", "vehicle"])
 def view(request):
     scene = SceneSection(kind="vehicle", position=("east", "north")) if request.param == "vehicle" else SceneSection()
-    engine = FakeEngine(RAIL, "pf", ViewSection(window=60.0, scene=scene))
+    engine = viewed(RAIL, "pf", ViewSection(window=60.0, scene=scene))
     engine.put(fixes(1, RESET_AT - 1))
     view = ViserView(engine, secret="x")
     view.frame()
@@ -140,10 +139,10 @@ def test_the_chart_begins_anew_after_the_estimate_was_not_a_number(view):
     view.panel._chart_drawn = -np.inf
     view.frame()
     engine = view.engine
-    lost = lost_rows(engine.fold.track)
+    lost = lost_rows(engine._fold.track)
     assert 8 <= lost[0] and lost[-1] == RESET_AT - 2 and lost.size == RESET_AT - 1 - lost[0]
-    unknown = np.flatnonzero(~np.isfinite(engine.fold.track.nis_mean))
-    seconds = (engine.log.events.t - engine.log.events.t[0]) * 1e-9
+    unknown = np.flatnonzero(~np.isfinite(engine._fold.track.nis_mean))
+    seconds = (engine._log.events.t - engine._log.events.t[0]) * 1e-9
     assert unknown[-1] >= lost[-1]
     np.testing.assert_allclose(view.panel.nis.handle.data[0], seconds[unknown[-1] + 1 :])
     assert np.isfinite(np.array(view.panel.nis.handle.data[1:4])).all()

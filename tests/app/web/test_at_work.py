@@ -15,8 +15,8 @@ import app.live.watchdog
 from app.live.commands import SetTuning
 from app.live.engine import Engine
 from app.web.server import PageServer
-from tests.app.scripted import MODEL, Scripted, readings, row_count, wait_for
-from tests.app.served import PATIENCE, SECRET, Client, shown_twin
+from tests.app.scripted import MODEL, Scripted, readings, row_count, twin, wait_for
+from tests.app.served import PATIENCE, SECRET, Client
 from tests.support import SECOND
 
 READINGS = 40
@@ -60,7 +60,7 @@ def running(monkeypatch, tmp_path):
     # Nobody gives the solver up.
     monkeypatch.setattr(app.live.watchdog, "CHECK_AFTER_S", float("inf"))
     solver, source = Solver(), Scripted()
-    engine = Engine(shown_twin(model=solver.model(), estimator="filterpy-ukf"), lambda report: source)
+    engine = Engine(twin(model=solver.model(), estimator="filterpy-ukf"), lambda report: source)
     server = PageServer(engine, port=0, viser_port=None, secret=SECRET)
     server.start()
     engine.start()

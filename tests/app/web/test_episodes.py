@@ -9,15 +9,15 @@ import pytest
 
 from app.live.engine import Engine
 from app.web.twin_json import episodes_json, status_json
-from tests.app.scripted import Scripted, readings
-from tests.app.served import PATIENCE, shown_twin
+from tests.app.scripted import Scripted, readings, twin
+from tests.app.served import PATIENCE
 
 ROOT = Path(__file__).parents[3]
 
 
 @pytest.fixture
 def engine():
-    return Engine(shown_twin(), lambda report: Scripted())
+    return Engine(twin(), lambda report: Scripted())
 
 
 def strict(content):

@@ -22,8 +22,8 @@ from app.web.door import FormerSessions, check_port
 from app.web.server import PageServer
 from app.web.session import BrowserPage
 from estimators.errors import ConfigError
-from tests.app.scripted import Scripted, wait_for
-from tests.app.served import SECRET, shown_twin
+from tests.app.scripted import Scripted, twin, wait_for
+from tests.app.served import SECRET
 from tests.app.web.page.browsed import DRAWN, PATIENCE, until
 
 posix = pytest.mark.skipif(os.name != "posix", reason="permissions and command lines as on POSIX")
@@ -156,7 +156,7 @@ def test_the_file_is_removed_with_a_session_that_no_browser_opened(runtime):
 @pytest.mark.browser
 def test_the_file_opens_the_page_and_the_next_session_asks_for_its_own_address(browser, tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-    engine = Engine(shown_twin(), lambda report: Scripted())
+    engine = Engine(twin(), lambda report: Scripted())
     server = PageServer(engine, port=0, viser_port=None, secret=SECRET)
     server.start()
     opening = BrowserPage(server.url)

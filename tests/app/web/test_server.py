@@ -11,8 +11,8 @@ from app.web.gate import Gate
 from app.web.server import PageServer
 from app.web.viewer_assets import FILES, viewer_assets, viewer_version
 from estimators.errors import ConfigError
-from tests.app.scripted import Scripted
-from tests.app.served import SECRET, Client, shown_twin
+from tests.app.scripted import Scripted, twin
+from tests.app.served import SECRET, Client
 
 
 @pytest.fixture(autouse=True)
@@ -23,14 +23,14 @@ def cache(tmp_path, monkeypatch):
 
 def served(monkeypatch, prepare):
     monkeypatch.setattr("app.web.server.viewer_assets", prepare)
-    engine = Engine(shown_twin(), lambda report: Scripted())
+    engine = Engine(twin(), lambda report: Scripted())
     server = PageServer(engine, port=0, viser_port=None, secret=SECRET)
     server.start()
     return server
 
 
 def test_each_session_has_a_token_of_its_own(cache):
-    engine = Engine(shown_twin(), lambda report: Scripted())
+    engine = Engine(twin(), lambda report: Scripted())
     tokens = {PageServer(engine, port=0, viser_port=None, secret=SECRET).url.partition("token=")[2] for _ in range(3)}
     assert len(tokens) == 3 and all(len(token) >= 32 for token in tokens)
     # Nothing of it stays: what the last session's browsers know opens nothing.

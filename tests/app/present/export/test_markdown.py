@@ -1,28 +1,10 @@
 """docs/alarms.md as a page: every heading that an episode names is there, and nothing of the markup is left."""
 
 import re
-from html.parser import HTMLParser
 
 from app.present.export.alarm_guide import alarms_text, as_html
 from estimators.diagnostics.detectors import CAUSES, anchor
-
-
-class Texts(HTMLParser):
-    def __init__(self, text):
-        super().__init__()
-        self.open, self.said, self.ids, self.tags = [], [], [], []
-        self.feed(text)
-
-    def handle_starttag(self, tag, attrs):
-        self.open.append(tag)
-        self.tags.append(tag)
-        self.ids += [value for name, value in attrs if name == "id"]
-
-    def handle_endtag(self, tag):
-        assert self.open.pop() == tag
-
-    def handle_data(self, data):
-        self.said.append(data)
+from tests.app.cli.test_check import ParsedHtml
 
 
 def test_forms():
@@ -37,10 +19,11 @@ def test_forms():
 
 
 def test_the_whole_of_it():
-    found = Texts(as_html(alarms_text()))
-    assert not found.open and {anchor(cause) for cause in CAUSES} <= set(found.ids)
-    assert len(found.ids) == len(set(found.ids)) == len(re.findall(r"^#", alarms_text(), re.MULTILINE))
-    words = " ".join("".join(found.said).split())
+    found = ParsedHtml(as_html(alarms_text()))
+    ids = [value for _, name, value in found.attributes if name == "id"]
+    assert {anchor(cause) for cause in CAUSES} <= set(ids)
+    assert len(ids) == len(set(ids)) == len(re.findall(r"^#", alarms_text(), re.MULTILINE))
+    words = " ".join("".join(found.text).split())
     plain = re.sub(r"^\|---.*$|^#+ |^- |[*`|]", " ", alarms_text(), flags=re.MULTILINE)
     squeezed = [re.sub(r"\s", "", text) for text in (re.sub(r"[*`|]", "", words), plain)]
     assert squeezed[0] == squeezed[1]

@@ -18,7 +18,6 @@ from estimators.log import READING, Events
 from estimators.track import USED, Track
 from estimators.tuning import Tuning
 from tests.app.scripted import MODEL, Stepped, pull_all, readings
-from tests.app.served import shown_twin
 
 
 def consistent(n=4000, seed=3):
@@ -37,7 +36,7 @@ def slow_error(n=4000):
 
 
 def looked(events, **options):
-    stepped = Stepped(of=shown_twin(**options))
+    stepped = Stepped(**options)
     engine = stepped.engine
     stepped.put(events)
     return engine, json.loads(json.dumps(Diagnosis(engine)._look(), allow_nan=False))
@@ -128,7 +127,7 @@ def test_a_sensor_in_doubt_is_not_called_consistent():
 
 
 def test_only_the_last_rows_are_looked_at():
-    stepped = Stepped(of=shown_twin())
+    stepped = Stepped()
     engine = stepped.engine
     events = consistent(9000)
     stepped.put(events)
@@ -139,7 +138,7 @@ def test_only_the_last_rows_are_looked_at():
 
 
 def test_nothing_is_said_before_the_first_reading():
-    stepped = Stepped(of=shown_twin())
+    stepped = Stepped()
     engine = stepped.engine
     said = json.loads(json.dumps(Diagnosis(engine).look(), allow_nan=False))
     assert said["events"] == 0 and said["rows"][0]["verdict"] == "winding: no reading among the last rows"

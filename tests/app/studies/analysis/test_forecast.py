@@ -15,14 +15,14 @@ from estimators.errors import ConfigError
 from estimators.forecast import Forecast, forecast
 from estimators.log import INPUT, READING, Events
 from estimators.models import MODELS
-from tests.app.scripted import MODEL, Scripted, pull_all, readings
-from tests.app.served import SECRET, Client, shown_twin
+from tests.app.scripted import MODEL, Scripted, pull_all, readings, twin
+from tests.app.served import SECRET, Client
 from tests.support import SECOND
 
 
 def running(n=200):
     """A twin of the winding's temperature and rate, which has had readings every half second."""
-    engine = Engine(shown_twin(), lambda report: Scripted())
+    engine = Engine(twin(), lambda report: Scripted())
     y = 40.0 + np.random.default_rng(2).normal(0, 2, n)
     if n:
         engine._accept([readings(0.5 * np.arange(1, n + 1), y)])
@@ -70,7 +70,7 @@ def test_a_place_on_the_earth_is_told_to_a_hundredth_of_its_deviation():
 
 
 def test_inputs_hold_from_the_time_that_is_asked_for():
-    engine = Engine(shown_twin(model=MODELS["motor_drive"], estimator="ekf"), lambda report: Scripted())
+    engine = Engine(twin(model=MODELS["motor_drive"], estimator="ekf"), lambda report: Scripted())
     times = np.arange(1, 40) * SECOND
     y = np.full((39, MODELS["motor_drive"].width), np.nan)
     y[:, 0] = 45.0
@@ -88,7 +88,7 @@ def test_inputs_hold_from_the_time_that_is_asked_for():
 def driven(*, changes):
     """A drive that was read every second for 40 s, and whose current changed meanwhile, by (seconds, A)."""
     model = MODELS["motor_drive"]
-    engine = Engine(shown_twin(model=model, estimator="ekf"), lambda report: Scripted())
+    engine = Engine(twin(model=model, estimator="ekf"), lambda report: Scripted())
     read = np.arange(1, 41) * SECOND
     turned = np.array([round(seconds * SECOND) for seconds, _ in changes], np.int64)
     t = np.concatenate((read, turned))

@@ -9,8 +9,8 @@ import pytest
 from app.live import commands
 from app.live.engine import Engine
 from app.web.server import PageServer
-from tests.app.scripted import Scripted, readings, wait_for
-from tests.app.served import SECRET, shown_twin
+from tests.app.scripted import Scripted, readings, twin, wait_for
+from tests.app.served import SECRET
 from tests.app.web.page.browsed import PATIENCE, until
 
 pytestmark = pytest.mark.browser
@@ -52,7 +52,7 @@ def at_rest(page):
 
 def test_the_viewer_is_covered_until_it_has_drawn_the_next(browser):
     source = Scripted()
-    engine = Engine(shown_twin(), lambda report: source)
+    engine = Engine(twin(), lambda report: source)
     server = PageServer(engine, port=0, viser_port=None, secret=SECRET)
     engine.start()
     server.start()

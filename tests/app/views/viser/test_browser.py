@@ -9,8 +9,7 @@ from app.views.viser.scene import place
 from app.views.viser.view import ViserView
 from estimators.log import READING, TRUTH, Events
 from estimators.models import MODELS
-from tests.app.fake_engine import FakeEngine, events
-from tests.app.scripted import wait_for
+from tests.app.scripted import events, viewed, wait_for
 
 pytestmark = pytest.mark.browser
 
@@ -20,7 +19,7 @@ CHARTS = "Object.values(window.__viserTestpoints?.uplots ?? {}).map(item => item
 
 @pytest.fixture
 def engine():
-    engine = FakeEngine(WINDING, "kf")
+    engine = viewed(WINDING)
     rng = np.random.default_rng(3)
     t = 1.0 + np.arange(60)
     truth = 40.0 + 0.1 * t

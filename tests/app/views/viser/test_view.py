@@ -30,8 +30,7 @@ from estimators.log import READING, TRUTH, Events
 from estimators.models import MODELS
 from estimators.numerics.peaks import Peak
 from estimators.track import DIVERGED, HEALTH_NAMES, SUSPECT
-from tests.app.fake_engine import FakeEngine, events
-from tests.app.scripted import wait_for
+from tests.app.scripted import events, fresh_status, viewed, wait_for
 from tests.support import SECOND
 
 WINDING = MODELS["motor_winding"]
@@ -49,7 +48,7 @@ def history(n=60, seed=0):
 
 @pytest.fixture
 def engine():
-    engine = FakeEngine(WINDING, "kf")
+    engine = viewed(WINDING)
     engine.put(history())
     return engine
 
@@ -154,7 +153,7 @@ def test_the_controls_follow_the_engine_without_an_echo(view, engine):
 
 
 def test_slow_engine_does_not_snap_the_slider_back(view, engine, monkeypatch):
-    engine.carry_out = False
+    monkeypatch.setattr(engine, "submit", engine.commands.append)
     slider = view.panel.controls.handles["Q.rate"]
     edit(slider, 1.0)
     view.frame()
@@ -172,7 +171,7 @@ def test_a_variance_of_zero_has_no_slider():
         states=(replace(WINDING.states[0], std=0.0), WINDING.states[1]),
         sensors=(replace(WINDING.sensors[0], rows=(row,)),),
     )
-    engine = FakeEngine(exact, "kf")
+    engine = viewed(exact)
     engine.put(history())
     with shown(engine) as view:
         assert list(view.panel.controls.handles) == ["estimator", "gate", "Q.temperature", "Q.rate"]
@@ -180,14 +179,14 @@ def test_a_variance_of_zero_has_no_slider():
 
 def test_the_status_has_a_sign_a_cause_and_no_markup_of_others():
     assert set(SIGNS) == set(HEALTH_NAMES) and len(set(SIGNS.values())) == len(SIGNS)
-    status = FakeEngine(WINDING, "kf").state
-    status.health, status.since, status.t = SUSPECT, 3 * SECOND, 9 * SECOND
-    status.cause, status.episodes_open = "winding reads 3 °C < the prediction", 3
+    status = replace(
+        fresh_status(viewed(WINDING)), health=SUSPECT, since=3 * SECOND, t=9 * SECOND, episodes_open=3,
+        cause="winding reads 3 °C < the prediction",
+    )  # fmt: skip
     text = re.sub(r"<[^>]+>", " ", status_html(status, SECOND))
     for part in ("◐ suspect since 2.0 s", "revision 0", "8.0 s", "&lt; the prediction (2 more)"):
         assert part in text
-    status.health, status.cause = DIVERGED, ""
-    assert "contradict the estimate" in status_html(status, SECOND)
+    assert "contradict the estimate" in status_html(replace(status, health=DIVERGED, cause=""), SECOND)
     assert "&lt;script&gt;" in error_html("<script>")
 
 
@@ -195,7 +194,7 @@ def test_the_status_has_a_sign_a_cause_and_no_markup_of_others():
 
 
 def test_the_chart_holds_nis_in_its_bounds(view, engine):
-    track, t = engine.fold.track, engine.log.events.t
+    track, t = engine._fold.track, engine._log.events.t
     x, high, low, mean, ends = view.panel.nis.handle.data
     first = int(np.flatnonzero(~np.isfinite(track.nis_mean))[-1]) + 1 if np.isnan(track.nis_mean).any() else 0
     assert x[-1] == pytest.approx((t[-1] - t[0]) * 1e-9) and x.size <= 200
@@ -210,8 +209,8 @@ def test_the_chart_has_at_most_200_points_and_keeps_extremes(view, engine):
     engine.put(events(WINDING, READING, 0, t, 45.0 + rng.normal(0, 2, t.size)))
     view.frame()
     x, high, low, mean, ends = view.panel.nis.handle.data
-    recent = engine.log.events.t >= engine.log.events.t[-1] - int(ViewSection().window * 1e9)
-    nis = engine.fold.track.nis_mean[recent]
+    recent = engine._log.events.t >= engine._log.events.t[-1] - int(ViewSection().window * 1e9)
+    nis = engine._fold.track.nis_mean[recent]
     assert 50 < x.size <= 200 and np.all(np.diff(x) >= 0)
     assert (mean.min(), mean.max()) == (nis.min(), nis.max())
 
@@ -283,7 +282,7 @@ def test_nobody_there_nothing_pulled(engine, monkeypatch):
         browser = threading.Thread(target=lambda: asyncio.run(browse()))
         browser.start()
         assert connected.wait(30)
-        wait_for(lambda: view.history.n == engine.log.n)
+        wait_for(lambda: view.history.n == engine._log.n)
         assert addresses(view.server) == ["part=scene&theme=dark"] and pulled
         leave.set()
         assert gone.wait(30)
@@ -330,17 +329,14 @@ def test_blocks_of_true_states_are_drawn(engine):
 def test_peaks_are_marked_with_their_weights_while_there_are_several(view, engine):
     belief = engine.belief()
     std = np.sqrt(np.diag(belief.cov))
-    engine.peaks = tuple(
-        Peak(weight, belief.mean + side * std, belief.cov) for weight, side in ((0.75, 0.5), (0.25, -0.5))
-    )
-    view.stage.scene.draw(view.history, engine.belief())
+    peaks = tuple(Peak(weight, belief.mean + side * std, belief.cov) for weight, side in ((0.75, 0.5), (0.25, -0.5)))
+    view.stage.scene.draw(view.history, replace(belief, peaks=peaks))
     (first, heavy), (second, light), (third, _) = view.stage.scene._marks.handles[:3]
     assert first.visible and second.visible and not third.visible
     assert (heavy.text, light.text) == ("75 %", "25 %")
-    place = [axis.place(engine.peaks[1].mean[axis.state]) for axis in view.stage.scene.axes]
+    place = [axis.place(peaks[1].mean[axis.state]) for axis in view.stage.scene.axes]
     np.testing.assert_allclose(second.points[0, : len(place)], place[:3], atol=0.05)
-    engine.peaks = ()
-    view.stage.scene.draw(view.history, engine.belief())
+    view.stage.scene.draw(view.history, belief)
     assert not (first.visible or second.visible)
 
 
@@ -406,7 +402,7 @@ def test_vehicle_scene_keeps_the_vehicle_in_the_middle():
         noises=(Noise("speed", "(m/s)²/s", 0.1),),
         sensors=(Sensor("gnss", (Row("east", "m", 1.0), Row("north", "m", 1.0)), fix),),
     )  # fmt: skip
-    engine = FakeEngine(model, "kf", ViewSection(scene=SceneSection(kind="vehicle", position=("east", "north"))))
+    engine = viewed(model, view=ViewSection(scene=SceneSection(kind="vehicle", position=("east", "north"))))
     t = np.arange(1.0, 61.0)
     engine.put(events(model, READING, 0, t, np.stack((10 * t, 0 * t), axis=1)))
     north = np.where(t == 30.0, np.nan, 3.0)

@@ -161,21 +161,6 @@ def test_csv_of_a_plant_becomes_a_twin(visit, tmp_path, data):
         page.locator(f".file[data-name='{log.name}']").wait_for()
 
 
-def test_ranges_of_a_robot_become_a_twin(visit, tmp_path, data):
-    log = data("agv_uwb_labyrinth", "ranges.csv")
-    ranges = np.genfromtxt(log, delimiter=",", names=True)["range_m"]
-    with opened(tmp_path / "recordings") as session:
-        page = visit_log(visit, session, log)
-        assert drawn_range(page, "range_m") == pytest.approx((ranges.max(), ranges.min()), abs=0.005)
-        # Two of the three tables of the rover's twin are missing: it says which columns.
-        page.locator("details.unfit > summary").click() if page.locator("details.unfit[open]").count() == 0 else None
-        why = page.locator("details[data-twin=uwb_rover_labyrinth]")
-        why.locator("summary").click()
-        assert "no column 'v_left_mps'" in why.inner_text()
-        pull = drafted(page, session, "ranges")
-        np.testing.assert_array_equal(rows_of(pull, session.engine.model, "range_m")[0], ranges)
-
-
 def test_mat_of_a_battery_becomes_a_twin(visit, tmp_path, data):
     from scipy.io import loadmat
 
