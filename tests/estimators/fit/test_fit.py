@@ -12,6 +12,7 @@ from scipy.stats import binom
 from estimators.errors import ConfigError
 from estimators.fit.entries import entries_of
 from estimators.fit.fit import fit
+from estimators.fit.judge import POWERS
 from estimators.fit.objective import Cancelled, FitProgress, Objective
 from estimators.fit.recording import Recording, held_out_rows, without_queries
 from estimators.log import READING, Log
@@ -145,7 +146,8 @@ def test_without_blocks_held_out_nothing_is_proposed(fitted):
 def test_a_tuning_that_is_wrong_is_replaced():
     wrong = Tuning.of(MODEL).set("Q.level", 0.005).set("R.float", 8.0)
     found = fit("kf", wrong, [Recording(log_of(simulated(2, 600)))], wanted=("Q", "R"))
-    assert found.proposed
+    # Its readings are independent news, and the blocks held out say so.
+    assert found.proposed and found.power >= POWERS[3]
     assert found.after.held_out.log_density > found.before.held_out.log_density
     for line, truth in zip(found.lines, (0.2, 0.5), strict=True):
         assert line.low < truth < line.high
@@ -256,9 +258,13 @@ def test_an_entry_that_is_none_is_refused(ys):
 LOGS = 6
 
 
-def test_true_noises_lie_in_their_intervals():
-    found = recover(next(case for case in CASES if case.twin == "motor_winding"), LOGS)
-    told = sum(found.told.values())
+@pytest.fixture(scope="module")
+def recovered():
+    return recover(next(case for case in CASES if case.twin == "motor_winding"), LOGS)
+
+
+def test_true_noises_lie_in_their_intervals(recovered):
+    found, told = recovered, sum(recovered.told.values())
     # All three are told by 1500 readings. Fewer inside than this would come by chance once in a thousand.
     assert told == 3 * LOGS
     assert sum(found.inside.values()) >= binom.ppf(1e-3, told, 0.95)
@@ -266,10 +272,8 @@ def test_true_noises_lie_in_their_intervals():
     assert found.consistent >= LOGS - 1
 
 
-def test_a_fit_makes_the_nis_of_another_log_as_uncertain_as_its_readings_do():
+def test_a_fit_makes_the_nis_of_another_log_as_uncertain_as_its_readings_do(recovered):
     """With the information I of a fit, ∂(mean NIS)/∂θ is -(2 / N) I e along the scale e of all noises, so gᵀ I⁻¹ g is
     2 / N: the variance of a chi-square's mean once more, whatever the model, if all Q and R are fitted."""
-    case = next(case for case in CASES if case.twin == "motor_winding")
-    found = recover(case, 3)
     # The belief takes from it, the sandwich adds, by a few percent each.
-    np.testing.assert_allclose(found.wider, np.sqrt(2.0), rtol=0.15)
+    np.testing.assert_allclose(recovered.wider, np.sqrt(2.0), rtol=0.15)

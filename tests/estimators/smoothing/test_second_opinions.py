@@ -1,25 +1,22 @@
-"""Other people's smoothers on the same data: statsmodels' and FilterPy's, of linear models and by sigma points."""
+"""Smoothers by sigma points against FilterPy's on the same data; the steady filter's against the Kalman filter's."""
 
 import numpy as np
-import pytest
-from filterpy.kalman import JulierSigmaPoints, KalmanFilter, UnscentedKalmanFilter
-from statsmodels.tsa.statespace.kalman_smoother import KalmanSmoother
+from filterpy.kalman import JulierSigmaPoints, UnscentedKalmanFilter
 
-from estimators import ESTIMATORS, Log, fold
+from estimators import Log, fold
 from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
-from estimators.smoothing.smooth import KINDS
-from tests.estimators.smoothing.test_dense import BODY, START, VARIANCE, moved
+from tests.estimators.smoothing.test_dense import BODY, START, VARIANCE, Q, moved
 
 DT, N = 0.3, 300
 
 
 def drive(seed=0):
     rng = np.random.default_rng(seed)
-    F, Q = moved(DT)
+    F, cov = moved(DT)
     x, ys = rng.multivariate_normal(*START), []
     for _ in range(N):
         ys.append(x[0] + rng.normal(0, np.sqrt(VARIANCE)))
-        x = F @ x + rng.multivariate_normal(np.zeros(2), Q)
+        x = F @ x + rng.multivariate_normal(np.zeros(2), cov)
     return np.array(ys)
 
 
@@ -27,44 +24,6 @@ def smoothed(estimator, model, ys, **settings):
     log = Log.of(model)
     log.add(model.sensor_names[0], DT * np.arange(ys.size), ys)
     return fold(estimator, model, log, covariance=True, smoothed=True, **settings)
-
-
-@pytest.mark.parametrize(
-    "estimator", [name for name in KINDS if name.endswith("kf") and ESTIMATORS[name].family == "Gaussian"]
-)
-def test_statsmodels_on_a_linear_model(estimator):
-    ys = drive()
-    ys[40:60] = np.nan
-    F, Q = moved(DT)
-    # Tolerance 0: it would take a covariance that hardly changes for the steady one.
-    its = KalmanSmoother(1, 2, design=[[1.0, 0.0]], transition=F, selection=np.eye(2), tolerance=0.0)
-    its["state_cov"], its["obs_cov"] = Q, [[VARIANCE]]
-    its.bind(ys[:, None])
-    its.initialize_known(*START)
-    expected = its.smooth()
-    ours = smoothed(estimator, BODY, ys)
-    # 300 steps, rounded at each, of numbers of order 10.
-    np.testing.assert_allclose(ours.mean, expected.smoothed_state.T, rtol=0, atol=1e-9)
-    np.testing.assert_allclose(ours.cov, expected.smoothed_state_cov.transpose(2, 0, 1), rtol=0, atol=1e-9)
-
-
-def test_filterpy_on_a_linear_model():
-    ys = drive(1)
-    F, Q = moved(DT)
-    its = KalmanFilter(2, 1)
-    its.x, its.P, its.F, its.Q = START[0][:, None].copy(), START[1].copy(), F, Q
-    its.H, its.R = np.array([[1.0, 0.0]]), np.array([[VARIANCE]])
-    means, covs = [], []
-    for k, y in enumerate(ys):
-        if k:
-            its.predict()
-        its.update(y)
-        means.append(its.x.copy())
-        covs.append(its.P.copy())
-    expected, cov, _, _ = its.rts_smoother(np.array(means), np.array(covs))
-    ours = smoothed("kf", BODY, ys)
-    np.testing.assert_allclose(ours.mean, expected[:, :, 0], rtol=0, atol=1e-9)
-    np.testing.assert_allclose(ours.cov, cov, rtol=0, atol=1e-9)
 
 
 def swing(x, u, p, dt, out):
@@ -76,12 +35,6 @@ def height(x, u, p, out):
     out[0] = np.sin(x[0])
 
 
-def swing_noise(x, u, p, q, dt, out):
-    out[0, 0] = q[0] * dt**3 / 3.0
-    out[0, 1] = out[1, 0] = q[0] * dt**2 / 2.0
-    out[1, 1] = q[0] * dt
-
-
 PENDULUM = StateSpaceModel(
     name="swing",
     title="a pendulum whose height is read, as Särkkä has it",
@@ -89,7 +42,7 @@ PENDULUM = StateSpaceModel(
     noises=(Noise("push", "rad²/s³", variance=0.01),),
     sensors=(Sensor("height", (Row("height", "m", variance=0.1),), h=height),),
     f=swing,
-    Q=swing_noise,
+    Q=Q,
 )
 
 
