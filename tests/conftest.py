@@ -6,6 +6,7 @@ How long each test takes is kept between runs, for `--quickest`.
 import os
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -73,6 +74,21 @@ def absent(reason: str) -> None:
     if os.environ.get("CI", "").lower() in ("true", "1"):
         pytest.fail(f"{reason}; with CI=true that is a failure", pytrace=False)
     pytest.skip(reason)
+
+
+def recorded(name: str) -> tuple[Any, Any]:
+    """A bundled twin and its own log; the test skips where the recording is absent."""
+    from app.twin.log_reader import read_log
+    from app.twin.twin import load_twin
+    from estimators.errors import SourceError
+
+    twin = load_twin(name)
+    try:
+        return twin, read_log(twin, None)[0]
+    except SourceError as error:
+        if "is not there" in str(error):
+            absent(str(error))
+        raise
 
 
 def data_folder() -> Path:

@@ -12,10 +12,9 @@ from app.studies.scores import COST, read_cell, read_scores, read_span
 from app.twin.log_reader import read_log
 from app.twin.twin import Twin, load_twin
 from config.loader import shipped
-from estimators.errors import SourceError
 from estimators.log import Events
 from estimators.registry import ESTIMATORS, unfit
-from tests.conftest import absent
+from tests.conftest import recorded
 
 SEED = 1234
 """Not among the table's 0 to 7."""
@@ -31,14 +30,9 @@ SIGMA = 5.0 * math.sqrt(1 + 1 / 8)
 
 
 @lru_cache(maxsize=1)
-def recorded(name: str) -> tuple[Twin, Events]:
-    twin = load_twin(name)
-    try:
-        return twin, without_marks(read_log(twin, None)[0].events)
-    except SourceError as error:
-        if "is not there" in str(error):
-            absent(str(error))
-        raise
+def twin_and_events(name: str) -> tuple[Twin, Events]:
+    twin, log = recorded(name)
+    return twin, without_marks(log.events)
 
 
 def quick(estimator: str, cells: dict[str, str], events: Events) -> bool:
@@ -94,7 +88,7 @@ def test_every_filter_that_applies_has_a_row(name: str) -> None:
 @pytest.mark.parametrize("name", shipped())
 def test_the_scores_say_what_the_filters_do(name: str) -> None:
     """To the last printed digit, or for filters that draw, as near as another seed comes."""
-    twin, events = recorded(name)
+    twin, events = twin_and_events(name)
     rows = scores_of(twin)
     assert {int(cells["events"]) for cells in rows.values()} == {len(events)}
     wrong = mismatches(twin, events, rows)
@@ -117,7 +111,7 @@ def test_other_logs_are_as_the_head_says(name: str) -> None:
 
 
 def test_scores_that_are_no_longer_true_are_found() -> None:
-    twin, events = recorded("motor_winding")
+    twin, events = twin_and_events("motor_winding")
     rows = scores_of(twin)
     for estimator in ("kf", "etkf"):
         for title in ("RMSE [°C]", "mean NIS", "in band [%]"):

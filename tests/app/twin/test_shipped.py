@@ -6,24 +6,15 @@ import pytest
 from app.twin.twin import load_twin
 from config.loader import TWINS, shipped
 from estimators.diagnostics.episodes import episodes
-from estimators.errors import SourceError
 from estimators.fold import Fold, fold
 from estimators.log import READING, Events, truth_of
 from estimators.track import GATED, USED, Track
-from tests.conftest import absent
+from tests.conftest import recorded
 from tests.support import SECOND, as_log, read_all
 
 
 def folded(name: str) -> tuple[Events, Track]:
-    twin = load_twin(name)
-    try:
-        source = twin.open_source(lambda key, text: None, live=False)
-    except SourceError as error:
-        if "is not there" in str(error):
-            absent(str(error))
-        raise
-    log = as_log(read_all(source))
-    source.close()
+    twin, log = recorded(name)
     return log.events, fold(twin.estimator, twin.model, twin.tuning, log)
 
 
@@ -56,15 +47,8 @@ def test_it_opens_and_folds(name: str) -> None:
 
 @pytest.mark.parametrize("name", [name for name in shipped() if name not in HUGE])
 def test_no_sensor_drops_out_in_the_first_minute(name: str) -> None:
-    twin = load_twin(name)
-    try:
-        source = twin.open_source(lambda key, text: None, live=False)
-    except SourceError as error:
-        if "is not there" in str(error):
-            absent(str(error))
-        raise
-    events = read_all(source)
-    source.close()
+    twin, log = recorded(name)
+    events = log.events
     log = as_log(events.select(events.t <= events.t[0] + 60 * SECOND))
     judged = Fold(twin.estimator, twin.model, twin.tuning, log, policy=twin.policy, expected=twin.expected)
     judged.advance()
@@ -96,12 +80,3 @@ def test_what_was_learned_of_the_magnet_holds_where_it_was_not_learned() -> None
     # Physics of a data sheet, with what 20 minutes taught: as the opening text says, and nearer than fitted physics.
     assert last("motor_bench_hybrid") == pytest.approx(0.627, abs=5e-3)
     assert last("motor_bench") == pytest.approx(0.746, abs=5e-3)
-
-
-def test_the_winding_gives_the_articles_numbers() -> None:
-    events, track = folded("motor_winding")
-    rows, values = truth_of(events, 0)
-    assert events.t[rows[0]] > 0
-    assert np.sqrt(np.mean((track.mean[rows, 0] - values) ** 2)) == pytest.approx(1.0432, abs=5e-5)
-    assert np.nanmean(track.nis) == pytest.approx(0.8227, abs=5e-5)
-    np.testing.assert_allclose(track.std[-1] ** 2, [0.81306, 0.012751], rtol=1e-5)

@@ -2,17 +2,12 @@
 
 import subprocess
 import sys
-from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from app.twin.log_reader import read_log
-from app.twin.twin import load_twin
 from estimators.compiled.model import compile_model
-from estimators.diagnostics.score import score
 from estimators.errors import ModelError
 from estimators.fold import fold
 from estimators.log import READING, Events, Log
@@ -153,30 +148,3 @@ def test_another_process_finds_the_compiled_code() -> None:
     for _ in range(2):
         told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     assert told.split()[-1] == "0", told
-
-
-@pytest.mark.parametrize("estimator", ["ekf", "ukf"])
-def test_a_silted_jacket_is_found(estimator: str) -> None:
-    twin = load_twin("motor_joint")
-    log, _ = read_log(twin, None)
-    track = fold(estimator, twin.model, twin.tuning, log)
-    result = score(track, log.events, twin.model)
-    late = slice(len(track.mean) // 2, None)
-    np.testing.assert_allclose(track.mean[late, 4], 0.04, atol=4 * track.std[late, 4].max())
-    assert track.std[-1, 4] < 5e-4 and track.mean[0, 4] == pytest.approx(0.03)
-    assert result.states["yoke_coolant"].coverage > 0.9
-    assert result.states["magnet"].rmse < 1.8
-    assert result.nis_low < result.nis < result.nis_high
-
-
-def test_on_the_bench_the_magnet_is_found_without_the_jackets_resistance(data: Callable[..., Path]) -> None:
-    data("motor_pmsm_paderborn", "session60_first_30min_2hz.csv")
-    twin = load_twin("motor_bench_joint")
-    log, _ = read_log(twin, None)
-    track = fold("ekf", twin.model, twin.tuning, log)
-    result = score(track, log.events, twin.model)
-    resistance = track.mean[:, twin.model.state_names.index("yoke_coolant")]
-    assert resistance[0] == pytest.approx(0.048)
-    assert 0.026 < resistance[-1] < 0.033  # fitted with all temperatures: 0.032
-    assert result.states["magnet"].rmse < 0.9
-    assert result.nis_low < result.nis < result.nis_high

@@ -1,22 +1,16 @@
 """The battery models: the circuit against an integrator and SciPy's PCHIP, and what the twins make of their logs."""
 
-from functools import lru_cache
-
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 from scipy.interpolate import PchipInterpolator
 
 from app.twin.log_reader import read_log
-from app.twin.twin import Twin, load_twin
+from app.twin.twin import load_twin
 from estimators.compiled.model import compile_model
-from estimators.diagnostics.score import Score, score
-from estimators.errors import SourceError
 from estimators.fold import fold
-from estimators.log import Log
 from estimators.models.battery_cell import BATTERY_CELL, NODES, open_circuit
 from estimators.models.battery_pack import BATTERY_PACK, CELLS
-from tests.conftest import absent
 
 
 def named(model) -> dict[str, float]:
@@ -140,50 +134,6 @@ def test_slopes_match_complex_step_from_below_empty_to_above_full(model, soc: fl
             exact[:, j] = out.imag / 1e-20
         slope(own)
         np.testing.assert_allclose(own, exact, rtol=1e-11, atol=1e-13)
-
-
-@lru_cache(maxsize=1)
-def recorded(name: str) -> tuple[Twin, Log]:
-    twin = load_twin(name)
-    try:
-        return twin, read_log(twin, None)[0]
-    except SourceError as error:
-        if "is not there" in str(error):
-            absent(str(error))
-        raise
-
-
-def scored(name: str, estimator: str) -> Score:
-    twin, log = recorded(name)
-    track = fold(estimator, twin.model, twin.tuning, log)
-    return score(track, log.events, twin.model)
-
-
-@pytest.mark.parametrize(
-    ("name", "estimator", "rmse", "coverage", "nis"),
-    [
-        # Half as much again as measured, RMSE and coverage; the mean NIS near the one that the twin's opening tells.
-        ("battery_panasonic", "ekf", 0.0095, 0.94, (0.6, 0.75)),
-        ("battery_panasonic", "ukf", 0.0095, 0.94, (0.6, 0.75)),
-        ("battery_dmegc", "ekf", 0.015, 0.93, (0.8964, 1.1092)),
-        ("battery_dmegc", "ukf", 0.008, 0.93, (0.8964, 1.1092)),
-    ],
-)
-def test_charge_is_found_on_recordings_from_forty_percent_wrong(name, estimator, rmse, coverage, nis) -> None:
-    result = scored(name, estimator)
-    assert result.states["soc"].rmse < rmse
-    assert result.states["soc"].coverage > coverage
-    assert nis[0] < result.nis < nis[1]
-
-
-@pytest.mark.parametrize("estimator", ["ekf", "ukf"])
-def test_the_pack_tells_the_weak_cell(estimator: str) -> None:
-    result = scored("battery_pack", estimator)
-    for k in range(1, CELLS + 1):
-        fit = result.states[f"soc_{k}"]
-        assert fit.rmse < (0.007 if k == 5 else 0.0035) and fit.coverage > (0.85 if k == 5 else 0.95)
-        assert result.states[f"temperature_{k}"].rmse < 0.08
-    assert 7.2 < result.nis < 8.1076
 
 
 def test_lost_capacity_is_found_when_it_is_estimated() -> None:

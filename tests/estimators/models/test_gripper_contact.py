@@ -27,10 +27,6 @@ def contact(name, seed, particles=300, duration=15.0):
     return run.track.mean[rows, CONTACT], truth, run
 
 
-def brier(name, **more):
-    return np.array([np.mean((p - truth) ** 2) for p, truth, _ in (contact(name, seed, **more) for seed in SEEDS)])
-
-
 def test_chances_over_two_half_steps_are_those_of_a_step():
     """The depth standing still, the jump is a Markov chain in continuous time: its two rates add up to λ."""
     for depth in (-1.0, -0.1, 0.0, 0.3):
@@ -89,28 +85,3 @@ def test_the_probability_of_contact_is_calibrated():
     middle = (p > 0.2) & (p < 0.8)
     # Neighbours of a doubtful stretch share its fate: some 10 stretches a run, each of standard deviation ≤ ½.
     assert abs(np.mean(truth[middle]) - np.mean(p[middle])) < 4 * 0.5 / np.sqrt(10 * len(SEEDS))
-
-
-def test_rbpf_tells_contact_better_than_ukf():
-    assert np.all(brier("rbpf") < brier("ukf")) and brier("ukf").mean() > 1.3 * brier("rbpf").mean()
-    p, _, run = contact("ukf", SEEDS[0])
-    assert p.min() < -0.05 and p.max() > 1.05, "the ukf's number keeps to no range, and this shows"
-    likelihood = {name: np.nansum(contact(name, SEEDS[0])[2].track.log_likelihood) for name in ("rbpf", "ukf")}
-    assert likelihood["rbpf"] > likelihood["ukf"] + 100
-
-
-def test_rbpf_needs_fewer_particles_than_pf():
-    """Of 300 particles each: what is integrated needs none."""
-    assert brier("rbpf").mean() < brier("pf").mean()
-    rows = [np.nansum(contact(name, seed)[2].track.log_likelihood) for name in ("rbpf", "pf") for seed in SEEDS]
-    assert np.all(np.array(rows[:4]) > np.array(rows[4:]))
-
-
-def test_the_estimate_is_consistent():
-    run = contact("rbpf", SEEDS[0])[2]
-    rows, surface = truth_of(run.log.events, SURFACE)
-    miss = (run.track.mean[rows, SURFACE] - surface) / run.track.std[rows, SURFACE]
-    # After the first touch; neighbours are the same estimate, a handful of independent ones remain.
-    assert np.sqrt(np.mean(miss[rows.size // 3 :] ** 2)) < 2.0
-    nis = run.track.nis[np.isfinite(run.track.nis) & (run.track.verdict == 1)]
-    assert nis.size > 1000 and abs(nis.mean() - 1) < 5 * np.sqrt(2 / nis.size)

@@ -1,22 +1,17 @@
-"""The rover among radio anchors, and a car: equations by hand, simulated runs, and what they make of recordings."""
+"""The rover among radio anchors: its equations by hand, its simulated self, and what it makes of a recording."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from app.twin.log_reader import read_log
-from app.twin.twin import load_twin
 from estimators.compiled.model import compile_model
-from estimators.diagnostics.score import score
-from estimators.errors import SourceError
 from estimators.fold import fold
 from estimators.log import truth_of
 from estimators.models.uwb_rover import UWB_ROVER, uwb_rover
-from estimators.track import Track
 from estimators.tuning import Tuning
 from sources.simulator import Simulator, constant_input, sine_input
-from tests.conftest import absent
+from tests.conftest import recorded
 from tests.support import as_log, read_all
 
 
@@ -69,64 +64,9 @@ def test_a_simulated_rover_is_tracked_within_what_the_filter_says(estimator: str
     assert track.mean[-1, 4] == pytest.approx(1.04, abs=4 * track.std[-1, 4])
 
 
-def replayed(name: str, estimator: str, *, ranges: bool = True) -> tuple[Track, float, dict, float]:
-    """The track, the position's RMSE, fits by state and the mean NIS."""
-    twin = load_twin(name)
-    try:
-        log, _ = read_log(twin, None)
-    except SourceError as error:
-        if "is not there" in str(error):
-            absent(str(error))
-        raise
-    tuning = twin.tuning
-    for sensor in twin.model.sensor_names if not ranges else ():
-        tuning = tuning.set(f"use.{sensor}", False)
-    track = fold(estimator, twin.model, tuning, log)
-    result = score(track, log.events, twin.model)
-    return track, float(np.hypot(result.states["east"].rmse, result.states["north"].rmse)), result.states, result.nis
-
-
 @pytest.mark.parametrize("estimator", ["ekf", "ukf"])
-def test_the_mower_among_its_beacons(estimator: str) -> None:
-    """Bounds a tenth above what is measured: a change that costs more than that is a change for the worse."""
-    track, position, fits, nis = replayed("uwb_rover_plaza", estimator)
-    assert position < 0.34 and fits["heading"].rmse < 0.036
-    assert min(fit.coverage for fit in fits.values()) > 0.93
-    assert nis == pytest.approx(1.0, abs=0.1)
-    # A least-squares line through the ranges and the true distances of each beacon gives 1.068 to 1.071.
+def test_the_mower_finds_the_scale_of_its_ranges(estimator: str) -> None:
+    """A least-squares line through the ranges and the true distances of each beacon gives 1.068 to 1.071."""
+    twin, log = recorded("uwb_rover_plaza")
+    track = fold(estimator, twin.model, twin.tuning, log)
     assert track.mean[-1, 4] == pytest.approx(1.0695, abs=0.005)
-    _, reckoned, _, _ = replayed("uwb_rover_plaza", estimator, ranges=False)
-    assert position < reckoned / 8
-
-
-@pytest.mark.parametrize("estimator", ["ekf", "ukf"])
-def test_the_robot_in_the_labyrinth(estimator: str) -> None:
-    _, position, fits, nis = replayed("uwb_rover_labyrinth", estimator)
-    assert position < 0.17
-    assert min(fit.coverage for fit in fits.values()) > 0.8
-    assert 0.8 < nis < 1.4
-    _, reckoned, _, _ = replayed("uwb_rover_labyrinth", estimator, ranges=False)
-    assert position < reckoned / 8
-
-
-def test_the_filter_that_refuses_the_fixes_is_not_preferred():
-    twin = load_twin("road_car")
-    try:
-        log, _ = read_log(twin, None)
-    except SourceError as error:
-        if "is not there" in str(error):
-            absent(str(error))
-        raise
-    # Without reopening, by which the lost filter would find itself again.
-    tuning = twin.tuning.set("gate.reopen", None)
-    results = {
-        name: score(fold(name, twin.model, tuning, log), log.events, twin.model, gate=tuning.gate)
-        for name in ("ekf", "iekf")
-    }
-    good, lost = results["ekf"], results["iekf"]
-    # The iterated filter is kilometres off; its predictions of the speed that is held out are 4 m/s off.
-    assert good.refused < 0.01 < 0.2 < lost.refused
-    assert good.held_out["gnss_speed"].rmse < 0.2 < 4.0 < lost.held_out["gnss_speed"].rmse
-    assert lost.log_likelihood_used > good.log_likelihood_used
-    # Each refusal costs log(1e5) = 11.5 at least, and what an outlier's distance costs.
-    assert good.log_likelihood > lost.log_likelihood + 11.5 * (lost.gated - good.gated)
