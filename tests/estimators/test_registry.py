@@ -9,7 +9,7 @@ from estimators.errors import EstimatorError
 from estimators.fold import Fold, fold
 from estimators.log import READING, Events, Log
 from estimators.models import MODELS
-from estimators.registry import ESTIMATORS, checked, find_estimator, unfit
+from estimators.registry import ESTIMATORS, checked, find_estimator
 from estimators.tuning import Tuning
 from tests.estimators.interpreted.test_filterpy import PENDULUM
 from tests.estimators.linear_models import random_linear, random_log
@@ -124,45 +124,6 @@ def test_kf_refuses_a_nonlinear_model_and_names_what_to_use():
 def test_an_unknown_name_is_told_the_near_ones():
     with pytest.raises(EstimatorError, match="'ukff' does not exist; did you mean ukf"):
         find_estimator("ukff", PENDULUM)
-
-
-LINEARISED = ("kf", "kf-steady", "ekf", "iekf", "sr-kf", "sr-ekf", "filterpy-kf", "filterpy-ekf")
-"""Filters that take h(x) for the mean of h."""
-
-
-@pytest.mark.parametrize("name", list(ESTIMATORS))
-@pytest.mark.parametrize("model", [m for m in MODELS.values() if m.nx < 100_000], ids=lambda m: m.name)
-def test_every_estimator_runs_every_model_it_applies_to(name, model):
-    """Events of exactly what the model expects at its prior: the estimate stays finite and near."""
-    if reason := unfit(ESTIMATORS[name], model):
-        assert model.name in reason
-        return
-    from estimators.compiled.model import compile_model
-
-    compiled = compile_model(model)
-    x = model.prior_mean
-    u = np.array([item.default for item in model.inputs])
-    p = np.array([item.value for item in model.parameters])
-    log = Log(model.width)
-    for k, sensor in enumerate(model.sensors):
-        y = np.empty(len(sensor.rows))
-        compiled.h[k](x, u, p, y)
-        log.extend(Events.one(0, 0, READING, k, y, model.width))
-    fold = folded(name, model, log)
-    mean, cov = fold.moments()
-    std = model.prior_std
-    if ESTIMATORS[name].family not in ("Gaussian", "reference") or name == "filterpy-enkf":
-        # Sharp readings leave few of the prior's particles, one perhaps: the mean is still one of the prior's.
-        assert np.all(np.isfinite(cov)) and np.all(np.abs(mean - x) <= 5 * std)
-        return
-    assert np.all(np.linalg.eigvalsh(cov) > 0)
-    if name != "kf-steady":  # a gain that is not the best one may make a state worse
-        assert np.all(np.sqrt(np.diag(cov)) <= std * (1 + 1e-12))
-    # The reading is what is expected at the mean, so a linearised filter does not move; one that sees curvature may.
-    if name in LINEARISED:
-        np.testing.assert_allclose(mean, x, atol=1e-9)
-    else:
-        assert np.all(np.abs(mean - x) <= 5 * std)
 
 
 def test_ukf_points_have_the_moments_of_the_state():

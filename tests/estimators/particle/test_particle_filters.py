@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 
 from estimators.fold import Fold, fold
-from estimators.log import READING, TICK, Events, Log
+from estimators.log import READING, TICK
 from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
 from estimators.particle.cloud import RECOVERIES, block, members
 from estimators.track import FAILED, GATED, HELD_OUT, MISSING, USED
 from estimators.tuning import Tuning
 from tests.estimators.linear_models import JointGaussian, random_linear, random_log
 from tests.models import first_state, first_state_squared, unchanged
-from tests.support import SECOND, assert_same, folded, log_of
+from tests.support import assert_same, folded, log_of
 
 NAMES = ("pf", "pf-reg", "pf-ekf", "apf")
 EXACT = ("pf", "pf-ekf", "apf")
@@ -370,39 +370,6 @@ def test_siblings_stand_side_by_side(name, scheme):
     assert np.array_equal(before[ancestors], block(run.options, run._now.state, 1)[:, 0])
     assert 100 < np.unique(ancestors).size < 2900
     assert np.all(np.diff(ancestors) >= 0)
-
-
-def swing(x, u, p, dt, out):
-    out[0] = x[0] + x[1] * dt
-    out[1] = x[1] - 9.81 * np.sin(x[0]) * dt
-
-
-def sine(x, u, p, out):
-    out[0] = np.sin(x[0])
-
-
-@pytest.mark.parametrize(("scheme", "most"), [(0, 0.0045), (1, 0.0065)])
-def test_resampling_often_keeps_what_the_strata_gain(scheme, most):
-    """A pendulum, resampled at each of 400 readings, over 40 seeds.
-
-    With siblings apart the estimates' standard deviations were 0.0054 and 0.0087 rad, side by side they are 0.0035 and
-    0.0046 (40 seeds tell one to a tenth); multinomial's is 0.017 in either order.
-    """
-    model = StateSpaceModel(
-        name="pendulum", title="", states=(State("angle", "rad", 1.5, 0.3), State("rate", "rad/s", 0.0, 0.3)),
-        noises=(Noise("rate", "rad²/s³", 0.01),), f=swing,
-        sensors=(Sensor("x", (Row("x", "m", 0.01),), h=sine),),
-    )  # fmt: skip
-    rng, x, log = np.random.default_rng(1), np.array([1.5, 0.0]), Log(model.width)
-    for k in range(1, 401):
-        out = np.empty(2)
-        swing(x, None, None, 0.01, out)
-        x = out + [0.0, 0.01 * rng.standard_normal()]
-        value = np.sin(x[0]) + 0.1 * rng.standard_normal()
-        log.extend(Events.one(k * SECOND // 100, 0, READING, 0, value, model.width))
-    tuning = Tuning.of(model).with_options({"particles": 2000, "fraction": 1.0, "resampling": scheme})
-    means = np.array([fold("pf", model, replace(tuning, seed=seed), log).mean[:, 0] for seed in range(40)])
-    assert np.sqrt(np.mean(means.var(axis=0, ddof=1))) < most
 
 
 def test_the_kernel_may_move_duplicates_only():
