@@ -57,17 +57,6 @@ def test_pinned_named_and_loaded(page):
     assert (last["number"], last["loaded"], last["name"], last["note"]) == (2, 0, "calm", "as delivered")
 
 
-def test_what_cannot_be_is_one_line(page):
-    for value in (0.1, 0.2, 0.3, 0.4):
-        assert page.command("Pin", number=page.engine.revisions.runs[-1].number) is None
-        page.command("SetTuning", key="Q.rate", value=value)
-    assert page.command("Pin", number=4) == "run 4 cannot be pinned: 4 are (0, 1, 2, 3); unpin one first"
-    for command in ("Pin", "Unpin", "Load"):
-        assert page.command(command, number=99) == "run 99 is not known; /api/runs lists those that are"
-    assert "it may have 60" in page.command("Note", number=0, name="x" * 61)
-    assert "must be a whole number" in page.command("Pin", number="0")
-
-
 def test_two_runs_are_compared(page):
     page.command("SetTuning", key="Q.rate", value=0.5)
     page.command("SetTuning", key="gate", value=0.99)

@@ -112,8 +112,6 @@ SECOND_EDITION = replace(
         (PENDULUM, 0.1, "ekf", {}, (0.12, None)),
         (PENDULUM, 0.1, "ukf", {}, (0.11, None)),
         (PENDULUM, 0.1, "ckf", {}, (0.11, None)),
-        (PENDULUM, 0.1, "iekf", {}, (None, None)),
-        (PENDULUM, 0.1, "sr-ukf", {}, (None, None)),
         (SECOND_EDITION, 0.0, "ekf", {}, (0.1683, 0.0574)),
         (SECOND_EDITION, 0.0, "ukf", {"alpha": 1.0, "beta": 0.0, "kappa": 1.0}, (0.0952, 0.0366)),
         (SECOND_EDITION, 0.0, "ckf", {}, (0.1142, 0.0406)),
