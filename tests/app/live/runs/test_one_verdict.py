@@ -15,8 +15,7 @@ from app.web.twin_json import status_json
 from estimators.diagnostics.detector_state import no_baseline
 from estimators.diagnostics.intervals import scale_interval
 from estimators.diagnostics.score import score
-from tests.app.scripted import MODEL, Scripted, pull_all, readings
-from tests.app.served import shown_twin
+from tests.app.scripted import MODEL, Scripted, pull_all, readings, twin
 
 READINGS = 40  # fewer than the window of the strip holds, so that all judge the same ones
 BIAS, SCALE, CORRELATION = 0.2, 0.5, 0.6
@@ -24,12 +23,12 @@ BIAS, SCALE, CORRELATION = 0.2, 0.5, 0.6
 
 @pytest.fixture(params=[False, True], ids=["not commissioned", "commissioned"])
 def engine(request):
-    twin = shown_twin()
+    made = twin()
     if request.param:
         baseline = no_baseline(MODEL)
         baseline[:, :3] = BIAS, SCALE, CORRELATION
-        twin.tuning = dataclasses.replace(twin.tuning, baseline=baseline)
-    engine = Engine(twin, lambda report: Scripted())
+        made.tuning = dataclasses.replace(made.tuning, baseline=baseline)
+    engine = Engine(made, lambda report: Scripted())
     rng = np.random.default_rng(5)
     engine._accept([readings(0.5 * np.arange(1, READINGS + 1), 40.0 + rng.normal(0, 2.0, READINGS))])
     return engine
