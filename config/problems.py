@@ -41,11 +41,7 @@ S = TypeVar("S", bound=BaseModel)
 def check_section(kind: type[S], text: str, path: Path, rule: str) -> tuple[S, dict[str, Any], ValuePlaces]:
     """Check YAML against a schema; return the section, the data, and the place of each value.
 
-    Args:
-        kind: The schema.
-        text: The YAML.
-        path: Its file.
-        rule: What the file must be, if it is no mapping.
+    `rule` says what the file must be, if it is no mapping.
 
     Raises:
         ConfigError: With a line for each of the first problems.
@@ -134,7 +130,15 @@ _RULES = {
     "tuple": "it must be a list",
     "list": "it must be a list",
     "finite": "it must be a finite number",
+    "less_than_equal": "it must be {le:g} at most",
+    "less_than": "it must be below {lt:g}",
+    "too_short": "it needs {min_length} or more entries",
+    "too_long": "it may have {max_length} entries at most",
+    "string_too_long": "it may have {max_length} characters at most",
+    "string_too_short": "it must not be empty",
+    "string_pattern_mismatch": "use letters, digits, _ and -, and begin with a letter or digit",
 }
+"""Rules by pydantic's type of error, or its first word; braces hold what pydantic tells of the rule."""
 
 
 def _rule(kind: str, context: dict[str, Any], text: str, value: Any) -> str:
@@ -142,21 +146,8 @@ def _rule(kind: str, context: dict[str, Any], text: str, value: Any) -> str:
         return "it must be positive" if context["gt"] == 0 else f"it must be above {context['gt']:g}"
     if kind == "greater_than_equal":
         return "it must be zero or positive" if context["ge"] == 0 else f"it must be {context['ge']:g} or more"
-    if kind == "less_than_equal":
-        return f"it must be {context['le']:g} at most"
-    if kind == "less_than":
-        return f"it must be below {context['lt']:g}"
     if kind == "literal_error":
         words = re.findall(r"'([^']*)'", context["expected"])
         return nearest(str(value), words) if len(words) > MAX_LISTED_WORDS else f"it must be {context['expected']}"
-    if kind == "too_short":
-        return f"it needs {context['min_length']} or more entries"
-    if kind == "too_long":
-        return f"it may have {context['max_length']} entries at most"
-    if kind == "string_too_long":
-        return f"it may have {context['max_length']} characters at most"
-    if kind == "string_too_short":
-        return "it must not be empty"
-    if kind == "string_pattern_mismatch":
-        return "use letters, digits, _ and -, and begin with a letter or digit"
-    return _RULES.get(kind.split("_")[0], text[:1].lower() + text[1:])
+    rule = _RULES.get(kind) or _RULES.get(kind.split("_")[0])
+    return text[:1].lower() + text[1:] if rule is None else rule.format(**context)

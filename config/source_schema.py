@@ -17,7 +17,7 @@ from .fields import (
     LevelSection,
     Number,
     Numbers,
-    Positive,
+    Positives,
     Seconds,
     Section,
     SomeSeconds,
@@ -45,9 +45,7 @@ class AccuracySection(Section):
     units: Texts | None = None
     """Unit of each, converted to the row's, or to its square for a variance (cm, m^2, ...). Default: the DBC's, else
     the model's."""
-    scale: Annotated[
-        tuple[Positive, ...], Field(min_length=1), BeforeValidator(as_list, json_schema_input_type=float | list[float])
-    ] = (1.0,)
+    scale: Positives = (1.0,)
     """Factor applied after the conversion of units: 0.5 if two standard deviations are reported. Default: 1."""
 
     @property

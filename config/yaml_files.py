@@ -66,14 +66,7 @@ class ValuePlaces:
 
 
 def parse(text: str, file: str) -> tuple[Any, ValuePlaces]:
-    """Parse YAML.
-
-    Args:
-        text: The YAML.
-        file: Its name in messages.
-
-    Returns:
-        The data, with every key as text, and the place of every value.
+    """Parse YAML; return the data, with every key as text, and the place of every value. Messages name `file`.
 
     Raises:
         ConfigError: In one line, if it is not YAML that a twin can be.
@@ -206,11 +199,7 @@ def shown_path(path: Path) -> str:
 
 
 def read_text(path: Path, listing: str) -> str:
-    """Return the text of a YAML file.
-
-    Args:
-        path: Where it is.
-        listing: The command that lists them.
+    """Return the text of a YAML file; `listing` is the command that lists them.
 
     Raises:
         ConfigError: If it is not there, no file, or no text.
@@ -237,11 +226,7 @@ def read_text(path: Path, listing: str) -> str:
 
 @contextmanager
 def writing(path: Path, option: str = "") -> Iterator[None]:
-    """Report an error while a file is written in one line that names it.
-
-    Args:
-        path: The file.
-        option: Option of the command line that gave it.
+    """Report an error while a file is written in one line that names it, with the command line's `option` for it.
 
     Raises:
         ConfigError: In place of any OSError; most of those name no file (a full disk).
@@ -282,7 +267,7 @@ def with_section(text: str, key: str, section: str) -> str:
     """Return a YAML text in which the section `key` has these lines; without one, they are appended."""
     # The key and the lines under it, to the last that is indented; a comment after that belongs to what follows.
     pattern = re.compile(
-        rf"^{re.escape(key)}:.*(?:\n|\Z)(?:(?:[ \t]*(?:#.*)?\n)*[ \t]+[^\s#].*(?:\n|\Z))*", re.MULTILINE
+        rf"^{re.escape(key)}[ \t]*:.*(?:\n|\Z)(?:(?:[ \t]*(?:#.*)?\n)*[ \t]+[^\s#].*(?:\n|\Z))*", re.MULTILINE
     )
     kept, found = pattern.subn(lambda _: section, text, count=1)
     return kept if found else text.rstrip("\n") + "\n\n" + section

@@ -65,11 +65,7 @@ def copy_rows(engine: Running) -> Pull | None:
 
 
 def last_written(index: np.ndarray) -> np.ndarray:
-    """Return which rows are valid, (n,): a row that is written again cuts off those after it.
-
-    Args:
-        index: Absolute indices of rows in the order in which they were written, (n,).
-    """
+    """Return which rows, by index in the order of writing (n,), are valid: one written again cuts off later ones."""
     later = np.minimum.accumulate(index[::-1])[::-1]
     return np.append(index[:-1] < later[1:], np.ones(min(1, index.size), bool))
 

@@ -184,9 +184,7 @@ class Revisions:
     def restarted(self, number: int, *, keep: bool = False) -> None:
         """Continue the running revision under another number: folded again, or over a log that has begun again.
 
-        Args:
-            number: The new number.
-            keep: Whether the log is still the same, so that the previous track remains comparable.
+        The previous track is kept if the log is still the same, so that it remains comparable.
         """
         *earlier, running = self.runs
         kept = earlier if keep else [replace(_without_track(run), episodes=()) for run in earlier]

@@ -47,14 +47,8 @@ def status_of(
 ) -> Status:
     """Return the status of a fold that does not change meanwhile.
 
-    Args:
-        fold: The running fold.
-        rows: Counts of its rows.
-        watchers: Its watchers.
-        source: Of its measurements.
-        fields: Those that are known without the fold, and the revision.
-        notices: Counts of notices by key.
-        late: Counts of measurements whose time is late or in doubt, by key.
+    `fields` are those that are known without the fold, and the revision; `notices` has counts of notices by key, `late`
+    those of measurements whose time is late or in doubt.
     """
     model, log, track = fold.model, fold.log, fold.track
     recent = slice(max(0, fold.n - MAX_ROWS_PER_READING * fold.policy.window), fold.n)
@@ -147,10 +141,7 @@ def past_status(engine: Running, watchers: Watchers, t: int) -> Status:
 def _nis_of_window(fold: Fold, events: Events, track: Track) -> NisVerdict:
     """Return the verdict on the mean NIS of the last window.
 
-    Args:
-        fold: The fold whose settings hold.
-        events: The last events, at least those of the window.
-        track: Their rows.
+    The events and their rows are the last ones, at least those of the window.
     """
     resets = np.flatnonzero(events.kind == RESET)
     begun = int(resets[-1]) + 1 if resets.size else 0

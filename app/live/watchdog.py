@@ -171,12 +171,7 @@ class Watchdog:
 def interruptible(fold: Fold, work: Callable[[], Any]) -> None:
     """Run work that folds in a thread that may be left behind, so that Ctrl-C ends even a call that never returns.
 
-    Args:
-        fold: The fold; a function of its model that does not return is named on standard error.
-        work: The work.
-
-    Raises:
-        BaseException: As the work.
+    A function of the fold's model that does not return is named on standard error. Raises as the work.
     """
     failure: list[BaseException] = []
     watchdog = Watchdog(lambda text, level: complain(text))

@@ -232,10 +232,7 @@ RED_CLASS = ' class="worse"'
 def to_html(title: str, topics: Sequence[Topic], *, now: float | None = None) -> str:
     """Return one HTML page that needs no other file; its security policy forbids to load anything.
 
-    Args:
-        title: Title of the page.
-        topics: From top to bottom; the first is the head of the page.
-        now: Time of writing, s since 1970, UTC; None means now.
+    The first topic is the head of the page. `now` is the time of writing, s since 1970, UTC; None means now.
     """
     head, *others = topics
     body = [f"<h1>{escape(head.title)}</h1>", *_sentences(head), f'<p class="small">{escape(stamp(now))}</p>']

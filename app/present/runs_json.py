@@ -13,6 +13,7 @@ from ..live.running_fold import Running
 from ..live.runs.scores import RunScore, RunScores
 from ..live.runs.sweep import NoiseEstimates, Swept
 from .result import plain
+from .series.columns import units_by_name
 
 if TYPE_CHECKING:
     from estimators.diagnostics.consistency import NisVerdict
@@ -22,10 +23,7 @@ if TYPE_CHECKING:
 
 def runs_json(scores: RunScores, engine: Running) -> list[dict[str, Any]]:
     """Return every run, oldest first, with its changes and scores."""
-    units = {state.name: state.unit for state in engine.model.shown_states}
-    rows = [row.unit for sensor in engine.model.sensors for row in sensor.rows]
-    units |= dict(zip(engine.model.row_names, rows, strict=True))
-    found = scores.all()
+    units, found = units_by_name(engine.model), scores.all()
     runs = []
     for run, known in found:
         running = run is found[-1][0]

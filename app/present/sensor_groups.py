@@ -61,10 +61,8 @@ def groups_json(
 ) -> dict[str, Any]:
     """Return the summary of each group: number of sensors by state, mean NIS per degree of freedom, worst members.
 
-    Args:
-        groups: The groups.
-        sensors: State and text of every sensor, in the model's order.
-        nis: Mean NIS per degree of freedom of each sensor's recent measurements, NaN without any.
+    `sensors` has state and text of every sensor, in the model's order; `nis` the mean of its recent measurements per
+    degree of freedom, NaN without any.
     """
     names, states = list(sensors), [state for state, _ in sensors.values()]
     found: dict[str, Any] = {}

@@ -57,12 +57,7 @@ SAME_LOG = 1e-9  # relative difference of the sums of one simulated log on two p
 
 
 def fold_figures(fold: Fold, rows: np.ndarray | None = None) -> dict[str, float]:
-    """Return every figure of a finished fold; the NIS is per degree of freedom.
-
-    Args:
-        fold: The fold.
-        rows: Mask of the rows to use, (n,); None means all.
-    """
+    """Return every figure of a finished fold, or of those rows (mask, (n,)); the NIS is per degree of freedom."""
     rows = np.ones(fold.n, bool) if rows is None else rows
     track, events = fold.track.select(rows), fold.log.events.select(slice(0, fold.n)).select(rows)
     # A picture shows the field before its event.
@@ -156,12 +151,7 @@ class ComparedFigure(NamedTuple):
 
 
 def compare_figures(known: ReferenceSection, found: ReferenceSection, *, simulated: bool) -> list[ComparedFigure]:
-    """Compare every recorded figure with its present value.
-
-    Args:
-        known: Recorded figures.
-        found: Present figures.
-        simulated: Whether the logs are simulated anew, so that they may differ.
+    """Compare every recorded figure with its present value; logs that are `simulated` anew may differ.
 
     Raises:
         ConfigError: If a recording is another one.

@@ -240,14 +240,8 @@ def compare(
 ) -> Iterator[FilterScore]:
     """Fold each filter over the logs, in processes of their own; rows come as they are done.
 
-    Args:
-        twin: Name or path.
-        overrides: See `load_twin`.
-        names: Of the filters.
-        logs: The events; see `fold_row`.
-        jobs: Processes; None for one a processor.
-        budget: Seconds for a filter; see `fold_row`.
-        scored: Times between which they are scored; see `fold_row`.
+    The twin is a name or path, with overrides as of `load_twin`; `logs`, `scored` and `budget`, the seconds for a
+    filter, are those of `fold_row`. `jobs` is the number of processes; None for one a processor.
     """
     jobs = jobs_of(jobs, len(names))
     if jobs == 1:

@@ -222,12 +222,7 @@ def folds_of(guarded: GuardedLog, twin: Twin) -> tuple[int, int]:
 
 
 def logs_of(guarded: GuardedLog, twin: Twin, span: float | None) -> Iterator[tuple[Log, Base | None]]:
-    """Yield each log, and where its folds start.
-
-    Args:
-        guarded: The guarded log.
-        twin: See `twin_of`.
-        span: Seconds to fold; None means all.
+    """Yield each log of a twin (`twin_of`), `span` seconds of it (None: all), and where its folds start.
 
     Raises:
         SourceError: If a recording is missing or cannot be read.
@@ -251,13 +246,9 @@ def logs_of(guarded: GuardedLog, twin: Twin, span: float | None) -> Iterator[tup
 
 
 def measure(guarded: GuardedLog, twin: Twin, span: float | None, note: str | None) -> ReferenceSection:
-    """Return all figures of a log.
+    """Return all figures of a log; `twin` and `span` are those of `logs_of`.
 
-    Args:
-        guarded: The guarded log.
-        twin: See `twin_of`.
-        span: Seconds to fold; None means all.
-        note: Reason for recording them; None if they are only compared, which needs no allowances.
+    `note` is the reason for recording them; None if they are only compared, which needs no allowances.
 
     Raises:
         NisusError: If it cannot be folded.
@@ -409,9 +400,7 @@ def guard_json(found: Sequence[GuardVerdict]) -> list[dict[str, Any]]:
 def junit(found: Sequence[GuardVerdict], *, absent_fails: bool) -> bytes:
     """Return the verdicts as JUnit XML: a suite per recording, a case per figure.
 
-    Args:
-        found: Every verdict.
-        absent_fails: Whether a missing recording is an error instead of skipped.
+    A missing recording is an error if `absent_fails`, otherwise skipped.
     """
     root = ET.Element("testsuites", name="nisus guard")
     for each in found:

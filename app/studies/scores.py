@@ -64,14 +64,6 @@ class FilterScore:
     failure: str = ""
 
 
-class ScoreCell(NamedTuple):
-    """A figure as it is printed: value, spread (NaN if there is none), and half a unit of the last digit."""
-
-    value: float
-    spread: float
-    rounding: float
-
-
 def pictures_of(fold: Fold) -> list[Picture]:
     """Return the pictures that a fold took of a large field."""
     return [] if fold.pictures is None else fold.pictures.taken
@@ -84,14 +76,9 @@ def spread(title: str) -> str:
 
 
 def cells(rows: Sequence[FilterScore], events: int, seconds: float) -> list[dict[str, str]]:
-    """The rows as text by column, empty where there is nothing to say; every row has the same columns.
+    """The rows of the filters as text by column, empty where there is nothing to say; all have the same columns.
 
-    Rejected measurements have a column if there are any.
-
-    Args:
-        rows: Of the filters.
-        events: Of the whole log.
-        seconds: Of the whole log.
+    Rejected measurements have a column if there are any. `events` and `seconds` are those of the whole log.
     """
     units = list(dict.fromkeys(unit for row in rows for unit in row.rmse))
     gated = any(row.refused > 0.0 for row in rows)
@@ -149,12 +136,9 @@ def _text(figure: Spread, digits: int = 4, decimals: int | None = None) -> str:
 
 
 def printed(name: str, lines: Sequence[Mapping[str, str]], logs: int = 1) -> list[str]:
-    """Return caption and table as lines of text; each filter has the 95 % bounds of its NIS.
+    """Return caption and table (`cells`) as lines of text; each filter has the 95 % bounds of its NIS.
 
-    Args:
-        name: Of the twin.
-        lines: See `cells`.
-        logs: How many were folded; with one, spreads are over seeds.
+    `logs` were folded; with one, spreads are over seeds.
     """
     over = f"{logs} logs" if logs > 1 else f"{max((int(line['seeds']) for line in lines), default=1)} seeds"
     first = lines[0]
@@ -203,19 +187,6 @@ def _notes(line: Mapping[str, str]) -> str:
     if line["failure"]:
         notes.append(line["failure"])
     return ", ".join(notes)
-
-
-def read_cell(line: Mapping[str, str], title: str) -> ScoreCell:
-    """A figure of a row; NaN where there is none."""
-    if not line[title]:
-        return ScoreCell(np.nan, np.nan, np.nan)
-    decimals = len(line[title].partition(".")[2])
-    return ScoreCell(float(line[title]), float(line[spread(title)] or "nan"), 0.5 * 10.0**-decimals)
-
-
-def read_span(line: Mapping[str, str]) -> float | None:
-    """Return the seconds of the log that a row covers; None means all."""
-    return float(line[SPAN]) if line[SPAN] else None
 
 
 SCORES = TWINS.parent / "scores"  # folder of the scores of the twins that ship

@@ -44,13 +44,12 @@ class TwinMatch:
     """Agreement of a twin with a log.
 
     `found` and `missing` are lines about channels, `blocking` one reason why the twin cannot read the log at all.
-    `untrue` tells that only true states are missing, without which a twin runs.
+    True states are in neither: a twin runs without them.
     """
 
     found: tuple[str, ...] = ()
     missing: tuple[str, ...] = ()
     blocking: str | None = None
-    untrue: bool = False
 
     @property
     def share(self) -> float:
@@ -79,7 +78,6 @@ def match_log(loaded: Loaded, model: StateSpaceModel, header: LogHeader) -> Twin
         return TwinMatch(blocking=f"it reads {reads}")
     found: list[str] = []
     missing: list[str] = []
-    untrue: list[str] = []
     blocking = None
     for key, part in parts.items():
         named = [channel for _, channel in channels(loaded, part, key, model)]
@@ -95,11 +93,10 @@ def match_log(loaded: Loaded, model: StateSpaceModel, header: LogHeader) -> Twin
         else:
             reason, lines = _of_frames(loaded, part, key, named, header)
         for channel, line in zip(named, lines, strict=True):
+            if channel.kind == TRUTH:
+                continue
             if line is None:
-                if channel.kind != TRUTH:
-                    found.append(f"{channel.name} ({_list(channel.signals)})")
-            elif channel.kind == TRUTH:
-                untrue.append(f"{channel.name}: {line}")
+                found.append(f"{channel.name} ({_list(channel.signals)})")
             else:
                 missing.append(f"{channel.name}: {line}")
         if isinstance(part, TableSection) and (missing or not found) and blocking is None:
@@ -110,7 +107,7 @@ def match_log(loaded: Loaded, model: StateSpaceModel, header: LogHeader) -> Twin
         blocking = blocking or reason
     if not found and blocking is None:
         blocking = "none of its messages is in the log"
-    return TwinMatch(tuple(found), tuple(missing), blocking, bool(untrue))
+    return TwinMatch(tuple(found), tuple(missing), blocking)
 
 
 def _of_table(part: TableSection, named: list[Channel], header: LogHeader) -> tuple[str | None, list[str | None]]:

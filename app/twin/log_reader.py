@@ -48,10 +48,7 @@ def remarking(report: Callable[[str, str], None]) -> Callable[[str, str], None]:
 def read_log(twin: Twin, duration: float | None, *, blind: bool = False) -> tuple[Log, Counter[str]]:
     """Return all events of the twin's source in order of time, and counts of dropped and corrected ones.
 
-    Args:
-        twin: The twin.
-        duration: Seconds to read; None for all.
-        blind: Leave the true states out, whatever source they come from.
+    `duration` is the seconds to read, None for all; `blind` leaves the true states out, whatever source they come from.
 
     Raises:
         ConfigError: If `duration` is not positive.
@@ -108,14 +105,9 @@ def read_log(twin: Twin, duration: float | None, *, blind: bool = False) -> tupl
 def read_logs(
     twin: Twin, name: str, overrides: Mapping[str, str], count: int = 1, duration: float | None = None
 ) -> list[Log]:
-    """Read the log of a twin, or several logs of its simulator with consecutive seeds.
+    """Read the log of a twin, or several logs of its simulator with consecutive seeds, `duration` seconds (None: all).
 
-    Args:
-        twin: The twin.
-        name: Name or path that it was loaded from.
-        overrides: Overrides that it was loaded with.
-        count: Number of logs.
-        duration: Seconds of each; None for all.
+    The twin was loaded from that name or path, with these overrides.
 
     Raises:
         NisusError: As `read_log`, or if the twin is not simulated.

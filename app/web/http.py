@@ -113,9 +113,12 @@ def get(
 def post(path: str, work: Callable[..., Any], *, status: int = 200, run: Runner = run_in_threadpool) -> Route:
     """Return a route that calls `work` in a thread with the fields of the request's JSON body; see `get`.
 
-    The body must be an object of exactly the parameters of `work`; one that is called `body` is the whole body.
+    The body must be an object of exactly the parameters of `work`, or of the fields of its one parameter if that is a
+    dataclass; one that is called `body` is the whole body.
     """
-    kind, takes_body = _parameters(work), "body" in inspect.signature(work).parameters
+    hints = [hint for name, hint in typing.get_type_hints(work).items() if name != "return"]
+    whole: Any = hints[0] if len(hints) == 1 and dataclasses.is_dataclass(hints[0]) else None
+    kind, takes_body = whole or _parameters(work), "body" in inspect.signature(work).parameters
 
     async def endpoint(request: Request) -> Response:
         if request.headers.get("content-type", "").partition(";")[0].strip() != "application/json":
@@ -131,7 +134,10 @@ def post(path: str, work: Callable[..., Any], *, status: int = 200, run: Runner 
         subject = request.url.path.removeprefix("/api/")
 
         def call() -> Any:
-            return work(body) if takes_body else work(**vars(parse(kind, body, subject)))
+            if takes_body:
+                return work(body)
+            given: Any = parse(kind, body, subject)
+            return work(given) if whole else work(**vars(given))
 
         return await _answered(call, run, status, 400)
 
@@ -211,15 +217,10 @@ class OneAtATime:
 
 
 def parse(kind: type[T], given: Any, subject: str, *, text: bool = False) -> T:
-    """Return a dataclass made of the fields of a JSON object, strictly: no text in place of a number.
+    """Return a dataclass (`kind`) of the fields of a JSON object, strictly: no text in place of a number.
 
-    Infinity is written "inf" in place of a number.
-
-    Args:
-        kind: The dataclass.
-        given: The object.
-        subject: Named at the start of an error line.
-        text: Whether all values are texts of an address, to be converted.
+    Infinity is written "inf" in place of a number. If all values are `text` of an address, they are converted. An error
+    line begins with `subject`.
 
     Raises:
         ConfigError: If it is no object, or a field is unknown, missing or of another type.

@@ -16,7 +16,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Protocol
 
 from estimators.errors import SourceError
 
@@ -155,16 +155,6 @@ class Session:
         return self._ran.recorder
 
     @property
-    def view(self) -> Any:
-        """Viser scene; None without a page."""
-        return self._ran.view
-
-    @property
-    def server(self) -> Any:
-        """Page server; None without a page."""
-        return self._ran.server
-
-    @property
     def _ran(self) -> RunningTwin:
         assert self.running is not None, "no twin runs"
         return self.running
@@ -199,9 +189,8 @@ class Session:
     def change(self, make: Callable[[], RunningTwin] | None, *, stop_first: bool = False) -> None:
         """Replace the running twin by another, or by none; from any thread.
 
-        Args:
-            make: Assembles the next twin. If it fails, the running one goes on, unless it had to be stopped first.
-            stop_first: Stop the running twin before `make` is called: both would read one bus.
+        `make` assembles the next twin; if it fails, the running one goes on. With `stop_first` that is stopped before,
+        since both would read one bus.
 
         Raises:
             NisusError: As `make` does.

@@ -36,8 +36,7 @@ def viewer_version() -> str:
 def viewer_assets(progress: Callable[[str], None] = lambda line: None) -> Path:
     """Return the folder of the viewer's files, each compressed (`NAME.gz`); they are made if absent.
 
-    Args:
-        progress: Called with a line of text when it takes time.
+    `progress` is called with a line of text when that takes time.
 
     Raises:
         ConfigError: If the files cannot be made or written.

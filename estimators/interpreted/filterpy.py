@@ -29,7 +29,7 @@ from typing import Any
 import numpy as np
 
 from ..ensemble import shared as ensemble
-from ..estimator import Estimator, Option, Options
+from ..estimator import Estimator, Option
 from ..gaussian import kf, ukf
 from ..gaussian import shared as gaussian
 from ..gaussian.ukf import only_rounding
@@ -60,15 +60,10 @@ def moments_of(view: View, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return state[:n], state[n:].reshape(n, n)
 
 
-def keep(view: View, state: np.ndarray, x: np.ndarray, P: np.ndarray) -> None:
-    """Write a mean, its angles within ±π, and a covariance, symmetric to the last bit."""
-    state[: view.nx] = wrapped(x, view.circular)
-    state[view.nx :] = (0.5 * (P + P.T)).ravel()
-
-
 def start(view: View, mean: np.ndarray, cov: np.ndarray, state: np.ndarray) -> None:
-    """Set the state to N(mean, cov)."""
-    keep(view, state, mean, cov)
+    """Set the state to N(mean, cov), with angles within ±π and a covariance that is symmetric to the last bit."""
+    state[: view.nx] = wrapped(mean, view.circular)
+    state[view.nx :] = (0.5 * (cov + cov.T)).ravel()
 
 
 def describe(view: View, state: np.ndarray, mean: np.ndarray, std: np.ndarray, cross: np.ndarray) -> None:
@@ -87,13 +82,14 @@ def predict_kf(view: View, u: np.ndarray, dt: float, index: int, state: np.ndarr
     filter_.x, filter_.P = x.copy(), P.copy()
     offset = view.f(x[None], u, dt)[0] - F @ x
     filter_.predict(u=np.ones(1), B=offset[:, None], F=F, Q=view.Q(x, u, dt))
-    keep(view, state, filter_.x, filter_.P)
+    start(view, filter_.x, filter_.P, state)
 
 
 def update_kf(view: View, u: np.ndarray, sensor: int, y: np.ndarray, *rest: Any) -> int:
     """Condition on z = y - h(x) + H x, which removes inputs, offsets and turns of angles."""
 
-    def step(x: np.ndarray, P: np.ndarray, rows: np.ndarray, R: np.ndarray) -> Any:
+    def step(state: np.ndarray, rows: np.ndarray, R: np.ndarray) -> Any:
+        x, P = moments_of(view, state.copy())
         filter_ = objects().KalmanFilter(dim_x=view.nx, dim_z=rows.size)
         filter_.x, filter_.P = x, P
         H = view.H(sensor, x, u)[rows]
@@ -112,13 +108,14 @@ def predict_ekf(view: View, u: np.ndarray, dt: float, index: int, state: np.ndar
     filter_.F, filter_.Q = view.F(x, u, dt), view.Q(x, u, dt)
     filter_.forward = view.f(x[None], u, dt)[0]
     filter_.predict()
-    keep(view, state, filter_.x, filter_.P)
+    start(view, filter_.x, filter_.P, state)
 
 
 def update_ekf(view: View, u: np.ndarray, sensor: int, y: np.ndarray, *rest: Any) -> int:
     """Condition on a measurement, linearised at the prediction."""
 
-    def step(x: np.ndarray, P: np.ndarray, rows: np.ndarray, R: np.ndarray) -> Any:
+    def step(state: np.ndarray, rows: np.ndarray, R: np.ndarray) -> Any:
+        x, P = moments_of(view, state.copy())
         filter_ = objects().Extended(dim_x=view.nx, dim_z=rows.size)
         filter_.x, filter_.P = x, P
         angles = view.circular_rows(sensor)[rows]
@@ -173,13 +170,14 @@ def predict_ukf(view: View, u: np.ndarray, dt: float, index: int, state: np.ndar
     except ValueError:  # no Cholesky factor: LinAlgError is one
         state[:] = np.nan
         return
-    keep(view, state, filter_.x, filter_.P)
+    start(view, filter_.x, filter_.P, state)
 
 
 def update_ukf(view: View, u: np.ndarray, sensor: int, y: np.ndarray, *rest: Any) -> int:
     """Condition on a measurement, with sigma points drawn again from the prediction."""
 
-    def step(x: np.ndarray, P: np.ndarray, rows: np.ndarray, R: np.ndarray) -> Any:
+    def step(state: np.ndarray, rows: np.ndarray, R: np.ndarray) -> Any:
+        x, P = moments_of(view, state.copy())
         filter_ = _unscented(view, view.circular_rows(sensor)[rows])
         filter_.x, filter_.P = x, P
         filter_.sigmas_f = filter_.points_fn.sigma_points(x, P)
@@ -206,21 +204,22 @@ def _update(
     innovation: np.ndarray,
     innovation_std: np.ndarray,
     score: np.ndarray,
+    *,
+    adopt: Callable[..., None] = lambda view, filter_, state: start(view, filter_.x, filter_.P, state),
 ) -> int:
-    """Update a copy with FilterPy by the finite rows, judge its innovation, and keep the copy if it is used."""
+    """Update a copy with FilterPy by the finite rows, judge its innovation, and `adopt` the copy if it is used."""
     R = view.covariance(sensor)
     rows = np.flatnonzero(np.isfinite(y[: len(R)]))
     if not rows.size:
         return MISSING
-    x, P = moments_of(view, state)
     try:
-        filter_ = step(x.copy(), P.copy(), rows, R[np.ix_(rows, rows)])
+        filter_ = step(state, rows, R[np.ix_(rows, rows)])
     except ValueError:  # S or P is singular or not finite
         score[1] = rows.size
         return FAILED
     verdict = view.admit(sensor, y, filter_.y, filter_.S, innovation, innovation_std, score)
     if verdict == USED:
-        keep(view, state, filter_.x, filter_.P)
+        adopt(view, filter_, state)
     return verdict
 
 
@@ -271,44 +270,31 @@ def predict_enkf(view: View, u: np.ndarray, dt: float, index: int, state: np.nda
     _settle(view, X)
 
 
-def update_enkf(
-    view: View,
-    u: np.ndarray,
-    sensor: int,
-    y: np.ndarray,
-    index: int,
-    state: np.ndarray,
-    work: np.ndarray,
-    innovation: np.ndarray,
-    innovation_std: np.ndarray,
-    score: np.ndarray,
-) -> int:
+def update_enkf(view: View, u: np.ndarray, sensor: int, y: np.ndarray, *rest: Any) -> int:
     """xᵢ ← xᵢ + K (y + vᵢ - h(xᵢ)), vᵢ ~ N(0, R), with the covariances of the members."""
-    R = view.covariance(sensor)
-    rows = np.flatnonzero(np.isfinite(y[: len(R)]))
-    if not rows.size:
-        return MISSING
-    X, filter_ = _members(view, state), _enkf(view)
-    angles = view.circular_rows(sensor)[rows]
-    expected = view.h(sensor, X, u)[:, rows]
-    # FilterPy does not wrap differences, so angles are given within half a turn of one another.
-    expected = expected[0] + wrapped(expected - expected[0], angles)
-    centre = expected.mean(axis=0)
-    nu = wrapped(y[rows] - centre, angles)
-    filter_.seed(view.seed, int(state[-1]), PERTURB)
-    filter_.sigmas, filter_.x, filter_.P = X.copy(), X.mean(axis=0), np.zeros((view.nx, view.nx))
-    filter_.hx, filter_._mean_z = in_turn(expected), np.zeros(rows.size)
-    try:
-        filter_.update(centre + nu, R=R[np.ix_(rows, rows)])
-    except ValueError:  # S is singular or not finite
-        score[1] = rows.size
-        return FAILED
-    verdict = view.admit(sensor, y, nu, filter_.S, innovation, innovation_std, score)
-    if verdict == USED:
+
+    def step(state: np.ndarray, rows: np.ndarray, R: np.ndarray) -> Any:
+        X, filter_ = _members(view, state), _enkf(view)
+        angles = view.circular_rows(sensor)[rows]
+        expected = view.h(sensor, X, u)[:, rows]
+        # FilterPy does not wrap differences, so angles are given within half a turn of one another.
+        expected = expected[0] + wrapped(expected - expected[0], angles)
+        centre = expected.mean(axis=0)
+        nu = wrapped(y[rows] - centre, angles)
+        filter_.seed(view.seed, int(state[-1]), PERTURB)
+        filter_.sigmas, filter_.x, filter_.P = X.copy(), X.mean(axis=0), np.zeros((view.nx, view.nx))
+        filter_.hx, filter_._mean_z = in_turn(expected), np.zeros(rows.size)
+        filter_.update(centre + nu, R=R)
+        filter_.y = nu
+        return filter_
+
+    def adopt(view: View, filter_: Any, state: np.ndarray) -> None:
+        X = _members(view, state)
         X[:] = filter_.sigmas
         state[-1] += 1.0
         _settle(view, X)
-    return verdict
+
+    return _update(view, sensor, y, step, *rest, adopt=adopt)
 
 
 def describe_enkf(view: View, state: np.ndarray, mean: np.ndarray, std: np.ndarray, cross: np.ndarray) -> None:
@@ -319,10 +305,6 @@ def describe_enkf(view: View, state: np.ndarray, mean: np.ndarray, std: np.ndarr
     cross[:] = P[view.pairs[:, 0], view.pairs[:, 1]]
 
 
-def _no_work(options: Options, nx: int, ny: int) -> int:
-    return 0
-
-
 def _entry(name: str, functions: tuple[Any, Any, Any, Any], **other: Any) -> Estimator:
     return Estimator(
         name=f"filterpy-{name}",
@@ -331,7 +313,7 @@ def _entry(name: str, functions: tuple[Any, Any, Any, Any], **other: Any) -> Est
         functions=functions,
         interpreted=True,
         state_size=other.pop("state_size", gaussian.state_size),
-        work_size=_no_work,
+        work_size=lambda options, nx, ny: 0,
         moments=other.pop("moments", gaussian.moments),
         points=other.pop("points", gaussian.no_points),
         source="Labbe (2014), FilterPy 2.0, https://github.com/rlabbe/filterpy",

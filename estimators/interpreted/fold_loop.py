@@ -206,10 +206,7 @@ def _soften(
 def run_and_judge(judge: Any, seen: np.void, *given: Any) -> int:
     """Fold events, and fill NIS windows, alarms and health of their rows; see `fold_kernel.run_and_judge`.
 
-    Args:
-        judge: The compiled function of fold_kernel.py.
-        seen: The context that `View` wraps.
-        given: Further arguments of the kernel.
+    `judge` is the compiled function there, called with the context that `View` wraps and the rest of its arguments.
     """
     *folded, policy, bounds, evidence = given
     _, _, _, _, start, end, t, kind, channel, value, *_, track = folded

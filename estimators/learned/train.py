@@ -199,10 +199,8 @@ def on_held_out(trained: Trained, given: Windows) -> OnWindows:
 def against(physics: Sequence[PartScore], corrected: PartScore, states: Sequence[str]) -> tuple[str, ...]:
     """Return the reasons against a correction on held-out blocks; empty if it is better.
 
-    Args:
-        physics: Scores of the physics alone, first with the twin's tuning: the correction must beat all of them.
-        corrected: Scores with the correction.
-        states: Corrected states: judged by their truth where it is known, otherwise by the next measurement.
+    It must beat all scores of the physics alone, first of which are those with the twin's tuning. Corrected states are
+    judged by their truth where it is known, otherwise by the next measurement.
     """
     reasons: list[str] = []
     for one in physics:

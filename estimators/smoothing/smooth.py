@@ -80,13 +80,7 @@ def consistency(track: Track, smoothed: Smoothed, model: StateSpaceModel) -> dic
 
     McReynolds' filter-smoother consistency, which needs no truth: where the model holds, the change of an estimate by
     later measurements has the covariance that they remove, Cov(x - xˢ) = P - Pˢ, so the mean is 1. Far above 1 the
-    filter is
-    overconfident: f bends within the spread, or Q is too small, and the smoother may be worse than the filter.
-
-    Args:
-        track: The filter's.
-        smoothed: Its smoothed estimates.
-        model: The model.
+    filter is overconfident: f bends within the spread, or Q is too small; the smoother may be worse than the filter.
     """
     moved = track.mean - smoothed.mean
     circular = np.array([state.circular for state in model.shown_states], bool)

@@ -328,11 +328,8 @@ def doubts(found: Mapping[str, SensorNoise], level: float | None) -> dict[str, s
     """Return, by key, why an estimate should not be used: the innovations are correlated, so their size misleads.
 
     Matching R to their size treats a coloured error as white noise: the bands become too narrow, and the estimate
-    follows the error. Matching Q is right only if it would remove the correlation too.
-
-    Args:
-        found: Estimated R by key.
-        level: Factor of all of Q at which the NIS is consistent; None if not known.
+    follows the error. Matching Q is right only if it would remove the correlation too: with all of Q times `level`, at
+    which the NIS is consistent; None if that is not known.
     """
     correlated = {key: estimate for key, estimate in found.items() if estimate.chance < MAX_CHANCE}
     reasons = {

@@ -222,12 +222,9 @@ def _header(head: VersionSection) -> str:
 
 
 def load_into(engine: Running, name: str, why: str | None = None) -> None:
-    """Queue the change to a version of the twin; the history is folded again with it.
+    """Queue the change to a version of the twin, or to `own`; the history is folded again with it.
 
-    Args:
-        engine: The running twin.
-        name: Of the version, or `own`.
-        why: Reason of the new run; None for the version's name.
+    `why` is the reason of the new run; None for the version's name.
 
     Raises:
         ConfigError: If there is no such version, it is wrong, or it does not fit the running twin.
@@ -247,14 +244,7 @@ def widths_of(twin: Twin, found: Fitted) -> ParameterWidths | None:
 
 
 def settings_of(twin: Twin, found: Fitted, fitted_on: Sequence[str], note: str = "") -> Settings:
-    """Return filter, tuning, widths and held-out scores of a fit.
-
-    Args:
-        twin: The twin.
-        found: Result of the fit.
-        fitted_on: Names of the recordings.
-        note: Note of the version.
-    """
+    """Return filter, tuning, widths and held-out scores of a fit of these recordings, with the note of a version."""
     tuning, prior = found.setting
     beliefs = {}
     if prior is not None:

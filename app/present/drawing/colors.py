@@ -237,11 +237,7 @@ def positioned(model: StateSpaceModel) -> tuple[np.ndarray, np.ndarray]:
 def take_innovations(normalised: np.ndarray, which: np.ndarray, events: Events, track: Track) -> bool:
     """Update the latest innovation of each sensor row, in units of its deviation, and return whether any came.
 
-    Args:
-        normalised: Shape (k,), changed in place.
-        which: (sensor, row) of each, shape (k, 2).
-        events: New events, n of them.
-        track: Their rows.
+    `normalised` (k,) is changed in place; `which` (k, 2) has sensor and row of each. The n events and rows are new.
     """
     found = False
     for k in np.unique(which[:, 0]):

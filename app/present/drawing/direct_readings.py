@@ -71,6 +71,15 @@ def observed(model: StateSpaceModel) -> list[Observed]:
     return found
 
 
+def measured_by(model: StateSpaceModel) -> dict[str, list[str]]:
+    """Return the names of the sensor rows that measure a state directly, by state."""
+    found: dict[str, list[str]] = {}
+    for item in observed(model):
+        name = model.row_names[model.row_start[item.sensor] + item.row]
+        found.setdefault(model.state_names[item.state], []).append(name)
+    return found
+
+
 def expected(model: StateSpaceModel, sensor: Sensor, x: np.ndarray, p: np.ndarray) -> np.ndarray:
     """Return h(x, u, p) of a sensor with the inputs' defaults, shape (ny,); NaN where it fails."""
     out = np.full(len(sensor.rows), np.nan)

@@ -18,10 +18,10 @@ from estimators.model.state_space import StateSpaceModel
 from estimators.track import Track
 
 from ..series.chart_stream import drawn
-from ..series.columns import DOTS, columns_of, rows_of
+from ..series.columns import DOTS, columns_of, rows_of, units_by_name
 from ..series.levels_of_detail import grouped
 from .colors import LIGHT, RGB
-from .direct_readings import observed
+from .direct_readings import measured_by
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -142,22 +142,13 @@ class TrackSeries:
     @cached_property
     def measured_by(self) -> dict[str, list[str]]:
         """Names of the sensor rows that measure a state directly, by state."""
-        names = {(sensor, row): name for name, sensor, row in rows_of(self.model)}
-        found: dict[str, list[str]] = {}
-        for item in observed(self.model):
-            found.setdefault(self.model.state_names[item.state], []).append(names[item.sensor, item.row])
-        return found
+        return measured_by(self.model)
 
 
 def draw_state(axes: Axes, series: TrackSeries, name: str, *, unit: TimeUnit = SECONDS, size: float = 1.0) -> None:
     """Draw a state over time: estimate with ± 2 σ, measurements, rejected ones, and the truth where it is known.
 
-    Args:
-        axes: Where to.
-        series: Of the fold.
-        name: Of the state; an angle is drawn between -π and π.
-        unit: Of the time axis.
-        size: Scale of lines and dots.
+    An angle is drawn between -π and π. Lines and dots are scaled by `size`.
     """
     estimate, measured, rejected = (hex_color(color) for color in (LIGHT.estimate, LIGHT.reading, LIGHT.refused))
     state = next(item for item in series.model.shown_states if item.name == name)
@@ -277,16 +268,15 @@ def plot_track(
     measured = [name for name in counts if name in measured]
     figure = new_figure(PANEL_INCHES[0], PANEL_INCHES[1] * (len(states) + len(measured) + 1))
     span = (events.t[-1] - events.t[0]) * 1e-9
-    unit, first = time_unit(float(span)), int(events.t[0]) * 1e-9
+    unit, first, units = time_unit(float(span)), int(events.t[0]) * 1e-9, units_by_name(model)
     panels = figure.subplots(len(states) + len(measured) + 1, 1, sharex=True, squeeze=False)[:, 0]
     for axes, state in zip(panels, states, strict=False):
         draw_state(axes, series, state.name, unit=unit)
         _label(axes, model.label(state.name), state.unit)
         axes.set_ylim((-3.3, 5.0) if state.circular else _extent(series, state.name))
-    row_units = dict(zip(model.row_names, (row.unit for sensor in model.sensors for row in sensor.rows), strict=True))
     for axes, name in zip(panels[len(states) :], measured, strict=False):
         draw_innovation(axes, series, name, unit)
-        _label(axes, f"innovation of {name}", row_units[name])
+        _label(axes, f"innovation of {name}", units[name])
     draw_nis(panels[-1], series, unit)
     panels[-1].set_ylabel("NIS", fontsize=9)
     panels[-1].set_xlabel(f"time [{unit.name}]")

@@ -25,6 +25,7 @@ from ...live.changes import difference, in_words
 from ...live.notices import Annotation
 from ...twin.twin import Twin
 from ..result import Bar, Topic
+from ..series.columns import units_by_name
 from .alarm_guide import advice
 from .calibration_lines import calibration_lines, health_shares
 from .report_charts import charts_html
@@ -112,9 +113,7 @@ def _source(twin: Twin) -> str:
 
 
 def _scores(run: Reported, found: Score) -> Topic:
-    model, track = run.twin.model, run.track
-    units = {state.name: state.unit for state in model.shown_states}
-    units |= dict(zip(model.row_names, (row.unit for sensor in model.sensors for row in sensor.rows), strict=True))
+    track, units = run.track, units_by_name(run.twin.model)
     rows: list[tuple[str, str, str]] = []
     marks: list[str] = []
     if found.nis_readings:

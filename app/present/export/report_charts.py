@@ -26,7 +26,7 @@ from estimators.tuning import Tuning
 
 from ...live.notices import Annotation
 from ...live.outputs import Pull
-from ..drawing.direct_readings import observed
+from ..drawing.direct_readings import measured_by
 from ..sensor_groups import sensor_groups
 from ..series.chart_stream import ChartQuery, ChartStream
 from ..series.charted_run import ChartedRun, KeptRows
@@ -178,13 +178,7 @@ def _position(grid: Sequence[GridAxis], cell: Sequence[float]) -> str:
 
 def charted_model(model: StateSpaceModel, view: ViewSection) -> dict[str, Any]:
     """Return states and sensor rows as charts need them: names, labels, units, and which rows measure which state."""
-    rows, labels = rows_of(model), page_labels(model, view)
-    names = {(sensor, row): name for name, sensor, row in rows}
-    readers: dict[str, list[str]] = {state.name: [] for state in model.shown_states}
-    for dot in observed(model):
-        name = model.state_names[int(dot.state)]
-        if name in readers:
-            readers[name].append(names[dot.sensor, dot.row])
+    measured, labels = measured_by(model), page_labels(model, view)
     return {
         "labels": labels,
         "groups": [
@@ -198,12 +192,12 @@ def charted_model(model: StateSpaceModel, view: ViewSection) -> dict[str, Any]:
                 "unit": state.unit,
                 "circular": bool(getattr(state, "circular", False)),
                 "probability": j == model.mode,
-                "rows": readers[state.name],
+                "rows": measured.get(state.name, []),
             }
             for j, state in enumerate(model.shown_states)
         ],
         "rows": [
             {"name": name, "sensor": model.sensor_names[sensor], "unit": model.sensors[sensor].rows[row].unit}
-            for name, sensor, row in rows
+            for name, sensor, row in rows_of(model)
         ],
     }

@@ -112,11 +112,7 @@ class RunRows(NamedTuple):
 
 
 def rows_of_run(engine: Running, number: int | None = None) -> RunRows:
-    """Return a run and its rows: a copy for the running one, the kept rows for another.
-
-    Args:
-        engine: The running twin.
-        number: Number of the run; None is the running one.
+    """Return a run and its rows: a copy for the running one (None), the kept rows for another.
 
     Raises:
         ConfigError: If there is no such run, no measurement has arrived, or its track is gone.

@@ -83,12 +83,9 @@ class ChartStream:
         self._dirty = min(self._dirty, row)
 
     def look(self, run: ChartedRun, origin: int, newest: int) -> None:
-        """Find the rows that the query covers, and the size of their groups.
+        """Find the rows that the query covers, and the size of their groups; the run's levels need not be up to date.
 
-        Args:
-            run: Whose rows; its levels need not be up to date.
-            origin: Time of the first event, ns, from which seconds count.
-            newest: Time of the last one.
+        `origin` and `newest` are the times of the first event, from which seconds count, and of the last one, ns.
         """
         query = self.query
         until = newest if query.until is None else min(newest, _instant(origin, query.until))

@@ -45,14 +45,7 @@ class Groups(NamedTuple):
 
 
 def grouped(size: int, first: int, t: np.ndarray, values: np.ndarray) -> Groups:
-    """Return rows in groups.
-
-    Args:
-        size: Rows in a group.
-        first: Absolute index of the first row.
-        t: Their times, shape (n,), ascending.
-        values: Shape (n, columns).
-    """
+    """Return rows, times (n,) ascending and values (n, columns), in groups of `size`; the first has index `first`."""
     if not t.size:
         return Groups(size, 0, t, t, values, values, values > 0.0)
     start, starts, lasts = _ends(size, first, t.size)
@@ -105,10 +98,8 @@ class Pyramid:
     def update(self, first: int, t: np.ndarray, values: np.ndarray) -> None:
         """Take rows that are new or rewritten; they replace all known ones from there on.
 
-        Args:
-            first: Absolute index of the first row, a multiple of `FIRST`, or the oldest row that still exists.
-            t: Their times, shape (n,), ascending.
-            values: Shape (n, columns).
+        `first` is the absolute index of the first one: a multiple of `FIRST`, or the oldest row that still exists.
+        Times (n,) ascend; values are (n, columns).
         """
         fresh = grouped(FIRST, first, t, values)
         for k in range(len(self._levels) + 1):

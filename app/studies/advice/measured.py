@@ -52,12 +52,8 @@ def without_faults(twin: Twin, log: Log, known: Sequence[Episode] | None = None)
     """Return the log without the readings of sensors in fault episodes, and what was left out.
 
     A fault is an alarm for which the sensor, not the tuning, is examined: biased, rejected, stuck, beyond its limits. A
-    row that is in fault for most of the log keeps its readings: they are what the twin has to explain.
-
-    Args:
-        twin: The twin.
-        log: Its log.
-        known: Episodes; None to find them by folding the log with the twin's estimator.
+    row that is in fault for most of the log keeps its readings: they are what the twin has to explain. Episodes that
+    are not `known` are found by folding the log with the twin's estimator.
     """
     if known is None:
         known = episodes(Measured(twin, log).folded(twin.estimator).fold)

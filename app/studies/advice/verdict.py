@@ -19,7 +19,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from config.tunings import SPREADS
-from config.yaml_files import as_flow, parse
+from config.yaml_files import as_flow, parse, with_section
 from estimators.diagnostics.calibration import LIMITS
 from estimators.errors import ConfigError, NisusError
 from estimators.fit.objective import ALONE
@@ -279,10 +279,6 @@ def advice_json(twin: Twin, log: Log, told: Advice) -> dict[str, Any]:
     }
 
 
-ESTIMATOR = re.compile(r"^estimator[ \t]*:[^\n]*\n(?:(?:[ \t]*\n)*[ \t]+\S[^\n]*\n)*", re.MULTILINE)
-"""The section of the YAML: its line, and the indented ones below."""
-
-
 def lines(advice: Advice) -> str:
     """The section `estimator`, with the options that were found."""
     why = ", ".join(advice.because)
@@ -340,8 +336,7 @@ def changed(text: str, section: str, entries: Mapping[str, Mapping[str, Any]] | 
     """Return a YAML text with the section `estimator` replaced or added, and with other entries."""
     if text and not text.endswith("\n"):
         text += "\n"
-    found, count = ESTIMATOR.subn(lambda _: section, text, count=1)
-    text = found if count else text + "\n" + section
+    text = with_section(text, "estimator", section)
     for key, entry in (entries or {}).items():
         text = with_entry(text, key, entry)
     return text

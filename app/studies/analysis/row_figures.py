@@ -38,16 +38,10 @@ MAX_ROWS = 24  # rows that are analysed, as many as have charts
 def rows_json(
     model: StateSpaceModel, events: Events, track: Track, tuning: Tuning, *, marginal: bool
 ) -> list[dict[str, Any]]:
-    """Return distribution, correlation and verdict of the whitened innovations of each row.
+    """Return distribution, correlation and verdict of the whitened innovations of each row of the last events.
 
     For `autocorrelation` a rejected measurement is clipped to the gate, so that one spike does not hide the others.
-
-    Args:
-        model: Whose sensors.
-        events: The last ones.
-        track: Their rows.
-        tuning: With which they were folded.
-        marginal: Whether `Track.whitened` holds each row by itself, as of particles and ensembles.
+    `marginal` tells whether `Track.whitened` holds each row by itself, as of particles and ensembles.
     """
     found = calibrations(model, events, track, gate=tuning.gate, marginal=marginal) if len(events) else []
     known = {item.subject: item for item in found}
@@ -98,18 +92,11 @@ def verdict(
     period: float,
     normal: np.ndarray | None = None,
 ) -> tuple[str, str]:
-    """Return a sentence, and whether it is good, bad or unknown.
+    """Return a sentence about a row, and whether it is good, bad or unknown.
 
-    The findings are those of calibration.py; a correlation is given with its duration. A row of a commissioned twin is
-    compared with its baseline, as its NIS is.
-
-    Args:
-        name: Of the row.
-        calibration: Of the same readings; None if there are none.
-        correlated: Their autocorrelation.
-        n: How many readings.
-        period: Between two, s.
-        normal: Its bias, scale and correlation when the twin was commissioned, first; None if it was not.
+    The findings are those of calibration.py, None without readings; a correlation is given with its duration, of `n`
+    readings every `period` seconds. A row of a commissioned twin is compared with its baseline, as its NIS is: with
+    `normal`, its bias, scale and correlation then, first; None if it was not.
     """
     if calibration is None or not n:
         return f"{name}: no reading among the last rows", "unknown"

@@ -27,13 +27,10 @@ NOTHING: frozenset[str] = frozenset()
 
 
 def matrix(model: StateSpaceModel, tuning: Tuning, events: Events, *, asset: bool) -> list[Mistake]:
-    """The mistakes that can be made with a twin.
+    """The mistakes that can be made with a twin, tuned as it ships; sizes count in its standard deviations.
 
-    Args:
-        model: The twin's.
-        tuning: As it ships; sizes count in its standard deviations.
-        events: A log of it, which tells how large its inputs are, and which sensors speak.
-        asset: Whether its true parameters can be changed, as those of a simulation can.
+    `events` is a log of it, which tells how large its inputs are, and which sensors speak; `asset` whether its true
+    parameters can be changed, as those of a simulation can.
     """
     # What is done to a sensor that says nothing is done to nobody; swapped with it, another one falls silent.
     spoken = set(events.channel[events.kind == READING].tolist())

@@ -316,12 +316,8 @@ def heard_in(fold: Fold, calm: Fold) -> list[tuple[int, Episode]]:
 def accused(fold: Fold, episode: Episode, until: int) -> str:
     """Whom a user is told to look at: the likeliest suspect where an episode leaves that open, else its subject.
 
-    A sensor row by its name alone, an input or a parameter after that word.
-
-    Args:
-        fold: In which the episode is.
-        episode: The episode.
-        until: Time of the question, ns of the log; later events are not known yet.
+    A sensor row by its name alone, an input or a parameter after that word. The question is asked at `until`, ns of the
+    log; later events are not known yet.
     """
     if not detector_of(episode.cause).isolate:
         return episode.subject

@@ -38,6 +38,8 @@ from ...live.history_copy import copy_rows
 from ...live.notices import Annotation
 from ...live.outputs import Pull
 from ...live.running_fold import Running
+from ...present.result import plain
+from ...present.series.columns import units_by_name
 from .rrd_file import END_MESSAGE, MESSAGE_HEADER, STREAM_HEADER, TAKEN, messages
 
 FORMAT = 2
@@ -308,28 +310,23 @@ def summary(
     `error` is {name, rmse, unit, coverage, against} of the first state with a truth, or else of a held-out sensor.
     """
     found = score(track, events, tuning.model, pictures, gate=tuning.gate, baseline=tuning.baseline)
-    return {
+    known = {
         "estimator": estimator,
-        "nis": _finite(found.nis),
-        "nis_low": _finite(found.nis_low),
-        "nis_high": _finite(found.nis_high),
+        "nis": found.nis,
+        "nis_low": found.nis_low,
+        "nis_high": found.nis_high,
         "nis_dof": found.nis_dof,
         "nis_words": found.nis_verdict.words,
         "error": _error(found, tuning.model),
     }
+    return dict(plain(known))
 
 
 def _error(found: Score, model: StateSpaceModel) -> dict[str, Any] | None:
-    units = {state.name: state.unit for state in model.shown_states}
-    rows = [row.unit for sensor in model.sensors for row in sensor.rows]
-    units |= dict(zip(model.row_names, rows, strict=True))
+    units = units_by_name(model)
     for against, part in (("truth", found.states), ("held out", found.held_out)):
         for name, fit in part.items():
             if math.isfinite(fit.rmse):
                 values = {"name": name, "rmse": fit.rmse, "unit": units.get(name, "")}
-                return {**values, "coverage": _finite(fit.coverage), "against": against}
+                return {**values, "coverage": fit.coverage, "against": against}
     return None
-
-
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None

@@ -13,7 +13,7 @@ from estimators.model.state_space import StateSpaceModel
 from estimators.numerics.quantiles import chi_square_quantile
 
 from ...present.drawing.colors import EITHER, RGB, Frame, Palette, kinds
-from ...present.drawing.direct_readings import observed
+from ...present.drawing.direct_readings import measured_by
 from .sink import NOTICES_PATH, SCALE_GAP, TIMELINE, band_color, pair_name, row_title, with_unit
 
 MAX_SENSOR_LANES = 6  # Sensors at most whose states are drawn, below the twin's health
@@ -30,14 +30,10 @@ def nis_limit(model: StateSpaceModel) -> float:
 def blueprint(
     model: StateSpaceModel, pairs: np.ndarray, *, window: float, root: str = "", truth: bool = False
 ) -> rrb.Blueprint:
-    """The layout of the charts.
+    """The layout of the charts, which show the last `window` seconds.
 
-    Args:
-        model: Names and units.
-        pairs: Indices of the states of each ellipse, shape (k, 2).
-        window: Seconds that the charts show.
-        root: Path before all entities.
-        truth: Whether the truth of a whole large field is known.
+    `pairs` (k, 2) has indices of the states of each ellipse, `root` is the path before all entities, and `truth` tells
+    whether the truth of a whole large field is known.
     """
     span = rr.TimeRange(
         start=rrb.TimeRangeBoundary.cursor_relative(seconds=-window),
@@ -51,10 +47,10 @@ def blueprint(
             plot_legend=rrb.PlotLegend(visible=False), **more,
         )  # fmt: skip
 
-    dots = observed(model)
+    measured = measured_by(model)
     states = []
-    for j, state in zip(model.shown.tolist(), model.shown_states, strict=True):
-        rows = [model.row_names[model.row_start[d.sensor] + d.row] for d in dots if d.state == j]
+    for state in model.shown_states:
+        rows = measured.get(state.name, [])
         over = [f"/{kind}/{row}" for row in rows for kind in ("reading", "refused", "screened")]
         lines = [f"{above}/state/{state.name}" for above in ("/previous", "/smoothed", "")]
         contents = [*over, *lines, f"/truth/{state.name}"]
@@ -149,7 +145,7 @@ def styles(
         style(f"/smoothed/state/{state.name}", dark)
         style(f"/truth/{state.name}", rr.SeriesLines(colors=[palette.truth], names=["truth"], widths=[1.0]))
         style(f"/previous/state/{state.name}", rr.SeriesLines(colors=[grey], names=["previous"], widths=[1.0]))
-    dots = {model.row_names[model.row_start[item.sensor] + item.row] for item in observed(model)}
+    dots = {row for rows in measured_by(model).values() for row in rows}
     for name in model.row_names:
         if model.grid is not None and name not in dots:
             continue

@@ -185,15 +185,9 @@ def ellipse_points(mean: np.ndarray, var: np.ndarray, cross: np.ndarray) -> np.n
 
 
 def anchors(mean: np.ndarray, ellipses: np.ndarray, ways: list[np.ndarray]) -> np.ndarray:
-    """Return the positions of the labels: the mean, but far enough from the edge that the view does not cut them off.
+    """Return the positions of the labels, (n, 2): the mean, but so far from the edge that no view cuts them off.
 
-    Args:
-        mean: Shape (n, 2).
-        ellipses: Shape (n, ELLIPSE_POINTS, 2).
-        ways: n lines of shape (k, 2).
-
-    Returns:
-        Shape (n, 2).
+    `mean` is (n, 2), `ellipses` (n, ELLIPSE_POINTS, 2), and `ways` are n lines of shape (k, 2).
     """
     low = np.stack([np.minimum(e.min(0), way.min(0)) for e, way in zip(ellipses, ways, strict=True)])
     high = np.stack([np.maximum(e.max(0), way.max(0)) for e, way in zip(ellipses, ways, strict=True)])

@@ -16,7 +16,7 @@ from ...live.notices import Notice
 from ...live.outputs import Pull
 from ...live.running_fold import Running
 from ...present.drawing.colors import EITHER, Palette
-from ...present.drawing.direct_readings import observed
+from ...present.drawing.direct_readings import measured_by
 from ...present.series.columns import Rows, columns_of, rows_of
 from .layout import MAX_SENSOR_LANES, blueprint, styles
 from .pictures import FieldDrawing, PairDrawing
@@ -59,8 +59,7 @@ class RerunRows:
         self._series = series
         self._layout = layout
         self._columns = columns_of(self.model)
-        names = {(sensor, row): name for name, sensor, row in rows_of(self.model)}
-        self._dots = [names[item.sensor, item.row] for item in observed(self.model)]
+        self._dots = [row for rows in measured_by(self.model).values() for row in rows]
         self._has_field_truth = bool(self.model.grid is not None and engine.twin.tells_field)
         self._revisions = 0
         self._waiting: list[Notice] = []
@@ -131,14 +130,10 @@ class RerunRows:
         dots: np.ndarray | None = None,
         past: bool = False,
     ) -> None:
-        """Log rows.
+        """Log events and their rows.
 
-        Args:
-            events: The events.
-            track: Their rows.
-            lines: Mask of the rows that lines are drawn of; None for all.
-            dots: Mask of the rows that dots are drawn of; None for all.
-            past: Whether these rows precede rows that are already drawn.
+        `lines` and `dots` are masks of the rows that these are drawn of, None for all; `past` tells whether these rows
+        precede rows that are already drawn.
         """
         t = events.t
         self.sink.started(int(t[0]))

@@ -277,11 +277,9 @@ class Outlook(NamedTuple):
 
 
 def place(outlook: Outlook, aspect: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return position and up direction of a camera that looks at the origin, both (3,).
+    """Return position and up direction of a camera that looks at the origin, both (3,), so that it sees the points.
 
-    Args:
-        outlook: Points to see.
-        aspect: Width of the view over its height.
+    `aspect` is the width of the view over its height.
     """
     straight = _distance(outlook, aspect)
     if outlook.turns:

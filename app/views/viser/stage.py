@@ -139,13 +139,7 @@ class Stage:
 
 
 def choices_of(model: StateSpaceModel, view: ViewSection, *, truth: bool) -> list[Choice]:
-    """Return the choices about the scenes of a twin.
-
-    Args:
-        model: Model of the twin.
-        view: Section `view` of its YAML.
-        truth: Whether the true values of a field are known.
-    """
+    """Return the choices about the scenes of a twin; `truth` tells whether the true values of a field are known."""
     if model.grid is not None:
         titles = tuple(kind.title for kind in kinds(truth))
         return [Choice(SHOW, "Show", (FIELD, SURFACE), FIELD), Choice("picture", "Picture", titles, titles[0])]

@@ -80,7 +80,7 @@ class VehicleScene:
         ]
         self.tuning = Tuning.of(model)
         walled = np.array([corner for line in scene.walls for corner in line]).reshape(-1, 2)
-        standing = BeaconPositions(model, scene.beacons.values()).at(model.prior_mean, self.tuning.p)
+        standing = np.concatenate((model.prior_mean, self.tuning.p))[beacon_entries(model, scene.beacons.values())]
         corners = np.concatenate((walled, standing))
         # With walls or beacons the view shows all of them: two peaks may be at opposite ends.
         self._home = 0.5 * (corners.min(axis=0) + corners.max(axis=0)) if corners.size else None
@@ -311,16 +311,10 @@ class PeakTrail:
         return np.concatenate((mean[kept], peaks[peaked]))[np.argsort(times, kind="stable")]
 
 
-class BeaconPositions:
-    """Positions of beacons: in parameters, or in states that are estimated."""
-
-    def __init__(self, model: StateSpaceModel, names: Iterable[tuple[str, str]]) -> None:
-        known = [*model.state_names, *(parameter.name for parameter in model.parameters)]
-        self._found = [[known.index(item) for item in pair] for pair in names]
-
-    def at(self, mean: np.ndarray, p: np.ndarray) -> np.ndarray:
-        """Return east and north of each (k, 2), from states (nx,) and parameters (np,)."""
-        return np.concatenate((mean, p))[np.array(self._found, int).reshape(-1, 2)]
+def beacon_entries(model: StateSpaceModel, names: Iterable[tuple[str, str]]) -> np.ndarray:
+    """Return where east and north of each beacon (k, 2) are among the states, estimated, and then the parameters."""
+    known = [*model.state_names, *(parameter.name for parameter in model.parameters)]
+    return np.array([[known.index(item) for item in pair] for pair in names], int).reshape(-1, 2)
 
 
 class Beacons:
@@ -332,7 +326,7 @@ class Beacons:
     ) -> None:  # fmt: skip
         self._palette, self._size = palette, size
         self._sensors = [model.sensor_names.index(sensor) for sensor in beacons]
-        self._places = BeaconPositions(model, beacons.values())
+        self._entries = beacon_entries(model, beacons.values())
         nowhere = np.zeros((len(beacons), 3), np.float32)
         self._marks = shapes.dots("places", palette.ink, size, nowhere, shape="diamond")
         angle = np.linspace(-RANGE_ARC, RANGE_ARC, ARC_SIDES)
@@ -344,7 +338,7 @@ class Beacons:
 
     def draw(self, history: History, mean: np.ndarray, here: np.ndarray, p: np.ndarray) -> None:
         """Send the positions of the beacons, and their recent ranges towards the vehicle, which is `here` (2,)."""
-        places = self._places.at(mean, p)
+        places = np.concatenate((mean, p))[self._entries]
         points = _raised(places, 0.2 * self._size).astype(np.float32)
         if not np.array_equal(points, self._marks.points):
             self._marks.points = points

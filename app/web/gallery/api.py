@@ -19,7 +19,7 @@ from estimators.errors import ConfigError, NisusError, quoted
 
 from ..http import PAGE, Json, TooLarge, bounded_body, get, one_line, page_file, post, refusal
 from .cards import picture_file, shelf
-from .dropped_logs import DroppedLogs, LogRequest
+from .dropped_logs import DroppedLogs
 from .gallery import Gallery, StartRequest
 from .recordings import DATABASE, RECORDING, Recordings
 
@@ -53,11 +53,11 @@ class GalleryApi:
             post("/api/gallery/recordings/delete", self._delete),
             Route("/api/gallery/recordings/drop", self._drop, methods=["POST"]),
             get("/recordings/{name}", self._download),
-            post("/api/gallery/log", self._log),
-            post("/api/gallery/log/curves", self._curves),
+            post("/api/gallery/log", self._logs.state),
+            post("/api/gallery/log/curves", self._logs.curves),
             get("/api/gallery/log/draft", self._logs.drafting),
-            post("/api/gallery/log/draft", self._draft, status=202),
-            post("/api/gallery/log/draft/stop", self._stop_draft),
+            post("/api/gallery/log/draft", self._logs.draft, status=202),
+            post("/api/gallery/log/draft/stop", self._logs.stop_draft),
         ]
         door.add_gallery(routes, Starlette(routes=[get("/", self._page)]))
 
@@ -131,48 +131,6 @@ class GalleryApi:
         else:
             raise ConfigError(f"{path.name} is a log; name the twin that is to read it")
         return {"opening": path.name}
-
-    def _log(
-        self,
-        name: str,
-        dbc: tuple[str, ...] | None = None,
-        time: str | None = None,
-        unit: str = "s",
-        zone: str | None = None,
-    ) -> Any:
-        """Begin to read a log, and return what is known of it: signals, databases, twins that fit."""
-        return self._logs.state(LogRequest(name, dbc, time, unit, zone))
-
-    def _curves(
-        self,
-        name: str,
-        signals: tuple[int, ...],
-        dbc: tuple[str, ...] | None = None,
-        time: str | None = None,
-        unit: str = "s",
-        zone: str | None = None,
-    ) -> Any:
-        """Return decimated curves of signals of a log that was read."""
-        return {"curves": self._logs.curves(LogRequest(name, dbc, time, unit, zone), signals)}
-
-    def _draft(
-        self,
-        name: str,
-        twin: str,
-        roles: dict[str, tuple[int, ...]],
-        dbc: tuple[str, ...] | None = None,
-        time: str | None = None,
-        unit: str = "s",
-        zone: str | None = None,
-    ) -> Any:
-        """Begin to draft a twin from a log, and run it."""
-        self._logs.draft(LogRequest(name, dbc, time, unit, zone), twin, roles)
-        return self._logs.drafting()
-
-    def _stop_draft(self) -> Any:
-        """Stop the draft."""
-        self._logs.stop_draft()
-        return self._logs.drafting()
 
     def _delete(self, name: str) -> Any:
         """Delete a recording or log."""

@@ -9,6 +9,7 @@ from functools import lru_cache
 from pathlib import Path
 
 from config.loader import TWINS, Loaded, find, load, shipped
+from config.tunings import ships
 from estimators.errors import NisusError
 from estimators.model.state_space import StateSpaceModel
 
@@ -22,8 +23,7 @@ CARDS = TWINS.parent / "cards"
 
 def picture_file(twin: Path) -> Path:
     """Return the path of a twin's picture; it may be absent."""
-    ships = twin.resolve().parent == TWINS.resolve()
-    return CARDS / f"{twin.stem}.svg" if ships else twin.with_suffix(".svg")
+    return CARDS / f"{twin.stem}.svg" if ships(twin) else twin.with_suffix(".svg")
 
 
 KINDS = {"simulator": "simulated", "can": "CAN bus", "can_log": "recorded", "table": "recorded", "merged": "recorded"}
@@ -54,8 +54,8 @@ class Card:
 
 def shelf(own: Iterable[str] = ()) -> list[Card]:
     """Return cards of the user's own twins, then of bundled ones, by number of states."""
-    ships = [card(name) for name in shipped()]
-    return [*map(card, own), *sorted(ships, key=lambda item: (item.states, item.source, item.name))]
+    bundled = [card(name) for name in shipped()]
+    return [*map(card, own), *sorted(bundled, key=lambda item: (item.states, item.source, item.name))]
 
 
 def card(name: str) -> Card:

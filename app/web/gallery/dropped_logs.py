@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import re
 import threading
-import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from config.source_schema import CanLogSection, CanSection
-from estimators.errors import ConfigError, NisusError, SourceError, quoted
+from estimators.errors import ConfigError, SourceError, quoted
 from sources.tables.times import SERIAL_DAYS, UNITS, TimeColumn
 from sources.worker_process import IsolatedReader
 
+from ...live.jobs import CANCELLED, CANCELLING, DONE, FAILED, RUNNING, Job
 from ...studies.advice.draft import check_new
 from ...studies.log_overview import DraftStep, LogOverview, draft, overview
 from ...twin.log_match import LogHeader, TwinMatch, match_log
@@ -36,6 +36,8 @@ OPTION_WORDS = {
 }  # fmt: skip
 """Options in messages of the command line, as the page has them."""
 
+STOPPED_STATES = {CANCELLING: RUNNING, CANCELLED: "stopped"}  # States of a job whose names on the page differ
+
 MAX_CURVES = 200  # Curves of one answer
 
 MAX_KEPT_LOGS = 2  # Overviews that are kept
@@ -52,7 +54,22 @@ class LogRequest:
     zone: str | None = None
 
 
-class ReaderJob:
+@dataclass(frozen=True, kw_only=True)
+class CurvesRequest(LogRequest):
+    """Signals of a log, by index, whose curves are wanted."""
+
+    signals: tuple[int, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class DraftRequest(LogRequest):
+    """Name of a twin to draft from a log, and indices of the signals in each of `ROLES`."""
+
+    twin: str
+    roles: dict[str, tuple[int, ...]]
+
+
+class ReaderJob(Job):
     """A generator of a reader process, run in a thread; `item` is what it yielded last."""
 
     def __init__(
@@ -60,58 +77,41 @@ class ReaderJob:
         function: Callable[..., Iterator[Any]],
         path: Path,
         *args: Any,
-        timeout: float,
         then: Callable[[Any], None] = lambda item: None,
     ) -> None:
-        """Begin.
+        """Begin `function(path, *args)`, a generator function, importable by name.
 
-        Args:
-            function: A generator function, importable by name.
-            path: Its first argument.
-            args: Its further arguments.
-            timeout: See `IsolatedReader`.
-            then: Called with the last item, in the job's thread.
+        `then` is called with the last item, in the job's thread.
         """
+        super().__init__(path.name, lambda job: self._read(function, path, args))
         self.item: Any = None
         self.answer: dict[str, Any] | None = None
-        self.error: str | None = None
-        self.state = "running"
-        self._begun = time.monotonic()
-        self._stopping = False
-        self._timeout, self._then = timeout, then
-        self._thread = threading.Thread(target=self._run, args=(function, path, args), name="log", daemon=True)
-        self._thread.start()
+        self._then = then
+        threading.Thread(target=self.run, name="log", daemon=True).start()
 
     @property
     def seconds(self) -> float:
         """Seconds since its start."""
-        return round(time.monotonic() - self._begun, 1)
+        return round(self.elapsed, 1)
 
-    def stop(self) -> None:
-        """End it, with its process, soon."""
-        self._stopping = True
+    @property
+    def error(self) -> str | None:
+        """Why it failed, with the name of the log; None unless it did."""
+        if self.state != FAILED:
+            return None
+        return self.reason if self.name in self.reason else f"{self.name}: {self.reason}"
 
-    def _run(self, function: Callable[..., Iterator[Any]], path: Path, args: tuple[Any, ...]) -> None:
+    def _read(self, function: Callable[..., Iterator[Any]], path: Path, args: tuple[Any, ...]) -> None:
         try:
-            reader = IsolatedReader(function, path, *args, timeout=self._timeout, keep=False)
-            try:
-                while not reader.ended and not self._stopping:
+            with closing(IsolatedReader(function, path, *args, timeout=JOB_TIMEOUT_S, keep=False)) as reader:
+                while not reader.ended:
+                    self.check()
                     item = reader.take(0.2)
                     self.item = self.item if item is None else item
-            finally:
-                reader.close()
-            if self._stopping:
-                self.state = "stopped"
-                return
+            self.check()
             self._then(self.item)
-            self.state = "done"
-        except (NisusError, OSError) as error:
-            text = str(error)
-            self.error = text if path.name in text else f"{path.name}: {text}"
-            self.state = "failed"
-        except Exception as error:  # noqa: BLE001  a file may hold anything; the page needs an answer
-            self.error = f"{path.name}: {type(error).__name__}: {error}"
-            self.state = "failed"
+        except OSError as error:
+            raise SourceError(str(error)) from None
 
 
 class DroppedLogs:
@@ -143,16 +143,16 @@ class DroppedLogs:
         with self._lock:
             if key not in self._jobs:
                 for job in self._jobs.values():
-                    job.stop()
-                done = [(other, job) for other, job in self._jobs.items() if job.state == "done"]
+                    job.cancel()
+                done = [(other, job) for other, job in self._jobs.items() if job.state == DONE]
                 self._jobs = dict(done[1 - MAX_KEPT_LOGS :])
-                self._jobs[key] = ReaderJob(overview, path, *args, timeout=JOB_TIMEOUT_S)
+                self._jobs[key] = ReaderJob(overview, path, *args)
             return path, self._jobs[key]
 
     def state(self, wanted: LogRequest) -> dict[str, Any]:
         """Return how far the log has been read, its signals, and the twins by how well they fit."""
         path, job = self.read(wanted)
-        running = job.state == "running"  # asked before its item, which is the last one once it has ended
+        running = not job.over  # asked before its item, which is the last one once it has ended
         if running and job.item is None:
             return {"name": path.name, "state": "reading", "seconds": job.seconds}
         if job.item is None:
@@ -183,13 +183,8 @@ class DroppedLogs:
         answer["twins"] = [] if found.needs == "time" else self.twins(header)
         return {"name": path.name, "state": "ready", "draft_name": self._free_name(path), **answer}
 
-    def draft(self, wanted: LogRequest, twin: str, roles: Mapping[str, Sequence[int]]) -> None:
-        """Begin to draft a twin from a log, which then runs.
-
-        Args:
-            wanted: The log.
-            twin: Name of the twin.
-            roles: Indices of signals for each of "states", "sensors", "inputs" and "held_out".
+    def draft(self, wanted: DraftRequest) -> dict[str, Any]:
+        """Begin to draft a twin from a log, which then runs; return the progress.
 
         Raises:
             ConfigError: If another draft is under way, or a name or role does not apply.
@@ -198,14 +193,14 @@ class DroppedLogs:
         found: LogOverview | None = job.item
         if found is None or not found.signals:
             raise ConfigError(f"{path.name}: no signals are known yet; wait until it is read")
-        if self._draft is not None and self._draft[1].state == "running":
+        if self._draft is not None and not self._draft[1].over:
             raise ConfigError(f"{self._draft[0]} is being drafted; wait for it or stop it")
-        check_new(twin, path.parent)
-        unknown = [role for role in roles if role not in ROLES]
+        check_new(wanted.twin, path.parent)
+        unknown = [role for role in wanted.roles if role not in ROLES]
         if unknown:
             raise ConfigError(f"role {quoted(unknown[0])} is not known; choose from {', '.join(ROLES)}")
         named = {}
-        for role, indices in roles.items():
+        for role, indices in wanted.roles.items():
             if not all(0 <= k < len(found.signals) for k in indices):
                 raise ConfigError(f"{role}: give indices below {len(found.signals)}")
             picked = [found.signals[k] for k in indices]
@@ -213,11 +208,9 @@ class DroppedLogs:
         if not named.get("states") and not named.get("sensors"):
             raise ConfigError("no signal is a state or a sensor; give at least one this role")
         column = TimeColumn(found.time, wanted.unit, None, wanted.zone)
-        args = ([Path(file) for file in found.used], column, twin, named)
-        self._draft = (
-            twin,
-            ReaderJob(draft, path, *args, timeout=JOB_TIMEOUT_S, then=lambda step: self._run(step.file)),
-        )
+        args = ([Path(file) for file in found.used], column, wanted.twin, named)
+        self._draft = wanted.twin, ReaderJob(draft, path, *args, then=lambda step: self._run(step.file))
+        return self.drafting()
 
     def drafting(self) -> dict[str, Any]:
         """Return the progress of the draft."""
@@ -227,12 +220,14 @@ class DroppedLogs:
         step: DraftStep | None = job.item
         known = {"doing": step.doing if step else "starting", "summary": step.summary if step else ""}
         error = None if job.error is None else self._words(job.error)
-        return {"state": job.state, "twin": twin, "seconds": job.seconds, "error": error, **known}
+        state = STOPPED_STATES.get(job.state, job.state)
+        return {"state": state, "twin": twin, "seconds": job.seconds, "error": error, **known}
 
-    def stop_draft(self) -> None:
-        """Stop the draft under way."""
+    def stop_draft(self) -> dict[str, Any]:
+        """Stop the draft under way; return the progress."""
         if self._draft is not None:
-            self._draft[1].stop()
+            self._draft[1].cancel()
+        return self.drafting()
 
     def _words(self, text: str) -> str:
         """Return a message without paths and options of the command line."""
@@ -252,8 +247,8 @@ class DroppedLogs:
                 break
         return name
 
-    def curves(self, wanted: LogRequest, signals: Sequence[int]) -> list[list[list[float]]]:
-        """Return curves of signals by their index: seconds, lowest and highest values.
+    def curves(self, wanted: CurvesRequest) -> dict[str, list[list[list[float]]]]:
+        """Return decimated curves of signals of a log that was read: seconds, lowest and highest values.
 
         Raises:
             ConfigError: If the log has not been read, or there is no such signal.
@@ -262,9 +257,9 @@ class DroppedLogs:
         found = job.item
         if found is None:
             raise ConfigError(f"{wanted.name}: is still being read; ask again")
-        if len(signals) > MAX_CURVES or not all(0 <= k < len(found.curves) for k in signals):
+        if len(wanted.signals) > MAX_CURVES or not all(0 <= k < len(found.curves) for k in wanted.signals):
             raise ConfigError(f"signals: give at most {MAX_CURVES} indices below {len(found.curves)}")
-        return [[part.tolist() for part in found.curves[k]] for k in signals]
+        return {"curves": [[part.tolist() for part in found.curves[k]] for k in wanted.signals]}
 
     def databases(self) -> dict[Path, list[str]]:
         """Return the DBC files in the folder, and those of the twins, with the names of the twins that use them."""

@@ -15,13 +15,10 @@ from app.studies.compare import fold_row, refold, tidy, within
 from app.studies.scores import (
     SCORES,
     FilterScore,
-    ScoreCell,
     Spread,
     cells,
     printed,
-    read_cell,
     read_scores,
-    read_span,
     scores_file,
     write_scores,
 )
@@ -32,6 +29,7 @@ from estimators.errors import ConfigError
 from estimators.fold import Fold, fold
 from estimators.registry import ESTIMATORS
 from estimators.track import GATED, USED
+from tests.app.cli.test_compare_tables import ScoreCell, read_cell, read_span
 from tests.support import as_log
 
 NOTHING = Spread(np.nan)

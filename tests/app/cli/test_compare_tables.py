@@ -3,12 +3,13 @@
 import math
 import re
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 import pytest
 
 from app.studies.compare import Outcome, draws, refold, within, without_marks
-from app.studies.scores import COST, read_cell, read_scores, read_span
+from app.studies.scores import COST, SPAN, read_scores, spread
 from app.twin.log_reader import read_log
 from app.twin.twin import Twin, load_twin
 from config.loader import shipped
@@ -27,6 +28,26 @@ LEAST = 0.5
 
 SIGMA = 5.0 * math.sqrt(1 + 1 / 8)
 """Standard deviations between a new seed's figure and the mean of eight, five if the spread were known exactly."""
+
+
+class ScoreCell(NamedTuple):
+    """A figure as it is printed: value, spread (NaN if there is none), and half a unit of the last digit."""
+
+    value: float
+    spread: float
+    rounding: float
+
+
+def read_cell(line: dict[str, str], title: str) -> ScoreCell:
+    if not line[title]:
+        return ScoreCell(np.nan, np.nan, np.nan)
+    decimals = len(line[title].partition(".")[2])
+    return ScoreCell(float(line[title]), float(line[spread(title)] or "nan"), 0.5 * 10.0**-decimals)
+
+
+def read_span(line: dict[str, str]) -> float | None:
+    """The seconds of the log that a row covers; None means all."""
+    return float(line[SPAN]) if line[SPAN] else None
 
 
 @lru_cache(maxsize=1)
@@ -68,8 +89,8 @@ def mismatches(twin: Twin, events: Events, rows: dict[str, dict[str, str]]) -> l
             # Rounding to the printed digit, and as much again for a spread that was rounded too.
             if np.isnan(cell.value) and np.isnan(value):
                 continue
-            spread = max(cell.spread + cell.rounding, LEAST if title == "in band [%]" else 0.0)
-            bound = SIGMA * spread + cell.rounding if random else 1.001 * cell.rounding
+            scatter = max(cell.spread + cell.rounding, LEAST if title == "in band [%]" else 0.0)
+            bound = SIGMA * scatter + cell.rounding if random else 1.001 * cell.rounding
             if not abs(value - cell.value) <= bound:
                 wrong.append(f"{estimator}: {title} is {cells[title]} in the scores and {value:.6g} now")
     return wrong

@@ -53,7 +53,7 @@ def test_the_report_has_the_episode_of_the_run_before_though_two_edits_came_sinc
     assert not any(item.subject == "yoke" for item in session.engine.episodes())
     first = session.engine.revisions.find(0)
     assert first.track is None and any(item.subject == "yoke" for item in first.episodes)
-    text = " ".join(ParsedHtml(Client(session.server).get("/api/report.html").text).text)
+    text = " ".join(ParsedHtml(Client(session.running.server).get("/api/report.html").text).text)
     assert "Episodes of earlier runs" in text and "0: as it began" in text
     for item in first.episodes:
         assert item.text in text

@@ -37,7 +37,7 @@ def session():
 
 @pytest.fixture(scope="module")
 def client(session):
-    return Client(session.server)
+    return Client(session.running.server)
 
 
 @pytest.fixture(scope="module")

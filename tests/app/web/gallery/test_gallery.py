@@ -127,7 +127,7 @@ def test_one_twin_after_another_behind_one_port(tmp_path):
         threads = {thread.name for thread in threading.enumerate() if thread.name != "MainThread"}
         for name in ("motor_winding", "motor_can", "motor_winding"):
             page = None if session.state()["running"] is None else stream(session)
-            before = None if page is None else (weakref.ref(session.engine), session.session.view.port)
+            before = None if page is None else (weakref.ref(session.engine), session.session.running.view.port)
             state = session.start(name)
             assert state["failed"] is None and state["running"]["name"] == name
             boots.append(state["boot"])

@@ -143,7 +143,7 @@ def shows(page, status, caption):
 
 def test_strip_and_scene_show_the_moment_of_the_cursor(visit, page, session):
     """Each page has its own strip; the scene is one, and says which moment it shows."""
-    engine, view = session.engine, session.view
+    engine, view = session.engine, session.running.view
     end = float(pull_all(engine).events.t[-1]) * 1e-9
     origin = engine.span()[0]
     page.evaluate("window.nisus.view.follow()")

@@ -20,22 +20,22 @@ def asked(session):
     """The queries of the browsers' sockets, as Viser's server knows them."""
     from app.views.viser.guarded_server import addresses
 
-    return sorted(addresses(session.view.server))
+    return sorted(addresses(session.running.view.server))
 
 
 def test_the_scene_is_chosen_enlarged_and_opened_alone(visit, session):
-    assert asked(session) == [] and session.view.history.n == 0
+    assert asked(session) == [] and session.running.view.history.n == 0
     page = visit(session.url)
     wait_for(lambda: asked(session) == ["theme=light&part=scene"], PATIENCE)
-    wait_for(lambda: session.view.history.n > 0, PATIENCE)
+    wait_for(lambda: session.running.view.history.n > 0, PATIENCE)
     # Its panel is not kept up while only the page shows the scene.
-    assert session.view.panel.status.content == ""
+    assert session.running.view.panel.status.content == ""
 
     select = page.get_by_label("Scene: Show")
     select.select_option("belief")
-    wait_for(lambda: session.view.stage.choices.values()["show"] == "belief", PATIENCE)
+    wait_for(lambda: session.running.view.stage.choices.values()["show"] == "belief", PATIENCE)
     page.get_by_label("Scene: x", exact=True).select_option("rate")
-    wait_for(lambda: session.view.stage.choices.values()["y"] == "temperature", PATIENCE)
+    wait_for(lambda: session.running.view.stage.choices.values()["y"] == "temperature", PATIENCE)
     until(page, "document.querySelector('[aria-label=\"Scene: y\"]').value === 'temperature'")
 
     # Once more S: the scene is larger than the charts, and stays so over a reload.
@@ -55,7 +55,7 @@ def test_the_scene_is_chosen_enlarged_and_opened_alone(visit, session):
     alone = opened.value
     alone.get_by_text("Reset estimate").wait_for()
     wait_for(lambda: asked(session) == ["theme=light", "theme=light&part=scene"], PATIENCE)
-    wait_for(lambda: "revision 0" in session.view.panel.status.content, PATIENCE)
+    wait_for(lambda: "revision 0" in session.running.view.panel.status.content, PATIENCE)
 
 
 def test_rerun_has_a_window_of_its_own(page, session):
@@ -68,7 +68,7 @@ def test_rerun_has_a_window_of_its_own(page, session):
 def test_in_the_dark_the_scene_has_light_labels_on_dark(visit, session):
     """Viser draws black on white: boxes of some thousand pixels. Letters alone are a few hundred."""
     page = visit(session.url, scheme="dark")
-    wait_for(lambda: session.view.history.n > 0, PATIENCE)
+    wait_for(lambda: session.running.view.history.n > 0, PATIENCE)
 
     def share(least):
         """Of the lower half, with a scale's numbers and the temperature in words: pixels as grey and as light."""
