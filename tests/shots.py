@@ -18,6 +18,7 @@ from playwright.sync_api import Browser, Page
 from app.cli.run import live_source
 from app.live.commands import InjectFault, Pause, SetEstimator, SetTunings
 from app.twin.twin import load_twin
+from app.web.running import OpenedTwin
 from app.web.session import Page as Served
 from app.web.session import Session
 from tests.chromium import find_chromium, launched
@@ -112,7 +113,7 @@ def elapsed(session: Session) -> float:
 def shown(browser: Browser, shot: Shot, size: dict[str, int]) -> Iterator[tuple[Session, Page]]:
     """The page of a twin, once its log is so long, and paused there if it can be."""
     twin = load_twin(shot.twin)
-    session = Session(twin, live_source(twin, shot.speed), page=Served(0, open_browser=False))
+    session = Session(OpenedTwin(twin, live_source(twin, shot.speed)), page=Served(0, open_browser=False))
     session.start()
     context = browser.new_context(viewport=size, color_scheme="light")  # type: ignore[arg-type]
     try:

@@ -151,17 +151,12 @@ def catalogue_json(source: Source, model: StateSpaceModel) -> dict[str, Any]:
     return {
         "available": layer is not None,
         "kinds": [
-            {
-                "name": kind.name,
-                "code": kind.code,
-                "help": kind.help,
-                "of": list(kind.of),
-                "rows": kind.rows,
-                "other": kind.other,
+            vars(kind)
+            | {
                 "parameters": [
                     {"name": item.name, "unit": item.unit, "help": item.help, "default": item.default}
                     for item in kind.parameters
-                ],
+                ]
             }
             for kind in KINDS.values()
             if kind.name != "model" or (layer is not None and layer.can_change)

@@ -33,6 +33,7 @@ from sources.source import WRONG_TIME
 from ..format_time import format_time
 from ..present.export.calibration_lines import calibration_lines, health_shares
 from ..present.result import Figure, Topic, plain
+from ..present.series.columns import units_by_name
 from ..twin.twin import Twin
 
 MAX_DECISIONS = 10  # latest decisions on rejected sensors that are printed; JSON has all
@@ -322,8 +323,7 @@ def fold_topics(result: FoldResult) -> list[Topic]:
 def _figures(result: FoldResult) -> list[Figure]:
     twin, fold, scored, counts = result.twin, result.fold, result.score, result.counts
     model, events, track = twin.model, result.events, result.track
-    units = {state.name: state.unit for state in model.shown_states}
-    units |= dict(zip(model.row_names, (row.unit for sensor in model.sensors for row in sensor.rows), strict=True))
+    units = units_by_name(model)
     found = [Figure("estimator", twin.estimator), Figure("tuning", twin.tuning.name)]
     if len(events) < fold.n:
         found.append(Figure("scored", f"{format_time(int(events.t[0]))} to {format_time(int(events.t[-1]))}"))

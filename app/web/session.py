@@ -28,11 +28,8 @@ from .door import Door
 from .running import OpenedTwin, RunningTwin
 
 if TYPE_CHECKING:
-    from sources.source import Source
-
     from ..live.engine import Engine
     from ..live.notices import Annotation
-    from ..twin.twin import Twin
     from ..views.recording.writer import Recorder
 
 DISCONNECT_TIMEOUT_S = 3.0
@@ -101,8 +98,7 @@ class Session:
 
     def __init__(
         self,
-        twin: Twin | OpenedTwin | None,
-        open_source: Callable[[Callable[[str, str], None]], Source] | None = None,
+        opening: OpenedTwin | None,
         *,
         page: Page | None,
         split: Split = NEVER,
@@ -111,8 +107,7 @@ class Session:
         """Put it together; nothing runs yet.
 
         Args:
-            twin: First twin; None for the gallery alone.
-            open_source: Opens the source of a `twin` that is no `OpenedTwin`; see `Engine`.
+            opening: First twin; None for the gallery alone.
             page: Port of the page; None for no page.
             split: Parts into which a recording is split.
             recordings: Folder of recordings made on the page; None is the working directory.
@@ -135,10 +130,8 @@ class Session:
         if page is not None:
             self.door = Door(page.port)
         try:
-            if isinstance(twin, OpenedTwin):
-                self.running = self.prepared(twin)
-            elif twin is not None and open_source is not None:
-                self.running = self.prepared(OpenedTwin(twin, open_source))
+            if opening is not None:
+                self.running = self.prepared(opening)
         except BaseException:
             if self.door is not None:
                 self.door.stop()

@@ -6,11 +6,10 @@ import threading
 from collections.abc import Iterable
 
 from ...live.running_fold import Running
+from .background_folds import PinnedFold, Smoother
 from .chart_stream import ChartStream
 from .charted_run import ChartedRun, KeptRows, RowSource
 from .columns import columns_of
-from .pinned_fold import PinnedFold
-from .smoothed import Smoother
 
 LIVE, PREVIOUS, SMOOTHED = "live", "previous", "smoothed"
 

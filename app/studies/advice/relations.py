@@ -26,7 +26,7 @@ MIN_DRIVER_TIMES = 60  # common times that it takes
 class Driven(NamedTuple):
     """A first-order lag, tau · y' = offset + Σ gain · u - y, of a signal y behind others.
 
-    `explained` is the share of the variance of the second half that is simulated, without any reading, with what was
+    `explained` is the share of the variance of the second half that is simulated, without any reading, with values
     fitted to the first. `start` is how far above the lag the signal began; that decays with tau.
     """
 

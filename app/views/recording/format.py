@@ -40,6 +40,7 @@ from ...live.outputs import Pull
 from ...live.running_fold import Running
 from ...present.result import plain
 from ...present.series.columns import units_by_name
+from ...twin.twin import Twin
 from .rrd_file import END_MESSAGE, MESSAGE_HEADER, STREAM_HEADER, TAKEN, messages
 
 FORMAT = 2
@@ -137,33 +138,16 @@ class RecordingFile:
     written here. A viewer reads a file without Rerun's footer from its start.
     """
 
-    def __init__(
-        self,
-        path: Path,
-        *,
-        name: str,
-        text: str,
-        twin_path: Path,
-        base: Base | None,
-        overrides: Mapping[str, str] | None = None,
-        version: Version | None = None,
-    ) -> None:
-        """Create the file.
+    def __init__(self, path: Path, twin: Twin, base: Base | None) -> None:
+        """Create the file; its path must be free, also of a broken link.
 
-        Args:
-            path: Where; it must be free, also of a broken link.
-            name: Name of the twin.
-            text: The twin's YAML.
-            twin_path: Path of the YAML, for a model file beside it.
-            base: Start of the fold, if older events were dropped; None for the prior.
-            overrides: Keys of the YAML that the command line changed, with their values.
-            version: Tuning version that replaces values of the YAML.
+        `base` is the start of the fold, if older events were dropped; None for the prior.
 
         Raises:
             SourceError: If the file cannot be written.
         """
         self.path, self.size = path, 0
-        self.stream = rr.RecordingStream(f"{PREFIX}{name}", recording_id=f"{name}-{path.stem}")
+        self.stream = rr.RecordingStream(f"{PREFIX}{twin.name}", recording_id=f"{twin.name}-{path.stem}")
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0), 0o666)
@@ -175,14 +159,15 @@ class RecordingFile:
         self.rows = 0
         self._annotations: tuple[Annotation, ...] = ()
         self._changes = 0
-        self._header = {"name": name, "path": str(twin_path), "base": base_to_json(base)}
-        self.twin(text, overrides or {}, version)
+        # The path is there for a model file beside it.
+        self._header = {"name": twin.name, "path": str(twin.path), "base": base_to_json(base)}
+        self.twin(twin)
 
-    def twin(self, text: str, overrides: Mapping[str, str], version: Version | None) -> None:
-        """Write the twin's YAML and its tuning version; the last ones count."""
-        more = {"yaml": text, "overrides": json.dumps(dict(overrides))}
-        if version is not None:
-            more["version"] = version_to_json(version)
+    def twin(self, twin: Twin) -> None:
+        """Write the twin's YAML, what the command line changed in it, and its tuning version; the last ones count."""
+        more = {"yaml": twin.text, "overrides": json.dumps(dict(twin.overrides))}
+        if twin.version is not None:
+            more["version"] = version_to_json(twin.version)
         self.stream.log("/nisus/twin", rr.AnyValues(format=FORMAT, **self._header, **more), static=True)
 
     def base(self, base: Base | None, index: int, revision: int) -> None:

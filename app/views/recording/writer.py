@@ -209,15 +209,7 @@ class RecordingPart:
         self._edited, self._undrawn = False, True
         self._turned: float | None = None
         try:
-            self.file = RecordingFile(
-                path,
-                name=twin.name,
-                text=twin.text,
-                twin_path=twin.path,
-                base=self._base,
-                overrides=twin.overrides,
-                version=twin.version,
-            )
+            self.file = RecordingFile(path, twin, self._base)
             self._drawing = draw(self.file.stream)
         except BaseException:
             self.release()
@@ -266,7 +258,7 @@ class RecordingPart:
                 tuning, estimator = pull.settings
                 if self._engine.twin is not self._twin:
                     self._twin = self._engine.twin
-                    self.file.twin(self._twin.text, self._twin.overrides, self._twin.version)
+                    self.file.twin(self._twin)
                 if (here := self._asked_of) is not None and here.revision != pull.revision:
                     self.file.tuning(here.tuning, here.estimator, pull.first, here.revision)
                 self._asked_of = None
@@ -358,10 +350,7 @@ def write_recording(
     ]
     try:
         path.unlink(missing_ok=True)
-        file = RecordingFile(
-            path, name=twin.name, text=twin.text, twin_path=twin.path, base=None, overrides=twin.overrides,
-            version=twin.version,
-        )  # fmt: skip
+        file = RecordingFile(path, twin, None)
         drawing = RerunRows(file.stream, SimpleNamespace(model=twin.model, pairs=twin.pairs, twin=twin), series=None)
         file.tuning(twin.tuning, twin.estimator, 0, 0)
         for start in range(0, log.n, MAX_PULL_ROWS):

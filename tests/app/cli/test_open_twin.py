@@ -119,9 +119,10 @@ from pathlib import Path
 from app.cli.run import live_source
 from app.live.commands import Annotate, DeleteAnnotation, Record
 from app.twin.twin import load_twin
+from app.web.running import OpenedTwin
 from app.web.session import Session
 twin = load_twin({twin!r})
-session = Session(twin, live_source(twin, float("inf")), page=None)
+session = Session(OpenedTwin(twin, live_source(twin, float("inf"))), page=None)
 session.engine.submit(Record(Path({path!r})))
 session.start()
 while not session.engine.status().finished:

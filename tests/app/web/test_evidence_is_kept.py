@@ -23,7 +23,7 @@ FAULT = "[{kind: bias, sensor: yoke, size: 6, start: 100}]"
 @pytest.fixture(scope="module")
 def session():
     twin = load_twin("motor_joint", overrides={"source.duration": "200.0", "faults": FAULT})
-    running = Session(twin, live_source(twin, np.inf), page=Page(0, open_browser=False))
+    running = Session(OpenedTwin(twin, live_source(twin, np.inf)), page=Page(0, open_browser=False))
     running.start()
     engine = running.engine
     wait_for(lambda: engine.status().finished)

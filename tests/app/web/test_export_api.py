@@ -14,6 +14,7 @@ from app.cli.run import live_source
 from app.live.commands import Maintenance, SetTuning
 from app.present.export import track_file
 from app.twin.twin import load_twin
+from app.web.running import OpenedTwin
 from app.web.session import Page, Session
 from tests.app.cli.test_check import ParsedHtml
 from tests.app.scripted import pull_all, wait_for
@@ -28,7 +29,7 @@ OWN = ("arrival_ns", "tuning_version")
 @pytest.fixture(scope="module")
 def session():
     twin = load_twin(TWIN, overrides={"source.duration": str(SECONDS)})
-    running = Session(twin, live_source(twin, np.inf), page=Page(0, open_browser=False))
+    running = Session(OpenedTwin(twin, live_source(twin, np.inf)), page=Page(0, open_browser=False))
     running.start()
     wait_for(lambda: running.engine.status().finished)
     yield running

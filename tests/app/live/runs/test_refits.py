@@ -13,6 +13,7 @@ from app.live.commands import Record, SetTuning
 from app.live.runs.refits import ADOPTED, BROKEN, DISMISSED, FITTING, NOTHING, OFFERED, OUTDATED, Refits
 from app.twin.twin import load_twin
 from app.views.recording.reader import read_recording
+from app.web.running import OpenedTwin
 from app.web.session import Session
 from config.loader import TWINS
 from config.tunings import load_version, version_files
@@ -243,7 +244,7 @@ def test_without_a_page_it_is_in_the_recording(tmp_path):
     shutil.copy(TWINS / "motor_winding.yaml", path)
     section = "{entries: [R.winding], every: 10 min, window: 10 min, adopt: if better}"
     twin = load_twin(path, overrides={"refit": section, "R.winding": "100", "source.duration": "900"})
-    session = Session(twin, live_source(twin, np.inf), page=None)
+    session = Session(OpenedTwin(twin, live_source(twin, np.inf)), page=None)
     session.start()
     try:
         session.engine.submit(Record(recording))

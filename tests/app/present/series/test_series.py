@@ -9,11 +9,10 @@ from app.live import commands
 from app.live.jobs import Job, Jobs
 from app.live.notices import Notices
 from app.live.outputs import event_window
+from app.present.series.background_folds import PinnedFold, Smoother
 from app.present.series.chart_stream import MAX_DOT_ROWS, ChartQuery, ChartStream, drawn
 from app.present.series.levels_of_detail import grouped
-from app.present.series.pinned_fold import PinnedFold
 from app.present.series.series import SMOOTHED, Series
-from app.present.series.smoothed import Smoother
 from estimators import fold
 from estimators.events.maintenance import maintained
 from estimators.fold import Fold

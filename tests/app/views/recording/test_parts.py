@@ -20,7 +20,7 @@ from app.views.recording.format import tuning_from_json
 from app.views.recording.reader import finished, read_recording
 from app.views.recording.rrd_file import NEVER, Split, parse_split
 from app.views.recording.writer import Recorder, RecordingPart
-from app.web.commands_json import command_from_json
+from app.web.server import command_from_json
 from estimators.errors import ConfigError
 from estimators.fold import Fold
 from estimators.log import Log
@@ -359,13 +359,15 @@ import sys
 sys.path.insert(0, {root!r})
 import numpy as np
 from pathlib import Path
+from types import SimpleNamespace
 from app.live.outputs import Pull
 from app.views.recording.format import RecordingFile
 from estimators.log import READING, Events
 from estimators.track import Track
 def resident():
     return int(Path("/proc/self/statm").read_text().split()[1]) * 4096
-file = RecordingFile(Path({path!r}), name="x", text="", twin_path=Path("x.yaml"), base=None)
+twin = SimpleNamespace(name="x", text="", path=Path("x.yaml"), overrides={{}}, version=None)
+file = RecordingFile(Path({path!r}), twin, None)
 rows, width = 4, 24
 track = Track.allocate(rows, 2, 1, width)
 for k in range(7000):

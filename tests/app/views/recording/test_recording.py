@@ -5,7 +5,6 @@ import signal
 import subprocess
 import sys
 import threading
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -214,7 +213,7 @@ def test_truncated_recording_keeps_what_is_whole(tmp_path):
     log.extend(readings(times, np.full(1000, 40.0)))
     track = fold("kf", MODEL, Tuning.of(MODEL), log, pairs=np.array([[0, 1]]))
     path = tmp_path / "run.rrd"
-    file = RecordingFile(path, name="scripted", text="model: motor_winding\n", twin_path=Path("x.yaml"), base=None)
+    file = RecordingFile(path, twin(), None)
     file.tuning(Tuning.of(MODEL), "kf", 0, 0)
     for start in range(0, 1000, 100):
         part = slice(start, start + 100)
@@ -236,7 +235,7 @@ def test_truncated_recording_keeps_what_is_whole(tmp_path):
 def test_a_recording_cut_before_its_first_row_is_told_from_another_programs(tmp_path):
     """Whatever its length, and also without its end; another program's is that, cut or whole."""
     path, cut = tmp_path / "run.rrd", tmp_path / "cut.rrd"
-    RecordingFile(path, name="scripted", text="model: motor_winding\n", twin_path=Path("x.yaml"), base=None).close()
+    RecordingFile(path, twin(), None).close()
     stream = rr.RecordingStream("another", recording_id="its")
     stream.set_sinks(rr.FileSink(str(tmp_path / "other.rrd")))
     stream.log("words", rr.TextLog("hello"))
@@ -274,7 +273,7 @@ def test_recordings_with_one_true_value_an_event_read_back(tmp_path):
     old = Events.concat([spoken, truths(0, x[:, :1]), truths(1, x[:, 1:])], 1)
     old = old.select(np.argsort(old.t, kind="stable"))
     path = tmp_path / "old.rrd"
-    file = RecordingFile(path, name="scripted", text="model: motor_winding\n", twin_path=Path("x.yaml"), base=None)
+    file = RecordingFile(path, twin(), None)
     file.tuning(Tuning.of(MODEL), "kf", 0, 0)
     file.write(Pull(0, True, 0, old, Track.allocate(150, 2, 1, 1)))
     file.close()

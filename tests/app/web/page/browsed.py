@@ -12,6 +12,7 @@ import numpy as np
 
 from app.cli.run import live_source
 from app.twin.twin import load_twin
+from app.web.running import OpenedTwin
 from app.web.session import Page, Session
 from tests.app.scripted import wait_for
 
@@ -39,7 +40,7 @@ def running(
 ) -> Iterator[Session]:
     """A session of a twin with its page, of a log in place of its source; played as fast as possible, it has ended."""
     twin = load_twin(name, log_files=None if log is None else [log], overrides=overrides)
-    session = Session(twin, live_source(twin, speed), page=Page(0, open_browser=False))
+    session = Session(OpenedTwin(twin, live_source(twin, speed)), page=Page(0, open_browser=False))
     session.start()
     try:
         if speed == float("inf"):
