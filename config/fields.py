@@ -249,15 +249,6 @@ class RangeSection(Section):
     """Highest value. Default: no limit."""
 
 
-def _range(value: Any) -> Any:
-    if isinstance(value, bool):
-        value = int(value)
-    return {"min": value, "max": value} if isinstance(value, (int, float)) else value
-
-
-Range = Annotated[RangeSection, BeforeValidator(_range, json_schema_input_type=float | bool | RangeSection)]
-
-
 class ConditionSection(RangeSection):
     """A range of values, its ends included, or texts of which a column must hold one."""
 
@@ -266,7 +257,11 @@ class ConditionSection(RangeSection):
 
 
 def _condition(value: Any) -> Any:
-    return {"text": value} if isinstance(value, (str, list)) else _range(value)
+    if isinstance(value, (str, list)):
+        return {"text": value}
+    if isinstance(value, bool):
+        value = int(value)
+    return {"min": value, "max": value} if isinstance(value, (int, float)) else value
 
 
 Condition = Annotated[

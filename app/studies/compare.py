@@ -81,12 +81,6 @@ def fold_row(
     return row_of(estimator, outcomes, options, span)
 
 
-def refold(twin: Twin, estimator: str, events: Events, seed: int = 0) -> Outcome:
-    """Fold one filter over all the events."""
-    fold, seconds = timed(twin, estimator, events, seed, np.inf, enough=0.0)
-    return outcome_of(fold, events, seconds)
-
-
 def within(events: Events, span: float | None) -> Events:
     """The events of the first `span` seconds."""
     if span is None:

@@ -11,7 +11,7 @@ from pyarrow import csv as pa_csv
 
 import app.cli.compare
 import app.studies.compare
-from app.studies.compare import fold_row, refold, tidy, within
+from app.studies.compare import fold_row, tidy, within
 from app.studies.scores import (
     SCORES,
     FilterScore,
@@ -29,7 +29,7 @@ from estimators.errors import ConfigError
 from estimators.fold import Fold, fold
 from estimators.registry import ESTIMATORS
 from estimators.track import GATED, USED
-from tests.app.cli.test_compare_tables import ScoreCell, read_cell, read_span
+from tests.app.cli.test_compare_tables import ScoreCell, read_cell, read_span, refold
 from tests.support import as_log
 
 NOTHING = Spread(np.nan)
