@@ -138,13 +138,9 @@ def event_window(
 ) -> EventWindow | None:
     """Copy the last events of a fold from a snapshot on; None while there are none. Takes about a millisecond.
 
-    Args:
-        fold: The running fold.
-        revision: Its number.
-        limit: Events; a few more, since the window begins at a snapshot.
-        origin: Where the fold itself started; None for the prior.
-        rows: Whether to copy the track too, and to begin where all revisions have a snapshot.
-        stop: Row after the last event; None for the end.
+    `revision` is the fold's number, `origin` where it started, None for the prior. A few more than `limit` events are
+    copied, since the window begins at a snapshot; with `rows` the track is copied too, and the window begins where all
+    revisions have a snapshot. `stop` is the row after the last event; None for the end.
     """
     if not fold.n:
         return None

@@ -148,16 +148,10 @@ class Revisions:
         self._become([*earlier, replace(running, estimator=estimator, tuning=tuning)])
 
     def left(self, pull: Pull, estimator: str, tuning: Tuning, gesture: str = "") -> None:
-        """Replace the running revision by the next.
+        """Replace the running revision, whose rows are `pull`, by the next, of that estimator and tuning.
 
-        Edits of one gesture are one revision: the values on the way are dropped. A revision that is taken up again
-        (`Revision.loaded`) continues under the new number, with its name.
-
-        Args:
-            pull: All rows of the revision that ends.
-            estimator: Estimator of the next one.
-            tuning: Its tuning.
-            gesture: Gesture of the edit; empty for one of its own.
+        Edits of one gesture are one revision: the values on the way are dropped; an edit of its own has an empty one. A
+        revision that is taken up again (`Revision.loaded`) continues under the new number, with its name.
         """
         *earlier, running = self.runs
         now = self._clock()

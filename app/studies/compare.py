@@ -99,8 +99,7 @@ def timed(
 ) -> tuple[Fold, float]:
     """Fold the events, or what the budget (s) allows; a short fold again and again, as other work disturbs it.
 
-    Returns:
-        The fold, and the shortest time an event, s of one processor.
+    The fold comes with the shortest time an event, s of one processor.
     """
     log = Log.of(twin.model, capacity=max(1, len(events)))
     log.extend(events)

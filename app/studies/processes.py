@@ -29,17 +29,10 @@ def jobs_of(given: int | None, most: int) -> int:
 def beside(
     work: Callable[..., Any], calls: Sequence[tuple[Any, ...]], jobs: int, begin: Callable[..., None], given: Any = ()
 ) -> Iterator[list[Future[Any]]]:
-    """Call `work` with each of `calls`.
+    """Call `work` with each of `calls`, its arguments, in this order; yield a future for each.
 
-    Args:
-        work: A function of a module, as another process finds it.
-        calls: Its arguments, in the order in which they are taken up.
-        jobs: Processes.
-        begin: First call in each process.
-        given: Its arguments.
-
-    Yields:
-        A future for each call.
+    There are so many processes as `jobs`; each begins with `begin`, called with `given`. Another process must find
+    `work` in a module.
     """
     # Read when a process loads NumPy: threads that spin beside a small matrix would count as the work's cost.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")

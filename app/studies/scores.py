@@ -199,10 +199,7 @@ def scores_file(twin: Path) -> Path:
 
 
 def write_scores(twin: Path, lines: Sequence[Mapping[str, str]]) -> Path:
-    """Write the cells of a comparison (see `compare_table.cells`) for a twin's YAML.
-
-    Returns:
-        The file.
+    """Write the cells of a comparison (see `cells`) for a twin's YAML; return the file.
 
     Raises:
         ConfigError: If it cannot be written.

@@ -48,8 +48,7 @@ MAX_PARTICLES = 400
 async def serve(browser: WebSocket, *works: Awaitable[None]) -> list[Exception]:
     """Run works concurrently until the first ends, then end the others and close the connection.
 
-    Returns:
-        Their errors, except disconnections.
+    Their errors are returned, except disconnections.
     """
     tasks = [asyncio.ensure_future(work) for work in works]
     try:

@@ -244,10 +244,7 @@ class Refits:
             self._begin(section)
 
     def accept(self, number: int, *, why: str = "by hand") -> str:
-        """Keep a proposal as a tuning version with its evidence, and load it.
-
-        Returns:
-            The version's name.
+        """Keep a proposal as a tuning version with its evidence, and load it; return the version's name.
 
         Raises:
             ConfigError: If it is not proposed any more, or cannot be kept or loaded.

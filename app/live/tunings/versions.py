@@ -152,10 +152,7 @@ def _taken(path: Path) -> ConfigError:
 
 
 def keep(twin: Twin, name: str, text: str) -> Path:
-    """Write a version beside its twin.
-
-    Returns:
-        The file.
+    """Write a version beside its twin; return the file.
 
     Raises:
         ConfigError: If the name is none or taken, the text is wrong, or the file cannot be written.

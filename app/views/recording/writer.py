@@ -326,16 +326,10 @@ def write_recording(
     episodes: Sequence[Episode] = (),
     smoothed: Smoothed | None = None,
 ) -> None:
-    """Write a finished fold as a recording.
+    """Write a finished fold as a recording, in place of an existing file; a link is not followed.
 
-    Args:
-        path: Where; an existing file is replaced, a link is not followed.
-        twin: The twin that was folded.
-        log: The events.
-        track: Their rows.
-        pictures: Of a large field.
-        episodes: Faults; one notice each.
-        smoothed: Smoothed states, drawn beside the filter's; a review shows the filter's only.
+    `pictures` are those of a large field. Each of `episodes` is a notice. The smoothed states are drawn beside the
+    filter's; a review shows the filter's only.
 
     Raises:
         SourceError: If the file cannot be written.

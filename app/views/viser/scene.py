@@ -227,11 +227,7 @@ class History:
         return start
 
     def trim(self) -> int:
-        """Drop rows older than the span, once they are a third of all rows.
-
-        Returns:
-            Number of dropped rows, by which all row numbers fall.
-        """
+        """Drop rows older than the span, once they are a third of all; return how many, by which row numbers fall."""
         if self.span is None or not self.n:
             return 0
         drop = int(np.searchsorted(self.column("t"), self._columns["t"][self.n - 1] - self.span))

@@ -98,12 +98,7 @@ class Stage:
         return self._late or isinstance(self.scene, FIELD_SCENES)
 
     def draw(self, history: History, at: int | None = None) -> None:
-        """Send changes.
-
-        Args:
-            history: The rows until then.
-            at: Time to show, ns; None is the newest row.
-        """
+        """Send changes at a time, ns, until which `history` has the rows; None is the newest row."""
         assert self.scene is not None
         now = time.monotonic()
         heavy = now - self._heavy >= HEAVY_PERIOD_S

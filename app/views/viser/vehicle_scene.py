@@ -280,10 +280,8 @@ class PeakTrail:
     def look(self, t: np.ndarray, mean: np.ndarray, peak: np.ndarray | None) -> None:
         """Keep the frame of the newest row.
 
-        Args:
-            t: Times of the rows, ns, (n,).
-            mean: Position by the mean of each, (n, 2).
-            peak: Position of the heaviest of several peaks, (2,); None if there is one.
+        `t` has times of the rows, ns, (n,), `mean` the position by the mean of each, (n, 2). `peak` is that of the
+        heaviest of several peaks, (2,); None if there is one.
         """
         if self._looks:
             then, place, _ = self._looks[-1]
