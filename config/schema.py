@@ -169,6 +169,9 @@ class SensorSection(SpreadSection):
     standard deviations. A list gives one a row. Default: no limit."""
     stuck: StuckSection | None = None
     """When repeated equal measurements are no longer used. Default: never."""
+    rests: Flag = False
+    """true switches off the detector of stuck values: the sensor may repeat its value for any time. Default: false, a
+    sensor is stuck that repeats its value although the model or other sensors predict movement."""
     duplicates: DuplicatesSection | None = None
     """When a measurement of equal values is a copy, which counts once. Default: if its time is equal too."""
     at: dict[Text, Numbers] | None = None
@@ -392,8 +395,8 @@ class TwinSection(Section):
     """Sensor noise R, limits and use by sensor. Default: the model's."""
     valid: dict[str, Validity] = {}
     """Range over which the model was fitted or validated, by state or input, in its unit, for example
-    {temperature: {min: 20, max: 38}}. Outside it health is suspect, and parameters `widen`. A fitted tuning version has
-    the range of its recordings. Default: the model's."""
+    {temperature: {min: 20, max: 38}}. Outside it health is suspect, or advisory where parameters `widen`. A fitted
+    tuning version has the range of its recordings. Default: the model's."""
     estimator: Annotated[
         EstimatorSection, BeforeValidator(as_estimator, json_schema_input_type=str | EstimatorSection)
     ] = EstimatorSection(name="ekf")

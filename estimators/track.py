@@ -21,9 +21,12 @@ itself; saturated converter; a measurement that arrived before. Bits of `Track.s
 
 RANGE, RATE, REPEATED, SATURATED, DUPLICATE = (1 << k for k in range(len(REASONS)))
 
-WAITING, TRACKING, SUSPECT, DEGRADED, DIVERGED, STALE = range(6)
-"""Health: no measurement has arrived; consistent; inconsistent; a sensor is lost or measurements are late; the estimate
-is lost; no data."""
+HEALTH_NAMES = ("waiting", "tracking", "advisory", "suspect", "degraded", "diverged", "stale")
+WAITING, TRACKING, ADVISORY, SUSPECT, DEGRADED, DIVERGED, STALE = range(len(HEALTH_NAMES))
+"""Health: no measurement has arrived; consistent; conservative, as bands are wider than necessary or the gate rejects
+outliers; overconfident or wrong; a sensor is lost or measurements are late; the estimate is lost; no data."""
+
+USABLE = (TRACKING, ADVISORY)  # Health in which estimate and band hold
 
 LOG_LIKELIHOOD = 2
 """Index of the log-likelihood in a filter's scores."""
@@ -31,8 +34,6 @@ LOG_LIKELIHOOD = 2
 EFFECTIVE, ANCESTORS, WHITENED = range(3, 6)
 """Indices in a filter's scores, after NIS, degrees of freedom and log-likelihood, of the effective sample size and the
 number of ancestors, and of the first whitened row of the measurement."""
-
-HEALTH_NAMES = ("waiting", "tracking", "suspect", "degraded", "diverged", "stale")
 
 
 class Track(NamedTuple):

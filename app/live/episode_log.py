@@ -19,7 +19,7 @@ from estimators.diagnostics.episodes import ALARM_KEYS, Episode, EpisodeTracker,
 from estimators.diagnostics.episodes.tracker import MAX_ROWS
 from estimators.diagnostics.held_out import Offset, offsets
 from estimators.registry import find_estimator
-from estimators.track import DIVERGED, HEALTH_NAMES, TRACKING, WAITING, estimated_rows
+from estimators.track import ADVISORY, DIVERGED, HEALTH_NAMES, TRACKING, WAITING, estimated_rows
 
 from .counts import last_run
 from .jobs import Job
@@ -103,8 +103,9 @@ class EpisodeSummary(NamedTuple):
 
 
 def _severity(episode: Episode) -> tuple[int, float]:
-    """Sort key: the most severe first, of these the newest."""
-    return detector_of(episode.cause).severity, -episode.start
+    """Sort key: the most severe first, of these the newest; advisories last."""
+    severity = detector_of(episode.cause).severity
+    return severity + DEFAULT_SEVERITY * (episode.grade == "advisory"), -episode.start
 
 
 class EpisodeLog:
@@ -195,11 +196,11 @@ class EpisodeLog:
                 new = [entry for entry in begun if entry.episode is leading]
                 text += f": {leading.text}" if new else f": {leading.subject} {leading.cause}"
                 begun = [entry for entry in begun if entry.episode is not leading]
-            level = {WAITING: "info", TRACKING: "info", DIVERGED: "error"}.get(health, "warn")
+            level = {WAITING: "info", TRACKING: "info", ADVISORY: "info", DIVERGED: "error"}.get(health, "warn")
             say(text, level=level, t=int(t[last_run(track.health)]))
         for episode in (entry.episode for entry in begun[:MAX_NOTICES]):
             lasted = "" if episode.end is None else f"; over after {_duration(episode)}"
-            level = "error" if episode.cause == "diverged" else "warn"
+            level = {"diverged": "error", "advisory": "info"}.get(episode.grade, "warn")
             say(f"{episode.text}{lasted}", level=level, t=round(episode.start * 1e9))
         if len(begun) > MAX_NOTICES:
             say(f"and {len(begun) - MAX_NOTICES} more episode(s) of this kind", level="warn")

@@ -21,7 +21,7 @@ MIN_MEMBERS = 4
 LISTED_MEMBERS = 8
 """Members with the largest NIS that a summary names."""
 
-STATE_ORDER = ("stale", "degraded", "suspect", "waiting", "tracking", "held out")
+STATE_ORDER = ("stale", "degraded", "suspect", "advisory", "waiting", "tracking", "held out")
 """States of sensors, the worst first."""
 
 ALARM_STATES = STATE_ORDER[:3]

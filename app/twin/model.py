@@ -298,6 +298,7 @@ def limits_of(sensor: Sensor, section: SensorSection, loaded: Loaded) -> Limits 
         rate=section.rate or own.rate,
         stuck=stuck,
         duplicates=own.duplicates if section.duplicates is None else section.duplicates.within,
+        rests=own.rests or section.rests,
     )
     wrong = limits.flaw(len(sensor.rows))
     if wrong is None:

@@ -62,7 +62,7 @@ _FIELDS = """
     noise_state noise_states max_step
     prior_mean prior_cov prior_rows n_considered linear_states n_linear sampled_states n_sampled jump mode n_modes
     p q r used gate width options n_options pairs n_pairs shown n_shown prepared n_prepared seed
-    baseline n_baseline normal ranges fitted column expected chances marginal n_tests limits limited duplicates
+    baseline n_baseline normal ranges fitted expected chances gated marginal n_tests limits limited duplicates
 """.split()
 
 _layout = np.dtype([(name, np.float64 if name == "max_step" else np.int64) for name in _FIELDS])

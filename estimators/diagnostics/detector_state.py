@@ -10,14 +10,15 @@ from ..events.batch import READING, Events
 from ..model.state_space import StateSpaceModel
 from ..numerics.jit import floats, inlined, part
 from ..track import HELD_OUT, MISSING, Track
-from .detectors import GAINS, JOINT, LOST, REJECTED_SHARE, SENSOR_FLAGS, TESTS
+from .detectors import ADVISORY_ALARM, AT_REPETITION, GAINS, JOINT, LOST, REJECTED_SHARE, SENSOR_FLAGS, TESTS
 from .health import HealthPolicy, normal_nis
 
-# Twin: rows in alarm and rows lost; time at which the next sensor drops out; time of the first event, whether a
-# measurement has arrived; states whose truth is missed; sensors that dropped out; measurements more, poor than not, of
-# a particle filter, and whether it is impoverished.
-SUSPECT_ROWS, LOST_ROWS, NEXT_DUE, BEGUN, HEARD, MISSED_STATES, SILENT_SENSORS, POOR, POOR_CLOUD = range(9)
-TWIN = 9
+# Twin: rows in alarm, of which the bands are valid and wider than necessary; rows lost; time at which the next sensor
+# drops out; time of the first event, whether a measurement has arrived; sensors that dropped out; measurements more,
+# poor than not, of a particle filter, and whether it is impoverished; measurements until divergence is judged after a
+# reset.
+SUSPECT_ROWS, ADVISED_ROWS, LOST_ROWS, NEXT_DUE, BEGUN, HEARD, SILENT_SENSORS, POOR, POOR_CLOUD, UNSETTLED = range(10)
+TWIN = 10
 
 # Sensor: W of the joint tests, then the number of measurements, time of the first and the last, longest gap, threshold
 # of the tests, time at which it drops out, whether it has, alarms of the joint tests.
@@ -26,23 +27,30 @@ SENSOR = JOINT + 8  # Numbers in the state for each sensor
 
 # Row: W of its tests, then its alarms; the last e, and the same whitened by the baseline; the last value; its smallest
 # step; length of the present run of equal values; repeated values, of how many; measurements since the last outlier;
-# the next e that each filter of `GAINS` predicts.
-MASK, RAW, WHITE, VALUE, QUANTUM, RUN, EQUAL, COUNTED, CALM_FOR, EXPECTED = range(TESTS, TESTS + 10)
+# mean and mean square of the recent e that are no outliers, and their number; grade of the alarms (0, `ADVISED` or
+# `ACTED_ON`); innovation that is left after the last update, and its variance; movement that was predicted during the
+# present run, the sum of squares of its steps, and their predicted variance; standard deviation of the last prediction,
+# of that before a reset, and measurements until the tests begin again after it; the next e that each filter of `GAINS`
+# predicts. The inputs that hold follow.
+MASK, RAW, WHITE, VALUE, QUANTUM, RUN, EQUAL, COUNTED = range(TESTS, TESTS + 8)
+CALM_FOR, MEAN_E, SQUARE_E, KNOWN, GRADE, LEFT, LEFT_VARIANCE = range(TESTS + 8, TESTS + 15)
+MOVED, MOVED_SQUARES, MOVED_VARIANCE, LAST_STD, STD_BEFORE, RESETTING, EXPECTED = range(TESTS + 15, TESTS + 22)
 ROW = EXPECTED + len(GAINS)  # Numbers in the state for each row
 
-# Shown state: mean square of its standardised errors, how many true values were given, whether it is missed. The
-# inputs that hold follow.
-STATE = 3
+ADVISED, ACTED_ON = 1.0, 2.0
 
-SENSOR_STATES = ("waiting", "tracking", "suspect", "degraded", "stale", "held out")
-"""State of a sensor: no measurement yet; consistent; in alarm; dropped out, stuck or rejected; dropped out for so long
-that a twin without other sensors would be stale; predicted and scored, never used."""
+SENSOR_STATES = ("waiting", "tracking", "advisory", "suspect", "degraded", "stale", "held out")
+"""State of a sensor: no measurement yet; consistent; in alarm, with valid bands; in alarm; dropped out, stuck or
+rejected; dropped out for so long that a twin without other sensors would be stale; predicted and scored, never used."""
 
 
 def no_baseline(model: StateSpaceModel) -> np.ndarray:
     """Return the baseline of white innovations, (rows, 3 + TESTS)."""
     baseline = np.zeros((len(model.row_names), 3 + TESTS))
     baseline[:, 1] = 1.0
+    for first, sensor in zip(model.row_start, model.sensors, strict=True):
+        if sensor.limits is not None and sensor.limits.rests:
+            baseline[first : first + len(sensor.rows), 3 + AT_REPETITION] = np.inf
     return baseline
 
 
@@ -63,29 +71,25 @@ def detector_context(
         expected: Sensors that must report, (sensors,); None for those that have reported.
 
     Returns:
-        `baseline` (rows, 3 + TESTS); `normal` (sensors, 3), see `normal_nis`; `ranges` (shown + inputs, 2) in which
-        the model was fitted, and `fitted`, 1 if there is any; `column` (nx,) of a state in the track, or -1; `expected`
-        (sensors,); `chances` (2,), log Λ of a rejected and of an accepted measurement; `marginal`; `n_tests` in all.
+        `baseline` (rows, 3 + TESTS); `normal` (sensors, 3), see `normal_nis`; `ranges` (shown + inputs, 3), in which
+        the model was fitted, and whether bands widen outside; `fitted`, 1 if there is any; `expected` (sensors,);
+        `chances` (2,), log Λ of a rejected and of an accepted measurement; `gated`, whether outliers are rejected;
+        `marginal`; `n_tests` in all.
     """
-    shown = model.shown
-    column = np.full(model.nx, -1, np.int64)
-    column[shown] = np.arange(len(shown))
-    if model.mode >= 0:
-        column[model.mode] = -1
-    ranges = np.full((len(shown) + model.nu, 2), [-np.inf, np.inf])
-    fitted = [item.fitted for item in model.shown_states] + [item.fitted for item in model.inputs]
-    for k, limits in enumerate(fitted):
+    ranges = np.full((len(model.shown) + model.nu, 3), [-np.inf, np.inf, 0.0])
+    fitted = [(item.fitted, item.widens) for item in model.shown_states]
+    for k, (limits, widens) in enumerate(fitted + [(item.fitted, item.widens) for item in model.inputs]):
         if limits is not None:
-            ranges[k] = limits
+            ranges[k] = *limits, widens
     counts = np.array([len(sensor.rows) for sensor in model.sensors], np.int64)
     return {
         "baseline": np.ascontiguousarray(baseline, float),
         "normal": normal_nis(model, baseline),
         "ranges": ranges,
-        "fitted": int(np.any(np.isfinite(ranges))),
-        "column": column,
+        "fitted": int(np.any(np.isfinite(ranges[:, :2]))),
         "expected": np.zeros(len(counts), np.int64) if expected is None else np.ascontiguousarray(expected, np.int64),
         "chances": gate_log_ratios(gate),
+        "gated": int(gate is not None),
         "marginal": int(marginal),
         "n_tests": int(counts.sum()) * TESTS + int(np.sum(counts > 1)) * JOINT,
     }
@@ -105,10 +109,10 @@ def threshold_of(model: StateSpaceModel, state: np.ndarray, s: int) -> float:
 def fresh(model: StateSpaceModel) -> np.ndarray:
     """Return the state before the first event."""
     rows, sensors = len(model.row_names), len(model.sensors)
-    state = np.zeros(TWIN + sensors * SENSOR + rows * ROW + len(model.shown) * STATE + model.nu)
+    state = np.zeros(TWIN + sensors * SENSOR + rows * ROW + model.nu)
     state[NEXT_DUE], state[BEGUN] = np.inf, np.nan
     _sensors(model, state)[:, DUE] = np.inf
-    _rows(model, state)[:, [RAW, WHITE, VALUE]] = np.nan
+    _rows(model, state)[:, [RAW, WHITE, VALUE, LEFT]] = np.nan
     state[state.size - model.nu :] = model.default_inputs
     return state
 
@@ -134,8 +138,9 @@ def sensor_states(
         now: Time of the last event, s.
         policy: Limits of the twin's health.
     """
-    own = _sensors(model, state)
-    masks = np.bitwise_or.reduceat(_rows(model, state)[:, MASK].astype(int), model.row_start)
+    own, rows = _sensors(model, state), _rows(model, state)
+    masks = np.bitwise_or.reduceat(rows[:, MASK].astype(int), model.row_start)
+    grades = np.maximum.reduceat(rows[:, GRADE], model.row_start)
     alarms = masks | own[:, JOINT_MASK].astype(int)
     silent, heard = own[:, SILENT] > 0.0, own[:, COUNT] > 0.0
     cases = {
@@ -143,7 +148,8 @@ def sensor_states(
         "stale": silent & heard & (now - own[:, LAST] > policy.stale_after),
         "degraded": silent | heard & (alarms & LOST != 0),
         "waiting": ~heard,
-        "suspect": alarms != 0,
+        "suspect": grades == ACTED_ON,
+        "advisory": alarms != 0,
     }
     words = np.select(list(cases.values()), list(cases), "tracking")
     return [str(word) for word in words]
@@ -159,8 +165,9 @@ def sensor_states_over_time(events: Events, track: Track, s: int) -> tuple[np.nd
     reported = (events.kind == READING) & (events.channel == s) & (track.verdict != MISSING)
     rows = np.flatnonzero(silent | reported)
     alarms = np.bitwise_or.reduce(track.alarms[rows], axis=1) * reported[rows]
-    cases = (track.verdict[rows] == HELD_OUT, silent[rows] | (alarms & LOST != 0), alarms != 0)
-    words = [SENSOR_STATES.index(word) for word in ("held out", "degraded", "suspect")]
+    advised = alarms & ADVISORY_ALARM != 0
+    cases = (track.verdict[rows] == HELD_OUT, silent[rows] | (alarms & LOST != 0), advised, alarms != 0)
+    words = [SENSOR_STATES.index(word) for word in ("held out", "degraded", "advisory", "suspect")]
     return rows, np.select(cases, words, SENSOR_STATES.index("tracking"))
 
 
@@ -177,8 +184,12 @@ def row_part(state, sensors, row):
 
 
 @part
-def forget(state, sensors, rows, states):
-    """Clear the evidence at a reset: measurements before it concern another estimate."""
+def forget(state, sensors, rows, window):
+    """Clear the evidence at a reset: measurements before it concern another estimate.
+
+    The tests of a row begin again when the prior no longer dominates its predictions, after `window` measurements at
+    the latest; divergence is judged again after `window` measurements.
+    """
     for s in range(sensors):
         own = sensor_part(state, s)
         own[JOINT_MASK] = 0.0
@@ -186,9 +197,11 @@ def forget(state, sensors, rows, states):
     for k in range(rows):
         own = row_part(state, sensors, k)
         own[:TESTS] = 0.0
-        own[MASK] = own[CALM_FOR] = 0.0
-        own[EXPECTED:ROW] = 0.0
-        own[RAW] = own[WHITE] = np.nan
-    begin = TWIN + sensors * SENSOR + rows * ROW
-    state[begin : begin + states * STATE] = 0.0
-    state[SUSPECT_ROWS] = state[LOST_ROWS] = state[MISSED_STATES] = state[POOR] = state[POOR_CLOUD] = 0.0
+        own[MASK] = 0.0
+        before = own[STD_BEFORE] if own[RESETTING] > 0.0 else own[LAST_STD]
+        own[CALM_FOR:ROW] = 0.0
+        own[STD_BEFORE] = before
+        own[RESETTING] = float(window) if before > 0.0 else 0.0
+        own[RAW] = own[WHITE] = own[LEFT] = np.nan
+    state[SUSPECT_ROWS] = state[ADVISED_ROWS] = state[LOST_ROWS] = state[POOR] = state[POOR_CLOUD] = 0.0
+    state[UNSETTLED] = float(window)

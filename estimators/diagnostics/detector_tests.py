@@ -25,6 +25,8 @@ import numpy as np
 
 from ..numerics.jit import inlined, jit, part
 from .detector_state import (
+    ACTED_ON,
+    ADVISED,
     CALM_FOR,
     COUNT,
     COUNTED,
@@ -32,15 +34,26 @@ from .detector_state import (
     EQUAL,
     EXPECTED,
     FIRST,
+    KNOWN,
     LAST,
+    LAST_STD,
+    LEFT,
+    LEFT_VARIANCE,
     LONGEST_GAP,
+    MEAN_E,
+    MOVED,
+    MOVED_SQUARES,
+    MOVED_VARIANCE,
     NEXT_DUE,
     QUANTUM,
     RAW,
+    RESETTING,
     ROW,
     RUN,
     SILENT,
     SILENT_SENSORS,
+    SQUARE_E,
+    STD_BEFORE,
     THRESHOLD,
     VALUE,
     WHITE,
@@ -53,6 +66,7 @@ from .detectors import (
     AT_REFUSALS,
     AT_REPETITION,
     BITS,
+    CONSERVATIVE,
     DENSITIES,
     DENSITY_RATIOS,
     DENSITY_STEPS,
@@ -63,13 +77,17 @@ from .detectors import (
     JOINT_BITS,
     JOINT_RATIOS,
     LAGGED,
+    LAGGING,
     MAX_SIGMA,
+    NARROW,
     NEW_VALUE,
     OUTLIER_TESTS,
     QUADRATIC,
     RARE_TESTS,
     RATIOS,
     REPEAT_PROBABILITY,
+    SHIFTED,
+    SPIKY,
     STUCK,
     TESTS,
     UNKNOWN_QUANTUM,
@@ -82,6 +100,26 @@ CALM_MEASUREMENTS, OUTLIER_FROM = 500, 3.5
 """Measurements without |e| beyond this after which earlier outliers are forgotten."""
 
 KNOWN_PERIOD = 100.0  # Measurements from which the period of a sensor is known; with fewer it may pause for longer
+
+EVIDENT_MOVEMENT, SIGNIFICANT_MOVEMENT, MIN_MOVEMENT_STEPS = 3.0, 4.0, 8.0
+"""Movement that a repeated value contradicts: predicted over the run, in quanta or standard deviations of the noise,
+whichever is larger; in root sums of squares of its steps, or in its standard deviations after so many steps."""
+
+NOISY_SHARE = 0.04
+"""Share of R below which the predicted variance of the change from one measurement to the next makes the sensor's own
+noise move it: a repetition is then improbable at rest, too."""
+
+PRIOR_MEASUREMENTS, RECENT_MEASUREMENTS = 20.0, 200.0
+"""Measurements for which a mean square of 1 is assumed at first, and over which e is averaged."""
+
+WIDE_SQUARE, COVERED_SQUARE, NORMAL_SQUARE = 0.8, 0.95, 1.3
+"""Mean square of the recent e below which bands are wider than necessary, below which they cover the measurements, and
+below which they are not too narrow."""
+
+FOLLOWING_SHARE = 0.5  # Share of the estimate's variance in S from which on the estimate follows each measurement
+
+RESET_STD = 1.2
+"""Standard deviation of a prediction, relative to that before a reset, from which on the prior dominates it."""
 
 
 @inlined
@@ -149,7 +187,14 @@ def weigh(own, e, h, base, before):
         own[EXPECTED + k] = FADING * own[EXPECTED + k] + FOLLOWED[k, 0] * white
         ratio = 0.5 * square - FOLLOWED[k, 1] * off * off + FOLLOWED[k, 2]
         mask |= alarm(add(own, AT_GAINS + k, ratio, h, base[3 + AT_GAINS + k]), ALTERNATING, before)
-    own[CALM_FOR] = 0.0 if abs(white) > OUTLIER_FROM else own[CALM_FOR] + 1.0
+    if abs(white) > OUTLIER_FROM:
+        own[CALM_FOR] = 0.0
+    else:
+        own[CALM_FOR] += 1.0
+        own[KNOWN] = min(own[KNOWN] + 1.0, RECENT_MEASUREMENTS - PRIOR_MEASUREMENTS)
+        share = 1.0 / (own[KNOWN] + PRIOR_MEASUREMENTS)
+        own[MEAN_E] += share * (raw - own[MEAN_E])
+        own[SQUARE_E] += share * (raw * raw - 1.0 - own[SQUARE_E])
     for k in range(DENSITIES):
         at = AT_DENSITIES + k
         if OUTLIER_TESTS[k] and own[CALM_FOR] >= CALM_MEASUREMENTS:
@@ -162,16 +207,95 @@ def weigh(own, e, h, base, before):
     return mask
 
 
+@inlined
+def grade(own, mask, gated, r):
+    """Return the grade of the alarms of a row: 0 for none, `ADVISED` if its bands are valid, else `ACTED_ON`.
+
+    Valid are bands that are too wide. They cover a correlation of e, which tests of unit variance also see where e is
+    merely small, if its mean square is small and its mean μ within the band of the estimate itself, μ² ≤ (S - R) / S:
+    an estimate that averages many measurements has a narrow band, however wide that of a measurement is. They cover
+    μ ≠ 0 only where the estimate follows each measurement, so that no error accumulates. Valid, too, is an estimate
+    from which a gate keeps the outliers, if e has the right scale without them.
+    """
+    if mask == 0:
+        return 0.0
+    rest = mask & ~CONSERVATIVE
+    if gated != 0 and rest & SPIKY != 0:
+        rest &= ~SPIKY
+        if 1.0 + own[SQUARE_E] < NORMAL_SQUARE:
+            rest &= ~NARROW
+    if rest & (SHIFTED | LAGGING) != 0:
+        variance, mean, square = own[LAST_STD] * own[LAST_STD], own[MEAN_E], 1.0 + own[SQUARE_E]
+        if mean * mean * variance <= variance - r:
+            if variance - r >= FOLLOWING_SHARE * variance and square < COVERED_SQUARE:
+                rest &= ~(SHIFTED | LAGGING)
+            elif square < WIDE_SQUARE:
+                rest &= ~LAGGING
+    return ADVISED if rest == 0 else ACTED_ON
+
+
+@inlined
+def resetting(own, std):
+    """Return whether the prior of a reset still dominates a prediction of this standard deviation."""
+    left = own[RESETTING]
+    if left <= 0.0:
+        return False
+    # The first measurement after a reset is predicted from the prior alone.
+    if own[LAST_STD] == 0.0 or not std <= RESET_STD * own[STD_BEFORE]:
+        own[RESETTING] = left - 1.0
+        return True
+    own[RESETTING] = 0.0
+    return False
+
+
+@inlined
+def _contradicted(own, innovation, std, r, used, repeated):
+    """Return whether the model or other sensors contradict that a row repeats its value.
+
+    Between two measurements the prediction moves by what the update before left of its innovation, (R/S) ν, less the
+    next innovation, as the measured value is the same. Its predicted variance is the growth of S - R meanwhile. A
+    movement contradicts the repetition if it exceeds quantum and noise, and is no sum of random steps. Without
+    movement, repetition is improbable only if the change between two measurements is mostly noise.
+    """
+    if not repeated:
+        own[MOVED] = own[MOVED_SQUARES] = own[MOVED_VARIANCE] = 0.0
+    found = False
+    if np.isfinite(innovation):
+        variance = std * std
+        if np.isfinite(own[LEFT]):
+            grown = max(0.0, variance - r - own[LEFT_VARIANCE])
+            if repeated:
+                step = own[LEFT] - innovation
+                own[MOVED] += step
+                own[MOVED_SQUARES] += step * step
+                own[MOVED_VARIANCE] += grown
+                moved = abs(own[MOVED])
+                evident = moved > EVIDENT_MOVEMENT * max(own[QUANTUM], math.sqrt(r))
+                coherent = moved > SIGNIFICANT_MOVEMENT * math.sqrt(own[MOVED_SQUARES])
+                if own[RUN] >= MIN_MOVEMENT_STEPS:
+                    coherent |= moved > SIGNIFICANT_MOVEMENT * math.sqrt(own[MOVED_VARIANCE])
+                found = evident and coherent or used and grown < NOISY_SHARE * r
+        left = r / variance if used and variance > 0.0 else 1.0
+        own[LEFT] = left * innovation
+        own[LEFT_VARIANCE] = r * (1.0 - left) if used else variance - r
+        own[LAST_STD] = std
+    else:
+        own[LEFT] = np.nan
+    return found
+
+
 @part
-def repeat(own, y, r, h, base, before):
-    """Apply the test of repetition to a value.
+def repeat(own, y, r, h, base, before, innovation, std, used):
+    """Apply the test of repetition to a value, of this innovation and its standard deviation.
 
     Two measurements of standard deviation σ, rounded to a quantum q, are equal with a probability of erf(q / 2σ) at
     most; q is the smallest step that the sensor has made so far. An asset at rest repeats itself more often: the share
-    of repetitions before the present run counts if it is larger.
+    of repetitions before the present run counts if it is larger, and a repetition only where the model or other sensors
+    predict movement, or the sensor has noise of its own at rest.
     """
     last = own[VALUE]
     own[VALUE] = y
+    contradicted = _contradicted(own, innovation, std, r, used, y == last)
     if not np.isfinite(last):
         return 0
     if y == last:
@@ -179,7 +303,7 @@ def repeat(own, y, r, h, base, before):
         chance = UNKNOWN_QUANTUM
         if own[QUANTUM] > 0.0 and r > 0.0:
             chance = max(math.erf(0.5 * own[QUANTUM] / math.sqrt(r)), 0.01, own[EQUAL] / own[COUNTED])
-        ratio = math.log(REPEAT_PROBABILITY / min(chance, REPEAT_PROBABILITY))
+        ratio = math.log(REPEAT_PROBABILITY / min(chance, REPEAT_PROBABILITY)) if contradicted else 0.0
     else:
         step = abs(y - last)
         if own[QUANTUM] == 0.0 or step < own[QUANTUM]:
@@ -192,17 +316,17 @@ def repeat(own, y, r, h, base, before):
 
 
 @jit
-def highest(e, refused, y, r, h, base, chances):
+def highest(e, refused, y, innovation, std, r, h, base, chances):
     """Return the highest W of each test of a row over its measurements, (TESTS,), with thresholds that never cap it.
 
     `refused` (n,): 1 where the gate rejected the measurement, 0 where it accepted it, -1 where it did not apply.
     """
     own = np.zeros(ROW)
-    own[RAW] = own[WHITE] = own[VALUE] = np.nan
+    own[RAW] = own[WHITE] = own[VALUE] = own[LEFT] = np.nan
     found = np.zeros(TESTS)
     for i in range(e.size):
         if np.isfinite(y[i]):
-            repeat(own, y[i], r, h, base, 0)
+            repeat(own, y[i], r, h, base, 0, innovation[i], std[i], refused[i] == 0)
         if refused[i] >= 0:
             add(own, AT_REFUSALS, chances[1 - refused[i]], h, base[3 + AT_REFUSALS])
         if np.isfinite(e[i]):

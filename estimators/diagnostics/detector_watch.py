@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..compiled.context import circular_states, sensor_rows, sensor_variances
-from ..log import INPUT, READING, RESET, TRUTH
+from ..compiled.context import sensor_rows, sensor_variances
+from ..log import INPUT, READING, RESET
 from ..numerics.jit import borrowed, borrowed_rows, floats, inlined, ints, part
-from ..numerics.linalg import wrap
 from ..track import (
+    ADVISORY,
     DEGRADED,
     DIVERGED,
     DUPLICATE,
@@ -23,49 +23,44 @@ from ..track import (
     borrowed_columns,
 )
 from .detector_state import (
+    ACTED_ON,
+    ADVISED,
+    ADVISED_ROWS,
     BEGUN,
     DUE,
+    GRADE,
     HEARD,
     JOINT_MASK,
     LOST_ROWS,
     MASK,
-    MISSED_STATES,
     NEXT_DUE,
     POOR,
     POOR_CLOUD,
-    ROW,
-    SENSOR,
+    RESETTING,
     SILENT,
     SILENT_SENSORS,
-    STATE,
     SUSPECT_ROWS,
     THRESHOLD,
-    TWIN,
+    UNSETTLED,
     forget,
     row_part,
     sensor_part,
 )
-from .detector_tests import add, alarm, find_dropouts, note_time, repeat, weigh, weigh_joint
+from .detector_tests import add, alarm, find_dropouts, grade, note_time, repeat, resetting, weigh, weigh_joint
 from .detectors import (
+    ADVISORY_ALARM,
     AGREEING,
     AT_REFUSALS,
     DISAGREEING,
     IMPOVERISHED,
     LOST,
-    MISSED,
     OUTSIDE,
+    OUTSIDE_WIDENED,
     REFUSED,
     SENSOR_FLAGS,
     STUCK,
     TESTS,
-    TRUTH_MISSED,
 )
-
-MISSED_RMS, MISSED_RMS_CLEARED = 4.5, 3.0
-"""Root mean square of (estimate - truth) / σ over about `TRUTH_VALUES` values from which a truth is missed, and below
-which it no longer is."""
-
-TRUTH_VALUES = 10
 
 MIN_PARTICLES = 4.0
 """Effective sample size below which particles are poor; they also are if all descend from one particle."""
@@ -73,16 +68,6 @@ MIN_PARTICLES = 4.0
 POOR_MEASUREMENTS = 60
 """Measurements more, poor than not, from which particles are impoverished; cleared at half as many. Three times the
 number between two counts of ancestors: by chance one count may be 1, hardly three in succession."""
-
-
-@part
-def _miss(own, z, before):
-    """Return `MISSED` if the truth of a state is missed after another error of z standard deviations, else 0."""
-    own[1] = min(own[1] + 1.0, TRUTH_VALUES)
-    own[0] += (min(z * z, 1e4) - own[0]) / own[1]
-    if own[1] == TRUTH_VALUES and own[0] > MISSED_RMS * MISSED_RMS:
-        return MISSED
-    return MISSED if before and own[0] > MISSED_RMS_CLEARED * MISSED_RMS_CLEARED else 0
 
 
 @inlined
@@ -121,7 +106,10 @@ def _test(i, now, y, s, context, policy, state, track):
     joint = 0
     base = floats(context.baseline + 8 * first * (3 + TESTS), 3)
     white = base[0] == 0.0 and base[1] == 1.0 and base[2] == 0.0
-    if judged and context.marginal == 0 and count > 1 and white:
+    unsettled = False
+    for k in range(count):
+        unsettled |= row_part(state, sensors, first + k)[RESETTING] > 0.0
+    if judged and context.marginal == 0 and count > 1 and white and not unsettled:
         joint = weigh_joint(own, track.nis[i], track.dof[i], h, int(own[JOINT_MASK]))
         own[JOINT_MASK] = joint
     for k in range(count):
@@ -134,24 +122,29 @@ def _test(i, now, y, s, context, policy, state, track):
         r = variances[k]
         if width + k < y.size and np.isfinite(y[width + k]):
             r = y[width + k]
-        mask = before & ~STUCK | repeat(each, y[k], r, h, base, before)
+        innovation, std = track.innovation[i, k], track.innovation_std[i, k]
+        begins = resetting(each, std)
+        mask = before & ~STUCK | repeat(each, y[k], r, h, base, before, innovation, std, verdict == USED)
         screened = track.screened[i, k] != 0
-        if judged or verdict == FAILED or screened:
+        if (judged or verdict == FAILED or screened) and not begins:
             ratio = chances[1] if verdict == USED and not screened else chances[0]
             level = add(each, AT_REFUSALS, ratio, h, base[3 + AT_REFUSALS])
             mask = mask & ~REFUSED | alarm(level, REFUSED, before)
-        if judged and not screened:
+        if judged and not screened and not begins:
             # NaN where the distribution function of a prediction that is not Gaussian is not known.
             e = track.whitened[i, k]
             if context.marginal == 0:
-                e = track.innovation[i, k] / track.innovation_std[i, k]
+                e = innovation / std
             if np.isfinite(e):
                 mask = mask & LOST | weigh(each, e, h, base, before)
         if k == 0:
             mask = mask & ~(DISAGREEING | AGREEING) | int(own[JOINT_MASK])
         each[MASK] = mask
-        track.alarms[i, k] = mask
-        state[SUSPECT_ROWS] += (mask != 0) - (before != 0)
+        graded, graded_before = grade(each, mask, context.gated, r), each[GRADE]
+        each[GRADE] = graded
+        track.alarms[i, k] = mask | ADVISORY_ALARM if graded == ADVISED else mask
+        state[SUSPECT_ROWS] += (graded == ACTED_ON) - (graded_before == ACTED_ON)
+        state[ADVISED_ROWS] += (graded == ADVISED) - (graded_before == ADVISED)
         state[LOST_ROWS] += (mask & LOST != 0) - (before & LOST != 0)
 
 
@@ -169,37 +162,18 @@ def _count_particles(effective, ancestors, state):
 
 
 @part
-def _compare(i, first, truth, context, state, track):
-    """Compare the estimate with true values of states from index `first` on."""
-    begin = TWIN + context.n_sensors * SENSOR + context.n_rows * ROW
-    columns, circular = ints(context.column, context.nx), circular_states(context)
-    for k in range(truth.size):
-        if not np.isfinite(truth[k]):
-            continue
-        column = columns[first + k]
-        if column < 0 or not track.std[i, column] > 0.0:
-            continue
-        error = track.mean[i, column] - truth[k]
-        if circular[first + k] != 0:
-            error = wrap(error)
-        own = floats(state.ctypes.data + 8 * (begin + column * STATE), STATE)
-        before = own[2] != 0.0
-        missed = _miss(own, error / track.std[i, column], before)
-        own[2] = missed
-        track.alarms[i, k] = missed
-        state[MISSED_STATES] += (missed != 0) - before
-
-
-@part
 def _range(i, u, context, track):
-    """Return whether a state or an input is outside the range in which the model was fitted."""
+    """Return the flag of a state or an input outside the range in which the model was fitted, 0 if there is none."""
     states = track.mean.shape[1]
-    ranges = floats(context.ranges, 2 * (states + u.size))
+    ranges = floats(context.ranges, 3 * (states + u.size))
+    found = 0
     for k in range(states + u.size):
         value = track.mean[i, k] if k < states else u[k - states]
-        if value < ranges[2 * k] or value > ranges[2 * k + 1]:
-            return True
-    return False
+        if value < ranges[3 * k] or value > ranges[3 * k + 1]:
+            if ranges[3 * k + 2] == 0.0:
+                return OUTSIDE
+            found = OUTSIDE_WIDENED
+    return found
 
 
 @part
@@ -214,13 +188,13 @@ def _health(i, now, silent, flags, state, policy, track):
         return STALE if now - state[BEGUN] > policy.stale_after else WAITING
     if track.age[i] > policy.stale_after:
         return STALE
-    if track.consistency[i] == DIVERGED:
+    if track.consistency[i] == DIVERGED and state[UNSETTLED] == 0.0:
         return DIVERGED
     if track.age[i] > policy.degraded_after or silent != 0 or state[LOST_ROWS] > 0.0:
         return DEGRADED
-    if state[SUSPECT_ROWS] > 0.0 or flags != 0:
+    if state[SUSPECT_ROWS] > 0.0 or flags & ~OUTSIDE_WIDENED != 0:
         return SUSPECT
-    return TRACKING
+    return ADVISORY if state[ADVISED_ROWS] > 0.0 or flags != 0 else TRACKING
 
 
 @part
@@ -252,19 +226,17 @@ def watch_rows(first, last, t, kind, channel, value, context, policy, state, tra
             if _has_value(y, sensor_rows(context, channel[i])[1]):
                 if track.verdict[i] != SCREENED:
                     state[HEARD] = 1.0
+                    state[UNSETTLED] = max(state[UNSETTLED] - 1.0, 0.0)
                 if not _is_copy(i, track):
                     _test(i, now, y, channel[i], context, policy, state, track)
             if np.isfinite(track.effective[i]):
                 _count_particles(track.effective[i], track.ancestors[i], state)
-        elif kind[i] == TRUTH:
-            truth = floats(value[i:].ctypes.data, min(width, context.nx - channel[i]))
-            _compare(i, channel[i], truth, context, state, track)
         elif kind[i] == INPUT:
             for k in range(nu):
                 if np.isfinite(value[i, k]):
                     u[k] = value[i, k]
         elif kind[i] == RESET:
-            forget(state, sensors, rows, track.mean.shape[1])
+            forget(state, sensors, rows, policy.window)
         if now > state[NEXT_DUE]:
             find_dropouts(state, sensors, now)
         flags = 0
@@ -272,10 +244,8 @@ def watch_rows(first, last, t, kind, channel, value, context, policy, state, tra
             if sensor_part(state, s)[SILENT] != 0.0:
                 flags |= 1 << min(s, SENSOR_FLAGS - 1)
         silent = flags
-        if context.fitted != 0 and _range(i, u, context, track):
-            flags |= OUTSIDE
-        if state[MISSED_STATES] > 0.0:
-            flags |= TRUTH_MISSED
+        if context.fitted != 0:
+            flags |= _range(i, u, context, track)
         if state[POOR_CLOUD] != 0.0:
             flags |= IMPOVERISHED
         track.flags[i] = flags

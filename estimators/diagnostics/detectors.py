@@ -81,6 +81,7 @@ class Detector(NamedTuple):
         severity: The smallest is the most urgent.
         sensor_lost: Whether the sensor carries no information on the asset meanwhile.
         isolate: Whether sensor, input and parameter are compared to find the most likely fault.
+        conservative: Whether the bands are wider than necessary meanwhile: an advisory.
     """
 
     name: str
@@ -93,11 +94,17 @@ class Detector(NamedTuple):
     severity: int = 5
     sensor_lost: bool = False
     isolate: bool = False
+    conservative: bool = False
 
     @property
     def anchor(self) -> str:
         """Anchor of its heading in the guide."""
         return anchor(self.name)
+
+    @property
+    def grade(self) -> str:
+        """Health that it gives to the twin, unless the bands are valid all the same."""
+        return "advisory" if self.conservative else GRADES.get(self.severity, "suspect")
 
     @property
     def bits(self) -> int:
@@ -108,6 +115,9 @@ class Detector(NamedTuple):
         """Return the sentence of an episode with these facts."""
         wording, remedy = self.wording.format(facts), self.remedy.format(facts)
         return f"{wording}{';' if ':' in wording else ':'} {remedy}"
+
+
+GRADES = {0: "diverged", 1: "stale", 2: "degraded"}  # Health by the severity of a detector; suspect for others
 
 
 def anchor(heading: str) -> str:
@@ -144,6 +154,7 @@ DETECTORS = (
         effect="ratio of the standard deviation to the predicted one",
         unit="×",
         alarms={"wide": (scale_ratio(0.6), scale_ratio(0.3), scale_ratio(0.05))},
+        conservative=True,
     ),
     Detector(
         "shifted",
@@ -221,16 +232,7 @@ DETECTORS = (
         effect="√(NIS / degrees of freedom)",
         unit="×",
         alarms={"agreeing": ()},
-    ),
-    Detector(
-        "missed",
-        "{0.name} is {0.offset} ({0.size:.1f} σ) from the truth {0.since}",
-        "the estimate is wrong and its band does not show it; check the other alarms",
-        statistic="root mean square of (estimate - truth) / σ",
-        effect="root mean square of (estimate - truth) / σ",
-        unit="σ",
-        alarms={"missed": ()},
-        severity=4,
+        conservative=True,
     ),
     Detector(
         "screened",
@@ -319,14 +321,23 @@ def detector_of(cause: str) -> Detector:
 
 NARROW, WIDE, SHIFTED_UP, SHIFTED_DOWN = map(bit_of, ("narrow", "wide", "shifted up", "shifted down"))
 CORRELATED, ALTERNATING, SPIKY = map(bit_of, ("correlated", "alternating", "spiky"))
-REFUSED, STUCK, DISAGREEING, AGREEING, MISSED = map(bit_of, ("refused", "stuck", "disagreeing", "agreeing", "missed"))
+REFUSED, STUCK, DISAGREEING, AGREEING = map(bit_of, ("refused", "stuck", "disagreeing", "agreeing"))
+
+CONSERVATIVE = sum(detector.bits for detector in DETECTORS if detector.conservative)
+"""Alarms during which bands are wider than necessary."""
+
+SHIFTED, LAGGING = SHIFTED_UP | SHIFTED_DOWN, CORRELATED | ALTERNATING
+"""Alarms of the mean and of the correlation of the innovations, which bands that are too wide may cover."""
+
+ADVISORY_ALARM = 1 << 30
+"""Bit of `Track.alarms` of a row whose bands are valid in spite of its alarms: an advisory."""
 
 LOST = sum(detector.bits for detector in DETECTORS if detector.sensor_lost)
 """Alarms during which a sensor carries no information on the asset."""
 
-IMPOVERISHED, OUTSIDE, TRUTH_MISSED = 1 << 59, 1 << 60, 1 << 61
+IMPOVERISHED, OUTSIDE, OUTSIDE_WIDENED = 1 << 59, 1 << 60, 1 << 61
 """Bits of `Track.flags` above those of the sensors that dropped out: few particles carry the estimate; outside the
-range in which the model was fitted; a known true state is outside its band."""
+range in which the model was fitted; the same where the bands widen there."""
 
 SENSOR_FLAGS = 58  # Sensors with a bit of their own in `Track.flags`; the others share the last
 

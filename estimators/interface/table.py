@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ..diagnostics.detectors import ALARM_NAMES, IMPOVERISHED, OUTSIDE, SENSOR_FLAGS, TRUTH_MISSED
+from ..diagnostics.detectors import ALARM_NAMES, IMPOVERISHED, OUTSIDE, OUTSIDE_WIDENED, SENSOR_FLAGS
 from ..diagnostics.episodes import Episode, episode_json
 from ..events.batch import KIND_NAMES, READING, Events, truth_of
 from ..events.maintenance import model_versions
@@ -85,7 +85,7 @@ def table_of(
 
 
 _CAUSES = {1 << k: cause for k, cause in enumerate(ALARM_NAMES)}
-_FLAGS = {IMPOVERISHED: "impoverished", OUTSIDE: "outside the fitted range", TRUTH_MISSED: "truth missed"}
+_FLAGS = {IMPOVERISHED: "impoverished", OUTSIDE: "outside the fitted range", OUTSIDE_WIDENED: "outside, bands widen"}
 
 
 def _words(masks: np.ndarray, bits: dict[int, str]) -> np.ndarray:

@@ -18,7 +18,7 @@ class State:
     """One entry of x with its prior N(mean, std²); a `circular` one is an angle in radians and wraps to ±π.
 
     `position` is for filters that localise measurements. `fitted` is the range in which the model was fitted or
-    checked; an estimate outside makes the twin suspect.
+    checked; an estimate outside makes the twin suspect, or advisory if the bands widen there (`widens`).
     """
 
     name: str
@@ -28,6 +28,7 @@ class State:
     circular: bool = False
     position: tuple[float, ...] | None = None
     fitted: tuple[float, float] | None = None
+    widens: bool = False
 
     def __post_init__(self) -> None:
         """Reject an empty range."""
@@ -252,7 +253,8 @@ class Limits:
     range: the smallest and largest possible value. saturation: where its converter clips: a value at either end or
     beyond is only a bound. rate: the largest change a second since the last measurement within all limits; noise may
     add `RATE_NOISE_STDS` standard deviations. duplicates: seconds after a measurement within which one of equal values
-    is a copy of it; of the same time it always is.
+    is a copy of it; of the same time it always is. rests: whether the sensor may repeat its value for as long as it
+    likes: no detector takes it for stuck.
     """
 
     range: tuple[Pair, ...] = ()
@@ -260,6 +262,7 @@ class Limits:
     rate: tuple[float, ...] = ()
     stuck: Stuck | None = None
     duplicates: float = 0.0
+    rests: bool = False
 
     def __post_init__(self) -> None:
         """Reject limits that no measurement, or every one, would violate."""

@@ -286,9 +286,11 @@ def plot_track(
             artist.set_clip_on(True)
         axes.grid(color=hex_color(LIGHT.grid), lw=0.6)
         axes.tick_params(labelsize=8)
-        for start, end in _spans([(item.start - first, item.end and item.end - first) for item in episodes], span):
-            shade = hex_color(LIGHT.health["suspect"])
-            axes.axvspan(start / unit.seconds, end / unit.seconds, color=shade, alpha=0.12, lw=0)
+        for grade in ("advisory", "suspect"):
+            own = [item for item in episodes if (item.grade == "advisory") == (grade == "advisory")]
+            shade = hex_color(LIGHT.health[grade])
+            for start, end in _spans([(item.start - first, item.end and item.end - first) for item in own], span):
+                axes.axvspan(start / unit.seconds, end / unit.seconds, color=shade, alpha=0.12, lw=0)
         axes.legend(fontsize=7, ncols=6, loc="upper left", framealpha=0.85, edgecolor="none", borderaxespad=0.2)
     left_out = [
         f"{len(names)} of {total} {what}"

@@ -18,7 +18,7 @@ from estimators.errors import NisusError, SourceError
 from estimators.fold import Fold
 from estimators.log import MARK, READING, TICK, TRUTH, Events, Log
 from estimators.snapshots import Base
-from estimators.track import TRACKING, WAITING
+from estimators.track import USABLE, WAITING
 from estimators.tuning import Tuning
 from sources.faults.layer import Faults, FaultySource
 from sources.merged import MemorySource
@@ -251,9 +251,8 @@ SAME_EPISODE_NS = 1_000_000_000
 
 
 def green(fold: Fold) -> np.ndarray:
-    """Return the rows in which the twin is tracking, (N,) of bool."""
-    health: np.ndarray = fold.track.health[: fold.n] == TRACKING
-    return health
+    """Return the rows in which nothing says that the estimate or its band is wrong, (N,) of bool."""
+    return np.isin(fold.track.health[: fold.n], USABLE)
 
 
 def said_at(fold: Fold, episode: Episode) -> int:
@@ -274,7 +273,7 @@ def said_at(fold: Fold, episode: Episode) -> int:
     elif sensors:
         heard = alarmed & (kind == READING) & (channel == sensors[0])
     else:
-        heard = (health != TRACKING) & (health != WAITING)
+        heard = ~np.isin(health, (*USABLE, WAITING))
     rows = np.flatnonzero(heard & since)
     return int(log.t[rows[0]]) if rows.size else round(episode.start * 1e9)
 

@@ -34,7 +34,7 @@ EDIT_HOLD_S = 2.0
 """Seconds after an edit in which the controls are not set to the engine's older values."""
 
 GATES = {"off": None, "95 %": 0.95, "99 %": 0.99, "99.9 %": 0.999, "99.99 %": 0.9999}
-SIGNS = {"waiting": "○", "tracking": "●", "suspect": "◐", "degraded": "▲", "diverged": "✖", "stale": "◌"}
+SIGNS = dict(zip(HEALTH_NAMES, "○●◆◐▲✖◌", strict=True))
 """Each health state has a sign of its own, for users who cannot distinguish the colours."""
 
 STYLE = "padding:0.2em 1.4em 0.6em 0.9em;font-size:0.85em;line-height:1.6;overflow-wrap:anywhere"

@@ -29,6 +29,7 @@ const LEGEND = {
   quiet: ["single value", "NIS of one measurement, or one state of a group"],
   bounds: ["95 % range", "Range in which a consistent filter has 95 % of these values"],
   "episode-strip": [null, "Time of a fault episode: see Episodes"],
+  "health-advisory": [null, "Time of an advisory: bands are wider than necessary, or the gate rejects outliers"],
   outside: [null, "Value beyond the axis; the furthest has its value beside it"],
 };
 
@@ -215,6 +216,7 @@ export class Charts {
     const add = (key, text, style) => key in LEGEND && !found.has(key) && found.set(key, [LEGEND[key][0] ?? text, style]);
     for (const chart of shown) for (const [text, style] of chart.legend) add(style.ring ? `${style.tone} ring` : style.tone, text, style);
     if (shown.some((chart) => chart.plot?.marked)) add("episode-strip", "fault episode", { mark: "line", tone: "episode-strip", width: 2.5 });
+    if (shown.some((chart) => chart.plot?.advised)) add("health-advisory", "advisory", { mark: "line", tone: "health-advisory", width: 2.5 });
     if (shown.some((chart) => chart.outsiders?.length)) add("outside", "off scale", { mark: "triangle", tone: "faint" });
     const items = Object.keys(LEGEND).flatMap((key) => (found.has(key) ? [[key, ...found.get(key)]] : []));
     const written = items.map(([, text]) => text).join();

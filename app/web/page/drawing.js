@@ -112,14 +112,23 @@ function stretches(episodes, [low, high]) {
 }
 
 // Behind the curves of a chart: episodes that concern it, and the moment that is looked at. `subjects`: names of its
-// states and rows; an episode of a sensor concerns its rows ("scan", "scan.left"). The time bar has all episodes.
+// states and rows; an episode of a sensor concerns its rows ("scan", "scan.left"). An advisory has a strip of its own
+// colour and no tint. The time bar has all episodes.
 export function marks(plot, { episodes, view: { at } }, subjects) {
   const { ctx, bbox } = plot;
   const concerns = ({ subject }) => subjects.some((name) => name === subject || name.startsWith(`${subject}.`));
   const [low, high] = [plot.scales.x.min, plot.scales.x.max];
-  const { found, strength } = stretches(episodes.filter(concerns), [low, high]);
+  const own = episodes.filter(concerns);
+  const { found, strength } = stretches(own.filter(({ grade }) => grade !== "advisory"), [low, high]);
+  const advised = stretches(own.filter(({ grade }) => grade === "advisory"), [low, high]).found;
   plot.marked = found.length > 0;
+  plot.advised = advised.length > 0;
   ctx.save();
+  ctx.fillStyle = colour("health-advisory");
+  for (const [from, to] of advised) {
+    const left = plot.valToPos(from, "x", true);
+    ctx.fillRect(left, bbox.top, Math.max(2, plot.valToPos(to, "x", true) - left), STRIP * devicePixelRatio);
+  }
   for (const [from, to] of found) {
     const left = plot.valToPos(from, "x", true);
     const width = Math.max(2, plot.valToPos(to, "x", true) - left);

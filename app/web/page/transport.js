@@ -5,7 +5,7 @@ import { clock } from "./format.js";
 import { Stream } from "./stream.js";
 import { SIGNS } from "./trust.js";
 
-const HEALTH = ["waiting", "tracking", "suspect", "degraded", "diverged", "stale"];
+const HEALTH = ["waiting", "tracking", "advisory", "suspect", "degraded", "diverged", "stale"];
 const SPEEDS = [["0.1×", 0.1], ["0.25×", 0.25], ["0.5×", 0.5], ["1×", 1], ["2×", 2], ["5×", 5], ["10×", 10], ["max", "inf"]];
 const WINDOWS = [10, 30, 60, 120, 300, 900, 3600];
 const POINTS = 400;
@@ -142,8 +142,11 @@ export class Transport {
     }
     ctx.font = "11px system-ui, sans-serif";
     ctx.textAlign = "center";
+    for (const episode of this.episodes) {
+      ctx.fillStyle = tone(episode.grade === "advisory" ? "health-advisory" : "ink");
+      ctx.fillText("▾", Math.min(width - 5, Math.max(5, place(episode.from))), 12);
+    }
     ctx.fillStyle = tone("ink");
-    for (const episode of this.episodes) ctx.fillText("▾", Math.min(width - 5, Math.max(5, place(episode.from))), 12);
     // Notes of users: flags below the track.
     for (const { from } of this.charts.notes) {
       const left = Math.min(width - 5, Math.max(0, place(from)));
@@ -189,7 +192,7 @@ export class Transport {
     const future = time > this.now ? (this.status?.seekable ? ": click to play on from here" : "") : "";
     const [start, end] = this.ends;
     const notes = this.charts.notes.filter(({ from }) => Math.abs(from - time) * this.canvas.clientWidth < NEAR * (end - start));
-    setAttribute(this.canvas, "title", [clock(time, 1) + future, ...notes.map((note) => `⚑ ${note.text}`), ...near.map((episode) => `${SIGNS.suspect} ${episode.text}`)].join("\n"));
+    setAttribute(this.canvas, "title", [clock(time, 1) + future, ...notes.map((note) => `⚑ ${note.text}`), ...near.map((episode) => `${SIGNS[episode.grade] ?? SIGNS.suspect} ${episode.text}`)].join("\n"));
   }
 
   keyed(event) {

@@ -5,10 +5,10 @@ import { clock, compact, inChartTime, span, words } from "./format.js";
 
 // Signs beside the colours, for users who cannot distinguish them.
 export const SIGNS = {
-  waiting: "○", tracking: "●", suspect: "◐", degraded: "▲", diverged: "✖", stale: "◌", "held out": "–", screened: "⊘",
+  waiting: "○", tracking: "●", advisory: "◆", suspect: "◐", degraded: "▲", diverged: "✖", stale: "◌", "held out": "–", screened: "⊘",
 };
 const MOST_LIGHTS = 8;
-const CALM = ["tracking", "held out", "waiting"];
+const CALM = ["tracking", "advisory", "held out", "waiting"];
 
 // What is shown as one: groups of sensors, and those in none, in the order of their first sensors: {name, sensors, declared}.
 export function unitsOf({ sensors, groups }) {
@@ -210,7 +210,7 @@ export class Episodes {
       this.view.show(episode.from - 0.2 * length, episode.from + 0.8 * length);
     };
     return element(
-      "li", { class: "episode", dataset: { open: String(episode.end === null), severity: episode.severity ?? "" } },
+      "li", { class: "episode", dataset: { open: String(episode.end === null), severity: episode.severity ?? "", grade: episode.grade } },
       element("button", { type: "button", title: "Show in the charts", onclick: show }, element("time", {}, times), element("b", {}, `${words(episode.subject)}: ${episode.cause}`)),
       element("p", {}, inChartTime(episode.text, this.link.status.origin)),
       element("a", { href: `/alarms#${episode.help.split("#")[1]}`, target: "_blank" }, `more on ${episode.cause}`),

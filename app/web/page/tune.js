@@ -15,7 +15,7 @@ const HINTS = {
 const GATES = [["off", null], ["95 %", 0.95], ["99 %", 0.99], ["99.73 %", 0.9973], ["99.99 %", 0.9999]];
 const MAX_OPEN_ENTRIES = 8; // entries from which on a group is closed at first
 const MAX_LISTED = 24; // entries or sensors of a group that are listed at once; the others are found by name
-const WORST = ["stale", "degraded", "suspect", "waiting", "held out", "tracking"];
+const WORST = ["stale", "degraded", "suspect", "advisory", "waiting", "held out", "tracking"];
 
 export class Tune {
   constructor(model, link) {

@@ -73,7 +73,9 @@ def commission(fold: Fold) -> dict[str, Normal]:
             judged = np.isin(verdict, (USED, GATED, FAILED))
             refused = np.where(judged, (verdict != USED).astype(np.int8), np.int8(-1))
             values = np.ascontiguousarray(log.value[rows, k])
-            W = highest(e, refused, values, float(fold.tuning.r[index]), h, base, gate_log_ratios(fold.tuning.gate))
+            nu, std = (np.ascontiguousarray(column[rows, k]) for column in (track.innovation, track.innovation_std))
+            r, chances = float(fold.tuning.r[index]), gate_log_ratios(fold.tuning.gate)
+            W = highest(e, refused, values, nu, std, r, h, base, chances)
             reached = {}
             for bit, name in enumerate(ALARM_NAMES):
                 own = W[BITS == 1 << bit]

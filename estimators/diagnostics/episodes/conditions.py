@@ -1,4 +1,4 @@
-"""Episodes of dropouts, true states, ranges, particles and the twin's health: conditions of single rows."""
+"""Episodes of dropouts, ranges, particles and the twin's health: conditions of single rows."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from ...log import INPUT, READING, TRUTH, truth_of
+from ...log import INPUT, READING
 from ...model.state_space import Input, State
 from ...track import DIVERGED, GATED, HEALTH_NAMES, SCREENED, STALE
 from ..detectors import (
     IMPOVERISHED,
-    MISSED,
     OUTSIDE,
+    OUTSIDE_WIDENED,
     REFUSED,
     SENSOR_FLAGS,
     SHIFTED_DOWN,
@@ -21,7 +21,6 @@ from ..detectors import (
     detector_of,
 )
 from ..health import HealthPolicy
-from ..references import wrapped
 from .episode import JOINED, AlarmRun, Episode, FoundEpisode, JudgedRows, runs
 from .wording import SensorFacts, TwinFacts
 
@@ -34,7 +33,8 @@ def _found(
     """Return the episode of these facts; `t`: times of the rows to which the run belongs, ns."""
     row = detector_of(facts.cause)
     unit = row.unit or facts.unit
-    episode = Episode(facts.start, end, facts.name, facts.cause, facts.size, low, high, unit, row.text(facts))
+    text = row.text(facts)
+    episode = Episode(facts.start, end, facts.name, facts.cause, facts.size, low, high, unit, text, row.grade)
     return FoundEpisode((kind, facts.name), run.begin, int(t[run.begin]), int(t[run.end - 1]), episode)
 
 
@@ -59,8 +59,8 @@ def dropouts(judged: JudgedRows) -> Iterator[FoundEpisode]:
             facts = SensorFacts(
                 model=model, s=s, cause=cause, start=start, size=size, lasted=None if run.lasts else size
             )
-            text = detector_of(cause).text(facts)
-            episode = Episode(start, over, sensor.name, cause, size, np.nan, np.nan, "s", text)
+            row = detector_of(cause)
+            episode = Episode(start, over, sensor.name, cause, size, np.nan, np.nan, "s", row.text(facts), row.grade)
             at, until = int(t[run.begin]), int(t[run.end - 1])
             yield FoundEpisode(("silence", sensor.name), run.begin, at, until, episode)
 
@@ -80,39 +80,11 @@ def _in_gap(t: np.ndarray, heard: np.ndarray) -> np.ndarray:
     return found
 
 
-def missed_truths(judged: JudgedRows) -> Iterator[FoundEpisode]:
-    """Yield the states whose known true value is far outside their bands."""
-    events, model, track = judged.events, judged.model, judged.track
-    known = np.flatnonzero(events.kind == TRUTH)
-    if not track.alarms[known].any():
-        return
-    for column, (j, state) in enumerate(zip(model.shown, model.shown_states, strict=True)):
-        rows, values = truth_of(events, int(j))
-        place = int(j) - events.channel[rows]
-        within = place < track.alarms.shape[1]
-        rows, values, place = rows[within], values[within], place[within]
-        if not rows.size:
-            continue
-        for run in runs(track.alarms[rows, place] & MISSED != 0, JOINED):
-            begin, end, lasts = run
-            own = rows[begin:end]
-            error = track.mean[own, column] - values[begin:end]
-            if state.circular:
-                error = wrapped(error)
-            sure = track.std[own, column] > 0.0
-            off = np.abs(error[sure]) / track.std[own[sure], column]
-            rms, size = (float(np.sqrt(np.mean(each**2))) for each in (error, off))
-            start = events.t[rows[begin]] * 1e-9
-            over = None if lasts else events.t[rows[end - 1]] * 1e-9
-            facts = TwinFacts(name=state.name, cause="missed", start=start, size=size, unit=state.unit, about=rms)
-            yield _found("truth", facts, over, float(off.min()), float(off.max()), run, events.t[rows])
-
-
 def left_ranges(judged: JudgedRows) -> Iterator[FoundEpisode]:
     """Yield shown states and inputs outside the range in which the model was fitted."""
     events, model, track = judged.events, judged.model, judged.track
     t = events.t
-    if not np.any(track.flags & OUTSIDE):
+    if not np.any(track.flags & (OUTSIDE | OUTSIDE_WIDENED)):
         return
     for column, state in enumerate(model.shown_states):
         yield from _outside(state, track.mean[:, column], t)
@@ -139,7 +111,8 @@ def _outside(item: State | Input, value: np.ndarray, t: np.ndarray) -> Iterator[
             unit=item.unit,
             limits=f"{low:g} to {high:g}",
         )
-        yield _found("range", facts, run.over(t), smallest, largest, run, t)
+        found = _found("range", facts, run.over(t), smallest, largest, run, t)
+        yield found._replace(episode=found.episode._replace(grade="advisory")) if item.widens else found
 
 
 def impoverished_particles(judged: JudgedRows) -> Iterator[FoundEpisode]:

@@ -20,7 +20,8 @@ class Episode(NamedTuple):
 
     start, end: seconds of the log; end is None while it lasts. subject: a sensor, one of its rows, a state, an input,
     or "twin". cause: name of a row of the table of detectors. size: in `unit`, with its 95 % interval `low` to `high`
-    (NaN where there is none). text: one sentence with the remedy.
+    (NaN where there is none). text: one sentence with the remedy. grade: health that it gives to the twin; "advisory"
+    where the bands are valid.
     """
 
     start: float
@@ -32,6 +33,7 @@ class Episode(NamedTuple):
     high: float
     unit: str
     text: str
+    grade: str = "suspect"
 
 
 class FoundEpisode(NamedTuple):

@@ -9,7 +9,19 @@ import numpy as np
 
 from ...log import READING, RESET
 from ...track import GATED, REASONS, SCREENED, USED
-from ..detectors import AGREEING, BITS, DETECTORS, DISAGREEING, LOST, REFUSED, STUCK, Detector, detector_of, log_ratios
+from ..detectors import (
+    ADVISORY_ALARM,
+    AGREEING,
+    BITS,
+    DETECTORS,
+    DISAGREEING,
+    LOST,
+    REFUSED,
+    STUCK,
+    Detector,
+    detector_of,
+    log_ratios,
+)
 from ..effects import EVIDENCE, KINDS, InnovationEffect, against, common_scale, effects, onset
 from .episode import JOINED, AlarmRun, Episode, FoundEpisode, JudgedRows, runs, standardised, without_baseline
 from .wording import SensorFacts, return_text
@@ -75,6 +87,11 @@ def sensor_alarms(judged: JudgedRows) -> Iterator[FoundEpisode]:
             own = sorted(item for item in lost if run.begin <= item.begin < run.end)
             later = [item for item in own if before + item.begin - run.begin > JOINED]
             shown, hidden = _effect_and_losses(judged, s, rows, masks, run, later)
+            if shown is not None and shown.cause == "stuck" and shown.back:
+                # It ends with another value, whatever other tests have yet to clear.
+                found.append(("sensor", AlarmRun(run.begin, shown.over, False), shown))
+                run = AlarmRun(shown.over, run.end, run.lasts)
+                shown = _shown(judged, s, rows, masks, run) if run.end - run.begin > JOINED else None
             found += [] if shown is None else [("sensor", run, shown)]
             found += [("lost", *item) for item in hidden]
         for kind, run, shown in found:
@@ -133,6 +150,9 @@ def _episode(judged: JudgedRows, s: int, rows: np.ndarray, run: AlarmRun, shown:
     unit = row.unit if cause == "stuck" else detector.unit if detector.effect else "nats"
     if run.lasts and over < rows.size and (back or run.end < rows.size):
         text = f"{text}; {return_text(cause, events.t[rows[over]] * 1e-9)}"
+    alarms = track.alarms[rows[run.begin : run.end], : len(model.sensors[s].rows)]
+    alarms = alarms[alarms.any(axis=1)]
+    valid = not detector.sensor_lost and np.mean(((alarms == 0) | (alarms & ADVISORY_ALARM != 0)).all(axis=1)) > 0.5
     return Episode(
         start=start,
         end=None if run.lasts else events.t[rows[max(over - 1, begun)]] * 1e-9,
@@ -143,6 +163,7 @@ def _episode(judged: JudgedRows, s: int, rows: np.ndarray, run: AlarmRun, shown:
         high=high,
         unit=unit,
         text=text,
+        grade="advisory" if valid else "suspect" if detector.conservative else detector.grade,
     )
 
 

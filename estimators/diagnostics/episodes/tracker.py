@@ -19,16 +19,16 @@ from ...track import GATED, SCREENED, Track
 from ...tuning import Tuning
 from ..detectors import detector_of
 from ..effects import EVIDENCE, MAX_SIGMA, NO_SUMS, Sums, gains
-from .conditions import dropouts, impoverished_particles, left_ranges, lost_estimates, missed_truths
+from .conditions import dropouts, impoverished_particles, left_ranges, lost_estimates
 from .episode import JOINED, Episode, FoundEpisode, JudgedRows, standardised, without_baseline
 from .sensors import ALARM_KEYS, LOSSES, OF_ALL_ROWS, UNKNOWN_EFFECTS, evidence, sensor_alarms
 
 MAX_ROWS = 65_536  # Rows kept at most; at least half of them once there were as many
 MAX_BYTES = 64 * 2**20  # Memory of the kept rows; rows of a large field are fewer
 
-CONDITIONS = (sensor_alarms, dropouts, missed_truths, left_ranges, impoverished_particles, lost_estimates)
+CONDITIONS = (sensor_alarms, dropouts, left_ranges, impoverished_particles, lost_estimates)
 
-JOINED_ROWS = {**dict.fromkeys(ALARM_KEYS, JOINED), "truth": JOINED, "range": JOINED}
+JOINED_ROWS = {**dict.fromkeys(ALARM_KEYS, JOINED), "range": JOINED}
 """Rows without an alarm that an episode bridges, by the first part of its key; 0 for the others."""
 
 REJECTIONS = {"refused": GATED, "screened": SCREENED}  # Verdict on the measurements of an episode, by its cause

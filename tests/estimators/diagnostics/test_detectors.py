@@ -9,13 +9,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from estimators.diagnostics.detector_state import no_baseline
-from estimators.diagnostics.detectors import ALARM_NAMES, OUTSIDE, TRUTH_MISSED
+from estimators.diagnostics.detectors import ADVISORY_ALARM, ALARM_NAMES, OUTSIDE, OUTSIDE_WIDENED
 from estimators.diagnostics.health import HealthPolicy
 from estimators.fold import Fold, fold
 from estimators.log import INPUT, READING, RESET, TICK, TRUTH, Events, Log
 from estimators.model.parts import Limits
 from estimators.model.state_space import Input, Noise, Row, Sensor, State, StateSpaceModel
 from estimators.track import (
+    ADVISORY,
     DEGRADED,
     DIVERGED,
     DUPLICATE,
@@ -53,7 +54,7 @@ MODEL = StateSpaceModel(
     name="tanks",
     title="two tanks",
     states=(State("a", "m", mean=0.0, std=1.0, fitted=(-3.0, 3.0)), State("b", "m", mean=0.0, std=1.0)),
-    inputs=(Input("feed", "m/s", fitted=(-1.0, 1.0)),),
+    inputs=(Input("feed", "m/s", fitted=(-1.0, 1.0), widens=True),),
     noises=(Noise("a", "m²/s", 0.04), Noise("b", "m²/s", 0.04)),
     sensors=(
         Sensor("one", (Row("one", "m", 0.25),), h=first_state, limits=Limits(range=((-9.0, 9.0),))),
@@ -145,9 +146,13 @@ class RowOracle:
     def __init__(self, base):
         self.base = base
         self.value, self.quantum, self.run, self.equal, self.counted = None, None, 0, 0, 0
+        self.std, self.std_before, self.resetting = 0.0, 0.0, 0
         self.forget()
 
     def forget(self):
+        self.std_before = self.std_before if self.resetting else self.std
+        self.resetting = POLICY.window if self.std_before else 0
+        self.std, self.left, self.steps, self.grown, self.recent, self.grade = 0.0, None, [], [], [0.0, 0.0, 0], None
         self.tests = [Cusum(cause) for cause, _ in OF_INNOVATIONS]
         self.followers = {FIRST_GAIN + k: Follower(gain) for k, gain in enumerate(GAINS)}
         self.refusals, self.repetition = Cusum("refused"), Cusum("stuck")
@@ -162,6 +167,11 @@ class RowOracle:
         if phi and self.raw is not None:
             white = min(max((raw - phi * self.raw) / math.sqrt(1.0 - phi**2), -6.0), 6.0)
         self.calm = 0 if abs(white) > 3.5 else self.calm + 1
+        if abs(white) <= 3.5:
+            # Averages over 200, the first 20 of which are taken for white noise.
+            mean, square, n = self.recent
+            n = min(n + 1, 180)
+            self.recent = [mean + (raw - mean) / (n + 20), square + (raw * raw - 1.0 - square) / (n + 20), n]
         said = set()
         for k, (test, (cause, ratio)) in enumerate(zip(self.tests, OF_INNOVATIONS, strict=True)):
             if k in self.followers:
@@ -180,8 +190,55 @@ class RowOracle:
         self.raw, self.before = raw, white
         return said
 
-    def repeat(self, y, r, h):
+    def resets(self, std):
+        """Whether the prior of a reset dominates a prediction."""
+        if self.resetting and (not self.std or not std <= 1.2 * self.std_before):
+            self.resetting -= 1
+            return True
+        self.resetting = 0
+        return False
+
+    def moves(self, nu, std, r, used, same):
+        """Whether something contradicts that a value is the one before."""
+        left, self.left = self.left, None
+        if not same:
+            self.steps, self.grown = [], []
+        if not np.isfinite(nu):
+            return False
+        S, gain = std**2, (1.0 - r / std**2 if used else 0.0)
+        self.std, self.left = std, ((1.0 - gain) * nu, (1.0 - gain) * (S - r))
+        if not same or left is None:
+            return False
+        # The predicted value went from y less what the update had left of its innovation to y less this one.
+        self.steps.append(left[0] - nu)
+        self.grown.append(max(0.0, S - r - left[1]))
+        moved = abs(sum(self.steps))
+        evident = moved > 3.0 * max(self.quantum or 0.0, math.sqrt(r))
+        coherent = moved > 4.0 * math.sqrt(sum(step**2 for step in self.steps))
+        if self.run >= 8:
+            coherent |= moved > 4.0 * math.sqrt(sum(self.grown))
+        return evident and coherent or used and self.grown[-1] < 0.04 * r
+
+    def graded(self, said, gated, r):
+        """None without an alarm, "advisory" where the bands are valid."""
+        if not said:
+            return None
+        rest = said - {"wide", "agreeing"}
+        mean, square, _ = self.recent
+        if gated and "spiky" in rest:
+            rest -= {"spiky", "narrow"} if square < 0.3 else {"spiky"}
+        share = 1.0 - r / self.std**2 if self.std else 0.0
+        if mean**2 <= share:
+            lagging = {"correlated", "alternating"}
+            if share >= 0.5 and square < -0.05:
+                rest -= lagging | {"shifted up", "shifted down"}
+            elif square < -0.2:
+                rest -= lagging
+        return "suspect" if rest else "advisory"
+
+    def repeat(self, y, r, h, nu, std, used):
         last, self.value = self.value, y
+        moves = self.moves(nu, std, r, used, y == last)
         if last is None:
             return set()
         if y == last:
@@ -190,7 +247,7 @@ class RowOracle:
             if self.quantum is not None:
                 share = self.equal / self.counted
                 chance = min(max(math.erf(0.5 * self.quantum / math.sqrt(r)), 0.01, share), 0.999)
-            ratio = math.log(0.999 / chance)
+            ratio = math.log(0.999 / chance) if moves else 0.0
         else:
             step = abs(y - last)
             self.quantum = step if self.quantum is None else min(step, self.quantum)
@@ -238,7 +295,7 @@ def by_definition(events, track, gate, baseline, expected):
     sensors, rows = [SensorOracle() for _ in ROWS], [RowOracle(base) for base in baseline]
     chance = 0.15 if gate is None else min(max(1e-6, 1.0 - gate), 0.15)
     refusal, acceptance = math.log(0.3 / chance), math.log(0.7 / (1.0 - chance))
-    squares, missed, feed, heard = [[], []], [False, False], 0.0, False
+    feed, heard, unsettled = 0.0, False, 0
     begun = events.t[0] * 1e-9
     for s, needed in enumerate(expected):
         if needed:
@@ -251,12 +308,14 @@ def by_definition(events, track, gate, baseline, expected):
             # Without a value in any row it says no more than silence does.
             says = bool(np.isfinite(events.value[i, : len(ROWS[s])]).any())
             heard |= says and verdict != SCREENED
+            unsettled = max(0, unsettled - (says and verdict != SCREENED))
             if says and not np.any(track.screened[i] & DUPLICATE):
                 sensor = sensors[s]
                 sensor.speaks(now)
                 judged = verdict in (USED, GATED)
                 plain = tuple(baseline[ROWS[s][0], :3]) == (0.0, 1.0, 0.0)
-                if judged and len(ROWS[s]) > 1 and plain:
+                fresh = any(rows[index].resetting for index in ROWS[s])
+                if judged and len(ROWS[s]) > 1 and plain and not fresh:
                     sensor.scale(track.nis[i], track.dof[i])
                 elif judged:
                     sensor.said = set()
@@ -265,56 +324,49 @@ def by_definition(events, track, gate, baseline, expected):
                     row, y = rows[index], events.value[i, k]
                     if not np.isfinite(y):
                         continue
-                    said = (row.said - {"stuck"}) | row.repeat(y, R[index], sensor.h)
+                    nu, std = track.innovation[i, k], track.innovation_std[i, k]
+                    begins = row.resets(std)
+                    said = (row.said - {"stuck"}) | row.repeat(y, R[index], sensor.h, nu, std, verdict == USED)
                     screened = track.screened[i, k] != 0
-                    if judged or verdict == FAILED or screened:
+                    if (judged or verdict == FAILED or screened) and not begins:
                         ratio = acceptance if verdict == USED and not screened else refusal
                         said = (said - {"refused"}) | row.refusals.put(ratio, sensor.h, row.base[-2], row.said)
-                    if judged and not screened:
-                        e = track.innovation[i, k] / track.innovation_std[i, k]
+                    if judged and not screened and not begins:
+                        e = nu / std
                         said = (said & {"refused", "stuck"}) | row.innovation(e, sensor.h)
                     if k == 0:
                         said = said - {"disagreeing", "agreeing"} | (together if judged else sensor.said)
-                    row.said = said
+                    row.said, row.grade = said, row.graded(said, gate is not None, R[index])
                     alarms[k] = sum(1 << ALARM_NAMES.index(cause) for cause in said)
-        elif kind == TRUTH:
-            for k, truth in enumerate(events.value[i, : 2 - s]):
-                if np.isfinite(truth):
-                    j = s + k
-                    z = (track.mean[i, j] - truth) / track.std[i, j]
-                    squares[j].append(min(z * z, 1e4))
-                    # The mean of the first ten, then with a memory of ten.
-                    n = len(squares[j])
-                    mean = squares[j][0]
-                    for m, square in enumerate(squares[j][1:], 2):
-                        mean += (square - mean) / min(m, 10)
-                    missed[j] = (n >= 10 and mean > 4.5**2) or (missed[j] and mean > 3.0**2)
-                    alarms[k] = missed[j] << ALARM_NAMES.index("missed")
+                    alarms[k] |= ADVISORY_ALARM * (row.grade == "advisory")
         elif kind == INPUT and np.isfinite(events.value[i, 0]):
             feed = events.value[i, 0]
         elif kind == RESET:
             for each in (*sensors, *rows):
                 each.forget()
-            squares, missed = [[], []], [False, False]
+            unsettled = POLICY.window
         for sensor in sensors:
             sensor.silent |= now > sensor.due
         silent = sum(1 << s for s, sensor in enumerate(sensors) if sensor.silent)
         flags = silent
-        if not -3.0 <= track.mean[i, 0] <= 3.0 or not -1.0 <= feed <= 1.0:
+        if not -3.0 <= track.mean[i, 0] <= 3.0:
             flags |= OUTSIDE
-        if any(missed):
-            flags |= TRUTH_MISSED
+        elif not -1.0 <= feed <= 1.0:
+            flags |= OUTSIDE_WIDENED
         said = set().union(*(row.said for row in rows))
         if not heard:
             health = STALE if now - begun > POLICY.stale_after else WAITING
         elif track.age[i] > POLICY.stale_after:
             health = STALE
-        elif track.consistency[i] == DIVERGED:
+        elif track.consistency[i] == DIVERGED and not unsettled:
             health = DIVERGED
         elif track.age[i] > POLICY.degraded_after or silent or said & {"refused", "stuck"}:
             health = DEGRADED
         else:
-            health = SUSPECT if said or flags else TRACKING
+            grades = {row.grade for row in rows}
+            health = SUSPECT if "suspect" in grades or flags & ~OUTSIDE_WIDENED else TRACKING
+            if health == TRACKING and ("advisory" in grades or flags):
+                health = ADVISORY
         yield alarms, flags, health
 
 
@@ -416,9 +468,9 @@ def test_all_that_can_be_said_is_said_in_those_streams():
         flags |= int(np.bitwise_or.reduce(growing.track.flags))
         healths |= set(growing.track.health)
         verdicts |= set(growing.track.verdict)
-    assert bits == (1 << len(ALARM_NAMES)) - 1
-    assert flags == OUTSIDE | TRUTH_MISSED | 0b111
-    assert healths == {WAITING, TRACKING, SUSPECT, DEGRADED, DIVERGED, STALE}
+    assert bits == (1 << len(ALARM_NAMES)) - 1 | ADVISORY_ALARM
+    assert flags == OUTSIDE | OUTSIDE_WIDENED | 0b111
+    assert healths == {WAITING, TRACKING, ADVISORY, SUSPECT, DEGRADED, DIVERGED, STALE}
     assert verdicts >= {USED, GATED, HELD_OUT, MISSING, SCREENED}
 
 
@@ -494,7 +546,10 @@ def walk(wrong, *, gate=None, silent=(0.0, 0.0)):
     [
         ({"wrong": lambda t: 0.0}, [WAITING, TRACKING]),
         ({"wrong": lambda t: 2.0 * (-1) ** round(4 * t) * (40 < t < 60)}, [WAITING, TRACKING, SUSPECT, TRACKING]),
-        ({"wrong": lambda t: 4.0 * (40 < t < 43), "gate": 0.9999}, [WAITING, TRACKING, DEGRADED, SUSPECT, TRACKING]),
+        (
+            {"wrong": lambda t: 4.0 * (40 < t < 43), "gate": 0.9999},
+            [WAITING, TRACKING, DEGRADED, SUSPECT, ADVISORY, TRACKING],
+        ),
         ({"wrong": lambda t: 0.0, "silent": (40, 50)}, [WAITING, TRACKING, DEGRADED, TRACKING]),
         ({"wrong": lambda t: 0.0, "silent": (40, 70)}, [WAITING, TRACKING, DEGRADED, STALE, TRACKING]),
         ({"wrong": lambda t: 0.0, "silent": (0, 60)}, [WAITING, STALE, TRACKING]),

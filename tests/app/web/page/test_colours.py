@@ -34,7 +34,7 @@ XYZ = np.array(
 )
 LINES = ("estimate", "truth", "previous", "smoothed", "pin-0", "pin-1", "pin-2", "pin-3")
 DOTS = ("reading", "refused")
-HEALTH = ("tracking", "suspect", "degraded", "diverged", "waiting")
+HEALTH = ("tracking", "advisory", "suspect", "degraded", "diverged", "waiting")
 
 
 def theme(selector):
