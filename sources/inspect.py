@@ -287,6 +287,9 @@ def _tables(files: list[Path], time: TimeColumn) -> RecordingContents:
             f"{files[0]}: which column holds the time is not known; name it with --time, one of {', '.join(names[:12])}"
         )
     time = time._replace(name=chosen)
+    named = heading_unit(chosen) or chosen.rpartition("_")[2]
+    if time.unit == "s" and named in ("ms", "us", "ns", "min", "h"):
+        time = time._replace(unit=named)
     faults: list[str] = []
     columns = [name for name in dict.fromkeys(names_of(files[0], chosen)) if name != chosen]
     if other := [name for name in dict.fromkeys(names) if name != chosen and name not in columns]:

@@ -82,6 +82,14 @@ class WorkerProcess:
         """Whether the process is still there."""
         return self._process.poll() is None
 
+    def processor_time(self) -> float | None:
+        """Return the processor time, s, of a process that computes or waits for a processor; None if it sleeps."""
+        try:
+            state, *fields = Path(f"/proc/{self.pid}/stat").read_text().rpartition(")")[2].split()
+            return (int(fields[10]) + int(fields[11])) / os.sysconf("SC_CLK_TCK") if state == "R" else None
+        except (OSError, ValueError, IndexError):
+            return None  # No Linux: what it waits for is not known.
+
     def kill(self) -> None:
         """Have the process end at once, without waiting."""
         self._process.kill()
@@ -154,7 +162,10 @@ def _end_with_parent(lifeline: int) -> None:
 
 
 ITEM_TIMEOUT_S = 30.0
-"""Seconds that a reader may take for its next item, and one more for each `BYTES_A_SECOND` of the file."""
+"""Seconds that a reader may take for its next item, and one more for each `BYTES_A_SECOND` of the file.
+
+While it waits for a processor, which others use, the time does not count.
+"""
 
 BYTES_A_SECOND = 2**20
 
@@ -255,6 +266,7 @@ class IsolatedReader:
         size = path.stat().st_size if path.is_file() else 0
         self._timeout = ITEM_TIMEOUT_S + size / BYTES_A_SECOND if timeout is None else timeout
         self._waited = 0.0
+        self._computed: float | None = None
         self._worker: WorkerProcess | None = _hire()
         self._worker.ask(_read, function, path, args)
 
@@ -282,7 +294,11 @@ class IsolatedReader:
             raise ReaderError(f"its reader {_end(worker, EXIT_TIMEOUT_S)}") from None
         if answer is None:
             # At most the timeout: a machine that was suspended meanwhile has not hung.
-            self._waited += min(time.monotonic() - begun, timeout)
+            waited = min(time.monotonic() - begun, timeout)
+            before, self._computed = self._computed, worker.processor_time()
+            if before is not None and self._computed is not None:
+                waited = min(self._computed - before, waited)
+            self._waited += waited
             if self._waited >= self._timeout:
                 self._worker = None
                 _end(worker)

@@ -207,7 +207,7 @@ def roles_json(drafted: DraftPlan) -> dict[str, Any]:
 
 def report_draft(draft: Draft, json: bool) -> None:
     """Print the files of a draft, its check, and the next step."""
-    from ..studies.advice.draft import check_lines, hint_lines, omission_lines
+    from ..studies.advice.draft import check_lines, duration_text, hint_lines, omission_lines
 
     check = draft.plan.check
     written = [str(path) for path in draft.paths]
@@ -218,7 +218,8 @@ def report_draft(draft: Draft, json: bool) -> None:
     if check is None:
         print("\nNot checked: the filter fails on this recording; choose other signals with --sensors.")
     else:
-        print(f"\nFitted to the first {check.start:.4g} s, checked on the other {check.end - check.start:.4g} s:")
+        first, other = duration_text(check.start), duration_text(check.end - check.start)
+        print(f"\nFitted to the first {first}, checked on the other {other}:")
         print("\n".join([check.words, *(f"  {line}" for line in check_lines(check))]))
     for line in hint_lines(draft.plan):
         print(f"\n{line}")

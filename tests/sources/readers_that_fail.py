@@ -2,6 +2,7 @@
 
 import ctypes
 import os
+import time
 
 
 def counting(path, n):
@@ -33,6 +34,19 @@ def leave():
 def hang():
     """For ever, and no thread of Python can run meanwhile: PyDLL keeps the interpreter's lock."""
     ctypes.PyDLL(None).pause()
+
+
+def compute(seconds):
+    """For some seconds of processor time, on the processor of whoever shares it."""
+    begun = time.process_time()
+    while time.process_time() - begun < seconds:
+        pass
+
+
+def computing(path, processor, seconds):
+    os.sched_setaffinity(0, {processor})
+    compute(seconds)
+    yield "read"
 
 
 def shout():

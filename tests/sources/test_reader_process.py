@@ -14,7 +14,18 @@ import pytest
 from estimators.errors import SourceError
 from sources import worker_process as module
 from sources.worker_process import IsolatedReader, ReaderError, read_isolated
-from tests.sources.readers_that_fail import abort, allocate, counting, fail, folder, hang, leave, pid_then, shout
+from tests.sources.readers_that_fail import (
+    abort,
+    allocate,
+    computing,
+    counting,
+    fail,
+    folder,
+    hang,
+    leave,
+    pid_then,
+    shout,
+)
 
 PATH = Path("recording")  # the functions do not read it
 
@@ -38,6 +49,30 @@ def gone(pid):
             return True
         time.sleep(0.01)
     return False
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="processes cannot be kept on one processor here")
+@pytest.mark.parametrize(("seconds", "ends"), [(0.8, True), (60.0, False)])
+def test_time_in_which_others_have_the_processor_does_not_count(seconds, ends):
+    """Four others on its processor: 0.8 s of its own take 4 s, far longer than the 1.5 s that it may take."""
+    processor = min(os.sched_getaffinity(0))
+    spin = f"import os\nos.sched_setaffinity(0, {{{processor}}})\nwhile True: pass"
+    others = [subprocess.Popen([sys.executable, "-c", spin]) for _ in range(4)]
+    try:
+        reader = IsolatedReader(computing, PATH, processor, seconds, timeout=1.5)
+        if ends:
+            while (item := reader.take(0.1)) is None:
+                assert not reader.ended
+            assert item == "read"
+            reader.close()
+        else:
+            with pytest.raises(ReaderError, match="gave nothing for 2 s and was ended"):
+                while not reader.ended:
+                    reader.take(0.1)
+    finally:
+        for other in others:
+            other.kill()
+            other.wait()
 
 
 def test_items_come_in_order_and_the_end_is_known():

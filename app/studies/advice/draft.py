@@ -427,8 +427,8 @@ def _comments(drafted: DraftPlan) -> list[str]:
     if drafted.check is not None:
         check = drafted.check
         lines += [
-            f"# Fitted to the first {check.start:.4g} s by maximum likelihood. Predictions of the other "
-            f"{check.end - check.start:.4g} s:",
+            f"# Fitted to the first {duration_text(check.start)} by maximum likelihood. Predictions of the other "
+            f"{duration_text(check.end - check.start)}:",
             f"# {check.words}.",
             *(f"#   {text}" for text in check_lines(check)),
         ]
@@ -451,13 +451,13 @@ def hint_lines(drafted: DraftPlan) -> list[str]:
             period, amplitude = item.cycle
             size = f"{amplitude:.3g} {item.signal.series.unit}".rstrip()
             lines.append(
-                f"{item.name} repeats every {_duration(period)} (amplitude {size}), which the draft does not know. For "
+                f"{item.name} repeats every {duration_text(period)} (amplitude {size}), which the draft does not know. For "
                 "forecasts add a cycle to the model: docs/twins.md, Cycles."
             )
     return lines
 
 
-def _duration(seconds: float) -> str:
+def duration_text(seconds: float) -> str:
     """Return a time in the largest unit of which there are two."""
     size, unit = next(
         (entry for entry in ((86400.0, "days"), (3600.0, "h"), (60.0, "min")) if seconds >= 1.9 * entry[0]), (1.0, "s")
