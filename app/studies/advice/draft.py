@@ -451,8 +451,8 @@ def hint_lines(drafted: DraftPlan) -> list[str]:
             period, amplitude = item.cycle
             size = f"{amplitude:.3g} {item.signal.series.unit}".rstrip()
             lines.append(
-                f"{item.name} repeats every {duration_text(period)} (amplitude {size}), which the draft does not know. For "
-                "forecasts add a cycle to the model: docs/twins.md, Cycles."
+                f"{item.name} repeats every {duration_text(period)} (amplitude {size}), which the draft does not know. "
+                "For forecasts add a cycle to the model: docs/twins.md, Cycles."
             )
     return lines
 

@@ -40,7 +40,7 @@ class Roles:
 
 OMISSIONS = {
     "switch": "a switch: few different values",
-    "counter": "time, counter or status by its name",
+    "counter": "time, counter or status",
     "constant": "constant",
     "short": f"fewer than {MIN_VALUES} values",
 }

@@ -14,7 +14,7 @@ from sources.inspect import RecordingContents, SignalSeries, holes
 MIN_VALUES = 20  # values needed to estimate a noise
 
 SKIPPED = re.compile(
-    r"time|epoch|date|count|check|crc|valid|status|mode|error|alive|_id$|^id$|parity|accuracy", re.IGNORECASE
+    r"time|epoch|utc|date|count|check|crc|valid|status|mode|error|alive|_id$|^id$|parity|accuracy", re.IGNORECASE
 )
 """Names that are not measurements."""
 
@@ -120,9 +120,25 @@ def _kind(series: SignalSeries, levels: np.ndarray) -> str:
         return "constant"
     if levels.size <= MAX_SWITCH_LEVELS:
         return "switch"
-    if SKIPPED.search(series.name):
+    if SKIPPED.search(series.name) or _counts_time(series):
         return "counter"
     return "signal"
+
+
+CLOCK_RATES = (1.0, 1e3, 1e6, 1e9, 1 / 60.0, 1 / 3600.0, 1 / 86400.0)
+"""Units of a clock per second: s, ms, us, ns, min, h, days."""
+
+
+def _counts_time(series: SignalSeries) -> bool:
+    """Return whether a signal is a clock: it grows at the rate of a unit of time, within a thousandth."""
+    seconds = (series.t - series.t[0]) * 1e-9
+    if not np.ptp(seconds) > 0.0:
+        return False
+    rate = (series.values[-1] - series.values[0]) / seconds[-1]
+    if not any(abs(rate / unit - 1.0) < 1e-3 for unit in CLOCK_RATES):
+        return False
+    late = series.values - series.values[0] - rate * seconds
+    return bool(np.ptp(late) < 1e-2 * np.ptp(series.values))
 
 
 def step_of(levels: np.ndarray) -> float:
@@ -194,7 +210,8 @@ def noise_of(series: SignalSeries, smooth: bool | None = None) -> tuple[bool, fl
             q = max(grown - 2 * r, 1e-4 * WALK_INTERVALS * power) / (WALK_INTERVALS * dt)
         return False, q, r
     e = d[both + 1] - d[both]
-    second = max(float(np.mean(e**2)), floor)
+    # Without three times at one interval the differences are taken to be independent, as those of a walk.
+    second = max(float(np.mean(e**2)) if e.size else 2.0 * power, floor)
     next_to = np.flatnonzero(np.diff(both) == 1)
     lagged = float(np.mean(e[next_to] * e[next_to + 1])) if next_to.size else 0.0
     r = max(min((second / 4 - lagged) / 5.5, second / 6), floor)

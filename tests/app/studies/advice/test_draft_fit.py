@@ -92,7 +92,7 @@ def test_every_signal_of_a_recording_has_a_role_or_a_reason(tmp_path):
     roles = plan(found, Roles()).roles
     assert [one.signal.name for one in roles] == [*walks, "counter"]
     omitted = {one.signal.name: one.reason for one in roles if one.role == OMITTED}
-    assert len(omitted) == 3 and omitted.pop("counter") == "time, counter or status by its name"
+    assert len(omitted) == 3 and omitted.pop("counter") == "time, counter or status"
     assert set(omitted.values()) == {"not among the 6 signals with most different values"}
 
 

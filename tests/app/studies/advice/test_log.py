@@ -6,7 +6,7 @@ import pytest
 from app.studies.advice.draft import hint_lines, write_draft
 from app.studies.advice.plan import Roles, plan
 from app.studies.advice.relations import driven, pairs
-from app.studies.advice.signals import rough, signal
+from app.studies.advice.signals import noise_of, rough, signal
 from app.twin.log_reader import read_log
 from app.twin.twin import load_twin
 from estimators.log import READING
@@ -35,6 +35,19 @@ def test_resolution_bounds_the_noise():
     assert found.noise >= 0.25 / np.sqrt(12.0)
     switch = signal(None, series("x", np.arange(100) // 10 % 2 * 1.0))
     assert switch.kind == "switch" and signal(None, series("x", np.ones(50))).kind == "constant"
+
+
+def test_a_clock_is_no_signal_and_three_times_at_one_interval_are_not_needed():
+    rng = np.random.default_rng(3)
+    t = np.cumsum(rng.uniform(0.9, 1.1, 300))
+    when = np.round(t * 1e9).astype(np.int64)
+    assert signal(None, SignalSeries("a", "", when, 5e5 + np.round(1e3 * t))).kind == "counter"
+    assert signal(None, SignalSeries("a", "", when, 2.0 * t)).kind == "signal"
+    # Pairs of rows, a quarter of a second and then some seconds apart: no two successive intervals are alike.
+    pairs = np.cumsum(np.where(np.arange(300) % 2, 0.25, rng.uniform(3.0, 5.0, 300)))
+    walk = SignalSeries("a", "", np.round(pairs * 1e9).astype(np.int64), np.cumsum(rng.normal(0, 1, 300)))
+    for smooth in (False, True):
+        assert all(0.0 < noise < 1e3 for noise in noise_of(walk, smooth)[1:])
 
 
 def test_two_sensors_of_one_quantity_are_told_from_two_that_are_alike():
