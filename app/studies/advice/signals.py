@@ -268,7 +268,7 @@ def _mean(series: SignalSeries, edges: np.ndarray, middles: np.ndarray, gap: flo
     return np.where(count > 0, mean, line)
 
 
-MIN_CYCLES = 5  # cycles in a recording, from which on they are one
+MIN_CYCLES = 10  # cycles in a recording, from which on they are one
 MIN_LINE = 25.0  # power of a spectral line over its surroundings, which noise reaches once in e^25 frequencies
 LINE_BINS, NEAR_BINS = 2, 20  # frequencies on each side that belong to a line, and its surroundings
 
@@ -288,11 +288,9 @@ def cycle_of(series: SignalSeries) -> tuple[float, float] | None:
     power = np.abs(np.fft.rfft((d - d.mean()) * np.hanning(d.size))) ** 2
     best, place = 0.0, 0
     for k in range(MIN_CYCLES, power.size // 4):
-        around = np.concatenate(
-            (power[max(1, k - NEAR_BINS) : max(1, k - LINE_BINS)], power[k + LINE_BINS + 1 : k + NEAR_BINS + 1])
-        )
+        sides = power[max(1, k - NEAR_BINS) : k - LINE_BINS], power[k + LINE_BINS + 1 : k + NEAR_BINS + 1]
         # The median of a periodogram of noise is ln 2 of its mean.
-        line = power[k] / max(float(np.median(around)) / np.log(2.0), 1e-300)
+        line = power[k] / max(*(float(np.median(side)) / np.log(2.0) for side in sides), 1e-300)
         if line > best:
             best, place = line, k
     if best < MIN_LINE:

@@ -103,7 +103,7 @@ def test_a_twin_of_a_recording_folds_as_it_stands(drive, nisus):
     path = drive / "pump.yaml"
     yaml, python, *checked = nisus("new", "pump", "--folder", drive, *given).out.splitlines()
     assert (yaml, python) == (str(path), str(drive / "pump.py"))
-    assert checked[2].startswith("consistent: NIS 1.09 per degree of freedom")
+    assert checked[2].startswith("consistent: mean NIS 1.09 per degree of freedom")
     assert checked[-1] == f"Next: nisus run {path}"
     twin = load_twin(path)
     assert set(twin.model.sensor_names) == {"rpm", "temp"}
