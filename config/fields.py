@@ -53,7 +53,14 @@ def as_seconds(value: Any) -> Any:
 Duration = Annotated[Seconds, BeforeValidator(as_seconds, json_schema_input_type=Seconds | str)]
 Time = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-MAX_TIME_S, le=MAX_TIME_S)]
 Count = Annotated[int, Field(strict=True, ge=1)]
-Option = Number | Annotated[str, Field(min_length=1)]
+
+
+def as_choice(value: Any) -> Any:
+    """Return the word of a switch: `adapt: false` is off."""
+    return {True: "on", False: "off"}[value] if isinstance(value, bool) else value
+
+
+Option = Annotated[Number | Annotated[str, Field(min_length=1)], BeforeValidator(as_choice)]
 Flag = Annotated[bool, Field(strict=True)]
 Text = Annotated[str, Field(min_length=1)]
 

@@ -403,9 +403,12 @@ class FiltersCommand(JsonOption):
 
     Examples:
       nisus filters
+      nisus filters ukf
       nisus filters --twin motor_can
     """
 
+    name: Annotated[str | None, tyro.conf.Positional] = None
+    """Name of an estimator, which is described alone, or of a twin, as --twin."""
     twin: str | None = None
     """Name of a bundled twin, or path to a YAML file: list which filters apply, their cost, and why others do not."""
 

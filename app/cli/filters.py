@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from estimators.estimator import Option
+import numpy as np
+
+from config.loader import shipped
+from estimators.errors import ConfigError, nearest, quoted
+from estimators.estimator import Estimator, Option
 from estimators.log import READING
 from estimators.registry import ESTIMATORS, unfit
 
@@ -18,26 +24,36 @@ from .prepare import attend
 if TYPE_CHECKING:
     from .arguments import FiltersCommand as Arguments
 
-SAMPLE_S = 60.0  # seconds of a twin's source from which its rate is taken
+SAMPLE_S = (60.0, 3.2e7)  # seconds of a twin's source from which its rate is taken, the first that have enough readings
+MIN_SAMPLE = 10
 
 
 def show_filters(arguments: Arguments) -> int:
     """Run the command."""
-    if arguments.twin is None:
-        print(to_json(catalogue_json()) if arguments.json else "\n".join(to_text(catalogue())))
+    twin, shown = arguments.twin, ESTIMATORS
+    if arguments.name in ESTIMATORS:
+        shown = {arguments.name: ESTIMATORS[arguments.name]}
+    elif arguments.name is not None and twin is None:
+        twin = arguments.name
+        if not twin.endswith((".yaml", ".yml")) and twin not in shipped():
+            raise ConfigError(
+                f"{quoted(twin)}: no estimator or bundled twin; {nearest(twin, [*ESTIMATORS, *shipped()])}"
+            )
+    if twin is None:
+        print(to_json(catalogue_json(shown)) if arguments.json else "\n".join(to_text(catalogue(shown))))
         return 0
-    found = applicable(load_twin(arguments.twin))
+    found = applicable(load_twin(twin))
     print(to_json(found) if arguments.json else "\n".join(to_text([applicable_topic(found)])))
     return 0
 
 
-def catalogue_json() -> list[dict[str, Any]]:
-    """Return every estimator for scripts."""
+def catalogue_json(shown: Mapping[str, Estimator] = ESTIMATORS) -> list[dict[str, Any]]:
+    """Return estimators for scripts."""
     words = ("name", "family", "title", "assumes", "model_runs", "fails_when", "source", "options")
-    return [{word: getattr(entry, word) for word in words} for entry in ESTIMATORS.values()]
+    return [{word: getattr(entry, word) for word in words} for entry in shown.values()]
 
 
-def catalogue() -> list[Topic]:
+def catalogue(shown: Mapping[str, Estimator] = ESTIMATORS) -> list[Topic]:
     """Return a topic per estimator: assumption, options, cost, failure and source."""
     return [
         Topic(
@@ -50,7 +66,7 @@ def catalogue() -> list[Topic]:
                 Figure("source", entry.source),
             ),
         )
-        for entry in ESTIMATORS.values()
+        for entry in shown.values()
     ]
 
 
@@ -116,9 +132,13 @@ def applicable_topic(found: TwinFilters) -> Topic:
 
 
 def _reading_rate(twin: Twin) -> float:
-    """Return the readings per second in the first minute of the twin's source."""
-    log, _ = attend(twin.model, lambda: read_log(twin, SAMPLE_S), "reading the source's first minute")
-    times = log.t[: log.n][log.kind[: log.n] == READING]
+    """Return the readings per second in the first minute of the twin's source, or in the first year of a slow one."""
+    times = np.zeros(0)
+    for seconds in SAMPLE_S:
+        log, _ = attend(twin.model, partial(read_log, twin, seconds), "reading the source")
+        times = log.t[: log.n][log.kind[: log.n] == READING]
+        if times.size > MIN_SAMPLE:
+            break
     return float((times.size - 1) / (times[-1] - times[0]) * 1e9) if times.size > 1 and times[-1] > times[0] else 0.0
 
 

@@ -19,6 +19,7 @@ from estimators.diagnostics.sensitivity.gramian import directions
 from estimators.diagnostics.sensitivity.held_out import HeldOut, held_out
 from estimators.diagnostics.sensitivity.posterior import Peaks, Tail, tails
 from estimators.diagnostics.sensitivity.responses import digits
+from estimators.errors import NisusError
 from estimators.fold import Fold
 from estimators.log import READING, Log
 
@@ -26,6 +27,7 @@ from ..present.export.calibration_lines import calibration_lines, health_shares
 from ..present.result import WORSE, Bar, Cell, Topic, plain
 from ..twin.twin import Twin
 from .advice.measured import Measured
+from .advice.questions import JUMPS, heavy
 from .compare import timed
 from .fold_result import calibration_json, calibration_of
 
@@ -69,6 +71,7 @@ class Checked:
     calibration: list[Calibration]
     episodes: list[Episode]
     held_out: HeldOut
+    jumps: str
 
     @property
     def health(self) -> dict[str, float]:
@@ -109,7 +112,17 @@ def check(twin: Twin, log: Log, counts: Counter[str]) -> Checked:
         calibration=calibration_of(fold, fold.log.events, fold.track),
         episodes=episodes(fold),
         held_out=held_out(twin.estimator, model, tuning, log),
+        jumps=_jumps(measured),
     )
+
+
+def _jumps(measured: Measured) -> str:
+    """Return the finding of `nisus advise` that the asset jumps and not a sensor; empty if it does not."""
+    try:
+        reason = heavy(measured, measured.twin.estimator)[0].reason
+    except NisusError:  # weights do not apply to this filter
+        return ""
+    return JUMPS if JUMPS in reason else ""
 
 
 def confounded(found: Sensitivity) -> list[tuple[str, str, float]]:
@@ -155,7 +168,8 @@ def figures(checked: Checked, checklist: Sequence[ChecklistLine]) -> dict[str, A
             "rank": part.rank,
             "conditioning": part.conditioning,
             "eigenvalues": part.eigenvalues,
-            "left": dict(zip(twin.model.state_names, part.deviation, strict=True)),
+            "forgotten": part.forgotten,
+            "left": dict(zip(twin.model.state_names, part.left, strict=True)),
             "weakest": part.text,
         }
 

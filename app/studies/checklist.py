@@ -18,7 +18,6 @@ from .scores import scores_file
 YES, PARTLY, NO, NONE = "yes", "partly", "no", "not told"
 
 MAX_CONDITIONING = 1e8  # conditioning beyond which the information of the weakest direction is rounding
-UNOBSERVED_SHARE = 0.9  # share of the prior deviation; a direction that keeps more is not observed
 LINEARISING = ("ekf", "iekf", "sr_ekf", "filterpy_ekf", "pf_ekf")
 
 Answer = tuple[str, str, str]  # answer, figures, remedy
@@ -90,6 +89,8 @@ def _posterior(checked: Checked) -> Answer:
         return NONE if found.reason and worst is None else NO, figures, ""
     if checked.linearity.passes is not None and not checked.linearity.white:
         remedy = "innovations are correlated too, which points to model errors: a gate would reject good measurements"
+    elif jumps := checked.jumps:
+        remedy = f"{jumps}; no gate, and no particles"
     elif gate is None:
         remedy = "heavy tails need a gate, not particles: set gate: 0.99999"
     else:
@@ -101,10 +102,7 @@ def _observability(checked: Checked) -> Answer:
     found, whole = checked.gramian, checked.gramian.whole
     if whole is None:
         return NONE, found.reason, ""
-    figures = (
-        f"rank {whole.rank} of {checked.twin.model.nx}, conditioning {digits(whole.conditioning)}; "
-        f"the weakest direction is {whole.text}"
-    )
+    figures = f"{whole.summary}; the weakest direction is {whole.text}"
     if found.windows:
         ranks = [window.rank for window in found.windows]
         each = f"{min(ranks)}" if min(ranks) == max(ranks) else f"{min(ranks)} to {max(ranks)}"
@@ -115,13 +113,13 @@ def _observability(checked: Checked) -> Answer:
         figures += f"; {len(pairs)} pair(s) look alike in the readings, most of all {first} and {second} ({value:+.2f})"
     if whole.beyond:
         return NONE, f"{figures}; {found.note}", ""
-    free = checked.twin.model.prior_std > 0.0
-    left = whole.deviation[free]
-    unobserved = bool(left.size and left.max() > UNOBSERVED_SHARE)
-    full = whole.rank >= int(free.sum()) and whole.conditioning < MAX_CONDITIONING
-    if unobserved or not full:
-        remedy = "an unobserved state keeps its prior and drifts: add a sensor, or rely on its band only"
-        return NO if unobserved else PARTLY, figures, remedy
+    model = checked.twin.model
+    if names := whole.unobserved(model):
+        remedy = f"{', '.join(names)} keeps its prior and drifts: add a sensor, or rely on its band only"
+        return NO, figures, remedy
+    if whole.rank + whole.forgotten < int(np.sum(model.prior_std > 0.0)) or whole.conditioning > MAX_CONDITIONING:
+        remedy = "the measurements determine the weakest direction worse than the prior: rely on its band only"
+        return PARTLY, figures, remedy
     if pairs:
         return PARTLY, figures, "do not estimate both of a pair from this log; measure one, or excite the asset more"
     return YES, figures, ""

@@ -324,7 +324,7 @@ def _figures(result: FoldResult) -> list[Figure]:
     twin, fold, scored, counts = result.twin, result.fold, result.score, result.counts
     model, events, track = twin.model, result.events, result.track
     units = units_by_name(model)
-    found = [Figure("estimator", twin.estimator), Figure("tuning", twin.tuning.name)]
+    found = [Figure("estimator", twin.estimator, remark=_options_text(fold)), Figure("tuning", twin.tuning.name)]
     if len(events) < fold.n:
         found.append(Figure("scored", f"{format_time(int(events.t[0]))} to {format_time(int(events.t[-1]))}"))
     found.append(Figure("readings", f"{scored.readings}"))
@@ -385,6 +385,16 @@ def _figures(result: FoldResult) -> list[Figure]:
         Figure("health, share of time", health_shares(health_of(events, track, fold.policy))),
         Figure("time per event", f"{1e6 * result.seconds:.2f} µs"),
     ]
+
+
+def _options_text(fold: Fold) -> str:
+    """Return the options that the YAML or the command line gives the filter, choices by their words."""
+    known = {option.name: option for option in fold.estimator.options}
+    given = [(known[name], value) for name, value in fold.tuning.options.items() if name in known]
+    return ", ".join(
+        f"{option.name} {option.choices[round(value)] if option.choices else format(value, 'g')}"
+        for option, value in given
+    )
 
 
 def _rmse(name: str, fit: Fit, unit: str) -> Figure:

@@ -189,7 +189,7 @@ DETECTORS = (
     Detector(
         "spiky",
         "{0.name} has spikes {0.since}: {0.percent:.2g} % of its measurements are outliers",
-        "set a gate, and check the wiring",
+        "check the wiring, and set a gate unless the asset jumps (nisus advise tests it)",
         statistic="mixtures in which 3 % or 0.3 % of e have 5 σ",
         effect="share of |e| beyond 4 σ",
         alarms={"spiky": (outlier_density(0.03), outlier_density(0.003, rare=True))},

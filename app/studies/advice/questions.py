@@ -11,6 +11,7 @@ from config.tunings import named
 from estimators.diagnostics.calibration import LIMITS, Calibration, calibrations
 from estimators.diagnostics.score import nis_verdict
 from estimators.diagnostics.sensitivity.checklist import DIFFERENCE_QUANTILE, Linearity
+from estimators.diagnostics.sensitivity.gramian import MAX_PRIOR_LEFT
 from estimators.diagnostics.sensitivity.posterior import FAR_SIGMA, FREQUENT_SHARE, HEAVY_KURTOSIS, MOST_STATES
 from estimators.diagnostics.sensitivity.posterior import tails as measure_tails
 from estimators.errors import EstimatorError, NisusError
@@ -38,7 +39,7 @@ Options = dict[str, float] | None
 STEADY = "kf-steady"
 PREFERRED = ("ensrf", "letkf", "etkf", "enkf")  # of large states: those that localise and draw no perturbations first
 
-MAX_PRIOR_LEFT = 0.9  # share of the prior deviation; a state that keeps more was not observed
+JUMPS = "the asset jumps, not the sensor; weights would reject good measurements"
 EXACT = 1e-9  # difference in σ of two filters on a linear model, by rounding
 PERIOD_TOLERANCE = 0.01  # share of the period by which the time between two readings may differ from it
 MAX_UNEVEN_SHARE = 0.001  # share of the intervals that may differ: a fixed gain cannot follow lost or late measurements
@@ -182,13 +183,13 @@ def observed(measured: Measured) -> Claim:
     free = np.flatnonzero(model.prior_std > 0.0)
     if not free.size:
         return OBSERVED.claim(YES, 0.0, "every state is certain at first")
-    left = found.whole.deviation[free]
+    left = found.whole.left[free]
     name, most = model.state_names[int(free[np.argmax(left)])], float(left.max())
     reason = (
-        f"after all readings {name} keeps {percent(most)} of its prior deviation, the most of all states; the Gramian "
-        f"has rank {found.whole.rank} of {model.nx} and conditioning {digits(found.whole.conditioning)}"
+        f"after all readings {name} keeps {percent(most)} of its prior deviation, the most of all states; "
+        f"the Gramian has {found.whole.summary}"
     )
-    names = ", ".join(model.state_names[int(k)] for k in free[left > MAX_PRIOR_LEFT])
+    names = ", ".join(found.whole.unobserved(model))
     if not names:
         return OBSERVED.claim(YES, most, reason)
     remedy = (
@@ -361,7 +362,7 @@ def heavy(measured: Measured, estimator: str, options: Options = None) -> tuple[
     change = after / before - 1.0
     reason += f"; weighted so, the innovations are {100 * abs(change):.2g} % {'larger' if change > 0 else 'smaller'}"
     if change > MAX_LARGER_INNOVATION:
-        reason += ": the asset jumps, not the sensor; weights would reject good measurements"
+        reason += f": {JUMPS}"
         return TAILS.claim(NO, worst.kurtosis, reason), np.inf
     return TAILS.claim(YES, worst.kurtosis, reason), dof
 

@@ -221,7 +221,7 @@ def _observability(engine: Running, found: FoldFigures | None) -> dict[str, Any]
         "rank": view.rank,
         "of": engine.model.nx,
         "conditioning": number(view.conditioning, 3),
-        "states": dict(zip(engine.model.state_names, listed(view.deviation, 3), strict=True)),
+        "states": dict(zip(engine.model.state_names, listed(view.left, 3), strict=True)),
         "weakest": view.text,
         "span": float(view.end - view.begin) * 1e-9,
     }

@@ -9,6 +9,10 @@ so I - G is the covariance of that state after the measurements, as a share of t
 g of G give those of J, the stochastic observability Gramian: g / (1 - g). Exact for linear models, the derivative along
 the track for others.
 
+A state that forgets its beginning quickly (a lag, a disturbance that decays) is told nothing about by these
+measurements, and needs not be: its prior is without effect. So the same nudges give Ψ = ∂x(T) / ∂x(0), how much of an
+error of the prior is left in the estimate at the end. A state is unobserved if neither determines it.
+
 Source: Σ dνᵀS⁻¹dν is the information of the marginal likelihood, Oᵀ (O Oᵀ + N)⁻¹ O; the second form is Woodbury's
 identity. For the Gramian: Jazwinski (1970), Stochastic Processes and Filtering Theory, 7.5.
 """
@@ -27,13 +31,28 @@ from ...model.state_space import StateSpaceModel
 from ...snapshots import Base
 from ...track import USED
 from ...tuning import Tuning
-from .responses import STEP, Nudge, Start, astray, each, max_events, reason_against, stand_in
+from .responses import (
+    STEP,
+    Nudge,
+    Response,
+    Start,
+    astray,
+    digits,
+    each,
+    max_events,
+    nonlinear_note,
+    reason_against,
+    stand_in,
+)
 
 RANK_INFORMATION = 1.0
 """Information, in units of the prior's, from which the measurements determine a direction better than the prior."""
 
 MIN_VARIANCE_SHARE = 1e-9
 """Least share of the prior's variance that differences tell from zero; no eigenvalue is larger than its reciprocal."""
+
+MAX_PRIOR_LEFT = 0.9  # share of the prior deviation from which a state is not observed
+MAX_FORGOTTEN_SHARE = 0.1  # share of an error of the prior that is left at the end, up to which it is forgotten
 
 MAX_LINEAR_EIGENVALUE = 1.05
 """Eigenvalue of G from which the filter responds nonlinearly to nudges: for a linear model none is above 1."""
@@ -44,9 +63,11 @@ class GramianView(NamedTuple):
 
     begin, end: ns. gramian (nx, nx): J, in the prior's standard deviations; eigenvalues (nx,), ascending. rank: number
     of those that the measurements determine better than the prior; conditioning: largest over smallest. deviation
-    (nx,): remaining share of each state's prior standard deviation. weakest (nx,): direction of the smallest
-    eigenvalue, in the prior's standard deviations; text describes it. beyond: the response to nudges was nonlinear, so
-    the result is unreliable.
+    (nx,): remaining share of each state's prior standard deviation. kept (nx,): largest share of an error of the prior
+    that is left in a state at the end, in prior deviations. forgotten: number of directions that the measurements do
+    not determine and the end does not depend on; conditioning leaves them out. weakest (nx,): direction of the smallest
+    eigenvalue of the others, in the prior's standard deviations; text describes it. beyond: the response to nudges was
+    nonlinear, so the result is unreliable.
     """
 
     begin: int
@@ -56,9 +77,27 @@ class GramianView(NamedTuple):
     rank: int
     conditioning: float
     deviation: np.ndarray
+    kept: np.ndarray
+    forgotten: int
     weakest: np.ndarray
     text: str
     beyond: bool
+
+    @property
+    def left(self) -> np.ndarray:
+        """Share of the prior deviation of each state that neither the measurements nor time remove, (nx,)."""
+        return np.minimum(self.deviation, self.kept)
+
+    @property
+    def summary(self) -> str:
+        """Rank and conditioning in words."""
+        forgotten = f" ({self.forgotten} forgotten)" if self.forgotten else ""
+        return f"rank {self.rank} of {self.deviation.size}{forgotten}, conditioning {digits(self.conditioning)}"
+
+    def unobserved(self, model: StateSpaceModel) -> list[str]:
+        """Return the states that keep their prior."""
+        free = np.flatnonzero((model.prior_std > 0.0) & (self.left > MAX_PRIOR_LEFT))
+        return [model.state_names[int(j)] for j in free]
 
 
 class Gramian(NamedTuple):
@@ -121,7 +160,7 @@ def gramian(
     parts = [(begin, log.n, bases[0]), *(span for span in spans if windows and span[1] > span[0])]
     views = each(lambda part: _view(name, model, tuning, log, *part), parts, executor)
     if any(view.beyond for view in views):
-        note = "; ".join(filter(None, [note, f"{name} responds nonlinearly to nudges: the Gramian is unreliable"]))
+        note = "; ".join(filter(None, [note, nonlinear_note(name, tuning, "the Gramian is unreliable")]))
     return Gramian(name, "", note, views[0], tuple(views[1:]))
 
 
@@ -134,13 +173,20 @@ def _view(
         part.drop_front(begin)
     begun = Start.of(estimator, tuning, part, base)
     used = begun.track.verdict == USED
-    g = information([_response(begun, j, std)[used] for j, std in enumerate(model.prior_std.tolist())])
+    responses = [_response(begun, j, std) for j, std in enumerate(model.prior_std.tolist())]
+    g = information([response.whitened[used] for response in responses])
+    # Of a state that is certain at first there is no share.
+    scale = np.where(model.prior_std > 0.0, model.prior_std, np.inf)[model.shown]
+    influence = np.array([response.states[-1] / scale for response in responses])
     values, vectors = np.linalg.eigh(g)
     left = np.clip(1.0 - values, MIN_VARIANCE_SHARE, 1.0)
     # A state that is certain at first cannot be nudged.
     free = model.prior_std > 0.0
     eigenvalues = np.clip(values, 0.0, None) / left
-    order = [k for k in range(model.nx) if np.any(np.abs(vectors[free, k]) > MIN_VARIANCE_SHARE)]
+    ends = np.abs(vectors.T @ influence).max(axis=1, initial=0.0)
+    forgotten = (eigenvalues <= RANK_INFORMATION) & (ends <= MAX_FORGOTTEN_SHARE)
+    moved = [k for k in range(model.nx) if np.any(np.abs(vectors[free, k]) > MIN_VARIANCE_SHARE)]
+    order = [k for k in moved if not forgotten[k]]
     weak = vectors[:, order[0]] if order else np.zeros(model.nx)
     weak = weak * (np.sign(weak[np.argmax(np.abs(weak))]) or 1.0)
     kept = eigenvalues[order]
@@ -152,20 +198,25 @@ def _view(
         rank=int(np.sum(eigenvalues > RANK_INFORMATION)),
         conditioning=float(kept[-1] / kept[0]) if kept.size and kept[0] > 0.0 else np.inf,
         deviation=np.sqrt((vectors**2) @ left),
+        kept=np.abs(influence).max(axis=1, initial=0.0),
+        forgotten=len(moved) - len(order),
         weakest=weak,
-        text=_in_words(weak, model, float(left[order[0]]) if order else 0.0),
+        text=_in_words(weak, model, float(left[order[0]]) if order else 0.0) if order or not moved else FORGOTTEN,
         beyond=bool(np.any(values > MAX_LINEAR_EIGENVALUE)),
     )
 
 
-def _response(begun: Start, j: int, std: float) -> np.ndarray:
-    """Return S^-1/2 dν (N, ny) by one prior deviation of state j."""
+FORGOTTEN = "every state forgets its prior"
+
+
+def _response(begun: Start, j: int, std: float) -> Response:
+    """Return the response to one prior deviation of state j."""
     tracks = []
     for size in (-STEP, STEP):
         mean = begun.base.mean.copy()
         mean[j] += size * std
         tracks.append(begun.refold(base=begun.base._replace(mean=mean)))
-    return begun.moved(tracks[1], tracks[0]).whitened / (2.0 * STEP)
+    return Response(*(change / (2.0 * STEP) for change in begun.moved(tracks[1], tracks[0])))
 
 
 def _in_words(weights: np.ndarray, model: StateSpaceModel, left: float) -> str:

@@ -137,6 +137,16 @@ def stand_in(estimator: str, model: StateSpaceModel) -> tuple[str, str]:
     )
 
 
+def nonlinear_note(estimator: str, tuning: Tuning, effect: str) -> str:
+    """Return the note on a filter that responds nonlinearly to nudges, with the options that make it so."""
+    options = [name for name in ("adapt", "robust") if tuning.options.get(name)]
+    if not options:
+        return f"{estimator} responds nonlinearly to nudges: {effect}"
+    off = " ".join(f"--set estimator.options.{name}=off" for name in options)
+    which = f"the option {' and '.join(options)} makes {estimator} respond nonlinearly to nudges"
+    return f"{which}: {effect}; repeat with {off}"
+
+
 def astray(estimator: str, instead: str, track: Track) -> str:
     """Return why the filter `instead` cannot replace an estimator on this track, or "".
 
@@ -177,6 +187,8 @@ def each(work: Callable[[T], R], items: Iterable[T], executor: Executor | str | 
 
 SENSOR, INPUT_, PARAMETER = KINDS = ("sensor", "input", "parameter")
 
+MAX_RELATIVE_SIZE = 10.0  # of a parameter's value, up to which a size is given in percent of it
+
 DRIFT = "drift"  # Kind of a nudge that grows in proportion to the time since the first event, of a sensor row
 
 STEP = 1e-3
@@ -203,13 +215,17 @@ class Nudge(NamedTuple):
     value: float = np.nan
 
     def in_words(self, size: float) -> str:
-        """Describe a fault of a size: of a parameter in percent of its value, if it has one; else in units."""
-        if self.kind == PARAMETER and self.value:
+        """Describe a fault of a size: of a parameter in percent of its value, if that is not near zero."""
+        if self._in_percent(size):
             return f"{self.name} {100.0 * size / abs(self.value):+.3g} %"
         if self.kind == DRIFT:
             return f"{SENSOR} {self.name} drifting by {size:+.3g} {self.unit}"
         kind = "" if self.kind == PARAMETER else f"{self.kind} "
-        return f"{kind}{self.name} {size:+.3g} {self.unit}"
+        return f"{kind}{self.name} {size:+.3g} {self.unit}".rstrip()
+
+    def _in_percent(self, size: float) -> bool:
+        """Return whether a size is given in percent of a parameter's value."""
+        return self.kind == PARAMETER and abs(size) <= MAX_RELATIVE_SIZE * abs(self.value) > 0.0
 
     @property
     def subject(self) -> str:
@@ -217,8 +233,8 @@ class Nudge(NamedTuple):
         return f"{self.kind} {self.name}"
 
     def size_text(self, size: float) -> str:
-        """Return the size of a fault without its sign: of a parameter in percent of its value, else in its unit."""
-        if self.kind == PARAMETER and self.value:
+        """Return the size of a fault without its sign: in percent as `in_words`, else in its unit."""
+        if self._in_percent(size):
             return f"{digits(100.0 * size / abs(self.value))} %"
         return f"{digits(size)} {self.unit}".rstrip()
 
@@ -226,7 +242,7 @@ class Nudge(NamedTuple):
         """Return the range of undetectable sizes: `-31 to +92 %`, or `± 2.51 °C`."""
         if not (np.isfinite(low) and np.isfinite(high)):
             return "any size"
-        percent = self.kind == PARAMETER and bool(self.value)
+        percent = self._in_percent(max(abs(low), abs(high)))
         scale, unit = (100.0 / abs(self.value), "%") if percent else (1.0, self.unit)
         first, last = digits(scale * low, "+"), digits(scale * high, "+")
         both = f"± {last[1:]}" if first[1:] == last[1:] and first != last else f"{first} to {last}"

@@ -28,6 +28,7 @@ from .responses import (
     astray,
     each,
     max_events,
+    nonlinear_note,
     nudges_of,
     reason_against,
     start,
@@ -162,7 +163,7 @@ def sensitivity(
         bias[worse], cause[worse] = fault.error[worse], k
     notes = [begun.note]
     if np.median([fault.nonlinearity for fault in faults]) > MAX_NONLINEARITY:
-        notes.append(f"{begun.estimator} responds nonlinearly to nudges: Fisher information is unreliable here")
+        notes.append(nonlinear_note(begun.estimator, tuning, "Fisher information is unreliable here"))
     used = track.verdict == USED
     return Sensitivity(
         estimator=begun.estimator,

@@ -6,7 +6,8 @@ refold with that nudge shows. Against the observed innovations ν,
     θ̂ = Σ Δνᵀν / Σ ΔνᵀΔν,   log Λ = ½ (Σ Δνᵀν)² / Σ ΔνᵀΔν
 
 are its most likely size and its log-likelihood ratio against no fault. Indistinguishable faults have the same log Λ and
-are named together.
+are named together. θ is the error of the twin's number: what a sensor or an input reads too much, or by how much the
+twin's parameter is too large. The parameter without this error must lie in its range.
 
 Source: Willsky & Jones (1976), doi:10.1109/TAC.1976.1101146, the generalised likelihood ratio of additive faults.
 """
@@ -28,6 +29,7 @@ from ...tuning import Tuning
 from .responses import (
     DRIFT,
     KINDS,
+    PARAMETER,
     SENSOR,
     Nudge,
     Start,
@@ -40,6 +42,7 @@ from .responses import (
 
 MAX_EVENTS = 4000  # Events since the beginning of an episode that are refolded at most
 EQUAL_NATS = 3.0  # Nats within which two faults explain equally much
+MAX_LINEAR_SIZE = 0.1  # Share of a parameter's value up to which its effect is taken as linear
 MIN_NATS = 5.0  # Nats below which a fault explains nothing
 
 
@@ -92,10 +95,25 @@ def suspects(
         moved = np.nan_to_num(response.whitened)
         power = float(np.sum(moved**2))
         if power > 0.0:
-            size = float(np.clip(np.sum(moved * seen) / power, nudge.low, nudge.high))
+            low, high = (-nudge.high, -nudge.low) if nudge.kind == PARAMETER else (nudge.low, nudge.high)
+            size = float(np.clip(np.sum(moved * seen) / power, low, high))
             gain = float(size * np.sum(moved * seen) - 0.5 * size**2 * power)
             found.append(Suspect(nudge, size, power**-0.5, gain))
-    return sorted(found, key=lambda suspect: -suspect.gain)
+    checked = each(lambda suspect: _refolded(begun, suspect), found, executor)
+    return sorted(checked, key=lambda suspect: -suspect.gain)
+
+
+def _refolded(begun: Start, suspect: Suspect) -> Suspect:
+    """Return a suspected parameter with the log-likelihood that a fold without its error gains, if that is less.
+
+    θ̂ is linear in the derivative; a change by many times the value, as of a short lag, is not.
+    """
+    nudge, size = suspect.nudge, suspect.size
+    if nudge.kind != PARAMETER or suspect.gain < MIN_NATS or abs(size) <= MAX_LINEAR_SIZE * abs(nudge.value):
+        return suspect
+    before, after = (np.nansum(track.log_likelihood) for track in (begun.track, begun.with_fault(nudge, -size)))
+    gain = float(after - before)
+    return suspect._replace(gain=min(suspect.gain, gain) if np.isfinite(gain) else 0.0)
 
 
 def _start(
@@ -130,4 +148,10 @@ def likeliest(found: Sequence[Suspect]) -> tuple[Suspect, ...]:
 
 def in_words(found: Sequence[Suspect], most: int = 3) -> str:
     """Describe the most likely faults, at most `most` of them."""
-    return " or ".join(suspect.nudge.in_words(suspect.size) for suspect in likeliest(found)[:most])
+    return " or ".join(_words(suspect.nudge, suspect.size) for suspect in likeliest(found)[:most])
+
+
+def _words(nudge: Nudge, size: float) -> str:
+    if nudge.kind != PARAMETER:
+        return nudge.in_words(size)
+    return f"{nudge.name} too {'large' if size > 0.0 else 'small'} by {nudge.size_text(abs(size))}"

@@ -267,7 +267,10 @@ def test_all_twins_in_turn_and_those_without_a_recording_are_named(monkeypatch, 
 def test_filters_lists_all_and_says_why_not(nisus):
     listed = nisus("filters").out
     assert all(re.search(rf"^{re.escape(name)} \(", listed, re.M) for name in ESTIMATORS)
+    assert nisus("filters", "ukf").out.strip() in listed and "\nekf (" not in nisus("filters", "ukf").out
+    assert "did you mean kf" in nisus.refuses("filters", "kff")
     fitting = nisus("filters", "--twin", "motor_can").out
+    assert nisus("filters", "motor_can").out == fitting
     assert "no: motor_drive is not linear" in fitting
     # Nine sigma points thirty times a second; twenty numbers of eight bytes.
     assert re.search(r"ukf .*20 × 8 B = 160 B .*9 × 30 = 27\d", fitting)

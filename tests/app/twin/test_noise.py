@@ -264,5 +264,9 @@ def test_options_that_are_choices_may_be_words(word: str) -> None:
 def test_a_word_that_is_no_choice_is_one_line() -> None:
     text = ROVER.replace("estimator: kf", "estimator: {name: kf, options: {adapt: sometimes}}")
     assert refusal(text) == "motor.yaml:6: estimator kf: adapt is 'sometimes'; it must be one of off, R, Q"
+    # YAML's own words of a switch: off is one of the choices.
+    text = ROVER.replace("estimator: kf", "estimator: {name: kf, options: {adapt: false}}")
+    assert twin_of(text).tuning.options == {"adapt": 0.0}
+    assert refusal(text.replace("false", "true")).endswith("adapt is 'on'; it must be one of off, R, Q")
     text = ROVER.replace("estimator: kf", "estimator: {name: kf, options: {inflation: R}}")
     assert refusal(text) == "motor.yaml:6: estimator kf: inflation is 'R'; it must be a number"

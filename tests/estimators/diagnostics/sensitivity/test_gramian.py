@@ -5,6 +5,7 @@ import pytest
 
 from estimators.diagnostics.sensitivity import gramian
 from estimators.log import Log
+from estimators.model import Noise, Parameter, Row, Sensor, State, StateSpaceModel
 from estimators.models import MODELS
 from estimators.tuning import Tuning
 
@@ -82,3 +83,32 @@ def test_a_field_is_refused():
     model = MODELS["thermal_field"]
     found = gramian("enkf", model, Tuning.of(model), Log.of(model))
     assert found.whole is None and "64" in found.reason
+
+
+@pytest.mark.parametrize(("rate", "observed"), [(0.0, False), (0.001, False), (0.5, True)])
+def test_a_state_that_forgets_its_prior_needs_no_measurement(rate, observed):
+    """A second state that nothing measures and that decays: e^-rate·n of its prior is left after n seconds."""
+
+    def f(x, u, p, dt, out):
+        out[0], out[1] = x[0], x[1] * np.exp(-p[0] * dt)
+
+    def h(x, u, p, out):
+        out[0] = x[0]
+
+    model = StateSpaceModel(
+        name=f"decay{rate}",
+        title="",
+        states=(State("level", "m", 0.0, 2.0), State("error", "m", 0.0, 3.0)),
+        parameters=(Parameter("rate", "1/s", rate, 0.0, 1.0),),
+        noises=(Noise("level", "m²/s", 0.1), Noise("error", "m²/s", 0.1)),
+        sensors=(Sensor("gauge", (Row("gauge", "m", 1.0),), h=h),),
+        f=f,
+    )
+    log = Log.of(model)
+    log.add("gauge", np.arange(N + 1.0), np.random.default_rng(3).standard_normal(N + 1))
+    found = gramian("ekf", model, Tuning.of(model), log, windows=0).whole
+    assert found.rank == 1 and found.deviation[1] == pytest.approx(1.0, abs=1e-9)
+    assert found.kept[1] == pytest.approx(np.exp(-rate * N), rel=1e-6)
+    assert found.unobserved(model) == ([] if observed else ["error"]) and found.forgotten == observed
+    assert found.text.startswith("level" if observed else "error")
+    assert found.summary.startswith("rank 1 of 2 (1 forgotten), conditioning 1" if observed else "rank 1 of 2, ")

@@ -1,5 +1,7 @@
 """Who is to blame: single faults of a simulated motor, whose names and sizes are known."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -12,6 +14,7 @@ from tests.support import read_all
 
 MODEL = MODELS["motor_drive"]
 SINCE = 60.0
+PARAMETERS = [item.name for item in MODEL.parameters]
 
 
 @pytest.fixture(scope="module")
@@ -82,6 +85,29 @@ def test_an_input_that_is_off(log):
     found = blamed(wrong)
     coolant = next(suspect for suspect in found if suspect.nudge.name == "coolant")
     assert found[0].gain - coolant.gain < 3.0 and abs(coolant.size - 15.0) < 4.0 * coolant.deviation
+
+
+@pytest.mark.parametrize(("factor", "word"), [(0.7, "small"), (1.4, "large")])
+def test_a_parameter_of_the_twin_that_is_too_small_or_too_large(log, factor, word):
+    """The words name the error of the twin's value, in percent of it."""
+    p = Tuning.of(MODEL).p.copy()
+    k = PARAMETERS.index("winding_magnet")
+    p[k] *= factor
+    found = suspects("ekf", MODEL, replace(Tuning.of(MODEL), p=p), log, SINCE)
+    wrong = next(one for one in found if one.nudge.name == "winding_magnet")
+    assert wrong.size * (factor - 1.0) > 0.0
+    assert f"winding_magnet too {word} by " in in_words([wrong])
+
+
+def test_a_parameter_without_its_error_lies_in_its_range(log):
+    """An offset of a sensor would need a capacity below zero, or a change far beyond what a refold confirms."""
+    wrong = log.copy()
+    late = (wrong.t[: wrong.n] >= SINCE * 1e9) & (wrong.kind[: wrong.n] == READING)
+    wrong.value[: wrong.n][late & (wrong.channel[: wrong.n] == 0), 0] += 30.0
+    for one in blamed(wrong):
+        if one.nudge.kind == "parameter":
+            item = MODEL.parameters[PARAMETERS.index(one.nudge.name)]
+            assert item.low <= item.value - one.size <= item.high
 
 
 def test_what_lasts_is_cut_and_what_is_before_is_left_alone(log):
