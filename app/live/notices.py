@@ -55,12 +55,8 @@ class Notices:
     def report(self, key: str, text: str, level: str = "warn", *, counted: bool = True, times: int = 1) -> None:
         """Count under `key`, and add a line unless one of that key came within the last second.
 
-        Args:
-            key: Of the counter.
-            text: Of the line.
-            level: Of the line: "info", "warn" or "error".
-            counted: Whether `counts` has the key; False if it is counted better elsewhere.
-            times: How many the line stands for.
+        The line has a level, "info", "warn" or "error", and stands for so many `times`. `counts` has the key unless it
+        is counted better elsewhere: then `counted` is False.
         """
         with self._lock:
             self._counts[key] += times

@@ -71,13 +71,10 @@ class Running(ABC):
     recorder: Records | None
 
     def __init__(self, twin: Twin, watchdog: Watchdog, base: Base | None, ready: Callable[[str], bool]) -> None:
-        """Prepare the fold.
+        """Prepare the fold from a base; None is the prior.
 
-        Args:
-            twin: The twin to fold.
-            watchdog: Watches the thread that folds.
-            base: Start of the fold; None for the prior.
-            ready: Whether a filter is compiled; while the first is not, an idle fold takes its place.
+        The watchdog watches the thread that folds. While the first filter is not compiled (`ready`), an idle fold takes
+        its place.
         """
         self.twin = twin
         self.model = twin.model

@@ -57,9 +57,7 @@ class Windows(NamedTuple):
 def known_states(fold: Fold, physics: StateSpaceModel) -> np.ndarray:
     """Return the known states of the physics (events, nx): the truth, interpolated in time; otherwise smoothed.
 
-    Args:
-        fold: Over the whole log, of a model whose first states are those of the physics.
-        physics: The model to correct.
+    The fold is over the whole log, of a model whose first states are those of the physics, which is to be corrected.
 
     Raises:
         EstimatorError: If the fold's filter cannot be smoothed.

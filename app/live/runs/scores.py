@@ -126,10 +126,8 @@ def _step_us(engine: Running, run: Revision) -> float:
 def seconds_per_event(fold: Fold, chunk: int, budget: float = 0.0) -> float:
     """Return the elapsed time of an event of a new fold, s; NaN without events.
 
-    Args:
-        fold: At its start; the first `chunk` events, half of all at most, are not timed.
-        chunk: Events that are folded at once.
-        budget: Seconds after which no other chunk begins.
+    The first `chunk` events, half of all at most, are not timed; that many are folded at once. After `budget` seconds
+    no other chunk begins.
     """
     fold.advance(min(chunk, fold.log.n // 2))
     events, begun, seconds = 0, time.perf_counter(), 0.0

@@ -178,18 +178,10 @@ def apply_tuning(
     widths: ParameterWidths | None = None,
     out: Path | None = None,
 ) -> str:
-    """Write a tuning into the YAML of a twin, or into a copy.
+    """Write a tuning into the YAML of a twin, or into the copy `out`; return what was written, in words.
 
-    Args:
-        twin: The twin as its file has it.
-        estimator: Filter of the tuning.
-        tuning: The tuning.
-        prior: Mean and covariance, if fitted.
-        widths: Covariance of the parameters, if fitted.
-        out: File of the copy.
-
-    Returns:
-        What was written, in words.
+    The twin is as its file has it. `prior` (mean and covariance) and `widths` (covariance of the parameters) are those
+    of a fit.
 
     Raises:
         ConfigError: If it cannot be written.

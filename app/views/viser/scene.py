@@ -15,14 +15,10 @@ from ...present.drawing.colors import RGB
 
 
 def ellipsoid(cov: np.ndarray, sigmas: float = 2.0) -> tuple[np.ndarray, tuple[float, float, float, float]]:
-    """Return the ellipsoid x' cov⁻¹ x = sigmas² as a scaled and turned unit sphere.
+    """Return the ellipsoid x' cov⁻¹ x = sigmas², at that Mahalanobis distance, as a scaled and turned unit sphere.
 
-    Args:
-        cov: Symmetric positive semidefinite, shape (3, 3).
-        sigmas: Mahalanobis distance of its surface.
-
-    Returns:
-        Lengths of the half axes (3,), and the unit quaternion (w, x, y, z) that turns the axes into place.
+    Those are the lengths of its half axes (3,), and the unit quaternion (w, x, y, z) that turns them into place; `cov`
+    (3, 3) is symmetric positive semidefinite.
     """
     values, vectors = np.linalg.eigh(cov)
     if np.linalg.det(vectors) < 0:
@@ -206,11 +202,7 @@ class History:
         self.base, self.n = 0, 0
 
     def take(self, pull: Pull) -> int:
-        """Write a pull of at most `limit` rows into the arrays.
-
-        Returns:
-            The first row that changed; all after it did too.
-        """
+        """Write a pull of at most `limit` rows into the arrays; return the first changed row: all after it did too."""
         count = len(pull.events)
         if pull.fresh or not self.n or not self.base <= pull.first <= self.base + self.n:
             self.base, self.n = pull.first, 0

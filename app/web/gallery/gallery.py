@@ -66,13 +66,9 @@ class Gallery:
     """Starts, switches and stops the twin of a session."""
 
     def __init__(self, session: Session, opener: Opener, *, first: StartRequest | None = None, own: Sequence[str] = ()):
-        """Take over a session.
+        """Take over a session, whose page shows the running twin; `opener` reads requested ones, `first` runs at first.
 
-        Args:
-            session: Its page shows the running twin.
-            opener: Reads requested twins.
-            first: Runs at first.
-            own: Paths of twins beside those that ship; nothing else may be started, as a twin's model is a program.
+        `own` has paths of twins beside those that ship; nothing else may be started, as a twin's model is a program.
         """
         self.session = session
         self.own = tuple(own)
