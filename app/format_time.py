@@ -12,3 +12,10 @@ def format_time(t: int) -> str:
     if t < FIRST_DATED_NS:
         return f"{t * 1e-9:.6g} s"
     return time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime(t // 10**9))
+
+
+def duration_text(seconds: float) -> str:
+    """Return a time in the largest unit of which there are two."""
+    units = ((86400.0, "days"), (3600.0, "h"), (60.0, "min"))
+    size, unit = next((entry for entry in units if seconds >= 2.0 * entry[0]), (1.0, "s"))
+    return f"{seconds / size:.3g} {unit}"

@@ -15,7 +15,7 @@ from sources.can.readers import EXTENDED, BusName
 from sources.inspect import Message, RecordingContents, SignalSeries, inspect_recordings
 from sources.tables.times import SERIAL_DAYS, UNITS, TimeColumn
 
-from ..format_time import FIRST_DATED_NS, format_time
+from ..format_time import FIRST_DATED_NS, duration_text, format_time
 from ..present.result import Cell, TableColumn, Topic, to_json, to_text
 from ..terminal import complain
 
@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 MAX_LISTED = 5  # gaps and faults that are listed; the others are counted
 
 MAX_TEXTS_SHOWN = 8
+
+MIN_LONG_NS = 7_200_000_000_000  # Time from which on hours and days are shown
 
 TIMES = (
     "number",
@@ -89,8 +91,8 @@ def _topic(found: RecordingContents) -> Topic:
     name = found.files[0].name + (f" and {len(found.files) - 1} more" if len(found.files) > 1 else "")
     unit = "frames" if found.kind == "can_log" else "rows"
     when = f", from {format_time(start)}" if start >= FIRST_DATED_NS else ""
-    title = f"{name}: {found.t.size} {unit} in {(end - start) * 1e-9:.1f} s{when}"
-    gaps = [f"{(b - a) * 1e-9:.1f} s at {(a - start) * 1e-9:.1f} s" for a, b in found.holes[:MAX_LISTED]]
+    title = f"{name}: {found.t.size} {unit} in {_duration(end - start)}{when}"
+    gaps = [f"{_duration(b - a)} at {_duration(a - start)}" for a, b in found.holes[:MAX_LISTED]]
     more = f", and {len(found.holes) - MAX_LISTED} more" if len(found.holes) > MAX_LISTED else ""
     sentences = [f"{len(found.holes)} gaps: {', '.join(gaps)}{more}" if gaps else "no gaps"]
     if found.kind == "table":
@@ -114,6 +116,11 @@ def _topic(found: RecordingContents) -> Topic:
             lines.append(("", "", f"  {empty} signals without a value", "", *[None] * len(TIMES)))
     columns = ("bus", "id", "message, signals", "unit", TableColumn("number", absent=""), *TIMES[1:])
     return Topic(title, tuple(sentences), columns, tuple(lines))
+
+
+def _duration(ns: int) -> str:
+    """Return a time in seconds, and one of hours in hours or days."""
+    return f"{ns * 1e-9:.1f} s" if ns < MIN_LONG_NS else duration_text(ns * 1e-9)
 
 
 def _time_cells(t: np.ndarray, start: int) -> tuple[Cell, ...]:

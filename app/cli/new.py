@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from config.yaml_files import writing
 from estimators.errors import ConfigError
 
+from ..format_time import duration_text
 from ..present.result import to_json
 from .options import roles_of
 
@@ -207,7 +208,7 @@ def roles_json(drafted: DraftPlan) -> dict[str, Any]:
 
 def report_draft(draft: Draft, json: bool) -> None:
     """Print the files of a draft, its check, and the next step."""
-    from ..studies.advice.draft import check_lines, duration_text, hint_lines, omission_lines
+    from ..studies.advice.draft import check_lines, hint_lines, omission_lines
 
     check = draft.plan.check
     written = [str(path) for path in draft.paths]

@@ -21,6 +21,7 @@ from sources.can.readers import BusName
 from sources.inspect import RecordingContents
 from sources.units import heading_unit
 
+from ...format_time import duration_text
 from .plan import OMITTED, DraftCheck, DraftPlan, Moves, Reads
 from .signals import Signal
 
@@ -446,23 +447,17 @@ def hint_lines(drafted: DraftPlan) -> list[str]:
                 f"Input {name} is not used: no first-order lag behind it explains half of the variance of a state. "
                 "Write its effect into step(), or omit it."
             )
+    cycles = []
     for item in drafted.states:
         if item.cycle is not None:
-            period, amplitude = item.cycle
-            size = f"{amplitude:.3g} {item.signal.series.unit}".rstrip()
-            lines.append(
-                f"{item.name} repeats every {duration_text(period)} (amplitude {size}), which the draft does not know. "
-                "For forecasts add a cycle to the model: docs/twins.md, Cycles."
-            )
+            size = f"{item.cycle[1]:.3g} {item.signal.series.unit}".strip()
+            cycles.append(f"{item.name} every {duration_text(item.cycle[0])} (amplitude {size})")
+    if cycles:
+        lines.append(
+            f"Cycles that the draft does not know: {', '.join(cycles)}. For forecasts add them to the model: "
+            "docs/twins.md, Cycles."
+        )
     return lines
-
-
-def duration_text(seconds: float) -> str:
-    """Return a time in the largest unit of which there are two."""
-    size, unit = next(
-        (entry for entry in ((86400.0, "days"), (3600.0, "h"), (60.0, "min")) if seconds >= 1.9 * entry[0]), (1.0, "s")
-    )
-    return f"{seconds / size:.3g} {unit}"
 
 
 def omission_lines(drafted: DraftPlan) -> list[str]:

@@ -251,7 +251,7 @@ def test_a_cycle_of_days_is_found_and_a_random_walk_has_none(tmp_path, size):
         return
     # A line of 60 cycles is known to 1/60 of its period at worst; the walk hides a few per cent of the amplitude.
     assert item.cycle == (pytest.approx(86400, rel=1 / 60), pytest.approx(size, rel=0.1))
-    assert hint_lines(planned)[0].startswith("value repeats every 24 h (amplitude ")
+    assert hint_lines(planned)[0].startswith("Cycles that the draft does not know: value every 24 h (amplitude ")
 
 
 def test_an_input_that_explains_nothing_is_said_to_be_unused(tmp_path):
