@@ -307,37 +307,6 @@ def test_dt_of_zero_predicts_nothing(estimator):
     np.testing.assert_allclose(track.innovation_std[0, 0], np.sqrt(S), rtol=1e-14)
 
 
-def test_one_missing_row_leaves_the_others(estimator):
-    """A NaN row is as if the sensor had not had that row."""
-    t = 3 * SECOND
-    y = np.array([0.4, np.nan, -1.0])
-    fold_ = folded(estimator, MODEL, as_log(reading(t, 2, y)))
-    mean, cov = fold_.moments()
-    keep = [0, 2]
-    H, D, R = MATRICES.H[2][keep], MATRICES.D[2][keep], np.diag(MATRICES.R[2][keep])
-    P = np.diag(MATRICES.std**2)
-    information = np.linalg.inv(P) + H.T @ np.linalg.inv(R) @ H  # information form: other algebra than the filters'
-    expected = np.linalg.inv(information)
-    innovation = y[keep] - H @ MATRICES.mean - D @ MATRICES.u
-    np.testing.assert_allclose(cov, expected, rtol=1e-11, atol=1e-12)
-    np.testing.assert_allclose(mean, MATRICES.mean + expected @ H.T @ np.linalg.inv(R) @ innovation, rtol=1e-11)
-    assert fold_.track.dof[0] == 2
-    assert np.isnan(fold_.track.innovation[0, 1])
-
-
-@pytest.mark.parametrize("bad", [np.inf, -np.inf, np.nan])
-def test_a_reading_that_is_not_finite_is_missing(estimator, bad):
-    """An infinite row is no number; it must not reach the estimate."""
-    t = 3 * SECOND
-    track = fold(
-        estimator, MODEL, Tuning.of(MODEL), as_log(Events.concat([reading(t, 0, [1.0]), reading(2 * t, 0, [bad])], 3))
-    )
-    assert track.verdict[1] == MISSING
-    assert np.isnan(track.nis[1])
-    assert np.all(np.isfinite(track.mean))
-    assert np.all(np.isfinite(track.std))
-
-
 def test_an_enormous_reading_does_not_raise(estimator):
     """1e300 overflows the NIS: the reading fails or is gated; nothing raises, and the estimate stays a number."""
     log = as_log(Events.concat([reading(SECOND, 0, [1.0]), reading(2 * SECOND, 0, [1e300])], 3))

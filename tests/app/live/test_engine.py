@@ -229,16 +229,6 @@ def test_bad_commands_are_one_line_and_change_nothing(started):
     assert engine.tuning.get("R.winding") == 9.0 and texts and all("\n" not in text for text in texts)
 
 
-def test_reset_returns_to_the_prior():
-    stepped = Stepped()
-    stepped.put(readings([1.0, 2.0], [50, 51]))
-    stepped.submit(commands.Reset())
-    track = pull_all(stepped.engine).track
-    assert len(track) == 3
-    np.testing.assert_array_equal(track.mean[-1], [35.0, 0.0])
-    np.testing.assert_allclose(track.std[-1], [5.0, 1.0], rtol=1e-15)
-
-
 def test_a_live_source_that_fails_is_reopened(started):
     sources = [Scripted(live=True), Scripted(live=True)]
     engine = started(*sources)
