@@ -120,11 +120,13 @@ def test_inputs_parameters_rates_and_losses():
     assert changes.tolist() == [2 * 10**9], "inputs are said when they change, at the time from which they hold"
 
 
-def test_long_steps_are_split_as_the_model_asks():
-    source = Simulator(model(max_step=0.1), seed=0, step=0.5, duration=0.5, sensors=QUIET)
+@pytest.mark.parametrize(("truth", "pieces"), [({}, 5), ({"truth_model": model(max_step=0.2)}, 3)])
+def test_long_steps_are_split_into_equal_pieces_as_the_asset_asks(truth, pieces):
+    """The asset is the model of the estimator, of at most 0.1 s, or a truth of its own."""
+    source = Simulator(model(max_step=0.1), seed=0, step=0.5, duration=0.5, sensors=QUIET, **truth)
     b = 1.0
-    for _ in range(5):
-        b -= 0.1 * b * b
+    for _ in range(pieces):
+        b -= 0.5 / pieces * b * b
     assert read_all(source).value[-1, 1] == pytest.approx(b, rel=1e-12)
 
 
@@ -259,15 +261,6 @@ def test_steps_that_are_no_binary_fraction_are_at_their_nanosecond():
     got = read_all(source)
     assert np.unique(got.t).tolist() == [k * 300_000_000 for k in range(10)]
     assert source.span == (0, 2_700_000_000)
-
-
-def test_steps_are_split_as_the_truth_asks_the_last_piece_no_longer_than_the_others():
-    """A truth of at most 0.2 s in steps of 0.5 s: three pieces of a sixth, whatever the estimator's model allows."""
-    source = Simulator(model(), seed=0, step=0.5, duration=0.5, truth_model=model(max_step=0.2), sensors=QUIET)
-    b = 1.0
-    for _ in range(3):
-        b -= 0.5 / 3 * b * b
-    assert read_all(source).value[-1, 1] == pytest.approx(b, rel=1e-12)
 
 
 def raises_above_one(x, u, p, dt, out):

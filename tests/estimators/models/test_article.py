@@ -13,8 +13,7 @@ from estimators.log import READING, TICK, TRUTH, Events, Log
 from estimators.models import MODELS
 from estimators.models.lorenz import LORENZ63, LORENZ96
 from estimators.track import MISSING, USED
-from sources.simulator import SensorPlan, Simulator
-from tests.support import SECOND, read_all
+from tests.support import SECOND
 from tests.support import folded as advanced
 
 
@@ -102,24 +101,6 @@ def test_lost_samples_are_missing_and_covariance_grows(folded, rows):
     assert np.all(verdict[~lost] == USED)
     std = folded.track.std[at, 0]
     assert np.all(std[lost] > std[np.flatnonzero(lost) - 1])
-
-
-def test_the_simulator_draws_the_same(rows):
-    model = MODELS["motor_winding"]
-    source = Simulator(
-        model,
-        seed=7,
-        step=1.0,
-        duration=120.0,
-        initial={"temperature": 40.0, "rate": 0.2},
-        sensors={"winding": SensorPlan(drop_every=15)},
-    )
-    events = read_all(source)
-    expected = example_log(rows).events
-    np.testing.assert_array_equal(events.kind, expected.kind)
-    np.testing.assert_array_equal(events.t, expected.t)
-    # The simulator factorises Q once where the example draws from it anew: the last bit may differ.
-    np.testing.assert_allclose(events.value, expected.value, rtol=1e-13)
 
 
 def butterfly(t, s):
