@@ -397,6 +397,9 @@ class TwinSection(Section):
     """Range over which the model was fitted or validated, by state or input, in its unit, for example
     {temperature: {min: 20, max: 38}}. Outside it health is suspect, or advisory where parameters `widen`. A fitted
     tuning version has the range of its recordings. Default: the model's."""
+    withhold: dict[str, Positive] = {}
+    """Half-width of the 95 % band of a state beyond which its estimate is withheld, in its unit, for example
+    {soc: 0.2}: page, API and files then show the reason in place of a value. Default: never."""
     estimator: Annotated[
         EstimatorSection, BeforeValidator(as_estimator, json_schema_input_type=str | EstimatorSection)
     ] = EstimatorSection(name="ekf")

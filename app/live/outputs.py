@@ -185,7 +185,8 @@ class Status:
     filter's own figures (see `Fold.account`). `latency_ms` is the 99th percentile from a measurement's arrival to its
     row. `faults` are the injected ones that are active or planned. `integrity` has the protection levels; None until
     they are known. `compiling` are the filters that are not compiled yet: seconds since each was begun, None for one
-    that waits; `awaited` is the one for which a refold waits. `nis` is the verdict on the last window, `sensor_nis`
+    that waits; `awaited` is the one for which a refold waits. `withheld` has the reason of each state whose estimate
+    is withheld. `nis` is the verdict on the last window, `sensor_nis`
     (sensors,) the mean NIS per degree of freedom of each sensor's recent measurements.
     """
 
@@ -218,4 +219,5 @@ class Status:
     integrity: ProtectionLevels | None = None
     awaited: str | None = None
     compiling: Mapping[str, float | None] = field(default_factory=dict)
+    withheld: Mapping[str, str] = field(default_factory=dict)
     sensor_nis: np.ndarray = field(default_factory=lambda: np.zeros(0))

@@ -15,6 +15,7 @@ from estimators.diagnostics.consistency import nees
 from estimators.diagnostics.detectors import detector_of
 from estimators.diagnostics.episodes import Episode, episode_json
 from estimators.diagnostics.failure_cause import failures
+from estimators.diagnostics.references import withheld, withheld_reasons
 from estimators.diagnostics.score import Fit, Score, health_of, score
 from estimators.diagnostics.sensitivity.suspects import Suspect, in_words, likeliest, suspects
 from estimators.errors import NisusError
@@ -205,7 +206,9 @@ def fold_json(result: FoldResult) -> dict[str, Any]:
     part, s. `log_likelihood` includes the price of rejected measurements, which `log_likelihood_used` leaves out;
     `refused` is their share. `calibration` has an entry per sensor row and per state with known truth. `nees` is null
     without truth (`TruthNees`). `episodes` have start and end in seconds of the log (end null while one lasts) and
-    `suspects`. `smoothed` has `rmse`, `coverage` and `consistency` of the smoothed states.
+    `suspects`. `withheld` has the share of events of each state with a limit (`withhold`) in which its estimate is not
+    shown, and the reason at the end, null where it is shown there. `smoothed` has `rmse`, `coverage` and `consistency`
+    of the smoothed states.
     """
     twin, fold, scored, counts = result.twin, result.fold, result.score, result.counts
     smoothing = result.smoothing
@@ -253,11 +256,24 @@ def fold_json(result: FoldResult) -> dict[str, Any]:
         "failure": _failure_cause(fold),
         "account": fold.account(),
         "health": health_of(result.events, result.track, fold.policy),
+        "withheld": _withheld(result),
         "calibration": [calibration_json(entry) for entry in result.calibration],
         "episodes": [_episode_json(item) for item in result.episodes],
         "seconds_per_event": result.seconds,
     }
     return plain(found)  # type: ignore[no-any-return]
+
+
+def _withheld(result: FoldResult) -> dict[str, dict[str, Any]]:
+    """Return share and reason of withheld estimates, by state."""
+    model, track = result.twin.model, result.track
+    reasons = withheld_reasons(model, track, result.fold.u) if len(track) else {}
+    shares = withheld(model, track).mean(axis=0) if len(track) else np.zeros(len(model.shown_states))
+    return {
+        state.name: {"share": share, "reason": reasons.get(state.name)}
+        for state, share in zip(model.shown_states, shares.tolist(), strict=True)
+        if state.withhold < np.inf
+    }
 
 
 def _errors(states: Mapping[str, Fit]) -> dict[str, dict[str, float]]:
@@ -369,6 +385,10 @@ def _figures(result: FoldResult) -> list[Figure]:
     lost = dropped(counts, fold)
     return [
         *found,
+        *(
+            Figure(f"withheld {name}", f"{item['share']:.1%} of the events", remark=item["reason"] or "")
+            for name, item in _withheld(result).items()
+        ),
         Figure("final variances", ", ".join(f"{model.state_names[j]} {value**2:.5g}" for j, value in variances)),
         Figure(
             "late readings", f"{'used on arrival, R inflated' if twin.late.inflate else 'exact'}: {twin.late.reason}"

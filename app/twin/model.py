@@ -121,6 +121,7 @@ def configure(model: StateSpaceModel, loaded: Loaded) -> StateSpaceModel:
     field = isinstance(model.states, Field)
     places = [*(() if field else model.state_names), *(item.name for item in model.inputs)]
     check_names(loaded, ("valid",), config.valid, places, "state or input", model)
+    check_names(loaded, ("withhold",), config.withhold, () if field else model.state_names, "state", model)
     known = (model.states.name,) if isinstance(model.states, Field) else model.state_names
     check_names(loaded, ("prior",), config.prior, known, "field" if field else "state", model)
     check_names(loaded, ("noise",), config.noise, [item.name for item in model.noises], "noise", model)
@@ -242,7 +243,14 @@ def _states(model: StateSpaceModel, loaded: Loaded) -> Sequence[State]:
     for state in states:
         prior = given.get(state.name)
         mean, std = (prior.mean, prior.std) if prior else (None, None)
-        found.append(replace(state, mean=state.mean if mean is None else mean, std=state.std if std is None else std))
+        found.append(
+            replace(
+                state,
+                mean=state.mean if mean is None else mean,
+                std=state.std if std is None else std,
+                withhold=loaded.config.withhold.get(state.name, state.withhold),
+            )
+        )
     return _ranged(tuple(found), loaded)
 
 

@@ -21,7 +21,7 @@ from ..present.series.columns import columns_of
 
 STATUS_FIELDS = (
     "estimator", "options", "revision", "refolding", "awaited", "compiling", "t", "since", "cause", "episodes_open",
-    "lost", "model_version", "clock", "counts", "account", "paused",
+    "lost", "model_version", "clock", "counts", "account", "paused", "withheld",
     "finished", "speed", "seekable", "latency_ms",
 )  # fmt: skip
 """Fields of `Status` that JSON has under the same name."""
@@ -29,7 +29,7 @@ STATUS_FIELDS = (
 
 TRUST_FIELDS = (
     "t", "health", "since", "cause", "sensors", "episodes_open", "lost", "nis", "nis_low", "nis_high", "nis_dof",
-    "nis_judged", "nis_place", "nis_words", "groups",
+    "nis_judged", "nis_place", "nis_words", "groups", "withheld",
 )  # fmt: skip
 """Fields of a status that belong to its time."""
 

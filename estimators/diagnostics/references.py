@@ -1,4 +1,4 @@
-"""Quantities that a fold did not use and that judge it: true states, and measurements of held-out sensors."""
+"""True states and held-out sensors, which judge a fold that did not use them; estimates too uncertain to be shown."""
 
 from __future__ import annotations
 
@@ -58,6 +58,47 @@ def held_out_references(model: StateSpaceModel, events: Events, track: Track, s:
     for k, row in enumerate(model.sensors[s].rows):
         name = model.row_names[model.row_start[s] + k]
         yield Reference(name, row.unit, False, own, track.innovation[own, k], track.innovation_std[own, k])
+
+
+HALF_WIDTH = 1.959963984540054  # Half-width of a 95 % band, in standard deviations
+
+
+def withheld(model: StateSpaceModel, track: Track) -> np.ndarray:
+    """Return where the estimate of a shown state is withheld, (n, shown): its 95 % band is wider than its limit."""
+    limits = np.array([state.withhold for state in model.shown_states])
+    found: np.ndarray = track.std > limits / HALF_WIDTH
+    return found
+
+
+def withheld_reasons(model: StateSpaceModel, track: Track, u: np.ndarray) -> dict[str, str]:
+    """Return why the last estimate of each withheld state is, in words, with its band.
+
+    Args:
+        model: The model.
+        track: Rows of a fold, at least one.
+        u: Inputs at the last of them (nu,).
+    """
+    mean, std = track.mean[-1], track.std[-1]
+    places = [(item.name, item.unit, item.fitted) for item in (*model.shown_states, *model.inputs)]
+    left = [
+        f"{name} {value:.4g}{_unit(unit)}, fitted at {limits[0]:.4g} to {limits[1]:.4g}"
+        for (name, unit, limits), value in zip(places, (*mean, *u), strict=True)
+        if limits is not None and not limits[0] <= value <= limits[1]
+    ]
+    why = f"outside the fitted range ({'; '.join(left)})" if left else "too uncertain"
+    return {
+        state.name: f"{why}, ± {_two_digits(HALF_WIDTH * deviation)}{_unit(state.unit)}"
+        for state, deviation, hidden in zip(model.shown_states, std, withheld(model, track)[-1], strict=True)
+        if hidden
+    }
+
+
+def _two_digits(value: float) -> str:
+    return f"{float(f'{value:.2g}'):g}"
+
+
+def _unit(unit: str) -> str:
+    return "" if unit in ("", "1") else f" {unit}"
 
 
 def references(model: StateSpaceModel, events: Events, track: Track) -> list[Reference]:

@@ -10,6 +10,7 @@ import numpy as np
 
 from ..diagnostics.detectors import ALARM_NAMES, IMPOVERISHED, OUTSIDE, OUTSIDE_WIDENED, SENSOR_FLAGS
 from ..diagnostics.episodes import Episode, episode_json
+from ..diagnostics.references import withheld
 from ..events.batch import KIND_NAMES, READING, Events, truth_of
 from ..events.maintenance import model_versions
 from ..model.state_space import StateSpaceModel
@@ -59,7 +60,8 @@ def table_of(
         true = np.full(len(events), np.nan)
         true[rows] = values
         columns[f"{name}_true"] = true
-    columns |= {name: track.mean[:, k] for k, name in enumerate(shown)}
+    hidden = withheld(model, track)
+    columns |= {name: np.where(hidden[:, k], np.nan, track.mean[:, k]) for k, name in enumerate(shown)}
     columns |= {f"{name}_std": track.std[:, k] for k, name in enumerate(shown)}
     if smoothed is not None:
         columns |= {f"{name}_smooth": smoothed.mean[:, k] for k, name in enumerate(shown)}
@@ -77,6 +79,9 @@ def table_of(
     columns["alarms"] = pa.array(
         _words(np.bitwise_or.reduce(track.alarms, axis=1, dtype=np.int64), _CAUSES), pa.string()
     )
+    if any(state.withhold < np.inf for state in model.shown_states):
+        names = {1 << k: name for k, name in enumerate(shown)}
+        columns["withheld"] = pa.array(_words(hidden @ np.array(list(names), np.int64), names), pa.string())
     bits = {1 << k: f"{name} silent" for k, name in enumerate(model.sensor_names[:SENSOR_FLAGS])} | _FLAGS
     columns["flags"] = pa.array(_words(track.flags, bits), pa.string())
     plain = {k: np.ascontiguousarray(c) if isinstance(c, np.ndarray) else c for k, c in columns.items()}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -18,7 +19,8 @@ class State:
     """One entry of x with its prior N(mean, std²); a `circular` one is an angle in radians and wraps to ±π.
 
     `position` is for filters that localise measurements. `fitted` is the range in which the model was fitted or
-    checked; an estimate outside makes the twin suspect, or advisory if the bands widen there (`widens`).
+    checked; an estimate outside makes the twin suspect, or advisory if the bands widen there (`widens`). `withhold` is the
+    half-width of its 95 % band beyond which it is not shown as an estimate.
     """
 
     name: str
@@ -29,6 +31,7 @@ class State:
     position: tuple[float, ...] | None = None
     fitted: tuple[float, float] | None = None
     widens: bool = False
+    withhold: float = math.inf
 
     def __post_init__(self) -> None:
         """Reject an empty range."""

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from estimators.diagnostics.references import HALF_WIDTH
 from estimators.log import INPUT, READING, Events, truth_of
 from estimators.model.state_space import StateSpaceModel
 from estimators.track import FAILED, GATED, HELD_OUT, USED, Track, estimated_rows
@@ -57,7 +58,7 @@ def columns_of(model: StateSpaceModel) -> dict[str, Column]:
     for j, state in enumerate(model.shown_states):
         spread = 0.0 if j == model.mode else 2.0  # a probability has no band
         found += [
-            Column(f"mean:{state.name}", LINE, partial(_mean, j, 0.0)),
+            Column(f"mean:{state.name}", LINE, partial(_mean, j, 0.0, withhold=state.withhold)),
             Column(f"upper:{state.name}", UPPER, partial(_mean, j, spread)),
             Column(f"lower:{state.name}", LOWER, partial(_mean, j, -spread)),
             Column(f"truth:{state.name}", LINE, partial(_truth, int(model.shown[j]))),
@@ -100,10 +101,11 @@ def units_by_name(model: StateSpaceModel) -> dict[str, str]:
     return units | {name: model.sensors[sensor].rows[row].unit for name, sensor, row in rows_of(model)}
 
 
-def _mean(j: int, spread: float, rows: Rows) -> np.ndarray:
+def _mean(j: int, spread: float, rows: Rows, withhold: float = np.inf) -> np.ndarray:
     track = rows.track
     value = track.mean[:, j] + spread * track.std[:, j] if spread else track.mean[:, j]
-    return np.where(rows.estimated, value, np.nan)
+    shown = rows.estimated if withhold == np.inf else rows.estimated & (track.std[:, j] <= withhold / HALF_WIDTH)
+    return np.where(shown, value, np.nan)
 
 
 def _truth(state: int, rows: Rows) -> np.ndarray:

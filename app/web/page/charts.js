@@ -190,6 +190,7 @@ export class Charts {
   update(status) {
     setText($("no-rows"), status.t === null ? status.cause || "waiting for the first measurement" : "");
     if (status.integrity) this.integrity = status.integrity;
+    if (status.withheld) this.withheld = status.withheld;
     if (status.nis_dof) this.nisDof = status.nis_dof;
   }
 

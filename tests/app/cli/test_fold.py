@@ -16,6 +16,7 @@ from app.studies.fold_result import ExplainedEpisode, dropped, episodes_topic
 from app.twin.log_reader import read_log
 from app.twin.twin import load_twin
 from estimators.diagnostics.episodes import Episode
+from estimators.diagnostics.references import HALF_WIDTH
 from estimators.fold import Fold as FoldOf
 from estimators.interface.by_name import fold as fold_by_name
 from estimators.log import Log
@@ -59,6 +60,31 @@ def test_true_states_have_columns_of_their_own(tmp_path: Path, nisus: CommandLin
     # The events as they were read are in the table too.
     log, _ = read_log(load_twin(path), None)
     np.testing.assert_array_equal(table["value_1"].to_numpy(), log.events.value[:, 1])
+
+
+def test_an_estimate_with_too_wide_a_band_is_withheld_with_its_reason(tmp_path: Path, nisus: CommandLine) -> None:
+    """The mean is absent from the file; the band stays. σ of the rate is 1 °C/s at first and falls."""
+    limits = "withhold: {rate: 1.5}\nvalid: {temperature: {min: -10, max: 20}}\n"
+    path = drive(tmp_path, text=DRIVE + limits)
+    out = tmp_path / "track.parquet"
+    found = json.loads(nisus("fold", path, "--out", out, "--json"))
+    table = pq.read_table(out).to_pandas()
+    hidden = HALF_WIDTH * table["rate_std"] > 1.5
+    assert 0 < hidden.sum() < len(table)
+    np.testing.assert_array_equal(table["rate"].isna(), hidden)
+    assert not table["temperature"].isna().any()
+    assert table["withheld"].dropna().tolist() == ["rate"] * hidden.sum()
+    assert found["withheld"]["rate"]["share"] == pytest.approx(hidden.mean())
+    assert (found["withheld"]["rate"]["reason"] is None) == (not hidden.iloc[-1])
+
+
+def test_the_reason_of_a_withheld_estimate_names_what_left_the_fitted_range(tmp_path: Path, nisus: CommandLine) -> None:
+    limits = "withhold: {rate: 1e-3}\nvalid: {temperature: {min: -10, max: 20}}\n"
+    path = drive(tmp_path, text=DRIVE + limits)
+    reason = json.loads(nisus("fold", path, "--json"))["withheld"]["rate"]["reason"]
+    assert re.fullmatch(
+        r"outside the fitted range \(temperature 4\d\.\d+ °C, fitted at -10 to 20\), ± [\d.]+ °C/s", reason
+    )
 
 
 @pytest.mark.parametrize("back", [3600.0, 1234.0])

@@ -2,7 +2,7 @@
 
 import { band, dots, edge, line } from "../chart.js";
 import { aboutMean, marks, unbroken, wrapped } from "../drawing.js";
-import { bracketed, compact, decimals, fixed, withDeviation } from "../format.js";
+import { bracketed, compact, decimals, fixed, spaced, withDeviation } from "../format.js";
 import { Range, shownExtent, within } from "../ranges.js";
 import { groupsOf } from "./group.js";
 
@@ -76,7 +76,8 @@ function chartOf(charts, state) {
       return axisRange.fit(...charts.layers.reduce((range, layer) => layer.widened?.(range, state, span) ?? range, shown));
     },
     says: (value) => {
-      const [upper, truth, mean] = ["upper", "truth", "mean"].map(value);
+      const [upper, lower, truth, mean] = ["upper", "lower", "truth", "mean"].map(value);
+      if (!Number.isFinite(mean) && upper > lower) return `withheld: ${charts.withheld?.[state.name] ?? `± ${compact((upper - lower) / 2, 2)}${spaced(state.unit)}`}`;
       const deviation = upper - mean;
       const bound = level();
       const known = !Number.isFinite(bound) ? "" : bound > UNBOUNDED * Math.max(deviation, Math.abs(mean)) ? "  (unbounded)" : `  (≤ ${compact(bound, 2)})`;
