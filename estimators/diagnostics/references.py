@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..events.batch import READING, Events, truth_of
-from ..model.state_space import StateSpaceModel
+from ..model.state_space import Input, State, StateSpaceModel
 from ..track import HELD_OUT, Track
 
 
@@ -79,7 +79,8 @@ def withheld_reasons(model: StateSpaceModel, track: Track, u: np.ndarray) -> dic
         u: Inputs at the last of them (nu,).
     """
     mean, std = track.mean[-1], track.std[-1]
-    places = [(item.name, item.unit, item.fitted) for item in (*model.shown_states, *model.inputs)]
+    items: tuple[State | Input, ...] = (*model.shown_states, *model.inputs)
+    places = [(item.name, item.unit, item.fitted) for item in items]
     left = [
         f"{name} {value:.4g}{_unit(unit)}, fitted at {limits[0]:.4g} to {limits[1]:.4g}"
         for (name, unit, limits), value in zip(places, (*mean, *u), strict=True)

@@ -40,7 +40,7 @@ def considered(twin: Twin, first: Log, *, fitted: bool) -> tuple[Settings, str]:
     """Return the settings that a fit to the first half gives a twin, and what the data said, in words."""
     held = with_held(twin)
     prior = width_priors(twin.config, held.model, ("p",))
-    recording, setting = Recording(first), Setting(held.tuning, None)
+    recording, setting = Recording(first, 1.0, np.zeros(first.n, bool)), Setting(held.tuning, None)
     if fitted:
         found = fit(
             twin.estimator, held.tuning, [recording], wanted=[f"p.{name}" for name in prior],
