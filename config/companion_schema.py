@@ -208,6 +208,8 @@ class TuningSection(Section):
     """Parameters of the model, with the covariance that the fit gives them: std and correlation."""
     valid: dict[str, Validity] = {}
     """Range of the fitted recordings, by state or input, outside which parameters widen."""
+    withhold: dict[str, Positive] = {}
+    """Half-width of the 95 % band of a state beyond which its estimate is withheld."""
     prior: dict[str, PriorSection] = {}
     """Prior before the first measurement."""
     noise: dict[str, NoiseSection] = {}

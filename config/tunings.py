@@ -153,7 +153,8 @@ def overlay(data: dict[str, Any], places: ValuePlaces, version: Version) -> None
 def _merge(data: dict[str, Any], key: Key, value: dict[str, Any], places: ValuePlaces, version: Version) -> None:
     own = data.get(str(key[-1]))
     if not isinstance(own, dict):
-        own = {}
+        # A parameter of the twin may be a number, to which the version adds a width.
+        own = {"value": own} if key[0] == "parameters" and own is not None else {}
         places.options[key] = version.places.at(key)
     own = {name: item for name, item in own.items() if name not in SPREADS} if set(value) & set(SPREADS) else dict(own)
     data[str(key[-1])] = own

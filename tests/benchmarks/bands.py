@@ -2,9 +2,9 @@
 
 Each twin with recordings is folded twice with the same values: as its file has it with every parameter held (before),
 and with every parameter considered, by the covariance that the first half of its own recording gives them and its
-`widen` (after). Widths without data are those of the file (`std`), or 10 %. Both are scored on the second half, and
-with `--log TWIN=FILE` on whole recordings that no fit saw, against true states and held-out sensors: error (RMS), mean
-2 σ, share in the 95 % band, share withheld, health. `--fit` first fits the parameters to the first half too.
+`widen` (after). Widths without data are those of the version `considered`, or 10 %. Both are scored on the second half,
+and with `--log TWIN=FILE` on whole recordings that no fit saw, against true states and held-out sensors: error (RMS),
+mean 2 σ, share in the 95 % band, share withheld, health. `--fit` first fits the parameters to the first half too.
 """
 
 from __future__ import annotations
@@ -21,6 +21,8 @@ from app.present.export.calibration_lines import health_shares
 from app.twin.defaults import bounds_of, natural_aim, width_priors
 from app.twin.log_reader import read_log
 from app.twin.twin import Twin, load_twin, with_held
+from config.loader import find
+from config.tunings import version_files
 from estimators.diagnostics.references import references
 from estimators.diagnostics.score import health_of
 from estimators.errors import NisusError
@@ -35,11 +37,13 @@ from estimators.log import Log
 
 from .recordings import CASES, halves
 
+DATA_SHEET = "considered"  # Version that ships with the widths of data sheets
+
 
 def considered(twin: Twin, first: Log, *, fitted: bool) -> tuple[Settings, str]:
     """Return the settings that a fit to the first half gives a twin, and what the data said, in words."""
     held = with_held(twin)
-    prior = width_priors(twin.config, held.model, ("p",))
+    prior = width_priors(twin.config, held.model, ()) or width_priors(twin.config, held.model, ("p",))
     recording, setting = Recording(first, 1.0, np.zeros(first.n, bool)), Setting(held.tuning, None)
     if fitted:
         found = fit(
@@ -81,7 +85,8 @@ def score(twin: Twin, log: Log, part: np.ndarray, what: str) -> None:
 
 def report(name: str, seconds: float | None, more: Sequence[Path], *, fitted: bool) -> None:
     """Print the table of one twin."""
-    twin = load_twin(name)
+    shipped = {"tuning": DATA_SHEET} if DATA_SHEET in version_files(find(name)) else {}
+    twin = load_twin(name, overrides=shipped)
     log = read_log(twin, seconds)[0]
     first, second = halves(log)
     settings, words = considered(twin, first, fitted=fitted)

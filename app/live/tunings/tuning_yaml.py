@@ -62,15 +62,16 @@ def tuning_yaml(
     times = {*map(disturbance_time, lasting), *(error_time(sensor.name) for sensor in erring)}
     turned = {name: value for name, value in values.items() if name in config.parameters or value != known[name]}
     given = {name: section.model_dump(mode="json", exclude_unset=True) for name, section in config.parameters.items()}
-    parameters: dict[str, Any] = given if whole else {}
+    # A version replaces another, so it has the widths that are not the fit's too.
+    parameters: dict[str, Any] = {name: item for name, item in given.items() if whole or set(item) - {"value"}}
     for name, value in (turned if whole else values).items():
         parameters[name] = {**parameters.get(name, {}), "value": value}
     if widths is not None:
         parameters = _with_widths(parameters, widths)
     parameters = {name: item["value"] if list(item) == ["value"] else item for name, item in parameters.items()}
     lines += as_section("parameters", {name: item for name, item in parameters.items() if name not in times})
-    if widths is not None:
-        lines += as_section("valid", _fitted_ranges(config, model, widths, whole))
+    if widths is not None or not whole:
+        lines += as_section("valid", _fitted_ranges(config, model, widths))
     if prior is not None:
         beliefs = zip(model.state_names, prior[0].tolist(), np.sqrt(np.diag(prior[1])).tolist(), strict=True)
         lines += as_section("prior", {name: {"mean": mean, "std": std} for name, mean, std in beliefs})
@@ -106,16 +107,17 @@ def _with_widths(parameters: Mapping[str, Any], widths: ParameterWidths) -> dict
 
 
 def _fitted_ranges(
-    config: TwinSection, model: StateSpaceModel, widths: ParameterWidths, whole: bool
+    config: TwinSection, model: StateSpaceModel, widths: ParameterWidths | None
 ) -> dict[str, dict[str, float]]:
     """Return the section `valid`: the range of the fit, of each state and input that has one or widens a parameter."""
+    found = {name: section.model_dump(mode="json", exclude_unset=True) for name, section in config.valid.items()}
+    if widths is None:
+        return found
     items: tuple[State | Input, ...] = (
         model.inputs if isinstance(model.states, Field) else (*model.states, *model.inputs)
     )
     limited = {item.name for item in items if item.fitted is not None}
     limited |= {place for section in config.parameters.values() for place in section.widen}
-    found = {name: section.model_dump(mode="json", exclude_unset=True) for name, section in config.valid.items()}
-    found = found if whole else {}
     for name in sorted(limited & set(widths.envelope)):
         low, high = widths.envelope[name]
         found[name] = {"min": float(f"{low:.4g}"), "max": float(f"{high:.4g}")}

@@ -130,7 +130,8 @@ def version_text(twin: Twin, given: Settings) -> str:
             name: section.model_dump(mode="json", exclude_unset=True)
             for name, section in twin.config.commissioned.items()
         }
-    more = [*as_section("prior", given.prior), *as_section("commissioned", normal)]
+    sections = {"prior": given.prior, "withhold": twin.config.withhold, "commissioned": normal}
+    more = [line for key, section in sections.items() for line in as_section(key, section)]
     values = tuning_yaml(twin.config, given.estimator, given.tuning, whole=False, widths=given.widths)
     return heading + _header(head) + values + "".join(f"{line}\n" for line in more)
 

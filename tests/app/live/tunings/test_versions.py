@@ -367,3 +367,17 @@ def test_one_that_cannot_be_read_is_listed_beneath_the_others(own, capsys):
     table, beneath = capsys.readouterr().out.split("Cannot be read")
     assert [line.split()[0] for line in table.splitlines()[-3:-1]] == ["own", "good"]
     assert "bad.yaml:1: the file is [1]; a tuning version is a mapping" in " ".join(beneath.split())
+
+
+@pytest.mark.parametrize("name", ["battery_panasonic", "motor_bench"])
+def test_a_version_that_ships_adds_widths_to_the_values_of_its_twin(name):
+    """Not those of the model: a twin may have other values of it."""
+    own, found = load_twin(name), load_twin(name, overrides={"tuning": "considered"})
+    assert own.model.considered == 0 < found.model.considered
+    np.testing.assert_array_equal(found.tuning.p, own.tuning.p)
+    text = version_text(found, Settings("ekf", found.tuning))
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "again.yaml"
+        path.write_text(text, encoding="utf-8")
+        again = load_twin(name, overrides={"tuning": str(path)})
+    assert again.model.states == found.model.states and again.model.considered == found.model.considered
