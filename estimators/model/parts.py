@@ -19,8 +19,8 @@ class State:
     """One entry of x with its prior N(mean, std²); a `circular` one is an angle in radians and wraps to ±π.
 
     `position` is for filters that localise measurements. `fitted` is the range in which the model was fitted or
-    checked; an estimate outside makes the twin suspect, or advisory if the bands widen there (`widens`). `withhold` is the
-    half-width of its 95 % band beyond which it is not shown as an estimate.
+    checked; an estimate outside makes the twin suspect, or advisory if the bands widen there (`widens`). `withhold` is
+    the half-width of its 95 % band beyond which it is not shown as an estimate.
     """
 
     name: str
