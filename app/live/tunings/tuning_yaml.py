@@ -102,7 +102,8 @@ def _with_widths(parameters: Mapping[str, Any], widths: ParameterWidths) -> dict
         pairs = zip(widths.names[:i], widths.correlation[i, :i].tolist(), strict=True)
         own = found.setdefault(name, {})
         own |= {"std": float(f"{widths.std[i]:.4g}")}
-        own |= {"correlation": {other: float(f"{value:.{CORRELATION_DIGITS}g}") for other, value in pairs}}
+        if i > 0:
+            own["correlation"] = {other: float(f"{value:.{CORRELATION_DIGITS}g}") for other, value in pairs}
     return found
 
 

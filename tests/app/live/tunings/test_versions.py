@@ -370,9 +370,10 @@ def test_one_that_cannot_be_read_is_listed_beneath_the_others(own, capsys):
 
 
 @pytest.mark.parametrize("name", ["battery_panasonic", "motor_bench"])
-def test_a_version_that_ships_adds_widths_to_the_values_of_its_twin(name):
+@pytest.mark.parametrize("version", ["considered", "fitted"])
+def test_a_version_that_ships_adds_widths_to_the_values_of_its_twin(name, version):
     """Not those of the model: a twin may have other values of it."""
-    own, found = load_twin(name), load_twin(name, overrides={"tuning": "considered"})
+    own, found = load_twin(name), load_twin(name, overrides={"tuning": version})
     assert own.model.considered == 0 < found.model.considered
     np.testing.assert_array_equal(found.tuning.p, own.tuning.p)
     text = version_text(found, Settings("ekf", found.tuning))
