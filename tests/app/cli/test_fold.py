@@ -325,6 +325,8 @@ def test_the_json_says_what_a_script_needs(tmp_path: Path, nisus: CommandLine) -
     shares = {"degraded": policy.stale_after - policy.degraded_after, "stale": 460 - heard - policy.stale_after}
     shares["tracking"] = 460 - sum(shares.values())
     assert told["health"] == pytest.approx({name: shares.get(name, 0.0) / 460 for name in HEALTH_NAMES}, abs=1e-9)
+    (gap,) = [item for item in told["episodes"] if item["cause"] == "stale"]
+    assert (gap["start"], gap["end"], gap["size"]) == pytest.approx((heard, 460.0, 460.0 - heard))
     (tmp_path / "drive.yaml").write_text(yaml)
     shown = nisus("fold", tmp_path / "drive.yaml").out
     assert re.search(r"health, share of time +tracking \d+\.?\d* %, stale", shown)

@@ -91,12 +91,12 @@ def test_an_input_that_is_off(log):
 def test_a_parameter_of_the_twin_that_is_too_small_or_too_large(log, factor, word):
     """The words name the error of the twin's value, in percent of it."""
     p = Tuning.of(MODEL).p.copy()
-    k = PARAMETERS.index("winding_magnet")
+    k = PARAMETERS.index("capacity_winding")
     p[k] *= factor
     found = suspects("ekf", MODEL, replace(Tuning.of(MODEL), p=p), log, SINCE)
-    wrong = next(one for one in found if one.nudge.name == "winding_magnet")
+    wrong = next(one for one in found if one.nudge.name == "capacity_winding")
     assert wrong.size * (factor - 1.0) > 0.0
-    assert f"winding_magnet too {word} by " in in_words([wrong])
+    assert f"capacity_winding too {word} by " in in_words([wrong])
 
 
 def test_a_parameter_without_its_error_lies_in_its_range(log):
