@@ -210,6 +210,13 @@ def _reason(
         if narrow.correlation.low > MAX_CORRELATION:
             return _missing_cause(narrow)
         return _varies(narrow.name)
+    contrary = min(known, key=lambda one: one.correlation.high)
+    if contrary.correlation.high < -MAX_CORRELATION:
+        return (
+            f"successive innovations of {contrary.name} alternate ({contrary.correlation.value:+.2f}): its rows are of "
+            "several sources, or its noise is larger than fitted; give each source its rows by `only`, or raise "
+            f"R.{contrary.name} with nisus tune NAME.yaml"
+        )
     if place == "below" or any(one.low > MAX_COVERAGE for one in shares.values()):
         reads = next(one for one in sensors if one.name == wide.name)
         if reads.r <= MAX_FLOOR_FACTOR * reads.signal.resolution**2 / 12.0:
@@ -220,18 +227,9 @@ def _reason(
         if ratios[wide.name] * MAX_NIS_FACTOR < 1.0:
             return f"{wide.name} moves less in the second half than in the first; fit all of the log with nisus tune"
         return _varies(wide.name)
-    lasting, contrary = (
-        max(known, key=lambda one: one.correlation.low),
-        min(known, key=lambda one: one.correlation.high),
-    )
+    lasting = max(known, key=lambda one: one.correlation.low)
     if lasting.correlation.low > MAX_CORRELATION:
         return _missing_cause(lasting)
-    if contrary.correlation.high < -MAX_CORRELATION:
-        return (
-            f"successive innovations of {contrary.name} alternate ({contrary.correlation.value:+.2f}): its rows are of "
-            f"several sources, or its noise is larger than fitted; give each source its rows by `only`, or raise "
-            f"R.{contrary.name} with nisus tune NAME.yaml"
-        )
     for name, e in alone.items():
         share = share_interval(np.abs(e) <= BAND_SIGMA, e)
         if share.high < MIN_COVERAGE:

@@ -105,3 +105,15 @@ def test_no_time_constant_is_beyond_the_recording():
     found = [signal(None, SignalSeries(name, "", t * 10**9, x)) for name, x in (("tank", tank), ("heater", heater))]
     lag = driven(found, 0, [1])
     assert lag is None or lag.tau <= 1147 / 3
+
+
+def test_rows_of_two_sources_in_turn_are_not_consistent_though_their_nis_is(tmp_path):
+    """Nothing names the source of a row: each innovation is followed by one of the other sign."""
+    rng = np.random.default_rng(11)
+    level = np.cumsum(rng.normal(0, 0.1, N)) + np.where(np.arange(N) % 2, 1.0, -1.0) + rng.normal(0, 0.1, N)
+    found = inspect_recordings([write(tmp_path / "tank.csv", level=level)])
+    check = fit_all(plan(found, Roles())).check
+    assert check.sensors[0].correlation.high < -0.2 and 0.90 < check.sensors[0].coverage
+    assert check.reason.startswith("successive innovations of level alternate (-0.") and check.words.startswith(
+        "not con"
+    )
