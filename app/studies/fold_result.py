@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from estimators.diagnostics.calibration import BANDS, Calibration, calibrations, truth_calibration
+from estimators.diagnostics.considered_shares import shares_text, variance_shares
 from estimators.diagnostics.consistency import nees
 from estimators.diagnostics.detectors import detector_of
 from estimators.diagnostics.episodes import Episode, episode_json, episodes
@@ -222,10 +223,11 @@ def fold_json(result: FoldResult) -> dict[str, Any]:
     decisions on time, with reasons. `health` is the share of time in each state; `start` and `end` bound the scored
     part, s. `log_likelihood` includes the price of rejected measurements, which `log_likelihood_used` leaves out;
     `refused` is their share. `calibration` has an entry per sensor row and per state with known truth. `nees` is null
-    without truth (`TruthNees`). `episodes` have start and end in seconds of the log (end null while one lasts) and
-    `suspects`. `withheld` has the share of events of each state with a limit (`withhold`) in which its estimate is not
-    shown, and the reason at the end, null where it is shown there. `smoothed` has `rmse`, `coverage` and `consistency`
-    of the smoothed states.
+    without truth (`TruthNees`). `variance` has the share of each state's last variance by considered parameter, and the
+    rest as `noise`; it is empty where none is considered. `episodes` have start and end in seconds of the log (end null
+    while one lasts) and `suspects`. `withheld` has the share of events of each state with a limit (`withhold`) in which
+    its estimate is not shown, and the reason at the end, null where it is shown there. `smoothed` has `rmse`, `coverage`
+    and `consistency` of the smoothed states.
     """
     twin, fold, scored, counts = result.twin, result.fold, result.score, result.counts
     smoothing = result.smoothing
@@ -275,6 +277,7 @@ def fold_json(result: FoldResult) -> dict[str, Any]:
         "health": health_of(result.events, result.track, fold.policy),
         "withheld": _withheld(result),
         "calibration": [calibration_json(entry) for entry in result.calibration],
+        "variance": _variance_shares(fold),
         "episodes": [_episode_json(item) for item in result.episodes],
         "seconds_per_event": result.seconds,
     }
@@ -353,6 +356,11 @@ def fold_topics(result: FoldResult) -> list[Topic]:
     return [*topics, episodes_topic(result.episodes)]
 
 
+def _variance_shares(fold: Fold) -> dict[str, dict[str, float]]:
+    """Return the shares of each state's last variance; nothing where no parameter is considered."""
+    return variance_shares(fold.model, fold.moments()[1]) if fold.model.considered else {}
+
+
 def _figures(result: FoldResult) -> list[Figure]:
     twin, fold, scored, counts = result.twin, result.fold, result.score, result.counts
     model, events, track = twin.model, result.events, result.track
@@ -407,6 +415,7 @@ def _figures(result: FoldResult) -> list[Figure]:
             for name, item in _withheld(result).items()
         ),
         Figure("final variances", ", ".join(f"{model.state_names[j]} {value**2:.5g}" for j, value in variances)),
+        *(Figure(f"variance of {name}", shares_text(shares)) for name, shares in _variance_shares(fold).items()),
         Figure(
             "late readings", f"{'used on arrival, R inflated' if twin.late.inflate else 'exact'}: {twin.late.reason}"
         ),

@@ -122,7 +122,13 @@ def configure(model: StateSpaceModel, loaded: Loaded) -> StateSpaceModel:
     places = [*(() if field else model.state_names), *(item.name for item in model.inputs)]
     check_names(loaded, ("valid",), config.valid, places, "state or input", model)
     check_names(loaded, ("withhold",), config.withhold, () if field else model.state_names, "state", model)
-    known = (model.states.name,) if isinstance(model.states, Field) else model.state_names
+    own = model.state_names[: model.nx - model.considered]
+    for name in model.state_names[len(own) :]:
+        if name in config.prior:
+            raise loaded.error(
+                ("prior", name), "is considered, so its prior is the `std` of the parameter; give it there"
+            )
+    known = (model.states.name,) if isinstance(model.states, Field) else own
     check_names(loaded, ("prior",), config.prior, known, "field" if field else "state", model)
     check_names(loaded, ("noise",), config.noise, [item.name for item in model.noises], "noise", model)
     families = dict.fromkeys(sensor.family for sensor in model.sensors if sensor.family)

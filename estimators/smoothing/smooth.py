@@ -46,6 +46,14 @@ def check_smooth(estimator: Estimator, model: StateSpaceModel, options: Mapping[
     """
     if estimator.name not in (*KINDS, *PARTICLES):
         raise EstimatorError(f"{estimator.name} cannot be smoothed; use {', '.join((*KINDS, *PARTICLES))}")
+    if model.considered:
+        # The gains of a smoother suppose that those of the filter are optimal. Otherwise its covariance is still right,
+        # but can be many times that of the filter.
+        names = ", ".join(model.state_names[model.nx - model.considered :])
+        raise EstimatorError(
+            f"{estimator.name} cannot be smoothed: {model.name} considers {names}, and the smoothed estimate may be "
+            "worse than the filtered one; hold (`use: held`) or estimate them to smooth"
+        )
     if model.black_box:
         raise EstimatorError(f"{estimator.name} cannot be smoothed: {model.name} is a black box, which is not compiled")
     if estimator.name in KINDS and KINDS[estimator.name].holds == MEMBERS:

@@ -73,7 +73,8 @@ def tuning_yaml(
     if widths is not None or not whole:
         lines += as_section("valid", _fitted_ranges(config, model, widths))
     if prior is not None:
-        beliefs = zip(model.state_names, prior[0].tolist(), np.sqrt(np.diag(prior[1])).tolist(), strict=True)
+        own = model.state_names[: model.nx - model.considered]  # the prior of the others is that of their parameters
+        beliefs = zip(own, prior[0].tolist(), np.sqrt(np.diag(prior[1])).tolist(), strict=False)
         lines += as_section("prior", {name: {"mean": mean, "std": std} for name, mean, std in beliefs})
     errors = {sensor.name: [noises.pop(name) for name in errors_of(sensor)] for sensor in erring}
     over = {name: {"over": values.get(disturbance_time(name), seconds)} for name, seconds in lasting.items()}

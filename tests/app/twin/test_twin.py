@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from app.live.tunings.tuning_yaml import tuning_yaml
 from app.twin.twin import load_twin, restore_twin
 from estimators.compiled.model import compile_model
 from estimators.errors import ConfigError, ModelError, NisusError
@@ -355,3 +356,14 @@ def test_a_filter_named_anew_keeps_what_the_yaml_gives_it() -> None:
     assert more.tuning.options == {"alpha": 0.7, "beta": 1.0}
     with pytest.raises(ConfigError, match=r"^motor.yaml:8: .*alpha is 90"):
         twin_of(text.replace("alpha: 0.5", "alpha: 90"), overrides={"estimator": "iekf"})
+
+
+def test_the_prior_of_what_is_considered_is_that_of_the_parameter() -> None:
+    text = "model: motor_drive\nparameters: {yoke_coolant: {std: 10 %}}\nsource: {type: simulator}\n"
+    twin = twin_of(text)
+    assert twin.model.states[-1].name == "yoke_coolant_deviation"
+    said = refusal(text + "prior: {yoke_coolant_deviation: {std: 1}}\n")
+    assert "prior.yoke_coolant_deviation is considered, so its prior is the `std` of the parameter" in said
+    mean, cov = twin.model.prior_mean, twin.model.prior_cov
+    written = tuning_yaml(twin.config, twin.estimator, twin.tuning, (mean, cov), whole=True)
+    assert "winding: {mean" in written and "yoke_coolant_deviation" not in written

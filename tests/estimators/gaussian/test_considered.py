@@ -5,12 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from estimators.errors import ModelError
+from estimators.diagnostics.considered_shares import variance_shares
+from estimators.errors import EstimatorError, ModelError
 from estimators.fold import Fold
 from estimators.log import READING, Events, Log
 from estimators.model.assemble import JointParameter, joint
 from estimators.model.state_space import Input, Noise, Parameter, Row, Sensor, State, StateSpaceModel
-from estimators.registry import ESTIMATORS
+from estimators.registry import ESTIMATORS, find_estimator
+from estimators.smoothing.smooth import check_smooth
 from estimators.tuning import Tuning
 from tests.support import SECOND
 
@@ -206,3 +208,47 @@ def test_correlated_and_widened_parameters_equal_the_equations_in_blocks(estimat
 def test_impossible_widths_are_refused(estimated, correlations, rule):
     with pytest.raises(ModelError, match=rule):
         joint(ranged(), estimated, correlations)
+
+
+def simulated(physics, p, steps=40):
+    """A log without noise of an asset with parameters p from the prior's mean on, and its last state."""
+    log, x, u = log_of(steps), physics.prior_mean.copy(), physics.default_inputs
+    for k in range(steps):
+        if k > 0:
+            forward = np.empty(2)
+            physics.f(x, u, p, STEP, forward)
+            x = forward
+        out = np.empty(1 + k % 2)
+        physics.sensors[k % 2].h(x, u, p, out)
+        log.events.value[k, : out.size] = np.where(np.isnan(log.events.value[k, : out.size]), np.nan, out)
+    return log, x
+
+
+@pytest.mark.parametrize("estimator", ["ekf", "sr-ekf"])
+def test_shares_of_the_variance_are_those_of_refolds(estimator):
+    """The error of a fold changes with the asset's parameters by the sensitivity that the shares are made of."""
+    own = physics(f)
+    model = joint(own, CONSIDERED)
+    errors = []
+    for moved in ({}, {0: 0.3}, {1: 0.02}):
+        p = own.default_parameters + np.array([moved.get(k, 0.0) for k in range(3)])
+        log, truth = simulated(own, p)
+        fold = Fold(estimator, model, Tuning.of(model), log)
+        fold.advance()
+        mean, P = fold.moments()
+        errors.append(truth - mean[:2])
+    shares = variance_shares(model, P)
+    for i, name in enumerate(own.state_names):
+        offset, loss = ((error[i] - errors[0][i]) ** 2 / P[i, i] for error in errors[1:])
+        assert shares[name] == pytest.approx({"offset": offset, "loss": loss, "noise": 1.0 - offset - loss}, abs=1e-8)
+        assert list(shares[name])[0] == max(("offset", offset), ("loss", loss), key=lambda item: item[1])[0]
+    correlated = joint(own, CONSIDERED, {("offset", "loss"): 0.9})
+    fold = Fold(estimator, correlated, Tuning.of(correlated), log)
+    fold.advance()
+    assert sum(variance_shares(correlated, fold.moments()[1])["a"].values()) == pytest.approx(1.0)
+
+
+def test_a_smoother_refuses_what_is_considered():
+    model = joint(physics(f), CONSIDERED)
+    with pytest.raises(EstimatorError, match="considers offset_deviation, loss_deviation.*use: held"):
+        check_smooth(find_estimator("ekf", model), model, {})

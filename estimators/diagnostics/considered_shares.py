@@ -1,0 +1,64 @@
+"""Sources of the variance of a state: considered parameters, and noise."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from ..model.assemble import deviation, outside
+from ..model.state_space import StateSpaceModel
+
+NOISE = "noise"
+"""What no considered parameter explains: noise of process and sensors, and the prior of the states."""
+
+
+def considered_labels(model: StateSpaceModel) -> list[str]:
+    """Return the names of the parameters behind the considered states, with "outside" for what their range adds."""
+    names = model.state_names[model.nx - model.considered :]
+    known = {deviation(item.name): item.name for item in model.parameters}
+    known |= {outside(item.name): f"{item.name} outside" for item in model.parameters}
+    return [known.get(name, name) for name in names]
+
+
+def variance_shares(model: StateSpaceModel, cov: np.ndarray) -> dict[str, dict[str, float]]:
+    """Return for each estimated state the share of its variance by considered parameter, largest first, and `NOISE`.
+
+    With G = P_xc C⁻¹, the sensitivity of the error of x to the deviations c, the variance is that of noise and
+    (G C Gᵀ)_ii = Σ_j G_ij (P_xc)_ij, a term for each parameter: G_ij² C_jj of an independent one. Correlated parameters
+    share their joint terms equally, so that one whose error cancels another's has a negative share.
+
+    Source: Li et al. (2010), doi:10.1021/jp9096919, for shares of correlated inputs (structural and correlative).
+
+    Args:
+        model: A model with considered states.
+        cov: Covariance of its states (nx, nx), as of `Fold.moments`.
+
+    Returns:
+        Nothing for a model without considered states; of a state only those with a positive, finite variance.
+    """
+    n = model.nx - model.considered
+    if model.considered == 0 or cov.shape[0] != model.nx or not np.all(np.isfinite(cov)):
+        return {}
+    C, cross = cov[n:, n:], cov[:n, n:]
+    # In units of the deviations, so that small ones do not drown; members fewer than parameters leave C singular.
+    unit = np.sqrt(np.diag(C))
+    unit = np.where(unit > 0.0, unit, 1.0)
+    terms = (cross / unit) @ np.linalg.pinv(C / np.outer(unit, unit), hermitian=True) / unit * cross
+    labels = considered_labels(model)
+    found = {}
+    for i, name in enumerate(model.state_names[:n]):
+        if cov[i, i] > 0.0:
+            shares = sorted(zip(labels, (terms[i] / cov[i, i]).tolist(), strict=True), key=lambda item: -item[1])
+            found[name] = {**dict(shares), NOISE: 1.0 - sum(share for _, share in shares)}
+    return found
+
+
+MIN_SHARE = 0.005
+"""Share of a variance below which a parameter is not named."""
+
+
+def shares_text(shares: Mapping[str, float]) -> str:
+    """Return the shares of one state's variance as text, the largest first: "capacity 60 %, noise 38 %, r0 2 %"."""
+    named = [(name, share) for name, share in shares.items() if abs(share) >= MIN_SHARE]
+    return ", ".join(f"{name} {100 * share:.0f} %" for name, share in sorted(named, key=lambda item: -item[1]))
