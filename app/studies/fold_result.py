@@ -226,8 +226,8 @@ def fold_json(result: FoldResult) -> dict[str, Any]:
     without truth (`TruthNees`). `variance` has the share of each state's last variance by considered parameter, and the
     rest as `noise`; it is empty where none is considered. `episodes` have start and end in seconds of the log (end null
     while one lasts) and `suspects`. `withheld` has the share of events of each state with a limit (`withhold`) in which
-    its estimate is not shown, and the reason at the end, null where it is shown there. `smoothed` has `rmse`, `coverage`
-    and `consistency` of the smoothed states.
+    its estimate is not shown, and the reason at the end, null where it is shown there. `smoothed` has `rmse`,
+    `coverage` and `consistency` of the smoothed states.
     """
     twin, fold, scored, counts = result.twin, result.fold, result.score, result.counts
     smoothing = result.smoothing

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from estimators.diagnostics.considered_shares import shares_text, variance_shares
 from estimators.diagnostics.innovations import flat_range
 from estimators.diagnostics.score import nis_verdict
 from estimators.diagnostics.sensitivity import GramianView, gramian
@@ -106,7 +107,7 @@ class Diagnosis:
 
         `rows` are the first of the sensors' rows (row_figures.py), `rows_in_all` how many there are, `ranks` counts of
         an ensemble's histogram, `particles` what is left of a cloud over time, `correlation` a map of the present
-        covariance, `nis` how the mean NIS is judged,
+        covariance, `variance` sources of the present variance by state, `nis` how the mean NIS is judged,
         `observability`, `faults` and `integrity` what could be wrong unnoticed, `cost` microseconds of an
         event.
         """
@@ -135,6 +136,7 @@ class Diagnosis:
             "ranks": _ranks(status),
             "particles": _particles(status, events, track),
             "correlation": _correlation(engine),
+            "variance": _variance(engine),
             "observability": _observability(engine, slow),
             "nis": nis.words,
             "nis_place": nis.place,
@@ -205,8 +207,17 @@ def _correlation(engine: Running) -> dict[str, Any]:
     with np.errstate(all="ignore"):
         matrix = some / np.outer(std, std)
     names = [model.shown_states[k].name for k in range(len(places))]
-    left = "" if len(places) == model.nx else f"{len(places)} of {model.nx:,} states"
+    own = model.nx - model.considered
+    left = "" if len(places) == own else f"{len(places)} of {own:,} states"
     return {"names": names, "matrix": listed(matrix, 3), "reason": left}
+
+
+def _variance(engine: Running) -> dict[str, str]:
+    """Return the sources of each state's present variance in words; nothing where no parameter is considered."""
+    if not engine.model.considered:
+        return {}
+    found = variance_shares(engine.model, engine.belief().cov)
+    return {name: shares_text(shares) for name, shares in found.items()}
 
 
 def _observability(engine: Running, found: FoldFigures | None) -> dict[str, Any]:

@@ -58,7 +58,7 @@ export class Diagnose {
     this.node.replaceChildren(
       element("p", { class: "summary" }, element("b", {}, `${good} of ${found.rows.length} sensor rows${left} are consistent${but}. `), `Last ${found.events.toLocaleString("en")} events, ${span(found.span)}, ${found.estimator}: ${found.nis}.${cost}`),
       ...rows.map((row) => rowCard({ ...row, verdict: inChartTime(row.verdict, this.link.status.origin) }, found.marginal, open(row), (now) => this.turned.set(row.name, now))),
-      element("div", { class: "cards" }, ...[ranksCard(found), particlesCard(found), correlationCard(found), ...unseenCards(found)].filter(Boolean)),
+      element("div", { class: "cards" }, ...[ranksCard(found), particlesCard(found), varianceCard(found), correlationCard(found), ...unseenCards(found)].filter(Boolean)),
     );
     this.savable(found.events);
     if (focused) this.node.querySelector(`[aria-label="${CSS.escape(focused)}"]`)?.focus();
@@ -159,6 +159,17 @@ function correlationCard({ correlation }) {
 }
 
 const n = (count, value, a, b) => (count < 2 ? "There is one state." : `All are distinguishable; most correlated: ${a} and ${b} (${value.toFixed(2)}).`);
+
+// Of a twin with considered parameters: whose uncertainty the bands come from.
+function varianceCard({ variance }) {
+  const entries = Object.entries(variance);
+  if (!entries.length) return null;
+  return card(
+    "Sources of uncertainty", "good: none that a measurement could remove",
+    "Share of each state's variance by considered parameter. Noise is the rest: sensors, process and prior.",
+    table(["state", "variance from"], entries.map(([name, text]) => [words(name), words(text)])),
+  );
+}
 
 // One card where all three have the same reason.
 function unseenCards(found) {

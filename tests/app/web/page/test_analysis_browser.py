@@ -156,6 +156,19 @@ def test_rows_in_order_do_not_hide_a_mean_nis_that_is_not(page, place):
     assert said == f"3 of 3 sensor rows are consistent{but}."
 
 
+def test_diagnose_states_which_considered_parameters_the_bands_come_from(page):
+    def answer(route):
+        told = route.fetch().json()
+        route.fulfill(json=told | {"variance": {"winding": "yoke_coolant 60 %, noise 40 %", "magnet": "noise 100 %"}})
+
+    page.route("**/api/diagnose", answer)
+    page.get_by_role("tab", name="Diagnose").click()
+    until(page, "window.nisus.diagnosed > 0")
+    card = page.get_by_label("Sources of uncertainty", exact=True)
+    assert card.locator("tr").nth(1).inner_text().split("\t") == ["winding", "yoke coolant 60 %, noise 40 %"]
+    assert card.locator("tr").count() == 3
+
+
 def test_nothing_is_asked_while_both_are_hidden(page):
     page.get_by_role("tab", name="Charts").click()
     until(page, "!('whatif' in window.nisus.link.streams) && !window.nisus.panes.whatif.busy")
