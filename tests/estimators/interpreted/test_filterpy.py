@@ -2,11 +2,10 @@
 
 What is avoided, because FilterPy 2.0 is wrong or silent there:
 - `ExtendedKalmanFilter.predict_update` evaluates H before it predicts: linearised at the wrong point. So predict() and
-  update() are called instead (`test_predict_update_is_wrong` shows the difference).
+  update() are called instead.
 - `ExtendedKalmanFilter.predict_x` is F x even when f is curved; it is overridden with f.
 - `UnscentedKalmanFilter.update` reuses the sigma points of the last predict(): right for the first reading after it,
-  stale for a second one at the same time. They are drawn anew before every update
-  (`test_stale_sigma_points_are_wrong`).
+  stale for a second one at the same time. They are drawn anew before every update.
 - A reading with some rows missing is not supported (z is all or None): each subset is passed with its own h and R.
 - Angles: its residuals must be given by hand and its mean of angles is another definition; compared elsewhere.
 
@@ -16,13 +15,12 @@ we factorise.
 
 import numpy as np
 import pytest
-from filterpy.kalman import ExtendedKalmanFilter, KalmanFilter, MerweScaledSigmaPoints, UnscentedKalmanFilter
+from filterpy.kalman import ExtendedKalmanFilter, MerweScaledSigmaPoints, UnscentedKalmanFilter
 
 from estimators.fold import Fold
 from estimators.log import READING, TICK, Events, Log
 from estimators.model.state_space import Input, Noise, Parameter, Row, Sensor, State, StateSpaceModel
 from estimators.tuning import Tuning
-from tests.estimators.linear_models import ROWS, random_linear
 from tests.support import SECOND
 
 Q = np.array([0.02, 0.05, 0.01])
@@ -190,53 +188,3 @@ def test_ukf(log, values):
             ukf.sigmas_f = points.sigma_points(ukf.x, ukf.P)
             ukf.update(y, R=r, hx=lambda x, s=sensor, i=rows: hx(s, x)[i])
         check(track, k, ukf.x, ukf.P, ukf.log_likelihood if rows.size else None)
-
-
-def test_kf():
-    rng = np.random.default_rng(3)
-    matrices = random_linear(rng, 3, 2)
-    batch = [Events.one(0, 0, TICK, 0, (), 3)]
-    t = 0
-    for _ in range(150):
-        t += int(rng.integers(1, 5)) * 10**8
-        sensor = int(rng.integers(3))
-        batch.append(Events.one(t, t, READING, sensor, rng.normal(0, 2, ROWS[sensor]), 3))
-    log = Log(3)
-    log.extend(Events.concat(batch, 3))
-    track = folded("kf", matrices.model, log)
-    kf = KalmanFilter(dim_x=3, dim_z=3, dim_u=2)
-    kf.x, kf.P = matrices.mean.copy(), np.diag(matrices.std**2)
-    events = log.events
-    for k in range(1, len(events)):
-        dt = (int(events.t[k]) - int(events.t[k - 1])) / SECOND
-        kf.predict(u=matrices.u, B=dt * matrices.B, F=np.eye(3) + dt * matrices.A, Q=matrices.q * dt * matrices.W)
-        sensor = int(events.channel[k])
-        y = events.value[k, : ROWS[sensor]] - matrices.D[sensor] @ matrices.u
-        kf.update(y, R=np.diag(matrices.R[sensor]), H=matrices.H[sensor])
-        check(track, k, kf.x, kf.P, kf.log_likelihood)
-
-
-def test_predict_update_is_wrong(log):
-    """The fault that is avoided exists: H at the estimate before the prediction gives another gain."""
-    x, dt, y = X0, 0.1, np.array([0.7])
-    late, early = (ExtendedKalmanFilter(dim_x=3, dim_z=1) for _ in range(2))
-    for ekf in (late, early):
-        ekf.x, ekf.P, ekf.F, ekf.Q, ekf.R = x.copy(), np.diag(P0), F_of(x, dt), np.diag(Q * dt), np.diag(R[0])
-    late.predict()
-    late.update(y, lambda x: H_of(0, x), lambda x: hx(0, x))
-    early.predict_update(y, lambda x: H_of(0, x), lambda x: hx(0, x))
-    assert np.max(np.abs(late.x - early.x)) > 1e-3
-
-
-def test_stale_sigma_points_are_wrong(log):
-    """The fault that is avoided exists: a second update without a prediction takes the points of before the first."""
-    points, fresh = unscented({"alpha": 1.0, "beta": 2.0, "kappa": 0.0})
-    _, stale = unscented({"alpha": 1.0, "beta": 2.0, "kappa": 0.0})
-    for ukf in (fresh, stale):
-        ukf.Q = np.diag(Q * 0.1)
-        ukf.predict(dt=0.1)
-        ukf.update(np.array([0.7]), R=np.diag(R[0]), hx=lambda x: hx(0, x))
-    fresh.sigmas_f = points.sigma_points(fresh.x, fresh.P)
-    for ukf in (fresh, stale):
-        ukf.update(np.array([0.2, 2.0]), R=np.diag(R[1]), hx=lambda x: hx(1, x))
-    assert np.max(np.abs(fresh.x - stale.x)) > 1e-2

@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from filterpy.kalman import EnsembleKalmanFilter
 
 from estimators.fold import Fold, fold
 from estimators.log import READING, TICK, Events, Log
@@ -132,16 +131,6 @@ def test_enkf_draws_by_seed_and_leaves_the_global_generator_alone():
     assert_same(pieces.track, one)
     other = fold("filterpy-enkf", MODEL, replace(tuning, seed=1), as_log(events))
     assert np.mean(other.mean != one.mean) > 0.9  # all but the resets, which give the prior's draw
-
-
-def test_enkf_p_is_not_its_members_covariance():
-    """The fault that is avoided exists: after an update FilterPy's P differs from the spread of its own members."""
-    np.random.seed(1)  # noqa: NPY002  FilterPy draws from the global generator
-    enkf = EnsembleKalmanFilter(np.zeros(1), np.eye(1), 1, 1.0, 10, hx=lambda x: x, fx=lambda x, dt: x)
-    enkf.Q *= 0.01
-    enkf.predict()
-    enkf.update(np.array([1.0]))
-    assert abs(enkf.P[0, 0] / np.var(enkf.sigmas, ddof=1) - 1) > 0.01
 
 
 def test_a_covariance_without_a_factor_fails_and_is_no_exception():
