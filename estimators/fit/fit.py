@@ -149,7 +149,7 @@ def fit(
     lean: list[Recording] = []
     left_out = Counter[str]()
     for item in recordings:
-        log, repetitions = without_stuck(tuning, item.log)
+        log, repetitions = without_stuck(estimator, tuning, item.log, item.base)
         left_out.update(repetitions)
         for into, part in ((whole, log), (lean, without_queries(log, truth=references))):
             into.append(item._replace(log=part, held_out=held_out_rows(part, blocks)))

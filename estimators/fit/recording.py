@@ -8,10 +8,13 @@ blocks are predictions of data that took no part in the fit.
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
+from ..diagnostics.detectors import STUCK
+from ..fold import Fold
 from ..log import INPUT, MAINTENANCE, READING, RESET, TRUTH, Log
 from ..snapshots import Base
 from ..tuning import Tuning
@@ -79,17 +82,17 @@ def without_queries(log: Log, *, truth: bool = False) -> Log:
     return _selected(log, kept)
 
 
-def without_stuck(tuning: Tuning, log: Log) -> tuple[Log, dict[str, int]]:
+def without_stuck(estimator: str, tuning: Tuning, log: Log, base: Base | None = None) -> tuple[Log, dict[str, int]]:
     """Return the log without the repetitions of stuck sensors, and their number by sensor.
 
     A stuck sensor predicts itself, so its fitted R would tend to zero. Two readings of standard deviation σ, rounded to
     a quantum q, are equal with a probability of at most erf(q / 2σ), and an asset at rest repeats more often: the share
     of repetitions in all other runs counts if it is larger. A run is stuck if its probability is below
-    `RUN_PROBABILITY`. The running twin uses the same test (diagnostics/detector_tests.py); here it sees the whole
-    log. A sensor that never changes is left as it is: its R is not fitted in any case.
+    `RUN_PROBABILITY`, and if the detector of the running twin (diagnostics/detector_tests.py) is in alarm in it: an
+    asset at rest repeats itself, too. A sensor that never changes is left as it is: its R is not fitted in any case.
     """
     model, kind = tuning.model, log.kind[: log.n]
-    kept, counts = np.ones(log.n, bool), {}
+    kept, counts, fold = np.ones(log.n, bool), {}, None
     for s, sensor in enumerate(model.sensors):
         own = np.flatnonzero((kind == READING) & (log.channel[: log.n] == s))
         first = model.row_start[s]
@@ -100,6 +103,14 @@ def without_stuck(tuning: Tuning, log: Log) -> tuple[Log, dict[str, int]]:
         ]
         # All rows must repeat: a receiver at rest may repeat one of them.
         stuck = np.logical_and.reduce(rows) if rows and tuning.used[s] else np.zeros(own.size, bool)
+        if not stuck.any():
+            continue
+        if fold is None:
+            fold = Fold(estimator, model, replace(tuning, baseline=None), log, base=base)
+            fold.advance()
+        alarms = (fold.track.alarms[own, : len(sensor.rows)] & STUCK != 0).any(axis=1)
+        run = np.cumsum(np.diff(stuck.astype(np.int8), prepend=0) == 1) * stuck
+        stuck &= np.isin(run, run[alarms & stuck])
         if stuck.any():
             kept[own[stuck]] = False
             counts[sensor.name] = int(stuck.sum())

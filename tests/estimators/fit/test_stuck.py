@@ -7,11 +7,12 @@ from estimators.fit.recording import Recording, repeated, without_stuck
 from estimators.tuning import Tuning
 from tests.estimators.fit.test_fit import MODEL, log_of, simulated
 
-RIGHT = Tuning.of(MODEL).set("Q.level", 0.2).set("R.float", 0.5)
+RIGHT = Tuning.of(MODEL).set("Q.level", 0.01).set("R.float", 0.5)
+"""The level hardly moves between two readings: without the sensor's noise they would be equal, but it has some."""
 
 
 def stuck_for(share: float) -> np.ndarray:
-    ys = simulated(6, 400)
+    ys = simulated(6, 400, q=0.01)
     ys[100 : 100 + int(share * ys.size)] = ys[100]
     return ys
 
@@ -44,6 +45,15 @@ def test_an_asset_at_rest_is_not_stuck():
     assert repeated(speeds, 10.0).sum() == 149
 
 
+def test_what_the_model_does_not_contradict_takes_part():
+    """The level tends to 0 and may rest there, if it moves as far as the noise; it does not rest elsewhere."""
+    active, rest = RIGHT.set("Q.level", 2.0), stuck_for(0.2)
+    rest[100:180] = 0.0
+    assert without_stuck("kf", active, log_of(rest))[1] == {}
+    assert without_stuck("kf", active, log_of(stuck_for(0.2)))[1] == {"float": 79}
+    assert without_stuck("kf", RIGHT, log_of(rest))[1] == {"float": 79}
+
+
 def test_what_is_missing_does_not_interrupt():
     ys = stuck_for(0.2)
     ys[110:180:5] = np.nan
@@ -52,7 +62,7 @@ def test_what_is_missing_does_not_interrupt():
 
 def test_a_short_run_stays():
     log = log_of(stuck_for(0.03))
-    same, found = without_stuck(RIGHT, log)
+    same, found = without_stuck("kf", RIGHT, log)
     assert found == {} and same is log
 
 
