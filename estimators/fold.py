@@ -251,17 +251,18 @@ class Fold:
             self.decisions.append(decision)
         return changed
 
-    def second_story(self, start: int, stop: int, sensor: int) -> Story:
+    def second_story(self, start: int, stop: int, sensor: int, *, every: bool = False) -> Story:
         """Fold events `start` to `stop` separately, under the hypothesis that the estimate was wrong before them.
 
         Args:
             start: Row of a rejected measurement of the sensor.
             stop: Row after the last; these rows have been folded.
             sensor: Sensor whose gate is off; the covariance is widened before its measurement.
+            every: Whether the gates of all sensors are off.
         """
         at = self._snapshots.last(self.log.first + start)
         first = at - self.log.first, self._snapshots[at]
-        return self._machine.second_story(self.log, *first, start, stop, sensor, self._rows.innovation[start])
+        return self._machine.second_story(self.log, *first, start, stop, sensor, self._rows.innovation[start], every)
 
     def go_on_with(self, story: Story) -> None:
         """Adopt the state at the end of a story."""

@@ -228,8 +228,9 @@ class Machine:
         return int(asking)
 
     def second_story(
-        self, log: Log, at: int, snapshot: Snapshot, start: int, stop: int, sensor: int, innovation: np.ndarray
-    ) -> Story:
+        self, log: Log, at: int, snapshot: Snapshot, start: int, stop: int, sensor: int, innovation: np.ndarray,
+        every: bool = False,
+    ) -> Story:  # fmt: skip
         """Fold events under the hypothesis that the estimate was wrong before a rejected measurement.
 
         Args:
@@ -240,12 +241,13 @@ class Machine:
             stop: The event after the last.
             sensor: Sensor of the measurement: its gate is off, and the covariance is widened before.
             innovation: Innovation of the measurement when it was rejected, (width,).
+            every: Whether the gates of all sensors are off.
         """
         # Under this hypothesis no sensor is wrong, so the record of rejected sensors starts empty.
         end = snapshot.copy()._replace(doubt=doubt.fresh(len(self.model.sensors)))
         self.run_apart(log, at, start, end)
         added = self.widen(end, sensor, innovation)
-        with self.open(sensor):
+        with self.open(slice(None) if every else sensor):
             track, _ = self.run_apart(log, start, stop, end)
         return Story(track, end, np.sqrt(added))
 
@@ -279,8 +281,8 @@ class Machine:
         return H
 
     @contextmanager
-    def open(self, sensor: int) -> Iterator[None]:
-        """Context manager: switch the sensor's gate off."""
+    def open(self, sensor: int | slice) -> Iterator[None]:
+        """Context manager: switch the gate of a sensor, or of several, off."""
         self.held["gate"][sensor] = np.inf
         try:
             yield

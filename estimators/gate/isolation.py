@@ -13,6 +13,10 @@ g costs as much as with its noise inflated until it lies on it,
 so that no single measurement decides. A faulty sensor can report any value, so its own measurements count only against
 it, where they contradict one another although the second fold accepts them.
 
+Without a decision the sensor is accepted after a time only if the others could not have decided: if the folds predict
+their measurements alike. What could be confirmed and was not stays rejected. If most measurements of several sensors
+are rejected, the estimate is the suspect: the second fold opens the gate to all of them, and all measurements count.
+
 Sources: Willsky & Jones (1976), doi:10.1109/TAC.1976.1101146, for the likelihood ratio of a jump in the state since the
 time of its onset; Gustafsson (2000), Adaptive Filtering and Change Detection, chapter 9; Bar-Shalom, Li & Kirubarajan
 (2001), Estimation with Applications to Tracking and Navigation, chapter 11.
@@ -25,11 +29,11 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from ..diagnostics.detectors import since
-from ..log import READING, Log
+from ..log import MAINTENANCE, READING, Log
 from ..model.state_space import StateSpaceModel
 from ..snapshots import Story
 from ..track import GATED, HELD_OUT, USED, Track
-from .rejection_runs import ASKED, DUE, EVER, FROM, PASSED, RUN, SINCE, WAIT
+from .rejection_runs import ASKED, DUE, EVER, FROM, MIN_RUN, PASSED, RUN, SINCE, WAIT
 
 MAX_COMPARED_EVENTS = 1024
 """Events over which two folds are compared at most."""
@@ -73,7 +77,7 @@ class ReopeningFold(Protocol):
     def track(self) -> Track:
         """Rows folded so far."""
 
-    def second_story(self, start: int, stop: int, sensor: int) -> Story:
+    def second_story(self, start: int, stop: int, sensor: int, *, every: bool = False) -> Story:
         """Fold the events from `start` to `stop` apart, as if the twin had been wrong before."""
 
     def go_on_with(self, story: Story) -> None:
@@ -103,11 +107,14 @@ def decide(fold: ReopeningFold, row: int, doubt: np.ndarray, reopen: float) -> t
         return Decision(index, index, time, name, AGREES, 0, time, np.nan, 0, text), False
     run, begun = int(own[RUN]), own[FROM]
     start = _first_refused(fold, row, sensor, int(own[SINCE]) - log.first)
-    story = fold.second_story(start, row + 1, sensor)
     kind, channel = log.kind[start : row + 1], log.channel[start : row + 1]
-    evidence = weigh(fold.track.select(slice(start, row + 1)), story.track, kind, channel, sensor, fold.gate_limits)
+    first = fold.track.select(slice(start, row + 1))
+    most = _most_rejected(first, kind, channel)
+    story = fold.second_story(start, row + 1, sensor, every=most)
+    evidence = weigh(first, story.track, kind, channel, sensor, fold.gate_limits, every=most)
     never, asked = own[EVER] == 0.0, own[ASKED] != 0.0
-    outcome = decided(evidence, never, now >= begun + reopen * 1e9)
+    changed_asset = maintained(log.kind[: log.n], start)
+    outcome = decided(evidence, never or changed_asset, now >= begun + reopen * 1e9)
     own[ASKED] = 1.0
     changed = outcome in (REOPENED, BELIEVED)
     if changed:
@@ -125,9 +132,70 @@ def decide(fold: ReopeningFold, row: int, doubt: np.ndarray, reopen: float) -> t
     text = decision_text(
         model, name, outcome, run, since(begun * 1e-9), evidence, own[WAIT], reopen, never, story.widened
     )
+    if changed_asset:
+        text += "; maintenance has changed the asset, so the twin is wrong rather than the sensor"
+    other = "" if changed else swapped(fold, start, row + 1, sensor)
+    text += f"; {name} and {other} would fit if they were swapped" if other else ""
     return Decision(
         index, log.first + start, time, name, outcome, run, begun * 1e-9, evidence.total, evidence.witnesses, text
     ), changed
+
+
+def maintained(kind: np.ndarray, row: int) -> bool:
+    """Return whether maintenance was reported within `MAX_COMPARED_EVENTS` events before a row."""
+    return bool(np.any(kind[max(0, row - MAX_COMPARED_EVENTS) : row] == MAINTENANCE))
+
+
+def _most_rejected(track: Track, kind: np.ndarray, channel: np.ndarray) -> bool:
+    """Return whether most measurements of several sensors are rejected, and most of all measurements."""
+    rows = (kind == READING) & np.isin(track.verdict, (GATED, USED))
+    rejected = np.where(track.verdict[rows] == GATED, 1.0, 0.0)
+    sensors, place = np.unique(channel[rows], return_inverse=True)
+    count = np.bincount(place)
+    shares = np.bincount(place, rejected) / count
+    several = np.sum((shares > 0.5) & (count >= MIN_RUN)) > 1
+    return bool(several and sensors.size > 2 and rejected.mean() > 0.5)
+
+
+def swapped(fold: ReopeningFold, start: int, stop: int, sensor: int) -> str:
+    """Return the rejected sensor with which this one, rejected too, would fit if their names were exchanged, else "".
+
+    Each is compared with the prediction for the other, interpolated in time between rows `start` and `stop`.
+    """
+    model, log = fold.model, fold.log
+    track = fold.track.select(slice(start, stop))
+    kind, channel = log.kind[start:stop], log.channel[start:stop]
+
+    def series(s: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Return times, values, predictions and their variances of a sensor of which most measurements are rejected."""
+        m = len(model.sensors[s].rows)
+        rows = np.flatnonzero((kind == READING) & (channel == s) & np.isin(track.verdict, (GATED, USED)))
+        if rows.size < MIN_RUN or np.mean(track.verdict[rows] == GATED) <= 0.5:
+            rows = rows[:0]
+        y = log.value[start + rows, :m]
+        return log.t[start + rows], y, y - track.innovation[rows, :m], track.innovation_std[rows, :m] ** 2
+
+    own, units = series(sensor), [row.unit for row in model.sensors[sensor].rows]
+    limit = fold.gate_limits[len(units)]
+    best, least = "", float(limit)
+    for s, other in enumerate(model.sensors):
+        theirs = series(s) if s != sensor and [row.unit for row in other.rows] == units else (np.zeros(0),)
+        if not own[0].size or not theirs[0].size:
+            continue
+        fits = max(_exchanged(own, theirs), _exchanged(theirs, own))
+        if fits < least:
+            best, least = other.name, fits
+    return best
+
+
+def _exchanged(one: tuple[np.ndarray, ...], other: tuple[np.ndarray, ...]) -> float:
+    """Return the median NIS of the measurements of one sensor as measurements of another."""
+    (t, y, _, _), (at, _, predicted, variance) = one, other
+    nis = np.zeros(t.size)
+    for k in range(y.shape[1]):
+        off = y[:, k] - np.interp(t, at, predicted[:, k])
+        nis += off**2 / np.interp(t, at, variance[:, k])
+    return float(np.nanmedian(nis))
 
 
 def _first_refused(fold: ReopeningFold, row: int, sensor: int, since: int) -> int:
@@ -153,11 +221,15 @@ the sensor is accepted; the sensor passes the gate again."""
 
 
 class ReopeningEvidence(NamedTuple):
-    """Evidence for the second fold: log-likelihood of the other sensors, number of measurements, own part (≤ 0)."""
+    """Evidence for the second fold: log-likelihood of the other sensors, number of measurements, own part (≤ 0).
+
+    possible: the evidence to expect of the others, ½ Σ Δν² / S of what the two folds predict of them.
+    """
 
     others: float
     witnesses: int
     own: float
+    possible: float = 0.0
 
     @property
     def total(self) -> float:
@@ -197,21 +269,26 @@ def log_likelihoods(track: Track, limits: np.ndarray) -> np.ndarray:
 
 
 def weigh(
-    first: Track, second: Track, kind: np.ndarray, channel: np.ndarray, sensor: int, limits: np.ndarray
-) -> ReopeningEvidence:
+    first: Track, second: Track, kind: np.ndarray, channel: np.ndarray, sensor: int, limits: np.ndarray, *,
+    every: bool = False,
+) -> ReopeningEvidence:  # fmt: skip
     """Return the evidence in the rows of the two folds; the first row is the sensor's first rejected measurement.
 
-    That one does not count: the second fold was widened by it.
+    That one does not count: the second fold was widened by it. `every`: whether all sensors are in doubt, so that those
+    of this one count as the others do.
     """
     judged = [np.isin(track.verdict, (USED, GATED, HELD_OUT)) for track in (first, second)]
-    others = (kind == READING) & (channel != sensor) & judged[0] & judged[1]
+    others = (kind == READING) & ((channel != sensor) | every) & judged[0] & judged[1]
+    others[0] = False
     gained = log_likelihoods(second.select(others), limits) - log_likelihoods(first.select(others), limits)
+    moved = (second.innovation[others] - first.innovation[others]) / first.innovation_std[others]
     own = (kind == READING) & (channel == sensor) & judged[1]
     own[0] = False
     mine = second.select(own)
     dof = degrees(mine)
     wild = mine.nis - cost(mine.nis, dof, limits[dof])
-    return ReopeningEvidence(float(np.nansum(gained)), int(np.sum(np.isfinite(gained))), -0.5 * float(np.nansum(wild)))
+    count, against = int(np.sum(np.isfinite(gained))), 0.0 if every else -0.5 * float(np.nansum(wild))
+    return ReopeningEvidence(float(np.nansum(gained)), count, against, 0.5 * float(np.nansum(moved**2)))
 
 
 def widening(cov: np.ndarray, prior: np.ndarray, H: np.ndarray, innovation: np.ndarray) -> np.ndarray:
@@ -250,6 +327,8 @@ def decided(evidence: ReopeningEvidence, never_agreed: bool, waited: bool) -> st
         return REOPENED
     if evidence.total <= -DECISION_NATS:
         return ISOLATED
+    if evidence.possible > DECISION_NATS and evidence.total <= 0.0:
+        return ISOLATED if waited else DOUBTED
     return BELIEVED if never_agreed or waited else DOUBTED
 
 
@@ -262,6 +341,9 @@ def decision_text(
     others = f"the other sensors, by exp({evidence.others:+.0f})"
     if outcome == AGREES:
         return f"{sensor}: passes the gate again"
+    if outcome == ISOLATED and evidence.total > -DECISION_NATS:
+        why = "no other sensor confirms it, though they could"
+        return f"{begun}; {why}: it stays rejected and is checked again in {wait:g} s"
     if outcome == ISOLATED:
         alone = evidence.own <= evidence.others
         why = "its measurements contradict one another" if alone else f"{others}, contradict it"

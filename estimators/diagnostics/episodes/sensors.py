@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ...gate.isolation import maintained
 from ...log import READING, RESET
 from ...track import GATED, REASONS, SCREENED, USED
 from ..detectors import (
@@ -148,6 +149,8 @@ def _episode(judged: JudgedRows, s: int, rows: np.ndarray, run: AlarmRun, shown:
     )  # fmt: skip
     text = detector.text(facts)
     unit = row.unit if cause == "stuck" else detector.unit if detector.effect else "nats"
+    if detector.isolate and maintained(events.kind, int(rows[begun])):
+        text = f"{text}; maintenance has changed the asset, so the twin is wrong rather than the sensor"
     if run.lasts and over < rows.size and (back or run.end < rows.size):
         text = f"{text}; {return_text(cause, events.t[rows[over]] * 1e-9)}"
     alarms = track.alarms[rows[run.begin : run.end], : len(model.sensors[s].rows)]

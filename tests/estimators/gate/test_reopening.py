@@ -5,11 +5,14 @@ from itertools import product
 import numpy as np
 import pytest
 
+from estimators.diagnostics.episodes import episodes
 from estimators.fold import Fold
 from estimators.gate.isolation import MIN_VARIANCE_SHARE, ReopeningEvidence, cost, decided, widening
 from estimators.gate.rejection_runs import MIN_RUN, RUN_PROBABILITY, rule_of
-from estimators.log import READING, RESET, Events, Log
+from estimators.log import MAINTENANCE, READING, RESET, Events, Log
+from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
 from estimators.track import GATED, USED
+from estimators.tuning import Tuning
 from tests.support import SECOND, arrive, as_log, assert_same
 
 from .two_sensors import JUMP, MODEL, TUNING, series
@@ -65,6 +68,19 @@ def test_where_nothing_tells_the_asset_is_believed_after_a_time(name):
     assert sooner.decisions[1].time == pytest.approx(JUMP + 5.0, abs=0.15)
     never = folded(name, series(1, a=5.0, with_b=False), TUNING.set("gate.reopen", None))
     assert not never.decisions and np.sum(never.track.verdict == GATED) == 400
+
+
+def test_a_jump_after_maintenance_is_the_twins():
+    """The asset has been changed, so the sensor is believed as soon as chance no longer explains its rejections."""
+    events = series(1, a=5.0, with_b=False)
+    t = round((JUMP - 0.05) * SECOND)
+    growing = folded("kf", Events.concat([events, Events.one(t, t, MAINTENANCE, 0, (), 1)], 1))
+    assert outcomes(growing)[-1] == "believed" and growing.decisions[-1].time < JUMP + 1.0
+    said = "maintenance has changed the asset, so the twin is wrong rather than the sensor"
+    assert growing.decisions[-1].text.endswith(said)
+    track = Fold("kf", MODEL, TUNING.set("gate.reopen", None), growing.log)
+    track.advance()
+    assert any(episode.cause == "refused" and episode.text.endswith(said) for episode in episodes(track))
 
 
 def test_a_sensor_gone_wild_is_isolated_by_its_own_readings():
@@ -180,6 +196,72 @@ def test_what_follows_from_the_evidence():
     assert decided(ReopeningEvidence(6.0, 3, 0.0), False, False) == "doubted"
     assert decided(ReopeningEvidence(-6.0, 3, 0.0), False, True) == "believed"
     assert decided(ReopeningEvidence(-6.0, 3, 0.0), True, False) == "believed"
+
+
+def test_what_could_have_been_confirmed_and_was_not_stays_rejected():
+    assert decided(ReopeningEvidence(-6.0, 3, 0.0, 50.0), False, True) == "isolated"
+    assert decided(ReopeningEvidence(-6.0, 3, 0.0, 50.0), True, False) == "doubted"
+    assert decided(ReopeningEvidence(2.0, 3, 0.0, 50.0), False, True) == "believed"
+
+
+def _along(x, u, p, dt, out):
+    out[:] = x
+
+
+def _from_west(x, u, p, out):
+    out[0] = x[0] + 10.0
+
+
+def _from_east(x, u, p, out):
+    out[0] = 30.0 - x[0]
+
+
+def _itself(x, u, p, out):
+    out[0] = x[0]
+
+
+LANDMARKS = StateSpaceModel(
+    name="rail",
+    title="position between two landmarks",
+    states=(State("x", "m", mean=0.0, std=1.0),),
+    noises=(Noise("x", "m²/s", 1e-4),),
+    sensors=tuple(
+        Sensor(name, (Row(name, "m", 0.01),), h=h)
+        for name, h in (("west", _from_west), ("east", _from_east), ("fix", _itself))
+    ),
+    f=_along,
+    linear=True,
+)
+
+
+def ranges(exchanged=False, jump=0.0):
+    """Ranges to both landmarks and fixes, each twice a second for two minutes; from `JUMP` on wrong or elsewhere."""
+    rng, log, t = np.random.default_rng(3), Log.of(LANDMARKS), np.arange(0.0, 120.0, 0.5)
+    x = jump * (t >= JUMP)
+    west, east = (level + 0.1 * rng.standard_normal(t.size) for level in (x + 10.0, 30.0 - x))
+    after = exchanged & (t >= JUMP)
+    log.add("west", t, np.where(after, east, west))
+    log.add("east", t + 0.1, np.where(after, west, east))
+    log.add("fix", t + 0.2, x + 0.1 * rng.standard_normal(t.size))
+    growing = Fold("kf", LANDMARKS, Tuning.of(LANDMARKS).set("gate", 0.9999), log)
+    growing.advance()
+    return growing
+
+
+def test_swapped_landmarks_are_named_and_never_accepted():
+    growing = ranges(exchanged=True)
+    assert {decision.outcome for decision in growing.decisions} == {"doubted", "isolated"}
+    texts = {decision.sensor: decision.text for decision in growing.decisions if decision.outcome == "isolated"}
+    assert texts["west"].endswith("west and east would fit if they were swapped") and "east and west" in texts["east"]
+    # The fixes alone: 0.01 m² at 2 Hz against a walk of 1e-4 m²/s.
+    assert abs(growing.track.mean[-1, 0]) < 4 * np.sqrt(np.sqrt(0.01 / 2 * 1e-4))
+
+
+def test_an_estimate_that_most_sensors_contradict_is_the_suspect():
+    growing = ranges(jump=5.0)
+    assert outcomes(growing)[-1] == "reopened" and growing.decisions[-1].time < JUMP + 3.0
+    late = growing.log.t[: growing.n] > (JUMP + 3.0) * SECOND
+    assert np.all(growing.track.verdict[late] == USED) and abs(growing.track.mean[-1, 0] - 5.0) < 0.2
 
 
 def test_a_story_that_begins_after_another_starts_from_what_that_one_left():
