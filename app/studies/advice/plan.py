@@ -202,7 +202,9 @@ def plan(found: RecordingContents, roles: Roles) -> DraftPlan:
             leads[second] = first
     groups = {k: [other for other in leads if leads[other] == k and other != k] for k in leads if leads[k] == k}
     heads = [k for k in groups if not any(pair.first == k and pair.rate for pair in told)]
-    lags = _lags(picked, heads, sorted(inputs) or [k for k in heads if k not in sensors and not groups[k]])
+    # What one source of a table measures does not drive what another one does.
+    free_heads = [k for k in heads if k not in sensors and not groups[k] and picked[k].series.only is None]
+    lags = _lags(picked, heads, sorted(inputs) or free_heads)
     used = sorted({k for lag in lags.values() for k in lag.drivers} | inputs)
     states = []
     for k in groups:

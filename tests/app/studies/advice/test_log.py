@@ -204,7 +204,8 @@ def test_rows_of_several_sources_are_sensors_that_by_tells_apart(tmp_path, name,
     if sorted_by == "source":
         rows.sort(key=lambda row: row[1])
     log = csv(tmp_path / "plant.csv", **dict(zip(("t", name, "value"), zip(*rows, strict=True), strict=True)))
-    twin, read, _ = drafted(tmp_path, log, sensors=("value",))
+    twin, read, planned = drafted(tmp_path, log)
+    assert [one.role for one in planned.roles if one.signal.series.only] == ["sensor", "sensor"]
     assert 'value: {columns: "value", by: ' in twin.path.read_text()
     for k, sensor in enumerate(sorted(twin.model.sensor_names, key=lambda sensor: not sensor.endswith(("3", "101")))):
         t, found = of_sensor(read, twin, sensor)
