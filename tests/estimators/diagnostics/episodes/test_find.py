@@ -114,7 +114,7 @@ SENSORS = {
         {"gauge": spiked},
         ("gauge", "", 0.04, 0.09),
         "gauge has spikes since",
-        "% of its measurements are outliers; set a gate, and check the wiring",
+        "% of its measurements are outliers; check the wiring, and set a gate unless the asset jumps",
     ),
     "refused": (
         {"gauge": lambda x, z, rng: x + 5.0 + 0.2 * z, "gate": 0.9999},
