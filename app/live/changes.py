@@ -103,19 +103,23 @@ RESTART_SECTIONS = ("name", "source", "faults", "time", "maintenance", "history"
 """Sections of the YAML that only a restart applies."""
 
 
-def obstacle(before: Twin, after: Twin) -> str | None:
-    """Return why a running twin cannot go on with the one that was saved, but must be restarted; None if it can."""
-    old, new = shape(before.model), shape(after.model)
+def obstacle(before: Twin, after: Twin, *, from_prior: bool = False) -> str | None:
+    """Return why a running twin cannot go on with the one that was saved, but must be restarted; None if it can.
+
+    Folds that begin at the prior (`from_prior`), and not at an estimate, may consider other parameters.
+    """
+    old, new = (shape(twin.model, considered=not from_prior) for twin in (before, after))
     changed = [f"its {what} changed" for what in old if old[what] != new[what]]
     sections = [name for name in RESTART_SECTIONS if getattr(before.config, name) != getattr(after.config, name)]
     return next(iter([*changed, *(f"its `{name}` changed" for name in sections)]), None)
 
 
-def shape(model: StateSpaceModel) -> Mapping[str, Any]:
-    """Return everything that logs, tracks, tunings and charts of a model are laid out by."""
+def shape(model: StateSpaceModel, *, considered: bool = True) -> Mapping[str, Any]:
+    """Return everything that logs, tracks, tunings and charts of a model are laid out by; `considered` states too."""
     field = model.grid
+    states = model.states if considered else model.states[: model.nx - model.considered]
     return {
-        "states": field.shape if field is not None else [(item.name, item.unit) for item in model.states],
+        "states": field.shape if field is not None else [(item.name, item.unit) for item in states],
         "sensors": [(item.name, [(row.name, row.unit) for row in item.rows]) for item in model.sensors],
         "inputs": [(item.name, item.unit) for item in model.inputs],
         "noises": [(item.name, item.unit) for item in model.noises],

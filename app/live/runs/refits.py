@@ -160,7 +160,8 @@ class Fitting:
                 wanted=attempt.wanted,
                 bounds=bounds_of(config, model),
                 aim=natural_aim(config),
-                considered=width_priors(config, model, attempt.wanted),
+                # A fit of a window is loaded while the twin runs, which can add no states.
+                considered=width_priors(config, model, attempt.wanted if since is None else ()),
                 go=go,
                 progress=attempt.progress,
             )

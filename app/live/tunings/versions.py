@@ -220,7 +220,7 @@ def load_into(engine: Running, name: str, why: str | None = None) -> None:
         ConfigError: If there is no such version, it is wrong, or it does not fit the running twin.
     """
     twin = with_version(engine.twin, name)
-    reason = obstacle(engine.twin, twin)
+    reason = obstacle(engine.twin, twin, from_prior=engine.rows(0, 0).first == 0)
     if reason is not None:
         raise ConfigError(f"{name}: {reason}; start the twin with --tuning {name}")
     # Compiled before the engine's thread asks for it.

@@ -139,3 +139,18 @@ def test_the_time_of_an_alarm_is_that_of_the_charts(page):
         "yoke is rejected since 2023-11-15 00:00:25 UTC (100 %)",
         "yoke is silent since 1:02.5",
     ]
+
+
+def test_a_withheld_estimate_has_its_reason_in_place_of_a_value_and_a_band_without_a_line(visit, tmp_path):
+    limits = {"withhold": "{rate: 1e-3}", "valid": "{temperature: {min: -10, max: 20}}", "source.duration": "60"}
+    with running("motor_winding", **limits) as session:
+        page = visit(session.url)
+        reason = session.engine.status().withheld["rate"]
+        assert reason.startswith("outside the fitted range (temperature ")
+        shown = "[...document.querySelectorAll('#charts article.chart')].map((chart) => chart.innerText)"
+        until(page, f"{shown}.some((text) => text.includes('withheld: {reason}'))")
+        page.screenshot(path=tmp_path / "withheld.png")
+        # No other chart, and no line: the columns of the mean are empty, those of the band are not.
+        assert sum("withheld" in text for text in page.evaluate(shown)) == 1
+        column = "window.nisus.charts.live.column('{}:rate').filter(Number.isFinite).length"
+        assert page.evaluate(column.format("mean")) == 0 < page.evaluate(column.format("upper"))
