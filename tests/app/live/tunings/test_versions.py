@@ -17,7 +17,7 @@ from app.cli.main import main
 from app.cli.open_twin import recorded_twin
 from app.cli.tunings import tunings_of
 from app.live.tunings.tuning_yaml import tuning_yaml, with_tuning
-from app.live.tunings.versions import Settings, accept, keep, version_text
+from app.live.tunings.versions import Settings, accept, keep, load_into, version_text
 from app.twin.log_reader import read_log
 from app.twin.twin import load_twin, restore_twin, with_held
 from app.views.recording.reader import read_recording
@@ -26,6 +26,7 @@ from config.tunings import accepted_version, find_version, folders, load_version
 from estimators.errors import ConfigError
 from estimators.fit.uncertainty import ParameterWidths
 from estimators.registry import ESTIMATORS
+from tests.app.web.page.browsed import running, settled
 
 
 @pytest.fixture
@@ -382,3 +383,18 @@ def test_a_version_that_ships_adds_widths_to_the_values_of_its_twin(name, versio
         path.write_text(text, encoding="utf-8")
         again = load_twin(name, overrides={"tuning": str(path)})
     assert again.model.states == found.model.states and again.model.considered == found.model.considered
+
+
+def test_a_version_that_considers_parameters_is_loaded_while_the_twin_runs(tmp_path):
+    """It adds states that nobody sees, and widens bands: that of the magnet most, which no sensor measures."""
+    with running("motor_joint", **{"source.duration": "60"}) as session:
+        engine = session.engine
+        before = engine.rows(engine.end() - 1, engine.end()).track.std[-1]
+        widths = ParameterWidths(("magnet_ambient",), np.array([0.1]), np.eye(1), np.array([0.1]), 1.0, {})
+        path = tmp_path / "wide.yaml"
+        path.write_text(version_text(engine.twin, Settings("ekf", engine.twin.tuning, widths=widths)), encoding="utf-8")
+        load_into(engine, str(path))
+        settled(engine, 1)
+        assert engine.status().tuning.name == "wide" and engine.model.considered == 1
+        after = engine.rows(engine.end() - 1, engine.end()).track.std[-1]
+        assert np.all(after > before) and np.argmax(after / before) == 3
