@@ -9,13 +9,15 @@ from typing import Any
 import numpy as np
 
 from estimators.diagnostics.consistency import NisVerdict
-from estimators.diagnostics.detector_state import sensor_states
-from estimators.diagnostics.health import MAX_ROWS_PER_READING
+from estimators.diagnostics.detector_state import SENSOR_STATES, sensor_states, sensor_states_over_time
+from estimators.diagnostics.health import MAX_ROWS_PER_READING, HealthPolicy
 from estimators.diagnostics.references import withheld_reasons
 from estimators.diagnostics.score import nis_verdict
 from estimators.fold import Fold
 from estimators.log import RESET, Events, model_version_at
+from estimators.model.state_space import LARGE
 from estimators.track import FAILED, GATED, USED, Track, estimated_rows
+from estimators.tuning import Tuning
 from sources.source import Source
 
 from .counts import RowCounts, last_run
@@ -53,7 +55,7 @@ def status_of(
     """
     model, log, track = fold.model, fold.log, fold.track
     recent = slice(max(0, fold.n - MAX_ROWS_PER_READING * fold.policy.window), fold.n)
-    nis = _nis_of_window(fold, log.events.select(recent), track.select(recent))
+    nis = _nis_of_window(fold.tuning, fold.policy, log.events.select(recent), track.select(recent))
     last = fold.n - 1
     t = int(log.t[last]) if last >= 0 else None
     states = sensor_states(model, fold.tuning.used, fold.evidence, (t or 0) * 1e-9, fold.policy)
@@ -108,31 +110,40 @@ def past_status(engine: Running, watchers: Watchers, t: int) -> Status:
 
     What does not belong to a time (counts, tuning, recording) is the present one.
     """
-    status, fold = engine.status(), engine.fold_until(t)
-    if fold is None:
+    status, model, policy = engine.status(), engine.model, engine.policy
+    # A step of a large field takes tens of milliseconds: there sensors are as their rows show them.
+    fold = engine.fold_until(t) if model.nx <= LARGE else None
+    if fold is None and (model.nx <= LARGE or status.t is None):
         return status
-    end, now = fold.log.first + fold.n, int(fold.log.t[fold.n - 1])
+    end = max(1, engine.index_at(t + 1)) if fold is None else fold.log.first + fold.n
+    tuning = engine.folded_with()[0] if fold is None else fold.tuning
+    sensors = len(model.sensors)
     # A fold from a snapshot lacks the earlier rows of its window.
-    sensors = len(fold.model.sensors)
-    pull = engine.rows(end - max(MAX_ROWS_PER_READING * fold.policy.window, RECENT_READINGS * sensors), end)
+    pull = engine.rows(end - max(MAX_ROWS_PER_READING * policy.window, RECENT_READINGS * sensors), end)
+    if not len(pull.events):
+        return status
+    now = int(pull.events.t[-1])
     sensor_nis = _nis_of_sensors(pull.events, pull.track, sensors)
     track, health = pull.track, int(pull.track.health[-1])
-    nis = _nis_of_window(fold, pull.events, track)
-    states = sensor_states(fold.model, fold.tuning.used, fold.evidence, now * 1e-9, fold.policy)
+    nis = _nis_of_window(tuning, policy, pull.events, track)
+    if fold is None:
+        states = [_state_of_rows(pull.events, track, s, used) for s, used in enumerate(tuning.used)]
+    else:
+        states = sensor_states(model, tuning.used, fold.evidence, now * 1e-9, policy)
     since = now
     while len(pull.events) and int(pull.track.health[-1]) == health:
         begun = last_run(pull.track.health)
         since = int(pull.events.t[begun])
         pull = engine.rows(pull.first - SINCE_ROWS, pull.first if not begun else 0)
     account = watchers.episode_log.summary.at(now * 1e-9)
-    leading = account.leading(dict(zip(fold.model.sensor_names, states, strict=True)))
+    leading = account.leading(dict(zip(model.sensor_names, states, strict=True)))
     return replace(
         status,
         t=now,
         health=health,
         since=since,
         cause=watchers.cause(leading, health, past=True),
-        sensors=account.of_sensors(fold.model.sensor_names, states),
+        sensors=account.of_sensors(model.sensor_names, states),
         episodes_open=len(account.lasting),
         lost=None if estimated_rows(track.select(slice(-1, None)))[0] else now,
         nis=nis,
@@ -141,15 +152,21 @@ def past_status(engine: Running, watchers: Watchers, t: int) -> Status:
     )
 
 
-def _nis_of_window(fold: Fold, events: Events, track: Track) -> NisVerdict:
+def _state_of_rows(events: Events, track: Track, s: int, used: bool) -> str:
+    """Return the state of sensor s as the last of these rows that concern it show it."""
+    rows, states = sensor_states_over_time(events, track, s)
+    return "held out" if not used else SENSOR_STATES[states[-1]] if rows.size else "waiting"
+
+
+def _nis_of_window(tuning: Tuning, policy: HealthPolicy, events: Events, track: Track) -> NisVerdict:
     """Return the verdict on the mean NIS of the last window.
 
     The events and their rows are the last ones, at least those of the window.
     """
     resets = np.flatnonzero(events.kind == RESET)
     begun = int(resets[-1]) + 1 if resets.size else 0
-    judged = begun + np.flatnonzero(np.isin(track.verdict[begun:], (USED, GATED, FAILED)))[-fold.policy.window :]
-    return nis_verdict(track.select(judged), events.select(judged), fold.model, fold.tuning.baseline)
+    judged = begun + np.flatnonzero(np.isin(track.verdict[begun:], (USED, GATED, FAILED)))[-policy.window :]
+    return nis_verdict(track.select(judged), events.select(judged), tuning.model, tuning.baseline)
 
 
 def _cause_without_rows(fold: Fold, watchers: Watchers, fields: Mapping[str, Any]) -> str:

@@ -245,9 +245,9 @@ export class Chart {
   }
 
   // The value of a column there, or the last one before it.
-  at(name, index, data = this.data) {
+  at(name, index, data = this.data, reach = 256) {
     const values = data[name];
-    for (let k = index; k >= Math.max(0, index - 256); k--) if (typeof values?.[k] === "number") return values[k];
+    for (let k = index; k >= Math.max(0, index - reach); k--) if (typeof values?.[k] === "number") return values[k];
     return NaN;
   }
 

@@ -184,7 +184,7 @@ export class Charts {
     const row = size > 1 ? -1 : looked === null ? x.length - 1 : x.findLastIndex((time) => time <= looked + EQUAL_S);
     if (row < 0 || (looked !== null && x[row] < looked - this.reach)) return null;
     const data = what.data();
-    return what.says((name) => chart.at(name, row, data));
+    return what.says((name) => chart.at(name, row, data, MOMENT_POINTS));
   }
 
   update(status) {

@@ -139,6 +139,14 @@ const KINDS = [
   ["failed", "failed"], ["stale", "dropped: too late"], ["wrong time", "dropped: wrong time"], ["inflated", "late, with R inflated"], ["held", "waiting for a clock check"], ["silenced", "dropped by an injected fault"],
 ];
 
+// Causes of episodes in words, where their names are not.
+const CAUSES = {
+  narrow: "band too narrow", wide: "band too wide", shifted: "offset", correlated: "correlated innovations", alternating: "alternating innovations",
+  spiky: "outliers", refused: "rejected", disagreeing: "rows disagree", agreeing: "rows closer than their noise", missed: "truth outside the band",
+  screened: "implausible", silent: "dropout", "never heard": "no measurement yet", outside: "outside the fitted range",
+  impoverished: "few particles left", stale: "no measurements", dropped: "measurements dropped",
+};
+
 const grouped = (n) => n.toLocaleString("en");
 
 export class Episodes {
@@ -211,16 +219,16 @@ export class Episodes {
     };
     return element(
       "li", { class: "episode", dataset: { open: String(episode.end === null), severity: episode.severity ?? "", grade: episode.grade } },
-      element("button", { type: "button", title: "Show in the charts", onclick: show }, element("time", {}, times), element("b", {}, `${words(episode.subject)}: ${episode.cause}`)),
+      element("button", { type: "button", title: "Show in the charts", onclick: show }, element("time", {}, times), element("b", {}, `${words(episode.subject)}: ${CAUSES[episode.cause] ?? episode.cause}`)),
       element("p", {}, inChartTime(episode.text, this.link.status.origin)),
-      element("a", { href: `/alarms#${episode.help.split("#")[1]}`, target: "_blank" }, `more on ${episode.cause}`),
+      element("a", { href: `/alarms#${episode.help.split("#")[1]}`, target: "_blank" }, `about “${CAUSES[episode.cause] ?? episode.cause}”`),
     );
   }
 
   // Newest first, with a line between runs, which fold the same time again.
   event(notice, after) {
     const when = notice.from === null ? "" : clock(notice.from);
-    const line = element("li", { class: "event", dataset: { level: notice.level } }, element("time", {}, when), element("span", {}, notice.text));
+    const line = element("li", { class: "event", dataset: { level: notice.level } }, element("time", {}, when), element("span", {}, inChartTime(notice.text, this.link.status.origin)));
     return after && after.run !== notice.run ? [element("li", { class: "run-before" }, `run ${notice.run}`), line] : [line];
   }
 }

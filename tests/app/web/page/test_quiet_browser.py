@@ -106,8 +106,8 @@ def test_hidden_charts_ask_for_nothing(page, session):
     assert page.evaluate("window.nisus.charts.range[1]") == pytest.approx(300, rel=0.01)
     drawn = page.evaluate("window.nisus.drawn")
     page.get_by_role("tab", name="Charts").click()
-    # Of what has ended, all is shown with the cursor at the end, whose row is asked for.
-    asked = {"overview", "charts", "previous", "run 0", "less 0", "moment"}
+    # Of what has ended, all is shown with the cursor at the end; its row is not asked for, as points are rows here.
+    asked = {"overview", "charts", "previous", "run 0", "less 0"}
     wait_for(lambda: streams(session).keys() == asked, PATIENCE)
     until(page, f"window.nisus.drawn > {drawn} && window.nisus.revision === 1")
 
@@ -161,7 +161,7 @@ def test_an_episode_that_is_told_at_rest_is_drawn(page, session):
     until(page, "performance.now() - window.nisus.charts.drawnAt > 700")
     drawn = page.evaluate("window.nisus.drawn")
     strip = """(() => {
-      const { plot } = window.nisus.charts.charts.find((chart) => !chart.node.hidden);
+      const { plot } = window.nisus.charts.charts.find(({ what }) => what.key === "state:tooth");
       const { left, top, width } = plot.bbox;
       return [...plot.ctx.getImageData(Math.round(left + width / 2), Math.round(top), 1, 1).data];
     })()"""
