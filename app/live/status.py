@@ -14,7 +14,7 @@ from estimators.diagnostics.health import MAX_ROWS_PER_READING, HealthPolicy
 from estimators.diagnostics.references import withheld_reasons
 from estimators.diagnostics.score import nis_verdict
 from estimators.fold import Fold
-from estimators.log import RESET, Events, model_version_at
+from estimators.log import INPUT, RESET, Events, model_version_at
 from estimators.model.state_space import LARGE
 from estimators.track import FAILED, GATED, USED, Track, estimated_rows
 from estimators.tuning import Tuning
@@ -128,7 +128,13 @@ def past_status(engine: Running, watchers: Watchers, t: int) -> Status:
     nis = _nis_of_window(tuning, policy, pull.events, track)
     if fold is None:
         states = [_state_of_rows(pull.events, track, s, used) for s, used in enumerate(tuning.used)]
+        told = pull.events.value[pull.events.kind == INPUT, : model.nu].T
+        known = [row[np.isfinite(row)] for row in told]
+        inputs = np.array(
+            [row[-1] if row.size else item.default for row, item in zip(known, model.inputs, strict=True)]
+        )
     else:
+        inputs = fold.u
         states = sensor_states(model, tuning.used, fold.evidence, now * 1e-9, policy)
     since = now
     while len(pull.events) and int(pull.track.health[-1]) == health:
@@ -147,7 +153,7 @@ def past_status(engine: Running, watchers: Watchers, t: int) -> Status:
         episodes_open=len(account.lasting),
         lost=None if estimated_rows(track.select(slice(-1, None)))[0] else now,
         nis=nis,
-        withheld=withheld_reasons(fold.model, track, fold.u),
+        withheld=withheld_reasons(model, track, inputs),
         sensor_nis=sensor_nis,
     )
 
