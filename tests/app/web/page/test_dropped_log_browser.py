@@ -30,11 +30,13 @@ DRAFT_PATIENCE = 600.0
 BY_ASAMMDF = """
 import json, sys, asammdf, numpy
 file = asammdf.MDF(sys.argv[1])
-speed = file.extract_bus_logging({"CAN": [(sys.argv[2], 2)]}).get("Speed")
+decoded = file.extract_bus_logging({"CAN": [(sys.argv[2], 2)]})
+speed, valid = decoded.get("Speed"), decoded.get("SpeedValid", raw=True)
 times = numpy.concatenate([file.get_master(k) for k in range(len(file.groups))])
-print(json.dumps([speed.samples.tolist(), (speed.timestamps[0] - times.min()) / numpy.ptp(times)]))
+begins = (speed.timestamps[0] - times.min()) / numpy.ptp(times)
+print(json.dumps([speed.samples.tolist(), valid.samples.tolist(), begins]))
 """
-"""Speed of the GNSS receiver in an MF4 file, and the part of the log before it."""
+"""Speed of the GNSS receiver in an MF4 file, its flag of validity, and the part of the log before it."""
 
 WHEEL = re.compile(r"\((\S+)\) can0 0AA#(....)(....)")
 
@@ -185,8 +187,8 @@ def test_mf4_with_a_dropped_dbc_becomes_a_twin(visit, tmp_path, data):
     database = data("can_css_imu100_obd2", "dbc", "canmod-gps.dbc")
     # In a process of its own, since its libraries are not made for ours.
     text = subprocess.check_output([sys.executable, "-c", BY_ASAMMDF, log, database], text=True)
-    speed, begins = json.loads(text.splitlines()[-1])
-    speed = np.array(speed)
+    speed, valid, begins = json.loads(text.splitlines()[-1])
+    speed, valid = np.array(speed), np.array(valid) == 1
     with opened(tmp_path / "recordings") as session:
         # The DBC first: the log is read with it at once.
         page = visit_log(visit, session, database, log)
@@ -194,7 +196,8 @@ def test_mf4_with_a_dropped_dbc_becomes_a_twin(visit, tmp_path, data):
         assert f"{speed.size} values" in row(page, "Speed").inner_text()
         assign(page, Speed="state")
         pull = drafted(page, session, "drive")
-        np.testing.assert_allclose(rows_of(pull, session.engine.model, "speed")[0], speed, atol=1e-9)
+        used = rows_of(pull, session.engine.model, "speed")[0]
+        np.testing.assert_allclose(used, np.where(valid, speed, np.nan), atol=1e-9)
 
 
 def written(folder, name):
