@@ -78,8 +78,9 @@ class EpisodeSummary(NamedTuple):
         def order(entry: TrackedEpisode) -> tuple[bool, int, float]:
             kind, name = entry.key
             state = states.get(name) if kind in SENSOR_KEYS else None
-            lost = LOST_SEVERITY if state in ("degraded", "stale") else DEFAULT_SEVERITY
-            return state == "tracking", min(_severity(entry.episode)[0], lost), -entry.episode.start
+            severity, newest = _severity(entry.episode)
+            severity = min(severity, LOST_SEVERITY) if state in ("degraded", "stale") else severity
+            return state == "tracking", severity, newest
 
         first = min(self.lasting, key=order, default=None)
         return None if first is None else first.episode

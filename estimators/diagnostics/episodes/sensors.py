@@ -90,9 +90,10 @@ def sensor_alarms(judged: JudgedRows) -> Iterator[FoundEpisode]:
             shown, hidden = _effect_and_losses(judged, s, rows, masks, run, later)
             if shown is not None and shown.cause == "stuck" and shown.back:
                 # It ends with another value, whatever other tests have yet to clear.
-                found.append(("sensor", AlarmRun(run.begin, shown.over, False), shown))
+                others = run.end - shown.over > JOINED
+                found.append(("sensor", AlarmRun(run.begin, shown.over if others else run.end, False), shown))
                 run = AlarmRun(shown.over, run.end, run.lasts)
-                shown = _shown(judged, s, rows, masks, run) if run.end - run.begin > JOINED else None
+                shown = _shown(judged, s, rows, masks, run) if others else None
             found += [] if shown is None else [("sensor", run, shown)]
             found += [("lost", *item) for item in hidden]
         for kind, run, shown in found:

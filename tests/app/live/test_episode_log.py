@@ -227,10 +227,9 @@ def test_the_cause_is_that_of_a_sensor_that_is_lost_before_that_of_one_that_is_n
     silent, gone = entry("silence", "c", "silent", 3.0), entry("twin", "diverged", "diverged", 4.0)
     assert EpisodeSummary((), (noisy, silent)).leading({"a": "suspect", "c": "degraded"}).text == "c silent"
     assert EpisodeSummary((), (noisy, silent, gone)).leading({"c": "stale"}).text == "diverged diverged"
-    # What a shifted sensor leads to, a state off the truth, does not hide it.
-    shifted, missed = entry("sensor", "a", "shifted", 1.0), entry("truth", "x", "missed", 2.0)
-    assert EpisodeSummary((), (shifted, missed)).leading({"a": "suspect"}).text == "a shifted"
-    assert EpisodeSummary((), (noisy, missed)).leading({"a": "suspect"}).text == "x missed"
+    # An advisory never hides what is to be acted on.
+    advised = noisy._replace(episode=lost.episode._replace(grade="advisory", start=9.0, text="advised"))
+    assert EpisodeSummary((), (advised, lost)).leading({"a": "advisory", "b": "suspect"}).text == "b narrow"
     # A sensor in order again has an episode that lasts until it is certain to be over: the one that is lost leads.
     assert account.leading({"a": "tracking", "b": "suspect"}).text == "b narrow"
     assert EpisodeSummary((), (noisy,)).leading({"a": "tracking"}) is noisy.episode
