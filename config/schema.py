@@ -92,9 +92,11 @@ class ParameterSection(Section):
     @model_validator(mode="after")
     def _complete(self) -> ParameterSection:
         if self.use == "estimated" and self.std is None:
-            raise refused("absent", "an estimated parameter needs the standard deviation of its prior", "std")
+            raise refused("absent", "is estimated and needs the standard deviation of its prior", "std")
         if self.use != "estimated" and self.drift:
             raise refused("relation", "is for a parameter with `use: estimated`; leave it out", "drift")
+        if "use" in self.model_fields_set and self.use == "considered" and self.std is None and not self.widen:
+            raise refused("absent", "is considered and needs a standard deviation, as in std: 10 %", "std")
         if self.use == "estimated" and self.widen:
             raise refused("relation", "is for a considered parameter; the width of an estimated one evolves", "widen")
         return self

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shutil
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
@@ -274,19 +275,33 @@ def with_section(text: str, key: str, section: str) -> str:
 
 
 def with_values(text: str, values: Mapping[Key, Any]) -> tuple[str, list[Key]]:
-    """Return a YAML text with other values at some keys, and the keys that it does not have; comments stay."""
+    """Return a YAML text with other values at some keys, and the keys that it does not have; comments stay.
+
+    A value that an alias shares with another key counts as one that it does not have.
+    """
     root = _composed(text)
+    places = Counter(map(id, _nodes(root)))
     edits: list[tuple[int, int, str]] = []
     missing: list[Key] = []
     for key, value in values.items():
-        node = root
+        node, shared = root, False
         for part in key:
             items = node.value if isinstance(node, yaml.MappingNode) else ()
             node = next((item for name, item in items if name.value == part), None)
-        if isinstance(node, yaml.SequenceNode if isinstance(value, list) else yaml.ScalarNode):
+            shared |= places[id(node)] > 1
+        if not shared and isinstance(node, yaml.SequenceNode if isinstance(value, list) else yaml.ScalarNode):
             edits.append((node.start_mark.index, node.end_mark.index, as_flow(value)))
         else:
             missing.append(key)
     for begin, end, value in sorted(edits, reverse=True):
         text = text[:begin] + value + text[end:]
     return text, missing
+
+
+def _nodes(node: Any) -> Iterator[Any]:
+    """Return a node and those below it; that of an alias at each of its places."""
+    yield node
+    if isinstance(node, yaml.CollectionNode):
+        for item in node.value:
+            for part in item if isinstance(item, tuple) else (item,):
+                yield from _nodes(part)

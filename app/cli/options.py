@@ -137,7 +137,7 @@ def _moment(option: str, text: str, events: Events) -> int:
         raise ConfigError(f"{option} {text}: is no date; write for example 2024-05-01T14:00 (UTC)") from None
     if when is None:
         try:
-            return int(events.t[0]) + round(seconds_of(option, text) * 1e9)
+            return int(events.t[0]) + (0 if text in ("0", "0s") else round(seconds_of(option, text) * 1e9))
         except ConfigError:
             rule = "give a share (50%), a time after the start (600, 10min) or a date (2024-05-01T14:00)"
             raise ConfigError(f"{option} {text}: {rule}") from None

@@ -48,6 +48,8 @@ def tune_twin(arguments: Arguments) -> int:
         check_output("--save", arguments.save, ".yaml", ".yml")
     if arguments.out is not None:
         check_output("--out", arguments.out, ".yaml", ".yml")
+        if arguments.out.exists():
+            raise ConfigError(f"--out {arguments.out}: there is such a file; choose another name, or use --apply")
     if arguments.keep is not None:
         check_free(find(arguments.twin), arguments.keep)
     if arguments.windows is not None:

@@ -167,6 +167,12 @@ def _assembled(model: StateSpaceModel, loaded: Loaded) -> StateSpaceModel:
                 raise loaded.error(("estimate", item.name), "has a std in `parameters` too; give it in one place")
             considered, widened = section.use == "considered", section.widened(item.value)
             estimated[item.name] = JointParameter(std, section.drift, considered, widened)
+    for name, section in config.parameters.items():
+        for other, value in section.correlation.items():
+            mirrored = config.parameters[other].correlation.get(name, value) if other in config.parameters else value
+            if name == other or mirrored != value:
+                text = "is with itself" if name == other else f"is {value:g} here and {mirrored:g} under {other}"
+                raise loaded.error(("parameters", name, "correlation", other), f"{text}; give each pair once")
     held = {name for name, section in config.parameters.items() if section.use != "considered"}
     correlations = {
         (name, other): value

@@ -367,3 +367,22 @@ def test_the_prior_of_what_is_considered_is_that_of_the_parameter() -> None:
     mean, cov = twin.model.prior_mean, twin.model.prior_cov
     written = tuning_yaml(twin.config, twin.estimator, twin.tuning, (mean, cov), whole=True)
     assert "winding: {mean" in written and "yoke_coolant_deviation" not in written
+
+
+@pytest.mark.parametrize(
+    ("parameters", "said"),
+    [
+        (
+            "{yoke_coolant: {value: 0.2, use: considered}}",
+            "is considered and needs a standard deviation, as in std: 10 %",
+        ),
+        ("{yoke_coolant: {std: 1 %, correlation: {yoke_coolant: 0.5}}}", "is with itself; give each pair once"),
+        (
+            "{yoke_coolant: {std: 1 %, correlation: {iron_magnet: 0.5}},"
+            " iron_magnet: {std: 1 %, correlation: {yoke_coolant: -0.5}}}",
+            "is 0.5 here and -0.5 under iron_magnet; give each pair once",
+        ),
+    ],
+)
+def test_a_width_is_given_once(parameters: str, said: str) -> None:
+    assert said in refusal(f"model: motor_drive\nparameters: {parameters}\nsource: {{type: simulator}}\n")

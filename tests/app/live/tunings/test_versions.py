@@ -153,6 +153,16 @@ def test_values_without_a_place_replace_their_section():
     assert "noise:\n  temperature: {variance: 0.04}\n  rate: {variance: 2}\n" in found and "# data sheet" in found
 
 
+def test_a_value_that_an_alias_shares_is_written_for_each():
+    text = "model: motor_can\nsensors:\n  yoke: &same {std: 0.5}\n  tooth: *same\n"
+    before, after = (
+        f"sensors:\n  yoke: {{variance: {yoke}}}\n  tooth: {{variance: {tooth}}}\n"
+        for yoke, tooth in ((0.25, 0.25), (1.0, 4.0))
+    )
+    found = with_tuning(text, before, after)
+    assert found == "model: motor_can\n" + after
+
+
 def test_words_stand_for_choices():
     twin = load_twin("motor_can")
     tuning = twin.tuning.set("use.tooth", False).set("gate.reopen", None).with_options({"adapt": 1.0})
