@@ -34,6 +34,7 @@ from .scenario import (
     first_word,
     green_share,
     heard_in,
+    quiet_of,
     recovery,
     said_at,
 )
@@ -243,7 +244,7 @@ def make(bench: Bench, mistake: Mistake, estimator: str, foretold: Foretold) -> 
     fit = next(fits, None)
     # That the estimate is lost is no cause, and is said sooner than one can be told.
     first = next((item for _, item in after if item.cause != "diverged"), after[0][1] if after else None)
-    word = first_word(shipped, begun, undisturbed.fold)
+    word = first_word(shipped, begun, undisturbed.fold, quiet_of(mistake))
     heard = word is not None and word < (ended - begun) / 1e9
     scores = {name: _score(item, begun, ended) for name, item in (("gated", gated), ("bare", bare))}
     calm = _score(undisturbed, begun, ended)
@@ -276,8 +277,7 @@ def make(bench: Bench, mistake: Mistake, estimator: str, foretold: Foretold) -> 
 def _outcome(mistake: Mistake, foretold: str, heard: bool, named: bool) -> str:
     if not mistake.causes:
         return FALSE if heard else RIGHTLY_SILENT
-    # Bands that are too wide are named in an advisory, which is green.
-    if not heard and not named:
+    if not heard:
         return MISSED if foretold == VISIBLE else UNSEEN
     return NAMED if named else MISNAMED
 

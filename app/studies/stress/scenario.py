@@ -18,7 +18,7 @@ from estimators.errors import NisusError, SourceError
 from estimators.fold import Fold
 from estimators.log import MARK, READING, TICK, TRUTH, Events, Log
 from estimators.snapshots import Base
-from estimators.track import USABLE, WAITING
+from estimators.track import TRACKING, USABLE, WAITING
 from estimators.tuning import Tuning
 from sources.faults.layer import Faults, FaultySource
 from sources.merged import MemorySource
@@ -169,7 +169,8 @@ class Bench:
         """
         start, end = self.span(mistake)
         gate = self.twin.tuning.gate
-        word = first_word(self.fold(mistake, estimator, gate).fold, start, self.fold(None, estimator, gate).fold)
+        fold, calm = (self.fold(made, estimator, gate).fold for made in (mistake, None))
+        word = first_word(fold, start, calm, quiet_of(mistake))
         return _share(word, end - start)
 
     def found_within(self, mistake: Mistake, estimator: str, begin: int, end: int) -> float:
@@ -185,7 +186,7 @@ class Bench:
         log.n = int(np.searchsorted(log.t[: log.n], end))
         log.drop_front(at)
         fold = self._folded(estimator, self._tuning(estimator, mistake).set("gate", gate), log, base)
-        return _share(first_word(fold, begin, calm), end - begin)
+        return _share(first_word(fold, begin, calm, quiet_of(mistake)), end - begin)
 
     def fold(self, mistake: Mistake | None, estimator: str, gate: float | None) -> StressFold:
         """The log with a mistake, or without, folded with a filter and a gate.
@@ -278,19 +279,24 @@ def said_at(fold: Fold, episode: Episode) -> int:
     return int(log.t[rows[0]]) if rows.size else round(episode.start * 1e9)
 
 
-def first_word(fold: Fold, start: int, calm: Fold | None = None) -> float | None:
-    """Seconds from `start` (ns) to the first row that is not green, once a reading has come; None if all stay green.
+def quiet_of(mistake: Mistake) -> tuple[int, ...]:
+    """Return the grades of health that say nothing of a mistake: an advisory tells a fault, and is no false alarm."""
+    return (TRACKING,) if mistake.causes else USABLE
 
-    Where `calm`, the fold without the mistake, was not green either at that time, the fault is not detected.
+
+def first_word(fold: Fold, start: int, calm: Fold | None = None, quiet: tuple[int, ...] = USABLE) -> float | None:
+    """Seconds from `start` (ns) to the first row whose health is not `quiet`, once a reading has come; None without.
+
+    Where `calm`, the fold without the mistake, was not quiet either at that time, the fault is not detected.
     """
-    t, ok = fold.log.t[: fold.n], green(fold)
+    t, ok = fold.log.t[: fold.n], np.isin(fold.track.health[: fold.n], quiet)
     waiting = fold.track.health[: fold.n] == WAITING
     said = ~ok & ~waiting & (t >= start)
     if calm is not None:
         # What holds at a time is what held before its events, and after each of them.
         before = np.searchsorted(calm.log.t[: calm.n], t, side="left") - 1
         after = np.searchsorted(calm.log.t[: calm.n], t, side="right")
-        wrong = np.concatenate(([0], np.cumsum(~green(calm))))
+        wrong = np.concatenate(([0], np.cumsum(~np.isin(calm.track.health[: calm.n], quiet))))
         said &= wrong[after] == wrong[np.maximum(before, 0)]
     rows = np.flatnonzero(said)
     return int(t[rows[0]] - start) / 1e9 if rows.size else None
