@@ -167,14 +167,18 @@ def viewed(model, estimator="kf", view=None):
     made.config.view = view or made.config.view
     stepped = Stepped(of=made)
     engine, submit = stepped.engine, stepped.engine.submit
-    engine.put, engine.commands = stepped.put, []
+    engine.commands = []
+
+    def put(*batches):
+        stepped.put(*batches)
+        fresh_status(engine)  # A view takes the kept one
 
     def carry_out(command):
         engine.commands.append(command)
         submit(command)
         engine.settle()
 
-    engine.submit = carry_out
+    engine.put, engine.submit = put, carry_out
     return engine
 
 

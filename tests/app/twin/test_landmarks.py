@@ -129,7 +129,7 @@ def test_there_is_one_entry_for_all_landmarks_of_a_sensor(folder):
     names = [item.key for item in one.tuning.items()]
     assert [name for name in names if name[0] in "Rp"] == ["R.sighting.range", "R.sighting.bearing", "p.scale"]
     assert one.tuning.r.tolist() == pytest.approx([0.09, 0.0009] * 3) and not one.tuning.used.any()
-    assert len(calibration_lines(calibration_of(one, run), one.model)) == 1
+    assert len(calibration_lines(calibration_of(run, run.log.events, run.track), one.model)) == 1
     # One landmark can still differ, and its coordinates can be set.
     other = one.tuning.set("R.sighting_7.range", 0.5).set("p.sighting_7_east", -3.5)
     assert other.r[2] == 0.5 and other.r[0] == 0.09

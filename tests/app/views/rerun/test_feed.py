@@ -20,6 +20,7 @@ from app.views.rerun.layout import blueprint
 from app.views.rerun.pictures import LABEL_HALF_WIDTH, LABEL_HEIGHT, PICTURE_RATIO, anchors, axis_scales, ellipse_points
 from app.views.rerun.rows import RerunRows
 from app.views.rerun.sink import last_of_each_time, pair_name, thin
+from estimators.diagnostics.detectors import ADVISORY_ALARM
 from estimators.log import READING, TRUTH, Events
 from estimators.track import HEALTH_NAMES
 from tests.app.scripted import Replayed, pull_all, readings, twin, wait_for
@@ -144,7 +145,10 @@ def test_bytes_hold_the_rows_of_the_track(fed):
     times, states = fed.column("/health", "StateChange:state")
     assert states.ravel().tolist() == [HEALTH_NAMES[code] for code in health[changes]]
     np.testing.assert_array_equal(times, pull.events.t[changes])
-    words = ["suspect" if mask.any() else "tracking" for mask in pull.track.alarms[reading]]
+    words = [
+        "advisory" if mask[0] & ADVISORY_ALARM else "suspect" if mask[0] else "tracking"
+        for mask in pull.track.alarms[reading]
+    ]
     changes = [word for word, before in zip(words, [None, *words], strict=False) if word != before]
     assert fed.column(f"/sensor/{sensor}", "StateChange:state")[1].ravel().tolist() == changes
 
