@@ -92,6 +92,6 @@ def source_digest(helpers: list[Any]) -> str:
         cells = [cell.cell_contents for cell in helper.__closure__ or ()]
         functions = [plain(item) for item in cells if _plain(plain(item))]
         helpers += functions
-        values = [item for item in cells if plain(item) not in functions]
+        values = [item for item in cells if not _plain(plain(item))]
         digest.update(dumps((values, helper.__defaults__, helper.__kwdefaults__)))
     return digest.hexdigest()

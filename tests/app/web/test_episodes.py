@@ -35,7 +35,7 @@ def test_a_stuck_sensor_in_the_api(engine):
     engine._watchers.episode_log.update()
     engine._status = None
     (episode,) = strict(episodes_json(engine))
-    assert " ".join(episode) == "start end subject cause size low high unit text help severity"
+    assert " ".join(episode) == "start end subject cause size low high unit text grade help severity"
     # The first of the equal readings is that at 101 s; what is stuck has a value, and no interval of it.
     assert (episode["start"], episode["end"], episode["subject"], episode["cause"]) == (101.0, None, "winding", "stuck")
     assert (episode["size"], episode["low"], episode["high"], episode["unit"]) == (41.5, None, None, "°C")

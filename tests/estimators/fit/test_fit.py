@@ -275,5 +275,6 @@ def test_true_noises_lie_in_their_intervals(recovered):
 def test_a_fit_makes_the_nis_of_another_log_as_uncertain_as_its_readings_do(recovered):
     """With the information I of a fit, ∂(mean NIS)/∂θ is -(2 / N) I e along the scale e of all noises, so gᵀ I⁻¹ g is
     2 / N: the variance of a chi-square's mean once more, whatever the model, if all Q and R are fitted."""
-    # The belief takes from it, the sandwich adds, by a few percent each.
-    np.testing.assert_allclose(recovered.wider, np.sqrt(2.0), rtol=0.15)
+    # The belief takes from it, the sandwich adds, by a few percent each; a fit that held-out blocks doubt is less sure.
+    np.testing.assert_allclose(np.median(recovered.wider), np.sqrt(2.0), rtol=0.15)
+    assert min(recovered.wider) > 0.85 * np.sqrt(2.0)

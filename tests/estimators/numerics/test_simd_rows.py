@@ -39,7 +39,7 @@ def cross_covariance_of(U, across, w, C):
 
 @njit
 def without_squares(n, m, W, P):
-    subtract_squares(W, m, P)
+    subtract_squares(W, m, P.shape[0], P)
 
 
 @pytest.mark.parametrize("n", ORDERS)

@@ -41,6 +41,7 @@ def test_a_note_is_written_at_a_moment_and_every_browser_has_it(visit, session):
     for each in (page, other):
         each.get_by_role("tab", name="Episodes").click()
     left, top, time = at(page, 0.3)
+    low = page.evaluate("window.nisus.charts.range[0]")
     before = dotted(page, left)
     page.mouse.move(left, top)
     page.keyboard.down("Alt")
@@ -51,6 +52,7 @@ def test_a_note_is_written_at_a_moment_and_every_browser_has_it(visit, session):
     until(page, "!window.nisus.view.following")
     assert page.locator("#note").is_hidden()
     page.evaluate("window.nisus.view.follow()")
+    until(page, f"window.nisus.charts.range[0] === {low}")
     page.mouse.move(left, top)
     page.mouse.click(left, top)
     page.keyboard.up("Alt")
