@@ -85,8 +85,8 @@ class GramianView(NamedTuple):
 
     @property
     def left(self) -> np.ndarray:
-        """Share of the prior deviation of each state that neither the measurements nor time remove, (nx,)."""
-        return np.minimum(self.deviation, self.kept)
+        """Share of the prior deviation of each state that measurements leave, or time where they tell none, (nx,)."""
+        return np.where(self.deviation > MAX_PRIOR_LEFT, np.minimum(self.deviation, self.kept), self.deviation)
 
     @property
     def summary(self) -> str:

@@ -45,8 +45,11 @@ STUCK = slice(200, 260)
 
 
 def stuck(rng):
-    """As `linear`, twice as long, with a sensor that is stuck for a minute."""
-    values = cart(rng, 2 * N) + rng.normal(0, 1, 2 * N)
+    """As `linear`, twice as long, with a sensor that is stuck for a minute while the cart, so far moving on, rests."""
+    steps = np.diff(cart(rng, 2 * N), prepend=0.0)
+    steps[: STUCK.start] += 2.0
+    steps[STUCK] = 0.0
+    values = np.cumsum(steps) + rng.normal(0, 1, 2 * N)
     values[STUCK] = values[STUCK.start]
     return {"rail": values}, {}
 

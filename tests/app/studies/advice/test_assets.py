@@ -141,7 +141,6 @@ def test_of_few_readings_nothing_is_said_of_the_innovations(tmp_path, number):
     assert found.answer == UNTOLD and found.remedy == ""
 
 
-@pytest.mark.xfail(strict=True, reason="a repetition that nothing contradicts is an advisory, whose rows stay")
 def test_faults_of_a_sensor_are_left_out(tmp_path, nisus):
     path = write(tmp_path, "stuck", "LINEAR", "kf", recordings.stuck, "rail")
     twin = load_twin(path)

@@ -164,7 +164,7 @@ def test_observability_and_cost_come_from_a_background_job():
     told = said["observability"]
     # A thermometer read over minutes determines both temperature and its rate.
     assert (told["rank"], told["of"]) == (2, 2) and set(told["states"]) == {"temperature", "rate"}
-    assert all(0.0 <= left < 1.0 for left in told["states"].values())
+    assert all(0.0 < left < 1.0 for left in told["states"].values())
     # Of another revision nothing is known at first.
     stepped.submit(SetEstimator("ekf"))
     assert diagnosis._look()["observability"]["reason"] == "being computed"
