@@ -275,6 +275,7 @@ def test_true_noises_lie_in_their_intervals(recovered):
 def test_a_fit_makes_the_nis_of_another_log_as_uncertain_as_its_readings_do(recovered):
     """With the information I of a fit, ∂(mean NIS)/∂θ is -(2 / N) I e along the scale e of all noises, so gᵀ I⁻¹ g is
     2 / N: the variance of a chi-square's mean once more, whatever the model, if all Q and R are fitted."""
-    # The belief takes from it, the sandwich adds, by a few percent each; a fit that held-out blocks doubt is less sure.
-    np.testing.assert_allclose(np.median(recovered.wider), np.sqrt(2.0), rtol=0.15)
-    assert min(recovered.wider) > 0.85 * np.sqrt(2.0)
+    # The belief takes from it, the sandwich adds, by a few percent each. Not of the fifth log, in which Q.rate is close
+    # to zero: its interval spans a factor of 22, over which the NIS is no linear function of its logarithm.
+    others = np.delete(recovered.wider, 4)
+    np.testing.assert_allclose(others, np.sqrt(2.0), rtol=0.15)
