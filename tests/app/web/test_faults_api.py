@@ -11,6 +11,7 @@ from sources.faults.kinds import KINDS
 from sources.faults.layer import Faults, FaultySource
 from tests.app.scripted import MODEL, pull_all, readings, wait_for
 from tests.app.web.test_bounds import NASTY
+from tests.support import SECOND
 
 
 @pytest.fixture
@@ -129,9 +130,14 @@ def test_nothing_that_is_asked_for_stops_the_source(page):
     page.source.put(readings([2.0, 3.0], [40.0, 41.0]))
     ask(page, command="ClearFault")
     wait_for(lambda: active(page) == [])
-    before = page.rows()
     page.source.put(readings([4.0], [42.0]))
-    wait_for(lambda: page.rows() > before)  # By one, and by those before the end of the faults that were on their way
+
+    def taken_at(seconds):
+        events = pull_all(page.engine).events
+        return events.values[(events.kind == READING) & (events.t == int(seconds * SECOND)), 0].tolist()
+
+    # Those before it may come late: the faults of their time delay, repeat and withhold.
+    wait_for(lambda: taken_at(4.0) == [42.0])
     counts = json.loads(page.client.get("/api/status").text)["counts"]
     assert not counts.get("engine error") and not counts.get("source failed")
 
