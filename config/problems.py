@@ -138,7 +138,7 @@ _RULES = {
     "string_too_short": "it must not be empty",
     "string_pattern_mismatch": "use letters, digits, _ and -, and begin with a letter or digit",
 }
-"""Rules by pydantic's type of error, or its first word; braces hold what pydantic tells of the rule."""
+"""Rules by pydantic's type of error, or its first word; braces are filled from the context of the error."""
 
 
 def _rule(kind: str, context: dict[str, Any], text: str, value: Any) -> str:

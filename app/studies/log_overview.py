@@ -75,7 +75,7 @@ class DatabaseOverview:
 
 @dataclass(frozen=True)
 class LogOverview:
-    """What a log holds; `curves` belong to `signals`. `choices` are columns that may hold the time of a table.
+    """Contents of a log; `curves` belong to `signals`. `choices` are columns that may hold the time of a table.
 
     `roles` are those that a draft proposes, each with its reason; None until they are known.
     `needs` names what is missing before the log can be read: "time" or "database". `keys` are buses and ids of frames,

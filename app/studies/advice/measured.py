@@ -188,7 +188,7 @@ class Claim:
     """A question and its answer.
 
     `figure` is the number that decides, `threshold` what it is compared with, and `of` says what both are, with the
-    unit; the figure is None where nothing could be measured, and `answer` is then by the model's own word or "not
+    unit; the figure is None where nothing could be measured, and `answer` is then declared by the model or "not
     told". `reason` has the arithmetic; `remedy` is what to do beside the choice of a filter, if anything.
     """
 

@@ -252,7 +252,7 @@ SAME_EPISODE_NS = 1_000_000_000
 
 
 def green(fold: Fold) -> np.ndarray:
-    """Return the rows in which nothing says that the estimate or its band is wrong, (N,) of bool."""
+    """Return the rows whose health reports neither a wrong estimate nor a wrong band, (N,) of bool."""
     return np.isin(fold.track.health[: fold.n], USABLE)
 
 
