@@ -55,8 +55,7 @@ MAX_STEPS = 200  # Most quasi-Newton steps
 MAX_ROUNDS = 8  # Most rounds of L-BFGS-B, each with a new scale
 ROUND_STEPS = 15  # Steps per round
 GRADIENT = 0.02  # Gradient at the maximum, in deviations of an estimate: half its square is the remaining gain, in nats
-MIN_GAIN = 0.01  # Nats that a round must gain to be followed by another
-RESOLUTION = 0.05  # Nats of gain below which a step that falls short of its promise counts as failed
+RESOLUTION = 0.05  # Nats of gain below which a step that falls short of its promise counts as failed, and a round ends
 MIN_SHARE = 0.25  # Share of the promised gain of which a step falls short then
 PRECISION = 1e-3  # Nats of promised gain below which it ends: a twentieth of a deviation of one entry
 MAX_CHANGE = 2.0  # Largest change of an entry in one step, in logarithms or deviations
@@ -254,7 +253,9 @@ def scaled_rounds(objective: Objective, x: np.ndarray, *, rounds: int = MAX_ROUN
 
     low, high = np.array(objective.limits).T
     value, best = -np.inf, _BestPoint(objective, x)
+    progress, folds = objective.progress, (ROUND_STEPS + 1) * (x.size + 1) * objective.folds
     for _ in range(rounds):
+        progress.expected = max(progress.expected, progress.folds + folds)
         _, slopes = objective.slopes(x)
         unit = 1.0 / np.sqrt(np.sum(slopes**2, axis=1) + objective.precision)
 
@@ -277,7 +278,7 @@ def scaled_rounds(objective: Objective, x: np.ndarray, *, rounds: int = MAX_ROUN
             break
         gained, value = -found.fun - value, float(-found.fun)
         x = np.clip(x + unit * found.x, low, high)
-        if gained < MIN_GAIN or found.status == 0:
+        if gained < RESOLUTION or found.status == 0:
             break
     return best.x, best.value
 
