@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Discriminator, Field, Tag, model_validator
@@ -88,6 +88,8 @@ class Section(BaseModel):
     """A mapping of the YAML. A key that it does not have is an error, with the keys that it has."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
+    free_keys: ClassVar[str | None] = None
+    """Beginning of keys that may hold anything and are ignored."""
 
     @model_validator(mode="before")
     @classmethod
@@ -97,6 +99,8 @@ class Section(BaseModel):
             # `from` is a word of Python, and so the name of no field.
             fields = {field.alias or name: field for name, field in cls.model_fields.items()}
             known = list(fields)
+            if cls.free_keys is not None:
+                data = {key: value for key, value in data.items() if not key.startswith(cls.free_keys)}
             for key in data:
                 if key not in known:
                     raise PydanticCustomError("unknown_key", "unknown key", {"key": key, "known": known})
@@ -300,7 +304,7 @@ def _holds_something(given: RangeSection) -> RangeSection:
     if given.min is None and given.max is None:
         raise refused("absent", "gives neither min nor max")
     if given.min is not None and given.max is not None and not given.min < given.max:
-        raise refused("value", "its min must be below its max")
+        raise refused("value", f"its min ({given.min:g}) must be below its max ({given.max:g})")
     return given
 
 

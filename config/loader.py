@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
@@ -16,7 +16,7 @@ from estimators.errors import ConfigError, nearest
 from .problems import report, shown
 from .schema import TwinSection, as_gate
 from .tunings import Version, find_version, keep_options, overlay
-from .yaml_files import Key, ValuePlaces, dotted, parse, read_text, shown_path
+from .yaml_files import Key, ValuePlaces, dotted, parse, read_text, shown_path, with_values
 
 TWINS = Path(str(resources.files("config"))) / "twins"  # Folder of the twins that ship
 
@@ -114,6 +114,63 @@ def load_text(
         config = config.model_copy(update={"name": _name(path)})
     without = None if version is None else load_text(text, path, overrides)
     return Loaded(config, path, text, places, version, without)
+
+
+def moved(text: str, path: Path, out: Path) -> str:
+    """Return the text of a twin's YAML for a copy `out`, whose relative paths name the same files from its folder.
+
+    Raises:
+        ConfigError: If an alias shares a path with another key.
+    """
+    before, after = path.absolute().parent, out.absolute().parent
+    if before == after:
+        return text
+
+    def there(name: str) -> str:
+        return os.path.relpath(before / name, after) if not Path(name).expanduser().is_absolute() else name
+
+    data = parse(text, shown_path(path))[0]
+    changed, shared = with_values(text, dict(_paths_of(data, there, before)))
+    if shared:
+        remedy = "write the path out, or write the copy to the same folder"
+        raise ConfigError(f"{shown_path(path)}: an alias shares {dotted(shared[0])} with another key; {remedy}")
+    return changed
+
+
+def _paths_of(data: Any, there: Callable[[str], str], folder: Path) -> Iterator[tuple[Key, Any]]:
+    """Yield key and new value of every path of a twin's data; `folder` is that of its file."""
+
+    def file_of(reference: str) -> str:
+        file, colon, name = reference.rpartition(":")
+        return f"{there(file)}:{name}" if colon else reference
+
+    def of_source(section: Any, key: Key) -> Iterator[tuple[Key, Any]]:
+        if not isinstance(section, dict):
+            return
+        root = section.get("folder")
+        if root is not None:
+            yield (*key, "folder"), there(root)
+        for name in ("files", "recording"):
+            files = section.get(name)
+            if files is not None and root is None:
+                yield (*key, name), [there(file) for file in files] if isinstance(files, list) else there(files)
+        databases = section.get("dbc")
+        for k, item in enumerate(databases if isinstance(databases, list) else [databases] if databases else []):
+            file = item["file"] if isinstance(item, dict) else item
+            place: Key = ("dbc", k) if isinstance(databases, list) else ("dbc",)
+            if root is None or not (folder / root / file).is_file():
+                yield (*key, *place, *(("file",) if isinstance(item, dict) else ())), there(file)
+        asset = (section.get("truth") or {}).get("model")
+        if isinstance(asset, str):
+            yield (*key, "truth", "model"), file_of(asset)
+        yield from of_source(section.get("asset"), (*key, "asset"))
+        for k, part in enumerate(section.get("parts") or ()):
+            yield from of_source(part, (*key, "parts", k))
+
+    yield ("model",), file_of(data["model"])
+    if data.get("learned") is not None:
+        yield ("learned",), there(data["learned"])
+    yield from of_source(data.get("source"), ("source",))
 
 
 def _name(path: Path) -> str:

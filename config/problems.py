@@ -15,6 +15,7 @@ from .source_schema import PartSection, SourceSection
 from .yaml_files import Key, ValuePlaces, dotted, parse, shown_path
 
 MAX_PROBLEMS = 5  # Problems shown at once
+MAX_SHOWN_ITEMS = 40  # Characters up to which a list or mapping is shown in full
 MAX_LISTED_WORDS = 8  # Choices up to which all are listed; of more, the nearest ones
 
 
@@ -25,10 +26,11 @@ def shown(value: Any) -> str:
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, dict):
-        return "a mapping"
+        text = ", ".join(f"{key}: {shown(item)}" for key, item in value.items())
+        return f"{{{text}}}" if 0 < len(text) <= MAX_SHOWN_ITEMS else "a mapping"
     if isinstance(value, (list, tuple)):
         text = ", ".join(shown(item) for item in value)
-        return f"[{text}]" if len(text) <= 40 else f"a list of {len(value)}"
+        return f"[{text}]" if len(text) <= MAX_SHOWN_ITEMS else f"a list of {len(value)}"
     if isinstance(value, str):
         value = value if len(value) <= 60 else value[:57] + "..."
         return repr(value)

@@ -6,9 +6,10 @@ The docstring under each field is its documentation in the JSON Schema that `nis
 from __future__ import annotations
 
 import json
-from typing import Annotated, Any, Literal
+import re
+from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import BeforeValidator, ConfigDict, Field, model_validator
 
 from .fields import (
     MAX_DURATION_S,
@@ -38,8 +39,20 @@ from .fields import (
 )
 from .source_schema import FaultSection, SourceSection
 
-Percent = Annotated[str, Field(pattern=r"^[0-9.]*[1-9][0-9.]* ?%$")]
-"""A share above zero, as in 10 %."""
+PERCENT = r"^([0-9]+\.?[0-9]*|\.[0-9]+) ?%$"
+Percent = Annotated[str, Field(pattern=PERCENT)]
+"""A share, as in 10 %."""
+
+
+def _no_other_text(value: Any) -> Any:
+    """Return a width; refuse text that is no share above zero."""
+    if isinstance(value, str) and (not re.match(PERCENT, value) or not float(value.rstrip(" %")) > 0.0):
+        raise refused("value", "give a positive number without a unit, or a share of the value above zero, as in 10 %")
+    return value
+
+
+Width = Annotated[Positive | Percent, BeforeValidator(_no_other_text, json_schema_input_type=Positive | Percent)]
+"""A standard deviation, as a number or as a share of the value."""
 
 GateProbability = Annotated[float, Field(strict=True, ge=0.5, lt=1)]
 
@@ -64,7 +77,7 @@ class WidenSection(Section):
 
     per: Positive = 1.0
     """Distance from that range, in its unit, that adds `by`. Default: 1."""
-    by: Positive | Percent
+    by: Width
     """Standard deviation that it adds, in the parameter's unit, or in percent of the parameter's value, as in 50 %."""
 
 
@@ -73,7 +86,7 @@ class ParameterSection(Section):
 
     value: Number | None = None
     """Its value, in its unit. Default: the model's."""
-    std: Positive | Percent | None = None
+    std: Width | None = None
     """Standard deviation of its true value about this one, in its unit, or in percent of the value, as in 10 %.
     Default: none, it is certain."""
     drift: NotNegative = 0.0
@@ -364,7 +377,13 @@ def as_gate(value: Any) -> Any:
 
 
 class TwinSection(Section):
-    """A twin: a model of an asset, the source of its measurements, and the estimator that combines them."""
+    """A twin: a model of an asset, the source of its measurements, and the estimator that combines them.
+
+    Keys that begin with `x-` are ignored: a place for anchors that several sections share.
+    """
+
+    model_config = ConfigDict(json_schema_extra={"patternProperties": {"^x-": {}}})
+    free_keys: ClassVar[str] = "x-"
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$")] | None = None
     """Short name: letters, digits, _ and -. Default: the file's name without its ending."""

@@ -18,6 +18,7 @@ import yaml
 from estimators.errors import ConfigError
 
 Key = tuple[str | int, ...]
+MERGE = "<<"  # Key whose value is a mapping, or a list of these, with defaults for the keys beside it
 MAX_VALUES = 100_000  # A twin has a few hundred values; nested aliases could otherwise ask for billions
 
 
@@ -127,7 +128,14 @@ class _Builder:
 
     def mapping(self, node: yaml.MappingNode, key: Key, around: tuple[int, ...]) -> dict[str, Any]:
         data: dict[str, Any] = {}
+        merged: dict[str, Any] = {}
         for name, item in node.value:
+            if name.value == MERGE and not name.style:
+                for part in item.value if isinstance(item, yaml.SequenceNode) else (item,):
+                    if not isinstance(part, yaml.MappingNode):
+                        raise self.fail(name, f"{dotted(key)}.{MERGE} must name mappings, as in {MERGE}: *name")
+                    merged = {**self.value(part, key, around), **merged}
+                continue
             if not isinstance(name, yaml.ScalarNode):
                 raise self.fail(name, "a key must be one word, not a list or mapping; put braces in quotes")
             path = (*key, name.value)
@@ -136,7 +144,7 @@ class _Builder:
                 raise self.fail(name, f"{dotted(path)} is given twice, first in line {first}; remove one")
             self.places.lines[path] = name.start_mark.line + 1
             data[name.value] = self.value(item, path, around)
-        return data
+        return {**merged, **data}
 
     def scalar(self, node: yaml.ScalarNode) -> Any:
         text = node.value
@@ -286,8 +294,11 @@ def with_values(text: str, values: Mapping[Key, Any]) -> tuple[str, list[Key]]:
     for key, value in values.items():
         node, shared = root, False
         for part in key:
-            items = node.value if isinstance(node, yaml.MappingNode) else ()
-            node = next((item for name, item in items if name.value == part), None)
+            if isinstance(node, yaml.SequenceNode) and isinstance(part, int):
+                node = node.value[part]
+            else:
+                items = node.value if isinstance(node, yaml.MappingNode) else ()
+                node = next((item for name, item in items if name.value == part), None)
             shared |= places[id(node)] > 1
         if not shared and isinstance(node, yaml.SequenceNode if isinstance(value, list) else yaml.ScalarNode):
             edits.append((node.start_mark.index, node.end_mark.index, as_flow(value)))

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
 from typing import BinaryIO
+
+from estimators.errors import SourceError
 
 CAN_LOGS = (".asc", ".blf", ".csv", ".db", ".log", ".mf4", ".trc")  # Endings of CAN logs
 
@@ -29,6 +32,47 @@ def is_compressed(path: Path) -> bool:
 def is_recording(name: str) -> bool:
     """Return whether a file of this name can replace a twin's own recording."""
     return suffix_of(Path(name)) in {*CAN_LOGS, *TABLES}
+
+
+def check_once(files: Sequence[Path], where: str = "") -> None:
+    """Refuse a recording that is named twice, as its measurements would count twice; `where` begins the message.
+
+    Raises:
+        SourceError: Naming it.
+    """
+    seen: set[Path] = set()
+    for path in files:
+        if path.resolve() in seen:
+            raise SourceError(f"{where}{path}: is given twice; name each recording once")
+        seen.add(path.resolve())
+
+
+BEGINNINGS = {
+    b"PK\x03\x04": "an Excel workbook or a ZIP archive; export the sheet as CSV",
+    b"\x89HDF": "HDF5; export it as Parquet or CSV",
+    b"%PDF": "a PDF; give a CSV",
+    b"RRF": "a recording of Nisus; nisus review opens it",
+    b"MDF ": "MF4; let its name end in .mf4",
+    b'VERSION "': "a DBC; name it with --dbc",
+    b"{": "JSON; export it as CSV",
+    b"[{": "JSON; export it as CSV",
+    b"<": "XML or HTML; export it as CSV",
+}
+"""Files that are no table, by their first bytes, and the remedy."""
+
+
+def refuse_others(path: Path, head: bytes) -> None:
+    """Refuse a file that begins as one of another format.
+
+    Raises:
+        SourceError: Naming that format.
+    """
+    begin = head.lstrip(b"\xef\xbb\xbf \t\r\n")
+    for start, what in BEGINNINGS.items():
+        if begin.startswith(start):
+            raise SourceError(f"{path}: is no table; it is {what}")
+    if path.suffix.lower() in (".yaml", ".yml"):
+        raise SourceError(f"{path}: is no table; it is YAML, as of a twin, whose recording nisus fold reads")
 
 
 def open_binary(path: Path) -> BinaryIO:

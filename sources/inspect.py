@@ -12,14 +12,14 @@ from pathlib import Path
 
 import numpy as np
 
-from estimators.errors import SourceError
+from estimators.errors import SourceError, nearest, quoted
 from estimators.log import READING
 
 from .can.decoder import Decoder, load_database, same_bus
 from .can.log import CanLog, check_log, frames_reader
 from .can.readers import EXTENDED, BusName, LogSummary, Raw
-from .formats import CAN_LOGS, suffix_of
-from .source import Channel
+from .formats import CAN_LOGS, check_once, suffix_of
+from .source import UNDATED, Channel
 from .tables.order import Order, time_order
 from .tables.rows import TableRows, is_text, names_of, rows_of
 from .tables.text import UNREADABLE, TextMatch, csv_format, open_text
@@ -151,6 +151,7 @@ def inspect_recordings(
             raise SourceError(f"{path}: there is no such file; check the path")
         if not path.stat().st_size:
             raise SourceError(f"{path}: the file is empty; record it again")
+    check_once(files)
     groups: dict[tuple[str, ...], list[Path]] = {}
     for path in files:
         groups.setdefault(("table", *sorted(set(names_of(path)))) if is_table(path) else ("log",), []).append(path)
@@ -282,7 +283,14 @@ def _series(name: str, unit: str, t: np.ndarray, values: np.ndarray) -> SignalSe
 def _tables(files: list[Path], time: TimeColumn) -> RecordingContents:
     names = names_of(files[0])
     chosen = time.name or _time_of(files[0], names, time)
-    if chosen is None or chosen not in names:
+    if time.name and time.name not in names:
+        raise SourceError(f"--time {quoted(time.name)}: is no column of {files[0]}; {nearest(time.name, names)}")
+    if len(names) < 2:
+        raise SourceError(
+            f"{files[0]}: has one column, {quoted(names[0] if names else '')}; a table has a header, a column of times "
+            "and one of values"
+        )
+    if chosen is None:
         raise SourceError(
             f"{files[0]}: which column holds the time is not known; name it with --time, one of {', '.join(names[:12])}"
         )
@@ -291,26 +299,36 @@ def _tables(files: list[Path], time: TimeColumn) -> RecordingContents:
     if time.unit == "s" and named in ("ms", "us", "ns", "min", "h"):
         time = time._replace(unit=named)
     faults: list[str] = []
-    columns = [name for name in dict.fromkeys(names_of(files[0], chosen)) if name != chosen]
-    if other := [name for name in dict.fromkeys(names) if name != chosen and name not in columns]:
+    copies = [name for name, count in Counter(names).items() if count > 1]
+    if chosen in copies:
+        raise SourceError(f"{files[0]}: there are {names.count(chosen)} columns {chosen!r}; give each its own name")
+    if copies:
+        faults.append(f"several columns are named {', '.join(copies)} and are left out; give each its own name")
+    columns = [name for name in dict.fromkeys(names_of(files[0], chosen)) if name != chosen and name not in copies]
+    if other := [name for name in dict.fromkeys(names) if name not in (chosen, *copies, *columns)]:
         shown = ", ".join(other[:3]) + (", ..." if len(other) > 3 else "")
         faults.append(
             f"{len(other)} columns have another number of rows than {chosen} and are left out: {shown}; name their "
             "own time column to read them"
         )
     times, values = [], []
-    order = Order(chosen, time.unit, HORIZON_NS, lambda key, text: faults.append(text))
+    undated: list[str] = []
+    order = Order(chosen, time.unit, HORIZON_NS, lambda key, text: None if text in faults else faults.append(text))
     for path in files:
-        for rows in _rows(path, time, columns, faults):
+        for rows in _rows(path, time, columns, faults, undated):
             times.append(rows.t[rows.known])
             values.append(rows.values[rows.known])
             order.look(path.name, rows.line[rows.known], times[-1])
     if not any(part.size for part in times):
-        raise SourceError(
-            "; ".join(faults)
-            or f"{files[0]}: no row has a time in column {chosen}; give its unit (--time-unit) or format "
-            "(--time-format), or another column"
+        none = (
+            f"no row has a time; {undated[0]}"
+            if undated
+            else f"{files[0]}: it has a header and no rows; record it again"
         )
+        raise SourceError("; ".join(faults) or none)
+    if undated:
+        more = f"; so are {len(undated) - 1} more rows" if len(undated) > 1 else ""
+        faults.append(undated[0] + more)
     t, v = np.concatenate(times), np.concatenate(values)
     texts = _texts(files, [name for name, column in zip(columns, v.T, strict=True) if not np.isfinite(column).any()])
     by, labels, source = _source_of(files, time, dict(zip(columns, v.T, strict=True)), texts, t)
@@ -372,12 +390,16 @@ def _split(
     return parts
 
 
-def _rows(path: Path, time: TimeColumn, columns: list[str], faults: list[str]) -> Iterator[TableRows]:
-    """Yield the rows of one table as far as it can be read."""
+def _rows(
+    path: Path, time: TimeColumn, columns: list[str], faults: list[str], undated: list[str]
+) -> Iterator[TableRows]:
+    """Yield the rows of one table as far as it can be read; texts of rows without a time are added to `undated`."""
     try:
         for rows in rows_of(path, time, columns, lambda: 1.0):
             if rows is not None:
-                faults += [f"{path.name}:{line}: {text}" for key, line, text in rows.problems if key != UNREADABLE]
+                for key, line, text in rows.problems:
+                    if key != UNREADABLE:
+                        (undated if key == UNDATED else faults).append(f"{path.name}:{line}: {text}")
                 yield rows
     except SourceError as error:
         faults.append(str(error))

@@ -15,6 +15,8 @@ Report = Callable[[str, str], None]
 LOST_FRAMES = "frames lost"  # Key of frames that a bus's socket lost before they were read
 NEVER = "never seen"  # Key of messages, signals and columns that channels need and the source never provides
 WRONG_TIME = "wrong time"  # Key of events that are rejected for their time
+UNDATED = "undated row"  # Key of rows of a table without a time
+UNASSIGNED = "row of no sensor"  # Key of rows without a value in the column that names their source
 TRUNCATED = "truncated file"  # Key of incomplete files
 
 

@@ -7,7 +7,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from config.loader import shipped
+from config.loader import moved, shipped
 from config.yaml_files import rewrite
 from estimators.errors import ConfigError
 from estimators.log import READING, Log
@@ -33,7 +33,7 @@ from ..twin.log_reader import read_log
 from ..twin.twin import Twin, load_twin
 from .log import databases_of, look
 from .new import fit_draft, report_draft, roles_json
-from .options import roles_of, settings
+from .options import check_output, roles_of, settings
 from .prepare import attend, prepare
 
 if TYPE_CHECKING:
@@ -68,6 +68,8 @@ def advise(arguments: Arguments) -> int:
 
 
 def _of_twin(arguments: Arguments, name: str) -> int:
+    if arguments.out is not None:
+        check_output("--out", arguments.out, ".yaml", ".yml", new="choose another name, or use --apply")
     twin = load_twin(name, log_files=arguments.log or None, overrides=settings(arguments.set, arguments.estimator))
     prepare(twin)
     log, _ = read_log(twin, arguments.duration)
@@ -84,7 +86,8 @@ def _of_twin(arguments: Arguments, name: str) -> int:
     advice: Advice = attend(twin.model, work, "measuring", text=text)
     print(to_json(advice_json(twin, log, advice)) if arguments.json else "\n".join(to_text(_topics(twin, log, advice))))
     if arguments.apply or arguments.out is not None:
-        kept = rewrite(twin.path, lambda text: changed(text, lines(advice), advice.sections), arguments.out)
+        path, out = twin.path, arguments.out
+        kept = rewrite(path, lambda text: moved(changed(text, lines(advice), advice.sections), path, out or path), out)
         if not arguments.json:
             before = f"; the previous file is {kept}" if kept else ""
             print(f"\n{arguments.out or twin.path}: its estimator is {advice.estimator}{before}")

@@ -209,8 +209,7 @@ class AdviseCommand(JsonOption, RoleOptions, TableOptions, LogOptions, Estimator
     apply: Flag = False
     """Write the lines into the twin's YAML; the previous file is kept beside it."""
     out: Path | None = None
-    """Write the changed YAML to this file (same folder if it names other files). Recordings: fit the draft,
-    check it, and write NAME.yaml and NAME.py."""
+    """Write the changed YAML to this file. Recordings: fit the draft, check it, and write NAME.yaml and NAME.py."""
 
 
 @dataclass(frozen=True)
@@ -240,7 +239,7 @@ class CompareCommand(JsonOption, PartOptions, LogOptions, TuningOption):
 
 
 @dataclass(frozen=True)
-class TuneCommand(JsonOption, EstimatorOption, TwinOptions):
+class TuneCommand(JsonOption, PartOptions, EstimatorOption, TwinOptions):
     """Fit noises, parameters and options to recordings, and propose the result if it predicts held-out data better.
 
     Each recording is divided into blocks of time, and every third is held out to judge the fit. So are each sensor in
@@ -270,6 +269,11 @@ class TuneCommand(JsonOption, EstimatorOption, TwinOptions):
     """Number of simulated logs, with consecutive seeds."""
     duration: float | None = None
     """Read only this many seconds of each recording."""
+    since: str | None = None
+    """Fit only from here: a share of the measurements (50%), a time after the start (600, 10min), or a date
+    (2024-05-01T14:00, UTC). The filter still runs from the start."""
+    until: str | None = None
+    """Fit only up to here, given as --since."""
     blocks: int = 9
     """Number of blocks with equally many measurements; every third is held out."""
     windows: str | None = None
@@ -280,7 +284,7 @@ class TuneCommand(JsonOption, EstimatorOption, TwinOptions):
     apply: Flag = False
     """Write the proposed values into the twin's YAML; comments stay, and the previous file is kept beside it."""
     out: Path | None = None
-    """Write a copy of the twin's YAML with the proposed values to this file (same folder if it names other files)."""
+    """Write a copy of the twin's YAML with the proposed values to this file."""
     save: Path | None = None
     """Write the proposed tuning to this .yaml file, as sections that replace the twin's own."""
     keep: str | None = None

@@ -9,10 +9,10 @@ from zoneinfo import available_timezones
 
 import numpy as np
 
-from estimators.errors import ConfigError, nearest
+from estimators.errors import ConfigError, nearest, quoted
 from sources.can.decoder import shown_id
 from sources.can.readers import EXTENDED, BusName
-from sources.inspect import Message, RecordingContents, SignalSeries, inspect_recordings
+from sources.inspect import Message, RecordingContents, SignalSeries, inspect_recordings, is_table
 from sources.tables.times import SERIAL_DAYS, UNITS, TimeColumn
 
 from ..format_time import FIRST_DATED_NS, duration_text, format_time
@@ -69,8 +69,17 @@ def look(files: tuple[Path, ...], options: TableOptions) -> RecordingContents:
     if options.time_zone is not None and options.time_zone not in available_timezones():
         remedy = nearest(options.time_zone, available_timezones())
         raise ConfigError(f"--time-zone {options.time_zone}: is no time zone of this machine; {remedy}")
+    files, databases = tuple(file.expanduser() for file in files), databases_of(options)
+    for path, _ in databases:
+        if not path.is_file():
+            raise ConfigError(f"--dbc {path}: there is no such file; check the path")
+    tables = [is_table(file) for file in files if file.is_file()]
+    if databases and tables and all(tables):
+        raise ConfigError(f"--dbc {databases[0][0]}: describes CAN logs, and {files[0]} is a table; leave it out")
+    if options.time and tables and not any(tables):
+        raise ConfigError(f"--time {quoted(options.time)}: is for tables, and {files[0]} is a CAN log; leave it out")
     time = TimeColumn(options.time or "", options.time_unit, options.time_format, options.time_zone)
-    return inspect_recordings([file.expanduser() for file in files], databases_of(options), time)
+    return inspect_recordings(files, databases, time)
 
 
 def databases_of(options: TableOptions) -> list[tuple[Path, BusName]]:

@@ -6,7 +6,7 @@ import dataclasses
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, get_args, get_type_hints
+from typing import TYPE_CHECKING, Any, get_args, get_origin, get_type_hints
 
 import tyro
 
@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     from .arguments import PartOptions, RoleOptions
 
 
-def check_output(option: str, path: Path, *endings: str) -> None:
-    """Refuse a file that cannot be written, before minutes of work.
+def check_output(option: str, path: Path, *endings: str, new: str = "") -> None:
+    """Refuse a file that cannot be written, before minutes of work; with the remedy `new`, one that exists.
 
     Raises:
         ConfigError: If it has none of the endings, is a folder, or its folder is missing or not writable.
@@ -32,6 +32,8 @@ def check_output(option: str, path: Path, *endings: str) -> None:
         raise ConfigError(f"{option} {path}: is a folder; name a file in it")
     if not folder.is_dir():
         raise ConfigError(f"{option} {path}: there is no folder {path.parent}; create it first")
+    if new and os.path.lexists(path):
+        raise ConfigError(f"{option} {path}: there is such a file; {new}")
     if not os.access(path if path.exists() else folder, os.W_OK):
         raise ConfigError(f"{option} {path}: cannot be written; check the permissions")
 
@@ -165,6 +167,12 @@ def check_options(name: str, command: type, words: Sequence[str]) -> None:
     """
     hints = get_type_hints(command)
     known = {f"--{field.replace('_', '-')}": hints[field] for field in options_of(command)}
+    repeatable = {
+        f"--{field.replace('_', '-')}"
+        for field, hint in options_of(command).items()
+        if tyro.conf.UseAppendAction in getattr(hint, "__metadata__", ())
+    }
+    seen: set[str] = set()
     for word, after in zip(words, [*words[1:], ""], strict=False):
         option, equals, own = word.partition("=")
         if not option.startswith("--") or option == "--help":
@@ -172,6 +180,11 @@ def check_options(name: str, command: type, words: Sequence[str]) -> None:
         hint = known.get(option.replace("_", "-"))
         if hint is None:
             raise ConfigError(f"{quoted(option)}: `nisus {name}` has no such option; {nearest(option, known)}")
+        name_of = option.replace("_", "-")
+        if name_of in seen - repeatable:
+            several = "; name all values after the first" if get_origin(hint) is tuple else ""
+            raise ConfigError(f"{option}: is given twice, of which only the last would count{several}")
+        seen.add(name_of)
         value = own if equals else after
         number = next((kind for kind in (hint, *get_args(hint)) if kind in (int, float)), None)
         if number is None or value in ("", "None") or value.startswith("--"):

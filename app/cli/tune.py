@@ -12,22 +12,24 @@ from config.loader import find
 from config.yaml_files import shown_path, writing
 from estimators.errors import ConfigError, printable
 from estimators.fit.aims import CRPS, ERROR, LIKELIHOOD
-from estimators.fit.dual import WindowFit, walk
+from estimators.fit.dual import WindowFit, tail, walk
 from estimators.fit.fit import Fitted, fit
 from estimators.fit.objective import FitProgress
 from estimators.fit.recording import Recording
+from sources.formats import check_once
 
 from ..live.tunings.tuning_yaml import tuning_yaml
 from ..live.tunings.versions import apply_tuning, check_free, keep, settings_of, version_text, widths_of
 from ..present.result import to_text
 from ..present.runs_json import fit_json
+from ..studies.fold_result import rows_of
 from ..studies.tune import fit_text, heading, sections, window_json, window_topics, windows_verdict
 from ..terminal import complain
 from ..twin.defaults import bounds_of, natural_aim, width_priors
 from ..twin.log_reader import read_log, read_logs
 from ..twin.twin import Twin, load_twin, with_held
-from .options import check_output, names_of, seconds_of, settings
-from .prepare import attend, prepare
+from .options import check_output, names_of, seconds_of, settings, span_of
+from .prepare import attend, fold_log, prepare
 
 if TYPE_CHECKING:
     from .arguments import TuneCommand as Arguments
@@ -47,9 +49,7 @@ def tune_twin(arguments: Arguments) -> int:
     if arguments.save is not None:
         check_output("--save", arguments.save, ".yaml", ".yml")
     if arguments.out is not None:
-        check_output("--out", arguments.out, ".yaml", ".yml")
-        if arguments.out.exists():
-            raise ConfigError(f"--out {arguments.out}: there is such a file; choose another name, or use --apply")
+        check_output("--out", arguments.out, ".yaml", ".yml", new="choose another name, or use --apply")
     if arguments.keep is not None:
         check_free(find(arguments.twin), arguments.keep)
     if arguments.windows is not None:
@@ -122,16 +122,31 @@ def _recordings(arguments: Arguments) -> tuple[Twin, list[Recording]]:
     if not arguments.log:
         twin = load_twin(arguments.twin, overrides=overrides)
         prepare(twin)
-        return twin, [
-            Recording(log) for log in read_logs(twin, arguments.twin, overrides, arguments.logs, arguments.duration)
-        ]
+        logs = read_logs(twin, arguments.twin, overrides, arguments.logs, arguments.duration)
+        return twin, [_part(arguments, twin, Recording(log)) for log in logs]
     if arguments.logs != 1:
         raise ConfigError("--logs: is for a simulated twin; a recording is named by --log, once each")
     named = [_named(text) for text in arguments.log]
+    check_once([file.expanduser() for files, _ in named for file in files], "--log ")
     twins = [load_twin(arguments.twin, log_files=files, overrides=overrides) for files, _ in named]
     prepare(twins[0])
     logs = [read_log(twin, arguments.duration)[0] for twin in twins]
-    return twins[0], [Recording(log, weight) for log, (_, weight) in zip(logs, named, strict=True)]
+    recordings = [Recording(log, weight) for log, (_, weight) in zip(logs, named, strict=True)]
+    return twins[0], [_part(arguments, twins[0], item) for item in recordings]
+
+
+def _part(arguments: Arguments, twin: Twin, recording: Recording) -> Recording:
+    """Return the part of a recording that `--since` and `--until` select, with the state of the filter before it."""
+    log = recording.log
+    part = rows_of(log, span_of(arguments, log.events))
+    if part == slice(0, log.n):
+        return recording
+    log.n = part.stop
+    fold = fold_log(twin, log)
+    if fold.failure is not None:
+        raise fold.failure
+    log, base = tail(fold, part.start)
+    return recording._replace(log=log, base=base)
 
 
 def _named(text: str) -> tuple[list[Path], float]:
@@ -156,6 +171,8 @@ def tune_windows(arguments: Arguments, wanted: Sequence[str], windows: str) -> i
     """Fit window after window; return 0 if something was adopted, else 1."""
     window = seconds_of("--windows", windows)
     every = window if arguments.every is None else seconds_of("--every", arguments.every)
+    if arguments.since is not None or arguments.until is not None:
+        raise ConfigError("--since and --until: cannot be used with --windows, which go through the whole log")
     if arguments.aim not in (None, LIKELIHOOD):
         raise ConfigError(
             f"--aim {arguments.aim}: cannot be used with --windows, which are fitted by likelihood; omit it"

@@ -111,6 +111,7 @@ EDGE = "at the edge of its range: the optimum may lie beyond"
 STOPPED = "The search was ended early: better values may exist."
 BY_LIKELIHOOD = "--aim likelihood fits to all measurements, and leaves true states and held-out sensors as a check"
 NOT_WRITTEN = "Nothing is written. --apply writes the values into {}, --out FILE into a copy, --keep NAME as a version."
+MAX_CORRELATION = 0.2  # Of successive innovations, above which a cause is missing
 WELL_TUNED = 0.2  # logarithm of the NIS per degree of freedom within which the values suit
 TEMPERED = "The likelihood of the fitted blocks has weight {:.2g}; more does not improve held-out predictions."
 
@@ -123,9 +124,11 @@ def fit_text(progress: FitProgress, seconds: float) -> str:
     if progress.expected > progress.folds:
         left = seconds / progress.folds * (progress.expected - progress.folds)
         text += f", about {left:.0f} s left" if left < MINUTES_FROM_S else f", about {left / 60.0:.0f} min left"
+    if progress.judging:
+        return f"{text}; the held-out blocks decide how much of the fit remains"
     if not progress.gain > 0.0:
         return text
-    return f"{text}; best so far {progress.gain:+.3g} on the fitted blocks ({moves_text(progress)})"
+    return f"{text}; so far {progress.gain:+.3g} on the fitted blocks, not yet checked ({moves_text(progress)})"
 
 
 def moves_text(progress: FitProgress) -> str:
@@ -203,13 +206,26 @@ def _scores(fitted: Fitted) -> Topic:
             _pair(before.log_density, after.log_density, ".4f"),
             _pair(before.nis, after.nis, ".3f"),
             _pair(100 * before.coverage, 100 * after.coverage, ".1f", " %"),
+            _correlation(before, after),
         )
 
     rows = [row("fitted", fitted.before.fitted, fitted.after.fitted)]
     if fitted.before.held_out.n:
         rows.append(row("held out", fitted.before.held_out, fitted.after.held_out))
-    head = ("blocks", "readings", "log density per reading [nats]", "NIS / dof", "in the 95 % band")
+    band = "in the 95 % band"
+    head = ("blocks", "readings", "log density per reading [nats]", "NIS / dof", band, "largest correlation")
     return Topic("Predictions of the next reading, before and after", (), head, tuple(rows))
+
+
+def most_correlated(before: PartScore) -> str:
+    """Return the row whose successive innovations are most correlated; empty without one."""
+    return max(before.correlation, key=lambda name: abs(before.correlation[name]), default="")
+
+
+def _correlation(before: PartScore, after: PartScore) -> str:
+    """Return the largest correlation of successive innovations before, and that of the same row after."""
+    name = most_correlated(before)
+    return f"{name} {_pair(before.correlation[name], after.correlation.get(name, np.nan), '+.2f')}" if name else ""
 
 
 def _held_out(fitted: Fitted) -> Topic:
@@ -286,6 +302,19 @@ def next_step(twin: Twin, fitted: Fitted, aim: str) -> str:
         return (
             f"the noises of the twin compensate for a model error: fit its parameters too (--fit Q,R,p), look at "
             f"nisus check {name}, or give the error a correlation time (nisus advise {name} tests it)."
+        )
+    before, after = fitted.before.held_out.correlation, fitted.after.held_out.correlation
+    row = most_correlated(fitted.before.held_out)
+    if row and abs(before[row]) > MAX_CORRELATION:
+        change = f"{before[row]:+.2f} -> {after.get(row, np.nan):+.2f}"
+        if abs(after.get(row, 1.0)) <= MAX_CORRELATION:
+            return (
+                f"the fitted values end the correlation of successive innovations of {row} ({change}), which this log "
+                "is too short to confirm: give more recordings with --log."
+            )
+        return (
+            f"successive innovations of {row} are correlated ({change}), so a cause is missing: look at nisus advise "
+            f"{name}, which tests remedies, or fit parameters too, with --fit Q,R,p."
         )
     if fitted.before.held_out.nis > 0.0 and abs(np.log(fitted.before.held_out.nis)) < WELL_TUNED:
         return "nothing: the twin's values already predict the held-out blocks as well."

@@ -168,6 +168,7 @@ def _assembled(model: StateSpaceModel, loaded: Loaded) -> StateSpaceModel:
             considered, widened = section.use == "considered", section.widened(item.value)
             estimated[item.name] = JointParameter(std, section.drift, considered, widened)
     for name, section in config.parameters.items():
+        check_names(loaded, ("parameters", name, "correlation"), section.correlation, parameters, "parameter", model)
         for other, value in section.correlation.items():
             mirrored = config.parameters[other].correlation.get(name, value) if other in config.parameters else value
             if name == other or mirrored != value:

@@ -230,7 +230,10 @@ def _find(key: str, known: Mapping[str, TuningEntry], tuning: Tuning) -> TuningE
     model = tuning.model
     group, _, name = key.partition(".")
     if group != "R" or name not in model.sensor_names:
-        raise ConfigError(f"{shown_name(key)} is no entry that can be fitted; {nearest(key, [*known, *GROUPS])}")
+        own = [item for item in known if item.startswith(f"{group}.")] if name else []
+        none = f"{model.name} has none of {group}; " if name and group in GROUPS and not own else ""
+        remedy = none + nearest(key, own or [*known, *GROUPS])
+        raise ConfigError(f"{shown_name(key)} is no entry that can be fitted; {remedy}")
     unit = model.sensors[model.sensor_names.index(name)].rows[0].unit
     return _entry(key, f"({unit})²" if unit else "", float(tuning.get(key) or 0.0), 0.0, np.inf, SPREAD["R"])
 

@@ -131,7 +131,7 @@ def fit(
         EstimatorError: As `Fold`; if there is nothing to fit to, or no such aim.
     """
     progress = progress or FitProgress()
-    progress.folds, progress.gain, progress.values = 0, 0.0, {}
+    progress.folds, progress.gain, progress.values, progress.judging = 0, 0.0, {}, False
 
     def count(done: int) -> bool:
         progress.folds += done
@@ -197,6 +197,7 @@ def fit(
         return with_values(tuning, kept.entries, values)
 
     progress.expect(judging)
+    progress.judging = True
     chosen = tempered(
         kept, x, shape, setting_at, lambda settings: worths(estimator, settings, whole, count, aimed), aim=aimed,
         powers=POWERS if blocks and x.size else (1.0,),

@@ -30,6 +30,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..diagnostics.innovations import mean_nis
+from ..diagnostics.intervals import correlation_interval
 from ..diagnostics.references import Reference, held_out_references, references
 from ..diagnostics.sensitivity.responses import each
 from ..log import READING, TRUTH
@@ -57,6 +58,7 @@ MIN_TOTAL_GAIN = 1.0  # Nats that a fit must gain on all held-out data: with les
 MAX_LOSS = 0.05  # Share by which the score of a held-out prediction may grow before it counts
 MIN_COVERAGE = 0.9  # Coverage of a 95 % band from which on it is not too narrow
 MAX_COVERAGE_LOSS = 0.05  # Coverage that may be lost before it counts, below `MIN_COVERAGE`
+MIN_CORRELATED = 30  # Innovations from which their correlation is given
 UNITS = {LIKELIHOOD: "a reading", WITNESSES: "a reading or witness"}  # Unit of a gain in nats, by aim
 
 
@@ -81,7 +83,7 @@ class PartScore(NamedTuple):
     Mean log density of a measurement, mean NIS per degree of freedom, share of innovations inside their 95 % band.
     `terms` (n,) are the single log densities, `aimed` the terms of the fit's aim from measurements and truths, if it
     holds no sensor out. `sensors` are those held out in turn, `withheld` the rows that the twin itself never uses,
-    `states` those with a known truth, by name.
+    `states` those with a known truth, by name. `correlation` is that of successive innovations, by row.
     """
 
     n: int
@@ -93,6 +95,7 @@ class PartScore(NamedTuple):
     sensors: dict[str, PredictionScore]
     withheld: dict[str, PredictionScore]
     states: dict[str, PredictionScore]
+    correlation: dict[str, float] = {}
 
 
 class Worth(NamedTuple):
@@ -178,8 +181,11 @@ def _part(
         used = part & (track.verdict == USED)
         normal.append((track.innovation[used] / track.innovation_std[used]).ravel())
         tracks.append(track.select(part))
-        in_turn = (held_out_references(model, log.events, other, s) for s, other in zip(sensors, others, strict=True))
-        found = [(0, item.finite()) for items in in_turn for item in items]
+        found = [
+            (0, item.finite())
+            for s, other in zip(sensors, others, strict=True)
+            for item in held_out_references(model, log.events, other, s)
+        ]
         found += [(2 if item.truth else 1, item) for item in references(model, log.events, track)]
         for group, item in found:
             kept = part[item.rows]
@@ -191,7 +197,7 @@ def _part(
     nis = np.array([mean_nis(track, gate) for track in tracks])
     finite = np.isfinite(nis)
     weights = np.array([len(track) for track in tracks])[finite]
-    predictions = ({name: _prediction(items) for name, items in group.items()} for group in groups)
+    in_turn, withheld, states = ({name: _prediction(items) for name, items in group.items()} for group in groups)
     return PartScore(
         every.size,
         float(every.mean()) if every.size else np.nan,
@@ -199,8 +205,30 @@ def _part(
         float(np.mean(np.abs(inside) <= Z)) if inside.size else np.nan,
         every,
         np.concatenate(aimed),
-        *predictions,
+        in_turn,
+        withheld,
+        states,
+        _correlations(setting, [(record, track) for record, (track, *_) in folded], held_out),
     )
+
+
+def _correlations(setting: Setting, folded: list[tuple[Recording, Track]], held_out: bool) -> dict[str, float]:
+    """Return the correlation of successive used innovations of each row, its mean over recordings by their length."""
+    model, found = setting.tuning.model, {}
+    for s, (sensor, start) in enumerate(zip(model.sensors, model.row_start, strict=True)):
+        for k in range(len(sensor.rows)):
+            series = []
+            for record, track in folded:
+                own = (track.verdict == USED) & (record.held_out == held_out)
+                own &= record.log.channel[: record.log.n] == s
+                e = track.innovation[own, k] / track.innovation_std[own, k]
+                e = e[np.isfinite(e)]
+                if e.size >= MIN_CORRELATED and np.ptp(e) > 0.0:
+                    series.append((e.size, correlation_interval(e).value))
+            if series:
+                sizes, values = np.array(series).T
+                found[model.row_names[start + k]] = float(np.average(values, weights=sizes))
+    return found
 
 
 def _prediction(items: list[Reference]) -> PredictionScore:

@@ -80,6 +80,7 @@ class FitProgress:
         expected: Folds in all, estimated.
         gain: Gain on the fitted blocks so far, in the unit of the aim (nats for likelihoods).
         values: Entries at the best point so far, before and after, by key.
+        judging: Whether the search is over; the held-out blocks then decide how much of it remains.
         stop: Set it to end the search: the best point so far is judged and returned.
     """
 
@@ -87,6 +88,7 @@ class FitProgress:
     expected: int = 0
     gain: float = 0.0
     values: dict[str, tuple[float, float]] = field(default_factory=dict)
+    judging: bool = False
     stop: bool = False
 
     def expect(self, more: int) -> None:

@@ -32,7 +32,7 @@ class Order:
         """Look at the times of `column`, in `unit`; `horizon` in ns, None for none."""
         self._column, self._unit, self._horizon, self._report = column, unit, horizon, report
         self._newest, self._newest_at = BEFORE, ""
-        self._late = ""
+        self._late, self._late_rows = "", 0
         self._run, self._run_at, self._run_length = BEFORE, "", 0
         self._stands = False
 
@@ -77,25 +77,33 @@ class Order:
         return events if order is None else events.select(order)
 
     def report_late(self, sorted_rows: bool) -> None:
-        """Report the first row that is too late, if there is one, and whether the rows were sorted."""
-        if self._late and sorted_rows:
-            self._report(
-                SORTED,
-                f"{self._late}; the rows are out of order and were sorted by {self._column}; if its clock was set "
-                "there, correct it",
-            )
-        elif self._late and self._horizon is not None:
-            self._report(
-                BACKWARDS,
+        """Report the rows that are too late, each with the place of the first, and whether the rows were sorted."""
+        if not self._late or self._horizon is None:
+            return
+        key, text = (
+            BACKWARDS,
+            (
                 f"{self._late}, more than time.horizon ({self._horizon * 1e-9:g} s), which is a lone wrong time or a "
-                f"change of time zone, so the rows are not sorted: correct {self._column}, or give its time.zone",
+                f"change of time zone, so the rows are not sorted: correct {self._column}, or give its time.zone"
+            ),
+        )
+        if sorted_rows:
+            key, text = (
+                SORTED,
+                (
+                    f"{self._late}; the rows are out of order and were sorted by {self._column}; if its clock was set "
+                    "there, correct it"
+                ),
             )
+        for _ in range(self._late_rows):
+            self._report(key, text)
 
     def _backwards(self, file: str, line: np.ndarray, t: np.ndarray) -> None:
         if self._horizon is None:
             return
         newest = np.maximum.accumulate(np.concatenate(([self._newest], t)))
         late = np.flatnonzero(t < newest[:-1] - self._horizon)
+        self._late_rows += late.size
         if late.size and not self._late:
             k = int(late[0])
             at = f"{file}:{line[int(np.argmax(t[:k]))]}" if k and np.max(t[:k]) > self._newest else self._newest_at

@@ -7,13 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterator, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from estimators.errors import SourceError
+from estimators.errors import SourceError, quoted
 
 from ..formats import suffix_of
+from ..source import UNDATED
 from ..worker_process import IsolatedReader, read_isolated
 from .binary import mat_names, npz_names, parquet_names, read_mat, read_npz, read_parquet
 from .text import Chunk, Problem, TextMatch, csv_format, read_csv
@@ -107,11 +108,22 @@ def read_rows(path: Path, time: TimeColumn, columns: Sequence[str | TextMatch]) 
     times = TimeReader(time)
     for chunk in read(path, time.name, columns, lambda *problem: problems.append(problem)):
         t, known = times.read(chunk.time)
+        for row in np.flatnonzero(~known).tolist():
+            problems.append((UNDATED, int(chunk.line[row]), _undated(time, chunk.time[row])))
         yield TableRows(chunk.line, t, known, chunk.values, chunk.blank, taken())
     if problems:
         none = np.zeros(0, np.int64)
         nothing = np.zeros((0, len(columns)))
         yield TableRows(none, none, none.astype(np.bool_), nothing, nothing.astype(np.bool_), taken())
+
+
+def _undated(time: TimeColumn, cell: Any) -> str:
+    """Return why a row has no time, and the remedy."""
+    text = "" if cell is None else str(cell).strip()
+    if text in ("", "None", "nan", "NaT"):
+        return f"{time.name} is empty; the row is left out"
+    rule = f"is not of the format {time.format!r}" if time.format else f"is neither a time in {time.unit} nor a date"
+    return f"{time.name} is {quoted(text)}, which {rule}; the row is left out: correct it, or give its unit or format"
 
 
 def _names(path: Path, time: str) -> Iterator[list[str]]:

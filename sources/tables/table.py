@@ -14,7 +14,7 @@ from estimators.log import Events
 
 from ..formats import suffix_of
 from ..mapping import ABSENT, PRESENT, ChannelMapping
-from ..source import NEVER, TRUNCATED, Channel, Report, ignore
+from ..source import NEVER, TRUNCATED, UNASSIGNED, Channel, Report, ignore
 from ..units import heading_unit
 from .order import Order
 from .rows import TableRows, names_of, rows_of
@@ -78,6 +78,7 @@ class Table:
         for path in self._files:
             _check(path, [time_column, *map(column_of, self._columns)])
         self._channels = channels
+        self._selectors = _selectors(channels, self._columns)
         self._valued: set[str | TextMatch] = set()
         self._count = 0
         self._timeout = 0.0
@@ -120,12 +121,6 @@ class Table:
         for key, line, text in rows.problems:
             self._report(key, f"{path.name}:{line}: {text}")
         known = rows.known
-        for row in np.flatnonzero(~known):
-            self._report(
-                "undated row",
-                f"{path.name}:{rows.line[row]}: {self._time.name} is not a time, or needs another unit or format; "
-                "the row is left out",
-            )
         t, used = rows.t + self._shift, known.copy()
         if first:
             wrong = self._order.first(path.name, rows.line[known], t[known])
@@ -136,6 +131,11 @@ class Table:
             valued = np.any(np.where(matched, rows.values == 1.0, np.isfinite(rows.values)), axis=0)
             self._valued.update(self._columns[k] for k in np.flatnonzero(valued))
         self._order.look(path.name, rows.line[used], t[used])
+        for name, (keys, values) in self._selectors.items():
+            named, valued = (np.any(np.isfinite(rows.values[:, k]) & ~rows.blank[:, k], axis=1) for k in (keys, values))
+            for line in rows.line[used & valued & ~named]:
+                text = f"{name} has no value, so the row is of no sensor and is left out; give it its {name}"
+                self._report(UNASSIGNED, f"{path.name}:{line}: {text}")
         state = np.where(rows.blank, ABSENT, PRESENT).astype(np.int8)
         plan = np.zeros(t.size, np.int64)
         return self._mapping.events(plan, t, t, rows.values, state, (~used).astype(np.int8))
@@ -160,6 +160,19 @@ class Table:
     def close(self) -> None:
         """Close the file that is open."""
         self._batches.close()
+
+
+def _selectors(
+    channels: Sequence[Channel], columns: Sequence[str | TextMatch]
+) -> dict[str, tuple[list[int], list[int]]]:
+    """Return the places of each column that selects rows (`only`), and those of the values in these rows."""
+    found: dict[str, tuple[list[int], list[int]]] = {}
+    for channel in channels:
+        for condition in channel.only:
+            keys, values = found.setdefault(column_of(condition.signal), ([], []))
+            keys.append(columns.index(condition.signal))
+            values += [columns.index(name) for name in channel.signals]
+    return found
 
 
 def _check(path: Path, wanted: Sequence[str]) -> None:

@@ -14,7 +14,7 @@ import numpy as np
 
 from estimators.errors import SourceError, quoted
 
-from ..formats import open_binary
+from ..formats import open_binary, refuse_others
 from ..source import TRUNCATED
 
 CHUNK_ROWS = 4096  # Rows of a chunk, at most
@@ -76,6 +76,7 @@ def csv_format(path: Path) -> CsvFormat:
             head = binary.read(HEAD_BYTES)
     except OSError as error:
         raise SourceError(f"{path}: it cannot be read ({error.strerror or error}); check that it is complete") from None
+    refuse_others(path, head)
     encoding = "utf-16" if head.startswith((b"\xff\xfe", b"\xfe\xff")) else _single_bytes(head)
     if encoding != "utf-16" and any(byte < 9 or 13 < byte < 32 for byte in head[:4096]):
         raise SourceError(
@@ -204,6 +205,7 @@ def fill(
     """Fill a column of values, and its mask of blank ones, from text; with a decimal comma, a point is an error."""
     if isinstance(name, TextMatch):
         values[:] = [cell.strip() in name.texts for cell in cells]
+        blank[:] = [not cell.strip() for cell in cells]
         return
     texts = cells
     if decimal == ",":

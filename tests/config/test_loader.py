@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from app.twin.twin import restore_twin
-from config.loader import find, load, load_text, shipped
+from config.loader import find, load, load_text, moved, shipped
 from config.source_schema import CanSection, SimulatorSection
 from config.yaml_files import as_flow, as_section, parse
 from estimators.errors import ConfigError
@@ -331,6 +331,56 @@ def test_one_clear_line(gate, rule):
     with pytest.raises(ConfigError) as caught:
         loaded(gate)
     assert str(caught.value).startswith(rule)
+
+
+SHARED = """\
+x-slow: &slow {variance: 4, use: false}
+x-list: [1, *slow]
+model: motor_winding
+sensors:
+  winding: *slow
+  yoke: {<<: *slow, variance: 9}
+source: {type: simulator}
+"""
+
+
+def test_anchors_stand_under_keys_that_begin_with_x():
+    sensors = load_text(SHARED, Path("motor.yaml")).config.sensors
+    assert [(name, one.variance, one.use) for name, one in sensors.items()] == [
+        ("winding", (4.0,), False),
+        ("yoke", (9.0,), False),
+    ]
+    assert message(SHARED.replace("x-list", "y-list")).startswith("motor.yaml:2: y-list is not known; ")
+    assert message(SHARED.replace("<<: *slow", "<<: 5")).startswith("motor.yaml:6: sensors.yoke.<< must name mappings")
+
+
+PLACES = """\
+model: ./{0}pump.py:Pump         # comments stay
+learned: {0}net.yaml
+source:
+  type: merged
+  parts:
+  - {{type: table, files: [{0}a.csv, {0}dir/*.csv, /data/b.csv], time: {{column: t}}}}
+  - type: can_log
+    files: {0}c.blf
+    dbc: [{0}car.dbc, {{file: {0}gnss.dbc, channel: 2}}]
+  - {{type: table, folder: {0}logs, files: d.csv, time: {{column: t}}}}
+"""
+
+
+@pytest.mark.parametrize(("out", "back"), [("copy.yaml", ""), ("sub/copy.yaml", "../"), ("../copy.yaml", "here/")])
+def test_relative_paths_of_a_copy_name_the_same_files(tmp_path, out, back):
+    (tmp_path / "here" / "sub").mkdir(parents=True)
+    (text,) = {moved(PLACES.format(""), tmp_path / "here" / "twin.yaml", tmp_path / "here" / out)}
+    expected = parse(PLACES.format(back), "a.yaml")[0]
+    if back:  # no leading dot is needed
+        expected["model"] = expected["model"].removeprefix("./")
+        assert "# comments stay" in text
+    assert parse(text, "a.yaml")[0] == expected
+    shared = PLACES.format("").replace("learned: net", "x-net: &net net.yaml\nlearned: *net #")
+    if back:
+        with pytest.raises(ConfigError, match="twin.yaml: an alias shares learned with another key; write the path"):
+            moved(shared, tmp_path / "here" / "twin.yaml", tmp_path / "here" / out)
 
 
 NAMES = st.text(st.characters(codec="utf-8", categories=("L", "N", "P", "S", "Zs")), min_size=1, max_size=12)

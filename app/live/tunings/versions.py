@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from config.companion_schema import AcceptedSection, EvidenceSection, MovedSection, VersionSection
+from config.loader import moved
 from config.tunings import OWN_VALUES, Version, check_name, folders, load_version, version_files, version_of
 from config.yaml_files import as_section, rewrite, shown_path, with_section, writing
 from estimators.diagnostics.score import Score
@@ -189,7 +190,8 @@ def apply_tuning(
     """
     before = tuning_yaml(twin.config, twin.estimator, twin.tuning)
     after = tuning_yaml(twin.config, estimator, tuning, prior, widths=widths)
-    kept = rewrite(twin.path, lambda text: with_tuning(text, before, after), out)
+    path = twin.path
+    kept = rewrite(path, lambda text: moved(with_tuning(text, before, after), path, out or path), out)
     words = f"{shown_path(out or twin.path)}: has the values"
     return words if kept is None else f"{words}; the previous file is {shown_path(kept)}"
 

@@ -26,10 +26,10 @@ def calibration_lines(found: Sequence[Calibration], model: StateSpaceModel) -> l
         group = "states" if entry.role == "truth" and states >= SHARED_ENTRY_ROWS else many.get(entry.subject)
         if group is not None:
             groups.setdefault((group, entry.role), []).append(entry)
-        elif entry.words:
-            lines += entry.words
         else:
-            lines.append(f"{entry.subject}{', truth' if entry.role == 'truth' else ''}: {_figures(entry)}")
+            lines += entry.words
+            if not entry.words or entry.role != "used":  # the words of a used row have its figures
+                lines.append(f"{entry.subject}{', truth' if entry.role == 'truth' else ''}: {_figures(entry)}")
     for (group, role), entries in groups.items():
         inside = 100 * float(np.mean([entry.coverage[-1].value for entry in entries]))
         bad = [entry for entry in entries if entry.words]

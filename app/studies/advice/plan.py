@@ -169,8 +169,16 @@ def plan(found: RecordingContents, roles: Roles) -> DraftPlan:
         ConfigError: If a signal is not there, is named by several messages, has two roles, or has too few values.
     """
     every = signals(found)
-    if not found.columns and not any(message.signals for message in found.messages):
-        raise ConfigError(f"{found.files[0]}: no message of it is in a DBC; give one that describes it with --dbc")
+    for part in found.parts or (found,):
+        if part.kind == "can_log" and not any(message.signals for message in part.messages):
+            remedy = "give one that describes it with --dbc" + (", or leave the log out" if found.parts else "")
+            raise ConfigError(f"{part.files[0]}: no message of it is in a DBC; {remedy}")
+        if part.kind == "table" and not any(one.values.size for one in part.columns):
+            texts = f" (text in {', '.join(part.texts)})" if part.texts else ""
+            raise ConfigError(f"{part.files[0]}: no column beside {part.time.name} has numbers{texts}")
+        if part.t.size > 1 and part.t[0] == part.t[-1]:
+            column = f"if {part.time.name} is not the time, name it with --time; otherwise " * (part.kind == "table")
+            raise ConfigError(f"{part.files[0]}: its {part.t.size:,} times are all the same; {column}record it again")
     given = _given(roles, found, every)
     named = {id(one) for one, _ in given}
     free = (
@@ -390,7 +398,12 @@ def _finest(found: RecordingContents, every: Sequence[Signal]) -> list[Signal]:
     ]
     kept = sorted(range(len(fine)), key=lambda k: (-fine[k].levels, k))[:MAX_SIGNALS]
     if not kept:
-        raise ConfigError(f"{found.files[0]}: no signal of it varies; name those to take with --signals")
+        longest = max((one.series.values.size for one in every), default=0)
+        if longest < MIN_VALUES:
+            text = f"no signal has more than {longest} values, of which a draft needs {MIN_VALUES}; record a longer log"
+        else:
+            text = "no signal varies; name those to take with --signals"
+        raise ConfigError(f"{found.files[0]}: {text}")
     return [fine[k] for k in sorted(kept)]
 
 

@@ -14,6 +14,7 @@ from config.source_schema import CanLogSection, CanSection, RecordingSection
 from config.yaml_files import Key, dotted
 from estimators.errors import SourceError
 from estimators.model.state_space import StateSpaceModel
+from sources.formats import check_once
 
 from ..channels import channels
 
@@ -112,6 +113,7 @@ def find_recording(
                 raise SourceError(f"--log {file}: there is no such file; check the path")
             if not file.is_file():
                 raise SourceError(f"--log {file}: it is a device or a pipe; name a file, which can be read again")
+        check_once(files, "--log ")
         return files
     if isinstance(section, RecordingSection):
         patterns, where = section.files, (*key, "files")
@@ -131,6 +133,7 @@ def find_recording(
         if not matches:
             raise _absent(loaded, where, exact, section)
         found += matches
+    check_once(found, f"{loaded.places.at(where)}: {dotted(where)}: ")
     return found
 
 

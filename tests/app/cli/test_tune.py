@@ -83,6 +83,18 @@ def test_a_proposal_is_applied_to_the_file_in_one_step(nisus, winding, tmp_path)
     assert len(changed) == 1 and "# °C²" in changed[0][1]
 
 
+def test_a_part_of_a_log_is_fitted_from_the_state_of_the_filter_before_it(nisus):
+    """The density of the part's measurements, fitted and held out, is that of a fold, which runs from the start."""
+    given = "motor_winding", *SHORT, "--set", "R.winding=1", "--since", "40%", "--until", "200", "--json"
+    found = nisus.run("tune", *given, "--fit", "R").json["before"]
+    folded = nisus("fold", *given).json
+    parts = found["fitted"], found["held_out"]
+    assert sum(part["readings"] for part in parts) == folded["readings"] > 50
+    total = sum(part["readings"] * part["log_density"] for part in parts)
+    assert total == pytest.approx(folded["log_likelihood"], rel=1e-9)
+    assert "--windows, which go through the whole log" in nisus.refuses("tune", *given, "--windows", 60)
+
+
 def test_a_taken_name_is_refused_before_the_fit(nisus, winding, monkeypatch):
     nisus("tunings", winding, "--save", "taken")
     monkeypatch.setattr("app.cli.tune.fit", lambda *_, **__: pytest.fail("it was fitted"))

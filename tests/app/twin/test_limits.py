@@ -84,7 +84,7 @@ def test_a_range_of_validity_takes_the_place_of_the_models() -> None:
         (
             "use: true",
             "valid: {rate: {min: 1, max: 1}}",
-            "valid.rate is a mapping; its min must be below its max",
+            r"valid.rate is \{min: 1, max: 1\}; its min \(1\) must be below its max \(1\)",
         ),
         ("use: true", "valid: {temperature: {}}", "motor.yaml:7: valid.temperature gives neither min nor max; add it"),
         (

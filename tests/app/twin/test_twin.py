@@ -382,7 +382,19 @@ def test_the_prior_of_what_is_considered_is_that_of_the_parameter() -> None:
             " iron_magnet: {std: 1 %, correlation: {yoke_coolant: -0.5}}}",
             "is 0.5 here and -0.5 under iron_magnet; give each pair once",
         ),
+        (
+            "{yoke_coolant: {std: 1 %, correlation: {iron_magnt: 0.5}}}",
+            "correlation.iron_magnt is no parameter of motor_drive; did you mean iron_magnet",
+        ),
+        *(
+            (
+                f"{{yoke_coolant: {{std: {width}}}}}",
+                f"parameters.yoke_coolant.std is {width!r}; give a positive number without a unit, or a share of the "
+                "value above zero, as in 10 %",
+            )
+            for width in ("-10 %", "10 %%", "5 cm²", "0 %")
+        ),
     ],
 )
-def test_a_width_is_given_once(parameters: str, said: str) -> None:
+def test_a_width_is_given_once_and_as_a_number_or_share(parameters: str, said: str) -> None:
     assert said in refusal(f"model: motor_drive\nparameters: {parameters}\nsource: {{type: simulator}}\n")

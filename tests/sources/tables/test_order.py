@@ -28,9 +28,10 @@ def looked(t, pieces=1, horizon=2 * SECOND):
 
 @pytest.mark.parametrize("pieces", [1, 2, 7, 60])
 def test_a_reversed_file_is_told_once_at_the_first_row_beyond_the_horizon(pieces):
-    ((key, text),) = looked(np.arange(60)[::-1] * 0.5 + 100.0, pieces)
-    # 0.5 s a row: the fifth row after the first, in line 2, is the first more than 2 s behind it.
-    assert key == SORTED
+    told = looked(np.arange(60)[::-1] * 0.5 + 100.0, pieces)
+    # 0.5 s a row: the fifth row after the first, in line 2, is the first of 55 more than 2 s behind it.
+    ((key, text),) = set(told)
+    assert key == SORTED and len(told) == 55
     assert text == (
         "drive.csv:7: t is 2.5 s before that of drive.csv:2; the rows are out of order and were sorted by t; "
         "if its clock was set there, correct it"
@@ -39,7 +40,7 @@ def test_a_reversed_file_is_told_once_at_the_first_row_beyond_the_horizon(pieces
 
 @pytest.mark.parametrize("pieces", [1, 2, 3, 5, 9])
 def test_the_newest_row_before_is_named(pieces):
-    ((_, text),) = looked([0, 1, 50, 2, 51, 3, 4, 5, 6], pieces)
+    ((_, text),) = set(looked([0, 1, 50, 2, 51, 3, 4, 5, 6], pieces))
     assert text.startswith("drive.csv:5: t is 48 s before that of drive.csv:4; ")
 
 
@@ -114,7 +115,7 @@ def test_files_in_a_wrong_order_are_sorted_and_told_with_both(tmp_path):
     files = [tmp_path / "a.csv", tmp_path / "b.csv"]
     batch = read_all(Table(files, time_column="t", time_unit="s", channels=X, width=1, report=reports, horizon=2.0))
     assert batch.t.tolist() == [s * SECOND for s in (*range(5), *range(100, 105))]
-    assert reports.counts == {SORTED: 1}
+    assert reports.counts == {SORTED: 5}
     assert reports.texts[SORTED].startswith("b.csv:2: t is 104 s before that of a.csv:6; the rows are out of order")
 
 
