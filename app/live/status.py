@@ -29,6 +29,7 @@ from .watchers import Watchers
 FOLDING_CAUSE = "the measurements so far are being folded"
 """Cause of a twin without a row yet."""
 
+WINDOW_REACH = 2 * MAX_ROWS_PER_READING  # Rows per measurement of the window: also those after its last measurement
 SINCE_ROWS = 4096  # Rows copied at once in search of the beginning of a health
 
 
@@ -54,7 +55,7 @@ def status_of(
     those of measurements whose time is late or in doubt.
     """
     model, log, track = fold.model, fold.log, fold.track
-    recent = slice(max(0, fold.n - MAX_ROWS_PER_READING * fold.policy.window), fold.n)
+    recent = slice(max(0, fold.n - WINDOW_REACH * fold.policy.window), fold.n)
     nis = _nis_of_window(fold.tuning, fold.policy, log.events.select(recent), track.select(recent))
     last = fold.n - 1
     t = int(log.t[last]) if last >= 0 else None
@@ -119,7 +120,7 @@ def past_status(engine: Running, watchers: Watchers, t: int) -> Status:
     tuning = engine.folded_with()[0] if fold is None else fold.tuning
     sensors = len(model.sensors)
     # A fold from a snapshot lacks the earlier rows of its window.
-    pull = engine.rows(end - max(MAX_ROWS_PER_READING * policy.window, RECENT_READINGS * sensors), end)
+    pull = engine.rows(end - max(WINDOW_REACH * policy.window, RECENT_READINGS * sensors), end)
     if not len(pull.events):
         return status
     now = int(pull.events.t[-1])
@@ -167,11 +168,13 @@ def _state_of_rows(events: Events, track: Track, s: int, used: bool) -> str:
 def _nis_of_window(tuning: Tuning, policy: HealthPolicy, events: Events, track: Track) -> NisVerdict:
     """Return the verdict on the mean NIS of the last window.
 
-    The events and their rows are the last ones, at least those of the window.
+    The events and their rows are the last ones, at least those of the window, which ends with the last measurement, as
+    in the track.
     """
     resets = np.flatnonzero(events.kind == RESET)
     begun = int(resets[-1]) + 1 if resets.size else 0
-    judged = begun + np.flatnonzero(np.isin(track.verdict[begun:], (USED, GATED, FAILED)))[-policy.window :]
+    judged = begun + np.flatnonzero(np.isin(track.verdict[begun:], (USED, GATED, FAILED)))
+    judged = judged[judged > judged[-1:] - MAX_ROWS_PER_READING * policy.window][-policy.window :]
     return nis_verdict(track.select(judged), events.select(judged), tuning.model, tuning.baseline)
 
 

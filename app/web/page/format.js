@@ -28,7 +28,7 @@ export const spaced = (unit) => (unit && unit !== "1" ? ` ${unit}` : "");
 
 export const bracketed = (unit) => (unit && unit !== "1" ? `[${unit}]` : "");
 
-const MAX_HOURS = 48; // from which on a clock counts days
+const MAX_HOURS = 24; // from which on a clock counts days
 
 // Seconds of the log as a clock: 0:07.3, 12:31, 3:05:00, 2 d 07:30.
 export function clock(seconds, fraction = 0) {
@@ -66,8 +66,11 @@ export function span(seconds) {
 
 let labels = {}; // of the twin, by name
 
-// Take the labels of a twin: {name: label} of states, sensors, rows and parameters.
-export const setLabels = (known) => (labels = known ?? {});
+// Take the labels of a twin: {name: label} of states, sensors, rows and parameters. A name without one is its words.
+export function setLabels({ labels: known, states, rows }) {
+  const names = [...states, ...rows].map(({ name }) => name).filter((name) => name.includes("_"));
+  labels = { ...Object.fromEntries(names.map((name) => [name, name.replaceAll("_", " ")])), ...known };
+}
 
 export const words = (name) => (Object.hasOwn(labels, name) ? labels[name] : name.replaceAll("_", " "));
 

@@ -31,7 +31,7 @@ $("theme").addEventListener("click", () => {
 const answer = await fetch("/api/model");
 if (!answer.ok) throw new Error(await answer.text());
 const model = await answer.json();
-setLabels(model.labels);
+setLabels(model);
 const kinds = await Promise.all(settings.charts.map((name) => import(`/page/charts/${name}`)));
 window.nisus = { model, drawn: 0, revision: null };
 

@@ -12,7 +12,7 @@ const PAPER = [960, 300]; // px of a drawing
 
 const { model, kinds, streams, episodes, annotations, integrity, nis_dof: nisDof } = JSON.parse(document.getElementById("chart-data").textContent);
 
-setLabels(model.labels);
+setLabels(model);
 const context = { model, episodes, integrity, nisDof, view: { at: null }, live: streamOf(streams.live), layers: [] };
 const whole = [context.live.x[0], context.live.x.at(-1)];
 context.range = whole;

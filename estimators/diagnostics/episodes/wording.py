@@ -130,10 +130,11 @@ class SensorFacts(EpisodeFacts):
         if model.nx <= MAX_STATES and not model.black_box:
             observed = observed_states(model)
             others = np.delete(observed, self.s, axis=0).any(axis=0)
-            only = [model.state_names[int(j)] for j in np.flatnonzero(observed[self.s] & ~others)]
+            only = [model.state_names[int(j)] for j in np.flatnonzero(observed[self.s] & ~others)][:4]
         if not only:
             return "other sensors measure the same states"
-        return f"{' and '.join(only[:4])} {'is' if len(only) == 1 else 'are'} measured by no other sensor"
+        named = f"{', '.join(only[:-1])} and {only[-1]}" if only[1:] else only[0]
+        return f"{named} {'is' if len(only) == 1 else 'are'} measured by no other sensor"
 
     @property
     def cross_check(self) -> str:

@@ -60,6 +60,8 @@ def test_the_status_of_a_moment_of_a_large_field_is_that_of_its_rows(monkeypatch
     engine.start()
     try:
         wait_for(lambda: engine.status().finished)
+        # True states are 41 rows per measurement; the window ends with the last measurement, as that of the charts.
+        assert engine.status().nis.nis == pytest.approx(pull_all(engine).track.nis_mean[-1], rel=1e-12)
         moments = [engine.span()[0] + hour * 3600 * SECOND for hour in (0, 5, 60, 200, 330)]
         with monkeypatch.context() as patch:
             patch.setattr(Engine, "fold_until", None)

@@ -141,6 +141,20 @@ def test_the_time_of_an_alarm_is_that_of_the_charts(page):
     ]
 
 
+def test_sentences_have_the_words_of_names_and_clocks_count_days(page):
+    found = page.evaluate(
+        """async () => {
+          const { clock, inChartTime, setLabels } = await import("/page/format.js");
+          setLabels({ labels: { soc: "state of charge" }, states: [{ name: "soc" }, { name: "ocv_error" }], rows: [] });
+          const text = "soc and ocv_error drift; reduce Q.ocv_error, see a_file.csv";
+          return [inChartTime(text, "0"), clock(86399), clock(90000)];
+        }"""
+    )
+    assert found == [
+        "state of charge and ocv error drift; reduce Q.ocv_error, see a_file.csv", "23:59:59", "1 d 01:00",
+    ]  # fmt: skip
+
+
 def test_a_withheld_estimate_has_its_reason_in_place_of_a_value_and_a_band_without_a_line(visit, tmp_path):
     limits = {"withhold": "{rate: 1e-3}", "valid": "{temperature: {min: -10, max: 20}}", "source.duration": "60"}
     with running("motor_winding", **limits) as session:

@@ -10,9 +10,10 @@ import pytest
 from estimators.diagnostics.detector_state import no_baseline
 from estimators.diagnostics.detectors import BITS, CAUSES, IMPOVERISHED, NARROW, SHIFTED_DOWN, SHIFTED_UP, SPIKY, STUCK
 from estimators.diagnostics.episodes import JOINED, Episode, episode_json, episodes, found_in, judged_rows
+from estimators.diagnostics.episodes.wording import SensorFacts
 from estimators.diagnostics.health import HealthPolicy
 from estimators.log import READING, RESET, Events, Log
-from estimators.model.state_space import Input, State
+from estimators.model.state_space import Input, Noise, State
 from estimators.track import DIVERGED, GATED, TRACKING, USED, WAITING
 from estimators.tuning import Tuning
 from tests.models import level_model
@@ -420,3 +421,27 @@ def test_the_onset_of_an_episode_is_not_before_the_reset_nor_in_the_episode_befo
     found = [each for each in episodes(fold) if each.subject == "gauge"]
     assert found[0].start == pytest.approx(BEGIN, abs=10) and found[0].end == pytest.approx(END, abs=30)
     assert found[1].start == pytest.approx(cut + 100, abs=10)
+
+
+@pytest.mark.parametrize(
+    ("states", "said"),
+    [
+        (("x",), "x is measured by no other sensor"),
+        (("x", "y"), "x and y are measured by no other sensor"),
+        (("x", "y", "z"), "x, y and z are measured by no other sensor"),
+    ],
+)
+def test_states_that_one_sensor_alone_observes_are_listed(states, said):
+    model = level_model(
+        {"total": 1.0}, 1.0, h=total, states=tuple(State(name, "1") for name in states), f=kept,
+        noises=(Noise(states[0], "1/s", 1.0),),
+    )  # fmt: skip
+    assert SensorFacts(cause="silent", start=0.0, model=model, s=0).observed_by == said
+
+
+def kept(x, u, p, dt, out):
+    out[:] = x
+
+
+def total(x, u, p, out):
+    out[0] = np.sum(x)
