@@ -34,7 +34,7 @@ def stress_twin(arguments: Arguments) -> int:
     mistakes = [
         item
         for item in matrix(twin.model, twin.tuning, first.events, asset=asset_of(twin, 0) is not None)
-        if not arguments.only or any(text.lower() in item.name.lower() for text in arguments.only)
+        if not arguments.only or any(text.lower() in item.key for text in arguments.only)
     ]
     if not mistakes:
         raise ConfigError(f"--only {' '.join(arguments.only)}: no mistake has that in its name; see --list")
@@ -54,7 +54,9 @@ def stress_twin(arguments: Arguments) -> int:
                 for name in names:
                     for mistake in mistakes:
                         try:
-                            trials.append(make(bench, mistake, name, oracle.foretell(bench, mistake, name)))
+                            foretold = oracle.foretell(bench, mistake, name)
+                            listed = oracle.listed(first, mistake, name)
+                            trials.append(make(bench, mistake, name, foretold, listed=listed))
                         except NisusError as error:
                             failed.append(f"{mistake.name}, {name}, seed {seed}: {error}")
                         advance()

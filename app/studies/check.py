@@ -13,12 +13,12 @@ from config.source_schema import CanLogSection, CanSection, MergedSection
 from estimators.diagnostics.calibration import BANDS, Calibration
 from estimators.diagnostics.episodes import Episode, episode_json
 from estimators.diagnostics.score import health_of
-from estimators.diagnostics.sensitivity import Gramian, GramianView, Sensitivity, bounds_of, sensitivity
+from estimators.diagnostics.sensitivity import Gramian, GramianView, Sensitivity, bounds_of, sensitivities, worse_faults
 from estimators.diagnostics.sensitivity.checklist import Arrivals, Dimension, Linearity, arrivals, dimension
 from estimators.diagnostics.sensitivity.gramian import directions
 from estimators.diagnostics.sensitivity.held_out import HeldOut, held_out
 from estimators.diagnostics.sensitivity.posterior import Peaks, Tail, tails
-from estimators.diagnostics.sensitivity.responses import digits
+from estimators.diagnostics.sensitivity.responses import NOW, PRIOR, digits
 from estimators.errors import NisusError
 from estimators.fold import Fold
 from estimators.log import READING, Log
@@ -33,6 +33,7 @@ from .fold_result import calibration_json, calibration_of, episodes_of_recording
 
 BUDGET_S = 20.0  # seconds of one processor for the folds with held-out sensors, which limit the part of the log
 MAX_CORRELATION = 0.9  # correlation beyond which two faults are hardly distinguishable
+BEGINS = {PRIOR: "at the prior", NOW: "later"}  # words for the beginning of a fault
 MAX_ROWS = 12  # rows of a table as text or HTML; JSON has all
 
 
@@ -54,7 +55,10 @@ class ChecklistLine(NamedTuple):
 
 @dataclass(frozen=True)
 class Checked:
-    """All measurements on a twin. `span` is the part of the log, from its start, that was folded, s; None: all."""
+    """All measurements on a twin. `span` is the part of the log, from its start, that was folded, s; None: all.
+
+    sensitivity: to faults that are present from the prior on; onset: to those that begin now, see `sensitivities`.
+    """
 
     twin: Twin
     log: Log
@@ -67,6 +71,7 @@ class Checked:
     tails: tuple[Tail, ...]
     gramian: Gramian
     sensitivity: Sensitivity
+    onset: Sensitivity
     arrivals: tuple[Arrivals, ...]
     calibration: list[Calibration]
     episodes: list[Episode]
@@ -96,6 +101,7 @@ def check(twin: Twin, log: Log, counts: Counter[str]) -> Checked:
     measured = Measured(twin, log)
     readings = int(np.sum(log.kind[: log.n] == READING))
     covariance = fold.estimator.family not in ("particle", "ensemble")
+    present, onset = sensitivities(twin.estimator, model, tuning, log, false_alarm=twin.policy.false_alarm_every)
     return Checked(
         twin=twin,
         log=log,
@@ -107,7 +113,8 @@ def check(twin: Twin, log: Log, counts: Counter[str]) -> Checked:
         peaks=measured.peaks,
         tails=tails(model, log, fold.track, marginal=fold.marginal),
         gramian=measured.gramian,
-        sensitivity=sensitivity(twin.estimator, model, tuning, log, false_alarm=twin.policy.false_alarm_every),
+        sensitivity=present,
+        onset=onset,
         arrivals=tuple(item for s, item in enumerate(arrivals(model, log)) if s in twin.plan.fed or item.n),
         calibration=calibration_of(fold, fold.log.events, fold.track),
         episodes=episodes_of_recording(fold),
@@ -131,7 +138,7 @@ def confounded(found: Sensitivity) -> list[tuple[str, str, float]]:
     The correlation is that of two unknown faults with all others known; pairs beyond `MAX_CORRELATION` are returned,
     the largest first.
     """
-    names = [nudge.subject for nudge in found.nudges]
+    names = [nudge.subject for nudge in found.nudges[: len(found.fisher)]]
     root = np.sqrt(np.diag(found.fisher))
     with np.errstate(all="ignore"):
         c = -found.fisher / np.outer(root, root)
@@ -153,8 +160,9 @@ def figures(checked: Checked, checklist: Sequence[ChecklistLine]) -> dict[str, A
 
     `checklist`: question, answer (yes, partly, no, not told), figures, remedy. `observability`: the Gramian of the log
     and of each window, and pairs of faults that the log hardly distinguishes. `smallest_visible`: minimal detectable
-    fault of every sensor row, input and parameter, null if there is none in its range, and the undetectable range `low`
-    to `high`. `integrity`: protection level of each state beside 2 σ, and its fault. `held_out`: prediction of each
+    size of every fault, null if there is none in its range, and the undetectable range `low` to `high`. `integrity`:
+    protection level of each state beside 2 σ, and its fault. Both are the worse of faults that begin "now" and those
+    present from the "prior" on (`begin`), over `window` seconds. `held_out`: prediction of each
     sensor row by the others. `open_loop`: RMS without measurements, by sensor row and by state with known truth;
     `worse` where that of the filter is larger.
     """
@@ -175,7 +183,7 @@ def figures(checked: Checked, checklist: Sequence[ChecklistLine]) -> dict[str, A
 
     integrity: dict[str, Any] = {"reason": found.reason, "states": {}}
     if not found.reason:
-        bounds = bounds_of(twin.model, found)
+        bounds = bounds_of(twin.model, found, checked.onset)
         integrity |= {
             "note": found.note,
             "estimator": found.estimator,
@@ -195,7 +203,7 @@ def figures(checked: Checked, checklist: Sequence[ChecklistLine]) -> dict[str, A
                 "windows": [view(part) for part in gramian.windows],
                 "blame": [dict(zip(("one", "other", "correlation"), pair, strict=True)) for pair in confounded(found)],
                 "deviation": {
-                    nudge.subject: value for nudge, value in zip(found.nudges, found.among().deviation, strict=True)
+                    nudge.subject: value for nudge, value in zip(found.nudges, found.among().deviation, strict=False)
                 },
             },
             "smallest_visible": [
@@ -205,8 +213,10 @@ def figures(checked: Checked, checklist: Sequence[ChecklistLine]) -> dict[str, A
                     "low": fault.low,
                     "high": fault.high,
                     "seen": np.isfinite(fault.visible),
+                    "begin": one.begin,
+                    "window": one.window,
                 }
-                for fault in found.faults
+                for fault, one in worse_faults(found, checked.onset)
             ],
             "integrity": integrity,
             "held_out": {
@@ -311,34 +321,38 @@ def _fault_topics(checked: Checked) -> list[Topic]:
         levels, smallest, alike = (Topic(title, (f"Not computed: {found.reason}.",)) for title in titles)
     else:
         note = f"{found.note}." if found.note else ""
-        bounds = bounds_of(model, found)
+        bounds = bounds_of(model, found, checked.onset)
         levels = _table(
             titles[0],
-            ("state", "unit", "± 2 σ", "integrity bound", "by"),
-            [(name, item.unit, item.two_sigma, item.bound, item.fault or "none") for name, item in bounds.items()],
+            ("state", "unit", "± 2 σ", "integrity bound", "by", "begins", "lasts, s"),
+            [
+                (name, item.unit, item.two_sigma, item.bound, item.fault or "none", BEGINS[item.begin], item.window)
+                for name, item in bounds.items()
+            ],
             note,
             bars=[Bar(name, item.unit, item.two_sigma, item.bound) for name, item in bounds.items()],
             legend=("± 2 σ", "integrity bound"),
         )
-        seconds = float(found.t[-1] - found.t[0]) * 1e-9
         smallest = _table(
             titles[1],
-            ("fault", "smallest visible", "passes unseen"),
+            ("fault", "smallest visible", "passes unseen", "begins"),
             [
                 (
                     fault.nudge.subject,
                     fault.nudge.size_text(fault.visible) if np.isfinite(fault.visible) else "undetectable in its range",
                     fault.range_text,
+                    BEGINS[one.begin],
                 )
-                for fault in found.faults
+                for fault, one in worse_faults(found, checked.onset)
             ],
             note,
-            f"Smallest constant fault over all {seconds:.4g} s that is detected with a probability of 95 %.",
+            "Smallest fault that is detected with a probability of 95 %, the worse of two: present from the prior on, "
+            f"for {found.window:.4g} s, or beginning later, for {checked.onset.window:.4g} s.",
         )
         pairs = confounded(found)
         free = (
-            [item for item in directions(found.fisher, found.nudges) if not item.deviation < 1.0]
-            if found.nudges
+            [item for item in directions(found.fisher, found.nudges[: len(found.fisher)]) if not item.deviation < 1.0]
+            if len(found.fisher)
             else []
         )
         alike = _table(

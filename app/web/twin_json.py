@@ -83,7 +83,7 @@ def status_json(engine: Running, status: Status | None = None) -> dict[str, Any]
         "integrity": {}
         if levels is None
         else {
-            name: {key: value for key, value in item._asdict().items() if key != "bias"}
+            name: {key: getattr(item, key) for key in ("bound", "two_sigma", "unit", "fault")}
             for name, item in levels.bounds.items()
         },
         "integrity_age": None if levels is None else levels.age(status.t),

@@ -19,6 +19,7 @@ import numpy as np
 from estimators.diagnostics.detectors import OUTSIDE
 from estimators.diagnostics.episodes import episodes
 from estimators.diagnostics.score import Score, score
+from estimators.diagnostics.sensitivity import Sensitivity, sensitivities, worse_faults
 from estimators.diagnostics.sensitivity.responses import DETERMINISTIC_FILTERS, astray, stand_in
 from estimators.diagnostics.sensitivity.visibility import fault_tests
 from estimators.fold import Fold
@@ -70,6 +71,25 @@ class Oracle:
         self._benches: list[Bench] = []
         self._whole: Bench | None = None
         self._rehearsed: dict[tuple[str, str], Foretold] = {}
+        self._checked: dict[str, tuple[Sensitivity, Sensitivity]] = {}
+
+    def listed(self, bench: Bench, mistake: Mistake, estimator: str) -> bool:
+        """Return whether `nisus check` lists every part of a mistake as undetectable, on the undamaged log.
+
+        Raises:
+            NisusError: As `Bench.run`.
+        """
+        if estimator not in self._checked:
+            calm = bench.fold(None, estimator, self.twin.tuning.gate).fold
+            every = self.twin.policy.false_alarm_every
+            self._checked[estimator] = sensitivities(estimator, calm.model, calm.tuning, calm.log, false_alarm=every)
+        known = self._checked[estimator]
+        ranges = {(fault.nudge.kind, fault.nudge.name): (fault.low, fault.high) for fault, _ in worse_faults(*known)}
+        nothing = (0.0, 0.0)
+        return bool(mistake.nudges) and all(
+            ranges.get((kind, name), nothing)[0] <= size <= ranges.get((kind, name), nothing)[1]
+            for kind, name, size in mistake.nudges
+        )
 
     def foretell(self, bench: Bench, mistake: Mistake, estimator: str) -> Foretold:
         """Whether a mistake will be seen on a bench with a filter.
@@ -88,6 +108,8 @@ class Oracle:
 
     def _rehearse(self, mistake: Mistake, estimator: str) -> Foretold:
         recorded = asset_of(self.twin, 0) is None
+        if mistake.whole and mistake.fault is not None and recorded:
+            return Foretold(CHANCE)  # there is no other log of it
         if mistake.fault is None and recorded:
             after = self._later(mistake, estimator)
         else:
@@ -196,7 +218,8 @@ class Trial:
     episodes that were heard of before it began. `green`: share of green rows while it lasted. `error` and `bare`: RMSE
     by state over the truth meanwhile, with a gate and without; `calm`: of the same filter over the same time, without
     the mistake; `coverage`: share of the truth in the 95 % band, by state. `recovery`: seconds from its end until green
-    for good; None is never, or that it does not end.
+    for good; None is never, or that it does not end. `suspects`: all that explain it equally well. `wrong`: state whose
+    truth leaves its band most, if it stays inside without the mistake. `listed`: whether `nisus check` lists it.
     """
 
     mistake: str
@@ -221,9 +244,20 @@ class Trial:
     coverage: dict[str, float]
     recovery: float | None
     stale: int
+    suspects: tuple[str, ...] = ()
+    wrong: str | None = None
+    listed: bool = False
+
+    @property
+    def detected(self) -> bool:
+        """Whether health changed while it lasted."""
+        return self.outcome in (NAMED, MISNAMED, FALSE)
 
 
-def make(bench: Bench, mistake: Mistake, estimator: str, foretold: Foretold) -> Trial:
+MIN_COVERAGE = 0.8  # share of the truth in the 95 % band of a state below which it is wrong
+
+
+def make(bench: Bench, mistake: Mistake, estimator: str, foretold: Foretold, *, listed: bool = False) -> Trial:
     """Make a mistake with a filter, of which it was told before what would be seen.
 
     Raises:
@@ -240,7 +274,7 @@ def make(bench: Bench, mistake: Mistake, estimator: str, foretold: Foretold) -> 
     since = [(at, item) for at, item in told if at >= begun]
     after = [(at, item) for at, item in since if at < ended]
     blamed = cache(lambda item: accused(shipped, item, ended))
-    fits = (at for at, item in after if mistake.right_cause(item) and mistake.right_subject(blamed(item)))
+    fits = (at for at, item in after if mistake.right_cause(item) and any(map(mistake.right_subject, blamed(item))))
     fit = next(fits, None)
     # That the estimate is lost is no cause, and is said sooner than one can be told.
     first = next((item for _, item in after if item.cause != "diverged"), after[0][1] if after else None)
@@ -248,6 +282,8 @@ def make(bench: Bench, mistake: Mistake, estimator: str, foretold: Foretold) -> 
     heard = word is not None and word < (ended - begun) / 1e9
     scores = {name: _score(item, begun, ended) for name, item in (("gated", gated), ("bare", bare))}
     calm = _score(undisturbed, begun, ended)
+    coverage = {name: fit.coverage for name, fit in scores["gated" if ships is gated else "bare"].states.items()}
+    off = [name for name, share in coverage.items() if share < MIN_COVERAGE <= calm.states[name].coverage]
     return Trial(
         mistake=mistake.name,
         estimator=estimator,
@@ -260,17 +296,20 @@ def make(bench: Bench, mistake: Mistake, estimator: str, foretold: Foretold) -> 
         delay=(fit - begun) / 1e9 if fit is not None else None,
         word=word,
         named=f"{first.subject} {first.cause}" if first is not None else None,
-        accused=blamed(first) if first is not None else None,
+        accused=blamed(first)[0] if first is not None else None,
         cause_right=first is not None and mistake.right_cause(first),
-        subject_right=first is not None and mistake.right_subject(blamed(first)),
+        subject_right=first is not None and any(map(mistake.right_subject, blamed(first))),
         early=sum(said_at(undisturbed.fold, item) < begun for item in episodes(undisturbed.fold)),
         green=green_share(shipped, begun, ended),
         error={name: fit.rmse for name, fit in scores["gated"].states.items()},
         bare={name: fit.rmse for name, fit in scores["bare"].states.items()},
         calm={name: fit.rmse for name, fit in calm.states.items()},
-        coverage={name: fit.coverage for name, fit in scores["gated" if ships is gated else "bare"].states.items()},
-        recovery=None if mistake.fault is None else recovery(shipped, ended),
+        coverage=coverage,
+        recovery=None if mistake.whole else recovery(shipped, ended),
         stale=ships.stale,
+        suspects=blamed(first) if first is not None else (),
+        wrong=min(off, key=lambda name: coverage[name]) if off else None,
+        listed=listed,
     )
 
 

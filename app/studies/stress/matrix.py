@@ -7,13 +7,26 @@ from dataclasses import replace
 
 import numpy as np
 
+from estimators.diagnostics.sensitivity.responses import (
+    DELAY,
+    DRIFT,
+    INPUT_,
+    INPUT_SCALE,
+    PARAMETER,
+    PRIOR,
+    R_,
+    SCALE,
+    SENSOR,
+    SWAP,
+    SWAPPED,
+)
 from estimators.errors import ConfigError
 from estimators.log import INPUT, READING, Events
 from estimators.model.state_space import Sensor, StateSpaceModel
 from estimators.tuning import Tuning
 from sources.faults.kinds import Fault
 
-from .scenario import Mistake
+from .scenario import ANY_SUBJECT, Mistake
 
 SMALL_BANDS = frozenset({"narrow", "correlated", "shifted"})  # causes that show an overconfident filter
 
@@ -25,6 +38,9 @@ MODEL = frozenset({"shifted", "correlated", "narrow", "refused"})
 INPUT_WRONG = MODEL | {"outside"}
 NOTHING: frozenset[str] = frozenset()
 
+PRIOR_SIGMAS, PRIOR_CERTAINTY = 5.0, 20.0  # offset of a wrong prior, and how many times its deviation is too small
+MAX_PAIRS = 20  # pairs of faults at once
+
 
 def matrix(model: StateSpaceModel, tuning: Tuning, events: Events, *, asset: bool) -> list[Mistake]:
     """The mistakes that can be made with a twin, tuned as it ships; sizes count in its standard deviations.
@@ -35,24 +51,73 @@ def matrix(model: StateSpaceModel, tuning: Tuning, events: Events, *, asset: boo
     # What is done to a sensor that says nothing is done to nobody; swapped with it, another one falls silent.
     spoken = set(events.channel[events.kind == READING].tolist())
     sensors = [sensor for s, sensor in enumerate(model.sensors) if s in spoken]
-    return [
-        *_of_noises(model),
-        *_of_sensors(model, tuning, sensors),
-        *_of_inputs(model, events),
-        *_of_time(sensors),
-        *_of_model(model, tuning, asset),
-    ]
+    faults = [*_of_sensors(model, tuning, sensors), *_of_inputs(model, events), *_of_time(sensors)]
+    found = [*_of_noises(model), *_of_priors(model), *faults, *_of_model(model, tuning, asset)]
+    lasting = [_lasting(item) for item in faults if item.nudges]
+    return [*found, *lasting, *_pairs([*found, *lasting])]
+
+
+def _lasting(mistake: Mistake) -> Mistake:
+    """Return a fault of the source over the whole log."""
+    return replace(mistake, name=f"{mistake.name} from the start", from_start=True)
+
+
+def _pairs(mistakes: Sequence[Mistake]) -> Iterator[Mistake]:
+    """Yield pairs of faults of different subjects, both in one window or both over the whole log, drawn at random."""
+    known = [item for item in mistakes if item.nudges and not item.of_asset and not item.prior]
+    rng = np.random.default_rng(len(known))
+    made: set[tuple[str, str]] = set()
+    for _ in range(10 * MAX_PAIRS if len(known) > 1 else 0):
+        one, other = (known[k] for k in rng.choice(len(known), 2, replace=False))
+        names = {name for _, name, _ in one.nudges}
+        alike = one.whole == other.whole and names.isdisjoint(name for _, name, _ in other.nudges)
+        if not alike or (one.name, other.name) in made or len(made) == MAX_PAIRS:
+            continue
+        made.add((one.name, other.name))
+        yield _both(one, other)
+
+
+def _both(one: Mistake, other: Mistake) -> Mistake:
+    faults = [item.fault for item in (one, other) if item.fault is not None]
+    anyone = not one.subjects or not other.subjects
+    return Mistake(
+        f"{one.name} with {other.name}",
+        one.causes | other.causes,
+        ANY_SUBJECT if anyone else one.subjects | other.subjects,
+        belief={**one.belief, **other.belief},
+        fault=(lambda start, end: [item for each in faults for item in each(start, end)]) if faults else None,
+        shifts=one.shifts and other.shifts,
+        nudges=one.nudges + other.nudges,
+        from_start=one.whole and bool(faults),
+        parts=2,
+    )
 
 
 def _of_noises(model: StateSpaceModel) -> Iterator[Mistake]:
-    q = [f"Q.{noise.name}" for noise in model.noises]
-    r = [f"R.{name}" for name in model.row_names]
-    for factor in (10.0, 100.0):
-        yield Mistake(f"R x{factor:g}", LARGE_BANDS, belief=dict.fromkeys(r, factor))
-    yield Mistake("R /10", frozenset({"narrow", "alternating"}), belief=dict.fromkeys(r, 0.1))
-    for factor in (10.0, 100.0):
-        yield Mistake(f"Q /{factor:g}", SMALL_BANDS, belief=dict.fromkeys(q, 1.0 / factor))
-    yield Mistake("Q x100", LARGE_BANDS, belief=dict.fromkeys(q, 100.0))
+    q, r = [noise.name for noise in model.noises], list(model.row_names)
+    for kind, names, factor, causes in (
+        ("R", r, 10.0, LARGE_BANDS),
+        ("R", r, 100.0, LARGE_BANDS),
+        ("R", r, 0.1, frozenset({"narrow", "alternating"})),
+        ("Q", q, 0.1, SMALL_BANDS),
+        ("Q", q, 0.01, SMALL_BANDS),
+        ("Q", q, 100.0, LARGE_BANDS),
+    ):
+        label = f"{kind} x{factor:g}" if factor > 1.0 else f"{kind} /{1.0 / factor:g}"
+        belief = {f"{kind}.{name}": factor for name in names}
+        yield Mistake(label, causes, belief=belief, nudges=tuple((kind, name, factor - 1.0) for name in names))
+
+
+def _of_priors(model: StateSpaceModel) -> Iterator[Mistake]:
+    for state, std in zip(model.states, model.prior_std.tolist(), strict=True):
+        if std > 0.0:
+            yield Mistake(
+                f"prior of {state.name} {PRIOR_SIGMAS:g} σ off and {PRIOR_CERTAINTY:g} times too certain",
+                SMALL_BANDS | SHIFT,
+                frozenset({f"prior {state.name}"}),
+                prior={state.name: (PRIOR_SIGMAS, 1.0 / PRIOR_CERTAINTY)},
+                nudges=((PRIOR, state.name, PRIOR_SIGMAS * std),),
+            )
 
 
 def _fault(kind: str, **given: object) -> Callable[[float, float], list[Fault]]:
@@ -76,15 +141,21 @@ def _of_sensors(model: StateSpaceModel, tuning: Tuning, sensors: Sequence[Sensor
             for size in (2.0, 5.0, 20.0):
                 fault = _fault("bias", sensor=name, row=row, size=size * std)
                 plain = Mistake(f"{label} +{size:g} σ", SHIFT, own, fault=fault, shifts=True)
-                yield replace(plain, size=size * std, unit=sensor.rows[0].unit)
-            drift = _fault("drift", sensor=name, row=row, size=0.1 * std)
-            yield Mistake(f"{label} drifts 1 σ in 10 s", SHIFT | {"correlated"}, own, fault=drift, shifts=True)
+                known = ((SENSOR, label, size * std),)
+                yield replace(plain, size=size * std, unit=sensor.rows[0].unit, nudges=known)
+            for seconds in (10.0, 100.0):
+                drift = _fault("drift", sensor=name, row=row, size=std / seconds)
+                drifting = Mistake(f"{label} drifts 1 σ in {seconds:g} s", SHIFT | {"correlated"}, own, fault=drift)
+                yield replace(drifting, shifts=True, nudges=((DRIFT, label, std / seconds),))
             noisy = _fault("noise", sensor=name, row=row, size=3.0 * std)
-            yield Mistake(f"{label} noise x3", frozenset({"narrow", "refused"}), own, fault=noisy)
+            times_ten = ((R_, label, 0.1 - 1.0),)  # the twin's R is a tenth of the asset's
+            yield Mistake(f"{label} noise x3", frozenset({"narrow", "refused"}), own, fault=noisy, nudges=times_ten)
             spikes = _fault("spike", sensor=name, row=row, size=10.0 * std, rate=0.01)
             yield Mistake(f"{label} spikes 1 %", frozenset({"spiky"}), own, fault=spikes)
-            scaled = _fault("scale", sensor=name, row=row, size=1.1)
-            yield Mistake(f"{label} x1.1", MODEL, own, fault=scaled, shifts=True)
+            for factor in (1.02, 1.1):
+                scaled = _fault("scale", sensor=name, row=row, size=factor)
+                known = ((SCALE, label, factor - 1.0),)
+                yield Mistake(f"{label} x{factor:g}", MODEL, own, fault=scaled, shifts=True, nudges=known)
         yield Mistake(f"{name} stuck", frozenset({"stuck"}), own, fault=_fault("stuck", sensor=name))
         lost = _fault("silence", sensor=name)
         if len(model.sensors) > 1:
@@ -97,7 +168,8 @@ def _of_sensors(model: StateSpaceModel, tuning: Tuning, sensors: Sequence[Sensor
         first, second = pair
         swapped = _fault("swap", sensor=first, other=second)
         # With its mean each gets the noise of the other.
-        yield Mistake(f"{first} and {second} swapped", MODEL, frozenset(pair), fault=swapped)
+        known = ((SWAP, f"{first}{SWAPPED}{second}", 1.0),)
+        yield Mistake(f"{first} and {second} swapped", MODEL, frozenset(pair), fault=swapped, nudges=known)
 
 
 def _silent(model: StateSpaceModel) -> Callable[[float, float], list[Fault]]:
@@ -125,12 +197,16 @@ def _of_inputs(model: StateSpaceModel, events: Events) -> Iterator[Mistake]:
         if size:
             biased = _fault("bias", input=item.name, size=size)
             name = f"{item.name} +{size:.3g} {item.unit}"
-            yield Mistake(name, INPUT_WRONG, fault=biased, size=size, unit=item.unit, shifts=True)
-            scaled = _fault("scale", input=item.name, size=1.3)
-            yield Mistake(f"{item.name} x1.3", INPUT_WRONG, fault=scaled, shifts=True)
+            own = frozenset({f"input {item.name}"})
+            plain = Mistake(name, INPUT_WRONG, own, fault=biased, size=size, unit=item.unit, shifts=True)
+            yield replace(plain, nudges=((INPUT_, item.name, size),))
+            for factor in (1.1, 1.3):
+                scaled = _fault("scale", input=item.name, size=factor)
+                known = ((INPUT_SCALE, item.name, factor - 1.0),)
+                yield Mistake(f"{item.name} x{factor:g}", INPUT_WRONG, own, fault=scaled, shifts=True, nudges=known)
         if np.ptp(values):
             lost = _fault("silence", input=item.name)
-            yield Mistake(f"{item.name} lost", INPUT_WRONG, fault=lost, shifts=True)
+            yield Mistake(f"{item.name} lost", INPUT_WRONG, frozenset({f"input {item.name}"}), fault=lost, shifts=True)
 
 
 def _of_time(sensors: Sequence[Sensor]) -> Iterator[Mistake]:
@@ -143,6 +219,11 @@ def _of_time(sensors: Sequence[Sensor]) -> Iterator[Mistake]:
         name = sensor.name
         jump = _fault("clock_jump", sensor=name, size=-1.0)
         yield Mistake(f"clock of {name} 1 s behind", clock | MODEL, frozenset({name}), fault=jump)
+        for seconds in (0.5, 3.0):
+            # Measured so long before the time in its stamp.
+            late = _fault("clock_jump", sensor=name, size=seconds)
+            known = ((DELAY, name, seconds),)
+            yield Mistake(f"{name} {seconds:g} s late", clock | MODEL, frozenset({name}), fault=late, nudges=known)
         again = _fault("duplicate", sensor=name, count=4, every=0.001)
         repeated = frozenset({"duplicate", "stuck", "correlated", "wide"})
         yield Mistake(f"{name} said five times", repeated, frozenset({name}), fault=again)
@@ -158,8 +239,12 @@ def _of_model(model: StateSpaceModel, tuning: Tuning, asset: bool) -> Iterator[M
             continue  # out of the range in which it makes sense
         if not value:
             continue
-        believed = Mistake(f"{item.name} believed +30 %", MODEL | LARGE_BANDS, belief={key: 1.3}, shifts=True)
+        own = frozenset({f"parameter {item.name}"})
+        believed = Mistake(f"{item.name} believed +30 %", MODEL | LARGE_BANDS, own, belief={key: 1.3}, shifts=True)
+        believed = replace(believed, nudges=((PARAMETER, item.name, 0.3 * value),))
         yield believed
         if asset:
             changed = _fault("model", parameter=item.name, size=1.3)
-            yield replace(believed, name=f"{item.name} of the asset +30 %", belief={}, fault=changed, of_asset=True)
+            known = ((PARAMETER, item.name, -0.3 * value),)
+            changes = replace(believed, belief={}, fault=changed, of_asset=True, nudges=known)
+            yield replace(changes, name=f"{item.name} of the asset +30 %")

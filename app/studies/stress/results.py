@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -20,6 +20,9 @@ ERROR_COLUMNS: tuple[TableColumn | str, ...] = (
     *("mistake", "filter", "state", "undamaged", "gate", "no gate"),
     TableColumn("in band [%]", 0, 100.0),
 )
+
+
+WRONG_COLUMNS = ("faults", "made", "a state is wrong", "undetected", "listed", "neither")
 
 
 def stress_topics(title: str, trials: Sequence[Trial], mistakes: Sequence[Mistake]) -> list[Topic]:
@@ -50,11 +53,35 @@ def stress_topics(title: str, trials: Sequence[Trial], mistakes: Sequence[Mistak
         f"of {len(harmless)} that the log corrects {_count(harmless, FALSE)} raised an alarm",
         f"{len(wrong)} rows wrong and green{': ' if wrong else ''}{', '.join(wrong)}",
     )
+    unlisted = [f"{t.mistake} ({t.estimator}, seed {t.seed}): {t.wrong}" for t in real if t.wrong and _unknown(t)]
     return [
         Topic(title, (), DETECTION_COLUMNS, rows),
         Topic("RMSE of the state whose error grew most", (), ERROR_COLUMNS, errors),
+        Topic("Wrong states, detected or listed by nisus check beforehand", (), WRONG_COLUMNS, _wrong_rows(real, made)),
+        Topic("Wrong, undetected and not listed", tuple(unlisted) or ("none",)),
         Topic("All", sentences),
     ]
+
+
+def _unknown(trial: Trial) -> bool:
+    return not trial.detected and not trial.listed
+
+
+def _wrong_rows(trials: Sequence[Trial], made: Mapping[str, Mistake]) -> tuple[tuple[Cell, ...], ...]:
+    """Return counts of faults, wrong states, and of these undetected, listed and neither."""
+    groups = {
+        "some time": [t for t in trials if not made[t.mistake].whole],
+        "from the start": [t for t in trials if made[t.mistake].whole],
+        "of these two at once": [t for t in trials if made[t.mistake].parts > 1],
+        "all": list(trials),
+    }
+    rows = []
+    for title, group in groups.items():
+        wrong = [t for t in group if t.wrong]
+        hidden = [t for t in wrong if not t.detected]
+        counts = (len(group), len(wrong), len(hidden), sum(t.listed for t in hidden), sum(map(_unknown, hidden)))
+        rows.append((title, *counts))
+    return tuple(rows)
 
 
 def _count(trials: Sequence[Trial], outcome: str) -> int:

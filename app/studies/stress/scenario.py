@@ -12,11 +12,12 @@ import numpy as np
 from config.source_schema import AssetSection, CanSection
 from estimators.diagnostics.detectors import detector_of
 from estimators.diagnostics.episodes import Episode, episodes
-from estimators.diagnostics.sensitivity.responses import DRIFT, SENSOR
+from estimators.diagnostics.sensitivity.responses import SENSOR
 from estimators.diagnostics.sensitivity.suspects import likeliest, suspects
 from estimators.errors import NisusError, SourceError
 from estimators.fold import Fold
 from estimators.log import MARK, READING, TICK, TRUTH, Events, Log
+from estimators.model.state_space import StateSpaceModel
 from estimators.snapshots import Base
 from estimators.track import TRACKING, USABLE, WAITING
 from estimators.tuning import Tuning
@@ -31,21 +32,26 @@ if TYPE_CHECKING:
     from sources.faults.kinds import Fault
     from sources.source import Source
 
+AT_ONCE = "two at once"
+
 ANY_SUBJECT: frozenset[str] = frozenset()
 """Subjects of a fault that concerns no particular sensor."""
 
 
 @dataclass(frozen=True)
 class Mistake:
-    """One deliberate fault, a row of the matrix.
+    """One deliberate fault, or several at once; a row of the matrix.
 
-    belief: factors on entries of the tuning, from the start of the log. fault: returns the faults of the source for a
-    window (start, end) in seconds of the log. An episode has the right cause if it is among `causes`, and the right
-    subject if its most likely fault (`accused`), or the sensor of that row, is among `subjects`. A fault without causes
-    is harmless and must not raise an alarm.
+    belief: factors on entries of the tuning, from the start of the log. prior: offset, in standard deviations, and
+    factor on the standard deviation of the prior of a state. fault: returns the faults of the source for a window
+    (start, end) in seconds of the log. An episode has the right cause if it is among `causes`, and the right subject if
+    one of the most likely faults (`accused`), or the sensor of that row, is among `subjects`. A fault without causes is
+    harmless and must not raise an alarm.
 
     size, in unit: of a constant added to a sensor or an input. shifts: whether it moves only the means of the
-    innovations, equally in every log; otherwise it changes their noise or the times of events.
+    innovations, equally in every log; otherwise it changes their noise or the times of events. nudges: kind, name and
+    size of each as `nisus check` knows them. from_start: whether faults of the source hold over the whole log. parts:
+    number of faults at once.
     """
 
     name: str
@@ -57,6 +63,20 @@ class Mistake:
     size: float = nan
     unit: str = ""
     shifts: bool = False
+    prior: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    nudges: tuple[tuple[str, str, float], ...] = ()
+    from_start: bool = False
+    parts: int = 1
+
+    @property
+    def key(self) -> str:
+        """Text in which `--only` looks for a name: pairs are chosen together."""
+        return AT_ONCE if self.parts > 1 else self.name.lower()
+
+    @property
+    def whole(self) -> bool:
+        """Whether it holds over the whole log."""
+        return self.fault is None or self.from_start
 
     def right_cause(self, episode: Episode) -> bool:
         """Return whether the cause of an episode belongs to this fault."""
@@ -154,7 +174,7 @@ class Bench:
     def window(self, mistake: Mistake) -> tuple[float, float]:
         """When a mistake lasts, seconds after the log's first event."""
         begin, third = (round(share * self.length, 3) for share in (self.begin, 1.0 / 3.0))
-        return (0.0, self.length) if mistake.fault is None else (begin, begin + third)
+        return (0.0, self.length) if mistake.whole else (begin, begin + third)
 
     def span(self, mistake: Mistake) -> tuple[int, int]:
         """The same in ns of the log."""
@@ -185,7 +205,7 @@ class Bench:
         log = calm.log.copy()
         log.n = int(np.searchsorted(log.t[: log.n], end))
         log.drop_front(at)
-        fold = self._folded(estimator, self._tuning(estimator, mistake).set("gate", gate), log, base)
+        fold = self._folded(estimator, self._tuning(estimator, mistake).set("gate", gate), log, base, mistake.prior)
         return _share(first_word(fold, begin, calm, quiet_of(mistake)), end - begin)
 
     def fold(self, mistake: Mistake | None, estimator: str, gate: float | None) -> StressFold:
@@ -199,7 +219,8 @@ class Bench:
         made, key = self._calm if mistake is None else self._wrong, (estimator, gate)
         if key not in made:
             events = self.events if mistake is None else self._damaged(mistake)
-            made[key] = self._fold(estimator, self._tuning(estimator, mistake).set("gate", gate), events)
+            prior = {} if mistake is None else mistake.prior
+            made[key] = self._fold(estimator, self._tuning(estimator, mistake).set("gate", gate), events, prior)
         return made[key]
 
     def _damaged(self, mistake: Mistake) -> Events:
@@ -224,21 +245,39 @@ class Bench:
             tuning = tuning.set(key, factor * float(tuning.get(key) or 0.0))
         return tuning
 
-    def _fold(self, estimator: str, tuning: Tuning, events: Events) -> StressFold:
+    def _fold(
+        self, estimator: str, tuning: Tuning, events: Events, prior: Mapping[str, tuple[float, float]]
+    ) -> StressFold:
         twin = self.twin
         log = Log.of(twin.model, capacity=max(1, len(events)))
         _, stale = log.extend(events, round(twin.config.time.horizon * 1e9))
         truth = log.events.select(slice(None))
         untold = Log.of(twin.model, capacity=max(1, len(truth)))
         untold.extend(without_truth(truth))
-        return StressFold(self._folded(estimator, tuning, untold), truth, stale)
+        return StressFold(self._folded(estimator, tuning, untold, None, prior), truth, stale)
 
-    def _folded(self, estimator: str, tuning: Tuning, log: Log, base: Base | None = None) -> Fold:
+    def _folded(
+        self, estimator: str, tuning: Tuning, log: Log, base: Base | None, prior: Mapping[str, tuple[float, float]]
+    ) -> Fold:
         twin = self.twin
         fold = Fold(estimator, twin.model, tuning, log, pairs=twin.pairs, policy=twin.policy, base=base)
+        if prior:
+            base = _wrong_prior(fold.base_at(0)[1], twin.model, prior)
+            fold = Fold(estimator, twin.model, tuning, log, pairs=twin.pairs, policy=twin.policy, base=base)
         fold.advance()
         fold.finish()
         return fold
+
+
+def _wrong_prior(base: Base, model: StateSpaceModel, prior: Mapping[str, tuple[float, float]]) -> Base:
+    """Return the start of a fold whose prior is off, and too certain."""
+    mean, cov = base.mean.copy(), base.cov.copy()
+    for name, (sigmas, factor) in prior.items():
+        j = model.state_names.index(name)
+        mean[j] += sigmas * np.sqrt(cov[j, j])
+        cov[j] *= factor
+        cov[:, j] *= factor
+    return base._replace(mean=mean, cov=cov, state=None)
 
 
 def _share(word: float | None, length: int) -> float:
@@ -318,24 +357,22 @@ def heard_in(fold: Fold, calm: Fold) -> list[tuple[int, Episode]]:
     )
 
 
-def accused(fold: Fold, episode: Episode, until: int) -> str:
-    """Whom a user is told to look at: the likeliest suspect where an episode leaves that open, else its subject.
+def accused(fold: Fold, episode: Episode, until: int) -> tuple[str, ...]:
+    """Whom a user is told to look at: the most likely suspects where an episode leaves that open, else its subject.
 
     A sensor row by its name alone, an input or a parameter after that word. The question is asked at `until`, ns of the
     log; later events are not known yet.
     """
     if not detector_of(episode.cause).isolate:
-        return episode.subject
+        return (episode.subject,)
     seen = fold.log.copy()
     seen.n = int(np.searchsorted(fold.log.t[: fold.n], until))
     try:
         found = likeliest(suspects(fold.estimator.name, fold.model, fold.tuning, seen, episode.start))
     except NisusError:
         found = ()
-    if not found:
-        return episode.subject
-    nudge = found[0].nudge
-    return nudge.name if nudge.kind in (SENSOR, DRIFT) else f"{nudge.kind} {nudge.name}"
+    targets = [item.nudge.target for item in found]
+    return tuple(name if kind == SENSOR else f"{kind} {name}" for kind, name in targets) or (episode.subject,)
 
 
 def green_share(fold: Fold, start: int, end: int) -> float:

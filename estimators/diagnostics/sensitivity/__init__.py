@@ -2,9 +2,9 @@
 
 from .gramian import Gramian, GramianView, gramian
 from .responses import Nudge, Response
-from .sensitivity import Bound, Sensitivity, Smallest, bounds_of, sensitivity, smallest_of
+from .sensitivity import Bound, Sensitivity, Smallest, bounds_of, sensitivities, sensitivity, smallest_of, worse_faults
 
 __all__ = [
     "Bound", "Gramian", "GramianView", "Nudge", "Response", "Sensitivity", "Smallest", "bounds_of", "gramian",
-    "sensitivity", "smallest_of",
+    "sensitivities", "sensitivity", "smallest_of", "worse_faults",
 ]  # fmt: skip

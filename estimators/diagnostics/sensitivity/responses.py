@@ -66,24 +66,62 @@ class Start(NamedTuple):
     def with_fault(self, nudge: Nudge, size: float) -> Track:
         """Return the track of a fold with a fault of this size."""
         model, tuning = self.tuning.model, self.tuning
+        if nudge.kind in NOISES:
+            key = f"{nudge.kind}.{nudge.name}"
+            return self.refold(tuning=tuning.set(key, float(tuning.get(key) or 0.0) * (1.0 + size)))
         if nudge.kind == PARAMETER:
             p = tuning.p.copy()
             p[[item.name for item in model.parameters].index(nudge.name)] += size
             return self.refold(tuning=replace(tuning, p=p))
+        if nudge.kind == PRIOR:
+            mean = self.base.mean.copy()
+            mean[model.state_names.index(nudge.name)] += size
+            return self.refold(base=self.base._replace(mean=mean, state=None))
         other = self.log.copy()
         kind, value = other.kind[: other.n], other.value[: other.n]
-        if nudge.kind == INPUT_:
+        if nudge.kind in (INPUT_, INPUT_SCALE):
             k = model.input_names.index(nudge.name)
-            value[kind == INPUT, k] += size
+            factor, offset = (1.0 + size, 0.0) if nudge.kind == INPUT_SCALE else (1.0, size)
+            value[kind == INPUT, k] = factor * value[kind == INPUT, k] + offset
             u = self.base.u.copy()
-            u[k] += size
+            u[k] = factor * u[k] + offset
             return self.refold(log=other, base=self.base._replace(u=u))
+        if nudge.kind == SWAP:
+            names = nudge.name.split(SWAPPED)
+            (own, at, was), (others, then, theirs) = map(self._predicted, names)
+            value[own, : was.shape[1]] += size * (_at(at, then, theirs) - was)
+            value[others, : was.shape[1]] += size * (_at(then, at, was) - theirs)
+            return self.refold(log=other)
+        if nudge.kind == DELAY:
+            own, at, predicted = self._predicted(nudge.name)
+            value[own, : predicted.shape[1]] += _at(at - size, at, predicted) - predicted
+            return self.refold(log=other)
         row = model.row_names.index(nudge.name)
         sensor = int(np.searchsorted(model.row_start, row, side="right")) - 1
         own = np.flatnonzero((kind == READING) & (other.channel[: other.n] == sensor))
-        off = size if nudge.kind == SENSOR else size * 1e-9 * (other.t[own] - other.t[0])
-        value[own, row - model.row_start[sensor]] += off
+        column = row - model.row_start[sensor]
+        if nudge.kind == SCALE:
+            value[own, column] *= 1.0 + size
+        else:
+            value[own, column] += size if nudge.kind == SENSOR else size * 1e-9 * (other.t[own] - other.t[0])
         return self.refold(log=other)
+
+    def _predicted(self, name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return rows (n,), times (n,) in s and predictions (n, ny) of the measurements of a sensor.
+
+        Exchanged or delayed predictions move the mean of a measurement as the fault does, without its noise.
+        """
+        model, log = self.tuning.model, self.log
+        s = model.sensor_names.index(name)
+        own = np.flatnonzero((log.kind[: log.n] == READING) & (log.channel[: log.n] == s))
+        count = len(model.sensors[s].rows)
+        predicted = log.value[own, :count] - self.track.innovation[own, :count]
+        known = np.isfinite(predicted).all(axis=1)
+        for k, row in enumerate(model.sensors[s].rows):
+            if row.circular:
+                predicted[known, k] = np.unwrap(predicted[known, k])
+        own = own[known]
+        return own, 1e-9 * (log.t[own] - log.t[0]), predicted[known]
 
     def moved(self, new: Track, old: Track | None = None) -> Response:
         """Subtract a track from another, by default that of the fold without nudge; angles by the shorter way."""
@@ -110,6 +148,11 @@ class Start(NamedTuple):
         low, high = max(-nudge.step, nudge.low), min(nudge.step, nudge.high)
         below, above = (self.track if size == 0.0 else self.with_fault(nudge, size) for size in (low, high))
         return Response(*(change / (high - low) for change in self.moved(above, below)))
+
+
+def _at(t: np.ndarray, times: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Interpolate series of values (n, rows) at times t."""
+    return np.stack([np.interp(t, times, column) for column in values.T], axis=1)
 
 
 def _track(estimator: str, tuning: Tuning, log: Log, base: Base) -> Track:
@@ -157,12 +200,21 @@ def astray(estimator: str, instead: str, track: Track) -> str:
     return f"{estimator} is a Monte Carlo filter, and {instead}, which would be nudged in its place, diverges"
 
 
-def start(estimator: str, model: StateSpaceModel, tuning: Tuning, log: Log, base: Base | None, most: int) -> Start:
-    """Fold once, and prepare to refold the last `most` events from the state before them.
+NOW, PRIOR = "now", "prior"
+"""Beginnings of a fault: after the log has shown the state, or at the prior. Of a nudge: offset of a prior mean."""
+
+
+def start(
+    estimator: str, model: StateSpaceModel, tuning: Tuning, log: Log, base: Base | None, most: int, begin: str = NOW
+) -> Start:
+    """Fold once, and prepare to refold the last `most` events from the state before them, or the first from the prior.
 
     Rejected measurements stay rejected under every nudge: they are removed from the log, and the gate is opened.
     """
     name, note = stand_in(estimator, model)
+    if begin == PRIOR:
+        log = log.copy()
+        log.n = min(log.n, most)
     if name != estimator:
         tuning = tuning.with_options({})
     fold = Fold(name, model, tuning, log, base=base)
@@ -190,14 +242,40 @@ SENSOR, INPUT_, PARAMETER = KINDS = ("sensor", "input", "parameter")
 MAX_RELATIVE_SIZE = 10.0  # of a parameter's value, up to which a size is given in percent of it
 
 DRIFT = "drift"  # Kind of a nudge that grows in proportion to the time since the first event, of a sensor row
+SCALE, INPUT_SCALE = "scale", "input scale"  # Of a sensor row and of an input: factor, less 1
+DELAY = "delay"  # Of a sensor, s
+SWAP = "swap"  # Of the names of two sensors with the same units, 0 or 1
+R_, Q_ = NOISES = ("R", "Q")  # Factor on a variance, less 1
+FROM_PRIOR = (PRIOR, *NOISES)  # Kinds that are there from the prior on
+CATALOGUE = (*KINDS, DRIFT, SCALE, INPUT_SCALE, DELAY, SWAP, *FROM_PRIOR)
+
+SWAPPED = " and "  # Between the names of two sensors
+
+MAX_DELAY_S, MAX_DELAY_PERIODS, MAX_DELAY_SHARE = 10.0, 10.0, 0.1
+"""Delay of a sensor at most: seconds or periods, whichever is longer, and share of the log."""
+
+MAX_SCALE = 0.5  # Largest relative error of a scale
+MAX_OFFSET_SIGMAS = 50.0  # Largest offset of a sensor, in standard deviations, unless its values extend further
+MAX_NOISE_FACTOR = 100.0  # Largest factor on a variance, and its reciprocal the smallest
+MAX_PRIOR_SIGMAS = 5.0  # Range of a prior mean, in its standard deviations, where the state moves less
 
 STEP = 1e-3
 """Step of a difference, as a share of the nudge's scale: the error of a central difference is of the order of its
 square, that of rounding 1e-16 over it."""
 
 
+WORDS = {
+    DRIFT: "drift of",
+    SCALE: "scale of",
+    INPUT_SCALE: "scale of input",
+    DELAY: "delay of",
+    SWAP: "swap of",
+    PRIOR: "prior of",
+}
+
+
 class Nudge(NamedTuple):
-    """A constant or a drift added to the measurements of a sensor row, or a constant added to an input or parameter.
+    """A fault of one of the kinds of `CATALOGUE`: for the first, a constant added to a sensor row, input or parameter.
 
     `step` is added and subtracted for the differences, `low` and `high` the range in which a fault of this kind
     (a change from the present value) makes sense, `scale` the size by which nudges are compared: the deviation of the
@@ -216,30 +294,52 @@ class Nudge(NamedTuple):
 
     def in_words(self, size: float) -> str:
         """Describe a fault of a size: of a parameter in percent of its value, if that is not near zero."""
+        if self.kind == SWAP:
+            return self.subject
+        if self.kind in NOISES:
+            return f"{self.subject} × {digits(1.0 + size)}"
         if self._in_percent(size):
-            return f"{self.name} {100.0 * size / abs(self.value):+.3g} %"
+            name = self.name if self.kind == PARAMETER else self.subject
+            return f"{name} {100.0 * size / abs(self.value):+.3g} %"
         if self.kind == DRIFT:
             return f"{SENSOR} {self.name} drifting by {size:+.3g} {self.unit}"
+        if self.kind in WORDS:
+            return f"{self.subject} {size:+.3g} {self.unit}".rstrip()
         kind = "" if self.kind == PARAMETER else f"{self.kind} "
         return f"{kind}{self.name} {size:+.3g} {self.unit}".rstrip()
 
     def _in_percent(self, size: float) -> bool:
         """Return whether a size is given in percent of a parameter's value."""
-        return self.kind == PARAMETER and abs(size) <= MAX_RELATIVE_SIZE * abs(self.value) > 0.0
+        return self.kind in (PARAMETER, SCALE, INPUT_SCALE) and abs(size) <= MAX_RELATIVE_SIZE * abs(self.value) > 0.0
 
     @property
     def subject(self) -> str:
         """Kind and name."""
-        return f"{self.kind} {self.name}"
+        return f"{self.kind}.{self.name}" if self.kind in NOISES else f"{WORDS.get(self.kind, self.kind)} {self.name}"
+
+    @property
+    def target(self) -> tuple[str, str]:
+        """What is at fault, sensor, input, parameter, prior, swap or noise, and its name."""
+        if self.kind in (DRIFT, SCALE, DELAY, R_):
+            return SENSOR, self.name
+        return (INPUT_ if self.kind == INPUT_SCALE else self.kind), self.name
 
     def size_text(self, size: float) -> str:
         """Return the size of a fault without its sign: in percent as `in_words`, else in its unit."""
+        if self.kind == SWAP:
+            return "exchanged"
+        if self.kind in NOISES:
+            return f"× {digits(1.0 + size)}"
         if self._in_percent(size):
             return f"{digits(100.0 * size / abs(self.value))} %"
         return f"{digits(size)} {self.unit}".rstrip()
 
     def range_text(self, low: float, high: float) -> str:
         """Return the range of undetectable sizes: `-31 to +92 %`, or `± 2.51 °C`."""
+        if self.kind == SWAP:
+            return "exchanged" if high > 0.0 else "none"
+        if self.kind in NOISES:
+            return f"× {digits(1.0 + low)} to × {digits(1.0 + high)}"
         if not (np.isfinite(low) and np.isfinite(high)):
             return "any size"
         percent = self._in_percent(max(abs(low), abs(high)))
@@ -249,37 +349,77 @@ class Nudge(NamedTuple):
         return f"{both} {unit}".rstrip()
 
 
-def nudges_of(model: StateSpaceModel, tuning: Tuning, log: Log, kinds: Sequence[str] = KINDS) -> list[Nudge]:
-    """Return all nudges of a model: rows of used sensors with measurements, inputs, parameters that may vary."""
-    found = []
+def nudges_of(
+    model: StateSpaceModel, tuning: Tuning, log: Log, kinds: Sequence[str] = KINDS, track: Track | None = None
+) -> list[Nudge]:
+    """Return all nudges of a model, those of `KINDS` first: rows of used sensors with measurements, inputs, parameters.
+
+    `track`: of the log, by which the priors of states have a range.
+    """
+    found, others = [], []
     seconds = float(log.t[log.n - 1] - log.t[0]) * 1e-9 if log.n else 0.0
     units = [row.unit for sensor in model.sensors for row in sensor.rows]
     kind, channel = log.kind[: log.n], log.channel[: log.n]
     reporting = tuning.used & np.isin(np.arange(len(model.sensors)), channel[kind == READING])
     in_use = np.repeat(reporting, [len(sensor.rows) for sensor in model.sensors])
-    for name, unit, variance, used in zip(model.row_names, units, tuning.r, in_use, strict=True):
+    for row, (name, unit, variance, used) in enumerate(zip(model.row_names, units, tuning.r, in_use, strict=True)):
         if used:
             scale = float(np.sqrt(variance)) or 1.0
-            found.append(Nudge(SENSOR, name, unit, STEP * scale, -np.inf, np.inf, scale))
+            s = int(np.searchsorted(model.row_start, row, side="right")) - 1
+            values = log.value[: log.n][(kind == READING) & (channel == s), row - model.row_start[s]]
+            values = values[np.isfinite(values)]
+            extent = float(max(MAX_SCALE * np.abs(values).max(), np.ptp(values))) if values.size else 0.0
+            most = max(MAX_OFFSET_SIGMAS * scale, extent)
+            found.append(Nudge(SENSOR, name, unit, STEP * scale, -most, most, scale))
+            others.append(Nudge(SCALE, name, "", STEP, -MAX_SCALE, MAX_SCALE, 1.0, 1.0))
+            if variance > 0.0:
+                others.append(_noise(R_, name))
             if seconds > 0.0:
                 rate = scale / seconds
-                found.append(Nudge(DRIFT, name, f"{unit}/s", STEP * rate, -np.inf, np.inf, rate))
+                others.append(Nudge(DRIFT, name, f"{unit}/s", STEP * rate, -np.inf, np.inf, rate))
     given = log.value[: log.n][kind == INPUT]
     for k, item in enumerate(model.inputs):
         values = given[np.isfinite(given[:, k]), k]
         values = values if values.size else np.array([item.default])
         scale = float(np.std(values)) or float(np.abs(values[0])) or 1.0
         found.append(Nudge(INPUT_, item.name, item.unit, STEP * scale, -np.inf, np.inf, scale))
+        if np.any(values != 0.0):
+            others.append(Nudge(INPUT_SCALE, item.name, "", STEP, -MAX_SCALE, MAX_SCALE, 1.0, 1.0))
     for parameter, value in zip(model.parameters, tuning.p.tolist(), strict=True):
         low, high = parameter.low - value, parameter.high - value
         scale = abs(value) or (high - low if np.isfinite(high - low) else 1.0)
         if low < high:
             found.append(Nudge(PARAMETER, parameter.name, parameter.unit, STEP * scale, low, high, scale, value))
-    return [nudge for nudge in found if nudge.kind in kinds]
+    sensors = [sensor for sensor, used in zip(model.sensors, reporting, strict=True) if used]
+    for k, sensor in enumerate(sensors):
+        times = log.t[: log.n][(kind == READING) & (channel == model.sensor_names.index(sensor.name))]
+        period = float(np.median(np.diff(times))) * 1e-9 if times.size > 1 else 0.0
+        most = min(max(MAX_DELAY_S, MAX_DELAY_PERIODS * period), MAX_DELAY_SHARE * seconds)
+        if period > 0.0 and most > 0.0:
+            others.append(Nudge(DELAY, sensor.name, "s", STEP * period, -most, most, period))
+        for other in sensors[k + 1 :]:
+            if [row.unit for row in other.rows] == [row.unit for row in sensor.rows]:
+                others.append(Nudge(SWAP, f"{sensor.name}{SWAPPED}{other.name}", "", STEP, 0.0, 1.0, 1.0))
+    for j, state in enumerate(model.states):
+        std = float(model.prior_std[j])
+        if std > 0.0:
+            shown = np.flatnonzero(model.shown == j)
+            moved = np.ptp(track.mean[:, shown[0]]) if track is not None and shown.size and len(track) else 0.0
+            most = MAX_PRIOR_SIGMAS * std + (float(moved) if np.isfinite(moved) else 0.0)
+            others.append(Nudge(PRIOR, state.name, state.unit, STEP * std, -most, most, std))
+    for noise in model.noises:
+        if float(tuning.get(f"Q.{noise.name}") or 0.0) > 0.0:
+            others.append(_noise(Q_, noise.name))
+    return [nudge for nudge in found + others if nudge.kind in kinds]
+
+
+def _noise(kind: str, name: str) -> Nudge:
+    return Nudge(kind, name, "", STEP, 1.0 / MAX_NOISE_FACTOR - 1.0, MAX_NOISE_FACTOR - 1.0, 1.0, 1.0)
 
 
 MAX_STATES = 64  # States up to which a model is refolded for each of its nudges
-MAX_REFOLD_EVENTS = 20_000  # Events that are refolded at most, the last of the log
+MAX_REFOLD_EVENTS = 20_000  # Events that are refolded at most beside a running twin
+MAX_CHECKED_EVENTS = 60_000  # Events that are refolded at most to check a log
 MAX_RESPONSE_NUMBERS = 32_000_000  # Numbers in all responses at most
 MAX_REFOLD_OPERATIONS = 2_000_000_000  # Events times nudges times nx³, as a covariance costs: some ten seconds
 
@@ -293,9 +433,7 @@ def reason_against(model: StateSpaceModel, log: Log) -> str:
     return ""
 
 
-def max_events(model: StateSpaceModel, nudges: int) -> int:
+def max_events(model: StateSpaceModel, nudges: int, most: int = MAX_REFOLD_EVENTS) -> int:
     """Return the number of events to refold for this number of nudges, by their cost."""
     numbers = nudges * (2 * model.ny + 2 * len(model.shown))
-    return max(
-        1, min(MAX_REFOLD_EVENTS, MAX_RESPONSE_NUMBERS // numbers, MAX_REFOLD_OPERATIONS // (nudges * model.nx**3))
-    )
+    return max(1, min(most, MAX_RESPONSE_NUMBERS // numbers, MAX_REFOLD_OPERATIONS // (nudges * model.nx**3)))

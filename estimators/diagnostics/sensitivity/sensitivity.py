@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ...errors import EstimatorError
-from ...log import Log
+from ...log import READING, Log
 from ...model.state_space import StateSpaceModel
 from ...numerics.quantiles import normal_quantile
 from ...registry import find_estimator
@@ -23,8 +23,18 @@ from ...tuning import Tuning
 from ..health import HealthPolicy
 from .gramian import Uncertainty, information, uncertainty
 from .responses import (
+    CATALOGUE,
+    FROM_PRIOR,
     KINDS,
+    MAX_CHECKED_EVENTS,
+    NOISES,
+    NOW,
+    PRIOR,
+    STEP,
+    SWAP,
     Nudge,
+    Response,
+    Start,
     astray,
     each,
     max_events,
@@ -33,7 +43,7 @@ from .responses import (
     reason_against,
     start,
 )
-from .visibility import UndetectableFault, fault_tests, undetectable_fault
+from .visibility import FaultTests, UndetectableFault, fault_tests, undetectable_fault
 
 PROBABILITY = 0.95  # Probability that an error stays below the protection level, under the worst undetectable fault
 
@@ -45,6 +55,14 @@ MAX_NONLINEARITY = 0.5
 
 BANK, BEST = WITNESSES = ("bank", "best")
 """Tests for a fault: the detectors of the twin, or the optimal test of a known fault."""
+
+
+MAX_PRIOR_SHARE = 0.1
+"""Share of an error of the prior, in prior deviations, from which on a state remembers it."""
+
+MIN_CHECKED_EVENTS = 1000  # Events that are refolded at least, of logs that have as many
+
+NOISE_BISECTIONS = 5  # Of the factor on a variance, between 1 and a hundred: to 15 %
 
 
 class ErrorBounds(NamedTuple):
@@ -67,9 +85,10 @@ class Sensitivity(NamedTuple):
 
     estimator: the filter that was nudged. reason: why nothing was computed and all arrays are empty, or ""; note: a
     remark on the result, or "". t (N,): times of the events, ns; first: index of the first in the log. std (N, shown):
-    σ of the states without nudge. faults: one for each nudge, k in all. fisher (k, k): Fisher information of the
-    nudges. h (rows,): thresholds of the tests by sensor row; noncentrality: the λ that passes them with the requested
-    probability. bounds: protection levels after each event.
+    σ of the states without nudge. faults: one for each nudge. fisher (k, k): Fisher information of the
+    constant nudges, which are the first. h (rows,): thresholds of the tests by sensor row; noncentrality: the λ that
+    passes them with the requested probability. bounds: protection levels after each event. begin: beginning of the
+    faults, `NOW` (first event) or `PRIOR`.
     """
 
     estimator: str
@@ -83,6 +102,12 @@ class Sensitivity(NamedTuple):
     h: np.ndarray = np.zeros(0)
     noncentrality: float = np.nan
     bounds: ErrorBounds = ErrorBounds(NOTHING, NOTHING, NOTHING)
+    begin: str = NOW
+
+    @property
+    def window(self) -> float:
+        """Duration of the faults, s."""
+        return float(self.t[-1] - self.t[0]) * 1e-9 if self.t.size else 0.0
 
     @property
     def nudges(self) -> tuple[Nudge, ...]:
@@ -98,8 +123,8 @@ class Sensitivity(NamedTuple):
         return [(nudge.kind, nudge.name) for nudge in self.nudges].index((kind, name))
 
     def among(self, indices: Sequence[int] | None = None) -> Uncertainty:
-        """Return the uncertainty of some nudges if these are unknown and all others are known; None for all."""
-        some = list(range(len(self.faults)) if indices is None else indices)
+        """Return the uncertainty of constant nudges if these are unknown and all others known; None for all."""
+        some = list(range(len(self.fisher)) if indices is None else indices)
         return uncertainty(self.fisher[np.ix_(some, some)])
 
 
@@ -112,6 +137,7 @@ def sensitivity(
     base: Base | None = None,
     kinds: Sequence[str] = KINDS,
     most: int | None = None,
+    begin: str = NOW,
     seen_by: str = BANK,
     false_alarm: float = HealthPolicy().false_alarm_every,
     detection: float = 0.95,
@@ -128,8 +154,9 @@ def sensitivity(
         tuning: As the twin's.
         log: The events; it must not grow meanwhile (give a copy). Rejected measurements stay rejected.
         base: Where the log starts, if older events were dropped; see `Fold.base_at`.
-        kinds: Kinds of nudges, of "sensor", "input", "parameter".
-        most: Number of events to refold, from the end; None for at most seconds and 256 MB.
+        kinds: Kinds of nudges, of `CATALOGUE`; those of `FROM_PRIOR` only if faults begin there.
+        most: Number of events to refold; None for at most seconds and 256 MB.
+        begin: `NOW` for faults of the last events, `PRIOR` for faults of the first ones, present from the prior on.
         seen_by: "bank" for the detectors of the twin, "best" for the optimal test of a known fault, a bound for all
             tests.
         false_alarm: Mean time between false alarms of all tests together, s.
@@ -147,22 +174,24 @@ def sensitivity(
     if reason:
         return Sensitivity(estimator, reason)
     count = len(model.row_names) + model.nu + len(model.parameters)
-    begun = start(estimator, model, tuning, log, base, most or max_events(model, count))
-    nudges = nudges_of(model, tuning, begun.log, kinds)
+    begun = start(estimator, model, tuning, log, base, most or max_events(model, count), begin)
+    if begin != PRIOR:
+        kinds = [kind for kind in kinds if kind not in FROM_PRIOR]
+    nudges = nudges_of(model, tuning, begun.log, kinds, begun.track)
     reason = astray(estimator, begun.estimator, begun.track)
     if reason or not nudges:
         return Sensitivity(estimator, reason or f"{model.name} has nothing to nudge of {', '.join(kinds)}")
     track = begun.track
     bank = seen_by == BANK
     tests = fault_tests(model, tuning, begun.log, track, every=false_alarm, detection=detection, bank=bank)
-    responses = each(begun.respond, nudges, executor)
-    faults = each(lambda item: undetectable_fault(begun, *item, tests), zip(nudges, responses, strict=True), executor)
+    constant = [nudge.kind in KINDS for nudge in nudges].count(True)
+    faults = each(lambda nudge: _undetectable(begun, nudge, tests), nudges, executor)
     bias, cause = np.zeros(track.std.shape), np.full(track.std.shape, -1)
     for k, fault in enumerate(faults):
         worse = fault.error > bias
         bias[worse], cause[worse] = fault.error[worse], k
     notes = [begun.note]
-    if np.median([fault.nonlinearity for fault in faults]) > MAX_NONLINEARITY:
+    if constant and np.median([fault.nonlinearity for fault in faults[:constant]]) > MAX_NONLINEARITY:
         notes.append(nonlinear_note(begun.estimator, tuning, "Fisher information is unreliable here"))
     used = track.verdict == USED
     return Sensitivity(
@@ -173,18 +202,116 @@ def sensitivity(
         t=begun.log.t[: begun.log.n].copy(),
         std=track.std.copy(),
         faults=tuple(faults),
-        fisher=information([response.whitened[used] for response in responses]),
+        fisher=information([fault.response.whitened[used] for fault in faults[:constant]]),
         h=tests.h,
         noncentrality=tests.noncentrality,
         bounds=ErrorBounds(bias, bias + TWO_SIGMA * track.std, cause),
+        begin=begin,
     )
+
+
+def sensitivities(
+    estimator: str,
+    model: StateSpaceModel,
+    tuning: Tuning,
+    log: Log,
+    *,
+    false_alarm: float = HealthPolicy().false_alarm_every,
+    executor: Executor | str | None = "threads",
+) -> tuple[Sensitivity, Sensitivity]:
+    """Return the sensitivity to all faults of `CATALOGUE`: present from the prior on, and beginning now.
+
+    Over as many events as the slowest state remembers, from the prior on; half a log at most for those beginning now.
+    For the arguments see `sensitivity`.
+    """
+    find_estimator(estimator, model)
+    reason = reason_against(model, log)
+    if reason:
+        return Sensitivity(estimator, reason, begin=PRIOR), Sensitivity(estimator, reason)
+    most = max_events(model, len(nudges_of(model, tuning, log, CATALOGUE)), MAX_CHECKED_EVENTS)
+    window = _remembered(start(estimator, model, tuning, log, None, most, PRIOR), executor)
+
+    def of(begin: str, events: int) -> Sensitivity:
+        return sensitivity(
+            estimator, model, tuning, log, kinds=CATALOGUE, most=events, begin=begin, false_alarm=false_alarm,
+            executor=executor,
+        )  # fmt: skip
+
+    return of(PRIOR, window), of(NOW, max(1, min(window, log.n // 2)))
+
+
+def _remembered(begun: Start, executor: Executor | str | None) -> int:
+    """Return the number of events from the prior after which its errors are forgotten; all if one never is."""
+    model, scale = begun.tuning.model, begun.tuning.model.prior_std
+    uncertain = scale[model.shown] > 0.0
+
+    def events(j: int) -> int:
+        nudge = Nudge(PRIOR, model.state_names[j], "", STEP * scale[j], -np.inf, np.inf, scale[j])
+        left = np.abs(begun.respond(nudge).states[:, uncertain]) * scale[j] / scale[model.shown][uncertain]
+        rows = np.flatnonzero(~(left <= MAX_PRIOR_SHARE).all(axis=1))
+        return int(rows[-1]) + 2 if rows.size else 1
+
+    found = each(events, [int(j) for j in np.flatnonzero(scale > 0.0)], executor)
+    return min(begun.log.n, max([MIN_CHECKED_EVENTS, *found]))
+
+
+def _undetectable(begun: Start, nudge: Nudge, tests: FaultTests) -> UndetectableFault:
+    """Return the undetectable sizes of a nudge of any kind."""
+    if nudge.kind in NOISES:
+        return _undetectable_noise(begun, nudge)
+    if nudge.kind != SWAP:
+        return undetectable_fault(begun, nudge, begun.respond(nudge), tests)
+    # Sensors are exchanged or not: there is no smaller exchange.
+    response = begun.moved(begun.with_fault(nudge, 1.0))
+    finite = bool(np.all(np.isfinite(response.states)))
+    hidden = finite and tests.multiple(response.whitened, response.innovation / begun.track.innovation_std) > 1.0
+    size, error = (1.0, np.abs(response.states)) if hidden else (0.0, np.zeros_like(begun.track.mean))
+    return UndetectableFault(nudge, response, 0.0, size, np.inf if hidden else 1.0, error, 0.0)
+
+
+def _undetectable_noise(begun: Start, nudge: Nudge) -> UndetectableFault:
+    """Return the undetectable factors on a variance, at which the detectors raise no new alarm in this log.
+
+    If the other variance is right, the estimate is off by its change, and its band is that of the other.
+    """
+    log, calm = begun.log, begun.track
+    sensor = np.where(log.kind[: log.n] == READING, log.channel[: log.n], -1)
+    raised = np.zeros_like(calm.alarms)
+    for s in np.unique(sensor):
+        raised[sensor == s] = np.bitwise_or.reduce(calm.alarms[sensor == s], axis=0)
+    none = np.zeros_like(calm.mean)
+
+    def tried(factor: float) -> tuple[bool, np.ndarray]:
+        track = begun.with_fault(nudge, factor - 1.0)
+        error = np.abs(begun.moved(track).states) + TWO_SIGMA * np.maximum(track.std - calm.std, 0.0)
+        alarmed = bool(np.any(track.alarms & ~raised)) or not np.all(np.isfinite(error))
+        return alarmed, error
+
+    sizes, shown, errors = [], np.inf, none
+    for limit in (1.0 + nudge.low, 1.0 + nudge.high):
+        hidden, error = limit, none
+        alarmed, error = tried(limit)
+        if alarmed:
+            hidden, error, beyond = 1.0, none, limit
+            for _ in range(NOISE_BISECTIONS):
+                middle = float(np.sqrt(hidden * beyond))
+                alarmed, moved = tried(middle)
+                if alarmed:
+                    beyond = middle
+                else:
+                    hidden, error = middle, moved
+            shown = min(shown, max(beyond, 1.0 / beyond) - 1.0)
+        sizes.append(hidden - 1.0)
+        errors = np.maximum(errors, error)
+    return UndetectableFault(nudge, Response(NOTHING, NOTHING, NOTHING), sizes[0], sizes[1], shown, errors, 0.0)
 
 
 class Bound(NamedTuple):
     """Protection level of one state, in `unit`: bounds of its error with a probability of 95 %.
 
     two_sigma: by the covariance, without a fault; bound: under the worst undetectable fault, which moves it by bias.
-    fault: that fault with its undetectable range; "" if none moves the state.
+    fault: that fault with its undetectable range; "" if none moves the state. begin: of the fault, `NOW` or `PRIOR`;
+    window: its duration, s.
     """
 
     unit: str
@@ -192,16 +319,39 @@ class Bound(NamedTuple):
     bias: float
     two_sigma: float
     fault: str
+    begin: str = NOW
+    window: float = 0.0
 
 
-def bounds_of(model: StateSpaceModel, found: Sensitivity) -> dict[str, Bound]:
-    """Return the protection levels by state at the last event; none where there is a reason against it."""
-    bounds = {}
-    for k, state in enumerate(() if found.reason else model.shown_states):
-        bias, bound, cause = (column[-1, k] for column in found.bounds)
-        fault = found.faults[cause].text if cause >= 0 else ""
-        bounds[state.name] = Bound(state.unit, float(bound), float(bias), TWO_SIGMA * float(found.std[-1, k]), fault)
+def bounds_of(model: StateSpaceModel, *found: Sensitivity) -> dict[str, Bound]:
+    """Return the largest protection level by state at the last event; none where there is a reason against it."""
+    bounds: dict[str, Bound] = {}
+    for one in found:
+        for k, state in enumerate(() if one.reason else model.shown_states):
+            bias, bound, cause = (column[-1, k] for column in one.bounds)
+            fault = one.faults[cause].text if cause >= 0 else ""
+            two_sigma = TWO_SIGMA * float(one.std[-1, k])
+            level = Bound(state.unit, float(bound), float(bias), two_sigma, fault, one.begin, one.window)
+            if state.name not in bounds or level.bound > bounds[state.name].bound:
+                bounds[state.name] = level
     return bounds
+
+
+def worse_faults(*found: Sensitivity) -> list[tuple[UndetectableFault, Sensitivity]]:
+    """Return the fault of every nudge that is harder to detect, with the sensitivity that it belongs to."""
+    worse: dict[tuple[str, str], tuple[UndetectableFault, Sensitivity]] = {}
+    for one in found:
+        for fault in one.faults:
+            key = fault.nudge.kind, fault.nudge.name
+            known = worse.get(key)
+            if known is None or _hidden(fault) > _hidden(known[0]):
+                worse[key] = fault, one
+    return list(worse.values())
+
+
+def _hidden(fault: UndetectableFault) -> tuple[float, float]:
+    """Return the smallest visible size and the extent of the undetectable range, by which faults are compared."""
+    return fault.visible, fault.high - fault.low
 
 
 class Smallest(NamedTuple):

@@ -66,8 +66,13 @@ def test_keys_are_those_that_scripts_read(checked):
 
 def test_figures_agree_with_each_other(checked):
     found, _ = checked
-    (fault,) = found["smallest_visible"]
-    assert (fault["kind"], fault["name"], fault["unit"]) == ("sensor", "winding", "°C")
+    faults = {(fault["kind"], fault["name"]): fault for fault in found["smallest_visible"]}
+    assert set(faults) == {
+        *((kind, "winding") for kind in ("sensor", "scale", "R", "drift", "delay")),
+        *((kind, state) for kind in ("prior", "Q") for state in ("temperature", "rate")),
+    }
+    # One sensor alone: its reading 10 % too high is the temperature of a hotter motor.
+    assert not faults["scale", "winding"]["seen"] and faults["scale", "winding"]["high"] == 0.5
     states = found["integrity"]["states"]
     assert set(states) == {"temperature", "rate"}
     for state in states.values():
