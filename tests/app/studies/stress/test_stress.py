@@ -77,6 +77,14 @@ def test_the_matrix_can_be_made():
     found = matrix(MODEL, tuning, events.events, asset=True)
     names = [item.name for item in found]
     assert len(set(names)) == len(names) and len(found) > 60
+    assert sum(item.parts == 2 for item in found) == 20
+    for wanted in (
+        "yoke +5 σ from the start",
+        "yoke 3 s late",
+        "yoke drifts 1 σ in 100 s",
+        "speed x1.1 from the start",
+    ):
+        assert wanted in names
     for item in found:
         assert item.parts > 1 or (item.fault is None) != (not item.belief and not item.prior)
         for key, factor in item.belief.items():
@@ -89,11 +97,12 @@ def test_the_matrix_can_be_made():
     assert "speed +25 rad/s" in names and "i_q +2 A" in names and not any(name.startswith("i_d +") for name in names)
     assert not any(item.of_asset for item in matrix(MODEL, tuning, events.events, asset=False))
     # Nothing is done to a sensor that says nothing, nor in its name.
-    mute = [item.name for item in matrix(MODEL, tuning, log_of(MODEL.width, *inputs, *readings[1:]).events, asset=True)]
+    names = [item.name for item in found if item.parts == 1]
+    mute = matrix(MODEL, tuning, log_of(MODEL.width, *inputs, *readings[1:]).events, asset=True)
     assert "winding stuck" in names and "winding and tooth swapped" in names and "clock of winding 1 s behind" in names
-    assert set(mute) == {
-        name for name in names if "winding" not in name or name.startswith(("capacity_", "winding_"))
-    } | {"tooth and yoke swapped"}
+    assert {item.name for item in mute if item.parts == 1} == {
+        name for name in names if "winding" not in name or name.startswith(("capacity_", "winding_", "prior of "))
+    } | {"tooth and yoke swapped", "tooth and yoke swapped from the start"}
 
 
 def test_subject_and_cause():

@@ -1,5 +1,7 @@
 """Nudges of models whose answers are known in closed form, or by Monte Carlo."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.optimize import minimize
@@ -7,8 +9,9 @@ from scipy.stats import binom, norm
 
 from estimators.diagnostics.detector_state import no_baseline
 from estimators.diagnostics.detectors import RATIOS, TESTS
-from estimators.diagnostics.sensitivity import sensitivity
+from estimators.diagnostics.sensitivity import bounds_of, sensitivities, sensitivity, worse_faults
 from estimators.diagnostics.sensitivity.gramian import directions
+from estimators.diagnostics.sensitivity.responses import CATALOGUE, PRIOR, SCALE
 from estimators.diagnostics.sensitivity.visibility import FaultTests, noncentrality, threshold
 from estimators.fold import fold
 from estimators.log import READING, Log
@@ -77,6 +80,39 @@ def test_responses_of_a_walk_in_closed_form(walk):
     # The estimate follows a biased sensor in the end, and is behind the drift by what a reading leaves of it.
     np.testing.assert_allclose(readings(walk, sensor.states)[:, 0], 1.0 - KEPT ** (STEPS + 1), atol=1e-9)
     np.testing.assert_allclose(readings(walk, push.states)[:, 0], -KEPT * DRIFT, atol=1e-8)
+
+
+def test_a_scale_and_a_wrong_prior_of_a_walk_in_closed_form():
+    log = walk_log()
+    y = log.value[: log.n][log.kind[: log.n] == READING, 0]
+    found = sensitivity("ekf", WALK, Tuning.of(WALK), log, kinds=CATALOGUE, begin=PRIOR)
+    scale, prior = (found.faults[found.place(kind, name)] for kind, name in ((SCALE, "level"), (PRIOR, "x")))
+    # Each measurement leaves KEPT of an error of the prediction; one of the measurement moves the estimate by the rest.
+    moved, dnu = 0.0, []
+    for value in y:
+        dnu.append(value - moved)
+        moved += (1.0 - KEPT) * dnu[-1]
+    np.testing.assert_allclose(readings(found, scale.response.innovation)[:, 0], dnu, atol=1e-9)
+    np.testing.assert_allclose(readings(found, prior.response.innovation)[:, 0], -SENSOR, atol=1e-9)
+    np.testing.assert_allclose(readings(found, prior.response.states)[:, 0], KEPT ** (STEPS + 1), atol=1e-9)
+    # Faults that begin later know no prior.
+    assert not {"prior", "Q", "R"} & {fault.nudge.kind for fault in sensitivity(
+        "ekf", WALK, Tuning.of(WALK), log, kinds=CATALOGUE).faults}  # fmt: skip
+
+
+def test_a_bias_from_the_prior_on_is_harder_to_detect_where_the_prior_is_wide():
+    """The first innovations are larger, and so is their variance: a wide prior takes the bias for the state."""
+    wide = replace(WALK, states=(replace(WALK.states[0], std=100.0),))
+    present, onset = sensitivities("ekf", wide, Tuning.of(wide), walk_log(n=4 * N))
+    at_start, later = (found.faults[found.place("sensor", "level")] for found in (present, onset))
+    assert at_start.visible > 1.5 * later.visible
+    worse = {(fault.nudge.kind, fault.nudge.name): one.begin for fault, one in worse_faults(present, onset)}
+    assert worse["sensor", "level"] == PRIOR
+    # R: each end of the range was folded without an alarm, and the next step beyond it with one.
+    noise = present.faults[present.place("R", "level")]
+    assert -1.0 < noise.low < 0.0 < noise.high and noise.visible >= 0.0
+    level = bounds_of(wide, present, onset)["x"]
+    assert level.bound == max(found.bounds.bound[-1, 0] for found in (present, onset))
 
 
 def test_information_and_smallest_visible_faults_in_closed_form(walk):
