@@ -22,6 +22,7 @@ from ..present.result import to_html, to_json, to_text
 from ..studies.fold_result import (
     FoldResult,
     calibration_of,
+    coverage_of,
     dropped,
     episodes_of_recording,
     explained,
@@ -78,6 +79,7 @@ def fold_twin(arguments: Arguments) -> int:
         part,
         smoothing_score(fold, smoothed, part) if smoothed is not None else None,
         nees_of(fold, known, part),
+        coverage_of(fold, part),
     )
     if out is not None:
         _write(out, result, smoothed)

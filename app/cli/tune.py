@@ -15,7 +15,7 @@ from estimators.fit.aims import CRPS, ERROR, LIKELIHOOD
 from estimators.fit.dual import WindowFit, tail, walk
 from estimators.fit.fit import Fitted, fit
 from estimators.fit.objective import FitProgress
-from estimators.fit.recording import Recording
+from estimators.fit.recording import BLOCKS, Recording
 from sources.formats import check_once
 
 from ..live.tunings.tuning_yaml import tuning_yaml
@@ -42,8 +42,10 @@ def tune_twin(arguments: Arguments) -> int:
     wanted = names_of(arguments.fit)
     if not wanted:
         raise ConfigError("--fit names nothing; write for example --fit Q,R")
-    if arguments.blocks < MIN_BLOCKS:
-        raise ConfigError(f"--blocks {arguments.blocks}: must be {MIN_BLOCKS} or more, or nothing is held out")
+    plain = arguments.belief == "none"
+    blocks = (0 if plain else BLOCKS) if arguments.blocks is None else arguments.blocks
+    if blocks < MIN_BLOCKS and blocks:
+        raise ConfigError(f"--blocks {blocks}: must be {MIN_BLOCKS} or more, or 0 to hold nothing out")
     if arguments.predict and arguments.aim not in (CRPS, ERROR):
         raise ConfigError("--predict: is for --aim crps and --aim error; the likelihood is that of every sensor")
     if arguments.save is not None:
@@ -53,11 +55,14 @@ def tune_twin(arguments: Arguments) -> int:
     if arguments.keep is not None:
         check_free(find(arguments.twin), arguments.keep)
     if arguments.windows is not None:
-        return tune_windows(arguments, wanted, arguments.windows)
+        if plain or not blocks:
+            given = "--belief none" if plain else "--blocks 0"
+            raise ConfigError(f"{given}: cannot be used with --windows, whose fits are judged one by one; omit it")
+        return tune_windows(arguments, wanted, arguments.windows, blocks)
     if arguments.every is not None:
         raise ConfigError("--every: is the time between the ends of two --windows; give both")
     twin, recordings = _recordings(arguments)
-    aim = arguments.aim or natural_aim(twin.config)
+    aim = arguments.aim or (LIKELIHOOD if plain else natural_aim(twin.config))
     held = with_held(twin)
     prepare(held)
 
@@ -70,10 +75,11 @@ def tune_twin(arguments: Arguments) -> int:
             recordings,
             wanted=wanted,
             bounds=bounds_of(twin.config, held.model),
-            blocks=arguments.blocks,
+            blocks=blocks,
             aim=aim,
             predict=arguments.predict,
             considered=width_priors(twin.config, held.model, wanted),
+            penalised=not plain,
             progress=state,
         )
 
@@ -167,7 +173,7 @@ def _named(text: str) -> tuple[list[Path], float]:
     return [Path(part) for part in files.split(",")], number
 
 
-def tune_windows(arguments: Arguments, wanted: Sequence[str], windows: str) -> int:
+def tune_windows(arguments: Arguments, wanted: Sequence[str], windows: str, blocks: int) -> int:
     """Fit window after window; return 0 if something was adopted, else 1."""
     window = seconds_of("--windows", windows)
     every = window if arguments.every is None else seconds_of("--every", arguments.every)
@@ -195,7 +201,7 @@ def tune_windows(arguments: Arguments, wanted: Sequence[str], windows: str) -> i
                 window=window,
                 every=every,
                 bounds=bounds_of(twin.config, twin.model),
-                blocks=arguments.blocks,
+                blocks=blocks,
                 progress=state,
             ):
                 # Its rows are many and not needed here.

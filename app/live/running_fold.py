@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from estimators.diagnostics.episodes import Episode
+from estimators.diagnostics.references import hidden_states
 from estimators.errors import EstimatorError
 from estimators.fold import Fold
 from estimators.log import READING, Events, Log
@@ -215,7 +216,7 @@ class Running(ABC):
     def belief(self, t: int | None = None) -> Belief:
         """Return the estimate after the last event at or before a time, ns; None is the present one.
 
-        An earlier one is folded again from the snapshot before it, beside the running fold.
+        An earlier one is folded again from the snapshot before it, beside the running fold. Withheld states are NaN.
         """
         past = None if t is None else self.fold_until(t)
         with self._reading() if past is None else nullcontext():
@@ -224,6 +225,10 @@ class Running(ABC):
             points, clock = fold.points(), fold.clock
         # Clustering takes milliseconds, which the engine's thread must not wait for.
         peaks = peaks_of(points, fold.model.circular) if fold.estimator.peaks is not None else []
+        hidden = hidden_states(fold.model, cov)
+        if hidden.size:
+            mean, points, peaks = mean.copy(), points.copy(), []
+            mean[hidden], points[:, hidden] = np.nan, np.nan
         return Belief(clock, mean, cov, points, tuple(peaks) if len(peaks) > 1 else ())
 
     def fold_until(self, t: int) -> Fold | None:

@@ -108,10 +108,11 @@ HIGH_CORRELATION = 0.9
 def fit_json(fitted: Fitted) -> dict[str, Any]:
     """Return a fit as JSON; null stands for a value that is not a number.
 
-    `entries` have before and after, the 95 % interval, the change in deviations of the estimate (`sigma`), whether
-    they are identifiable, and whether they were left alone; `correlated` has pairs of entries that are hardly
-    identifiable separately. `power` is the exponent of the tempered likelihood, `left_out` the measurements of stuck
-    sensors. `before` and `after` have scores of the fitted and the held-out part: log density per measurement, mean
+    `entries` have before and after, the 95 % interval, the change in deviations of the estimate (`sigma`), whether they
+    are identifiable, whether they were left alone, and by how many deviations the weak prior has moved them (`pull`);
+    `penalised` is whether there is one. `correlated` has pairs of entries that are hardly identifiable separately.
+    `power` is the exponent of the tempered likelihood, `left_out` the measurements of stuck sensors. `before` and
+    `after` have scores of the fitted and the held-out part: log-likelihood, mean per measurement (`log_density`), mean
     NIS per degree of freedom, coverage of the 95 % bands; `sensors` held out in turn, those `withheld`, which the twin
     never uses, and true `states`. `verdict` says whether the fit is proposed, its gain in nats on the held-out blocks,
     and the reasons against it. `widths` has the standard deviation of each parameter to consider after the fit and
@@ -120,7 +121,7 @@ def fit_json(fitted: Fitted) -> dict[str, Any]:
     # Half a second of imports, which a twin without a fit need not wait for.
     from estimators.fit.dual import shift
 
-    names = ("estimator", "proposed", "power", "skipped", "left_out", "folds", "stopped")
+    names = ("estimator", "proposed", "penalised", "power", "skipped", "left_out", "folds", "stopped")
     verdict = fitted.verdict
     found = {name: getattr(fitted, name) for name in names} | {
         "verdict": {"gain": verdict.gain, "error": verdict.error, "reasons": verdict.reasons},
@@ -152,9 +153,10 @@ def correlated(fitted: Fitted) -> list[dict[str, Any]]:
 
 def part_json(part: PartScore) -> dict[str, Any]:
     """Return the scores of one part of the recordings."""
-    found = {name: getattr(part, name) for name in ("log_density", "nis", "coverage")} | {"readings": part.n}
+    names = ("log_density", "nis", "coverage", "log_likelihood")
+    found = {name: getattr(part, name) for name in names} | {"readings": part.n}
     for group in ("sensors", "withheld", "states"):
         scores: Mapping[str, PredictionScore] = getattr(part, group)
-        names = ("unit", "n", "rms", "coverage", "crps")
-        found[group] = {key: {name: getattr(item, name) for name in names} for key, item in scores.items()}
+        of = ("unit", "n", "rms", "coverage", "crps")
+        found[group] = {key: {name: getattr(item, name) for name in of} for key, item in scores.items()}
     return dict(plain(found))

@@ -10,14 +10,22 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from estimators.diagnostics.calibration import BANDS, Calibration, calibrations, truth_calibration
+from estimators.diagnostics.calibration import (
+    BANDS,
+    Calibration,
+    CoverageBin,
+    calibrations,
+    coverage_bins,
+    held_inputs,
+    truth_calibration,
+)
 from estimators.diagnostics.considered_shares import shares_text, variance_shares
 from estimators.diagnostics.consistency import nees
 from estimators.diagnostics.detectors import detector_of
 from estimators.diagnostics.episodes import Episode, episode_json, episodes
 from estimators.diagnostics.episodes.wording import TwinFacts
 from estimators.diagnostics.failure_cause import failures
-from estimators.diagnostics.references import withheld, withheld_reasons
+from estimators.diagnostics.references import WITHHELD, state_grades, withheld, withheld_reasons
 from estimators.diagnostics.score import Fit, Score, health_of, score
 from estimators.diagnostics.sensitivity.suspects import Suspect, in_words, likeliest, suspects
 from estimators.errors import NisusError
@@ -29,12 +37,12 @@ from estimators.plausibility import reasons_by_sensor
 from estimators.registry import find_entry
 from estimators.smoothing.smooth import consistency
 from estimators.smoothing.walk import Smoothed
-from estimators.track import FAILED, HEALTH_NAMES, REASONS, STALE, USED, WAITING, Track
+from estimators.track import FAILED, HEALTH_NAMES, REASONS, STALE, TRACKING, USED, WAITING, Track
 from estimators.tuning import SHARED_ENTRY_ROWS
 from sources.source import WRONG_TIME
 
 from ..format_time import format_time
-from ..present.export.calibration_lines import calibration_lines, health_shares
+from ..present.export.calibration_lines import COVERAGE_HEAD, calibration_lines, coverage_rows, health_shares
 from ..present.result import Figure, Topic, plain
 from ..present.series.columns import units_by_name
 from ..twin.twin import Twin
@@ -99,6 +107,7 @@ class FoldResult:
     part: slice
     smoothing: SmoothingScore | None = None
     nees: TruthNees | None = None
+    coverage: Sequence[CoverageBin] = ()
 
     @property
     def events(self) -> Events:
@@ -167,6 +176,14 @@ def calibration_of(fold: Fold, events: Events, track: Track) -> list[Calibration
     return rows + truth_calibration(fold.model, events, track)
 
 
+def coverage_of(fold: Fold, part: slice) -> list[CoverageBin]:
+    """Return the coverage of the bands in some rows of a fold, by time and operating point."""
+    inputs = held_inputs(fold.model, fold.log.events)[part]
+    return coverage_bins(
+        fold.model, fold.log.events.select(part), fold.track.select(part), inputs, marginal=fold.marginal
+    )
+
+
 def dropped(counts: Mapping[str, int], fold: Fold) -> list[Episode]:
     """Return an episode if many measurements never reached the log."""
     lost = counts.get("stale", 0) + counts.get(WRONG_TIME, 0)
@@ -221,13 +238,14 @@ def fold_json(result: FoldResult) -> dict[str, Any]:
     `inflated` late ones used on arrival, `conditioned` those rejected by a condition of the source's map. `screened`
     counts rejections before the filter by sensor and reason, with these as `condition`. `late` and `degraded_after` are
     decisions on time, with reasons. `health` is the share of time in each state; `start` and `end` bound the scored
-    part, s. `log_likelihood` includes the price of rejected measurements, which `log_likelihood_used` leaves out;
-    `refused` is their share. `calibration` has an entry per sensor row and per state with known truth. `nees` is null
-    without truth (`TruthNees`). `variance` has the share of each state's last variance by considered parameter, and the
-    rest as `noise`; it is empty where none is considered. `episodes` have start and end in seconds of the log (end null
-    while one lasts) and `suspects`. `withheld` has the share of events of each state with a limit (`withhold`) in which
-    its estimate is not shown, and the reason at the end, null where it is shown there. `smoothed` has `rmse`,
-    `coverage` and `consistency` of the smoothed states.
+    part, s. `coverage_bins` has the coverage of the 95 % bands by time and by operating point (`CoverageBin`), with
+    that of the adaptive conformal interval. `log_likelihood` includes the price of rejected measurements, which
+    `log_likelihood_used` leaves out; `refused` is their share. `calibration` has an entry per sensor row and per state
+    with known truth. `nees` is null without truth (`TruthNees`). `variance` has the share of each state's last variance
+    by considered parameter, and the rest as `noise`; it is empty where none is considered. `episodes` have start and
+    end in seconds of the log (end null while one lasts) and `suspects`. `withheld` has the share of events of each
+    state with a limit (`withhold`) in which its estimate is not shown, and the reason at the end, null where it is
+    shown there. `smoothed` has `rmse`, `coverage` and `consistency` of the smoothed states.
     """
     twin, fold, scored, counts = result.twin, result.fold, result.score, result.counts
     smoothing = result.smoothing
@@ -275,8 +293,10 @@ def fold_json(result: FoldResult) -> dict[str, Any]:
         "failure": _failure_cause(fold),
         "account": fold.account(),
         "health": health_of(result.events, result.track, fold.policy),
+        "states": _grades(result),
         "withheld": _withheld(result),
         "calibration": [calibration_json(entry) for entry in result.calibration],
+        "coverage_bins": result.coverage,
         "variance": _variance_shares(fold),
         "episodes": [_episode_json(item) for item in result.episodes],
         "seconds_per_event": result.seconds,
@@ -293,6 +313,27 @@ def _withheld(result: FoldResult) -> dict[str, dict[str, Any]]:
         state.name: {"share": share, "reason": reasons.get(state.name)}
         for state, share in zip(model.shown_states, shares.tolist(), strict=True)
         if state.withhold < np.inf
+    }
+
+
+def _grades(result: FoldResult) -> dict[str, dict[str, Any]]:
+    """Return grade and reason of each state at the end, and the share of time of each grade."""
+    model, track, events, policy = result.twin.model, result.track, result.events, result.fold.policy
+    if not len(track):
+        return {}
+    lasting = [item.episode for item in result.episodes if item.episode.end is None]
+    leading = min(lasting, key=lambda episode: detector_of(episode.cause).severity, default=None)
+    health = int(track.health[-1])
+    cause = leading.text if leading is not None and health != TRACKING else ""
+    grades = state_grades(model, withheld_reasons(model, track, result.fold.u), health, cause)
+    hidden, own = withheld(model, track), health_of(events, track, policy)
+    return {
+        name: {
+            "grade": grade,
+            "reason": reason,
+            "share": health_of(events, track, policy, hidden[:, j]) if hidden[:, j].any() else {**own, WITHHELD: 0.0},
+        }
+        for j, (name, (grade, reason)) in enumerate(grades.items())
     }
 
 
@@ -353,6 +394,15 @@ def fold_topics(result: FoldResult) -> list[Topic]:
     topics = [Topic(f"{result.twin.name}: {result.twin.title}", figures=tuple(_figures(result)))]
     if calibration:
         topics.append(Topic("Calibration, 95 % intervals", tuple(calibration)))
+    if result.coverage:
+        topics.append(
+            Topic(
+                "Coverage of the 95 % bands over time",
+                (),
+                COVERAGE_HEAD,
+                tuple(coverage_rows(result.coverage, result.twin.model)),
+            )
+        )
     return [*topics, episodes_topic(result.episodes)]
 
 

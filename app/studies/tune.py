@@ -113,6 +113,9 @@ BY_LIKELIHOOD = "--aim likelihood fits to all measurements, and leaves true stat
 NOT_WRITTEN = "Nothing is written. --apply writes the values into {}, --out FILE into a copy, --keep NAME as a version."
 MAX_CORRELATION = 0.2  # Of successive innovations, above which a cause is missing
 WELL_TUNED = 0.2  # logarithm of the NIS per degree of freedom within which the values suit
+MIN_PULL = 0.1  # deviations by which the weak prior moves an entry, from which on it is reported
+PLAIN = "Maximum likelihood, without a prior. Entries that the data do not determine have only a bound."
+PENALISED = "Penalised: the weak prior about the twin's values moves {}. --belief none gives plain maximum likelihood."
 TEMPERED = "The likelihood of the fitted blocks has weight {:.2g}; more does not improve held-out predictions."
 
 
@@ -186,8 +189,17 @@ def _entries(twin: Twin, fitted: Fitted) -> Topic:
     ]
     said = [f"Hardly distinguishable: {', '.join(pairs)}."] if pairs else []
     said += [f"{name} was stuck: {n:,} of its readings were left out." for name, n in fitted.left_out.items()]
+    said += [prior_text(fitted)]
     head = ("entry", "before", "after", "95 % interval", "unit", "")
     return Topic(f"{twin.name}: {fitted.estimator}, {fitted.folds} folds", tuple(said), head, tuple(rows))
+
+
+def prior_text(fitted: Fitted) -> str:
+    """Return whether the estimates are penalised, and how far the prior moves them."""
+    if not fitted.penalised:
+        return PLAIN
+    moved = [f"{line.key} by {line.pull:+.1f} σ" for line in fitted.lines if abs(line.pull) >= MIN_PULL]
+    return PENALISED.format(", ".join(moved) or f"no entry by {MIN_PULL:g} σ or more")
 
 
 def _remark(line: EntryFit) -> str:
@@ -214,7 +226,9 @@ def _scores(fitted: Fitted) -> Topic:
         rows.append(row("held out", fitted.before.held_out, fitted.after.held_out))
     band = "in the 95 % band"
     head = ("blocks", "readings", "log density per reading [nats]", "NIS / dof", band, "largest correlation")
-    return Topic("Predictions of the next reading, before and after", (), head, tuple(rows))
+    total = _pair(fitted.before.fitted.log_likelihood, fitted.after.fitted.log_likelihood, ".4f")
+    said = (f"Log-likelihood of the fitted readings: {total} nats.",)
+    return Topic("Predictions of the next reading, before and after", said, head, tuple(rows))
 
 
 def most_correlated(before: PartScore) -> str:

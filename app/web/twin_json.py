@@ -6,6 +6,7 @@ from typing import Any
 
 from estimators.diagnostics.detectors import detector_of
 from estimators.diagnostics.episodes import episode_json
+from estimators.diagnostics.references import state_grades
 from estimators.registry import ESTIMATORS, unfit
 from estimators.track import HEALTH_NAMES
 
@@ -29,7 +30,7 @@ STATUS_FIELDS = (
 
 TRUST_FIELDS = (
     "t", "health", "since", "cause", "sensors", "episodes_open", "lost", "nis", "nis_low", "nis_high", "nis_dof",
-    "nis_judged", "nis_place", "nis_words", "groups", "withheld",
+    "nis_judged", "nis_place", "nis_words", "groups", "withheld", "states",
 )  # fmt: skip
 """Fields of a status that belong to its time."""
 
@@ -56,6 +57,12 @@ def status_json(engine: Running, status: Status | None = None) -> dict[str, Any]
         "began_as": began_as(twin),
         "turned": turned(twin, status.estimator, tuning),
         "health": HEALTH_NAMES[status.health],
+        "states": {
+            name: {"grade": grade, "reason": reason}
+            for name, (grade, reason) in state_grades(
+                engine.model, status.withheld, status.health, status.cause
+            ).items()
+        },
         **nis_json(status.nis),
         "late": {"inflate": twin.late.inflate, "reason": twin.late.reason},
         "degraded_after": {"seconds": twin.degraded.seconds, "reason": twin.degraded.reason},

@@ -3,17 +3,29 @@
 On a real asset no filter is exactly consistent, and with enough measurements every test is significant. So each figure
 is an effect size with a 95 % interval that allows for correlation, and it is reported in words only where the whole
 interval lies beyond a size that matters.
+
+A band may be right on average and wrong at times, so coverage is also given by time and by operating point. Beside it
+stands the adaptive conformal interval, which needs no Gaussian: with the scores s = |e| of the last measurements it has
+the half-width Q(1 - α_t), their quantile, and follows its own errors,
+
+    α_{t+1} = α_t + γ (α - [s_t > Q(1 - α_t)]),
+
+so that over n predictions its coverage is within about 2 / (γ n) of 1 - α, whatever their distribution.
+
+Source: Gibbs & Candès (2021), Adaptive conformal inference under distribution shift, arXiv:2106.00170, (2), prop. 4.1.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from bisect import bisect_left, insort
+from collections import deque
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
 from scipy.special import ndtr
 
-from ..events.batch import READING, Events
+from ..events.batch import INPUT, READING, Events
 from ..model.state_space import StateSpaceModel
 from ..numerics.quantiles import chi_square_quantile, normal_quantile
 from ..track import GATED, HELD_OUT, USED, Track
@@ -259,3 +271,157 @@ def _wide(band: float, share: Interval) -> str:
 
 def _share(share: Interval) -> str:
     return f"{100 * share.value:.3g} % ({100 * share.low:.3g} to {100 * share.high:.3g})"
+
+
+WHOLE, TIME = "whole log", "time"
+"""Values of `CoverageBin.by` other than names of states and inputs."""
+
+HOUR_S = 3600.0
+MIN_HOURS, MAX_HOURS = 3, 48  # Lengths of a log that is divided into hours
+TENTHS = 10  # Parts of a shorter or longer log
+OPERATING_BINS = 5  # Bins of a state or an input, with equally many measurements
+MAX_SUBJECTS = 40  # Rows and states whose coverage is divided
+MAX_OPERATING = 12  # States and inputs by which it is divided
+MAX_ADAPTIVE = 20_000  # Measurements of a row, evenly thinned, that the adaptive interval follows
+ADAPTIVE_RATE = 0.005  # γ
+ADAPTIVE_WINDOW, MIN_ADAPTIVE = 500, 40  # Most and fewest scores of a quantile
+BAND = BANDS[-1]
+
+
+class CoverageBin(NamedTuple):
+    """Coverage of the 95 % bands of one sensor row or state in one part of a log.
+
+    by: `WHOLE`, `TIME` (low and high in s), or the state or input whose value lies between low and high. coverage:
+    share of n values inside, with an interval that allows for correlation. adaptive: share inside the adaptive
+    conformal interval, whose median half-width is `factor` times that of the band; NaN where it has too few values.
+    """
+
+    subject: str
+    role: str
+    by: str
+    low: float
+    high: float
+    n: int
+    coverage: Interval
+    adaptive: float
+    factor: float
+
+
+def held_inputs(model: StateSpaceModel, events: Events) -> np.ndarray:
+    """Return the inputs that hold at each event, (n, nu); NaN before the first of each."""
+    found = np.where((events.kind == INPUT)[:, None], events.value[:, : model.nu], np.nan)
+    last = np.where(np.isfinite(found), np.arange(len(events))[:, None], 0)
+    np.maximum.accumulate(last, axis=0, out=last)
+    return np.take_along_axis(found, last, axis=0)
+
+
+def coverage_bins(
+    model: StateSpaceModel, events: Events, track: Track, inputs: np.ndarray, *, marginal: bool = False
+) -> list[CoverageBin]:
+    """Return the coverage of one-step predictions, held-out sensors and true states, by time and operating point.
+
+    Args:
+        model: The model; of more than `MAX_SUBJECTS` rows and true states the first are divided.
+        events: The folded events, or a window of them.
+        track: Their rows of the track.
+        inputs: Inputs that hold at each event (n, nu), see `held_inputs`.
+        marginal: As in `calibrations`.
+    """
+    before = np.maximum(np.arange(len(events)) - 1, 0)
+    # The estimate before the measurement, which must not sort its own innovation.
+    points = {state.name: track.mean[before, k] for k, state in enumerate(model.shown_states[:MAX_OPERATING])}
+    points |= {item.name: inputs[:, k] for k, item in enumerate(model.inputs[:MAX_OPERATING])}
+    found: list[CoverageBin] = []
+    for count, (subject, role, rows, e) in enumerate(_subjects(model, events, track, marginal)):
+        if count == MAX_SUBJECTS:
+            break
+        seconds = events.t[rows] * 1e-9
+        half = normal_quantile(0.5 + 0.5 * BAND)
+        inside, widths = np.abs(e) <= half, _thinned_adaptive(e)
+        parts = [(WHOLE, float(seconds[0]), float(seconds[-1]), np.ones(rows.size, bool))]
+        parts += _parts(TIME, seconds, _time_edges(events.t[0] * 1e-9, events.t[-1] * 1e-9))
+        for name, values in points.items():
+            own = values[rows]
+            parts += _parts(name, own, _operating_edges(own)) if name != subject or role != "truth" else []
+        for by, low, high, mask in parts:
+            n, width = int(mask.sum()), widths[mask]
+            known = np.isfinite(e[mask]) & ~np.isnan(width)
+            adaptive = float(np.mean(np.abs(e[mask])[known] <= width[known])) if known.any() else np.nan
+            factor = float(np.median(width[known])) / half if known.any() else np.nan
+            coverage = share_interval(inside[mask], e[mask])
+            found.append(CoverageBin(subject, role, by, low, high, n, coverage, adaptive, factor))
+    return found
+
+
+def _subjects(
+    model: StateSpaceModel, events: Events, track: Track, marginal: bool
+) -> Iterator[tuple[str, str, np.ndarray, np.ndarray]]:
+    """Yield name, role, rows (m,) and e (m,) of each sensor row, used and held out, and of each true state."""
+    for i, (sensor, start) in enumerate(zip(model.sensors, model.row_start, strict=True)):
+        own = (events.kind == READING) & (events.channel == i)
+        for k in range(len(sensor.rows)):
+            e = standardised(track, k, marginal)
+            for role, verdicts in (("used", (USED, GATED)), ("held out", (HELD_OUT,))):
+                rows = np.flatnonzero(own & np.isfinite(e) & np.isin(track.verdict, verdicts))
+                if rows.size:
+                    yield model.row_names[start + k], role, rows, e[rows]
+    for item in true_states(model, events, track):
+        with np.errstate(all="ignore"):
+            e = item.error / item.std
+        known = np.isfinite(e)
+        if known.any() and not (model.jump and item.name == model.jump.state):
+            yield item.name, "truth", item.rows[known], e[known]
+
+
+def _time_edges(first: float, last: float) -> np.ndarray:
+    """Return the edges of hours since the start, or of tenths of a log shorter or longer than that, s."""
+    hours = (last - first) / HOUR_S
+    if MIN_HOURS <= hours <= MAX_HOURS:
+        return first + HOUR_S * np.arange(np.ceil(hours) + 1.0)
+    return np.linspace(first, last, TENTHS + 1)
+
+
+def _operating_edges(values: np.ndarray) -> np.ndarray:
+    """Return the edges of bins with about equally many values (n,); fewer where values repeat."""
+    known = values[np.isfinite(values)]
+    if not known.size:
+        return np.zeros(0)
+    edges = np.unique(np.quantile(known, np.linspace(0.0, 1.0, OPERATING_BINS + 1)))
+    return edges if edges.size > 2 else np.zeros(0)
+
+
+def _parts(by: str, values: np.ndarray, edges: np.ndarray) -> list[tuple[str, float, float, np.ndarray]]:
+    """Return name, ends and mask (n,) of each bin that has values; the last one contains its upper end."""
+    found = []
+    for k, (low, high) in enumerate(zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True)):
+        mask = (values >= low) & ((values < high) | (k == edges.size - 2) & (values <= high))
+        if mask.any():
+            found.append((by, low, high, mask))
+    return found
+
+
+def _thinned_adaptive(e: np.ndarray) -> np.ndarray:
+    """Return the half-widths of adaptive intervals for e (n,), NaN for values that are left out."""
+    found, step = np.full(e.size, np.nan), -(-e.size // MAX_ADAPTIVE)
+    found[::step] = adaptive_widths(e[::step])
+    return found
+
+
+def adaptive_widths(e: np.ndarray) -> np.ndarray:
+    """Return the half-width of the adaptive conformal interval before each of e (n,), in σ.
+
+    NaN for the first `MIN_ADAPTIVE`; infinite where it has missed too often.
+    """
+    found = np.full(e.size, np.nan)
+    recent, ordered, alpha = deque[float](), list[float](), 1.0 - BAND
+    for k, score in enumerate(np.abs(e).tolist()):
+        if len(ordered) >= MIN_ADAPTIVE:
+            place = int(np.ceil((1.0 - alpha) * (len(ordered) + 1)))
+            width = np.inf if place > len(ordered) else ordered[place - 1] if place > 0 else 0.0
+            found[k] = width
+            alpha += ADAPTIVE_RATE * (1.0 - BAND - float(score > width))
+        insort(ordered, score)
+        recent.append(score)
+        if len(recent) > ADAPTIVE_WINDOW:
+            del ordered[bisect_left(ordered, recent.popleft())]
+    return found

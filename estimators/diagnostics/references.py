@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import NamedTuple
 
 import numpy as np
 
 from ..events.batch import READING, Events, truth_of
 from ..model.state_space import Input, State, StateSpaceModel
-from ..track import HELD_OUT, Track
+from ..track import HEALTH_NAMES, HELD_OUT, WAITING, Track
 
 
 class Reference(NamedTuple):
@@ -68,6 +68,41 @@ def withheld(model: StateSpaceModel, track: Track) -> np.ndarray:
     limits = np.array([state.withhold for state in model.shown_states])
     found: np.ndarray = track.std > limits / HALF_WIDTH
     return found
+
+
+def shown_track(model: StateSpaceModel, track: Track) -> Track:
+    """Return a track with NaN in place of the withheld estimates, for views of the mean."""
+    hidden = withheld(model, track)
+    return track._replace(mean=np.where(hidden, np.nan, track.mean)) if hidden.any() else track
+
+
+def hidden_states(model: StateSpaceModel, cov: np.ndarray) -> np.ndarray:
+    """Return the indices of the states whose estimate is withheld, given a covariance (nx, nx) or variances (1, nx)."""
+    variance = np.diag(cov) if len(cov) == model.nx else cov[0]
+    limits = np.array([state.withhold for state in model.shown_states])
+    found: np.ndarray = np.asarray(model.shown)[variance[model.shown] > (limits / HALF_WIDTH) ** 2]
+    return found
+
+
+WITHHELD = "withheld"  # Grade of a state beside those of health
+
+
+def state_grades(
+    model: StateSpaceModel, reasons: Mapping[str, str], health: int, cause: str
+) -> dict[str, tuple[str, str]]:
+    """Return grade and reason of each shown state: `WITHHELD`, or the health of the twin with its cause.
+
+    Args:
+        model: The model.
+        reasons: Those of `withheld_reasons`.
+        health: Health of the twin; before the first measurement nothing is withheld.
+        cause: Its cause.
+    """
+    own = HEALTH_NAMES[health], cause
+    return {
+        state.name: (WITHHELD, reasons[state.name]) if state.name in reasons and health != WAITING else own
+        for state in model.shown_states
+    }
 
 
 def withheld_reasons(model: StateSpaceModel, track: Track, u: np.ndarray) -> dict[str, str]:

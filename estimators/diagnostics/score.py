@@ -32,7 +32,7 @@ from .consistency import NisVerdict
 from .field_pictures import Picture
 from .health import MAX_ROWS_PER_READING, MEAN, PROBABILITY, HealthPolicy, nis_bounds, normal_nis
 from .intervals import scale_interval
-from .references import held_out_references, true_states
+from .references import WITHHELD, held_out_references, true_states
 
 BASELINE_CLIP_SIGMA = 6.0  # σ at which the innovations of a row are clipped in a baseline (episodes/baseline.py)
 MAX_NIS_FACTOR = (1.0 + LIMITS.width) ** 2  # bands that are wrong by as much as the calibration reports
@@ -249,8 +249,8 @@ def spread_ratio(track: Track, window: int) -> float:
     return 1.0 / square if square > 0.0 else np.nan
 
 
-def health_of(events: Events, track: Track, policy: HealthPolicy) -> dict[str, float]:
-    """Return the share of time in each state of health.
+def health_of(events: Events, track: Track, policy: HealthPolicy, hidden: np.ndarray | None = None) -> dict[str, float]:
+    """Return the share of time in each state of health, and as `withheld` that of the rows `hidden` (n,), if given.
 
     A state holds until the next event. Where that is long after the last measurement, the twin is degraded and then
     stale from the times of its policy on, as a running one is; a recording has no event then.
@@ -258,6 +258,8 @@ def health_of(events: Events, track: Track, policy: HealthPolicy) -> dict[str, f
     held = np.diff(events.t, append=events.t[-1:]) * 1e-9
     if not held.any():
         held = np.ones(len(events))
+    total, covered = held.sum(), 0.0 if hidden is None else held[hidden].sum()
+    held = held if hidden is None else np.where(hidden, 0.0, held)
     seconds = np.bincount(track.health, held, len(HEALTH_NAMES))
     later = held
     for limit, code, better in (
@@ -269,4 +271,5 @@ def health_of(events: Events, track: Track, policy: HealthPolicy) -> dict[str, f
         seconds -= np.bincount(track.health, beyond, len(HEALTH_NAMES))
         seconds[code] += beyond.sum()
         later = later - beyond
-    return dict(zip(HEALTH_NAMES, (np.maximum(seconds, 0.0) / held.sum()).tolist(), strict=True))
+    found = dict(zip(HEALTH_NAMES, (np.maximum(seconds, 0.0) / total).tolist(), strict=True))
+    return found if hidden is None else found | {WITHHELD: float(covered / total)}

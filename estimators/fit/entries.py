@@ -43,7 +43,9 @@ SPREAD = {
 """Deviation of the weak prior, in logarithms: two decades of a variance is one of a standard deviation."""
 
 
-DIGITS = 4  # Significant digits of a proposed value: finer than any interval
+DIGITS, PLAIN_DIGITS = 4, 6
+"""Significant digits of a value: finer than any interval, and to compare a plain maximum with that of others."""
+
 MAX_FACTOR = 1e4  # Largest factor between a value and that of the twin where nothing else bounds it
 
 
@@ -72,9 +74,9 @@ class TuningEntry:
         """Return the value at a point of the scale, within its range."""
         return float(np.clip(np.exp(x) if self.log else x, self.low, self.high))
 
-    def written(self, x: float) -> float:
-        """Return the value at a point, rounded to `DIGITS`."""
-        return float(np.clip(float(f"{self.outward(x):.{DIGITS}g}"), self.low, self.high))
+    def written(self, x: float, digits: int = DIGITS) -> float:
+        """Return the value at a point, rounded to so many significant digits."""
+        return float(np.clip(float(f"{self.outward(x):.{digits}g}"), self.low, self.high))
 
     @property
     def group(self) -> str:

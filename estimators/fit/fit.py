@@ -19,9 +19,9 @@ from ..log import READING
 from ..registry import find_estimator
 from ..tuning import Tuning
 from .aims import LIKELIHOOD, WITNESSES, aim_of, sensors_in_turn
-from .entries import Setting, Skipped, TuningEntry, entries_of, with_values
+from .entries import DIGITS, PLAIN_DIGITS, Setting, Skipped, TuningEntry, entries_of, with_values
 from .judge import POWERS, FitVerdict, Tempered, Worth, tempered, worths
-from .objective import ALONE, SEARCH_FOLDS, SHARES, FitProgress, Go, Objective, maximise, search
+from .objective import ALONE, SEARCH_FOLDS, SHARES, FitProgress, Go, Objective, maximise, polished, search
 from .recording import BLOCKS, Recording, held_out_rows, until_last_fitted, without_queries, without_stuck
 from .uncertainty import (
     LikelihoodCurvature,
@@ -48,7 +48,7 @@ class EntryFit(NamedTuple):
     told: whether the data identify it; an entry that they do not identify is reset where that costs nothing (`alone`),
     and then `after` is `before`; otherwise only a bound is known. deviation: of the estimate, on the logarithm if
     `log`. profile: whether the interval is by profile likelihood. edge: whether the value is at an end of its range, so
-    that the optimum may lie beyond.
+    that the optimum may lie beyond. pull: deviations by which the weak prior has moved the value; 0 without it.
     """
 
     key: str
@@ -63,6 +63,7 @@ class EntryFit(NamedTuple):
     alone: bool = True
     profile: bool = False
     edge: bool = False
+    pull: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -72,7 +73,8 @@ class Fitted:
     `setting` is the fitted tuning (and the prior, where it was fitted); `verdict` is whether it is proposed. `power` is
     that of the likelihood. correlation (k, k) is that of the estimates of `lines`, NaN for reset entries. `left_out` is
     the number of readings of stuck sensors, by sensor. `stopped` is whether the search was ended early. `widths` is the
-    uncertainty of the parameters to consider, None if there are none.
+    uncertainty of the parameters to consider, None if there are none. `penalised` is whether the objective has the weak
+    prior; without it the values are those of maximum likelihood.
     """
 
     estimator: str
@@ -88,6 +90,7 @@ class Fitted:
     folds: int
     stopped: bool = False
     widths: ParameterWidths | None = None
+    penalised: bool = True
 
     @property
     def proposed(self) -> bool:
@@ -106,6 +109,7 @@ def fit(
     aim: str = LIKELIHOOD,
     predict: Sequence[str] = (),
     considered: Mapping[str, float] | None = None,
+    penalised: bool = True,
     go: Go = lambda folds: True,
     progress: FitProgress | None = None,
 ) -> Fitted:
@@ -122,6 +126,8 @@ def fit(
         aim: Aim of the fit, see aims.py.
         predict: Sensors to hold out, for an aim that does; each in turn by default.
         considered: Parameters whose uncertainty is wanted, with their deviations without data, in their units.
+        penalised: Whether the objective has the weak prior. Without it all entries are fitted, also those that the data
+            do not identify, with the full weight of the likelihood.
         go: Called from any thread with the number of folds done since; returns whether to continue.
         progress: Kept up to date from any thread; with its `stop` set, the best point so far is judged and returned.
 
@@ -155,7 +161,9 @@ def fit(
             into.append(item._replace(log=part, held_out=held_out_rows(part, blocks)))
     lean = [until_last_fitted(item) for item in lean]
     aimed = aim_of(aim, estimator, Setting(tuning, None), lean, tuple(predict))
-    objective = Objective(estimator, tuning, tuple(entries), tuple(lean), aim=aimed, go=count, progress=progress)
+    objective = Objective(
+        estimator, tuning, tuple(entries), tuple(lean), aim=aimed, go=count, progress=progress, penalised=penalised
+    )
     alone = find_estimator(estimator, tuning.model).family in ALONE
     judging = len(recordings) * (2 if not blocks else 1 + len(POWERS))
     judging *= 1 + len(sensors_in_turn(Setting(tuning, None), whole))
@@ -170,8 +178,11 @@ def fit(
     kept, x, value = objective, *(search if alone else maximise)(objective, objective.start)
     expect(x.size, 0)
     shape = curvature(kept, x)
+    if not penalised and not alone:
+        x = polished(kept, x, shape.cov)
+        value, shape = kept.value(x), curvature(kept, x)
     identified = _identified(kept, shape)
-    for _ in range(MAX_RESETS):
+    for _ in range(MAX_RESETS if penalised else 0):
         if progress.stop:
             break
         reset = _resettable(kept, x, value, shape, identified)
@@ -193,14 +204,15 @@ def fit(
         identified = _identified(kept, shape)
 
     def setting_at(point: np.ndarray) -> Setting:
-        values = [item.written(value) for item, value in zip(kept.entries, point.tolist(), strict=True)]
+        digits = DIGITS if penalised else PLAIN_DIGITS
+        values = [item.written(value, digits) for item, value in zip(kept.entries, point.tolist(), strict=True)]
         return with_values(tuning, kept.entries, values)
 
     progress.expect(judging)
     progress.judging = True
     chosen = tempered(
         kept, x, shape, setting_at, lambda settings: worths(estimator, settings, whole, count, aimed), aim=aimed,
-        powers=POWERS if blocks and x.size else (1.0,),
+        powers=POWERS if blocks and x.size and penalised else (1.0,),
     )  # fmt: skip
     widths = None
     if considered:
@@ -221,6 +233,7 @@ def fit(
         folds=progress.folds,
         stopped=progress.stop,
         widths=widths,
+        penalised=penalised,
     )
 
 
@@ -268,6 +281,9 @@ def _lines(
         low, high = np.array(kept.limits).T[:, :, None]
         ends = np.clip(np.stack([x - Z * deviation, x + Z * deviation], axis=1), low, high)
     place = {item.key: i for i, item in enumerate(kept.entries)} if x.size else {}
+    # To first order, from the maximum of the likelihood on the parabola.
+    pulls = -shape.cov @ (kept.precision * (chosen.x - kept.start)) if x.size and kept.penalised else np.zeros(x.size)
+    digits = DIGITS if kept.penalised else PLAIN_DIGITS
     lines = []
     for item in entries:
         if item.key not in place:
@@ -280,7 +296,7 @@ def _lines(
                 key=item.key,
                 unit=item.unit,
                 before=item.start,
-                after=item.written(at),
+                after=item.written(at, digits),
                 low=item.outward(float(ends[i, 0])),
                 high=item.outward(float(ends[i, 1])),
                 deviation=float(deviation[i]),
@@ -289,6 +305,7 @@ def _lines(
                 alone=False,
                 profile=bool(profiled[i]),
                 edge=_at_edge(item, at),
+                pull=float(pulls[i] / deviation[i]),
             )
         )
     correlation = np.full((len(lines), len(lines)), np.nan)

@@ -97,6 +97,11 @@ class PartScore(NamedTuple):
     states: dict[str, PredictionScore]
     correlation: dict[str, float] = {}
 
+    @property
+    def log_likelihood(self) -> float:
+        """Log density of all its measurements, nats."""
+        return float(self.terms.sum())
+
 
 class Worth(NamedTuple):
     """Scores of the fitted part, and of the held-out part."""

@@ -1,6 +1,7 @@
 """How often the bank of tests speaks of an asset that is as the model says, against the rate that was asked for.
 
-    python -m tests.benchmarks.false_alarms 10_000_000
+    python -m tests.benchmarks.false_alarms 10_000_000    so many measurements of all cases
+    python -m tests.benchmarks.false_alarms --days 30     so many days of three twins, for each of four families
 
 Truth, start and readings are drawn from the filter's own model, so every alarm is a false one. What the rate is
 counted against is the asset's time; an onset is counted for each row and cause.
@@ -8,9 +9,10 @@ counted against is the asset's time; an onset is counted for each row and cause.
 
 from __future__ import annotations
 
-import sys
+import argparse
 from collections import Counter
 from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from time import perf_counter
 from typing import NamedTuple
@@ -20,13 +22,14 @@ from scipy.stats import poisson
 
 from estimators.compiled.context import steps_of
 from estimators.compiled.model import compile_model
-from estimators.diagnostics.detectors import ALARM_NAMES, IMPOVERISHED
+from estimators.diagnostics.detectors import ALARM_NAMES, IMPOVERISHED, SENSOR_FLAGS
 from estimators.diagnostics.health import HealthPolicy
 from estimators.fold import Fold
 from estimators.log import READING, TICK, Events, Log
 from estimators.model.state_space import StateSpaceModel
 from estimators.models import MODELS
 from estimators.numerics.jit import jit_brief
+from estimators.track import HEALTH_NAMES, SUSPECT
 from estimators.tuning import Tuning
 
 from ..support import SECOND
@@ -148,7 +151,12 @@ def onsets(fold: Fold) -> Counter[str]:
     poor = track.flags & IMPOVERISHED != 0
     if count := int(np.sum(poor[1:] & ~poor[:-1])):
         found["(impoverished)"] += count
-    return found
+    silent = track.flags & ((1 << SENSOR_FLAGS) - 1)
+    found["(silent)"] += int(sum(int(began).bit_count() for began in silent[1:] & ~silent[:-1]))
+    for code in range(SUSPECT, len(HEALTH_NAMES)):
+        own = track.health == code
+        found[f"({HEALTH_NAMES[code]})"] += int(np.sum(own[1:] & (track.health[:-1] < SUSPECT)))
+    return +found
 
 
 def count_alarms(case: Case, readings: int, every: float, seed: int) -> tuple[float, Counter[str]]:
@@ -190,14 +198,70 @@ def false_alarms(readings: int = 300_000) -> Iterator[BenchmarkRow]:
         yield from rows(readings, every)
 
 
+FAMILIES: dict[str, tuple[str, dict[str, float]]] = {
+    "kf, ekf": ("ekf", {}),
+    "ukf": ("ukf", {}),
+    "enkf": ("enkf", {"members": 50}),
+    "pf": ("pf", {"particles": 1000}),
+}
+"""Estimator of each family, and its options; a linear model has the KF in place of the EKF."""
+
+TWINS = (MODELS["motor_winding"], ring(4, 2, linear=True), WARM)
+"""Right twins; each reports once a second."""
+
+PROCESSES = 2
+
+
+def day_counts(family: str, twin: int, days: float, seed: int) -> tuple[float, float, Counter[str]]:
+    """Return days and seconds of computing of one of `TWINS`, and the onsets by cause."""
+    begun = perf_counter()
+    estimator, options = FAMILIES[family]
+    model = TWINS[twin]
+    case = Case("kf" if model.linear and estimator == "ekf" else estimator, model, 1.0, 1.0, options=options)
+    seconds, found = count_alarms(case, round(days * DAY) * len(model.sensors), DAY, seed)
+    return seconds / DAY, perf_counter() - begun, found
+
+
+def family_days(days: float = 30.0) -> Iterator[BenchmarkRow]:
+    """False alarms a day of twins without a fault, by family and twin, where one is allowed."""
+    jobs = [(family, twin) for family in FAMILIES for twin in range(len(TWINS))]
+    with ProcessPoolExecutor(PROCESSES) as pool:
+        told = [
+            pool.submit(day_counts, family, model, days / len(TWINS), seed) for seed, (family, model) in enumerate(jobs)
+        ]
+        for family in FAMILIES:
+            total, past, took = Counter[str](), 0.0, 0.0
+            for (of, twin), item in zip(jobs, told, strict=True):
+                if of != family:
+                    continue
+                length, spent, found = item.result()
+                total, past, took = total + found, past + length, took + spent
+                yield _days_row(f"{family}, {TWINS[twin].name}", length, spent, found)
+            yield _days_row(f"{family}, all", past, took, total, (Bound("alarms a day", 1.0),))
+
+
+def _days_row(
+    name: str, days: float, spent: float, found: Counter[str], bounds: tuple[Bound, ...] = ()
+) -> BenchmarkRow:
+    alarms = sum(count for cause, count in found.items() if cause in ALARM_NAMES)
+    act = sum(found[f"({HEALTH_NAMES[code]})"] for code in range(SUSPECT, len(HEALTH_NAMES)))
+    figures = {"days": days, "alarms": alarms, "alarms a day": alarms / days, "to act on": act, "time [s]": spent}
+    causes = ", ".join(f"{cause} {count}" for cause, count in found.most_common())
+    return BenchmarkRow(name, figures, bounds, causes)
+
+
 def main() -> None:
-    """Count alarms on as many readings as the command line names."""
+    """Count alarms on as many measurements, or as many days, as the command line names."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("measurements", nargs="?", type=int, default=300_000)
+    parser.add_argument("--days", type=float, help="days of each family, on twins that report once a second")
+    given = parser.parse_args()
 
-    def of_so_many() -> Iterator[BenchmarkRow]:
+    def counted() -> Iterator[BenchmarkRow]:
         """False alarms on consistent measurements."""
-        return false_alarms(int(sys.argv[1]))
+        return family_days(given.days) if given.days else false_alarms(given.measurements)
 
-    run_sections([of_so_many])
+    run_sections([counted])
 
 
 if __name__ == "__main__":

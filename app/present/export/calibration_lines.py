@@ -6,7 +6,8 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from estimators.diagnostics.calibration import BANDS, Calibration
+from estimators.diagnostics.calibration import BAND, BANDS, TIME, WHOLE, Calibration, CoverageBin
+from estimators.diagnostics.intervals import Interval
 from estimators.model.state_space import StateSpaceModel
 from estimators.tuning import SHARED_ENTRY_ROWS
 
@@ -37,6 +38,42 @@ def calibration_lines(found: Sequence[Calibration], model: StateSpaceModel) -> l
         beyond = f"beyond the limits {len(bad)}, as {bad[0].words[0]}" if bad else "none beyond the limits"
         lines.append(f"{group}, {counted}: in the 95 % band {inside:.3g} %; {beyond}")
     return lines
+
+
+COVERAGE_HEAD = ("", "", "in the 95 % band", "lowest in time", "lowest by operating point", "adaptive interval")
+
+
+def coverage_rows(found: Sequence[CoverageBin], model: StateSpaceModel) -> list[tuple[str, ...]]:
+    """Return a line for each sensor row and true state: its coverage, and the worst by time and operating point."""
+    units = {state.name: state.unit for state in model.shown_states} | {item.name: item.unit for item in model.inputs}
+    units[TIME] = "s"
+    begun = min((item.low for item in found if item.by == TIME), default=0.0)
+    found = [item._replace(low=item.low - begun, high=item.high - begun) if item.by == TIME else item for item in found]
+    rows = []
+    for entry in (entry for entry in found if entry.by == WHOLE):
+        own = [item for item in found if (item.subject, item.role) == (entry.subject, entry.role)]
+        parts = [[item for item in own if item.by == TIME], [item for item in own if item.by not in (TIME, WHOLE)]]
+        adaptive = f"{entry.factor:.2f} × band: {_percent(entry.adaptive)}" if np.isfinite(entry.factor) else "-"
+        worst = (worst_part(part, units) for part in parts)
+        rows.append((entry.subject, entry.role, _share(entry.coverage), *worst, adaptive))
+    return rows
+
+
+def worst_part(parts: Sequence[CoverageBin], units: Mapping[str, str]) -> str:
+    """Return the part with the lowest coverage among those that are below 95 % beyond chance."""
+    low = [item for item in parts if item.coverage.high < BAND]
+    if not low:
+        return f"none of {len(parts)} below" if parts else "-"
+    item = min(low, key=lambda item: item.coverage.high)
+    name = "" if item.by == TIME else f"{item.by} "
+    unit = units.get(item.by, "")
+    place = f"{name}{item.low:.4g} to {item.high:.4g}{f' {unit}' if unit not in ('', '1') else ''}"
+    return f"{_share(item.coverage)} at {place}"
+
+
+def _share(share: Interval) -> str:
+    interval = f" ({100 * share.low:.3g} to {100 * share.high:.3g})" if np.isfinite(share.low) else ""
+    return f"{_percent(share.value)}{interval}"
 
 
 def _figures(entry: Calibration) -> str:

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from estimators.diagnostics.references import HALF_WIDTH
 from estimators.errors import LARGEST, ConfigError
 from estimators.forecast import Crossing, Forecast, first_time, forecast
 from estimators.log import INPUT, Events
@@ -124,8 +125,9 @@ def forecast_json(model: StateSpaceModel, here: Here, found: Forecast) -> dict[s
     """Return a forecast as JSON.
 
     `now` is in seconds of the log, `t` in seconds from then; `states` have mean and the edges of their ± 1σ and ± 2σ
-    bands, a probability its mean alone; `inputs` are those that hold now. Of each limit: whether it is looked at from
-    below, the probability of it over the horizon and at each time, and when that is 10, 50 and 90 %.
+    bands, a probability its mean alone; the mean is null where the state is withheld. `inputs` are those that hold now.
+    Of each limit: whether it is looked at from below, the probability of it over the horizon and at each time, and when
+    that is 10, 50 and 90 %.
     """
     bands = {}
     for j, state in enumerate(model.shown_states):
@@ -134,9 +136,8 @@ def forecast_json(model: StateSpaceModel, here: Here, found: Forecast) -> dict[s
         # Digits down to a hundredth of σ: a place on the earth needs more than a temperature.
         digits = int(np.clip(3 + math.ceil(math.log10(size / spread)), 4, 14)) if spread > 0.0 < size else 8
         edges = {} if int(model.shown[j]) == model.mode else dict(zip(_EDGES, found.bands[:, :, j].T, strict=True))
-        bands[state.name] = {
-            name: listed(values, digits) for name, values in {"mean": found.mean[:, j], **edges}.items()
-        }
+        mean = np.where(found.std[:, j] > state.withhold / HALF_WIDTH, np.nan, found.mean[:, j])
+        bands[state.name] = {name: listed(values, digits) for name, values in {"mean": mean, **edges}.items()}
     return {
         "now": here.t * 1e-9,
         "revision": here.revision,

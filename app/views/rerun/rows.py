@@ -9,6 +9,7 @@ import rerun as rr
 
 from estimators.diagnostics.detector_state import SENSOR_STATES, sensor_states_over_time
 from estimators.diagnostics.field_pictures import Picture
+from estimators.diagnostics.references import shown_track
 from estimators.log import READING, Events
 from estimators.track import FAILED, HEALTH_NAMES, Track
 
@@ -145,7 +146,7 @@ class RerunRows:
             self._draw_lines(drawn.t, part, width, drawn)
             self._draw_states(drawn, part, past)
             for ellipse in self._ellipses:
-                ellipse.draw(self.sink, drawn.t, part, drawn, past)
+                ellipse.draw(self.sink, drawn.t, shown_track(self.model, part), drawn, past)
         if dots is None or dots.any():
             drawn, part = (events, track) if dots is None else (events.select(dots), track.select(dots))
             self._draw_dots(drawn, part, width)

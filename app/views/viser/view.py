@@ -5,8 +5,11 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 from urllib.parse import parse_qs
+
+from estimators.diagnostics.references import shown_track
 
 from ...live.running_fold import Running
 from ...present.drawing.colors import THEMES
@@ -118,7 +121,7 @@ class ViserView:
     def _take(self, pull: Any) -> None:
         if isinstance(self.stage.scene, FIELD_SCENES):
             self.stage.scene.take(pull)
-        self.history.take(pull)
+        self.history.take(replace(pull, track=shown_track(self.engine.model, pull.track)))
         self.history.trim()
 
     def _waits(self, now: float, there: Sequence[str]) -> bool:

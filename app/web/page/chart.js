@@ -89,9 +89,10 @@ export class Chart {
     this.names = Object.keys(what.series);
     this.reading = element("output", { class: "reading", title: what.help });
     this.ramp = what.ramp && element("span", { class: "ramp", role: "img" }, element("span"), element("i", { style: `background: linear-gradient(to right, ${what.ramp().colors.join()})` }), element("span"));
+    this.grade = element("span", { class: "grade", hidden: true });
     this.head = element(
       "header", {},
-      element("h3", {}, what.title), element("span", { class: "unit" }, what.unit ?? ""),
+      this.grade, element("h3", {}, what.title), element("span", { class: "unit" }, what.unit ?? ""),
       what.note ? element("span", { class: "note" }, what.note) : null,
       what.control ?? null, this.ramp ?? null,
       element("span", { class: "space" }), this.reading,
@@ -104,6 +105,14 @@ export class Chart {
     this.notes = []; // notes of users, [{from, text}] by time
     this.visible = true;
     this.empty = true;
+  }
+
+  // Mark a state that is not tracking, and why.
+  graded({ grade, reason }, sign) {
+    this.grade.hidden = ["tracking", "waiting"].includes(grade);
+    this.grade.dataset.health = grade;
+    setText(this.grade, sign);
+    setAttribute(this.grade, "title", `${grade}${reason ? `: ${reason}` : ""}`);
   }
 
   // Once it is in the page, and has a size. withTime: labels of time below it.

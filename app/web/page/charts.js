@@ -4,6 +4,7 @@ import { Chart, declared, TimeAxis } from "./chart.js";
 import { $, element, setAttribute, setText } from "./dom.js";
 import { Pins, Previous, Smoothed, Strong } from "./layers.js";
 import { Stream } from "./stream.js";
+import { SIGNS } from "./trust.js";
 
 const DENSITY = 1.6; // px to a group of rows
 const REDRAW_AFTER_MS = 500; // ms without a frame
@@ -190,7 +191,12 @@ export class Charts {
   update(status) {
     setText($("no-rows"), status.t === null ? status.cause || "waiting for the first measurement" : "");
     if (status.integrity) this.integrity = status.integrity;
-    if (status.withheld) this.withheld = status.withheld;
+    const { states, withheld } = { ...status, ...status.moment };
+    if (withheld) this.withheld = withheld;
+    for (const chart of states ? this.charts : []) {
+      const own = states[chart.what.state];
+      if (own) chart.graded(own, own.grade === "withheld" ? "⊘ withheld" : SIGNS[own.grade]);
+    }
     if (status.nis_dof) this.nisDof = status.nis_dof;
   }
 

@@ -223,7 +223,14 @@ function scores({ before, after }) {
 }
 
 const about = ({ result, revision, events, elapsed }) =>
-  element("p", { class: "about" }, `From run ${revision}, ${result.estimator}: ${result.folds} folds of ${events.toLocaleString("en")} events in ${compact(elapsed, 2)} s.${result.power < 1 ? ` The likelihood of the fitted blocks is weighted by ${compact(result.power, 2)}, also in the intervals: a larger weight does not improve the held-out predictions.` : ""}`);
+  element("p", { class: "about" }, `From run ${revision}, ${result.estimator}: ${result.folds} folds of ${events.toLocaleString("en")} events in ${compact(elapsed, 2)} s.${result.power < 1 ? ` The likelihood of the fitted blocks is weighted by ${compact(result.power, 2)}, also in the intervals: a larger weight does not improve the held-out predictions.` : ""} ${prior(result)}`);
+
+// Whether the values are those of maximum likelihood, and the entries that the prior moves most.
+function prior({ penalised, entries }) {
+  if (!penalised) return "Plain maximum likelihood.";
+  const moved = entries.filter((line) => Math.abs(line.pull) >= 0.1).map((line) => `${words(line.key)} by ${line.pull.toFixed(1)} σ`);
+  return `Penalised: a weak prior about the twin's values moves ${moved.join(", ") || "no entry by 0.1 σ or more"}.`;
+}
 
 // Dual estimation: fits of the last window beside the running twin. A proposal is a card above the sliders, to be accepted
 // or dismissed; every fit, with its evidence, is in a panel.

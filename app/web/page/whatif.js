@@ -287,6 +287,7 @@ function fan(whatif, state) {
       const [x, upper, lower, mean] = ["x", "upper2", "lower2", "forecast"].map(value);
       const now = whatif.times?.[0] ?? 0;
       if (!(x >= now)) return "";
+      if (!Number.isFinite(mean) && upper > lower) return `in ${span(x - now)} withheld: ± ${compact((upper - lower) / 2, 2)}${spaced(state.unit)}`;
       return `in ${span(x - now)} ${withDeviation(mean, (upper - lower) / 2, state.unit)}`;
     },
   };

@@ -38,6 +38,7 @@ function chartOf(charts, state) {
   return {
     key: `state:${state.name}`,
     title: state.label,
+    state: state.name,
     unit: bracketed(state.unit),
     note: !state.rows.length ? "not measured" : state.rows.length > drawn.length ? `measurements of ${drawn.length} of ${state.rows.length} sensors` : null,
     help: "Estimate ± 2σ; in brackets the protection level: the largest error that one undetected fault can cause",
