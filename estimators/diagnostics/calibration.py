@@ -20,6 +20,7 @@ from __future__ import annotations
 from bisect import bisect_left, insort
 from collections import deque
 from collections.abc import Iterator, Sequence
+from itertools import islice
 from typing import NamedTuple
 
 import numpy as np
@@ -282,7 +283,7 @@ TENTHS = 10  # Parts of a shorter or longer log
 OPERATING_BINS = 5  # Bins of a state or an input, with equally many measurements
 MAX_SUBJECTS = 40  # Rows and states whose coverage is divided
 MAX_OPERATING = 12  # States and inputs by which it is divided
-MAX_ADAPTIVE = 20_000  # Measurements of a row, evenly thinned, that the adaptive interval follows
+MAX_COVERED = 20_000  # Measurements of a row or state that count; of more, evenly spaced ones
 ADAPTIVE_RATE = 0.005  # γ
 ADAPTIVE_WINDOW, MIN_ADAPTIVE = 500, 40  # Most and fewest scores of a quantile
 BAND = BANDS[-1]
@@ -332,12 +333,12 @@ def coverage_bins(
     points = {state.name: track.mean[before, k] for k, state in enumerate(model.shown_states[:MAX_OPERATING])}
     points |= {item.name: inputs[:, k] for k, item in enumerate(model.inputs[:MAX_OPERATING])}
     found: list[CoverageBin] = []
-    for count, (subject, role, rows, e) in enumerate(_subjects(model, events, track, marginal)):
-        if count == MAX_SUBJECTS:
-            break
+    for subject, role, rows, e in islice(_subjects(model, events, track, marginal), MAX_SUBJECTS):
+        step = -(-rows.size // MAX_COVERED)
+        rows, e = rows[::step], e[::step]
         seconds = events.t[rows] * 1e-9
         half = normal_quantile(0.5 + 0.5 * BAND)
-        inside, widths = np.abs(e) <= half, _thinned_adaptive(e)
+        inside, widths = np.abs(e) <= half, adaptive_widths(e)
         parts = [(WHOLE, float(seconds[0]), float(seconds[-1]), np.ones(rows.size, bool))]
         parts += _parts(TIME, seconds, _time_edges(events.t[0] * 1e-9, events.t[-1] * 1e-9))
         for name, values in points.items():
@@ -382,10 +383,13 @@ def _time_edges(first: float, last: float) -> np.ndarray:
 
 
 def _operating_edges(values: np.ndarray) -> np.ndarray:
-    """Return the edges of bins with about equally many values (n,); fewer where values repeat."""
+    """Return the edges of bins with about equally many values (n,), or of a bin for each of few levels."""
     known = values[np.isfinite(values)]
     if not known.size:
         return np.zeros(0)
+    levels = np.unique(known)
+    if 1 < levels.size <= OPERATING_BINS:
+        return np.append(levels, levels[-1])
     edges = np.unique(np.quantile(known, np.linspace(0.0, 1.0, OPERATING_BINS + 1)))
     return edges if edges.size > 2 else np.zeros(0)
 
@@ -397,13 +401,6 @@ def _parts(by: str, values: np.ndarray, edges: np.ndarray) -> list[tuple[str, fl
         mask = (values >= low) & ((values < high) | (k == edges.size - 2) & (values <= high))
         if mask.any():
             found.append((by, low, high, mask))
-    return found
-
-
-def _thinned_adaptive(e: np.ndarray) -> np.ndarray:
-    """Return the half-widths of adaptive intervals for e (n,), NaN for values that are left out."""
-    found, step = np.full(e.size, np.nan), -(-e.size // MAX_ADAPTIVE)
-    found[::step] = adaptive_widths(e[::step])
     return found
 
 

@@ -69,7 +69,8 @@ def test_an_estimate_with_too_wide_a_band_is_withheld(tmp_path: Path, nisus: Com
     bands = HALF_WIDTH * pq.read_table(out)["rate_std"].to_numpy()
     limit = 0.5 * float(bands.min() + bands.max())
     path = drive(tmp_path, text=f"{DRIVE}withhold: {{rate: {limit}}}\n")
-    found = nisus("fold", path, "--out", out, "--json").json["withheld"]["rate"]
+    said = nisus("fold", path, "--out", out, "--json").json
+    found, states = said["withheld"]["rate"], said["states"]
     table = pq.read_table(out).to_pandas()
     hidden = bands > limit
     assert 0 < hidden.sum() < len(table)
@@ -79,12 +80,22 @@ def test_an_estimate_with_too_wide_a_band_is_withheld(tmp_path: Path, nisus: Com
     np.testing.assert_array_equal(table["withheld"] == "rate", hidden)
     assert found["share"] == pytest.approx(hidden.mean())
     assert (found["reason"] is None) == (not hidden[-1])
+    # Three rows, a second apart, of which the last has no time.
+    seconds = np.diff(table["seconds"], append=table["seconds"].iloc[-1])
+    assert states["rate"]["share"]["withheld"] == pytest.approx(seconds[hidden].sum() / seconds.sum())
+    assert states["temperature"]["share"] == said["health"] | {"withheld": 0.0}
+    assert all(sum(state["share"].values()) == pytest.approx(1.0) for state in states.values())
 
 
 def test_the_reason_of_a_withheld_estimate_names_what_left_the_fitted_range(tmp_path: Path, nisus: CommandLine) -> None:
     limits = "withhold: {rate: 1e-3}\nvalid: {temperature: {min: -10, max: 20}}\n"
     path = drive(tmp_path, text=DRIVE + limits)
-    reason = json.loads(nisus("fold", path, "--json").out)["withheld"]["rate"]["reason"]
+    found = nisus("fold", path, "--json").json
+    reason = found["withheld"]["rate"]["reason"]
+    assert found["states"]["rate"] | {"share": 0} == {"grade": "withheld", "reason": reason, "share": 0}
+    assert (
+        found["states"]["temperature"]["grade"] == "suspect" and "outside" in found["states"]["temperature"]["reason"]
+    )
     assert re.fullmatch(
         r"outside the fitted range \(temperature 4\d\.\d+ °C, fitted at -10 to 20\), ± [\d.]+ °C/s", reason
     )

@@ -7,9 +7,16 @@ import pytest
 from scipy.signal import lfilter
 from scipy.stats import chi2, norm
 
-from estimators.diagnostics.calibration import CalibrationLimits, calibrations, truth_calibration
-from estimators.events.batch import READING, TRUTH, Events
-from estimators.model.state_space import State
+from estimators.diagnostics.calibration import (
+    CalibrationLimits,
+    adaptive_widths,
+    calibrations,
+    coverage_bins,
+    held_inputs,
+    truth_calibration,
+)
+from estimators.events.batch import INPUT, READING, TRUTH, Events
+from estimators.model.state_space import Input, State
 from estimators.track import GATED, HELD_OUT, MISSING, USED, Track
 from tests.models import FLOAT_AND_SONAR
 from tests.support import SECOND
@@ -172,3 +179,82 @@ def test_few_readings_have_figures_and_no_words():
     assert calibrations(MODEL, events, track) == [] == truth_calibration(MODEL, events, track)
     (said,) = of(np.zeros(50)).words
     assert said.startswith("float: bands far too wide: the readings never differ from the prediction (scale 0.00")
+
+
+def settled(q: float, r: float) -> tuple[float, float]:
+    """Return predicted variance and gain of a random walk's filter in steady state."""
+    P = 0.5 * (q + np.sqrt(q * q + 4.0 * q * r))
+    return P, P / (P + r)
+
+
+def test_coverage_by_time_and_operating_point_is_that_of_a_filter_whose_noise_changes():
+    """The filter expects r; the sensor has twice as much in the second half, which its input tells.
+
+    The error before a measurement has the variance V' = (1 - K)² V + K² r' + q, its innovation V + r'.
+    """
+    n, q, r = 10_000, 0.1, 1.0
+    P, gain = settled(q, r)
+    rng = np.random.default_rng(8)
+    noise = np.where(np.arange(n) < n // 2, r, 2.0 * r)
+    error, variance = np.sqrt(P) * rng.standard_normal(), P
+    innovation, expected = np.empty(n), np.empty(n)
+    for k in range(n):
+        v = np.sqrt(noise[k]) * rng.standard_normal()
+        innovation[k] = error + v
+        expected[k] = 2.0 * norm.cdf(1.959964 * np.sqrt((P + r) / (variance + noise[k]))) - 1.0
+        error = (1.0 - gain) * error - gain * v + np.sqrt(q) * rng.standard_normal()
+        variance = (1.0 - gain) ** 2 * variance + gain**2 * noise[k] + q
+    model = replace(MODEL, inputs=(Input("load", "kW", 0.0),))
+    events, track = read(innovation / np.sqrt(P + r))
+    load = np.where(np.arange(n) < n // 2, 0.0, 7.0)[:, None]
+    found = coverage_bins(model, events, track, load)
+    tenths = [item for item in found if item.by == "time"]
+    loads = [item for item in found if item.by == "load"]
+    assert [item.n for item in tenths] == [n // 10] * 10 and [item.low for item in loads] == [0.0, 7.0]
+    parts = [(item, expected[k * n // 10 : (k + 1) * n // 10].mean()) for k, item in enumerate(tenths)]
+    parts += [(item, expected[k * n // 2 : (k + 1) * n // 2].mean()) for k, item in enumerate(loads)]
+    assert expected[0] == pytest.approx(0.95) and expected[-1] < 0.87
+    for item, share in parts:
+        # Positive correlation of neighbours, below 0.4, doubles the variance of the share at most.
+        assert abs(item.coverage.value - share) < 4.0 * np.sqrt(2.0 * share * (1.0 - share) / item.n)
+    inside = [item.coverage.low <= share <= item.coverage.high for item, share in parts]
+    # Of 12 intervals of 95 %, 8 or fewer hold with a probability of 2e-4.
+    assert sum(inside) >= 9
+    # Only the second half is below 95 % beyond chance; there the adaptive interval is as much wider as it must be.
+    assert [item.coverage.high < 0.95 for item in tenths] == [False] * 5 + [True] * 5
+    late = tenths[-1]
+    wide = norm.ppf(0.975) / norm.ppf(0.5 + 0.5 * expected[-1])
+    assert late.factor == pytest.approx(wide, rel=0.1) and abs(late.adaptive - 0.95) < 0.02
+
+
+def test_adaptive_intervals_are_those_of_their_definition_and_hold_for_any_distribution():
+    """Gibbs & Candès, proposition 4.1: over n predictions the error is off by (max(α, 1 - α) + γ) / (γ n) at most."""
+    e = np.random.default_rng(9).standard_cauchy(5000) * np.linspace(1.0, 3.0, 5000)
+    widths = adaptive_widths(e)
+    alpha, rate, window, first = 0.05, 0.005, 500, 40
+    assert np.isnan(widths[:first]).all()
+    level = alpha
+    for k in range(first, 1500):
+        scores = np.sort(np.abs(e[max(0, k - window) : k]))
+        place = int(np.ceil((1.0 - level) * (scores.size + 1)))
+        expected = np.inf if place > scores.size else scores[place - 1]
+        assert widths[k] == expected
+        level += rate * (alpha - (abs(e[k]) > expected))
+    missed = np.mean(np.abs(e[first:]) > widths[first:])
+    assert abs(missed - alpha) <= (1.0 - alpha + rate) / (rate * (e.size - first))
+
+
+def test_a_log_of_hours_is_divided_into_hours():
+    found = coverage_bins(MODEL, *read(normal(6, 4 * 3600 + 1)), np.zeros((4 * 3600 + 1, 0)))
+    assert [(item.low, item.high) for item in found if item.by == "time"] == [
+        (3600.0 * k, 3600.0 * (k + 1)) for k in range(4)
+    ]
+
+
+def test_inputs_hold_until_they_change():
+    t = np.arange(5)
+    kind = np.array([READING, INPUT, READING, INPUT, READING], np.int8)
+    value = np.array([[9.0, 9.0], [1.0, np.nan], [9.0, 9.0], [np.nan, 2.0], [9.0, 9.0]])
+    model = replace(MODEL, inputs=(Input("a", "V", 0.0), Input("b", "V", 0.0)))
+    held = held_inputs(model, Events(t, t, kind, np.zeros(5, np.int32), value))
+    np.testing.assert_array_equal(held, [[np.nan] * 2, [1.0, np.nan], [1.0, np.nan], [1.0, 2.0], [1.0, 2.0]])
