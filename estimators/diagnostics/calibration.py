@@ -288,6 +288,9 @@ ADAPTIVE_RATE = 0.005  # γ
 ADAPTIVE_WINDOW, MIN_ADAPTIVE = 500, 40  # Most and fewest scores of a quantile
 BAND = BANDS[-1]
 
+LOW_COVERAGE = float(2.0 * ndtr(normal_quantile(0.5 + 0.5 * BAND) / (1.0 + LIMITS.width)) - 1.0)
+"""Coverage of a band that is too narrow by the size that matters."""
+
 
 class CoverageBin(NamedTuple):
     """Coverage of the 95 % bands of one sensor row or state in one part of a log.

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from estimators.diagnostics.calibration import BAND, BANDS, TIME, WHOLE, Calibration, CoverageBin
+from estimators.diagnostics.calibration import BANDS, LOW_COVERAGE, TIME, WHOLE, Calibration, CoverageBin
 from estimators.diagnostics.intervals import Interval
 from estimators.model.state_space import StateSpaceModel
 from estimators.tuning import SHARED_ENTRY_ROWS
@@ -60,10 +60,10 @@ def coverage_rows(found: Sequence[CoverageBin], model: StateSpaceModel) -> list[
 
 
 def worst_part(parts: Sequence[CoverageBin], units: Mapping[str, str]) -> str:
-    """Return the part with the lowest coverage among those that are below 95 % beyond chance."""
-    low = [item for item in parts if item.coverage.high < BAND]
+    """Return the part with the lowest coverage among those whose whole interval is below `LOW_COVERAGE`."""
+    low = [item for item in parts if item.coverage.high < LOW_COVERAGE]
     if not low:
-        return f"none of {len(parts)} below" if parts else "-"
+        return f"none of {len(parts)} below {_percent(LOW_COVERAGE)}" if parts else "-"
     item = min(low, key=lambda item: item.coverage.high)
     name = "" if item.by == TIME else f"{item.by} "
     unit = units.get(item.by, "")
