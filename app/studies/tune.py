@@ -11,6 +11,7 @@ from config.tunings import named
 from estimators.diagnostics.sensitivity.responses import digits
 from estimators.fit.aims import WITNESSES
 from estimators.fit.dual import WindowFit, against, shift
+from estimators.fit.entries import PLAIN_DIGITS
 from estimators.fit.fit import EntryFit, Fitted
 from estimators.fit.judge import PartScore, PredictionScore, Worth
 from estimators.fit.objective import FitProgress
@@ -176,7 +177,7 @@ def _entries(twin: Twin, fitted: Fitted) -> Topic:
         (
             line.key,
             _number(line.before),
-            _number(line.after),
+            _number(line.after) if fitted.penalised else f"{line.after:,.{PLAIN_DIGITS}g}",
             "" if line.alone else f"{_number(line.low)} to {_number(line.high)}",
             line.unit,
             _remark(line),

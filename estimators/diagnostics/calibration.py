@@ -320,7 +320,13 @@ def held_inputs(model: StateSpaceModel, events: Events) -> np.ndarray:
 
 
 def coverage_bins(
-    model: StateSpaceModel, events: Events, track: Track, inputs: np.ndarray, *, marginal: bool = False
+    model: StateSpaceModel,
+    events: Events,
+    track: Track,
+    inputs: np.ndarray,
+    *,
+    marginal: bool = False,
+    most: int = MAX_COVERED,
 ) -> list[CoverageBin]:
     """Return the coverage of one-step predictions, held-out sensors and true states, by time and operating point.
 
@@ -330,6 +336,7 @@ def coverage_bins(
         track: Their rows of the track.
         inputs: Inputs that hold at each event (n, nu), see `held_inputs`.
         marginal: As in `calibrations`.
+        most: Measurements of a row or state that count.
     """
     before = np.maximum(np.arange(len(events)) - 1, 0)
     # The estimate before the measurement, which must not sort its own innovation.
@@ -337,7 +344,7 @@ def coverage_bins(
     points |= {item.name: inputs[:, k] for k, item in enumerate(model.inputs[:MAX_OPERATING])}
     found: list[CoverageBin] = []
     for subject, role, rows, e in islice(_subjects(model, events, track, marginal), MAX_SUBJECTS):
-        step = -(-rows.size // MAX_COVERED)
+        step = -(-rows.size // most)
         rows, e = rows[::step], e[::step]
         seconds = events.t[rows] * 1e-9
         half = normal_quantile(0.5 + 0.5 * BAND)

@@ -7,7 +7,18 @@ from typing import Any
 
 import numpy as np
 
-from estimators.diagnostics.calibration import LIMITS, Calibration, calibrations, reading_words, standardised
+from estimators.diagnostics.calibration import (
+    LIMITS,
+    TIME,
+    WHOLE,
+    Calibration,
+    CoverageBin,
+    calibrations,
+    coverage_bins,
+    held_inputs,
+    reading_words,
+    standardised,
+)
 from estimators.diagnostics.innovations import (
     Autocorrelation,
     autocorrelation,
@@ -23,6 +34,7 @@ from estimators.numerics.quantiles import chi_square_quantile
 from estimators.track import FAILED, GATED, HELD_OUT, SCREENED, USED, Track
 from estimators.tuning import Tuning
 
+from ...present.export.calibration_lines import worst_part
 from ...present.series.columns import rows_of
 
 LAGS = 50
@@ -33,6 +45,7 @@ SLOW, SLOW_SHARE = 25, 0.02
 """A slow error is the part of the innovations' variance that remains over so many lags, if it exceeds this share."""
 
 MAX_ROWS = 24  # rows that are analysed, as many as have charts
+COVERED = 4000  # measurements of a row whose coverage is divided: a question takes a tenth of a second
 
 
 def rows_json(
@@ -45,6 +58,8 @@ def rows_json(
     """
     found = calibrations(model, events, track, gate=tuning.gate, marginal=marginal) if len(events) else []
     known = {item.subject: item for item in found}
+    bins = coverage_bins(model, events, track, held_inputs(model, events), marginal=marginal, most=COVERED)
+    units = {state.name: state.unit for state in model.shown_states} | {item.name: item.unit for item in model.inputs}
     rows = dict(zip(model.row_names, () if tuning.baseline is None else tuning.baseline, strict=False))
     said = []
     for name, s, k in rows_of(model)[:MAX_ROWS]:
@@ -56,7 +71,7 @@ def rows_json(
             edge = float(np.sqrt(chi_square_quantile(tuning.gate, len(model.sensors[s].rows))))
         clipped = np.clip(e, -edge, edge)
         correlated = autocorrelation(clipped, LAGS)
-        bins, pairs, ranks = histogram(e), quantile_pairs(e), rank_histogram(e)
+        shares, pairs, ranks = histogram(e), quantile_pairs(e), rank_histogram(e)
         n = int(np.isfinite(e).sum())
         times = events.t[judged]
         period = float(times[-1] - times[0]) * 1e-9 / (times.size - 1) if times.size > 1 else np.nan
@@ -71,11 +86,12 @@ def rows_json(
                 "period": number(period),
                 "mean": number(np.nanmean(e) if n else np.nan, 3),
                 "std": number(np.nanstd(e) if n else np.nan, 3),
-                "histogram": {"low": bins.low, "high": bins.high, "counts": bins.counts.tolist()},
+                "histogram": {"low": shares.low, "high": shares.high, "counts": shares.counts.tolist()},
                 "autocorrelation": {"r": listed(correlated.r, 3), "bound": number(correlated.bound, 3)},
                 "quantiles": listed(pairs, 4),
                 "ranks": {"counts": ranks.counts.tolist(), "low": number(ranks.low), "high": number(ranks.high)},
                 "refused": _share(track, own, (GATED, FAILED, SCREENED)),
+                "coverage": _coverage([item for item in bins if item.subject == name and item.role != "truth"], units),
                 **_figures(calibration),
                 "verdict": words,
                 "tone": tone,
@@ -152,6 +168,22 @@ def _figures(calibration: Calibration | None) -> dict[str, Any]:
         "scale": calibration.scale, "bias": calibration.bias, "correlation": calibration.correlation,
     }  # fmt: skip
     return {name: [number(value, 3) for value in interval] for name, interval in figures.items()}
+
+
+def _coverage(bins: list[CoverageBin], units: dict[str, str]) -> dict[str, Any]:
+    """Return coverage with its interval by time, the lowest by operating point in words, and the adaptive interval's.
+
+    `t` has the ends of each part, s. `adaptive` has the coverage of the adaptive conformal interval and its width
+    relative to the band.
+    """
+    parts = [item for item in bins if item.by == TIME]
+    whole = next((item for item in bins if item.by == WHOLE), None)
+    return {
+        "t": [[item.low, item.high] for item in parts],
+        "share": [[number(value, 3) for value in item.coverage] for item in parts],
+        "operating": worst_part([item for item in bins if item.by not in (TIME, WHOLE)], units),
+        "adaptive": None if whole is None else [number(whole.adaptive, 3), number(whole.factor, 3)],
+    }
 
 
 def number(value: Any, digits: int = 6) -> float | None:

@@ -94,6 +94,7 @@ function rowCard(row, marginal, open, turned) {
       figure("Distribution", "good: bars along the curve", distribution(row.histogram, `Distribution of the innovations of ${name}, beside N(0, 1)`)),
       figure("Autocorrelation", "good: within the band", stems(row.autocorrelation, `Autocorrelation of the innovations of ${name}`, row.period ?? 1)),
       third,
+      figure("Coverage over time", "good: bars across 95 %", coverage(row.coverage, `Coverage of the 95 % band of ${name} over time`)),
     ),
     element("p", { class: "faint" }, figures(row)),
   );
@@ -109,6 +110,9 @@ function figures(row) {
   if (row.correlation?.[0] != null) parts.push(`lag-1 correlation ${interval(row.correlation)}`);
   if (row.refused !== null) parts.push(`${compact(100 * row.refused, 2)} % rejected`);
   if (!row.used) parts.push("held out");
+  const [inside, factor] = row.coverage.adaptive ?? [null, null];
+  if (/ at /.test(row.coverage.operating)) parts.push(`lowest coverage ${words(row.coverage.operating)}`);
+  if (factor !== null) parts.push(`adaptive 95 % interval ${compact(factor, 2)} × band, ${compact(100 * inside, 3)} % inside`);
   return parts.join(" · ");
 }
 
@@ -291,6 +295,23 @@ function flat({ counts, low, high }, label) {
   const { node, x, y } = frame([0, counts.length], [0, top], label, { xs: [[0.5, "lowest"], [counts.length - 0.7, "highest"]], ys: [[0], [high]].map(([v]) => [v, compact(v, 2)]) });
   counts.forEach((count, k) => node.append(svg("rect", { class: "bar", x: x(k) + 1, width: x(1) - x(0) - 2, y: y(count), height: y(0) - y(count) })));
   node.append(svg("rect", { class: "bounds", x: x(0), width: x(counts.length) - x(0), y: y(high), height: y(Math.max(0, low)) - y(high) }));
+  return node;
+}
+
+// Share of measurements inside the 95 % band in each part of the time, with its interval.
+function coverage({ t, share }, label) {
+  const low = Math.min(0.8, ...share.map(([value, under]) => under ?? value));
+  const [from, to] = [t[0]?.[0] ?? 0, t.at(-1)?.[1] ?? 1];
+  const { node, x, y } = frame([from, to], [Math.max(0, low - 0.02), 1], label, { xs: [[from, `−${span(to - from)}`], [to, "now"]], ys: [[0.95, "95 %"], [1, ""], [low, `${Math.round(100 * low)} %`]] });
+  const texts = node.querySelectorAll('text[text-anchor="middle"]');
+  texts[0]?.setAttribute("text-anchor", "start");
+  texts[1]?.setAttribute("text-anchor", "end");
+  node.append(svg("line", { class: "expected", x1: x(from), x2: x(to), y1: y(0.95), y2: y(0.95) }));
+  share.forEach(([value, under, over], k) => {
+    const middle = x((t[k][0] + t[k][1]) / 2);
+    if (under !== null) node.append(svg("line", { class: "stem", x1: middle, x2: middle, y1: y(under), y2: y(over) }));
+    node.append(svg("circle", { class: "dot", r: 2.4, cx: middle, cy: y(value) }));
+  });
   return node;
 }
 
