@@ -94,7 +94,7 @@ function rowCard(row, marginal, open, turned) {
       figure("Distribution", "good: bars along the curve", distribution(row.histogram, `Distribution of the innovations of ${name}, beside N(0, 1)`)),
       figure("Autocorrelation", "good: within the band", stems(row.autocorrelation, `Autocorrelation of the innovations of ${name}`, row.period ?? 1)),
       third,
-      figure("Coverage over time", "good: bars across 95 %", coverage(row.coverage, `Coverage of the 95 % band of ${name} over time`)),
+      figure("Coverage", "good: 95 % at all times", coverage(row.coverage, `Coverage of the 95 % band of ${name} over time`)),
     ),
     element("p", { class: "faint" }, figures(row)),
   );

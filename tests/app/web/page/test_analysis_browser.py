@@ -127,14 +127,20 @@ def test_how_likely_a_limit_is_passed_stands_at_the_foot_of_its_chart(page):
     until(page, "!window.nisus.panes.whatif.found.chosen.i_q")
 
 
-def test_diagnose_draws_what_the_rows_say(page):
+def test_diagnose_draws_what_the_rows_say(page, tmp_path):
     page.get_by_role("tab", name="Diagnose").click()
     until(page, "window.nisus.diagnosed > 0")
     for name in ("winding", "tooth", "yoke"):
         row = page.get_by_label(f"Innovations of {name}", exact=True)
-        assert row.locator("svg").count() == 3 and row.locator("figcaption").count() == 3
+        assert row.locator("svg").count() == 4 and row.locator("figcaption").count() == 4
         assert "good: " in row.locator("figcaption").first.inner_text()
-        assert row.locator("svg rect.bar").count() > 5 and row.locator("svg line.stem").count() == 50
+        assert row.locator("svg rect.bar").count() > 5
+        # Correlations at 50 lags; coverage of ten parts of the time, each with its interval.
+        assert row.locator("svg[aria-label^=Autocorrelation] line.stem").count() == 50
+        over = row.locator("svg[aria-label^=Coverage]")
+        assert over.locator("circle").count() == over.locator("line.stem").count() == 10
+        assert "adaptive 95 % interval" in row.inner_text()
+    page.locator("#diagnose").screenshot(path=tmp_path / "diagnose.png")
     assert page.locator("#diagnose svg.map rect").count() == 16
     # What takes many folds comes later.
     wait_for(lambda: page.get_by_label("Smallest visible faults", exact=True).count() == 1, PATIENCE)

@@ -3,6 +3,8 @@
 import numpy as np
 import pytest
 
+from app.studies.analysis.forecast import Forecasts, question_from_json
+from app.web.streams import belief_json
 from estimators.log import READING
 from tests.app.scripted import pull_all, wait_for
 from tests.app.web.page.browsed import PATIENCE, running, until
@@ -168,3 +170,14 @@ def test_a_withheld_estimate_has_its_reason_in_place_of_a_value_and_a_band_witho
         assert sum("withheld" in text for text in page.evaluate(shown)) == 1
         column = "window.nisus.charts.live.column('{}:rate').filter(Number.isFinite).length"
         assert page.evaluate(column.format("mean")) == 0 < page.evaluate(column.format("upper"))
+        # The mark at its name, with the reason; the other state has the health of the twin.
+        marks = "[...document.querySelectorAll('.grade:not([hidden])')].map((own) => [own.innerText, own.title])"
+        until(page, f"{marks}.length === 2")
+        (_, own), (said, other) = sorted(page.evaluate(marks), key=lambda mark: "withheld" in mark[0])
+        assert own.startswith("suspect: temperature is ") and (said, other) == ("⊘ withheld", f"withheld: {reason}")
+        # Two states against each other and a forecast leave it out as well; the forecast keeps its band.
+        engine = session.engine
+        assert np.isnan(engine.belief().mean[1]) and np.isfinite(engine.belief().mean[0])
+        assert belief_json(engine, [0, 1]) is None
+        told = Forecasts(engine).ask(question_from_json({"horizon": 5.0}, engine.model))["states"]
+        assert set(told["rate"]["mean"]) == {None} and None not in told["rate"]["upper2"] + told["temperature"]["mean"]
