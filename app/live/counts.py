@@ -20,6 +20,8 @@ class RowCounts:
 
     def __init__(self, model: StateSpaceModel) -> None:
         self._sensors = model.sensor_names
+        self.by_sensor = np.zeros((len(self._sensors), len(VERDICT_NAMES)), np.int64)
+        """Rows by sensor and verdict, as last counted."""
         self._forgotten = np.zeros((len(self._sensors), len(VERDICT_NAMES) + len(REASONS)), np.int64)
         self.again()
 
@@ -44,6 +46,7 @@ class RowCounts:
         self._settled = settled
         table = self._counts + self._of(track, channel, slice(settled, len(track)))
         each, reasons = np.split(table, [len(VERDICT_NAMES)], axis=1)
+        self.by_sensor = each
         totals = each.sum(axis=0)
         counts = {"readings": int(totals[1:].sum())}
         counts |= {name: int(count) for name, count in zip(VERDICT_NAMES[1:], totals[1:], strict=True)}

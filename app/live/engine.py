@@ -226,6 +226,7 @@ class Engine(Running):
             "speed": paced.speed if paced is not None else None,
             "seekable": paced is not None,
             "span": span_of(self.source),
+            "heard": self._idle_ticks.since,
         }
 
     # On the engine's own thread

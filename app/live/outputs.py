@@ -187,7 +187,9 @@ class Status:
     they are known. `compiling` are the filters that are not compiled yet: seconds since each was begun, None for one
     that waits; `awaited` is the one for which a refold waits. `withheld` has the reason of each state whose estimate
     is withheld. `nis` is the verdict on the last window, `sensor_nis`
-    (sensors,) the mean NIS per degree of freedom of each sensor's recent measurements.
+    (sensors,) the mean NIS per degree of freedom of each sensor's recent measurements, `sensor_rows` (sensors,
+    verdicts) how many have which verdict. `heard` is the monotonic time at which the last event arrived, s; `mean` and
+    `std` (shown states,) and `inputs` (nu,) are those after it.
     """
 
     estimator: str
@@ -221,3 +223,8 @@ class Status:
     compiling: Mapping[str, float | None] = field(default_factory=dict)
     withheld: Mapping[str, str] = field(default_factory=dict)
     sensor_nis: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    sensor_rows: np.ndarray = field(default_factory=lambda: np.zeros((0, 0), np.int64))
+    heard: float = 0.0
+    mean: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    std: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    inputs: np.ndarray = field(default_factory=lambda: np.zeros(0))

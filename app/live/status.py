@@ -65,6 +65,8 @@ def status_of(
     leading = account.leading(dict(zip(model.sensor_names, states, strict=True)))
     layer = source.faults if isinstance(source, Faulty) else None
     optional = {**late, "recovered": fold.recoveries()}
+    columns = track.mean, track.std
+    mean, std = (column[last].copy() if last >= 0 else np.full(column.shape[1], np.nan) for column in columns)
     return Status(
         **fields,
         t=t,
@@ -90,6 +92,10 @@ def status_of(
         latency_p50_ms=watchers.latency.percentile(50.0),
         integrity=watchers.integrity.of(fields["revision"]),
         faults=layer.status() if layer is not None else (),
+        sensor_rows=rows.by_sensor,
+        mean=mean,
+        std=std,
+        inputs=fold.u.copy(),
     )
 
 
@@ -156,6 +162,9 @@ def past_status(engine: Running, watchers: Watchers, t: int) -> Status:
         nis=nis,
         withheld=withheld_reasons(model, track, inputs),
         sensor_nis=sensor_nis,
+        mean=track.mean[-1].copy(),
+        std=track.std[-1].copy(),
+        inputs=inputs,
     )
 
 

@@ -81,17 +81,18 @@ class IdleTicks:
     def __init__(self, tick: float) -> None:
         """`tick`: seconds without events before the first prediction."""
         self._tick = tick
-        self._since = time.monotonic()
+        self.since = time.monotonic()
+        """Monotonic time of the last arrival, s."""
         self._newest: int | None = None
 
     def broken(self, newest: int) -> None:
         """Note an arrival; `newest` is the time of the log's newest event, ns."""
-        self._since = time.monotonic()
+        self.since = time.monotonic()
         self._newest = newest
 
     def asks(self, source: Source, last: int) -> int | None:
         """Return the time (ns) to predict for, after the log's last event at `last`; None for not yet."""
-        silent = time.monotonic() - self._since
+        silent = time.monotonic() - self.since
         if silent < self._tick:
             return None
         if source.live:

@@ -22,8 +22,9 @@ from typing import Any
 import h11
 import uvicorn
 from starlette.applications import Starlette
+from starlette.requests import Request
 from starlette.responses import JSONResponse, PlainTextResponse
-from starlette.routing import BaseRoute
+from starlette.routing import BaseRoute, Route
 from starlette.types import ASGIApp, Receive, Scope, Send
 from starlette.websockets import WebSocket
 from uvicorn.protocols.http.h11_impl import H11Protocol
@@ -175,7 +176,7 @@ class Door:
         self._token = secrets.token_urlsafe(32)
         self._shown = ShownApplication(self._no_twin, uuid.uuid4().hex)
         self._page: ASGIApp | None = None
-        self._own = Starlette()
+        self._own = Starlette(routes=[Route("/healthz", _alive)])
         self._own.router.default = self._behind
         self._own.router.redirect_slashes = False
         self._loop: asyncio.AbstractEventLoop | None = None
@@ -210,7 +211,7 @@ class Door:
     @property
     def has_gallery(self) -> bool:
         """Whether it has routes of its own."""
-        return bool(self._own.routes)
+        return self._page is not None
 
     def add_gallery(self, routes: Sequence[BaseRoute], page: ASGIApp) -> None:
         """Add routes that are always served, and the page for when no twin runs; before the start."""
@@ -269,6 +270,11 @@ class Door:
             await JSONResponse({"error": NO_TWIN}, 409)(scope, receive, send)
         else:
             await PlainTextResponse(f"Nisus: {NO_TWIN}.\n", 404)(scope, receive, send)
+
+
+async def _alive(request: Request) -> PlainTextResponse:
+    """Answer that the process serves, whatever its twin does."""
+    return PlainTextResponse("ok\n")
 
 
 class BoundedProtocol(H11Protocol):

@@ -24,6 +24,9 @@ LOOPBACK_HOST = re.compile(r"(127\.0\.0\.1|localhost|\[::1\])(:\d{1,5})?", re.IG
 
 STAGE = "/viser/"
 
+OPEN_PATHS = ("/healthz", "/readyz")
+"""For supervisors of processes, which have no token; they tell nothing of the twin."""
+
 REFUSED_HOST = "Nisus: this Host is not served; open the page at 127.0.0.1.\n"
 REFUSED_ORIGIN = "Nisus: requests from other sites are refused.\n"
 REFUSED_TOKEN = "Nisus: open the page at the address, with its token, that `nisus run` printed.\n"
@@ -83,7 +86,7 @@ class Gate:
             return _refusal(REFUSED_ORIGIN)
         if exchange:
             return self._exchange(same_site)
-        if shows_token or framed or self._is_known(headers) or self._is_former(headers):
+        if scope["path"] in OPEN_PATHS or shows_token or framed or self._is_known(headers) or self._is_former(headers):
             return None
         return _refusal(REFUSED_TOKEN)
 

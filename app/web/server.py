@@ -6,27 +6,32 @@ import asyncio
 import gzip
 import sys
 import threading
+import time
 import uuid
+from collections.abc import AsyncIterator
 from concurrent.futures import Future
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
 from starlette.requests import Request
-from starlette.responses import FileResponse, PlainTextResponse, Response
+from starlette.responses import FileResponse, PlainTextResponse, Response, StreamingResponse
 from starlette.routing import BaseRoute, Mount, Route, WebSocketRoute
 from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocket
 
 from estimators.errors import ConfigError, NisusError
 
+from ..live.engine import STATUS_PERIOD_S
 from ..live.faults import catalogue_json
 from ..live.running_fold import Running
 from ..live.runs.refits import Refits
 from ..present.drawing.colors import EITHER, THEMES
 from ..present.export.alarm_guide import alarms_text, as_html
 from ..present.series.series import Series
+from ..present.state_message import StateMessage, state_message, state_schema
 from ..studies.analysis.diagnosis import Diagnosis
 from ..studies.analysis.forecast import Forecasts, question_from_json
 from .commands_json import command_from_json
@@ -50,8 +55,15 @@ COMPILE_POLL_PERIOD_S = 0.5
 CHART_FILES = sorted(path.name for path in (PAGE / "charts").glob("*.js"))
 """Kinds of charts, one per file."""
 
+HEARTBEAT_S = 1.0
+"""Between two messages of a state that does not change: its age does."""
+
 IMMUTABLE = "public, max-age=31536000, immutable"
 MEDIA_TYPES = {".js": "text/javascript", ".wasm": "application/wasm"}
+
+
+def _message(found: StateMessage) -> Response:
+    return Response(found.model_dump_json(), media_type="application/json", headers={"Cache-Control": "no-store"})
 
 
 class PageServer:
@@ -133,7 +145,11 @@ class PageServer:
             get("/", self._index),
             get("/explore", self._explore),
             get("/alarms", self._alarms),
+            get("/readyz", self._ready),
             get("/api/status", self._status),
+            get("/api/state", self._state),
+            get("/api/state/schema.json", state_schema),
+            Route("/api/state/stream", self._state_stream),
             get("/api/model", self._model),
             get("/api/episodes", self._episodes),
             get("/api/annotations", self._annotations),
@@ -264,6 +280,34 @@ class PageServer:
         if path is None or not path.is_file():
             return PlainTextResponse("Nisus: this process has no such recording.\n", 404)
         return FileResponse(path, media_type="application/octet-stream", filename=path.name)
+
+    def _ready(self) -> Response:
+        """Answer 200 once the filter is compiled and measurements arrive, else 503 with the reason."""
+        status = self._engine.status()
+        if status.awaited is not None:
+            return PlainTextResponse("the filter is being compiled\n", 503)
+        if status.t is None:
+            return PlainTextResponse("no measurement has arrived\n", 503)
+        return PlainTextResponse("ok\n")
+
+    def _state(self, covariance: bool = False) -> Response:
+        """Answer with the present state (see docs/publishing.md)."""
+        return _message(state_message(self._engine, covariance=covariance))
+
+    async def _state_stream(self, request: Request) -> Response:
+        """Send the state as server-sent events: after each change, and otherwise each second."""
+
+        async def events() -> AsyncIterator[str]:
+            sent, at = None, -np.inf
+            while not self._stopping.is_set() and not await request.is_disconnected():
+                found = await run_in_threadpool(state_message, self._engine)
+                new, now = (found.time_ns, found.revision, found.health, found.cause), time.monotonic()
+                if new != sent or now - at >= HEARTBEAT_S:
+                    sent, at = new, now
+                    yield f"event: state\nid: {found.revision}:{found.time_ns}\ndata: {found.model_dump_json()}\n\n"
+                await asyncio.sleep(STATUS_PERIOD_S)
+
+        return StreamingResponse(events(), media_type="text/event-stream", headers={"Cache-Control": "no-store"})
 
     async def _page_stream(self, browser: WebSocket) -> None:
         await PageStream(browser, self._engine, self.series, self._status, self._boot, self._choices).run()

@@ -1,0 +1,160 @@
+"""The published state: equal to the last row, complete, and never a number that does not hold."""
+
+import http.client
+import json
+from dataclasses import replace
+from types import SimpleNamespace
+
+import jsonschema
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from app.present.state_message import PublishedState, StateMessage, state_message, state_schema
+from estimators.track import DEGRADED, DIVERGED, STALE, SUSPECT, WAITING
+from tests.app.scripted import pull_all, readings, wait_for
+from tests.support import SECOND
+
+
+@pytest.fixture
+def page(serve):
+    return serve(50)
+
+
+def last_row(page):
+    pull = pull_all(page.engine)
+    return pull.events.t[-1], pull.track.mean[-1], pull.track.std[-1]
+
+
+def state(page, query=""):
+    """The answer once the status has the last row, since it is renewed ten times a second."""
+    t = int(last_row(page)[0])
+    wait_for(lambda: page.get("/api/state")["time_ns"] == t)
+    return page.get(f"/api/state{query}")
+
+
+def test_the_message_has_the_numbers_of_the_last_row(page):
+    found, (t, mean, std) = state(page, "?covariance=true"), last_row(page)
+    jsonschema.validate(found, page.get("/api/state/schema.json"))
+    assert (found["version"], found["twin"], found["time_ns"], found["time"]) == (
+        "nisus.state/1", page.engine.twin.name, t, None,
+    )  # fmt: skip
+    assert [item["value"] for item in found["states"]] == mean.tolist()
+    assert [item["std"] for item in found["states"]] == std.tolist()
+    assert [item["valid"] for item in found["states"]] == [True] * mean.size and found["estimate_valid"]
+    assert found["covariance_of"] == list(page.engine.model.state_names)
+    np.testing.assert_allclose(np.sqrt(np.diag(found["covariance"])), std, rtol=1e-12)
+    (winding,) = found["sensors"]
+    assert (winding["name"], winding["accepted"], winding["rejected"], winding["dropouts"]) == ("winding", 50, 0, 0)
+    assert 0.0 <= found["age_s"] < 600.0 and found["sent"].endswith("Z")
+
+
+def test_rejected_and_empty_measurements_are_counted(page):
+    page.source.put(readings([6.0, 7.0, 8.0], [np.nan, np.nan, 40.0]))
+    wait_for(lambda: page.rows() == 53)
+    (winding,) = state(page)["sensors"]
+    assert (winding["accepted"], winding["dropouts"]) == (51, 2)
+
+
+def test_before_the_first_event_there_is_no_number(serve):
+    found = serve().get("/api/state")
+    jsonschema.validate(found, state_schema())
+    assert (found["health"], found["time_ns"], found["age_s"], found["estimate_valid"]) == (
+        "waiting",
+        None,
+        None,
+        False,
+    )
+    assert {(item["value"], item["std"], item["valid"]) for item in found["states"]} == {(None, None, False)}
+    assert all(item["reason"] for item in found["states"])
+
+
+def changed(page, **fields):
+    """The message of a status in which something is otherwise."""
+    engine = page.engine
+    status = replace(engine.status(), **fields)
+    return state_message(
+        SimpleNamespace(status=lambda: status, model=engine.model, twin=engine.twin, belief=engine.belief),
+        covariance=True,
+    )
+
+
+@pytest.mark.parametrize("wrong", ["mean", "std"])
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_a_state_whose_mean_or_deviation_is_no_number_is_not_valid(page, wrong, value):
+    """As it was published elsewhere: P is NaN beside a finite x."""
+    column = last_row(page)[1 if wrong == "mean" else 2].copy()
+    column[0] = value
+    found = changed(page, t=5 * SECOND, **{wrong: column})
+    first, *others = found.states
+    assert (first.value, first.std, first.valid, first.reason) == (None, None, False, "the estimate is not a number")
+    assert all(item.valid for item in others) and not found.estimate_valid and found.covariance is None
+    assert "NaN" not in found.model_dump_json() and "Infinity" not in found.model_dump_json()
+
+
+@pytest.mark.parametrize(
+    ("health", "valid"), [(WAITING, False), (SUSPECT, True), (DEGRADED, True), (DIVERGED, False), (STALE, False)]
+)
+def test_health_decides_whether_an_estimate_is_published(page, health, valid):
+    found = changed(page, t=5 * SECOND, health=health, cause="its cause")
+    assert {item.valid for item in found.states} == {valid} and found.estimate_valid == valid
+    assert {item.reason for item in found.states} == {"" if valid else "its cause"}
+
+
+def test_a_withheld_state_has_its_reason(page):
+    name = page.engine.model.shown_states[0].name
+    first = changed(page, t=5 * SECOND, withheld={name: "too uncertain, ± 3 °C"}).states[0]
+    assert (first.name, first.value, first.valid, first.reason) == (name, None, False, "too uncertain, ± 3 °C")
+
+
+def test_a_time_of_the_calendar_is_written_as_such(page):
+    assert changed(page, t=1700006390000001000).time == "2023-11-14T23:59:50.000001Z"
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {"value": 1.0, "std": float("nan"), "valid": True, "reason": ""},
+        {"value": 1.0, "std": None, "valid": True, "reason": ""},
+        {"value": 1.0, "std": 1.0, "valid": False, "reason": "x"},
+        {"value": None, "std": None, "valid": False, "reason": ""},
+    ],
+)
+def test_no_message_can_hold_a_value_without_validity(fields):
+    with pytest.raises(ValidationError):
+        PublishedState(name="x", unit="1", protection_level=None, **fields)
+
+
+def test_the_stream_sends_each_change(page):
+    t = int(last_row(page)[0])
+    connection = http.client.HTTPConnection("127.0.0.1", page.client.port, timeout=60)
+    connection.request("GET", "/api/state/stream", headers={"Cookie": page.client.cookie})
+    answer = connection.getresponse()
+    assert (answer.status, answer.headers["content-type"]) == (200, "text/event-stream; charset=utf-8")
+
+    def until(time_ns):
+        while True:
+            line = answer.readline().decode()
+            if line.startswith("data: "):
+                message = StateMessage.model_validate_json(line.removeprefix("data: "))
+                if message.time_ns == time_ns:
+                    return message
+
+    first = until(t)
+    page.source.put(readings([6.0], [41.0]))
+    second = until(6 * SECOND)
+    assert second.states[0].value == last_row(page)[1][0] != first.states[0].value
+    connection.close()
+
+
+def test_supervisors_need_no_token(serve):
+    page = serve()
+    host = [("Host", page.client.host)]
+    assert [page.client.raw("GET", path, host).status for path in ("/healthz", "/readyz", "/api/state")] == [
+        200,
+        503,
+        403,
+    ]
+    page.source.put(readings([1.0], [40.0]))
+    wait_for(lambda: page.client.raw("GET", "/readyz", host).status == 200)
+    assert json.loads(page.client.get("/api/state").text)["time_ns"] == SECOND
