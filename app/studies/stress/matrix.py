@@ -125,6 +125,12 @@ def _fault(kind: str, **given: object) -> Callable[[float, float], list[Fault]]:
     return lambda start, end: [Fault(kind, start=start, end=end, **given)]  # type: ignore[arg-type]
 
 
+def _late(sensor: str, seconds: float) -> Callable[[float, float], list[Fault]]:
+    """Measurements that are stamped so long after they were taken, when they arrive."""
+    kinds = ("clock_jump", "delay")
+    return lambda start, end: [Fault(kind, sensor, start=start, end=end, size=seconds) for kind in kinds]
+
+
 def _rows(model: StateSpaceModel, sensor: Sensor, tuning: Tuning) -> list[tuple[str | None, float]]:
     """The rows of a sensor that are tried, each with its standard deviation: its own row, or the first of several."""
     start = model.row_start[model.sensor_names.index(sensor.name)]
@@ -220,9 +226,8 @@ def _of_time(sensors: Sequence[Sensor]) -> Iterator[Mistake]:
         jump = _fault("clock_jump", sensor=name, size=-1.0)
         yield Mistake(f"clock of {name} 1 s behind", clock | MODEL, frozenset({name}), fault=jump)
         for seconds in (0.5, 3.0):
-            # Measured so long before the time in its stamp.
-            late = _fault("clock_jump", sensor=name, size=seconds)
             known = ((DELAY, name, seconds),)
+            late = _late(name, seconds)
             yield Mistake(f"{name} {seconds:g} s late", clock | MODEL, frozenset({name}), fault=late, nudges=known)
         again = _fault("duplicate", sensor=name, count=4, every=0.001)
         repeated = frozenset({"duplicate", "stuck", "correlated", "wide"})

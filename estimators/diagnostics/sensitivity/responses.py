@@ -26,6 +26,8 @@ DETERMINISTIC_FILTERS = ("ekf", "ukf", "kf")
 
 MAX_DIVERGED_SHARE = 0.1  # Share of diverged rows up to which a filter can replace another
 
+SMOOTHED = 10  # Measurements on each side over which the corrections of predictions are averaged
+
 THREADS = int(numba.config.NUMBA_NUM_THREADS)
 
 T = TypeVar("T")
@@ -109,19 +111,24 @@ class Start(NamedTuple):
     def _predicted(self, name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return rows (n,), times (n,) in s and predictions (n, ny) of the measurements of a sensor.
 
-        Exchanged or delayed predictions move the mean of a measurement as the fault does, without its noise.
+        Exchanged or delayed predictions move the mean of a measurement as the fault does, without its noise. A
+        prediction follows noise by its corrections, H K ν = ν (S - R) / S, so that these are smoothed; the steps of the
+        model between them are kept.
         """
         model, log = self.tuning.model, self.log
         s = model.sensor_names.index(name)
         own = np.flatnonzero((log.kind[: log.n] == READING) & (log.channel[: log.n] == s))
         count = len(model.sensors[s].rows)
-        predicted = log.value[own, :count] - self.track.innovation[own, :count]
-        known = np.isfinite(predicted).all(axis=1)
+        own = own[np.isfinite(log.value[own, :count] - self.track.innovation[own, :count]).all(axis=1)]
+        predicted = np.zeros((own.size, count))
         for k, row in enumerate(model.sensors[s].rows):
-            if row.circular:
-                predicted[known, k] = np.unwrap(predicted[known, k])
-        own = own[known]
-        return own, 1e-9 * (log.t[own] - log.t[0]), predicted[known]
+            nu, variance = self.track.innovation[own, k], self.track.innovation_std[own, k] ** 2
+            mean = log.value[own, k] - nu
+            mean = np.unwrap(mean) if row.circular else mean
+            follows = np.where(self.track.verdict[own] == USED, variance - self.tuning.r[model.row_start[s] + k], 0.0)
+            corrections = np.cumsum(np.concatenate([np.zeros(min(1, own.size)), (nu * follows / variance)[:-1]]))
+            predicted[:, k] = mean - corrections + _smoothed(corrections)
+        return own, 1e-9 * (log.t[own] - log.t[0]), predicted
 
     def moved(self, new: Track, old: Track | None = None) -> Response:
         """Subtract a track from another, by default that of the fold without nudge; angles by the shorter way."""
@@ -148,6 +155,15 @@ class Start(NamedTuple):
         low, high = max(-nudge.step, nudge.low), min(nudge.step, nudge.high)
         below, above = (self.track if size == 0.0 else self.with_fault(nudge, size) for size in (low, high))
         return Response(*(change / (high - low) for change in self.moved(above, below)))
+
+
+def _smoothed(series: np.ndarray) -> np.ndarray:
+    """Return the centred moving mean of a series (n,) over `SMOOTHED` values on each side, fewer at its ends."""
+    total = np.concatenate([np.zeros(1), np.cumsum(series)])
+    at = np.arange(series.size)
+    first, last = np.maximum(at - SMOOTHED, 0), np.minimum(at + SMOOTHED + 1, series.size)
+    mean: np.ndarray = (total[last] - total[first]) / (last - first)
+    return mean
 
 
 def _at(t: np.ndarray, times: np.ndarray, values: np.ndarray) -> np.ndarray:
