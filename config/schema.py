@@ -211,6 +211,8 @@ class NormalSection(Section):
     nis: NotNegative = 0.0
     """Largest mean NIS of recent measurements there, as a multiple of the value that `bias` and `scale` give. The
     estimate counts as diverged from 1.5 times this on, and not below ten. Default: 0."""
+    forced: str = ""
+    """Why its log contradicted the baseline, if it was accepted with `--force`. Default: it did not."""
 
 
 class EstimatorSection(Section):

@@ -400,7 +400,7 @@ class CommissionCommand(JsonOption, FoldOptions):
     """
 
     force: Flag = False
-    """Accept the data even if sensors are rejected or stuck, or the twin diverges."""
+    """Accept a log that its own detectors or calibration contradict; the baseline keeps the reason as a mark."""
     write: Flag = False
     """Write the section into the twin's YAML, replacing the one there."""
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from estimators.diagnostics.episodes.baseline import Normal, commission
+from estimators.diagnostics.episodes.baseline import Normal, commission, contradictions
+from estimators.diagnostics.score import score
 from estimators.errors import ConfigError
 from estimators.fold import Fold
 from estimators.log import READING
@@ -27,6 +29,9 @@ if TYPE_CHECKING:
 MAX_FAULTY_SHARE = 0.1
 """Share of readings refused, of rows lost, or of one value in a row, beyond which data are not in order."""
 
+MIN_COVERAGE = 0.6
+"""Share of the true values in the 95 % band below which an estimate is not in order: errors are 2.3 times σ there."""
+
 MAX_EQUAL_RUN = 50  # equal readings in a row that are never too many
 
 
@@ -42,9 +47,10 @@ def commission_twin(arguments: Arguments) -> int:
     broken = against(fold)
     if broken and not arguments.force:
         raise ConfigError(
-            f"{twin.name}: {broken}; commission on data on which everything was in order, or --force it to be normal"
+            f"{twin.name}: {broken}; commission on a log without the fault, fit the tuning (nisus tune), or accept it "
+            "with --force, which marks the baseline"
         )
-    normals = commission(fold)
+    normals = {name: normal._replace(forced=broken) for name, normal in commission(fold).items()}
     text = lines(normals)
     path = twin.path if twin.version is None else twin.version.path
     if arguments.write:
@@ -79,6 +85,12 @@ def against(fold: Fold) -> str:
             longest = int(np.max(np.diff(changes))) if changes.size > 1 else 0
             if longest > max(MAX_EQUAL_RUN, MAX_FAULTY_SHARE * rows.size):
                 return f"{row.name} of {sensor.name} says the same {longest} times in a row"
+    for row_name, why in contradictions(fold).items():
+        return f"{row_name} contradicts its own log, {why}"
+    scored = score(track, log.events.select(slice(0, fold.n)), model)
+    for state, fit in scored.states.items():
+        if fit.coverage < MIN_COVERAGE:
+            return f"the true {state} is in its 95 % band only {100 * fit.coverage:.0f} % of the time"
     return ""
 
 
@@ -94,7 +106,8 @@ def lines(normals: Mapping[str, Normal]) -> str:
     for name, normal in normals.items():
         reached = ", ".join(f"{cause}: {peak:g}" for cause, peak in normal.reached.items())
         nis = f", nis: {normal.nis:g}" if normal.nis else ""
-        moments = f"bias: {normal.bias:g}, scale: {normal.scale:g}, correlation: {normal.correlation:g}{nis}"
+        forced = f", forced: {json.dumps(normal.forced, ensure_ascii=False)}" if normal.forced else ""
+        moments = f"bias: {normal.bias:g}, scale: {normal.scale:g}, correlation: {normal.correlation:g}{nis}{forced}"
         text += f"  {name}: {{{moments},\n"
         text += f"    reached: {{{reached}}}}}\n"
     return text

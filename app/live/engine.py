@@ -98,6 +98,8 @@ class Engine(Running):
         self._tick = section.tick
         self._last_options: dict[str, Mapping[str, float]] = {}
         self._workshop.report = lambda text: self.notices.say(text, level="warn")
+        if self.twin.forced_baseline:
+            self.notices.say(f"the baseline was accepted with --force: {self.twin.forced_baseline}", level="warn")
         self._begin_intake()
         self._feeder = Feeder(
             lambda: open_source(self.notices.report),

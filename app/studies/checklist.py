@@ -166,14 +166,15 @@ def _health(checked: Checked) -> Answer:
 
 
 def _tuning(checked: Checked) -> Answer:
-    path, baseline = checked.twin.path, checked.twin.tuning.baseline
+    path, baseline, forced = checked.twin.path, checked.twin.tuning.baseline, checked.twin.forced_baseline
     scores = scores_file(path)
     wide = 1.0 + LIMITS.width
     off = [
         entry.subject for entry in checked.calibration if entry.role == "used" and entry.scale.beyond(1.0 / wide, wide)
     ]
     figures = (
-        f"Q and R are those of {path.name}; their baseline is {'not ' * (baseline is None)}stored; scores of every "
+        f"Q and R are those of {path.name}; their baseline is {'not ' * (baseline is None)}stored"
+        f"{' with --force: ' * bool(forced)}{forced}; scores of every "
         f"filter are {f'in {scores.name}' if scores.exists() else 'not stored'}; bands off by more than a quarter: "
         f"{', '.join(off[:4]) if off else 'none'}{f' and {len(off) - 4} more' if len(off) > 4 else ''}"
     )

@@ -416,6 +416,8 @@ def _figures(result: FoldResult) -> list[Figure]:
     model, events, track = twin.model, result.events, result.track
     units = units_by_name(model)
     found = [Figure("estimator", twin.estimator, remark=_options_text(fold)), Figure("tuning", twin.tuning.name)]
+    if twin.forced_baseline:
+        found.append(Figure("baseline", "forced", remark=twin.forced_baseline))
     if len(events) < fold.n:
         found.append(Figure("scored", f"{format_time(int(events.t[0]))} to {format_time(int(events.t[-1]))}"))
     found.append(Figure("readings", f"{scored.readings}"))

@@ -32,7 +32,7 @@ def commissioned(loaded: Loaded, model: StateSpaceModel) -> dict[str, Normal]:
                     ("commissioned", name, "reached", cause), f"is no cause; choose from {', '.join(ALARM_NAMES)}"
                 )
     return {
-        name: Normal(section.bias, section.scale, section.correlation, section.reached, section.nis)
+        name: Normal(section.bias, section.scale, section.correlation, section.reached, section.nis, section.forced)
         for name, section in given.items()
     }
 

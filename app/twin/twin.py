@@ -138,6 +138,11 @@ class Twin:
         return np.isin(np.arange(len(self.model.sensors)), () if self.plan.recorded else self.plan.fed)
 
     @property
+    def forced_baseline(self) -> str:
+        """Why the log of its baseline contradicted it, if it was accepted with --force; "" otherwise."""
+        return next((item.forced for item in self.config.commissioned.values() if item.forced), "")
+
+    @property
     def tells_field(self) -> bool:
         """Whether the source provides the true state of a whole large field."""
         grid, source = self.model.grid, self.config.source

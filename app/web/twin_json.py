@@ -158,6 +158,7 @@ def model_json(engine: Running) -> dict[str, Any]:
             for name, entry in ESTIMATORS.items()
         ],
         "commissioned": twin.tuning.baseline is not None,
+        "baseline_forced": twin.forced_baseline,
         "window": twin.config.view.window,
         "recorded": twin.recorded or twin.plan.recorded,
         "speed": twin.config.view.speed,

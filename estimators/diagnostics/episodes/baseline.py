@@ -6,7 +6,7 @@ is the bias, scale and correlation of each row, and the highest value of each te
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -17,7 +17,7 @@ from ...model.state_space import StateSpaceModel
 from ...track import FAILED, GATED, USED
 from ..detector_state import gate_log_ratios, no_baseline, threshold_of
 from ..detector_tests import highest
-from ..detectors import ALARM_NAMES, BITS
+from ..detectors import ALARM_NAMES, BITS, SHIFTED
 from ..health import JUDGED_MEAN, MAX_ROWS_PER_READING, MIN_WINDOW_EVENTS, HealthPolicy, normal_nis
 from . import judged_rows, standardised
 
@@ -25,6 +25,9 @@ BASELINE_MARGIN = 1.5
 """Factor on the highest value of a test, which is added to its threshold, and on the highest NIS over a window."""
 
 MIN_MEASUREMENTS = 50  # Measurements of a row from which it has a baseline
+MAX_SCALE = 1.5  # Scale of innovations beyond which R is not that of the sensor
+MAX_SHIFT = 0.5  # Change of the bias from one half of a log to the other, in standard deviations, that is relevant
+SHIFTS = BITS & SHIFTED != 0  # Tests of the mean
 
 
 class Normal(NamedTuple):
@@ -32,7 +35,7 @@ class Normal(NamedTuple):
 
     bias, scale: of its standardised innovations e; correlation: lag 1, of (e - bias) / scale; reached: highest W of the
     tests of each alarm, by name; nis: highest NIS over the twin's window at a measurement of this sensor, as a multiple
-    of its mean, 0 where that is far below divergence.
+    of its mean, 0 where that is far below divergence. forced: why the data contradicted it all the same, or "".
     """
 
     bias: float
@@ -40,6 +43,7 @@ class Normal(NamedTuple):
     correlation: float
     reached: Mapping[str, float]
     nis: float = 0.0
+    forced: str = ""
 
 
 def commission(fold: Fold) -> dict[str, Normal]:
@@ -51,42 +55,110 @@ def commission(fold: Fold) -> dict[str, Normal]:
     Returns:
         The baseline of each row that has `MIN_MEASUREMENTS` measurements.
     """
-    model, log, track = fold.model, fold.log, fold.track
+    model = fold.model
     found: dict[str, Normal] = {}
-    for s, sensor in enumerate(model.sensors):
-        rows = np.flatnonzero((log.kind[: fold.n] == READING) & (log.channel[: fold.n] == s))
-        verdict = track.verdict[rows]
-        h = threshold_of(model, fold.evidence, s)
-        for k in range(len(sensor.rows)):
-            e = standardised(judged_rows(fold), rows, k)
-            known = np.isfinite(e)
-            if known.sum() < MIN_MEASUREMENTS:
-                continue
-            clipped = np.clip(e[known], -6.0, 6.0)
-            bias, scale = float(clipped.mean()), float(max(clipped.std(), 1e-3))
-            rest = (clipped - bias) / scale
-            phi = float(np.clip(np.mean(rest[1:] * rest[:-1]), -0.95, 0.95))
-            index = model.row_start[s] + k
-            base = no_baseline(model)[index]
-            base[:3] = bias, scale, phi
-            base[3:] = np.inf
-            judged = np.isin(verdict, (USED, GATED, FAILED))
-            refused = np.where(judged, (verdict != USED).astype(np.int8), np.int8(-1))
-            values = np.ascontiguousarray(log.value[rows, k])
-            nu, std = (np.ascontiguousarray(column[rows, k]) for column in (track.innovation, track.innovation_std))
-            r, chances = float(fold.tuning.r[index]), gate_log_ratios(fold.tuning.gate)
-            W = highest(e, refused, values, nu, std, r, h, base, chances)
-            reached = {}
-            for bit, name in enumerate(ALARM_NAMES):
-                own = W[BITS == 1 << bit]
-                if own.size and own.max() > 1.0:
-                    reached[name] = round(float(own.max()), 1)
-            found[model.row_names[index]] = Normal(round(bias, 3), round(scale, 3), round(phi, 3), reached)
+    for series in _series(fold):
+        moments = series.moments(slice(None))
+        W = series.highest(slice(None), moments)
+        reached = {}
+        for bit, name in enumerate(ALARM_NAMES):
+            own = W[BITS == 1 << bit]
+            if own.size and own.max() > 1.0:
+                reached[name] = round(float(own.max()), 1)
+        bias, scale, phi = (round(value, 3) for value in moments)
+        found[series.row] = Normal(bias, scale, phi, reached)
     most = _most_nis(fold, normal_nis(model, baseline_of(model, found))[:, JUDGED_MEAN])
     most[BASELINE_MARGIN * most <= HealthPolicy().diverged_nis] = 0.0
     of_row = np.repeat(most, [len(sensor.rows) for sensor in model.sensors]).tolist()
     nis = {name: round(value, 3) for name, value in zip(model.row_names, of_row, strict=True)}
     return {name: normal._replace(nis=nis[name]) for name, normal in found.items()}
+
+
+class RowSeries(NamedTuple):
+    """Measurements of a sensor row with a baseline: n of them, in the columns that the tests of a row need.
+
+    place: of the row. h: threshold of its tests. e: standardised innovations, NaN where not judged; refused: as in
+    `highest`; values, innovation, std; r: variance of its noise; chances: `gate_log_ratios`.
+    """
+
+    model: StateSpaceModel
+    place: int
+    h: float
+    e: np.ndarray
+    refused: np.ndarray
+    values: np.ndarray
+    innovation: np.ndarray
+    std: np.ndarray
+    r: float
+    chances: np.ndarray
+
+    @property
+    def row(self) -> str:
+        """Name of the row."""
+        return self.model.row_names[self.place]
+
+    def moments(self, part: slice) -> tuple[float, float, float]:
+        """Return bias, scale and lag-1 correlation of a part."""
+        e = self.e[part]
+        clipped = np.clip(e[np.isfinite(e)], -6.0, 6.0)
+        bias, scale = float(clipped.mean()), float(max(clipped.std(), 1e-3))
+        rest = (clipped - bias) / scale
+        return bias, scale, float(np.clip(np.mean(rest[1:] * rest[:-1]), -0.95, 0.95))
+
+    def highest(self, part: slice, moments: tuple[float, float, float]) -> np.ndarray:
+        """Return the highest W of each test over a part, (TESTS,), if these moments are the baseline."""
+        base = no_baseline(self.model)[self.place]
+        base[:3] = moments
+        base[3:] = np.inf
+        columns = (self.e, self.refused, self.values, self.innovation, self.std)
+        found: np.ndarray = highest(
+            *(np.ascontiguousarray(column[part]) for column in columns), self.r, self.h, base, self.chances
+        )
+        return found
+
+
+def _series(fold: Fold) -> Iterator[RowSeries]:
+    """Yield the rows that have enough measurements for a baseline."""
+    model, log, track = fold.model, fold.log, fold.track
+    for s, sensor in enumerate(model.sensors):
+        rows = np.flatnonzero((log.kind[: fold.n] == READING) & (log.channel[: fold.n] == s))
+        verdict = track.verdict[rows]
+        judged = np.isin(verdict, (USED, GATED, FAILED))
+        refused = np.where(judged, (verdict != USED).astype(np.int8), np.int8(-1))
+        for k in range(len(sensor.rows)):
+            e = standardised(judged_rows(fold), rows, k)
+            index = model.row_start[s] + k
+            if np.isfinite(e).sum() >= MIN_MEASUREMENTS:
+                yield RowSeries(
+                    model, index, threshold_of(model, fold.evidence, s), e, refused, log.value[rows, k],
+                    track.innovation[rows, k], track.innovation_std[rows, k], float(fold.tuning.r[index]),
+                    gate_log_ratios(fold.tuning.gate),
+                )  # fmt: skip
+
+
+def contradictions(fold: Fold) -> dict[str, str]:
+    """Return why a fold cannot be a baseline, by sensor row: its noise is not that of R, or it changes within the log.
+
+    With the bias, scale and correlation of either half as baseline, the other half must raise no alarm of a shift that
+    is relevant.
+    """
+    found: dict[str, str] = {}
+    for series in _series(fold):
+        scale = series.moments(slice(None))[1]
+        middle = series.e.size // 2
+        halves = slice(0, middle), slice(middle, None)
+        if scale > MAX_SCALE:
+            found[series.row] = f"its innovations are {scale:.1f} times as large as predicted"
+        elif all(np.isfinite(series.e[half]).sum() >= MIN_MEASUREMENTS for half in halves):
+            moments = [series.moments(half) for half in halves]
+            for one, other in ((0, 1), (1, 0)):
+                known, seen = (series.highest(halves[k], moments[one]) for k in (one, other))
+                excess = seen - BASELINE_MARGIN * known - series.h
+                relevant = abs(moments[1][0] - moments[0][0]) > MAX_SHIFT * scale
+                if relevant and np.any(excess[SHIFTS] > 0.0):
+                    halfway = f"{moments[0][0]:+.1f} σ before, {moments[1][0]:+.1f} σ after"
+                    found[series.row] = f"its innovations shift halfway: {halfway}"
+    return found
 
 
 def _most_nis(fold: Fold, normal: np.ndarray) -> np.ndarray:

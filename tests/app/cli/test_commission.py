@@ -8,6 +8,7 @@ import pytest
 
 from app.cli.arguments import CommissionCommand
 from app.cli.commission import commission_twin, lines
+from app.cli.main import main
 from app.live.tunings.versions import write_section
 from app.twin.log_reader import read_log
 from app.twin.twin import load_twin
@@ -44,7 +45,7 @@ view:
 
 def drive(folder: Path, text: str = TWIN) -> str:
     """A recording of 300 readings, noisier than the model believes, and its twin."""
-    y = 40.0 + np.random.default_rng(1).normal(0.0, 4.0, 300)
+    y = 40.0 + np.random.default_rng(1).normal(0.0, 2.8, 300)
     (folder / "drive.csv").write_text("t,y\n" + "".join(f"{k},{value:.3f}\n" for k, value in enumerate(y)))
     path = folder / "drive.yaml"
     path.write_bytes(text.encode())
@@ -59,7 +60,7 @@ def test_what_is_printed_is_what_is_read_again(tmp_path: Path, capsys: pytest.Ca
     assert Path(path).read_text() == TWIN
     Path(path).write_text(TWIN + printed)
     baseline = load_twin(path).tuning.baseline
-    assert baseline is not None and baseline[0, 1] > 1.5
+    assert baseline is not None and baseline[0, 1] > 1.2
     # Against white innovations, not against what was normal before: the same again.
     assert commission_twin(CommissionCommand(path)) == 0
     assert capsys.readouterr().out == printed
@@ -146,3 +147,25 @@ def test_a_twin_is_commissioned_against_white_innovations_whatever_was_normal_be
     assert lost(twin.tuning) == 0.0 and lost(replace(twin.tuning, baseline=None)) > 0.5
     with pytest.raises(ConfigError, match="the twin is diverged or stale for"):
         commission_twin(CommissionCommand(path))
+
+
+def test_a_log_that_its_own_detectors_contradict_is_rejected_and_a_forced_one_is_marked(
+    tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    path = drive(tmp_path)
+    noise = np.random.default_rng(1).normal(0.0, 1.0, (2, 300))
+    for y, said in (
+        (40.0 + 4.0 * noise[0], r"winding contradicts its own log, its innovations are [12]\.\d times as large"),
+        (40.0 + 2.0 * noise[0] + 0.01 * np.maximum(0.0, np.arange(300.0) - 150.0) ** 2, "winding contradicts its own"),
+    ):
+        (tmp_path / "drive.csv").write_text("t,y\n" + "".join(f"{k},{value:.3f}\n" for k, value in enumerate(y)))
+        with pytest.raises(ConfigError, match=said) as problem:
+            commission_twin(CommissionCommand(path, write=True))
+        assert "--force" in str(problem.value) and Path(path).read_text() == TWIN
+    assert commission_twin(CommissionCommand(path, write=True, force=True)) == 0
+    twin = load_twin(path)
+    assert twin.forced_baseline and twin.forced_baseline in str(problem.value)
+    # What was contradicted once is shown by every fold from then on.
+    capsys.readouterr()
+    assert main(["fold", path]) == 0
+    assert twin.forced_baseline[:60] in " ".join(capsys.readouterr().out.split())
