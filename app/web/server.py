@@ -38,6 +38,7 @@ from .commands_json import command_from_json
 from .door import Door
 from .fit_api import FitApi
 from .http import PAGE, OneAtATime, get, page_file, post
+from .metrics import metrics
 from .runs_api import RunsApi
 from .streams import PageStream, feed_rerun
 from .twin_json import annotations_json, episodes_json, model_json, status_json
@@ -147,6 +148,7 @@ class PageServer:
             get("/alarms", self._alarms),
             get("/readyz", self._ready),
             get("/api/status", self._status),
+            get("/metrics", self._metrics, refused=501),
             get("/api/state", self._state),
             get("/api/state/schema.json", state_schema),
             Route("/api/state/stream", self._state_stream),
@@ -289,6 +291,10 @@ class PageServer:
         if status.t is None:
             return PlainTextResponse("no measurement has arrived\n", 503)
         return PlainTextResponse("ok\n")
+
+    def _metrics(self, states: bool = False) -> Response:
+        """Answer with metrics for Prometheus; `states` adds a series per state."""
+        return metrics(self._engine, states)
 
     def _state(self, covariance: bool = False) -> Response:
         """Answer with the present state (see docs/publishing.md)."""

@@ -2,12 +2,14 @@
 
 import http.client
 import json
+import sys
 from dataclasses import replace
 from types import SimpleNamespace
 
 import jsonschema
 import numpy as np
 import pytest
+from prometheus_client.parser import text_string_to_metric_families
 from pydantic import ValidationError
 
 from app.present.state_message import PublishedState, StateMessage, state_message, state_schema
@@ -145,6 +147,33 @@ def test_the_stream_sends_each_change(page):
     second = until(6 * SECOND)
     assert second.states[0].value == last_row(page)[1][0] != first.states[0].value
     connection.close()
+
+
+def test_metrics_are_those_of_the_message(page):
+    """Read by the parser of another package's own format."""
+    message = state(page)
+
+    def samples(query=""):
+        families = text_string_to_metric_families(page.client.get(f"/metrics{query}").text)
+        return {(item.name, *sorted(item.labels.items())): item.value for family in families for item in family.samples}
+
+    twin, found = ("twin", message["twin"]), samples()
+    on = [dict(labels)["health"] for (name, *labels), value in found.items() if name == "nisus_health" and value == 1.0]
+    assert on == [message["health"]]
+    assert found["nisus_nis_ratio", twin] == message["nis"]
+    assert found["nisus_measurements_total", ("sensor", "winding"), twin, ("verdict", "used")] == 50.0
+    assert found["process_resident_memory_bytes",] > 1e6
+    assert not any(name.startswith("nisus_state_m") for name, *_ in found)
+    first = message["states"][0]
+    labels = ("state", first["name"]), twin, ("unit", first["unit"])
+    found = samples("?states=true")
+    assert (found["nisus_state_mean", *labels], found["nisus_state_std", *labels]) == (first["value"], first["std"])
+
+
+def test_metrics_name_the_package_that_they_need(page, monkeypatch):
+    monkeypatch.setitem(sys.modules, "prometheus_client", None)
+    answer = page.client.get("/metrics")
+    assert (answer.status, "pip install 'nisus[service]'" in answer.text) == (501, True)
 
 
 def test_supervisors_need_no_token(serve):

@@ -1,0 +1,85 @@
+"""The running twin for Prometheus, in base units. Extra `service`: `pip install 'nisus[service]'`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from starlette.responses import Response
+
+from estimators.errors import ConfigError
+from estimators.track import HEALTH_NAMES, VERDICT_NAMES
+
+from ..live.running_fold import Running
+from ..present.state_message import state_message
+
+if TYPE_CHECKING:
+    from prometheus_client.core import Metric
+
+
+class TwinCollector:
+    """Metrics of one twin, made anew for each scrape."""
+
+    def __init__(self, engine: Running, *, states: bool) -> None:
+        """`states`: also one series per state, which a large twin has thousands of."""
+        self._engine, self._states = engine, states
+
+    def collect(self) -> Iterator[Metric]:
+        """Yield the metrics (prometheus_client's protocol)."""
+        from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
+
+        status, message = self._engine.status(), state_message(self._engine)
+
+        def gauge(name: str, text: str, value: float | None) -> Metric:
+            found = GaugeMetricFamily(f"nisus_{name}", text, labels=["twin"])
+            if value is not None and np.isfinite(value):
+                found.add_metric([message.twin], value)
+            return found
+
+        health = GaugeMetricFamily("nisus_health", "1 for the present health, else 0.", labels=["twin", "health"])
+        for name in HEALTH_NAMES:
+            health.add_metric([message.twin, name], float(name == message.health))
+        yield health
+        yield gauge("estimate_valid", "Whether all states are valid.", float(message.estimate_valid))
+        yield gauge("inputs_valid", "Whether all inputs are valid.", float(message.inputs_valid))
+        yield gauge("nis_ratio", "Mean NIS per degree of freedom of the last window, expected 1.", message.nis)
+        yield gauge("nis_ratio_low", "Lower 95 % bound of nisus_nis_ratio.", status.nis.low / status.nis.dof)
+        yield gauge("nis_ratio_high", "Upper 95 % bound of nisus_nis_ratio.", status.nis.high / status.nis.dof)
+        yield gauge("state_age_seconds", "Since the last event arrived.", message.age_s)
+        latency = None if status.latency_ms is None else status.latency_ms * 1e-3
+        yield gauge("latency_p99_seconds", "From the arrival of a measurement to its estimate.", latency)
+        yield gauge("episodes_open", "Fault episodes that last.", float(status.episodes_open))
+        yield gauge("revision", "Increases when the past is estimated again.", float(message.revision))
+        measurements = CounterMetricFamily(
+            "nisus_measurements", "Measurements by what became of them.", labels=["twin", "sensor", "verdict"]
+        )
+        for sensor, counts in zip(self._engine.model.sensor_names, status.sensor_rows, strict=True):
+            for verdict, count in zip(VERDICT_NAMES[1:], counts[1:], strict=True):
+                measurements.add_metric([message.twin, sensor, verdict], float(count))
+        yield measurements
+        if self._states:
+            labels = ["twin", "state", "unit"]
+            mean = GaugeMetricFamily("nisus_state_mean", "Estimate of a valid state, in its unit.", labels=labels)
+            std = GaugeMetricFamily("nisus_state_std", "Its standard deviation.", labels=labels)
+            for state in message.states:
+                for family, value in ((mean, state.value), (std, state.std)):
+                    if value is not None:
+                        family.add_metric([message.twin, state.name, state.unit], value)
+            yield from (mean, std)
+
+
+def metrics(engine: Running, states: bool = False) -> Response:
+    """Answer with the metrics of a twin and of this process, in the text format of Prometheus.
+
+    Raises:
+        ConfigError: If prometheus-client is not installed.
+    """
+    try:
+        from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, ProcessCollector, generate_latest
+    except ModuleNotFoundError:
+        raise ConfigError("metrics need prometheus-client: pip install 'nisus[service]'") from None
+    registry: Any = CollectorRegistry()
+    registry.register(TwinCollector(engine, states=states))
+    ProcessCollector(registry=registry)
+    return Response(generate_latest(registry), media_type=CONTENT_TYPE_LATEST)
