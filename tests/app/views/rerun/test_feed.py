@@ -2,6 +2,7 @@
 
 import json
 import os
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -21,9 +22,11 @@ from app.views.rerun.pictures import LABEL_HALF_WIDTH, LABEL_HEIGHT, PICTURE_RAT
 from app.views.rerun.rows import RerunRows
 from app.views.rerun.sink import last_of_each_time, pair_name, thin
 from estimators.diagnostics.detectors import ADVISORY_ALARM
+from estimators.diagnostics.references import HALF_WIDTH
 from estimators.log import READING, TRUTH, Events
 from estimators.track import HEALTH_NAMES
-from tests.app.scripted import Replayed, pull_all, readings, twin, wait_for
+from tests.app.scripted import MODEL, Replayed, pull_all, readings, twin, wait_for
+from tests.support import SECOND
 
 WINDOW = 10.0
 
@@ -31,9 +34,9 @@ WINDOW = 10.0
 class Fed:
     """An engine on readings that the test gives, and a feed of it."""
 
-    def __init__(self, tmp_path):
+    def __init__(self, tmp_path, **options):
         self.source = Replayed()
-        made = twin()
+        made = twin(**options)
         made.config.view = SimpleNamespace(window=WINDOW)
         self.engine = Engine(made, lambda report: self.source)
         self.feed = RerunFeed(self.engine)
@@ -80,6 +83,8 @@ class Fed:
             if chunk.entity_path != path or chunk.is_static:
                 continue
             batch = chunk.to_record_batch()
+            if "Clear:is_recursive" in batch.schema.names:
+                continue
             t = batch.column(batch.schema.names.index("time")).cast(pa.int64()).to_numpy()
             times.append(t)
             flat = batch.column(batch.schema.names.index(component)).flatten().to_numpy(zero_copy_only=False)
@@ -276,6 +281,25 @@ def test_a_reset_at_the_time_of_the_last_reading_is_seen_in_the_picture(fed):
     _, values = fed.column(f"/pair/{pair_name(model, pair)}/up/mean", "Points2D:positions")
     prior = [state.mean for state in model.states] / axis_scales(model, pair)
     np.testing.assert_allclose(np.concatenate(values[-1]), prior, rtol=1e-6)
+
+
+def test_a_withheld_estimate_is_neither_drawn_in_lines_nor_in_pictures(tmp_path):
+    """Until its band is narrow enough."""
+    limit = 0.5
+    first, second = MODEL.states
+    fed = Fed(tmp_path, model=replace(MODEL, states=(first, replace(second, withhold=limit))))
+    t = np.arange(1.0, 21.0)
+    fed.put(readings(t, 40.0 + 0.1 * t))
+    fed.next()
+    track = fed.track().track
+    shown = HALF_WIDTH * track.std[:, 1] <= limit
+    assert 0 < shown.sum() < t.size
+    assert (fed.column("/state/rate")[0] // SECOND).tolist() == t[shown].tolist()
+    assert (fed.column("/state/temperature")[0] // SECOND).tolist() == t.tolist()
+    drawn, _ = fed.column(f"/pair/{pair_name(MODEL, [0, 1])}/up/mean", "Points2D:positions")
+    assert drawn.size and set((drawn // SECOND).tolist()) <= set(t[shown].tolist())
+    fed.feed.close()
+    fed.engine.stop()
 
 
 def test_dates_are_dates_and_seconds_are_durations(fed):
