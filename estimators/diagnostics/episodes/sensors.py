@@ -211,13 +211,16 @@ def _share(k: int, verdict: np.ndarray, refusal: int, begun: int, run: AlarmRun,
 
 
 def _stuck(values: np.ndarray, masks: np.ndarray, k: int, run: AlarmRun) -> RunEffect | None:
-    """Return the run of a repeated value, from its first measurement to the first that differs.
+    """Return the run of a repeated value, from its first measurement to the first that differs; gaps have no value.
 
     None if most alarms until then have another cause, during which a coarse sensor repeats itself, too.
     """
     at = run.begin + int(np.argmax(masks[run.begin : run.end] & STUCK != 0))
-    begun = _after_last(values[:at] != values[at])
-    others = np.flatnonzero(values[begun : run.end] != values[begun])
+    known = np.flatnonzero(np.isfinite(values))
+    value = values[known[np.searchsorted(known, at, side="right") - 1]]
+    differs = np.isfinite(values) & (values != value)
+    begun = int(known[np.searchsorted(known, _after_last(differs[:at]))])
+    others = np.flatnonzero(differs[begun : run.end])
     over = begun + int(others[0]) if others.size else run.end
     if np.mean(run.begin + np.flatnonzero(masks[run.begin : over]) >= begun) < LOSS_SHARE:
         return None

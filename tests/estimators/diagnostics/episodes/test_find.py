@@ -390,6 +390,20 @@ def test_a_reset_is_advised_only_when_no_sensor_is_off():
     assert text((USED, USED)).endswith("reset the twin to its prior, then check the sensor that was in alarm first")
 
 
+def test_gaps_of_a_stuck_sensor_are_no_movement():
+    def stuck(gaps):
+        def change(x, z, rng):
+            values = np.full_like(x, 0.125)
+            values[9::gaps] = np.nan
+            return values
+
+        return only(episodes(folded(gauge=change)), "stuck")
+
+    whole, with_gaps = stuck(N), stuck(10)
+    assert (with_gaps.start, with_gaps.end, with_gaps.size) == (whole.start, whole.end, whole.size)
+    assert whole.start == BEGIN + 1
+
+
 def test_a_stuck_sensor_that_moves_again_is_over_whatever_other_alarms_follow():
     """Its noise is tenfold after a hundred equal readings, which the other sensor contradicts."""
 
