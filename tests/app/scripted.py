@@ -57,6 +57,7 @@ def twin(history=200_000, horizon=2.0, tick=1000.0, model=MODEL, estimator="kf")
         name="scripted",
         title="scripted",
         text="model: motor_winding\n",
+        forced_baseline="",
         overrides={},
         version=None,
         path="scripted.yaml",

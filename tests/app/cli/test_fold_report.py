@@ -33,6 +33,7 @@ def test_many_rows_of_one_sensor_are_one_line():
         "wall: scale 1.00 (0.95 to 1.05), bias +0.00 σ, correlation +0.00, 50, 90, 95 % in the 50, 90, 95 % bands",
         "air: truth in its 95 % band 3 % of the time",
         "air: truth above",
+        "air, truth: scale 1.00 (0.95 to 1.05), bias +0.00 σ, 50, 90, 3 % in the 50, 90, 95 % bands",
         "grid, 16 rows used: in the 95 % band 93 %; beyond the limits 1, as grid.g15: bands a half too narrow",
     ]
     assert calibration_lines(grid, MODEL) == ["grid, 15 rows used: in the 95 % band 94 %; none beyond the limits"]

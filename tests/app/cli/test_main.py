@@ -147,7 +147,7 @@ RUNS = {
     "twins": "twins",
     "twins of one": "twins lorenz63",
     "filters": "filters",
-    "filters of one": "filters --twin lorenz63 --json",
+    "filters of one": "filters --twin lorenz63",
     "tunings": "tunings lorenz63",
     "tunings compared": "tunings lorenz63 own own",
     "fold": "fold lorenz63 --duration 2",
