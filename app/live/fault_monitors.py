@@ -12,11 +12,10 @@ from collections.abc import Callable, Sequence
 from math import inf
 from typing import NamedTuple
 
-from estimators.diagnostics.detectors import detector_of
 from estimators.diagnostics.episodes import Episode
 from estimators.diagnostics.sensitivity import bounds_of, sensitivity, smallest_of
-from estimators.diagnostics.sensitivity.responses import DRIFT, SENSOR
-from estimators.diagnostics.sensitivity.suspects import in_words, likeliest, suspects
+from estimators.diagnostics.sensitivity.responses import SENSOR
+from estimators.diagnostics.sensitivity.suspects import in_words, isolates, likeliest, suspects
 from estimators.errors import NisusError
 from estimators.model.state_space import StateSpaceModel
 from estimators.registry import find_entry
@@ -104,8 +103,8 @@ class RootCause:
             return
         words, known = in_words(found), self._found[episode.subject]
         if words:
-            first = likeliest(found)[0].nudge
-            row = first.name if first.kind in (SENSOR, DRIFT) else ""
+            kind, name = next((item.nudge.target for item in likeliest(found)), ("", ""))
+            row = name if kind == SENSOR else ""
             self._found[episode.subject] = known._replace(words=words, row=row)
             if not known.words:
                 text = f"{episode.subject}: most likely fault: {words}"
@@ -113,7 +112,7 @@ class RootCause:
 
 
 def _is_open(episode: Episode) -> bool:
-    return episode.end is None and detector_of(episode.cause).isolate
+    return episode.end is None and isolates(episode.cause)
 
 
 class ProtectionMonitor:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -27,7 +28,7 @@ from estimators.diagnostics.episodes.wording import TwinFacts
 from estimators.diagnostics.failure_cause import failures
 from estimators.diagnostics.references import WITHHELD, state_grades, withheld, withheld_reasons
 from estimators.diagnostics.score import Fit, Score, health_of, score
-from estimators.diagnostics.sensitivity.suspects import Suspect, in_words, likeliest, suspects
+from estimators.diagnostics.sensitivity.suspects import Suspect, in_words, isolates, likeliest, odds, suspects
 from estimators.errors import NisusError
 from estimators.fold import Fold
 from estimators.fold_failures import cause_of
@@ -61,6 +62,7 @@ class ExplainedEpisode(NamedTuple):
 
     episode: Episode
     suspects: tuple[Suspect, ...]
+    words: str = ""
 
 
 class SmoothingScore(NamedTuple):
@@ -220,13 +222,13 @@ def explained(fold: Fold, episodes: Sequence[Episode]) -> list[ExplainedEpisode]
     searched = 0
     for episode in episodes:
         named: tuple[Suspect, ...] = ()
-        if detector_of(episode.cause).isolate and searched < MAX_EXPLAINED:
+        words = ""
+        if isolates(episode.cause) and searched < MAX_EXPLAINED:
             searched += 1
-            try:
-                named = likeliest(suspects(fold.estimator.name, fold.model, fold.tuning, fold.log, episode.start))
-            except NisusError:
-                named = ()
-        found.append(ExplainedEpisode(episode, named))
+            with suppress(NisusError):
+                likely = suspects(fold.estimator.name, fold.model, fold.tuning, fold.log, episode.start)
+                named, words = likeliest(likely), in_words(likely)
+        found.append(ExplainedEpisode(episode, named, words))
     return found
 
 
@@ -359,10 +361,11 @@ def _episode_json(item: ExplainedEpisode) -> dict[str, Any]:
             "deviation": suspect.deviation,
             "unit": suspect.nudge.unit,
             "log_likelihood": suspect.gain,
+            "odds": share,
         }
-        for suspect in item.suspects
+        for suspect, share in zip(item.suspects, odds(item.suspects), strict=True)
     ]
-    return {**episode_json(item.episode), "suspects": named}
+    return {**episode_json(item.episode), "suspects": named, "likely": item.words}
 
 
 def _softened(result: FoldResult) -> int:
@@ -529,9 +532,9 @@ def episodes_topic(found: Sequence[ExplainedEpisode]) -> Topic:
     if not found:
         return Topic("No faults detected")
     lines = []
-    for episode, named in found[:MAX_EPISODES]:
+    for episode, _, words in found[:MAX_EPISODES]:
         lasted = "at the end" if episode.end is None else f"for {episode.end - episode.start:.3g} s"
-        suspected = f" Most likely: {in_words(named)}." if named else ""
+        suspected = f" Most likely: {words}." if words else ""
         lines.append(f"{episode.cause}, {lasted}: {episode.text}.{suspected}")
     if len(found) > MAX_EPISODES:
         lines.append(f"and {len(found) - MAX_EPISODES} more; --json has all")

@@ -12,11 +12,13 @@ from estimators.diagnostics.sensitivity.responses import (
     DRIFT,
     INPUT_,
     INPUT_SCALE,
+    INPUT_STUCK,
     PARAMETER,
     PRIOR,
     R_,
     SCALE,
     SENSOR,
+    STUCK,
     SWAP,
     SWAPPED,
 )
@@ -162,7 +164,8 @@ def _of_sensors(model: StateSpaceModel, tuning: Tuning, sensors: Sequence[Sensor
                 scaled = _fault("scale", sensor=name, row=row, size=factor)
                 known = ((SCALE, label, factor - 1.0),)
                 yield Mistake(f"{label} x{factor:g}", MODEL, own, fault=scaled, shifts=True, nudges=known)
-        yield Mistake(f"{name} stuck", frozenset({"stuck"}), own, fault=_fault("stuck", sensor=name))
+        held = ((STUCK, name, 1.0),)
+        yield Mistake(f"{name} stuck", frozenset({"stuck"}), own, fault=_fault("stuck", sensor=name), nudges=held)
         lost = _fault("silence", sensor=name)
         if len(model.sensors) > 1:
             yield Mistake(f"{name} silent", frozenset({"silent"}), own, fault=lost)
@@ -212,7 +215,8 @@ def _of_inputs(model: StateSpaceModel, events: Events) -> Iterator[Mistake]:
                 yield Mistake(f"{item.name} x{factor:g}", INPUT_WRONG, own, fault=scaled, shifts=True, nudges=known)
         if np.ptp(values):
             lost = _fault("silence", input=item.name)
-            yield Mistake(f"{item.name} lost", INPUT_WRONG, frozenset({f"input {item.name}"}), fault=lost, shifts=True)
+            own, held = frozenset({f"input {item.name}"}), ((INPUT_STUCK, item.name, 1.0),)
+            yield Mistake(f"{item.name} lost", INPUT_WRONG, own, fault=lost, shifts=True, nudges=held)
 
 
 def _of_time(sensors: Sequence[Sensor]) -> Iterator[Mistake]:
@@ -224,7 +228,8 @@ def _of_time(sensors: Sequence[Sensor]) -> Iterator[Mistake]:
     for sensor in sensors:
         name = sensor.name
         jump = _fault("clock_jump", sensor=name, size=-1.0)
-        yield Mistake(f"clock of {name} 1 s behind", clock | MODEL, frozenset({name}), fault=jump)
+        known = ((DELAY, name, -1.0),)
+        yield Mistake(f"clock of {name} 1 s behind", clock | MODEL, frozenset({name}), fault=jump, nudges=known)
         for seconds in (0.5, 3.0):
             known = ((DELAY, name, seconds),)
             late = _late(name, seconds)

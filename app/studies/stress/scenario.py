@@ -10,10 +10,9 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from config.source_schema import AssetSection, CanSection
-from estimators.diagnostics.detectors import detector_of
 from estimators.diagnostics.episodes import Episode, episodes
-from estimators.diagnostics.sensitivity.responses import SENSOR
-from estimators.diagnostics.sensitivity.suspects import likeliest, suspects
+from estimators.diagnostics.sensitivity.responses import SENSOR, SWAP, SWAPPED
+from estimators.diagnostics.sensitivity.suspects import isolates, likeliest, suspects
 from estimators.errors import NisusError, SourceError
 from estimators.fold import Fold
 from estimators.log import MARK, READING, TICK, TRUTH, Events, Log
@@ -363,7 +362,7 @@ def accused(fold: Fold, episode: Episode, until: int) -> tuple[str, ...]:
     A sensor row by its name alone, an input or a parameter after that word. The question is asked at `until`, ns of the
     log; later events are not known yet.
     """
-    if not detector_of(episode.cause).isolate:
+    if not isolates(episode.cause):
         return (episode.subject,)
     seen = fold.log.copy()
     seen.n = int(np.searchsorted(fold.log.t[: fold.n], until))
@@ -371,8 +370,10 @@ def accused(fold: Fold, episode: Episode, until: int) -> tuple[str, ...]:
         found = likeliest(suspects(fold.estimator.name, fold.model, fold.tuning, seen, episode.start))
     except NisusError:
         found = ()
-    targets = [item.nudge.target for item in found]
-    return tuple(name if kind == SENSOR else f"{kind} {name}" for kind, name in targets) or (episode.subject,)
+    names: list[str] = []
+    for kind, name in (item.nudge.target for item in found):
+        names += name.split(SWAPPED) if kind == SWAP else [name if kind == SENSOR else f"{kind} {name}"]
+    return tuple(names) or (episode.subject,)
 
 
 def green_share(fold: Fold, start: int, end: int) -> float:

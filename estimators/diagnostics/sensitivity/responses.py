@@ -26,7 +26,7 @@ DETERMINISTIC_FILTERS = ("ekf", "ukf", "kf")
 
 MAX_DIVERGED_SHARE = 0.1  # Share of diverged rows up to which a filter can replace another
 
-SMOOTHED = 10  # Measurements on each side over which the corrections of predictions are averaged
+SMOOTHED = 20  # Earlier measurements over which the corrections of predictions are averaged
 
 THREADS = int(numba.config.NUMBA_NUM_THREADS)
 
@@ -88,6 +88,16 @@ class Start(NamedTuple):
             u = self.base.u.copy()
             u[k] = factor * u[k] + offset
             return self.refold(log=other, base=self.base._replace(u=u))
+        if nudge.kind in (STUCK, INPUT_STUCK):
+            of_input = nudge.kind == INPUT_STUCK
+            k = (model.input_names if of_input else model.sensor_names).index(nudge.name)
+            what = INPUT if of_input else READING
+            own = np.flatnonzero((kind == what) & ((what == INPUT) | (other.channel[: other.n] == k)))
+            columns = [k] if what == INPUT else range(len(model.sensors[k].rows))
+            for column in columns:
+                there = own[np.isfinite(value[own, column])]
+                value[there, column] = value[there[:1], column] if what == READING else self.base.u[column]
+            return self.refold(log=other)
         if nudge.kind == SWAP:
             names = nudge.name.split(SWAPPED)
             (own, at, was), (others, then, theirs) = map(self._predicted, names)
@@ -103,7 +113,8 @@ class Start(NamedTuple):
         own = np.flatnonzero((kind == READING) & (other.channel[: other.n] == sensor))
         column = row - model.row_start[sensor]
         if nudge.kind == SCALE:
-            value[own, column] *= 1.0 + size
+            own, _, predicted = self._predicted(model.sensor_names[sensor])
+            value[own, column] += size * predicted[:, column]
         else:
             value[own, column] += size if nudge.kind == SENSOR else size * 1e-9 * (other.t[own] - other.t[0])
         return self.refold(log=other)
@@ -111,7 +122,7 @@ class Start(NamedTuple):
     def _predicted(self, name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return rows (n,), times (n,) in s and predictions (n, ny) of the measurements of a sensor.
 
-        Exchanged or delayed predictions move the mean of a measurement as the fault does, without its noise. A
+        Scaled, exchanged or delayed predictions move the mean of a measurement as the fault does, without its noise. A
         prediction follows noise by its corrections, H K ν = ν (S - R) / S, so that these are smoothed; the steps of the
         model between them are kept.
         """
@@ -158,10 +169,10 @@ class Start(NamedTuple):
 
 
 def _smoothed(series: np.ndarray) -> np.ndarray:
-    """Return the centred moving mean of a series (n,) over `SMOOTHED` values on each side, fewer at its ends."""
+    """Return the mean of each value of a series (n,) and the `SMOOTHED` before it: later ones contain its noise."""
     total = np.concatenate([np.zeros(1), np.cumsum(series)])
-    at = np.arange(series.size)
-    first, last = np.maximum(at - SMOOTHED, 0), np.minimum(at + SMOOTHED + 1, series.size)
+    last = np.arange(1, series.size + 1)
+    first = np.maximum(last - SMOOTHED - 1, 0)
     mean: np.ndarray = (total[last] - total[first]) / (last - first)
     return mean
 
@@ -261,9 +272,11 @@ DRIFT = "drift"  # Kind of a nudge that grows in proportion to the time since th
 SCALE, INPUT_SCALE = "scale", "input scale"  # Of a sensor row and of an input: factor, less 1
 DELAY = "delay"  # Of a sensor, s
 SWAP = "swap"  # Of the names of two sensors with the same units, 0 or 1
+STUCK, INPUT_STUCK = "stuck", "input stuck"  # Of a sensor and of an input: the first value is repeated, 0 or 1
+SWITCHED = (SWAP, STUCK, INPUT_STUCK)  # Kinds that are there or not
 R_, Q_ = NOISES = ("R", "Q")  # Factor on a variance, less 1
 FROM_PRIOR = (PRIOR, *NOISES)  # Kinds that are there from the prior on
-CATALOGUE = (*KINDS, DRIFT, SCALE, INPUT_SCALE, DELAY, SWAP, *FROM_PRIOR)
+CATALOGUE = (*KINDS, DRIFT, SCALE, INPUT_SCALE, DELAY, *SWITCHED, *FROM_PRIOR)
 
 SWAPPED = " and "  # Between the names of two sensors
 
@@ -286,6 +299,8 @@ WORDS = {
     INPUT_SCALE: "scale of input",
     DELAY: "delay of",
     SWAP: "swap of",
+    STUCK: "stuck",
+    INPUT_STUCK: "stuck input",
     PRIOR: "prior of",
 }
 
@@ -310,7 +325,7 @@ class Nudge(NamedTuple):
 
     def in_words(self, size: float) -> str:
         """Describe a fault of a size: of a parameter in percent of its value, if that is not near zero."""
-        if self.kind == SWAP:
+        if self.kind in SWITCHED:
             return self.subject
         if self.kind in NOISES:
             return f"{self.subject} × {digits(1.0 + size)}"
@@ -336,14 +351,14 @@ class Nudge(NamedTuple):
     @property
     def target(self) -> tuple[str, str]:
         """What is at fault, sensor, input, parameter, prior, swap or noise, and its name."""
-        if self.kind in (DRIFT, SCALE, DELAY, R_):
+        if self.kind in (DRIFT, SCALE, DELAY, STUCK, R_):
             return SENSOR, self.name
-        return (INPUT_ if self.kind == INPUT_SCALE else self.kind), self.name
+        return (INPUT_ if self.kind in (INPUT_SCALE, INPUT_STUCK) else self.kind), self.name
 
     def size_text(self, size: float) -> str:
         """Return the size of a fault without its sign: in percent as `in_words`, else in its unit."""
-        if self.kind == SWAP:
-            return "exchanged"
+        if self.kind in SWITCHED:
+            return "always"
         if self.kind in NOISES:
             return f"× {digits(1.0 + size)}"
         if self._in_percent(size):
@@ -352,8 +367,8 @@ class Nudge(NamedTuple):
 
     def range_text(self, low: float, high: float) -> str:
         """Return the range of undetectable sizes: `-31 to +92 %`, or `± 2.51 °C`."""
-        if self.kind == SWAP:
-            return "exchanged" if high > 0.0 else "none"
+        if self.kind in SWITCHED:
+            return "always" if high > 0.0 else "none"
         if self.kind in NOISES:
             return f"× {digits(1.0 + low)} to × {digits(1.0 + high)}"
         if not (np.isfinite(low) and np.isfinite(high)):
@@ -399,6 +414,8 @@ def nudges_of(
         values = values if values.size else np.array([item.default])
         scale = float(np.std(values)) or float(np.abs(values[0])) or 1.0
         found.append(Nudge(INPUT_, item.name, item.unit, STEP * scale, -np.inf, np.inf, scale))
+        if np.ptp(values) > 0.0:
+            others.append(Nudge(INPUT_STUCK, item.name, "", STEP, 0.0, 1.0, 1.0))
         if np.any(values != 0.0):
             others.append(Nudge(INPUT_SCALE, item.name, "", STEP, -MAX_SCALE, MAX_SCALE, 1.0, 1.0))
     for parameter, value in zip(model.parameters, tuning.p.tolist(), strict=True):
@@ -409,6 +426,7 @@ def nudges_of(
     sensors = [sensor for sensor, used in zip(model.sensors, reporting, strict=True) if used]
     for k, sensor in enumerate(sensors):
         times = log.t[: log.n][(kind == READING) & (channel == model.sensor_names.index(sensor.name))]
+        others.append(Nudge(STUCK, sensor.name, "", STEP, 0.0, 1.0, 1.0))
         period = float(np.median(np.diff(times))) * 1e-9 if times.size > 1 else 0.0
         most = min(max(MAX_DELAY_S, MAX_DELAY_PERIODS * period), MAX_DELAY_SHARE * seconds)
         if period > 0.0 and most > 0.0:

@@ -18,7 +18,7 @@ from ...model.state_space import StateSpaceModel
 from ...numerics.quantiles import normal_quantile
 from ...registry import find_estimator
 from ...snapshots import Base
-from ...track import USED
+from ...track import USED, Track
 from ...tuning import Tuning
 from ..health import HealthPolicy
 from .gramian import Uncertainty, information, uncertainty
@@ -32,6 +32,7 @@ from .responses import (
     PRIOR,
     STEP,
     SWAP,
+    SWITCHED,
     Nudge,
     Response,
     Start,
@@ -259,14 +260,27 @@ def _undetectable(begun: Start, nudge: Nudge, tests: FaultTests) -> Undetectable
     """Return the undetectable sizes of a nudge of any kind."""
     if nudge.kind in NOISES:
         return _undetectable_noise(begun, nudge)
-    if nudge.kind != SWAP:
+    if nudge.kind not in SWITCHED:
         return undetectable_fault(begun, nudge, begun.respond(nudge), tests)
-    # Sensors are exchanged or not: there is no smaller exchange.
-    response = begun.moved(begun.with_fault(nudge, 1.0))
-    finite = bool(np.all(np.isfinite(response.states)))
-    hidden = finite and tests.multiple(response.whitened, response.innovation / begun.track.innovation_std) > 1.0
+    track = begun.with_fault(nudge, 1.0)
+    response = begun.moved(track)
+    if nudge.kind == SWAP:
+        hidden = tests.multiple(response.whitened, response.innovation / begun.track.innovation_std) > 1.0
+    else:
+        hidden = not _alarmed(begun, track)
+    hidden &= bool(np.all(np.isfinite(response.states)))
     size, error = (1.0, np.abs(response.states)) if hidden else (0.0, np.zeros_like(begun.track.mean))
     return UndetectableFault(nudge, response, 0.0, size, np.inf if hidden else 1.0, error, 0.0)
+
+
+def _alarmed(begun: Start, track: Track) -> bool:
+    """Return whether a refold has an alarm of a sensor that the fold without nudge never has."""
+    log, calm = begun.log, begun.track
+    sensor = np.where(log.kind[: log.n] == READING, log.channel[: log.n], -1)
+    raised = np.zeros_like(calm.alarms)
+    for s in np.unique(sensor):
+        raised[sensor == s] = np.bitwise_or.reduce(calm.alarms[sensor == s], axis=0)
+    return bool(np.any(track.alarms & ~raised)) or bool(np.any((track.flags != 0) & (calm.flags == 0)))
 
 
 def _undetectable_noise(begun: Start, nudge: Nudge) -> UndetectableFault:
@@ -274,18 +288,13 @@ def _undetectable_noise(begun: Start, nudge: Nudge) -> UndetectableFault:
 
     If the other variance is right, the estimate is off by its change, and its band is that of the other.
     """
-    log, calm = begun.log, begun.track
-    sensor = np.where(log.kind[: log.n] == READING, log.channel[: log.n], -1)
-    raised = np.zeros_like(calm.alarms)
-    for s in np.unique(sensor):
-        raised[sensor == s] = np.bitwise_or.reduce(calm.alarms[sensor == s], axis=0)
+    calm = begun.track
     none = np.zeros_like(calm.mean)
 
     def tried(factor: float) -> tuple[bool, np.ndarray]:
         track = begun.with_fault(nudge, factor - 1.0)
         error = np.abs(begun.moved(track).states) + TWO_SIGMA * np.maximum(track.std - calm.std, 0.0)
-        alarmed = bool(np.any(track.alarms & ~raised)) or not np.all(np.isfinite(error))
-        return alarmed, error
+        return _alarmed(begun, track) or not np.all(np.isfinite(error)), error
 
     sizes, shown, errors = [], np.inf, none
     for limit in (1.0 + nudge.low, 1.0 + nudge.high):

@@ -5,11 +5,17 @@ refold with that nudge shows. Against the observed innovations ν,
 
     θ̂ = Σ Δνᵀν / Σ ΔνᵀΔν,   log Λ = ½ (Σ Δνᵀν)² / Σ ΔνᵀΔν
 
-are its most likely size and its log-likelihood ratio against no fault. Indistinguishable faults have the same log Λ and
-are named together. θ is the error of the twin's number: what a sensor or an input reads too much, or by how much the
-twin's parameter is too large. The parameter without this error must lie in its range.
+are its most likely size and its log-likelihood ratio against no fault. θ is the error of the twin's number: the excess
+of a sensor or an input, or by how much the twin's parameter is too large. The parameter without this error must lie in
+its range.
 
-Source: Willsky & Jones (1976), doi:10.1109/TAC.1976.1101146, the generalised likelihood ratio of additive faults.
+What the best fault leaves over, φ = Σ (ν - θ̂ Δν)² / n, is 1 if nothing else is wrong. Where it is larger, the model is
+not exact either, and log Λ / φ takes its place (quasi-likelihood). Faults are reported together with their odds, the
+exponentials of that, if these are close; and none, if the best explains only a small part of what is to be explained,
+Σ ν² - n.
+
+Sources: Willsky & Jones (1976), doi:10.1109/TAC.1976.1101146, the generalised likelihood ratio of additive faults;
+McCullagh & Nelder (1989), Generalized Linear Models, chapter 9, for the division by φ.
 """
 
 from __future__ import annotations
@@ -26,11 +32,16 @@ from ...log import Log
 from ...model.state_space import StateSpaceModel
 from ...snapshots import Base
 from ...tuning import Tuning
+from ..detectors import detector_of
 from .responses import (
+    DELAY,
     DRIFT,
+    INPUT_SCALE,
     KINDS,
     PARAMETER,
-    SENSOR,
+    PRIOR,
+    SCALE,
+    SWAP,
     Nudge,
     Start,
     astray,
@@ -44,15 +55,29 @@ MAX_EVENTS = 4000  # Events since the beginning of an episode that are refolded 
 EQUAL_NATS = 3.0  # Nats within which two faults explain equally much
 MAX_LINEAR_SIZE = 0.1  # Share of a parameter's value up to which its effect is taken as linear
 MIN_NATS = 5.0  # Nats below which a fault explains nothing
+RARER_NATS = 3.0  # log of how much rarer faults are that are no constants
+MIN_EXPLAINED = 0.2  # Share of Σ ν² - n below which the best fault is no explanation
+ISOLATED_TOO = ("correlated", "narrow", "diverged")  # Causes that leave open who is at fault, beside `Detector.isolate`
+
+NO_EXPLANATION = "none of the sensors, inputs and parameters alone"
+
+
+def isolates(cause: str) -> bool:
+    """Return whether the episodes of a cause leave open who is at fault."""
+    return detector_of(cause).isolate or cause in ISOLATED_TOO
 
 
 class Suspect(NamedTuple):
-    """A fault that may be the cause: its most likely size with its standard deviation, and log Λ against no fault."""
+    """A fault that may be the cause: its most likely size with its standard deviation, and log Λ / φ against no fault.
+
+    explained: share of Σ ν² - n that it explains, at most 1.
+    """
 
     nudge: Nudge
     size: float
     deviation: float
     gain: float
+    explained: float = 1.0
 
 
 def suspects(
@@ -89,8 +114,11 @@ def suspects(
     if begun is None:
         return []
     seen = np.nan_to_num(begun.track.whitened)
-    nudges = nudges_of(model, tuning, begun.log, (*KINDS, DRIFT))
-    found = []
+    kinds = (*KINDS, DRIFT, SCALE, INPUT_SCALE, DELAY, SWAP, PRIOR)
+    nudges = nudges_of(model, tuning, begun.log, kinds, begun.track)
+    found, left = [], float(np.sum(seen**2))
+    count = int(np.isfinite(begun.track.whitened).sum())
+    excess = left - count
     for nudge, response in zip(nudges, each(begun.respond, nudges, executor), strict=True):
         moved = np.nan_to_num(response.whitened)
         power = float(np.sum(moved**2))
@@ -98,9 +126,18 @@ def suspects(
             low, high = (-nudge.high, -nudge.low) if nudge.kind == PARAMETER else (nudge.low, nudge.high)
             size = float(np.clip(np.sum(moved * seen) / power, low, high))
             gain = float(size * np.sum(moved * seen) - 0.5 * size**2 * power)
+            gain -= 0.0 if nudge.kind in KINDS else RARER_NATS
             found.append(Suspect(nudge, size, power**-0.5, gain))
     checked = each(lambda suspect: _refolded(begun, suspect), found, executor)
-    return sorted(checked, key=lambda suspect: -suspect.gain)
+    best = max((suspect.gain for suspect in checked), default=0.0)
+    spread = max(1.0, (left - 2.0 * best) / max(1, count))
+    weighed = [
+        suspect._replace(
+            gain=suspect.gain / spread, explained=min(1.0, 2.0 * suspect.gain / excess) if excess > 0.0 else 1.0
+        )
+        for suspect in checked
+    ]
+    return sorted(weighed, key=lambda suspect: -suspect.gain)
 
 
 def _refolded(begun: Start, suspect: Suspect) -> Suspect:
@@ -132,26 +169,38 @@ def _start(
 
 
 def likeliest(found: Sequence[Suspect]) -> tuple[Suspect, ...]:
-    """Return the most likely fault and those that explain as much; none if no single fault explains anything.
+    """Return the most likely fault and those that explain as much; none if no single fault explains enough.
 
-    Offset and drift of one sensor count as one fault, the more likely of the two.
+    Offset, drift, scale and delay of one sensor count as one fault, the most likely of them.
     """
-    if not found or found[0].gain < MIN_NATS:
+    if not found or found[0].gain < MIN_NATS or found[0].explained < MIN_EXPLAINED:
         return ()
     alike: dict[tuple[str, str], Suspect] = {}
     for suspect in found:
         if found[0].gain - suspect.gain < EQUAL_NATS:
-            kind = SENSOR if suspect.nudge.kind == DRIFT else suspect.nudge.kind
-            alike.setdefault((kind, suspect.nudge.name), suspect)
+            alike.setdefault(suspect.nudge.target, suspect)
     return tuple(alike.values())
 
 
+def odds(alike: Sequence[Suspect]) -> tuple[float, ...]:
+    """Return the probabilities of faults of which one is the cause, equally likely before."""
+    weights = np.exp([suspect.gain - alike[0].gain for suspect in alike]) if alike else np.zeros(0)
+    return tuple((weights / weights.sum()).tolist())
+
+
 def in_words(found: Sequence[Suspect], most: int = 3) -> str:
-    """Describe the most likely faults, at most `most` of them."""
-    return " or ".join(_words(suspect.nudge, suspect.size) for suspect in likeliest(found)[:most])
+    """Describe the most likely faults, at most `most` of them, with their odds; "" if nothing needs to be explained."""
+    alike = likeliest(found)
+    if not alike:
+        return NO_EXPLANATION if found and found[0].gain >= MIN_NATS else ""
+    shares = [f" ({100.0 * share:.0f} %)" if len(alike) > 1 else "" for share in odds(alike)]
+    words = [_words(one.nudge, one.size) + share for one, share in zip(alike[:most], shares, strict=False)]
+    return " or ".join(words) + (f" or {len(alike) - most} more" if len(alike) > most else "")
 
 
 def _words(nudge: Nudge, size: float) -> str:
+    if nudge.kind == PRIOR:
+        return f"the estimate of {nudge.name} when it began, {size:+.3g} {nudge.unit}".rstrip()
     if nudge.kind != PARAMETER:
         return nudge.in_words(size)
     return f"{nudge.name} too {'large' if size > 0.0 else 'small'} by {nudge.size_text(abs(size))}"
