@@ -178,7 +178,9 @@ def _smoothed(series: np.ndarray) -> np.ndarray:
 
 
 def _at(t: np.ndarray, times: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Interpolate series of values (n, rows) at times t."""
+    """Interpolate series of values (n, rows) at times t; without any value nothing is moved."""
+    if not times.size:
+        return np.zeros((t.size, values.shape[1]))
     return np.stack([np.interp(t, times, column) for column in values.T], axis=1)
 
 
@@ -334,6 +336,8 @@ class Nudge(NamedTuple):
             return f"{name} {100.0 * size / abs(self.value):+.3g} %"
         if self.kind == DRIFT:
             return f"{SENSOR} {self.name} drifting by {size:+.3g} {self.unit}"
+        if self.kind == DELAY:
+            return f"{SENSOR} {self.name} {'delayed' if size > 0.0 else 'early'} by about {abs(size):.2g} s"
         if self.kind in WORDS:
             return f"{self.subject} {size:+.3g} {self.unit}".rstrip()
         kind = "" if self.kind == PARAMETER else f"{self.kind} "

@@ -68,7 +68,7 @@ def test_figures_agree_with_each_other(checked):
     found, _ = checked
     faults = {(fault["kind"], fault["name"]): fault for fault in found["smallest_visible"]}
     assert set(faults) == {
-        *((kind, "winding") for kind in ("sensor", "scale", "R", "drift", "delay")),
+        *((kind, "winding") for kind in ("sensor", "scale", "R", "drift", "delay", "stuck")),
         *((kind, state) for kind in ("prior", "Q") for state in ("temperature", "rate")),
     }
     # One sensor alone: its reading 10 % too high is the temperature of a hotter motor.

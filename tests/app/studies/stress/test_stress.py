@@ -205,9 +205,9 @@ def test_the_command_prints_a_table_or_json(nisus):
     out = nisus(*given).out
     assert "winding stuck" in out and "2/2" in out and "0 rows wrong and green" in out
     rows = nisus(*given, "--json").json
-    assert [(row["mistake"], row["seed"]) for row in rows] == [
-        ("R x100", 0), ("winding stuck", 0), ("R x100", 1), ("winding stuck", 1),
-    ]  # fmt: skip
+    made = ["R x100", "winding stuck", "winding stuck from the start"]
+    assert [(row["mistake"], row["seed"]) for row in rows] == [(name, seed) for seed in (0, 1) for name in made]
+    assert "Wrong, undetected and not listed\n  none" in out
     assert "Q /100" in nisus("stress", "motor_winding", "--list", "--duration", 60).out.splitlines()
 
 
