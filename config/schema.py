@@ -135,6 +135,26 @@ Parameters = dict[
 ]
 
 
+OptionalParameter = Annotated[
+    ParameterSection | None,
+    BeforeValidator(
+        lambda value: value if value is None else as_parameter(value),
+        json_schema_input_type=Number | ParameterSection | None,
+    ),
+]
+
+
+class InstrumentSection(Section):
+    """Offset and scale of a sensor or an input."""
+
+    offset: OptionalParameter = None
+    """What it adds: a value, or {value, std, use} as a parameter, as in {std: 0.005}, in its unit. It becomes the
+    parameter NAME_offset (NAME_ROW_offset of several rows), which `parameters` may give in its place. Default: none."""
+    scale: OptionalParameter = None
+    """By what it multiplies: a value, or {value, std, use} as a parameter, as in {std: 0.2 %}. It becomes the parameter
+    NAME_scale (NAME_ROW_scale of several rows). Default: none."""
+
+
 class EstimateSection(Section):
     """A parameter of the model that is estimated jointly with the state."""
 
@@ -163,7 +183,7 @@ class RefitSection(Section):
     Default: by hand."""
 
 
-class SensorSection(SpreadSection):
+class SensorSection(SpreadSection, InstrumentSection):
     """Noise of one sensor as the estimator assumes it, limits of its measurements, and whether they are used."""
 
     error: ErrorSection | None = None
@@ -416,6 +436,9 @@ class TwinSection(Section):
     """Process noise Q by name: its strength and correlation time. Default: the model's, white."""
     sensors: dict[str, SensorSection] = {}
     """Sensor noise R, limits and use by sensor. Default: the model's."""
+    inputs: dict[str, InstrumentSection] = {}
+    """Offsets and scales of inputs: the model takes scale·u + offset, as in {current: {offset: {std: 0.02}}}. Default:
+    none."""
     valid: dict[str, Validity] = {}
     """Range over which the model was fitted or validated, by state or input, in its unit, for example
     {temperature: {min: 20, max: 38}}. Outside it health is suspect, or advisory where parameters `widen`. A fitted

@@ -15,12 +15,13 @@ import numpy as np
 
 from config.fields import bounds
 from config.loader import Loaded, shown_path
-from config.schema import SensorSection, TwinSection
+from config.schema import ParameterSection, SensorSection, TwinSection
 from config.yaml_files import Key, dotted
 from estimators.errors import ConfigError, ModelError, NisusError, nearest
 from estimators.model.assemble import AppendError, JointParameter, assemble
 from estimators.model.coloured import ColouredError, disturbance_time, error_time
 from estimators.model.hybrid import learned_noise
+from estimators.model.instruments import Instrument, instrument_parameters
 from estimators.model.parts import Correlation, Limits, Stuck, correlation_error
 from estimators.model.state_space import Field, Sensor, State, StateSpaceModel
 from estimators.model.user_file import imported_beside, run_file
@@ -156,35 +157,50 @@ def _assembled(model: StateSpaceModel, loaded: Loaded) -> StateSpaceModel:
         key = ("sensors", name, "error", "std" if error.std is not None else "variance")
         errors[name] = ColouredError(one_each(loaded, key, error.variances, rows), error.over)
     times = [*map(disturbance_time, noises), *map(error_time, errors)]
-    parameters = [*(item.name for item in model.parameters), *times]
-    check_names(loaded, ("estimate",), config.estimate, parameters, "parameter", model)
+    instruments = _instruments(model, loaded)
+    sections = {**config.parameters, **{item: own for parts in instruments.values() for item, own in parts.items()}}
+    values = {item.name: item.value for item in model.parameters}
+    values |= {name: _value(name, section) for name, section in sections.items() if name not in values}
+    check_names(loaded, ("estimate",), config.estimate, [*values, *times], "parameter", model)
     estimated = {name: JointParameter(section.std, section.drift) for name, section in config.estimate.items()}
-    for item in model.parameters:
-        section = config.parameters.get(item.name)
-        std = section.spread(item.value) if section is not None else None
-        if section is not None and std is not None:
-            if item.name in config.estimate:
-                raise loaded.error(("estimate", item.name), "has a std in `parameters` too; give it in one place")
-            considered, widened = section.use == "considered", section.widened(item.value)
-            estimated[item.name] = JointParameter(std, section.drift, considered, widened)
-    for name, section in config.parameters.items():
-        check_names(loaded, ("parameters", name, "correlation"), section.correlation, parameters, "parameter", model)
+    for name, section in sections.items():
+        std = section.spread(values[name])
+        if std is not None:
+            if name in config.estimate:
+                raise loaded.error(("estimate", name), "has a std in `parameters` too; give it in one place")
+            considered, widened = section.use == "considered", section.widened(values[name])
+            estimated[name] = JointParameter(std, section.drift, considered, widened)
+    for name, section in sections.items():
+        check_names(
+            loaded, ("parameters", name, "correlation"), section.correlation, [*values, *times], "parameter", model
+        )
         for other, value in section.correlation.items():
-            mirrored = config.parameters[other].correlation.get(name, value) if other in config.parameters else value
+            mirrored = sections[other].correlation.get(name, value) if other in sections else value
             if name == other or mirrored != value:
                 text = "is with itself" if name == other else f"is {value:g} here and {mirrored:g} under {other}"
                 raise loaded.error(("parameters", name, "correlation", other), f"{text}; give each pair once")
-    held = {name for name, section in config.parameters.items() if section.use != "considered"}
+    held = {name for name, section in sections.items() if section.use != "considered"}
     correlations = {
         (name, other): value
-        for name, section in config.parameters.items()
+        for name, section in sections.items()
         for other, value in section.correlation.items()
         if not held & {name, other}
     }
     model = replace(model, states=_ranged(model.states, loaded), inputs=_ranged(model.inputs, loaded))
     try:
         return assemble(
-            model, learned=learned, noises=noises, errors=errors, estimated=estimated, correlations=correlations
+            model,
+            learned=learned,
+            noises=noises,
+            errors=errors,
+            instruments={
+                name: Instrument(
+                    *(tuple(values[item] for item in parts if item.endswith(f"_{kind}")) for kind in Instrument._fields)
+                )
+                for name, parts in instruments.items()
+            },
+            estimated=estimated,
+            correlations=correlations,
         )
     except AppendError as error:
         kind, name = error.part
@@ -195,8 +211,39 @@ def _assembled(model: StateSpaceModel, loaded: Loaded) -> StateSpaceModel:
             "error": ("sensors", name, "error"),
             "estimate": ("estimate", name) if name in config.estimate else ("parameters", name),
             "correlation": ("parameters",),
+            "instrument": ("sensors" if name in config.sensors else "inputs", name),
         }
         raise ConfigError(f"{loaded.places.at(keys[kind])}: {dotted(keys[kind])}: {error}") from None
+
+
+def _instruments(model: StateSpaceModel, loaded: Loaded) -> dict[str, dict[str, ParameterSection]]:
+    """Return the sections of the parameters that offsets and scales become, by sensor or input.
+
+    What `parameters` gives of such a parameter takes the place of the instrument's.
+    """
+    config = loaded.config
+    check_names(loaded, ("inputs",), config.inputs, [item.name for item in model.inputs], "input", model)
+    found: dict[str, dict[str, ParameterSection]] = {}
+    for group in (config.sensors, config.inputs):
+        for name, section in group.items():
+            if group is config.sensors and name not in model.sensor_names:
+                continue
+            for kind in Instrument._fields:
+                given = getattr(section, kind)
+                if given is None:
+                    continue
+                if name in found and group is config.inputs and name in config.sensors:
+                    raise loaded.error(("inputs", name), "is a sensor's name too, whose offset or scale is given")
+                for item in instrument_parameters(model, name, kind):
+                    own = config.parameters.get(item)
+                    changes = {key: getattr(own, key) for key in own.model_fields_set} if own is not None else {}
+                    found.setdefault(name, {})[item] = given.model_copy(update=changes)
+    return found
+
+
+def _value(name: str, section: ParameterSection) -> float:
+    """Return the value of an offset or a scale."""
+    return section.value if section.value is not None else 1.0 if name.endswith("_scale") else 0.0
 
 
 def _with_noise(model: StateSpaceModel, loaded: Loaded) -> StateSpaceModel:
@@ -217,6 +264,7 @@ def with_parameters(model: StateSpaceModel, loaded: Loaded) -> StateSpaceModel:
     """Return the model with the YAML's parameters in place of its own; raises as `configure`."""
     config = loaded.config
     names = [item.name for item in model.parameters]
+    names += [item for parts in _instruments(model, loaded).values() for item in parts]
     check_names(loaded, ("parameters",), config.parameters, names, "parameter", model)
     values = {name: section.value for name, section in config.parameters.items() if section.value is not None}
     for item in model.parameters:

@@ -17,6 +17,7 @@ from numba import types
 from ..errors import ModelError
 from ..model.check import check_parts, probe, probe_angles, probe_likelihoods
 from ..model.state_space import LARGE, Field, StateSpaceModel
+from ..model.wrapping import is_derived
 from ..numerics.helpers import with_helpers
 from ..numerics.jit import address, jit, plain
 from .black_box import ANSWER, BlackBox, answered_f, answered_h
@@ -96,15 +97,13 @@ def _compile(model: StateSpaceModel) -> CompiledModel:
     sizes = (model.nx, model.nu, len(model.parameters) + (ANSWER if box else 0))
     f_one = made.compiled(answered_f if box else model.f, f_signature, "f")
     f = made.address(looped_f(f_one, *sizes), f_rows_signature)
-    F = made.of(model.F, F_signature, "F")
+    F = made.over_complex(model.F, F_signature) if is_derived(model.F) else made.of(model.F, F_signature, "F")
     diagonal = model.shape is not None or model.nx > LARGE
     model_Q = _each_cell if isinstance(model.states, Field) and not model.Q and not diagonal else model.Q
     Q_dispatcher = made.compiled(model_Q, Q_signature, "Q") if model_Q else None
     shape_dispatcher = made.compiled(model.shape, shape_signature, "shape") if model.shape else None
     derivable = model.nx <= LARGE and box is None
-    f_complex = (
-        0 if model.F or not derivable else made.over_complex(jit(with_helpers(plain(model.f))), f_complex_signature)
-    )
+    f_complex = 0 if F or not derivable else made.over_complex(jit(with_helpers(plain(model.f))), f_complex_signature)
     h, h_calls = _h_of_sensors(made, model, sizes, box)
     H = _of_sensors(made, model, "H", H_signature)
     likelihoods = _of_sensors(made, model, "log_likelihood", log_likelihood_signature)
@@ -222,7 +221,10 @@ def _of_sensors(made: ModelCode, model: StateSpaceModel, field: str, signature: 
     """Return the addresses of an optional function of the sensors."""
 
     def own(k: int) -> int:
-        return made.of(getattr(model.sensors[k], field), signature, f"{field} of sensor {model.sensors[k].name}")
+        function = getattr(model.sensors[k], field)
+        if is_derived(function):
+            return made.over_complex(function, signature)
+        return made.of(function, signature, f"{field} of sensor {model.sensors[k].name}")
 
     functions = [getattr(sensor, field) for sensor in model.sensors]
     return made.of_sensors(functions, signature, own, lambda shared: made.address(*shared.with_own(signature)))
@@ -319,7 +321,9 @@ def _check_derivatives(compiled: CompiledModel) -> None:
     tolerance = 1e-4  # central differences with a step of 1e-5 are good to about 1e-8; a wrong formula is off by more
     if static["F_mode"] == ANALYTIC:
         error = disagree(lambda x, J: plain(model.F)(x, u, p, dt, J), f, model.nx)
-        if error > tolerance:
+        if error > tolerance and is_derived(model.F):
+            static["F_mode"] = CENTRAL
+        elif error > tolerance:
             raise ModelError(f"model {model.name}: F differs from central differences of f by {error:.2g} (relative)")
     elif static["F_mode"] == COMPLEX_STEP:
         if disagree(lambda x, J: complex_step_f(static["f_complex"], x, u, p, dt, J, scratch), f, model.nx) > tolerance:
@@ -333,7 +337,9 @@ def _check_derivatives(compiled: CompiledModel) -> None:
         mode = static["H_mode"][k]
         if mode == ANALYTIC:
             error = disagree(lambda x, J, s=sensor: plain(s.H)(x, u, p, J), h, rows)
-            if error > tolerance:
+            if error > tolerance and is_derived(sensor.H):
+                static["H_mode"][k] = CENTRAL
+            elif error > tolerance:
                 raise ModelError(
                     f"model {model.name}: H of sensor {sensor.name} differs from central differences of h "
                     f"by {error:.2g} (relative)"

@@ -5,6 +5,10 @@
 with the covariances of the members. The perturbations have mean zero over the members, so that the mean is updated
 with the measurement itself; without them the spread would become too small.
 
+Members keep their considered states: K has no rows for them. As every member of the other states moves by the gain of
+its own measurement, the covariance with them is then that of Schmidt's filter, on average, which a deterministic
+analysis would have to restore (Schmidt, 1966; gaussian/shared.py).
+
 Sources: Evensen (1994), doi:10.1029/94JC00572; Burgers, van Leeuwen & Evensen (1998),
 doi:10.1175/1520-0493(1998)126<1719:ASITEK>2.0.CO;2; Evensen (2003), doi:10.1007/s10236-003-0036-9. Localisation of
 both covariances: Houtekamer & Mitchell (2001), doi:10.1175/1520-0493(2001)129<0123:ASEKFF>2.0.CO;2.
@@ -14,6 +18,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from ..compiled.context import estimated
 from ..compiled.context import options as numbers
 from ..numerics.jit import jit
 from ..numerics.random import key_of, normal
@@ -115,12 +120,14 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     crews = int(given[CREWS])
     # B = R^(-1/2) (y + vᵢ - h(xᵢ)), then xᵢ ← xᵢ + C_xy R^(-1/2) (I + Zᵀ Z)⁻¹ B, tapered or in the members' space.
     perturbed_innovations(context.seed, index, m, a.ZT, a.d, a.B)
+    considered = X[:, estimated(context) :].copy()
     if localised(context):
         gains(m, a)
         regress_all(context, sensor, X, a.places, a.ZT, a.B, False, given[INFLATION], crews, rest)
     else:
         weights(m, a, given[INFLATION])
         transform_all(X, a.W, crews, rest)
+    X[:, estimated(context) :] = considered
     finish(context, index, X, rest)
     return USED
 
@@ -135,4 +142,5 @@ ENKF = ensemble_filter(
     functions=(start, predict, update, describe),
     work_size=work_size,
     prepare=prepare,
+    considers=True,
 )

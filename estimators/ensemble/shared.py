@@ -23,6 +23,7 @@ from numba import prange
 from ..compiled.context import (
     circular_states,
     context_at,
+    estimated,
     place_of,
     prior,
     process_variances,
@@ -319,7 +320,7 @@ def add_spread(context, index, X, scratch):
         if context.shape != 0:
             shaped(context, z, w)
             drawn = w
-        for j in range(n):
+        for j in range(estimated(context)):
             a = share * drawn[j] * np.sqrt(cov[0, j] if cov.shape[0] < n else cov[j, j])
             X[2 * i, j] += a
             X[2 * i + 1, j] -= a

@@ -91,10 +91,23 @@ def predict(context, u, dt, index, state, work):
     own = predicting(start_of(work), context.nx)
     state_jacobian(context, x, u, dt, own.F, own.jacobian)
     transition(context, x, u, dt, own.forward)
-    congruence(own.F, P, own.products)
+    congruence(own.F, estimated(context), P, own.products)
     # Noise that depends on the state does so where the step began.
     add_noise(context, x, u, dt, state, P, own.Q)
     move_to(context, own.forward, x)
+
+
+@inlined
+def sparse_product(P, H, C):
+    """C = P Hᵀ, where most of H is zero, as a sensor sees few of the states and the considered ones."""
+    for k in range(H.shape[0]):
+        for i in range(C.shape[0]):
+            C[i, k] = 0.0
+        for j in range(H.shape[1]):
+            a = H[k, j]
+            if a != 0.0:
+                for i in range(C.shape[0]):
+                    C[i, k] += a * P[j, i]
 
 
 @embedded
@@ -104,12 +117,15 @@ def linearise(context, sensor, x, u, P, reading, H, scratch):
     n, m = C.shape
     sensor_jacobian(context, sensor, x, u, H, scratch)
     expect(context, sensor, x, u, reading.nu)
-    for i in range(n):
-        for k in range(m):
-            s = 0.0
-            for j in range(n):
-                s += P[i, j] * H[k, j]
-            C[i, k] = s
+    if estimated(context) < n:
+        sparse_product(P, H, C)
+    else:
+        for i in range(n):
+            for k in range(m):
+                s = 0.0
+                for j in range(n):
+                    s += P[i, j] * H[k, j]
+                C[i, k] = s
     for k in range(m):
         for i in range(m):
             s = 0.0

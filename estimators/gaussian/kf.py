@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from ..compiled.context import transition
+from ..compiled.context import estimated, transition
 from ..compiled.jacobians import state_jacobian
 from ..estimator import Estimator, Options
 from ..model.state_space import StateSpaceModel
@@ -58,14 +58,18 @@ def predict(context, u, dt, index, state, work):
     constant = kept_in(work, n)
     constant_jacobian(context, u, dt, constant, own.jacobian)
     transition(context, x, u, dt, own.forward)
-    congruence(constant.F, P, own.products)
+    congruence(constant.F, estimated(context), P, own.products)
     add_noise(context, x, u, dt, state, P, own.Q)
     move_to(context, own.forward, x)
 
 
 def applies(model: StateSpaceModel) -> str | None:
     """Return why the filter does not apply: only a linear model has one F and one H."""
-    return None if model.linear else f"{model.name} is not linear; use an extended or unscented Kalman filter"
+    if model.linear:
+        return None
+    names = model.state_names[model.nx - model.considered :]
+    why = f" once {', '.join(names)} are considered: they multiply states, or are bounded" if names else ""
+    return f"{model.name} is not linear{why}; use an extended or unscented Kalman filter: ekf, ukf, sr-ekf or sr-ukf"
 
 
 KF = Estimator(
@@ -84,6 +88,7 @@ KF = Estimator(
     options=(JOSEPH_OPTION, *OPTIONS),
     tune=ekf.tune,
     memory=memory,
+    considers=True,
     singular=True,
     applies=applies,
 )

@@ -119,7 +119,7 @@ def predict(context, u, dt, index, state, work):
         constant = kept_in(work, n)
         counted = numbers[STEP] if near else dt
         constant_jacobian(context, u, counted, constant, own.jacobian)
-        congruence(constant.F, P, own.products)
+        congruence(constant.F, n, P, own.products)
         add_noise(context, x, u, counted, state, P, own.Q)
         phase[0] = MOVING
     move_to(context, own.forward, x)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..compiled.context import add_process_noise, options, sensor_rows, sensor_variances
+from ..compiled.context import add_process_noise, estimated, options, sensor_rows, sensor_variances
 from ..estimator import Option, Options
 from ..model.state_space import StateSpaceModel
 from ..numerics.jit import embedded, floats, inlined, part
@@ -114,23 +114,27 @@ def noise_scale(context, state):
 
 @embedded
 def add_noise(context, x, u, dt, state, P, scratch):
-    """P ← growth·P + scale·Q; scratch is (nx, nx)."""
+    """P ← growth·P + scale·Q, where the covariance of considered states does not grow; scratch is (nx, nx)."""
     scaled = options(context)[INFLATION] != 0.0 or options(context)[ADAPT] == ADAPT_Q
     scale = noise_scale(context, state) if scaled else 1.0
     if scaled:
-        multiply(growth(context, dt) / scale, P)
+        multiply(growth(context, dt) / scale, estimated(context), P)
     # Called in one place: it is inlined there.
     add_process_noise(context, x, u, dt, P, scratch)
     if scaled:
-        multiply(scale, P)
+        multiply(scale, estimated(context), P)
 
 
 @part
-def multiply(a, P):
-    """P ← a P."""
+def multiply(a, estimated, P):
+    """P ← D P D, where D has √a on its diagonal for the `estimated` states, and 1 for the considered ones."""
+    root = np.sqrt(a)
     for i in range(P.shape[0]):
         for j in range(P.shape[1]):
-            P[i, j] *= a
+            if i < estimated and j < estimated:
+                P[i, j] *= a
+            elif i < estimated or j < estimated:
+                P[i, j] *= root
 
 
 @embedded

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..compiled.context import expect, row_count, transition
+from ..compiled.context import estimated, expect, row_count, transition
 from ..compiled.jacobians import scratch_size, sensor_jacobian, state_jacobian
 from ..estimator import Estimator, Options
 from ..numerics.jit import by_address, inlined
@@ -46,15 +46,15 @@ def work_size(options: Options, nx: int, ny: int) -> int:
 
 
 @inlined
-def turn(U, F, a, out):
-    """Leading rows of `out` = a U Fᵀ, with upper U (n, n) and F (k, n)."""
+def turn(U, F, a, grown, out):
+    """Leading rows of `out` = U Fᵀ, with upper U (n, n) and F (k, n), and its `grown` leading columns times a."""
     n = U.shape[0]
     for i in range(n):
         for k in range(F.shape[0]):
             s = 0.0
             for j in range(i, n):
                 s += U[i, j] * F[k, j]
-            out[i, k] = a * s
+            out[i, k] = a * s if k < grown else s
 
 
 @inlined
@@ -63,7 +63,7 @@ def advance(context, u, dt, state, own, F):
     n = context.nx
     x, U = moments_of(state, n)
     good = noise_root(context, x, u, dt, state, own.A[n:], own.scratch)
-    turn(U, F, np.sqrt(growth(context, dt)), own.A)
+    turn(U, F, np.sqrt(growth(context, dt)), estimated(context), own.A)
     triangularise(own.A, own.scratch[0])
     settle(context, own.forward, own.A, good, state)
 
@@ -91,7 +91,7 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     own = updating(start_of(work), context.nx, row_count(context, sensor))
     sensor_jacobian(context, sensor, x, u, own.H, own.jacobian)
     expect(context, sensor, x, u, own.expected)
-    turn(U, own.H, 1.0, own.Y)
+    turn(U, own.H, 1.0, 0, own.Y)
     return condition(
         context, sensor, y, state, own.expected, own.Y, own.nothing, own.conditioning, innovation, innovation_std, score
     )

@@ -50,6 +50,7 @@ SR_KF = Estimator(
     options=OPTIONS,
     tune=sr_ekf.tune,
     memory=memory,
+    considers=True,
     singular=True,
     applies=applies,
 )

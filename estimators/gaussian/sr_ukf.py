@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..compiled.context import circular_rows, circular_states, expect_points, row_count, transition_points
+from ..compiled.context import circular_rows, circular_states, estimated, expect_points, row_count, transition_points
 from ..estimator import Estimator, Options
 from ..numerics.jit import by_address, inlined
 from ..numerics.linalg import remove, triangularise
@@ -64,11 +64,12 @@ def work_size(options: Options, nx: int, ny: int) -> int:
 
 
 @inlined
-def weigh_central(central, a, deviation, lost, row):
-    """Fill `lost` with the central point's row a √|w| D₀, and `row` too if its weight w is positive."""
-    w = a * np.sqrt(abs(central))
+def weigh_central(central, a, grown, deviation, lost, row):
+    """Fill `lost` with the central point's row √|w| D₀, its `grown` entries times a; `row` too if w is positive."""
+    bare = np.sqrt(abs(central))
+    w = a * bare
     for j in range(lost.size):
-        lost[j] = w * deviation[j]
+        lost[j] = (w if j < grown else bare) * deviation[j]
         row[j] = lost[j] if central > 0.0 else 0.0
 
 
@@ -90,11 +91,12 @@ def predict(context, u, dt, index, state, work):
     deviations(own.moved, w.outer, circular_states(context), own.mean)
     good = noise_root(context, x, u, dt, state, D[2 * n + 1 :], own.scratch)
     grown = np.sqrt(growth(context, dt))
-    outer = grown * np.sqrt(w.outer)
+    bare = np.sqrt(w.outer)
+    outer = grown * bare
     for i in range(1, 2 * n + 1):
         for j in range(n):
-            D[i, j] = outer * own.moved[i, j]
-    weigh_central(w.central, grown, own.moved[0], own.lost, D[0])
+            D[i, j] = (outer if j < estimated(context) else bare) * own.moved[i, j]
+    weigh_central(w.central, grown, estimated(context), own.moved[0], own.lost, D[0])
     triangularise(D, own.scratch[0])
     if w.central < 0.0 and good:
         good = remove(D, n, own.lost)
@@ -129,7 +131,7 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     deviations(own.D, w.outer, circular_rows(context, sensor), own.mean)
     turn_pairs(own.D, n, w.outer, own.Y)
     lost = own.lost
-    weigh_central(w.central, 1.0, own.D[0], lost, own.Y[2 * n])
+    weigh_central(w.central, 1.0, 0, own.D[0], lost, own.Y[2 * n])
     if w.central >= 0.0:
         lost = lost[:0]
     return condition(

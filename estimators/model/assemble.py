@@ -4,7 +4,8 @@ The order is fixed, and each step wraps the model of the step before:
 
 1. `hybrid`: a learned correction beside f, with a noise for each corrected state.
 2. `coloured`: states for process noise and sensor errors with a correlation time; correlation times are parameters.
-3. `joint`: parameters, those of step 2 included, as the last states; then what considered ones may be off by.
+3. `with_instruments`: offsets and scales of sensors and inputs, as parameters.
+4. `joint`: parameters, those of steps 2 and 3 included, as the last states; then what considered ones may be off by.
 
 So the physics keeps its states first, in their order: x = (physics, disturbances, sensor errors, parameters, deviations
 of considered parameters).
@@ -41,17 +42,18 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..errors import ModelError, nearest
-from ..numerics.jit import jit
+from ..numerics.jit import part, plain, stack_vector
 from .coloured import ColouredError, coloured
 from .hybrid import LearnedCorrection, hybrid, places
+from .instruments import Instrument, with_instruments
 from .state_space import Noise, Parameter, State, StateSpaceModel, squared
-from .wrapping import as_inner
+from .wrapping import as_inner, derived
 
 
 class AppendError(ModelError):
     """An addition that the model cannot have.
 
-    `part` is its kind (learned, noise, error, estimate, correlation) and its name.
+    `part` is its kind (learned, noise, error, instrument, estimate, correlation) and its name.
     """
 
     def __init__(self, part: tuple[str, str], message: str) -> None:
@@ -65,6 +67,7 @@ def assemble(
     learned: LearnedCorrection | None = None,
     noises: Mapping[str, float] | None = None,
     errors: Mapping[str, ColouredError] | None = None,
+    instruments: Mapping[str, Instrument] | None = None,
     estimated: Mapping[str, JointParameter] | None = None,
     correlations: Mapping[tuple[str, str], float] | None = None,
 ) -> StateSpaceModel:
@@ -75,6 +78,7 @@ def assemble(
         learned: A correction of its f.
         noises: Correlation time in seconds, by process noise.
         errors: Coloured errors, by sensor.
+        instruments: Offsets and scales, by sensor or input.
         estimated: Parameters to estimate or to consider, by name.
         correlations: See `joint`.
 
@@ -93,6 +97,10 @@ def assemble(
         with _blamed("error", name):
             coloured(model, errors={name: error})
     model = coloured(model, noises, errors)
+    for name, instrument in (instruments or {}).items():
+        with _blamed("instrument", name):
+            with_instruments(model, {name: instrument})
+    model = with_instruments(model, instruments or {})
     for name, parameter in estimated.items():
         with _blamed("estimate", name):
             joint(model, {name: parameter})
@@ -185,14 +193,44 @@ def joint(
         parameters=tuple(kept),
         noises=(*model.noises, *noises),
         f=_step(model.f, *layout),
-        F=None,
+        F=_slopes(model.f, *layout),
         Q=None if model.Q is None else _noise(model.Q, len(model.noises), len(moved), *layout),
-        sensors=tuple(replace(sensor, h=_sensor(sensor.h, *layout), H=None) for sensor in model.sensors),
+        sensors=tuple(
+            replace(sensor, h=_sensor(sensor.h, *layout), H=_sensor_slopes(sensor.h, len(sensor.rows), *layout))
+            for sensor in model.sensors
+        ),
         jump=None if model.jump is None else replace(model.jump, chances=_chances(model.jump.chances, *layout)),
         linear=False,
         considered=len(considered) + len(widened),
     )
+    if model.linear and not widened and is_linear(found):
+        found = replace(found, linear=True)
     return _correlated(found, [item.name for item in considered], correlations or {})
+
+
+def is_linear(model: StateSpaceModel) -> bool:
+    """Return whether f and h of a joint model are linear in all of its states: superposition at points of its prior.
+
+    A model that is linear stays so with offsets, but not with parameters that multiply states, or with bounded ones,
+    which act within their range only.
+    """
+    rng = np.random.default_rng(0)
+    p, dt, n = model.default_parameters, min(1.0, model.max_step), model.nx
+    for spread in (1.0, 1e3):
+        u = model.default_inputs + rng.standard_normal(model.nu)
+        a, b = model.prior_mean + spread * (model.prior_std + 1e-3) * rng.standard_normal((2, n))
+        middle = 0.5 * (a + b)
+        images = [np.zeros((3, n)), *(np.zeros((3, len(sensor.rows))) for sensor in model.sensors)]
+        for k, x in enumerate((a, b, middle)):
+            plain(model.f)(x, u, p, dt, images[0][k])
+            for sensor, image in zip(model.sensors, images[1:], strict=True):
+                plain(sensor.h)(x, u, p, image[k])
+        size = float(np.abs([a, b]).max())
+        for image in images:
+            bend = np.abs(image[2] - 0.5 * (image[0] + image[1]))
+            if not np.all(bend <= 1e-9 * (size + np.abs(image).max(axis=0))):
+                return False
+    return True
 
 
 def deviation(parameter: str) -> str:
@@ -262,10 +300,21 @@ def _correlated(
     return replace(model, prior_correlation=tuple(map(tuple, whole.tolist())))
 
 
-@jit
-def _parameters(x, u, p, n, place, low, high, distances):
-    """Return p(θ, δ, η): the model's own parameters, with moved and considered ones held within their ranges."""
-    full = np.empty(len(place), x.dtype)
+@part
+def _width(k, x, u, distances):
+    """Return what η of parameter k is multiplied by: the distances outside their ranges, each times its width."""
+    width = 0.0
+    for i in range(len(distances)):
+        if distances[i, 0] == k:
+            at = int(distances[i, 1])
+            z = x[at].real if at >= 0 else u[-1 - at]
+            width += distances[i, 4] * max(0.0, distances[i, 2] - z, z - distances[i, 3])
+    return width
+
+
+@part
+def _fill(full, x, u, p, n, place, low, high, distances):
+    """Fill p(θ, δ, η): the model's own parameters, with moved and considered ones held within their ranges."""
     for k in range(len(place)):
         j, own, out = place[k]
         if j < 0 and out < 0:
@@ -273,20 +322,23 @@ def _parameters(x, u, p, n, place, low, high, distances):
             continue
         value = x[n + j] if own < 0 else p[own] + x[n + j] if j >= 0 else p[own] + 0.0 * x[n]
         if out >= 0:
-            width = 0.0
-            for i in range(len(distances)):
-                if distances[i, 0] == k:
-                    at = int(distances[i, 1])
-                    z = x[at].real if at >= 0 else u[-1 - at]
-                    width += distances[i, 4] * max(0.0, distances[i, 2] - z, z - distances[i, 3])
-            value = value + width * x[n + out]
+            value = value + _width(k, x, u, distances) * x[n + out]
         if value.real < low[k]:
             full[k] = low[k]
         elif value.real > high[k]:
             full[k] = high[k]
         else:
             full[k] = value
-    return full
+
+
+@part
+def _free(x, u, p, n, at, k, low, high, distances):
+    """Return the complex step of parameter k, of `at` = (j, own, out): zero where its range ends."""
+    j, own, out = at
+    value = x[n + j] if own < 0 else p[own] + x[n + j] if j >= 0 else p[own]
+    if out >= 0:
+        value += _width(k, x, u, distances) * x[n + out]
+    return STEP if low[k] <= value <= high[k] else 0.0
 
 
 def _constant(distances: Distances) -> np.ndarray:
@@ -298,11 +350,90 @@ def _step(function: Callable, n: int, place: Any, low: Any, high: Any, distances
     inner, reach = as_inner(function), _constant(distances)
 
     def f(x, u, p, dt, out):  # noqa: ANN001, ANN202
-        inner(x[:n], u, _parameters(x, u, p, n, place, low, high, reach), dt, out[:n])
+        full = stack_vector(x[0], place)
+        _fill(full, x, u, p, n, place, low, high, reach)
+        inner(x[:n], u, full, dt, out[:n])
         for j in range(n, x.size):
             out[j] = x[j]
 
     return f
+
+
+STEP = 1e-20
+"""Complex step of a derivative: see compiled/jacobians.py."""
+
+
+@lru_cache(maxsize=64)
+def _slopes(function: Callable, n: int, place: Any, low: Any, high: Any, distances: Distances) -> Callable:
+    """Return df/d(x, θ, δ, η) by complex step; the parameters are filled once for all columns."""
+    inner, reach, states = as_inner(function), _constant(distances), (0,) * n
+
+    def F(x, u, p, dt, out):  # noqa: ANN001, ANN202
+        z, forward, full = stack_vector(1j, states), stack_vector(1j, states), stack_vector(1j, place)
+        for j in range(n):
+            z[j] = x[j]
+        _fill(full, x, u, p, n, place, low, high, reach)
+        for j in range(n):
+            z[j] = complex(x[j], STEP)
+            inner(z, u, full, dt, forward)
+            z[j] = x[j]
+            for i in range(n):
+                out[i, j] = forward[i].imag / STEP
+        for k in range(len(place)):
+            j, _, outside = place[k]
+            if j < 0 and outside < 0:
+                continue
+            full[k] = complex(full[k].real, _free(x, u, p, n, place[k], k, low, high, reach))
+            inner(z, u, full, dt, forward)
+            full[k] = full[k].real
+            width = _width(k, x, u, reach) if outside >= 0 else 0.0
+            for i in range(n):
+                slope = forward[i].imag / STEP
+                if j >= 0:
+                    out[i, n + j] = slope
+                if outside >= 0:
+                    out[i, n + outside] = width * slope
+        for i in range(n, x.size):
+            for j in range(x.size):
+                out[i, j] = 1.0 if i == j else 0.0
+
+    return derived(F)
+
+
+@lru_cache(maxsize=256)
+def _sensor_slopes(
+    function: Callable, rows: int, n: int, place: Any, low: Any, high: Any, distances: Distances
+) -> Callable:
+    """Return dh/d(x, θ, δ, η) by complex step; the parameters are filled once for all columns."""
+    inner, reach, states, measured = as_inner(function), _constant(distances), (0,) * n, (0,) * rows
+
+    def H(x, u, p, out):  # noqa: ANN001, ANN202
+        z, expected, full = stack_vector(1j, states), stack_vector(1j, measured), stack_vector(1j, place)
+        for j in range(n):
+            z[j] = x[j]
+        _fill(full, x, u, p, n, place, low, high, reach)
+        for j in range(n):
+            z[j] = complex(x[j], STEP)
+            inner(z, u, full, expected)
+            z[j] = x[j]
+            for i in range(rows):
+                out[i, j] = expected[i].imag / STEP
+        for k in range(len(place)):
+            j, _, outside = place[k]
+            if j < 0 and outside < 0:
+                continue
+            full[k] = complex(full[k].real, _free(x, u, p, n, place[k], k, low, high, reach))
+            inner(z, u, full, expected)
+            full[k] = full[k].real
+            width = _width(k, x, u, reach) if outside >= 0 else 0.0
+            for i in range(rows):
+                slope = expected[i].imag / STEP
+                if j >= 0:
+                    out[i, n + j] = slope
+                if outside >= 0:
+                    out[i, n + outside] = width * slope
+
+    return derived(H)
 
 
 @lru_cache(maxsize=64)
@@ -310,7 +441,9 @@ def _chances(function: Callable, n: int, place: Any, low: Any, high: Any, distan
     inner, reach = as_inner(function), _constant(distances)
 
     def chances(x, u, p, dt, out):  # noqa: ANN001, ANN202
-        inner(x[:n], u, _parameters(x, u, p, n, place, low, high, reach), dt, out)
+        full = stack_vector(x[0], place)
+        _fill(full, x, u, p, n, place, low, high, reach)
+        inner(x[:n], u, full, dt, out)
 
     return chances
 
@@ -320,7 +453,9 @@ def _sensor(function: Callable, n: int, place: Any, low: Any, high: Any, distanc
     inner, reach = as_inner(function), _constant(distances)
 
     def h(x, u, p, out):  # noqa: ANN001, ANN202
-        inner(x[:n], u, _parameters(x, u, p, n, place, low, high, reach), out)
+        full = stack_vector(x[0], place)
+        _fill(full, x, u, p, n, place, low, high, reach)
+        inner(x[:n], u, full, out)
 
     return h
 
@@ -332,7 +467,9 @@ def _noise(
     inner, reach = as_inner(function), _constant(distances)
 
     def Q(x, u, p, q, dt, out):  # noqa: ANN001, ANN202
-        inner(x[:n], u, _parameters(x, u, p, n, place, low, high, reach), q[:nw], dt, out[:n, :n])
+        full = stack_vector(x[0], place)
+        _fill(full, x, u, p, n, place, low, high, reach)
+        inner(x[:n], u, full, q[:nw], dt, out[:n, :n])
         for j in range(moved):
             out[n + j, n + j] = q[nw + j] * dt
 

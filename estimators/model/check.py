@@ -19,6 +19,7 @@ import numpy as np
 from ..errors import ModelError
 from ..numerics.jit import plain
 from .state_space import LARGE, StateSpaceModel
+from .wrapping import is_derived
 
 
 def place(function: Any, error: BaseException | None = None) -> str:
@@ -214,7 +215,7 @@ def probe(model: StateSpaceModel) -> None:
         calls.append((f"h of sensor {sensor.name}", sensor.h, "x, u, p", (m,)))
         calls.append((f"H of sensor {sensor.name}", sensor.H, "x, u, p", (m, n)))
     for what, function, takes, shape in calls:
-        if function is None or (model.black_box and what not in ("Q", "shape")):
+        if function is None or is_derived(function) or (model.black_box and what not in ("Q", "shape")):
             continue
         out = np.full(shape, 0.0 if what == "Q" else np.nan)
         sizes = f"{n} states, {model.nu} inputs and {len(model.parameters)} parameters, out of shape {shape}"

@@ -39,6 +39,17 @@ def as_inner(function: Callable) -> Any:
     return inner
 
 
+def derived(function: Callable) -> Callable:
+    """Mark a Jacobian by complex step: where f or h is not analytic, differences take its place."""
+    function.derived = True  # type: ignore[attr-defined]
+    return function
+
+
+def is_derived(function: Callable | None) -> bool:
+    """Return whether a Jacobian is marked by `derived`."""
+    return getattr(plain(function), "derived", False)
+
+
 def noise_function(model: StateSpaceModel) -> Callable:
     """Return the model's Q, or one that adds each noise to the states of its name."""
     if model.Q is not None:

@@ -12,11 +12,12 @@ from functools import lru_cache, partial
 from typing import Any
 
 import numba
+import numpy as np
 from numba import carray, njit, types
 from numba.core import cgutils
 from numba.core.registry import CPUDispatcher
 from numba.experimental.function_type import _get_jit_address
-from numba.extending import intrinsic, register_jitable
+from numba.extending import intrinsic, overload, register_jitable
 
 from .cache import cache_folder
 from .cache_entries import use_entries
@@ -191,6 +192,32 @@ def matrix(vector, start, rows, columns):
 def complexes(scratch, start, n):
     """Return a view of the float64s of `scratch` from `start` on as n complex numbers."""
     return carray(_to_complex(scratch.ctypes.data + 8 * start), (n,))
+
+
+@intrinsic
+def _on_stack(typing_context: Any, like: Any, entries: Any) -> Any:
+    """Return the address of room on the stack for as many numbers of the kind of `like` as a tuple has entries."""
+
+    def codegen(context: Any, builder: Any, signature: Any, given: Any) -> Any:
+        return cgutils.alloca_once(builder, context.get_data_type(like), size=max(1, entries.count))
+
+    return types.CPointer(like)(like, entries), codegen
+
+
+def stack_vector(like: Any, entries: Any) -> Any:
+    """Return a new vector of the kind of the number `like`, with as many numbers as the tuple `entries` has.
+
+    Compiled, it lies on the stack of the caller, who may not return it: other memory takes 30 to 50 ns.
+    """
+    return np.empty(len(entries), type(like))
+
+
+@overload(stack_vector, inline="always", jit_options={"error_model": "numpy"})
+def _stack_vector(like: Any, entries: Any) -> Any:
+    def made(like: Any, entries: Any) -> Any:
+        return carray(_on_stack(like, entries), (len(entries),))
+
+    return made
 
 
 @part

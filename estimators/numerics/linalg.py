@@ -210,9 +210,12 @@ def solve_unit(L, m, b):
 
 
 @part
-def congruence(F, P, T):
-    """Overwrite symmetric P with F P Fᵀ; T is scratch of twice the shape (2n, n)."""
+def congruence(F, rows, P, T):
+    """Overwrite symmetric P with F P Fᵀ, where F is the identity beyond its first `rows`; T (2n, n) is scratch."""
     n = P.shape[0]
+    if rows < n:
+        bordered_congruence(F, rows, P, T)
+        return
     for i in range(n):
         for j in range(n):
             T[i, j] = 0.0
@@ -231,6 +234,42 @@ def congruence(F, P, T):
                 for j in range(i + 1):
                     P[i, j] += a * T[n + k, j]
     mirror(P)
+
+
+@part
+def bordered_congruence(F, rows, P, T):
+    """Overwrite P with F P Fᵀ as `congruence`; beyond `rows` P stays, is often diagonal, and its zeros are left out."""
+    n = P.shape[0]
+    diagonal = True
+    for i in range(rows + 1, n):
+        for j in range(rows, i):
+            diagonal = diagonal and P[i, j] == 0.0
+    for i in range(rows):
+        for j in range(rows):
+            s = 0.0
+            for k in range(n):
+                s += F[i, k] * P[j, k]
+            T[i, j] = s
+        for j in range(rows, n):
+            s = 0.0
+            for k in range(rows):
+                s += F[i, k] * P[j, k]
+            if diagonal:
+                s += F[i, j] * P[j, j]
+            else:
+                for k in range(rows, n):
+                    s += F[i, k] * P[j, k]
+            T[i, j] = s
+    for i in range(rows):
+        for j in range(i + 1):
+            s = 0.0
+            for k in range(n):
+                s += T[i, k] * F[j, k]
+            P[i, j] = s
+            P[j, i] = s
+        for j in range(rows, n):
+            P[i, j] = T[i, j]
+            P[j, i] = T[i, j]
 
 
 @inlined

@@ -41,7 +41,7 @@ MEMBERS, FRACTION, SCHEME, THREADS, WIDTH, DUPLICATES = range(6)
 """Positions in the context's options. `WIDTH` is the kernel width of `pf-reg`, 0 in all others; `DUPLICATES` is whether
 the kernel moves only particles that have a sibling."""
 
-PROCESS, START, RESAMPLE, JITTER, RECOVER, DRAW = range(6)
+PROCESS, START, RESAMPLE, JITTER, RECOVER, DRAW, CONSIDER = range(7)
 """Streams of randomness; see numerics/random.py."""
 
 THREADED_FROM = 16_384

@@ -6,11 +6,13 @@ import math
 
 import numpy as np
 
-from ..compiled.context import circular_states, jump_chances
+from ..compiled.context import circular_states, estimated, jump_chances
 from ..compiled.noise import add_noise, belief_root
 from ..numerics.jit import floats, jit, matrix
 from ..numerics.random import GAMMA, key_of, mix, normal, unit, word
+from ..numerics.symmetric import symmetric_eigen
 from .cloud import (
+    CONSIDER,
     HEAD,
     RECOVER,
     RECOVERIES,
@@ -155,6 +157,57 @@ def spread_by(context, root, key, first, records):
 
 
 @jit
+def reconsider(context, index, state):
+    """Give considered states c the mean and covariance of their prior again, after a measurement that weighed them.
+
+    c ← c - c̄ + c₀ + L z, z ~ N(0, I), with L Lᵀ = C - P_cc, the variance that the measurement took. As z is independent
+    of everything, mean and covariance of the other states, and their covariance with c, stay those of the weighted
+    cloud: for a linear model they are those of Schmidt's filter (gaussian/shared.py). Particles that kept their c
+    would lose the prior's spread with their weights; a filter for each c, mixed by the prior alone, would have no gain
+    that falls where measurements say more of c.
+
+    Sources: Schmidt (1966), for the moments; Liu & West (2001), doi:10.1007/978-1-4757-3437-9_10, for draws that
+    restore the moments of constant states.
+    """
+    first, nx = estimated(context), context.nx
+    count = nx - first
+    if count == 0:
+        return
+    cloud = own_cloud(context, state)
+    prior = matrix(floats(context.prior_cov, nx * nx), 0, nx, nx)
+    mean = floats(context.prior_mean, nx)
+    A, V, values = np.empty((count, count)), np.empty((count, count)), np.empty(count)
+    for i in range(count):
+        for j in range(count):
+            # In units of the prior's deviations, so that none of them drowns in rounding errors of another.
+            scale = np.sqrt(prior[first + i, first + i] * prior[first + j, first + j])
+            A[i, j] = (prior[first + i, first + j] - cloud.cov[first + i, first + j]) / scale
+    if not symmetric_eigen(A, count, values, V, np.empty(3 * count)):
+        return
+    root = np.zeros((count, count))
+    for k in range(count):
+        # Chance makes some variances of the cloud larger than the prior's.
+        length = np.sqrt(max(values[k], 0.0))
+        for i in range(count):
+            root[i, k] = length * V[k, i] * np.sqrt(prior[first + i, first + i])
+    key = key_of(context.seed, index, CONSIDER)
+    z = np.empty(count)
+    for member in range(cloud.records.shape[0]):
+        for k in range(count):
+            z[k] = normal(key, np.uint64(member * count + k))
+        for i in range(count):
+            moved = mean[first + i] - cloud.mean[first + i]
+            for k in range(count):
+                moved += root[i, k] * z[k]
+            cloud.records[member, first + i] += moved
+    for i in range(count):
+        cloud.mean[first + i] = mean[first + i]
+        for j in range(count):
+            for k in range(count):
+                cloud.cov[first + i, first + j] += root[i, k] * root[j, k]
+
+
+@jit
 def lost_moments(context, state, mean, cov):
     """Count a recovery; fill mean and covariance of the lost cloud; return whether they are finite."""
     state[RECOVERIES] += 1.0
@@ -189,6 +242,7 @@ def recover(context, index, state):
         cov[i, i] = max(cov[i, i], SEED_VARIANCE * prior[i, i])
     root = np.empty((nx, nx))
     belief_root(cov, root)
+    root[estimated(context) :] = 0.0
     key = key_of(context.seed, index, RECOVER)
     spread_by(context, root, key, 0, records)
     if context.mode >= 0:

@@ -8,6 +8,9 @@ Regularised: after resampling each particle moves by a draw from a Gaussian kern
 covariance, with the bandwidth h that is best for a Gaussian cloud, times the option `bandwidth`. Optionally only
 particles that have a sibling move.
 
+Each particle has its own values of the considered states. A measurement weighs the particles with them, so that mean
+and covariance of the others account for their uncertainty; then `reconsider` gives them their prior again.
+
 Sources: Gordon, Salmond & Smith (1993), doi:10.1049/ip-f-2.1993.0015; Musso, Oudjane & Le Gland (2001), Improving
 regularised particle filters, in Sequential Monte Carlo Methods in Practice, doi:10.1007/978-1-4757-3437-9_12.
 """
@@ -21,6 +24,7 @@ import numpy as np
 from ..compiled.context import (
     circular_rows,
     circular_states,
+    estimated,
     expect_points,
     has_own_likelihood,
     own_likelihood,
@@ -66,7 +70,7 @@ from .cloud import (
     tune,
     wrap_record,
 )
-from .draws import jump, jump_key, recover, spread_by, start
+from .draws import jump, jump_key, reconsider, recover, spread_by, start
 from .innovation import about, finite_rows, first_residual, half_square, predicted, score_rows
 from .weights import (
     NO_KEY,
@@ -328,6 +332,7 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
         drawn = keep_or_resample(context, key_of(context.seed, index, RESAMPLE), log_sum, state, work)
         if drawn and numbers(context)[WIDTH] > 0.0:
             smooth(context, key_of(context.seed, index, JITTER), cloud.cov, shared.L, state, work)
+        reconsider(context, index, state)
         score_cloud(state, score)
     elif verdict == USED or verdict == FAILED:
         verdict = FAILED
@@ -343,7 +348,7 @@ def smooth(context, key, cov, L, state, work):
     belief_root(cov, L)
     for i in range(L.shape[0]):
         for j in range(L.shape[0]):
-            L[i, j] *= numbers(context)[WIDTH]
+            L[i, j] *= numbers(context)[WIDTH] if i < estimated(context) else 0.0
     sweep(SMOOTH, context, state, 0.0, 0, state, key, 0.0, state, work)
 
 
@@ -381,6 +386,7 @@ PF = Estimator(
     work_size=work_sized(room_at),
     blocks=block,
     prepare=phases(propagate_block, weigh_block, smooth_block),
+    considers=True,
     **SHARED,
 )
 

@@ -127,7 +127,7 @@ def move_block(context, u, dt, sensor, y, key, value, state, work, number):
             certain &= P[j, j] == 0.0
         if not certain:
             state_jacobian(context, x, u, dt, F, scratch)
-            congruence(F, P, T)
+            congruence(F, P.shape[0], P, T)
         transition(context, x, u, dt, forward)
         add_process_noise(context, x, u, dt, P, T[:nx])
         finite = True

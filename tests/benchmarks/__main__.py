@@ -33,6 +33,7 @@ def main() -> None:
     sections: list[Section] = [
         filters.beside_filterpy,
         filters.step_alone,
+        filters.considered,
         filters.beside_stone_soup,
         filters.growing_n,
         filters.growing_m,

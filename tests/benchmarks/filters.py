@@ -11,7 +11,8 @@ from filterpy.kalman import ExtendedKalmanFilter, KalmanFilter, MerweScaledSigma
 from estimators.estimator import call_predict, call_update
 from estimators.fold import Fold
 from estimators.log import READING, Events, Log
-from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
+from estimators.model.assemble import JointParameter, joint
+from estimators.model.state_space import Input, Noise, Parameter, Row, Sensor, State, StateSpaceModel
 from estimators.models import MODELS
 from estimators.numerics.jit import borrowed, floats, jit
 from estimators.registry import ESTIMATORS
@@ -84,7 +85,7 @@ def noisy_log(model: StateSpaceModel, events: int, *, step: float = 1.0) -> Log:
     m = len(model.sensors[0].rows)
     x = np.array([state.mean for state in model.states])
     expected = np.empty(m)
-    model.sensors[0].h(x, np.zeros(0), np.zeros(0), expected)
+    model.sensors[0].h(x, model.default_inputs, model.default_parameters, expected)
     t = np.arange(events, dtype=np.int64) * round(step * SECOND)
     value = expected + 0.3 * rng.standard_normal((events, m))
     log = Log(model.width, events)
@@ -210,6 +211,42 @@ def step_alone() -> Iterator[BenchmarkRow]:
     step, whole = (value / STEPS * 1e6 for value in medians(calls, REPETITIONS))
     figures = {"step [µs]": step, "with history [µs]": whole}
     yield BenchmarkRow("UKF n=4 m=2", figures, (Bound("step [µs]", 1.0),))
+
+
+def chain_f(x, u, p, dt, out):
+    out[0] = x[0] + dt * (u[0] * p[0] - p[1] * x[0] + p[2] * (x[1] - x[0]))
+    out[1] = x[1] + dt * (p[3] * (x[0] - x[1]) - p[4] * (x[1] - x[2]))
+    out[2] = x[2] + dt * (p[5] * (x[1] - x[2]) - p[6] * (x[2] - x[3]))
+    out[3] = x[3] + dt * (p[7] * (x[2] - x[3]) - p[8] * x[3])
+
+
+def chain_h(x, u, p, out):
+    out[0] = x[0] + p[9] * u[0]
+
+
+def chain() -> StateSpaceModel:
+    """Return a chain of four masses of heat with ten parameters, heated and measured at one end."""
+    return StateSpaceModel(
+        name="chain",
+        title="chain of four",
+        states=tuple(State(f"x{i}", "K", mean=1.0, std=1.0) for i in range(4)),
+        noises=tuple(Noise(f"x{i}", "K²/s", 0.01) for i in range(4)),
+        sensors=(Sensor("y", (Row("y", "K", 0.04),), h=chain_h),),
+        f=chain_f,
+        inputs=(Input("power", "W", default=0.5),),
+        parameters=tuple(Parameter(f"p{k}", "1", 0.1) for k in range(10)),
+    )
+
+
+def considered() -> Iterator[BenchmarkRow]:
+    """A step of n=4 m=1 with ten considered parameters, beside the same with ten held ones."""
+    model = chain()
+    wide = joint(model, {item.name: JointParameter(0.01, considered=True) for item in model.parameters})
+    for name in ("ekf", "sr-ekf", "ukf"):
+        calls = [folding(name, each, noisy_log(each, STEPS, step=0.1)) for each in (model, wide)]
+        pair = compare(calls[1], calls[0], steps=(STEPS, STEPS), repetitions=REPETITIONS)
+        figures = {"held [µs]": pair.theirs * 1e6, "considered [µs]": pair.ours * 1e6, "times": 1.0 / pair.ratio}
+        yield BenchmarkRow(name, figures, (Bound("times", 2.0),) if name == "ekf" else ())
 
 
 def beside_stone_soup() -> Iterator[BenchmarkRow]:

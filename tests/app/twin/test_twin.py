@@ -398,3 +398,41 @@ def test_the_prior_of_what_is_considered_is_that_of_the_parameter() -> None:
 )
 def test_a_width_is_given_once_and_as_a_number_or_share(parameters: str, said: str) -> None:
     assert said in refusal(f"model: motor_drive\nparameters: {parameters}\nsource: {{type: simulator}}\n")
+
+
+def test_offsets_and_scales_are_parameters_of_the_instruments() -> None:
+    drive = MOTOR.replace("motor_winding", "motor_drive").replace("estimator: kf\n", "")
+    drive = drive[: drive.index("prior:")] + (
+        "sensors:\n  winding: {offset: {std: 0.5}, scale: {value: 1.01, std: 0.2 %}}\n  tooth: {offset: 0.3}\n"
+        "inputs:\n  coolant: {offset: {std: 2, use: estimated, drift: 0.1}}\n"
+        "parameters: {winding_offset: 0.1, tooth_offset: {std: 0.4, use: held}}\nsource: {type: simulator}\n"
+    )
+    model = twin_of(drive).model
+    own = {item.name: item.value for item in model.parameters}
+    assert (own["winding_offset"], own["winding_scale"], own["tooth_offset"]) == (0.1, 1.01, 0.3)
+    assert model.considered == 2 and "coolant_offset" not in own
+    last = {state.name: (state.mean, state.std) for state in model.states[4:]}
+    assert last == {
+        "coolant_offset": (0.0, 2.0),
+        "winding_scale_deviation": (0.0, pytest.approx(0.00202)),
+        "winding_offset_deviation": (0.0, 0.5),
+    }
+
+
+def test_an_offset_leaves_a_linear_model_to_the_kalman_filter() -> None:
+    assert twin_of(MOTOR.replace("{std: 3}", "{std: 3, offset: {std: 0.5}}")).model.linear
+    scale = MOTOR.replace("{std: 3}", "{std: 3, scale: {std: 1 %}}")
+    assert "not linear once winding_scale_deviation are considered" in refusal(scale)
+
+
+@pytest.mark.parametrize(
+    ("section", "message"),
+    [
+        ("inputs: {power: {offset: {std: 1}}}", "inputs.power is no input of motor_winding"),
+        ("sensors: {winding: {offset: {std: 1 %}}}", "the prior of winding_offset has std 0"),
+        ("prior: {winding_offset_deviation: {std: 1}}\nsensors: {winding: {offset: {std: 1}}}",
+         "prior.winding_offset_deviation is considered, so its prior is the `std` of the parameter"),
+    ],
+)  # fmt: skip
+def test_impossible_offsets_are_refused(section: str, message: str) -> None:
+    assert message in refusal(f"model: motor_winding\n{section}\nsource: {{type: simulator}}\n")

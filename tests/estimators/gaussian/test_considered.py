@@ -10,13 +10,14 @@ from estimators.errors import EstimatorError, ModelError
 from estimators.fold import Fold
 from estimators.log import READING, Events, Log
 from estimators.model.assemble import JointParameter, joint
+from estimators.model.instruments import Instrument, with_instruments
 from estimators.model.state_space import Input, Noise, Parameter, Row, Sensor, State, StateSpaceModel
 from estimators.registry import ESTIMATORS, find_estimator
 from estimators.smoothing.smooth import check_smooth
 from estimators.tuning import Tuning
 from tests.support import SECOND
 
-CONSIDERING = [name for name, entry in ESTIMATORS.items() if entry.considers]
+CONSIDERING = [name for name, entry in ESTIMATORS.items() if entry.considers and entry.family == "Gaussian"]
 CONSIDERED = {"offset": JointParameter(0.3, considered=True), "loss": JointParameter(0.02, considered=True)}
 ESTIMATED = {"heat": JointParameter(0.5, drift=0.01)}
 STEP = 0.5
@@ -56,6 +57,7 @@ def physics(f):
         f=f,
         inputs=(Input("power", "W", default=0.5),),
         parameters=(Parameter("offset", "K", 0.1), Parameter("loss", "1/s", 0.1), Parameter("heat", "K/J", 1.0)),
+        linear=f is not bilinear,
     )
 
 
@@ -73,8 +75,10 @@ def log_of(steps=40):
     return log
 
 
-def schmidt(model, log, u):
+def schmidt(model, log, u, inflation=1.0):
     """Mean (nx,) and covariance after each event, by the equations in blocks, with NumPy and complex steps.
+
+    `inflation` is the factor a second on the covariance of the estimated states, with the correlations unchanged.
 
     Source: Jazwinski (1970), Stochastic Processes and Filtering Theory, 8.4.
     """
@@ -106,8 +110,9 @@ def schmidt(model, log, u):
             forward = np.empty(model.nx)
             step(z, forward)
             z = forward
-            Pxx = A @ Pxx @ A.T + A @ Pxc @ B.T + B @ Pxc.T @ A.T + B @ C @ B.T + STEP * np.diag(q[:n])
-            Pxc = A @ Pxc + B @ C
+            Pxx = A @ Pxx @ A.T + A @ Pxc @ B.T + B @ Pxc.T @ A.T + B @ C @ B.T
+            Pxx = inflation**STEP * Pxx + STEP * np.diag(q[:n])
+            Pxc = inflation ** (0.5 * STEP) * (A @ Pxc + B @ C)
         sensor = model.sensors[log.events.channel[k]]
         rows = len(sensor.rows)
         H = jacobian(lambda x, out, h=sensor.h: h(x, u, p, out), rows)
@@ -132,6 +137,7 @@ def schmidt(model, log, u):
         *((name, f, {}) for name in CONSIDERING),
         *((name, bilinear, {}) for name in ("ekf", "sr-ekf")),
         ("ekf", bilinear, {"joseph": "on"}),
+        *((name, f, {"inflation": 1.5}) for name in ("kf", "ukf", "sr-ekf", "sr-ukf")),
     ],
 )
 def test_it_equals_the_equations_in_blocks(estimator, f, options):
@@ -139,7 +145,7 @@ def test_it_equals_the_equations_in_blocks(estimator, f, options):
     assert model.state_names == ("a", "b", "heat", "offset_deviation", "loss_deviation") and model.considered == 2
     log = log_of()
     fold = Fold(estimator, model, Tuning.of(model).with_options(options), log)
-    for mean, cov, nis in schmidt(model, log, model.default_inputs):
+    for mean, cov, nis in schmidt(model, log, model.default_inputs, **options if "inflation" in options else {}):
         fold.advance(1)
         actual, P = fold.moments()
         np.testing.assert_allclose(actual, mean, rtol=0, atol=1e-9 * np.max(np.abs(mean)))
@@ -210,6 +216,64 @@ def test_impossible_widths_are_refused(estimated, correlations, rule):
         joint(ranged(), estimated, correlations)
 
 
+@pytest.mark.parametrize("estimator", ["ekf", "sr-ukf"])
+@pytest.mark.parametrize("options", [{"adapt": "Q"}, {"adapt": "R"}, {"robust": "huber"}, {"inflation": 2.0}])
+def test_options_leave_what_is_considered(estimator, options):
+    model = joint(physics(bilinear), CONSIDERED)
+    fold = Fold(estimator, model, Tuning.of(model).with_options(options), log_of())
+    fold.advance()
+    mean, P = fold.moments()
+    np.testing.assert_allclose(mean[2:], 0.0, atol=1e-13)  # sigma points leave rounding errors
+    np.testing.assert_allclose(P[2:, 2:], np.diag([0.3**2, 0.02**2]), rtol=1e-9, atol=1e-12)
+
+
+def driven_by_hand(x, u, p, dt, out):
+    power = p[5] * u[0] + p[6]
+    out[0] = x[0] + dt * (power * p[2] - p[1] * x[0] + 0.05 * x[1])
+    out[1] = x[1] + dt * (0.05 * x[0] - 0.08 * x[1])
+
+
+def both_by_hand(x, u, p, out):
+    out[0] = p[3] * (x[0] - x[1]) + p[7]
+    out[1] = p[4] * (x[1] + 0.5 * p[0]) + p[8]
+
+
+def test_offsets_and_scales_equal_a_model_that_has_them():
+    own = physics(bilinear)
+    made = with_instruments(own, {"power": Instrument((0.0,), (1.0,)), "both": Instrument((0.05, 0.02), (1.0, 0.9))})
+    names = ["power_scale", "power_offset", "both_difference_scale", "both_b_scale"]
+    names += ["both_difference_offset", "both_b_offset"]
+    assert [item.name for item in made.parameters[3:]] == names
+    order = ["both_difference_scale", "both_b_scale", "power_scale", "power_offset", "both_difference_offset"]
+    by_name = {item.name: item for item in made.parameters}
+    by_hand = replace(
+        own,
+        f=driven_by_hand,
+        sensors=(own.sensors[0], replace(own.sensors[1], h=both_by_hand)),
+        parameters=(*own.parameters, *(by_name[name] for name in [*order, "both_b_offset"])),
+    )
+    widths = {name: JointParameter(0.02 * (k + 1), considered=True) for k, name in enumerate(names)}
+    folds = [Fold("ekf", joint(model, widths), Tuning.of(joint(model, widths)), log_of()) for model in (made, by_hand)]
+    for fold in folds:
+        fold.advance()
+    place = [folds[1].model.state_names.index(name) for name in folds[0].model.state_names]
+    (mean, P), (expected, Q) = folds[0].moments(), folds[1].moments()
+    np.testing.assert_allclose(mean, expected[place], rtol=1e-12)
+    np.testing.assert_allclose(P, Q[np.ix_(place, place)], rtol=1e-9, atol=1e-15)
+
+
+@pytest.mark.parametrize(("given", "kind", "linear"), [("power", "offset", True), ("first", "scale", False)])
+def test_offsets_keep_a_model_linear_and_scales_do_not(given, kind, linear):
+    own = with_instruments(physics(f), {given: Instrument(**{kind: (0.0 if kind == "offset" else 1.0,)})})
+    model = joint(own, {f"{given}_{kind}": JointParameter(0.05, considered=True)})
+    assert model.linear == linear
+    if linear:
+        assert find_estimator("kf", model).name == "kf"
+    else:
+        with pytest.raises(EstimatorError, match=f"not linear once {given}_{kind}_deviation .* use .*: ekf, ukf"):
+            find_estimator("kf", model)
+
+
 def simulated(physics, p, steps=40):
     """A log without noise of an asset with parameters p from the prior's mean on, and its last state."""
     log, x, u = log_of(steps), physics.prior_mean.copy(), physics.default_inputs
@@ -252,3 +316,32 @@ def test_a_smoother_refuses_what_is_considered():
     model = joint(physics(f), CONSIDERED)
     with pytest.raises(EstimatorError, match="considers offset_deviation, loss_deviation.*use: held"):
         check_smooth(find_estimator("ekf", model), model, {})
+
+
+# Of N members the mean scatters by σ/√N and a covariance by √2 σσ/√N; of weighted particles N is the smallest effective
+# sample size so far.
+@pytest.mark.parametrize(
+    ("estimator", "options"),
+    [
+        ("enkf", {"members": 4000.0}),
+        ("pf", {"particles": 40000.0}),
+        ("pf-reg", {"bandwidth": 0.1, "particles": 40000.0}),
+    ],
+)
+def test_members_have_the_moments_of_the_equations(estimator, options):
+    own = physics(f)
+    model = joint(own, CONSIDERED)
+    log, _ = simulated(own, own.default_parameters)
+    noise = np.random.default_rng(1).standard_normal((log.n, 2))
+    for k in range(log.n):
+        rows = own.sensors[k % 2].rows
+        log.events.value[k, : len(rows)] += noise[k, : len(rows)] * np.sqrt([row.variance for row in rows])
+    fold = Fold(estimator, model, Tuning.of(model).with_options(options), log)
+    count = options.get("members", np.inf)
+    for k, (mean, cov, _) in enumerate(schmidt(model, log, model.default_inputs)):
+        fold.advance(1)
+        count = np.fmin(count, fold.track.effective[k])
+        std = np.sqrt(np.diag(cov))
+        actual, P = fold.moments()
+        assert np.max(np.abs(actual - mean) / std) < 5.0 / np.sqrt(count)
+        assert np.max(np.abs(P - cov) / np.outer(std, std)) < 5.0 * np.sqrt(2.0 / count)
