@@ -20,7 +20,7 @@ from estimators.diagnostics.calibration import (
     held_inputs,
     truth_calibration,
 )
-from estimators.diagnostics.considered_shares import shares_text, variance_shares
+from estimators.diagnostics.considered_shares import known_stds, source_texts, variance_shares
 from estimators.diagnostics.consistency import nees
 from estimators.diagnostics.detectors import detector_of
 from estimators.diagnostics.episodes import Episode, episode_json, episodes
@@ -244,13 +244,15 @@ def fold_json(result: FoldResult) -> dict[str, Any]:
     that of the adaptive conformal interval. `log_likelihood` includes the price of rejected measurements, which
     `log_likelihood_used` leaves out; `refused` is their share. `calibration` has an entry per sensor row and per state
     with known truth. `nees` is null without truth (`TruthNees`). `variance` has the share of each state's last variance
-    by considered parameter, and the rest as `noise`; it is empty where none is considered. `episodes` have start and
-    end in seconds of the log (end null while one lasts) and `suspects`. `withheld` has the share of events of each
-    state with a limit (`withhold`) in which its estimate is not shown, and the reason at the end, null where it is
-    shown there. `smoothed` has `rmse`, `coverage` and `consistency` of the smoothed states.
+    by considered parameter, and the rest as `noise`, and `known` the deviation that would be left if one of them were
+    known; they are empty where none is considered. `episodes` have start and end in seconds of the log (end null while
+    one lasts) and `suspects`. `withheld` has the share of events of each state with a limit (`withhold`) in which its
+    estimate is not shown, and the reason at the end, null where it is shown there. `smoothed` has `rmse`, `coverage`
+    and `consistency` of the smoothed states.
     """
     twin, fold, scored, counts = result.twin, result.fold, result.score, result.counts
     smoothing = result.smoothing
+    cov = fold.moments()[1] if fold.model.considered else None
     found = {
         "twin": twin.name,
         "estimator": twin.estimator,
@@ -299,7 +301,8 @@ def fold_json(result: FoldResult) -> dict[str, Any]:
         "withheld": _withheld(result),
         "calibration": [calibration_json(entry) for entry in result.calibration],
         "coverage_bins": result.coverage,
-        "variance": _variance_shares(fold),
+        "variance": variance_shares(fold.model, cov) if cov is not None else {},
+        "known": known_stds(fold.model, cov) if cov is not None else {},
         "episodes": [_episode_json(item) for item in result.episodes],
         "seconds_per_event": result.seconds,
     }
@@ -409,11 +412,6 @@ def fold_topics(result: FoldResult) -> list[Topic]:
     return [*topics, episodes_topic(result.episodes)]
 
 
-def _variance_shares(fold: Fold) -> dict[str, dict[str, float]]:
-    """Return the shares of each state's last variance; nothing where no parameter is considered."""
-    return variance_shares(fold.model, fold.moments()[1]) if fold.model.considered else {}
-
-
 def _figures(result: FoldResult) -> list[Figure]:
     twin, fold, scored, counts = result.twin, result.fold, result.score, result.counts
     model, events, track = twin.model, result.events, result.track
@@ -462,6 +460,7 @@ def _figures(result: FoldResult) -> list[Figure]:
     conditions = {f"condition {name}" for name in model.sensor_names}
     found += [Figure(key, f"{count}") for key, count in sorted(counts.items()) if key not in conditions]
     variances = zip(model.shown, track.std[-1], strict=True)
+    sources = source_texts(model, fold.moments()[1]) if model.considered else {}
     lost = dropped(counts, fold)
     return [
         *found,
@@ -470,7 +469,10 @@ def _figures(result: FoldResult) -> list[Figure]:
             for name, item in _withheld(result).items()
         ),
         Figure("final variances", ", ".join(f"{model.state_names[j]} {value**2:.5g}" for j, value in variances)),
-        *(Figure(f"variance of {name}", shares_text(shares)) for name, shares in _variance_shares(fold).items()),
+        *(
+            Figure(f"variance of {name}", source, remark=f"if measured, {gain}")
+            for name, (source, gain) in sources.items()
+        ),
         Figure(
             "late readings", f"{'used on arrival, R inflated' if twin.late.inflate else 'exact'}: {twin.late.reason}"
         ),

@@ -15,6 +15,7 @@ from estimators.estimator import Estimator
 from estimators.fold_checks import check_variances
 from estimators.late import EVENT_S_PER_NUMBER, rewind_seconds
 from estimators.model.coloured import disturbance_time, error_time
+from estimators.model.instruments import Instrument, instrument_parameters
 from estimators.model.state_space import StateSpaceModel
 from estimators.snapshots import Snapshots
 from estimators.tuning import Tuning
@@ -91,6 +92,28 @@ def bounds_of(config: TwinSection, model: StateSpaceModel) -> dict[str, tuple[fl
     return {key: bounds for key, bounds in found.items() if bounds is not None}
 
 
+def instrument_sections(model: StateSpaceModel, config: TwinSection) -> dict[str, dict[str, ParameterSection]]:
+    """Return the sections of the parameters that offsets and scales become, by sensor or input.
+
+    What `parameters` gives of such a parameter takes the place of the instrument's.
+    """
+    found: dict[str, dict[str, ParameterSection]] = {}
+    for name, section in (*config.sensors.items(), *config.inputs.items()):
+        for kind in Instrument._fields:
+            given = getattr(section, kind)
+            for item in instrument_parameters(model, name, kind) if given is not None else ():
+                own = config.parameters.get(item)
+                changes = {key: getattr(own, key) for key in own.model_fields_set} if own is not None else {}
+                found.setdefault(name, {})[item] = given.model_copy(update=changes)
+    return found
+
+
+def parameter_sections(model: StateSpaceModel, config: TwinSection) -> dict[str, ParameterSection]:
+    """Return the YAML's sections of parameters, those of offsets and scales included."""
+    instruments = instrument_sections(model, config).values()
+    return {**config.parameters, **{item: section for parts in instruments for item, section in parts.items()}}
+
+
 TOLERANCE = 0.1  # Deviation of a fitted parameter without data and without a `std`, as a share of its value
 
 
@@ -105,9 +128,9 @@ def width_priors(config: TwinSection, model: StateSpaceModel, wanted: Sequence[s
         wanted: Keys and groups of the fit.
     """
     times = {disturbance_time(noise.name) for noise in model.noises} | set(map(error_time, model.sensor_names))
-    found = {}
+    found, sections = {}, parameter_sections(model, config)
     for item in model.parameters:
-        section = config.parameters.get(item.name, ParameterSection())
+        section = sections.get(item.name, ParameterSection())
         if item.name in times or section.use != "considered" or "use" in section.model_fields_set and not section.std:
             continue
         if section.std is not None:

@@ -21,7 +21,7 @@ from estimators.errors import ConfigError, ModelError, NisusError, nearest
 from estimators.model.assemble import AppendError, JointParameter, assemble
 from estimators.model.coloured import ColouredError, disturbance_time, error_time
 from estimators.model.hybrid import learned_noise
-from estimators.model.instruments import Instrument, instrument_parameters
+from estimators.model.instruments import Instrument
 from estimators.model.parts import Correlation, Limits, Stuck, correlation_error
 from estimators.model.state_space import Field, Sensor, State, StateSpaceModel
 from estimators.model.user_file import imported_beside, run_file
@@ -29,7 +29,7 @@ from estimators.models import MODELS
 from estimators.plausibility import DAY, surprise
 
 from .checks import check_named, check_names, one_each
-from .defaults import sensor_period
+from .defaults import instrument_sections, parameter_sections, sensor_period
 from .landmarks import expanded
 from .learned import load_learned
 
@@ -158,7 +158,7 @@ def _assembled(model: StateSpaceModel, loaded: Loaded) -> StateSpaceModel:
         errors[name] = ColouredError(one_each(loaded, key, error.variances, rows), error.over)
     times = [*map(disturbance_time, noises), *map(error_time, errors)]
     instruments = _instruments(model, loaded)
-    sections = {**config.parameters, **{item: own for parts in instruments.values() for item, own in parts.items()}}
+    sections = parameter_sections(model, config)
     values = {item.name: item.value for item in model.parameters}
     values |= {name: _value(name, section) for name, section in sections.items() if name not in values}
     check_names(loaded, ("estimate",), config.estimate, [*values, *times], "parameter", model)
@@ -217,28 +217,15 @@ def _assembled(model: StateSpaceModel, loaded: Loaded) -> StateSpaceModel:
 
 
 def _instruments(model: StateSpaceModel, loaded: Loaded) -> dict[str, dict[str, ParameterSection]]:
-    """Return the sections of the parameters that offsets and scales become, by sensor or input.
-
-    What `parameters` gives of such a parameter takes the place of the instrument's.
-    """
+    """Return the sections of offsets and scales of the sensors and inputs that the model has."""
     config = loaded.config
     check_names(loaded, ("inputs",), config.inputs, [item.name for item in model.inputs], "input", model)
-    found: dict[str, dict[str, ParameterSection]] = {}
-    for group in (config.sensors, config.inputs):
-        for name, section in group.items():
-            if group is config.sensors and name not in model.sensor_names:
-                continue
-            for kind in Instrument._fields:
-                given = getattr(section, kind)
-                if given is None:
-                    continue
-                if name in found and group is config.inputs and name in config.sensors:
-                    raise loaded.error(("inputs", name), "is a sensor's name too, whose offset or scale is given")
-                for item in instrument_parameters(model, name, kind):
-                    own = config.parameters.get(item)
-                    changes = {key: getattr(own, key) for key in own.model_fields_set} if own is not None else {}
-                    found.setdefault(name, {})[item] = given.model_copy(update=changes)
-    return found
+    for name in config.inputs:
+        if name in config.sensors and any(getattr(config.sensors[name], kind) for kind in Instrument._fields):
+            raise loaded.error(("inputs", name), "is a sensor's name too, whose offset or scale is given")
+    found = instrument_sections(model, config)
+    # A sensor that the model lacks is an error later, in its place.
+    return {name: parts for name, parts in found.items() if name in config.inputs or name in model.sensor_names}
 
 
 def _value(name: str, section: ParameterSection) -> float:

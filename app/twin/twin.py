@@ -28,7 +28,7 @@ from estimators.tuning import CHANGED_MARK, Tuning
 
 from ..ingest import Planned
 from .checks import check_named, check_refit, check_scene, commissioned
-from .defaults import DegradedAfter, Late, degraded_after, late_policy
+from .defaults import DegradedAfter, Late, degraded_after, late_policy, parameter_sections
 from .landmarks import expanded
 from .learned import correction_files
 from .model import configure, find_model, model_files
@@ -249,7 +249,7 @@ def with_held(twin: Twin) -> Twin:
         return twin
     parameters = {
         name: section.model_copy(update={"use": "held"}) if section.use == "considered" else section
-        for name, section in twin.config.parameters.items()
+        for name, section in parameter_sections(twin.model, twin.config).items()
     }
     loaded = replace(twin.loaded, config=twin.config.model_copy(update={"parameters": parameters}))
     found, loaded = expanded(find_model(loaded, ("model",), loaded.config.model), loaded)

@@ -54,6 +54,32 @@ def variance_shares(model: StateSpaceModel, cov: np.ndarray) -> dict[str, dict[s
     return found
 
 
+def known_stds(model: StateSpaceModel, cov: np.ndarray) -> dict[str, dict[str, float]]:
+    """Return for each estimated state its deviation if one considered parameter were measured exactly, smallest first.
+
+    Conditioned on c_j the variance is P_ii - (P_xc)_ij² / C_jj, whatever the correlations of the parameters. The gain
+    is that of the past: a filter that had known c_j from the start may be better still.
+
+    Args:
+        model: A model with considered states.
+        cov: Covariance of its states (nx, nx), as of `Fold.moments`.
+
+    Returns:
+        Nothing for a model without considered states; of a state only those with a positive, finite variance.
+    """
+    n = model.nx - model.considered
+    if model.considered == 0 or cov.shape[0] != model.nx or not np.all(np.isfinite(cov)):
+        return {}
+    variance, labels = np.diag(cov), considered_labels(model)
+    gained = np.divide(cov[:n, n:] ** 2, variance[n:], out=np.zeros((n, model.considered)), where=variance[n:] > 0.0)
+    left = np.sqrt(np.maximum(variance[:n, None] - gained, 0.0))
+    return {
+        name: dict(sorted(zip(labels, left[i].tolist(), strict=True), key=lambda item: item[1]))
+        for i, name in enumerate(model.state_names[:n])
+        if variance[i] > 0.0
+    }
+
+
 MIN_SHARE = 0.005
 """Share of a variance below which a parameter is not named."""
 
@@ -62,3 +88,17 @@ def shares_text(shares: Mapping[str, float]) -> str:
     """Return the shares of one state's variance as text, the largest first: "capacity 60 %, noise 38 %, r0 2 %"."""
     named = [(name, share) for name, share in shares.items() if abs(share) >= MIN_SHARE]
     return ", ".join(f"{name} {100 * share:.0f} %" for name, share in sorted(named, key=lambda item: -item[1]))
+
+
+def source_texts(model: StateSpaceModel, cov: np.ndarray) -> dict[str, tuple[str, str]]:
+    """Return for each estimated state the sources of its variance, and the gain of measuring one of them, as text.
+
+    The gain is that of the parameter that reduces σ most: "capacity: σ 0.021 to 0.013".
+    """
+    known, found = known_stds(model, cov), {}
+    for name, shares in variance_shares(model, cov).items():
+        std = float(np.sqrt(cov[(k := model.state_names.index(name)), k]))
+        label, left = next(iter(known[name].items()))
+        gain = f"{label}: σ {std:.2g} to {left:.2g}" if left < (1.0 - MIN_SHARE) * std else "no parameter reduces σ"
+        found[name] = shares_text(shares), gain
+    return found

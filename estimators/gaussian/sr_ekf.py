@@ -46,15 +46,17 @@ def work_size(options: Options, nx: int, ny: int) -> int:
 
 
 @inlined
-def turn(U, F, a, grown, out):
-    """Leading rows of `out` = U Fᵀ, with upper U (n, n) and F (k, n), and its `grown` leading columns times a."""
+def turn(U, F, rows, a, out):
+    """Leading rows of `out` = U Fᵀ with upper U (n, n), `rows` columns times a; F is the identity beyond `rows`."""
     n = U.shape[0]
     for i in range(n):
-        for k in range(F.shape[0]):
+        for k in range(rows):
             s = 0.0
             for j in range(i, n):
                 s += U[i, j] * F[k, j]
-            out[i, k] = a * s if k < grown else s
+            out[i, k] = a * s
+        for k in range(rows, out.shape[1]):
+            out[i, k] = U[i, k]
 
 
 @inlined
@@ -63,7 +65,7 @@ def advance(context, u, dt, state, own, F):
     n = context.nx
     x, U = moments_of(state, n)
     good = noise_root(context, x, u, dt, state, own.A[n:], own.scratch)
-    turn(U, F, np.sqrt(growth(context, dt)), estimated(context), own.A)
+    turn(U, F, estimated(context), np.sqrt(growth(context, dt)), own.A)
     triangularise(own.A, own.scratch[0])
     settle(context, own.forward, own.A, good, state)
 
@@ -91,7 +93,7 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     own = updating(start_of(work), context.nx, row_count(context, sensor))
     sensor_jacobian(context, sensor, x, u, own.H, own.jacobian)
     expect(context, sensor, x, u, own.expected)
-    turn(U, own.H, 1.0, 0, own.Y)
+    turn(U, own.H, own.H.shape[0], 1.0, own.Y)
     return condition(
         context, sensor, y, state, own.expected, own.Y, own.nothing, own.conditioning, innovation, innovation_std, score
     )

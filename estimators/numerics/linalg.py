@@ -238,28 +238,17 @@ def congruence(F, rows, P, T):
 
 @part
 def bordered_congruence(F, rows, P, T):
-    """Overwrite P with F P Fᵀ as `congruence`; beyond `rows` P stays, is often diagonal, and its zeros are left out."""
+    """Overwrite P with F P Fᵀ as `congruence`; beyond `rows` P stays, as do the covariances among what is there."""
     n = P.shape[0]
-    diagonal = True
-    for i in range(rows + 1, n):
-        for j in range(rows, i):
-            diagonal = diagonal and P[i, j] == 0.0
     for i in range(rows):
-        for j in range(rows):
-            s = 0.0
-            for k in range(n):
-                s += F[i, k] * P[j, k]
-            T[i, j] = s
-        for j in range(rows, n):
-            s = 0.0
-            for k in range(rows):
-                s += F[i, k] * P[j, k]
-            if diagonal:
-                s += F[i, j] * P[j, j]
-            else:
-                for k in range(rows, n):
-                    s += F[i, k] * P[j, k]
-            T[i, j] = s
+        for j in range(n):
+            T[i, j] = 0.0
+        # A row depends on few of the states beyond.
+        for k in range(n):
+            a = F[i, k]
+            if a != 0.0:
+                for j in range(n):
+                    T[i, j] += a * P[k, j]
     for i in range(rows):
         for j in range(i + 1):
             s = 0.0

@@ -17,7 +17,7 @@ from estimators.model.state_space import Field, Input, State, StateSpaceModel
 from estimators.registry import find_entry
 from estimators.tuning import REOPEN_S, Tuning
 
-from ...twin.defaults import bounds_of
+from ...twin.defaults import bounds_of, parameter_sections
 
 if TYPE_CHECKING:
     from estimators.fit.uncertainty import ParameterWidths
@@ -119,7 +119,7 @@ def _fitted_ranges(
         model.inputs if isinstance(model.states, Field) else (*model.states, *model.inputs)
     )
     limited = {item.name for item in items if item.fitted is not None}
-    limited |= {place for section in config.parameters.values() for place in section.widen}
+    limited |= {place for section in parameter_sections(model, config).values() for place in section.widen}
     for name in sorted(limited & set(widths.envelope)):
         low, high = widths.envelope[name]
         found[name] = {"min": float(f"{low:.4g}"), "max": float(f"{high:.4g}")}

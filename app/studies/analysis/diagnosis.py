@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from estimators.diagnostics.considered_shares import shares_text, variance_shares
+from estimators.diagnostics.considered_shares import source_texts
 from estimators.diagnostics.innovations import flat_range
 from estimators.diagnostics.score import nis_verdict
 from estimators.diagnostics.sensitivity import GramianView, gramian
@@ -107,9 +107,9 @@ class Diagnosis:
 
         `rows` are the first of the sensors' rows (row_figures.py), `rows_in_all` how many there are, `ranks` counts of
         an ensemble's histogram, `particles` what is left of a cloud over time, `correlation` a map of the present
-        covariance, `variance` sources of the present variance by state, `nis` how the mean NIS is judged,
-        `observability`, `faults` and `integrity` what could be wrong unnoticed, `cost` microseconds of an
-        event.
+        covariance, `variance` sources of the present variance by state, `gain` what a measurement of one of them would
+        leave, `nis` how the mean NIS is judged, `observability`, `faults` and `integrity` what could be wrong
+        unnoticed, `cost` microseconds of an event.
         """
         known = self._known
         if known is None or time.monotonic() - known[0] > REUSE_S:
@@ -125,6 +125,7 @@ class Diagnosis:
         marginal = find_entry(estimator).family in ("particle", "ensemble")
         slow = self._figures.of(revision) if len(events) else None
         nis = nis_verdict(track, events, engine.model, tuning.baseline)
+        sources = source_texts(engine.model, engine.belief().cov) if engine.model.considered else {}
         return {
             "revision": revision,
             "estimator": estimator,
@@ -136,7 +137,8 @@ class Diagnosis:
             "ranks": _ranks(status),
             "particles": _particles(status, events, track),
             "correlation": _correlation(engine),
-            "variance": _variance(engine),
+            "variance": {name: source for name, (source, _) in sources.items()},
+            "gain": {name: gain for name, (_, gain) in sources.items()},
             "observability": _observability(engine, slow),
             "nis": nis.words,
             "nis_place": nis.place,
@@ -210,14 +212,6 @@ def _correlation(engine: Running) -> dict[str, Any]:
     own = model.nx - model.considered
     left = "" if len(places) == own else f"{len(places)} of {own:,} states"
     return {"names": names, "matrix": listed(matrix, 3), "reason": left}
-
-
-def _variance(engine: Running) -> dict[str, str]:
-    """Return the sources of each state's present variance in words; nothing where no parameter is considered."""
-    if not engine.model.considered:
-        return {}
-    found = variance_shares(engine.model, engine.belief().cov)
-    return {name: shares_text(shares) for name, shares in found.items()}
 
 
 def _observability(engine: Running, found: FoldFigures | None) -> dict[str, Any]:

@@ -165,13 +165,13 @@ function correlationCard({ correlation }) {
 const n = (count, value, a, b) => (count < 2 ? "There is one state." : `All are distinguishable; most correlated: ${a} and ${b} (${value.toFixed(2)}).`);
 
 // Of a twin with considered parameters: whose uncertainty the bands come from.
-function varianceCard({ variance }) {
+function varianceCard({ variance, gain }) {
   const entries = Object.entries(variance);
   if (!entries.length) return null;
   return card(
     "Sources of uncertainty", "good: none that a measurement could remove",
-    "Share of each state's variance by considered parameter. Noise is the rest: sensors, process and prior.",
-    table(["state", "variance from"], entries.map(([name, text]) => [words(name), words(text)])),
+    "Share of each state's variance by considered parameter; noise is the rest: sensors, process and prior. Last column: the parameter whose measurement would reduce σ most.",
+    table(["state", "variance from", "if measured"], entries.map(([name, text]) => [words(name), words(text), words(gain[name])])),
   );
 }
 

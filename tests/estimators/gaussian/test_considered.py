@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from estimators.diagnostics.considered_shares import variance_shares
+from estimators.diagnostics.considered_shares import known_stds, variance_shares
 from estimators.errors import EstimatorError, ModelError
 from estimators.fold import Fold
 from estimators.log import READING, Events, Log
@@ -309,7 +309,15 @@ def test_shares_of_the_variance_are_those_of_refolds(estimator):
     correlated = joint(own, CONSIDERED, {("offset", "loss"): 0.9})
     fold = Fold(estimator, correlated, Tuning.of(correlated), log)
     fold.advance()
-    assert sum(variance_shares(correlated, fold.moments()[1])["a"].values()) == pytest.approx(1.0)
+    P = fold.moments()[1]
+    assert sum(variance_shares(correlated, P)["a"].values()) == pytest.approx(1.0)
+    known = known_stds(correlated, P)
+    for j, name in ((2, "offset"), (3, "loss")):
+        rest = np.delete(np.arange(4), j)
+        # Conditioned on it by a measurement almost without noise, in information form.
+        information = np.linalg.inv(P) + np.diag(np.eye(4)[j]) * 1e9 / P[j, j]
+        left = np.sqrt(np.diag(np.linalg.inv(information)))[rest[:2]]
+        assert [known[state][name] for state in ("a", "b")] == pytest.approx(left.tolist(), rel=1e-6)
 
 
 def test_a_smoother_refuses_what_is_considered():
