@@ -42,7 +42,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..errors import ModelError, nearest
-from ..numerics.jit import part, plain, stack_vector
+from ..numerics.jit import inlined, plain, stack_vector
 from .coloured import ColouredError, coloured
 from .hybrid import LearnedCorrection, hybrid, places
 from .instruments import Instrument, with_instruments
@@ -300,7 +300,7 @@ def _correlated(
     return replace(model, prior_correlation=tuple(map(tuple, whole.tolist())))
 
 
-@part
+@inlined
 def _width(k, x, u, distances):
     """Return what η of parameter k is multiplied by: the distances outside their ranges, each times its width."""
     width = 0.0
@@ -312,46 +312,47 @@ def _width(k, x, u, distances):
     return width
 
 
-@part
-def _fill(full, x, u, p, n, place, low, high, distances):
+@inlined
+def _fill(full, x, u, p, n, place, ends, distances):
     """Fill p(θ, δ, η): the model's own parameters, with moved and considered ones held within their ranges."""
-    for k in range(len(place)):
-        j, own, out = place[k]
+    for k in range(place.shape[0]):
+        j, own, out = place[k, 0], place[k, 1], place[k, 2]
         if j < 0 and out < 0:
             full[k] = p[own]
             continue
         value = x[n + j] if own < 0 else p[own] + x[n + j] if j >= 0 else p[own] + 0.0 * x[n]
         if out >= 0:
             value = value + _width(k, x, u, distances) * x[n + out]
-        if value.real < low[k]:
-            full[k] = low[k]
-        elif value.real > high[k]:
-            full[k] = high[k]
+        if value.real < ends[k, 0]:
+            full[k] = ends[k, 0]
+        elif value.real > ends[k, 1]:
+            full[k] = ends[k, 1]
         else:
             full[k] = value
 
 
-@part
-def _free(x, u, p, n, at, k, low, high, distances):
-    """Return the complex step of parameter k, of `at` = (j, own, out): zero where its range ends."""
-    j, own, out = at
+@inlined
+def _free(x, u, p, n, k, place, ends, distances):
+    """Return the complex step of parameter k: zero where its range ends."""
+    j, own, out = place[k, 0], place[k, 1], place[k, 2]
     value = x[n + j] if own < 0 else p[own] + x[n + j] if j >= 0 else p[own]
     if out >= 0:
         value += _width(k, x, u, distances) * x[n + out]
-    return STEP if low[k] <= value <= high[k] else 0.0
+    return STEP if ends[k, 0] <= value <= ends[k, 1] else 0.0
 
 
-def _constant(distances: Distances) -> np.ndarray:
-    return np.array(distances, float).reshape(-1, 5)
+def _tables(place: Any, low: Any, high: Any, distances: Distances) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the layout as arrays, which compiled code reads faster than tuples."""
+    return np.array(place, np.int64), np.array([low, high], float).T.copy(), np.array(distances, float).reshape(-1, 5)
 
 
 @lru_cache(maxsize=64)
 def _step(function: Callable, n: int, place: Any, low: Any, high: Any, distances: Distances) -> Callable:
-    inner, reach = as_inner(function), _constant(distances)
+    inner, (at, ends, reach) = as_inner(function), _tables(place, low, high, distances)
 
     def f(x, u, p, dt, out):  # noqa: ANN001, ANN202
         full = stack_vector(x[0], place)
-        _fill(full, x, u, p, n, place, low, high, reach)
+        _fill(full, x, u, p, n, at, ends, reach)
         inner(x[:n], u, full, dt, out[:n])
         for j in range(n, x.size):
             out[j] = x[j]
@@ -366,24 +367,25 @@ STEP = 1e-20
 @lru_cache(maxsize=64)
 def _slopes(function: Callable, n: int, place: Any, low: Any, high: Any, distances: Distances) -> Callable:
     """Return df/d(x, θ, δ, η) by complex step; the parameters are filled once for all columns."""
-    inner, reach, states = as_inner(function), _constant(distances), (0,) * n
+    inner, states = as_inner(function), (0,) * n
+    at, ends, reach = _tables(place, low, high, distances)
 
     def F(x, u, p, dt, out):  # noqa: ANN001, ANN202
         z, forward, full = stack_vector(1j, states), stack_vector(1j, states), stack_vector(1j, place)
         for j in range(n):
             z[j] = x[j]
-        _fill(full, x, u, p, n, place, low, high, reach)
+        _fill(full, x, u, p, n, at, ends, reach)
         for j in range(n):
             z[j] = complex(x[j], STEP)
             inner(z, u, full, dt, forward)
             z[j] = x[j]
             for i in range(n):
                 out[i, j] = forward[i].imag / STEP
-        for k in range(len(place)):
-            j, _, outside = place[k]
+        for k in range(at.shape[0]):
+            j, outside = at[k, 0], at[k, 2]
             if j < 0 and outside < 0:
                 continue
-            full[k] = complex(full[k].real, _free(x, u, p, n, place[k], k, low, high, reach))
+            full[k] = complex(full[k].real, _free(x, u, p, n, k, at, ends, reach))
             inner(z, u, full, dt, forward)
             full[k] = full[k].real
             width = _width(k, x, u, reach) if outside >= 0 else 0.0
@@ -405,24 +407,25 @@ def _sensor_slopes(
     function: Callable, rows: int, n: int, place: Any, low: Any, high: Any, distances: Distances
 ) -> Callable:
     """Return dh/d(x, θ, δ, η) by complex step; the parameters are filled once for all columns."""
-    inner, reach, states, measured = as_inner(function), _constant(distances), (0,) * n, (0,) * rows
+    inner, states, measured = as_inner(function), (0,) * n, (0,) * rows
+    at, ends, reach = _tables(place, low, high, distances)
 
     def H(x, u, p, out):  # noqa: ANN001, ANN202
         z, expected, full = stack_vector(1j, states), stack_vector(1j, measured), stack_vector(1j, place)
         for j in range(n):
             z[j] = x[j]
-        _fill(full, x, u, p, n, place, low, high, reach)
+        _fill(full, x, u, p, n, at, ends, reach)
         for j in range(n):
             z[j] = complex(x[j], STEP)
             inner(z, u, full, expected)
             z[j] = x[j]
             for i in range(rows):
                 out[i, j] = expected[i].imag / STEP
-        for k in range(len(place)):
-            j, _, outside = place[k]
+        for k in range(at.shape[0]):
+            j, outside = at[k, 0], at[k, 2]
             if j < 0 and outside < 0:
                 continue
-            full[k] = complex(full[k].real, _free(x, u, p, n, place[k], k, low, high, reach))
+            full[k] = complex(full[k].real, _free(x, u, p, n, k, at, ends, reach))
             inner(z, u, full, expected)
             full[k] = full[k].real
             width = _width(k, x, u, reach) if outside >= 0 else 0.0
@@ -438,11 +441,11 @@ def _sensor_slopes(
 
 @lru_cache(maxsize=64)
 def _chances(function: Callable, n: int, place: Any, low: Any, high: Any, distances: Distances) -> Callable:
-    inner, reach = as_inner(function), _constant(distances)
+    inner, (at, ends, reach) = as_inner(function), _tables(place, low, high, distances)
 
     def chances(x, u, p, dt, out):  # noqa: ANN001, ANN202
         full = stack_vector(x[0], place)
-        _fill(full, x, u, p, n, place, low, high, reach)
+        _fill(full, x, u, p, n, at, ends, reach)
         inner(x[:n], u, full, dt, out)
 
     return chances
@@ -450,11 +453,11 @@ def _chances(function: Callable, n: int, place: Any, low: Any, high: Any, distan
 
 @lru_cache(maxsize=256)
 def _sensor(function: Callable, n: int, place: Any, low: Any, high: Any, distances: Distances) -> Callable:
-    inner, reach = as_inner(function), _constant(distances)
+    inner, (at, ends, reach) = as_inner(function), _tables(place, low, high, distances)
 
     def h(x, u, p, out):  # noqa: ANN001, ANN202
         full = stack_vector(x[0], place)
-        _fill(full, x, u, p, n, place, low, high, reach)
+        _fill(full, x, u, p, n, at, ends, reach)
         inner(x[:n], u, full, out)
 
     return h
@@ -464,11 +467,11 @@ def _sensor(function: Callable, n: int, place: Any, low: Any, high: Any, distanc
 def _noise(
     function: Callable, nw: int, moved: int, n: int, place: Any, low: Any, high: Any, distances: Distances
 ) -> Callable:
-    inner, reach = as_inner(function), _constant(distances)
+    inner, (at, ends, reach) = as_inner(function), _tables(place, low, high, distances)
 
     def Q(x, u, p, q, dt, out):  # noqa: ANN001, ANN202
         full = stack_vector(x[0], place)
-        _fill(full, x, u, p, n, place, low, high, reach)
+        _fill(full, x, u, p, n, at, ends, reach)
         inner(x[:n], u, full, q[:nw], dt, out[:n, :n])
         for j in range(moved):
             out[n + j, n + j] = q[nw + j] * dt

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..errors import ModelError
-from ..numerics.jit import part, stack_vector
+from ..numerics.jit import inlined, stack_vector
 from .state_space import Field, Input, Parameter, Row, StateSpaceModel
 from .wrapping import as_inner
 
@@ -92,7 +92,7 @@ def with_instruments(model: StateSpaceModel, instruments: Mapping[str, Instrumen
     )
 
 
-@part
+@inlined
 def _drive(driven, u, p, v):
     """Fill v (nu,) with the inputs, scaled and shifted by the parameters at `driven`."""
     for j in range(u.size):

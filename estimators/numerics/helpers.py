@@ -64,7 +64,10 @@ def _compiled(helper: Any, known: dict[Any, Any]) -> Any:
 
 
 def _plain(item: Any) -> bool:
-    return isinstance(item, FunctionType) and str(item.__module__).split(".")[0] not in LIBRARIES
+    if not isinstance(item, FunctionType) or item.__module__ == plain.__module__:
+        # Those of jit.py Numba knows, some by an implementation of its own.
+        return False
+    return str(item.__module__).split(".")[0] not in LIBRARIES
 
 
 def _names(code: CodeType) -> Iterator[str]:
