@@ -1,4 +1,4 @@
-"""Check the times of events between a source and the log, and add planned maintenance."""
+"""Check the times of events between a source and the log; add planned maintenance, and pauses of unknown inputs."""
 
 from __future__ import annotations
 
@@ -9,12 +9,13 @@ import numpy as np
 
 from estimators.events.clocks import ClockGuard, Moved, Passed, Refused
 from estimators.events.maintenance import maintained
-from estimators.log import INPUT, READING, Events
+from estimators.log import BEFORE, INPUT, READING, Events
 from estimators.model.state_space import StateSpaceModel
 from sources.source import WRONG_TIME, Report
 
 CLOCK_MOVED = "clock moved"  # key of jumps of a source's clock
 MAINTENANCE = "maintenance"  # key of maintenance
+PAUSED = "paused"  # key of pauses of a source, over which inputs are unknown
 
 
 class Planned(NamedTuple):
@@ -25,18 +26,33 @@ class Planned(NamedTuple):
     states: tuple[int, ...]
 
 
+class UnknownInputs(NamedTuple):
+    """Time without any event after which the inputs of a pause are unknown, ns, and the indices of driven states."""
+
+    after: int
+    states: tuple[int, ...]
+
+
 def maintenance_text(what: str, states: Sequence[int], model: StateSpaceModel) -> str:
     """Return the notice of a maintenance."""
+    return f"maintenance: {what}; {_restarted(states, model)}, and a new version of the model begins"
+
+
+def _restarted(states: Sequence[int], model: StateSpaceModel) -> str:
     names = [model.state_names[k] for k in states]
-    shown = ", ".join(names[:6]) + (", ..." if len(names) > 6 else "")
-    return f"maintenance: {what}; {shown} as uncertain as at the start, and a new version of the model begins"
+    return ", ".join(names[:6]) + (", ..." if len(names) > 6 else "") + " as uncertain as at the start"
 
 
 class Ingest:
     """Accepts, corrects or rejects the times of a source's events, and reports each change."""
 
     def __init__(
-        self, model: StateSpaceModel, horizon: int | None, report: Report, planned: Sequence[Planned] = ()
+        self,
+        model: StateSpaceModel,
+        horizon: int | None,
+        report: Report,
+        planned: Sequence[Planned] = (),
+        unknown: UnknownInputs | None = None,
     ) -> None:
         """Prepare for a source of this model.
 
@@ -45,10 +61,13 @@ class Ingest:
             horizon: The log's, ns; None is a recording's log, which was judged when it was recorded.
             report: Receives rejections, corrections and maintenance.
             planned: Maintenance by the YAML; a recording's log contains it already.
+            unknown: Pauses over which the inputs are unknown, by the YAML; a recording's log contains them already.
         """
         self._model, self._report = model, report
         self._guard = None if horizon is None else ClockGuard(len(model.sensors), horizon)
         self._planned = [] if horizon is None else sorted(planned, key=lambda item: item.at)
+        self._unknown = None if horizon is None else unknown
+        self._newest = BEFORE
 
     @property
     def held(self) -> int:
@@ -73,14 +92,31 @@ class Ingest:
         for by in dict.fromkeys(moved.by for moved in passed.moved):
             self._report(CLOCK_MOVED, self._move([moved for moved in passed.moved if moved.by == by]))
         while self._planned and len(passed.events) and self._planned[0].at <= passed.events.t.max():
-            passed = self._maintain(passed, self._planned.pop(0))
+            item = self._planned.pop(0)
+            self._report(MAINTENANCE, maintenance_text(item.what, item.states, self._model))
+            passed = self._restart(passed, item.at, item.states)
+        return passed if self._unknown is None else self._paused(passed, self._unknown)
+
+    def _paused(self, passed: Passed, unknown: UnknownInputs) -> Passed:
+        """Return the events with a restart of the driven states at the end of each pause."""
+        t = passed.events.t[np.isin(passed.events.kind, (READING, INPUT))]
+        newest = np.maximum.accumulate(np.concatenate(([self._newest], t)))
+        self._newest = int(newest[-1])
+        for k in np.flatnonzero((newest[:-1] != BEFORE) & (t > newest[:-1] + unknown.after)).tolist():
+            length = (t[k] - newest[k]) * 1e-9
+            self._report(
+                PAUSED,
+                f"no event for {length:.4g} s until {t[k] * 1e-9:.6g} s, longer than time.paused_after: its inputs are "
+                f"unknown, {_restarted(unknown.states, self._model)}",
+            )
+            # Before all events that end the pause.
+            passed = self._restart(passed, int(t[k]) - 1, unknown.states)
         return passed
 
-    def _maintain(self, passed: Passed, item: Planned) -> Passed:
-        """Return the events with a maintenance that is due."""
+    def _restart(self, passed: Passed, t: int, states: Sequence[int]) -> Passed:
+        """Return the events with some whose states restart at t (ns)."""
         model = self._model
-        events = maintained(item.at, item.at, item.states, model.width)
-        self._report(MAINTENANCE, maintenance_text(item.what, item.states, model))
+        events = maintained(t, t, states, model.width)
         settled = np.concatenate((passed.settled, np.ones(len(events), np.bool_)))
         return passed._replace(events=Events.concat([passed.events, events], model.width), settled=settled)
 

@@ -276,6 +276,10 @@ class TimeSection(Section):
     stale_after; `nisus fold` prints where it comes from."""
     stale_after: Seconds = 15.0
     """Seconds without a used measurement after which health is stale; not below degraded_after. Default: 15."""
+    paused_after: Seconds | None = None
+    """Seconds without any event, measurement or input, after which the inputs of the pause count as unknown, as where a
+    logger was off while the asset ran on: the states that inputs drive become as uncertain as at the start. Default:
+    never; the last inputs are held."""
     late: Literal["exact", "inflate", "auto"] = "auto"
     """Treatment of a late measurement within the horizon. exact: it is inserted at its time and the filter rewinds.
     inflate: it is used on arrival, with its variance inflated by the predicted change since; fast, approximate, and not

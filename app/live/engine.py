@@ -126,7 +126,9 @@ class Engine(Running):
     def _begin_intake(self) -> None:
         """Begin a log, of which no event has been judged."""
         self._late = 0
-        self._intake = Ingest(self.model, self._horizon, self.notices.report, self.twin.maintenance)
+        self._intake = Ingest(
+            self.model, self._horizon, self.notices.report, self.twin.maintenance, self.twin.unknown_inputs
+        )
 
     # From any thread
 

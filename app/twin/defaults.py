@@ -17,6 +17,7 @@ from estimators.late import EVENT_S_PER_NUMBER, rewind_seconds
 from estimators.model.coloured import disturbance_time, error_time
 from estimators.model.instruments import Instrument, instrument_parameters
 from estimators.model.state_space import StateSpaceModel
+from estimators.numerics.jit import plain
 from estimators.snapshots import Snapshots
 from estimators.tuning import Tuning
 
@@ -68,6 +69,21 @@ def _slowest(model: StateSpaceModel) -> float | None:
     except ModelError:
         return None
     return float(constants[0]) if constants.size else None
+
+
+def driven_states(model: StateSpaceModel) -> tuple[int, ...]:
+    """Return the indices of the states that inputs drive, directly or through others; all of a large model."""
+    if model.black_box or model.nx > MAX_STATES:
+        return tuple(range(model.nx))
+    rng, p, dt = np.random.default_rng(0), model.default_parameters, min(1.0, model.max_step)
+    x, moved = np.empty((2, 2, model.nx))
+    x[:] = model.prior_mean + model.prior_std * rng.standard_normal(model.nx)
+    # An input reaches the last state of a chain after as many steps.
+    for _ in range(model.nx + 1):
+        for k, u in enumerate(model.default_inputs + np.outer((0.0, 1.0), 0.5 + rng.random(model.nu))):
+            plain(model.f)(x[k], u, p, dt, moved[k])
+        x[:] = moved
+    return tuple(np.flatnonzero(x[0] != x[1]).tolist())
 
 
 def sensor_period(config: TwinSection, name: str | None = None) -> float | None:

@@ -85,7 +85,7 @@ def read_log(twin: Twin, duration: float | None, *, blind: bool = False) -> tupl
     horizon = round(twin.config.time.horizon * 1e9)
     # What a late reading is inflated by is asked of the estimate when it comes.
     beside = Fold(twin.estimator, twin.model, twin.tuning, log) if twin.late.inflate else None
-    intake = Ingest(twin.model, horizon, remark, twin.maintenance)
+    intake = Ingest(twin.model, horizon, remark, twin.maintenance, twin.unknown_inputs)
     try:
         while (batch := source.read(1.0)) is not None:
             put(intake.take(batch))

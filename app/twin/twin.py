@@ -26,9 +26,9 @@ from estimators.model.state_space import StateSpaceModel
 from estimators.registry import checked, find_entry, find_estimator
 from estimators.tuning import CHANGED_MARK, Tuning
 
-from ..ingest import Planned
+from ..ingest import Planned, UnknownInputs
 from .checks import check_named, check_refit, check_scene, commissioned
-from .defaults import DegradedAfter, Late, degraded_after, late_policy, parameter_sections
+from .defaults import DegradedAfter, Late, degraded_after, driven_states, late_policy, parameter_sections
 from .landmarks import expanded
 from .learned import correction_files
 from .model import configure, find_model, model_files
@@ -109,6 +109,12 @@ class Twin:
             Planned(round(item.at * 1e9), item.what, tuple(sorted(names.index(name) for name in item.states)))
             for item in self.config.maintenance
         )
+
+    @property
+    def unknown_inputs(self) -> UnknownInputs | None:
+        """Pauses of the source over which the inputs are unknown; None if they are held for however long."""
+        after = self.config.time.paused_after
+        return None if after is None else UnknownInputs(round(after * 1e9), driven_states(self.model))
 
     @property
     def policy(self) -> HealthPolicy:
@@ -291,6 +297,8 @@ def _assemble(loaded: Loaded, overrides: Mapping[str, str], log_files: Sequence[
     changed = bool(turned) or any(key.split(".")[0] in TuningSection.model_fields for key in overrides)
     tuning = replace(tuning, name=name + (CHANGED_MARK if changed else ""))
     check_refit(loaded, first.name, tuning)
+    if config.time.paused_after is not None and not driven_states(model):
+        raise loaded.error(("time", "paused_after"), f"is for inputs, and none drives {model.name}; leave it out")
     for k, item in enumerate(config.maintenance):
         check_named(loaded, ("maintenance", k, "states"), item.states, model)
         if len(set(item.states)) != len(item.states):

@@ -66,6 +66,7 @@ def twin(history=200_000, horizon=2.0, tick=1000.0, model=MODEL, estimator="kf")
         estimator=estimator,
         recorded=False,
         maintenance=(),
+        unknown_inputs=None,
         late=Late(False, "scripted"),
         degraded=DegradedAfter(time.degraded_after, "scripted"),
         pairs=np.array([[0, 1]]),

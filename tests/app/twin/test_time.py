@@ -2,12 +2,16 @@
 
 import json
 
+import numpy as np
 import pytest
 
 from app.cli.arguments import FoldCommand
 from app.cli.fold import fold_twin
+from app.twin.log_reader import read_log
 from app.twin.twin import load_twin
 from estimators.errors import ConfigError
+from estimators.fold import Fold
+from estimators.log import MAINTENANCE
 
 TWIN = """
 model: motor_winding
@@ -80,6 +84,40 @@ def test_maintenance_of_states_that_are_not_there_is_refused_with_its_line(tmp_p
     more = f"maintenance:\n- {{at: 100, what: new fan, states: {states}}}\n"
     with pytest.raises(ConfigError, match=f"motor.yaml:[67].*{text}"):
         load_twin(made(tmp_path, more=more))
+
+
+def test_inputs_are_unknown_over_a_pause(tmp_path):
+    """A logger that was off from 50 to 400 s: what a cell was drained of meanwhile is not in the file."""
+    lines = [f"{k}.0,1.0,3.6,25.0" for k in (*range(51), *range(400, 420))]
+    (tmp_path / "log.csv").write_text("\n".join(["t,i,v,c", *lines]))
+    text = (
+        "model: battery_cell\nestimate: {r0: {std: 0.005}}\nprior: {soc: {mean: 0.45, std: 0.2}}\ntime: {%s}\n"
+        "source:\n  {type: table, files: log.csv, time: {column: t}, inputs: {current: {columns: i}},"
+        " sensors: {voltage: {columns: v}, temperature: {columns: c}}}\n"
+    )
+    at = {}
+    for name, time in (("held", "paused_after: 400"), ("unknown", "paused_after: 60")):
+        path = tmp_path / f"{name}.yaml"
+        path.write_text(text % time)
+        twin = load_twin(path)
+        log, counts = read_log(twin, None)
+        fold = Fold(twin.estimator, twin.model, twin.tuning, log)
+        fold.advance()
+        at[name] = log, fold, counts
+    log, fold, counts = at["unknown"]
+    rows = np.flatnonzero(log.kind[: log.n] == MAINTENANCE)
+    assert log.t[rows].tolist() == [400_000_000_000 - 1] * 3
+    assert [twin.model.state_names[k] for k in log.channel[rows]] == ["soc", "v1", "temperature"]
+    np.testing.assert_allclose(fold.track.std[rows[-1], :3], [0.2, 0.02, 3.0], rtol=1e-12)
+    assert fold.track.std[rows[-1], 3] < 0.005
+    assert counts["paused"] == 1
+    log, fold, counts = at["held"]
+    assert not np.any(log.kind[: log.n] == MAINTENANCE) and counts["paused"] == 0
+
+
+def test_a_pause_of_a_model_without_inputs_is_refused(tmp_path):
+    with pytest.raises(ConfigError, match="motor.yaml:3: time.paused_after is for inputs, and none drives"):
+        load_twin(made(tmp_path, "paused_after: 60"))
 
 
 @pytest.mark.parametrize("how", ["exact", "inflate"])
