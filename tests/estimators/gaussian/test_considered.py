@@ -143,6 +143,31 @@ def schmidt(model, log, u, inflation=1.0):
 def test_it_equals_the_equations_in_blocks(estimator, f, options):
     model = joint(physics(f), CONSIDERED | ESTIMATED)
     assert model.state_names == ("a", "b", "heat", "offset_deviation", "loss_deviation") and model.considered == 2
+    equal_to_the_equations(estimator, model, options)
+
+
+# Offsets leave the model linear, and all forms exact; scales multiply states, where the tangents are those of the EKF.
+OFFSETS = {
+    "power": Instrument(offset=(0.1,)),
+    "first": Instrument(offset=(0.0,)),
+    "both": Instrument(offset=(0.2, 0.0)),
+}
+SCALES = {"power": Instrument((0.1,), (0.9,)), "both": Instrument((0.2, 0.0), (1.0, 1.1))}
+
+
+@pytest.mark.parametrize(
+    ("estimator", "f", "instruments"),
+    [*((name, f, OFFSETS) for name in CONSIDERING), *((name, bilinear, SCALES) for name in ("ekf", "sr-ekf"))],
+)
+def test_offsets_and_scales_equal_the_equations_in_blocks(estimator, f, instruments):
+    own = with_instruments(physics(f), instruments)
+    widths = {item.name: JointParameter(0.05 + 0.02 * k, considered=True) for k, item in enumerate(own.parameters[3:])}
+    model = joint(own, CONSIDERED | widths, {("loss", own.parameters[3].name): 0.6})
+    assert model.considered == 2 + sum(len(values) for given in instruments.values() for values in given)
+    equal_to_the_equations(estimator, model, {})
+
+
+def equal_to_the_equations(estimator, model, options):
     log = log_of()
     fold = Fold(estimator, model, Tuning.of(model).with_options(options), log)
     for mean, cov, nis in schmidt(model, log, model.default_inputs, **options if "inflation" in options else {}):

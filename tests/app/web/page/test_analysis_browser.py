@@ -165,13 +165,17 @@ def test_rows_in_order_do_not_hide_a_mean_nis_that_is_not(page, place):
 def test_diagnose_states_which_considered_parameters_the_bands_come_from(page):
     def answer(route):
         told = route.fetch().json()
-        route.fulfill(json=told | {"variance": {"winding": "yoke_coolant 60 %, noise 40 %", "magnet": "noise 100 %"}})
+        variance = {"winding": "yoke_coolant 60 %, noise 40 %", "magnet": "noise 100 %"}
+        gain = {"winding": "yoke_coolant: σ 0.9 to 0.57", "magnet": "no parameter reduces σ"}
+        route.fulfill(json=told | {"variance": variance, "gain": gain})
 
     page.route("**/api/diagnose", answer)
     page.get_by_role("tab", name="Diagnose").click()
     until(page, "window.nisus.diagnosed > 0")
     card = page.get_by_label("Sources of uncertainty", exact=True)
-    assert card.locator("tr").nth(1).inner_text().split("\t") == ["winding", "yoke coolant 60 %, noise 40 %"]
+    assert card.locator("tr").nth(1).inner_text().split("\t") == [
+        "winding", "yoke coolant 60 %, noise 40 %", "yoke coolant: σ 0.9 to 0.57"
+    ]  # fmt: skip
     assert card.locator("tr").count() == 3
 
 
