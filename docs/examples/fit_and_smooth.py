@@ -17,7 +17,7 @@ def fit_and_smooth(name="motor_can"):
     """Return the log, the tuning fitted by expectation maximisation, and the filtered and smoothed estimates."""
     twin = load_twin(name)
     log, _ = read_log(twin, None)  # the recording that the twin's YAML names
-    fitted = em("ekf", twin.model, twin.tuning, log, rounds=6)
+    fitted = em("ekf", twin.model, twin.tuning, log)
     tuned = {"tuning": fitted.tuning, "covariance": True}
     return log, fitted, fold("ekf", twin.model, log, **tuned), fold("ekf", twin.model, log, smoothed=True, **tuned)
 

@@ -16,6 +16,7 @@ Sources: Shumway & Stoffer (1982), doi:10.1111/j.1467-9892.1982.tb00349.x; Särk
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple
@@ -51,11 +52,15 @@ MAX_EXTRAPOLATION = 5.0  # Largest extrapolation of the logarithm of a variance
 
 
 class EmFit(NamedTuple):
-    """The fitted tuning; the log-likelihood at the start and after each pair of rounds; whether it has converged."""
+    """The fitted tuning; the log-likelihood at the start and after each pair of rounds; whether it has converged.
+
+    change: largest relative change of a variance in the last round.
+    """
 
     tuning: Tuning
     log_likelihood: np.ndarray
     converged: bool
+    change: float
 
 
 def em(
@@ -82,6 +87,9 @@ def em(
 
     Raises:
         EstimatorError: If filter or model do not meet the assumptions.
+
+    Warns:
+        RuntimeWarning: If the variances still change after all rounds.
     """
     fold = _folded(estimator, model, tuning, log)
     _check(fold)
@@ -100,14 +108,20 @@ def em(
         return np.where(found > 0.0, np.log(np.where(found > 0.0, found, 1.0)), logs)
 
     logs = np.log(begin[moving])
-    likelihoods, converged = [_likelihood(fold)], False
+    likelihoods, converged, change = [_likelihood(fold)], False, np.inf
     while not converged and len(likelihoods) <= rounds:
         first = onward(fold, logs)
         second = onward(at(first), first)
-        converged = bool(np.all(np.abs(second - first) < tolerance))
+        change = float(np.max(np.abs(second - first), initial=0.0))
+        converged = change < tolerance
         logs, fold = _better(logs, first, second, at)
         likelihoods.append(_likelihood(fold))
-    return EmFit(fold.tuning, np.array(likelihoods), converged)
+    if not converged:
+        text = (
+            f"em: not converged after {rounds} pairs of rounds: a variance changes by {change:.2g} of itself per round"
+        )
+        warnings.warn(f"{text} (tolerance {tolerance:g}); give more rounds", RuntimeWarning, stacklevel=2)
+    return EmFit(fold.tuning, np.array(likelihoods), converged, change)
 
 
 def _better(
