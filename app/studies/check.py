@@ -19,9 +19,11 @@ from estimators.diagnostics.sensitivity.gramian import directions
 from estimators.diagnostics.sensitivity.held_out import HeldOut, held_out
 from estimators.diagnostics.sensitivity.posterior import Peaks, Tail, tails
 from estimators.diagnostics.sensitivity.responses import NOW, PRIOR, digits
+from estimators.diagnostics.sensitivity.visibility import UndetectableFault
 from estimators.errors import NisusError
 from estimators.fold import Fold
 from estimators.log import READING, Log
+from estimators.model.state_space import StateSpaceModel
 
 from ..present.export.calibration_lines import calibration_lines, health_shares
 from ..present.result import WORSE, Bar, Cell, Topic, plain
@@ -335,19 +337,21 @@ def _fault_topics(checked: Checked) -> list[Topic]:
         )
         smallest = _table(
             titles[1],
-            ("fault", "smallest visible", "passes unseen", "begins"),
+            ("fault", "smallest visible", "passes unseen", "moves", "begins"),
             [
                 (
                     fault.nudge.subject,
                     fault.nudge.size_text(fault.visible) if np.isfinite(fault.visible) else "undetectable in its range",
                     fault.range_text,
+                    moves,
                     BEGINS[one.begin],
                 )
-                for fault, one in worse_faults(found, checked.onset)
+                for fault, one, moves in _by_harm(model, worse_faults(found, checked.onset))
             ],
             note,
             "Smallest fault that is detected with a probability of 95 %, the worse of two: present from the prior on, "
-            f"for {found.window:.4g} s, or beginning later, for {checked.onset.window:.4g} s.",
+            f"for {found.window:.4g} s, or beginning later, for {checked.onset.window:.4g} s. First the fault whose "
+            "undetectable part moves a state furthest out of its band.",
         )
         pairs = confounded(found)
         free = (
@@ -382,6 +386,22 @@ def _fault_topics(checked: Checked) -> list[Topic]:
     ]
     columns = ("part of the log", "rank", "conditioning", "weakest direction")
     return [levels, smallest, _table(title, columns, views, f"{gramian.note}." if gramian.note else ""), alike]
+
+
+def _by_harm(
+    model: StateSpaceModel, faults: Sequence[tuple[UndetectableFault, Sensitivity]]
+) -> list[tuple[UndetectableFault, Sensitivity, str]]:
+    """Return faults by the largest error of a state, in its standard deviations, with that error in words."""
+    found = []
+    for fault, one in faults:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            share = np.nan_to_num(fault.error[-1] / one.std[-1], nan=0.0, posinf=np.inf)
+        k = int(np.argmax(share))
+        state, error = model.shown_states[k], float(fault.error[-1, k])
+        moves = f"{state.name} by {digits(error)} {state.unit}".rstrip() if error > 0.0 else "nothing"
+        found.append((float(share[k]), fault, one, moves))
+    found.sort(key=lambda item: -item[0])
+    return [(fault, one, moves) for _, fault, one, moves in found]
 
 
 def _held_out_topics(checked: Checked) -> list[Topic]:

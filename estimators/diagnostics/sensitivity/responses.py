@@ -106,7 +106,14 @@ class Start(NamedTuple):
             return self.refold(log=other)
         if nudge.kind == DELAY:
             own, at, predicted = self._predicted(nudge.name)
-            value[own, : predicted.shape[1]] += _at(at - size, at, predicted) - predicted
+            count = predicted.shape[1]
+            if abs(size) < nudge.scale:
+                value[own, :count] += _at(at - size, at, predicted) - predicted
+            else:
+                # Whole measurements with their noise, those nearest in time; at the ends there are none.
+                there = (at - size >= at[0]) & (at - size <= at[-1]) if at.size else np.zeros(0, bool)
+                nearest = np.searchsorted(0.5 * (at[1:] + at[:-1]), at[there] - size)
+                value[own[there], :count] = value[own[nearest], :count]
             return self.refold(log=other)
         row = model.row_names.index(nudge.name)
         sensor = int(np.searchsorted(model.row_start, row, side="right")) - 1

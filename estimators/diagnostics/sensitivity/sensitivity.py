@@ -24,6 +24,7 @@ from ..health import HealthPolicy
 from .gramian import Uncertainty, information, uncertainty
 from .responses import (
     CATALOGUE,
+    DELAY,
     FROM_PRIOR,
     KINDS,
     MAX_CHECKED_EVENTS,
@@ -63,7 +64,7 @@ MAX_PRIOR_SHARE = 0.1
 
 MIN_CHECKED_EVENTS = 1000  # Events that are refolded at least, of logs that have as many
 
-NOISE_BISECTIONS = 5  # Of the factor on a variance, between 1 and a hundred: to 15 %
+ALARM_BISECTIONS = 5  # Of the factor on a variance, between 1 and a hundred: to 15 %; of a delay, to a thirtieth
 
 
 class ErrorBounds(NamedTuple):
@@ -258,8 +259,8 @@ def _remembered(begun: Start, executor: Executor | str | None) -> int:
 
 def _undetectable(begun: Start, nudge: Nudge, tests: FaultTests) -> UndetectableFault:
     """Return the undetectable sizes of a nudge of any kind."""
-    if nudge.kind in NOISES:
-        return _undetectable_noise(begun, nudge)
+    if nudge.kind in (*NOISES, DELAY):
+        return _undetectable_by_alarms(begun, nudge)
     if nudge.kind not in SWITCHED:
         return undetectable_fault(begun, nudge, begun.respond(nudge), tests)
     track = begun.with_fault(nudge, 1.0)
@@ -283,34 +284,41 @@ def _alarmed(begun: Start, track: Track) -> bool:
     return bool(np.any(track.alarms & ~raised)) or bool(np.any((track.flags != 0) & (calm.flags == 0)))
 
 
-def _undetectable_noise(begun: Start, nudge: Nudge) -> UndetectableFault:
-    """Return the undetectable factors on a variance, at which the detectors raise no new alarm in this log.
+def _undetectable_by_alarms(begun: Start, nudge: Nudge) -> UndetectableFault:
+    """Return the undetectable factors on a variance, or delays: the detectors raise no new alarm in this log.
 
-    If the other variance is right, the estimate is off by its change, and its band is that of the other.
+    If the other variance is right, the estimate is off by its change, and its band is that of the other. Measurements
+    are delayed with their noise, so that the innovations change by more than their mean.
     """
     calm = begun.track
     none = np.zeros_like(calm.mean)
 
-    def tried(factor: float) -> tuple[bool, np.ndarray]:
-        track = begun.with_fault(nudge, factor - 1.0)
+    def tried(size: float) -> tuple[bool, np.ndarray]:
+        track = begun.with_fault(nudge, size)
         error = np.abs(begun.moved(track).states) + TWO_SIGMA * np.maximum(track.std - calm.std, 0.0)
         return _alarmed(begun, track) or not np.all(np.isfinite(error)), error
 
+    def between(one: float, other: float) -> float:
+        return float(np.sqrt((1.0 + one) * (1.0 + other))) - 1.0 if nudge.kind in NOISES else 0.5 * (one + other)
+
+    def extent(size: float) -> float:
+        return max(1.0 + size, 1.0 / (1.0 + size)) - 1.0 if nudge.kind in NOISES else abs(size)
+
     sizes, shown, errors = [], np.inf, none
-    for limit in (1.0 + nudge.low, 1.0 + nudge.high):
-        hidden, error = limit, none
+    for limit in (nudge.low, nudge.high):
+        hidden = limit
         alarmed, error = tried(limit)
         if alarmed:
-            hidden, error, beyond = 1.0, none, limit
-            for _ in range(NOISE_BISECTIONS):
-                middle = float(np.sqrt(hidden * beyond))
+            hidden, error, beyond = 0.0, none, limit
+            for _ in range(ALARM_BISECTIONS):
+                middle = between(hidden, beyond)
                 alarmed, moved = tried(middle)
                 if alarmed:
                     beyond = middle
                 else:
                     hidden, error = middle, moved
-            shown = min(shown, max(beyond, 1.0 / beyond) - 1.0)
-        sizes.append(hidden - 1.0)
+            shown = min(shown, extent(beyond))
+        sizes.append(hidden)
         errors = np.maximum(errors, error)
     return UndetectableFault(nudge, Response(NOTHING, NOTHING, NOTHING), sizes[0], sizes[1], shown, errors, 0.0)
 

@@ -11,13 +11,14 @@ from estimators.diagnostics.detector_state import no_baseline
 from estimators.diagnostics.detectors import RATIOS, TESTS
 from estimators.diagnostics.sensitivity import bounds_of, sensitivities, sensitivity, worse_faults
 from estimators.diagnostics.sensitivity.gramian import directions
-from estimators.diagnostics.sensitivity.responses import CATALOGUE, PRIOR, SCALE
+from estimators.diagnostics.sensitivity.responses import CATALOGUE, DELAY, PRIOR, SCALE
 from estimators.diagnostics.sensitivity.visibility import FaultTests, noncentrality, threshold
 from estimators.fold import fold
 from estimators.log import READING, Log
 from estimators.models import MODELS
 from estimators.track import GATED
 from estimators.tuning import Tuning
+from tests.models import level_model
 from tests.support import folded
 
 from .models import COUPLED, KEPT, TWICE, WALK, Q, R, S, simulate
@@ -95,6 +96,26 @@ def test_a_scale_and_a_wrong_prior_of_a_walk_in_closed_form():
     # Faults that begin later know no prior.
     later = sensitivity("ekf", model, Tuning.of(model), log, kinds=CATALOGUE)
     assert not {"prior", "Q", "R"} & {nudge.kind for nudge in later.nudges}
+
+
+def test_a_delay_of_the_only_sensor_is_undetectable_and_one_of_two_is_not():
+    """Two sensors of one swinging quantity contradict each other if one is late; alone it is a later asset."""
+    n = 400
+    swing = 3.0 * np.sin(np.arange(n) / 8.0)
+    for names in (("level",), ("level", "other")):
+        model = level_model(dict.fromkeys(names, 0.01), 0.2, state="x")
+        log = Log.of(model)
+        rng = np.random.default_rng(4)
+        for name in names:
+            log.add(name, np.arange(n), swing + 0.1 * rng.normal(size=n))
+        found = sensitivity("ekf", model, Tuning.of(model), log, kinds=(DELAY,), begin=PRIOR)
+        fault = found.faults[0]
+        assert fault.nudge.high == 10.0
+        if len(names) == 1:
+            assert (fault.low, fault.high, fault.visible) == (-10.0, 10.0, np.inf)
+        else:
+            # A delay of one period is at most 0.37 in 0.1 σ of noise: bisected to a thirtieth of ten seconds.
+            assert fault.visible <= 2.0 and -2.0 < fault.low <= 0.0 <= fault.high < 2.0
 
 
 def test_a_bias_from_the_prior_on_is_harder_to_detect_where_the_prior_is_wide():
