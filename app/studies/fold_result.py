@@ -13,6 +13,7 @@ import numpy as np
 
 from estimators.diagnostics.calibration import (
     BANDS,
+    WHOLE,
     Calibration,
     CoverageBin,
     calibrations,
@@ -400,15 +401,10 @@ def fold_topics(result: FoldResult) -> list[Topic]:
     topics = [Topic(f"{result.twin.name}: {result.twin.title}", figures=tuple(_figures(result)))]
     if calibration:
         topics.append(Topic("Calibration, 95 % intervals", tuple(calibration)))
-    if result.coverage:
-        topics.append(
-            Topic(
-                "Coverage of the 95 % bands over time",
-                (),
-                COVERAGE_HEAD,
-                tuple(coverage_rows(result.coverage, result.twin.model)),
-            )
-        )
+    if rows := coverage_rows(result.coverage, result.twin.model):
+        left = sum(item.by == WHOLE for item in result.coverage) - len(rows)
+        said = (f"The {len(rows)} lowest; {left} more are in --json.",) if left else ()
+        topics.append(Topic("Coverage of the 95 % bands over time", said, COVERAGE_HEAD, tuple(rows)))
     return [*topics, episodes_topic(result.episodes)]
 
 

@@ -40,17 +40,23 @@ def calibration_lines(found: Sequence[Calibration], model: StateSpaceModel) -> l
     return lines
 
 
+MAX_COVERAGE_ROWS = 12  # rows that are printed; JSON has all
 COVERAGE_HEAD = ("", "", "in the 95 % band", "lowest in time", "lowest by operating point", "adaptive interval")
 
 
 def coverage_rows(found: Sequence[CoverageBin], model: StateSpaceModel) -> list[tuple[str, ...]]:
-    """Return a line for each sensor row and true state: its coverage, and the worst by time and operating point."""
+    """Return a line for each sensor row and true state: its coverage, and the worst by time and operating point.
+
+    Of more than `MAX_COVERAGE_ROWS` those with the lowest coverage.
+    """
     units = {state.name: state.unit for state in model.shown_states} | {item.name: item.unit for item in model.inputs}
     units[TIME] = "s"
     begun = min((item.low for item in found if item.by == TIME), default=0.0)
     found = [item._replace(low=item.low - begun, high=item.high - begun) if item.by == TIME else item for item in found]
     rows = []
-    for entry in (entry for entry in found if entry.by == WHOLE):
+    whole = [entry for entry in found if entry.by == WHOLE]
+    lowest = sorted(entry.coverage.value for entry in whole)[:MAX_COVERAGE_ROWS]
+    for entry in [entry for entry in whole if entry.coverage.value <= lowest[-1]][:MAX_COVERAGE_ROWS]:
         own = [item for item in found if (item.subject, item.role) == (entry.subject, entry.role)]
         parts = [[item for item in own if item.by == TIME], [item for item in own if item.by not in (TIME, WHOLE)]]
         adaptive = f"{entry.factor:.2f} × band: {_percent(entry.adaptive)}" if np.isfinite(entry.factor) else "-"

@@ -76,7 +76,9 @@ export class XY {
     const ctx = canvas.getContext("2d");
     ctx.scale(devicePixelRatio, devicePixelRatio);
     const belief = this.paint(ctx, width, height);
-    this.text.textContent = belief ? `correlation ${compact(belief.cov[1] / Math.sqrt(belief.cov[0] * belief.cov[2]), 2)}` : "";
+    const { withheld } = this.charts;
+    const hidden = this.pair.filter((name) => withheld?.[name]).map((name) => `${words(name)} withheld: ${withheld[name]}`);
+    this.text.textContent = belief ? `correlation ${compact(belief.cov[1] / Math.sqrt(belief.cov[0] * belief.cov[2]), 2)}` : hidden.join("; ");
   }
 
   // As a file.

@@ -2,9 +2,9 @@
 
 from app.cli.arguments import FoldCommand
 from app.cli.fold import fold_twin
-from app.present.export.calibration_lines import calibration_lines
+from app.present.export.calibration_lines import calibration_lines, coverage_rows
 from app.twin.twin import load_twin
-from estimators.diagnostics.calibration import Calibration
+from estimators.diagnostics.calibration import Calibration, CoverageBin
 from estimators.diagnostics.intervals import UNKNOWN, Interval
 from tests.models import level_model
 
@@ -55,3 +55,18 @@ def test_only_a_mode_of_two_values_is_a_probability() -> None:
     model = load_twin("gripper_contact").model
     assert [model.label(name) for name in model.state_names[:2]] == ["probability of contact", "depth"]
     assert load_twin("motor_winding").model.label("temperature") == "temperature"
+
+
+def test_the_rows_with_the_lowest_coverage_name_where_it_is_lowest():
+    """A band counts as too narrow from 88.3 % on, 2 Φ(1.96 / 1.25) - 1; times count from the first of all."""
+
+    def part(subject: str, by: str, low: float, value: float, high: float) -> CoverageBin:
+        return CoverageBin(subject, "used", by, low, low + 60.0, 100, Interval(value, value - 0.05, high), 0.95, 1.4)
+
+    found = [part(f"g{k}", "whole log", 1000.0, 0.95 - 0.01 * k, 0.99) for k in range(14)]
+    found += [part("g13", "time", 1000.0, 0.9, 0.94), part("g13", "time", 1060.0, 0.7, 0.882)]
+    found += [part("g13", "air", 3.0, 0.8, 0.884)]
+    rows = coverage_rows(found, MODEL)
+    assert [row[0] for row in rows] == [f"g{k}" for k in range(2, 14)]
+    assert rows[0][2:] == ("93 % (88 to 99)", "-", "-", "1.40 × band: 95 %")
+    assert rows[-1][3:5] == ("70 % (65 to 88.2) at 60 to 120 s", "none of 1 below 88.3 %")

@@ -176,6 +176,8 @@ def test_a_withheld_estimate_has_its_reason_in_place_of_a_value_and_a_band_witho
         (_, own), (said, other) = sorted(page.evaluate(marks), key=lambda mark: "withheld" in mark[0])
         assert own.startswith("suspect: temperature is ") and (said, other) == ("⊘ withheld", f"withheld: {reason}")
         # Two states against each other and a forecast leave it out as well; the forecast keeps its band.
+        page.get_by_role("tab", name="XY").click()
+        until(page, f"document.getElementById('xy').innerText.includes('rate withheld: {reason}')")
         engine = session.engine
         assert np.isnan(engine.belief().mean[1]) and np.isfinite(engine.belief().mean[0])
         assert belief_json(engine, [0, 1]) is None
