@@ -223,7 +223,8 @@ def sensitivities(
 ) -> tuple[Sensitivity, Sensitivity]:
     """Return the sensitivity to all faults of `CATALOGUE`: present from the prior on, and beginning now.
 
-    Over as many events as the slowest state remembers, from the prior on; half a log at most for those beginning now.
+    Over as many events as the slowest state remembers, from the prior on; a third of a log at most for those beginning
+    now, as shorter faults are harder to detect.
     For the arguments see `sensitivity`.
     """
     find_estimator(estimator, model)
@@ -239,7 +240,7 @@ def sensitivities(
             executor=executor,
         )  # fmt: skip
 
-    return of(PRIOR, window), of(NOW, max(1, min(window, log.n // 2)))
+    return of(PRIOR, window), of(NOW, max(1, min(window, log.n // 3)))
 
 
 def _remembered(begun: Start, executor: Executor | str | None) -> int:
