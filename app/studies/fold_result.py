@@ -227,7 +227,8 @@ def explained(fold: Fold, episodes: Sequence[Episode]) -> list[ExplainedEpisode]
         if isolates(episode.cause) and searched < MAX_EXPLAINED:
             searched += 1
             with suppress(NisusError):
-                likely = suspects(fold.estimator.name, fold.model, fold.tuning, fold.log, episode.start)
+                _, base = fold.base_at(0)
+                likely = suspects(fold.estimator.name, fold.model, fold.tuning, fold.log, episode.start, base=base)
                 named, words = likeliest(likely), in_words(likely)
         found.append(ExplainedEpisode(episode, named, words))
     return found

@@ -367,7 +367,8 @@ def accused(fold: Fold, episode: Episode, until: int) -> tuple[str, ...]:
     seen = fold.log.copy()
     seen.n = int(np.searchsorted(fold.log.t[: fold.n], until))
     try:
-        found = likeliest(suspects(fold.estimator.name, fold.model, fold.tuning, seen, episode.start))
+        _, base = fold.base_at(0)
+        found = likeliest(suspects(fold.estimator.name, fold.model, fold.tuning, seen, episode.start, base=base))
     except NisusError:
         found = ()
     names: list[str] = []
