@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import traceback
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from math import inf, log, sqrt
 from pathlib import Path
@@ -163,8 +163,12 @@ def _assembled(model: StateSpaceModel, loaded: Loaded) -> StateSpaceModel:
     values |= {name: _value(name, section) for name, section in sections.items() if name not in values}
     check_names(loaded, ("estimate",), config.estimate, [*values, *times], "parameter", model)
     estimated = {name: JointParameter(section.std, section.drift) for name, section in config.estimate.items()}
+    own = _instrument_keys(config, instruments)
     for name, section in sections.items():
         std = section.spread(values[name])
+        if std == 0.0 and section.std is not None:
+            at: Key = (*own.get(name, ("parameters", name)), "std")
+            raise loaded.error(at, f"is {section.std} of {values[name]:g}; give it in the unit of the value")
         if std is not None:
             if name in config.estimate:
                 raise loaded.error(("estimate", name), "has a std in `parameters` too; give it in one place")
@@ -178,7 +182,8 @@ def _assembled(model: StateSpaceModel, loaded: Loaded) -> StateSpaceModel:
             mirrored = sections[other].correlation.get(name, value) if other in sections else value
             if name == other or mirrored != value:
                 text = "is with itself" if name == other else f"is {value:g} here and {mirrored:g} under {other}"
-                raise loaded.error(("parameters", name, "correlation", other), f"{text}; give each pair once")
+                at = (*own.get(name, ("parameters", name)), "correlation", other)
+                raise loaded.error(at, f"{text}; give each pair once")
     held = {name for name, section in sections.items() if section.use != "considered"}
     correlations = {
         (name, other): value
@@ -209,7 +214,7 @@ def _assembled(model: StateSpaceModel, loaded: Loaded) -> StateSpaceModel:
         keys = {
             "noise": ("noise", name, "over"),
             "error": ("sensors", name, "error"),
-            "estimate": ("estimate", name) if name in config.estimate else ("parameters", name),
+            "estimate": ("estimate", name) if name in config.estimate else own.get(name, ("parameters", name)),
             "correlation": ("parameters",),
             "instrument": ("sensors" if name in config.sensors else "inputs", name),
         }
@@ -220,12 +225,26 @@ def _instruments(model: StateSpaceModel, loaded: Loaded) -> dict[str, dict[str, 
     """Return the sections of offsets and scales of the sensors and inputs that the model has."""
     config = loaded.config
     check_names(loaded, ("inputs",), config.inputs, [item.name for item in model.inputs], "input", model)
+    given = {name for name, section in config.sensors.items() if any(getattr(section, k) for k in Instrument._fields)}
+    check_names(loaded, ("sensors",), dict.fromkeys(given), model.sensor_names, "sensor", model)
     for name in config.inputs:
-        if name in config.sensors and any(getattr(config.sensors[name], kind) for kind in Instrument._fields):
+        if name in given:
             raise loaded.error(("inputs", name), "is a sensor's name too, whose offset or scale is given")
     found = instrument_sections(model, config)
-    # A sensor that the model lacks is an error later, in its place.
-    return {name: parts for name, parts in found.items() if name in config.inputs or name in model.sensor_names}
+    for item, key in _instrument_keys(config, found).items():
+        section = found[str(key[1])][item]
+        if key[2] == "scale" and not _value(item, section) > 0.0:
+            raise loaded.error(key, f"is {section.value:g}; it must be positive")
+    return found
+
+
+def _instrument_keys(config: TwinSection, found: Mapping[str, Mapping[str, Any]]) -> dict[str, Key]:
+    """Return the keys at which the YAML has the offsets and scales, by their parameters."""
+    return {
+        item: ("inputs" if name in config.inputs else "sensors", name, item.rpartition("_")[2])
+        for name, parts in found.items()
+        for item in parts
+    }
 
 
 def _value(name: str, section: ParameterSection) -> float:

@@ -429,7 +429,10 @@ def test_an_offset_leaves_a_linear_model_to_the_kalman_filter() -> None:
     ("section", "message"),
     [
         ("inputs: {power: {offset: {std: 1}}}", "inputs.power is no input of motor_winding"),
-        ("sensors: {winding: {offset: {std: 1 %}}}", "the prior of winding_offset has std 0"),
+        ("sensors: {winding: {offset: {std: 1 %}}}",
+         "motor.yaml:2: sensors.winding.offset.std is 1 % of 0; give it in the unit of the value"),
+        ("sensors: {winding: {scale: -1}}", "motor.yaml:2: sensors.winding.scale is -1; it must be positive"),
+        ("sensors: {winder: {scale: {std: 1 %}}}", "motor.yaml:2: sensors.winder is no sensor of motor_winding"),
         ("prior: {winding_offset_deviation: {std: 1}}\nsensors: {winding: {offset: {std: 1}}}",
          "prior.winding_offset_deviation is considered, so its prior is the `std` of the parameter"),
     ],
