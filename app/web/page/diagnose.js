@@ -94,7 +94,7 @@ function rowCard(row, marginal, open, turned) {
       figure("Distribution", "good: bars along the curve", distribution(row.histogram, `Distribution of the innovations of ${name}, beside N(0, 1)`)),
       figure("Autocorrelation", "good: within the band", stems(row.autocorrelation, `Autocorrelation of the innovations of ${name}`, row.period ?? 1)),
       third,
-      figure("Coverage", "good: 95 % at all times", coverage(row.coverage, `Coverage of the 95 % band of ${name} over time`)),
+      figure("Coverage [%]", "good: 95 at all times", coverage(row.coverage, `Coverage of the 95 % band of ${name} over time`)),
     ),
     element("p", { class: "faint" }, figures(row)),
   );
@@ -302,7 +302,7 @@ function flat({ counts, low, high }, label) {
 function coverage({ t, share }, label) {
   const low = Math.min(0.8, ...share.map(([value, under]) => under ?? value));
   const [from, to] = [t[0]?.[0] ?? 0, t.at(-1)?.[1] ?? 1];
-  const { node, x, y } = frame([from, to], [Math.max(0, low - 0.02), 1], label, { xs: [[from, `−${span(to - from)}`], [to, "now"]], ys: [[0.95, "95 %"], [1, ""], [low, `${Math.round(100 * low)} %`]] });
+  const { node, x, y } = frame([from, to], [Math.max(0, low - 0.02), 1], label, { xs: [[from, `−${span(to - from)}`], [to, "now"]], ys: [[0.95, "95"], [1, ""], [low, String(Math.round(100 * low))]] });
   const texts = node.querySelectorAll('text[text-anchor="middle"]');
   texts[0]?.setAttribute("text-anchor", "start");
   texts[1]?.setAttribute("text-anchor", "end");

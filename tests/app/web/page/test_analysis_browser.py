@@ -135,10 +135,11 @@ def test_diagnose_draws_what_the_rows_say(page, tmp_path):
         assert row.locator("svg").count() == 4 and row.locator("figcaption").count() == 4
         assert "good: " in row.locator("figcaption").first.inner_text()
         assert row.locator("svg rect.bar").count() > 5
-        # Correlations at 50 lags; coverage of ten parts of the time, each with its interval.
+        # Correlations at 50 lags; coverage of ten parts of the time, each with its interval once it has 8 readings.
         assert row.locator("svg[aria-label^=Autocorrelation] line.stem").count() == 50
         over = row.locator("svg[aria-label^=Coverage]")
-        assert over.locator("circle").count() == over.locator("line.stem").count() == 10
+        wait_for(lambda over=over: over.locator("line.stem").count() == 10, PATIENCE)
+        assert over.locator("circle").count() == 10
         assert "adaptive 95 % interval" in row.inner_text()
     page.locator("#diagnose").screenshot(path=tmp_path / "diagnose.png")
     assert page.locator("#diagnose svg.map rect").count() == 16
