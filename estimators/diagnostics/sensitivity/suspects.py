@@ -54,8 +54,10 @@ from .responses import (
 MAX_EVENTS = 4000  # Events since the beginning of an episode that are refolded at most
 EQUAL_NATS = 3.0  # Nats within which two faults explain equally much
 MAX_LINEAR_SIZE = 0.1  # Share of a parameter's value up to which its effect is taken as linear
+MIN_EXCHANGED = 0.5  # Share of an exchange below which it is none
 MIN_NATS = 5.0  # Nats below which a fault explains nothing
 RARER_NATS = 3.0  # log of how much rarer faults are that are no constants
+EXCESS_SIGMAS = 6.0  # Standard deviations of Σ ν² from which on something needs to be explained
 MIN_EXPLAINED = 0.2  # Share of Σ ν² - n below which the best fault is no explanation
 ISOLATED_TOO = ("correlated", "narrow", "diverged")  # Causes that leave open who is at fault, beside `Detector.isolate`
 
@@ -118,7 +120,8 @@ def suspects(
     nudges = nudges_of(model, tuning, begun.log, kinds, begun.track)
     found, left = [], float(np.sum(seen**2))
     count = int(np.isfinite(begun.track.whitened).sum())
-    excess = left - count
+    # What chance adds to χ² of so many degrees of freedom needs no explanation.
+    excess = left - count if left - count > EXCESS_SIGMAS * np.sqrt(2.0 * count) else 0.0
     for nudge, response in zip(nudges, each(begun.respond, nudges, executor), strict=True):
         moved = np.nan_to_num(response.whitened)
         power = float(np.sum(moved**2))
@@ -141,12 +144,16 @@ def suspects(
 
 
 def _refolded(begun: Start, suspect: Suspect) -> Suspect:
-    """Return a suspected parameter with the log-likelihood that a fold without its error gains, if that is less.
+    """Return a suspected parameter or delay with the log-likelihood that a fold without it gains, if that is less.
 
-    θ̂ is linear in the derivative; a change by many times the value, as of a short lag, is not.
+    θ̂ is linear in the derivative; a change by many times the value, as of a short lag, is not, nor a delay of more than
+    a period. Sensors that are exchanged are so entirely.
     """
     nudge, size = suspect.nudge, suspect.size
-    if nudge.kind != PARAMETER or suspect.gain < MIN_NATS or abs(size) <= MAX_LINEAR_SIZE * abs(nudge.value):
+    if nudge.kind == SWAP and size < MIN_EXCHANGED:
+        return suspect._replace(gain=0.0)
+    linear = {PARAMETER: MAX_LINEAR_SIZE * abs(nudge.value), DELAY: nudge.scale}.get(nudge.kind, np.inf)
+    if suspect.gain < MIN_NATS or abs(size) <= linear:
         return suspect
     before, after = (np.nansum(track.log_likelihood) for track in (begun.track, begun.with_fault(nudge, -size)))
     gain = float(after - before)
@@ -192,7 +199,7 @@ def in_words(found: Sequence[Suspect], most: int = 3) -> str:
     """Describe the most likely faults, at most `most` of them, with their odds; "" if nothing needs to be explained."""
     alike = likeliest(found)
     if not alike:
-        return NO_EXPLANATION if found and found[0].gain >= MIN_NATS else ""
+        return NO_EXPLANATION if found and found[0].explained < MIN_EXPLAINED else ""
     shares = [f" ({100.0 * share:.0f} %)" if len(alike) > 1 else "" for share in odds(alike)]
     words = [_words(one.nudge, one.size) + share for one, share in zip(alike[:most], shares, strict=False)]
     return " or ".join(words) + (f" or {len(alike) - most} more" if len(alike) > most else "")

@@ -5,12 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from estimators.diagnostics.sensitivity.suspects import in_words, suspects
+from estimators.diagnostics.sensitivity.suspects import NO_EXPLANATION, in_words, likeliest, odds, suspects
 from estimators.log import INPUT, READING, Log
 from estimators.models import MODELS
 from estimators.tuning import Tuning
 from sources.simulator import Simulator, constant_input, stepped_input
 from tests.support import read_all
+
+from .models import WALK
 
 MODEL = MODELS["motor_drive"]
 SINCE = 60.0
@@ -115,3 +117,29 @@ def test_what_lasts_is_cut_and_what_is_before_is_left_alone(log):
     blamed(log)
     for column, kept in zip(log.events, before, strict=True):
         np.testing.assert_array_equal(column, kept)
+
+
+def walk_log(disturbed):
+    """A random walk of 300 s under a push that the model knows, with a disturbance (300,) in the measurements."""
+    rng, n = np.random.default_rng(2), 300
+    found = Log.of(WALK)
+    found.add_inputs(np.arange(n), push=np.full(n, -1.0))
+    y = 0.5 * rng.normal(size=n) + np.cumsum(0.2 * rng.normal(size=n)) + disturbed
+    found.add("level", np.arange(n), y)
+    return found
+
+
+def test_explanations_that_are_equally_good_have_equal_odds():
+    """The walk drifts by the sum of an input and a parameter: an error of either is the same."""
+    found = suspects("ekf", WALK, Tuning.of(WALK).set("p.slope", 0.1), walk_log(np.zeros(300)), 20.0)
+    alike = likeliest(found)
+    share = {suspect.nudge.subject: value for suspect, value in zip(alike, odds(alike), strict=True)}
+    assert share["input push"] == pytest.approx(share["parameter slope"], rel=0.01)
+    assert sum(share.values()) == pytest.approx(1.0) and " %) or " in in_words(found)
+
+
+def test_what_no_quantity_explains_is_said_so():
+    """Neither an offset nor a drift, scale or delay explains that a sensor swings."""
+    found = suspects("ekf", WALK, Tuning.of(WALK), walk_log(6.0 * (np.arange(300) // 40 % 2)), 20.0)
+    assert likeliest(found) == () and in_words(found) == NO_EXPLANATION
+    assert in_words(suspects("ekf", WALK, Tuning.of(WALK), walk_log(np.zeros(300)), 20.0)) == ""
