@@ -50,7 +50,15 @@ def random_walk(n, seed=1, step=0.1):
 
 def twin(history=200_000, horizon=2.0, tick=1000.0, model=MODEL, estimator="kf"):
     time = SimpleNamespace(horizon=horizon, degraded_after=5.0, stale_after=30.0, tick=tick)
-    parts = {"noise": {}, "sensors": {}, "source": None, "refit": None, "view": ViewSection()}
+    parts = {
+        "parameters": {},
+        "noise": {},
+        "sensors": {},
+        "inputs": {},
+        "source": None,
+        "refit": None,
+        "view": ViewSection(),
+    }
     config = SimpleNamespace(time=time, history=history, **parts)
     return SimpleNamespace(
         options_of=lambda estimator: {},

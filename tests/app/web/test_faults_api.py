@@ -134,7 +134,7 @@ def test_nothing_that_is_asked_for_stops_the_source(page):
 
     def taken_at(seconds):
         events = pull_all(page.engine).events
-        return events.values[(events.kind == READING) & (events.t == int(seconds * SECOND)), 0].tolist()
+        return events.value[(events.kind == READING) & (events.t == int(seconds * SECOND)), 0].tolist()
 
     # Those before it may come late: the faults of their time delay, repeat and withhold.
     wait_for(lambda: taken_at(4.0) == [42.0])

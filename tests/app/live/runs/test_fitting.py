@@ -63,7 +63,7 @@ def test_a_data_sheet_bounds_it():
     free = alone(1500).lines[1].after
     # R was found below where the data sheet ends.
     bounds = (1.2 * free, FIRST.get("R.winding"))
-    engine.twin.config.sensors = {"winding": SimpleNamespace(bounds=bounds)}
+    engine.twin.config.sensors = {"winding": SimpleNamespace(bounds=bounds, offset=None, scale=None)}
     line = fitted(engine, WANTED).fitted.lines[1]
     assert free < bounds[0] <= line.after <= bounds[1]
 
