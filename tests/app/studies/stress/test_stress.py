@@ -234,6 +234,9 @@ def test_an_input_that_moves_nothing_is_invisible_and_a_large_bias_is_not():
     bench, oracle = Bench(twin, 0, 60.0), Oracle(twin, 60.0)
     mistakes = {item.name: item for item in matrix(twin.model, twin.tuning, bench.events, asset=True)}
     assert oracle.foretell(bench, mistakes["magnet_ambient of the asset +30 %"], "ekf").verdict == INVISIBLE
+    # What nisus check lists beforehand is the same, and so is what it does not list.
+    assert oracle.listed(bench, mistakes["magnet_ambient believed +30 %"], "ekf")
+    assert not oracle.listed(bench, mistakes["tooth +20 σ from the start"], "ekf")
     few, many = (oracle.foretell(bench, mistakes[f"tooth +{n} σ"], "ekf") for n in (5, 20))
     assert few.verdict == many.verdict == VISIBLE
     # One constant that is seen from the same size on, whatever was tried: the filter is linear in it.
