@@ -8,16 +8,19 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from estimators.diagnostics.episodes import episodes
 from estimators.diagnostics.episodes.baseline import Normal, commission, contradictions
 from estimators.diagnostics.score import score
 from estimators.errors import ConfigError
 from estimators.fold import Fold
 from estimators.log import READING
-from estimators.track import DIVERGED, FAILED, GATED, SCREENED, STALE
+from estimators.track import DIVERGED, FAILED, GATED, HEALTH_NAMES, SCREENED, STALE
 
+from ..format_time import duration_text
 from ..live.tunings.versions import write_section
 from ..live.watchdog import interruptible
 from ..present.result import to_json
+from ..terminal import complain
 from ..twin.log_reader import read_log
 from ..twin.twin import load_twin
 from .options import settings
@@ -44,6 +47,12 @@ def commission_twin(arguments: Arguments) -> int:
     log, _ = read_log(twin, arguments.duration)
     fold = Fold(twin.estimator, twin.model, twin.tuning, log, policy=twin.policy)
     interruptible(fold, fold.advance)
+    gaps = [item.size for item in episodes(fold) if item.cause == HEALTH_NAMES[STALE]]
+    if gaps:
+        complain(
+            f"{twin.name}: {len(gaps)} gap(s) without measurements, the longest {duration_text(max(gaps))}; the "
+            "estimate is stale there, and they take no part in the baseline"
+        )
     broken = against(fold)
     if broken and not arguments.force:
         raise ConfigError(

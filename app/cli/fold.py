@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from config.yaml_files import writing
+from estimators.diagnostics.episodes import episodes
 from estimators.diagnostics.score import score
 from estimators.errors import ConfigError
 from estimators.interface.table import table_of
@@ -24,7 +25,6 @@ from ..studies.fold_result import (
     calibration_of,
     coverage_of,
     dropped,
-    episodes_of_recording,
     explained,
     fold_json,
     fold_topics,
@@ -75,7 +75,7 @@ def fold_twin(arguments: Arguments) -> int:
         seconds,
         score(track, events, twin.model, pictures, gate=twin.tuning.gate, baseline=twin.tuning.baseline),
         calibration_of(fold, events, track),
-        explained(fold, [*dropped(counts, fold), *within(episodes_of_recording(fold), events)]),
+        explained(fold, [*dropped(counts, fold), *within(episodes(fold), events)]),
         part,
         smoothing_score(fold, smoothed, part) if smoothed is not None else None,
         nees_of(fold, known, part),

@@ -12,11 +12,12 @@ import numpy as np
 from estimators.errors import ConfigError, nearest, quoted
 from sources.can.decoder import shown_id
 from sources.can.readers import EXTENDED, BusName
-from sources.inspect import Message, RecordingContents, SignalSeries, inspect_recordings, is_table
+from sources.inspect import Message, RecordingContents, SignalSeries, holes, inspect_recordings, is_table
 from sources.tables.times import SERIAL_DAYS, UNITS, TimeColumn
 
 from ..format_time import FIRST_DATED_NS, duration_text, format_time
 from ..present.result import Cell, TableColumn, Topic, to_json, to_text
+from ..studies.advice.signals import signals
 from ..terminal import complain
 
 if TYPE_CHECKING:
@@ -103,7 +104,8 @@ def _topic(found: RecordingContents) -> Topic:
     title = f"{name}: {found.t.size} {unit} in {_duration(end - start)}{when}"
     gaps = [f"{_duration(b - a)} at {_duration(a - start)}" for a, b in found.holes[:MAX_LISTED]]
     more = f", and {len(found.holes) - MAX_LISTED} more" if len(found.holes) > MAX_LISTED else ""
-    sentences = [f"{len(found.holes)} gaps: {', '.join(gaps)}{more}" if gaps else "no gaps"]
+    sentences = [f"{len(found.holes)} gaps: {', '.join(gaps)}{more}" if gaps else "no gaps of all signals together"]
+    sentences += _own_gaps(found)
     if found.kind == "table":
         rows = tuple((series.name, *_series_cells(series, start)) for series in found.columns)
         zone = f", local time of {found.time.zone}" if found.time.zone else ""
@@ -125,6 +127,29 @@ def _topic(found: RecordingContents) -> Topic:
             lines.append(("", "", f"  {empty} signals without a value", "", *[None] * len(TIMES)))
     columns = ("bus", "id", "message, signals", "unit", TableColumn("number", absent=""), *TIMES[1:])
     return Topic(title, tuple(sentences), columns, tuple(lines))
+
+
+def _own_gaps(found: RecordingContents) -> list[str]:
+    """Return the gaps of single messages and columns, and of signals where their flag of validity is 1."""
+    of_all = set(found.holes)
+    named: dict[tuple[tuple[int, int], ...], list[str]] = {}
+    for one in signals(found):
+        series = one.series
+        own = tuple(hole for hole in holes(series.t) if hole not in of_all)
+        if own:
+            name = series.name if one.message is None else f"{one.message}.{series.name}"
+            named.setdefault(own, []).append(name + (f" where {one.valid} is 1" if one.valid else ""))
+    longest = sorted(named, key=lambda own: -max(end - begin for begin, end in own))
+    lines = []
+    for own in longest[:MAX_LISTED]:
+        begin, end = max(own, key=lambda hole: hole[1] - hole[0])
+        others = f" and {len(named[own]) - 1} more" if len(named[own]) > 1 else ""
+        start = int(found.t[0])
+        lines.append(
+            f"{named[own][0]}{others}: {len(own)} gap{'s' * (len(own) > 1)}, the longest {_duration(end - begin)} at "
+            f"{_duration(begin - start)}"
+        )
+    return lines + ([f"and gaps of {len(longest) - MAX_LISTED} more groups of signals"] if longest[MAX_LISTED:] else [])
 
 
 def _duration(ns: int) -> str:

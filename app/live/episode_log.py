@@ -126,7 +126,13 @@ class EpisodeLog:
         tuning, estimator = pull.settings
         marginal = find_estimator(estimator, tuning.model).family in ("particle", "ensemble")
         return EpisodeTracker(
-            self._engine.model, tuning, marginal, first=pull.first, max_rows=self._max_rows, max_closed=MAX_CLOSED
+            self._engine.model,
+            tuning,
+            marginal,
+            first=pull.first,
+            max_rows=self._max_rows,
+            max_closed=MAX_CLOSED,
+            stale_after=self._engine.twin.policy.stale_after,
         )
 
     def stop(self) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 
 from config.source_schema import CanLogSection, CanSection, MergedSection
 from estimators.diagnostics.calibration import BANDS, Calibration
-from estimators.diagnostics.episodes import Episode, episode_json
+from estimators.diagnostics.episodes import Episode, episode_json, episodes
 from estimators.diagnostics.score import health_of
 from estimators.diagnostics.sensitivity import Gramian, GramianView, Sensitivity, bounds_of, sensitivities, worse_faults
 from estimators.diagnostics.sensitivity.checklist import Arrivals, Dimension, Linearity, arrivals, dimension
@@ -31,7 +31,7 @@ from ..twin.twin import Twin
 from .advice.measured import Measured
 from .advice.questions import JUMPS, heavy
 from .compare import timed
-from .fold_result import calibration_json, calibration_of, episodes_of_recording
+from .fold_result import calibration_json, calibration_of
 
 BUDGET_S = 20.0  # seconds of one processor for the folds with held-out sensors, which limit the part of the log
 MAX_CORRELATION = 0.9  # correlation beyond which two faults are hardly distinguishable
@@ -119,7 +119,7 @@ def check(twin: Twin, log: Log, counts: Counter[str]) -> Checked:
         onset=onset,
         arrivals=tuple(item for s, item in enumerate(arrivals(model, log)) if s in twin.plan.fed or item.n),
         calibration=calibration_of(fold, fold.log.events, fold.track),
-        episodes=episodes_of_recording(fold),
+        episodes=episodes(fold),
         held_out=held_out(twin.estimator, model, tuning, log),
         jumps=_jumps(measured),
     )

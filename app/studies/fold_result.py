@@ -24,8 +24,7 @@ from estimators.diagnostics.calibration import (
 from estimators.diagnostics.considered_shares import known_stds, source_texts, variance_shares
 from estimators.diagnostics.consistency import nees
 from estimators.diagnostics.detectors import detector_of
-from estimators.diagnostics.episodes import Episode, episode_json, episodes
-from estimators.diagnostics.episodes.wording import TwinFacts
+from estimators.diagnostics.episodes import Episode, episode_json
 from estimators.diagnostics.failure_cause import failures
 from estimators.diagnostics.references import WITHHELD, state_grades, withheld, withheld_reasons
 from estimators.diagnostics.score import Fit, Score, health_of, score
@@ -39,7 +38,7 @@ from estimators.plausibility import reasons_by_sensor
 from estimators.registry import find_entry
 from estimators.smoothing.smooth import consistency
 from estimators.smoothing.walk import Smoothed
-from estimators.track import FAILED, HEALTH_NAMES, REASONS, STALE, TRACKING, USED, WAITING, Track
+from estimators.track import FAILED, HEALTH_NAMES, REASONS, TRACKING, USED, Track
 from estimators.tuning import SHARED_ENTRY_ROWS
 from sources.source import WRONG_TIME
 
@@ -199,22 +198,6 @@ def dropped(counts: Mapping[str, int], fold: Fold) -> list[Episode]:
         "times; check the times of the source, or lengthen time.horizon"
     )
     return [Episode(float(fold.log.t[0]) * 1e-9, None, "twin", "dropped", share, math.nan, math.nan, "", text)]
-
-
-def episodes_of_recording(fold: Fold) -> list[Episode]:
-    """Return the episodes of a fold, with the gaps in which no event shows that the estimate was stale.
-
-    A running twin has ticks then; a recording may have no event for days.
-    """
-    t, track, limit = fold.log.t[: fold.n], fold.track, fold.policy.stale_after
-    silent = (track.age[:-1] + np.diff(t) * 1e-9 > limit) & (track.health[:-1] != STALE) & (track.health[1:] != STALE)
-    row, found = detector_of(HEALTH_NAMES[STALE]), episodes(fold)
-    for k in np.flatnonzero(silent & (track.health[:-1] != WAITING)).tolist():
-        start, end = float(t[k]) * 1e-9 - float(track.age[k]), float(t[k + 1]) * 1e-9
-        facts = TwinFacts(name="twin", cause=row.name, start=start, size=end - start)
-        text = row.text(facts)
-        found.append(Episode(start, end, "twin", row.name, end - start, math.nan, math.nan, row.unit, text, row.grade))
-    return sorted(found, key=lambda item: item.start)
 
 
 def explained(fold: Fold, episodes: Sequence[Episode]) -> list[ExplainedEpisode]:

@@ -441,8 +441,16 @@ def _comments(drafted: DraftPlan) -> list[str]:
 def hint_lines(drafted: DraftPlan) -> list[str]:
     """Return what the draft does not use of its signals, with the next step, a line each."""
     lines = []
-    for name, _ in drafted.inputs:
+    for name, one in drafted.inputs:
         if not any(name in item.inputs for item in drafted.states):
+            rate = next((pair for pair in drafted.pairs if pair.rate and drafted.signals[pair.second] is one), None)
+            if rate is not None:
+                state = drafted.signals[rate.first].name
+                lines.append(
+                    f"Input {name} is the rate of {state} (it explains {rate.explained:.0%} of the changes): write its "
+                    " effect into step() (docs/twins.md, Inputs that integrate), or give it with --sensors."
+                )
+                continue
             lines.append(
                 f"Input {name} is not used: no first-order lag behind it explains half of the variance of a state. "
                 "Write its effect into step(), or omit it."

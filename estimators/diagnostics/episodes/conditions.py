@@ -8,7 +8,7 @@ import numpy as np
 
 from ...log import INPUT, READING
 from ...model.state_space import Input, State
-from ...track import DIVERGED, GATED, HEALTH_NAMES, SCREENED, STALE
+from ...track import DIVERGED, GATED, HEALTH_NAMES, SCREENED, STALE, WAITING
 from ..detectors import (
     IMPOVERISHED,
     OUTSIDE,
@@ -152,6 +152,17 @@ def lost_estimates(judged: JudgedRows) -> Iterator[FoundEpisode]:
     for code in (STALE, DIVERGED):
         for run in runs(judged.track.health == code):
             yield _lost(judged, code, run)
+
+
+def silent_gaps(judged: JudgedRows) -> Iterator[FoundEpisode]:
+    """Yield the gaps of a recording in which no event shows that the estimate was stale; a running twin has ticks."""
+    t, track, health = judged.events.t, judged.track, judged.track.health
+    silent = track.age[:-1] + np.diff(t) * 1e-9 > judged.stale_after
+    silent &= (health[:-1] != STALE) & (health[1:] != STALE) & (health[:-1] != WAITING)
+    for k in np.flatnonzero(silent).tolist():
+        start, end = float(t[k]) * 1e-9 - float(track.age[k]), float(t[k + 1]) * 1e-9
+        facts = TwinFacts(name="twin", cause=HEALTH_NAMES[STALE], start=start, size=end - start)
+        yield _found("gap", facts, end, np.nan, np.nan, AlarmRun(k + 1, k + 2, False), t)
 
 
 def _lost(judged: JudgedRows, code: int, run: AlarmRun) -> FoundEpisode:

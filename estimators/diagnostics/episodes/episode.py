@@ -60,7 +60,8 @@ class JudgedRows(NamedTuple):
 
     marginal: whether predictions are not Gaussian. last_heard (sensors,): time of each sensor's last measurement before
     these events, ns, 0 where there is none; None if they are the first. alarmed (sensors,): measurements for which the
-    sensor had been in alarm by then without being lost.
+    sensor had been in alarm by then without being lost. stale_after: seconds without a measurement after which the
+    estimate is stale, also where no event shows it.
     """
 
     model: StateSpaceModel
@@ -70,6 +71,7 @@ class JudgedRows(NamedTuple):
     track: Track
     last_heard: np.ndarray | None = None
     alarmed: np.ndarray | None = None
+    stale_after: float = np.inf
 
 
 class AlarmRun(NamedTuple):

@@ -19,14 +19,14 @@ from ...track import GATED, SCREENED, Track
 from ...tuning import Tuning
 from ..detectors import detector_of
 from ..effects import EVIDENCE, MAX_SIGMA, NO_SUMS, Sums, gains
-from .conditions import dropouts, impoverished_particles, left_ranges, lost_estimates
+from .conditions import dropouts, impoverished_particles, left_ranges, lost_estimates, silent_gaps
 from .episode import JOINED, Episode, FoundEpisode, JudgedRows, standardised, without_baseline
 from .sensors import ALARM_KEYS, LOSSES, OF_ALL_ROWS, UNKNOWN_EFFECTS, evidence, sensor_alarms
 
 MAX_ROWS = 65_536  # Rows kept at most; at least half of them once there were as many
 MAX_BYTES = 64 * 2**20  # Memory of the kept rows; rows of a large field are fewer
 
-CONDITIONS = (sensor_alarms, dropouts, left_ranges, impoverished_particles, lost_estimates)
+CONDITIONS = (sensor_alarms, dropouts, left_ranges, impoverished_particles, lost_estimates, silent_gaps)
 
 JOINED_ROWS = {**dict.fromkeys(ALARM_KEYS, JOINED), "range": JOINED}
 """Rows without an alarm that an episode bridges, by the first part of its key; 0 for the others."""
@@ -41,14 +41,15 @@ def episodes(fold: Fold) -> list[Episode]:
 
 def episodes_of(judged: JudgedRows) -> list[Episode]:
     """Return the episodes of consecutive rows, in the order of their start."""
-    tracker = EpisodeTracker(judged.model, judged.tuning, judged.marginal)
+    tracker = EpisodeTracker(judged.model, judged.tuning, judged.marginal, stale_after=judged.stale_after)
     tracker.feed(judged.events, judged.track)
     return tracker.episodes
 
 
 def judged_rows(fold: Fold) -> JudgedRows:
     """Return the rows of a fold so far, as views."""
-    return JudgedRows(fold.model, fold.tuning, fold.marginal, fold.log.events.select(slice(0, fold.n)), fold.track)
+    events, stale_after = fold.log.events.select(slice(0, fold.n)), fold.policy.stale_after
+    return JudgedRows(fold.model, fold.tuning, fold.marginal, events, fold.track, stale_after=stale_after)
 
 
 def found_in(judged: JudgedRows) -> list[FoundEpisode]:
@@ -156,6 +157,7 @@ class EpisodeTracker:
         first: Index of the first row.
         max_rows: Rows kept at most.
         max_closed: Closed episodes kept at most, the last; None for all.
+        stale_after: See `JudgedRows`.
     """
 
     def __init__(
@@ -167,10 +169,12 @@ class EpisodeTracker:
         first: int = 0,
         max_rows: int = MAX_ROWS,
         max_closed: int | None = None,
+        stale_after: float = np.inf,
     ) -> None:
         self.model, self.tuning, self.marginal = model, tuning, marginal
         self.first, self.n = first, 0
         self._max_rows, self._max_closed = max_rows, max_closed
+        self._stale_after = stale_after
         self._columns: list[np.ndarray] = []
         self._last_heard = np.zeros(len(model.sensors), np.int64)
         self._closed: list[TrackedEpisode] = []
@@ -242,7 +246,16 @@ class EpisodeTracker:
         known = (self._carried.get(("sensor", name)) for name in self.model.sensor_names)
         alarmed = [0 if e is None or e.episode.cause in LOSSES else e.dropped.readings for e in known]
         events, track = self.events.select(rows), self.track.select(rows)
-        return JudgedRows(self.model, self.tuning, self.marginal, events, track, self._last_heard, np.array(alarmed))
+        return JudgedRows(
+            self.model,
+            self.tuning,
+            self.marginal,
+            events,
+            track,
+            self._last_heard,
+            np.array(alarmed),
+            self._stale_after,
+        )
 
     def _find(self) -> list[TrackedEpisode]:
         """Return all episodes, those of the kept rows joined with those carried on."""

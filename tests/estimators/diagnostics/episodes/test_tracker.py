@@ -11,17 +11,30 @@ from estimators.diagnostics.effects import EVIDENCE, KINDS, gains
 from estimators.diagnostics.episodes import EpisodeTracker, episodes, judged_rows
 from tests.estimators.diagnostics.episodes.test_find import SENSORS, folded
 
-FAULTS = {**{cause: SENSORS[cause][0] for cause in SENSORS}, "silent": {"skip": (0,)}, "outside": {"feed": 3.0}}
+FAULTS = {
+    **{cause: SENSORS[cause][0] for cause in SENSORS},
+    "silent": {"skip": (0,)},
+    "outside": {"feed": 3.0},
+    "gap": {},
+}
+GAP_S = 20.0
 
 
 @cache
 def rows_with(fault):
-    return judged_rows(folded(**FAULTS[fault]))
+    judged = judged_rows(folded(**FAULTS[fault]))
+    if fault != "gap":
+        return judged
+    late = np.arange(len(judged.track)) >= len(judged.track) // 2
+    t = judged.events.t + np.where(late, round(GAP_S * 1e9), 0)
+    return judged._replace(events=judged.events._replace(t=t), stale_after=15.0)
 
 
 def tracked(judged, max_rows, sizes, rewind=0):
     """Episodes of a tracker that is fed chunks of these sizes, over and over; each replaces the last `rewind` rows."""
-    tracker = EpisodeTracker(judged.model, judged.tuning, judged.marginal, max_rows=max_rows)
+    tracker = EpisodeTracker(
+        judged.model, judged.tuning, judged.marginal, max_rows=max_rows, stale_after=judged.stale_after
+    )
     done, k = 0, 0
     while done < len(judged.track):
         begin = max(tracker.first, done - rewind) if sizes[k % len(sizes)] > rewind else done
@@ -47,6 +60,16 @@ def test_chunks_and_replaced_rows_give_the_same_episodes(fault, max_rows, sizes,
     once = tracked(judged, max_rows, [len(judged.track)])
     many = tracked(judged, max_rows, sizes, rewind)
     assert [repr(item) for item in many] == [repr(item) for item in once]
+
+
+def test_a_gap_of_a_recording_without_any_event_is_an_episode():
+    judged = rows_with("gap")
+    t, k = judged.events.t * 1e-9, len(judged.track) // 2
+    (found,) = (item for item in tracked(judged, 65_536, [1000]) if item.cause == "stale")
+    start = t[k - 1] - judged.track.age[k - 1]
+    assert (found.subject, found.start, found.end) == ("twin", pytest.approx(start), pytest.approx(t[k]))
+    assert found.size == pytest.approx(t[k] - start) and found.size > GAP_S
+    assert not [item for item in tracked(judged._replace(stale_after=30.0), 65_536, [1000]) if item.cause == "stale"]
 
 
 @pytest.mark.parametrize("cause", SENSORS)
