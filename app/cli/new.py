@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 from config.yaml_files import writing
 from estimators.errors import ConfigError
 
-from ..format_time import duration_text
 from ..present.result import to_json
 from .options import roles_of
 
@@ -219,8 +218,7 @@ def report_draft(draft: Draft, json: bool) -> None:
     if check is None:
         print("\nNot checked: the filter fails on this recording; choose other signals with --sensors.")
     else:
-        first, other = duration_text(check.start), duration_text(check.end - check.start)
-        print(f"\nFitted to the first {first}, checked on the other {other}:")
+        print(f"\n{check.fitted_to}:")
         print("\n".join([check.words, *(f"  {line}" for line in check_lines(check))]))
     for line in hint_lines(draft.plan):
         print(f"\n{line}")

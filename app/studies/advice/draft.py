@@ -428,8 +428,7 @@ def _comments(drafted: DraftPlan) -> list[str]:
     if drafted.check is not None:
         check = drafted.check
         lines += [
-            f"# Fitted to the first {duration_text(check.start)} by maximum likelihood. Predictions of the other "
-            f"{duration_text(check.end - check.start)}:",
+            *(f"# {text}" for text in textwrap.wrap(f"{check.fitted_to}:", LINE_LENGTH)),
             f"# {check.words}.",
             *(f"#   {text}" for text in check_lines(check)),
         ]

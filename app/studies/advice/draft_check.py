@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -25,6 +26,8 @@ from .signals import Signal
 
 BAND_SIGMA = 1.959963984540054  # half width of the 95 % band
 MIN_CHECKED = 60  # measurements that a check takes
+MAX_CHANGE = 4.0  # Of the power of the innovations, from the first to the second half of the checked parts
+HALVES_DIFFER = "in the second half than in the first"
 MAX_CORRELATION = 0.2  # of successive innovations, as in the claims of `nisus advise`
 MAX_FLOOR_FACTOR = 1.1  # of the variance of a resolution, up to which a noise is that resolution alone
 FAR_SIGMA, MAX_FAR_SHARE = 4.0, 0.01  # innovations that are jumps, and their share from which on these are the cause
@@ -38,10 +41,34 @@ def with_options(tuning: Tuning, options: Mapping[str, str | float]) -> Tuning:
     return tuning.with_options({key: complete[key] for key in options})
 
 
-def middle_of(drafted: DraftPlan) -> int:
-    """Return the time, ns, before which half of all readings of the sensors lie."""
-    times = [reads.signal.series.t for item in drafted.states for reads in item.sensors]
-    return int(np.median(np.concatenate(times)))
+class Split(NamedTuple):
+    """Parts of a recording between times `edges`, ns, in turn fitted and checked; the first is fitted."""
+
+    edges: tuple[int, ...]
+
+    @property
+    def alternate(self) -> bool:
+        """Whether there are more than two parts."""
+        return len(self.edges) > 1
+
+    @property
+    def last_fitted(self) -> int:
+        """End of the last part that is fitted, ns."""
+        return self.edges[-1]
+
+    def fitted(self, t: np.ndarray) -> np.ndarray:
+        """Return the mask of the times (n,), ns, that are in a fitted part."""
+        mask: np.ndarray = np.searchsorted(self.edges, t, side="right") % 2 == 0
+        return mask
+
+
+ALTERNATE_PARTS = 8  # Parts of a recording whose halves differ
+
+
+def split_of(drafted: DraftPlan, parts: int = 2) -> Split:
+    """Return an even number of parts with as many readings of the sensors each."""
+    times = np.concatenate([reads.signal.series.t for item in drafted.states for reads in item.sensors])
+    return Split(tuple(int(np.quantile(times, k / parts)) for k in range(1, parts)))
 
 
 def log_of(
@@ -82,11 +109,11 @@ def model_with(
 class DraftFold:
     """Fold of a whole draft, as its YAML has it, over its recording, or over the first half alone."""
 
-    def __init__(self, drafted: DraftPlan, model: StateSpaceModel, middle: int, *, first_half: bool = False) -> None:
+    def __init__(self, drafted: DraftPlan, model: StateSpaceModel, split: Split, *, fitted_only: bool = False) -> None:
         self.drafted = drafted
         self._sensors = [reads for item in drafted.states for reads in item.sensors]
         zero = min(int(reads.signal.series.t[0]) for reads in self._sensors)
-        self._middle = middle - zero
+        self._zero, self._split = zero, split
         noises = {item.second if item.smooth else item.name: rounded(item.over) for item in drafted.states if item.over}
         errors = {
             reads.name: ColouredError((rounded(reads.error[0]),), rounded(reads.error[1]))
@@ -96,14 +123,19 @@ class DraftFold:
         larger = coloured(model, noises, errors)
         used = np.array([name not in drafted.held_out for name in larger.sensor_names])
         self._tuning = replace(with_options(Tuning.of(larger), drafted.options), used=used)
-        end = middle if first_half else np.iinfo(np.int64).max
+        end = split.last_fitted if fitted_only else np.iinfo(np.int64).max
         self._log = log_of(larger, self._sensors, drafted.inputs, zero, end, zero)
         self._fold = self._folded(self._tuning)
 
     @property
     def log_likelihood(self) -> float:
-        """Log-likelihood of the measurements."""
-        return float(np.nansum(self._fold.track.log_likelihood))
+        """Log-likelihood of the fitted measurements."""
+        return float(np.nansum(self._fold.track.log_likelihood[self._fitted]))
+
+    @property
+    def _fitted(self) -> np.ndarray:
+        """Mask of the events in fitted parts."""
+        return self._split.fitted(self._log.t[: self._log.n] + self._zero)
 
     @property
     def memory(self) -> float:
@@ -117,22 +149,22 @@ class DraftFold:
             raise fold.failure
         return fold
 
-    def _innovations(self, fold: Fold, k: int, *, late: bool = True) -> np.ndarray:
-        """Return the innovations of sensor k on the second half, or the first, in σ."""
+    def _innovations(self, fold: Fold, k: int, *, fitted: bool = False) -> np.ndarray:
+        """Return the innovations of sensor k on the checked parts, or the fitted ones, in σ."""
         log = self._log
-        rows = (log.kind[: log.n] == READING) & (log.channel[: log.n] == k)
-        rows &= (log.t[: log.n] >= self._middle) == late
+        rows = (log.kind[: log.n] == READING) & (log.channel[: log.n] == k) & (self._fitted == fitted)
         with np.errstate(all="ignore"):
             e: np.ndarray = fold.track.innovation[rows, 0] / fold.track.innovation_std[rows, 0]
         return e[np.isfinite(e)]
 
     def check(self, span: float) -> DraftCheck:
-        """Return the check on the second half; `span` is the length of the recording, s."""
+        """Return the check on the parts that were not fitted; `span` is the length of the recording, s."""
         found, late, alone, ratios = [], {}, {}, {}
         for k, reads in enumerate(self._sensors):
             e = late[reads.name] = self._innovations(self._fold, k)
-            before = self._innovations(self._fold, k, late=False)
-            ratios[reads.name] = _power(e) / max(_power(before), 1e-300)
+            before = self._innovations(self._fold, k, fitted=True)
+            before, after = np.array_split(e, 2) if self._split.alternate else (before, e)
+            ratios[reads.name] = _power(after) / max(_power(before), 1e-300)
             item = next(item for item in self.drafted.states if reads in item.sensors)
             others = [one for one in item.sensors if one.name not in self.drafted.held_out and one is not reads]
             if reads.name in self.drafted.held_out:
@@ -142,13 +174,12 @@ class DraftFold:
                 alone[reads.name] = self._innovations(self._folded(without), k)
             held_out = _coverage(alone.get(reads.name, e[:0]))
             found.append(SensorCheck(reads.name, e.size, _coverage(e), correlation_interval(e), held_out))
-        halves = np.searchsorted(self._log.t[: self._log.n], self._middle)
-        fitted, nis = (self._verdict(part) for part in (slice(0, halves), slice(halves, self._log.n)))
-        reason = _reason(nis, fitted, self._sensors, found, late, alone, ratios)
-        start = self._middle * 1e-9
-        return DraftCheck(start, span, nis.ratio, nis.low, nis.high, tuple(found), reason, nis.words)
+        fitted, nis = (self._verdict(self._fitted == part) for part in (True, False))
+        reason = _reason(nis, fitted, self._sensors, found, late, alone, ratios, alternate=self._split.alternate)
+        start, parts = (self._split.edges[0] - self._zero) * 1e-9, len(self._split.edges) + 1
+        return DraftCheck(start, span, nis.ratio, nis.low, nis.high, tuple(found), reason, nis.words, parts)
 
-    def _verdict(self, part: slice) -> NisVerdict:
+    def _verdict(self, part: np.ndarray) -> NisVerdict:
         """Return the verdict on the mean NIS of some events, as `nisus fold` gives it."""
         return nis_verdict(self._fold.track.select(part), self._log.events.select(part), self._fold.model)
 
@@ -178,30 +209,38 @@ def _reason(
     late: Mapping[str, np.ndarray],
     alone: Mapping[str, np.ndarray],
     ratios: Mapping[str, float],
+    *,
+    alternate: bool,
 ) -> str:
     """Return why a draft is not consistent, and the next step; empty if it is.
 
     Args:
-        nis: Verdict on the NIS of the second half.
-        fitted: The same of the first half, to which the noises were fitted.
+        nis: Verdict on the NIS of the checked parts.
+        fitted: The same of the parts to which the noises were fitted.
         sensors: Sensors.
         checks: Their checks.
-        late: Their innovations on the second half, σ.
+        late: Their innovations on the checked parts, σ.
         alone: The same of those that were held out.
-        ratios: Power of these over that on the first half.
+        ratios: Power of the innovations on the second half of the recording over that on the first.
+        alternate: Whether parts of both halves were fitted.
     """
     known = [one for one in checks if one.n]
     if sum(one.n for one in known) < MIN_CHECKED or not nis.place:
-        return f"the second half has fewer than {MIN_CHECKED} measurements; record a longer log"
+        part = "checked parts have" if alternate else "second half has"
+        return f"the {part} fewer than {MIN_CHECKED} measurements; record a longer log"
     shares = {one.name: share_interval(np.abs(late[one.name]) <= BAND_SIGMA, late[one.name]) for one in known}
     narrow, wide = min(known, key=lambda one: one.coverage), max(known, key=lambda one: -_power(late[one.name]))
+    if alternate:
+        changed = max(ratios, key=lambda name: abs(np.log(max(ratios[name], 1e-300))))
+        if abs(np.log(max(ratios[changed], 1e-300))) > np.log(MAX_CHANGE):
+            return _varies(changed)
     good = shares[narrow.name].high >= MIN_COVERAGE
     place = "inside" if _within_fit_error(nis, fitted) else nis.place
     if place == "above" or not good:
         far = {one.name: float(np.mean(np.abs(late[one.name]) > FAR_SIGMA)) for one in known}
         worst = max(far, key=lambda name: far[name])
-        if ratios[narrow.name] > MAX_NIS_FACTOR:
-            return f"{narrow.name} moves more in the second half than in the first; fit all of the log with nisus tune"
+        if ratios[narrow.name] > MAX_NIS_FACTOR and not alternate:
+            return f"{narrow.name} moves more {HALVES_DIFFER}; fit all of the log with nisus tune"
         if far[worst] > MAX_FAR_SHARE:
             return (
                 f"{100 * far[worst]:.1f} % of the innovations of {worst} exceed {FAR_SIGMA:g} σ, so it jumps; give the "
@@ -224,8 +263,8 @@ def _reason(
                 f"{wide.name} varies less than its resolution of {reads.signal.resolution:.3g} "
                 f"{reads.signal.series.unit or 'units'}, so its bands are wider than needed; they are valid"
             )
-        if ratios[wide.name] * MAX_NIS_FACTOR < 1.0:
-            return f"{wide.name} moves less in the second half than in the first; fit all of the log with nisus tune"
+        if ratios[wide.name] * MAX_NIS_FACTOR < 1.0 and not alternate:
+            return f"{wide.name} moves less {HALVES_DIFFER}; fit all of the log with nisus tune"
         return _varies(wide.name)
     lasting = max(known, key=lambda one: one.correlation.low)
     if lasting.correlation.low > MAX_CORRELATION:

@@ -1,4 +1,4 @@
-"""Fit the structure and the noises of a draft by maximum likelihood on the first half, and check it on the second.
+"""Fit structure and noises of a draft by maximum likelihood to the first half of its recording; check it on the second.
 
 The states of a draft are independent, so each is fitted by itself, with its sensors and inputs. For every structure (a
 random walk, or a speed; process noise white or with a correlation time; sensor errors white or with one) the noises are
@@ -8,7 +8,7 @@ fitted as `nisus tune` does, and the structure of the highest likelihood is kept
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
@@ -25,7 +25,16 @@ from estimators.model.coloured import ColouredError, coloured, disturbance_time,
 from estimators.model.state_space import StateSpaceModel
 from estimators.tuning import Tuning
 
-from .draft_check import DraftFold, log_of, middle_of, model_with, with_options
+from .draft_check import (
+    ALTERNATE_PARTS,
+    HALVES_DIFFER,
+    DraftFold,
+    Split,
+    log_of,
+    model_with,
+    split_of,
+    with_options,
+)
 from .plan import DraftPlan, Moves, Reads, reads_of
 from .relations import pairs
 from .signals import MIN_VALUES, Signal, noise_of
@@ -65,32 +74,41 @@ class FittedStructure(NamedTuple):
     item: Moves
 
 
-def windows_of(item: Moves, middle: int) -> list[tuple[int, int]]:
-    """Return windows of the first half with at most `MAX_FIT_READINGS` readings."""
+def windows_of(item: Moves, split: Split) -> list[tuple[int, int]]:
+    """Return windows of the fitted parts with at most `MAX_FIT_READINGS` readings together."""
     t = np.sort(np.concatenate([reads.signal.series.t for reads in item.sensors]))
-    t = t[t < middle]
-    if t.size <= MAX_FIT_READINGS:
-        return [(int(t[0]), middle)]
-    each = MAX_FIT_READINGS // WINDOWS
-    starts = np.linspace(0, t.size - each - 1, WINDOWS).astype(int)
-    return [(int(t[k]), int(t[k + each])) for k in starts]
+    ends = [*split.edges, int(t[-1]) + 1]
+    begins = [int(t[0]), *ends[1::2]]
+    parts = [(t[(t >= begin) & (t < end)], end) for begin, end in zip(begins, ends[::2], strict=False)]
+    parts = [(own, end) for own, end in parts if own.size]
+    if sum(own.size for own, _ in parts) <= MAX_FIT_READINGS:
+        return [(int(own[0]), end) for own, end in parts]
+    count = max(1, WINDOWS // len(parts))
+    each = MAX_FIT_READINGS // (count * len(parts))
+    windows = []
+    for own, end in parts:
+        if own.size <= each:
+            windows.append((int(own[0]), end))
+            continue
+        windows += [(int(own[k]), int(own[k + each])) for k in np.linspace(0, own.size - each - 1, count).astype(int)]
+    return windows
 
 
 def fitted(
-    item: Moves, inputs: Sequence[tuple[str, Signal]], middle: int, span: float, folder: Path, progress: FitProgress
+    item: Moves, inputs: Sequence[tuple[str, Signal]], split: Split, span: float, folder: Path, progress: FitProgress
 ) -> list[FittedStructure | None]:
     """Return the best structure of a state, fitted with each of `OPTIONS`; none if it cannot be fitted.
 
     Args:
         item: The state with its sensors.
         inputs: Inputs that it follows.
-        middle: End of the part that is fitted, ns.
+        split: Parts that are fitted.
         span: Length of the recording, s, beyond which no time constant is.
         folder: For the files of models, which must outlive their use.
         progress: Of the whole draft; once it is to stop, structures that were not begun are left out.
     """
     rated = any(reads.rate for reads in item.sensors)
-    fit = partial(_fit, inputs=inputs, middle=middle, span=span, progress=progress)
+    fit = partial(_fit, inputs=inputs, split=split, span=span, progress=progress)
     models: dict[bool, tuple[Moves, StateSpaceModel]] = {}
     for smooth in (True,) if rated else (False, True):
         moving = _begun(item, smooth)
@@ -129,7 +147,7 @@ def _fit(
     options: Options,
     *,
     inputs: Sequence[tuple[str, Signal]],
-    middle: int,
+    split: Split,
     span: float,
     progress: FitProgress,
 ) -> FittedStructure | None:
@@ -149,7 +167,7 @@ def _fit(
         tuning = with_options(Tuning.of(larger), options)
         keys, bounds = _keys(item, noise, structure, span, period, tuning)
         zero = int(min(reads.signal.series.t[0] for reads in item.sensors))
-        logs = [log_of(larger, item.sensors, inputs, *window, zero) for window in windows_of(item, middle)]
+        logs = [log_of(larger, item.sensors, inputs, *window, zero) for window in windows_of(item, split)]
         entries, _ = entries_of("kf", tuning, logs, keys, bounds)
         recordings = tuple(Recording(log, 1.0, np.zeros(log.n, bool)) for log in logs)
         objective = Objective("kf", tuning, tuple(entries), recordings, go=counted, progress=progress)
@@ -209,60 +227,69 @@ class FitStep(NamedTuple):
 def fit_plan(drafted: DraftPlan, progress: FitProgress | None = None) -> Iterator[FitStep]:
     """Yield the steps of fitting a draft and checking it; the last one has the plan with its `check`.
 
-    `check` is None if the filter fails on the recording.
+    It is fitted to the first half of the recording and checked on the second. If these differ, it is fitted to every
+    other eighth and checked on the others. `check` is None if the filter fails on the recording.
 
     Args:
         drafted: The plan.
         progress: Counts folds; once it is to stop, the draft is checked as far as it has been fitted.
     """
     progress = progress or FitProgress()
-    middle = middle_of(drafted)
+    found = yield from _fit_split(drafted, split_of(drafted), progress)
+    if found.check is not None and HALVES_DIFFER in found.check.reason and not progress.stop:
+        yield FitStep("the halves differ: fitting every other eighth")
+        again = yield from _fit_split(drafted, split_of(drafted, ALTERNATE_PARTS), progress)
+        found = again if again.check is not None else found
+    yield FitStep("", found)
+
+
+def _fit_split(drafted: DraftPlan, split: Split, progress: FitProgress) -> Generator[FitStep, None, DraftPlan]:
+    """Yield the steps of fitting a draft to some parts of its recording; return the plan, checked on the others."""
     t = np.concatenate([reads.signal.series.t for item in drafted.states for reads in item.sensors])
     span = float(t.max() - t.min()) * 1e-9
-    drafted = replace(drafted, states=tuple(_scaled_before(item, middle) for item in drafted.states))
+    drafted = replace(drafted, states=tuple(_scaled_on(item, split) for item in drafted.states))
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         choices: list[list[FittedStructure | None]] = []
         for k, item in enumerate(drafted.states):
             yield FitStep(f"fitting {item.name}, {k + 1} of {len(drafted.states)} states")
             inputs = [each for each in drafted.inputs if each[0] in item.inputs]
-            early = sum(int((reads.signal.series.t < middle).sum()) for reads in item.sensors)
+            early = sum(int(split.fitted(reads.signal.series.t).sum()) for reads in item.sensors)
             able = early >= MIN_VALUES and not progress.stop
-            choices.append(fitted(item, inputs, middle, span, folder, progress) if able else [])
+            choices.append(fitted(item, inputs, split, span, folder, progress) if able else [])
         tried: list[DraftFold] = []
         for k, one in enumerate(_combined(drafted, choices)):
             if not tried or not progress.stop:
                 yield FitStep(f"comparing filters, number {k + 1}")
                 with suppress(NisusError):  # It diverges.
                     model = model_with(one.states, one.inputs, folder, f"draft_{k}")
-                    tried.append(DraftFold(one, model, middle, first_half=True))
+                    tried.append(DraftFold(one, model, split, fitted_only=True))
                 progress.folds += 1
         if not tried:
-            yield FitStep("", drafted)
-            return
-        # A filter that adapts must be worth it; an asset may change faster than in the first half, so of those that are
-        # alike there, the fastest.
+            return drafted
+        # A filter that adapts must be worth it; an asset may change faster than in the fitted parts, so of those that
+        # are alike there, the fastest.
         limit = max(one.log_likelihood for one in tried) - MARGIN
         alike = [one for one in tried if one.log_likelihood >= limit]
         plain = [one for one in alike if not one.drafted.options]
         fitted_plan = min(plain or alike, key=lambda one: one.memory).drafted
-        yield FitStep("checking on the second half")
+        yield FitStep("checking on the parts left out" if split.alternate else "checking on the second half")
         model = model_with(fitted_plan.states, fitted_plan.inputs, folder, "draft")
         with suppress(NisusError):
-            fitted_plan = replace(fitted_plan, check=DraftFold(fitted_plan, model, middle).check(span))
-        yield FitStep("", fitted_plan)
+            fitted_plan = replace(fitted_plan, check=DraftFold(fitted_plan, model, split).check(span))
+        return fitted_plan
 
 
-def _scaled_before(item: Moves, middle: int) -> Moves:
-    """Return the state with scales and offsets of its other sensors from the first half alone, where that has them."""
+def _scaled_on(item: Moves, split: Split) -> Moves:
+    """Return the state with scales and offsets of its other sensors from the fitted parts alone, where these do."""
 
-    def before(one: Signal) -> Signal:
-        count = int(np.searchsorted(one.series.t, middle))
-        return one._replace(series=replace(one.series, t=one.series.t[:count], values=one.series.values[:count]))
+    def early(one: Signal) -> Signal:
+        kept = split.fitted(one.series.t)
+        return one._replace(series=replace(one.series, t=one.series.t[kept], values=one.series.values[kept]))
 
     sensors = [item.sensors[0]]
     for reads in item.sensors[1:]:
-        both = [before(one) for one in (item.signal, reads.signal)]
+        both = [early(one) for one in (item.signal, reads.signal)]
         found = pairs(both) if min(one.series.t.size for one in both) > 1 else []
         if found and found[0].first == 0 and found[0].rate == reads.rate:
             reads = reads_of(reads.name, item.signal, reads.signal, found[0])

@@ -16,6 +16,7 @@ from estimators.errors import ConfigError, nearest
 from sources.inspect import RecordingContents
 from sources.units import unit_scale
 
+from ...format_time import duration_text
 from .relations import Driven, Pair, driven, pairs, simulated
 from .signals import MIN_VALUES, Signal, cycle_of, noise_of, signals, walk_of
 
@@ -121,6 +122,7 @@ class SensorCheck(NamedTuple):
 class DraftCheck(NamedTuple):
     """Check of a draft on data that took no part in the fit: from `start` to `end`, s after the first measurement.
 
+    Of more than two `parts` every other one was fitted and the others checked; `start` is where the first one ends.
     `nis` is the mean NIS per degree of freedom, with the bounds `low` and `high` of `nisus fold`. `reason` says why it
     is not consistent; empty if it is. `said` is the NIS and its position in words.
     """
@@ -133,6 +135,17 @@ class DraftCheck(NamedTuple):
     sensors: tuple[SensorCheck, ...]
     reason: str
     said: str
+    parts: int = 2
+
+    @property
+    def fitted_to(self) -> str:
+        """The fitted and the checked parts in words."""
+        if self.parts > 2:
+            length = duration_text(self.end / self.parts)
+            parts = f"every other of {self.parts} parts (about {length} each)"
+            return f"The halves of the recording differ. Fitted to {parts}, checked on the others"
+        first, other = duration_text(self.start), duration_text(self.end - self.start)
+        return f"Fitted to the first {first}, checked on the other {other}"
 
     @property
     def words(self) -> str:

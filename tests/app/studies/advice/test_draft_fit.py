@@ -1,4 +1,4 @@
-"""A draft is fitted to the first half of a recording; its check is what a fold of its YAML gives on the second half."""
+"""A draft is fitted to the first half of a recording, or to every other eighth; its check is a fold of its YAML."""
 
 import numpy as np
 import pytest
@@ -65,14 +65,26 @@ def test_three_wheels_are_sensors_of_one_speed_and_the_check_is_a_fold_of_the_ya
         assert 0.90 < one["held_out"] < 0.98
 
 
-def test_a_sensor_that_worsens_in_the_second_half_is_named_with_the_next_step(tmp_path):
-    rng = np.random.default_rng(8)
-    noise = np.where(np.arange(N) < N // 2, 0.3, 3.0)
-    level = np.cumsum(rng.normal(0, 0.05, N)) + noise * rng.normal(0, 1, N)
+LATE = np.arange(N) >= N // 2
+
+
+@pytest.mark.parametrize(("step", "noise"), [((0.1, 1.0), (0.3, 0.3)), ((0.05, 0.05), (0.3, 3.0))])
+def test_an_asset_whose_halves_differ_is_fitted_to_parts_of_both(tmp_path, step, noise):
+    """It moves faster, or its sensor worsens; fitted to the first half alone, its bands are too narrow in the other."""
+    rng = np.random.default_rng(12)
+    level = np.cumsum(np.where(LATE, *step[::-1]) * rng.normal(size=N))
+    level += np.where(LATE, *noise[::-1]) * rng.normal(size=N)
     found = inspect_recordings([write(tmp_path / "tank.csv", level=level)])
-    check = fit_all(plan(found, Roles())).check
-    assert "level moves more in the second half than in the first; fit all of the log with nisus tune" == check.reason
-    assert check.sensors[0].coverage < 0.9 and check.words.startswith("not consistent")
+    drafted = fit_all(plan(found, Roles()))
+    check = drafted.check
+    assert check.parts == 8 and not check.reason and check.low <= check.nis <= check.high
+    # No one noise fits both.
+    assert drafted.options["adapt"] == "Q"
+    # Every other eighth of the measurements was fitted.
+    assert check.sensors[0].n == N // 2 and check.start == pytest.approx(N / 8, abs=1.0)
+    assert 0.93 < check.sensors[0].coverage < 0.97
+    parts = "Fitted to every other of 8 parts (about 6.25 min each), checked on the others"
+    assert check.fitted_to == f"The halves of the recording differ. {parts}"
 
 
 def test_a_fit_that_is_stopped_keeps_the_draft_and_checks_it(tmp_path):
