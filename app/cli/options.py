@@ -181,9 +181,8 @@ def check_options(name: str, command: type, words: Sequence[str]) -> None:
         if hint is None:
             raise ConfigError(f"{quoted(option)}: `nisus {name}` has no such option; {nearest(option, known)}")
         name_of = option.replace("_", "-")
-        if name_of in seen - repeatable:
-            several = "; name all values after the first" if get_origin(hint) is tuple else ""
-            raise ConfigError(f"{option}: is given twice, of which only the last would count{several}")
+        if name_of in seen - repeatable and get_origin(hint) is tuple:
+            raise ConfigError(f"{option}: is given twice, of which only the last would count; name all after the first")
         seen.add(name_of)
         value = own if equals else after
         number = next((kind for kind in (hint, *get_args(hint)) if kind in (int, float)), None)
