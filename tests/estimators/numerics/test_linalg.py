@@ -103,7 +103,20 @@ def test_congruence(n, sparse):
     P = spd(rng, n)
     F = rng.normal(0, 1, (n, n)) * (rng.random((n, n)) < (0.4 if sparse else 1.0))
     expected = F @ P @ F.T
-    congruence(F, P, np.full((2 * n, n), np.nan))
+    congruence(F, n, P, np.full((2 * n, n), np.nan))
+    np.testing.assert_allclose(P, expected, rtol=0, atol=1e-13 * n * max(1.0, np.abs(expected).max()))
+    np.testing.assert_array_equal(P, P.T)
+
+
+@pytest.mark.parametrize(("n", "rows"), [(2, 1), (5, 2), (8, 7), (33, 4)])
+def test_congruence_of_a_bordered_matrix(n, rows):
+    """Beyond its first rows F is the identity, as with parameters that a joint model adds."""
+    rng = np.random.default_rng(n)
+    P = spd(rng, n)
+    F = np.eye(n)
+    F[:rows] = rng.normal(0, 1, (rows, n))
+    expected = F @ P @ F.T
+    congruence(F, rows, P, np.full((2 * n, n), np.nan))
     np.testing.assert_allclose(P, expected, rtol=0, atol=1e-13 * n * max(1.0, np.abs(expected).max()))
     np.testing.assert_array_equal(P, P.T)
 
