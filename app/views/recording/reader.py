@@ -84,6 +84,9 @@ def read_recording(path: Path) -> Recorded:
         raise SourceError(f"{path}: {text}")
     if int(header["format"]) not in READABLE:
         raise SourceError(f"{path}: has format {header['format']}, this version reads {FORMAT}; use the other")
+    if not content.events:
+        text = _truncated(path) or "holds no measurement, it was ended before the first; record for longer"
+        raise SourceError(f"{path}: {text}")
     first, columns = _latest(content.events)
     base = base_from_json(content.bases[-1][1] if content.bases else str(header["base"]))
     start = content.bases[-1][0] if content.bases else first
@@ -224,8 +227,6 @@ def _truncated(path: Path) -> str | None:
 
 def _latest(chunks: list[tuple[np.ndarray, dict[str, np.ndarray]]]) -> tuple[int, dict[str, np.ndarray]]:
     """Return the first index and the columns of the rows that are valid at the end of the file."""
-    if not chunks:
-        return 0, {}
     index = np.concatenate([chunk for chunk, _ in chunks])
     # Columns of variances begin with the first measurement that has its own.
     names = dict.fromkeys(name for _, values in chunks for name in values)
@@ -242,5 +243,5 @@ def _column(name: str, columns: dict[str, np.ndarray]) -> np.ndarray:
     if name in columns:
         return columns[name]
     count = next(k for k in range(len(columns) + 1) if f"{name}_{k}" not in columns)
-    rows = len(next(iter(columns.values()))) if columns else 0
+    rows = len(next(iter(columns.values())))
     return np.stack([columns[f"{name}_{k}"] for k in range(count)], axis=1) if count else np.zeros((rows, 0))

@@ -215,7 +215,8 @@ def test_truncated_recording_keeps_what_is_whole(tmp_path):
     path = tmp_path / "run.rrd"
     file = RecordingFile(path, twin(), None)
     file.tuning(Tuning.of(MODEL), "kf", 0, 0)
-    sizes = []
+    file.flush()
+    sizes = [path.stat().st_size]
     for start in range(0, 1000, 100):
         part = slice(start, start + 100)
         file.write(Pull(0, start == 0, start, log.events.select(part), track.select(part)))
@@ -225,8 +226,12 @@ def test_truncated_recording_keeps_what_is_whole(tmp_path):
     whole = path.read_bytes()
     cut = tmp_path / "cut.rrd"
     kept = []
+    for size in (sizes[0] - 1, sizes[0]):  # with a tuning and without a row
+        cut.write_bytes(whole[:size])
+        with pytest.raises(SourceError, match="is a recording of Nisus, cut short before its first row"):
+            read_recording(cut)
     # In bytes: as a share of the file, the first may be rounded down to less than the first rows.
-    for size in np.linspace(sizes[0], len(whole), 12).astype(int):
+    for size in np.linspace(sizes[1], len(whole), 12).astype(int):
         cut.write_bytes(whole[:size])
         recorded = read_recording(cut)
         assert finished(cut) == (size == len(whole))
