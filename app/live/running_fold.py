@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
+from estimators.diagnostics.considered_shares import considered_pairs
 from estimators.diagnostics.episodes import Episode
 from estimators.diagnostics.references import hidden_states
 from estimators.errors import EstimatorError
@@ -352,12 +353,14 @@ class Running(ABC):
 
     def _make_fold(self, estimator: str, tuning: Tuning, log: Log, base: Base | None, *, idle: bool = False) -> Fold:
         period = self.twin.picture if self.model.grid is not None else None
+        # The last pairs tell how much of a band is noise; only charts read them.
+        pairs = np.concatenate((self.pairs, considered_pairs(self.model)))
         return Fold(
             estimator,
             self.model,
             tuning,
             log,
-            pairs=self.pairs,
+            pairs=pairs,
             policy=self.policy,
             base=base,
             picture=period,

@@ -80,6 +80,38 @@ def known_stds(model: StateSpaceModel, cov: np.ndarray) -> dict[str, dict[str, f
     }
 
 
+MAX_PAIRS = 128
+"""Pairs of a state and a deviation whose covariance is kept at most, 8 bytes an event each."""
+
+
+def considered_pairs(model: StateSpaceModel) -> np.ndarray:
+    """Return the pairs (k, 2) of each shown state with each considered deviation, for `noise_std`; none if too many."""
+    every = [(int(j), model.nx - model.considered + c) for j in model.shown for c in range(model.considered)]
+    return np.array(every if len(every) <= MAX_PAIRS else [], int).reshape(-1, 2)
+
+
+def noise_std(model: StateSpaceModel, shown: int, std: np.ndarray, cross: np.ndarray) -> np.ndarray:
+    """Return the deviation (N,) that a shown state would have without its considered parameters; see `variance_shares`.
+
+    Args:
+        model: A model with considered states.
+        shown: Index of the state among the shown ones.
+        std: Deviations of the shown states (N, shown).
+        cross: Covariances of a fold's pairs (N, pairs), the last of which are `considered_pairs`.
+
+    Returns:
+        Undefined (NaN) where the fold kept no covariances with the deviations.
+    """
+    first = cross.shape[1] - (len(model.shown) - shown) * model.considered
+    if not len(considered_pairs(model)) or first < shown * model.considered:
+        return np.full(len(std), np.nan)
+    C = model.prior_cov[model.nx - model.considered :, model.nx - model.considered :]
+    unit = np.sqrt(np.diag(C))
+    own = cross[:, first : first + model.considered] / unit
+    whitened = np.linalg.pinv(C / np.outer(unit, unit), hermitian=True)
+    return np.sqrt(np.maximum(std[:, shown] ** 2 - np.einsum("ni,ij,nj->n", own, whitened, own), 0.0))
+
+
 MIN_SHARE = 0.005
 """Share of a variance below which a parameter is not named."""
 

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from estimators.diagnostics.considered_shares import considered_pairs, noise_std
 from estimators.diagnostics.references import HALF_WIDTH
 from estimators.log import INPUT, READING, Events, truth_of
 from estimators.model.state_space import StateSpaceModel
@@ -61,6 +62,7 @@ def columns_of(model: StateSpaceModel) -> dict[str, Column]:
             Column(f"mean:{state.name}", LINE, partial(_mean, j, 0.0, withhold=state.withhold)),
             Column(f"upper:{state.name}", UPPER, partial(_mean, j, spread)),
             Column(f"lower:{state.name}", LOWER, partial(_mean, j, -spread)),
+            *_noise_band(model, j, state.name),
             Column(f"truth:{state.name}", LINE, partial(_truth, int(model.shown[j]))),
         ]
     for name, sensor, row in rows_of(model):
@@ -106,6 +108,21 @@ def _mean(j: int, spread: float, rows: Rows, withhold: float = np.inf) -> np.nda
     value = track.mean[:, j] + spread * track.std[:, j] if spread else track.mean[:, j]
     shown = rows.estimated if withhold == np.inf else rows.estimated & (track.std[:, j] <= withhold / HALF_WIDTH)
     return np.where(shown, value, np.nan)
+
+
+def _noise_band(model: StateSpaceModel, j: int, name: str) -> list[Column]:
+    """Return the band of a state without the uncertainty of considered parameters; nothing where none is considered."""
+    if not len(considered_pairs(model)):
+        return []
+
+    def edge(sign: float, rows: Rows) -> np.ndarray:
+        std = noise_std(model, j, rows.track.std, rows.track.cross)
+        return np.where(rows.estimated, rows.track.mean[:, j] + sign * 2.0 * std, np.nan)
+
+    return [
+        Column(f"noise_upper:{name}", UPPER, partial(edge, 1.0)),
+        Column(f"noise_lower:{name}", LOWER, partial(edge, -1.0)),
+    ]
 
 
 def _truth(state: int, rows: Rows) -> np.ndarray:

@@ -33,7 +33,7 @@ const NEAR_NOTE = 6; // px from a note at which its text is shown
 
 const NAMES = {
   estimate: "estimate", truth: "truth", reading: "measurement", "reading ring": "held out", refused: "rejected",
-  "refused ring": "implausible", bound: "bounds", quiet: "single value", band: "± 2σ", bounds: "bounds",
+  "refused ring": "implausible", bound: "bounds", quiet: "single value", band: "± 2σ", "band-noise": "of which noise", bounds: "bounds",
 };
 
 export const line = (tone, options = {}) => ({

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from estimators.diagnostics.considered_shares import known_stds, variance_shares
+from estimators.diagnostics.considered_shares import considered_pairs, known_stds, noise_std, variance_shares
 from estimators.errors import EstimatorError, ModelError
 from estimators.fold import Fold
 from estimators.log import READING, Events, Log
@@ -322,7 +322,8 @@ def test_shares_of_the_variance_are_those_of_refolds(estimator):
     for moved in ({}, {0: 0.3}, {1: 0.02}):
         p = own.default_parameters + np.array([moved.get(k, 0.0) for k in range(3)])
         log, truth = simulated(own, p)
-        fold = Fold(estimator, model, Tuning.of(model), log)
+        pairs = np.concatenate(([[0, 1]], considered_pairs(model)))
+        fold = Fold(estimator, model, Tuning.of(model), log, pairs=pairs)
         fold.advance()
         mean, P = fold.moments()
         errors.append(truth - mean[:2])
@@ -331,6 +332,9 @@ def test_shares_of_the_variance_are_those_of_refolds(estimator):
         offset, loss = ((error[i] - errors[0][i]) ** 2 / P[i, i] for error in errors[1:])
         assert shares[name] == pytest.approx({"offset": offset, "loss": loss, "noise": 1.0 - offset - loss}, abs=1e-8)
         assert list(shares[name])[0] == max(("offset", offset), ("loss", loss), key=lambda item: item[1])[0]
+        noise = noise_std(model, i, fold.track.std, fold.track.cross)
+        assert noise[-1] == pytest.approx(np.sqrt(P[i, i] * (1.0 - offset - loss)), rel=1e-7)
+        assert np.isnan(noise_std(model, i, fold.track.std, fold.track.cross[:, :1])).all()
     correlated = joint(own, CONSIDERED, {("offset", "loss"): 0.9})
     fold = Fold(estimator, correlated, Tuning.of(correlated), log)
     fold.advance()

@@ -32,7 +32,9 @@ function chartOf(charts, state) {
   const { live } = charts;
   const drawn = state.rows.slice(0, MAX_SENSORS);
   const measured = drawn.flatMap((row) => Object.keys(MEASURED).map((kind) => `${kind}:${row}`));
-  const own = Object.fromEntries(["upper", "lower", "truth", "mean"].map((kind) => [kind, `${kind}:${state.name}`]));
+  // Of a twin that considers parameters: the part of the band that is noise.
+  const inner = charts.model.columns.includes(`noise_upper:${state.name}`) ? ["noise_upper", "noise_lower"] : [];
+  const own = Object.fromEntries(["upper", "lower", ...inner, "truth", "mean"].map((kind) => [kind, `${kind}:${state.name}`]));
   const marked = (kinds) => Object.fromEntries(measured.filter((name) => kinds.includes(name.split(":")[0])).map((name) => [name, MEASURED[name.split(":")[0]]()]));
   const level = () => charts.integrity?.[state.name]?.bound;
   return {
@@ -49,16 +51,17 @@ function chartOf(charts, state) {
       ...marked(["reading", "held"]),
       upper: edge(),
       lower: edge(),
+      ...Object.fromEntries(inner.map((name) => [name, edge()])),
       ...marked(["refused", "screened"]),
       truth: line("truth", { dash: [5, 3], spanGaps: true }),
       mean: line("estimate", { width: 1.75 }),
     },
-    bands: [band("band", "upper", "lower")],
+    bands: [band("band", "upper", "lower"), ...(inner.length ? [band("band-noise", ...inner)] : [])],
     data: () => {
       const columns = Object.fromEntries(Object.entries(own).map(([kind, name]) => [kind, live.column(name)]));
       const dotted = measured.map((name) => [name, state.circular ? live.column(name).map(wrapped) : live.column(name)]);
       if (state.circular) {
-        for (const side of ["upper", "lower"]) columns[side] = aboutMean(columns.mean, columns[side]);
+        for (const side of ["upper", "lower", ...inner]) columns[side] = aboutMean(columns.mean, columns[side]);
         for (const kind of ["truth", "mean"]) columns[kind] = unbroken(columns[kind]);
       }
       return { x: live.x, ...columns, ...Object.fromEntries(dotted) };
