@@ -359,6 +359,20 @@ class TableSection(RecordingSection):
     with a cell for each of its own; cells that a sensor reads are left out."""
 
 
+class PushSection(Section):
+    """Messages that other programs send, with POST /api/readings or `nisus push`."""
+
+    type: Literal["push"]
+    """push"""
+    sensors: dict[str, ColumnSection] = {}
+    """Sensors of the model and the names of the values that feed them. Default, without any sensor and input: all of
+    them, by the names of the model."""
+    inputs: dict[str, ColumnSection] = {}
+    """Inputs of the model and the names of the values that feed them."""
+    truth: dict[str, ColumnSection] = {}
+    """States whose true value is sent too. They are scored, never used."""
+
+
 PartSection = Annotated[CanLogSection | TableSection, Field(discriminator="type")]
 """Recordings that can be merged."""
 
@@ -373,7 +387,8 @@ class MergedSection(Section):
 
 
 SourceSection = Annotated[
-    SimulatorSection | CanSection | CanLogSection | TableSection | MergedSection, Field(discriminator="type")
+    SimulatorSection | CanSection | CanLogSection | TableSection | MergedSection | PushSection,
+    Field(discriminator="type"),
 ]
 
 

@@ -18,6 +18,7 @@ from .channels import channels, read_faults
 from .sources.asset import SIMULATOR
 from .sources.can import CAN, CAN_LOG, make_player
 from .sources.kind import Kind, Opening, find_databases, find_recording
+from .sources.push import PUSH
 from .sources.recordings import MERGED, TABLE
 
 if TYPE_CHECKING:
@@ -172,5 +173,6 @@ SOURCES: dict[str, Kind] = {
     "can_log": CAN_LOG,
     "table": TABLE,
     "merged": MERGED,
+    "push": PUSH,
 }
 """By the `type` of the section."""

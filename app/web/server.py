@@ -34,6 +34,7 @@ from ..present.series.series import Series
 from ..present.state_message import StateMessage, state_message, state_schema
 from ..studies.analysis.diagnosis import Diagnosis
 from ..studies.analysis.forecast import Forecasts, question_from_json
+from . import readings
 from .commands_json import command_from_json
 from .door import Door
 from .fit_api import FitApi
@@ -156,6 +157,7 @@ class PageServer:
             get("/api/episodes", self._episodes),
             get("/api/annotations", self._annotations),
             get("/api/faults", self._faults),
+            *readings.routes(self._engine),
             *self._runs.routes(),
             *self._fit.routes(),
             post("/api/command", self._command, status=202),
@@ -297,7 +299,7 @@ class PageServer:
         return metrics(self._engine, states)
 
     def _state(self, covariance: bool = False) -> Response:
-        """Answer with the present state (see docs/publishing.md)."""
+        """Answer with the present state (see docs/http-api.md)."""
         return _message(state_message(self._engine, covariance=covariance))
 
     async def _state_stream(self, request: Request) -> Response:

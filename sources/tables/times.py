@@ -123,7 +123,7 @@ class TimeReader:
         try:
             number = float(text)
         except ValueError:
-            return _of_iso(text) or self._of_date(text)
+            return ns_of_iso(text) or self._of_date(text)
         if not np.isfinite(number):
             return None
         return int(((Decimal(text) - self._origin) * self._factor).to_integral_value()), self._origin > 0
@@ -185,7 +185,7 @@ def _since_epoch(when: datetime) -> tuple[int, bool]:
     return (delta.days * 86_400 + delta.seconds) * 10**9 + delta.microseconds * 1000, naive
 
 
-def _of_iso(text: str) -> tuple[int, bool] | None:
+def ns_of_iso(text: str) -> tuple[int, bool] | None:
     """Return an ISO 8601 date as ns, and whether it has no offset."""
     head, dot, tail = text.partition(".")
     digits = len(tail) - len(tail.lstrip("0123456789"))
@@ -206,7 +206,7 @@ def _day_and_month(name: str, cells: Sequence[str]) -> str:
     unclear = None
     for cell in islice(cells, MAX_DETECTION_CELLS):
         match = _DATE.fullmatch(cell)
-        if match is None or len(match[1]) == 4 or not match[3].isdigit() or _of_iso(cell):
+        if match is None or len(match[1]) == 4 or not match[3].isdigit() or ns_of_iso(cell):
             continue
         if match[2] == "." or int(match[1]) > 12:
             return "day"

@@ -26,7 +26,7 @@ def picture_file(twin: Path) -> Path:
     return CARDS / f"{twin.stem}.svg" if ships(twin) else twin.with_suffix(".svg")
 
 
-KINDS = {"simulator": "simulated", "can": "CAN bus", "can_log": "recorded", "table": "recorded", "merged": "recorded"}
+KINDS = {"simulator": "simulated", "can": "CAN bus", "push": "messages"}
 """Names of source types on a card; any other type is recorded."""
 
 
@@ -91,7 +91,7 @@ def _read(name: str, stamp: Stamp) -> tuple[Card, Loaded, StateSpaceModel]:
         states=twin.model.nx,
         rows=len(twin.model.row_names),
         estimator=twin.estimator,
-        log=config.source.type != "simulator",
+        log=config.source.type not in ("simulator", "push"),
     )
     return found, twin.loaded, twin.model
 

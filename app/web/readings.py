@@ -1,0 +1,123 @@
+"""Measurements by HTTP, for twins whose source is of type push; see `sources/messages.py`."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+from starlette.concurrency import run_in_threadpool
+from starlette.requests import Request
+from starlette.responses import PlainTextResponse, Response
+from starlette.routing import BaseRoute, Route
+
+from estimators.errors import ConfigError
+from sources.messages import ACCEPTED, DUPLICATE, FIELDS, REFUSED, Messages
+
+from ..live.running_fold import Running
+from .http import Json, TooLarge, bounded_body, get, refusal
+
+MAX_BYTES = 8 * 2**20
+"""Longest body of measurements."""
+
+
+def routes(engine: Running) -> list[BaseRoute]:
+    """Return the routes of a running twin."""
+
+    def names() -> dict[str, Any]:
+        """Return names and units of the values that the twin reads."""
+        source = messages_of(engine)
+        return {"values": [{"name": name, "unit": source.units.get(name)} for name in source.names]}
+
+    async def send(request: Request) -> Response:
+        kind = request.headers.get("content-type", "").partition(";")[0].strip()
+        try:
+            source = messages_of(engine)
+        except ConfigError as error:
+            return refusal(error, 409)
+        if kind not in READERS:
+            return PlainTextResponse(f"Nisus: Content-Type must be one of {', '.join(READERS)}.\n", 415)
+        try:
+            body = await bounded_body(request, MAX_BYTES)
+            return Json(await run_in_threadpool(lambda: answer(source, READERS[kind](body))))
+        except TooLarge:
+            return PlainTextResponse(
+                f"Nisus: a body may have {MAX_BYTES // 2**20} MB; send fewer messages at once.\n", 413
+            )
+        except ConfigError as error:
+            return refusal(error)
+
+    return [get("/api/readings", names, refused=409), Route("/api/readings", send, methods=["POST"])]
+
+
+def messages_of(engine: Running) -> Messages:
+    """Return the source of messages of a running twin.
+
+    Raises:
+        ConfigError: If its source is of another type.
+    """
+    source = getattr(engine.source, "inner", engine.source)
+    if not isinstance(source, Messages):
+        kind = engine.twin.config.source.type
+        raise ConfigError(f"the source of {engine.twin.name} is of type {kind}; only one of type push takes messages")
+    return source
+
+
+def answer(source: Messages, messages: Sequence[Any]) -> dict[str, Any]:
+    """Send messages; return what became of each, and the counts."""
+    answers = source.send(messages)
+    counts = {status: sum(item.status == status for item in answers) for status in (ACCEPTED, DUPLICATE, REFUSED)}
+    items = [
+        {"index": k, "status": item.status} | ({"reason": item.reason} if item.reason else {})
+        for k, item in enumerate(answers)
+    ]
+    return counts | {"items": items}
+
+
+def _of_json(body: bytes) -> Sequence[Any]:
+    try:
+        found = json.loads(body)
+    except (ValueError, RecursionError):
+        raise ConfigError("the body is no JSON; send one message, a list of them, or lines as NDJSON") from None
+    return found if isinstance(found, list) else [found]
+
+
+def _of_lines(body: bytes) -> Sequence[Any]:
+    """Return the messages of NDJSON; a line that is no JSON is refused alone."""
+    found: list[Any] = []
+    for line in body.splitlines():
+        if line.strip():
+            try:
+                found.append(json.loads(line))
+            except (ValueError, RecursionError):
+                found.append(None)
+    return found
+
+
+def _of_arrow(body: bytes) -> Sequence[Any]:
+    """Return the messages of a stream of Arrow batches: time, source and sequence, and a column for each value."""
+    import pyarrow as pa
+
+    try:
+        table = pa.ipc.open_stream(body).read_all()
+        for k, field in enumerate(table.schema):
+            if pa.types.is_timestamp(field.type):
+                table = table.set_column(k, field.name, table.column(k).cast(pa.timestamp("ns")).cast(pa.int64()))
+        rows = table.to_pylist()
+    except (pa.ArrowException, ValueError, OSError) as error:
+        raise ConfigError(f"the body is no stream of Arrow batches: {error}") from None
+    return [_message(row) for row in rows]
+
+
+def _message(row: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a message of a row; a null is no value, as rows of one batch may come from several sensors."""
+    head = {name: row[name] for name in FIELDS if name != "values" and row.get(name) is not None}
+    return head | {"values": {name: value for name, value in row.items() if name not in FIELDS and value is not None}}
+
+
+READERS: dict[str, Callable[[bytes], Sequence[Any]]] = {
+    "application/json": _of_json,
+    "application/x-ndjson": _of_lines,
+    "application/vnd.apache.arrow.stream": _of_arrow,
+}
+"""By the type of a body."""

@@ -1,0 +1,214 @@
+"""Source of messages: rows of named values that other programs send, by HTTP or through a broker."""
+
+from __future__ import annotations
+
+import queue
+import threading
+import time
+from collections import OrderedDict
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from estimators.errors import nearest, quoted, shown_name
+from estimators.log import Events
+
+from .mapping import ABSENT, PRESENT, ChannelMapping
+from .source import Channel, Report, ignore
+from .tables.text import TextMatch, column_of
+from .tables.times import ns_of_iso
+
+ACCEPTED, DUPLICATE, REFUSED = "accepted", "duplicate", "refused"
+"""What became of a message."""
+
+FIELDS = ("time", "values", "source", "sequence")
+"""Fields of a message."""
+
+MAX_WAITING = 200_000
+"""Messages that may wait to be read; further ones are refused, so that the sender repeats them."""
+
+MAX_SEQUENCES = 65_536
+"""Last sequence numbers that are remembered of a sender; one below all of them counts as a duplicate."""
+
+MAX_SENDERS = 1024
+"""Senders whose sequence numbers are remembered; the one that was silent longest is forgotten first."""
+
+LATEST = 2**62
+"""Times must be below it, ns: the year 2116."""
+
+
+class Answer(NamedTuple):
+    """What became of a message, and why it was refused."""
+
+    status: str
+    reason: str = ""
+
+
+class Rows(NamedTuple):
+    """Messages as rows: times (n,) in ns; values and their state (n, columns), see `ChannelMapping`."""
+
+    t: np.ndarray
+    values: np.ndarray
+    state: np.ndarray
+
+
+class Messages:
+    """Live source of the messages that are sent to it. `send` may be called from any thread.
+
+    A message is `{"time": ..., "values": {"LT101": 1.2}, "source": "plc", "sequence": 7}`. Its time is ISO 8601 with an
+    offset, or ns since 1970; without one it is that of its arrival. Values are numbers, texts for conditions on texts,
+    or null for a missing value. A message with the source and sequence number of an earlier one is a duplicate.
+
+    Args:
+        channels: What feeds the model; their signals are names of values.
+        width: Value columns of an event.
+        report: Receives measurements that a condition rejects.
+
+    Raises:
+        SourceError: If a unit does not convert to the model's.
+    """
+
+    live = True
+
+    def __init__(self, channels: Iterable[Channel], *, width: int, report: Report = ignore) -> None:
+        channels = list(channels)
+        self._width = width
+        self._columns = list(dict.fromkeys(name for channel in channels for name in channel.needed))
+        self.names = tuple(dict.fromkeys(map(column_of, self._columns)))
+        """Names of the values that the twin reads."""
+        self.units = {
+            name: unit or model
+            for channel in channels
+            for name, unit, model in zip(channel.signals, channel.units, channel.model_units, strict=True)
+        }
+        """Unit of the numbers among them, by name."""
+        self._mapping = ChannelMapping(
+            [(channels, self._columns, [None] * len(self._columns))], width=width, report=report
+        )
+        self._waiting: queue.SimpleQueue[Rows] = queue.SimpleQueue()
+        self._room = MAX_WAITING
+        self._sequences: OrderedDict[str, OrderedDict[int, None]] = OrderedDict()
+        self._sending = threading.Lock()
+        self._newest: tuple[int, int] | None = None
+
+    def send(self, messages: Sequence[Any]) -> list[Answer]:
+        """Take messages in their order; return for each what became of it. Wrong ones do not hold up the others."""
+        arrival = time.time_ns()
+        values = np.full((len(messages), len(self._columns)), np.nan)
+        state = np.full(values.shape, ABSENT, np.int8)
+        t = np.full(len(messages), arrival, np.int64)
+        answers = []
+        with self._sending:
+            for row, message in enumerate(messages):
+                answer = Answer(REFUSED, "too many messages wait; send it again") if row >= self._room else None
+                answer = answer or self._take(message, t[row : row + 1], values[row], state[row])
+                answers.append(answer or self._number(message))
+            taken = np.array([answer.status == ACCEPTED for answer in answers], np.bool_)
+            if taken.any():
+                rows = Rows(t[taken], values[taken], state[taken])
+                self._room -= rows.t.size
+                self._waiting.put(rows)
+        return answers
+
+    def _take(self, message: Any, t: np.ndarray, values: np.ndarray, state: np.ndarray) -> Answer | None:
+        """Write the values of a message into its row; return why it is refused, None if it is not."""
+        if not isinstance(message, Mapping) or not isinstance(message.get("values"), Mapping):
+            return Answer(REFUSED, 'it must be an object with values, such as {"values": {"NAME": 1.2}}')
+        for name in message:
+            if name not in FIELDS:
+                return Answer(REFUSED, f"{shown_name(str(name))} is not known; {nearest(str(name), FIELDS)}")
+        if message.get("time") is not None:
+            found = _ns(message["time"])
+            if isinstance(found, str):
+                return Answer(REFUSED, found)
+            t[0] = found
+        number, sender = message.get("sequence"), message.get("source", "")
+        if number is not None and (type(number) is not int or not 0 <= number < 2**63):
+            return Answer(REFUSED, f"sequence is {_shown(number)}; it must be a whole number from 0 on")
+        if not isinstance(sender, str) or len(sender) > 200:
+            return Answer(REFUSED, f"source is {_shown(sender)}; it must be a text of at most 200 letters")
+        given = message["values"]
+        if not given:
+            return Answer(REFUSED, f"values is empty; give one of {', '.join(self.names[:8])}")
+        for name in given:
+            if name not in self.names:
+                return Answer(REFUSED, f"{shown_name(str(name))} is no value of this twin; {nearest(name, self.names)}")
+        for k, column in enumerate(self._columns):
+            name = column_of(column)
+            if name not in given:
+                continue
+            value, state[k] = given[name], PRESENT
+            if isinstance(column, TextMatch):
+                values[k] = float(str(value) in column.texts)
+            elif isinstance(value, int | float) and not isinstance(value, bool):
+                try:
+                    values[k] = value
+                except OverflowError:
+                    return Answer(REFUSED, f"{shown_name(name)} is {_shown(value)}, which is too large")
+            elif value is not None:
+                return Answer(
+                    REFUSED, f"{shown_name(name)} is {_shown(value)}; it must be a number, or null if missing"
+                )
+        return None
+
+    def _number(self, message: Mapping[str, Any]) -> Answer:
+        """Remember the sequence number of a message; tell whether it is a duplicate."""
+        number = message.get("sequence")
+        if number is None:
+            return Answer(ACCEPTED)
+        sender = message.get("source", "")
+        known = self._sequences.setdefault(sender, OrderedDict())
+        self._sequences.move_to_end(sender)
+        if len(self._sequences) > MAX_SENDERS:
+            self._sequences.popitem(last=False)
+        if number in known or (len(known) >= MAX_SEQUENCES and number < next(iter(known))):
+            return Answer(DUPLICATE)
+        known[number] = None
+        if len(known) > MAX_SEQUENCES:
+            known.popitem(last=False)
+        return Answer(ACCEPTED)
+
+    def read(self, timeout: float) -> Events | None:
+        """Return the events of the next messages; none after `timeout` seconds without one."""
+        try:
+            found = [self._waiting.get(timeout=timeout)]
+        except queue.Empty:
+            return Events.empty(self._width)
+        while not self._waiting.empty():
+            found.append(self._waiting.get())
+        rows = Rows(*map(np.concatenate, zip(*found, strict=True)))
+        latest = int(rows.t.max())
+        with self._sending:
+            self._room += rows.t.size
+            if self._newest is None or latest > self._newest[0]:
+                self._newest = latest, time.monotonic_ns()
+        plan, skip = np.zeros(rows.t.size, np.int64), np.zeros(rows.t.size, np.int8)
+        # What was buffered on its way, or is history, arrives at once: its arrival would tell nothing of its clock.
+        return self._mapping.events(plan, rows.t, rows.t, rows.values, rows.state, skip)
+
+    def now(self) -> int | None:
+        """Return the present time by the clock of the senders, ns: that of the newest message and its age."""
+        newest = self._newest
+        return None if newest is None else newest[0] + time.monotonic_ns() - newest[1]
+
+    def close(self) -> None:
+        """Do nothing: the source has neither file nor connection."""
+
+
+def _ns(value: Any) -> int | str:
+    """Return a time as ns, or why it is none."""
+    if isinstance(value, str):
+        found = ns_of_iso(value)
+        if found is None:
+            return f"time is {quoted(value)}; it must be ISO 8601 such as 2026-01-31T12:00:00.5Z, or ns since 1970"
+        if found[1]:
+            return f"time is {quoted(value)}, which has no offset; append Z for UTC or one such as +01:00"
+        value = found[0]
+    if type(value) is not int:
+        return f"time is {_shown(value)}; it must be a whole number of ns since 1970, or ISO 8601"
+    return value if -LATEST < value < LATEST else f"time is {value} ns; it must be before the year 2116"
+
+
+def _shown(value: Any) -> str:
+    return shown_name(str(value)) if isinstance(value, str) else shown_name(repr(value))

@@ -1,0 +1,174 @@
+"""Measurements by POST: the state of the fold of the same log, an answer for each, and nothing taken twice."""
+
+import json
+
+import numpy as np
+import pyarrow as pa
+import pytest
+
+from app.twin.twin import load_twin
+from estimators import fold
+from estimators.log import Log
+from sources.messages import MAX_SEQUENCES, Messages
+from sources.source import Channel, Condition, ignore
+from sources.tables.text import TextMatch
+from tests.app.scripted import wait_for
+from tests.app.served import ServedEngine
+from tests.support import SECOND
+
+BEGIN = 1_767_225_600 * SECOND  # 2026-01-01T00:00:00Z
+JSON, LINES, ARROW = "application/json", "application/x-ndjson", "application/vnd.apache.arrow.stream"
+
+
+@pytest.fixture(scope="module")
+def page():
+    twin = load_twin("motor_winding", overrides={"source": "{type: push}"})
+    served = ServedEngine(twin=twin, behind=lambda _: twin.open_source(ignore))
+    yield served
+    served.stop()
+
+
+def sent(page, body, kind=JSON):
+    headers = [("Host", page.client.host), ("Cookie", page.client.cookie), ("Content-Type", kind)]
+    body = body if isinstance(body, bytes) else json.dumps(body).encode()
+    answer = page.client.raw("POST", "/api/readings", [*headers, ("Origin", page.client.origin)], body)
+    return answer.status, json.loads(answer.text) if answer.headers["content-type"] == JSON else answer.text
+
+
+def message(k, value, **more):
+    return {"time": BEGIN + k * SECOND, "values": {"winding": value}, **more}
+
+
+def test_the_published_state_is_that_of_the_fold_whatever_the_form(page):
+    values = (40.0 + np.random.default_rng(1).normal(0.0, 2.0, 40)).tolist()
+    assert sent(page, message(0, values[0])) == (
+        200, {"accepted": 1, "duplicate": 0, "refused": 0, "items": [{"index": 0, "status": "accepted"}]},
+    )  # fmt: skip
+    iso = [{"time": f"2026-01-01T01:00:{k:02d}+01:00", "values": {"winding": values[k]}} for k in range(1, 10)]
+    assert sent(page, iso)[1]["accepted"] == 9
+    lines = "\n".join(json.dumps(message(k, values[k])) for k in range(10, 20)).encode()
+    assert sent(page, lines, LINES)[1]["accepted"] == 10
+    for times in (
+        pa.array([BEGIN + k * SECOND for k in range(20, 30)]),
+        pa.array([(BEGIN + k * SECOND) // 10**6 for k in range(30, 40)], pa.timestamp("ms", tz="UTC")),
+    ):
+        first = 20 if pa.types.is_integer(times.type) else 30
+        table = pa.table({"time": times, "winding": values[first : first + 10]})
+        sink = pa.BufferOutputStream()
+        with pa.ipc.new_stream(sink, table.schema) as stream:
+            stream.write_table(table)
+        assert sent(page, sink.getvalue().to_pybytes(), ARROW)[1]["accepted"] == 10
+    twin = page.engine.twin
+    log = Log.of(twin.model, start=BEGIN * 1e-9)
+    log.add("winding", BEGIN * 1e-9 + np.arange(40.0), values)
+    track = fold(twin.estimator, twin.model, log, tuning=twin.tuning)
+    wait_for(lambda: page.get("/api/state")["time_ns"] == BEGIN + 39 * SECOND)
+    (temperature, rate) = page.get("/api/state")["states"]
+    assert [temperature["value"], rate["value"]] == track.mean[-1].tolist()
+    assert [temperature["std"], rate["std"]] == track.std[-1].tolist()
+
+
+def test_each_message_has_its_answer_and_a_wrong_one_does_not_hold_up_the_others(page):
+    before = page.rows()
+    wrong = [
+        (None, "it must be an object with values"),
+        ({"values": {}}, "values is empty; give one of winding"),
+        ({"values": {"windng": 1.0}}, "windng is no value of this twin; did you mean winding?"),
+        ({"values": {"winding": "hot"}}, "winding is hot; it must be a number, or null if missing"),
+        ({"values": {"winding": True}}, "winding is True; it must be a number"),
+        ({"values": {"winding": 10**400}}, "which is too large"),
+        ({"values": {"winding": 1.0}, "tme": 3}, "tme is not known; did you mean time?"),
+        (message(0, 1.0) | {"time": "yesterday"}, "time is 'yesterday'; it must be ISO 8601"),
+        (message(0, 1.0) | {"time": "2026-01-01T00:00:00"}, "which has no offset; append Z for UTC"),
+        (message(0, 1.0) | {"time": 1.5}, "time is 1.5; it must be a whole number of ns"),
+        (message(0, 1.0) | {"time": 2**63}, "it must be before the year 2116"),
+        (message(0, 1.0, sequence=-1), "sequence is -1; it must be a whole number from 0 on"),
+        (message(0, 1.0, source=3, sequence=1), "source is 3; it must be a text"),
+    ]
+    good = [message(50 + k, 41.0) for k in range(len(wrong))]
+    status, found = sent(page, [item for pair in zip([item for item, _ in wrong], good, strict=True) for item in pair])
+    assert (status, found["accepted"], found["refused"]) == (200, len(good), len(wrong))
+    for k, (_, reason) in enumerate(wrong):
+        item = found["items"][2 * k]
+        assert item["status"] == "refused" and reason in item["reason"] and "\n" not in item["reason"]
+        assert found["items"][2 * k + 1] == {"index": 2 * k + 1, "status": "accepted"}
+    wait_for(lambda: page.rows() == before + len(good))
+
+
+def test_a_message_that_was_sent_before_is_taken_once(page):
+    before = page.rows()
+    batch = [message(100 + k, 42.0, source="plc", sequence=k) for k in range(5)]
+    assert sent(page, batch)[1]["accepted"] == 5
+    again = sent(page, [*batch[::-1], message(105, 42.0, source="plc", sequence=5)])[1]
+    assert (again["accepted"], again["duplicate"]) == (1, 5)
+    assert [item["status"] for item in again["items"]] == ["duplicate"] * 5 + ["accepted"]
+    other = sent(page, message(106, 42.0, source="gateway", sequence=5))[1]
+    assert other["accepted"] == 1
+    wait_for(lambda: page.rows() == before + 7)
+
+
+def test_null_is_a_dropout(page):
+    before = page.get("/api/state")["sensors"][0]["dropouts"]
+    assert sent(page, message(107, None))[1]["accepted"] == 1
+    wait_for(lambda: page.get("/api/state")["sensors"][0]["dropouts"] == before + 1)
+
+
+@pytest.mark.parametrize(
+    ("body", "kind", "status", "text"),
+    [
+        (b"{", JSON, 400, "the body is no JSON; send one message, a list of them, or lines as NDJSON"),
+        (b"[" * 100_000, JSON, 400, "the body is no JSON"),
+        (b"arrow", ARROW, 400, "the body is no stream of Arrow batches"),
+        (b"winding", "text/plain", 415, "Content-Type must be one of application/json, application/x-ndjson"),
+        (b" " * (8 * 2**20 + 1), JSON, 413, "a body may have 8 MB; send fewer messages at once"),
+    ],
+)
+def test_a_body_that_cannot_be_read_is_refused_in_one_line(page, body, kind, status, text):
+    found, answer = sent(page, body, kind)
+    assert found == status and text in str(answer) and str(answer).strip().count("\n") == 0
+
+
+def test_a_line_that_is_no_json_is_refused_alone(page):
+    body = b'{"values": {"winding": 40}\n' + json.dumps(message(108, 40.0)).encode()
+    assert [item["status"] for item in sent(page, body, LINES)[1]["items"]] == ["refused", "accepted"]
+
+
+def test_names_and_units_are_told(page):
+    assert page.get("/api/readings") == {"values": [{"name": "winding", "unit": "°C"}]}
+
+
+def test_a_twin_with_another_source_says_so(serve):
+    status, found = sent(serve(twin=load_twin("motor_winding")), message(0, 1.0))
+    assert status == 409
+    assert found["error"].endswith("is of type simulator; only one of type push takes messages")
+
+
+def test_units_and_conditions_are_those_of_a_table():
+    channels = [
+        Channel(
+            0, 0, "level", ("LT101",), units=("mm",), model_units=("m",), scale=(2.0,),
+            where=(Condition(TextMatch("quality", ("Good",)), 1.0, 1.0),),
+        ),
+    ]  # fmt: skip
+    source = Messages(channels, width=1)
+    assert source.names == ("LT101", "quality")
+    rows = [{"LT101": 1500, "quality": quality} for quality in ("Good", "Bad")]
+    assert {answer.status for answer in source.send([{"values": row} for row in rows])} == {"accepted"}
+    events = source.read(0.0)
+    np.testing.assert_array_equal(events.value[:, 0], [3.0, np.nan])
+    assert len(source.read(0.0)) == 0
+
+
+def test_what_waits_and_what_is_remembered_is_bounded(monkeypatch):
+    monkeypatch.setattr("sources.messages.MAX_WAITING", 3)
+    source = Messages([Channel(0, 0, "level", ("LT101",), model_units=("m",))], width=1)
+    statuses = [answer.status for answer in source.send([{"values": {"LT101": k}} for k in range(5)])]
+    assert statuses == ["accepted"] * 3 + ["refused"] * 2
+    assert len(source.read(0.0)) == 3
+    assert source.send([{"values": {"LT101": 1.0}}])[0].status == "accepted"
+    monkeypatch.setattr("sources.messages.MAX_WAITING", 10**6)
+    source = Messages([Channel(0, 0, "level", ("LT101",), model_units=("m",))], width=1)
+    numbered = [{"values": {"LT101": 0.0}, "sequence": k} for k in range(MAX_SEQUENCES + 10)]
+    assert {answer.status for answer in source.send(numbered)} == {"accepted"}
+    # Those that are forgotten count as duplicates too.
+    assert {answer.status for answer in source.send([numbered[0], numbered[9], numbered[-1]])} == {"duplicate"}
