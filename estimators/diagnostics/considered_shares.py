@@ -84,10 +84,16 @@ MAX_PAIRS = 128
 """Pairs of a state and a deviation whose covariance is kept at most, 8 bytes an event each."""
 
 
+def noise_states(model: StateSpaceModel) -> int:
+    """Return the number of shown states, the first ones, whose covariances with the deviations are kept."""
+    return min(len(model.shown), MAX_PAIRS // model.considered) if model.considered else 0
+
+
 def considered_pairs(model: StateSpaceModel) -> np.ndarray:
-    """Return the pairs (k, 2) of each shown state with each considered deviation, for `noise_std`; none if too many."""
-    every = [(int(j), model.nx - model.considered + c) for j in model.shown for c in range(model.considered)]
-    return np.array(every if len(every) <= MAX_PAIRS else [], int).reshape(-1, 2)
+    """Return the pairs (k, 2) of each of these states with each considered deviation, for `noise_std`."""
+    states = model.shown[: noise_states(model)].tolist()
+    every = [(j, model.nx - model.considered + c) for j in states for c in range(model.considered)]
+    return np.array(every, int).reshape(-1, 2)
 
 
 def noise_std(model: StateSpaceModel, shown: int, std: np.ndarray, cross: np.ndarray) -> np.ndarray:
@@ -95,15 +101,15 @@ def noise_std(model: StateSpaceModel, shown: int, std: np.ndarray, cross: np.nda
 
     Args:
         model: A model with considered states.
-        shown: Index of the state among the shown ones.
+        shown: Index of the state among the shown ones, below `noise_states`.
         std: Deviations of the shown states (N, shown).
         cross: Covariances of a fold's pairs (N, pairs), the last of which are `considered_pairs`.
 
     Returns:
-        Undefined (NaN) where the fold kept no covariances with the deviations.
+        NaN where the fold kept no covariances with the deviations.
     """
-    first = cross.shape[1] - (len(model.shown) - shown) * model.considered
-    if not len(considered_pairs(model)) or first < shown * model.considered:
+    first = cross.shape[1] - (noise_states(model) - shown) * model.considered
+    if first < shown * model.considered:
         return np.full(len(std), np.nan)
     C = model.prior_cov[model.nx - model.considered :, model.nx - model.considered :]
     unit = np.sqrt(np.diag(C))

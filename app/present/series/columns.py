@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from estimators.diagnostics.considered_shares import considered_pairs, noise_std
+from estimators.diagnostics.considered_shares import noise_states, noise_std
 from estimators.diagnostics.references import HALF_WIDTH
 from estimators.log import INPUT, READING, Events, truth_of
 from estimators.model.state_space import StateSpaceModel
@@ -112,7 +112,7 @@ def _mean(j: int, spread: float, rows: Rows, withhold: float = np.inf) -> np.nda
 
 def _noise_band(model: StateSpaceModel, j: int, name: str) -> list[Column]:
     """Return the band of a state without the uncertainty of considered parameters; nothing where none is considered."""
-    if not len(considered_pairs(model)):
+    if j >= noise_states(model):
         return []
 
     def edge(sign: float, rows: Rows) -> np.ndarray:
