@@ -208,6 +208,7 @@ def roles_json(drafted: DraftPlan) -> dict[str, Any]:
 def report_draft(draft: Draft, json: bool) -> None:
     """Print the files of a draft, its check, and the next step."""
     from ..studies.advice.draft import check_lines, hint_lines, omission_lines
+    from ..studies.advice.plan import YAML_NAME
 
     check = draft.plan.check
     written = [str(path) for path in draft.paths]
@@ -219,7 +220,7 @@ def report_draft(draft: Draft, json: bool) -> None:
         print("\nNot checked: the filter fails on this recording; choose other signals with --sensors.")
     else:
         print(f"\n{check.fitted_to}:")
-        print("\n".join([check.words, *(f"  {line}" for line in check_lines(check))]))
+        print("\n".join([check.words.replace(YAML_NAME, written[0]), *(f"  {line}" for line in check_lines(check))]))
     for line in hint_lines(draft.plan):
         print(f"\n{line}")
     if omitted := omission_lines(draft.plan):

@@ -42,7 +42,7 @@ from estimators.track import FAILED, HEALTH_NAMES, REASONS, TRACKING, USED, Trac
 from estimators.tuning import SHARED_ENTRY_ROWS
 from sources.source import WRONG_TIME
 
-from ..format_time import format_time
+from ..format_time import duration_text, format_time
 from ..present.export.calibration_lines import COVERAGE_HEAD, calibration_lines, coverage_rows, health_shares
 from ..present.result import Figure, Topic, plain
 from ..present.series.columns import units_by_name
@@ -456,7 +456,7 @@ def _figures(result: FoldResult) -> list[Figure]:
         Figure(
             "late readings", f"{'used on arrival, R inflated' if twin.late.inflate else 'exact'}: {twin.late.reason}"
         ),
-        Figure("degraded after", f"{twin.degraded.seconds:g} s without a reading: {twin.degraded.reason}"),
+        Figure("degraded after", f"{duration_text(twin.degraded.seconds)} without a reading: {twin.degraded.reason}"),
         *(Figure(f"at {decision.time:.1f} s", decision.text) for decision in fold.decisions[-MAX_DECISIONS:]),
         # The track has no rows of measurements that never reached the log, so its health cannot show them.
         Figure(
@@ -515,7 +515,7 @@ def episodes_topic(found: Sequence[ExplainedEpisode]) -> Topic:
         return Topic("No faults detected")
     lines = []
     for episode, _, words in found[:MAX_EPISODES]:
-        lasted = "at the end" if episode.end is None else f"for {episode.end - episode.start:.3g} s"
+        lasted = "at the end" if episode.end is None else f"for {duration_text(episode.end - episode.start)}"
         suspected = f" Most likely: {words}." if words else ""
         lines.append(f"{episode.cause}, {lasted}: {episode.text}.{suspected}")
     if len(found) > MAX_EPISODES:

@@ -22,7 +22,7 @@ from sources.inspect import RecordingContents
 from sources.units import heading_unit
 
 from ...format_time import duration_text
-from .plan import OMITTED, DraftCheck, DraftPlan, Moves, Reads
+from .plan import OMITTED, YAML_NAME, DraftCheck, DraftPlan, Moves, Reads
 from .signals import Signal
 
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]*")
@@ -215,9 +215,11 @@ def _start(item: Moves) -> float:
 
 
 def _speed(item: Moves) -> float:
-    """Typical speed of a signal, by its differences."""
+    """Typical speed of a signal, by its differences; two rows at nearly one time count as an interval apart."""
     series = item.signal.series
-    return max(float(np.std(np.diff(series.values) / np.maximum(np.diff(series.t) * 1e-9, 1e-9))), 1e-9)
+    apart = np.diff(series.t) * 1e-9
+    usual = float(np.median(apart[apart > 0.0])) if np.any(apart > 0.0) else 1.0
+    return max(float(np.std(np.diff(series.values) / np.maximum(apart, usual))), 1e-9)
 
 
 def _moving(item: Moves, k: int, inputs: Sequence[str], first: int) -> list[str]:
@@ -295,7 +297,7 @@ def yaml_text(
 # {name}: signals of a recording, each with its own motion. Change it, and {name}.py beside it, into your own twin.
 #
 # Source: {", ".join(path.name for path in found.files[:3])}{", ..." if len(found.files) > 3 else ""}
-{text(_comments(drafted))}
+{text(_comments(drafted, name))}
 # Run it: nisus run {name}.yaml      Score it: nisus fold {name}.yaml      Every key: nisus schema
 title: {_text(_title(drafted))}
 model: ./{name}.py:{model}       # file beside this one, and the name of the model in it
@@ -414,7 +416,7 @@ def _estimator(drafted: DraftPlan, name: str) -> str:
     return f"estimator: {{name: kf, options: {{{options}}}}}  {why}"
 
 
-def _comments(drafted: DraftPlan) -> list[str]:
+def _comments(drafted: DraftPlan, name: str) -> list[str]:
     """Return the states in words, the check and the omitted signals, as comments."""
     lines = []
     for item in drafted.states:
@@ -429,7 +431,7 @@ def _comments(drafted: DraftPlan) -> list[str]:
         check = drafted.check
         lines += [
             *(f"# {text}" for text in textwrap.wrap(f"{check.fitted_to}:", LINE_LENGTH)),
-            f"# {check.words}.",
+            f"# {check.words.replace(YAML_NAME, f'{name}.yaml')}.",
             *(f"#   {text}" for text in check_lines(check)),
         ]
     for line in (*hint_lines(drafted), *omission_lines(drafted)):
@@ -481,7 +483,7 @@ def check_lines(check: DraftCheck) -> list[str]:
     lines = []
     for one in check.sensors:
         if not one.n:
-            lines.append(f"{one.name}: no measurement in the second half")
+            lines.append(f"{one.name}: no measurement with a prediction in the checked part")
             continue
         held_out = f", {100 * one.held_out:.1f} % when held out" if math.isfinite(one.held_out) else ""
         lines.append(

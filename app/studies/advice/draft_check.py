@@ -21,7 +21,7 @@ from estimators.registry import find_entry
 from estimators.tuning import Tuning
 
 from .draft import python_text, rounded
-from .plan import MAX_COVERAGE, MIN_COVERAGE, DraftCheck, DraftPlan, Moves, Reads, SensorCheck
+from .plan import MAX_COVERAGE, MIN_COVERAGE, YAML_NAME, DraftCheck, DraftPlan, Moves, Reads, SensorCheck
 from .signals import Signal
 
 BAND_SIGMA = 1.959963984540054  # half width of the 95 % band
@@ -149,10 +149,15 @@ class DraftFold:
             raise fold.failure
         return fold
 
+    def _rows(self, k: int, *, fitted: bool = False) -> np.ndarray:
+        """Return the mask of the measurements of sensor k in the checked parts, or the fitted ones."""
+        log = self._log
+        mask: np.ndarray = (log.kind[: log.n] == READING) & (log.channel[: log.n] == k) & (self._fitted == fitted)
+        return mask
+
     def _innovations(self, fold: Fold, k: int, *, fitted: bool = False) -> np.ndarray:
         """Return the innovations of sensor k on the checked parts, or the fitted ones, in σ."""
-        log = self._log
-        rows = (log.kind[: log.n] == READING) & (log.channel[: log.n] == k) & (self._fitted == fitted)
+        rows = self._rows(k, fitted=fitted)
         with np.errstate(all="ignore"):
             e: np.ndarray = fold.track.innovation[rows, 0] / fold.track.innovation_std[rows, 0]
         return e[np.isfinite(e)]
@@ -160,8 +165,10 @@ class DraftFold:
     def check(self, span: float) -> DraftCheck:
         """Return the check on the parts that were not fitted; `span` is the length of the recording, s."""
         found, late, alone, ratios = [], {}, {}, {}
+        failed = np.zeros(len(self._sensors), np.int64)
         for k, reads in enumerate(self._sensors):
             e = late[reads.name] = self._innovations(self._fold, k)
+            failed[k] = np.count_nonzero(self._rows(k)) - e.size
             before = self._innovations(self._fold, k, fitted=True)
             before, after = np.array_split(e, 2) if self._split.alternate else (before, e)
             ratios[reads.name] = _power(after) / max(_power(before), 1e-300)
@@ -175,9 +182,12 @@ class DraftFold:
             held_out = _coverage(alone.get(reads.name, e[:0]))
             found.append(SensorCheck(reads.name, e.size, _coverage(e), correlation_interval(e), held_out))
         fitted, nis = (self._verdict(self._fitted == part) for part in (True, False))
-        reason = _reason(nis, fitted, self._sensors, found, late, alone, ratios, alternate=self._split.alternate)
+        reason, wide = _reason(nis, fitted, self._sensors, found, late, alone, ratios, alternate=self._split.alternate)
+        if failed.any():
+            name, count = self._sensors[int(np.argmax(failed))].name, int(failed.max())
+            reason, wide = f"the estimate of {name} diverged: {count:,} measurements have no prediction; omit it", False
         start, parts = (self._split.edges[0] - self._zero) * 1e-9, len(self._split.edges) + 1
-        return DraftCheck(start, span, nis.ratio, nis.low, nis.high, tuple(found), reason, nis.words, parts)
+        return DraftCheck(start, span, nis.ratio, nis.low, nis.high, tuple(found), reason, nis.words, parts, wide)
 
     def _verdict(self, part: np.ndarray) -> NisVerdict:
         """Return the verdict on the mean NIS of some events, as `nisus fold` gives it."""
@@ -211,8 +221,10 @@ def _reason(
     ratios: Mapping[str, float],
     *,
     alternate: bool,
-) -> str:
-    """Return why a draft is not consistent, and the next step; empty if it is.
+) -> tuple[str, bool]:
+    """Return why a draft is not consistent, with the next step, and whether its bands are only wider than needed.
+
+    The reason is empty if it is consistent.
 
     Args:
         nis: Verdict on the NIS of the checked parts.
@@ -227,56 +239,68 @@ def _reason(
     known = [one for one in checks if one.n]
     if sum(one.n for one in known) < MIN_CHECKED or not nis.place:
         part = "checked parts have" if alternate else "second half has"
-        return f"the {part} fewer than {MIN_CHECKED} measurements; record a longer log"
+        return f"the {part} fewer than {MIN_CHECKED} measurements; record a longer log", False
     shares = {one.name: share_interval(np.abs(late[one.name]) <= BAND_SIGMA, late[one.name]) for one in known}
     narrow, wide = min(known, key=lambda one: one.coverage), max(known, key=lambda one: -_power(late[one.name]))
     if alternate:
         changed = max(ratios, key=lambda name: abs(np.log(max(ratios[name], 1e-300))))
         if abs(np.log(max(ratios[changed], 1e-300))) > np.log(MAX_CHANGE):
-            return _varies(changed)
+            return _varies(changed), False
     good = shares[narrow.name].high >= MIN_COVERAGE
     place = "inside" if _within_fit_error(nis, fitted) else nis.place
     if place == "above" or not good:
         far = {one.name: float(np.mean(np.abs(late[one.name]) > FAR_SIGMA)) for one in known}
         worst = max(far, key=lambda name: far[name])
         if ratios[narrow.name] > MAX_NIS_FACTOR and not alternate:
-            return f"{narrow.name} moves more {HALVES_DIFFER}; fit all of the log with nisus tune"
+            return f"{narrow.name} moves more {HALVES_DIFFER}; fit all of the log with nisus tune {YAML_NAME}", False
         if far[worst] > MAX_FAR_SHARE:
             return (
                 f"{100 * far[worst]:.1f} % of the innovations of {worst} exceed {FAR_SIGMA:g} σ, so it jumps; give the "
-                f"cause with --inputs, or omit {worst}"
+                f"cause with --inputs, or omit {worst}",
+                False,
             )
         if narrow.correlation.low > MAX_CORRELATION:
-            return _missing_cause(narrow)
-        return _varies(narrow.name)
+            return _missing_cause(narrow), False
+        return _varies(narrow.name), False
     contrary = min(known, key=lambda one: one.correlation.high)
     if contrary.correlation.high < -MAX_CORRELATION:
         return (
             f"successive innovations of {contrary.name} alternate ({contrary.correlation.value:+.2f}): its rows are of "
             "several sources, or its noise is larger than fitted; give each source its rows by `only`, or raise "
-            f"R.{contrary.name} with nisus tune NAME.yaml"
+            f"R.{contrary.name} with nisus tune {YAML_NAME}",
+            False,
         )
     if place == "below" or any(one.low > MAX_COVERAGE for one in shares.values()):
         reads = next(one for one in sensors if one.name == wide.name)
         if reads.r <= MAX_FLOOR_FACTOR * reads.signal.resolution**2 / 12.0:
             return (
                 f"{wide.name} varies less than its resolution of {reads.signal.resolution:.3g} "
-                f"{reads.signal.series.unit or 'units'}, so its bands are wider than needed; they are valid"
+                f"{reads.signal.series.unit or 'units'}, so its bands are wider than needed; they are valid",
+                narrow.coverage >= MIN_COVERAGE,
             )
         if ratios[wide.name] * MAX_NIS_FACTOR < 1.0 and not alternate:
-            return f"{wide.name} moves less {HALVES_DIFFER}; fit all of the log with nisus tune"
-        return _varies(wide.name)
+            why = f"{wide.name} moves less {HALVES_DIFFER}; fit all of the log with nisus tune {YAML_NAME}"
+        elif narrow.coverage >= MIN_COVERAGE:
+            widest = max(known, key=lambda one: one.coverage)
+            why = (
+                f"{100 * widest.coverage:.1f} % of {widest.name} are in the 95 % band, so its bands are wider than "
+                f"needed; they are valid (nisus advise {YAML_NAME} --apply compares filters that follow its noise)"
+            )
+        else:
+            why = _varies(wide.name)
+        return why, narrow.coverage >= MIN_COVERAGE
     lasting = max(known, key=lambda one: one.correlation.low)
     if lasting.correlation.low > MAX_CORRELATION:
-        return _missing_cause(lasting)
+        return _missing_cause(lasting), False
     for name, e in alone.items():
         share = share_interval(np.abs(e) <= BAND_SIGMA, e)
         if share.high < MIN_COVERAGE:
             return (
                 f"predicted from the other sensors alone, {100 * share.value:.1f} % of {name} is in the 95 % band, so "
-                f"its scale or offset changes; omit it"
+                f"its scale or offset changes; omit it",
+                False,
             )
-    return ""
+    return "", False
 
 
 def _missing_cause(one: SensorCheck) -> str:
@@ -288,5 +312,6 @@ def _missing_cause(one: SensorCheck) -> str:
 
 def _varies(name: str) -> str:
     return (
-        f"the noise of {name} varies; nisus advise NAME.yaml --apply compares filters that follow it, and sets the best"
+        f"the noise of {name} varies; nisus advise {YAML_NAME} --apply compares filters that follow it, and sets the "
+        "best"
     )

@@ -1,8 +1,11 @@
 """A draft is fitted to the first half of a recording, or to every other eighth; its check is a fold of its YAML."""
 
+import re
+
 import numpy as np
 import pytest
 
+from app.studies.advice.draft import python_text
 from app.studies.advice.draft_fit import fit_all
 from app.studies.advice.plan import OMITTED, Roles, plan
 from app.studies.advice.relations import driven
@@ -129,3 +132,33 @@ def test_rows_of_two_sources_in_turn_are_not_consistent_though_their_nis_is(tmp_
     assert check.reason.startswith("successive innovations of level alternate (-0.") and check.words.startswith(
         "not con"
     )
+
+
+def test_two_rows_at_nearly_one_time_do_not_make_a_prior_that_diverges(tmp_path):
+    """Rows of a clock that was set back were sorted between the others, a microsecond from their neighbours."""
+    rng = np.random.default_rng(14)
+    t = np.arange(N) * 1.0
+    t[1000:1003] = t[900:903] + 1e-6
+    level = 30.0 + 20.0 * np.sin(t / 40.0) + rng.normal(0, 0.3, N)
+    drafted = fit_all(
+        plan(inspect_recordings([write(tmp_path / "tank.csv", t=t, level=level)]), Roles(states=("level",)))
+    )
+    check = drafted.check
+    assert drafted.states[0].smooth
+    # The curve moves by at most 20/40 a second, its noise by 0.3 √2 from one row to the next.
+    text = python_text("tank", "Tank", drafted)
+    std = float(re.search(r'"level_rate".*std=([\d.e+-]+)', text)[1])
+    assert 0.3 < std < 1.0
+    assert check.sensors[0].n == N // 2 and 0.9 < check.nis < 1.1
+
+
+def test_bands_that_are_too_wide_alone_are_conservative(tmp_path):
+    """The noise of a held-out sensor is uniform: none of it is beyond √3 σ, so the 95 % band contains all of it."""
+    rng = np.random.default_rng(15)
+    level = np.cumsum(rng.normal(0, 0.3, N))
+    columns = {"level": level + rng.normal(0, 0.3, N), "second": level + rng.uniform(-4.0, 4.0, N)}
+    found = inspect_recordings([write(tmp_path / "tank.csv", **columns)])
+    check = fit_all(plan(found, Roles(sensors=("level",), held_out=("second",)))).check
+    coverage = {one.name: one.coverage for one in check.sensors}
+    assert coverage["second"] > 0.98 and coverage["level"] > 0.9
+    assert check.wide and check.words.startswith("conservative: ")
