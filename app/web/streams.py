@@ -41,6 +41,9 @@ MAX_STREAMS = 24
 MANY_ENTRIES = 32
 """Entries of a field of the status from which on only the changed ones are sent."""
 
+EQUAL_NS = 1_000
+"""Rounding of the times of a page, whose numbers have 53 bits: of a calendar 256 ns. As EQUAL_S of charts.js."""
+
 MAX_PARTICLES = 400
 """Particles in the chart of one state over another; a larger cloud is thinned."""
 
@@ -158,7 +161,7 @@ class PageStream:
             self._pair = None if wanted.pair is None else tuple(known.index(name) for name in wanted.pair)
             self._estimated = None
         if "at" in message and (origin := self._series.origin()) is not None:
-            self._at = None if wanted.at is None else origin + round(wanted.at * 1e9)
+            self._at = None if wanted.at is None else origin + round(wanted.at * 1e9) + EQUAL_NS
             if self._choices is not None:
                 self._choices.look(self, self._at)
             self._pointed.set()

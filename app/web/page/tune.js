@@ -330,8 +330,8 @@ export class Tune {
   }
 }
 
-// Those whose name contains the text.
-const matches = (items, nameOf, text) => items.filter((item) => nameOf(item).toLowerCase().includes(text.trim().toLowerCase()));
+// Those whose name, as it is or in words, contains the text.
+const matches = (items, nameOf, text) => items.filter((item) => [nameOf(item), words(nameOf(item))].some((name) => name.toLowerCase().includes(text.trim().toLowerCase())));
 
 export function section(title, hint, open, ...children) {
   return element("details", { class: "section", open }, element("summary", { title: hint }, title), ...children);

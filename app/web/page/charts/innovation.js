@@ -47,7 +47,7 @@ class Member {
 
   choose(name, chosen) {
     this.chosen = chosen;
-    for (const field of this.fields) if (field !== document.activeElement || chosen) field.value = name;
+    for (const field of this.fields) if (field !== document.activeElement || chosen) field.value = words(name);
     if (name === this.name) return;
     this.name = name;
     this.charts.ask();
@@ -56,13 +56,14 @@ class Member {
   // A field for the name of a member: empty for the first in alarm.
   get field() {
     const field = element("input", {
-      type: "text", class: "member", value: this.name, spellcheck: "false", autocomplete: "off", size: 12,
+      type: "text", class: "member", value: words(this.name), spellcheck: "false", autocomplete: "off", size: 12,
       "aria-label": `Sensor of ${words(this.group.name)}`, title: `Name of one of the ${this.group.sensors.length} sensors; empty: the first in alarm`,
       onchange: () => {
         const wanted = field.value.trim().toLowerCase();
-        const found = this.group.sensors.find((name) => name.toLowerCase() === wanted) ?? this.group.sensors.find((name) => wanted && name.toLowerCase().includes(wanted));
+        const named = (fits) => this.group.sensors.find((name) => wanted && [name, words(name)].some((text) => fits(text.toLowerCase())));
+        const found = named((text) => text === wanted) ?? named((text) => text.includes(wanted));
         this.choose(found ?? this.name, Boolean(found));
-        field.value = this.name;
+        field.value = words(this.name);
       },
     });
     this.fields.push(field);

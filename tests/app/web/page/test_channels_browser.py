@@ -22,6 +22,7 @@ def innovations(engine, sensor):
 def test_a_group_opens_to_its_members(tmp_path, visit, family):
     path = write_plant(tmp_path, COUNT, family=family, seconds=60, biased=BIASED)
     name = "TT_{:04d}" if family else "TT{:04d}"
+    shown = name.replace("_", " ")  # names are shown in words
     with running(str(path)) as session:
         page = visit(session.url)
         count = page.locator
@@ -37,19 +38,19 @@ def test_a_group_opens_to_its_members(tmp_path, visit, family):
         assert count(".knob[data-key^='R.']").count() == (1 if family else LISTED)
         # The chart follows the first that is in alarm.
         field = page.get_by_label("Sensor of TT")
-        until(page, f"document.querySelector('.member').value === '{name.format(BIASED)}'")
+        until(page, f"document.querySelector('.member').value === '{shown.format(BIASED)}'")
         page.screenshot(path=tmp_path / "closed.png")
         # A click on the light opens the group: the faulty one first.
         count(".light").click()
         rows = count(".sensor-group .sensor span")
         until(page, f"document.querySelectorAll('.sensor-group > div .sensor').length === {LISTED}")
-        assert rows.all_inner_texts()[1].replace(" ", "_") == name.format(BIASED)
+        assert rows.all_inner_texts()[1] == shown.format(BIASED)
         page.screenshot(path=tmp_path / "open.png")
         # A name is found, and charted.
-        page.get_by_label("Find a sensor").fill("0377")
+        page.get_by_label("Find a sensor").fill(shown.format(377))
         until(page, "document.querySelectorAll('.sensor-group > div .sensor').length === 1")
-        page.get_by_label(f"Chart {name.format(377).replace('_', ' ')}").click()
-        assert field.input_value() == name.format(377)
+        page.get_by_label(f"Chart {shown.format(377)}").click()
+        assert field.input_value() == shown.format(377)
         expected = innovations(session.engine, 377)
         column = f"innovation:{name.format(377)}"
         until(page, f"window.nisus.charts.live.columns['{column}']?.some((value) => value !== null)")
@@ -57,6 +58,12 @@ def test_a_group_opens_to_its_members(tmp_path, visit, family):
             f"window.nisus.charts.live.columns['{column}'].filter((value) => typeof value === 'number')"
         )
         assert len(drawn) > 40 and all(np.abs(expected - value).min() < 1e-5 for value in drawn)
+        # The chart takes a name as it is shown, and as it is written.
+        for text, k in ((shown.format(42), 42), (name.format(43), 43)):
+            field.fill(text)
+            field.press("Enter")
+            until(page, f"document.querySelector('.member').value === '{shown.format(k)}'")
+            assert f"innovation:{name.format(k)}" in page.evaluate("window.nisus.charts.columns")
 
 
 def test_a_status_of_many_entries_is_sent_by_what_changed():
