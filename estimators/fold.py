@@ -154,6 +154,28 @@ class Fold:
         """Return mean (nx,) and covariance (nx, nx) at `clock`; beyond `LARGE` states the variances (1, nx)."""
         return self._start if self.idle else self._machine.moments(self._now.state)
 
+    def described(self, t: int | None = None, u: np.ndarray | None = None) -> np.ndarray:
+        """Return the mean of the shown states at `clock`, or as the next event would be predicted at its time `t`, ns.
+
+        The prediction draws the same random numbers as that of the event itself; nothing changes. `u` (nu,) takes the
+        place of the inputs.
+        """
+        now, log, row = self._now, self.log, min(self.n, self.log.n - 1)
+        kept, event = now.copy(), (log.kind[row], log.t[row])
+        log.kind[row], log.t[row] = TICK, now.clock[0] if t is None else t
+        line = self._rows.select(slice(row, row + 1)).copy()
+        try:
+            if u is not None:
+                now.u[:] = u
+            self._machine.run(log, row, row + 1, now, self._spare, self._rows)
+            return self._rows.mean[row].copy()
+        finally:
+            log.kind[row], log.t[row] = event
+            now.put(kept)
+            for column, value in zip(self._rows, line, strict=True):
+                column[row : row + 1] = value
+            self._asked = -1
+
     def points(self) -> np.ndarray:
         """Return sigma points or particles (k, nx) to draw beside the mean; none for most filters."""
         nothing = np.empty((0, self.model.nx))

@@ -177,6 +177,24 @@ class FoldCommand(JsonOption, PartOptions, FoldOptions):
 
 
 @dataclass(frozen=True)
+class WhyCommand(JsonOption, FoldOptions):
+    """Tell what moved the estimate: attribute its change to the model, each input and each sensor.
+
+    Examples:
+      nisus why battery_panasonic --at 1500 --span 600
+      nisus why motor_can --duration 60 --state magnet --json
+    """
+
+    at: str | None = None
+    """End of the change: a time after the start (1500, 25min), a share of the measurements (50%), or a date.
+    Default: the end of the log."""
+    span: float | None = None
+    """Its duration, s. Default: the window of the twin's view."""
+    state: Repeated = ()
+    """State to show, repeatable. Default: the four that moved by most standard deviations."""
+
+
+@dataclass(frozen=True)
 class CheckCommand(JsonOption, FoldOptions):
     """Print a checklist of what could be wrong with a twin without being detected.
 
@@ -579,6 +597,7 @@ class CompletionCommand:
 COMMANDS: dict[type, str] = {
     RunCommand: "run:run_twin",
     FoldCommand: "fold:fold_twin",
+    WhyCommand: "why:explain_change",
     CheckCommand: "check:check_twin",
     AdviseCommand: "advise:advise",
     CompareCommand: "compare:compare_twin",

@@ -104,8 +104,8 @@ def span_of(options: PartOptions, events: Events) -> tuple[int, int] | None:
 
     if options.since is None and options.until is None:
         return None
-    begin = int(events.t[0]) if options.since is None else _moment("--since", options.since, events)
-    end = int(events.t[-1]) + 1 if options.until is None else _moment("--until", options.until, events)
+    begin = int(events.t[0]) if options.since is None else moment_of("--since", options.since, events)
+    end = int(events.t[-1]) + 1 if options.until is None else moment_of("--until", options.until, events)
     if not ((events.kind == READING) & (events.t >= begin) & (events.t < end)).any():
         given = " ".join(
             f"{name} {text}" for name, text in (("--since", options.since), ("--until", options.until)) if text
@@ -117,7 +117,7 @@ def span_of(options: PartOptions, events: Events) -> tuple[int, int] | None:
     return begin, end
 
 
-def _moment(option: str, text: str, events: Events) -> int:
+def moment_of(option: str, text: str, events: Events) -> int:
     """Return a moment of a log, ns: a share of the measurements, a time after the start, or a date."""
     from datetime import UTC, datetime
 

@@ -275,6 +275,16 @@ class Running(ABC):
                 return None
             return event_window(self._fold, self._revision, limit, origin=self._base, rows=rows)
 
+    def window(self, since: int, until: int) -> EventWindow | None:
+        """Copy the events between two times, ns, and those from the snapshot before on; None while there are none."""
+        with self._reading():
+            t = self._log.t[: self._fold.n]
+            start, stop = (int(np.searchsorted(t, time, side="right")) for time in (since, until))
+            if self._fold.idle or not stop:
+                return None
+            # The snapshot is that before the row whose estimate the change begins with.
+            return event_window(self._fold, self._revision, stop - max(0, start - 1), origin=self._base, stop=stop)
+
     # Added by the engine
 
     @property

@@ -30,10 +30,12 @@ from ..live.running_fold import Running
 from ..live.runs.refits import Refits
 from ..present.drawing.colors import EITHER, THEMES
 from ..present.export.alarm_guide import alarms_text, as_html
+from ..present.result import plain
 from ..present.series.series import Series
 from ..present.state_message import StateMessage, state_message, state_schema
 from ..studies.analysis.diagnosis import Diagnosis
 from ..studies.analysis.forecast import Forecasts, question_from_json
+from ..studies.analysis.why import change_of, why_json
 from . import readings
 from .commands_json import command_from_json
 from .door import Door
@@ -155,6 +157,7 @@ class PageServer:
             Route("/api/state/stream", self._state_stream),
             get("/api/model", self._model),
             get("/api/episodes", self._episodes),
+            get("/api/why", self._why, refused=409, run=OneAtATime("attribution")),
             get("/api/annotations", self._annotations),
             get("/api/faults", self._faults),
             *readings.routes(self._engine),
@@ -220,6 +223,12 @@ class PageServer:
     def _episodes(self) -> list[dict[str, Any]]:
         """Return all episodes by their start."""
         return episodes_json(self._engine)
+
+    def _why(self, since: float, until: float) -> dict[str, Any]:
+        """Attribute the change of the estimate between two times of the charts, s."""
+        model, origin = self._engine.model, self.series.origin() or 0
+        begin, end = (origin + round(max(-1e9, min(at, 1e9)) * 1e9) for at in (since, until))
+        return dict(plain(why_json(model, change_of(self._engine, begin, end), origin)))
 
     def _annotations(self) -> list[dict[str, Any]]:
         """Return all notes of users by time."""

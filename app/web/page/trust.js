@@ -1,7 +1,7 @@
 // The strip on top: which filter, may it be trusted and if not why, NIS in its bounds, a light for each sensor.
 
 import { $, element, setAttribute, setText } from "./dom.js";
-import { clock, compact, inChartTime, span, words } from "./format.js";
+import { clock, compact, inChartTime, spaced, span, words } from "./format.js";
 
 // Signs beside the colours, for users who cannot distinguish them.
 export const SIGNS = {
@@ -147,6 +147,8 @@ const CAUSES = {
   impoverished: "few particles left", stale: "no measurements", dropped: "measurements dropped",
 };
 
+const MAX_CAUSES = 5; // of the change of one state
+
 const grouped = (n) => n.toLocaleString("en");
 
 export class Episodes {
@@ -157,7 +159,10 @@ export class Episodes {
     this.notices = [];
     this.held = []; // offsets of held-out sensors, in words
     this.counts = element("dl", { class: "counts", "aria-label": "Measurement counts" });
-    node.replaceChildren(this.counts, notes, this.body);
+    this.change = element("ol", { "aria-live": "polite" });
+    const explain = element("button", { type: "button", class: "go", title: "Of all that the charts show: by the model, each input and each sensor", onclick: () => this.explain(...this.charts.range) }, "Explain");
+    const why = element("section", { class: "why", "aria-label": "What moved the estimate" }, element("header", {}, element("h3", {}, "What moved the estimate"), explain), this.change);
+    node.replaceChildren(this.counts, notes, why, this.body);
     link.addEventListener("episodes", (event) => this.show(event.detail));
     link.addEventListener("notices", (event) => {
       // After a reconnection all arrive again.
@@ -184,6 +189,35 @@ export class Episodes {
       element("dt", {}, "measurements"), element("dd", {}, grouped(counts.readings ?? 0)),
       ...found.flatMap(([key, name, n]) => [element("dt", { title: whose(key) }, name), element("dd", { title: whose(key) }, `${grouped(n)}${key === "used" || !counts.readings ? "" : ` (${compact((100 * n) / counts.readings, 2)} %)`}`)]),
     );
+  }
+
+  // Attribute the change of each state between two times to its causes, the largest first.
+  async explain(since, until) {
+    this.change.replaceChildren(element("li", { class: "faint" }, "folding …"));
+    let found;
+    try {
+      const answer = await fetch(`/api/why?since=${since}&until=${until}`);
+      found = await answer.json();
+      if (found.error) throw new Error(found.error);
+    } catch (error) {
+      return this.change.replaceChildren(element("li", { class: "error" }, error.message));
+    }
+    this.change.replaceChildren(
+      element("li", { class: "faint" }, `${clock(found.start)} – ${clock(found.end)}`),
+      ...Object.entries(found.states).map(([name, state]) => element("li", {}, element("b", {}, words(name)), ` ${this.moved(state)}`)),
+    );
+    window.nisus.explained = (window.nisus.explained ?? 0) + 1;
+  }
+
+  moved({ unit, before, after, model, inputs, sensors, restarts, largest }) {
+    const causes = [["model", model], ["restarts", restarts], ...Object.entries(inputs), ...Object.entries(sensors)].filter(([, change]) => change);
+    causes.sort(([, a], [, b]) => Math.abs(b) - Math.abs(a));
+    const signed = (value) => `${value < 0 ? "−" : "+"}${compact(Math.abs(value), 2)}`;
+    const parts = causes.slice(0, MAX_CAUSES).map(([name, change]) => `${words(name)} ${signed(change)}`);
+    const left = causes.length > MAX_CAUSES ? `, ${causes.length - MAX_CAUSES} more` : "";
+    const [most] = largest;
+    const once = most ? `; most at once: ${words(most.sensor)} at ${clock(most.t)}, ${signed(most.change)}` : "";
+    return `${compact(before)} to ${compact(after)}${spaced(unit)}: ${parts.join(", ")}${left}${once}`;
   }
 
   // Held-out sensors have no episodes, but their offsets are shown.
@@ -221,6 +255,7 @@ export class Episodes {
       "li", { class: "episode", dataset: { open: String(episode.end === null), severity: episode.severity ?? "", grade: episode.grade } },
       element("button", { type: "button", title: "Show in the charts", onclick: show }, element("time", {}, times), element("b", {}, `${words(episode.subject)}: ${CAUSES[episode.cause] ?? episode.cause}`)),
       element("p", {}, inChartTime(episode.text, this.link.status.origin)),
+      element("button", { type: "button", class: "go", onclick: () => this.explain(episode.from, episode.to ?? this.charts.newest) }, "what moved the estimate"),
       element("a", { href: `/alarms#${episode.help.split("#")[1]}`, target: "_blank" }, `about “${CAUSES[episode.cause] ?? episode.cause}”`),
     );
   }

@@ -151,6 +151,7 @@ RUNS = {
     "tunings": "tunings lorenz63",
     "tunings compared": "tunings lorenz63 own own",
     "fold": "fold lorenz63 --duration 2",
+    "why": "why motor_winding --duration 60",
     "check": "check motor_winding --duration 60",
     "advise": "advise motor_winding --duration 60",
     "compare": "compare lorenz63 --duration 2 --estimators ekf",

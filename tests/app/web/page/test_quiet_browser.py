@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 
 from app.live.commands import Pin, SetTuning, UseSensor
-from estimators.log import READING
+from estimators.attribution import attribution
+from estimators.fold import Fold
+from estimators.log import READING, Log
 from tests.app.scripted import pull_all, wait_for
 from tests.app.web.page.browsed import PATIENCE, running, settled, until
 from tests.support import SECOND
@@ -179,3 +181,36 @@ def test_an_episode_that_is_told_at_rest_is_drawn(page, session):
     # Over again right after it was drawn: that is drawn too, a moment later.
     page.evaluate("window.nisus.charts.draw(); window.nisus.link.tell('episodes', (window.nisus.link.episodes = []))")
     wait_for(lambda: page.evaluate(strip) == before, PATIENCE)
+
+
+def test_what_moved_the_estimate_in_the_charts_is_explained(page, session):
+    """The figures of the API, which are those of the attribution over the same log, and add up to the change."""
+    page.evaluate("window.nisus.view.show(50, 60)")
+    until(page, "window.nisus.charts.range[0] === 50")
+    page.get_by_role("tab", name="Episodes").click()
+    why = page.get_by_role("region", name="What moved the estimate")
+    why.get_by_role("button", name="Explain").click()
+    until(page, "window.nisus.explained === 1")
+    engine, model = session.engine, session.engine.model
+    rows = pull_all(engine)
+    origin = int(rows.events.t[0])
+    log = Log.of(model)
+    log.extend(rows.events)
+    fold = Fold(engine.estimator, model, engine.tuning, log, policy=engine.policy, expected=engine.twin.expected)
+    found = attribution(fold, origin + 50 * SECOND, origin + 60 * SECOND)
+    answer = page.evaluate("fetch('/api/why?since=50&until=60').then((answer) => answer.json())")
+    for j, (name, state) in enumerate(answer["states"].items()):
+        assert state["model"] == found.model[j] and state["before"] == found.before[j]
+        assert list(state["inputs"].values()) == found.inputs[:, j].tolist()
+        assert list(state["sensors"].values()) == found.sensors[:, j].tolist()
+        parts = [state["model"], state["restarts"], *state["inputs"].values(), *state["sensors"].values()]
+        assert sum(parts) == pytest.approx(state["after"] - state["before"], abs=1e-9), name
+    said = why.locator("li").nth(1).inner_text()
+    name, state = next(iter(answer["states"].items()))
+    most = max({**state["inputs"], **state["sensors"], "model": state["model"]}.items(), key=lambda item: abs(item[1]))
+    assert said.startswith(name.replace("_", " ")) and f": {most[0].replace('_', ' ')} " in said
+    for span, text in (
+        ("since=-20&until=-10", "the estimate of this span is not there"),
+        ("since=9&until=9", "no event"),
+    ):
+        assert text in page.evaluate(f"fetch('/api/why?{span}').then((answer) => answer.json())")["error"]
