@@ -8,6 +8,8 @@ so that a model function that never returns does not block the interpreter.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from .compiled.model import CompiledModel
@@ -24,7 +26,7 @@ from .log import BEFORE, MAINTENANCE, MARK, TICK, TRUTH, Log
 from .model.state_space import StateSpaceModel
 from .numerics.peaks import Peak
 from .registry import find_estimator
-from .snapshots import Base, Snapshot, Snapshots, Story
+from .snapshots import Base, Blank, Snapshot, Snapshots, Story
 from .track import Track
 from .tuning import Tuning
 
@@ -107,7 +109,7 @@ class Fold:
         self._snapshots = Snapshots(self._now.state.nbytes)
         self.pictures = Pictures(model.grid, picture) if model.grid is not None else None
         self._asked = -1
-        self._remember()
+        self._remember(self._now.copy())
         self._rows = self._machine.rows(max(log.capacity, room))
 
     @property
@@ -240,8 +242,8 @@ class Fold:
             if self.pictures is not None and self.pictures.check(log, self.n):
                 self._take_picture()
             # Snapshots are dense at the end of the log, where late measurements fall, not at the end of this call.
-            boundary = self._snapshots.next_stop(log.first + self.n, log.first + log.n) - log.first
-            stop = min(end, boundary)
+            boundaries = [at - log.first for at in self._snapshots.stops(log.first + self.n, log.first + log.n)]
+            stop = min(end, boundaries[-1])
             if self.pictures is not None:
                 stop = self.pictures.next(log, self.n, stop)
             stop = self._maintenance(stop)
@@ -251,8 +253,13 @@ class Fold:
                     self._maintain(self.n)
                     self.n = stop
                 else:
-                    asking = self._run_events(self.n, stop)
+                    blanks = [(at, *self._now.blank()) for at in boundaries if at < stop]
+                    asking = self._run_events(self.n, stop, blanks)
                     stop = stop if asking < 0 else asking + 1
+                    for at, snapshot, _ in blanks:
+                        if at < stop:
+                            self.n = at
+                            self._remember(snapshot)
                     self.n = stop
                     if asking >= 0:
                         changed = self._decide(asking)
@@ -261,8 +268,8 @@ class Fold:
                 self._machine.settle()
                 self._restore(begun_at)
                 raise
-            if stop == boundary or changed:
-                self._remember(pinned=changed)
+            if stop in boundaries or changed:
+                self._remember(self._now.copy(), changed)
         return end - begun
 
     def _decide(self, row: int) -> bool:
@@ -292,9 +299,12 @@ class Fold:
         now.clock[:], now.u[:], now.state[:] = end.clock, end.u, end.state
         self._asked = -1
 
-    def _run_events(self, start: int, stop: int) -> int:
-        """Fold events in place; return the row of a measurement that asks for a decision and ends the loop, or -1."""
-        asking = self._machine.run(self.log, start, stop, self._now, self._spare, self._rows)
+    def _run_events(self, start: int, stop: int, blanks: Sequence[Blank] = ()) -> int:
+        """Fold events in place; return the row of a measurement that asks for a decision and ends the loop, or -1.
+
+        The `blanks` become snapshots at their events, all before `stop`; after a decision, the later ones stay blank.
+        """
+        asking = self._machine.run(self.log, start, stop, self._now, self._spare, self._rows, blanks)
         self._asked = stop - 1 if asking < 0 else -1
         return asking
 
@@ -333,8 +343,8 @@ class Fold:
         mean, cov = self._machine.moments(self._spare if query else self._now.state)
         self.pictures.take(self.log, self.n, mean, variances_of(cov))
 
-    def _remember(self, pinned: bool = False) -> None:
-        self._snapshots.keep(self.log.first + self.n, self.log.first, self._now.copy(), pinned)
+    def _remember(self, snapshot: Snapshot, pinned: bool = False) -> None:
+        self._snapshots.keep(self.log.first + self.n, self.log.first, snapshot, pinned)
 
     def rewind(self, index: int) -> None:
         """Go back so that the event at `index` and all after it are folded again."""

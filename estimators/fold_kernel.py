@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numba import types
 
-from .compiled.context import context_type, prior, sensor_rows, steps_of
+from .compiled.context import context_at, context_type, prior, sensor_rows, steps_of
 from .compiled.verdict import limit_of
 from .diagnostics.detector_watch import watch_rows
 from .diagnostics.health import NORMALS, assess, bounds_type, policy_type
@@ -17,7 +17,7 @@ from .gate.rejection_runs import forget, note, rule_type
 from .gate.soften import soften
 from .interpreted.fold_loop import MAX_PREDICT_STEPS, UNSET
 from .log import INPUT, MARK, READING, RESET, TICK, TRUTH
-from .numerics.jit import B1, F1, F2, I1, borrowed, borrowed_rows, floats, i64, inlined, jit, part
+from .numerics.jit import B1, F1, F2, I1, borrowed, borrowed_rows, floats, i64, inlined, ints, jit, part
 from .plausibility import pass_on, screen_reading, screen_signature
 from .track import ANCESTORS, EFFECTIVE, GATED, MISSING, NONE, SCREENED, USED, WHITENED, borrowed_columns, track_type
 
@@ -76,6 +76,8 @@ def run(
     u = borrowed(u)
     state = borrowed(state)
     spare = borrowed(spare)
+    edge = borrowed(edge)
+    doubt = borrowed_rows(doubt)
     work = borrowed(work)
     score = borrowed(score)
     value = borrowed_rows(value)
@@ -193,35 +195,60 @@ def judge(start, end, t, kind, channel, value, context, policy, bounds, evidence
     watch_rows(start, end, t, kind, channel, value, context, policy, evidence, track)
 
 
+@part
+def remember(place, clock, u, state, evidence, edge, doubt):
+    """Copy the state of a fold to the float64s at an address; the order is that of `Snapshot`."""
+    ints(place, 1)[0] = clock[0]
+    place += 8
+    for column in (u, state, evidence, edge, doubt.ravel()):
+        kept = floats(place, column.size)
+        for k in range(column.size):
+            kept[k] = column[k]
+        place += 8 * column.size
+
+
 @jit
 def run_and_judge(
-    code, context, rule, first, start, end, t, kind, channel, value, width,
-    clock, u, state, doubt, edge, spare, work, score, track, policy, bounds, evidence,
+    code, context_place, rule, first, start, stops, t, kind, channel, value, width,
+    clock, u, state, doubt, edge, spare, work, score, track, policy, bounds, evidence, places,
 ):  # fmt: skip
-    """Both in one call: of a few events, the handing over takes longer than the work."""
-    asking = run(
-        code, context, rule, first, start, end, t, kind, channel, value, width,
-        clock, u, state, doubt, edge, spare, work, score, track,
-    )  # fmt: skip
-    judge(start, end if asking < 0 else asking + 1, t, kind, channel, value, context, policy, bounds, evidence, track)
-    return asking
+    """Fold and judge events `start` to the last of `stops` (n,) in one call: of a few events, a call takes longer.
+
+    At the first stops a snapshot is written to the addresses in `places` (n or fewer,). The context is passed by its
+    address, as finding the type of a record takes as long as ten steps.
+    """
+    context = context_at(context_place)
+    for k in range(stops.size):
+        asking = run(
+            code, context, rule, first, start, stops[k], t, kind, channel, value, width,
+            clock, u, state, doubt, edge, spare, work, score, track,
+        )  # fmt: skip
+        end = stops[k] if asking < 0 else asking + 1
+        judge(start, end, t, kind, channel, value, context, policy, bounds, evidence, track)
+        if asking >= 0:
+            return asking
+        if k < places.size:
+            remember(places[k], clock, u, state, evidence, edge, doubt)
+        start = end
+    return -1
 
 
 I4 = types.int32[::1]
 _log = (I1, B1, I4, F2)
 begin_signature = types.void(code_type, context_type, F1, F2, F1)
 judge_signature = types.void(i64, i64, *_log, context_type, policy_type, bounds_type, F1, track_type)
-run_signature = i64(
-    code_type, context_type, rule_type, i64, i64, i64, *_log, i64, I1, F1, F1, F2, F1, F1, F1, F1, track_type,
-    policy_type, bounds_type, F1,
-)  # fmt: skip
+_state = I1, F1, F1, F2, F1, F1, F1, F1, track_type
+run_signature = i64(code_type, context_type, rule_type, i64, i64, i64, *_log, i64, *_state)
+run_and_judge_signature = i64(
+    code_type, i64, rule_type, i64, i64, I1, *_log, i64, *_state, policy_type, bounds_type, F1, I1
+)
 
 
 @lru_cache(maxsize=1)
 def compiled() -> tuple[Any, ...]:
     """Return the entry points, compiled for their only signatures or loaded from the cache."""
     functions = (run_and_judge, judge, begin, screen_reading)
-    signatures = (run_signature, judge_signature, begin_signature, screen_signature)
+    signatures = (run_and_judge_signature, judge_signature, begin_signature, screen_signature)
     for function, signature in zip(functions, signatures, strict=True):
         function.compile(signature.args)
     return functions

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
 
-from .compiled.context import context_of
-from .compiled.jacobians import scratch_size, sensor_jacobian
+from .compiled.context import context_of, place_of_record
+from .compiled.jacobians import constant_rows, scratch_size, sensor_jacobian
 from .compiled.model import compile_model
 from .diagnostics.detector_state import detector_context, fresh, no_baseline
 from .diagnostics.health import Bounds, HealthPolicy, chi_square_bounds
@@ -28,7 +28,7 @@ from .model.state_space import LARGE, StateSpaceModel
 from .model.wrapping import indicator
 from .numerics.quantiles import chi_square_quantile
 from .plausibility import fresh_screen, limits_of
-from .snapshots import Base, Snapshot, Story
+from .snapshots import Base, Blank, Snapshot, Story
 from .track import WHITENED, Track
 from .tuning import Tuning
 
@@ -63,6 +63,7 @@ class Machine:
         if tuning.gate is not None:
             self.gate_limits[1:] = chi_square_quantile(tuning.gate, np.arange(1, model.width + 1))
         self._seen = self._see(expected, prior)
+        self._place = place_of_record(self._seen)
         self.context: Any = self._seen
         self._in_python = model.black_box or estimator.interpreted
         if self._in_python:
@@ -79,7 +80,7 @@ class Machine:
     def _run(self) -> Callable:
         """The loop over events, compiled or loaded from the cache at first use."""
         run, judge, _, _ = compiled()
-        return partial(fold_loop.run_and_judge, judge, self._seen) if self._in_python else run
+        return partial(fold_loop.run_and_judge, judge, self.context) if self._in_python else run
 
     @cached_property
     def _begin(self) -> Callable:
@@ -102,6 +103,9 @@ class Machine:
             **limits_of(model),
             **detector_context(model, tuning.gate, self.marginal, baseline, expected),
         }
+        if model.linear and model.nu == 0:
+            rows = [len(sensor.rows) for sensor in model.sensors]
+            own["H"], own["H_mode"], self._jacobians = constant_rows(self.compiled.static, own["p"], rows, model.nx)
         self.held: dict[str, Any] = {**self.compiled.static, **own}
         if prior is not None:
             self.held["prior_mean"], self.held["prior_cov"] = prior
@@ -175,7 +179,10 @@ class Machine:
         """Return mean and covariance (beyond `LARGE` states the variances) of a filter's state."""
         return self.estimator.moments(self.options, state, self.model.nx)
 
-    def run(self, log: Log, start: int, stop: int, now: Snapshot, spare: np.ndarray, track: Track) -> int:
+    def run(
+        self, log: Log, start: int, stop: int, now: Snapshot, spare: np.ndarray, track: Track,
+        blanks: Sequence[Blank] = (),
+    ) -> int:  # fmt: skip
         """Fold events `start` to `stop` of a log into the same rows of a track.
 
         Args:
@@ -185,12 +192,13 @@ class Machine:
             now: Snapshot before `start`; becomes the one before `stop`.
             spare: Scratch of the size of `now.state`; holds the state that answered the last query.
             track: Its rows are filled.
+            blanks: Become snapshots before events between `start` and `stop`, ascending.
 
         Returns:
             The row of a measurement that asks for a decision, after which the loop stopped, or -1.
         """
         columns = log.t, log.kind, log.channel, log.value, log.width
-        return self._call(self.rule, log.first, start, stop, *columns, now, spare, track)
+        return self._call(self.rule, log.first, start, stop, *columns, now, spare, track, blanks=blanks)
 
     def run_apart(
         self, log: Log, start: int, stop: int, now: Snapshot, code: Code | None = None
@@ -217,13 +225,15 @@ class Machine:
     def _call(
         self, rule: doubt.Rule, first: int, start: int, stop: int, t: np.ndarray, kind: np.ndarray,
         channel: np.ndarray, value: np.ndarray, width: int, now: Snapshot, spare: np.ndarray, track: Track,
-        code: Code | None = None,
+        code: Code | None = None, blanks: Sequence[Blank] = (),
     ) -> int:  # fmt: skip
         """Call `fold_kernel.run_and_judge`."""
+        stops = np.array([*(at for at, _, _ in blanks), stop], np.int64)
+        places = np.array([place for _, _, place in blanks], np.int64)
         asking = self._run(
-            code or self.code, self.context, rule, first, start, stop, t, kind, channel, value, width,
+            code or self.code, self._place, rule, first, start, stops, t, kind, channel, value, width,
             now.clock, now.u, now.state, now.doubt, now.edge, spare, self.work, self.score, track,
-            self.policy, self._bounds, now.evidence,
+            self.policy, self._bounds, now.evidence, [kept for _, kept, _ in blanks] if self._in_python else places,
         )  # fmt: skip
         return int(asking)
 

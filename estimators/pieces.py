@@ -12,6 +12,7 @@ from .fold_kernel import (
     judge_signature,
     run,
     run_and_judge,
+    run_and_judge_signature,
     run_signature,
     screen_reading,
     screen_signature,
@@ -52,11 +53,10 @@ def function_of(piece: Piece) -> tuple[Any, tuple[Any, ...]]:
     if piece.of == SMOOTHER:
         return PIECES[piece.place]
     if piece.of == LOOP:
-        inner = run_signature.args[: -len(("policy", "bounds", "evidence"))]
         return (
             (judge, judge_signature.args),
-            (run, inner),
-            (run_and_judge, run_signature.args),
+            (run, run_signature.args),
+            (run_and_judge, run_and_judge_signature.args),
             (begin, begin_signature.args),
             (screen_reading, screen_signature.args),
         )[piece.place]

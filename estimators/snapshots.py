@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import accumulate, pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -48,7 +49,7 @@ class Base(NamedTuple):
 
 
 class Snapshot(NamedTuple):
-    """State of a fold before an event.
+    """State of a fold before an event, in the order of `fold_kernel.remember`.
 
     Clock (1,) in ns, inputs (nu,), state of the filter, of the detectors and of the screen, record of rejected sensors.
     """
@@ -64,10 +65,23 @@ class Snapshot(NamedTuple):
         """Return an independent copy."""
         return Snapshot(*(part.copy() for part in self))
 
+    def blank(self) -> tuple[Snapshot, int]:
+        """Return a snapshot of the same sizes for `fold_kernel.remember` to fill, and the address of its memory."""
+        _, u, state, evidence, edge, doubt = (part.size for part in self)
+        ends = list(accumulate((1, u, state, evidence, edge, doubt)))
+        block = np.empty(ends[-1])
+        parts = [block[begin:end] for begin, end in pairwise(ends)]
+        parts[-1] = parts[-1].reshape(self.doubt.shape)
+        return Snapshot(block[:1].view(np.int64), *parts), block.ctypes.data
+
     def put(self, other: Snapshot) -> None:
         """Copy the numbers of another snapshot into this one."""
         for mine, its in zip(self, other, strict=True):
             mine[:] = its
+
+
+Blank = tuple[int, Snapshot, int]
+"""Row of the event before which a snapshot is to be taken, the snapshot, and the address of its memory."""
 
 
 class Story(NamedTuple):
@@ -113,8 +127,16 @@ class Snapshots:
     def next_stop(self, at: int, end: int) -> int:
         """Return the absolute index after `at` at which a fold that goes on to `end` takes the next snapshot."""
         # Stop only for snapshots that are still kept once the fold has reached the end.
-        zones = (0, self._sparse), (end - RECENT_EVENTS, self._wider), (end - NEAR_EVENTS, self._every)
-        return min(-(-max(at + 1, begin) // stride) * stride for begin, stride in zones)
+        recent, near = max(at + 1, end - RECENT_EVENTS), max(at + 1, end - NEAR_EVENTS)
+        sparse, wider, every = self._sparse, self._wider, self._every
+        return min(-(-(at + 1) // sparse) * sparse, -(-recent // wider) * wider, -(-near // every) * every)
+
+    def stops(self, at: int, end: int) -> list[int]:
+        """Return the next stops that one call may take together: the first, and others within `PERMANENT_SPACING`."""
+        found = [self.next_stop(at, end)]
+        while found[-1] < end and (stop := self.next_stop(found[-1], end)) <= at + PERMANENT_SPACING:
+            found.append(stop)
+        return found
 
     def keep(self, at: int, first: int, snapshot: Snapshot, pinned: bool = False) -> None:
         """Keep a snapshot; drop those too close to others for their age. `first`: index of the log's first event."""

@@ -85,6 +85,12 @@ def context_of(**values: float) -> np.void:
     return np.array([tuple(values[name] for name in _FIELDS)], _layout)[0]
 
 
+def place_of_record(context: np.void) -> int:
+    """Return the address of a context, which must outlive it."""
+    assert isinstance(context.base, np.ndarray)  # a record of its own would be copied
+    return int(context.base.ctypes.data)
+
+
 @intrinsic
 def place_of(typing_context: Any, context: Any) -> Any:
     """Return the address of a context, as a parallel loop takes no records."""

@@ -6,7 +6,12 @@ Source: Squire & Trapp (1998), doi:10.1137/S003614459631241X.
 
 from __future__ import annotations
 
-from ..numerics.jit import complexes, ints, jit
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from ..numerics.jit import complexes, floats, ints, jit
 from ..numerics.linalg import wrap
 from ..numerics.workspace import layout
 from .context import (
@@ -21,8 +26,8 @@ from .context import (
     transition,
 )
 
-ANALYTIC, COMPLEX_STEP, CENTRAL = range(3)
-"""Method of a Jacobian: the model's own function, complex step, central differences."""
+ANALYTIC, COMPLEX_STEP, CENTRAL, CONSTANT = range(4)
+"""Method of a Jacobian: the model's own function, complex step, central differences, or the same at every state."""
 
 
 @layout
@@ -68,6 +73,29 @@ def complex_step_h(target, x, u, p, J, scratch):
             J[i, j] = out[i].imag / _COMPLEX_STEP
 
 
+def constant_rows(
+    static: Mapping[str, Any], p: np.ndarray, rows: list[int], nx: int
+) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
+    """Return `H` and `H_mode` of a linear model without inputs, whose dh/dx is the same at every state.
+
+    Only for complex step, which gives the same bits at every state. The arrays must outlive the context.
+
+    Args:
+        static: Entries of the compiled model.
+        p: Parameters.
+        rows: Number of rows of each sensor.
+        nx: Number of states.
+    """
+    H, mode, made = static["H"].copy(), static["H_mode"].copy(), []
+    for k in np.flatnonzero(mode == COMPLEX_STEP).tolist():
+        J = np.empty((rows[k], nx))
+        scratch = np.empty(scratch_size(nx, rows[k]))
+        complex_step_h(static["h_complex"][k], static["prior_mean"], np.empty(0), p, J, scratch)
+        H[k], mode[k] = J.ctypes.data, CONSTANT
+        made.append(J)
+    return H, mode, made
+
+
 @jit
 def state_jacobian(context, x, u, dt, F, scratch):
     """Fill F (nx, nx) with df/dx at x; `scratch` has `scratch_size` numbers."""
@@ -106,6 +134,11 @@ def sensor_jacobian(context, sensor, x, u, H, scratch):
     mode = ints(context.H_mode, context.n_sensors)[sensor]
     if mode == ANALYTIC:
         call_H(ints(context.H, context.n_sensors)[sensor], x, u, parameters(context), H)
+    elif mode == CONSTANT:
+        constant = floats(ints(context.H, context.n_sensors)[sensor], H.size)
+        for i in range(H.shape[0]):
+            for j in range(H.shape[1]):
+                H[i, j] = constant[i * H.shape[1] + j]
     elif mode == COMPLEX_STEP:
         target = ints(context.h_complex, context.n_sensors)[sensor]
         complex_step_h(target, x, u, parameters(context), H, scratch)

@@ -6,7 +6,7 @@ import numpy as np
 
 from ..compiled.context import sensor_rows, sensor_variances
 from ..log import INPUT, READING, RESET
-from ..numerics.jit import borrowed, borrowed_rows, floats, inlined, ints, part
+from ..numerics.jit import borrowed, borrowed_rows, embedded, floats, inlined, ints, part
 from ..track import (
     ADVISORY,
     DEGRADED,
@@ -79,7 +79,7 @@ def _is_copy(i, track):
     return False
 
 
-@part
+@embedded
 def _has_value(y, count):
     """Return whether a measurement has a value in any row."""
     for k in range(count):
@@ -88,7 +88,7 @@ def _has_value(y, count):
     return False
 
 
-@part
+@embedded
 def _test(i, now, y, s, context, policy, state, track):
     """Apply all tests to a measurement y of sensor s and the variances that may follow it."""
     width = track.alarms.shape[1]
@@ -107,8 +107,9 @@ def _test(i, now, y, s, context, policy, state, track):
     base = floats(context.baseline + 8 * first * (3 + TESTS), 3)
     white = base[0] == 0.0 and base[1] == 1.0 and base[2] == 0.0
     unsettled = False
-    for k in range(count):
-        unsettled |= row_part(state, sensors, first + k)[RESETTING] > 0.0
+    if count > 1:
+        for k in range(count):
+            unsettled |= row_part(state, sensors, first + k)[RESETTING] > 0.0
     if judged and context.marginal == 0 and count > 1 and white and not unsettled:
         joint = weigh_joint(own, track.nis[i], track.dof[i], h, int(own[JOINT_MASK]))
         own[JOINT_MASK] = joint
@@ -148,7 +149,7 @@ def _test(i, now, y, s, context, policy, state, track):
         state[LOST_ROWS] += (mask & LOST != 0) - (before & LOST != 0)
 
 
-@part
+@embedded
 def _count_particles(effective, ancestors, state):
     """Update whether particles are impoverished after another measurement that was used."""
     if effective < MIN_PARTICLES or ancestors < 2.0:
@@ -161,7 +162,7 @@ def _count_particles(effective, ancestors, state):
         state[POOR_CLOUD] = 0.0
 
 
-@part
+@embedded
 def _range(i, u, context, track):
     """Return the flag of a state or an input outside the range in which the model was fitted, 0 if there is none."""
     states = track.mean.shape[1]
@@ -176,7 +177,7 @@ def _range(i, u, context, track):
     return found
 
 
-@part
+@embedded
 def _health(i, now, silent, flags, state, policy, track):
     """Return the health of the twin after an event."""
     finite = True

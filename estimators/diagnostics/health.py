@@ -22,12 +22,13 @@ from numba import types
 
 from ..log import RESET
 from ..model.state_space import StateSpaceModel
-from ..numerics.jit import F1, f64, i64, inlined, jit, plain
+from ..numerics.jit import F1, borrowed, borrowed_rows, f64, i64, inlined, ints, jit, plain
 from ..numerics.quantiles import chi_square_quantile
 from ..numerics.simd import total as sum_of
 from ..track import DIVERGED, FAILED, GATED, TRACKING, USED, borrowed_columns
 
 MIN_WINDOW_EVENTS = 10  # Events in a window below which it is not judged
+MAX_EXACT = 2.0**30  # Whole numbers of which any sum over a window is exact
 MAX_ROWS_PER_READING = 20  # Rows for each measurement of the window, beyond which a measurement is too old to count
 
 
@@ -99,21 +100,19 @@ def _quantile(table, dof):
 
 
 @inlined
-def _judge(i, total, due, mean, variance, dof, used, refused, track, policy, bounds):
-    """Fill mean NIS, bounds and consistency of row i from the window that ends there."""
-    if used > 0:
-        free = free_degrees(mean, variance, dof)
-        track.nis_mean[i] = total / used
-        track.nis_low[i] = mean / free * _quantile(bounds.low, free) / used
-        track.nis_high[i] = mean / free * _quantile(bounds.high, free) / used
-    else:
-        track.nis_mean[i] = np.nan
-        track.nis_low[i] = np.nan
-        track.nis_high[i] = np.nan
-    judged = used + refused
-    track.consistency[i] = TRACKING
-    if judged >= MIN_WINDOW_EVENTS and (refused > policy.diverged_gated * judged or total > policy.diverged_nis * due):
-        track.consistency[i] = DIVERGED
+def _bounds(mean, variance, dof, used, low, high):
+    """Return the 95 % bounds of the mean NIS of `used` measurements, of tables of quantiles by degrees of freedom."""
+    free = free_degrees(mean, variance, dof)
+    return mean / free * _quantile(low, free) / used, mean / free * _quantile(high, free) / used
+
+
+@inlined
+def _all_whole(normal):
+    """Return whether the expected NIS are whole numbers, as without a baseline: sums of them have no rounding."""
+    for k in range(normal.size):
+        if not (abs(normal[k]) < MAX_EXACT and normal[k] == np.floor(normal[k])):
+            return False
+    return True
 
 
 @jit
@@ -126,11 +125,12 @@ def assess(first, last, t, kind, channel, track, normal, policy, bounds):
     """
     window = policy.window
     track = borrowed_columns(track)
+    low, high = borrowed(bounds.low), borrowed(bounds.high)
     # The window lies at `begin` to `end`, the oldest first: row, degrees of freedom (-1 if rejected), and `terms` (0 if
     # rejected): NIS, then `NORMALS`. It moves up, and back to the start when it reaches the end.
-    rows = np.empty(2 * window, np.int64)
-    dofs = np.empty(2 * window, np.int64)
-    terms = np.empty((1 + NORMALS, 2 * window))
+    room, places = np.empty((1 + NORMALS, 2 * window)), np.empty((2, 2 * window), np.int64)
+    terms = borrowed_rows(room)
+    rows, dofs = ints(places.ctypes.data, 2 * window), ints(places[1:].ctypes.data, 2 * window)
     begin = window
     end = window
     row = first - 1
@@ -139,12 +139,20 @@ def assess(first, last, t, kind, channel, track, normal, policy, bounds):
             begin -= 1
             _keep(begin, row, track, channel, normal, rows, dofs, terms)
         row -= 1
+    whole = _all_whole(normal)
     dof = 0
     used = 0
+    due = mean = variance = 0.0
     for k in range(begin, end):
         if dofs[k] >= 0:
             dof += dofs[k]
             used += 1
+        due += terms[1 + JUDGED_MEAN, k]
+        mean += terms[1 + MEAN, k]
+        variance += terms[1 + VARIANCE, k]
+    # The bounds change only with these.
+    bounded_dof, bounded_used, bounded_mean, bounded_variance = -1, -1, np.nan, np.nan
+    nis_low = nis_high = np.nan
     for i in range(first, last):
         reset = kind[i] == RESET
         judged = judges(track.verdict[i])
@@ -163,25 +171,47 @@ def assess(first, last, t, kind, channel, track, normal, policy, bounds):
                 if dofs[end] >= 0:
                     dof += dofs[end]
                     used += 1
+                due += terms[1 + JUDGED_MEAN, end]
+                mean += terms[1 + MEAN, end]
+                variance += terms[1 + VARIANCE, end]
                 end += 1
             # Drop measurements beyond the window, too old, or from before a reset.
             while begin < end and (reset or end - begin > window or i - rows[begin] >= MAX_ROWS_PER_READING * window):
                 if dofs[begin] >= 0:
                     dof -= dofs[begin]
                     used -= 1
+                due -= terms[1 + JUDGED_MEAN, begin]
+                mean -= terms[1 + MEAN, begin]
+                variance -= terms[1 + VARIANCE, begin]
                 begin += 1
             # Summed again each time: a running sum would keep the rounding of an outlier.
             total = sum_of(end - begin, terms[0, begin:])
-            due = sum_of(end - begin, terms[1 + JUDGED_MEAN, begin:])
-            mean = sum_of(end - begin, terms[1 + MEAN, begin:])
-            variance = sum_of(end - begin, terms[1 + VARIANCE, begin:])
-            _judge(i, total, due, mean, variance, dof, used, end - begin - used, track, policy, bounds)
+            if not whole:
+                due = sum_of(end - begin, terms[1 + JUDGED_MEAN, begin:])
+                mean = sum_of(end - begin, terms[1 + MEAN, begin:])
+                variance = sum_of(end - begin, terms[1 + VARIANCE, begin:])
+            if used == 0:
+                nis_low = nis_high = np.nan
+            elif dof != bounded_dof or used != bounded_used or mean != bounded_mean or variance != bounded_variance:
+                nis_low, nis_high = _bounds(mean, variance, dof, used, low, high)
+            bounded_dof, bounded_used, bounded_mean, bounded_variance = dof, used, mean, variance
+            track.nis_mean[i] = total / used if used > 0 else np.nan
+            track.nis_low[i] = nis_low
+            track.nis_high[i] = nis_high
+            kept, refused = end - begin, end - begin - used
+            track.consistency[i] = TRACKING
+            if kept >= MIN_WINDOW_EVENTS and (
+                refused > policy.diverged_gated * kept or total > policy.diverged_nis * due
+            ):
+                track.consistency[i] = DIVERGED
         else:
             track.age[i] = track.age[i - 1] + (t[i] - t[i - 1]) * 1e-9
             track.nis_mean[i] = track.nis_mean[i - 1]
             track.nis_low[i] = track.nis_low[i - 1]
             track.nis_high[i] = track.nis_high[i - 1]
             track.consistency[i] = track.consistency[i - 1]
+    # Used to the end: their views are not counted, and the memory would be given back.
+    room[0, 0], places[0, 0] = 0.0, 0
 
 
 PROBABILITY = 0.95  # Probability of the bounds in charts and reports

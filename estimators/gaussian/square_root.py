@@ -3,6 +3,10 @@
 The state is x (nx,) followed by upper U (nx, nx) with P = Uᵀ U, and the memory of an adaptation as in shared.py. P and
 S are never formed, so a standard deviation of 1e-9 beside one of 1 keeps half its digits, where P would lose 1e-18
 beside 1.
+
+With considered states the factor of the tangent filters is bordered: U = [U_e 0; U_ec U_c], U_e and U_c upper, the rows
+of the estimated states first. U_c is a factor of the considered covariance, which never changes; so a step costs
+little more than one of the estimated states alone.
 """
 
 from __future__ import annotations
@@ -13,7 +17,17 @@ from ..compiled.context import add_process_noise, circular_rows, estimated, opti
 from ..compiled.noise import has_correlated_rows, independent_rows
 from ..estimator import Options
 from ..numerics.jit import by_address, embedded, inlined, ints, part
-from ..numerics.linalg import EPSILON, add_square, remove, root, solve_transposed, solve_unit, triangularise, wrap
+from ..numerics.linalg import (
+    EPSILON,
+    add_square,
+    remove,
+    root,
+    solve_transposed,
+    solve_unit,
+    solve_upper,
+    triangularise,
+    wrap,
+)
 from ..numerics.workspace import declare_layout, start_of, take_matrix
 from ..track import FAILED, MISSING, USED
 from . import robust
@@ -40,8 +54,26 @@ Conditioning, conditioning = declare_layout(
     L="m, m = S",  # unit lower, R = L diag(d) Lᵀ, where rows are correlated
     z="2 * m",  # scratch of a weight
     V="m, m",  # scratch of a weight
+    K="n, m",  # gain, where the factor is bordered
+    B="n + m, n",  # factor of the estimated states over K √R, where it is
 )
 """Workspace of `condition` with m rows and n states whose spread has k rows."""
+
+
+@part
+def bordered_root(cov, U, first):
+    """Fill U (n, n) with the bordered factor of a covariance of `first` estimated states; False if it is indefinite."""
+    n = U.shape[0]
+    # The considered states come first while it is factored.
+    W = np.empty((n, n))
+    for i in range(n):
+        for j in range(n):
+            W[i, j] = cov[(i + first) % n, (j + first) % n]
+    good = root(W, W, n)
+    for i in range(n):
+        for j in range(n):
+            U[(i + first) % n, (j + first) % n] = W[i, j]
+    return good
 
 
 @by_address
@@ -49,7 +81,7 @@ def start(context, mean, cov, state):
     """Set the state to N(mean, cov); to NaN if cov is indefinite."""
     n = mean.size
     x, U = moments_of(state, n)
-    good = root(cov, U, n)
+    good = bordered_root(cov, U, estimated(context)) if context.n_considered > 0 else root(cov, U, n)
     for i in range(n):
         x[i] = mean[i]
         for j in range(n):
@@ -62,11 +94,12 @@ def describe(context, state, mean, std, cross):
     """Fill mean, standard deviation and the configured covariances."""
     x, U = moments_of(state, context.nx)
     shown = shown_states(context)
+    bordered = context.n_considered > 0
     for k in range(mean.size):
         i = shown[k]
         mean[k] = x[i]
         variance = 0.0
-        for j in range(i + 1):
+        for j in range(context.nx if bordered else i + 1):
             variance += U[j, i] * U[j, i]
         std[k] = np.sqrt(variance)
     pairs = ints(context.pairs, 2 * context.n_pairs)
@@ -74,7 +107,7 @@ def describe(context, state, mean, std, cross):
         i = pairs[2 * c]
         j = pairs[2 * c + 1]
         cross[c] = 0.0
-        for k in range(min(i, j) + 1):
+        for k in range(context.nx if bordered else min(i, j) + 1):
             cross[c] += U[k, i] * U[k, j]
 
 
@@ -86,7 +119,8 @@ def noise_root(context, x, u, dt, state, V, scratch):
         for j in range(n):
             V[i, j] = 0.0
     add_process_noise(context, x, u, dt, V, scratch)
-    if not root(V, V, n):
+    # Considered states have no noise.
+    if not root(V, V, estimated(context)):
         return False
     scale = robust.noise_scale(context, state)
     if scale != 1.0:
@@ -120,8 +154,8 @@ def triangularise_joint(d, m, Y, U, lost, A, w, v):
 
     Y (k, ny) holds n rows that go with U's, then rows E of the reading alone; `lost` (m,) is a row whose square is
     taken off (a negative weight), or empty; R = diag(d). W = S^-½ᵀ C, so x⁺ = x + Wᵀ S^-½ᵀ ν, and
-    U⁺ᵀ U⁺ = P - C S⁻¹ Cᵀ. Rows of U come before those of √R: a tiny √R then keeps its digits. w and v (m + n,) are
-    scratch.
+    U⁺ᵀ U⁺ = P - C S⁻¹ Cᵀ. Without U, A is the factor of S. Rows of U come before those of √R: a tiny √R then keeps its
+    digits. w and v (m + n,) are scratch.
     """
     n = U.shape[0]
     k = Y.shape[0]
@@ -145,7 +179,7 @@ def triangularise_joint(d, m, Y, U, lost, A, w, v):
         for i in range(j + 1):
             whole += A[i, j] * A[i, j]
         # Triangularising leaves errors of a few n ε of the column's length: a diagonal entry that small is no result.
-        if not (A[j, j] > 4.0 * (n + m) * EPSILON * np.sqrt(whole) and whole < np.inf):
+        if not (A[j, j] > 4.0 * ((n if n > 0 else k) + m) * EPSILON * np.sqrt(whole) and whole < np.inf):
             return False
     return True
 
@@ -192,10 +226,11 @@ def dependent_variance(A, L, k):
 
 
 @embedded
-def condition(context, sensor, y, state, expected, Y, lost, own, innovation, innovation_std, score):
+def condition(context, sensor, y, state, expected, Y, lost, own, innovation, innovation_std, score, bordered):
     """Condition on a measurement whose prediction is `expected` (ny,), and return the verdict.
 
-    Y (k, ny) and lost are those of `triangularise_joint`, for all rows; they and `expected` are overwritten.
+    Y (k, ny) and lost are those of `triangularise_joint`, for all rows; they and `expected` are overwritten. Where the
+    factor is `bordered`, Y = U Hᵀ.
 
     Source: the array algorithm of Kailath, Sayed & Hassibi, Linear Estimation (2000), chapter 12; for sigma points,
     whose (D₊ - D₋) take the place of U Hᵀ, Arasaratnam, Haykin & Hurd (2010), doi:10.1109/TSP.2010.2056923.
@@ -214,8 +249,9 @@ def condition(context, sensor, y, state, expected, Y, lost, own, innovation, inn
         make_independent(m, own.L, nu, Y, lost)
     gone = lost[: min(m, lost.size)]
     # Rows that are missing make it smaller.
-    A, _ = take_matrix(start_of(own.A), Y.shape[0] + m, m + n)
-    if not triangularise_joint(own.d, m, Y, U, gone, A, own.w, own.v):
+    spread, _ = take_matrix(start_of(U), 0 if bordered else n, 0 if bordered else n)
+    A, _ = take_matrix(start_of(own.A), Y.shape[0] + m, m + spread.shape[0])
+    if not triangularise_joint(own.d, m, Y, spread, gone, A, own.w, own.v):
         return FAILED
     row = 0
     for i in range(expected.size):
@@ -231,10 +267,13 @@ def condition(context, sensor, y, state, expected, Y, lost, own, innovation, inn
     for i in range(m):
         own.raw[i] = nu[i]
     verdict = judge(context, sensor, m, nu, A, score)
-    if verdict == USED and is_robust(context) and not reweigh_joint(context, m, nu, own, Y, U, gone, A):
+    if verdict == USED and is_robust(context) and not reweigh_joint(context, m, nu, own, Y, spread, gone, A):
         verdict = FAILED
     if verdict == USED:
-        take_over(m, nu, A, estimated(context), x, U)
+        if bordered:
+            correct_bordered(m, nu, A, own.d, Y, estimated(context), x, U, own.K, own.B, own.w)
+        else:
+            take_over(m, nu, A, estimated(context), x, U)
         wrap_mean(context, x)
         if is_adaptive(context):
             adapt(context, sensor, y, state, innovation, innovation_std, score)
@@ -262,6 +301,47 @@ def take_over(m, nu, A, estimated, x, U):
             for j in range(estimated):
                 lost[j] = 0.0
             add_square(U, n, lost)
+
+
+@part
+def correct_bordered(m, nu, A, d, Y, first, x, U, K, B, w):
+    """Correct the `first` estimated states with the gain K = C S⁻¹, S = Aᵀ A; the others stay, and so does their U_c.
+
+        U_ec ← U_ec - Y_c Kᵀ,      U_e ← triangle of [U_e - Y_e Kᵀ; √R Kᵀ],      Y = U Hᵀ
+
+    This is Joseph's form in factors: the columns of the estimated states become U ((I - K H)ᵀ), over the measurement's
+    noise. `nu` (m,) is whitened. Sources: Schmidt (1966), Application of state-space methods to navigation problems;
+    Bierman (1977), Factorization Methods for Discrete Sequential Estimation, chapter 8.
+    """
+    n = U.shape[0]
+    for j in range(first):
+        for k in range(m):
+            s = 0.0
+            for i in range(j + 1):
+                s += Y[i, k] * U[i, j]
+            for i in range(first, n):
+                s += Y[i, k] * U[i, j]
+            K[j, k] = s
+        solve_transposed(A, m, K[j])
+        for k in range(m):
+            x[j] += K[j, k] * nu[k]
+        solve_upper(A, m, K[j])
+    T, _ = take_matrix(start_of(B), first + m, first)
+    for j in range(first):
+        for i in range(n):
+            s = U[i, j]
+            for k in range(m):
+                s -= Y[i, k] * K[j, k]
+            if i < first:
+                T[i, j] = s
+            else:
+                U[i, j] = s
+        for k in range(m):
+            T[first + k, j] = np.sqrt(d[k]) * K[j, k]
+    triangularise(T, w)
+    for i in range(first):
+        for j in range(i, first):
+            U[i, j] = T[i, j]
 
 
 @part

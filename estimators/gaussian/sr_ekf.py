@@ -7,12 +7,12 @@ import numpy as np
 from ..compiled.context import estimated, expect, row_count, transition
 from ..compiled.jacobians import scratch_size, sensor_jacobian, state_jacobian
 from ..estimator import Estimator, Options
-from ..numerics.jit import by_address, inlined
+from ..numerics.jit import by_address, inlined, part
 from ..numerics.linalg import triangularise
-from ..numerics.workspace import declare_layout, size_of, start_of
+from ..numerics.workspace import declare_layout, size_of, start_of, take_matrix
 from .ekf import tune
 from .robust import OPTIONS, growth, memory
-from .shared import moments_of, no_points, state_size
+from .shared import moments_of, move_to, no_points, state_size
 from .square_root import condition, conditioning, describe, moments, noise_root, settle, start
 
 Predicting, predicting = declare_layout(
@@ -46,17 +46,15 @@ def work_size(options: Options, nx: int, ny: int) -> int:
 
 
 @inlined
-def turn(U, F, rows, a, out):
-    """Leading rows of `out` = U Fᵀ with upper U (n, n), `rows` columns times a; F is the identity beyond `rows`."""
+def turn(U, F, first, a, out):
+    """Leading rows of `out` (n or more, k) = a U Fᵀ, with F (k, n) and U upper above its border from row `first` on."""
     n = U.shape[0]
     for i in range(n):
-        for k in range(rows):
+        for k in range(out.shape[1]):
             s = 0.0
-            for j in range(i, n):
+            for j in range(i if i < first else 0, n):
                 s += U[i, j] * F[k, j]
             out[i, k] = a * s
-        for k in range(rows, out.shape[1]):
-            out[i, k] = U[i, k]
 
 
 @inlined
@@ -65,9 +63,45 @@ def advance(context, u, dt, state, own, F):
     n = context.nx
     x, U = moments_of(state, n)
     good = noise_root(context, x, u, dt, state, own.A[n:], own.scratch)
-    turn(U, F, estimated(context), np.sqrt(growth(context, dt)), own.A)
-    triangularise(own.A, own.scratch[0])
-    settle(context, own.forward, own.A, good, state)
+    grown = np.sqrt(growth(context, dt))
+    if estimated(context) < n:
+        advance_bordered(U, F, estimated(context), grown, own.A, own.scratch, own.jacobian, good)
+        for i in range(n):
+            own.forward[i] = own.forward[i] if good else np.nan
+        move_to(context, own.forward, x)
+    else:
+        turn(U, F, n, grown, own.A)
+        triangularise(own.A, own.scratch[0])
+        settle(context, own.forward, own.A, good, state)
+
+
+@part
+def advance_bordered(U, F, first, a, A, N, w, good):
+    """U_ec ← a (U_ec F_eᵀ + U_c F_cᵀ);  U_e ← triangle of [a U_e F_eᵀ; Q^½], with F = [F_e F_c; 0 I]; NaN if not good.
+
+    On entry A (2n, n) holds Q^½ from row n on; N (n, n) and w (n or more,) are scratch.
+    """
+    n = U.shape[0]
+    for i in range(first):
+        for j in range(first):
+            N[i, j] = A[n + i, j]
+    T, _ = take_matrix(start_of(A), 2 * first, first)
+    for i in range(n):
+        for k in range(first):
+            s = 0.0
+            for j in range(i if i < first else 0, first if i < first else n):
+                s += U[i, j] * F[k, j]
+            w[k] = a * s
+        for k in range(first):
+            if i < first:
+                T[i, k] = w[k]
+                T[first + i, k] = N[i, k]
+            else:
+                U[i, k] = w[k] if good else np.nan
+    triangularise(T, w)
+    for i in range(first):
+        for j in range(i, first):
+            U[i, j] = T[i, j] if good else np.nan
 
 
 @by_address
@@ -93,10 +127,12 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     own = updating(start_of(work), context.nx, row_count(context, sensor))
     sensor_jacobian(context, sensor, x, u, own.H, own.jacobian)
     expect(context, sensor, x, u, own.expected)
-    turn(U, own.H, own.H.shape[0], 1.0, own.Y)
+    bordered = context.n_considered > 0
+    turn(U, own.H, estimated(context), 1.0, own.Y)
     return condition(
-        context, sensor, y, state, own.expected, own.Y, own.nothing, own.conditioning, innovation, innovation_std, score
-    )
+        context, sensor, y, state, own.expected, own.Y, own.nothing, own.conditioning, innovation, innovation_std,
+        score, bordered,
+    )  # fmt: skip
 
 
 SR_EKF = Estimator(

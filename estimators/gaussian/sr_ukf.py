@@ -135,7 +135,7 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     if w.central >= 0.0:
         lost = lost[:0]
     return condition(
-        context, sensor, y, state, own.expected, own.Y, lost, own.conditioning, innovation, innovation_std, score
+        context, sensor, y, state, own.expected, own.Y, lost, own.conditioning, innovation, innovation_std, score, False
     )
 
 

@@ -18,6 +18,7 @@ from ..gate.rejection_runs import Rule, forget, note
 from ..gate.soften import inflation
 from ..log import INPUT, MARK, READING, RESET, TICK, TRUTH
 from ..plausibility import pass_on, screen_reading
+from ..snapshots import Snapshot
 from ..track import (
     ANCESTORS,
     EFFECTIVE,
@@ -203,13 +204,21 @@ def _soften(
     return verdict
 
 
-def run_and_judge(judge: Any, seen: np.void, *given: Any) -> int:
+def run_and_judge(judge: Any, context: Any, code: Any, place: int, *given: Any) -> int:
     """Fold events, and fill NIS windows, alarms and health of their rows; see `fold_kernel.run_and_judge`.
 
-    `judge` is the compiled function there, called with the context that `View` wraps and the rest of its arguments.
+    `judge` is the compiled function there, `context` a `View` in place of the context at the address. The last argument
+    lists snapshots to fill in place of their addresses.
     """
-    *folded, policy, bounds, evidence = given
-    _, _, _, _, start, end, t, kind, channel, value, *_, track = folded
-    asking = run(*folded)
-    judge(start, end if asking < 0 else asking + 1, t, kind, channel, value, seen, policy, bounds, evidence, track)
-    return asking
+    rule, first, start, stops, *rest, policy, bounds, evidence, kept = given
+    t, kind, channel, value, _, clock, u, state, doubt, edge, _, _, _, track = rest
+    for k, stop in enumerate(stops.tolist()):
+        asking = run(code, context, rule, first, start, stop, *rest)
+        end = stop if asking < 0 else asking + 1
+        judge(start, end, t, kind, channel, value, context.context, policy, bounds, evidence, track)
+        if asking >= 0:
+            return asking
+        if k < len(kept):
+            kept[k].put(Snapshot(clock, u, state, evidence, edge, doubt))
+        start = end
+    return -1

@@ -18,6 +18,7 @@ from app.studies.stress.scenario import plain_log
 from app.twin.log_reader import read_log
 from app.twin.twin import load_twin
 from estimators import fold_kernel
+from estimators.compiled.context import context_at
 from estimators.diagnostics.health import NORMALS, assess
 from estimators.errors import SourceError
 from estimators.fold import Fold
@@ -169,18 +170,23 @@ def bare_kernel() -> Any:
 
     @jit_brief(cache=False)
     def kernel(
-        code, context, rule, first, start, end, t, kind, channel, value, width,
-        clock, u, state, doubt, edge, spare, work, score, track, policy, bounds, evidence,
+        code, place, rule, first, start, stops, t, kind, channel, value, width,
+        clock, u, state, doubt, edge, spare, work, score, track, policy, bounds, evidence, places,
     ):  # fmt: skip
-        loop(
-            code, context, rule, first, start, end, t, kind, channel, value, width,
-            clock, u, state, doubt, edge, spare, work, score, track,
-        )  # fmt: skip
+        context = context_at(place)
         normal = floats(context.normal, NORMALS * context.n_sensors)
-        assess(start, end, t, kind, channel, track, normal, policy, bounds)
+        for k in range(stops.size):
+            loop(
+                code, context, rule, first, start, stops[k], t, kind, channel, value, width,
+                clock, u, state, doubt, edge, spare, work, score, track,
+            )  # fmt: skip
+            assess(start, stops[k], t, kind, channel, track, normal, policy, bounds)
+            start = stops[k]
+            if k < places.size:
+                fold_kernel.remember(places[k], clock, u, state, evidence, edge, doubt)
         return -1
 
-    kernel.compile(fold_kernel.run_signature.args)
+    kernel.compile(fold_kernel.run_and_judge_signature.args)
     return kernel
 
 
@@ -201,7 +207,7 @@ def defences() -> Iterator[BenchmarkRow]:
         times = np.array([[seconds(partial(again, fold)) for fold in (defended, bare)] for _ in range(9)])
         least = times[1:].min(axis=0) / log.n * 1e6
         figures = {"all [µs]": least[0], "bare [µs]": least[1], "ratio": least[0] / least[1]}
-        yield BenchmarkRow(f"{name} {estimator}", figures, (Bound("ratio", 2.0),))
+        yield BenchmarkRow(f"{name} {estimator}", figures, (Bound("ratio", 1.5),))
 
 
 CHANNELS = (100, 1_000, 4_000)

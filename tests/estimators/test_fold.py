@@ -107,7 +107,7 @@ def test_a_fold_in_pieces_stops_no_more_often_than_one():
     for size in (log.n, RECENT_EVENTS, 700):
         growing = Fold("kf", MODEL, Tuning.of(MODEL), log)
         remember, places = growing._remember, []
-        growing._remember = lambda pinned=False, of=growing, to=places, do=remember: (to.append(of.n), do(pinned))
+        growing._remember = lambda *given, of=growing, to=places, do=remember: (to.append(of.n), do(*given))
         while growing.advance(size):
             pass
         taken.append(places)
