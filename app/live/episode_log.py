@@ -21,6 +21,7 @@ from estimators.diagnostics.held_out import Offset, offsets
 from estimators.registry import find_estimator
 from estimators.track import ADVISORY, DIVERGED, HEALTH_NAMES, TRACKING, WAITING, estimated_rows
 
+from ..format_time import duration_text
 from .counts import last_run
 from .jobs import Job
 from .outputs import Pull
@@ -243,4 +244,4 @@ def _overlap(one: TrackedEpisode, other: TrackedEpisode) -> bool:
 
 def _duration(episode: Episode) -> str:
     assert episode.end is not None
-    return f"{episode.end - episode.start:.3g} s"
+    return duration_text(episode.end - episode.start)

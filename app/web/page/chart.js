@@ -363,14 +363,17 @@ const STEPS = [
   21600, 43200, 86400, 172800, 345600, 864000, 2592000, 8640000, 31536000,
 ];
 
-const timeAxis = () => ({ ...axis(), size: TIME, values: clocks, incrs: STEPS, space: 60 });
+const DAY = 86400; // s
+const [CLOCK_PX, DAY_CLOCK_PX] = [60, 84]; // px of a label, without and with a day
+
+const timeAxis = () => ({ ...axis(), size: TIME, values: clocks, incrs: STEPS, space: (self, k, low, high) => (high > DAY ? DAY_CLOCK_PX : CLOCK_PX) });
 
 function clocks(self, splits) {
   const step = splits.length > 1 ? splits[1] - splits[0] : 1;
   const fraction = step >= 1 ? 0 : Math.min(3, Math.ceil(-Math.log10(step)));
   // One at the very end would be cut off.
   const last = self.posToVal((self.over.clientWidth || self.bbox.width / devicePixelRatio) + 10 - LABEL_OVERHANG_PX, "x");
-  return splits.map((value) => (value > last ? "" : clock(value, fraction)));
+  return splits.map((value) => (value > last ? "" : step >= DAY ? `${Math.round(value / DAY)} d` : clock(value, fraction)));
 }
 
 // Labels of time alone, below a stack of charts wherever it is scrolled to.

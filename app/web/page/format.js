@@ -55,13 +55,14 @@ export function inChartTime(text, origin) {
     .replace(/since ([\d.]+) s\b/g, (_, seconds) => `since ${clock(Math.max(0, seconds - start), 1)}`);
 }
 
-// A length of time: 3.2 s, 4 min, 2.5 h.
+// A length of time: 3.2 s, 4 min, 2.5 h, 329 d.
 export function span(seconds) {
   if (seconds > 0 && seconds < 0.1) return `${Number((1000 * seconds).toPrecision(2))} ms`;
   if (seconds < 10) return `${Number(seconds.toPrecision(2))} s`;
   if (seconds < 120) return `${Math.round(seconds)} s`;
   if (seconds < 7200) return `${Math.round(seconds / 60)} min`;
-  return `${Number((seconds / 3600).toPrecision(2))} h`;
+  if (seconds < 172800) return `${Number((seconds / 3600).toPrecision(2))} h`;
+  return `${Number((seconds / 86400).toPrecision(3))} d`;
 }
 
 let labels = {}; // of the twin, by name

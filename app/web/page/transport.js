@@ -1,15 +1,18 @@
 // The bar of time: pause, step, speed, where we are, health and events on a track; click to look there.
 
 import { $, element, setAttribute, setText } from "./dom.js";
-import { clock } from "./format.js";
+import { clock, span } from "./format.js";
 import { Stream } from "./stream.js";
 import { SIGNS } from "./trust.js";
 
 const HEALTH = ["waiting", "tracking", "advisory", "suspect", "degraded", "diverged", "stale"];
 const SPEEDS = [["0.1×", 0.1], ["0.25×", 0.25], ["0.5×", 0.5], ["1×", 1], ["2×", 2], ["5×", 5], ["10×", 10], ["max", "inf"]];
 const WINDOWS = [10, 30, 60, 120, 300, 900, 3600];
+const [MIN_REPLAY_S, MAX_REPLAY_S] = [60, 3600]; // s of a replay whose speed nobody has chosen
 const POINTS = 400;
 const NEAR = 6; // px from a note
+
+const offered = ([text, value]) => element("option", { value }, text);
 
 export class Transport {
   constructor(model, link, view, charts) {
@@ -18,10 +21,10 @@ export class Transport {
     this.episodes = [];
     this.canvas = $("timeline");
     const spans = [...new Set([...WINDOWS, model.window])].sort((a, b) => a - b);
-    $("window").replaceChildren(...spans.map((s) => element("option", { value: s }, s < 60 ? `${s} s` : s < 3600 ? `${s / 60} min` : `${s / 3600} h`)), element("option", { value: "all" }, "all"));
+    $("window").replaceChildren(...spans.map((s) => element("option", { value: s }, s < 60 ? `${s} s` : s < 3600 ? `${s / 60} min` : s < 172800 ? `${s / 3600} h` : span(s))), element("option", { value: "all" }, "all"));
     $("window").value = model.recorded ? "all" : String(model.window);
     $("window").addEventListener("change", () => view.follow($("window").value === "all" ? null : Number($("window").value)));
-    $("speed").replaceChildren(...SPEEDS.map(([text, value]) => element("option", { value }, text)));
+    $("speed").replaceChildren(...SPEEDS.map(offered));
     $("speed").addEventListener("change", () => link.ask("Speed", { factor: $("speed").value === "inf" ? "inf" : Number($("speed").value) }));
     $("pause").addEventListener("click", () => this.pause());
     $("step").addEventListener("click", () => link.ask("Step"));
@@ -71,10 +74,17 @@ export class Transport {
     else this.view.hold(this.charts.range);
   }
 
+  // Speed of a replay: that of the twin, or a power of ten of it where that would take hours.
+  get pace() {
+    const [start, end] = this.extent;
+    const length = (end - start) / this.model.speed;
+    return this.model.speed * (length > MAX_REPLAY_S ? 10 ** Math.floor(Math.log10(length / MIN_REPLAY_S)) : 1);
+  }
+
   // Play from a moment on: the same log and fold, at the pace of the asset. At the end, from the start.
   async replay(from) {
     const [start, end] = this.extent;
-    if (this.status.speed === "inf" || this.status.speed === null) await this.link.ask("Speed", { factor: this.model.speed });
+    if (this.status.speed === "inf" || this.status.speed === null) await this.link.ask("Speed", { factor: this.pace });
     if (this.status.paused) await this.link.ask("Pause", { paused: false });
     await this.link.ask("Seek", { seconds: from < end ? from : start });
     this.view.follow(this.model.window);
@@ -88,7 +98,10 @@ export class Transport {
     setAttribute($("pause"), "title", ended ? "Replay from the cursor (space)" : status.seekable ? (held ? "Continue (space)" : "Pause the replay (space)") : "Hold the charts (space)");
     $("step").hidden = $("speed").hidden = !status.seekable;
     $("step").disabled = !status.paused;
-    if (status.seekable && document.activeElement !== $("speed")) this.offerSpeed(String(status.speed ?? 1));
+    if (status.seekable && document.activeElement !== $("speed")) {
+      if (ended) this.offerSpeed(String(this.pace));
+      this.offerSpeed(String(status.speed ?? 1));
+    }
     setText($("state"), status.finished ? "ended" : status.paused ? "paused" : "");
     const now = status.origin && status.t !== null ? this.now : NaN;
     setText($("now"), clock(now, 1));
@@ -96,7 +109,9 @@ export class Transport {
 
   // A speed from the command line may be another than those of the list.
   offerSpeed(value) {
-    if (![...$("speed").options].some((option) => option.value === value)) $("speed").append(element("option", { value }, `${value}×`));
+    const known = [...$("speed").options];
+    // In its place among them.
+    if (!known.some((option) => option.value === value)) $("speed").insertBefore(offered([`${Number(value).toLocaleString("en")}×`, value]), known.find((option) => !(Number(option.value) < Number(value))));
     $("speed").value = value;
   }
 

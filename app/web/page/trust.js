@@ -236,7 +236,7 @@ export class Episodes {
       element("h3", {}, open.length ? `Now (${open.length})` : `Now: no faults${this.held.length ? " in the sensors in use" : ""}`),
       list(open, (item) => this.entry(item)),
       this.held.length ? element("h3", {}, "Held out") : "",
-      list(this.held, (text) => element("li", { class: "event held-out" }, element("span", {}, text))),
+      list(this.held, (text) => element("li", { class: "event held-out" }, element("span", {}, inChartTime(text, this.link.status.origin)))),
       over.length ? element("h3", {}, `Before (${over.length})`) : "",
       list(over.slice(0, MAX_EPISODES), (item) => this.entry(item)),
       element("h3", {}, "Events"),

@@ -14,6 +14,8 @@ const FEW_STATES = 6; // up to so many, those that nobody measures have more roo
 const LASTING = 5; // rejected measurements in a row, from which they are in view: an offset lasts, a spike does not
 const UNBOUNDED = 100; // times the band, or the value itself, beyond which a protection level is shown as unbounded
 
+const NOISE = /_(disturbance|error)$/;
+
 const MEASURED = {
   reading: () => dots("reading", 4),
   held: () => dots("reading", 5, true),
@@ -22,7 +24,9 @@ const MEASURED = {
 };
 
 export default function (charts) {
-  const states = charts.model.states.toSorted((a, b) => (a.rows.length > 0) - (b.rows.length > 0));
+  // Those that nobody measures first; what only models noise with memory last.
+  const rank = ({ name, rows }) => (rows.length ? 1 : NOISE.test(name) ? 2 : 0);
+  const states = charts.model.states.toSorted((a, b) => rank(a) - rank(b));
   const grouped = new Set(groupsOf(states).flatMap(({ members }) => members.map((state) => state.name)));
   return states.slice(0, MAX_CHARTS).map((state) => ({ ...chartOf(charts, state), further: grouped.has(state.name) }));
 }
@@ -44,7 +48,7 @@ function chartOf(charts, state) {
     unit: bracketed(state.unit),
     note: !state.rows.length ? "not measured" : state.rows.length > drawn.length ? `measurements of ${drawn.length} of ${state.rows.length} sensors` : null,
     help: "Estimate ± 2σ; in brackets the protection level: the largest error that one undetected fault can cause",
-    weight: state.rows.length || charts.model.states.length > FEW_STATES ? 1 : 1.5,
+    weight: state.rows.length || NOISE.test(state.name) || charts.model.states.length > FEW_STATES ? 1 : 1.5,
     columns: [...Object.values(own), ...measured],
     // What matters most lies on top: the band over the measurements that are as expected.
     series: {

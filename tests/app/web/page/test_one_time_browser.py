@@ -123,6 +123,35 @@ def test_a_recording_opens_folded_and_is_replayed_from_the_cursor(visit):
         assert np.array_equal(pull_all(engine).track.mean, track.track.mean)
 
 
+LONG = """model: motor_winding
+estimator: kf
+prior: {temperature: {mean: 40, std: 5}, rate: {mean: 0, std: 0.001}}
+noise: {temperature: {variance: 0.001}, rate: {variance: 1e-12}}
+sensors: {winding: {std: 2}}
+time: {degraded_after: 20000, stale_after: 80000, tick: 3600}
+source: {type: table, files: month.csv, time: {column: t, unit: h}, sensors: {winding: {columns: T}}}
+view: {window: 720000}
+"""
+
+
+def test_a_month_is_replayed_in_minutes_and_its_axis_counts_days(tmp_path, visit):
+    rng = np.random.default_rng(0)
+    rows = np.column_stack([np.arange(30 * 24), 40 + np.cumsum(rng.normal(0, 1, 30 * 24))])
+    np.savetxt(tmp_path / "month.csv", rows, delimiter=",", header="t,T", comments="")
+    (tmp_path / "month.yaml").write_text(LONG)
+    with running(str(tmp_path / "month.yaml"), None) as session:
+        page = visit(session.url)
+        until(page, "window.nisus.link.status.finished && !window.nisus.view.following")
+        labels = page.evaluate("window.nisus.charts.axis.plot.axes[0]._values")
+        assert len(labels) > 5 and all(label == "" or label.endswith(" d") for label in labels)
+        assert "8.33 d" in page.locator("#window").inner_text()
+        # 30 days at real time would show a row an hour: 10,000 times faster they take 4 minutes.
+        page.locator("#pause").click()
+        wait_for(lambda: session.engine.status().speed == 1e4 and not session.engine.status().finished, PATIENCE)
+        until(page, "window.nisus.charts.newest > 20 * 3600")
+        page.screenshot(path=tmp_path / "replay.png")
+
+
 STRIP = """() => ["health", "nis", "cause", "stage-time"].map((id) => document.getElementById(id).textContent)"""
 
 
