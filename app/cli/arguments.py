@@ -120,6 +120,8 @@ class PageOptions:
     """Folder of recordings and of logs dropped on the page; created when needed."""
     no_browser: Flag = False
     """Print the URL without opening a browser."""
+    tokens: Path | None = None
+    """File of tokens for other programs, a line NAME ROLE TOKEN each; roles are view, feed, tune and admin."""
     duration: float | None = None
     """Stop after this many seconds."""
 

@@ -16,6 +16,7 @@ from ..terminal import complain
 from ..views.recording.rrd_file import NEVER, TAKEN, parse_split
 from ..web.door import check_port
 from ..web.gallery.gallery import StartRequest
+from ..web.gate import read_tokens
 from ..web.session import Page, Session
 from .open_twin import FileOpener, live_source, open_session, opened_review, opened_twin
 from .options import settings
@@ -25,12 +26,18 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from ..live.compilers import Compiler
-    from .arguments import RunCommand
+    from .arguments import PageOptions, RunCommand
 
 
 __all__ = ["live_source", "run_twin"]
 
 MAX_FAILURES = 5  # failures that a run without a page prints at its end
+
+
+def page_of(arguments: PageOptions) -> Page:
+    """Return the page that the options describe."""
+    grants = () if arguments.tokens is None else read_tokens(arguments.tokens)
+    return Page(arguments.port, not arguments.no_browser, grants)
 
 
 def run_twin(arguments: RunCommand, workers: Sequence[Compiler] = ()) -> int:
@@ -47,7 +54,7 @@ def run_twin(arguments: RunCommand, workers: Sequence[Compiler] = ()) -> int:
     if arguments.json and not arguments.headless:
         raise ConfigError("--json: is the result of a run without a page; give --headless")
     split = NEVER if arguments.record_split is None else parse_split(arguments.record_split)
-    page = None if arguments.headless else Page(arguments.port, not arguments.no_browser)
+    page = None if arguments.headless else page_of(arguments)
     opening, wanted, opener = None, None, FileOpener()
     if arguments.twin is not None:
         wanted = StartRequest(arguments.twin)
@@ -112,7 +119,7 @@ def open_review(path: Path, page: Page | None, recordings: Path = Path()) -> tup
 
 def review_recording(arguments: ReviewCommand) -> int:
     """Run the command."""
-    page = Page(arguments.port, not arguments.no_browser)
+    page = page_of(arguments)
     session, _ = open_review(arguments.file, page, arguments.recordings)
     session.run(record=None, duration=arguments.duration, until_finished=False)
     return 0

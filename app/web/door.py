@@ -31,7 +31,7 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from estimators.errors import ConfigError
 
-from .gate import Gate, with_security_headers
+from .gate import Gate, Grant, with_security_headers
 
 SERVICE_RESTART = 1012
 """Close code of a WebSocket whose application is replaced."""
@@ -165,8 +165,8 @@ class ShownApplication:
 class Door:
     """Serves its own routes, then the present application, in a thread."""
 
-    def __init__(self, port: int) -> None:
-        """Take the port; 0 takes a free one.
+    def __init__(self, port: int, grants: Sequence[Grant] = ()) -> None:
+        """Take the port; 0 takes a free one. `grants` are tokens of other programs.
 
         Raises:
             ConfigError: If the port is not free.
@@ -182,7 +182,7 @@ class Door:
         self._loop: asyncio.AbstractEventLoop | None = None
         former = FormerSessions(port) if port else None  # a free port is another one next time
         known = former.digests() if former is not None else []
-        gate = Gate(with_security_headers(self._enter, self.port), self._token, self.port, known)
+        gate = Gate(with_security_headers(self._enter, self.port), self._token, self.port, known, grants)
         if former is not None:
             former.keep([gate.digest, *known])
         self.entered = gate.entered

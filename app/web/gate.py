@@ -12,13 +12,19 @@ from __future__ import annotations
 
 import hashlib
 import hmac
+import os
 import re
+import stat
 import threading
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
+from pathlib import Path
+from typing import NamedTuple
 
 from starlette.datastructures import Headers, MutableHeaders, QueryParams
 from starlette.responses import HTMLResponse, PlainTextResponse, RedirectResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from estimators.errors import ConfigError, nearest, shown_name
 
 LOOPBACK_HOST = re.compile(r"(127\.0\.0\.1|localhost|\[::1\])(:\d{1,5})?", re.IGNORECASE)
 
@@ -41,12 +47,89 @@ COMMON_HEADERS = {
 }
 
 
+VIEW, FEED, TUNE, ADMIN = ROLES = ("view", "feed", "tune", "admin")
+"""Roles of tokens in a file: to read, to send measurements, to read and change, and all."""
+
+READINGS = "/api/readings"
+
+MIN_TOKEN_CHARACTERS = 16
+
+
+class Grant(NamedTuple):
+    """A token of a file: the name of its user, its role, and the digest of the token."""
+
+    name: str
+    role: str
+    digest: str
+
+    def allows(self, needed: str) -> bool:
+        """Return whether the role includes what a request needs."""
+        return needed == self.role or self.role == ADMIN or (self.role == TUNE and needed == VIEW)
+
+
+def read_tokens(path: Path) -> tuple[Grant, ...]:
+    """Return the tokens of a file with a line NAME ROLE TOKEN for each; # begins a comment.
+
+    Raises:
+        ConfigError: If others can read the file, or a line is wrong.
+    """
+    try:
+        with path.open(encoding="utf-8") as file:
+            mode = os.fstat(file.fileno()).st_mode
+            lines = file.read().splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"--tokens {path}: cannot be read ({error}); check the path") from None
+    if os.name == "posix" and mode & (stat.S_IRWXG | stat.S_IRWXO):
+        raise ConfigError(f"--tokens {path}: other users can read it; chmod 600 {path}")
+    found: list[Grant] = []
+    for number, line in enumerate(lines, 1):
+        words, where = line.partition("#")[0].split(), f"{path}:{number}: "
+        if not words:
+            continue
+        if len(words) != 3:
+            raise ConfigError(f"{where}has {len(words)} words; it must be NAME ROLE TOKEN")
+        name, role, token = words
+        if role not in ROLES:
+            raise ConfigError(f"{where}role {shown_name(role)} is not known; {nearest(role, ROLES)}")
+        if len(token) < MIN_TOKEN_CHARACTERS:
+            raise ConfigError(
+                f"{where}the token of {name} has {len(token)} letters; give at least {MIN_TOKEN_CHARACTERS}, "
+                "for example of `openssl rand -hex 24`"
+            )
+        if name in [grant.name for grant in found] or _digest(token) in [grant.digest for grant in found]:
+            raise ConfigError(f"{where}{name} or its token is there twice; give each user one token")
+        found.append(Grant(name, role, _digest(token)))
+    return tuple(found)
+
+
+def needed_role(scope: Scope) -> str:
+    """Return the role that a request needs."""
+    if scope["path"] == READINGS and scope.get("method") == "POST":
+        return FEED
+    if scope["path"].startswith(STAGE.rstrip("/")):
+        return TUNE  # the scene has controls
+    if scope["type"] == "websocket" or scope["method"] in ("GET", "HEAD"):
+        return VIEW
+    return ADMIN if scope["path"].startswith("/api/gallery/") else TUNE
+
+
 class Gate:
     """Lets a request through to an application, or answers 403 with one line."""
 
-    def __init__(self, app: ASGIApp, token: str, port: int, former: Collection[str] = ()) -> None:
-        """`former`: `digest` of sessions before at this port, whose open pages may return and get the new cookie."""
+    def __init__(
+        self, app: ASGIApp, token: str, port: int, former: Collection[str] = (), grants: Sequence[Grant] = ()
+    ) -> None:
+        """Prepare for an application.
+
+        Args:
+            app: The application.
+            token: The session's own, which allows everything.
+            port: That is served.
+            former: `digest` of sessions before at this port, whose open pages may return and get the new cookie.
+            grants: Tokens of other programs.
+        """
         self._app, self._token, self._former = app, token, frozenset(former)
+        self._grants = tuple(grants)
         self.entered = threading.Event()
         """Set once a browser has shown the token."""
         # The cookie is not the token, so that it does not reveal the address.
@@ -88,12 +171,24 @@ class Gate:
             return self._exchange(same_site)
         if scope["path"] in OPEN_PATHS or shows_token or framed or self._is_known(headers) or self._is_former(headers):
             return None
-        return _refusal(REFUSED_TOKEN)
+        return self._refused(scope, headers)
+
+    def _refused(self, scope: Scope, headers: Headers) -> ASGIApp | None:
+        """Return the answer to a request without the session's token; None if one of a file allows it."""
+        shown = hashlib.sha256(_bearer(headers).encode()).hexdigest()
+        held = [grant for grant in self._grants if hmac.compare_digest(grant.digest, shown)]
+        if not held:
+            return _refusal(REFUSED_TOKEN)
+        needed = needed_role(scope)
+        if scope["path"] == READINGS and scope.get("method") == "GET" and held[0].allows(FEED):
+            needed = FEED  # the names of the values, which a sender asks for
+        if held[0].allows(needed):
+            return None
+        return _refusal(f"Nisus: the token of {held[0].name} has the role {held[0].role}; this needs {needed}.\n")
 
     def _is_known(self, headers: Headers) -> bool:
         """Return whether a request has the cookie, or the token as a header."""
-        kind, _, token = (_single(headers, "authorization") or "").partition(" ")
-        if kind.lower() == "bearer" and _equals([token.strip()], self._token):
+        if _equals([_bearer(headers)], self._token):
             return True
         return any(_equals([cookie], self._cookie) for cookie in _cookies(headers))
 
@@ -126,6 +221,12 @@ class Gate:
         }
         # After a link on another page, the strict cookie would not be sent along a redirect.
         return RedirectResponse("/", 303, headers) if same_site else HTMLResponse(FORWARD, headers=headers)
+
+
+def _bearer(headers: Headers) -> str:
+    """Return the token of the header, empty without one."""
+    kind, _, token = (_single(headers, "authorization") or "").partition(" ")
+    return token.strip() if kind.lower() == "bearer" else ""
 
 
 def _cookies(headers: Headers) -> list[str]:

@@ -25,6 +25,7 @@ from ..live.commands import Record
 from ..terminal import EndRequest, complain, restore, when_asked_to_end
 from ..views.recording.rrd_file import NEVER, Split
 from .door import Door
+from .gate import Grant
 from .running import OpenedTwin, RunningTwin
 
 if TYPE_CHECKING:
@@ -49,10 +50,11 @@ SWITCH_INTERVAL_S = 0.0005
 
 @dataclass(frozen=True)
 class Page:
-    """Port of the page, and whether to open it in a browser."""
+    """Port of the page, whether to open it in a browser, and tokens of other programs."""
 
     port: int
     open_browser: bool
+    grants: tuple[Grant, ...] = ()
 
 
 def _settle(gone: threading.Event | None = None, before: Callable[[], Engine | None] | None = None) -> None:
@@ -128,7 +130,7 @@ class Session:
         """Notes of users on the twins that ran before, by twin and log."""
         self.threads: list[SessionThread] = []
         if page is not None:
-            self.door = Door(page.port)
+            self.door = Door(page.port, page.grants)
         try:
             if opening is not None:
                 self.running = self.prepared(opening)

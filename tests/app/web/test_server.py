@@ -7,7 +7,7 @@ import pytest
 
 from app.live.engine import Engine
 from app.web import viewer_assets as assets_module
-from app.web.gate import Gate
+from app.web.gate import Gate, read_tokens
 from app.web.server import PageServer
 from app.web.viewer_assets import FILES, viewer_assets, viewer_version
 from estimators.errors import ConfigError
@@ -50,15 +50,15 @@ def test_a_session_keeps_its_token_and_its_cookie(monkeypatch, tmp_path):
     server.stop()
 
 
-def ask(gate, path="/", query="", **headers):
-    """Status and headers that a gate answers a GET with; 299 is the application behind it."""
+def ask(gate, path="/", query="", method="GET", **headers):
+    """Status and headers that a gate answers with; 299 is the application behind it."""
     sent = []
 
     async def send(message):
         sent.append(message)
 
     raw = [(name.replace("_", "-").encode(), value.encode()) for name, value in headers.items()]
-    scope = {"type": "http", "method": "GET", "path": path, "query_string": query.encode(), "headers": raw}
+    scope = {"type": "http", "method": method, "path": path, "query_string": query.encode(), "headers": raw}
     asyncio.run(gate(scope, None, send))
     return sent[0]["status"], dict(sent[0]["headers"]), sent[1]["body"] if len(sent) > 1 else b""
 
@@ -87,6 +87,59 @@ def test_a_script_may_send_the_token_as_a_header():
     gate = Gate(behind, "t" * 40, 9900)
     assert ask(gate, "/api/status", host="127.0.0.1:9900", authorization="Bearer " + "t" * 40)[0] == 299
     assert ask(gate, "/api/status", host="127.0.0.1:9900", authorization="Bearer " + "x" * 40)[0] == 403
+
+
+def tokens_file(folder, text, mode=0o600):
+    path = folder / "tokens"
+    path.write_text(text)
+    path.chmod(mode)
+    return path
+
+
+ALLOWED = {
+    "view": {"GET /", "GET /api/status", "GET /metrics"},
+    "feed": {"GET /api/readings", "POST /api/readings"},
+    "tune": {"GET /", "GET /api/status", "GET /metrics", "POST /api/command", "GET /viser/"},
+}
+
+
+@pytest.mark.parametrize("role", ["view", "feed", "tune", "admin"])
+def test_a_token_of_a_file_opens_what_its_role_allows(tmp_path, role):
+    token = "secret-of-another-program"
+    grants = read_tokens(tokens_file(tmp_path, f"# who may do what\n\nprometheus {role} {token}  # since Monday\n"))
+    assert token not in repr(grants)
+    gate = Gate(behind, "t" * 40, 9900, grants=grants)
+    every = [
+        "GET /", "GET /api/status", "GET /metrics", "GET /api/readings", "POST /api/readings", "POST /api/command",
+        "GET /viser/", "POST /api/gallery/recordings/delete",
+    ]  # fmt: skip
+    allowed = ALLOWED.get(role, set(every)) | ({"GET /api/readings"} if role in ("view", "tune") else set())
+    for words in every:
+        method, path = words.split()
+        headers = {"host": "127.0.0.1:9900", "authorization": f"Bearer {token}"}
+        status, _, body = ask(gate, path, method=method, **headers)
+        assert status == (299 if words in allowed else 403), words
+        if status == 403:
+            assert body.startswith(f"Nisus: the token of prometheus has the role {role}; this needs ".encode())
+        assert ask(gate, path, method=method, host="127.0.0.1:9900", authorization="Bearer secret")[0] == 403
+        assert ask(gate, path, method=method, **headers, origin="http://elsewhere")[0] == 403
+
+
+@pytest.mark.parametrize(
+    ("text", "mode", "reason"),
+    [
+        ("grafana view 0123456789abcdef\n", 0o640, "other users can read it; chmod 600"),
+        ("grafana view\n", 0o600, ":1: has 2 words; it must be NAME ROLE TOKEN"),
+        ("\ngrafana veiw 0123456789abcdef\n", 0o600, ":2: role veiw is not known; did you mean view?"),
+        ("grafana view 0123\n", 0o600, ":1: the token of grafana has 4 letters; give at least 16"),
+        ("a view 0123456789abcdef\na tune 0123456789abcdeg\n", 0o600, ":2: a or its token is there twice"),
+        ("a view 0123456789abcdef\nb tune 0123456789abcdef\n", 0o600, ":2: b or its token is there twice"),
+    ],
+)
+def test_a_wrong_file_of_tokens_is_one_line(nisus, tmp_path, text, mode, reason):
+    path = tokens_file(tmp_path, text, mode)
+    assert reason in nisus.refuses("run", "motor_winding", "--no-browser", "--tokens", path)
+    assert "cannot be read" in nisus.refuses("run", "motor_winding", "--tokens", tmp_path / "none")
 
 
 def test_the_cookie_of_one_port_does_not_open_another():
