@@ -58,6 +58,14 @@ class TwinCollector:
             for verdict, count in zip(VERDICT_NAMES[1:], counts[1:], strict=True):
                 measurements.add_metric([message.twin, sensor, verdict], float(count))
         yield measurements
+        problems = CounterMetricFamily(
+            "nisus_problems",
+            "Reported problems: frames lost, wrong times, failures and others.",
+            labels=["twin", "kind"],
+        )
+        for kind, count in self._engine.notices.counts().items():
+            problems.add_metric([message.twin, kind], float(count))
+        yield problems
         if self._states:
             labels = ["twin", "state", "unit"]
             mean = GaugeMetricFamily("nisus_state_mean", "Estimate of a valid state, in its unit.", labels=labels)

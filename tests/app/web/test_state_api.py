@@ -2,8 +2,10 @@
 
 import http.client
 import json
+import re
 import sys
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import jsonschema
@@ -168,6 +170,23 @@ def test_metrics_are_those_of_the_message(page):
     labels = ("state", first["name"]), twin, ("unit", first["unit"])
     found = samples("?states=true")
     assert (found["nisus_state_mean", *labels], found["nisus_state_std", *labels]) == (first["value"], first["std"])
+
+
+def test_problems_are_counted_by_kind_and_the_dashboard_asks_for_what_there_is(page):
+    page.engine.notices.report("frames lost", "the socket dropped 3 frames", times=3)
+    families = list(text_string_to_metric_families(page.client.get("/metrics?states=true").text))
+    (problems,) = (family for family in families if family.name == "nisus_problems")
+    assert [(item.labels["kind"], item.value) for item in problems.samples] == [("frames lost", 3.0)]
+    # Without a sample, as there is no clock to measure the latency by, a metric has the label of its twin.
+    known = {family.name: {"twin"} for family in families}
+    known |= {item.name: set(item.labels) for family in families for item in family.samples}
+    panels = json.loads(Path("docs/grafana.json").read_text())["panels"]
+    asked = [target["expr"] for panel in panels for target in panel["targets"]]
+    assert len(asked) > 8
+    for expression in asked:
+        for name, labels in re.findall(r"\b((?:nisus|process)_\w+)(?:\{([^}]*)\})?", expression):
+            assert name in known, expression
+            assert set(re.findall(r"(\w+)[!=]", labels)) <= known[name], expression
 
 
 def test_metrics_name_the_package_that_they_need(page, monkeypatch):
