@@ -12,6 +12,9 @@ export class Stage {
     Object.assign(this, { there, theme, link });
     this.frame = $("stage");
     this.choices = {};
+    // Until its document is there, which a busy server sends late, the frame is blank.
+    setAttribute($("scene"), "data-loading", there ? "" : null);
+    this.frame.addEventListener("load", () => this.frame.hasAttribute("src") && setAttribute($("scene"), "data-loading", null));
     $("stage-alone").href = this.address(false);
     $("stage-large").addEventListener("click", () => this.enlarge());
     this.enlarge(localStorage.getItem(LARGE) === "1");
@@ -47,7 +50,10 @@ export class Stage {
     if (!this.there) return;
     if (!seen) this.frame.removeAttribute("src");
     // After the charts: three.js takes its time.
-    else if (!this.frame.hasAttribute("src")) this.frame.src = this.address(true);
+    else if (!this.frame.hasAttribute("src")) {
+      setAttribute($("scene"), "data-loading", "");
+      this.frame.src = this.address(true);
+    }
   }
 
   // Scene and charts change places.

@@ -23,6 +23,20 @@ def asked(session):
     return sorted(addresses(session.running.view.server))
 
 
+AFTER = "getComputedStyle(document.getElementById('scene'), '::after').content"
+
+
+def test_a_scene_whose_document_comes_late_is_announced(visit, session):
+    page = visit(session.url)
+    held = []
+    page.route("**/viser/?*", lambda route: held.append(route))
+    page.reload()
+    wait_for(lambda: held or page.evaluate("1") is None, PATIENCE)
+    assert "Loading the scene" in page.evaluate(AFTER)
+    held[0].continue_()
+    until(page, f"{AFTER} === 'none'")
+
+
 def test_the_scene_is_chosen_enlarged_and_opened_alone(visit, session):
     assert asked(session) == [] and session.running.view.history.n == 0
     page = visit(session.url)
