@@ -11,7 +11,7 @@ from estimators.errors import EstimatorError
 from estimators.fold import Fold, fold
 from estimators.log import INPUT, READING, RESET, TICK, TRUTH, Events, Log
 from estimators.registry import ESTIMATORS
-from estimators.snapshots import RECENT_EVENTS
+from estimators.snapshots import RECENT_EVENTS, Snapshot
 from estimators.track import FAILED, GATED, HELD_OUT, MISSING, NONE, USED
 from estimators.tuning import Tuning
 from tests.estimators.linear_models import ROWS, random_linear, random_log
@@ -113,6 +113,20 @@ def test_a_fold_in_pieces_stops_no_more_often_than_one():
         taken.append(places)
     assert taken[0] == taken[1] == taken[2]
     assert sum(place <= log.n - RECENT_EVENTS for place in taken[0]) == 2 * RECENT_EVENTS // 1024
+
+
+def test_snapshots_of_one_call_are_those_of_single_events(estimator):
+    """A call takes up to 16 snapshots. Each has clock, inputs, filter, detectors, screen and gates event by event."""
+    log = as_log(everything(np.random.default_rng(7), 700))
+    at_once, single = (Fold(estimator, MODEL, Tuning.of(MODEL), log) for _ in range(2))
+    at_once.advance()
+    while single.advance(1):
+        pass
+    places = at_once.snapshots.places
+    assert places == single.snapshots.places and len(places) > 8
+    for at in places:
+        for name, mine, its in zip(Snapshot._fields, at_once.snapshots[at], single.snapshots[at], strict=True):
+            np.testing.assert_array_equal(mine, its, f"{name} before event {at}")
 
 
 @pytest.mark.parametrize("size", [1, 50, None], ids=["event by event", "in pieces", "at once"])

@@ -152,3 +152,34 @@ def test_models_that_ship_are_analytic_or_say_why(name):
         pytest.skip("a field that only ensembles estimate: no filter asks for its derivatives")
     static = compile_model(MODELS[name]).static
     assert static["F_mode"] != CENTRAL
+
+
+def hold(x, u, p, dt, out):
+    out[0] = x[0]
+
+
+def scaled(x, u, p, out):
+    out[0] = p[0] * x[0]
+
+
+@pytest.mark.parametrize("estimator", ["kf", "ekf", "sr-kf"])
+def test_h_of_a_linear_model_is_that_of_the_parameters_in_use(estimator):
+    """H is computed once per tuning: y = p x of x ~ N(1, 4) with noise 0.25 has the variance 4 p² + 0.25."""
+    model = StateSpaceModel(
+        name="scaled",
+        title="scaled",
+        states=(State("x", "1", mean=1.0, std=2.0),),
+        noises=(Noise("x", "1/s", variance=0.01),),
+        sensors=(Sensor("y", (Row("y", "1", 0.25),), h=scaled),),
+        f=hold,
+        parameters=(Parameter("gain", "1", 2.0),),
+        linear=True,
+    )
+    log = Log.of(model)
+    log.extend(Events.one(0, 0, READING, 0, 3.0, 1))
+    for gain in (2.0, 5.0):
+        fold = Fold(estimator, model, Tuning.of(model).set("p.gain", gain), log)
+        fold.advance()
+        S = 4.0 * gain**2 + 0.25
+        assert fold.track.innovation_std[0, 0] == pytest.approx(np.sqrt(S), rel=1e-12)
+        assert fold.track.mean[0, 0] == pytest.approx(1.0 + 4.0 * gain / S * (3.0 - gain), rel=1e-12)
