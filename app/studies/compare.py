@@ -40,6 +40,7 @@ class Outcome(NamedTuple):
     lost: float
     refused: float
     nis_dof: float = 1.0
+    nis_judged: float = np.nan
 
 
 def draws(entry: Estimator) -> bool:
@@ -161,6 +162,7 @@ def outcome_of(fold: Fold, events: Events, seconds: float, scored: tuple[int, in
         lost=lost.size / len(track),
         refused=result.refused if result.gated else 0.0,
         nis_dof=result.nis_dof,
+        nis_judged=result.nis_verdict.measure,
     )
 
 
@@ -178,6 +180,7 @@ def row_of(
         seconds_per_step=min(outcome.seconds_per_step for outcome in outcomes),
         options=options,
         nis_dof=float(np.mean([outcome.nis_dof for outcome in outcomes])),
+        nis_judged=float(np.mean([outcome.nis_judged for outcome in outcomes])),
         seeds=len(outcomes),
         span=span,
         diverged=len(since),

@@ -26,6 +26,8 @@ NIS_PER_DOF = "NIS / dof"
 SPAN, EVENTS, LENGTH = "span [s]", "events", "log [s]"
 LOST = "diverged [% of events]"
 REFUSED = "refused [%]"
+JUDGED = "NIS judged"  # mean NIS that the bounds of a baseline judge, where it is another
+MIN_JUDGED_CHANGE = 0.005  # relative, from which on it is another
 
 
 class Spread(NamedTuple):
@@ -39,6 +41,7 @@ class Spread(NamedTuple):
 class FilterScore:
     """Scores of one filter on a log.
 
+    `nis_judged` is the mean NIS that is compared with the bounds: of a baseline, rejected measurements take part.
     `rmse` by unit: the root mean square over the states of that unit whose truth is known, or, where no truth is,
     over the sensors held out. `nis` and its bounds are per measurement, of `nis_dof` degrees of freedom. `coverage` is
     the share of those errors inside their 95 % band. `span` is the part of the log that was folded, s, or None for all
@@ -55,6 +58,7 @@ class FilterScore:
     seconds_per_step: float
     options: Mapping[str, float]
     nis_dof: float = 1.0
+    nis_judged: float = np.nan
     seeds: int = 1
     span: float | None = None
     diverged: int = 0
@@ -82,6 +86,7 @@ def cells(rows: Sequence[FilterScore], events: int, seconds: float) -> list[dict
     """
     units = list(dict.fromkeys(unit for row in rows for unit in row.rmse))
     gated = any(row.refused > 0.0 for row in rows)
+    judged = {row.estimator: abs(row.nis_judged / row.nis.value - 1.0) > MIN_JUDGED_CHANGE for row in rows}
     found = []
     for row in rows:
         line = {"filter": row.estimator}
@@ -91,6 +96,8 @@ def cells(rows: Sequence[FilterScore], events: int, seconds: float) -> list[dict
         low, high = row.nis_bounds
         dof = "" if row.failure else f"{row.nis_dof:.6g}"
         line |= {"NIS low": _number(low, ".3f"), "NIS high": _number(high, ".3f"), DOF: dof}
+        if any(judged.values()):
+            line[JUDGED] = _number(row.nis_judged, ".4g") if judged[row.estimator] else ""
         line |= _figure(BAND, Spread(100.0 * row.coverage.value, 100.0 * row.coverage.spread), decimals=1)
         line |= {
             COST: _text(Spread(1e6 * row.seconds_per_step), digits=3),
@@ -179,6 +186,8 @@ def _notes(line: Mapping[str, str]) -> str:
     if int(line["diverged"]):
         seeds = f"in {line['diverged']} of {line['seeds']} " if int(line["seeds"]) > 1 else ""
         notes.append(f"diverged {seeds}at {line['diverged at [s]']} s, {line[LOST]} % of events")
+    if line.get(JUDGED):
+        notes.append(f"NIS {float(line[JUDGED]) / float(line[DOF]):.3g} with rejected readings, as its bounds")
     if line.get(REFUSED, "") not in ("", "0"):
         notes.append(f"rejected {line[REFUSED]} % of the readings")
     if line[SPAN]:

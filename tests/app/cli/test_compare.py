@@ -146,6 +146,17 @@ def test_what_the_gate_refuses_is_told_where_it_refuses_anything():
     assert "refused [%]" not in LINES[0]
 
 
+def test_bounds_of_a_baseline_come_with_the_nis_that_they_judge():
+    """A baseline counts rejected measurements: a NIS of 0.98 inside bounds of 1.09 to 2.47 would read as below them."""
+    row = FilterScore("ekf", {}, Spread(1.07), (1.2, 2.7), Spread(np.nan), 1e-6, {}, nis_dof=1.1, nis_judged=1.804)
+    lines = cells([row, replace(row, estimator="ukf", nis_judged=1.071)], 10, 1.0)
+    assert [line["NIS judged"] for line in lines] == ["1.804", ""]
+    _, _, first, second = printed("car", lines)
+    assert first.split()[:5] == ["ekf", "0.9727", "1.091", "to", "2.455"]
+    assert first.endswith("NIS 1.64 with rejected readings, as its bounds") and "rejected" not in second
+    assert "NIS judged" not in cells([replace(row, nis_judged=1.07)], 10, 1.0)[0]
+
+
 def test_the_share_refused_is_that_of_a_fold():
     twin = load_twin("motor_winding", overrides={"gate": "0.8"})
     events = read_log(twin, 60)[0].events
