@@ -36,8 +36,8 @@ function chartOf(charts, state) {
   const { live } = charts;
   const drawn = state.rows.slice(0, MAX_SENSORS);
   const measured = drawn.flatMap((row) => Object.keys(MEASURED).map((kind) => `${kind}:${row}`));
-  // Of a twin that considers parameters: the part of the band that is noise.
-  const inner = charts.model.columns.includes(`noise_upper:${state.name}`) ? ["noise_upper", "noise_lower"] : [];
+  // Of a twin that considers parameters: the part of the band that is noise. The file of a report has one shade.
+  const inner = charts.model.columns?.includes(`noise_upper:${state.name}`) ? ["noise_upper", "noise_lower"] : [];
   const own = Object.fromEntries(["upper", "lower", ...inner, "truth", "mean"].map((kind) => [kind, `${kind}:${state.name}`]));
   const marked = (kinds) => Object.fromEntries(measured.filter((name) => kinds.includes(name.split(":")[0])).map((name) => [name, MEASURED[name.split(":")[0]]()]));
   const level = () => charts.integrity?.[state.name]?.bound;
