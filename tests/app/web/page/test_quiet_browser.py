@@ -74,7 +74,7 @@ def test_every_innovation_is_drawn_from_afar_in_a_new_tab_and_after_an_edit(page
         if revision == settled_at:
             session.engine.submit(SetTuning("R.winding", 3.0))
             settled(session.engine, settled_at + 1)
-            until(page, f"window.nisus.charts.live.revision === {settled_at + 1}")
+            until(page, f"window.nisus.revision === {settled_at + 1}")  # of what is drawn
 
 
 def test_dragging_across_a_part_of_a_chart_zooms_to_exactly_that_part(page):
