@@ -208,7 +208,9 @@ class Tuning:
 
     def _changed(self, **entries: Any) -> Tuning:
         name = self.name if self.name.endswith(CHANGED_MARK) else self.name and self.name + CHANGED_MARK
-        return replace(self, version=next(_versions), name=name, **entries)
+        changed = replace(self, version=next(_versions), name=name, **entries)
+        vars(changed)["_places"] = self._places  # of the model: hundreds of kept runs share it
+        return changed
 
     def _without_noise(self, rows: Any) -> bool:
         """Return whether the model declares zero noise for these rows; only then do all its filters support it."""

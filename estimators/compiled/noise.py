@@ -15,7 +15,8 @@ import numpy as np
 
 from ..numerics.jit import floats, ints, jit, part
 from ..numerics.linalg import unit_factor
-from .context import call_Q, parameters, process_variances, sensor_rows, sensor_variances
+from ..numerics.symmetric import symmetric_eigen
+from .context import call_Q, parameters, prior, process_variances, sensor_rows, sensor_variances
 
 _SMALL = 1e-13
 """A pivot below this part of its diagonal is rounding: its direction has no noise of its own."""
@@ -76,6 +77,29 @@ def belief_root(P, L):
         for i in range(L.shape[0]):
             for j in range(L.shape[1]):
                 L[i, j] = np.sqrt(max(P[i, i], 0.0)) if i == j else 0.0
+
+
+@jit
+def lost_root(context, first, P, root):
+    """Fill a root L (k, k) of C - P: prior covariance C of the states from `first` on, less their covariance P (k, k).
+
+    Chance makes P larger than C in some directions; L has no columns there. Returns False if P is not finite.
+    """
+    _, C = prior(context)
+    count = root.shape[0]
+    A, V, values = np.empty((count, count)), np.empty((count, count)), np.empty(count)
+    for i in range(count):
+        for j in range(count):
+            # In units of the prior's deviations, so that none of them drowns in rounding errors of another.
+            scale = np.sqrt(C[first + i, first + i] * C[first + j, first + j])
+            A[i, j] = (C[first + i, first + j] - P[i, j]) / scale
+    if not symmetric_eigen(A, count, values, V, np.empty(3 * count)):
+        return False
+    for k in range(count):
+        length = np.sqrt(max(values[k], 0.0))
+        for i in range(count):
+            root[i, k] = length * V[k, i] * np.sqrt(C[first + i, first + i])
+    return True
 
 
 @jit

@@ -233,7 +233,7 @@ def reading_words(
         why = "Q too small, or a state is missing" if correlation.value > 0.0 else "Q too large"
         said.append(f"{name}: innovations are correlated ({_figures(correlation, '+.2f')}): {why}")
     if refused.beyond(0.0, limits.refused):
-        said.append(f"{name}: the gate refuses {_share(refused)} of the readings")
+        said.append(f"{name}: the gate rejects {_share(refused)} of the measurements")
     return tuple(said)
 
 

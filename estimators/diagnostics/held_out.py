@@ -44,15 +44,12 @@ class Offset(NamedTuple):
     def words(self) -> str:
         """Description in one sentence."""
         unit = "" if self.unit == "1" else f" {self.unit}"
-        whom = "the model alone predicts" if self.alone else "the others say"
+        others = "the model alone" if self.alone else "the other sensors"
         side = "above" if self.offset > 0 else "below"
+        size, expected = f"{abs(self.offset):.2g}{unit} {side}", f"±{self.allowed:.2g}{unit} expected"
         if self.beyond:
-            return (
-                f"{self.row}, held out, reads {abs(self.offset):.2g}{unit} {side} what {whom}, "
-                f"beyond the ±{self.allowed:.2g}{unit} that they leave open"
-            )
-        where = f"{abs(self.offset):.2g}{unit} {side}, where they leave ±{self.allowed:.2g}{unit} open"
-        return f"{self.row}, held out, reads as {whom}: {where}"
+            return f"{self.row}, held out: {size} the prediction of {others}, {expected}"
+        return f"{self.row}, held out: agrees with {others} ({size} the prediction, {expected})"
 
 
 def offsets(events: Events, track: Track, tuning: Tuning) -> list[Offset]:

@@ -10,18 +10,21 @@ import numpy as np
 
 from ..compiled.context import (
     circular_rows,
+    estimated,
     expect,
+    prior,
     sensor_rows,
     sensor_variances,
 )
-from ..compiled.noise import has_correlated_rows, independent_rows
+from ..compiled.noise import has_correlated_rows, independent_rows, lost_root
 from ..compiled.verdict import verdict_of
 from ..estimator import Options
 from ..model.state_space import LARGE
 from ..numerics.jit import jit
 from ..numerics.linalg import solve_transposed, solve_upper, wrap
 from ..numerics.normal_score import student_score
-from ..numerics.simd import WIDE, add_scaled
+from ..numerics.random import key_of, normal
+from ..numerics.simd import WIDE, add_scaled, dot
 from ..numerics.symmetric import factor, gram
 from ..numerics.workspace import (
     after,
@@ -32,7 +35,16 @@ from ..numerics.workspace import (
 from ..track import FAILED, MISSING, WHITENED
 from .blocks import regression_at, transform_at
 from .localisation import between_rows, crews, localised
-from .shared import THREADED_FROM, count_ranks, ensemble, forecast_at, members
+from .shared import (
+    CONSIDER,
+    THREADED_FROM,
+    column_mean,
+    count_ranks,
+    covariance,
+    ensemble,
+    forecast_at,
+    members,
+)
 
 
 def side_of(options: Options, ny: int) -> int:
@@ -251,6 +263,60 @@ def judge_reading(context, sensor, m, a, score):
     for k in range(m):
         log_det += np.log(a.r[k])
     return verdict_of(context, sensor, m, nis, log_det, score)
+
+
+@jit
+def reconsider(context, index, X):
+    """Give considered states c the moments of their prior again, after an analysis without perturbations moved them.
+
+    c ← c - c̄ + c₀ + L z, z ~ N(0, I), with L Lᵀ = C - P_cc, as for particles (particle/draws.py): P - K S Kᵀ remains in
+    the other states and their covariance with c, which is Schmidt's filter. The draws are made orthogonal to the
+    anomalies, so that no covariance changes by chance, where there are members enough; otherwise only their mean is 0.
+    An inflation does not act on c.
+    """
+    first = estimated(context)
+    N, n = X.shape
+    count = n - first
+    if count == 0:
+        return
+    mean, C = prior(context)
+    others = n if N > n + count else 0
+    Z, P, root = np.empty((others + count, N)), np.empty((count, count)), np.zeros((count, count))
+    for j in range(first, n):
+        middle = column_mean(X, j)
+        variance = covariance(X, j, middle, j, middle)
+        shrunk = np.sqrt(C[j, j] / variance) if variance > C[j, j] else 1.0
+        for i in range(N):
+            X[i, j] = mean[j] + shrunk * (X[i, j] - middle)
+    for j in range(count):
+        for k in range(j + 1):
+            P[j, k] = covariance(X, first + j, mean[first + j], first + k, mean[first + k])
+            P[k, j] = P[j, k]
+    if not lost_root(context, first, P, root):
+        return
+    key = key_of(context.seed, index, CONSIDER)
+    for j in range(others + count):
+        z = Z[j]
+        total, size = 0.0, 0.0
+        for i in range(N):
+            z[i] = X[i, j] if j < others else normal(key, np.uint64(i * count + j - others))
+            total += z[i]
+        for i in range(N):
+            z[i] -= total / N
+            size += z[i] * z[i]
+        # Twice: the second time takes away what rounding left.
+        for _ in range(2):
+            for k in range(j):
+                add_scaled(N, -dot(N, z, Z[k]), Z[k], z)
+        left = dot(N, z, z)
+        # Anomalies that depend on those before them are rounding.
+        scale = 1.0 / np.sqrt(left) if left > 1e-20 * size else 0.0
+        for i in range(N):
+            z[i] *= scale
+    for j in range(count):
+        for k in range(count):
+            for i in range(N):
+                X[i, first + j] += np.sqrt(N - 1.0) * root[j, k] * Z[others + k, i]
 
 
 @jit

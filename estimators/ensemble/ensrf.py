@@ -19,7 +19,7 @@ from ..compiled.context import options as numbers
 from ..numerics.jit import jit
 from ..numerics.simd import add_scaled
 from ..track import USED
-from .analysis import begin_analysis, find_places, work_size
+from .analysis import begin_analysis, find_places, reconsider, work_size
 from .blocks import ROTATION, regress_all, rotate
 from .localisation import between_rows, prepare
 from .shared import (
@@ -81,6 +81,7 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     find_places(m, a.rows, a.places)
     regress_all(context, sensor, X, a.places, a.ZT, a.B, True, given[INFLATION], int(given[CREWS]), rest)
     rotate(context, index, X, a, rest)
+    reconsider(context, index, X)
     finish(context, index, X, rest)
     return USED
 
@@ -94,6 +95,7 @@ ENSRF = ensemble_filter(
     fails_when="few members of many states without a radius: chance covariances; the spread collapses",
     source="Whitaker & Hamill (2002), doi:10.1175/1520-0493(2002)130<1913:EDAWPO>2.0.CO;2",
     functions=(start, predict, update, describe),
+    considers=True,
     work_size=work_size,
     prepare=prepare,
 )

@@ -21,7 +21,7 @@ from ..numerics.jit import jit
 from ..numerics.simd import add_scaled
 from ..numerics.symmetric import gram, symmetric_eigen
 from ..track import FAILED, USED
-from .analysis import begin_analysis, work_size
+from .analysis import begin_analysis, reconsider, work_size
 from .blocks import ROTATION, rotate_members, transform_all
 from .shared import (
     CREWS,
@@ -131,6 +131,7 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     index = next_draw(context, state)
     if not transform_members(context, index, m, a, X, rest):
         return FAILED
+    reconsider(context, index, X)
     finish(context, index, X, rest)
     return USED
 
@@ -143,5 +144,6 @@ ETKF = ensemble_filter(
     fails_when="few members of many states: chance covariances move states that the reading does not depend on",
     source="Hunt, Kostelich & Szunyogh (2007), doi:10.1016/j.physd.2006.11.008",
     functions=(start, predict, update, describe),
+    considers=True,
     work_size=work_size,
 )

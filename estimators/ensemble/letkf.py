@@ -21,7 +21,7 @@ from ..numerics.simd import WIDE, add_scaled, dot, scaled
 from ..numerics.symmetric import gram
 from ..numerics.workspace import declare_layout, share, size_of, start_of
 from ..track import FAILED, USED
-from .analysis import begin_analysis, find_places, work_size
+from .analysis import begin_analysis, find_places, reconsider, work_size
 from .blocks import ROTATION, block_at, load, rotate, store
 from .etkf import transform_members
 from .localisation import localised, prepare, reached
@@ -177,6 +177,7 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
         rotate(context, index, X, a, rest)
     elif not transform_members(context, index, m, a, X, rest):
         return FAILED
+    reconsider(context, index, X)
     finish(context, index, X, rest)
     return USED
 
@@ -190,6 +191,7 @@ LETKF = ensemble_filter(
     fails_when="radius too long for the members (chance covariances) or too short for the physics",
     source="Hunt, Kostelich & Szunyogh (2007), doi:10.1016/j.physd.2006.11.008",
     functions=(start, predict, update, describe),
+    considers=True,
     work_size=lambda options, nx, ny: work_size(
         options, nx, ny, size_of(local_at, members(options), ny, min(ny, members(options)))
     ),

@@ -47,7 +47,7 @@ SIZE, INFLATION, ADDITIVE, CREWS, OWN = range(5)
 """Positions in the context's options; the last is the filter's own option."""
 
 
-PROCESS, START, PERTURB, SPREAD, ROTATE, RANK = range(6)
+PROCESS, START, PERTURB, SPREAD, ROTATE, RANK, CONSIDER = range(7)
 """Streams of randomness; see numerics/random.py."""
 
 

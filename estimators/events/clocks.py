@@ -28,8 +28,9 @@ since events do not name their source.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Mapping, Sequence
+from copy import deepcopy
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -81,6 +82,32 @@ class ClockGuard:
     def held(self) -> int:
         """Number of held events."""
         return len(self._held)
+
+    def state(self) -> dict[str, Any]:
+        """Return a copy of the state, of arrays, lists and numbers, for `restore`."""
+        return {
+            "clocks": self._state.copy(),
+            "shift": self._shift.copy(),
+            "steps": self._steps.copy(),
+            "runs": {row: vars(deepcopy(run)) for row, run in self._runs.items()},
+            "held": tuple(self._held),
+            "raw": self._raw,
+        }
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Continue from the `state` of another guard of the same sensors, of which JSON may have made lists.
+
+        Raises:
+            ValueError: If it is of other sensors, or no such state.
+        """
+        clocks, shift = (np.array(state[name], np.int64) for name in ("clocks", "shift"))
+        if clocks.shape != self._state.shape or shift.shape != self._shift.shape:
+            raise ValueError("it is of other sensors")
+        self._state, self._shift, self._steps = clocks, shift, list(state["steps"])
+        self._raw = np.array(state["raw"], np.int64)
+        held = Events(*map(np.array, state["held"])) if self._raw.size else Events.empty(0)
+        self._held = plain_events(held)
+        self._runs = {int(row): HeldRun.restored(run) for row, run in state["runs"].items()}
 
     def take(self, batch: Events) -> Passed:
         """Take the next events, in order of arrival, and return those that may enter the log now."""
@@ -382,6 +409,14 @@ class HeldRun:
         self.t: list[int] = []
         self.top = self.begun = self.arrived = self.highest = self._lowest = 0
         self._on_time: deque[tuple[int, int, int]] = deque()
+
+    @staticmethod
+    def restored(fields: Mapping[str, Any]) -> HeldRun:
+        """Return the run of these fields, of which JSON may have made lists."""
+        run = HeldRun(False, False, 0, 0, 0)
+        vars(run).update(fields)
+        run._on_time = deque(map(tuple, fields["_on_time"]))
+        return run
 
     @property
     def full(self) -> bool:

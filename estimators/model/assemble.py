@@ -313,6 +313,16 @@ def _width(k, x, u, distances):
 
 
 @inlined
+def _within(value, low, high):
+    """Return the value, or the end of the range beyond which it lies."""
+    if value.real < low:
+        return low
+    if value.real > high:
+        return high
+    return value
+
+
+@inlined
 def _fill(full, x, u, p, n, place, ends, distances):
     """Fill p(θ, δ, η): the model's own parameters, with moved and considered ones held within their ranges."""
     for k in range(place.shape[0]):
@@ -323,12 +333,7 @@ def _fill(full, x, u, p, n, place, ends, distances):
         value = x[n + j] if own < 0 else p[own] + x[n + j] if j >= 0 else p[own] + 0.0 * x[n]
         if out >= 0:
             value = value + _width(k, x, u, distances) * x[n + out]
-        if value.real < ends[k, 0]:
-            full[k] = ends[k, 0]
-        elif value.real > ends[k, 1]:
-            full[k] = ends[k, 1]
-        else:
-            full[k] = value
+        full[k] = _within(value, ends[k, 0], ends[k, 1])
 
 
 @inlined

@@ -20,7 +20,8 @@ class State:
 
     `position` is for filters that localise measurements. `fitted` is the range in which the model was fitted or
     checked; an estimate outside makes the twin suspect, or advisory if the bands widen there (`widens`). `withhold` is
-    the half-width of its 95 % band beyond which it is not shown as an estimate.
+    the half-width of its 95 % band beyond which it is not shown as an estimate. `limits` are its physical limits: no
+    error is larger than the distance between them.
     """
 
     name: str
@@ -32,10 +33,12 @@ class State:
     fitted: tuple[float, float] | None = None
     widens: bool = False
     withhold: float = math.inf
+    limits: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
         """Reject an empty range."""
         check_range(f"state {self.name}: fitted", self.fitted)
+        check_range(f"state {self.name}: limits", self.limits)
 
 
 @dataclass(frozen=True)

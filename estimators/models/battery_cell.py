@@ -202,7 +202,7 @@ BATTERY_CELL = StateSpaceModel(
     name="battery_cell",
     title="Lithium-ion cell, state of charge and temperature",
     states=(
-        State("soc", "1", mean=0.5, std=0.3),
+        State("soc", "1", mean=0.5, std=0.3, limits=(0.0, 1.0)),
         State("v1", "V", mean=0.0, std=0.02),
         State("temperature", "°C", mean=25.0, std=3.0, fitted=TEMPERATURES),
     ),

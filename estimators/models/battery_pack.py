@@ -135,7 +135,7 @@ BATTERY_PACK = StateSpaceModel(
         state
         for k in NUMBERS
         for state in (
-            State(f"soc_{k}", "1", mean=0.8, std=0.1),
+            State(f"soc_{k}", "1", mean=0.8, std=0.1, limits=(0.0, 1.0)),
             State(f"v1_{k}", "V", mean=0.0, std=0.02),
             State(f"temperature_{k}", "°C", mean=25.0, std=3.0, fitted=TEMPERATURES),
         )

@@ -32,7 +32,7 @@ from .cloud import (
     own_covariance,
     score_cloud,
 )
-from .draws import recover, start
+from .draws import reconsider, recover, start
 from .innovation import finite_rows
 from .proposals import (
     PROPOSE,
@@ -118,6 +118,7 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
         log_sum += second
         if log_sum > -np.inf:
             keep(context, second, state, work)
+            reconsider(context, index, state)
             score_cloud(state, score)
     score[2] = log_sum if log_sum > -np.inf else np.nan
     if verdict == FAILED or (verdict == USED and not log_sum > -np.inf):
@@ -136,5 +137,6 @@ APF = Estimator(
     functions=(start, predict, update, describe),
     runs=lambda options, nx: 2 * options["particles"],
     prepare=phases(move_block, expect_block, propose_block),
+    considers=True,
     **(WAITING | {"options": tuple(option for option in OPTIONS if option.name != "fraction")}),
 )

@@ -7,10 +7,9 @@ import math
 import numpy as np
 
 from ..compiled.context import circular_states, estimated, jump_chances
-from ..compiled.noise import add_noise, belief_root
+from ..compiled.noise import add_noise, belief_root, lost_root
 from ..numerics.jit import floats, jit, matrix
 from ..numerics.random import GAMMA, key_of, mix, normal, unit, word
-from ..numerics.symmetric import symmetric_eigen
 from .cloud import (
     CONSIDER,
     HEAD,
@@ -174,22 +173,10 @@ def reconsider(context, index, state):
     if count == 0:
         return
     cloud = own_cloud(context, state)
-    prior = matrix(floats(context.prior_cov, nx * nx), 0, nx, nx)
     mean = floats(context.prior_mean, nx)
-    A, V, values = np.empty((count, count)), np.empty((count, count)), np.empty(count)
-    for i in range(count):
-        for j in range(count):
-            # In units of the prior's deviations, so that none of them drowns in rounding errors of another.
-            scale = np.sqrt(prior[first + i, first + i] * prior[first + j, first + j])
-            A[i, j] = (prior[first + i, first + j] - cloud.cov[first + i, first + j]) / scale
-    if not symmetric_eigen(A, count, values, V, np.empty(3 * count)):
-        return
     root = np.zeros((count, count))
-    for k in range(count):
-        # Chance makes some variances of the cloud larger than the prior's.
-        length = np.sqrt(max(values[k], 0.0))
-        for i in range(count):
-            root[i, k] = length * V[k, i] * np.sqrt(prior[first + i, first + i])
+    if not lost_root(context, first, cloud.cov[first:, first:], root):
+        return
     key = key_of(context.seed, index, CONSIDER)
     z = np.empty(count)
     for member in range(cloud.records.shape[0]):

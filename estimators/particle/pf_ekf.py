@@ -26,7 +26,7 @@ from .cloud import (
     own_covariance,
     score_cloud,
 )
-from .draws import recover, start
+from .draws import reconsider, recover, start
 from .innovation import finite_rows
 from .proposals import (
     PROPOSE,
@@ -123,6 +123,7 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     score[2] = log_sum if log_sum > -np.inf else np.nan
     if verdict == USED and log_sum > -np.inf:
         keep_or_resample(context, key_of(context.seed, index, RESAMPLE), log_sum, state, work)
+        reconsider(context, index, state)
         score_cloud(state, score)
     elif verdict == USED or verdict == FAILED:
         verdict = FAILED
@@ -140,5 +141,6 @@ PF_EKF = Estimator(
     functions=(start, predict, update, describe),
     runs=lambda options, nx: 3 * options["particles"],
     prepare=phases(move_block, expect_block, propose_block),
+    considers=True,
     **WAITING,
 )

@@ -6,7 +6,8 @@ states given their whole past; a measurement updates it like a Kalman filter and
 The estimate is the mixture of these Gaussians. States that are integrated exactly need no particles: the variance is
 never larger than that of `pf` with as many. With nothing to sample it is the Kalman filter.
 
-The mode and the sampled states move as the model predicts, without regard to the next measurement.
+The mode and the sampled states move as the model predicts, without regard to the next measurement. Considered states
+are sampled, and have their prior again after each measurement, see `reconsider`.
 
 Sources: Doucet, de Freitas, Murphy & Russell (2000), Rao-Blackwellised particle filtering for dynamic Bayesian
 networks, UAI 2000, section 3; Schön, Gustafsson & Nordlund (2005), Marginalized particle filters for mixed
@@ -17,7 +18,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..compiled.context import circular_states, sensor_variances
+from ..compiled.context import circular_states, estimated, sensor_variances
 from ..estimator import Estimator, Option, Options
 from ..gaussian.shared import admit
 from ..model.state_space import StateSpaceModel
@@ -47,7 +48,7 @@ from .cloud import (
     wrap_record,
 )
 from .cloud import OPTIONS as CLOUD_OPTIONS
-from .draws import any_mode, jump_key, lost_moments, nearest_mode, reset
+from .draws import any_mode, jump_key, lost_moments, nearest_mode, reconsider, reset
 from .innovation import finite_rows, score_rows
 from .rbpf_blocks import (
     ADOPT,
@@ -133,6 +134,8 @@ def _recover(context, index, state):
         if context.mode >= 0:
             drop(C, context.mode)
             mode = any_mode(context, jump_key(key), i)
+        for j in range(estimated(context), nx):
+            drop(C, j)
         _spread(context, C, False, key, i, mode, records[i, :nx], own_covariance(records[i], nx), column, before)
     begin_lineage(context, state)
     state[SETTLED] = 0.0
@@ -180,6 +183,7 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
         score[2] = log_sum
     if verdict == USED and log_sum > -np.inf:
         keep_or_resample(context, key_of(context.seed, index, RESAMPLE), log_sum, state, work)
+        reconsider(context, index, state)
         score_cloud(state, score)
     elif verdict == USED or (verdict == FAILED and not score[0] == np.inf):
         verdict = FAILED
@@ -227,6 +231,7 @@ RBPF = Estimator(
     work_size=work_size,
     prepare=phases(predict_block, condition_block, adopt_block),
     applies=applies,
+    considers=True,
     **(
         SHARED
         | {

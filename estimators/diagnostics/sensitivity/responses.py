@@ -122,6 +122,9 @@ class Start(NamedTuple):
         if nudge.kind == SCALE:
             own, _, predicted = self._predicted(model.sensor_names[sensor])
             value[own, column] += size * predicted[:, column]
+        elif nudge.kind == SPIKES:
+            spikes = own[min(SPIKE_PERIOD, own.size) // 2 :: SPIKE_PERIOD]
+            value[spikes, column] += size * (-1.0) ** np.arange(spikes.size)
         else:
             value[own, column] += size if nudge.kind == SENSOR else size * 1e-9 * (other.t[own] - other.t[0])
         return self.refold(log=other)
@@ -280,16 +283,20 @@ MAX_RELATIVE_SIZE = 10.0  # of a parameter's value, up to which a size is given 
 DRIFT = "drift"  # Kind of a nudge that grows in proportion to the time since the first event, of a sensor row
 SCALE, INPUT_SCALE = "scale", "input scale"  # Of a sensor row and of an input: factor, less 1
 DELAY = "delay"  # Of a sensor, s
+SPIKES = "spikes"  # Size of spikes in every `SPIKE_PERIOD`-th measurement of a sensor row, of alternating sign
 SWAP = "swap"  # Of the names of two sensors with the same units, 0 or 1
 STUCK, INPUT_STUCK = "stuck", "input stuck"  # Of a sensor and of an input: the first value is repeated, 0 or 1
 SWITCHED = (SWAP, STUCK, INPUT_STUCK)  # Kinds that are there or not
 R_, Q_ = NOISES = ("R", "Q")  # Factor on a variance, less 1
 FROM_PRIOR = (PRIOR, *NOISES)  # Kinds that are there from the prior on
-CATALOGUE = (*KINDS, DRIFT, SCALE, INPUT_SCALE, DELAY, *SWITCHED, *FROM_PRIOR)
+CATALOGUE = (*KINDS, DRIFT, SCALE, INPUT_SCALE, DELAY, SPIKES, *SWITCHED, *FROM_PRIOR)
+BY_ALARMS = (*NOISES, DELAY, SPIKES)  # Kinds that change the noise of innovations, so that alarms judge them
+
+SPIKE_PERIOD = 100  # Measurements from one spike to the next
 
 SWAPPED = " and "  # Between the names of two sensors
 
-MAX_DELAY_S, MAX_DELAY_PERIODS, MAX_DELAY_SHARE = 10.0, 10.0, 0.1
+MAX_DELAY_S, MAX_DELAY_PERIODS, MAX_DELAY_SHARE = 10.0, 10.0, 0.2
 """Delay of a sensor at most: seconds or periods, whichever is longer, and share of the log."""
 
 MAX_SCALE = 0.5  # Largest relative error of a scale
@@ -304,6 +311,7 @@ square, that of rounding 1e-16 over it."""
 
 WORDS = {
     DRIFT: "drift of",
+    SPIKES: "spikes of",
     SCALE: "scale of",
     INPUT_SCALE: "scale of input",
     DELAY: "delay of",
@@ -362,7 +370,7 @@ class Nudge(NamedTuple):
     @property
     def target(self) -> tuple[str, str]:
         """What is at fault, sensor, input, parameter, prior, swap or noise, and its name."""
-        if self.kind in (DRIFT, SCALE, DELAY, STUCK, R_):
+        if self.kind in (DRIFT, SCALE, DELAY, SPIKES, STUCK, R_):
             return SENSOR, self.name
         return (INPUT_ if self.kind in (INPUT_SCALE, INPUT_STUCK) else self.kind), self.name
 
@@ -414,6 +422,7 @@ def nudges_of(
             most = max(MAX_OFFSET_SIGMAS * scale, extent)
             found.append(Nudge(SENSOR, name, unit, STEP * scale, -most, most, scale))
             others.append(Nudge(SCALE, name, "", STEP, -MAX_SCALE, MAX_SCALE, 1.0, 1.0))
+            others.append(Nudge(SPIKES, name, unit, STEP * scale, 0.0, MAX_OFFSET_SIGMAS * scale, scale))
             if variance > 0.0:
                 others.append(_noise(R_, name))
             if seconds > 0.0:

@@ -62,7 +62,7 @@ def test_each_fault_is_said_and_no_other():
     assert said.startswith("float: innovations are correlated (-0.49, ") and "Q too large" in said
     spiky = np.where(np.arange(e.size) % 10 == 3, 1e5, e)
     said = of(spiky, 0.9999).words
-    assert any(line.startswith("float: the gate refuses 10 % (") for line in said)
+    assert any(line.startswith("float: the gate rejects 10 % (") for line in said)
 
 
 def test_only_what_surely_matters_is_said():

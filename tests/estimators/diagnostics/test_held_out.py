@@ -40,7 +40,7 @@ def test_a_shift_is_said_with_its_size_and_what_is_left_open():
     assert found.sensor == "yoke" and found.beyond
     assert found.offset == pytest.approx(2.4, abs=4 * 0.5 / np.sqrt(LAST_MEASUREMENTS))
     allowed = 1.96 * np.sqrt(P + 0.25 / LAST_MEASUREMENTS)
-    text = f"yoke, held out, reads 2.4 °C above what the others say, beyond the ±{allowed:.2g} °C that they leave open"
+    text = f"yoke, held out: 2.4 °C above the prediction of the other sensors, ±{allowed:.2g} °C expected"
     assert found.words == text
 
 
@@ -48,14 +48,14 @@ def test_only_the_last_readings_count_and_few_say_nothing():
     innovations = np.concatenate([np.full(1000, 50.0), np.full(LAST_MEASUREMENTS, -0.1)])
     (found,) = shown(innovations)
     assert found.offset == pytest.approx(-0.1) and not found.beyond
-    assert found.words.startswith("yoke, held out, reads as the others say: 0.1 °C below")
+    assert found.words.startswith("yoke, held out: agrees with the other sensors (0.1 °C below the prediction, ")
     assert shown(np.ones(MIN_MEASUREMENTS - 1)) == []
 
 
 def test_a_sensor_in_use_is_not_looked_at_and_one_without_others_says_so():
     assert shown(np.ones(50), Tuning.of(MODEL)) == []
     alone = TUNING.set("use.winding", False).set("use.tooth", False)
-    assert "what the model alone predicts" in shown(np.full(50, 9.0), alone)[0].words
+    assert "above the prediction of the model alone" in shown(np.full(50, 9.0), alone)[0].words
 
 
 def test_readings_that_were_used_before_it_was_held_out_do_not_count():
@@ -66,5 +66,5 @@ def test_readings_that_were_used_before_it_was_held_out_do_not_count():
     events = Events(t, t, np.full(n, READING, np.int8), np.full(n, YOKE, np.int32), np.zeros((n, 1)))
     assert offsets(events, track, TUNING) == []
     assert Offset("yoke", "yoke", 1.0, 2.0, "1").words == (
-        "yoke, held out, reads as the others say: 1 above, where they leave ±2 open"
+        "yoke, held out: agrees with the other sensors (1 above the prediction, ±2 expected)"
     )

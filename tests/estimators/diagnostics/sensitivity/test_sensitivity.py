@@ -121,16 +121,16 @@ def test_a_delay_of_the_only_sensor_is_undetectable_and_one_of_two_is_not():
 def test_a_bias_from_the_prior_on_is_harder_to_detect_where_the_prior_is_wide():
     """The first innovations are larger, and so is their variance: a wide prior takes the bias for the state."""
     wide = replace(WALK, states=(replace(WALK.states[0], std=100.0),))
-    present, onset = sensitivities("ekf", wide, Tuning.of(wide), walk_log(n=4 * N))
-    at_start, later = (found.faults[found.place("sensor", "level")] for found in (present, onset))
+    present, *onsets = sensitivities("ekf", wide, Tuning.of(wide), walk_log(n=4 * N))
+    at_start, later = (found.faults[found.place("sensor", "level")] for found in (present, onsets[0]))
     assert at_start.visible > 1.5 * later.visible
-    worse = {(fault.nudge.kind, fault.nudge.name): one.begin for fault, one in worse_faults(present, onset)}
+    worse = {(fault.nudge.kind, fault.nudge.name): one.begin for fault, one in worse_faults(present, *onsets)}
     assert worse["sensor", "level"] == PRIOR
     # R: each end of the range was folded without an alarm, and the next step beyond it with one.
     noise = present.faults[present.place("R", "level")]
     assert -1.0 < noise.low < 0.0 < noise.high and noise.visible >= 0.0
-    level = bounds_of(wide, present, onset)["x"]
-    assert level.bound == max(found.bounds.bound[-1, 0] for found in (present, onset))
+    level = bounds_of(wide, present, *onsets)["x"]
+    assert level.bound == max(found.bounds.bound[-1, 0] for found in (present, *onsets))
 
 
 def test_information_and_smallest_visible_faults_in_closed_form(walk):
@@ -144,6 +144,26 @@ def test_information_and_smallest_visible_faults_in_closed_form(walk):
     size = np.sqrt(walk.noncentrality / np.diag(expected))[:3]
     np.testing.assert_allclose(visible(walk)[:3], size, rtol=1e-6)
     np.testing.assert_allclose(unseen(walk)[:3], np.stack([-size, size], axis=1), rtol=1e-6)
+
+
+def test_faults_at_once_add_up_or_cancel(walk):
+    """A wrong input and a wrong slope of the walk have one effect."""
+    _, push, slope, _ = visible(walk)
+    assert push == pytest.approx(slope, rel=1e-6)
+    one, both = ("input", "push", 0.5), [("input", "push", 0.5), ("parameter", "slope", 0.5)]
+    assert walk.multiple([one]) == pytest.approx(push / 0.5, rel=1e-6)
+    assert walk.multiple(both) == pytest.approx(push / 1.0, rel=1e-6)
+    assert walk.multiple([one, ("parameter", "slope", -0.5)]) > 1e5 * push
+    assert np.isnan(walk.multiple([one, ("sensor", "none of that name", 1.0)]))
+
+
+def test_no_error_is_larger_than_a_state_can_be(walk):
+    """Between limits 0.7 apart; the bound of the walk itself reaches from below to beyond that."""
+    limited = replace(WALK, states=(replace(WALK.states[0], limits=(-0.3, 0.4)),))
+    found = sensitivity("ekf", limited, Tuning.of(limited), walk_log(), seen_by="best")
+    for own, free in zip(found.bounds[:2], walk.bounds[:2], strict=True):
+        assert free.min() < 0.7 < free.max()
+        np.testing.assert_array_equal(own, np.minimum(free, 0.7))
 
 
 def test_what_the_readings_cannot_tell_apart(walk):
