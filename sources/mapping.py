@@ -14,7 +14,7 @@ from estimators.log import INPUT, READING, TRUTH, Events
 from estimators.numerics.jit import B1, F1, F2, I1, i64, jit
 
 from .source import Accuracy, Channel, Report
-from .units import conversion, spread_factor
+from .units import conversion, declared_conversion, spread_factor
 
 PRESENT, ABSENT, SHORT = range(3)
 """The value is present; the frame does not carry the signal (multiplexing); the frame ends before it."""
@@ -176,8 +176,8 @@ class ChannelMapping:
                 for k, name in enumerate(channel.signals):
                     tables.slot.append(positions[name])
                     wanted = "deg" if channel.convert else channel.model_units[k]
-                    given = channel.units[k] or units[positions[name]]
-                    factor, shift = conversion(given, wanted, f"{channel.name}: {name}")
+                    found = units[positions[name]]
+                    factor, shift = declared_conversion(channel.units[k], found, wanted, f"{channel.name}: {name}")
                     tables.factor.append(factor)
                     tables.shift.append(shift)
                     # Scale and offset of a position apply to metres, not to degrees.

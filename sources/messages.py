@@ -5,7 +5,8 @@ from __future__ import annotations
 import queue
 import threading
 import time
-from collections import OrderedDict
+from bisect import bisect_right
+from collections import OrderedDict, deque
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -28,8 +29,8 @@ FIELDS = ("time", "values", "source", "sequence")
 MAX_WAITING = 200_000
 """Messages that may wait to be read; further ones are refused, so that the sender repeats them."""
 
-MAX_SEQUENCES = 65_536
-"""Last sequence numbers that are remembered of a sender; one below all of them counts as a duplicate."""
+MAX_GAPS = 1024
+"""Gaps between the sequence numbers of a sender that are remembered; numbers of an earlier gap count as duplicates."""
 
 MAX_SENDERS = 1024
 """Senders whose sequence numbers are remembered; the one that was silent longest is forgotten first."""
@@ -51,6 +52,38 @@ class Rows(NamedTuple):
     t: np.ndarray
     values: np.ndarray
     state: np.ndarray
+
+
+class SentNumbers:
+    """Sequence numbers of messages by sender, as ranges."""
+
+    def __init__(self) -> None:
+        self._ranges: OrderedDict[str, list[list[int]]] = OrderedDict()
+
+    def add(self, sender: str, number: int) -> bool:
+        """Note a number; return whether it is new."""
+        ranges = self._ranges.setdefault(sender, [])
+        self._ranges.move_to_end(sender)
+        if len(self._ranges) > MAX_SENDERS:
+            self._ranges.popitem(last=False)
+        k = bisect_right(ranges, number, key=lambda item: item[0])
+        if k and number <= ranges[k - 1][1]:
+            return False
+        ranges.insert(k, [number, number])
+        for left in (k, k - 1):
+            if 0 <= left < len(ranges) - 1 and ranges[left][1] + 1 == ranges[left + 1][0]:
+                ranges[left : left + 2] = [[ranges[left][0], ranges[left + 1][1]]]
+        if len(ranges) > MAX_GAPS:
+            ranges[:2] = [[ranges[0][0], ranges[1][1]]]
+        return True
+
+    def state(self) -> dict[str, list[list[int]]]:
+        """Return the first and last number of each range by sender, for `restore`."""
+        return {sender: [[*item] for item in ranges] for sender, ranges in self._ranges.items()}
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Take over the `state` of another."""
+        self._ranges = OrderedDict((sender, [[*map(int, item)] for item in ranges]) for sender, ranges in state.items())
 
 
 class Messages:
@@ -88,7 +121,14 @@ class Messages:
         )
         self._waiting: queue.SimpleQueue[Rows] = queue.SimpleQueue()
         self._room = MAX_WAITING
-        self._sequences: OrderedDict[str, OrderedDict[int, None]] = OrderedDict()
+        self._sent, self._stored = SentNumbers(), SentNumbers()
+        self._unstored: deque[tuple[int, str, int]] = deque()
+        """Count of messages until each numbered one that is not in `_stored` yet, its sender and number."""
+        self.accepted = 0
+        """Messages that were accepted."""
+        self.mark = 0
+        """Of these, messages that were read."""
+        self._stores = False
         self._sending = threading.Lock()
         self._newest: tuple[int, int] | None = None
 
@@ -103,7 +143,9 @@ class Messages:
             for row, message in enumerate(messages):
                 answer = Answer(REFUSED, "too many messages wait; send it again") if row >= self._room else None
                 answer = answer or self._take(message, t[row : row + 1], values[row], state[row])
-                answers.append(answer or self._number(message))
+                answer = answer or self._number(message)
+                self.accepted += answer.status == ACCEPTED
+                answers.append(answer)
             taken = np.array([answer.status == ACCEPTED for answer in answers], np.bool_)
             if taken.any():
                 rows = Rows(t[taken], values[taken], state[taken])
@@ -154,20 +196,27 @@ class Messages:
 
     def _number(self, message: Mapping[str, Any]) -> Answer:
         """Remember the sequence number of a message; tell whether it is a duplicate."""
-        number = message.get("sequence")
+        number, sender = message.get("sequence"), message.get("source", "")
         if number is None:
             return Answer(ACCEPTED)
-        sender = message.get("source", "")
-        known = self._sequences.setdefault(sender, OrderedDict())
-        self._sequences.move_to_end(sender)
-        if len(self._sequences) > MAX_SENDERS:
-            self._sequences.popitem(last=False)
-        if number in known or (len(known) >= MAX_SEQUENCES and number < next(iter(known))):
+        if not self._sent.add(sender, number):
             return Answer(DUPLICATE)
-        known[number] = None
-        if len(known) > MAX_SEQUENCES:
-            known.popitem(last=False)
+        if self._stores:
+            self._unstored.append((self.accepted + 1, sender, number))
         return Answer(ACCEPTED)
+
+    def numbers(self, mark: int) -> dict[str, list[list[int]]]:
+        """Return the sequence numbers of the first `mark` messages, for `restore`; in one thread, with rising marks."""
+        with self._sending:
+            while self._unstored and self._unstored[0][0] <= mark:
+                self._stored.add(*self._unstored.popleft()[1:])
+        return self._stored.state()
+
+    def restore(self, numbers: Mapping[str, Any]) -> None:
+        """Take over the `numbers` of the source before a restart, if any, and keep them from now on."""
+        self._stores = True
+        self._sent.restore(numbers)
+        self._stored.restore(numbers)
 
     def read(self, timeout: float) -> Events | None:
         """Return the events of the next messages; none after `timeout` seconds without one."""
@@ -181,6 +230,7 @@ class Messages:
         latest = int(rows.t.max())
         with self._sending:
             self._room += rows.t.size
+            self.mark += rows.t.size
             if self._newest is None or latest > self._newest[0]:
                 self._newest = latest, time.monotonic_ns()
         plan, skip = np.zeros(rows.t.size, np.int64), np.zeros(rows.t.size, np.int8)

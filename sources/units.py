@@ -146,6 +146,27 @@ def conversion(given: str | None, wanted: str, where: str) -> tuple[float, float
     raise SourceError(f"{where}: {given!r} does not convert to the model's {wanted!r}; {remedy}")
 
 
+def declared_conversion(declared: str | None, found: str | None, wanted: str, where: str) -> tuple[float, float]:
+    """Return `conversion` from the unit that the YAML declares, otherwise from the one found in the file.
+
+    Raises:
+        SourceError: As `conversion`, and if the YAML declares a unit with a dimension where the model has none.
+    """
+    if declared and declared.strip() and not wanted.strip() and _has_dimension(_normal(declared)):
+        raise SourceError(
+            f"{where}: the model's quantity has no unit, so {declared!r} under `units` has no effect; "
+            "write the unit in the model, or the factor as `scale`"
+        )
+    return conversion(declared or found, wanted, where)
+
+
+def _has_dimension(unit: str) -> bool:
+    try:
+        return not _unit(_OTHERWISE.get(unit, unit)).dimensionless
+    except LookupError:
+        return unit not in ("", "-")
+
+
 _HEADING = re.compile(r".+?\s*[\[(]([^\[\]()]+)[\])]\s*")
 
 

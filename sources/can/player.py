@@ -15,7 +15,7 @@ from estimators.errors import SourceError
 from estimators.log import INPUT, READING, TRUTH, Events
 
 from ..source import Channel, Report, Source, ignore
-from ..units import conversion
+from ..units import declared_conversion
 from .bus import open_bus
 from .decoder import BusName, find_messages
 
@@ -216,7 +216,7 @@ class Encoder:
             for k, name in enumerate(channel.signals):
                 signal = message.get_signal_by_name(name)
                 where = f"{channel.name}: {name}"
-                factor, shift = conversion(channel.units[k] or signal.unit, channel.model_units[k], where)
+                factor, shift = declared_conversion(channel.units[k], signal.unit, channel.model_units[k], where)
                 slope = channel.scale[k] * factor
                 if slope == 0.0:
                     raise SourceError(f"{where}: scale is 0; it must differ from 0")

@@ -5,7 +5,7 @@ import math
 import pytest
 
 from estimators.errors import SourceError
-from sources.units import conversion
+from sources.units import conversion, declared_conversion
 
 
 @pytest.mark.parametrize(
@@ -67,3 +67,14 @@ def test_a_rotation_is_no_frequency(given, wanted, what):
     with pytest.raises(SourceError, match=f"x: '{given}' is {what}.* they may differ by 2π; give .* under"):
         conversion(given, wanted, "x")
     assert conversion("rpm", "deg/s", "x")[0] == pytest.approx(6.0) and conversion("kHz", "1/s", "x")[0] == 1000.0
+
+
+def test_a_declared_unit_of_a_quantity_without_unit_is_refused():
+    """It would have no effect; one found in a file is only a remark of its logger, and % has no dimension."""
+    with pytest.raises(SourceError, match="x: the model's quantity has no unit, so 'furlong' .* as `scale`"):
+        declared_conversion("furlong", None, "", "x")
+    with pytest.raises(SourceError, match="so 'furz' under"):
+        declared_conversion("furz", "m", " ", "x")
+    for declared, found in (("%", None), ("-", "m"), (None, "furlong"), ("", "m")):
+        assert declared_conversion(declared, found, "", "x") == (1.0, 0.0)
+    assert declared_conversion("km/h", "mph", "m/s", "x")[0] == pytest.approx(1 / 3.6)
