@@ -14,7 +14,7 @@ from pydantic import ValidationError
 from estimators.errors import ConfigError, nearest
 
 from .problems import report, shown
-from .schema import TwinSection, as_gate
+from .schema import ParameterSection, TwinSection, as_gate
 from .tunings import Version, find_version, keep_options, overlay
 from .yaml_files import Key, ValuePlaces, dotted, parse, read_text, shown_path, with_values
 
@@ -211,5 +211,9 @@ def _override(data: dict[str, Any], places: ValuePlaces, dotted_key: str, text: 
         elif isinstance(here, dict) and here.get(part) is None:
             here[part] = {}
             places.options[tuple(key)] = option
+        elif parts[0] in ("parameters", "sensors", "inputs") and parts[k + 1] in ParameterSection.model_fields:
+            # A number is the short form of a parameter, an offset or a scale.
+            if isinstance(here, dict) and isinstance(here[part], int | float):
+                here[part] = {"value": here[part]}
         here = here[key[-1]]
     places.options[tuple(key)] = option

@@ -37,6 +37,7 @@ from .fields import (
     Validity,
     refused,
 )
+from .output_schema import AlertSection, OutputsSection
 from .source_schema import FaultSection, SourceSection
 
 PERCENT = r"^([0-9]+\.?[0-9]*|\.[0-9]+) ?%$"
@@ -278,8 +279,8 @@ class TimeSection(Section):
     """Seconds without a used measurement after which health is stale; not below degraded_after. Default: 15."""
     paused_after: Seconds | None = None
     """Seconds without any event, measurement or input, after which the inputs of the pause count as unknown, as where a
-    logger was off while the asset ran on: the states that inputs drive become as uncertain as at the start. Default:
-    never; the last inputs are held."""
+    logger was off while the asset ran on: the states that inputs drive become as uncertain as at the start. A gap of
+    up to three median periods of the recording is none. Default: never; the last inputs are held."""
     late: Literal["exact", "inflate", "auto"] = "auto"
     """Treatment of a late measurement within the horizon. exact: it is inserted at its time and the filter rewinds.
     inflate: it is used on arrival, with its variance inflated by the predicted change since; fast, approximate, and not
@@ -472,10 +473,15 @@ class TwinSection(Section):
     history: Count = 200_000
     """Events that are kept, and folded again when the tuning changes; older ones are dropped. Default: 200,000."""
     source: SourceSection
-    """Source of the measurements; its `type` is simulator, can, can_log, table or merged."""
+    """Source of the measurements; its `type` is simulator, can, can_log, table, merged, push, mqtt or opcua."""
     faults: tuple[FaultSection, ...] = ()
     """Faults that are injected into the source: a list of {kind, sensor, input, start, end, size, rate, ...}. They act
     in this order, after those of a simulator. Default: none."""
+    outputs: OutputsSection = OutputsSection()
+    """Where the estimate is published, and who receives alerts: {receivers, ...}. Default: nowhere but the page."""
+    alerts: tuple[AlertSection, ...] = ()
+    """Rules for alerts to the receivers, as in [{health: suspect}, {state: winding, above: 150, probability: 0.05}].
+    Default: {health: suspect} if there are receivers."""
     view: ViewSection = ViewSection()
     """Contents of the page."""
 

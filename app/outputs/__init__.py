@@ -1,0 +1,221 @@
+"""The estimate for other programs: brokers, servers, buses and receivers of alerts.
+
+A thread of its own waits for new rows, makes one message, and hands it to every output, none of which may block.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from functools import partial
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+
+import numpy as np
+
+from config.output_schema import AlertSection
+from estimators.errors import NisusError
+
+from ..live.jobs import Jobs
+from ..live.outputs import OutputLink
+from ..present.state_message import StateMessage, state_message
+from .alerts import FIRING, AlertRules, Delivery, heartbeat, make_receivers
+
+if TYPE_CHECKING:
+    from config.schema import TwinSection
+
+    from ..live.running_fold import Running
+
+ALIVE_PERIOD_S = 1.0
+"""Between two messages of a state that does not change: its age does."""
+
+HEALTH_RULE = AlertSection(health="suspect")
+"""Rule of a twin that has receivers and no rules."""
+
+RULES_PERIOD_S = 0.2
+"""Between two looks at the rules of alerts."""
+
+
+class Output(Protocol):
+    """Publishes states; no method may wait for a client or a network."""
+
+    name: str
+
+    def start(self) -> None:
+        """Begin to connect or to serve."""
+
+    def publish(self, message: StateMessage) -> None:
+        """Publish a state, or drop it if that is not possible now."""
+
+    def stop(self) -> None:
+        """Disconnect, within a second."""
+
+    def link(self) -> OutputLink:
+        """Return whether clients are reached."""
+
+
+class Parts(NamedTuple):
+    """Outputs, rules and receivers of one version of the twin's YAML."""
+
+    config: TwinSection
+    outputs: tuple[Output, ...]
+    rules: AlertRules
+    deliveries: dict[str, Delivery]
+    heartbeats: dict[str, float]
+    jobs: Jobs
+
+
+class Publisher:
+    """Outputs and alerts of one running twin, as its YAML asks for them."""
+
+    def __init__(self, engine: Running, *, page: str | None = None) -> None:
+        """Prepare; nothing is connected yet.
+
+        Args:
+            engine: The running twin.
+            page: Address of its page, without the token; None without one.
+
+        Raises:
+            NisusError: If a package or a secret is missing.
+        """
+        self._engine, self._page = engine, page
+        self._parts = self._make()
+        self._grown, self._stopping = threading.Event(), threading.Event()
+        self._thread = threading.Thread(target=self._run, name="outputs", daemon=True)
+        self._beats: dict[str, float] = {}
+
+    def start(self) -> None:
+        """Connect and begin to publish."""
+        self._begin()
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Disconnect."""
+        self._stopping.set()
+        self._grown.set()
+        self._engine.grown -= {self._grown.set}
+        if self._thread.is_alive():
+            self._thread.join(2.0)
+        self._end()
+
+    @property
+    def outputs(self) -> tuple[Output, ...]:
+        """Outputs that publish at present."""
+        return self._parts.outputs
+
+    def json(self) -> dict[str, Any]:
+        """Return the state of outputs, receivers and alerts."""
+        parts, mute = self._parts, self._engine.mute
+        return {
+            "outputs": [{"name": item.name} | item.link()._asdict() for item in parts.outputs],
+            "receivers": [
+                {name: getattr(item, name) for name in ("name", "failing", "waiting", "delivered", "dropped")}
+                for item in parts.deliveries.values()
+            ],
+            "alerts": [
+                {"id": item.id, "rule": item.rule.title, "subject": item.finding.subject, "since": item.since}
+                | {"text": item.finding.text}
+                for item in parts.rules.open
+            ],
+            "muted_s": 0.0 if mute is None else mute.seconds,
+            "mute_reason": mute.reason if mute is not None and mute.active else "",
+        }
+
+    def _make(self) -> Parts:
+        twin, notices = self._engine.twin, self._engine.notices
+        section, rules = twin.config.outputs, twin.config.alerts
+        mqtt = None
+        if section.mqtt is not None:
+            from .mqtt import MqttOutput
+
+            mqtt = MqttOutput(section.mqtt, self._engine)
+        outputs: list[Output] = [] if mqtt is None else [mqtt]
+        if section.opcua is not None:
+            from .opcua import OpcUaOutput
+
+            outputs.append(OpcUaOutput(section.opcua, self._engine))
+        if section.can is not None:
+            from .can import CanOutput
+
+            outputs.append(CanOutput(section.can, self._engine, twin.path.absolute().parent))
+        receivers = make_receivers(section.receivers, twin.path.absolute().parent, mqtt)
+        if receivers and not rules:
+            rules = (HEALTH_RULE,)
+        deliveries = {name: Delivery(name, item, notices) for name, item in receivers.items()}
+        beats = {name: getattr(item, "heartbeat", None) for name, item in section.receivers.items()}
+        heartbeats = {name: period for name, period in beats.items() if period is not None}
+        jobs = Jobs(notices, "output", threads=1 + len(deliveries), niceness=0)
+        return Parts(twin.config, tuple(outputs), AlertRules(rules, link=self._page), deliveries, heartbeats, jobs)
+
+    def _begin(self) -> None:
+        parts = self._parts
+        for output in parts.outputs:
+            output.start()
+        if parts.outputs:
+            self._engine.grown |= {self._grown.set}
+        if parts.deliveries:
+            parts.jobs.run("alerts", lambda job: self._look(parts), every=RULES_PERIOD_S)
+        for delivery in parts.deliveries.values():
+            parts.jobs.run(f"alerts to {delivery.name}", delivery.step, every=RULES_PERIOD_S)
+        parts.jobs.start()
+
+    def _end(self) -> None:
+        self._parts.jobs.stop()
+        for output in self._parts.outputs:
+            output.stop()
+
+    def _run(self) -> None:
+        sent, at = None, -np.inf
+        while not self._stopping.is_set():
+            self._grown.wait(ALIVE_PERIOD_S)
+            self._grown.clear()
+            self._follow()
+            parts = self._parts
+            if self._stopping.is_set() or not parts.outputs:
+                continue
+            section = parts.config.outputs
+            message = state_message(self._engine, covariance=section.covariance)
+            new, now = (message.time_ns, message.revision, message.health, message.cause), time.monotonic()
+            if new == sent and now - at < ALIVE_PERIOD_S:
+                continue
+            sent, at = new, now
+            for output in parts.outputs:
+                self._guarded(f"output {output.name}", partial(output.publish, message))
+            self._stopping.wait(section.every)
+
+    def _follow(self) -> None:
+        """Begin again with the outputs of the YAML that was saved meanwhile."""
+        config, old = self._engine.twin.config, self._parts.config
+        if (config.outputs, config.alerts) == (old.outputs, old.alerts):
+            return
+        try:
+            parts = self._make()
+        except NisusError as error:
+            self._engine.notices.say(f"the outputs stay as they were: {error}", level="error")
+            self._parts = self._parts._replace(config=config)
+            return
+        self._end()
+        self._engine.grown -= {self._grown.set}
+        self._parts = parts
+        self._begin()
+
+    def _guarded(self, name: str, work: Callable[[], object]) -> None:
+        try:
+            work()
+        except Exception as error:  # noqa: BLE001  no client or library may end the thread of all outputs
+            self._engine.notices.report(name, f"{name}: {type(error).__name__}: {error}", level="error")
+
+    def _look(self, parts: Parts) -> None:
+        """Put the alerts that are due into the queues of their receivers."""
+        message = state_message(self._engine)
+        for rule, alert in parts.rules.look(self._engine, message):
+            self._engine.notices.say(
+                f"alert {alert.status}: {alert.text}", level="warn" if alert.status == FIRING else "info"
+            )
+            for name in rule.to or parts.deliveries:
+                parts.deliveries[name].put(alert)
+        now = time.monotonic()
+        for name, period in parts.heartbeats.items():
+            if now - self._beats.get(name, -np.inf) >= period:
+                self._beats[name] = now
+                parts.deliveries[name].put(heartbeat(message.twin, message.health))

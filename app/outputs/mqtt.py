@@ -1,0 +1,157 @@
+"""MQTT: states, birth, last will and alerts at a broker, under PREFIX/TWIN."""
+
+from __future__ import annotations
+
+import json
+import threading
+from typing import TYPE_CHECKING, Any
+
+from estimators.errors import printable
+
+from ..live.outputs import OutputLink
+from ..present.state_message import StateMessage, iso_now, state_schema
+from .alerts import TIMEOUT_S, AlertMessage, secret
+
+if TYPE_CHECKING:
+    from config.output_schema import MqttSection
+
+    from ..live.notices import Notices
+    from ..live.running_fold import Running
+
+MAX_UNSENT = 100
+"""States that the connection has not taken; with more, a broker that reads too slowly loses some."""
+
+STATUS, BIRTH, STATE, ALERT = "status", "birth", "state", "alert"
+"""Last parts of the topics."""
+
+
+class MqttOutput:
+    """Publishes through a thread of paho-mqtt, which connects again for as long as the twin runs."""
+
+    name = "mqtt"
+
+    def __init__(self, section: MqttSection, engine: Running) -> None:
+        """Prepare; nothing is connected yet.
+
+        Raises:
+            ConfigError: If paho-mqtt or a secret is missing.
+        """
+        from sources.brokers import mqtt_client
+
+        self._section, self._engine = section, engine
+        self._root = f"{section.prefix}/{engine.twin.name}"
+        password = None if section.password_env is None else secret(section.password_env)
+        self.client: Any = mqtt_client(section, password, client_id=f"nisus-{engine.twin.name}")
+        self.client.will_set(f"{self._root}/{STATUS}", self._status(online=False), qos=1, retain=True)
+        self.client.on_connect, self.client.on_disconnect = self._connected, self._disconnected
+        self.client.on_connect_fail = lambda *_: self._lost("the broker does not answer")
+        self.client.on_publish = self._taken
+        self._unsent, self._dropped, self._counting = 0, 0, threading.Lock()
+        self._problem = "not connected yet"
+        self._reported = False
+
+    @property
+    def _notices(self) -> Notices:
+        return self._engine.notices
+
+    def start(self) -> None:
+        """See `Output`."""
+        self.client.connect_async(self._section.host, self._section.port, keepalive=15)
+        self.client.loop_start()
+
+    def publish(self, message: StateMessage) -> None:
+        """See `Output`."""
+        if not self.client.is_connected():
+            return
+        with self._counting:
+            if self._unsent >= MAX_UNSENT:
+                self._dropped += 1
+                late = self._dropped == 1
+            else:
+                self._unsent += 1
+                late = None
+        if late is None:
+            self.client.publish(f"{self._root}/{STATE}", message.model_dump_json(), qos=0)
+        elif late:
+            text = f"output mqtt: the broker at {self._place} takes states too slowly; some are dropped"
+            self._notices.count("output mqtt")
+            self._notices.say(text, level="warn")
+
+    def send(self, alert: AlertMessage) -> None:
+        """Publish an alert (see `alerts.Receiver`); it waits while there is no broker.
+
+        Raises:
+            OSError: If the broker does not confirm it.
+        """
+        if not self.client.is_connected():
+            raise OSError(self._problem)
+        with self._counting:
+            self._unsent += 1
+        sent = self.client.publish(f"{self._root}/{ALERT}", alert.model_dump_json(), qos=1)
+        try:
+            sent.wait_for_publish(TIMEOUT_S)
+        except RuntimeError as error:
+            raise OSError(str(error)) from None
+        if not sent.is_published():
+            raise OSError(f"the broker did not confirm it within {TIMEOUT_S:g} s")
+
+    def stop(self) -> None:
+        """Publish the death, and disconnect."""
+        if self.client.is_connected():
+            sent = self.client.publish(f"{self._root}/{STATUS}", self._status(online=False), qos=1, retain=True)
+            try:
+                sent.wait_for_publish(1.0)
+            except (RuntimeError, ValueError):
+                pass  # the last will says the same
+        self.client.on_disconnect = None
+        self.client.disconnect()
+        self.client.loop_stop()
+
+    def link(self) -> OutputLink:
+        """See `Output`."""
+        connected = bool(self.client.is_connected())
+        return OutputLink(connected, self._place if connected else self._problem)
+
+    @property
+    def _place(self) -> str:
+        return f"{self._section.host}:{self._section.port}, {self._root}"
+
+    def _status(self, *, online: bool) -> str:
+        return json.dumps({"online": online, "since": iso_now()})
+
+    def _birth(self) -> str:
+        """Return names and units of all values, and the schema of the messages."""
+        model = self._engine.model
+        parts: dict[str, Any] = {"states": model.shown_states, "inputs": model.inputs}
+        names = {key: [{"name": item.name, "unit": item.unit} for item in items] for key, items in parts.items()}
+        told = {"twin": self._engine.twin.name, "since": iso_now(), **names, "sensors": list(model.sensor_names)}
+        return json.dumps(told | {"schema": state_schema()})
+
+    # On the thread of the client
+
+    def _connected(self, client: Any, _data: Any, _flags: Any, reason: Any, _properties: Any) -> None:
+        if reason.is_failure:
+            self._lost(f"the broker refuses: {reason}")
+            return
+        for part, text in ((BIRTH, self._birth()), (STATUS, self._status(online=True))):
+            client.publish(f"{self._root}/{part}", text, qos=1, retain=True)
+        with self._counting:
+            self._unsent, self._dropped = 2, 0
+        if self._reported:
+            self._reported = False
+            self._notices.say(f"output mqtt: connected again to {self._place}")
+
+    def _disconnected(self, _client: Any, _data: Any, _flags: Any, reason: Any, _properties: Any) -> None:
+        self._lost(f"the connection ended: {reason}")
+
+    def _lost(self, text: str) -> None:
+        self._problem = printable(text)
+        if not self._reported:
+            self._reported = True
+            place = f"{self._section.host}:{self._section.port}"
+            self._notices.say(f"output mqtt: no broker at {place} ({self._problem}); it is tried again", level="warn")
+            self._notices.count("output mqtt")
+
+    def _taken(self, *_: Any) -> None:
+        with self._counting:
+            self._unsent = max(0, self._unsent - 1)

@@ -1,0 +1,202 @@
+"""Sections of a twin's YAML about its outputs: where the estimate is published, who is alerted, and when."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import BeforeValidator, Field, model_validator
+
+from .fields import Duration, Number, Positive, Section, Text, Texts, as_seconds, one_of, refused
+from .source_schema import BrokerSection
+
+EnvironmentName = Annotated[str, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_]*$")]
+"""Name of an environment variable: secrets stand in the environment, never in a file."""
+
+Host = Annotated[str, Field(pattern=r"^[^\s/]+$")]
+Port = Annotated[int, Field(strict=True, ge=1, le=65535)]
+Url = Annotated[str, Field(pattern=r"^(https?://\S+|\$[A-Za-z_][A-Za-z0-9_]*)$")]
+
+DelayOrNone = Annotated[
+    Annotated[float, Field(strict=True, ge=0, le=1e9)], BeforeValidator(as_seconds, json_schema_input_type=float | str)
+]
+"""A duration that may be 0."""
+
+
+class WebhookSection(Section):
+    """A receiver of alerts: an HTTP server, to which each is sent by POST as JSON."""
+
+    type: Literal["webhook"]
+    """webhook"""
+    url: Url
+    """Address, http or https; or $NAME: the environment variable that holds it."""
+    secret_env: EnvironmentName | None = None
+    """Environment variable with the key of the signature, HMAC-SHA256. Default: none, alerts are not signed."""
+    heartbeat: Duration | None = None
+    """Seconds between two messages that the twin runs, so that the receiver notices when they end. Default: never."""
+
+
+class EmailSection(Section):
+    """A receiver of alerts: e-mail addresses."""
+
+    type: Literal["email"]
+    """email"""
+    to: Texts
+    """Addresses of the recipients."""
+    sender: Text
+    """Address of the sender."""
+    server: Host = "localhost"
+    """Mail server. Default: localhost."""
+    port: Port = 25
+    """Its port. Default: 25; 587 is usual with starttls, 465 with tls."""
+    security: Literal["none", "starttls", "tls"] = "none"
+    """Encryption of the connection. Default: none, for a server on this machine."""
+    user: Text | None = None
+    """User name at the server. Default: none, no login."""
+    password_env: EnvironmentName | None = None
+    """Environment variable with the password."""
+
+    @model_validator(mode="after")
+    def _login(self) -> EmailSection:
+        if (self.user is None) != (self.password_env is None):
+            raise refused("absent", "needs both user and password_env, or neither")
+        return self
+
+
+class CommandSection(Section):
+    """A receiver of alerts: a program, which is started for each alert and reads it as JSON from standard input."""
+
+    type: Literal["command"]
+    """command"""
+    command: Texts
+    """Program and its arguments; a program that begins with ./ is beside the YAML. No shell is involved."""
+    timeout: Duration = 30.0
+    """Seconds after which it is ended. Default: 30."""
+
+
+class MqttReceiverSection(Section):
+    """A receiver of alerts: the broker of `outputs.mqtt`, under the topic PREFIX/TWIN/alert."""
+
+    type: Literal["mqtt"]
+    """mqtt"""
+
+
+ReceiverSection = Annotated[
+    WebhookSection | EmailSection | CommandSection | MqttReceiverSection, Field(discriminator="type")
+]
+
+
+class AlertSection(Section):
+    """A rule for alerts: exactly one of health, episode, nis, state and lost."""
+
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$")] | None = None
+    """Name of the rule. Default: its condition, as in health-suspect."""
+    health: Literal["advisory", "suspect", "degraded", "diverged", "stale"] | None = None
+    """Health from which on there is an alert: suspect includes degraded, diverged and stale."""
+    episode: Texts | None = None
+    """Causes of episodes, as in [stuck, silent]; all for every cause. Each episode is an alert of its own."""
+    nis: Positive | None = None
+    """Mean NIS per degree of freedom of the last window above which there is an alert; 1 is expected."""
+    state: Text | None = None
+    """A state whose estimate is compared with `above` or `below`."""
+    above: Number | None = None
+    """Upper limit of the state, in its unit."""
+    below: Number | None = None
+    """Lower limit of the state, in its unit."""
+    probability: Annotated[float, Field(strict=True, gt=0, lt=1)] = 0.5
+    """Probability that the state is beyond its limit from which on there is an alert, from its mean and standard
+    deviation. Default: 0.5, when the mean is beyond; 0.05 warns earlier, 0.95 when it is certain."""
+    lost: Duration | None = None
+    """Seconds without any event, or in which the fold does not answer, after which there is an alert."""
+    after: DelayOrNone = 1.0
+    """Seconds for which the condition must last. Default: 1."""
+    clear: DelayOrNone = 10.0
+    """Seconds without the condition after which the alert is resolved. Default: 10."""
+    repeat: Duration | Literal["never"] = 3600.0
+    """Seconds after which an alert that lasts is sent again. Default: 3600."""
+    maintenance: DelayOrNone = 600.0
+    """Seconds after a maintenance in which nothing is sent. Default: 600."""
+    to: Texts | None = None
+    """Names of receivers. Default: all."""
+
+    @model_validator(mode="after")
+    def _one(self) -> AlertSection:
+        one_of(self, "health", "episode", "nis", "state", "lost", required=True)
+        one_of(self, "above", "below", required=self.state is not None)
+        if self.state is None:
+            for key in ("above", "below", "probability"):
+                if key in self.model_fields_set:
+                    raise refused("relation", "belongs to a limit of a state; give the state too", key)
+        return self
+
+    @property
+    def title(self) -> str:
+        """Name of the rule, or its condition."""
+        if self.name is not None:
+            return self.name
+        if self.state is not None:
+            return f"{self.state}-{'above' if self.above is not None else 'below'}"
+        if self.health is not None:
+            return f"health-{self.health}"
+        return "episode" if self.episode is not None else "nis" if self.nis is not None else "lost"
+
+
+class MqttSection(BrokerSection):
+    """Publication of the state at an MQTT broker, under the topics PREFIX/TWIN/state, birth, status and alert."""
+
+    prefix: Annotated[str, Field(pattern=r"^[^+#\x00]+$")] = "nisus"
+    """First part of the topics. Default: nisus."""
+
+
+class OpcUaSection(Section):
+    """An OPC UA server with the states as variables."""
+
+    host: Host = "127.0.0.1"
+    """Address at which it listens. Default: 127.0.0.1; any other needs user and password_env."""
+    port: Port = 4840
+    """Its port. Default: 4840."""
+    user: Text | None = None
+    """Name of the only user who may read. Default: everyone on this machine."""
+    password_env: EnvironmentName | None = None
+    """Environment variable with the password."""
+
+    @model_validator(mode="after")
+    def _guarded(self) -> OpcUaSection:
+        if (self.user is None) != (self.password_env is None):
+            raise refused("absent", "needs both user and password_env, or neither")
+        if self.user is None and self.host not in ("127.0.0.1", "localhost", "::1"):
+            raise refused("relation", "is not this machine; give user and password_env too", "host")
+        return self
+
+
+class CanOutputSection(Section):
+    """The estimate as frames on a CAN bus, two for each state, described by a DBC."""
+
+    interface: Text
+    """Interface of python-can: socketcan, virtual, udp_multicast, ..."""
+    channel: Annotated[int, Field(strict=True)] | str
+    """Channel of the interface."""
+    options: dict[str, Any] = {}
+    """Further arguments of python-can's interface. Default: none."""
+    id: Annotated[int, Field(strict=True, ge=0, le=0x1FFFFFFF)]
+    """Identifier of the first frame; each state takes two. None may be one of the source's databases."""
+    extended: Annotated[bool, Field(strict=True)] = False
+    """Whether the identifiers have 29 bits. Default: false, 11 bits."""
+    dbc: Text
+    """DBC file that is written when the twin starts, beside this YAML."""
+
+
+class OutputsSection(Section):
+    """Where the estimate is published, and who receives alerts. Nothing is published by default."""
+
+    every: DelayOrNone = 0.1
+    """Seconds between two states that are published; 0 publishes after each batch of measurements. Default: 0.1."""
+    covariance: Annotated[bool, Field(strict=True)] = False
+    """Whether published messages have the covariance of all states. Default: false."""
+    mqtt: MqttSection | None = None
+    """MQTT broker to which the state is published: {host, port, prefix, ...}. Default: none."""
+    opcua: OpcUaSection | None = None
+    """OPC UA server with the states as variables: {host, port, ...}. Default: none."""
+    can: CanOutputSection | None = None
+    """CAN bus on which the estimate is a virtual sensor: {interface, channel, id, dbc, ...}. Default: none."""
+    receivers: dict[Text, ReceiverSection] = {}
+    """Receivers of alerts, by name. Default: none."""

@@ -1,0 +1,90 @@
+"""A Mosquitto of a test's own on loopback, and a client that keeps what it hears."""
+
+import json
+import os
+import shutil
+import socket
+import subprocess
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import paho.mqtt.client as paho
+import pytest
+
+MOSQUITTO = shutil.which("mosquitto", path=f"{os.environ.get('PATH', '')}:/usr/sbin")
+
+
+def needs_mosquitto() -> None:
+    """Skip the test, or in CI fail it, without Mosquitto."""
+    if MOSQUITTO is None:
+        if os.environ.get("CI"):
+            pytest.fail("mosquitto is not installed; .ci/run installs it")
+        pytest.skip("mosquitto is not installed (Debian: apt install mosquitto)")
+
+
+def free_port() -> int:
+    """A TCP port of loopback that nobody uses."""
+    with socket.socket() as sock:
+        sock.bind(("127.0.0.1", 0))
+        return int(sock.getsockname()[1])
+
+
+class Broker:
+    """A Mosquitto that may be stopped and started again at its port."""
+
+    def __init__(self, folder: Path) -> None:
+        self.port = free_port()
+        self.settings = folder / "mosquitto.conf"
+        self.settings.write_text(
+            f"listener {self.port} 127.0.0.1\nallow_anonymous true\npersistence false\nset_tcp_nodelay true\n"
+        )
+        self.start()
+
+    def start(self) -> None:
+        command = [str(MOSQUITTO), "-c", str(self.settings)]
+        self.process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        end = time.monotonic() + 60.0
+        while not self.answers():
+            assert time.monotonic() < end and self.process.poll() is None, "mosquitto does not start"
+            time.sleep(0.01)
+
+    def answers(self) -> bool:
+        try:
+            socket.create_connection(("127.0.0.1", self.port), 1.0).close()
+        except OSError:
+            return False
+        return True
+
+    def stop(self) -> None:
+        self.process.terminate()
+        self.process.wait(10)
+
+
+class Listener:
+    """Subscribes to everything, and keeps topic, payload and retain flag of each message."""
+
+    def __init__(self, broker: Broker) -> None:
+        self.heard: list[tuple[str, Any, bool]] = []
+        self.ready = threading.Event()
+        self.client = paho.Client(paho.CallbackAPIVersion.VERSION2)  # type: ignore[attr-defined]
+        self.client.on_connect = lambda client, *_: client.subscribe("#", qos=1)
+        self.client.on_subscribe = lambda *_: self.ready.set()
+        self.client.message_callback_add("nisus/#", lambda _client, _data, item: self.heard.append(
+            (item.topic, json.loads(item.payload), item.retain)
+        ))  # fmt: skip
+        self.client.connect("127.0.0.1", broker.port)
+        self.client.loop_start()
+        assert self.ready.wait(60.0)
+
+    def of(self, topic: str) -> list[Any]:
+        return [body for name, body, _ in self.heard.copy() if name == topic]
+
+    def publish(self, topic: str, body: Any, **options: Any) -> None:
+        text = body if isinstance(body, str | bytes) else json.dumps(body)
+        self.client.publish(topic, text, qos=1, **options).wait_for_publish(60.0)
+
+    def stop(self) -> None:
+        self.client.disconnect()
+        self.client.loop_stop()

@@ -1,0 +1,3 @@
+from tests.app.web.conftest import serve
+
+__all__ = ["serve"]

@@ -1,0 +1,319 @@
+"""Alerts: when each rule fires, repeats and resolves, and that every receiver gets it whatever the others do."""
+
+import hashlib
+import hmac
+import json
+import socketserver
+import sys
+import threading
+from http.server import BaseHTTPRequestHandler, HTTPServer
+from types import SimpleNamespace
+
+import pytest
+from scipy.stats import norm
+
+from app.live.outputs import AlertMute
+from app.outputs import Publisher
+from app.outputs.alerts import MAX_WAITING_ALERTS, AlertRules, Delivery, heartbeat
+from app.present.state_message import PublishedState, StateMessage
+from app.twin.twin import load_twin
+from config.output_schema import AlertSection
+from estimators.diagnostics.episodes import Episode
+from estimators.errors import ConfigError
+from sources.source import ignore
+from tests.app.scripted import wait_for
+from tests.support import SECOND
+
+BEGIN = 1_767_225_600 * SECOND
+
+
+def state(value=100.0, std=10.0, **fields):
+    """A message of one state."""
+    given = {"name": "winding", "unit": "°C", "protection_level": None, "valid": value is not None}
+    one = PublishedState(**given, value=value, std=None if value is None else std, reason="" if value else "diverged")
+    known = dict(twin="motor", estimator="kf", time_ns=1, time=None, sent="", age_s=0.1, revision=0, tuning=None)
+    known |= dict(model_version=1, health="tracking", cause="", estimate_valid=True, inputs_valid=True, nis=1.0)
+    known |= dict(states=(one,), inputs=(), sensors=(), covariance=None, covariance_of=None)
+    return StateMessage(**known | fields)
+
+
+def episode(subject, cause="stuck", start=3.0, end=None):
+    return Episode(start, end, subject, cause, 1.0, 0.5, 1.5, "σ", f"{subject}: it is {cause}")
+
+
+class Looked:
+    """Rules with a clock of their own; `at(t, ...)` returns (status, text) of the messages that are due then."""
+
+    def __init__(self, **rule):
+        self.now = 0.0
+        self.engine = SimpleNamespace(mute=None, episodes=lambda: self.episodes)
+        self.episodes = []
+        self.rules = AlertRules([AlertSection(**rule)], link="http://127.0.0.1:9900", clock=lambda: self.now)
+
+    def messages(self, t, **fields):
+        self.now = t
+        return [alert for _, alert in self.rules.look(self.engine, state(**fields))]
+
+    def at(self, t, **fields):
+        return [alert.status for alert in self.messages(t, **fields)]
+
+
+def test_an_alert_fires_after_its_time_repeats_and_is_resolved_once():
+    rules = Looked(health="suspect", after=2.0, repeat=60.0, clear=5.0)
+    bad = {"health": "degraded", "cause": "yoke is silent"}
+    assert rules.at(0.0) == rules.at(1.0, **bad) == rules.at(2.9, **bad) == []
+    (first,) = rules.messages(3.0, **bad)
+    assert (first.status, first.text, first.rule) == ("firing", "degraded: yoke is silent", "health-suspect")
+    assert rules.at(10.0, **bad) == rules.at(62.9, **bad) == []
+    (again,) = rules.messages(63.0, **bad)
+    assert (again.status, again.id, again.since) == ("repeated", first.id, first.since)
+    # A gap that is shorter than `clear` is the same alert.
+    assert rules.at(64.0) == rules.at(66.0, **bad) == rules.at(70.9) == []
+    (last,) = rules.messages(71.0)
+    assert (last.status, last.id) == ("resolved", first.id)
+    assert rules.at(80.0) == [] and not rules.rules.open
+    rules.at(90.0, **bad)
+    (other,) = rules.messages(92.0, **bad)
+    assert other.status == "firing" and other.id != first.id
+
+
+@pytest.mark.parametrize(
+    ("rule", "over"),
+    [({"above": 120.0}, lambda value, std: norm.sf(120.0, value, std)),
+     ({"below": 80.0}, lambda value, std: norm.cdf(80.0, value, std))],
+)  # fmt: skip
+@pytest.mark.parametrize("probability", [0.05, 0.5, 0.95])
+def test_a_limit_counts_with_its_probability(rule, over, probability):
+    for value in (60.0, 79.0, 81.0, 95.0, 105.0, 119.0, 121.0, 150.0):
+        rules = Looked(state="winding", probability=probability, after=0.0, **rule)
+        found = rules.messages(0.0, value=value)
+        assert bool(found) == (over(value, 10.0) >= probability)
+        for alert in found:
+            assert alert.probability == pytest.approx(over(value, 10.0), rel=1e-12)
+            assert (alert.value, alert.std, alert.unit, alert.subject) == (value, 10.0, "°C", "winding")
+    assert Looked(state="winding", **rule).at(0.0, value=None) == []
+
+
+def test_each_episode_is_an_alert_of_its_own():
+    rules = Looked(episode=["stuck"], after=0.0, clear=0.0)
+    rules.episodes = [episode("yoke"), episode("winding"), episode("tooth", "shifted"), episode("magnet", end=4.0)]
+    first = rules.messages(0.0)
+    assert [alert.subject for alert in first] == ["yoke", "winding"] and len({alert.id for alert in first}) == 2
+    assert {alert.guide for alert in first} == {"docs/alarms.md#stuck"}
+    assert {alert.link for alert in first} == {"http://127.0.0.1:9900/alarms#stuck"}
+    assert all("sensor" in alert.response for alert in first)
+    rules.episodes = rules.episodes[:1]
+    assert [(alert.status, alert.subject) for alert in rules.messages(1.0)] == [("resolved", "winding")]
+
+
+@pytest.mark.parametrize(
+    ("rule", "fields"), [({"nis": 2.0}, {"nis": 2.1}), ({"lost": 30.0}, {"age_s": 31.0, "health": "stale"})]
+)
+def test_nis_and_loss(rule, fields):
+    rules = Looked(**rule, after=0.0)
+    assert rules.at(0.0) == [] and rules.at(1.0, **fields) == ["firing"]
+
+
+def test_nothing_is_sent_while_muted_or_after_a_maintenance():
+    rules = Looked(health="suspect", after=0.0, clear=1.0, maintenance=100.0)
+    bad = {"health": "suspect"}
+    assert rules.at(0.0, **bad) == ["firing"]
+    rules.engine.mute = AlertMute(sys.float_info.max)
+    assert rules.at(1.0) == rules.at(5.0) == rules.at(6.0) == []
+    rules.engine.mute = AlertMute(0.0)
+    assert rules.at(7.0) == ["resolved"]
+    assert rules.at(8.0, model_version=2, **bad) == rules.at(107.9, model_version=2, **bad) == []
+    assert rules.at(108.0, model_version=2, **bad) == ["firing"]
+
+
+class Hook:
+    """An HTTP server that keeps what it gets and answers with `code`."""
+
+    def __init__(self):
+        self.received, self.code = [], 200
+        hook = self
+
+        class Handler(BaseHTTPRequestHandler):
+            def do_POST(self):  # noqa: N802
+                body = self.rfile.read(int(self.headers["Content-Length"]))
+                if hook.code == 200:
+                    hook.received.append((dict(self.headers), body))
+                self.send_response(hook.code)
+                self.send_header("Location", "http://127.0.0.1:9/")
+                self.end_headers()
+
+            def log_message(self, *args):
+                pass
+
+        self.server = HTTPServer(("127.0.0.1", 0), Handler)
+        self.url = f"http://127.0.0.1:{self.server.server_port}/hook"
+        threading.Thread(target=self.server.serve_forever, daemon=True).start()
+
+    @property
+    def alerts(self):
+        return [json.loads(body) for _, body in self.received]
+
+
+@pytest.fixture
+def hook():
+    made = Hook()
+    yield made
+    made.server.shutdown()
+    made.server.server_close()
+
+
+class MailServer(socketserver.StreamRequestHandler):
+    """As much of SMTP as one message needs."""
+
+    def handle(self):
+        self.wfile.write(b"220 test\r\n")
+        for line in self.rfile:
+            word = line[:4].upper().strip()
+            if word == b"DATA":
+                self.wfile.write(b"354 go on\r\n")
+                text = b"".join(iter(self.rfile.readline, b".\r\n"))
+                self.server.mails.append(text.decode())
+            self.wfile.write(b"221 bye\r\n" if word == b"QUIT" else b"250 ok\r\n")
+
+
+def started(receivers, alerts="[{state: temperature, above: 45, after: 0, clear: 0}]"):
+    """A twin whose measurements come by `send`, with its publisher."""
+    overrides = {"source": "{type: push}", "outputs": json.dumps({"receivers": receivers}), "alerts": alerts}
+    overrides["time.tick"] = "1000"
+    return load_twin("motor_winding", overrides=overrides)
+
+
+def send(page, k, value):
+    message = {"time": BEGIN + k * SECOND, "values": {"winding": value}}
+    assert page.post("/api/readings", **message)[1]["accepted"] == 1
+
+
+def test_every_receiver_gets_the_alert_although_one_is_dead(serve, hook, tmp_path, monkeypatch):
+    mail = socketserver.ThreadingTCPServer(("127.0.0.1", 0), MailServer)
+    mail.mails = []
+    threading.Thread(target=mail.serve_forever, daemon=True).start()
+    monkeypatch.setenv("NISUS_TEST_SECRET", "a key")
+    program = "import sys; open(sys.argv[1], 'a').write(sys.stdin.read() + chr(10))"
+    twin = started({
+        "dead": {"type": "webhook", "url": "http://127.0.0.1:9/"},
+        "ops": {"type": "webhook", "url": hook.url, "secret_env": "NISUS_TEST_SECRET", "heartbeat": 3600},
+        "mail": {"type": "email", "to": "ops@plant", "sender": "nisus@plant", "server": "127.0.0.1",
+                 "port": mail.server_address[1]},
+        "log": {"type": "command", "command": [sys.executable, "-c", program, str(tmp_path / "alerts")]},
+    })  # fmt: skip
+    page = serve(twin=twin, behind=lambda _: twin.open_source(ignore))
+    publisher = page.engine.published = Publisher(page.engine, page="http://127.0.0.1:9900")
+    publisher.start()
+    try:
+        for k in range(30):
+            send(page, k, 50.0)
+        wait_for(lambda: len(hook.received) == 2 and mail.mails and (tmp_path / "alerts").exists())
+        first, alert = sorted(hook.alerts, key=lambda item: item["status"] == "firing")
+        assert first["status"] == "heartbeat"
+        probability = norm.sf(45.0, alert["value"], alert["std"])
+        assert alert["probability"] == pytest.approx(probability, rel=1e-12) and probability >= 0.5
+        assert alert["link"] == "http://127.0.0.1:9900/alarms#limit-of-a-state" and alert["response"]
+        headers, body = hook.received[-1]
+        signed = headers["X-Nisus-Timestamp"].encode() + b"." + body
+        assert headers["X-Nisus-Signature"] == "sha256=" + hmac.new(b"a key", signed, hashlib.sha256).hexdigest()
+        assert "Subject: [motor_winding] firing: temperature-above" in mail.mails[0]
+        assert json.loads((tmp_path / "alerts").read_text())["id"] == alert["id"]
+        wait_for(lambda: page.get("/api/alerts")["receivers"][0]["failing"])
+        # The program of the command may not have ended yet.
+        wait_for(lambda: [item["waiting"] for item in page.get("/api/alerts")["receivers"]] == [1, 0, 0, 0])
+        found = page.get("/api/alerts")
+        assert [(item["rule"], item["subject"]) for item in found["alerts"]] == [("temperature-above", "temperature")]
+        text = page.client.get("/metrics").text
+        assert 'nisus_output_up{output="alerts to dead",twin="motor_winding"} 0.0' in text
+        assert 'nisus_alerts_total{outcome="delivered",receiver="ops",twin="motor_winding"} 2.0' in text
+        lines = [line.text for line in page.engine.notices.since(0)]
+        assert sum("receiver dead fails" in line for line in lines) == 1
+        for k in range(30, 80):
+            send(page, k, 40.0)
+        wait_for(lambda: hook.alerts[-1]["status"] == "resolved")
+        assert hook.alerts[-1]["id"] == alert["id"]
+    finally:
+        publisher.stop()
+        mail.shutdown()
+        mail.server_close()
+
+
+def test_a_receiver_that_failed_gets_what_waited_in_order_and_a_full_queue_drops_the_oldest():
+    class Flaky:
+        def __init__(self):
+            self.dead, self.got = True, []
+
+        def send(self, alert):
+            if self.dead:
+                raise OSError("refused")
+            self.got.append(alert.sent)
+
+    receiver, said = Flaky(), []
+    notices = SimpleNamespace(say=lambda text, level="info": said.append(text), count=lambda key: None)
+    delivery = Delivery("ops", receiver, notices)
+    alerts = [
+        heartbeat("motor", "tracking").model_copy(update={"status": "firing", "sent": str(k)})
+        for k in range(MAX_WAITING_ALERTS + 2)
+    ]
+    for alert in alerts:
+        delivery.put(alert)
+    assert [delivery.step() for _ in range(9)] == [1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 60.0, 60.0, 60.0]
+    assert (delivery.dropped, delivery.failing) == (2, True)
+    receiver.dead = False
+    delivery.step()
+    assert receiver.got == [alert.sent for alert in alerts[2:]] and not delivery.waiting
+    assert said == [
+        "alerts: receiver ops fails (refused); they wait, and it is tried again",
+        "alerts: receiver ops takes them again",
+    ]
+
+
+@pytest.mark.parametrize("code", [302, 500])
+def test_an_answer_that_is_no_success_counts_as_a_failure_and_is_not_followed(hook, code):
+    from app.outputs.alerts import Webhook
+    from config.output_schema import WebhookSection
+
+    hook.code = code
+    with pytest.raises(OSError, match=f"it answers {code}"):
+        Webhook(WebhookSection(type="webhook", url=hook.url)).send(heartbeat("motor", "tracking"))
+
+
+def test_a_mute_is_asked_for_by_a_command(serve):
+    page = serve(3)
+    assert page.command("MuteAlerts", seconds=1e9) == (
+        "MuteAlerts: seconds is 1e+09; it must be from 0 to 2592000, 30 days"
+    )
+    page.post("/api/command", command="MuteAlerts", seconds=3600, reason="cleaning")
+    wait_for(lambda: page.engine.mute is not None and page.engine.mute.active)
+    assert "alerts are muted for 60 min: cleaning" in [line.text for line in page.engine.notices.since(0)]
+
+
+OPS = '{"receivers": {"ops": {"type": "webhook", "url": "http://127.0.0.1:9/"}}}'
+
+
+@pytest.mark.parametrize(
+    ("outputs", "alerts", "text"),
+    [
+        (OPS, "[{state: windng, above: 1}]", "alerts[0].state names 'windng', no state of motor_winding"),
+        (OPS, "[{state: temperature}]", "alerts[0] gives neither above nor below"),
+        (OPS, "[{episode: stuk}]", "alerts[0].episode names 'stuk', no cause of an episode; did you mean stuck?"),
+        (OPS, "[{health: suspect, to: op}]", "alerts[0].to names 'op', no receiver under outputs.receivers"),
+        (OPS, "[{health: suspect, nis: 2}]", "alerts[0] gives both health and nis"),
+        (OPS, "[{nis: 2, above: 3}]", "belongs to a limit of a state"),
+        ("{}", "[{health: suspect}]", "alerts[0] has no receiver; name one under outputs.receivers"),
+        (OPS.replace("http:", "ftp:"), "[]", "url"),
+    ],
+)
+def test_a_rule_that_means_nothing_is_refused_in_one_line(outputs, alerts, text):
+    with pytest.raises(ConfigError) as error:
+        load_twin("motor_winding", overrides={"outputs": outputs, "alerts": alerts})
+    assert text in str(error.value) and "\n" not in str(error.value)
+
+
+def test_a_secret_that_is_not_set_is_named(serve, monkeypatch):
+    monkeypatch.delenv("NISUS_NO_SECRET", raising=False)
+    twin = started({"ops": {"type": "webhook", "url": "$NISUS_NO_SECRET"}})
+    page = serve()
+    page.engine.twin = twin
+    with pytest.raises(ConfigError, match="the environment variable NISUS_NO_SECRET is not set"):
+        Publisher(page.engine)

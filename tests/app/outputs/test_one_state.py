@@ -1,0 +1,259 @@
+"""One measurement by POST, MQTT, OPC UA or CAN: the same state from every output, equal to the row of the fold."""
+
+import json
+import struct
+import uuid
+from datetime import UTC, datetime, timedelta
+
+import can
+import cantools
+import numpy as np
+import pytest
+from asyncua import ua
+from asyncua.sync import Client, Server
+
+from app.outputs import Publisher
+from app.outputs.can import checksum, frames
+from app.outputs.opcua import STATUS_CODES, values_of
+from app.twin.twin import load_twin
+from estimators import fold
+from estimators.errors import ConfigError
+from estimators.log import Log
+from estimators.track import HEALTH_NAMES
+from sources.source import ignore
+from tests.app.outputs.broker import Broker, Listener, free_port, needs_mosquitto
+from tests.app.outputs.test_alerts import state
+from tests.app.scripted import pull_all, wait_for
+from tests.support import SECOND
+
+BEGIN = 1_767_225_600 * SECOND
+VALUES = (40.25, 41.5, 42.125, 41.75)
+"""Exact in float32, so that a frame of the bus carries them."""
+
+DBC = """VERSION ""
+BU_: Nisus
+BO_ 256 Plant: 8 Nisus
+ SG_ winding : 0|32@1- (1,0) [0|0] "degC" Nisus
+SIG_VALTYPE_ 256 winding : 1;
+"""
+
+
+class Plant:
+    """The measurements of one kind of source."""
+
+    def __init__(self, folder, broker):
+        self.folder, self.broker = folder, broker
+        self.channel = f"test {uuid.uuid4().hex}"
+        (folder / "plant.dbc").write_text(DBC)
+        self.closing = []
+
+    def post(self, page):
+        for k, value in enumerate(VALUES):
+            message = {"time": BEGIN + k * SECOND, "values": {"winding": value}}
+            assert page.post("/api/readings", **message)[1]["accepted"] == 1
+
+    def source(self, kind):
+        if kind == "mqtt":
+            topics = {"plant/t": {"values": {"winding": "v"}, "time": "t", "unit": "s"}}
+            return {"type": kind, "host": "127.0.0.1", "port": self.broker.port, "topics": topics}
+        if kind == "opcua":
+            self.server, url = Server(), f"opc.tcp://127.0.0.1:{free_port()}"
+            self.server.set_endpoint(url)
+            index = self.server.register_namespace("plant")
+            node = ua.NodeId("winding", index)
+            self.node = self.server.nodes.objects.add_variable(node, "winding", 0.0)
+            self.write(-1, 0.0, ua.StatusCodes.Bad)
+            self.server.start()
+            self.closing.append(self.server.stop)
+            return {"type": kind, "url": url, "nodes": {"winding": f"ns={index};s=winding"}, "every": 0.01}
+        if kind == "can":
+            sensors = {"winding": {"message": "Plant", "signals": "winding"}}
+            bus = {"interface": "virtual", "channel": self.channel, "dbc": str(self.folder / "plant.dbc")}
+            return {"type": kind, **bus, "sensors": sensors}
+        return {"type": kind}
+
+    def write(self, k, value, status=ua.StatusCodes.Good):
+        stamp = datetime(2026, 1, 1, tzinfo=UTC) + timedelta(seconds=k)
+        self.node.write_value(ua.DataValue(ua.Variant(value), ua.StatusCode(status), SourceTimestamp=stamp))
+
+    def send(self, kind, page):
+        if kind == "push":
+            self.post(page)
+        elif kind == "mqtt":
+            wait_for(page.engine.source.inner.connected.is_set)
+            sender = Listener(self.broker)
+            for k, value in enumerate(VALUES):
+                sender.publish("plant/t", {"v": value, "t": BEGIN // SECOND + k})
+            sender.stop()
+        elif kind == "opcua":
+            wait_for(page.engine.source.inner.connected.is_set)
+            for k, value in enumerate(VALUES):
+                # Between two publications a server keeps the last value only.
+                wait_for(lambda k=k: len(finite_rows(page)[1]) >= k)
+                self.write(k, value)
+        else:
+            bus = can.Bus(interface="virtual", channel=self.channel)
+            for k, value in enumerate(VALUES):
+                bus.send(can.Message(arbitration_id=256, data=struct.pack("<fI", value, 0), is_extended_id=False))
+                wait_for(lambda k=k: len(finite_rows(page)[1]) > k)
+            bus.shutdown()
+
+    def close(self):
+        for close in self.closing:
+            close()
+
+
+def finite_rows(page):
+    """All rows, and the indices of those with a measurement."""
+    rows = pull_all(page.engine)
+    return rows, np.flatnonzero(np.isfinite(rows.events.value[:, 0]))
+
+
+class Subscriber:
+    """A client of the OPC UA output, which keeps the last value of each variable."""
+
+    def __init__(self, url, names):
+        self.last, self.client = {}, Client(url)
+        self.client.connect()
+        index = self.client.get_namespace_index("urn:nisus")
+        self.paths = {f"ns={index};s=motor_winding.{name}": name for name in names}
+        subscription = self.client.create_subscription(10, self)
+        subscription.subscribe_data_change([self.client.get_node(node) for node in self.paths])
+
+    def datachange_notification(self, node, value, data):
+        self.last[self.paths[node.nodeid.to_string()]] = data.monitored_item.Value
+
+    def stop(self):
+        self.client.disconnect()
+
+
+@pytest.mark.parametrize("kind", ["push", "mqtt", "opcua", "can"])
+def test_the_same_state_from_every_output_whatever_the_source(serve, tmp_path, kind):
+    needs_mosquitto()
+    broker = Broker(tmp_path)
+    plant, port, dbc = Plant(tmp_path, broker), free_port(), tmp_path / "estimate.dbc"
+    bus = {"interface": "virtual", "channel": plant.channel, "id": 1536, "dbc": str(dbc)}
+    outputs = {"every": 0, "mqtt": {"host": "127.0.0.1", "port": broker.port}, "opcua": {"port": port}, "can": bus}
+    given = {"source": json.dumps(plant.source(kind)), "outputs": json.dumps(outputs), "time.tick": "1000"}
+    twin = load_twin("motor_winding", overrides=given)
+    page = serve(twin=twin, behind=lambda _: twin.open_source(ignore))
+    publisher = page.engine.published = Publisher(page.engine)
+    publisher.start()
+    hears, monitor = Listener(broker), can.Bus(interface="virtual", channel=plant.channel)
+    try:
+        wait_for(lambda: all(item["connected"] for item in publisher.json()["outputs"]))
+        plant.send(kind, page)
+        wait_for(lambda: len(finite_rows(page)[1]) == len(VALUES))
+        rows, read = finite_rows(page)
+        times = rows.events.t[read]
+        if kind != "can":  # whose times are those of the bus
+            assert times.tolist() == [BEGIN + k * SECOND for k in range(len(VALUES))]
+        assert rows.events.value[read, 0].tolist() == list(VALUES)
+        log = Log.resume(twin.model, None, rows.events)
+        track = fold(twin.estimator, twin.model, log, tuning=twin.tuning)
+        mean, std, t = track.mean[-1].tolist(), track.std[-1].tolist(), int(times[-1])
+
+        # HTTP and MQTT
+        names = [item.name for item in twin.model.shown_states]
+        wait_for(lambda: [m for m in hears.of("nisus/motor_winding/state") if m["time_ns"] == t])
+        for found in (page.get("/api/state"), hears.of("nisus/motor_winding/state")[-1]):
+            assert found["time_ns"] == t
+            assert [item["value"] for item in found["states"]] == mean
+            assert [item["std"] for item in found["states"]] == std
+
+        # OPC UA
+        paths = [*names, *(f"{name}.std" for name in names), "message"]
+        client = Subscriber(f"opc.tcp://127.0.0.1:{port}/nisus", paths)
+        wait_for(lambda: len(client.last) == len(paths))
+        wait_for(lambda: json.loads(client.last["message"].Value.Value)["time_ns"] == t)
+        wait_for(lambda: [client.last[path].Value.Value for path in paths[:-1]] == [*mean, *std])
+        assert {client.last[name].StatusCode.name for name in names} == {STATUS_CODES[found["health"]]}
+        stamp = datetime(1970, 1, 1, tzinfo=UTC) + timedelta(microseconds=t // 1000)
+        assert abs(client.last[names[0]].SourceTimestamp.replace(tzinfo=UTC) - stamp) <= timedelta(microseconds=1)
+        with pytest.raises(ua.UaStatusCodeError):
+            client.client.get_node(next(iter(client.paths))).write_value(0.0)
+        client.stop()
+
+        # CAN: the last frames, by the DBC that Nisus wrote; float32 rounds to half a unit of its last place.
+        database, signals = cantools.database.load_file(dbc), {}
+        while (frame := monitor.recv(0.5)) is not None:
+            if frame.arbitration_id >= 1536:
+                signals |= database.decode_message(frame.arbitration_id, frame.data)
+                assert frame.data[7] == checksum(frame.arbitration_id, bytes(frame.data[:7]))
+        assert [signals[f"{name}_mean"] for name in names] == [float(np.float32(value)) for value in mean]
+        assert [signals[f"{name}_std"] for name in names] == [float(np.float32(value)) for value in std]
+        assert {signals[f"{name}_mean_valid"] for name in names} == {1}
+        assert {str(signals[f"{name}_mean_health"]) for name in names} == {found["health"]}
+    finally:
+        publisher.stop()
+        hears.stop()
+        monitor.shutdown()
+        page.stop()
+        plant.close()
+        broker.stop()
+
+
+@pytest.mark.parametrize("health", HEALTH_NAMES)
+def test_the_status_code_says_whether_a_value_may_be_used(health):
+    valid = health in ("tracking", "advisory", "suspect", "degraded")
+    found = values_of(state(100.0 if valid else None, health=health, estimate_valid=valid))
+    wanted = {
+        "waiting": "BadWaitingForInitialData", "tracking": "Good", "advisory": "Good", "diverged": "Bad",
+        "suspect": "UncertainSubNormal", "degraded": "UncertainLastUsableValue", "stale": "BadNoCommunication",
+    }[health]  # fmt: skip
+    assert {found[name].StatusCode.name for name in ("winding", "winding.std")} == {wanted}
+    assert (found["winding"].Value.Value is None) == (not valid)
+    assert found["winding.protection_level"].Value.Value is None
+
+
+def test_a_withheld_state_is_bad_while_the_twin_is_good():
+    assert values_of(state(None))["winding"].StatusCode.name == "Bad"
+
+
+def test_frames_carry_validity_age_and_counter_and_a_checksum_that_is_the_standards():
+    # The check value of CRC-8 SAE J1850 over "123456789" is 0x4B; here the identifier is its first four bytes.
+    assert checksum(int.from_bytes(b"1234", "little"), b"56789") == 0x4B
+    (identifier, mean), (_, std) = frames(1536, state(100.0, age_s=0.5, health="suspect"), 7)
+    assert (identifier, struct.unpack_from("<fBBB", mean)) == (1536, (100.0, 0x37, 1, 50))
+    assert struct.unpack_from("<fBBB", std) == (10.0, 0x37, 1, 50)
+    (_, lost), _ = frames(1536, state(None, age_s=99.0, health="diverged"), 8)
+    assert struct.unpack_from("<fBBB", lost) == (0.0, 0x58, 0, 255)
+
+
+@pytest.mark.parametrize(
+    ("outputs", "text"),
+    [
+        ({"can": {"interface": "virtual", "channel": "x", "id": 255, "dbc": "{}/e.dbc"}},
+         "identifier 0x100 is Plant of the source's database"),
+        ({"can": {"interface": "virtual", "channel": "x", "id": 2045, "dbc": "{}/e.dbc"}},
+         "2 states need the identifiers 0x7fd to 0x800; the largest is 0x7ff"),
+        ({"can": {"interface": "virtual", "channel": "x", "id": 1536, "dbc": "{}/none/e.dbc"}}, "cannot be written"),
+        ({"opcua": {"host": "0.0.0.0"}}, "outputs.opcua.host is not this machine; give user and password_env too"),
+        ({"opcua": {"user": "a"}}, "needs both user and password_env, or neither"),
+    ],
+)  # fmt: skip
+def test_an_output_that_cannot_be_is_refused_in_one_line(serve, tmp_path, outputs, text):
+    plant = Plant(tmp_path, None)
+    overrides = {"source": json.dumps(plant.source("can")), "outputs": json.dumps(outputs).replace("{}", str(tmp_path))}
+    page = serve()
+    with pytest.raises(ConfigError) as error:
+        page.engine.twin = load_twin("motor_winding", overrides=overrides)
+        Publisher(page.engine)
+    assert text in str(error.value) and "\n" not in str(error.value)
+
+
+def test_a_port_in_use_is_reported_and_delays_nothing(serve, tmp_path):
+    import socket
+
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        outputs = {"opcua": {"port": taken.getsockname()[1]}}
+        given = {"source": "{type: push}", "outputs": json.dumps(outputs), "time.tick": "1000"}
+        twin = load_twin("motor_winding", overrides=given)
+        page = serve(twin=twin, behind=lambda _: twin.open_source(ignore))
+        publisher = Publisher(page.engine)
+        publisher.start()
+        Plant(tmp_path, None).post(page)
+        wait_for(lambda: any("is not served" in line.text for line in page.engine.notices.since(0)))
+        assert not publisher.json()["outputs"][0]["connected"]
+        wait_for(lambda: page.rows() == len(VALUES))
+        publisher.stop()
