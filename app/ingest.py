@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections import deque
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -16,6 +17,9 @@ from sources.source import WRONG_TIME, Report
 CLOCK_MOVED = "clock moved"  # key of jumps of a source's clock
 MAINTENANCE = "maintenance"  # key of maintenance
 PAUSED = "paused"  # key of pauses of a source, over which inputs are unknown
+PAUSE_PERIODS = 3.0  # median periods of a source beyond which a gap may be a pause: some log once a minute
+PERIODS = 20  # latest periods of which the median is taken
+MIN_STEP_BACK_NS = 10**9  # by which arrivals go back if this machine's clock was set; those of a moment are unordered
 
 
 class Planned(NamedTuple):
@@ -68,17 +72,65 @@ class Ingest:
         self._planned = [] if horizon is None else sorted(planned, key=lambda item: item.at)
         self._unknown = None if horizon is None else unknown
         self._newest = BEFORE
+        self._periods = deque[int](maxlen=PERIODS)
+        self._step_back = max(MIN_STEP_BACK_NS, horizon or 0)
+        self._arrived = BEFORE
+        self._set_back = 0
+        """Time by which this machine's clock was set back since the first event, ns."""
 
     @property
     def held(self) -> int:
         """Number of events held until the next one confirms their time."""
         return 0 if self._guard is None else self._guard.held
 
+    def state(self) -> dict[str, Any]:
+        """Return a copy of the state for `restore`, of arrays, lists and numbers."""
+        own = {"newest": self._newest, "arrived": self._arrived, "set_back": self._set_back}
+        guard = None if self._guard is None else self._guard.state()
+        return own | {"periods": [*self._periods], "guard": guard}
+
+    def restore(self, state: Mapping[str, Any], newest: int) -> None:
+        """Continue from the `state` of another; `newest` is the time of the log's newest event, ns.
+
+        Raises:
+            ValueError: If it is of another model.
+        """
+        self._newest, self._arrived = int(state["newest"]), int(state["arrived"])
+        self._set_back = int(state["set_back"])
+        self._periods.extend(state["periods"])
+        self._planned = [item for item in self._planned if item.at > newest]
+        if self._guard is not None and state["guard"] is not None:
+            self._guard.restore(state["guard"])
+
     def take(self, batch: Events) -> Passed:
         """Return those of the next events, in order of arrival, that enter the log."""
         if self._guard is None:
             return Passed(batch, np.zeros(len(batch), np.bool_), [], [])
-        return self._reported(self._guard.take(batch))
+        return self._reported(self._guard.take(self._arrivals_in_order(batch)))
+
+    def _arrivals_in_order(self, batch: Events) -> Events:
+        """Return the events with arrivals as if this machine's clock had not been set back.
+
+        `ClockGuard` finds a step of the source's clock in t - arrival, where a step of both does not show.
+        """
+        live = np.flatnonzero(batch.arrival != batch.t)
+        if not live.size:
+            return batch
+        arrival = batch.arrival[live] + self._set_back
+        while True:
+            before = np.maximum.accumulate(np.concatenate(([self._arrived], arrival)))[:-1]
+            back = np.flatnonzero(arrival < before - self._step_back)
+            if not back.size:
+                break
+            step = int(before[back[0]] - arrival[back[0]])
+            arrival[back[0] :] += step
+            self._set_back += step
+        self._arrived = int(max(self._arrived, arrival.max()))
+        if not self._set_back:
+            return batch
+        arrivals = batch.arrival.copy()
+        arrivals[live] = arrival
+        return batch._replace(arrival=arrivals)
 
     def finish(self) -> Passed:
         """Return the events that are held at the end of the source."""
@@ -102,8 +154,17 @@ class Ingest:
         t = passed.events.t[np.isin(passed.events.kind, (READING, INPUT))]
         newest = np.maximum.accumulate(np.concatenate(([self._newest], t)))
         self._newest = int(newest[-1])
-        for k in np.flatnonzero((newest[:-1] != BEFORE) & (t > newest[:-1] + unknown.after)).tolist():
-            length = (t[k] - newest[k]) * 1e-9
+        known = newest[:-1] != BEFORE
+        periods = np.where(known, newest[1:] - newest[:-1], 0)
+        regular = np.flatnonzero(periods > 0)
+        before = [*self._periods, *periods[regular].tolist()]
+        places = len(self._periods) + np.searchsorted(regular, np.arange(t.size))
+        self._periods.extend(before[-PERIODS:])
+        for k in np.flatnonzero(periods > unknown.after).tolist():
+            usual = before[max(0, places[k] - PERIODS) : places[k]]
+            if usual and periods[k] <= PAUSE_PERIODS * np.median(usual):
+                continue
+            length = periods[k] * 1e-9
             self._report(
                 PAUSED,
                 f"no event for {length:.4g} s until {t[k] * 1e-9:.6g} s, longer than time.paused_after: its inputs are "

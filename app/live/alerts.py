@@ -45,6 +45,12 @@ class Alerts:
         self._said.clear()
         self._examine_all = True
 
+    def examined(self, fold: Fold) -> None:
+        """Note that the rows so far were reported by an earlier process."""
+        self._failures, self._recoveries = fold.failures, fold.recoveries()
+        self._decided = max([self._decided, *(decision.time for decision in fold.decisions)])
+        self._lost, self._examine_all = self._first_lost_row(fold, 0), False
+
     def look(self, fold: Fold, before: int) -> None:
         """Report the rows from `before` on."""
         say, report = self._notices.say, self._notices.report

@@ -204,9 +204,17 @@ class ClearFault:
     number: int | None = None
 
 
+@dataclass(frozen=True)
+class MuteAlerts:
+    """Send no alerts for so many seconds, for example during maintenance; 0 ends it."""
+
+    seconds: float
+    reason: str = ""
+
+
 Command = (
     SetEstimator | SetTuning | SetTunings | SetOption | UseSensor | Restore | Undo | Redo | Load | Pin | Unpin
     | Note | Annotate | DeleteAnnotation | Reset | Maintenance | Pause | Speed | Step | Seek | Record | InjectFault
-    | ClearFault
+    | ClearFault | MuteAlerts
 )  # fmt: skip
 """Any command."""

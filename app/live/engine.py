@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from estimators.diagnostics.references import withheld_reasons
 from estimators.errors import NisusError
 from estimators.late import inflated
 from estimators.log import TICK, Events
@@ -24,24 +25,23 @@ from estimators.registry import find_estimator
 from estimators.snapshots import PERMANENT_SPACING, Base
 from sources.source import controls_of, span_of
 
-from ..concurrency import run_all
 from ..ingest import Ingest
 from ..terminal import complain
 from . import commands
 from .batches import BatchSizer
 from .changes import merged
 from .execute import execute
-from .feeder import Feeder
-from .jobs import Job, Jobs
-from .outputs import Status
-from .running_fold import Records, Running
+from .feeder import Delivery, Feeder
+from .jobs import Job, Jobs, run_all
+from .outputs import LogTail, Status
+from .running_fold import Keeper, Records, Running, StoredTwin
 from .status import busy_status, past_status, status_of
 from .watchdog import Watchdog
 from .watchers import IdleTicks, Watchers
 from .workshop import Workshop
 
 if TYPE_CHECKING:
-    from estimators.diagnostics.episodes import Episode
+    from estimators.diagnostics.episodes import Episode, TrackedEpisode
     from estimators.events.clocks import Passed
     from estimators.fold import Fold
     from estimators.tuning import Tuning
@@ -70,6 +70,7 @@ class Engine(Running):
         base: Base | None = None,
         horizon: float | None = None,
         workshop: Workshop | None = None,
+        stored: StoredTwin | None = None,
     ) -> None:
         """Open the source and prepare the fold.
 
@@ -81,13 +82,14 @@ class Engine(Running):
                 recording were judged when it was made).
             workshop: Compiles filters, also the first, without which the log then begins. None: each is compiled where
                 it is needed.
+            stored: State of the twin to continue, in place of `base`.
 
         Raises:
             NisusError: If the source cannot be opened or the model does not compile.
         """
-        self._inbox: queue.SimpleQueue[Events | Callable[[], Any]] = queue.SimpleQueue()
+        self._inbox: queue.SimpleQueue[Events | Delivery | Callable[[], Any]] = queue.SimpleQueue()
         self._workshop = workshop or Workshop()
-        super().__init__(twin, Watchdog(self._report_stalled), base, self._workshop.ready)
+        super().__init__(twin, Watchdog(self._report_stalled), base, self._workshop.ready, stored)
         self._awaited = self.estimator if self._fold.idle else None
         self._gesture = ""
         """Gesture of the edit that asked for the present settings."""
@@ -120,15 +122,36 @@ class Engine(Running):
         self._watchers = Watchers(self)
         self.revisions.said = self._watchers.episodes_of
         self.recorder: Records | None = None
+        self.store: Keeper | None = None
         self._status: tuple[float, Status] | None = (-np.inf, self._status_now())
         self._thread = threading.Thread(target=self._run, name="engine", daemon=True)
+        if stored is not None:
+            self._go_on_from(stored.tail)
+            self._watchers.episode_log.restore(stored.episodes)
 
     def _begin_intake(self) -> None:
         """Begin a log, of which no event has been judged."""
-        self._late = 0
+        self._late = self._taken = self._skipped = 0
+        self._intake_state = {}
         self._intake = Ingest(
             self.model, self._horizon, self.notices.report, self.twin.maintenance, self.twin.unknown_inputs
         )
+
+    def _go_on_from(self, tail: LogTail) -> None:
+        """Continue with a stored log, whose events have been judged and reported."""
+        if tail.intake:
+            self._intake.restore(tail.intake, self._log.newest)
+        paced = controls_of(self.source)
+        if paced is not None and self._log.n:
+            # It is read from its start again.
+            self._skipped = tail.taken
+            paced.seek(self._log.newest)
+        self._taken, self._intake_state = tail.taken, tail.intake
+        if self._log.n:
+            # The age of the estimate includes the time for which the twin was stopped.
+            stopped = max(0.0, (time.time_ns() - int(tail.events.arrival.max())) * 1e-9) if self._feeder.live else 0.0
+            self._idle_ticks.broken(self._log.newest, stopped)
+        self._inbox.put(self._fold_stored)
 
     # From any thread
 
@@ -176,6 +199,11 @@ class Engine(Running):
         """The source of the measurements; it may be reopened."""
         return self._feeder.source
 
+    @property
+    def innermost(self) -> Any:
+        """The source itself, also if faults are injected into it."""
+        return self._feeder.innermost
+
     def options_of(self, estimator: str) -> Mapping[str, float]:
         """Return the options with which an estimator starts."""
         if estimator == self.estimator:
@@ -185,6 +213,10 @@ class Engine(Running):
     def episodes(self) -> list[Episode]:
         """Return all episodes in the order of their start."""
         return self._watchers.episodes()
+
+    def tracked_episodes(self) -> tuple[TrackedEpisode, ...]:
+        """Return the same with their keys, for the store."""
+        return self._watchers.episode_log.summary.entries
 
     def status_at(self, t: int) -> Status:
         """See `Running`."""
@@ -204,6 +236,28 @@ class Engine(Running):
                 status = busy_status(last[1], fields, self._watchdog.busy)
         self._status = (time.monotonic(), status)
         return status
+
+    def latest(self) -> Status:
+        """See `Running`."""
+        status = self.status()
+        with self._reading(STATUS_TIMEOUT_S) as still:
+            fold, last = self._fold, self._fold.n - 1
+            if not still or last < 0:
+                return status
+            row, u = fold.track.select(slice(last, last + 1)).copy(), fold.u.copy()
+            t, revision, heard = int(self._log.t[last]), self._revision, self._idle_ticks.since
+        return replace(
+            status,
+            t=t,
+            revision=revision,
+            heard=heard,
+            health=int(row.health[0]),
+            cause=status.cause if int(row.health[0]) == status.health else "",
+            mean=row.mean[0],
+            std=row.std[0],
+            inputs=u,
+            withheld=withheld_reasons(self.model, row, u),
+        )
 
     def _status_now(self) -> Status:
         """Return the status of a fold that does not change meanwhile."""
@@ -239,6 +293,8 @@ class Engine(Running):
         while not self._stopping.is_set():
             try:
                 self._round(min(0.05, self._tick))
+                for tell in self.grown:
+                    tell()
             except NisusError as error:
                 self.notices.report("engine error", str(error), level="error")
             except (Exception, SystemExit) as error:  # noqa: BLE001  no input of a user or sensor may stop the twin
@@ -252,38 +308,48 @@ class Engine(Running):
             self._when_idle()
             return
         batches: list[Events] = []
+        mark = self._mark
         while item is not None:
-            if isinstance(item, Events):
+            if isinstance(item, Delivery):
+                batches.append(item.events)
+                mark = item.mark
+            elif isinstance(item, Events):
                 batches.append(item)
                 if not self._feeder.live:
                     self._feeder.taken()
             else:
-                self._accept(batches)
+                self._accept(batches, mark)
                 batches = []
                 item()
             try:
                 item = self._inbox.get_nowait() if sum(map(len, batches)) < PERMANENT_SPACING else None
             except queue.Empty:
                 item = None
-        self._accept(batches)
+        self._accept(batches, mark)
 
-    def _accept(self, batches: list[Events]) -> None:
+    def _accept(self, batches: list[Events], mark: int | None = None) -> None:
         if not batches:
             return
         batch = batches[0] if len(batches) == 1 else Events.concat(batches, self.model.width)
+        if self._skipped:
+            batch, self._skipped = batch.select(slice(self._skipped, None)), max(0, self._skipped - len(batch))
         passed = self._intake.take(batch)
-        self._put(passed)
+        self._put(passed, len(batch), mark)
         if self._feeder.live and not self._fold.idle:
             self._watchers.arrived(batch, passed.events)
 
-    def _put(self, passed: Passed) -> None:
+    def _put(self, passed: Passed, taken: int = 0, mark: int | None = None) -> None:
         with self._moving():
+            self._taken += taken
+            self._mark = self._mark if mark is None else mark
+            self._intake_state = {} if self.store is None else self._intake.state()
             events = passed.events
             if self._horizon is not None and self.twin.late.inflate:
                 events, late = inflated(events, self._fold, self._log.newest, self._horizon)
                 self._late += late
             stale = self._take(events, self._horizon, passed.settled)
-            self._idle_ticks.broken(self._log.newest)
+            if taken or mark is None:
+                self._idle_ticks.broken(self._log.newest)
             if self._log.n:
                 self._watchers.silence.broken()
         self._fold_on()
@@ -306,6 +372,15 @@ class Engine(Running):
                 before = self._fold.n
                 self._batches.advance(self._fold)
                 self._watchers.alerts.look(self._fold, before)
+
+    def _fold_stored(self) -> None:
+        """Fold the stored events, in batches as `_fold_on`; nothing about them is reported again."""
+        while True:
+            with self._moving():
+                self._batches.advance(self._fold)
+                self._watchers.alerts.examined(self._fold)
+            if not self._behind or self._stopping.is_set():
+                return
 
     def _when_idle(self) -> None:
         if self._finished:
@@ -383,7 +458,8 @@ class Engine(Running):
             tuning = replace(tuning, model=self.model)
         # First, so that nobody sees the new tuning without a refold that is waited for.
         ticket = self._requests.ask()
-        self.estimator, self.tuning, self._gesture = estimator, tuning, gesture
+        with self._lock:
+            self.estimator, self.tuning, self._gesture = estimator, tuning, gesture
         self._awaited = None if self._workshop.ready(estimator) else estimator
         if (last := self._status) is not None:
             self._status = (-np.inf, last[1])

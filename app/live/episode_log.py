@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from typing import NamedTuple
 
@@ -120,6 +120,7 @@ class EpisodeLog:
         self.tracker = self._new_tracker(engine.rows(0, 0))
         self._health = WAITING
         self.summary = EpisodeSummary()
+        self._earlier: tuple[TrackedEpisode, ...] = ()
         self._lock = threading.Lock()
 
     def _new_tracker(self, pull: Pull) -> EpisodeTracker:
@@ -135,6 +136,11 @@ class EpisodeLog:
             max_closed=MAX_CLOSED,
             stale_after=self._engine.twin.policy.stale_after,
         )
+
+    def restore(self, entries: Iterable[TrackedEpisode]) -> None:
+        """Take over the episodes of an earlier session that began before the first event of the log."""
+        first = self._engine.span()[0]
+        self._earlier = tuple(entry for entry in entries if entry.episode.start * 1e9 < first)
 
     def stop(self) -> None:
         """Update once more, for the last rows, and give the cursor back."""
@@ -169,13 +175,14 @@ class EpisodeLog:
                 # In another revision, episodes that last are known. Another log has had none yet.
                 again = log == self._cursor.log
                 before = before if again else []
+                self._earlier = self._earlier if again or log < 0 else ()
                 self.tracker = self._new_tracker(pull)
             self.tracker.feed(pull.events, pull.track, pull.first)
             if len(pull.events) < PULLED_ROWS:
                 break
         tracker = self.tracker
         if tracker.n:
-            entries = tracker.entries
+            entries = _joined(self._earlier, tracker.entries)
             self.summary = EpisodeSummary(
                 tuple(entry.episode for entry in entries),
                 tuple(entry for entry in entries if entry.episode.end is None),
@@ -216,6 +223,18 @@ class EpisodeLog:
             assert episode.end is not None
             what = "heard at last" if episode.cause == "never heard" else f"no longer {episode.cause}"
             say(f"{episode.subject}: {what}, after {_duration(episode)}", t=round(episode.end * 1e9))
+
+
+def _joined(earlier: Sequence[TrackedEpisode], entries: Sequence[TrackedEpisode]) -> list[TrackedEpisode]:
+    """Return earlier episodes and those of the present rows, of which some are the rest of an earlier one."""
+    left, found = list(earlier), []
+    for entry in entries:
+        old = next((item for item in left if _overlap(item, entry)), None)
+        if old is not None:
+            left.remove(old)
+            entry = entry._replace(at=old.at, episode=entry.episode._replace(start=old.episode.start))
+        found.append(entry)
+    return [*(item for item in left if item.episode.end is not None), *found]
 
 
 def _changes(

@@ -17,9 +17,11 @@ from estimators.model.state_space import StateSpaceModel
 from estimators.registry import checked, find_estimator
 from sources.source import Source, controls_of, span_of
 
+from ..format_time import duration_text
 from ..ingest import maintenance_text
 from . import commands
 from .faults import prepared_fault
+from .outputs import AlertMute
 from .running_fold import Running
 
 if TYPE_CHECKING:
@@ -39,6 +41,9 @@ OPTION_PREFIX = "options."
 
 MAX_MAINTENANCE_TEXT = 200
 """Characters that describe a maintenance."""
+
+MAX_MUTE_S = 30 * 86400.0
+"""Longest time in which no alerts are sent."""
 
 MAX_GESTURE_LENGTH = 64
 
@@ -111,10 +116,23 @@ def prepared(command: commands.Command, engine: Running) -> Callable[[], Any]:
                 raise ConfigError("Maintenance: no measurement has arrived yet; the estimate is still the prior")
             event = maintained(now, time.time_ns(), states, model.width)
             return partial(insert, event, maintenance_text(what, states, model))
+        case commands.MuteAlerts(seconds, reason):
+            if not 0.0 <= seconds <= MAX_MUTE_S:
+                raise ConfigError(f"MuteAlerts: seconds is {seconds:g}; it must be from 0 to {MAX_MUTE_S:.0f}, 30 days")
+            if len(reason) > MAX_MAINTENANCE_TEXT:
+                text = f"has {len(reason)} characters; it may have {MAX_MAINTENANCE_TEXT}"
+                raise ConfigError(f"MuteAlerts: reason {text}")
+            return partial(_mute, engine, seconds, printable(reason))
         case commands.Record(path):
             if engine.recorder is None:
                 raise ConfigError("Record: this session cannot record")
             return partial(engine.recorder.record, path)
+
+
+def _mute(engine: Running, seconds: float, reason: str) -> None:
+    engine.mute = AlertMute(time.monotonic() + seconds, reason)
+    why = f": {reason}" if reason else ""
+    engine.notices.say(f"alerts are muted for {duration_text(seconds)}{why}" if seconds else "alerts are sent again")
 
 
 def retuned(command: REFOLDING, engine: Running) -> tuple[str, Tuning]:

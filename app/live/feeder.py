@@ -5,12 +5,13 @@ from __future__ import annotations
 import queue
 import threading
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from estimators.errors import NisusError
 from sources.source import controls_of
 
 if TYPE_CHECKING:
+    from estimators.log import Events
     from sources.source import Source
 
 READ_TIMEOUT_S = 0.05
@@ -20,6 +21,13 @@ MAX_RETRY_S = 5.0
 
 MAX_BATCHES_AHEAD = 32
 """Batches that may wait for the engine. A replay waits then; a bus is never held up."""
+
+
+class Delivery(NamedTuple):
+    """Events of a source that counts what it has read: after them, its `mark`."""
+
+    events: Events
+    mark: int
 
 
 class Feeder:
@@ -50,6 +58,7 @@ class Feeder:
         self._restarted, self._finished = restarted, finished
         self.source = open_source()
         self.live = self.source.live
+        self._mark = 0
         self._stop = threading.Event()
         self._room = threading.Semaphore(MAX_BATCHES_AHEAD)
         self._thread = threading.Thread(target=self._run, name="source", daemon=True)
@@ -78,11 +87,21 @@ class Feeder:
             self._inbox.put(self._restarted)
         if batch is None:
             return None
-        if len(batch):
+        mark = getattr(self.innermost, "mark", None)
+        if mark is not None:
+            if len(batch) or mark != self._mark:
+                self._inbox.put(Delivery(batch, mark))
+            self._mark = mark
+        elif len(batch):
             if not self.source.live:
                 self._room.acquire()
             self._inbox.put(batch)
         return len(batch)
+
+    @property
+    def innermost(self) -> Any:
+        """The source itself, also if faults are injected into it."""
+        return getattr(self.source, "inner", self.source)
 
     def _restarts(self) -> int:
         paced = controls_of(self.source)

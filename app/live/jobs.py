@@ -137,7 +137,7 @@ class PacedExecutor(Executor):
 
 
 class Jobs:
-    """Pool of threads, started as they are needed."""
+    """Pool of threads, which start with the first job: started one by one they would look like a leak for an hour."""
 
     def __init__(
         self,
@@ -156,7 +156,6 @@ class Jobs:
         self._order = itertools.count()
         self._under_way: dict[Job, threading.Thread] = {}
         self._threads: list[threading.Thread] = []
-        self._idle = 0
         self._open = self._stopping = False
 
     def run(
@@ -225,11 +224,10 @@ class Jobs:
             self._wake.notify()
 
     def _hire(self) -> None:
-        """Start a thread if jobs wait and none is idle."""
-        if self._open and not self._stopping and self._queue and not self._idle and len(self._threads) < self._limit:
+        """Start the threads that the pool lacks, if jobs wait."""
+        while self._open and not self._stopping and self._queue and len(self._threads) < self._limit:
             thread = threading.Thread(target=self._serve, name=f"{self._name} {len(self._threads)}", daemon=True)
             self._threads.append(thread)
-            self._idle += 1
             thread.start()
 
     def _is_due(self) -> bool:
@@ -251,13 +249,10 @@ class Jobs:
                 if self._stopping:
                     return
                 job = self._take()
-                self._idle -= 1
-                self._hire()
             self._carry_out(job)
             with self._wake:
                 if threading.current_thread() not in self._threads:
                     return
-                self._idle += 1
 
     def _carry_out(self, job: Job) -> None:
         again = job.run()
@@ -265,3 +260,28 @@ class Jobs:
             self._under_way.pop(job, None)
         if again is not None and math.isfinite(again):
             self._put(job, again)
+
+
+def run_all(*works: Callable[[], Any]) -> None:
+    """Run callables concurrently, the first in this thread, and wait for all.
+
+    Raises:
+        BaseException: The error of the first one that failed, once all are done.
+    """
+    failures: list[BaseException] = []
+
+    def carry_out(work: Callable[[], Any]) -> None:
+        try:
+            work()
+        except BaseException as error:  # noqa: BLE001  raised again below, in the caller's thread
+            failures.append(error)
+
+    threads = [threading.Thread(target=carry_out, args=(work,), daemon=True) for work in works[1:]]
+    for thread in threads:
+        thread.start()
+    for work in works[:1]:
+        carry_out(work)
+    for thread in threads:
+        thread.join()
+    if failures:
+        raise failures[0]

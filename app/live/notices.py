@@ -1,4 +1,4 @@
-"""Counters and messages about the running twin, and notes of users at moments; the number of both is bounded."""
+"""Counters and messages about the running twin, commands of its users, and their notes at moments; all bounded."""
 
 from __future__ import annotations
 
@@ -6,8 +6,9 @@ import math
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
 
 from estimators.errors import ConfigError, printable, quoted
 
@@ -70,6 +71,11 @@ class Notices:
             self._number[key] = self._next
             self._add(level, text if more < 1 else f"{text} ({more} more before)")
 
+    def count(self, key: str) -> None:
+        """Count under `key` without a line."""
+        with self._lock:
+            self._counts[key] += 1
+
     def latest(self, key: str, seconds: float) -> str | None:
         """Return the last line under a key that was reported within some seconds; None if there is none."""
         with self._lock:
@@ -110,6 +116,65 @@ class Notices:
         """Return the counters."""
         with self._lock:
             return {key: count for key, count in self._counts.items() if key not in self._elsewhere}
+
+
+MAX_COMMANDS = 1000
+"""Commands of users that a running twin remembers; its store keeps more."""
+
+
+@dataclass(frozen=True)
+class AuditEntry:
+    """A request of a user that changed something: `at` in s since 1970, and what was sent.
+
+    `address` is that of the client, `revision` the one that was shown. `change` counts the entries and their
+    replacements: those of one gesture, such as the drag of a slider, are one entry.
+    """
+
+    number: int
+    at: float
+    user: str
+    role: str
+    address: str
+    path: str
+    body: Mapping[str, Any]
+    revision: int
+    change: int = 0
+
+
+class Audit:
+    """Audit log of a running twin; any thread may add to it and read it."""
+
+    def __init__(self, revision: Callable[[], int]) -> None:
+        self._revision = revision
+        self._lock = threading.Lock()
+        self._entries: deque[AuditEntry] = deque(maxlen=MAX_COMMANDS)
+        self._next = self._changes = 0
+
+    def add(self, user: str, role: str, address: str, path: str, body: Mapping[str, Any]) -> None:
+        """Note a request that was carried out."""
+        with self._lock:
+            last, gesture = self._entries[-1] if self._entries else None, body.get("gesture")
+            number = self._next
+            if last is not None and gesture and (last.user, last.address, last.body.get("gesture")) == (
+                user, address, gesture,
+            ):  # fmt: skip
+                number = self._entries.pop().number
+            self._next, self._changes = number + 1, self._changes + 1
+            revision = self._revision()
+            self._entries.append(
+                AuditEntry(number, time.time(), user, role, address, path, body, revision, self._changes)
+            )
+
+    def entries(self, after: int = -1) -> list[AuditEntry]:
+        """Return the entries after a change, by their number; those of an earlier session have the change 0."""
+        with self._lock:
+            return [entry for entry in self._entries if entry.change > after]
+
+    def restore(self, entries: Iterable[AuditEntry]) -> None:
+        """Take over the entries of an earlier session."""
+        with self._lock:
+            self._entries.extend(replace(entry, change=0) for entry in entries)
+            self._next = 1 + max((entry.number for entry in self._entries), default=-1)
 
 
 @dataclass(frozen=True)

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -65,6 +66,58 @@ class Pull:
     changed: int = 0
     version: int = 1
     settings: tuple[Tuning, str] | None = None
+
+
+class OutputLink(NamedTuple):
+    """Whether an output reaches its clients, and its address, or the problem, in words."""
+
+    connected: bool
+    text: str
+
+
+@dataclass(frozen=True)
+class AlertMute:
+    """Time in which no alerts are sent, with its reason; `until` is monotonic, s."""
+
+    until: float
+    reason: str = ""
+
+    @property
+    def seconds(self) -> float:
+        """Seconds that are left."""
+        return max(0.0, self.until - time.monotonic())
+
+    @property
+    def active(self) -> bool:
+        """Whether it lasts."""
+        return self.seconds > 0.0
+
+
+@dataclass(frozen=True)
+class LogTail:
+    """Events since a cursor, folded or not, and the state from which log, fold and the checks on entry continue.
+
+    `fresh`, `first` and `oldest` as in `Pull`; `floor` is that of the log, `base` the start of its fold. `estimator`
+    and `tuning` are the requested ones. `taken` events of the source were accepted or rejected, with which the checks
+    on entry came to the state `intake`, and the source to its `mark`.
+    """
+
+    fresh: bool
+    first: int
+    events: Events
+    oldest: int
+    floor: int
+    base: Base | None
+    estimator: str
+    tuning: Tuning
+    taken: int
+    intake: Mapping[str, Any]
+    mark: int = 0
+
+    @property
+    def end(self) -> int:
+        """Absolute index after the last event."""
+        return self.first + len(self.events)
 
 
 @dataclass(frozen=True)

@@ -142,6 +142,10 @@ class Revisions:
         self.said: Callable[[int], tuple[Episode, ...]] = lambda number: ()
         """Returns the episodes of the running revision."""
 
+    def restore(self, runs: tuple[Revision, ...]) -> None:
+        """Take over the revisions of an earlier process; the last one runs."""
+        self._become([*runs])
+
     def began_with(self, estimator: str, tuning: Tuning) -> None:
         """Begin with the first fold, whose settings may have been changed while it was compiled."""
         *earlier, running = self.runs

@@ -7,14 +7,14 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
 from estimators.diagnostics.considered_shares import considered_pairs
-from estimators.diagnostics.episodes import Episode
+from estimators.diagnostics.episodes import Episode, TrackedEpisode
 from estimators.diagnostics.references import hidden_states
 from estimators.errors import EstimatorError
 from estimators.fold import Fold
@@ -28,9 +28,9 @@ from .batches import BatchSizer, FairLock, Requests
 from .commands import Command
 from .counts import RowCounts
 from .jobs import Jobs
-from .notices import Annotations, Notices
-from .outputs import Belief, Cursor, EventWindow, Here, Pull, Status, event_window
-from .revisions import Revisions
+from .notices import Annotation, Annotations, Audit, AuditEntry, Notices
+from .outputs import AlertMute, Belief, Cursor, EventWindow, Here, LogTail, Pull, Status, event_window
+from .revisions import Revision, Revisions
 from .watchdog import Watchdog
 
 if TYPE_CHECKING:
@@ -61,6 +61,44 @@ class Records(Protocol):
         """Record into a new file from now on, or finish the open one."""
 
 
+class Published(Protocol):
+    """Outputs of a running twin."""
+
+    def json(self) -> dict[str, Any]:
+        """Return the state of outputs, receivers and alerts."""
+
+
+class Keeper(Protocol):
+    """Writer of the store of a running twin."""
+
+    def ask(self) -> None:
+        """Write soon."""
+
+    def has(self, mark: int) -> bool | None:
+        """Return whether the store has the events of the source up to a mark; None while it cannot be written."""
+
+
+@dataclass(frozen=True)
+class StoredTwin:
+    """State of a twin whose process ended, for an engine that continues it.
+
+    `twin` is under the tuning version that was loaded last, `tail` has the whole log. `runs` and `annotations` are
+    those of the session. The state was `written` at that time, s since 1970, and `closed` is whether it was the last.
+    `numbers` are the sequence numbers of messages that the log has, by sender, `commands` the last ones of
+    users.
+    """
+
+    twin: Twin
+    tail: LogTail
+    runs: tuple[Revision, ...]
+    annotations: tuple[Annotation, ...]
+    written: float
+    closed: bool
+    numbers: Mapping[str, Any]
+    episodes: tuple[TrackedEpisode, ...]
+    commands: tuple[AuditEntry, ...]
+
+
 class Running(ABC):
     """A running twin: its log, the fold that follows it, and earlier revisions. The engine adds source and commands.
 
@@ -71,9 +109,23 @@ class Running(ABC):
 
     jobs: Jobs
     recorder: Records | None
+    published: Published | None = None
+    """Outputs of the twin, None if it has none."""
+    mute: AlertMute | None = None
+    """Time in which no alerts are sent, None if it was never asked for."""
+    grown: frozenset[Callable[[], object]] = frozenset()
+    """Called on the engine's thread after each batch; they must return at once."""
+    store: Keeper | None
 
-    def __init__(self, twin: Twin, watchdog: Watchdog, base: Base | None, ready: Callable[[str], bool]) -> None:
-        """Prepare the fold from a base; None is the prior.
+    def __init__(
+        self,
+        twin: Twin,
+        watchdog: Watchdog,
+        base: Base | None,
+        ready: Callable[[str], bool],
+        stored: StoredTwin | None = None,
+    ) -> None:
+        """Prepare the fold from a base, where None is the prior, or from the stored state of the twin.
 
         The watchdog watches the thread that folds. While the first filter is not compiled (`ready`), an idle fold takes
         its place.
@@ -93,9 +145,24 @@ class Running(ABC):
         self.revisions = Revisions(self.estimator, self.tuning)
         self._revision = 0
         self._logs = 0
+        self._taken = self._mark = 0
+        """Events that the source gave since it began, and its mark after them; see `feeder.Delivery`."""
+        self._intake_state: Mapping[str, Any] = {}
+        if stored is not None:
+            self.estimator, self.tuning = stored.tail.estimator, stored.tail.tuning
+            self.revisions.restore(stored.runs)
+            self._revision = self.revisions.runs[-1].number
+            base = stored.tail.base
         self._clear(base)
         self.notices = Notices(lambda: self._log.newest if self._log.n else 0)
         self.annotations = Annotations()
+        self.audit = Audit(lambda: self.notices.revision)
+        if stored is not None:
+            self.annotations.restore(stored.annotations)
+            self._log.extend(stored.tail.events)
+            self._log.floor = max(self._log.floor, stored.tail.floor)
+            self._note_span()
+            self.audit.restore(stored.commands)
 
     @contextmanager
     def _reading(self, timeout: float = np.inf) -> Iterator[bool]:
@@ -149,6 +216,17 @@ class Running(ABC):
         if lines:
             cursor.notice = lines[-1].number + 1
         return replace(pull, notices=lines)
+
+    def tail(self, cursor: Cursor) -> LogTail:
+        """Copy the events since the cursor, also those that are not folded yet, with what continues them."""
+        with self._reading():
+            log = self._log
+            fresh, cursor.log = cursor.log != self._logs, self._logs
+            start = log.first if fresh else max(cursor.next, log.first)
+            cursor.next = log.first + log.n
+            events = Events(*(column.copy() for column in log.events.select(slice(start - log.first, None))))
+            settings, taken = (self._base, self.estimator, self.tuning), (self._taken, self._intake_state, self._mark)
+            return LogTail(fresh, start, events, log.first, log.floor, *settings, *taken)
 
     def _from(self, span: int | None) -> int:
         """Return the absolute index of the first folded event in the last `span` ns; 0 for all."""
@@ -312,12 +390,25 @@ class Running(ABC):
         """Return the status, computed at most ten times per second; during a refold usually the previous one."""
 
     @abstractmethod
+    def latest(self) -> Status:
+        """Return the status with time, estimate, inputs and health of the newest row; the rest may be 0.1 s old."""
+
+    @abstractmethod
     def status_at(self, t: int) -> Status:
         """Return the status with health, sensors, episodes and NIS as they were at a time, ns."""
 
     @abstractmethod
     def episodes(self) -> list[Episode]:
         """Return all episodes in the order of their start; at most a second behind the rows."""
+
+    @abstractmethod
+    def tracked_episodes(self) -> tuple[TrackedEpisode, ...]:
+        """Return the same with their keys, for the store."""
+
+    @property
+    @abstractmethod
+    def innermost(self) -> Any:
+        """The source itself, also if faults are injected into it."""
 
     @abstractmethod
     def options_of(self, estimator: str) -> Mapping[str, float]:
@@ -347,8 +438,11 @@ class Running(ABC):
             try:
                 yield
             finally:
-                log = self._log
-                self._span = (int(log.t[0]), int(log.t[log.n - 1])) if log.n else (0, 0)
+                self._note_span()
+
+    def _note_span(self) -> None:
+        log = self._log
+        self._span = (int(log.t[0]), int(log.t[log.n - 1])) if log.n else (0, 0)
 
     def _clear(self, base: Base | None) -> None:
         """Begin an empty log and the fold that follows it."""
@@ -386,7 +480,10 @@ class Running(ABC):
         """
         shown = self._fold.n
         newest = int(self._log.t[shown - 1]) if shown else 0
+        end = self._log.n
         first, stale = self._log.extend(batch, horizon, settled)
+        if first < end:
+            self._inserted(first)
         if first < shown:
             self._go_back(first)
             again = int(np.searchsorted(self._log.t[: self._log.n], newest, side="right"))
@@ -400,9 +497,12 @@ class Running(ABC):
         return not self._fold.idle and self._fold.n < self._log.n
 
     def _go_back(self, index: int) -> None:
-        """Fold the events from `index` on again, and let every cursor fetch them again."""
+        """Fold the events from `index` on again."""
         self._fold.rewind(index)
         self._row_counts.changed(index)
+
+    def _inserted(self, index: int) -> None:
+        """Let every cursor fetch the events from `index` on again, and refolds fold them again."""
         absolute = self._log.first + index
         self._requests.changed(absolute)
         for cursor in self._cursors:

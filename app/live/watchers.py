@@ -85,9 +85,9 @@ class IdleTicks:
         """Monotonic time of the last arrival, s."""
         self._newest: int | None = None
 
-    def broken(self, newest: int) -> None:
-        """Note an arrival; `newest` is the time of the log's newest event, ns."""
-        self.since = time.monotonic()
+    def broken(self, newest: int, ago: float = 0.0) -> None:
+        """Note an arrival some seconds `ago`; `newest` is the time of the log's newest event, ns."""
+        self.since = time.monotonic() - ago
         self._newest = newest
 
     def asks(self, source: Source, last: int) -> int | None:

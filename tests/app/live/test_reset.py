@@ -5,11 +5,10 @@ import pytest
 
 from app.live import commands
 from app.live.counts import last_run
+from app.live.fold_json import tuning_from_json
 from app.twin.twin import load_twin
-from app.views.recording.format import tuning_from_json
 from app.views.recording.reader import read_recording
 from app.views.recording.writer import RecordingPart
-from app.views.viser.panel import status_html
 from app.web.commands_json import command_from_json
 from app.web.twin_json import status_json
 from estimators.errors import NisusError
@@ -60,17 +59,16 @@ def test_what_diverges_says_since_when_and_is_reset(name):
     # More than half of the 50 readings of the window are refused from the 26th on that are.
     first = int(np.searchsorted(np.cumsum(track.verdict == GATED), 26))
     assert status.health == DIVERGED and status.since == (first + 1) * SECOND
-    assert f"diverged since {first:.1f} s" in status_html(status, SECOND)
     # What to do depends on what else is wrong, which the episode says.
     remedy = "winding still contradicts it: check the sensor; if it is right, reset the twin"
-    assert status.cause.endswith(remedy) and remedy in status_html(status, SECOND)
+    assert status.cause.endswith(remedy)
     (line,) = [line for line in engine.notices.since(0) if "diverged" in line.text]
     assert line.level == "error" and "reset the twin" in line.text and line.t == status.since
     stepped.submit(command_from_json({"command": "Reset"}, engine))
     stepped.put(readings(T[RESET_AT:], Y[RESET_AT:]))
     track, status = pull_all(engine).track, stepped.status()
     assert np.all(track.verdict[RESET_AT + 1 :] == USED) and np.all(track.health[RESET_AT:] == TRACKING)
-    assert status.since == RESET_AT * SECOND and "diverged" not in status_html(status, SECOND)
+    assert status.since == RESET_AT * SECOND and status.health != DIVERGED
     assert status_json(engine)["since"] == RESET_AT * SECOND
     # The prior's weight is down to a few readings' after 20 of variance 1 (or as tuned): within 4 deviations.
     assert abs(track.mean[-1, 0] - 26.0) < 4.0 * max(track.std[-1, 0], np.sqrt(MODEL.sensors[0].rows[0].variance / 20))

@@ -18,8 +18,8 @@ import pytest
 from app.live.commands import Record, SetEstimator, SetTuning
 from app.live.compilers import MAX_COMPILERS, Compiler, first_compilers
 from app.live.engine import Engine
+from app.live.fold_json import tuning_from_json
 from app.live.workshop import Workshop
-from app.views.recording.format import tuning_from_json
 from app.views.recording.reader import read_recording
 from app.views.recording.writer import Recorder
 from estimators.fold import Fold, fold
@@ -154,6 +154,32 @@ def test_before_the_first_filter_is_compiled_the_log_grows_and_nothing_is_estima
     assert_same(pull_all(engine).track, cold(times, values, "kf", Tuning.of(MODEL).set("Q.rate", 0.5)))
     (run,) = engine.revisions.runs
     assert run.number == fresh_status(engine).revision == 0 and run.tuning.get("Q.rate") == 0.5
+
+
+class OneFilter(Workshop):
+    """A workshop that says whether its filter is compiled."""
+
+    compiled = False
+
+    def ready(self, name):
+        return self.compiled
+
+
+def test_a_late_reading_reaches_the_first_fold_that_was_begun_without_it():
+    """The first refold has copied the log when a reading of before the copy's end arrives; no event is folded yet."""
+    source, workshop, (times, values) = Scripted(), OneFilter(), series(300)
+    engine = Engine(twin(), lambda report: source, workshop=workshop)
+    source.put(readings(np.delete(times, 100), np.delete(values, 100)))
+    engine.settle()
+    assert engine.status().t is None
+    workshop.compiled = True
+    engine.submit(SetTuning("R.winding", 2.0))
+    source.put(readings(times[100:101], values[100:101]))
+    engine.settle()
+    pull = pull_all(engine)
+    np.testing.assert_array_equal(pull.events.value[:, 0], values)
+    assert_same(pull.track, cold(times, values, "kf", Tuning.of(MODEL).set("R.winding", 2.0)))
+    engine.stop()
 
 
 def test_a_recording_that_begins_before_the_first_filter_holds_all_of_it(started, tmp_path):

@@ -380,12 +380,19 @@ def test_one_that_cannot_be_read_is_listed_beneath_the_others(own, capsys):
     assert "bad.yaml:1: the file is [1]; a tuning version is a mapping" in " ".join(beneath.split())
 
 
-@pytest.mark.parametrize("name", ["battery_panasonic", "motor_bench"])
-@pytest.mark.parametrize("version", ["considered", "fitted"])
-def test_a_version_that_ships_adds_widths_to_the_values_of_its_twin(name, version):
-    """Not those of the model: a twin may have other values of it."""
+@pytest.mark.parametrize(
+    ("name", "own_count", "version", "count"),
+    [
+        ("battery_panasonic", 11 + 3, "held", 0),
+        ("battery_dmegc", 11 + 3, "held", 0),
+        ("motor_bench", 17 + 4, "held", 0),
+        ("motor_bench", 17 + 4, "fitted", 17 + 4),
+    ],
+)
+def test_a_version_that_ships_changes_widths_and_not_the_values_of_its_twin(name, own_count, version, count):
+    """Not those of the model: a twin may have other values of it. A parameter whose width grows counts twice."""
     own, found = load_twin(name), load_twin(name, overrides={"tuning": version})
-    assert own.model.considered == 0 < found.model.considered
+    assert (own.model.considered, found.model.considered) == (own_count, count)
     np.testing.assert_array_equal(found.tuning.p, own.tuning.p)
     text = version_text(found, Settings("ekf", found.tuning))
     with tempfile.TemporaryDirectory() as folder:
