@@ -130,6 +130,8 @@ class PageOptions:
 class RunCommand(JsonOption, PageOptions, TuningOption, EstimatorOption):
     """Run a twin and show it in the browser. Without a twin: the gallery of bundled twins.
 
+    An option is also taken from the environment: NISUS_RUN_PORT=8080 is --port 8080, unless that is given.
+
     Examples:
       nisus run
       nisus run motor_can
@@ -144,13 +146,55 @@ class RunCommand(JsonOption, PageOptions, TuningOption, EstimatorOption):
     log: tuple[Path, ...] = ()
     """Recordings to read instead of the twin's own."""
     record: Path | None = None
-    """Record to this .rrd file from the start."""
+    """Record to this .rrd file from the start. %Y %m %d %H %M %S stand for local date and time, so that a service can
+    repeat the command: run-%Y%m%d-%H%M%S.rrd."""
+    store: Path | None = None
+    """Keep the state of the twin in this file (in a folder: TWIN.store), and continue from it after a restart or a
+    kill."""
     record_split: str | None = None
-    """Continue in a new file (run-2.rrd after run.rrd) at this size or duration: 1GB, 10min."""
+    """Continue in a new file (run-2.rrd after run.rrd) at this size or duration, or at midnight: 1GB, 10min, day;
+    several are separated by commas."""
+    record_keep: str | None = None
+    """Remove the oldest recordings of this name beyond this total size or age: 20GB, 30d."""
     speed: float | None = None
     """Speed of replays and simulations, as a multiple of real time; inf is as fast as possible. Default: the twin's."""
     headless: Flag = False
     """Run without a page, to the end of the source, and print the counts of events (--json: as JSON)."""
+    log_format: Literal["text", "json"] | None = None
+    """Print the notices of the twin and errors on standard error, as lines of text or of JSON."""
+
+
+@dataclass(frozen=True)
+class ServeCommand:
+    """Run several twins as one service on one port: an overview, the worst health first, and the page of each.
+
+    Each twin is a process of its own; if it ends, it is started again. An option is also taken from the environment:
+    NISUS_SERVE_PORT=8080 is --port 8080, unless that is given.
+
+    Examples:
+      nisus serve pump.yaml fan.yaml --store /var/lib/nisus
+      nisus serve twins/
+      nisus serve twins/ --tokens tokens.txt --public https://twins.example.com
+    """
+
+    twins: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
+    """YAML files, names of bundled twins, or one folder of YAML files, which is watched."""
+    port: int = 9900
+    """Port of the overview; 0 picks a free one."""
+    host: str = "127.0.0.1"
+    """IP address to listen on; any other than a loopback address needs --tokens."""
+    public: str | None = None
+    """Address at which a reverse proxy offers the service, https://HOST; needs --tokens."""
+    tokens: Path | None = None
+    """File of tokens for users and programs, a line NAME ROLE TOKEN each; roles are view, feed, tune and admin."""
+    store: Path | None = None
+    """Folder in which each twin keeps its state, TWIN.store, and continues from it after a restart or a kill."""
+    recordings: Path = Path("recordings")
+    """Folder of recordings, with a folder for each twin; created when needed."""
+    log_format: Literal["text", "json"] = "text"
+    """Form of the lines on standard error: notices of the twins, and processes that end."""
+    duration: float | None = None
+    """Stop after this many seconds."""
 
 
 @dataclass(frozen=True)
@@ -194,6 +238,25 @@ class WhyCommand(JsonOption, FoldOptions):
     """Its duration, s. Default: the window of the twin's view."""
     state: Repeated = ()
     """State to show, repeatable. Default: the four that moved by most standard deviations."""
+
+
+@dataclass(frozen=True)
+class ExportCommand(JsonOption, FoldOptions):
+    """Write the filter of a twin as C99 for a controller, with a test on the twin's own log.
+
+    kf, kf-steady and ekf of models of up to 32 states, without allocation. The test compares the C code with the fold.
+
+    Examples:
+      nisus export motor_winding --c
+      nisus export motor_can --c --out firmware --duration 60
+    """
+
+    c: Flag = False
+    """Write NAME.h, NAME.c, NAME_test.c and NAME_vectors.csv."""
+    out: Path = field(default_factory=Path.cwd)
+    """Folder to write to; it is created if needed."""
+    events: int = 2000
+    """Largest number of measurements and inputs in the test."""
 
 
 @dataclass(frozen=True)
@@ -598,8 +661,10 @@ class CompletionCommand:
 
 COMMANDS: dict[type, str] = {
     RunCommand: "run:run_twin",
+    ServeCommand: "serve:serve",
     FoldCommand: "fold:fold_twin",
     WhyCommand: "why:explain_change",
+    ExportCommand: "export:export_filter",
     CheckCommand: "check:check_twin",
     AdviseCommand: "advise:advise",
     CompareCommand: "compare:compare_twin",

@@ -19,8 +19,8 @@ import tyro
 from estimators.errors import ConfigError, NisusError, nearest, shown_name
 
 from ..terminal import complain
-from .arguments import COMMANDS, NAMES, RunCommand
-from .options import check_options
+from .arguments import COMMANDS, NAMES, RunCommand, ServeCommand
+from .options import check_options, environment_options
 
 HEAD = """Keep a digital twin in step with its asset: fold, tune, check and watch it.
 
@@ -49,8 +49,11 @@ def parse(arguments: Sequence[str]) -> Any:
     name = arguments[0] if arguments else "--help"
     if name in NAMES:
         command = NAMES[name]
-        check_options(name, command, arguments[1:])
-        return tyro.cli(command, args=arguments[1:], prog=f"nisus {name}", description=described(command))
+        given = [*arguments[1:]]
+        if command in (RunCommand, ServeCommand):
+            given += environment_options(name, command, given, os.environ)
+        check_options(name, command, given)
+        return tyro.cli(command, args=given, prog=f"nisus {name}", description=described(command))
     if name not in ("-h", "--help"):
         kind = "option" if name.startswith("-") else "command"
         names = ["--help", "--version"] if name.startswith("-") else list(NAMES)

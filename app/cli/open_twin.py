@@ -41,9 +41,14 @@ def live_source(twin: Twin, speed: float | None = None) -> Callable[[Callable[[s
 
 
 def opened_twin(
-    name: str, *, logs: Sequence[Path] = (), overrides: Mapping[str, str] | None = None, speed: float | None = None
+    name: str,
+    *,
+    logs: Sequence[Path] = (),
+    overrides: Mapping[str, str] | None = None,
+    speed: float | None = None,
+    store: Path | None = None,
 ) -> OpenedTwin:
-    """A twin on its source, and how to read it again when its files were changed.
+    """A twin on its source, and how to read it again when its files were changed; `store` may be a folder.
 
     Raises:
         NisusError: If its YAML or its model is wrong.
@@ -53,7 +58,10 @@ def opened_twin(
         return load_twin(name, log_files=logs or None, overrides=overrides)
 
     twin = read()
-    return OpenedTwin(twin, live_source(twin, speed), files=twin.files, stamp=stamp_of(twin.files), again=read)
+    if store is not None and store.is_dir():
+        store = store / f"{twin.name}.store"
+    source = live_source(twin, speed)
+    return OpenedTwin(twin, source, files=twin.files, stamp=stamp_of(twin.files), again=read, store=store)
 
 
 def recorded_twin(recorded: Recorded) -> Twin:
@@ -61,7 +69,7 @@ def recorded_twin(recorded: Recorded) -> Twin:
 
     The baseline of the innovations is not part of the tuning and comes from the YAML.
     """
-    from ..views.recording.format import tuning_from_json
+    from ..live.fold_json import tuning_from_json
 
     twin = restore_twin(recorded.text, recorded.twin_path, recorded.overrides, recorded.version)
     tuning, estimator = tuning_from_json(recorded.tuning, twin.model)
@@ -88,10 +96,13 @@ def opened_review(path: Path) -> OpenedTwin:
     if not recorded.closed:
         cut = f"{path.name}: was not closed (killed, or full disk); it is reviewed up to its last complete row"
         remarks.append(("warn", cut))
+    twin = recorded_twin(recorded)
+    base, remark = recorded.base_for(twin.model)
+    remarks += [("warn", remark)] if remark else []
     return OpenedTwin(
-        recorded_twin(recorded),
+        twin,
         open_source,
-        base=recorded.base,
+        base=base,
         horizon=np.inf,
         review=path,
         said=recorded.notices,
@@ -146,16 +157,18 @@ def open_session(
     page: Page | None,
     split: Split = NEVER,
     recordings: Path = Path(),
+    printed: bool = False,
 ) -> Session:
     """A session that runs what was opened, and on a page the gallery beside it.
 
     Raises:
         NisusError: If the source cannot be opened, or the page's port is in use.
     """
-    session = Session(opening, page=page, split=split, recordings=recordings)
+    session = Session(opening, page=page, split=split, recordings=recordings, printed=printed)
     if page is not None:
         own = [wanted.twin] if wanted is not None and wanted.twin is not None and wanted.twin not in shipped() else []
         gallery = Gallery(session, opener, first=wanted, own=own)
-        GalleryApi(gallery, Recordings(recordings, lambda: session.recorded))
+        if page.overview is None:
+            GalleryApi(gallery, Recordings(recordings, lambda: session.recorded))
         session.threads.append(SavedFiles(gallery))
     return session

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args, get_origin, get_type_hints
 
@@ -193,3 +193,38 @@ def check_options(name: str, command: type, words: Sequence[str]) -> None:
         except ValueError:
             kind = "a whole number" if number is int else "a number"
             raise ConfigError(f"{option} {quoted(value)}: must be {kind}") from None
+
+
+FLAG_ON, FLAG_OFF = ("1", "true", "yes", "on"), ("0", "false", "no", "off")
+
+
+def environment_options(name: str, command: type, arguments: Sequence[str], variables: Mapping[str, str]) -> list[str]:
+    """Return the options of a command that environment variables give and the arguments do not.
+
+    For --port of `nisus run` that is NISUS_RUN_PORT. A list is separated by blanks; a flag is on for 1, true, yes
+    or on.
+
+    Raises:
+        ConfigError: If there is no such option, or a flag has another value than these or their opposites.
+    """
+    hints = options_of(command)
+    given = {argument.partition("=")[0].replace("_", "-") for argument in arguments}
+    begin = f"NISUS_{name.upper()}_"
+    found: list[str] = []
+    for variable in sorted(each for each in variables if each.startswith(begin)):
+        field, value = variable.removeprefix(begin).lower(), variables[variable].strip()
+        if field not in hints:
+            near = nearest(variable, [f"{begin}{each.upper()}" for each in hints])
+            raise ConfigError(f"{variable}: there is no such option; {near}")
+        option, marks = f"--{field.replace('_', '-')}", getattr(hints[field], "__metadata__", ())
+        if option in given or not value:
+            continue
+        if tyro.conf.FlagCreatePairsOff in marks:
+            if value.lower() not in (*FLAG_ON, *FLAG_OFF):
+                raise ConfigError(f"{variable} is {quoted(value)}; it must be {', '.join((*FLAG_ON, *FLAG_OFF))}")
+            found += [option] * (value.lower() in FLAG_ON)
+        elif tyro.conf.UseAppendAction in marks:
+            found += [part for each in value.split() for part in (option, each)]
+        else:
+            found += [option, *(value.split() if get_origin(hints[field]) is tuple else [value])]
+    return found

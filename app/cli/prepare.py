@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -21,7 +20,7 @@ from sources.pieces import make, pieces_of
 from ..live.compilers import Compiler
 from ..live.watchdog import CallWatch, interruptible
 from ..live.workshop import Workshop
-from ..terminal import complain
+from ..terminal import complain, messages_file
 from ..twin.twin import Twin, load_twin
 from .options import settings
 
@@ -202,7 +201,7 @@ LINE_PERIOD_S = 5.0  # seconds between two lines where output is no terminal
 
 
 def _console() -> Console:
-    return Console(file=sys.stderr)
+    return Console(file=messages_file())
 
 
 @contextmanager
@@ -211,7 +210,7 @@ def _shown(text: Callable[[], str], console: Console, first: str = "") -> Iterat
     if not console.is_terminal:
         if first:
             console.print(first, highlight=False, soft_wrap=True)
-        with _every(LINE_PERIOD_S, lambda: print(text(), file=sys.stderr, flush=True)):
+        with _every(LINE_PERIOD_S, lambda: print(text(), file=console.file, flush=True)):
             yield
         return
     with console.status(text()) as status, _every(0.5, lambda: status.update(text())):

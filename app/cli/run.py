@@ -12,8 +12,8 @@ from estimators.errors import ConfigError
 
 from ..live.execute import MAX_SPEED
 from ..present.result import to_json
-from ..terminal import complain
-from ..views.recording.rrd_file import NEVER, TAKEN, parse_split
+from ..terminal import complain, use_lines_of_json
+from ..views.recording.rrd_file import TAKEN, check_date, parse_split
 from ..web.door import check_port
 from ..web.gallery.gallery import StartRequest
 from ..web.gate import read_tokens
@@ -31,6 +31,8 @@ if TYPE_CHECKING:
 
 __all__ = ["live_source", "run_twin"]
 
+OPTIONS_OF_TWIN = ("record", "store", "log", "set", "estimator", "tuning")  # of a twin that is named
+
 MAX_FAILURES = 5  # failures that a run without a page prints at its end
 
 
@@ -47,13 +49,17 @@ def run_twin(arguments: RunCommand, workers: Sequence[Compiler] = ()) -> int:
         raise ConfigError(
             f"--speed {speed:g}: must be positive and at most {MAX_SPEED:g}, or inf for as fast as possible"
         )
+    if arguments.log_format == "json":
+        use_lines_of_json()
     if arguments.record is not None and arguments.record.suffix != ".rrd":
         raise ConfigError(f"--record {arguments.record}: must end in .rrd")
+    if arguments.record is not None:
+        check_date(arguments.record)
     if arguments.record is not None and os.path.lexists(arguments.record):
         raise ConfigError(f"--record {arguments.record}: {TAKEN}")
     if arguments.json and not arguments.headless:
         raise ConfigError("--json: is the result of a run without a page; give --headless")
-    split = NEVER if arguments.record_split is None else parse_split(arguments.record_split)
+    split = parse_split(arguments.record_split, arguments.record_keep)
     page = None if arguments.headless else page_of(arguments)
     opening, wanted, opener = None, None, FileOpener()
     if arguments.twin is not None:
@@ -64,9 +70,10 @@ def run_twin(arguments: RunCommand, workers: Sequence[Compiler] = ()) -> int:
             logs=arguments.log,
             overrides=settings(arguments.set, arguments.estimator, arguments.tuning),
             speed=speed,
+            store=arguments.store,
         )
         opening, opener = read(), FileOpener({arguments.twin: read}, workers)
-    elif page is None or arguments.record or arguments.log or arguments.set or arguments.estimator or arguments.tuning:
+    elif page is None or any(getattr(arguments, name) for name in OPTIONS_OF_TWIN):
         raise ConfigError("run: the twin is missing; name one (`nisus twins` lists those that ship)")
     if page is not None:
         check_port(page.port)
@@ -74,7 +81,10 @@ def run_twin(arguments: RunCommand, workers: Sequence[Compiler] = ()) -> int:
         prepare(opening.twin)
     elif opening is not None:
         opening = opener.made_ready(opening)
-    session = open_session(opening, wanted, opener, page=page, split=split, recordings=arguments.recordings)
+    session = open_session(
+        opening, wanted, opener, page=page, split=split, recordings=arguments.recordings,
+        printed=arguments.log_format is not None,
+    )  # fmt: skip
     session.run(record=arguments.record, duration=arguments.duration, until_finished=arguments.headless)
     if arguments.headless:
         status = session.engine.status()

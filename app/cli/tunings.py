@@ -14,6 +14,9 @@ from estimators.errors import ConfigError, printable
 from ..live.changes import difference
 from ..live.tunings.versions import (
     COVERAGE,
+    LIKELIHOOD,
+    NIS,
+    REFUSED,
     Settings,
     accept,
     apply_tuning,
@@ -31,6 +34,8 @@ from .prepare import fold_log, prepared
 
 if TYPE_CHECKING:
     from .arguments import TuningsCommand as Arguments
+
+SCORE_TITLES = {NIS: "NIS / dof", LIKELIHOOD: "log L per measurement", REFUSED: "share rejected"}
 
 
 def tunings_of(arguments: Arguments) -> int:
@@ -136,7 +141,12 @@ def _compare(arguments: Arguments) -> None:
         return
     names = tuple(arguments.names)
     rows = tuple(
-        (name, f"{before:.6g}", f"{scores[1][name]:.6g}", _verdict(name, before, scores[1][name]))
+        (
+            SCORE_TITLES.get(name, name),
+            f"{before:.6g}",
+            f"{scores[1][name]:.6g}",
+            _verdict(name, before, scores[1][name]),
+        )
         for name, before in scores[0].items()
         if name in scores[1]
     )

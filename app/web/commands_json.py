@@ -8,6 +8,8 @@ import typing
 from pathlib import Path
 from typing import Any
 
+from pydantic import TypeAdapter
+
 from estimators.errors import ConfigError, nearest
 
 from ..live import commands
@@ -57,3 +59,14 @@ def _recording(name: str) -> Path:
     if len(os.fsencode(name)) > MAX_NAME_BYTES:
         raise ConfigError(f"{where}, which is too long; it may have {MAX_NAME_BYTES} bytes")
     return path
+
+
+def commands_schema() -> dict[str, Any]:
+    """Return the JSON Schema of the body of a command."""
+    kinds = []
+    for name, kind in COMMANDS.items():
+        schema = TypeAdapter(kind).json_schema()
+        schema["properties"] = {"command": {"const": name}, **schema.get("properties", {})}
+        schema["required"] = ["command", *schema.get("required", ())]
+        kinds.append(schema)
+    return {"oneOf": kinds}

@@ -9,29 +9,32 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import errno
+import json
 import os
 import secrets
 import socket
 import threading
 import time
 import uuid
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import h11
 import uvicorn
 from starlette.applications import Starlette
+from starlette.datastructures import QueryParams
 from starlette.requests import Request
 from starlette.responses import JSONResponse, PlainTextResponse
 from starlette.routing import BaseRoute, Route
-from starlette.types import ASGIApp, Receive, Scope, Send
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from starlette.websockets import WebSocket
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from estimators.errors import ConfigError
 
-from .gate import Gate, Grant, with_security_headers
+from .gate import SESSION, USER, Gate, Grant, User, changes, with_security_headers
+from .http import MAX_BODY_BYTES
 
 SERVICE_RESTART = 1012
 """Close code of a WebSocket whose application is replaced."""
@@ -45,12 +48,20 @@ some systems allow 256 in all."""
 BACKLOG = 64
 """Connections that may wait to be accepted."""
 
+MAX_NOTED_BYTES = 4096
+"""Longest body that an audit log keeps."""
+
 REQUEST_TIMEOUT_S = 10.0
 """From the first byte of a request, or the connection, to the last byte of its body."""
 
 
-def listen(port: int) -> tuple[list[socket.socket], bool]:
+LOOPBACK = "127.0.0.1"
+
+
+def listen(port: int, host: str = LOOPBACK) -> tuple[list[socket.socket], bool]:
     """Listen on 127.0.0.1, and on ::1 where it exists, as `localhost` may mean either; port 0 takes a free one.
+
+    Or on another address alone.
 
     Returns:
         The sockets, and whether `localhost` leads to them and to no other program.
@@ -59,10 +70,13 @@ def listen(port: int) -> tuple[list[socket.socket], bool]:
         ConfigError: If the port is not free on 127.0.0.1.
     """
     try:
-        first = _listener(socket.AF_INET, "127.0.0.1", port)
+        first = _listener(socket.AF_INET6 if ":" in host else socket.AF_INET, host, port)
     except (OSError, OverflowError) as error:
         reason = getattr(error, "strerror", None) or "is not a port"
-        raise ConfigError(f"port {port}: {reason}; choose another with --port") from None
+        where = f"port {port}" if host == LOOPBACK else f"address {host}, port {port}"
+        raise ConfigError(f"{where}: {reason}; choose another with --port") from None
+    if host != LOOPBACK:
+        return [first], False
     try:
         return [first, _listener(socket.AF_INET6, "::1", first.getsockname()[1])], True
     except OSError as error:
@@ -122,11 +136,18 @@ class FormerSessions:
             os.replace(part, self._file)
 
 
+class Auditor(Protocol):
+    """Takes the requests that changed something."""
+
+    def add(self, user: str, role: str, address: str, path: str, body: Mapping[str, Any]) -> None:
+        """Note a request that was carried out."""
+
+
 class ShownApplication:
     """An application behind the door; `boot` distinguishes it from those before."""
 
-    def __init__(self, application: ASGIApp, boot: str) -> None:
-        self.application, self.boot = application, boot
+    def __init__(self, application: ASGIApp, boot: str, audit: Auditor | None = None) -> None:
+        self.application, self.boot, self.audit = application, boot, audit
         self.replaced = asyncio.Event()
         """Set in the server's thread when another application has taken its place."""
         self.disconnected = threading.Event()
@@ -165,15 +186,30 @@ class ShownApplication:
 class Door:
     """Serves its own routes, then the present application, in a thread."""
 
-    def __init__(self, port: int, grants: Sequence[Grant] = ()) -> None:
-        """Take the port; 0 takes a free one. `grants` are tokens of other programs.
+    def __init__(
+        self,
+        port: int,
+        grants: Sequence[Grant] = (),
+        *,
+        host: str = LOOPBACK,
+        public: str | None = None,
+        overview: str | None = None,
+    ) -> None:
+        """Take the port; 0 takes a free one.
+
+        Args:
+            port: The port.
+            grants: Tokens of other programs, and of users.
+            host: Address to listen on.
+            public: Address, https://HOST, at which a reverse proxy offers the page.
+            overview: Address of the overview of a service, which passes requests on to this port.
 
         Raises:
             ConfigError: If the port is not free.
         """
-        self.sockets, localhost = listen(port)
+        self.sockets, localhost = listen(port, host)
         self.port = int(self.sockets[0].getsockname()[1])
-        self._token = secrets.token_urlsafe(32)
+        self.token = secrets.token_urlsafe(32)
         self._shown = ShownApplication(self._no_twin, uuid.uuid4().hex)
         self._page: ASGIApp | None = None
         self._own = Starlette(routes=[Route("/healthz", _alive)])
@@ -182,11 +218,15 @@ class Door:
         self._loop: asyncio.AbstractEventLoop | None = None
         former = FormerSessions(port) if port else None  # a free port is another one next time
         known = former.digests() if former is not None else []
-        gate = Gate(with_security_headers(self._enter, self.port), self._token, self.port, known, grants)
+        gate = Gate(
+            with_security_headers(self._enter, self.port, public), self.token, self.port, known, grants,
+            addresses=host != LOOPBACK, public=public,
+        )  # fmt: skip
         if former is not None:
             former.keep([gate.digest, *known])
         self.entered = gate.entered
-        self.stage_pass = gate.stage_pass if localhost else None
+        self.overview = overview
+        self.stage_pass = gate.stage_pass if localhost and overview is None else None
         """Pass of the stage for a frame under `localhost`; None where that may be another program."""
         config = uvicorn.Config(
             gate, log_config=None, log_level="critical", access_log=False,
@@ -201,7 +241,7 @@ class Door:
     @property
     def url(self) -> str:
         """Address of the page, with its token."""
-        return f"http://127.0.0.1:{self.port}/?token={self._token}"
+        return f"http://127.0.0.1:{self.port}/?token={self.token}"
 
     @property
     def boot(self) -> str:
@@ -213,20 +253,27 @@ class Door:
         """Whether it has routes of its own."""
         return self._page is not None
 
+    @property
+    def routes(self) -> list[BaseRoute]:
+        """Routes of its own."""
+        return list(self._own.router.routes)
+
     def add_gallery(self, routes: Sequence[BaseRoute], page: ASGIApp) -> None:
         """Add routes that are always served, and the page for when no twin runs; before the start."""
         self._own.router.routes.extend(routes)
         self._page = page
 
-    def show(self, application: ASGIApp | None, boot: str | None = None) -> threading.Event:
-        """Put another application behind the door, or none; from any thread.
+    def show(
+        self, application: ASGIApp | None, boot: str | None = None, audit: Auditor | None = None
+    ) -> threading.Event:
+        """Put another application behind the door, or none; from any thread. Its `audit` gets requests that change.
 
         Returns:
             An event that is set once the previous application has no connection left.
         """
         before = self._shown
         boot = uuid.uuid4().hex if boot is None else boot
-        self._shown = ShownApplication(self._no_twin if application is None else application, boot)
+        self._shown = ShownApplication(self._no_twin if application is None else application, boot, audit)
         if self._loop is not None and not self._loop.is_closed():
             self._loop.call_soon_threadsafe(before.replace)
         else:
@@ -249,7 +296,11 @@ class Door:
 
     async def _enter(self, scope: Scope, receive: Receive, send: Send) -> None:
         self._loop = asyncio.get_running_loop()
-        await self._own(scope, receive, send)
+        audit = self._shown.audit
+        if audit is not None and scope["type"] == "http" and scope["method"] == "POST" and changes(scope["path"]):
+            await _audited(audit, self._own, scope, receive, send)
+        else:
+            await self._own(scope, receive, send)
 
     async def _behind(self, scope: Scope, receive: Receive, send: Send) -> None:
         shown = self._shown
@@ -270,6 +321,32 @@ class Door:
             await JSONResponse({"error": NO_TWIN}, 409)(scope, receive, send)
         else:
             await PlainTextResponse(f"Nisus: {NO_TWIN}.\n", 404)(scope, receive, send)
+
+
+async def _audited(audit: Auditor, application: ASGIApp, scope: Scope, receive: Receive, send: Send) -> None:
+    """Serve a request, and note it if it was carried out; of its body only an object in JSON."""
+    body = bytearray()
+
+    async def receive_and_keep() -> Message:
+        message = await receive()
+        if len(body) <= MAX_BODY_BYTES:
+            body.extend(message.get("body", b""))
+        return message
+
+    async def send_and_note(message: Message) -> None:
+        if message["type"] == "http.response.start" and message["status"] < 400:
+            try:
+                found = json.loads(bytes(body))
+            except (ValueError, RecursionError):
+                found = None
+            fields = found if isinstance(found, dict) else dict(QueryParams(scope["query_string"]))
+            if len(body) > MAX_NOTED_BYTES:
+                fields = {"command": fields.get("command"), "bytes": len(body)}
+            user = scope.get(USER) or User(SESSION, "", "")
+            audit.add(user.name, user.role, user.address, scope["path"], fields)
+        await send(message)
+
+    await application(scope, receive_and_keep, send_and_note)
 
 
 async def _alive(request: Request) -> PlainTextResponse:

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import hashlib
 import hmac
+import ipaddress
 import os
 import re
 import stat
@@ -67,6 +68,21 @@ class Grant(NamedTuple):
         return needed == self.role or self.role == ADMIN or (self.role == TUNE and needed == VIEW)
 
 
+class User(NamedTuple):
+    """Who sent a request: name and role of the token, and the address of the client."""
+
+    name: str
+    role: str
+    address: str
+
+
+USER = "nisus.user"
+"""Key of the `User` in the scope of a request that was let through."""
+
+SESSION = "session"
+"""Name of a user who has the session's own token, such as that of the page."""
+
+
 def read_tokens(path: Path) -> tuple[Grant, ...]:
     """Return the tokens of a file with a line NAME ROLE TOKEN for each; # begins a comment.
 
@@ -102,22 +118,46 @@ def read_tokens(path: Path) -> tuple[Grant, ...]:
     return tuple(found)
 
 
+def path_of_twin(path: str) -> str:
+    """Return a path within the page of a twin, also of one among several: /api/state of /twins/NAME/api/state."""
+    _, twins, _, inner = (*path.split("/", 3), "", "", "")[:4]
+    return f"/{inner}" if twins == "twins" else path
+
+
 def needed_role(scope: Scope) -> str:
     """Return the role that a request needs."""
-    if scope["path"] == READINGS and scope.get("method") == "POST":
+    path = path_of_twin(scope["path"])
+    if path == READINGS and scope.get("method") == "POST":
         return FEED
-    if scope["path"].startswith(STAGE.rstrip("/")):
+    if path.startswith(STAGE.rstrip("/")):
         return TUNE  # the scene has controls
     if scope["type"] == "websocket" or scope["method"] in ("GET", "HEAD"):
         return VIEW
     return ADMIN if scope["path"].startswith("/api/gallery/") else TUNE
 
 
+QUESTIONS = ("/api/readings", "/api/forecast", "/api/scene", "/api/gallery/log", "/api/gallery/log/curves")
+"""Paths of POST requests that change no settings; measurements have no entry each in the audit log."""
+
+
+def changes(path: str) -> bool:
+    """Return whether a POST request to a path belongs in the audit log."""
+    return path not in QUESTIONS
+
+
 class Gate:
     """Lets a request through to an application, or answers 403 with one line."""
 
     def __init__(
-        self, app: ASGIApp, token: str, port: int, former: Collection[str] = (), grants: Sequence[Grant] = ()
+        self,
+        app: ASGIApp,
+        token: str,
+        port: int,
+        former: Collection[str] = (),
+        grants: Sequence[Grant] = (),
+        *,
+        addresses: bool = False,
+        public: str | None = None,
     ) -> None:
         """Prepare for an application.
 
@@ -126,10 +166,14 @@ class Gate:
             token: The session's own, which allows everything.
             port: That is served.
             former: `digest` of sessions before at this port, whose open pages may return and get the new cookie.
-            grants: Tokens of other programs.
+            grants: Tokens of other programs, and of users.
+            addresses: Whether a Host may be any IP address, which no other site's name can stand for.
+            public: Address, https://HOST, at which a reverse proxy offers the page.
         """
         self._app, self._token, self._former = app, token, frozenset(former)
         self._grants = tuple(grants)
+        self._addresses, self._public = addresses, public
+        self._name = f"nisus_{port}"
         self.entered = threading.Event()
         """Set once a browser has shown the token."""
         # The cookie is not the token, so that it does not reveal the address.
@@ -153,7 +197,8 @@ class Gate:
         """Return the answer to a request that does not pass."""
         headers, query = Headers(scope=scope), QueryParams(scope["query_string"])
         host = _single(headers, "host") or ""
-        if not LOOPBACK_HOST.fullmatch(host):
+        published = self._public is not None and host == self._public.partition("://")[2]
+        if not (LOOPBACK_HOST.fullmatch(host) or published or (self._addresses and _is_address(host))):
             return _refusal(REFUSED_HOST)
         shows_token = _equals(query.getlist("token"), self._token)
         framed = scope["path"] == STAGE and _equals(query.getlist("pass"), self.stage_pass)
@@ -162,29 +207,59 @@ class Gate:
         same_site = (_single(headers, "sec-fetch-site") or "none") in ("none", "same-origin")
         origins = headers.getlist("origin")
         if origins or scope["type"] == "websocket":
-            from_here = origins == [f"http://{host}"]
+            from_here = origins == ([self._public] if published else [f"http://{host}"])
         else:
             from_here = same_site or exchange or framed
         if not from_here:
             return _refusal(REFUSED_ORIGIN)
         if exchange:
-            return self._exchange(same_site)
+            return self._exchange(same_site, _marked(self._cookie, secure=self._secure(published)))
+        if scope["type"] == "http" and scope["path"] == "/" and scope["method"] == "GET":
+            for grant in self._granted(*query.getlist("token")[:1]):
+                return self._exchange(same_site, _marked(self._cookie_of(grant), secure=self._secure(published)))
         if scope["path"] in OPEN_PATHS or shows_token or framed or self._is_known(headers) or self._is_former(headers):
+            passed_on = (_single(headers, "nisus-user") or "").split(" ")
+            scope[USER] = User(*passed_on) if len(passed_on) == 3 else User(SESSION, ADMIN, self._address(scope))
             return None
         return self._refused(scope, headers)
 
     def _refused(self, scope: Scope, headers: Headers) -> ASGIApp | None:
         """Return the answer to a request without the session's token; None if one of a file allows it."""
-        shown = hashlib.sha256(_bearer(headers).encode()).hexdigest()
-        held = [grant for grant in self._grants if hmac.compare_digest(grant.digest, shown)]
+        held = self._granted(_bearer(headers))
+        if not held and self._grants:
+            cookies = _cookies(headers)
+            held = [grant for grant in self._grants if self._cookie_of(grant) in cookies]
         if not held:
             return _refusal(REFUSED_TOKEN)
         needed = needed_role(scope)
-        if scope["path"] == READINGS and scope.get("method") == "GET" and held[0].allows(FEED):
+        if path_of_twin(scope["path"]) == READINGS and scope.get("method") == "GET" and held[0].allows(FEED):
             needed = FEED  # the names of the values, which a sender asks for
         if held[0].allows(needed):
+            scope[USER] = User(held[0].name, held[0].role, self._address(scope))
             return None
         return _refusal(f"Nisus: the token of {held[0].name} has the role {held[0].role}; this needs {needed}.\n")
+
+    def _address(self, scope: Scope) -> str:
+        """Return the address of the client; behind a reverse proxy, the last one that it names."""
+        named = Headers(scope=scope).getlist("x-forwarded-for") if self._public is not None else []
+        if named:
+            return named[-1].rpartition(",")[2].strip()
+        client = scope.get("client")
+        return client[0] if client else ""
+
+    def _secure(self, published: bool) -> bool:
+        """Return whether a request came through TLS."""
+        return published and (self._public or "").startswith("https:")
+
+    def _granted(self, token: str = "") -> list[Grant]:
+        """Return the grant of a token, if there is one."""
+        shown = hashlib.sha256(token.encode()).hexdigest()
+        return [grant for grant in self._grants if hmac.compare_digest(grant.digest, shown)]
+
+    def _cookie_of(self, grant: Grant) -> str:
+        """Return the cookie for which a user's token is exchanged; it lasts as long as the token is in the file."""
+        value = hmac.new(grant.digest.encode(), self._name.encode(), hashlib.sha256).hexdigest()
+        return f"{self._name}_user={value}"
 
     def _is_known(self, headers: Headers) -> bool:
         """Return whether a request has the cookie, or the token as a header."""
@@ -209,18 +284,32 @@ class Gate:
 
     @property
     def _marked_cookie(self) -> str:
-        return f"{self._cookie}; Path=/; HttpOnly; SameSite=Strict"
+        return _marked(self._cookie)
 
-    def _exchange(self, same_site: bool) -> ASGIApp:
+    def _exchange(self, same_site: bool, cookie: str) -> ASGIApp:
         """Move the token from the address into a cookie."""
         self.entered.set()
         headers = {
-            "set-cookie": self._marked_cookie,
+            "set-cookie": cookie,
             "cache-control": "no-store",
             "referrer-policy": "no-referrer",
         }
         # After a link on another page, the strict cookie would not be sent along a redirect.
         return RedirectResponse("/", 303, headers) if same_site else HTMLResponse(FORWARD, headers=headers)
+
+
+def _marked(cookie: str, *, secure: bool = False) -> str:
+    return f"{cookie}; Path=/; HttpOnly; SameSite=Strict{'; Secure' if secure else ''}"
+
+
+def _is_address(host: str) -> bool:
+    """Return whether a Host is an IP address, with or without a port."""
+    name = host.rpartition(":")[0] if host.count(":") == 1 or "]:" in host else host
+    try:
+        ipaddress.ip_address(name.strip("[]"))
+    except ValueError:
+        return False
+    return True
 
 
 def _bearer(headers: Headers) -> str:
@@ -252,14 +341,14 @@ def _refusal(line: str) -> ASGIApp:
     return PlainTextResponse(line, 403, {"connection": "close"})
 
 
-def with_security_headers(app: ASGIApp, port: int) -> ASGIApp:
+def with_security_headers(app: ASGIApp, port: int, public: str | None = None) -> ASGIApp:
     """Return an application whose answers forbid the browser to load anything from elsewhere."""
     # Viser's client is one file of inline scripts that unpack themselves.
-    viser = _policy(port, "'unsafe-inline' 'unsafe-eval' 'wasm-unsafe-eval' blob: data:")
-    own = _policy(port, "'wasm-unsafe-eval'")
+    viser = _policy(port, "'unsafe-inline' 'unsafe-eval' 'wasm-unsafe-eval' blob: data:", public)
+    own = _policy(port, "'wasm-unsafe-eval'", public)
 
     async def serve(scope: Scope, receive: Receive, send: Send) -> None:
-        policy = viser if scope["path"].startswith("/viser") else own
+        policy = viser if path_of_twin(scope["path"]).startswith("/viser") else own
 
         async def send_more(message: Message) -> None:
             if message["type"] == "http.response.start":
@@ -273,11 +362,13 @@ def with_security_headers(app: ASGIApp, port: int) -> ASGIApp:
     return serve
 
 
-def _policy(port: int, scripts: str) -> str:
+def _policy(port: int, scripts: str, public: str | None) -> str:
     """Return a content security policy under which no request leaves this server."""
     # Not every browser takes 'self' to include the WebSockets of the same address.
     names = (f"127.0.0.1:{port}", f"localhost:{port}")
     sockets, here = (" ".join(f"{scheme}://{name}" for name in names) for scheme in ("ws", "http"))
+    if public is not None:
+        sockets, here = f"{sockets} {public.replace('http', 'ws', 1)}", f"{here} {public}"
     return (
         f"default-src 'self'; script-src 'self' {scripts}; style-src 'self' 'unsafe-inline'; "
         f"img-src 'self' data: blob:; font-src 'self' data:; connect-src 'self' data: blob: {sockets}; "

@@ -8,19 +8,21 @@ import html
 import inspect
 import json
 import math
+import re
 import threading
 import typing
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Awaitable, Callable, Iterable, Mapping
 from concurrent.futures import Future
 from functools import cache
+from importlib.metadata import version
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 from pydantic import TypeAdapter, ValidationError
 from starlette.concurrency import run_in_threadpool
 from starlette.requests import ClientDisconnect, Request
 from starlette.responses import HTMLResponse, JSONResponse, PlainTextResponse, Response
-from starlette.routing import Route
+from starlette.routing import BaseRoute, Route
 
 from estimators.errors import ConfigError, NisusError, nearest, printable, quoted, shown_name
 
@@ -46,6 +48,26 @@ RULES = {
     "tuple_type": "a list of texts", "dict_type": "an object of numbers", "none_required": "null",
 }  # fmt: skip
 """Types of pydantic's errors in words."""
+
+
+class Operation(NamedTuple):
+    """Endpoint for its description: the function, its fields, where they are sent, and what it answers.
+
+    `fields` is None if `body` returns the JSON Schema of the body.
+    """
+
+    work: Callable[..., Any]
+    fields: type | None
+    sends_body: bool
+    status: int
+    body: Callable[[], dict[str, Any]] | None = None
+    answer: type | None = None
+
+
+class ApiRoute(Route):
+    """Route with the description of its endpoint."""
+
+    operation: Operation
 
 
 class Json(JSONResponse):
@@ -79,7 +101,13 @@ def page_file(name: str, settings: Mapping[str, Any], **parts: str) -> Response:
 
 
 def get(
-    path: str, work: Callable[..., Any], *, method: str = "GET", refused: int = 400, run: Runner = run_in_threadpool
+    path: str,
+    work: Callable[..., Any],
+    *,
+    method: str = "GET",
+    refused: int = 400,
+    run: Runner = run_in_threadpool,
+    answer: type | None = None,
 ) -> Route:
     """Return a route that calls `work` in a thread and answers with its result as JSON.
 
@@ -92,6 +120,7 @@ def get(
         method: Method of the request.
         refused: Status code of an error.
         run: Runs a call; by default in the server's threads.
+        answer: Model of the answer, for the description of the API.
     """
     kind, takes_request = _parameters(work), "request" in inspect.signature(work).parameters
     names = [item.name for item in dataclasses.fields(kind)]
@@ -107,14 +136,23 @@ def get(
 
         return await _answered(call, run, 200, refused)
 
-    return Route(path, endpoint, methods=[method], name=work.__name__)
+    route = ApiRoute(path, endpoint, methods=[method], name=work.__name__)
+    route.operation = Operation(work, kind, False, 200, answer=answer)
+    return route
 
 
-def post(path: str, work: Callable[..., Any], *, status: int = 200, run: Runner = run_in_threadpool) -> Route:
+def post(
+    path: str,
+    work: Callable[..., Any],
+    *,
+    status: int = 200,
+    run: Runner = run_in_threadpool,
+    body_schema: Callable[[], dict[str, Any]] | None = None,
+) -> Route:
     """Return a route that calls `work` in a thread with the fields of the request's JSON body; see `get`.
 
     The body must be an object of exactly the parameters of `work`, or of the fields of its one parameter if that is a
-    dataclass; one that is called `body` is the whole body.
+    dataclass; one that is called `body` is the whole body, described by the JSON Schema of `body_schema`.
     """
     hints = [hint for name, hint in typing.get_type_hints(work).items() if name != "return"]
     whole: Any = hints[0] if len(hints) == 1 and dataclasses.is_dataclass(hints[0]) else None
@@ -141,7 +179,9 @@ def post(path: str, work: Callable[..., Any], *, status: int = 200, run: Runner 
 
         return await _answered(call, run, status, 400)
 
-    return Route(path, endpoint, methods=["POST"], name=work.__name__)
+    route = ApiRoute(path, endpoint, methods=["POST"], name=work.__name__)
+    route.operation = Operation(work, None if takes_body else kind, True, status, body_schema)
+    return route
 
 
 async def _answered(call: Callable[[], Any], run: Runner, status: int, refused: int) -> Response:
@@ -292,3 +332,70 @@ def _parameters(work: Callable[..., Any]) -> type:
             default = () if item.default is item.empty else (dataclasses.field(default=item.default),)
             fields.append((name, hints[name], *default))
     return dataclasses.make_dataclass(work.__name__, fields)
+
+
+# The description of the API
+
+MODELS_AT = "#/components/schemas/"
+
+
+def openapi(routes: Iterable[BaseRoute]) -> dict[str, Any]:
+    """Return the OpenAPI document of routes, from the docstrings and parameters of their functions."""
+    models: dict[str, Any] = {}
+    paths: dict[str, Any] = {}
+    for route in routes:
+        if not isinstance(route, Route) or not route.path.startswith(("/api/", "/metrics", "/healthz", "/readyz")):
+            continue
+        path = re.sub(r":\w+}", "}", route.path)
+        for method in sorted((route.methods or set()) - {"HEAD"}):
+            paths.setdefault(path, {})[method.lower()] = _described(route, method, path, models)
+    return {
+        "openapi": "3.1.0",
+        "info": {"title": "Nisus", "version": version("nisus"), "description": "HTTP interface of a running twin"},
+        "security": [{"token": []}],
+        "paths": dict(sorted(paths.items())),
+        "components": {"schemas": models, "securitySchemes": {"token": {"type": "http", "scheme": "bearer"}}},
+    }
+
+
+def _described(route: Route, method: str, path: str, models: dict[str, Any]) -> dict[str, Any]:
+    """Return one operation; the models that it refers to are added to `models`."""
+    operation = getattr(route, "operation", None)
+    work = route.endpoint if operation is None else operation.work
+    lines = (inspect.getdoc(work) or "").split("\n\n")[0].split()
+    found: dict[str, Any] = {"operationId": f"{method.lower()} {path}", "summary": " ".join(lines)}
+    answer: dict[str, Any] = {"description": "the answer"}
+    status = 200
+    if operation is not None:
+        status = operation.status
+        if operation.answer is not None:
+            schema = _schema(operation.answer, models)
+            answer["content"] = {"application/json": {"schema": schema}}
+        if operation.sends_body:
+            body = {} if operation.fields is None else _schema(operation.fields, models)
+            body = body if operation.body is None else operation.body()
+            found["requestBody"] = {"required": True, "content": {"application/json": {"schema": body}}}
+        else:
+            fields = _schema(operation.fields, models)
+            needed = fields.get("required", ())
+            found["parameters"] = [
+                {
+                    "name": name,
+                    "in": "path" if f"{{{name}}}" in path else "query",
+                    "required": name in needed or f"{{{name}}}" in path,
+                    "schema": schema,
+                }
+                for name, schema in fields.get("properties", {}).items()
+            ]
+    found["responses"] = {str(status): answer, "400": {"description": "the reason, in one line", "content": ERROR}}
+    return found
+
+
+ERROR = {"application/json": {"schema": {"type": "object", "properties": {"error": {"type": "string"}}}}}
+
+
+def _schema(kind: Any, models: dict[str, Any]) -> dict[str, Any]:
+    """Return the JSON Schema of a type, with references to `models`."""
+    schema = TypeAdapter(kind).json_schema(ref_template=f"{MODELS_AT}{{model}}")
+    models |= schema.pop("$defs", {})
+    return schema

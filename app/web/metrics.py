@@ -58,6 +58,7 @@ class TwinCollector:
             for verdict, count in zip(VERDICT_NAMES[1:], counts[1:], strict=True):
                 measurements.add_metric([message.twin, sensor, verdict], float(count))
         yield measurements
+        yield from self._published(message.twin)
         problems = CounterMetricFamily(
             "nisus_problems",
             "Reported problems: frames lost, wrong times, failures and others.",
@@ -75,6 +76,26 @@ class TwinCollector:
                     if value is not None:
                         family.add_metric([message.twin, state.name, state.unit], value)
             yield from (mean, std)
+
+    def _published(self, twin: str) -> Iterator[Metric]:
+        """Yield metrics of outputs and receivers of alerts; of the ones that the twin has."""
+        from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
+
+        found = {} if self._engine.published is None else self._engine.published.json()
+        up = GaugeMetricFamily("nisus_output_up", "Whether an output reaches clients.", labels=["twin", "output"])
+        for item in found.get("outputs", ()):
+            up.add_metric([twin, item["name"]], float(item["connected"]))
+        for item in found.get("receivers", ()):
+            up.add_metric([twin, f"alerts to {item['name']}"], float(not item["failing"]))
+        yield up
+        labels = ["twin", "receiver", "outcome"]
+        alerts = CounterMetricFamily("nisus_alerts", "Alerts by what became of them.", labels=labels)
+        waiting = GaugeMetricFamily("nisus_alerts_waiting", "Alerts not yet delivered.", labels=labels[:2])
+        for item in found.get("receivers", ()):
+            waiting.add_metric([twin, item["name"]], float(item["waiting"]))
+            for outcome in ("delivered", "dropped"):
+                alerts.add_metric([twin, item["name"], outcome], float(item[outcome]))
+        yield from (alerts, waiting)
 
 
 def metrics(engine: Running, states: bool = False) -> Response:

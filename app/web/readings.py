@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
+import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -20,6 +22,9 @@ from .http import Json, TooLarge, bounded_body, get, refusal
 MAX_BYTES = 8 * 2**20
 """Longest body of measurements."""
 
+STORE_TIMEOUT_S, STORE_POLL_S = 2.0, 0.005
+"""Longest wait for the store, and the time between two looks at it."""
+
 
 def routes(engine: Running) -> list[BaseRoute]:
     """Return the routes of a running twin."""
@@ -30,6 +35,7 @@ def routes(engine: Running) -> list[BaseRoute]:
         return {"values": [{"name": name, "unit": source.units.get(name)} for name in source.names]}
 
     async def send(request: Request) -> Response:
+        """Take measurements; answer what became of each."""
         kind = request.headers.get("content-type", "").partition(";")[0].strip()
         try:
             source = messages_of(engine)
@@ -39,7 +45,8 @@ def routes(engine: Running) -> list[BaseRoute]:
             return PlainTextResponse(f"Nisus: Content-Type must be one of {', '.join(READERS)}.\n", 415)
         try:
             body = await bounded_body(request, MAX_BYTES)
-            return Json(await run_in_threadpool(lambda: answer(source, READERS[kind](body))))
+            found = await run_in_threadpool(lambda: answer(source, READERS[kind](body)))
+            return Json(found | {"stored": await stored(engine, source.accepted)})
         except TooLarge:
             return PlainTextResponse(
                 f"Nisus: a body may have {MAX_BYTES // 2**20} MB; send fewer messages at once.\n", 413
@@ -72,6 +79,17 @@ def answer(source: Messages, messages: Sequence[Any]) -> dict[str, Any]:
         for k, item in enumerate(answers)
     ]
     return counts | {"items": items}
+
+
+async def stored(engine: Running, mark: int) -> bool:
+    """Wait until the store has the messages up to a mark; return whether it does, at once without a store."""
+    store, end = engine.store, time.monotonic() + STORE_TIMEOUT_S
+    while store is not None and (found := store.has(mark)) is not None:
+        if found or time.monotonic() > end:
+            return found
+        store.ask()
+        await asyncio.sleep(STORE_POLL_S)
+    return False
 
 
 def _of_json(body: bytes) -> Sequence[Any]:

@@ -10,9 +10,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..concurrency import run_all
 from ..live.engine import Engine
+from ..live.jobs import run_all
 from ..live.runs.refits import Refits
+from ..live.store import StoreWriter, open_store
+from ..outputs import Publisher
+from ..terminal import complain, print_line
 from ..views.recording.rrd_file import NEVER, Split
 from ..views.recording.writer import ALL_STRETCHES, Recorder
 
@@ -26,6 +29,9 @@ if TYPE_CHECKING:
     from ..views.rerun.rows import RerunRows
     from .door import Door
 
+
+PRINT_PERIOD_S = 0.5
+"""Seconds between two looks for notices to print."""
 
 Stamp = tuple[tuple[int, int] | None, ...]
 """Time of writing, ns, and size of each of some files; None where one is missing."""
@@ -50,7 +56,7 @@ class OpenedTwin:
     `open_source`, `base` and `horizon` are those of `Engine`; `review` is the reviewed recording, `said` the notices of
     its session, `annotations` its notes of users, `remarks` new notices, (level, text). `files` are the twin's files,
     `stamp` their state when read, and `again` reads them once more; a recording has none. `workshop` compiles its
-    filters, and stops with the engine.
+    filters, and stops with the engine. `store` is the file from which it continues after a restart.
     """
 
     twin: Twin
@@ -65,13 +71,20 @@ class OpenedTwin:
     stamp: Stamp = ()
     again: Callable[[], Twin] | None = None
     workshop: Workshop | None = None
+    store: Path | None = None
 
 
 class RunningTwin:
     """Starts the parts of a running twin in order, and stops them in reverse."""
 
     def __init__(
-        self, opening: OpenedTwin, *, door: Door | None, split: Split = NEVER, recordings: Path | None = None
+        self,
+        opening: OpenedTwin,
+        *,
+        door: Door | None,
+        split: Split = NEVER,
+        recordings: Path | None = None,
+        printed: bool = False,
     ) -> None:
         """Put it together; nothing runs yet.
 
@@ -80,26 +93,53 @@ class RunningTwin:
             door: Behind which the page shows it, once it is started; None for no page.
             split: Into what parts to split a recording.
             recordings: Folder of recordings made on the page; None is the working directory.
+            printed: Whether the notices are printed on standard error.
 
         Raises:
             NisusError: If the source cannot be opened.
         """
         self.opening = opening
-        self.engine = Engine(
-            opening.twin,
-            opening.open_source,
-            base=opening.base,
-            horizon=opening.horizon,
-            workshop=opening.workshop,
-        )
+        store, stored, remarks = None, None, list(opening.remarks)
+        if opening.store is not None:
+            store, stored, remark = open_store(opening.store, opening.twin)
+            remarks.append(remark)
+            if remark[0] != "info" and not printed:
+                complain(remark[1])
+        try:
+            self.engine = Engine(
+                opening.twin if stored is None else stored.twin,
+                opening.open_source,
+                base=opening.base,
+                horizon=opening.horizon,
+                workshop=opening.workshop,
+                stored=stored,
+            )
+        except BaseException:
+            if store is not None:
+                store.close()
+            raise
+        self.store = None if store is None else StoreWriter(self.engine, store, stored)
+        self.engine.store = self.store
         if opening.said:
             self.engine.notices.restore(list(opening.said))
-        self.engine.annotations.restore(opening.annotations)
-        for level, text in opening.remarks:
+        if stored is None:
+            self.engine.annotations.restore(opening.annotations)
+        for level, text in remarks:
             self.engine.notices.say(text, level=level)
+        self._next_line: int | None = 0 if printed else None
+        if printed:
+            self.engine.jobs.run("lines", lambda job: self._print_notices(), every=PRINT_PERIOD_S)
         self.recorder = Recorder(self.engine, self._draw_into, split, recordings or Path())
         self.engine.recorder = self.recorder
         self.refits = Refits(self.engine)
+        self.publisher: Publisher | None = None
+        config = opening.twin.config
+        if opening.review is not None or opening.twin.plan.recorded:
+            if config.outputs.receivers:
+                self.engine.notices.say("a recording is replayed: no alerts are sent")
+        else:
+            page = None if door is None else f"http://127.0.0.1:{door.port}"
+            self.publisher = self.engine.published = Publisher(self.engine, page=page)
         self.view: Any = None
         self.server: Any = None
         self.gone: threading.Event | None = None
@@ -133,6 +173,8 @@ class RunningTwin:
     def discard(self) -> None:
         """Discard a twin that was never started."""
         self.engine.stop()
+        if self.store is not None:
+            self.store.stop()
         if self.view is not None:
             self.view.stop()
 
@@ -143,6 +185,10 @@ class RunningTwin:
             self.view.start()
             self.gone = self.server.start()
         self.engine.start()
+        if self.publisher is not None:
+            self.publisher.start()
+        if self.store is not None:
+            self.store.start()
         if self.opening.review is None:
             # A recording is over; what it had adopted is in it.
             self.refits.start()
@@ -152,6 +198,18 @@ class RunningTwin:
         shown = () if self.server is None else (self.server.stop, self.view.stop)
         run_all(self._close_log, *shown)
 
+    def _print_notices(self) -> None:
+        for line in self.engine.notices.since(self._next_line or 0):
+            fields = {"twin": self.engine.twin.name, "t": line.t, "revision": line.revision}
+            print_line(line.level, line.text, **fields)
+            self._next_line = line.number + 1
+
     def _close_log(self) -> None:
+        if self.publisher is not None:
+            self.publisher.stop()
         self.engine.stop()
+        if self.store is not None:
+            self.store.stop()
         self.recorder.stop()
+        if self._next_line is not None:
+            self._print_notices()

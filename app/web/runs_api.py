@@ -28,6 +28,7 @@ from ..present.result import to_html
 from ..present.runs_json import changes_json, noise_json, runs_json, swept_json, what_changed
 from ..present.series.chart_stream import Seconds
 from ..present.series.series import Series
+from ..studies.commission import commission_running
 from ..studies.guard import last
 from ..twin.twin import with_version
 from .http import OneAtATime, get, post
@@ -56,6 +57,7 @@ class RunsApi:
             get("/api/tunings", self._tunings),
             post("/api/tunings", self._keep),
             post("/api/tunings/load", self._load),
+            post("/api/baseline", self._baseline, run=OneAtATime("baseline")),
             get("/api/tunings/{name}/against", self._against, refused=404),
             *(get(f"/api/track.{kind}", self._track, refused=409, run=copying) for kind in KINDS),
             get("/api/report.html", self._report, refused=409, run=copying),
@@ -117,6 +119,10 @@ class RunsApi:
         tuning, estimator = self._engine.folded_with()
         twin = with_version(self._engine.twin, _listed(name))
         return changes_json(difference(twin.estimator, twin.tuning, estimator, tuning))
+
+    def _baseline(self, force: bool = False) -> Any:
+        """Write the baseline of the running tuning into the twin's file, which is then read again."""
+        return {"file": commission_running(self._engine, force=force).name}
 
     # Files: of a copy of the rows, so that writing holds up no other reader.
 
@@ -189,12 +195,13 @@ def _listed(name: str) -> str:
 
 def _scored(scores: RunScores) -> tuple[tuple[str, ...], ...]:
     """Return a line for each run: name, change, NIS, log-likelihood, errors."""
-    lines = []
-    for run, known in scores.all():
+    lines, found = [], scores.all()
+    there = {run.number for run, _ in found}
+    for run, known in found:
         line = "", "", "not scored: its track is gone"
         if known is not None:
             fits = [*{**known.score.states, **known.score.held_out}.items()][:MAX_ERRORS]
             errors = ", ".join(f"{subject} {digits(fit.rmse)}" for subject, fit in fits)
             line = digits(known.score.nis_verdict.ratio), f"{known.log_likelihood_reading:.4g}", errors
-        lines.append((f"{run.number} {run.name}".rstrip(), what_changed(run), *line))
+        lines.append((f"{run.number} {run.name}".rstrip(), what_changed(run, there), *line))
     return tuple(lines)

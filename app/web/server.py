@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import gzip
-import sys
 import threading
 import time
 import uuid
@@ -28,6 +27,7 @@ from ..live.engine import STATUS_PERIOD_S
 from ..live.faults import catalogue_json
 from ..live.running_fold import Running
 from ..live.runs.refits import Refits
+from ..outputs.alerts import AlertMessage
 from ..present.drawing.colors import EITHER, THEMES
 from ..present.export.alarm_guide import alarms_text, as_html
 from ..present.result import plain
@@ -36,15 +36,16 @@ from ..present.state_message import StateMessage, state_message, state_schema
 from ..studies.analysis.diagnosis import Diagnosis
 from ..studies.analysis.forecast import Forecasts, question_from_json
 from ..studies.analysis.why import change_of, why_json
+from ..terminal import messages_file
 from . import readings
-from .commands_json import command_from_json
+from .commands_json import command_from_json, commands_schema
 from .door import Door
 from .fit_api import FitApi
-from .http import PAGE, OneAtATime, get, page_file, post
+from .http import PAGE, OneAtATime, get, openapi, page_file, post
 from .metrics import metrics
 from .runs_api import RunsApi
 from .streams import PageStream, feed_rerun
-from .twin_json import annotations_json, episodes_json, model_json, status_json
+from .twin_json import annotations_json, audit_json, episodes_json, model_json, status_json
 from .viewer_assets import FILES, viewer_assets, viewer_version
 from .viser_proxy import ViserProxy
 
@@ -58,6 +59,11 @@ COMPILE_POLL_PERIOD_S = 0.5
 
 CHART_FILES = sorted(path.name for path in (PAGE / "charts").glob("*.js"))
 """Kinds of charts, one per file."""
+
+NOT_PUBLISHED: dict[str, Any] = {
+    "outputs": [], "receivers": [], "alerts": [], "muted_s": 0.0, "mute_reason": "",
+}  # fmt: skip
+"""Of a recording, which is published nowhere."""
 
 HEARTBEAT_S = 1.0
 """Between two messages of a state that does not change: its age does."""
@@ -123,7 +129,7 @@ class PageServer:
     def start(self) -> threading.Event:
         """Serve; return an event that is set once the application before has no connection left."""
         threading.Thread(target=self._prepare_viewer, name="viewer assets", daemon=True).start()
-        disconnected = self.door.show(self.application, self._boot)
+        disconnected = self.door.show(self.application, self._boot, self._engine.audit)
         if self._own_door:
             self.door.start()
         return disconnected
@@ -140,7 +146,7 @@ class PageServer:
             if self._stopping.wait(COMPILE_POLL_PERIOD_S):
                 return
         try:
-            self._assets.set_result(viewer_assets(lambda line: print(line, file=sys.stderr, flush=True)))
+            self._assets.set_result(viewer_assets(lambda line: print(line, file=messages_file(), flush=True)))
         except NisusError as error:
             self._assets.set_exception(error)
 
@@ -152,18 +158,22 @@ class PageServer:
             get("/readyz", self._ready),
             get("/api/status", self._status),
             get("/metrics", self._metrics, refused=501),
-            get("/api/state", self._state),
+            get("/api/state", self._state, answer=StateMessage),
             get("/api/state/schema.json", state_schema),
+            get("/api/openapi.json", self._openapi),
             Route("/api/state/stream", self._state_stream),
+            get("/api/alerts", self._alerts),
+            get("/api/alerts/schema.json", AlertMessage.model_json_schema),
             get("/api/model", self._model),
             get("/api/episodes", self._episodes),
             get("/api/why", self._why, refused=409, run=OneAtATime("attribution")),
             get("/api/annotations", self._annotations),
+            get("/api/audit", self._audit),
             get("/api/faults", self._faults),
             *readings.routes(self._engine),
             *self._runs.routes(),
             *self._fit.routes(),
-            post("/api/command", self._command, status=202),
+            post("/api/command", self._command, status=202, body_schema=commands_schema),
             get("/api/forecast", self._forecasts.may, refused=409),
             post("/api/forecast", self._forecast, run=OneAtATime("forecast")),
             get("/api/diagnose", self._diagnosis.look, refused=503, run=OneAtATime("diagnosis")),
@@ -185,8 +195,9 @@ class PageServer:
         return routes
 
     def _page(self, name: str) -> Response:
-        settings = {"viewer": f"/viewer/{viewer_version()}", "boot": self._boot, "viser": self._viser is not None}
+        settings = {"viewer": f"viewer/{viewer_version()}", "boot": self._boot, "viser": self._viser is not None}
         settings |= {"charts": CHART_FILES, "gallery": self.door.has_gallery, "stage_pass": self.door.stage_pass}
+        settings |= {"overview": self.door.overview}
         return page_file(name, settings)
 
     def _index(self) -> Response:
@@ -233,6 +244,10 @@ class PageServer:
     def _annotations(self) -> list[dict[str, Any]]:
         """Return all notes of users by time."""
         return annotations_json(self._engine)
+
+    def _audit(self) -> list[dict[str, Any]]:
+        """Return the last commands of users."""
+        return audit_json(self._engine)
 
     def _faults(self) -> dict[str, Any]:
         """Return the faults that can be injected into the source."""
@@ -311,6 +326,15 @@ class PageServer:
         """Answer with the present state (see docs/http-api.md)."""
         return _message(state_message(self._engine, covariance=covariance))
 
+    def _openapi(self) -> dict[str, Any]:
+        """Return the OpenAPI document of all paths."""
+        return openapi([*self.door.routes, *self.application.routes])
+
+    def _alerts(self) -> dict[str, Any]:
+        """Return open alerts, and the state of outputs and receivers."""
+        published = self._engine.published
+        return NOT_PUBLISHED if published is None else published.json()
+
     async def _state_stream(self, request: Request) -> Response:
         """Send the state as server-sent events: after each change, and otherwise each second."""
 
@@ -333,7 +357,7 @@ class PageServer:
         await browser.accept()
         layout = browser.query_params.get("layout", "1") == "1"
         palette = THEMES.get(browser.query_params.get("theme", ""), EITHER)
-        feed = await asyncio.to_thread(self._rerun_feed, layout, palette)
+        feed = await run_in_threadpool(self._rerun_feed, layout, palette)
         await feed_rerun(browser, feed, self._rerun_status)
 
     def _rerun_feed(self, layout: bool, palette: Palette) -> RerunFeed:

@@ -20,8 +20,8 @@ from typing import TYPE_CHECKING, Protocol
 
 from estimators.errors import SourceError
 
-from ..concurrency import run_all
 from ..live.commands import Record
+from ..live.jobs import run_all
 from ..terminal import EndRequest, complain, restore, when_asked_to_end
 from ..views.recording.rrd_file import NEVER, Split
 from .door import Door
@@ -44,17 +44,25 @@ edits motor_can held 608 MB, with few heaps 479. Columns of a pull have 128 KiB 
 gaps that they left in the heaps grew by 60 MB in ten minutes of edits.
 """
 
+RUST_PURGE = ("MIMALLOC_PURGE_DELAY", "0")
+"""Rerun and Arrow bring an allocator of their own, mimalloc, which keeps the pages that ended threads have freed: with
+Explore and recordings opened and closed it grew by 20 MB in an hour. So free pages are returned at once."""
+
 SWITCH_INTERVAL_S = 0.0005
 """Time after which Python lets another thread run; the default of 5 ms is the time budget of a measurement."""
 
 
 @dataclass(frozen=True)
 class Page:
-    """Port of the page, whether to open it in a browser, and tokens of other programs."""
+    """Port of the page, whether to open it in a browser, and tokens of other programs.
+
+    `overview` is the address of the overview of a service, of which this twin is one; it then has no gallery.
+    """
 
     port: int
     open_browser: bool
     grants: tuple[Grant, ...] = ()
+    overview: str | None = None
 
 
 def _settle(gone: threading.Event | None = None, before: Callable[[], Engine | None] | None = None) -> None:
@@ -105,6 +113,7 @@ class Session:
         page: Page | None,
         split: Split = NEVER,
         recordings: Path | None = None,
+        printed: bool = False,
     ) -> None:
         """Put it together; nothing runs yet.
 
@@ -113,15 +122,17 @@ class Session:
             page: Port of the page; None for no page.
             split: Parts into which a recording is split.
             recordings: Folder of recordings made on the page; None is the working directory.
+            printed: Whether the notices of twins are printed on standard error.
 
         Raises:
             NisusError: If the source cannot be opened, or the port is in use.
         """
         sys.setswitchinterval(SWITCH_INTERVAL_S)
+        os.environ.setdefault(*RUST_PURGE)  # read when Rerun is imported
         with suppress(OSError, AttributeError):  # not glibc
             for option, value in MALLOC_OPTIONS:
                 ctypes.CDLL(None).mallopt(option, value)
-        self._page, self._split, self._recordings = page, split, recordings
+        self._page, self._split, self._recordings, self._printed = page, split, recordings, printed
         self.door: Door | None = None
         self.running: RunningTwin | None = None
         self._changing = threading.RLock()
@@ -130,7 +141,7 @@ class Session:
         """Notes of users on the twins that ran before, by twin and log."""
         self.threads: list[SessionThread] = []
         if page is not None:
-            self.door = Door(page.port, page.grants)
+            self.door = Door(page.port, page.grants, overview=page.overview)
         try:
             if opening is not None:
                 self.running = self.prepared(opening)
@@ -174,7 +185,8 @@ class Session:
         self._keep_notes()
         if not opening.annotations:
             opening = replace(opening, annotations=self._notes.get(_log_of(opening), ()))
-        return RunningTwin(opening, door=self.door, split=self._split, recordings=self._recordings)
+        split, folder, printed = self._split, self._recordings, self._printed
+        return RunningTwin(opening, door=self.door, split=split, recordings=folder, printed=printed)
 
     def _keep_notes(self) -> None:
         """Keep the notes of the running twin for its next start in this session."""

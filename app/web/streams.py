@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from starlette.concurrency import run_in_threadpool
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from estimators.errors import ConfigError, nearest
@@ -68,7 +69,7 @@ async def serve(browser: WebSocket, *works: Awaitable[None]) -> list[Exception]:
 
 async def in_thread(work: Callable[..., Any], *arguments: Any) -> Any:
     """Return the result of work in a thread, which is awaited also when the task is cancelled meanwhile."""
-    task = asyncio.ensure_future(asyncio.to_thread(work, *arguments))
+    task = asyncio.ensure_future(run_in_threadpool(work, *arguments))
     try:
         return await asyncio.shield(task)
     except asyncio.CancelledError:
@@ -134,7 +135,7 @@ class PageStream:
             watchers.discard(refolded)
             if self._choices is not None:
                 self._choices.leave(self)
-            await asyncio.to_thread(self._exchange, list(self._streams.values()), [])
+            await run_in_threadpool(self._exchange, list(self._streams.values()), [])
 
     async def _listen(self) -> None:
         while True:
@@ -316,7 +317,7 @@ async def feed_rerun(browser: WebSocket, feed: RerunFeed, status: Callable[[], d
             begun = time.monotonic()
             if begun - sent >= RERUN_STATUS_PERIOD_S:
                 sent = begun
-                await browser.send_text(json.dumps(await asyncio.to_thread(status)))
+                await browser.send_text(json.dumps(await run_in_threadpool(status)))
             if drawn.is_set():
                 for message in await in_thread(feed.next):  # a long history takes a while
                     if isinstance(message, str):
@@ -331,4 +332,4 @@ async def feed_rerun(browser: WebSocket, feed: RerunFeed, status: Callable[[], d
     try:
         await serve(browser, listen(), draw())
     finally:
-        await asyncio.to_thread(feed.close)
+        await run_in_threadpool(feed.close)

@@ -19,6 +19,7 @@ from ..present.result import plain
 from ..present.runs_json import nis_json
 from ..present.sensor_groups import groups_json, sensor_groups
 from ..present.series.columns import columns_of
+from ..studies.commission import storable
 
 STATUS_FIELDS = (
     "estimator", "options", "revision", "refolding", "awaited", "compiling", "t", "since", "cause", "episodes_open",
@@ -114,6 +115,12 @@ def episodes_json(engine: Running) -> list[dict[str, Any]]:
     ]
 
 
+def audit_json(engine: Running) -> list[dict[str, Any]]:
+    """Return the last commands of users by time, in seconds since 1970."""
+    names = ("number", "at", "user", "role", "address", "path", "body", "revision")
+    return [{name: getattr(entry, name) for name in names} for entry in engine.audit.entries()]
+
+
 def annotations_json(engine: Running) -> list[dict[str, Any]]:
     """Return all notes of users by time, in seconds of the log."""
     return [{"number": note.number, "at": note.t * 1e-9, "text": note.text} for note in engine.annotations.notes]
@@ -159,6 +166,7 @@ def model_json(engine: Running) -> dict[str, Any]:
         ],
         "commissioned": twin.tuning.baseline is not None,
         "baseline_forced": twin.forced_baseline,
+        "baseline_storable": storable(twin),
         "window": twin.config.view.window,
         "recorded": twin.recorded or twin.plan.recorded,
         "speed": twin.config.view.speed,

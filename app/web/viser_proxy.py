@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import asyncio
 import http.client
+from collections.abc import Mapping
 from contextlib import suppress
 from urllib.parse import quote, urlencode
 
 import websockets
+from starlette.concurrency import run_in_threadpool
 from starlette.requests import Request
 from starlette.responses import PlainTextResponse, Response
 from starlette.websockets import WebSocket, WebSocketDisconnect
@@ -22,12 +23,12 @@ REQUEST_HEADERS = ("accept", "accept-encoding", "if-none-match")
 HTML_HEAD = b"<head>"
 SCRIPT = PAGE / "viser_frame.js"
 
-SCENE_ALONE = """<style>
+SCENE_ALONE = b"""<style>
   [data-dock-region], [data-dock-region-handle], [data-floating-window], .mantine-Paper-root,
   .mantine-Notifications-root { display: none !important; }
   [data-dock-root] > div { inset: 0 !important; width: 100% !important; }
 </style>"""
-"""Style of a frame that shows the scene alone; the page has the controls."""
+"""Viser's own panel is hidden; the page has the controls."""
 
 MAX_MESSAGE_BYTES = 256 * 2**20
 """Largest message; a scene's first one holds all its point clouds."""
@@ -49,13 +50,13 @@ class ViserProxy:
         # The page uncompressed and not from a cache, as it is changed here.
         asked = {} if path == "/" else dict(request.headers)
         try:
-            status, headers, body = await asyncio.to_thread(self._fetch, path, asked)
+            status, headers, body = await run_in_threadpool(self._fetch, path, asked)
         except (OSError, http.client.HTTPException) as error:
             return PlainTextResponse(f"Nisus: the Viser pane does not answer ({error}).\n", 502)
         if path == "/":
             # In the text, as a frame under another name may fetch no more.
-            script = f"<script>{SCRIPT.read_text()}</script>" + (SCENE_ALONE if "scene" in request.query_params else "")
-            body = body.replace(HTML_HEAD, HTML_HEAD + script.encode(), 1)
+            script = b"<script>" + SCRIPT.read_bytes() + b"</script>"
+            body = body.replace(HTML_HEAD, HTML_HEAD + script + SCENE_ALONE, 1)
         answer = Response(body, status)
         for name, value in headers:
             if name.lower() in RESPONSE_HEADERS and not (path == "/" and name.lower() == "etag"):
@@ -78,27 +79,35 @@ class ViserProxy:
         query = urlencode([(name, value) for name, value in browser.query_params.multi_items() if name != "pass"])
         path = quote(browser.path_params.get("path", ""))
         url = f"ws://127.0.0.1:{self._port}/{path}" + (f"?{query}" if query else "")
-        offered = [websockets.Subprotocol(name) for name in browser.scope.get("subprotocols", [])]
-        try:
-            viser = await connect(
-                url, additional_headers={HEADER: self._secret}, subprotocols=offered or None, compression=None,
-                max_size=MAX_MESSAGE_BYTES, max_queue=MAX_QUEUED_MESSAGES, ping_interval=None, proxy=None,
-            )  # fmt: skip
-        except (OSError, websockets.WebSocketException):
-            await browser.close(1013)
-            return
-        async with viser:
-            await browser.accept(subprotocol=viser.subprotocol)
-            await serve(browser, self._up(browser, viser), self._down(browser, viser))
+        await couple(browser, url, {HEADER: self._secret})
 
-    async def _up(self, browser: WebSocket, viser: ClientConnection) -> None:
-        with suppress(websockets.ConnectionClosed):
-            while (message := await browser.receive())["type"] != "websocket.disconnect":
-                data = message.get("bytes")
-                await viser.send(data if data is not None else message["text"])
 
-    async def _down(self, browser: WebSocket, viser: ClientConnection) -> None:
-        with suppress(WebSocketDisconnect, websockets.ConnectionClosed, RuntimeError):
-            async for message in viser:
-                await (browser.send_text(message) if isinstance(message, str) else browser.send_bytes(message))
-            await browser.close(viser.close_code or 1000)
+async def couple(browser: WebSocket, url: str, headers: Mapping[str, str], origin: str | None = None) -> None:
+    """Couple a browser's WebSocket with one of another server, until either closes."""
+    offered = [websockets.Subprotocol(name) for name in browser.scope.get("subprotocols", [])]
+    try:
+        server = await connect(
+            url, additional_headers=headers, subprotocols=offered or None, compression=None,
+            origin=None if origin is None else websockets.Origin(origin),
+            max_size=MAX_MESSAGE_BYTES, max_queue=MAX_QUEUED_MESSAGES, ping_interval=None, proxy=None,
+        )  # fmt: skip
+    except (OSError, websockets.WebSocketException):
+        await browser.close(1013)
+        return
+    async with server:
+        await browser.accept(subprotocol=server.subprotocol)
+        await serve(browser, _up(browser, server), _down(browser, server))
+
+
+async def _up(browser: WebSocket, server: ClientConnection) -> None:
+    with suppress(websockets.ConnectionClosed):
+        while (message := await browser.receive())["type"] != "websocket.disconnect":
+            data = message.get("bytes")
+            await server.send(data if data is not None else message["text"])
+
+
+async def _down(browser: WebSocket, server: ClientConnection) -> None:
+    with suppress(WebSocketDisconnect, websockets.ConnectionClosed, RuntimeError):
+        async for message in server:
+            await (browser.send_text(message) if isinstance(message, str) else browser.send_bytes(message))
+        await browser.close(server.close_code or 1000)

@@ -14,7 +14,7 @@ from estimators.errors import NisusError
 from estimators.model.state_space import StateSpaceModel
 
 from ...twin.source import missing
-from ...twin.twin import load_twin
+from ...twin.twin import Twin, load_twin
 from ..running import Stamp, stamp_of
 
 CARDS = TWINS.parent / "cards"
@@ -81,8 +81,13 @@ def readable_twins(names: Iterable[str]) -> Iterator[tuple[Card, Loaded, StateSp
 def _read(name: str, stamp: Stamp) -> tuple[Card, Loaded, StateSpaceModel]:
     """Read a twin's files, once for each time that they were saved."""
     twin = load_twin(name)
+    return card_of(name, twin), twin.loaded, twin.model
+
+
+def card_of(name: str, twin: Twin) -> Card:
+    """Return the card of a twin that was read, without its picture."""
     config = twin.config
-    found = Card(
+    return Card(
         name=name,
         title=twin.title,
         question=config.question,
@@ -93,7 +98,6 @@ def _read(name: str, stamp: Stamp) -> tuple[Card, Loaded, StateSpaceModel]:
         estimator=twin.estimator,
         log=config.source.type not in ("simulator", "push"),
     )
-    return found, twin.loaded, twin.model
 
 
 def _title(name: str) -> str:

@@ -151,8 +151,10 @@ class Gallery:
         finally:
             self.compiling = None
         running = self.session.running
-        # Two twins on one bus would read each other's asset.
-        both = running is not None and _reads_a_bus(running.opening) and _reads_a_bus(opening)
+        # Two twins on one bus would read each other's asset; and a store is of one process at a time.
+        both = running is not None and (
+            (_reads_a_bus(running.opening) and _reads_a_bus(opening)) or opening.store is not None
+        )
         del running  # which is to be collected once it is replaced
         try:
             self.session.change(lambda: self.session.prepared(opening), stop_first=both)

@@ -21,7 +21,7 @@
 
 import { element, setAttribute, setText } from "./dom.js";
 import { colour, drawNotes, drawOutsiders, trace, writeNotes } from "./drawing.js";
-import { bracketed, clock, compact } from "./format.js";
+import { bracketed, clock, compact, decimals, fixed } from "./format.js";
 import { within } from "./ranges.js";
 import { drawnOn, svgFile } from "./svg.js";
 
@@ -82,6 +82,8 @@ export const heading = (what) => `${what.title} ${bracketed(what.unit.replace(/^
 // kinds: modules of the folder charts. Gives the declarations of all charts, from top to bottom; see chart.js.
 export const declared = (kinds, context) => kinds.toSorted((a, b) => a.order - b.order).flatMap((kind) => kind.default(context));
 
+const plain = (unit) => (unit ?? "").replace(/^\[|\]$/g, "");
+
 export class Chart {
   // select(since, until), home(), wheel(event, plot), save(chart, button), note(seconds, there), hover(seconds): on gestures
   constructor(what, { select, home, wheel, save, note, hover } = {}) {
@@ -99,7 +101,7 @@ export class Chart {
       save ? element("button", { type: "button", class: "save", title: "Save this chart", "aria-label": `Save the chart of ${what.title}`, "aria-haspopup": "menu", onclick: (event) => save(this, event.currentTarget) }, "⤓") : null,
     );
     this.canvas = element("div", { class: "plot" });
-    this.node = element("article", { class: "chart", style: `--weight:${what.weight}`, "aria-label": `Chart of ${what.title}` }, this.head, this.canvas);
+    this.node = element("article", { class: "chart", style: `--weight:${what.weight}`, dataset: { kind: what.key.split(":")[0] }, "aria-label": `Chart of ${what.title}` }, this.head, this.canvas);
     this.data = { x: [], ...Object.fromEntries(this.names.map((name) => [name, []])) };
     this.actions = { select, home, wheel, note, hover };
     this.notes = []; // notes of users, [{from, text}] by time
@@ -219,8 +221,11 @@ export class Chart {
   // Both ends of the colour bar, with the unit.
   scale() {
     const { low, high } = this.what.ramp();
-    setText(this.ramp.firstChild, Number.isFinite(low) ? compact(low, 3) : "");
-    setText(this.ramp.lastChild, Number.isFinite(high) ? this.amount(high) : "");
+    // Of a narrow scale, three digits would write both ends alike.
+    const text = (end) => (high > low && compact(low, 3) === compact(high, 3) ? fixed(end, decimals(high - low)) : compact(end, 3));
+    const [from, to] = [low, high].map((end) => (Number.isFinite(end) ? text(end) : ""));
+    setText(this.ramp.firstChild, from);
+    setText(this.ramp.lastChild, to && `${to} ${plain(this.what.unit)}`.trim());
     setAttribute(this.ramp, "aria-label", `Colours of ${heading(this.what)}: ${this.ramp.firstChild.textContent} to ${this.ramp.lastChild.textContent}`);
     setAttribute(this.ramp, "title", this.ramp.ariaLabel);
   }
@@ -262,7 +267,7 @@ export class Chart {
 
   // A value of the value axis as text.
   amount(value) {
-    return this.what.amount?.(value) ?? `${compact(value, 3)} ${this.what.unit.replace(/^\[|\]$/g, "")}`.trim();
+    return this.what.amount?.(value) ?? `${compact(value, 3)} ${plain(this.what.unit)}`.trim();
   }
 
   // The chart as the text of an SVG file, as it is shown now, with the texts of notes.

@@ -2,7 +2,7 @@
 // wrong unnoticed. Small multiples with one sentence each; nothing is asked while this is hidden.
 
 import { element, setText } from "./dom.js";
-import { compact, inChartTime, spaced, span, words } from "./format.js";
+import { compact, count, inChartTime, spaced, span, words } from "./format.js";
 
 const AGAIN = 3000; // ms between two looks
 const MAX_OPEN_ROWS = 6; // rows that are all open
@@ -34,7 +34,7 @@ export class Diagnose {
   async ask() {
     clearTimeout(this.timer);
     try {
-      const answer = await fetch("/api/diagnose");
+      const answer = await fetch("api/diagnose");
       if (!answer.ok) throw new Error((await answer.text()).trim());
       const text = await answer.text();
       if (this.shown && text !== this.drawn) {
@@ -104,7 +104,7 @@ function rowCard(row, marginal, open, turned) {
 // Sizes with their 95 % intervals.
 function figures(row) {
   const interval = ([value, low, high]) => (low === null ? compact(value, 2) : `${compact(value, 2)} (${compact(low, 2)} to ${compact(high, 2)})`);
-  const parts = [`${row.n.toLocaleString("en")} measurements`];
+  const parts = [count(row.n, "measurement")];
   if (row.scale?.[0] != null) parts.push(`band scale ${interval(row.scale)}`);
   if (row.bias?.[0] != null) parts.push(`bias ${interval(row.bias)} σ`);
   if (row.correlation?.[0] != null) parts.push(`lag-1 correlation ${interval(row.correlation)}`);

@@ -2,7 +2,7 @@
 // opens with its signals, the twins that fit, and a draft of a twin.
 
 import { element, setAttribute, setText } from "./dom.js";
-import { clock, compact, span, spaced } from "./format.js";
+import { clock, compact, count, span, spaced } from "./format.js";
 import { post } from "./session.js";
 
 const RECORDING = ".rrd";
@@ -13,7 +13,7 @@ const PAGE_ROWS = 100; // rows of a group that are added at once
 const CURVE_BATCH = 40;
 const GAP_INTERVALS = 6; // median intervals beyond which a curve is broken
 
-const address = (name) => `/gallery#log=${encodeURIComponent(name)}`;
+const address = (name) => `gallery#log=${encodeURIComponent(name)}`;
 const ending = (name) => name.slice(name.lastIndexOf(".")).toLowerCase();
 
 // `say` reports progress and errors, `follow` the progress of opening, `show` opens a log where it was dropped.
@@ -55,7 +55,7 @@ export function drops({ say, follow, show = (name) => location.assign(address(na
 
   async function open(name, twin) {
     if (ending(name) !== RECORDING && !twin) return show(name);
-    const answer = await post("/api/gallery/recordings/open", twin ? { name, twin } : { name });
+    const answer = await post("api/gallery/recordings/open", twin ? { name, twin } : { name });
     say(answer.error ?? "", Boolean(answer.error));
     if (!answer.error) follow();
   }
@@ -63,13 +63,13 @@ export function drops({ say, follow, show = (name) => location.assign(address(na
 }
 
 async function send(file, tell) {
-  const { piece } = await (await fetch("/api/gallery/recordings")).json();
+  const { piece } = await (await fetch("api/gallery/recordings")).json();
   for (let offset = 0; ; offset += piece) {
     const last = offset + piece >= file.size;
     const query = new URLSearchParams({ name: file.name, offset, ...(last ? { last: 1 } : {}) });
     let answer;
     try {
-      const sent = await fetch(`/api/gallery/recordings/drop?${query}`, {
+      const sent = await fetch(`api/gallery/recordings/drop?${query}`, {
         method: "POST", headers: { "Content-Type": "application/octet-stream" }, body: file.slice(offset, offset + piece),
       });
       answer = await sent.json();
@@ -89,7 +89,6 @@ const ROLES = [
   ["", "Ignore", "not in the twin"],
 ];
 
-const count = (number, word) => `${number.toLocaleString("en")} ${word}${number === 1 ? "" : "s"}`;
 const rate = (value) => (value === null ? "" : value >= 0.1 ? `${compact(value, 3)} Hz` : `every ${span(1 / value)}`);
 
 // The view of one log. `ask` has run(log, twin), which starts a twin on it, drop(files), and follow(), which reports how a
@@ -134,7 +133,7 @@ export class LogView {
 
   async poll() {
     const request = JSON.stringify(this.request);
-    const answer = await post("/api/gallery/log", this.request);
+    const answer = await post("api/gallery/log", this.request);
     if (request !== JSON.stringify(this.request)) return; // something else was asked meanwhile
     if (answer.state === "reading") {
       const note = this.node.querySelector(".reading") ?? element("p", { class: "faint reading", role: "status" });
@@ -163,7 +162,7 @@ export class LogView {
       log.gaps ? count(log.gaps, "gap") : null, log.kind === "can_log" ? count(log.ids, "id") : null, log.time ? `time: ${log.time}` : null,
     ].filter(Boolean).join(" · ");
     return element("header", { class: "log-head" },
-      element("a", { href: "/gallery", class: "go" }, "← All twins"), element("h2", {}, log.name), element("p", { class: "faint" }, facts));
+      element("a", { href: "gallery", class: "go" }, "← All twins"), element("h2", {}, log.name), element("p", { class: "faint" }, facts));
   }
 
   // Never a dead end: the file stays, and another reading of it, or another file, is one step away.
@@ -326,7 +325,7 @@ export class LogView {
     while (this.waiting?.size && log === this.log) {
       const signals = [...this.waiting].slice(0, CURVE_BATCH);
       for (const index of signals) this.waiting.delete(index);
-      const answer = await post("/api/gallery/log/curves", { ...request, signals });
+      const answer = await post("api/gallery/log/curves", { ...request, signals });
       if (answer.error || log.name !== this.name) break;
       signals.forEach((index, k) => {
         const row = this.rows.get(index);
@@ -386,7 +385,7 @@ export class LogView {
     this.twin = element("input", { type: "text", value: log.draft_name, "aria-label": "Name of the twin", spellcheck: "false" });
     this.chosen = element("p", { class: "chosen", role: "status" }, "finding roles …");
     this.start = element("button", { type: "button", class: "start", disabled: true, onclick: () => this.draft() }, "Draft and run");
-    this.stop = element("button", { type: "button", class: "go", hidden: true, onclick: () => post("/api/gallery/log/draft/stop", {}) }, "Stop");
+    this.stop = element("button", { type: "button", class: "go", hidden: true, onclick: () => post("api/gallery/log/draft/stop", {}) }, "Stop");
     this.progress = element("p", { role: "status", class: "faint" });
     this.wrong = element("p", { class: "error", role: "alert" });
     return element("section", { class: "draft", "aria-label": "Draft a twin" }, head,
@@ -446,7 +445,7 @@ export class LogView {
 
   async draft() {
     const roles = { states: this.members("state"), sensors: this.members("sensor"), inputs: this.members("input"), held_out: this.members("held out") };
-    this.follow(await post("/api/gallery/log/draft", { ...this.request, twin: this.twin.value.trim(), roles }));
+    this.follow(await post("api/gallery/log/draft", { ...this.request, twin: this.twin.value.trim(), roles }));
   }
 
   // Progress of the draft, until the session starts the twin.
@@ -463,7 +462,7 @@ export class LogView {
 
   // The next answer; while the session cannot be reached, the last one.
   async progressed(last) {
-    const found = await fetch("/api/gallery/log/draft").then((response) => response.json()).catch(() => last);
+    const found = await fetch("api/gallery/log/draft").then((response) => response.json()).catch(() => last);
     if (this.name) this.follow(found);
   }
 }

@@ -11,7 +11,7 @@ export class Faults {
   }
 
   async begin() {
-    const answer = await fetch("/api/faults");
+    const answer = await fetch("api/faults");
     if (!answer.ok) return;
     this.catalogue = await answer.json();
     this.node.append(element("h2", { class: "unseen" }, "Faults and maintenance"), this.faultSection(), this.maintenanceSection());

@@ -3,7 +3,7 @@
 
 import { Panel } from "./controls.js";
 import { element, setText } from "./dom.js";
-import { clock, compact, spaced, span, words } from "./format.js";
+import { clock, compact, count, spaced, span, words } from "./format.js";
 
 const FIT_PERIOD = 300; // ms between two progress queries
 const GROUPS = { Q: "Q", R: "R", p: "parameters", options: "options" };
@@ -61,7 +61,7 @@ export class Fit {
 
   async ask(method, body) {
     clearTimeout(this.timer);
-    const answer = await fetch("/api/fit", { method, ...(body ? { headers: { "Content-Type": "application/json" }, body: JSON.stringify(body) } : {}) }).catch(() => null);
+    const answer = await fetch("api/fit", { method, ...(body ? { headers: { "Content-Type": "application/json" }, body: JSON.stringify(body) } : {}) }).catch(() => null);
     const told = answer?.headers.get("content-type")?.includes("json") ? await answer.json() : { error: "no answer from the twin" };
     this.say(told.error ?? "");
     if (!told.error) this.take(told);
@@ -127,7 +127,7 @@ export class Fit {
     const name = element("input", { type: "text", id: "fit-name", "aria-label": "Name of the version", placeholder: "name", maxlength: 60, value: `fit-${told.number}` });
     const keep = async () => {
       const note = `fitted: ${told.wanted.join(", ")}`;
-      const answer = await fetch("/api/fit/keep", { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify({ name: name.value.trim(), note }) }).catch(() => null);
+      const answer = await fetch("api/fit/keep", { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify({ name: name.value.trim(), note }) }).catch(() => null);
       this.say(answer?.ok ? "" : ((await answer?.json().catch(() => null))?.error ?? "no answer from the twin"));
       setText(kept, answer?.ok ? `kept as ${name.value.trim()}, see Runs` : "");
     };
@@ -215,7 +215,7 @@ function scores({ before, after }) {
       rows.push(row(`${words(name)}${spaced(unit)}`, null, (part) => (part[group][name] ? `${compact(part[group][name].rms, 3)}, ${share(part[group][name].coverage, 0)}` : "–")));
     }
   }
-  const group = (title, readings) => element("th", { scope: "colgroup", colspan: 2 }, `${title}, ${readings.toLocaleString("en")} readings`);
+  const group = (title, readings) => element("th", { scope: "colgroup", colspan: 2 }, `${title}, ${count(readings, "reading")}`);
   const head = element("thead", {},
     element("tr", {}, element("td", {}), group("fitted to", before.fitted.readings), group("held out", before.held_out.readings)),
     element("tr", {}, element("td", {}), ...["before", "after", "before", "after"].map((text) => element("th", { scope: "col" }, text))));
@@ -246,7 +246,7 @@ export class Refit {
     this.card = element("section", { id: "refit", "aria-label": "Dual estimation", hidden: true }, head, this.offer, this.error);
     tune.sections.before(this.card);
     this.about = element("p", { class: "about" });
-    this.begin = element("button", { type: "button", id: "refit-begin", class: "go", title: "Fit the latest window now", onclick: () => this.post("/api/refit", {}) }, "Fit now");
+    this.begin = element("button", { type: "button", id: "refit-begin", class: "go", title: "Fit the latest window now", onclick: () => this.post("api/refit", {}) }, "Fit now");
     this.list = element("div", { class: "fits" });
     this.panel = new Panel(this.button, "refit-panel", "Dual estimation", () => this.look(), this.about, element("div", { class: "progress" }, this.begin), this.list);
     link.addEventListener("status", ({ detail }) => {
@@ -260,7 +260,7 @@ export class Refit {
   }
 
   async look() {
-    const answer = await fetch("/api/refit").catch(() => null);
+    const answer = await fetch("api/refit").catch(() => null);
     if (answer?.ok) this.show(await answer.json());
   }
 
@@ -295,7 +295,7 @@ export class Refit {
       element("th", { scope: "row" }, words(line.key)),
       element("td", { title: `95 % interval ${compact(line.low, 3)} … ${compact(line.high, 3)}${spaced(line.unit)}` }, `${compact(line.before)} → `, element("b", {}, compact(line.after)), spaced(line.unit)),
       element("td", { title: "Change in standard deviations of the estimate" }, `${line.sigma < 0 ? "−" : "+"}${Math.abs(line.sigma).toFixed(1)} σ`)));
-    const decide = (what) => () => this.post(`/api/refit/${what}`, { number: fit.number });
+    const decide = (what) => () => this.post(`api/refit/${what}`, { number: fit.number });
     return [
       element("table", {}, element("tbody", {}, ...rows)),
       element("p", { class: "about" }, `Better on the blocks held out: +${compact(verdict.gain, 3)} ± ${compact(verdict.error, 2)} nats a reading.`),
@@ -341,7 +341,7 @@ export class Advice {
 
   async ask(method) {
     clearTimeout(this.timer);
-    const answer = await fetch("/api/advice", { method, ...(method === "POST" ? { headers: { "Content-Type": "application/json" }, body: "{}" } : {}) }).catch(() => null);
+    const answer = await fetch("api/advice", { method, ...(method === "POST" ? { headers: { "Content-Type": "application/json" }, body: "{}" } : {}) }).catch(() => null);
     const told = answer?.headers.get("content-type")?.includes("json") ? await answer.json() : { error: "no answer from the twin" };
     this.say(told.error ?? told.reason);
     if (told.error) return;
@@ -380,7 +380,7 @@ export class Advice {
   excluded({ excluded }) {
     if (!excluded.length) return null;
     const at = (seconds) => clock(seconds - Number(this.link.status.origin ?? 0) / 1e9);
-    const text = (item) => `${words(item.row)}, ${at(item.start)} to ${at(item.end)}: ${item.cause} (${item.readings.toLocaleString("en")} readings)`;
+    const text = (item) => `${words(item.row)}, ${at(item.start)} to ${at(item.end)}: ${item.cause} (${count(item.readings, "reading")})`;
     return element("article", { class: "excluded" }, element("h3", {}, "Excluded: faults of sensors"), element("ul", {}, ...excluded.map((item) => element("li", { title: item.text }, text(item)))));
   }
 

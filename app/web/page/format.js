@@ -24,6 +24,9 @@ export function compact(value, digits = 4) {
   return rounded.toExponential().replace("e+", "e");
 }
 
+// A number of things: 1 reading, 1,200 readings.
+export const count = (number, word) => `${number.toLocaleString("en")} ${word}${number === 1 ? "" : "s"}`;
+
 export const spaced = (unit) => (unit && unit !== "1" ? ` ${unit}` : "");
 
 export const bracketed = (unit) => (unit && unit !== "1" ? `[${unit}]` : "");

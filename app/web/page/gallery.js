@@ -2,9 +2,9 @@
 // signals instead.
 
 import { keys } from "./controls.js";
-import { $, element, setText } from "./dom.js";
+import { $, element, setAttribute, setText } from "./dom.js";
 import { drops, LogView } from "./dropped_log.js";
-import { compact, spaced, span } from "./format.js";
+import { compact, count, spaced, span } from "./format.js";
 import { card, post, progress, Session } from "./session.js";
 
 const SUMMARY_POLL_MS = 1500; // while a file is being summarised
@@ -30,7 +30,7 @@ class Recordings {
   async refresh() {
     clearTimeout(this.timer);
     if (document.hidden) return;
-    const answer = await fetch("/api/gallery/recordings").catch(() => null);
+    const answer = await fetch("api/gallery/recordings").catch(() => null);
     if (answer?.ok) this.draw(await answer.json());
     clearTimeout(this.timer);
     this.timer = setTimeout(() => this.refresh(), this.looking ? SUMMARY_POLL_MS : POLL_MS);
@@ -65,7 +65,7 @@ class Recordings {
       "li", { class: "file", dataset: { name: file.name } },
       element("div", { class: "row" },
         element("button", { type: "button", class: "name", title: file.database ? `${file.name} describes CAN logs` : file.log ? `Signals of ${file.name}, and twins for it` : `Review ${file.name}`, disabled: file.database, onclick: () => this.ask.open(file) }, file.name),
-        element("a", { href: `/recordings/${encodeURIComponent(file.name)}`, download: file.name, title: "Download", "aria-label": `Download ${file.name}` }, "↓"),
+        element("a", { href: `recordings/${encodeURIComponent(file.name)}`, download: file.name, title: "Download", "aria-label": `Download ${file.name}` }, "↓"),
         element("button", { type: "button", class: "delete", title: "Delete", "aria-label": `Delete ${file.name}`, onclick: () => this.confirm(node, confirm, file.name) }, "✕")),
       element("p", { class: "faint" }, `${when(file.modified)} · ${file.log ? "log · " : file.database ? "DBC · " : ""}${file.looking ? "looking …" : facts}`),
       scores ? element("p", { class: "faint", title: summary.nis_words }, scores) : null,
@@ -83,7 +83,7 @@ class Recordings {
       node.querySelector(".delete").focus();
     };
     const remove = async () => {
-      const answer = await post("/api/gallery/recordings/delete", { name });
+      const answer = await post("api/gallery/recordings/delete", { name });
       delete node.dataset.asked;
       if (answer.error) this.ask.say(answer.error);
       this.key = null;
@@ -121,9 +121,9 @@ let told = ""; // what was wrong with a file, until something else is done
 const open = () => location.assign(linked ? `/${location.hash}` : "/");
 const start = (name) => {
   told = "";
-  session.tell(post("/api/gallery/start", { twin: name }));
+  session.tell(post("api/gallery/start", { twin: name }));
 };
-const stop = () => session.tell(post("/api/gallery/stop", {}));
+const stop = () => session.tell(post("api/gallery/stop", {}));
 
 function say(text, wrong = false) {
   told = wrong ? text : "";
@@ -134,13 +134,49 @@ const showLog = (name) => {
   if (location.hash === `#log=${encodeURIComponent(name)}`) view.open(name);
   else location.hash = `log=${encodeURIComponent(name)}`;
 };
-const files = drops({ say, follow: () => session.ask(), show: showLog, described: (names) => view.describe(names) });
+// The twins of a service: each card has its health, the worst first, and buttons for its process alone.
+function serve(twins) {
+  const found = Object.fromEntries(shown.map((item) => [item.name, item]));
+  if (twins.some(({ name }) => !found[name]) || shown.length !== twins.length) return list(); // of a folder that changed
+  twins.forEach((twin, place) => {
+    const { node } = found[twin.name];
+    if ($("cards").children[place] !== node) $("cards").insertBefore(node, $("cards").children[place] ?? null);
+    const runs = twin.state === "running";
+    const health = runs ? twin.health ?? "waiting" : twin.state === "failed" ? "diverged" : "waiting";
+    const again = twin.again_in === null ? "" : `; again in ${Math.ceil(twin.again_in)} s`;
+    const cause = runs ? twin.unread || twin.cause || (twin.episodes ? `${twin.episodes} open episodes` : "") : `${twin.text}${again}`;
+    const facts = runs ? [count(twin.measurements ?? 0, "measurement"), twin.age === null || twin.age === undefined ? null : `last ${span(twin.age)} ago`, twin.memory ? size(twin.memory) : null, twin.starts > 1 ? `${twin.starts} starts` : null].filter(Boolean).join(" · ") : "";
+    let served = node.querySelector(".served");
+    if (!served) {
+      served = element("div", { class: "served" }, element("p", {}, element("span", { class: "pill" }), element("span", {})), element("p", { class: "faint" }));
+      node.querySelector("footer").before(served);
+      node.querySelector(".picture").hidden = !node.querySelector(".picture svg");
+      node.querySelector("h2 .name").onclick = () => node.querySelector("footer a")?.click();
+    }
+    setAttribute(served.querySelector(".pill"), "data-health", health);
+    setText(served.querySelector(".pill"), runs ? health : twin.state);
+    setText(served.querySelector(".pill + span"), cause ? ` ${cause}` : "");
+    setText(served.lastElementChild, facts);
+    // Buttons stay as long as they are the same, so that they keep the focus.
+    if (node.dataset.state === twin.state) return;
+    node.dataset.state = twin.state;
+    node.dataset.runs = String(runs);
+    const act = (what) => () => post(`api/gallery/${what}`, { twin: twin.name }).then((answer) => (answer.error ? say(answer.error, true) : session.ask()));
+    const buttons = twin.state === "stopped" ? [["Start", act("start")]] : [["Restart", act("restart")], ["Stop", act("stop")]];
+    node.querySelector("footer").replaceChildren(
+      runs ? element("a", { class: "start", href: `twins/${encodeURIComponent(twin.name)}/` }, "Open") : "",
+      ...buttons.map(([text, onclick]) => element("button", { type: "button", class: "go", "aria-label": `${text} ${twin.name}`, onclick }, text)));
+  });
+}
+
+const files = settings.service ? null : drops({ say, follow: () => session.ask(), show: showLog, described: (names) => view.describe(names) });
 const view = new LogView($("log"), {
-  drop: files.take,
+  drop: files?.take,
   run: (name, twin) => files.open(name, twin),
   follow: () => session.ask(),
 });
-const recordings = new Recordings($("recordings"), { open: (file) => files.open(file.name), drop: files.take, say: (text) => say(text, true) });
+if (settings.service) $("recordings").remove();
+const recordings = settings.service ? null : new Recordings($("recordings"), { open: (file) => files.open(file.name), drop: files.take, say: (text) => say(text, true) });
 
 function route() {
   const name = new URLSearchParams(location.hash.slice(1)).get("log");
@@ -155,7 +191,8 @@ function route() {
 addEventListener("hashchange", route);
 
 function draw(state) {
-  for (const item of shown) item.sync(state);
+  if (state.twins) serve(state.twins);
+  else for (const item of shown) item.sync(state);
   const { running, starting, failed } = state;
   const now = [];
   if (starting) now.push(element("span", { class: "pill", dataset: { health: "suspect" } }, `${starting.title}: ${progress(starting)}`));
@@ -187,21 +224,21 @@ const find = () => {
 };
 $("find").addEventListener("input", find);
 
-const commands = [
-  ["/", "find a twin", () => $("find").focus()],
-  ["a", "add a file to the recordings", () => recordings.choose.click()],
-  ["g", "back to the twin that runs", () => session.state?.running && open()],
-];
+const commands = [["/", "find a twin", () => $("find").focus()]];
+if (recordings) commands.push(["a", "add a file to the recordings", () => recordings.choose.click()], ["g", "back to the twin that runs", () => session.state?.running && open()]);
 keys(commands);
 
-const answer = await fetch("/api/gallery");
-if (!answer.ok) {
-  setText($("none"), "The twins could not be listed; reload the page.");
-  throw new Error(await answer.text());
+async function list() {
+  const answer = await fetch("api/gallery");
+  if (!answer.ok) {
+    setText($("none"), "The twins could not be listed; reload the page.");
+    throw new Error(await answer.text());
+  }
+  shown = (await answer.json()).map((item) => card(item, { start, open }));
+  $("cards").replaceChildren(...shown.map((item) => item.node));
 }
-shown = (await answer.json()).map((item) => card(item, { start, open }));
-$("cards").replaceChildren(...shown.map((item) => item.node));
-commands.push(...shown.filter((item) => item.ready).map((item) => ["", `start ${item.short}`, () => start(item.name)]));
+await list();
+if (!settings.service) commands.push(...shown.filter((item) => item.ready).map((item) => ["", `start ${item.short}`, () => start(item.name)]));
 if (session.state) draw(session.state);
 setText($("none"), "No twin of that name, question or kind.");
 find();

@@ -275,11 +275,11 @@ export class Around {
 
   async ask(due, curves) {
     for (const curve of curves) {
-      const answer = await fetch(`/api/around?key=${encodeURIComponent(curve.key)}`).catch(() => null);
+      const answer = await fetch(`api/around?key=${encodeURIComponent(curve.key)}`).catch(() => null);
       if (answer?.ok) curve.take(await answer.json());
     }
     if (!due) return;
-    const answer = await fetch("/api/noise").catch(() => null);
+    const answer = await fetch("api/noise").catch(() => null);
     if (!answer?.ok) return;
     this.said = await answer.json();
     this.mark();

@@ -20,7 +20,7 @@ export class Link extends EventTarget {
     this.arrived = new Set(); // streams of the frames that are not drawn yet
     this.turned = -Infinity; // when something was edited, or folded anew
     this.line = new PageSocket({
-      address: () => "/api/stream",
+      address: () => "api/stream",
       taken: (data) => this.take(data),
       changed: (state) => {
         this.tell("connection", state);
@@ -111,7 +111,7 @@ export class Link extends EventTarget {
   async ask(command, fields = {}) {
     this.turned = performance.now();
     try {
-      const answer = await fetch("/api/command", {
+      const answer = await fetch("api/command", {
         method: "POST",
         headers: { "Content-Type": "application/json" },
         body: JSON.stringify({ command, ...fields }),

@@ -28,11 +28,11 @@ $("theme").addEventListener("click", () => {
   location.reload();
 });
 
-const answer = await fetch("/api/model");
+const answer = await fetch("api/model");
 if (!answer.ok) throw new Error(await answer.text());
 const model = await answer.json();
 setLabels(model);
-const kinds = await Promise.all(settings.charts.map((name) => import(`/page/charts/${name}`)));
+const kinds = await Promise.all(settings.charts.map((name) => import(`./charts/${name}`)));
 window.nisus = { model, drawn: 0, revision: null };
 
 // Nothing is awaited from here on: what arrives before all listen would be lost.
@@ -166,10 +166,12 @@ link.addEventListener("status", (event) => {
   if ($("recordings").dataset.names === key) return;
   $("recordings").dataset.names = key;
   $("recordings").replaceChildren(
-    ...names.slice(-3).map((name) => element("a", { href: `/rec/${encodeURIComponent(name)}`, download: name, title: "Download recording" }, name)),
+    ...names.slice(-3).map((name) => element("a", { href: `rec/${encodeURIComponent(name)}`, download: name, title: "Download recording" }, name)),
   );
 });
 
+// One twin of a service has its overview in place of a gallery.
+if (settings.overview) for (const id of ["gallery", "others"]) setAttribute($(id), "href", settings.overview);
 const leave = settings.gallery ? new Leave(model, settings.boot) : null;
 
 // Saved files of the twin: errors in them, and new configured values.
@@ -177,7 +179,7 @@ let reloads = null;
 link.addEventListener("status", async ({ detail: { unread, reloads: now } }) => {
   $("unread").hidden = !unread;
   setText($("unread"), unread ? `${unread}. The running twin goes on unchanged.` : "");
-  if (reloads !== null && now !== reloads) tune.configure((await (await fetch("/api/model")).json()).tuning);
+  if (reloads !== null && now !== reloads) tune.configure((await (await fetch("api/model")).json()).tuning);
   reloads = now;
 });
 

@@ -239,7 +239,7 @@ export class ExploreStream {
     // One message after the other: each is drawn before the next is looked at.
     let queue = Promise.resolve();
     this.line = new PageSocket({
-      address: () => `/rerun/stream?layout=${this.layout ? 1 : 0}&theme=${document.documentElement.dataset.theme}`,
+      address: () => `rerun/stream?layout=${this.layout ? 1 : 0}&theme=${document.documentElement.dataset.theme}`,
       taken: (data, socket) => (queue = queue.then(() => this.take(socket, data)).catch((error) => this.fail(error))),
       changed: () => {},
     });

@@ -21,8 +21,9 @@ export class Runs {
     this.error = element("p", { class: "error", role: "alert", hidden: true });
     this.compared = element("section", { class: "compared", "aria-label": "Two runs compared", hidden: true });
     this.table = element("table", { class: "runs" });
+    this.of = element("label", { class: "error-of faint" });
     this.versions = new Versions(link);
-    node.replaceChildren(this.versions.node, this.error, this.table, this.compared);
+    node.replaceChildren(this.versions.node, this.error, this.of, this.table, this.compared);
     // Not by the status: a twin whose source has ended says no more.
     setInterval(() => link.connected && link.status.runs && this.heard(link.status), RUNS_POLL_MS);
   }
@@ -35,7 +36,7 @@ export class Runs {
     if (this.node.contains(document.activeElement) && document.activeElement.matches("input, textarea")) return;
     if (this.noted !== null || document.querySelector("#save-menu:popover-open")) return;
     this.asking = true;
-    const answer = await fetch("/api/runs").catch(() => null);
+    const answer = await fetch("api/runs").catch(() => null);
     this.asking = false;
     if (!answer?.ok) return;
     [this.key, this.when, this.runs] = [key, performance.now(), await answer.json()];
@@ -74,10 +75,11 @@ export class Runs {
       : null;
     const unit = bracketed(subjects.find((fit) => fit.name === this.subject)?.unit);
     const cell = (title, ...text) => element("th", { scope: "col", title }, ...text);
+    this.of.replaceChildren(...(select ? ["Error of ", select] : []));
     return element("thead", {}, element("tr", {},
       cell("Run; its circle pins it to the charts", "run"), cell("Estimator", "filter"),
       cell("Mean NIS per degree of freedom of used measurements: 1 is consistent (▲ above, ▼ below its 95 % bounds)", "NIS / dof"),
-      cell("Root mean square error against the truth, or of predictions of a held-out sensor", `error ${unit}`.trim(), select),
+      cell("Root mean square error against the truth, or of predictions of a held-out sensor", `error ${unit}`.trim()),
       cell("Log-likelihood per measurement, with a penalty for rejected ones", "log L"),
       cell("Computing time per event", "time [µs]"), element("th", { "aria-label": "Menu" })));
   }
@@ -125,9 +127,9 @@ export class Runs {
       ["Load", "Fold the history again with this filter and tuning", () => this.ask("Load", { number }), run.running ? "it is running" : null],
       ["Name and note", "Name this run, and write a note", note],
       [other ? `Compare with run ${other.number}` : "Compare", "List the entries in which two runs differ", compare, other ? null : "there is no other run"],
-      ["Report: HTML", "Scores, charts, episodes and tuning in one file", () => fetched(`/api/report.html?run=${number}`), lost],
-      ["Track: CSV", "One line per event", () => fetched(`/api/track.csv?run=${number}`), lost],
-      ["Tuning: YAML", "The twin's file with this tuning", () => fetched(`/api/runs/${number}.yaml`)],
+      ["Report: HTML", "Scores, charts, episodes and tuning in one file", () => fetched(`api/report.html?run=${number}`), lost],
+      ["Track: CSV", "One line per event", () => fetched(`api/track.csv?run=${number}`), lost],
+      ["Tuning: YAML", "The twin's file with this tuning", () => fetched(`api/runs/${number}.yaml`)],
       ["Keep as a version", "Save beside the twin, under the run's name", () => this.versions.keep(run), run.name ? null : "give it a name first"],
     ];
   }
@@ -153,7 +155,7 @@ export class Runs {
     this.compared.hidden = this.chosen.length < 2;
     if (this.compared.hidden) return;
     const [a, b] = this.chosen;
-    const answer = await fetch(`/api/runs/${a}/against/${b}`).catch(() => null);
+    const answer = await fetch(`api/runs/${a}/against/${b}`).catch(() => null);
     if (!answer?.ok) return;
     const differ = await answer.json();
     const shown = (value) => (typeof value === "number" ? compact(value, 6) : value === null ? "off" : String(value));
@@ -201,7 +203,7 @@ class Versions {
 
   // While the tab is shown; the focus stays where it is.
   async list() {
-    const answer = await fetch("/api/tunings").catch(() => null);
+    const answer = await fetch("api/tunings").catch(() => null);
     if (!answer?.ok) return;
     const { running, versions, guard } = await answer.json();
     // Open from the start if there is something to choose.
@@ -226,13 +228,13 @@ class Versions {
       element("tr", {},
         element("th", { scope: "row" }, name, holds ? element("i", { title: "Accepted: reference of nisus guard" }, " ✓") : null, runs ? element("i", { title: "Running" }, " ▸") : running === `${name}*` ? element("i", { title: "Running, with edits since it was loaded" }, " ▸*") : null),
         element("td", {}, compact(scores.nis, 3)), element("td", {}, compact(scores.log_likelihood, 4)),
-        element("td", {}, button("load", "Load and fold the history again", () => this.ask("/api/tunings/load", { name })), button("⇄", "Compare with the running tuning", compare, { "aria-pressed": String(this.compared === name) }))),
+        element("td", {}, button("load", "Load and fold the history again", () => this.ask("api/tunings/load", { name })), button("⇄", "Compare with the running tuning", compare, { "aria-pressed": String(this.compared === name) }))),
       element("tr", { class: error ? "error" : "faint" }, element("td", { colspan: 4 }, about)),
       this.compared === name && differ ? element("tr", {}, element("td", { colspan: 4 }, differences(name, differ))) : null);
   }
 
   async difference(name) {
-    const answer = await fetch(`/api/tunings/${encodeURIComponent(name)}/against`).catch(() => null);
+    const answer = await fetch(`api/tunings/${encodeURIComponent(name)}/against`).catch(() => null);
     if (answer?.ok) return answer.json();
     this.say((await answer?.json().catch(() => null))?.error ?? "no answer");
     return null;
@@ -253,11 +255,11 @@ class Versions {
   }
 
   keep(run) {
-    return this.ask("/api/tunings", { run: run.number, name: run.name.trim().replaceAll(" ", "_"), note: run.note });
+    return this.ask("api/tunings", { run: run.number, name: run.name.trim().replaceAll(" ", "_"), note: run.note });
   }
 
   async keepRunning() {
-    const kept = await this.ask("/api/tunings", { run: this.link.status.revision, name: this.name.value.trim().replaceAll(" ", "_"), note: this.note.value });
+    const kept = await this.ask("api/tunings", { run: this.link.status.revision, name: this.name.value.trim().replaceAll(" ", "_"), note: this.note.value });
     if (kept) this.name.value = this.note.value = "";
   }
 }

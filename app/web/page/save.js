@@ -71,7 +71,7 @@ export class Save {
     const number = this.link.status.revision;
     const fetched = (address) => this.fetched(number, address);
     const [since, until] = this.charts.range.map((time) => Number(time.toFixed(6)));
-    const whole = (kind) => `/api/track.${kind}?run=${number}`;
+    const whole = (kind) => `api/track.${kind}?run=${number}`;
     const part = (kind) => `${whole(kind)}&since=${since}&until=${until}`;
     const reason = this.link.status.t === null ? "no measurement has arrived yet" : null;
     this.open(button, [
@@ -79,7 +79,7 @@ export class Save {
       ["Track, shown part: Parquet", "One row per event, with types", () => fetched(part("parquet")), reason],
       ["Track, all: CSV", "One line per event", () => fetched(whole("csv")), reason],
       ["Track, all: Parquet", "One row per event, with types", () => fetched(whole("parquet")), reason],
-      ["Report: HTML", "Scores, charts, episodes and tuning in one file", () => fetched(`/api/report.html?run=${number}`), reason],
+      ["Report: HTML", "Scores, charts, episodes and tuning in one file", () => fetched(`api/report.html?run=${number}`), reason],
       ["Copy a link to this moment (L)", "For browsers of this session: time, span and charts", () => this.copyLink()],
     ]);
   }

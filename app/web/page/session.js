@@ -25,7 +25,7 @@ export class Session extends EventTarget {
   async ask() {
     clearTimeout(this.timer);
     if (document.hidden || this.closed) return;
-    const answer = await fetch("/api/session").catch(() => null);
+    const answer = await fetch("api/session").catch(() => null);
     if (answer?.ok && !this.closed) this.take(await answer.json());
     clearTimeout(this.timer);
     if (!this.closed) this.timer = setTimeout(() => this.ask(), this.state?.starting ? HASTE : REST);
@@ -128,7 +128,7 @@ function picture(item) {
 // Into the page itself, so that it has the colours of the theme.
 async function draw(place, name) {
   // A page that is being left gets none.
-  const answer = await fetch(`/api/gallery/picture?twin=${encodeURIComponent(name)}`).catch(() => null);
+  const answer = await fetch(`api/gallery/picture?twin=${encodeURIComponent(name)}`).catch(() => null);
   if (!answer?.ok) return;
   const svg = new DOMParser().parseFromString(await answer.text(), "image/svg+xml").documentElement;
   if (svg.nodeName === "svg") place.replaceChildren(document.importNode(svg, true));
@@ -140,25 +140,25 @@ const READ = 8000; // ms that a line stays
 
 export class Leave {
   constructor(model, boot) {
-    for (const id of ["gallery", "others"]) setAttribute($(id), "href", "/gallery");
+    for (const id of ["gallery", "others"]) setAttribute($(id), "href", "gallery");
     this.boot = boot;
     this.model = model;
     drops({ say: (text, wrong) => this.say(text, wrong), follow: () => this.follow() });
     const go = (where) => location.assign(where);
     this.commands = [
-      ["g", "gallery: another twin", () => go("/gallery")],
-      ["", "recordings: open, download, delete", () => go("/gallery#recordings")],
+      ["g", "gallery: another twin", () => go("gallery")],
+      ["", "recordings: open, download, delete", () => go("gallery#recordings")],
     ];
   }
 
   // A link of another twin was opened: what runs goes on, unless that is started. The address stays, and with it the
   // moment to which the other twin's page goes.
   async offer(twin, reason) {
-    const all = await fetch("/api/gallery").then((answer) => answer.json()).catch(() => []);
+    const all = await fetch("api/gallery").then((answer) => answer.json()).catch(() => []);
     const item = named(all, twin);
     if (!item) return this.say(`${reason}. No twin of that name can be started here`, true);
     const start = async () => {
-      const answer = await post("/api/gallery/start", { twin: item.name });
+      const answer = await post("api/gallery/start", { twin: item.name });
       if (answer.error) this.say(answer.error, true);
       else this.follow();
     };

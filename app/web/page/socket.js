@@ -13,7 +13,9 @@ export class PageSocket {
   open() {
     clearTimeout(this.timer);
     if (this.socket || this.asleep || document.hidden) return;
-    const socket = new WebSocket(`ws://${location.host}${this.address()}`);
+    const address = new URL(this.address(), document.baseURI);
+    address.protocol = address.protocol.replace("http", "ws");
+    const socket = new WebSocket(address);
     socket.binaryType = "arraybuffer";
     this.socket = socket;
     socket.onmessage = (event) => this.socket === socket && this.taken(event.data, socket);
@@ -34,7 +36,7 @@ export class PageSocket {
   // A browser does not say why a socket was refused. A session at this port takes back the pages of those before it;
   // if it was started by another user, or at a free port, it refuses them.
   async askWhy() {
-    const answer = await fetch("/api/status").catch(() => null);
+    const answer = await fetch("api/status").catch(() => null);
     if (answer?.status === 403) this.close("ended");
   }
 

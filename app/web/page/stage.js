@@ -1,5 +1,4 @@
-// The stage: Viser's scene in a frame, and what may be chosen about it. Its panel is for a window of its own; here the
-// page has all that.
+// The stage: Viser's scene in a frame, and the choices about it, which also hold for a window of its own.
 
 import { $, element, setAttribute, setText } from "./dom.js";
 import { clock, span, words } from "./format.js";
@@ -32,17 +31,18 @@ export class Stage {
     view.addEventListener("change", place);
   }
 
-  // Address of Viser's page. Its query lists the shown parts, so that nothing else is sent. The frame uses this machine's
+  // Address of Viser's page; `scene` leaves the link to this page out. The frame uses this machine's
   // other name: a browser draws another site in a process of its own, so charts and sliders do not wait for three.js.
   // Cookies are not sent there, so a pass is.
   address(framed) {
     const names = { "127.0.0.1": "localhost", localhost: "127.0.0.1" };
     const other = framed && this.there?.pass && names[location.hostname];
-    const host = other ? `${other}:${location.port}` : location.host;
-    const query = `theme=${this.theme}${framed ? "&part=scene" : ""}${other ? `&pass=${this.there.pass}` : ""}`;
-    const socket = encodeURIComponent(`ws://${host}/viser/?${query}`);
+    const base = new URL("viser/", document.baseURI);
+    if (other) base.hostname = other;
+    const query = `theme=${this.theme}${other ? `&pass=${this.there.pass}` : ""}`;
+    const socket = encodeURIComponent(`${base.protocol.replace("http", "ws")}//${base.host}${base.pathname}?${query}`);
     const dark = this.theme === "dark" ? "&darkMode" : "";
-    return `//${host}/viser/?${framed ? "scene&" : ""}${other ? `pass=${this.there.pass}&` : ""}websocket=${socket}${dark}`;
+    return `${base.href}?${framed ? "scene&" : ""}${other ? `pass=${this.there.pass}&` : ""}websocket=${socket}${dark}`;
   }
 
   // Nothing is sent for a scene that nobody sees.
@@ -80,7 +80,7 @@ export class Stage {
     select.append(...options.map((option) => element("option", { value: option }, words(option))));
     select.value = value;
     select.addEventListener("change", async () => {
-      const answer = await fetch("/api/scene", {
+      const answer = await fetch("api/scene", {
         method: "POST",
         headers: { "Content-Type": "application/json" },
         body: JSON.stringify({ key, value: select.value }),

@@ -44,6 +44,23 @@ export class Transport {
     new ResizeObserver(() => this.draw()).observe(this.canvas);
   }
 
+  // The width of what the charts show, also after a drag in a chart or a replay.
+  showSpan() {
+    const select = $("window");
+    if (document.activeElement === select) return;
+    const { view } = this;
+    const width = view.following ? view.span : view.until - view.since;
+    const value = width === null || this.whole ? "all" : String(Number(width.toPrecision(3)));
+    if (select.value === value) return;
+    const known = [...select.options];
+    if (!known.some((option) => option.value === value)) {
+      this.otherSpan?.remove();
+      this.otherSpan = offered([span(Number(value)), value]);
+      select.insertBefore(this.otherSpan, known.find((option) => !(Number(option.value) < Number(value))));
+    }
+    select.value = value;
+  }
+
   // Ends of the track in seconds: of the whole recording where that is known.
   get ends() {
     const { x } = this.stream;
@@ -121,6 +138,7 @@ export class Transport {
   }
 
   draw() {
+    this.showSpan();
     $("follow").hidden = this.view.following || this.whole;
     setText($("follow"), this.ended ? "all" : "follow ▸");
     setAttribute($("follow"), "title", this.ended ? "Show the whole recording" : "Follow the newest data (F)");

@@ -2,6 +2,7 @@
 
 import { $, element, setAttribute, setText } from "./dom.js";
 import { clock, compact, inChartTime, spaced, span, words } from "./format.js";
+import { post } from "./session.js";
 
 // Signs beside the colours, for users who cannot distinguish them.
 export const SIGNS = {
@@ -162,7 +163,9 @@ export class Episodes {
     this.change = element("ol", { "aria-live": "polite" });
     const explain = element("button", { type: "button", class: "go", title: "Of all that the charts show: by the model, each input and each sensor", onclick: () => this.explain(...this.charts.range) }, "Explain");
     const why = element("section", { class: "why", "aria-label": "What moved the estimate" }, element("header", {}, element("h3", {}, "What moved the estimate"), explain), this.change);
-    node.replaceChildren(this.counts, notes, why, this.body);
+    this.commands = element("ol", {});
+    const log = element("details", { class: "commands", ontoggle: () => log.open && this.list() }, element("summary", {}, "Commands"), this.commands);
+    node.replaceChildren(this.counts, notes, this.baseline(), why, this.body, log);
     link.addEventListener("episodes", (event) => this.show(event.detail));
     link.addEventListener("notices", (event) => {
       // After a reconnection all arrive again.
@@ -176,6 +179,23 @@ export class Episodes {
       this.holds(detail.sensors);
     });
     this.show([]);
+  }
+
+  // Of a twin of the user's own that has none yet: its file then has one, and the history is folded again with it.
+  baseline() {
+    const { commissioned, baseline_storable: storable } = this.charts.model;
+    const said = element("p", { role: "status" }, "Alarms compare the innovations with white noise.");
+    const ask = async (force) => {
+      setText(said, "folding …");
+      const answer = await post("api/baseline", { force });
+      node.hidden = !answer.error;
+      setText(said, answer.error ?? "");
+      anyway.hidden = !answer.error;
+    };
+    const store = element("button", { type: "button", class: "go", title: "Store the statistics of these innovations as normal; alarms then report changes", onclick: () => ask(false) }, "Store baseline");
+    const anyway = element("button", { type: "button", class: "go", hidden: true, title: "Store it, marked with this reason", onclick: () => ask(true) }, "Store anyway");
+    const node = element("section", { class: "baseline", "aria-label": "Baseline", hidden: commissioned || !storable }, element("header", {}, element("h3", {}, "Baseline"), store), said, anyway);
+    return node;
   }
 
   // Measurement counts; those of each sensor in the tooltip.
@@ -196,7 +216,7 @@ export class Episodes {
     this.change.replaceChildren(element("li", { class: "faint" }, "folding …"));
     let found;
     try {
-      const answer = await fetch(`/api/why?since=${since}&until=${until}`);
+      const answer = await fetch(`api/why?since=${since}&until=${until}`);
       found = await answer.json();
       if (found.error) throw new Error(found.error);
     } catch (error) {
@@ -207,6 +227,19 @@ export class Episodes {
       ...Object.entries(found.states).map(([name, state]) => element("li", {}, element("b", {}, words(name)), ` ${this.moved(state)}`)),
     );
     window.nisus.explained = (window.nisus.explained ?? 0) + 1;
+  }
+
+  // The audit log, newest first: who changed what, from where.
+  async list() {
+    const answer = await fetch("api/audit").catch(() => null);
+    const entries = answer?.ok ? (await answer.json()).reverse() : [];
+    const item = ({ at, user, role, address, path, body, revision }) => {
+      const { command, gesture, ...fields } = body;
+      const what = [command ?? path.replace(/^\/api\//, ""), ...Object.entries(fields).map(([key, value]) => `${key} ${typeof value === "object" ? JSON.stringify(value) : value}`)].join(", ");
+      const when = new Date(1000 * at).toLocaleString("en-GB", { dateStyle: "short", timeStyle: "medium" });
+      return element("li", { class: "event", dataset: { level: "info" } }, element("time", {}, when), element("span", {}, `${user}${role && role !== user ? ` (${role})` : ""}${address ? ` from ${address}` : ""}, run ${revision}: ${what}`));
+    };
+    this.commands.replaceChildren(...(entries.length ? entries.slice(0, MAX_EPISODES).map(item) : [element("li", { class: "faint" }, answer?.ok ? "None yet." : "Nisus does not answer.")]));
   }
 
   moved({ unit, before, after, model, inputs, sensors, restarts, largest }) {
@@ -256,7 +289,7 @@ export class Episodes {
       element("button", { type: "button", title: "Show in the charts", onclick: show }, element("time", {}, times), element("b", {}, `${words(episode.subject)}: ${CAUSES[episode.cause] ?? episode.cause}`)),
       element("p", {}, inChartTime(episode.text, this.link.status.origin)),
       element("button", { type: "button", class: "go", onclick: () => this.explain(episode.from, episode.to ?? this.charts.newest) }, "what moved the estimate"),
-      element("a", { href: `/alarms#${episode.help.split("#")[1]}`, target: "_blank" }, `about “${CAUSES[episode.cause] ?? episode.cause}”`),
+      element("a", { href: `alarms#${episode.help.split("#")[1]}`, target: "_blank" }, `about “${CAUSES[episode.cause] ?? episode.cause}”`),
     );
   }
 

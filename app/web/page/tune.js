@@ -123,12 +123,12 @@ export class Tune {
 
   gateSection() {
     const choose = () => this.turn("gate", this.gate.value === "off" ? null : Number(this.gate.value));
-    this.gate = element("select", { "aria-label": "Gate", title: "Probability that a good measurement passes", onchange: choose });
+    this.gate = element("select", { "aria-label": "Gate", title: "Probability that a good measurement passes; off: every measurement is used", onchange: choose });
     this.kind = element(
       "select", { "aria-label": "Kind of gate", title: "Treatment of a measurement beyond the gate", onchange: () => this.turn("gate.kind", this.kind.value) },
       element("option", { value: "hard" }, "reject"), element("option", { value: "soft" }, "soften"),
     );
-    return section("Gate", "Readings that a good sensor would hardly give", true, element("div", { class: "pair" }, this.gate, this.kind));
+    return section("Gate", "Rejects or down-weights measurements that are too far from the prediction", true, element("div", { class: "pair" }, this.gate, this.kind));
   }
 
   sensorSection() {
@@ -209,7 +209,7 @@ export class Tune {
       if (document.activeElement !== box || box.checked === used) box.checked = used;
     }
     const states = [...new Set(names.map((name) => status.sensors[name]?.state ?? "tracking"))].filter((state) => state !== "tracking");
-    setText(note, [...states, ...(nis ? [`NIS ${compact(nis, 2)}`] : [])].join(", "));
+    setText(note, [...states, ...(nis ? [`NIS / dof ${compact(nis, 2)}`] : [])].join(", "));
   }
 
   sync(status) {
@@ -231,7 +231,7 @@ export class Tune {
       if (!group) continue;
       line.light.dataset.health = group.state;
       setText(line.light, SIGNS[group.state]);
-      setText(line.note, `${group.alarms ? `${group.alarms} in alarm` : group.state === "tracking" ? "" : group.state}${group.nis === null ? "" : ` NIS ${compact(group.nis, 2)}`}`.trim());
+      setText(line.note, `${group.alarms ? `${group.alarms} in alarm` : group.state === "tracking" ? "" : group.state}${group.nis === null ? "" : ` NIS / dof ${compact(group.nis, 2)}`}`.trim());
       setAttribute(line.node, "title", groupText(line.unit, group));
       const worst = new Map(group.worst);
       for (const member of line.members) this.state(member, status, worst.get(member.names[0]));

@@ -82,7 +82,7 @@ export function link({ model, link, view, charts }) {
     charts: charts.layout.shown().map(([key, height]) => (height ? `${key}/${height}` : key)).join(","),
   };
   const text = Object.entries(parts).map(([name, value]) => `${name}=${encodeURIComponent(value).replace(/%3A|%2C|%2F/g, decodeURIComponent)}`);
-  return `${location.origin}/#${text.join("&")}`;
+  return `${new URL(".", document.baseURI).href}#${text.join("&")}`;
 }
 
 // The twin that an address is of, or null.

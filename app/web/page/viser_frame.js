@@ -48,3 +48,11 @@ if (new URLSearchParams(location.search).has("darkMode")) {
       return draw.apply(this, place);
     };
 }
+
+// In a window of its own: the way back to charts and controls. The frame's address has `scene`.
+if (!new URLSearchParams(location.search).has("scene"))
+  addEventListener("DOMContentLoaded", () => {
+    const link = Object.assign(document.createElement("a"), { href: "../", textContent: "Charts and controls" });
+    link.style.cssText = "position: fixed; z-index: 1; top: 12px; right: 14px; font: 13px system-ui, sans-serif; color: #3d8fe0;";
+    document.body.append(link);
+  });

@@ -145,7 +145,7 @@ export class WhatIf {
       if (this.horizon === null || !this.longest) await this.learn();
       question = this.question;
       const headers = { "Content-Type": "application/json" };
-      const found = await told(await fetch("/api/forecast", { method: "POST", headers, body: question }));
+      const found = await told(await fetch("api/forecast", { method: "POST", headers, body: question }));
       this.asked = asked;
       this.take(found);
       setText(this.problem, "");
@@ -161,7 +161,7 @@ export class WhatIf {
 
   // How far can be asked for.
   async learn() {
-    const may = await told(await fetch("/api/forecast"));
+    const may = await told(await fetch("api/forecast"));
     this.longest = may.longest;
     this.shortest = Math.min(may.longest / 2, 10 * may.step);
     const horizon = this.horizon ?? 3 * this.model.window;

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from app.cli.arguments import CommissionCommand
-from app.cli.commission import commission_twin, lines
+from app.cli.commission import commission_twin
 from app.cli.main import main
 from app.live.tunings.versions import write_section
+from app.studies.commission import lines
 from app.twin.log_reader import read_log
 from app.twin.twin import load_twin
 from estimators.diagnostics.detectors import ALARM_NAMES

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from app.studies.compare import Outcome, draws, outcome_of, timed, within, without_marks
+from app.studies.compare import Outcome, able, draws, outcome_of, timed, within, without_marks
 from app.studies.scores import COST, SPAN, read_scores, spread
 from app.twin.log_reader import read_log
 from app.twin.twin import Twin, load_twin
@@ -32,7 +32,7 @@ SIGMA = 5.0 * math.sqrt(1 + 1 / 8)
 
 def refold(twin, estimator, events, seed=0):
     """Fold one filter over all the events."""
-    fold, seconds = timed(twin, estimator, events, seed, np.inf, enough=0.0)
+    fold, seconds = timed(able(twin, estimator), estimator, events, seed, np.inf, enough=0.0)
     return outcome_of(fold, events, seconds)
 
 
@@ -106,7 +106,7 @@ def mismatches(twin: Twin, events: Events, rows: dict[str, dict[str, str]]) -> l
 def test_every_filter_that_applies_has_a_row(name: str) -> None:
     twin = load_twin(name)
     rows = scores_of(twin)
-    assert list(rows) == [key for key, entry in ESTIMATORS.items() if unfit(entry, twin.model) is None]
+    assert list(rows) == [key for key, entry in ESTIMATORS.items() if unfit(entry, able(twin, key).model) is None]
     for estimator, cells in rows.items():
         options = [f"{option}={value:g}" for option, value in twin.options_of(estimator).items()]
         assert cells["options"].split() == options, f"{estimator}: options are now {options}"

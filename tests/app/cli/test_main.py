@@ -168,7 +168,7 @@ RUNS = {
 def test_every_command_with_a_result_prints_json_that_the_guide_describes():
     assert set(WITH_JSON) == set(documented()) >= {words.split()[0] for words in RUNS.values()}
     without = set(NAMES) - set(WITH_JSON)
-    assert without == {"review", "schema", "completion"}  # a page, a JSON Schema, a script
+    assert without == {"review", "serve", "schema", "completion"}  # pages, a JSON Schema, a script
 
 
 @pytest.mark.parametrize("case", RUNS)
@@ -184,3 +184,40 @@ def test_json_is_one_document_of_documented_fields_without_nan(case, nisus, tmp_
     document = json.loads(nisus(*words, "--json").out, parse_constant=refuse)
     first = document[0] if isinstance(document, list) else document
     assert set(first) <= fields[words[0]], set(first) - fields[words[0]]
+
+
+VARIABLES = {"PORT": "0", "HEADLESS": "yes", "SET": "Q.rate=2 use.winding=false", "LOG": "a.csv b.csv", "STORE": " "}
+
+
+def test_options_of_run_come_from_the_environment_unless_they_are_given(monkeypatch):
+    for name, value in VARIABLES.items():
+        monkeypatch.setenv(f"NISUS_RUN_{name}", value)
+    command = parse(["run", "motor_can", "--port", "8080"])
+    assert (command.twin, command.port, command.headless, command.store) == ("motor_can", 8080, True, None)
+    assert command.set == ("Q.rate=2", "use.winding=false") and command.log == (Path("a.csv"), Path("b.csv"))
+
+
+@pytest.mark.parametrize(
+    ("variable", "value", "line"),
+    [
+        ("PROT", "1", "NISUS_RUN_PROT: there is no such option; did you mean NISUS_RUN_PORT"),
+        ("HEADLESS", "si", "NISUS_RUN_HEADLESS is 'si'; it must be 1, true, yes, on, 0, false, no, off"),
+        ("PORT", "x", "--port 'x': must be a whole number"),
+    ],
+)
+def test_a_wrong_variable_is_one_line(nisus, monkeypatch, variable, value, line):
+    monkeypatch.setenv(f"NISUS_RUN_{variable}", value)
+    assert line in nisus.refuses("run", "motor_can")
+
+
+def test_every_line_of_a_service_is_json(tmp_path):
+    told = subprocess.run(
+        [sys.executable, "-m", "app.cli.main", "run", "motor_winding", "--headless", "--duration", "1"]
+        + ["--log-format", "json", "--store", str(tmp_path / "a.store")],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    lines = [json.loads(line) for line in told.stderr.splitlines()]
+    assert lines and all(line.keys() >= {"time", "level", "text"} for line in lines)
+    assert any("a new one; the twin continues" in line["text"] for line in lines)

@@ -128,7 +128,7 @@ def test_a_pass_opens_the_stage_without_a_cookie(page):
     assert framed(page, "/viser/", given).status == 200
     here = f"localhost:{page.client.port}"
     with connect(
-        f"ws://{here}/viser/?pass={given}&part=scene", origin=f"http://{here}", subprotocols=["viser-test"], proxy=None
+        f"ws://{here}/viser/?pass={given}&theme=light", origin=f"http://{here}", subprotocols=["viser-test"], proxy=None
     ) as viser:
         viser.send("text")
         assert viser.recv(timeout=PATIENCE) == "text"
@@ -217,10 +217,10 @@ def test_each_view_has_a_page_of_its_own(page):
     """Rerun's is without the rest of the page; Viser's is Viser's own, whose socket passes on what it is asked for."""
     alone = page.client.get("/explore").text
     assert 'id="rerun"' in alone and 'id="tune"' not in alone and "{{settings}}" not in alone
-    with page.connect("/viser/?part=scene&theme=dark", subprotocols=["viser-test"]) as socket:
+    with page.connect("/viser/?theme=dark", subprotocols=["viser-test"]) as socket:
         socket.send("hello")
         assert socket.recv(timeout=PATIENCE) == "hello"
-    assert page.viser.requests[-1] == ("/?part=scene&theme=dark", [SECRET])
+    assert page.viser.requests[-1] == ("/?theme=dark", [SECRET])
 
 
 def test_viser_files_pass_without_prefix_and_with_the_secret(page):

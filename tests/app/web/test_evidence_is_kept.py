@@ -44,8 +44,8 @@ def test_what_it_reads_is_said_beside_the_light_and_is_the_mean_of_its_last_inno
     model, pull = session.engine.model, taken.pull
     own = (pull.events.kind == READING) & (pull.events.channel == model.sensor_names.index("yoke"))
     innovations = pull.track.innovation[own & np.isfinite(pull.track.innovation[:, 0]), 0][-200:]
-    assert state == "held out" and text.startswith("yoke, held out, reads ")
-    said = float(re.search(r"reads ([\d.]+) °C above what the others say, beyond", text)[1])
+    assert state == "held out" and text.startswith("yoke, held out: ")
+    said = float(re.search(r": ([\d.]+) °C above the prediction of the other sensors", text)[1])
     assert said == pytest.approx(float(np.mean(innovations)), rel=0.06)  # two figures are said
 
 
@@ -57,7 +57,7 @@ def test_the_report_has_the_episode_of_the_run_before_though_two_edits_came_sinc
     assert "Episodes of earlier runs" in text and "0: as it began" in text
     for item in first.episodes:
         assert item.text in text
-    assert "Yoke, held out, reads" in text
+    assert "Yoke, held out: " in text
 
 
 def test_the_report_of_the_first_run_has_nothing_from_before(session):

@@ -11,7 +11,7 @@ from app.cli.push import Rows
 from app.twin.twin import load_twin
 from estimators import fold
 from estimators.log import Log
-from sources.messages import MAX_SEQUENCES, Messages
+from sources.messages import Messages, SentNumbers
 from sources.source import Channel, Condition, ignore
 from sources.tables.text import TextMatch
 from tests.app.scripted import wait_for
@@ -24,7 +24,8 @@ JSON, LINES, ARROW = "application/json", "application/x-ndjson", "application/vn
 
 @pytest.fixture(scope="module")
 def page():
-    twin = load_twin("motor_winding", overrides={"source": "{type: push}"})
+    # Without rows of predictions: the newest row is that of the newest measurement.
+    twin = load_twin("motor_winding", overrides={"source": "{type: push}", "time.tick": "1000"})
     served = ServedEngine(twin=twin, behind=lambda _: twin.open_source(ignore))
     yield served
     served.stop()
@@ -44,7 +45,8 @@ def message(k, value, **more):
 def test_the_published_state_is_that_of_the_fold_whatever_the_form(page):
     values = (40.0 + np.random.default_rng(1).normal(0.0, 2.0, 40)).tolist()
     assert sent(page, message(0, values[0])) == (
-        200, {"accepted": 1, "duplicate": 0, "refused": 0, "items": [{"index": 0, "status": "accepted"}]},
+        200,
+        {"accepted": 1, "duplicate": 0, "refused": 0, "items": [{"index": 0, "status": "accepted"}], "stored": False},
     )  # fmt: skip
     iso = [{"time": f"2026-01-01T01:00:{k:02d}+01:00", "values": {"winding": values[k]}} for k in range(1, 10)]
     assert sent(page, iso)[1]["accepted"] == 9
@@ -68,6 +70,7 @@ def test_the_published_state_is_that_of_the_fold_whatever_the_form(page):
     (temperature, rate) = page.get("/api/state")["states"]
     assert [temperature["value"], rate["value"]] == track.mean[-1].tolist()
     assert [temperature["std"], rate["std"]] == track.std[-1].tolist()
+    wait_for(lambda: page.rows() == 40)
 
 
 def test_each_message_has_its_answer_and_a_wrong_one_does_not_hold_up_the_others(page):
@@ -169,11 +172,24 @@ def test_what_waits_and_what_is_remembered_is_bounded(monkeypatch):
     assert len(source.read(0.0)) == 3
     assert source.send([{"values": {"LT101": 1.0}}])[0].status == "accepted"
     monkeypatch.setattr("sources.messages.MAX_WAITING", 10**6)
-    source = Messages([Channel(0, 0, "level", ("LT101",), model_units=("m",))], width=1)
-    numbered = [{"values": {"LT101": 0.0}, "sequence": k} for k in range(MAX_SEQUENCES + 10)]
-    assert {answer.status for answer in source.send(numbered)} == {"accepted"}
-    # Those that are forgotten count as duplicates too.
-    assert {answer.status for answer in source.send([numbered[0], numbered[9], numbered[-1]])} == {"duplicate"}
+    monkeypatch.setattr("sources.messages.MAX_GAPS", 3)
+    monkeypatch.setattr("sources.messages.MAX_SENDERS", 2)
+    sent = SentNumbers()
+    assert [sent.add("a", k) for k in (5, 7, 6, 5, 10, 20, 30)] == [True, True, True, False, True, True, True]
+    # Those of a gap that is forgotten count as duplicates too.
+    assert sent.state() == {"a": [[5, 10], [20, 20], [30, 30]]}
+    assert [sent.add(name, 8) for name in "abca"] == [False, True, True, True]
+
+
+def test_sequence_numbers_are_those_of_a_set():
+    numbers = np.random.default_rng(4).integers(0, 300, 1000).tolist()
+    sent, known = SentNumbers(), set()
+    for number in numbers:
+        assert sent.add("", number) == (number not in known)
+        known.add(number)
+    ranges = sent.state()[""]
+    assert [k for first, last in ranges for k in range(first, last + 1)] == sorted(known)
+    assert all(last + 1 < first for (_, last), (first, _) in zip(ranges, ranges[1:], strict=False))
 
 
 def pushed(page, nisus, monkeypatch, text, *options):

@@ -142,6 +142,39 @@ def test_a_wrong_file_of_tokens_is_one_line(nisus, tmp_path, text, mode, reason)
     assert "cannot be read" in nisus.refuses("run", "motor_winding", "--tokens", tmp_path / "none")
 
 
+@pytest.mark.parametrize(
+    ("host", "origin", "status"),
+    [
+        ("192.168.1.5:9900", None, 299),
+        ("192.168.1.5:9900", "http://192.168.1.5:9900", 299),
+        ("[fd00::1]:9900", None, 299),
+        ("twins.example.com", "https://twins.example.com", 299),
+        ("127.0.0.1:9900", None, 299),
+        ("elsewhere.example:9900", None, 403),
+        ("192.168.1.5.elsewhere.example:9900", None, 403),
+        ("192.168.1.5:9900", "http://elsewhere.example", 403),
+        ("twins.example.com", "http://twins.example.com", 403),
+        ("192.168.1.5:9900", "https://twins.example.com", 403),
+    ],
+)
+def test_a_service_on_other_addresses_has_its_own_names_only(host, origin, status):
+    gate = Gate(behind, "t" * 40, 9900, addresses=True, public="https://twins.example.com")
+    headers = {"host": host, "authorization": "Bearer " + "t" * 40} | ({"origin": origin} if origin else {})
+    assert ask(gate, "/api/state", **headers)[0] == status
+    if host != "127.0.0.1:9900":
+        assert ask(Gate(behind, "t" * 40, 9900), "/api/state", **headers)[0] == 403
+
+
+@pytest.mark.parametrize("role", ["view", "feed", "tune", "admin"])
+def test_a_role_is_the_same_for_one_twin_of_several(tmp_path, role):
+    gate = Gate(behind, "t" * 40, 9900, grants=read_tokens(tokens_file(tmp_path, f"ann {role} {'a' * 20}\n")))
+    headers = {"host": "127.0.0.1:9900", "authorization": "Bearer " + "a" * 20}
+    for words in ("GET /api/state", "GET /viser/", "POST /api/readings", "POST /api/command"):
+        method, path = words.split()
+        alone, among = (ask(gate, begin + path, method=method, **headers)[0] for begin in ("", "/twins/pump"))
+        assert alone == among, words
+
+
 def test_the_cookie_of_one_port_does_not_open_another():
     token = "t" * 40
     _, headers, _ = ask(Gate(behind, token, 9900), query=f"token={token}", host="127.0.0.1:9900")

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 from pydantic import ValidationError
+from starlette.routing import Route
 
 from app.present.state_message import PublishedState, StateMessage, state_message, state_schema
 from estimators.track import DEGRADED, DIVERGED, STALE, SUSPECT, WAITING
@@ -78,7 +79,7 @@ def changed(page, **fields):
     engine = page.engine
     status = replace(engine.status(), **fields)
     return state_message(
-        SimpleNamespace(status=lambda: status, model=engine.model, twin=engine.twin, belief=engine.belief),
+        SimpleNamespace(latest=lambda: status, model=engine.model, twin=engine.twin, belief=engine.belief),
         covariance=True,
     )
 
@@ -206,3 +207,34 @@ def test_supervisors_need_no_token(serve):
     page.source.put(readings([1.0], [40.0]))
     wait_for(lambda: page.client.raw("GET", "/readyz", host).status == 200)
     assert json.loads(page.client.get("/api/state").text)["time_ns"] == SECOND
+
+
+def test_the_description_of_the_api_has_every_path_and_is_true(page):
+    found = page.get("/api/openapi.json")
+    served = {
+        re.sub(r":\w+}", "}", route.path)
+        for route in page.server.application.routes
+        if isinstance(route, Route) and route.path.startswith("/api/")
+    }
+    assert served <= found["paths"].keys() and {"/healthz", "/readyz", "/metrics"} <= found["paths"].keys()
+    models = found["components"]["schemas"]
+
+    def check(schema, value=None):
+        jsonschema.Draft202012Validator.check_schema(schema)
+        if value is not None:
+            jsonschema.Draft202012Validator(schema | {"components": found["components"]}).validate(value)
+
+    operations = [item for path in found["paths"].values() for item in path.values()]
+    assert [item["operationId"] for item in operations if not item["summary"]] == []
+    for schema in [*models.values(), *(part["schema"] for item in operations for part in item.get("parameters", ()))]:
+        check(schema)
+    for name in re.findall(r'"#/components/schemas/([^"]+)"', json.dumps(found)):
+        assert name in models
+    state_of = found["paths"]["/api/state"]["get"]
+    assert [(item["name"], item["in"]) for item in state_of["parameters"]] == [("covariance", "query")]
+    check(state_of["responses"]["200"]["content"]["application/json"]["schema"], page.get("/api/state?covariance=true"))
+    command = found["paths"]["/api/command"]["post"]["requestBody"]["content"]["application/json"]["schema"]
+    check(command, {"command": "SetTuning", "key": "Q.temperature", "value": 1.0})
+    check(command, {"command": "Reset"})
+    with pytest.raises(jsonschema.ValidationError):
+        check(command, {"command": "SetTuning", "value": 1.0})

@@ -78,6 +78,33 @@ def test_nothing_is_wider_than_its_column(name, visit):
                 page.get_by_role("button", name="Tune").first.click()
 
 
+def test_the_nis_is_seen_on_a_low_window_and_the_choice_of_the_error_is_whole(visit):
+    with running("battery_pack", 60.0) as session:
+        page = visit(session.url, ready="window.nisus?.drawn > 3", size=(1440, 480))
+        charts = page.locator("#charts .chart:not([data-kind=nis]):visible")
+        above = sum(charts.nth(k).bounding_box()["height"] for k in range(3))
+        assert above > page.locator("#charts").evaluate("(node) => node.clientHeight") - 60
+        box, panel = (page.locator(name).first.bounding_box() for name in ("#charts > [data-kind=nis]", "#charts"))
+        assert box["y"] >= panel["y"] and box["y"] + box["height"] <= panel["y"] + panel["height"] + 1
+        page.get_by_role("tab", name="Runs").click()
+        select = page.get_by_label("State or sensor of the error")
+        select.wait_for()
+        # As wide as its longest text.
+        assert select.evaluate("(node) => node.scrollWidth <= node.clientWidth && node.clientWidth > 100")
+
+
+def test_a_narrow_scale_has_two_ends(visit):
+    with running("lorenz96", 4.0) as session:
+        page = visit(session.url, ready="window.nisus?.drawn > 5")
+        ends = page.evaluate("""(() => {
+          const chart = window.nisus.charts.charts.find((chart) => chart.what.ramp);
+          chart.what.ramp = () => ({ colors: [], low: 25.1034, high: 25.1287 });
+          chart.scale();
+          return [...chart.ramp.children].map((node) => node.textContent);
+        })()""")
+        assert ends[0] == "25.103" and ends[2].startswith("25.129")
+
+
 SIDE = {"Scene": "scene", "XY": "xy", "Runs": "runs", "Episodes": "episodes"}
 
 

@@ -5,11 +5,16 @@ import base64
 import numpy as np
 import pytest
 
-from app.live.commands import Record
+from app.cli.arguments import CommissionCommand
+from app.cli.commission import commission_twin
+from app.live.commands import Load, Record, SetTuning
 from app.views.recording.reader import read_recording
+from estimators.track import TRACKING
 from tests.app.scripted import pull_all, wait_for
 from tests.app.web.gallery.opened import opened
 from tests.app.web.page.browsed import PATIENCE, drawn, until
+from tests.app.web.test_service import Served
+from tests.conftest import ROOT
 
 pytestmark = pytest.mark.browser
 
@@ -231,3 +236,76 @@ def test_what_is_recorded_is_named_in_the_bar(visit, tmp_path):
         assert page.locator("#record").get_attribute("title") == f"{title}: end it (R)"
         session.engine.submit(Record(None))
         until(page, "document.getElementById('recording').hidden")
+
+
+def test_a_twin_of_ones_own_stores_its_baseline(visit, tmp_path, capsys):
+    """Measurements with 1.4 times the configured deviation: an alarm, until that is its baseline."""
+    y = 40.0 + np.random.default_rng(1).normal(0.0, 2.8, 300)
+    (tmp_path / "drive.csv").write_text("t,y\n" + "".join(f"{k},{value:.3f}\n" for k, value in enumerate(y)))
+    path = tmp_path / "drive.yaml"
+    source = "{type: table, files: drive.csv, time: {column: t, unit: s}, sensors: {winding: {columns: y}}}"
+    path.write_text(f"model: motor_winding\nsource: {source}\n")
+    with opened(tmp_path / "recordings", path, speed=float("inf")) as session:
+        page = visit(session.session.url, ready=None)
+        shows(page, "drive")
+        wait_for(lambda: session.engine.status().finished, PATIENCE)
+        # An edit is not in the file, so its baseline would be another tuning's.
+        session.engine.submit(SetTuning("Q.rate", 0.02))
+        wait_for(lambda: session.engine.folded_with()[0].get("Q.rate") == 0.02, PATIENCE)
+        page.get_by_role("tab", name="Episodes").click()
+        section = page.get_by_role("region", name="Baseline")
+        section.get_by_role("button", name="Store baseline").click()
+        section.get_by_text("has been edited; save it first").wait_for()
+        assert "commissioned" not in path.read_text()
+        session.engine.submit(Load(0))
+        wait_for(lambda: session.engine.folded_with()[0].get("Q.rate") != 0.02, PATIENCE)
+        section.get_by_role("button", name="Store baseline").click()
+        wait_for(lambda: session.engine.folded_with()[0].baseline is not None, PATIENCE)
+        # What `nisus commission` prints for the file.
+        stored = path.read_text().partition("commissioned:")[2]
+        assert commission_twin(CommissionCommand(str(path))) == 0
+        assert capsys.readouterr().out.partition("commissioned:")[2] == stored and "scale: 1.275" in stored
+        until(page, "document.querySelector('.baseline').hidden")
+        wait_for(lambda: session.engine.status().health == TRACKING, PATIENCE)
+
+
+def test_a_bundled_twin_has_no_baseline_to_store(visit, tmp_path):
+    with opened(tmp_path / "recordings", "motor_winding") as session:
+        page = visit(session.session.url, ready=None)
+        shows(page, "motor_winding")
+        page.get_by_role("tab", name="Episodes").click()
+        assert page.locator(".why").is_visible() and page.locator(".baseline").is_hidden()
+
+
+def test_the_overview_of_a_service_shows_health_and_leads_to_the_page_of_each_twin(visit, tmp_path):
+    text = (ROOT / "config" / "twins" / "motor_winding.yaml").read_text()
+    for name in ("north", "south"):
+        (tmp_path / f"{name}.yaml").write_text(text)
+    (tmp_path / "torn.yaml").write_text("model: motor_winding\n")
+    service = Served(tmp_path, "north.yaml", "south.yaml", "torn.yaml", "--store", "stores")
+    try:
+        states = {"north": "running", "south": "running", "torn": "failed"}
+        service.wait(lambda twins: {name: twin["state"] for name, twin in twins.items()} == states)
+        overview = visit(f"{service.url}/?token={service.token}", ready="window.nisus?.cards === 3")
+        order = "[...document.querySelectorAll('.card')].map((card) => card.dataset.name)[0]"
+        until(overview, f"{order} === 'torn'")
+        card(overview, "torn").get_by_text("source is missing; add it").wait_for()
+        card(overview, "north").get_by_text("tracking").wait_for()
+        overview.screenshot(path=tmp_path / "overview.png")
+        card(overview, "north").get_by_role("link", name="Open").click()
+        shows(overview, "north")
+        assert overview.url.endswith("/twins/north/")
+        overview.evaluate("window.nisus.link.ask('SetTuning', {key: 'Q.temperature', value: 0.5})")
+        overview.get_by_role("tab", name="Episodes").click()
+        overview.get_by_text("Commands", exact=True).click()
+        entry = "session (admin) from 127.0.0.1, run 0: SetTuning, key Q.temperature, value 0.5"
+        overview.get_by_text(entry).wait_for()
+        overview.screenshot(path=tmp_path / "twin.png")
+        overview.locator("#gallery").click()
+        until(overview, "window.nisus?.cards === 3")
+        card(overview, "north").get_by_role("button", name="Stop").click()
+        card(overview, "north").get_by_role("button", name="Start").wait_for()
+        until(overview, f"{order} === 'torn'")
+        assert service.twins()["south"]["state"] == "running"
+    finally:
+        service.stop()

@@ -103,6 +103,7 @@ def test_a_recording_opens_folded_and_is_replayed_from_the_cursor(visit):
         assert end > 170.0
         since, last = page.evaluate("window.nisus.charts.range")
         assert (since, last) == (start, pytest.approx(end, abs=1e-3))
+        assert page.evaluate("document.getElementById('window').value") == "all"
         assert not [item for item in engine.notices.since(0) if item.level == "warn"]
         # A page rounds the times of a calendar to 256 ns: just before its end is still the last row.
         page.evaluate("(end) => window.nisus.view.show(0, end, end - 2e-7)", last)
@@ -113,6 +114,11 @@ def test_a_recording_opens_folded_and_is_replayed_from_the_cursor(visit):
         page.locator("#pause").click()
         wait_for(lambda: engine.status().speed == 1.0 and not engine.status().finished, PATIENCE)
         until(page, "window.nisus.view.following && window.nisus.charts.newest < 100")
+        # The replay shows a window, and so does a part that is zoomed: the list of widths says so.
+        until(page, "document.getElementById('window').value === String(window.nisus.model.window)")
+        page.evaluate("window.nisus.view.show(10, 27)")
+        until(page, "document.getElementById('window').selectedOptions[0].text === '17 s'")
+        page.evaluate("window.nisus.view.follow()")
         replayed = pull_all(engine)
         n = len(replayed.track.mean)
         assert float(replayed.events.t[n - 1] - track.events.t[0]) * 1e-9 == pytest.approx(60.0, abs=30.0)

@@ -40,10 +40,8 @@ def test_a_scene_whose_document_comes_late_is_announced(visit, session):
 def test_the_scene_is_chosen_enlarged_and_opened_alone(visit, session):
     assert asked(session) == [] and session.running.view.history.n == 0
     page = visit(session.url)
-    wait_for(lambda: asked(session) == ["theme=light&part=scene"], PATIENCE)
+    wait_for(lambda: asked(session) == ["theme=light"], PATIENCE)
     wait_for(lambda: session.running.view.history.n > 0, PATIENCE)
-    # Its panel is not kept up while only the page shows the scene.
-    assert session.running.view.panel.status.content == ""
 
     select = page.get_by_label("Scene: Show")
     select.select_option("belief")
@@ -67,9 +65,13 @@ def test_the_scene_is_chosen_enlarged_and_opened_alone(visit, session):
     with page.context.expect_page() as opened:
         page.get_by_label("Scene in a window of its own").click()
     alone = opened.value
-    alone.get_by_text("Reset estimate").wait_for()
-    wait_for(lambda: asked(session) == ["theme=light", "theme=light&part=scene"], PATIENCE)
-    wait_for(lambda: "revision 0" in session.running.view.panel.status.content, PATIENCE)
+    wait_for(lambda: asked(session) == ["theme=light", "theme=light"], PATIENCE)
+    until(alone, "getComputedStyle(document.body).opacity === '1'")
+    alone.wait_for_selector("canvas")
+    # Viser's own panel is hidden; a link leads to the page.
+    assert not alone.locator(".mantine-Paper-root:visible").count()
+    alone.get_by_role("link", name="Charts and controls").click()
+    alone.wait_for_selector("#charts .chart canvas")
 
 
 def test_rerun_has_a_window_of_its_own(page, session):

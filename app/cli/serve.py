@@ -1,0 +1,218 @@
+"""`nisus serve`: several twins behind one port, each in a process of its own."""
+
+from __future__ import annotations
+
+import gc
+import ipaddress
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Mapping
+from functools import partial
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+from urllib.parse import urlsplit
+
+from config.loader import shipped
+from estimators.errors import ConfigError, NisusError
+
+from ..terminal import EndRequest, restore, use_lines_of_json, when_asked_to_end
+from ..web.door import LOOPBACK, Door, check_port
+from ..web.gate import read_tokens
+from ..web.service import STATUS_PERIOD_S, Service, twins_of_folder
+
+if TYPE_CHECKING:
+    from ..web.session import Session
+    from .arguments import ServeCommand
+
+PRELOADED = ("app.cli.serve", "app.cli.open_twin", "app.web.server", "app.views.viser.view", "app.views.rerun.rows")
+"""Modules that the processes of the twins share: they are imported once."""
+
+
+MEMORY_PERIOD_S = 10.0
+"""Between two looks at the memory, which take milliseconds."""
+
+
+class ServiceOptions(NamedTuple):
+    """What all twins of a service have in common."""
+
+    store: Path | None
+    recordings: Path
+    json: bool
+
+
+def serve(arguments: ServeCommand) -> int:
+    """Run the command."""
+    if arguments.log_format == "json":
+        use_lines_of_json()
+    loopback = _is_loopback(arguments.host)
+    if arguments.tokens is None and not (loopback and arguments.public is None):
+        where = f"--host {arguments.host}" if not loopback else f"--public {arguments.public}"
+        raise ConfigError(f"{where}: others can reach it; give --tokens FILE, which has a token for each user")
+    if arguments.public is not None and not _is_site(arguments.public):
+        raise ConfigError(f"--public {arguments.public}: must be like https://twins.example.com, without a path")
+    grants = () if arguments.tokens is None else read_tokens(arguments.tokens)
+    twins, folder = _named(arguments.twins)
+    options = ServiceOptions(arguments.store, arguments.recordings, arguments.log_format == "json")
+    for place in (options.store, options.recordings):
+        if place is not None and place.exists() and not place.is_dir():
+            raise ConfigError(f"{place}: must be a folder, in which each twin has its own file")
+    if loopback:
+        check_port(arguments.port)
+    host = LOOPBACK if loopback else arguments.host
+    door = Door(arguments.port, grants, host=host, public=arguments.public)
+    service = Service(
+        twins, partial(run_child, options), door=door, preload=PRELOADED, at_once=max(1, (os.cpu_count() or 2) // 2),
+        folder=None if folder is None else partial(twins_of_folder, folder),
+    )  # fmt: skip
+    done = EndRequest()
+    previous = when_asked_to_end(done.set)
+    end = time.monotonic() + (arguments.duration or float("inf"))
+    try:
+        service.start()
+        print(f"Nisus serves {len(twins)} twin(s) at\n\n    {door.url}\n\nCtrl-C ends it.", flush=True)
+        while time.monotonic() < end and not done.wait(min(1.0, end - time.monotonic())):
+            pass
+    except KeyboardInterrupt:
+        pass
+    finally:
+        service.stop()
+        restore(previous)
+    return 0
+
+
+def _named(given: tuple[str, ...]) -> tuple[dict[str, str], Path | None]:
+    """Return the twins by name, and the folder that has them, if one was given.
+
+    Raises:
+        ConfigError: If there are none, or two of one name.
+    """
+    if len(given) == 1 and Path(given[0]).is_dir():
+        folder = Path(given[0])
+        return twins_of_folder(folder), folder
+    if not given:
+        raise ConfigError("serve: the twins are missing; give YAML files, names of bundled twins, or a folder")
+    found: dict[str, str] = {}
+    for text in given:
+        name = text if text in shipped() else Path(text).stem
+        if Path(text).is_dir():
+            raise ConfigError(f"{text}: is a folder; give it alone, or files")
+        if text not in shipped() and not Path(text).is_file():
+            raise ConfigError(f"{text}: there is no such file or bundled twin; check the path")
+        if name in found:
+            raise ConfigError(f"{text}: a twin is called {name} already; rename the file")
+        found[name] = text
+    return found, None
+
+
+def _is_loopback(host: str) -> bool:
+    try:
+        return host == "localhost" or ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        raise ConfigError(f"--host {host}: must be an IP address, such as 0.0.0.0 for all of this machine") from None
+
+
+def _is_site(text: str) -> bool:
+    try:
+        parts = urlsplit(text)
+    except ValueError:
+        return False
+    return parts.scheme in ("http", "https") and bool(parts.netloc) and not (parts.path or parts.query)
+
+
+def run_child(options: ServiceOptions, name: str, path: str, pipe: Connection) -> None:
+    """Run one twin in this process until it is asked to stop, or the service has ended."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to the service, which stops this process
+    done = threading.Event()
+    when_asked_to_end(lambda: os._exit(0) if not running else ending.append(True))
+    running: list[bool] = []
+    ending: list[bool] = []
+    gc.freeze()
+    if options.json:
+        use_lines_of_json()
+    try:
+        session, card = _opened(options, name, path)
+        session.start()
+    except NisusError as error:
+        pipe.send(("failed", str(error).splitlines()[0]))
+        sys.exit(2)
+    running.append(True)
+    assert session.door is not None
+    pipe.send(("ready", (session.door.port, session.door.token, card)))
+    try:
+        memory, measured = 0, -MEMORY_PERIOD_S
+        while not (ending or done.is_set()):
+            if time.monotonic() - measured > MEMORY_PERIOD_S:
+                memory, measured = _memory(), time.monotonic()
+            pipe.send(("report", _report(session) | {"memory": memory}))
+            if pipe.poll(STATUS_PERIOD_S):
+                _take(pipe, session, done)
+        # A request that stops it is noted after it was carried out.
+        while pipe.poll(0.1):
+            _take(pipe, session, done)
+    except (EOFError, OSError):  # the service has ended
+        pass
+    finally:
+        session.stop()
+
+
+def _take(pipe: Connection, session: Session, done: threading.Event) -> None:
+    """Carry out a message of the service: (kind, content)."""
+    kind, content = pipe.recv()
+    if kind == "stop":
+        done.set()
+    elif kind == "audit" and session.running is not None:
+        session.engine.audit.add(*content)
+
+
+def _opened(options: ServiceOptions, name: str, path: str) -> tuple[Session, Mapping[str, Any]]:
+    from dataclasses import asdict
+
+    from ..web.gallery.cards import card_of
+    from ..web.gallery.gallery import StartRequest
+    from ..web.session import Page
+    from .open_twin import FileOpener, open_session, opened_twin
+
+    store = None if options.store is None else options.store / f"{name}.store"
+    read = partial(opened_twin, path, store=store)
+    opener = FileOpener({path: read})
+    opening = opener.made_ready(read())
+    session = open_session(
+        opening, StartRequest(path), opener, page=Page(0, False, overview="../../"),
+        recordings=options.recordings / name, printed=True,
+    )  # fmt: skip
+    return session, asdict(card_of(path, opening.twin))
+
+
+def _report(session: Session) -> dict[str, Any]:
+    """Return what the overview shows of a twin."""
+    from estimators.track import HEALTH_NAMES
+
+    running = session.running
+    if running is None:
+        return {"health": "waiting", "cause": "starting anew"}
+    status = running.engine.status()
+    cause = "the filter is being compiled" if status.awaited is not None else status.cause
+    return {
+        "health": HEALTH_NAMES[status.health],
+        "cause": cause,
+        "episodes": status.episodes_open,
+        "measurements": int(status.counts.get("readings", 0)),
+        "age": None if status.t is None else round(time.monotonic() - status.heard, 1),
+        "unread": running.server.unread,
+        "cpu": round(time.process_time(), 2),
+    }
+
+
+def _memory() -> int:
+    """Return the bytes of this process, with its share of those in common with others; 0 where not known."""
+    try:
+        for line in Path("/proc/self/smaps_rollup").read_text().splitlines():
+            if line.startswith("Pss:"):
+                return int(line.split()[1]) * 1024
+    except (OSError, ValueError, IndexError):
+        pass
+    return 0

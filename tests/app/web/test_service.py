@@ -1,0 +1,208 @@
+"""A service of several twins: one page each, processes of their own, and an overview."""
+
+import http.client
+import json
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import time
+from urllib.error import HTTPError
+from urllib.request import ProxyHandler, Request, build_opener
+
+import pytest
+from websockets.sync.client import connect
+
+from app.cli.main import main
+from tests.conftest import ROOT
+
+PATIENCE_S = 120.0
+TOKENS = {"ann": ("view", "a" * 20), "bob": ("tune", "b" * 20), "plc": ("feed", "c" * 20), "eve": ("admin", "e" * 20)}
+
+OPENER = build_opener(ProxyHandler({}))
+
+
+def free_port():
+    """A port that nobody listens on at present."""
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        return listener.getsockname()[1]
+
+
+class Served:
+    """A running `nisus serve`, and requests to it."""
+
+    def __init__(self, folder, *arguments, **variables):
+        self.folder = folder
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "app.cli.main", "serve", *arguments],
+            cwd=folder, text=True, stdout=subprocess.PIPE, stderr=(folder / "lines").open("w"),
+            env=os.environ | {"PYTHONPATH": str(ROOT), "NISUS_SERVE_PORT": "0"} | variables,
+        )  # fmt: skip
+        for line in self.process.stdout:
+            if found := re.search(r"(http://127.0.0.1:\d+)/\?token=(\S+)", line):
+                self.url, self.token = found.groups()
+                break
+
+    def ask(self, path, body=None, token=None, **headers):
+        """Status and content of an answer; JSON is read."""
+        data = None if body is None else json.dumps(body).encode()
+        headers = {"Authorization": f"Bearer {token or self.token}", "Content-Type": "application/json"} | headers
+        try:
+            with OPENER.open(Request(self.url + path, data, headers), timeout=PATIENCE_S) as answer:
+                text, status = answer.read().decode(), answer.status
+        except HTTPError as error:
+            text, status = error.read().decode(), error.code
+        return status, json.loads(text) if text[:1] in "[{" else text
+
+    def twins(self):
+        return {twin["name"]: twin for twin in self.ask("/api/session")[1]["twins"]}
+
+    def wait(self, condition):
+        """Wait until the twins fulfil a condition; return them."""
+        end = time.monotonic() + PATIENCE_S
+        while not condition(found := self.twins()):
+            assert time.monotonic() < end, f"waited in vain: {found}; {self.lines()}"
+            time.sleep(0.2)
+        return found
+
+    def lines(self):
+        return (self.folder / "lines").read_text()
+
+    def stop(self):
+        self.process.terminate()
+        self.process.wait(PATIENCE_S)
+        self.process.stdout.close()
+
+
+def all_run(twins):
+    return all(twin["state"] == "running" for twin in twins.values())
+
+
+@pytest.fixture(scope="module")
+def served(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("service")
+    for name in ("north", "south"):
+        text = (ROOT / "config" / "twins" / "motor_winding.yaml").read_text()
+        source = "source: {type: push}\n" if name == "south" else "source:\n  type: simulator\n"
+        (folder / f"{name}.yaml").write_text(re.sub(r"source:\n  type: simulator\n(  .*\n)*", source, text))
+    tokens = folder / "tokens"
+    tokens.write_text("".join(f"{name} {role} {token}\n" for name, (role, token) in TOKENS.items()))
+    tokens.chmod(0o600)
+    running = Served(
+        folder, "north.yaml", "south.yaml", "--tokens", "tokens", "--store", "stores", "--log-format", "json"
+    )
+    running.wait(all_run)
+    yield running
+    running.stop()
+    assert running.process.returncode == 0
+
+
+def test_each_twin_has_its_page_behind_one_port(served):
+    for name in ("north", "south"):
+        status, page = served.ask(f"/twins/{name}/")
+        assert status == 200 and 'src="page/page.js"' in page
+        assert served.ask(f"/twins/{name}/page/page.js")[0] == 200
+        assert served.ask(f"/twins/{name}/api/state")[1]["twin"] == name
+    assert served.ask("/twins/east/api/state") == (404, "Nisus: east is no twin of this service.\n")
+    headers = {"Authorization": f"Bearer {served.token}"}
+    address = f"{served.url.replace('http', 'ws')}/twins/north/api/stream"
+    with connect(address, origin=served.url, additional_headers=headers, proxy=None, open_timeout=PATIENCE_S) as page:
+        assert json.loads(page.recv(timeout=PATIENCE_S))["boot"]
+    cards = {card["name"]: card for card in served.ask("/api/gallery")[1]}
+    assert cards["north"]["states"] == 2 and cards["south"]["source"] == "messages"
+    assert served.ask("/readyz") == (200, "ok\n")
+
+
+def test_roles_hold_for_every_twin_and_commands_are_noted_with_their_user(served):
+    token = {name: token for name, (_, token) in TOKENS.items()}
+    edit = {"command": "SetTuning", "key": "Q.temperature", "value": 0.5}
+    assert served.ask("/twins/north/api/command", edit, token["ann"])[0] == 403
+    assert served.ask("/twins/north/api/command", edit, token["bob"])[0] == 202
+    assert served.ask("/api/gallery/stop", {"twin": "north"}, token["bob"])[0] == 403
+    message = {"time": "2026-01-01T00:00:00Z", "values": {"winding": 40.0}, "source": "plc", "sequence": 1}
+    status, answer = served.ask("/twins/south/api/readings", message, token["plc"])
+    assert (status, answer["accepted"], answer["stored"]) == (200, 1, True)
+    assert served.ask("/twins/south/api/state", token=token["plc"])[0] == 403
+    (entry,) = served.ask("/twins/north/api/audit", token=token["ann"])[1]
+    assert (entry["user"], entry["role"], entry["address"]) == ("bob", "tune", "127.0.0.1")
+    assert entry["path"] == "/api/command" and entry["body"] == edit
+    # A browser exchanges the token of its user for a cookie, with the same role.
+    connection = http.client.HTTPConnection(served.url.removeprefix("http://"), timeout=PATIENCE_S)
+    connection.request("GET", f"/?token={token['ann']}")
+    answer = connection.getresponse()
+    cookie = answer.getheader("set-cookie").partition(";")[0]
+    answer.read()
+    assert answer.status == 303 and token["ann"] not in cookie
+    for path, expected in (("/twins/north/api/state", 200), ("/api/gallery", 200)):
+        connection.request("GET", path, headers={"Cookie": cookie})
+        answer = connection.getresponse()
+        answer.read()
+        assert answer.status == expected
+    connection.request(
+        "POST", "/twins/north/api/command", json.dumps(edit), {"Cookie": cookie, "Content-Type": "application/json"}
+    )
+    assert connection.getresponse().status == 403
+    connection.close()
+
+
+def test_one_twin_is_stopped_and_started_alone(served):
+    before = served.twins()
+    assert served.ask("/api/gallery/stop", {"twin": "north"})[0] == 202
+    found = served.wait(lambda twins: twins["north"]["state"] == "stopped")
+    assert found["south"]["starts"] == before["south"]["starts"] and list(found)[-1] == "north"
+    assert served.ask("/twins/north/api/state")[0] == 503
+    assert served.ask("/api/gallery/start", {"twin": "north"})[0] == 202
+    served.wait(all_run)
+    # Its edit and its audit log are continued.
+    assert served.ask("/twins/north/api/status")[1]["tuning"]["Q.temperature"] == 0.5
+    end = time.monotonic() + PATIENCE_S
+    while len(entries := served.ask("/twins/north/api/audit")[1]) < 3 and time.monotonic() < end:
+        time.sleep(0.1)
+    assert [(entry["user"], entry["path"]) for entry in entries] == [
+        ("bob", "/api/command"), ("session", "/api/gallery/stop"), ("session", "/api/gallery/start"),
+    ]  # fmt: skip
+
+
+def test_a_twin_that_ends_is_started_again_and_no_other_notices(served):
+    before = served.twins()
+    os.kill(before["north"]["pid"], signal.SIGSEGV)
+    served.wait(lambda twins: twins["north"]["starts"] > before["north"]["starts"] and all_run(twins))
+    after = served.twins()
+    assert after["south"]["pid"] == before["south"]["pid"] and after["south"]["starts"] == before["south"]["starts"]
+    lines = [json.loads(line) for line in served.lines().splitlines()]
+    assert [line for line in lines if line["level"] == "error" and line["twin"] == "north"][-1]["text"] == (
+        "ended by SIGSEGV; started again in 1 s, then less often"
+    )
+
+
+def test_a_folder_is_watched_and_a_twin_that_cannot_start_is_one_line(tmp_path):
+    folder = tmp_path / "twins"
+    folder.mkdir()
+    (folder / "good.yaml").write_text((ROOT / "config" / "twins" / "motor_winding.yaml").read_text())
+    (folder / "bad.yaml").write_text("model: motor_winding\n")
+    running = Served(tmp_path, "twins")
+    try:
+        found = running.wait(lambda twins: twins["good"]["state"] == "running" and twins["bad"]["state"] == "failed")
+        assert found["bad"]["text"] == "twins/bad.yaml:1: source is missing; add it" and list(found) == ["bad", "good"]
+        (folder / "bad.yaml").unlink()
+        running.wait(lambda twins: list(twins) == ["good"])
+    finally:
+        running.stop()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "line"),
+    [
+        ([], "the twins are missing; give YAML files"),
+        (["motor_winding", "motor_winding"], "a twin is called motor_winding already"),
+        (["nothing.yaml"], "there is no such file or bundled twin"),
+        (["motor_winding", "--host", "0.0.0.0"], "--host 0.0.0.0: others can reach it; give --tokens FILE"),
+        (["motor_winding", "--public", "https://a.example"], "others can reach it; give --tokens FILE"),
+        (["motor_winding", "--host", "example.com"], "must be an IP address"),
+    ],
+)
+def test_a_service_that_cannot_be_is_one_line(capsys, arguments, line):
+    assert main(["serve", *arguments]) == 2
+    assert line in capsys.readouterr().err
