@@ -9,7 +9,6 @@ have absolute indices; after a late measurement the events are written again fro
 
 from __future__ import annotations
 
-import base64
 import json
 import math
 import os
@@ -23,17 +22,16 @@ import numpy as np
 import pyarrow as pa
 import rerun as rr
 
-from config.tunings import Version, version_of
 from estimators.diagnostics.field_pictures import Picture
 from estimators.diagnostics.score import Score, score
 from estimators.errors import NisusError, SourceError
-from estimators.gate.rejection_runs import REMEMBERED
 from estimators.log import Events
 from estimators.model.state_space import StateSpaceModel
 from estimators.snapshots import Base
 from estimators.track import Track
 from estimators.tuning import Tuning
 
+from ...live.fold_json import base_to_json, tuning_to_json, version_to_json
 from ...live.history_copy import copy_rows
 from ...live.notices import Annotation
 from ...live.outputs import Pull
@@ -43,90 +41,11 @@ from ...present.series.columns import units_by_name
 from ...twin.twin import Twin
 from .rrd_file import END_MESSAGE, MESSAGE_HEADER, STREAM_HEADER, TAKEN, messages
 
-FORMAT = 2
-READABLE = (1, 2)  # Formats that can be read; the first also stored the track
+FORMAT = 3
+READABLE = (1, 2, 3)  # Formats that can be read; the first also stored the track
+BORDERED = 3  # Format from which square-root filters with considered states store a bordered factor
 PREFIX = "nisus_"  # Start of the application id that Rerun shows; the name of the twin follows
 TIMELINE = "event"
-
-
-def tuning_to_json(tuning: Tuning, estimator: str) -> str:
-    """Return a tuning and its estimator as text, which keeps float64 exactly."""
-    arrays = {name: getattr(tuning, name).tolist() for name in ("q", "r", "p", "used")}
-    plain = {name: getattr(tuning, name) for name in ("gate", "gate_kind", "reopen", "seed", "name")}
-    return json.dumps({"estimator": estimator, **arrays, **plain, "options": dict(tuning.options)})
-
-
-def tuning_from_json(text: str, model: StateSpaceModel) -> tuple[Tuning, str]:
-    """Return the tuning and the estimator that `tuning_to_json` wrote."""
-    values = json.loads(text)
-    tuning = Tuning(
-        model=model,
-        q=np.array(values["q"], float),
-        r=np.array(values["r"], float),
-        p=np.array(values["p"], float),
-        used=np.array(values["used"], bool),
-        gate=values["gate"],
-        # In older recordings the gate was hard and never reopened.
-        gate_kind=values.get("gate_kind", "hard"),
-        reopen=values.get("reopen"),
-        options=values["options"],
-        seed=values["seed"],
-        name=values.get("name", ""),
-    )
-    return tuning, values["estimator"]
-
-
-def version_to_json(version: Version) -> str:
-    """Return a tuning version as text, with the content of its file."""
-    return json.dumps({"name": version.name, "path": str(version.path), "text": version.text})
-
-
-def version_from_json(text: str) -> Version:
-    """Return the version that `version_to_json` wrote."""
-    values = json.loads(text)
-    return version_of(values["name"], values["text"], Path(values["path"]))
-
-
-def base_to_json(base: Base | None) -> str:
-    """Return a base as text, which keeps float64 exactly."""
-    if base is None:
-        return "null"
-    moments = {"mean": base.mean.tolist(), "cov": base.cov.tolist(), "clock": base.clock, "u": base.u.tolist()}
-    moments |= {"first": base.first, "version": base.version}
-    arrays = {"state": base.state, "edge": base.edge, "evidence": base.evidence, "doubt": base.doubt}
-    held = {key: _to_base64(array) for key, array in arrays.items() if array is not None}
-    return json.dumps({**moments, "estimator": base.estimator, **held})
-
-
-def _to_base64(numbers: np.ndarray) -> str:
-    return base64.b64encode(np.ascontiguousarray(numbers, "<f8").tobytes()).decode()
-
-
-def _from_base64(text: str | None) -> np.ndarray | None:
-    return None if text is None else np.frombuffer(base64.b64decode(text), "<f8").astype(float)
-
-
-def base_from_json(text: str) -> Base | None:
-    """Return the base that `base_to_json` wrote; in older recordings it has moments only."""
-    values = json.loads(text)
-    if values is None:
-        return None
-    doubt = _from_base64(values.get("doubt"))
-    return Base(
-        np.array(values["mean"]),
-        np.array(values["cov"]),
-        int(values["clock"]),
-        np.array(values["u"], float),
-        values.get("estimator", ""),
-        _from_base64(values.get("state")),
-        int(values.get("first", 0)),
-        evidence=_from_base64(values.get("evidence")),
-        edge=_from_base64(values.get("edge")),
-        version=int(values.get("version", 1)),
-        doubt=None if doubt is None else doubt.reshape(-1, REMEMBERED),
-    )
-
-
 FLUSH_TIMEOUT_S = 5.0
 
 

@@ -20,12 +20,16 @@ from rerun.chunk import RrdReader
 from config.tunings import Version
 from estimators.errors import SourceError
 from estimators.log import Events
+from estimators.model.state_space import StateSpaceModel
 from estimators.snapshots import Base
 
+from ...live.fold_json import base_from_json, version_from_json
 from ...live.history_copy import last_written
 from ...live.notices import Annotation
-from .format import FORMAT, PREFIX, READABLE, TIMELINE, base_from_json, version_from_json
+from .format import BORDERED, FORMAT, PREFIX, READABLE, TIMELINE
 from .rrd_file import MAGIC, MESSAGE_HEADER, STREAM_HEADER, complete_until
+
+SQUARE_ROOT = ("sr-ekf", "sr-kf", "sr-ukf")  # Filters whose factor with considered states changed
 
 
 @dataclass(frozen=True)
@@ -36,6 +40,7 @@ class Recorded:
     recordings have none). `tuning` is the last of `tunings`. A fold of `events` starts at `base` (None: the prior);
     `first` is the index of the first event in the session, `rows` their number. `notices` are (t, level, text),
     `annotations` the notes of users by time, and `closed` is whether the recording was finished when it ended.
+    `format` is that of the file.
     """
 
     path: Path
@@ -53,6 +58,22 @@ class Recorded:
     first: int
     rows: int
     closed: bool
+    format: int = FORMAT
+
+    def base_for(self, model: StateSpaceModel) -> tuple[Base | None, str]:
+        """Return the start of a fold of `events`, and a remark if the filter's full state cannot be used there, or "".
+
+        Square-root filters with considered states once stored another factor. The fold then starts from mean and
+        covariance, which are right.
+        """
+        base = self.base
+        if base is None or not model.considered or self.format >= BORDERED or base.estimator not in SQUARE_ROOT:
+            return base, ""
+        remark = (
+            f"{self.path.name}: format {self.format} stored another factor of {base.estimator} with considered "
+            "parameters; it is folded from the mean and covariance at its first event, detectors start anew"
+        )
+        return base._replace(estimator="", state=None, evidence=None, doubt=None), remark
 
 
 def read_recording(path: Path) -> Recorded:
@@ -108,6 +129,7 @@ def read_recording(path: Path) -> Recorded:
         first=start,
         rows=len(events),
         closed=finished(path),
+        format=int(header["format"]),
     )
 
 

@@ -8,6 +8,7 @@ import shutil
 import struct
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
@@ -95,38 +96,104 @@ class Disk:
 
 @dataclass(frozen=True)
 class Split:
-    """A part ends at `size` bytes or after `seconds`, whichever comes first."""
+    """A part ends at `size` bytes, after `seconds`, or with the day if `daily`, whichever comes first.
+
+    Recordings of the same name are removed, oldest first, beyond `kept_bytes` in total and after `kept_seconds`.
+    """
 
     size: float = math.inf
     seconds: float = math.inf
+    daily: bool = False
+    kept_bytes: float = math.inf
+    kept_seconds: float = math.inf
 
 
 NEVER = Split()
 
+DAY = "day"  # Split at midnight
 
-def parse_split(text: str) -> Split:
-    """Parse `1GB` or `10min`.
+DATE = re.compile("%[YmdHMSj]")
+"""Date in the name of a recording, as of strftime: local time."""
+
+
+def parse_split(text: str | None, keep: str | None = None) -> Split:
+    """Parse `1GB`, `10min` or `day`, or several of them, for example `1GB,day`; `keep` is a size or a duration.
 
     Raises:
-        ConfigError: If it is neither a size nor a duration, or too small.
+        ConfigError: If one of them is wrong, or too small.
     """
+    parts = [] if text is None else [part.strip() for part in text.split(",")]
+    each = [_parse_limit("--record-split", part, f" or {DAY}") for part in parts if part != DAY]
+    kept_size, kept_seconds = (math.inf, math.inf) if keep is None else _parse_limit("--record-keep", keep)
+    size, seconds = (min([math.inf, *values]) for values in zip(*each, (math.inf, math.inf), strict=True))
+    return Split(size, seconds, DAY in parts, kept_size, kept_seconds)
+
+
+def _parse_limit(option: str, text: str, more: str = "") -> tuple[float, float]:
+    """Return a size in bytes and a duration in s, of which one is infinite."""
     match = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([a-zA-Z]+)\s*", text)
     number, unit = (float(match[1]), match[2]) if match else (math.nan, "")
     size = next((bytes_ for name, bytes_ in SIZES.items() if name.lower() == unit.lower()), None)
     if size is not None and MIN_PART_BYTES <= number * size < math.inf:
-        return Split(size=number * size)
+        return number * size, math.inf
     if unit in TIMES and MIN_PART_S <= number * TIMES[unit] < math.inf:
-        return Split(seconds=number * TIMES[unit])
+        return math.inf, number * TIMES[unit]
     raise ConfigError(
-        f"--record-split {text}: must be a size of 100kB or more ({', '.join(SIZES)}) or a time of 1s or more "
-        f"({', '.join(TIMES)}), for example 1GB or 10min"
+        f"{option} {text}: must be a size of 100kB or more ({', '.join(SIZES)}) or a time of 1s or more "
+        f"({', '.join(TIMES)}){more}, for example 1GB or 10min"
     )
 
 
+def check_date(path: Path) -> None:
+    """Reject a name with a `%` that is no part of a date.
+
+    Raises:
+        ConfigError: If there is one.
+    """
+    rest = DATE.sub("", str(path))
+    if "%" in rest:
+        raise ConfigError(f"--record {path}: {rest[rest.index('%') :][:2]} is no part of a date; use %Y %m %d %H %M %S")
+
+
 def part_path(path: Path, number: int) -> tuple[Path, int]:
-    """Return the path of a part and its number: the first at `path`, later ones numbered, skipping taken names."""
+    """Return the path of a part and its number: the first at `path`, later ones numbered, skipping taken names.
+
+    Each part of a path with a date has its own date, and a number if that is taken.
+    """
+    dated = Path(DATE.sub(lambda part: time.strftime(part[0]), str(path)))
+    if dated != path:
+        number = 1
     while True:
-        part = path if number == 1 else path.with_name(f"{path.stem}-{number}{path.suffix}")
-        if number == 1 or not (part.is_symlink() or part.exists()):
+        part = dated if number == 1 else dated.with_name(f"{dated.stem}-{number}{dated.suffix}")
+        if (number == 1 and dated == path) or not (part.is_symlink() or part.exists()):
             return part, number
         number += 1
+
+
+def surplus_parts(path: Path, split: Split, writing: Path) -> list[Path]:
+    """Return the recordings of the same name beyond the limits of a split, oldest first; `writing` is none of them."""
+    if split.kept_bytes == split.kept_seconds == math.inf:
+        return []
+    absolute, depth = path.absolute(), 0
+    folder = absolute.parent
+    while DATE.search(str(folder)):
+        folder, depth = folder.parent, depth + 1
+    pieces = re.split(f"({DATE.pattern})", str(absolute.with_suffix("")))
+    name = re.compile("".join(map(_digits, pieces)) + rf"(-\d+)?{re.escape(path.suffix)}")
+    found = []
+    for file in folder.glob("*/" * depth + f"*{path.suffix}"):
+        if file != writing.absolute() and not file.is_symlink() and name.fullmatch(str(file)):
+            with suppress(OSError):
+                found.append((file.stat().st_mtime, file.stat().st_size, file))
+    surplus, total = [], float(writing.stat().st_size if writing.exists() else 0)
+    for written, size, file in sorted(found, reverse=True):
+        total += size
+        if total > split.kept_bytes or time.time() - written > split.kept_seconds:
+            surplus.append(file)
+    return surplus[::-1]
+
+
+def _digits(piece: str) -> str:
+    """Return the regular expression of a piece of a name."""
+    widths = {"%Y": 4, "%j": 3}
+    return rf"\d{{{widths.get(piece, 2)}}}" if DATE.fullmatch(piece) else re.escape(piece)

@@ -21,7 +21,7 @@ from estimators.errors import NisusError, SourceError
 
 from ...live.notices import Notice
 from ...live.outputs import Cursor, Pull
-from .rrd_file import NEVER, Disk, Split, part_path
+from .rrd_file import DATE, NEVER, Disk, Split, part_path, surplus_parts
 
 if TYPE_CHECKING:
     from estimators.diagnostics.episodes import Episode
@@ -74,11 +74,15 @@ class Recorder:
 
     @property
     def writing(self) -> Path | None:
-        """Path of the file that is being written, or is next; of a split recording its last part."""
+        """Path of the file that is being written, or is next; of a split recording its last part.
+
+        A dated one is known once it is open.
+        """
         part = self._open
         if part is not None:
             return part.file.path
-        return next((path for path in (self._taken, *tuple(self._asked)) if path is not None), None)
+        known = (path for path in (self._taken, *tuple(self._asked)) if path is not None)
+        return next((path for path in known if not DATE.search(str(path))), None)
 
     @property
     def written(self) -> list[Path]:
@@ -115,7 +119,8 @@ class Recorder:
                     self._finish(self._open)
                 if self._open is None and wanted is not None:
                     self._open = RecordingPart(self._engine, wanted, self._draw)
-                    self._engine.notices.say(f"recording into {wanted}")
+                    self._engine.notices.say(f"recording into {self._open.file.path}")
+                    self._remove_surplus(self._open)
                 if self._open is not None:
                     self._go_on(self._open)
             except NisusError as error:
@@ -148,6 +153,16 @@ class Recorder:
             self._finish(part, goes_on=True)
             self._open = RecordingPart(self._engine, part.asked, self._draw, before=part)
             self._engine.notices.say(f"recording on into {self._open.file.path}")
+            self._remove_surplus(self._open)
+
+    def _remove_surplus(self, part: RecordingPart) -> None:
+        for path in surplus_parts(part.asked, self._split, part.file.path):
+            try:
+                path.unlink()
+            except OSError as error:
+                self._engine.notices.report("kept recording", f"{path}: it cannot be removed ({error.strerror})")
+                continue
+            self._engine.notices.say(f"removed {path}, beyond --record-keep")
 
     def _finish(self, part: RecordingPart, *, short: bool = False, goes_on: bool = False) -> None:
         part.end(short=short)
@@ -210,11 +225,15 @@ class RecordingPart:
         self._turned: float | None = None
         try:
             self.file = RecordingFile(path, twin, self._base)
+            # A process that is killed keeps these; the first charts of a process take seconds.
+            self._write_events()
+            self.file.flush()
             self._drawing = draw(self.file.stream)
         except BaseException:
             self.release()
             raise
         self._begun = self._drawn = time.monotonic()
+        self._day = time.localtime()[:3]
         self._opening = 0
 
     def write(self, *, last: bool = False) -> None:
@@ -239,7 +258,8 @@ class RecordingPart:
         """Return whether the next part should begin; not while this one holds little but its header."""
         grown = self.file.size - self._opening
         large = self.file.size >= split.size and grown >= split.size / 2
-        return large or time.monotonic() - self._begun >= split.seconds
+        over = split.daily and time.localtime()[:3] != self._day
+        return large or over or time.monotonic() - self._begun >= split.seconds
 
     def _write_events(self) -> None:
         for pull in self._pulls(self._events):

@@ -1,4 +1,4 @@
-"""Viser: the scene of the page, and the same scene with a small panel in a window of its own."""
+"""Viser: the scene of the page, in a frame or in a window of its own."""
 
 from __future__ import annotations
 
@@ -13,9 +13,7 @@ from estimators.diagnostics.references import shown_track
 
 from ...live.running_fold import Running
 from ...present.drawing.colors import THEMES
-from ...present.series.series import Series
 from .guarded_server import addresses, guarded_server, unprinted
-from .panel import Panel
 from .scene import History
 from .stage import FIELD_SCENES, Stage
 
@@ -35,8 +33,8 @@ MAX_PULL_ROWS = 16_384
 class ViserView:
     """Pulls rows from the engine at its own rate, with a cursor of its own, so that the engine never waits.
 
-    Without a browser it pulls, computes and sends nothing. The address of a browser's WebSocket has its options:
-    `?part=scene` for the scene without the panel, and `theme=dark`.
+    Without a browser it pulls, computes and sends nothing. The address of a browser's WebSocket has its theme:
+    `?theme=dark`.
 
     Browsers reach `port` through the page's server only, which has `secret`.
     """
@@ -46,12 +44,10 @@ class ViserView:
         self.server = guarded_server(secret, engine.twin.title)
         self.port: int = self.server.get_port()
         self.stage = Stage(self.server, engine)
-        self.panel = Panel(self.server, engine, self.stage)
         model, large = engine.model, engine.model.grid is not None
         limit = 4096 if large else 32_768
         self.history = History(len(model.shown), model.width, limit)
         self.history.span = int(engine.twin.config.view.window * 1e9)
-        self._series = Series(engine)
         self._rows = min(MAX_PULL_ROWS, limit)
         self._cursor: Any = None
         self._past: tuple[int, int] | None = None
@@ -73,8 +69,8 @@ class ViserView:
         with unprinted():
             self.server.stop()
 
-    def frame(self, *, panel: bool = True) -> None:
-        """Update the scene, and the panel if a browser shows it, to the engine's present state."""
+    def frame(self) -> None:
+        """Update the scene to the engine's present state."""
         with self.server.atomic():
             at = self.stage.choices.at
             if self.stage.prepare() or (self._cursor is None) != (at is not None):
@@ -84,15 +80,12 @@ class ViserView:
             changed = (self._pull() if at is None else self._look_back(at)) or self.stage.due
             if changed:
                 self.stage.draw(self.history, at)
-            if panel:
-                self.panel.sync(self._series.origin())
 
     def _rest(self) -> None:
         """Forget all rows, and the cursor."""
         if self._cursor is not None:
             self.engine.release(self._cursor)
             self._cursor = None
-            self.panel.nis.close()
         self._past = None
         self.history.clear()
 
@@ -124,18 +117,18 @@ class ViserView:
         self.history.take(replace(pull, track=shown_track(self.engine.model, pull.track)))
         self.history.trim()
 
-    def _waits(self, now: float, there: Sequence[str]) -> bool:
+    def _waits(self, now: float) -> bool:
         """Return whether the scene waits for the charts beside it, until the edited slider rests."""
         tuning = self.engine.tuning
         if tuning is not self._tuning:
             self._tuning, self._turned = tuning, now
-        return _scene_alone(there) and now - self._turned < EDIT_REST_S and now - self._drawn < MAX_EDIT_WAIT_S
+        return now - self._turned < EDIT_REST_S and now - self._drawn < MAX_EDIT_WAIT_S
 
     def _look(self, there: Sequence[str]) -> None:
         """Draw for the connected browsers, whose addresses have these queries."""
         # Two browsers may differ; the scene has the colours of the last one's theme.
         self.stage.palette = THEMES.get(parse_qs(there[-1]).get("theme", ["light"])[0], THEMES["light"])
-        self.frame(panel=not _scene_alone(there))
+        self.frame()
 
     def _run(self) -> None:
         due = time.monotonic()
@@ -145,7 +138,7 @@ class ViserView:
                 self._rest()
                 continue
             now = time.monotonic()
-            if now >= due and not self._waits(now, there):
+            if now >= due and not self._waits(now):
                 self._drawn, begun = now, time.thread_time()
                 try:
                     self._look(there)
@@ -153,8 +146,3 @@ class ViserView:
                     self.engine.notices.report("view error", f"view error: {type(error).__name__}: {error}", "error")
                 # CPU time of this thread, not the time it waited.
                 due = now + min(MAX_FRAME_PERIOD_S, max(FRAME_PERIOD_S, (time.thread_time() - begun) / MAX_CPU_SHARE))
-
-
-def _scene_alone(there: Sequence[str]) -> bool:
-    """Return whether no browser shows the panel."""
-    return all(parse_qs(query).get("part") == ["scene"] for query in there)

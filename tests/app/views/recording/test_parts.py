@@ -5,7 +5,9 @@ import shutil
 import signal
 import subprocess
 import sys
+import time
 from collections import namedtuple
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,14 +18,18 @@ import app.views.recording.writer
 from app.cli.main import main
 from app.live import commands
 from app.live.engine import Engine
-from app.views.recording.format import tuning_from_json
-from app.views.recording.reader import finished, read_recording
+from app.live.fold_json import tuning_from_json
+from app.views.recording.format import FORMAT, RecordingFile
+from app.views.recording.reader import Recorded, finished, read_recording
 from app.views.recording.rrd_file import NEVER, Split, parse_split
 from app.views.recording.writer import Recorder, RecordingPart
 from app.web.server import command_from_json
 from estimators.errors import ConfigError
 from estimators.fold import Fold
 from estimators.log import Log
+from estimators.model.assemble import JointParameter, joint
+from estimators.model.instruments import Instrument, with_instruments
+from estimators.tuning import Tuning
 from sources.merged import MemorySource
 from tests.app.scripted import MODEL, Scripted, Stepped, pull_all, readings, twin, wait_for
 from tests.conftest import ROOT
@@ -113,6 +119,36 @@ def reviewed(recorded):
         return pull_all(engine).track
     finally:
         engine.stop()
+
+
+@pytest.mark.parametrize("estimator", ["sr-ekf", "sr-kf", "sr-ukf"])
+def test_a_factor_of_an_older_format_is_replaced_by_its_moments(tmp_path, estimator):
+    """The upper factor of the whole covariance, as format 2 has it, in the place of the bordered one."""
+    own = with_instruments(MODEL, {"winding": Instrument(offset=(0.0,))})
+    model = joint(own, {"winding_offset": JointParameter(0.5, considered=True)})
+    log = Log(model.width)
+    log.extend(readings(TIMES[:400], VALUES[:400]))
+    whole = Fold(estimator, model, Tuning.of(model), log)
+    whole.advance()
+    at, base = whole.base_at(200)
+    mean, cov = base.mean, base.cov
+    old = np.concatenate([mean, np.linalg.cholesky(cov).T.ravel()])
+    state = base.state.copy()
+    state[: old.size] = old
+    for number, left in ((2, base._replace(state=state)), (FORMAT, base)):
+        recorded = Recorded(
+            tmp_path / "old.rrd", "", "", tmp_path, {}, None, left, "", 1, log.events, [], [], at, 0, True, number
+        )
+        resumed, remark = recorded.base_for(model)
+        assert ("old.rrd: format 2" in remark and estimator in remark) if number == 2 else not remark
+        rest = log.copy()
+        rest.drop_front(at)
+        fold = Fold(estimator, model, Tuning.of(model), rest, base=resumed)
+        fold.advance()
+        # As the filters equal the equations: to 1e-9 of the largest.
+        np.testing.assert_allclose(fold.track.mean, whole.track.mean[at:], rtol=0, atol=1e-9 * np.max(VALUES))
+        np.testing.assert_allclose(fold.track.std, whole.track.std[at:], rtol=1e-9)
+        assert Recorded.base_for(recorded, MODEL)[0] is left
 
 
 def written(path, entity="/nisus/events"):
@@ -221,13 +257,19 @@ def test_an_edit_while_a_part_is_begun_reviews_to_the_same_bits(start, tmp_path)
     assert_same(refold(third).select(slice(1000, None)), last.track.select(slice(third.first + 1000, end)))
 
 
+def test_a_part_has_its_events_before_its_first_chart(tmp_path):
+    """The first charts of a process take seconds, in which it may be killed."""
+    path, stepped, found = tmp_path / "run.rrd", Stepped(50), []
+    part = RecordingPart(stepped.engine, path, lambda stream: found.append(read_recording(path).events))
+    part.abandon()
+    np.testing.assert_array_equal(found[0].value, pull_all(stepped.engine).events.value)
+
+
 def test_an_edit_between_a_pull_and_its_tuning_is_written_once(tmp_path, monkeypatch):
-    stepped = Stepped(50)
-    part, written = RecordingPart(stepped.engine, tmp_path / "run.rrd", lambda stream: None), []
+    stepped, written = Stepped(50), []
     pull = stepped.engine.pull
     before = stepped.engine.tuning.get("Q.rate")
-    monkeypatch.setattr(part, "_drawing", lambda pull: None)
-    monkeypatch.setattr(part.file, "tuning", lambda tuning, *at: written.append((at[-1], tuning.get("Q.rate"))))
+    monkeypatch.setattr(RecordingFile, "tuning", lambda _, now, *at: written.append((at[-1], now.get("Q.rate"))))
 
     def pull_then_edit(*request):
         found = pull(*request)
@@ -236,6 +278,7 @@ def test_an_edit_between_a_pull_and_its_tuning_is_written_once(tmp_path, monkeyp
         return found
 
     monkeypatch.setattr(stepped.engine, "pull", pull_then_edit)
+    part = RecordingPart(stepped.engine, tmp_path / "run.rrd", lambda stream: lambda pull: None)
     part.write()
     part.write()
     assert written == [(0, before), (1, 0.5)]
@@ -341,6 +384,7 @@ def test_a_fast_growing_file_is_warned_of_by_its_rate(tmp_path, monkeypatch):
         ("500 mb", Split(size=5e8)),
         ("10min", Split(seconds=600.0)),
         ("1.5h", Split(seconds=5400.0)),
+        ("1GB, day", Split(size=1e9, daily=True)),
     ],
 )
 def test_a_split_is_a_size_or_a_time(text, split):
@@ -352,6 +396,41 @@ def test_what_is_no_split_is_one_line(text, capsys):
     assert main(["run", "motor_winding", "--headless", "--record", "x.rrd", f"--record-split={text}"]) == 2
     said = capsys.readouterr().err
     assert "must be a size of 100kB or more" in said and said.count("\n") == 1
+
+
+def test_parts_of_a_dated_name_have_their_date_and_the_oldest_are_removed(start, tmp_path, monkeypatch):
+    """Another day begins while the twin records; a name that is taken by an earlier process gets a number."""
+    clock = SimpleNamespace(now=time.struct_time((2026, 11, 23, 23, 59, 0, 0, 327, 0)))
+    for module in (app.views.recording.rrd_file, app.views.recording.writer):
+        monkeypatch.setattr(module.time, "localtime", lambda *_: clock.now, raising=True)
+    strftime = time.strftime
+    monkeypatch.setattr(app.views.recording.rrd_file.time, "strftime", lambda form: strftime(form, clock.now))
+    days = tmp_path / "11"
+    days.mkdir()
+    names = ["run-20261101.rrd", "run-20261123.rrd", "run-20261123-2.rrd", "run-2026112x.rrd", "other-20261101.rrd"]
+    for age, name in enumerate(reversed(names)):
+        (days / name).write_bytes(bytes(60_000))
+        os.utime(days / name, (1e9 + age * 1000.0,) * 2)
+    os.utime(days / names[0], (1e8,) * 2)
+    source, engine, _ = start(split=parse_split("day", "150kB"))
+    engine.submit(commands.Record(tmp_path / "%m" / "run-%Y%m%d.rrd"))
+    source.put(readings(TIMES[:100], VALUES[:100]))
+    wait_for(lambda: any("removed" in line.text for line in engine.notices.since(0)))
+    clock.now = time.struct_time((2026, 11, 24, 0, 0, 0, 1, 328, 0))
+    source.put(readings(TIMES[100:200], VALUES[100:200]))
+    wait_for(lambda: len(engine.recorder.written) == 2)
+    assert [path.name for path in engine.recorder.written] == ["run-20261123-3.rrd", "run-20261124.rrd"]
+    engine.recorder.record(None)
+    wait_for(lambda: len(engine.recorder.finished) == 2)
+    assert read_recording(days / "run-20261123-3.rrd").rows >= 100
+    left = {path.name for path in days.iterdir()}
+    assert "run-20261101.rrd" not in left and {"run-2026112x.rrd", "other-20261101.rrd"} < left
+
+
+@pytest.mark.parametrize(("name", "part"), [("run-%D.rrd", "%D"), ("50%.rrd", "%."), ("run-%", "%")])
+def test_a_name_with_another_part_than_a_date_is_one_line(nisus, name, part):
+    line = nisus.refuses("run", "motor_winding", "--headless", "--record", f"{name.removesuffix('.rrd')}.rrd")
+    assert f"{part} is no part of a date; use %Y" in line or part == "%"
 
 
 GROWTH = """
@@ -399,7 +478,7 @@ def test_a_terminal_that_closes_leaves_a_whole_recording(name, tmp_path):
     try:
         wait_for(lambda: path.exists() and path.stat().st_size > 2000, 120.0)
         os.kill(child.pid, getattr(signal, name))
-        assert child.wait(60.0) == 0
+        assert child.wait(180.0) == 0
     finally:
         child.kill()
     assert finished(path) and read_recording(path).rows > 0

@@ -12,9 +12,10 @@ import rerun as rr
 
 from app.live import commands
 from app.live.engine import Engine
+from app.live.fold_json import tuning_from_json
 from app.live.outputs import Pull
 from app.views.recording import writer
-from app.views.recording.format import RecordingFile, tuning_from_json
+from app.views.recording.format import RecordingFile
 from app.views.recording.reader import finished, read_recording
 from app.views.recording.writer import Recorder
 from app.views.viser.scene import History

@@ -1,13 +1,11 @@
-"""Viser against an engine without threads: who may connect, what an edit submits, what is shown and drawn."""
+"""Viser against an engine without threads: who may connect, and what is drawn."""
 
 import asyncio
 import base64
 import http.client
 import os
-import re
 import socket
 import threading
-from contextlib import contextmanager
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -17,11 +15,8 @@ import viser
 import websockets
 from viser import _messages
 
-from app.live.commands import SetEstimator, SetTuning
-from app.present.drawing.colors import DARK, LIGHT
-from app.views.viser import panel
+from app.present.drawing.colors import LIGHT
 from app.views.viser.guarded_server import HEADER, addresses, guarded_server
-from app.views.viser.panel import SIGNS, error_html, status_html
 from app.views.viser.scene import History
 from app.views.viser.vehicle_scene import VehicleScene
 from app.views.viser.view import EDIT_REST_S, ViserView
@@ -29,12 +24,9 @@ from config.schema import SceneSection, ViewSection
 from estimators.log import READING, TRUTH, Events
 from estimators.models import MODELS
 from estimators.numerics.peaks import Peak
-from estimators.track import DIVERGED, HEALTH_NAMES, SUSPECT
-from tests.app.scripted import events, fresh_status, viewed, wait_for
-from tests.support import SECOND
+from tests.app.scripted import events, viewed, wait_for
 
 WINDING = MODELS["motor_winding"]
-BROWSER = SimpleNamespace(client_id=0)
 
 
 def history(n=60, seed=0):
@@ -54,14 +46,7 @@ def engine():
 
 
 @pytest.fixture
-def view(engine, monkeypatch):
-    monkeypatch.setattr(panel, "CHART_PERIOD_S", 0.0)
-    with shown(engine) as view:
-        yield view
-
-
-@contextmanager
-def shown(engine):
+def view(engine):
     """A view that has drawn one frame."""
     view = ViserView(engine, secret="s3cret")
     try:
@@ -69,13 +54,6 @@ def shown(engine):
         yield view
     finally:
         view.stop()
-
-
-def edit(handle, value):
-    """What Viser does when a browser sends a value: set it, then call back with that browser."""
-    handle._impl.value = value
-    for callback in handle._impl.update_cb:
-        callback(viser.GuiEvent(BROWSER, 0, handle))
 
 
 # Who may connect
@@ -125,130 +103,20 @@ def test_serve_is_restored_and_the_tunnel_gone(guarded):
         assert raw.getpeername()[0] == "127.0.0.1"
 
 
-# The panel
-
-
-def test_an_edit_submits_its_command(view, engine):
-    handles = view.panel.controls.handles
-    edit(handles["Q.rate"], 1.0)
-    edit(handles["estimator"], "Unscented Kalman filter")
-    edit(handles["gate"], "99 %")
-    edit(handles["gate"], "off")
-    assert engine.commands == [
-        SetTuning("Q.rate", 0.01), SetEstimator("ukf"), SetTuning("gate", 0.99), SetTuning("gate", None),
-    ]  # fmt: skip
-
-
-def test_the_controls_follow_the_engine_without_an_echo(view, engine):
-    """As after a change by another browser or the API."""
-    engine.submit(SetTuning("Q.rate", 0.1))
-    engine.submit(SetEstimator("ukf"))
-    count = len(engine.commands)
-    view.frame()
-    handles = view.panel.controls.handles
-    assert handles["Q.rate"].value == pytest.approx(2.0)
-    assert handles["estimator"].value == "Unscented Kalman filter"
-    assert "revision 2" in view.panel.status.content
-    assert len(engine.commands) == count
-
-
-def test_slow_engine_does_not_snap_the_slider_back(view, engine, monkeypatch):
-    monkeypatch.setattr(engine, "submit", engine.commands.append)
-    slider = view.panel.controls.handles["Q.rate"]
-    edit(slider, 1.0)
-    view.frame()
-    assert slider.value == 1.0
-    monkeypatch.setattr(panel, "EDIT_HOLD_S", 0.0)
-    view.frame()
-    assert slider.value == 0.0, "an edit that the engine did not take must not stay on the panel"
-
-
-def test_a_variance_of_zero_has_no_slider():
-    """Powers of ten from zero lead nowhere; the page has a field for it."""
-    row = replace(WINDING.sensors[0].rows[0], variance=0.0)
-    exact = replace(
-        WINDING,
-        states=(replace(WINDING.states[0], std=0.0), WINDING.states[1]),
-        sensors=(replace(WINDING.sensors[0], rows=(row,)),),
-    )
-    engine = viewed(exact)
-    engine.put(history())
-    with shown(engine) as view:
-        assert list(view.panel.controls.handles) == ["estimator", "gate", "Q.temperature", "Q.rate"]
-
-
-def test_the_status_has_a_sign_a_cause_and_no_markup_of_others():
-    assert set(SIGNS) == set(HEALTH_NAMES) and len(set(SIGNS.values())) == len(SIGNS)
-    status = replace(
-        fresh_status(viewed(WINDING)), health=SUSPECT, since=3 * SECOND, t=9 * SECOND, episodes_open=3,
-        cause="winding reads 3 °C < the prediction",
-    )  # fmt: skip
-    text = re.sub(r"<[^>]+>", " ", status_html(status, SECOND))
-    for part in ("◐ suspect since 2.0 s", "revision 0", "8.0 s", "&lt; the prediction (2 more)"):
-        assert part in text
-    assert "contradict the estimate" in status_html(replace(status, health=DIVERGED, cause=""), SECOND)
-    assert "&lt;script&gt;" in error_html("<script>")
-
-
 # What is drawn
 
 
-def test_the_chart_holds_nis_in_its_bounds(view, engine):
-    track, t = engine._fold.track, engine._log.events.t
-    x, high, low, mean, ends = view.panel.nis.handle.data
-    first = int(np.flatnonzero(~np.isfinite(track.nis_mean))[-1]) + 1 if np.isnan(track.nis_mean).any() else 0
-    assert x[-1] == pytest.approx((t[-1] - t[0]) * 1e-9) and x.size <= 200
-    assert (mean.min(), mean.max()) == (track.nis_mean[first:].min(), track.nis_mean[first:].max())
-    assert low.min() == track.nis_low[first:].min()
-    assert high.max() == track.nis_high[first:].max() < ends.max()
-
-
-def test_the_chart_has_at_most_200_points_and_keeps_extremes(view, engine):
-    rng = np.random.default_rng(4)
-    t = 70.0 + 0.01 * np.arange(5000)
-    engine.put(events(WINDING, READING, 0, t, 45.0 + rng.normal(0, 2, t.size)))
-    view.frame()
-    x, high, low, mean, ends = view.panel.nis.handle.data
-    recent = engine._log.events.t >= engine._log.events.t[-1] - int(ViewSection().window * 1e9)
-    nis = engine._fold.track.nis_mean[recent]
-    assert 50 < x.size <= 200 and np.all(np.diff(x) >= 0)
-    assert (mean.min(), mean.max()) == (nis.min(), nis.max())
-
-
-def test_the_chart_is_drawn_at_a_bounded_rate(view, engine, monkeypatch):
-    drawn = []
-    monkeypatch.setattr(panel, "CHART_PERIOD_S", 1e9)
-    monkeypatch.setattr(view.panel.nis, "draw", drawn.append)
-    for k in range(20):
-        engine.put(events(WINDING, READING, 0, [80.0 + k], [45.0]))
-        view.frame()
-    assert len(drawn) <= 1
-
-
-def test_only_what_is_seen_is_kept_up(view, engine):
-    """A browser that shows the scene alone costs no panel; one without it does."""
-    engine.put(events(WINDING, READING, 0, [90.0], [45.0]))
-    shown = view.panel.status.content
-    view._look(["part=scene&theme=dark"])
-    assert view.panel.status.content == shown and view.stage.palette is DARK
-    view._look(["part=scene&theme=dark", "theme=light"])
-    assert view.panel.status.content != shown and view.stage.palette is LIGHT
-    assert "89.0 s" in view.panel.status.content
-
-
 def test_the_scene_waits_until_a_knob_rests_but_not_for_ever(view, engine):
-    scene, both = ["part=scene"], ["part=scene", "theme=light"]
     view._drawn = 100.0
-    assert not view._waits(100.0, scene)
+    assert not view._waits(100.0)
     engine.tuning = engine.tuning.set("R.winding", 2.0)
-    assert not view._waits(100.1, both)
-    assert view._waits(100.1, scene) and view._waits(100.0 + 0.9 * EDIT_REST_S, scene)
-    assert not view._waits(100.1 + EDIT_REST_S, scene)
+    assert view._waits(100.1) and view._waits(100.0 + 0.9 * EDIT_REST_S)
+    assert not view._waits(100.1 + EDIT_REST_S)
     # A drag: something new ten times a second.
     turned = []
     for k in range(1, 30):
         engine.tuning = engine.tuning.set("R.winding", 2.0 + k)
-        turned.append(view._waits(101.0 + 0.1 * k, scene))
+        turned.append(view._waits(101.0 + 0.1 * k))
         if not turned[-1]:
             view._drawn = 101.0 + 0.1 * k
     assert 2 <= turned.count(False) <= 4
@@ -265,7 +133,7 @@ def test_nobody_there_nothing_pulled(engine, monkeypatch):
 
     async def browse():
         async with websockets.connect(
-            f"ws://127.0.0.1:{view.port}/?part=scene&theme=dark",
+            f"ws://127.0.0.1:{view.port}/?theme=dark",
             additional_headers={HEADER: "s3cret"},
             subprotocols=[f"viser-v{viser.__version__}"],
             compression=None,
@@ -283,7 +151,7 @@ def test_nobody_there_nothing_pulled(engine, monkeypatch):
         browser.start()
         assert connected.wait(30)
         wait_for(lambda: view.history.n == engine._log.n)
-        assert addresses(view.server) == ["part=scene&theme=dark"] and pulled
+        assert addresses(view.server) == ["theme=dark"] and pulled
         leave.set()
         assert gone.wait(30)
         browser.join()
