@@ -59,7 +59,7 @@ class ChecklistLine(NamedTuple):
 class Checked:
     """All measurements on a twin. `span` is the part of the log, from its start, that was folded, s; None: all.
 
-    sensitivity: to faults that are present from the prior on; onset: to those that begin now, see `sensitivities`.
+    sensitivity: to faults that are present from the prior on; onsets: to those that begin later, see `sensitivities`.
     """
 
     twin: Twin
@@ -73,7 +73,7 @@ class Checked:
     tails: tuple[Tail, ...]
     gramian: Gramian
     sensitivity: Sensitivity
-    onset: Sensitivity
+    onsets: tuple[Sensitivity, ...]
     arrivals: tuple[Arrivals, ...]
     calibration: list[Calibration]
     episodes: list[Episode]
@@ -103,7 +103,7 @@ def check(twin: Twin, log: Log, counts: Counter[str]) -> Checked:
     measured = Measured(twin, log)
     readings = int(np.sum(log.kind[: log.n] == READING))
     covariance = fold.estimator.family not in ("particle", "ensemble")
-    present, onset = sensitivities(twin.estimator, model, tuning, log, false_alarm=twin.policy.false_alarm_every)
+    present, *onsets = sensitivities(twin.estimator, model, tuning, log, false_alarm=twin.policy.false_alarm_every)
     return Checked(
         twin=twin,
         log=log,
@@ -116,7 +116,7 @@ def check(twin: Twin, log: Log, counts: Counter[str]) -> Checked:
         tails=tails(model, log, fold.track, marginal=fold.marginal),
         gramian=measured.gramian,
         sensitivity=present,
-        onset=onset,
+        onsets=tuple(onsets),
         arrivals=tuple(item for s, item in enumerate(arrivals(model, log)) if s in twin.plan.fed or item.n),
         calibration=calibration_of(fold, fold.log.events, fold.track),
         episodes=episodes(fold),
@@ -148,6 +148,20 @@ def confounded(found: Sensitivity) -> list[tuple[str, str, float]]:
     return sorted((pair for pair in pairs if abs(pair[2]) > MAX_CORRELATION), key=lambda pair: -abs(pair[2]))
 
 
+def hidden_together(found: Sensitivity, one: str, other: str, correlation: float) -> str:
+    """Return the largest undetectable faults at once of a pair of `confounded`, whose effects cancel, in words."""
+    nudges = [nudge.subject for nudge in found.nudges]
+    pair = [found.nudges[nudges.index(name)] for name in (one, other)]
+    root = [1.0 / float(np.sqrt(found.fisher[k, k])) for k in map(nudges.index, (one, other))]
+    sizes = root[0], float(np.sign(correlation)) * root[1]
+    multiple = found.multiple((nudge.kind, nudge.name, size) for nudge, size in zip(pair, sizes, strict=True))
+    ends = [nudge.high if size > 0.0 else nudge.low for nudge, size in zip(pair, sizes, strict=True)]
+    multiple = min(multiple, *(end / size for end, size in zip(ends, sizes, strict=True)))
+    if not np.isfinite(multiple):
+        return "without limit"
+    return " with ".join(nudge.in_words(multiple * size) for nudge, size in zip(pair, sizes, strict=True))
+
+
 def stamps(twin: Twin) -> str:
     """Return the origin of the times of the measurements."""
     source = twin.config.source
@@ -161,8 +175,9 @@ def figures(checked: Checked, checklist: Sequence[ChecklistLine]) -> dict[str, A
     """Return all figures of a check; times in seconds of the log, null where there is no number.
 
     `checklist`: question, answer (yes, partly, no, not told), figures, remedy. `observability`: the Gramian of the log
-    and of each window, and pairs of faults that the log hardly distinguishes. `smallest_visible`: minimal detectable
-    size of every fault, null if there is none in its range, and the undetectable range `low` to `high`. `integrity`:
+    and of each window, and pairs of faults that the log hardly distinguishes, with the largest undetectable `together`.
+    `smallest_visible`: minimal detectable size of every fault, null if there is none in its range, and the undetectable
+    range `low` to `high`. `integrity`:
     protection level of each state beside 2 σ, and its fault. Both are the worse of faults that begin "now" and those
     present from the "prior" on (`begin`), over `window` seconds. `held_out`: prediction of each
     sensor row by the others. `open_loop`: RMS without measurements, by sensor row and by state with known truth;
@@ -185,7 +200,7 @@ def figures(checked: Checked, checklist: Sequence[ChecklistLine]) -> dict[str, A
 
     integrity: dict[str, Any] = {"reason": found.reason, "states": {}}
     if not found.reason:
-        bounds = bounds_of(twin.model, found, checked.onset)
+        bounds = bounds_of(twin.model, found, *checked.onsets)
         integrity |= {
             "note": found.note,
             "estimator": found.estimator,
@@ -203,7 +218,15 @@ def figures(checked: Checked, checklist: Sequence[ChecklistLine]) -> dict[str, A
                 "note": gramian.note,
                 "whole": None if gramian.whole is None else view(gramian.whole),
                 "windows": [view(part) for part in gramian.windows],
-                "blame": [dict(zip(("one", "other", "correlation"), pair, strict=True)) for pair in confounded(found)],
+                "blame": [
+                    {
+                        "one": pair[0],
+                        "other": pair[1],
+                        "correlation": pair[2],
+                        "together": hidden_together(found, *pair),
+                    }
+                    for pair in confounded(found)
+                ],
                 "deviation": {
                     nudge.subject: value for nudge, value in zip(found.nudges, found.among().deviation, strict=False)
                 },
@@ -218,7 +241,7 @@ def figures(checked: Checked, checklist: Sequence[ChecklistLine]) -> dict[str, A
                     "begin": one.begin,
                     "window": one.window,
                 }
-                for fault, one in worse_faults(found, checked.onset)
+                for fault, one in worse_faults(found, *checked.onsets)
             ],
             "integrity": integrity,
             "held_out": {
@@ -320,10 +343,11 @@ def _fault_topics(checked: Checked) -> list[Topic]:
         "Faults that are hard to distinguish",
     )
     if found.reason:
-        levels, smallest, alike = (Topic(title, (f"Not computed: {found.reason}.",)) for title in titles)
+        unknown = f"Not computed: {found.reason}. Any fault may stay undetected."
+        levels, smallest, alike = (Topic(title, (unknown,)) for title in titles)
     else:
         note = f"{found.note}." if found.note else ""
-        bounds = bounds_of(model, found, checked.onset)
+        bounds = bounds_of(model, found, *checked.onsets)
         levels = _table(
             titles[0],
             ("state", "unit", "± 2 σ", "integrity bound", "by", "begins", "lasts, s"),
@@ -346,12 +370,12 @@ def _fault_topics(checked: Checked) -> list[Topic]:
                     moves,
                     BEGINS[one.begin],
                 )
-                for fault, one, moves in _by_harm(model, worse_faults(found, checked.onset))
+                for fault, one, moves in _by_harm(model, worse_faults(found, *checked.onsets))
             ],
             note,
             "Smallest fault that is detected with a probability of 95 %, the worse of two: present from the prior on, "
-            f"for {found.window:.4g} s, or beginning later, for {checked.onset.window:.4g} s. First the fault whose "
-            "undetectable part moves a state furthest out of its band.",
+            f"for {found.window:.4g} s, or beginning later, for {checked.onsets[0].window:.4g} s. First the fault "
+            "whose undetectable part moves a state furthest out of its band.",
         )
         pairs = confounded(found)
         free = (
@@ -361,8 +385,8 @@ def _fault_topics(checked: Checked) -> list[Topic]:
         )
         alike = _table(
             titles[2],
-            ("one", "other", "correlation"),
-            [(one, other, f"{value:+.2f}") for one, other, value in pairs],
+            ("one", "other", "correlation", "hidden together"),
+            [(one, other, f"{value:+.2f}", hidden_together(found, one, other, value)) for one, other, value in pairs],
             note,
             "The log does not distinguish these faults."
             if pairs

@@ -16,10 +16,10 @@ from estimators.errors import EstimatorError, NisusError
 from estimators.estimator import Estimator
 from estimators.fold import Fold
 from estimators.log import MARK, Events, Log
-from estimators.registry import ESTIMATORS, find_estimator, unfit
+from estimators.registry import ESTIMATORS, find_entry, find_estimator, unfit
 from estimators.track import DIVERGED
 
-from ..twin.twin import Twin, load_twin
+from ..twin.twin import Twin, load_twin, with_held
 from .processes import beside, jobs_of
 from .scores import FilterScore, Spread, pictures_of
 
@@ -58,8 +58,10 @@ def fold_row(
     """Fold one filter over each of the logs, or, if it draws and there is one log, over that with several seeds.
 
     A filter that takes more than `budget` seconds of one processor folds a shorter span of the log; but the one that
-    the twin runs first folds all of it, whatever that takes. `scored` are the times, ns, between which it is scored.
+    the twin runs first folds all of it, whatever that takes. A filter that cannot consider parameters holds them.
+    `scored` are the times, ns, between which it is scored.
     """
+    twin = able(twin, estimator)
     entry = find_estimator(estimator, twin.model)
     options = dict(twin.options_of(estimator))
     folds = max(len(logs), SEEDS if draws(entry) else 1)
@@ -80,6 +82,11 @@ def fold_row(
         nothing = Spread(np.nan)
         return FilterScore(estimator, {}, nothing, (np.nan, np.nan), nothing, np.nan, options, failure=str(error))
     return row_of(estimator, outcomes, options, span)
+
+
+def able(twin: Twin, estimator: str) -> Twin:
+    """Return a twin as a filter can fold it: with its parameters held, if it cannot consider them."""
+    return twin if find_entry(estimator).considers else with_held(twin)
 
 
 def within(events: Events, span: float | None) -> Events:
@@ -221,8 +228,9 @@ def applicable(twin: Twin, names: Sequence[str] = ()) -> list[str]:
         EstimatorError: If a named filter does not apply.
     """
     for name in names:
-        find_estimator(name, twin.model)
-    return list(dict.fromkeys(names)) or [name for name, entry in ESTIMATORS.items() if not unfit(entry, twin.model)]
+        find_estimator(name, able(twin, name).model)
+    fit = (name for name, entry in ESTIMATORS.items() if not unfit(entry, able(twin, name).model))
+    return list(dict.fromkeys(names)) or list(fit)
 
 
 def compare(

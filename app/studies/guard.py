@@ -235,7 +235,7 @@ def logs_of(guarded: GuardedLog, twin: Twin, span: float | None) -> Iterator[tup
         log.extend(recorded.events)
         if span is not None and log.n:
             log.n = int(np.searchsorted(log.t[: log.n], log.t[0] + round(span * 1e9), side="right"))
-        yield log, recorded.base
+        yield log, recorded.base_for(twin.model)[0]
         return
     source = twin.config.source
     if not isinstance(source, SimulatorSection):

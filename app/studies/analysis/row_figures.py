@@ -116,14 +116,15 @@ def verdict(
     """
     if calibration is None or not n:
         return f"{name}: no reading among the last rows", "unknown"
+    too_few = f"{name}: too few measurements to judge ({n} of {MIN_READINGS})"
     then = ""
     if normal is not None and calibration.role == "used":
         changed = _since(calibration, normal)
         if not changed:
             if n < MIN_READINGS:
-                return f"{name}: {n} readings are too few to say", "unknown"
+                return too_few, "unknown"
             then = "; ".join(word.removeprefix(f"{name}: ") for word in calibration.words)
-            return f"{name}: as commissioned, as far as {n:,} readings tell{then and f' ({then})'}", "good"
+            return f"{name}: as commissioned ({n:,} measurements){then and f' ({then})'}", "good"
         then, calibration = "not as commissioned: ", calibration._replace(words=changed)
     if calibration.words:
         parts = [word.removeprefix(f"{name}: ") for word in calibration.words]
@@ -138,10 +139,10 @@ def verdict(
     if n >= MIN_READINGS and mean - 2.0 / np.sqrt(n * SLOW) > SLOW_SHARE:
         return f"{name}: innovations stay on one side for long, a slow error of about {np.sqrt(mean):.2f} σ", "bad"
     if n < MIN_READINGS:
-        return f"{name}: {n} readings are too few to say", "unknown"
+        return too_few, "unknown"
     if calibration.role == "held out":
-        return f"{name}: held out, and as the others predict it, within their bands ({n:,} readings)", "good"
-    return f"{name}: consistent, as far as {n:,} readings tell", "good"
+        return f"{name}: held out; agrees with the prediction of the other sensors ({n:,} measurements)", "good"
+    return f"{name}: consistent ({n:,} measurements)", "good"
 
 
 def _since(calibration: Calibration, normal: np.ndarray) -> tuple[str, ...]:

@@ -71,10 +71,13 @@ class Oracle:
         self._benches: list[Bench] = []
         self._whole: Bench | None = None
         self._rehearsed: dict[tuple[str, str], Foretold] = {}
-        self._checked: dict[str, tuple[Sensitivity, Sensitivity]] = {}
+        self._checked: dict[str, tuple[Sensitivity, ...]] = {}
 
     def listed(self, bench: Bench, mistake: Mistake, estimator: str) -> bool:
         """Return whether `nisus check` lists every part of a mistake as undetectable, on the undamaged log.
+
+        Where it computes nothing, it says that any fault may be. Faults at once are undetectable, too, if their effects
+        cancel.
 
         Raises:
             NisusError: As `Bench.run`.
@@ -84,12 +87,15 @@ class Oracle:
             every = self.twin.policy.false_alarm_every
             self._checked[estimator] = sensitivities(estimator, calm.model, calm.tuning, calm.log, false_alarm=every)
         known = self._checked[estimator]
+        if all(one.reason for one in known):
+            return bool(mistake.nudges)
         ranges = {(fault.nudge.kind, fault.nudge.name): (fault.low, fault.high) for fault, _ in worse_faults(*known)}
         nothing = (0.0, 0.0)
-        return bool(mistake.nudges) and all(
+        alone = all(
             ranges.get((kind, name), nothing)[0] <= size <= ranges.get((kind, name), nothing)[1]
             for kind, name, size in mistake.nudges
         )
+        return bool(mistake.nudges) and (alone or any(one.multiple(mistake.nudges) > 1.0 for one in known))
 
     def foretell(self, bench: Bench, mistake: Mistake, estimator: str) -> Foretold:
         """Whether a mistake will be seen on a bench with a filter.

@@ -18,6 +18,7 @@ from estimators.diagnostics.sensitivity.responses import (
     R_,
     SCALE,
     SENSOR,
+    SPIKES,
     STUCK,
     SWAP,
     SWAPPED,
@@ -159,7 +160,8 @@ def _of_sensors(model: StateSpaceModel, tuning: Tuning, sensors: Sequence[Sensor
             times_ten = ((R_, label, 0.1 - 1.0),)  # the twin's R is a tenth of the asset's
             yield Mistake(f"{label} noise x3", frozenset({"narrow", "refused"}), own, fault=noisy, nudges=times_ten)
             spikes = _fault("spike", sensor=name, row=row, size=10.0 * std, rate=0.01)
-            yield Mistake(f"{label} spikes 1 %", frozenset({"spiky"}), own, fault=spikes)
+            known = ((SPIKES, label, 10.0 * std),)
+            yield Mistake(f"{label} spikes 1 %", frozenset({"spiky"}), own, fault=spikes, nudges=known)
             for factor in (1.02, 1.1):
                 scaled = _fault("scale", sensor=name, row=row, size=factor)
                 known = ((SCALE, label, factor - 1.0),)
