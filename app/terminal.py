@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import io
+import json
 import signal
 import sys
 from collections.abc import Callable, Mapping
+from datetime import UTC, datetime
 from queue import Empty, SimpleQueue
-from typing import Any
+from typing import Any, TextIO, cast
 
 from estimators.errors import printable
 
@@ -58,4 +61,46 @@ def restore(previous: Mapping[int, Any]) -> None:
 
 def complain(text: object) -> None:
     """Print an error or warning."""
-    print(f"nisus: {printable(str(text))}", file=sys.stderr, flush=True)
+    if _lines_of_json:
+        print_line("error", text)
+    else:
+        print(f"nisus: {printable(str(text))}", file=sys.stderr, flush=True)
+
+
+_lines_of_json = False
+
+
+def use_lines_of_json() -> None:
+    """Print errors and notices as lines of JSON from now on, for services whose log is read by programs."""
+    global _lines_of_json
+    _lines_of_json = True
+
+
+class JsonLines(io.TextIOBase):
+    """Text file whose lines are printed as lines of JSON."""
+
+    def __init__(self) -> None:
+        self._rest = ""
+
+    def write(self, text: str) -> int:
+        """See `io.TextIOBase`."""
+        *lines, self._rest = (self._rest + text).split("\n")
+        for line in filter(None, lines):
+            print_line("info", line)
+        return len(text)
+
+
+def messages_file() -> TextIO:
+    """Return the file for messages about progress: standard error, or lines of JSON there."""
+    return cast(TextIO, JsonLines()) if _lines_of_json else sys.stderr
+
+
+def print_line(level: str, text: object, **fields: Any) -> None:
+    """Print a line of a log on standard error, with the present time (UTC); `fields` are added to one of JSON."""
+    now = datetime.now(UTC).isoformat(timespec="milliseconds")
+    if _lines_of_json:
+        line = json.dumps({"time": now, "level": level, "text": str(text)} | fields)
+    else:
+        twin = f"{fields['twin']}: " if "twin" in fields else ""
+        line = f"{now} {level.upper()} {twin}{printable(str(text))}"
+    print(line, file=sys.stderr, flush=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from estimators.registry import ESTIMATORS
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 def runs_json(scores: RunScores, engine: Running) -> list[dict[str, Any]]:
     """Return every run, oldest first, with its changes and scores."""
     units, found = units_by_name(engine.model), scores.all()
+    there = {run.number for run, _ in found}
     runs = []
     for run, known in found:
         running = run is found[-1][0]
@@ -33,7 +34,7 @@ def runs_json(scores: RunScores, engine: Running) -> list[dict[str, Any]]:
             {name: getattr(run, name) for name in names}
             | {
                 "title": ESTIMATORS[run.estimator].title,
-                "what": what_changed(run),
+                "what": what_changed(run, there),
                 "running": running,
                 "kept": kept,
                 "score": None if known is None else _score(known, units),
@@ -71,12 +72,16 @@ def nis_json(found: NisVerdict) -> dict[str, Any]:
     }
 
 
-def what_changed(run: Revision) -> str:
-    """Describe the changes of a run in words."""
+def what_changed(run: Revision, there: Container[int] | None = None) -> str:
+    """Describe the changes of a run in words; a run that was loaded is named if it is among those `there`."""
     changes = in_words(run.changes, units=units_of(run.estimator, run.tuning))
     said = ": ".join(part for part in (run.why, changes) if part)
     words = said or ("as it began" if run.first and run.loaded is None else "as before")
-    return words if run.loaded is None else f"back to run {run.loaded}: {words}"
+    if run.loaded is None:
+        return words
+    return (
+        f"back to {'an earlier run' if there is not None and run.loaded not in there else f'run {run.loaded}'}: {words}"
+    )
 
 
 def changes_json(changes: Sequence[SettingChange]) -> list[dict[str, Any]]:

@@ -102,7 +102,8 @@ class StateMessage(_Part):
 
 def state_message(engine: Running, *, covariance: bool = False) -> StateMessage:
     """Return the present state of a running twin; with `covariance`, P of all states of the filter."""
-    status, model, tuning = engine.status(), engine.model, engine.status().tuning
+    status, model = engine.latest(), engine.model
+    tuning = status.tuning
     health = status.health
     levels = {} if status.integrity is None else status.integrity.bounds
     reason = "" if health in PUBLISHED else status.cause or f"the twin is {HEALTH_NAMES[health]}"
@@ -146,8 +147,8 @@ def state_message(engine: Running, *, covariance: bool = False) -> StateMessage:
         twin=engine.twin.name,
         estimator=status.estimator,
         time_ns=status.t,
-        time=_iso(status.t) if status.t is not None and seconds >= CALENDAR_FROM_S else None,
-        sent=_iso(time.time_ns()),
+        time=iso(status.t) if status.t is not None and seconds >= CALENDAR_FROM_S else None,
+        sent=iso_now(),
         age_s=None if status.t is None else max(0.0, time.monotonic() - status.heard),
         revision=status.revision,
         tuning=tuning.name or None,
@@ -182,6 +183,11 @@ def _number(value: float) -> float | None:
     return float(value) if np.isfinite(value) else None
 
 
-def _iso(ns: int) -> str:
+def iso_now() -> str:
+    """Return the present time by the clock of this machine as ISO 8601 in UTC."""
+    return iso(time.time_ns())
+
+
+def iso(ns: int) -> str:
     """Return a time in ns as ISO 8601 in UTC, with microseconds."""
     return f"{np.datetime64(ns // 1000, 'us')}Z"

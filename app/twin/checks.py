@@ -6,7 +6,7 @@ from typing import Any
 
 from config.loader import Loaded
 from config.yaml_files import Key
-from estimators.diagnostics.detectors import ALARM_NAMES
+from estimators.diagnostics.detectors import ALARM_NAMES, CAUSES
 from estimators.diagnostics.episodes.baseline import Normal
 from estimators.errors import ConfigError, nearest
 from estimators.fit.entries import check_key
@@ -125,3 +125,27 @@ def check_refit(loaded: Loaded, estimator: str, tuning: Tuning) -> None:
             check_key(estimator, tuning, name)
         except ConfigError as error:
             raise loaded.error(("refit", "entries"), f"names {name}: {error}") from None
+
+
+def check_outputs(loaded: Loaded, model: StateSpaceModel) -> None:
+    """Refuse rules of alerts that name what model, guide or receivers do not have.
+
+    Raises:
+        ConfigError: With file and line, and the near names.
+    """
+    outputs, states = loaded.config.outputs, [state.name for state in model.shown_states]
+    for name, section in outputs.receivers.items():
+        if section.type == "mqtt" and outputs.mqtt is None:
+            raise loaded.error(("outputs", "receivers", name), "is of type mqtt; give the broker under outputs.mqtt")
+    for k, rule in enumerate(loaded.config.alerts):
+        for key, given, known, kind in (
+            ("state", (rule.state,) if rule.state else (), states, f"state of {model.name}"),
+            ("episode", rule.episode or (), ("all", *CAUSES), "cause of an episode"),
+            ("to", rule.to or (), tuple(outputs.receivers), "receiver under outputs.receivers"),
+        ):
+            for name in given:
+                if name not in known:
+                    near = nearest(name, known) if known else "there is none"
+                    raise loaded.error(("alerts", k, key), f"names {name!r}, no {kind}; {near}")
+        if not outputs.receivers:
+            raise loaded.error(("alerts", k), "has no receiver; name one under outputs.receivers")

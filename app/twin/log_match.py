@@ -113,7 +113,7 @@ def match_log(loaded: Loaded, model: StateSpaceModel, header: LogHeader) -> Twin
 def _of_table(part: TableSection, named: list[Channel], header: LogHeader) -> tuple[str | None, list[str | None]]:
     """Return the reason why a table cannot be read, and for each channel what it lacks."""
     from sources.tables.text import TextMatch, column_of
-    from sources.units import conversion, heading_unit
+    from sources.units import declared_conversion, heading_unit
 
     columns = header.columns or {}
     texts = header.texts or {}
@@ -131,7 +131,7 @@ def _of_table(part: TableSection, named: list[Channel], header: LogHeader) -> tu
                 return f"column {name.column!r} is never {' or '.join(map(repr, name.texts))}"
         for name, unit, wanted in zip(channel.signals, channel.units, channel.model_units, strict=True):
             try:
-                conversion(unit or heading_unit(name), wanted, repr(name))
+                declared_conversion(unit, heading_unit(name), wanted, repr(name))
             except SourceError as error:
                 return str(error)
         return None

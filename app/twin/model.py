@@ -184,6 +184,10 @@ def _assembled(model: StateSpaceModel, loaded: Loaded) -> StateSpaceModel:
                 text = "is with itself" if name == other else f"is {value:g} here and {mirrored:g} under {other}"
                 at = (*own.get(name, ("parameters", name)), "correlation", other)
                 raise loaded.error(at, f"{text}; give each pair once")
+    if estimated and isinstance(model.states, Field):
+        name = next(iter(estimated))
+        at = ("estimate", name) if name in config.estimate else own.get(name, ("parameters", name))
+        raise loaded.error(at, f"is uncertain, and {model.name} is a field, whose parameters are held; give no std")
     held = {name for name, section in sections.items() if section.use != "considered"}
     correlations = {
         (name, other): value

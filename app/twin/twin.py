@@ -27,7 +27,7 @@ from estimators.registry import checked, find_entry, find_estimator
 from estimators.tuning import CHANGED_MARK, Tuning
 
 from ..ingest import Planned, UnknownInputs
-from .checks import check_named, check_refit, check_scene, commissioned
+from .checks import check_named, check_outputs, check_refit, check_scene, commissioned
 from .defaults import DegradedAfter, Late, degraded_after, driven_states, late_policy, parameter_sections
 from .landmarks import expanded
 from .learned import correction_files
@@ -297,6 +297,7 @@ def _assemble(loaded: Loaded, overrides: Mapping[str, str], log_files: Sequence[
     changed = bool(turned) or any(key.split(".")[0] in TuningSection.model_fields for key in overrides)
     tuning = replace(tuning, name=name + (CHANGED_MARK if changed else ""))
     check_refit(loaded, first.name, tuning)
+    check_outputs(loaded, model)
     if config.time.paused_after is not None and not driven_states(model):
         raise loaded.error(("time", "paused_after"), f"is for inputs, and none drives {model.name}; leave it out")
     for k, item in enumerate(config.maintenance):

@@ -7,6 +7,7 @@ returns. A test that needs threads starts an `Engine` and polls with `wait_for`.
 import json
 import queue
 import struct
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -68,7 +69,7 @@ def twin(history=200_000, horizon=2.0, tick=1000.0, model=MODEL, estimator="kf")
         forced_baseline="",
         overrides={},
         version=None,
-        path="scripted.yaml",
+        path=Path("scripted.yaml"),
         model=model,
         tuning=Tuning.of(model),
         estimator=estimator,

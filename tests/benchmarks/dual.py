@@ -151,12 +151,17 @@ CASES = (
     Case(
         "motor_bench, resistance between tooth and magnet, which no sensor touches, initially 50 % off",
         "motor_bench", "magnet", "tooth_magnet", 600.0, 300.0,
-        {"parameters.tooth_magnet": "1.65", "estimate": "{tooth_magnet: {std: 0.5, drift: 1e-4}}", "view": "{}"},
+        {
+            "tuning": "held",
+            "parameters.tooth_magnet": "1.65",
+            "estimate": "{tooth_magnet: {std: 0.5, drift: 1e-4}}",
+            "view": "{}",
+        },
         "fitted with the magnet measured: 1.1 K/W",
     ),
     Case(
         "battery_panasonic, US06, series resistance as the cell was fitted",
-        "battery_panasonic", "soc", "r0", 1200.0, 600.0, {},
+        "battery_panasonic", "soc", "r0", 1200.0, 600.0, {"tuning": "held"},
         "fitted with the charge known: 0.0328 Ω",
     ),
     Case(
@@ -227,6 +232,7 @@ def one_cycle(number: int, parameters: Sequence[str], drift: float = 1.0) -> tup
     twin = load_twin(
         "battery_dmegc",
         overrides={
+            "tuning": "held",
             "estimate": f"{{{flow}}}",
             "view": "{}",
             "source.time": f"{{column: {column}.t, unit: s}}",

@@ -20,6 +20,7 @@ import urllib.request
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -240,7 +241,63 @@ def memory(edits: int = 60) -> Iterator[BenchmarkRow]:
         yield BenchmarkRow(f"after {edits} edits", more, (Bound("more [MB]", 50.0),))
 
 
-PARTS: dict[str, Section] = {part.__name__: part for part in (crowd, first, slider, share, arrival, memory)}
+def published(seconds: float = 15.0, rate: float = 1000.0) -> Iterator[BenchmarkRow]:
+    """From a measurement to the state that contains it, both through an MQTT broker, with the way there and back, ms.
+
+    Raises:
+        SourceError: If there is no Mosquitto.
+    """
+    from sources.brokers import mqtt_client
+
+    from ..app.outputs.broker import MOSQUITTO, Broker, free_port
+
+    if MOSQUITTO is None:
+        raise SourceError("no mosquitto was found")
+    with tempfile.TemporaryDirectory() as folder:
+        broker = Broker(Path(folder))
+        place = {"host": "127.0.0.1", "port": broker.port}
+        topics = {"plant/t": {"values": {"winding": "v"}, "time": "t"}}
+        source = json.dumps({"type": "mqtt", "topics": topics, "qos": 0} | place)
+        outputs = json.dumps({"every": 0, "mqtt": place, "opcua": {"port": free_port()}})
+        delays: list[float] = []
+
+        def heard(_client: Any, _data: Any, message: Any) -> None:
+            now, found = time.time_ns(), json.loads(message.payload)
+            delays.append((now - found["time_ns"]) * 1e-6 if found["time_ns"] else np.nan)
+
+        client = mqtt_client(SimpleNamespace(user=None, ca_file=None), None, client_id="")  # type: ignore[arg-type]
+        client.on_message = heard
+        try:
+            with running("motor_winding", "--set", f"source={source}", "--set", f"outputs={outputs}") as run:
+                client.connect("127.0.0.1", broker.port)
+                client.subscribe("nisus/+/state")
+                client.loop_start()
+                while not all(item["connected"] for item in run.ask("/api/alerts")["outputs"]):
+                    time.sleep(0.1)
+                for part in (3.0, seconds):  # the first part warms up
+                    delays.clear()
+                    cpu, begun, sent = run.cpu(), time.monotonic(), 0
+                    while (gone := time.monotonic() - begun) < part:
+                        while sent < gone * rate:
+                            client.publish("plant/t", json.dumps({"v": 40.0 + sent % 3, "t": time.time_ns()}))
+                            sent += 1
+                        time.sleep(0.5 / rate)
+                taken = np.array(delays)
+                figures = {
+                    "p50 [ms]": float(np.nanpercentile(taken, 50)),
+                    "p99 [ms]": float(np.nanpercentile(taken, 99)),
+                    "p99 to row [ms]": run.ask("/api/status")["latency_ms"],
+                    "sent per s": sent / seconds,
+                    "states per s": taken.size / seconds,
+                    "of a core [%]": 100.0 * (run.cpu() - cpu) / seconds,
+                }
+        finally:
+            client.loop_stop()
+            broker.stop()
+        yield BenchmarkRow("MQTT to MQTT and OPC UA", figures, (Bound("p99 [ms]", 5.0),))
+
+
+PARTS: dict[str, Section] = {part.__name__: part for part in (crowd, first, slider, share, arrival, published, memory)}
 
 
 def page() -> Iterator[BenchmarkRow]:

@@ -18,7 +18,7 @@ import numpy as np
 
 from app.twin.defaults import bounds_of
 from app.twin.log_reader import read_log
-from app.twin.twin import Twin, load_twin
+from app.twin.twin import Twin, load_twin, with_held
 from estimators.diagnostics.references import references
 from estimators.errors import NisusError
 from estimators.fit.aims import AIMS, WITNESSES, correlation_time, track_of
@@ -101,7 +101,7 @@ def line(name: str, part: PartScore) -> str:
 
 def show(case: Case, wanted: Sequence[str], aim: str) -> None:
     """Fit and print one recording."""
-    twin = load_twin(case.twin)
+    twin = with_held(load_twin(case.twin))
     log, _ = read_log(twin, case.seconds)
     first, second = halves(log)
     own = Setting(twin.tuning, None)

@@ -1,22 +1,27 @@
-"""Sources of type push: messages that other programs send."""
+"""Sources of messages: those that other programs send, and those of an MQTT broker or an OPC UA server."""
 
 from __future__ import annotations
 
+import os
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-from config.source_schema import ColumnSection, PushSection
+from config.source_schema import ColumnSection, MqttSourceSection, OpcUaSourceSection, PushSection
 from config.yaml_files import Key
+from estimators.errors import ConfigError, nearest
 from estimators.model.state_space import StateSpaceModel
 from sources.pieces import VALUES
 
 from .kind import Kind, Opening, blamed, failure
 
 if TYPE_CHECKING:
+    from sources.messages import Messages
     from sources.source import Source
 
+MessageSection = PushSection | MqttSourceSection | OpcUaSourceSection
 
-def _open(opening: Opening) -> Source:
+
+def _messages(opening: Opening) -> Messages:
     from sources.messages import Messages
 
     if not opening.live:
@@ -28,7 +33,50 @@ def _open(opening: Opening) -> Source:
     return blamed(named, lambda channels: Messages(channels, width=opening.model.width, report=opening.report))
 
 
-def with_channels(section: PushSection, model: StateSpaceModel) -> PushSection:
+def _password(name: str | None) -> str | None:
+    if name is None:
+        return None
+    value = os.environ.get(name)
+    if not value:
+        raise ConfigError(f"source: the environment variable {name} is not set; set it before the twin starts")
+    return value
+
+
+def _open_mqtt(opening: Opening) -> Source:
+    from sources.brokers import MqttSource, TopicMap
+
+    section: MqttSourceSection = opening.section
+    messages = _messages(opening)
+    _check_names(opening, messages, {name for topic in section.topics.values() for name in topic.values}, "topics")
+    topics = {name: TopicMap(**topic.model_dump()) for name, topic in section.topics.items()}
+    return MqttSource(
+        messages,
+        section,
+        topics,
+        qos=section.qos,
+        password=_password(section.password_env),
+        client_id=section.client_id,
+        report=opening.report,
+    )
+
+
+def _open_opcua(opening: Opening) -> Source:
+    from sources.brokers import OpcUaSource
+
+    section: OpcUaSourceSection = opening.section
+    messages = _messages(opening)
+    _check_names(opening, messages, set(section.nodes), "nodes")
+    return OpcUaSource(messages, section.url, section.nodes, period=section.every, report=opening.report)
+
+
+def _check_names(opening: Opening, messages: Messages, named: set[str], key: str) -> None:
+    """Refuse names of values that feed nothing."""
+    for name in sorted(named - set(messages.names)):
+        text = f"names {name!r}, no value of this twin; {nearest(name, messages.names)}"
+        raise failure(opening.loaded, (*opening.key, key), text)
+
+
+def with_channels(section: MessageSection, model: StateSpaceModel) -> MessageSection:
     """Return a section with its channels; of one without any, all sensors and inputs by their own names."""
     if _sections(section, ()):
         return section
@@ -41,8 +89,10 @@ def with_channels(section: PushSection, model: StateSpaceModel) -> PushSection:
     return section.model_copy(update={"sensors": sensors, "inputs": inputs})
 
 
-def _sections(section: PushSection, key: Key) -> dict[Key, Any]:
+def _sections(section: MessageSection, key: Key) -> dict[Key, Any]:
     return {key: section} if section.sensors or section.inputs or section.truth else {}
 
 
-PUSH = Kind(_open, sections=_sections, takes_log=False, kernels=(VALUES,))
+PUSH = Kind(_messages, sections=_sections, takes_log=False, kernels=(VALUES,))
+MQTT = Kind(_open_mqtt, sections=_sections, takes_log=False, kernels=(VALUES,))
+OPC_UA = Kind(_open_opcua, sections=_sections, takes_log=False, kernels=(VALUES,))

@@ -11,7 +11,7 @@ from app.cli.arguments import FoldCommand as Arguments
 from app.cli.fold import fold_twin
 from app.live.alerts import rejections
 from app.live.counts import RowCounts
-from app.views.recording.format import base_from_json, base_to_json
+from app.live.fold_json import base_from_json, base_to_json
 from estimators.errors import ConfigError
 from estimators.fold import Fold
 from estimators.log import Log

@@ -7,6 +7,7 @@ import pytest
 
 from app.cli.arguments import FoldCommand
 from app.cli.fold import fold_twin
+from app.ingest import Ingest
 from app.twin.log_reader import read_log
 from app.twin.twin import load_twin
 from estimators.errors import ConfigError
@@ -113,6 +114,32 @@ def test_inputs_are_unknown_over_a_pause(tmp_path):
     assert counts["paused"] == 1
     log, fold, counts = at["held"]
     assert not np.any(log.kind[: log.n] == MAINTENANCE) and counts["paused"] == 0
+
+
+def test_a_logger_of_one_row_a_minute_does_not_pause_all_the_time(tmp_path):
+    """Rows every 61 s are no pauses of more than 60 s, 400 s after them are one; batches of any size say the same."""
+    times = [*range(0, 1830, 61), 2230, 2291]
+    (tmp_path / "log.csv").write_text("\n".join(["t,i,v,c", *(f"{t},1.0,3.6,25.0" for t in times)]))
+    path = tmp_path / "cell.yaml"
+    path.write_text(
+        "model: battery_cell\nestimate: {r0: {std: 0.005}}\ntime: {paused_after: 60}\nsource:\n  {type: table, files:"
+        " log.csv, time: {column: t}, inputs: {current: {columns: i}}, sensors: {voltage: {columns: v}, temperature:"
+        " {columns: c}}}\n"
+    )
+    twin = load_twin(path)
+    log, counts = read_log(twin, None)
+    rows = np.flatnonzero(log.kind[: log.n] == MAINTENANCE)
+    # Of the first row nothing is usual yet.
+    assert counts["paused"] == 2 and set(log.t[rows].tolist()) == {61_000_000_000 - 1, 2_230_000_000_000 - 1}
+    events = log.events.select(log.kind[: log.n] != MAINTENANCE)
+    said = []
+    ingest = Ingest(twin.model, 0, lambda key, text: said.append((key, text)), unknown=twin.unknown_inputs)
+    for k in range(0, len(events), 7):
+        ingest.take(events.select(slice(k, k + 7)))
+    ingest.finish()
+    assert [text.split(",")[0] for key, text in said if key == "paused"] == [
+        "no event for 61 s until 61 s", "no event for 461 s until 2230 s",
+    ]  # fmt: skip
 
 
 def test_a_pause_of_a_model_without_inputs_is_refused(tmp_path):

@@ -400,6 +400,19 @@ def test_a_width_is_given_once_and_as_a_number_or_share(parameters: str, said: s
     assert said in refusal(f"model: motor_drive\nparameters: {parameters}\nsource: {{type: simulator}}\n")
 
 
+@pytest.mark.parametrize("given", ["parameters: {forcing: {std: 10 %}}", "estimate: {forcing: {std: 0.1}}"])
+def test_the_parameters_of_a_field_are_held(given: str) -> None:
+    assert "is uncertain, and lorenz96 is a field" in refusal(
+        f"model: lorenz96\n{given}\nsource: {{type: simulator}}\n"
+    )
+
+
+def test_a_width_is_added_to_a_parameter_given_as_a_number() -> None:
+    twin = load_twin("battery_pack", overrides={"parameters.r0_5.std": "10 %"})
+    assert twin.model.state_names[-1] == "r0_5_deviation" and twin.model.considered == 1
+    assert twin.model.prior_std[-1] == pytest.approx(0.1 * 0.042, rel=1e-12)
+
+
 def test_offsets_and_scales_are_parameters_of_the_instruments() -> None:
     drive = MOTOR.replace("motor_winding", "motor_drive").replace("estimator: kf\n", "")
     drive = drive[: drive.index("prior:")] + (

@@ -84,7 +84,7 @@ def test_a_small_error_that_stays_is_said_though_no_two_neighbours_tell_it():
     nothing = autocorrelation(e, LAGS)
     stays = autocorrelation(e + 0.4 * np.sign(np.sin(2 * np.pi * np.arange(1000) / 250)), LAGS)
     calm = SimpleNamespace(words=(), role="used")
-    assert verdict("y", calm, nothing, 1000, 0.5) == ("y: consistent, as far as 1,000 readings tell", "good")
+    assert verdict("y", calm, nothing, 1000, 0.5) == ("y: consistent (1,000 measurements)", "good")
     words, tone = verdict("y", calm, stays, 1000, 0.5)
     # A square wave of ± 0.4 in readings of deviation √(1 + 0.16), of which 25 lags of 125 keep four fifths and more.
     size = float(words.split("about ")[1].split(" ")[0])
@@ -112,7 +112,7 @@ def test_a_row_of_a_commissioned_twin_is_measured_by_what_was_normal():
     words, tone = said()
     assert tone == "bad" and "too wide" in words and "above the prediction" in words and "correlated" in words
     words, tone = said(0.5, 0.4, 0.7)
-    assert tone == "good" and words.startswith("winding: as commissioned, as far as 20,000 readings tell (bands")
+    assert tone == "good" and words.startswith("winding: as commissioned (20,000 measurements) (bands")
     words, tone = said(0.25, 0.2, 0.7)
     assert tone == "bad" and words.startswith("winding: not as commissioned: bands too narrow by a factor of 2 (")
     words, tone = said(0.5, 0.4, 0.0)
