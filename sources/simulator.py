@@ -106,7 +106,7 @@ class Simulator:
         ]
         # Factors of the correlation matrices, by which white noise becomes the sensor's.
         self._roots = [
-            None if sensor.correlation is None else np.linalg.cholesky(np.array(sensor.correlation))
+            None if sensor.correlation is None else factor(np.array(sensor.correlation))
             for sensor in model.sensors
         ]
         self._reported = [0] * len(self._plans)
@@ -187,7 +187,7 @@ class Simulator:
             if root is None:
                 y += self._rng.normal(0.0, self._std[i], size=y.size)
             else:
-                y += self._std[i] * (root @ self._rng.standard_normal(y.size))
+                y += self._std[i] * np.sum(root * self._rng.standard_normal(y.size), axis=1)
             lost = plan.drop_every is not None and self._reported[i] % plan.drop_every == plan.drop_every - 1
             self._reported[i] += 1
             rows.append((t, READING, i, np.full(y.size, np.nan) if lost else y))
@@ -233,7 +233,7 @@ class Simulator:
         self._x[self._truth.model.mode] = self._rng.choice(chances.size, p=chances)
 
     def _noise(self) -> np.ndarray:
-        """Return a draw of N(0, Q), as numpy's multivariate_normal makes it, with the factor kept while Q stays."""
+        """Return a draw of N(0, Q), with the factor kept while Q stays."""
         truth = self._truth
         if truth.draw is not None:
             return truth.draw(self._rng.standard_normal(self._x.size), self._p, self._q, self._step)
@@ -241,9 +241,8 @@ class Simulator:
         truth.Q(self._x, self._u, self._p, self._q, self._step, Q)
         key = Q.tobytes()
         if self._factor is None or key != self._factor[0]:
-            U, s, _ = np.linalg.svd(Q)
-            self._factor = (key, U * np.sqrt(s))
-        return self._factor[1] @ self._rng.standard_normal(self._x.size)
+            self._factor = (key, factor(Q))
+        return np.sum(self._factor[1] * self._rng.standard_normal(self._x.size), axis=1)
 
     def now(self) -> int | None:
         """Return None: a simulation has no clock."""
@@ -251,6 +250,28 @@ class Simulator:
 
     def close(self) -> None:
         """Release nothing."""
+
+
+def factor(Q: np.ndarray) -> np.ndarray:
+    """Return L (n, n) with L Lᵀ = Q for a positive semidefinite Q, by Cholesky with complete pivoting.
+
+    Elementwise operations only: LAPACK rounds differently on each processor, and a simulated recording must not. What
+    remains of a diagonal entry within rounding of zero is zero, so that a singular Q has columns of zeros.
+
+    Source: Higham (2002), Accuracy and Stability of Numerical Algorithms, 2nd edition, 10.3.
+    """
+    left = Q.copy()
+    L = np.zeros_like(Q)
+    floor = 16.0 * len(Q) * np.finfo(float).eps * np.diag(Q)
+    for k in range(len(Q)):
+        pivots = np.where(np.diag(left) > floor, np.diag(left), 0.0)
+        i = int(np.argmax(pivots))
+        if not pivots[i] > 0.0:
+            break
+        L[:, k] = left[:, i] / pivots[i] * np.sqrt(pivots[i])
+        left -= L[:, k, None] * L[:, k]
+        left[i, i] = 0.0
+    return L
 
 
 def _runs(states: np.ndarray, width: int) -> list[tuple[int, int]]:
