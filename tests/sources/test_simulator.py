@@ -7,7 +7,7 @@ from estimators.errors import SourceError
 from estimators.log import INPUT, READING, TICK, TRUTH, truth_of
 from estimators.model.state_space import Input, Jump, Noise, Parameter, Row, Sensor, State, StateSpaceModel
 from estimators.models import MODELS
-from sources.simulator import SensorPlan, Simulator, constant_input, sine_input, stepped_input, summed_inputs
+from sources.simulator import SensorPlan, Simulator, constant_input, factor, sine_input, stepped_input, summed_inputs
 from tests.models import first_state
 from tests.sources.can.can_tools import same
 from tests.support import read_all
@@ -224,6 +224,23 @@ def test_noise_that_is_correlated_and_depends_on_the_state_has_its_covariance():
         found = steps[here].T @ steps[here] / here.sum()
         error = np.sqrt((np.outer(np.diag(C), np.diag(C)) + C**2) / here.sum()) * factor
         assert np.all(np.abs(found - factor * C) < 5 * error)
+
+
+@pytest.mark.parametrize("rank", range(6))
+def test_the_factor_of_a_covariance_has_its_rank_and_its_product(rank):
+    rng = np.random.default_rng(rank)
+    A = np.round(rng.normal(size=(5, rank)), 2) * [[1e-6], [1.0], [1e3], [1.0], [1e-3]]
+    Q = A @ A.T
+    L = factor(Q)
+    np.testing.assert_allclose(L @ L.T, Q, rtol=0, atol=1e-13 * np.sqrt(np.outer(np.diag(Q), np.diag(Q))).max())
+    assert np.sum(np.any(L != 0.0, axis=0)) == rank
+
+
+def test_the_factor_of_a_covariance_has_the_same_bits_on_each_processor():
+    """The largest entry is the first pivot. Two states that move against each other share one column; LAPACK's decomposition had a second of 1e-9, by rounding that differed from processor to processor."""
+    np.testing.assert_array_equal(factor(np.array([[1.0, -1.0], [-1.0, 1.0]])), [[1.0, 0.0], [-1.0, 0.0]])
+    np.testing.assert_array_equal(factor(np.array([[4.0, 2.0], [2.0, 16.0]])), [[0.5, np.sqrt(3.75)], [4.0, 0.0]])
+    np.testing.assert_array_equal(factor(np.diag([4.0, 0.0, 9.0])), [[0.0, 2.0, 0.0], [0.0, 0.0, 0.0], [3.0, 0.0, 0.0]])
 
 
 def test_a_true_angle_stays_within_a_turn():

@@ -19,8 +19,11 @@ HORIZON = 2 * SECOND
 
 @pytest.fixture(scope="module")
 def gripper():
-    """With the `ukf`, which takes contact for a number and is wrong at every touch: its gate refuses the finger."""
-    twin = load_twin("gripper_contact")
+    """With the `ukf`, which takes contact for a number and is wrong at every touch: its gate refuses the finger.
+
+    Whether a second story then opens the gate depends on the recording; with the noise of seed 11 one does.
+    """
+    twin = load_twin("gripper_contact", overrides={"source.seed": "11"})
     log, _ = read_log(twin, None)
     return twin, twin.tuning.with_options(twin.options_of("ukf")), log
 
@@ -34,11 +37,13 @@ def whole(gripper):
 
 
 def test_a_second_story_doubts_no_sensor(whole):
-    """The reading whose story it is, and those that follow it, are let in: 438 are refused in all. A story that took
+    """The reading whose story it is, and those that follow it, are let in: 421 are refused in all. A story that took
     over the doubt of the first would refuse the same readings again, and be told for nothing.
     """
-    assert np.sum(whole.track.verdict == GATED) == 438
-    assert [item.outcome for item in whole.decisions] == ["doubted", "isolated", "agrees", "doubted", "reopened"]
+    assert np.sum(whole.track.verdict == GATED) == 421
+    assert [item.outcome for item in whole.decisions] == [
+        *("doubted", "isolated", "agrees", "doubted", "reopened", "doubted", "agrees"),
+    ]
 
 
 @pytest.mark.parametrize("seed", [0, 1])
