@@ -220,10 +220,10 @@ def test_noise_that_is_correlated_and_depends_on_the_state_has_its_covariance():
     at, steps = x[:-1], x[1:] - 0.5 * x[:-1]
     up = at[:, 0] > 0
     assert min(up.sum(), (~up).sum()) > 3000
-    for here, factor in ((up, 1.0), (~up, 0.5)):
+    for here, share in ((up, 1.0), (~up, 0.5)):
         found = steps[here].T @ steps[here] / here.sum()
-        error = np.sqrt((np.outer(np.diag(C), np.diag(C)) + C**2) / here.sum()) * factor
-        assert np.all(np.abs(found - factor * C) < 5 * error)
+        error = np.sqrt((np.outer(np.diag(C), np.diag(C)) + C**2) / here.sum()) * share
+        assert np.all(np.abs(found - share * C) < 5 * error)
 
 
 @pytest.mark.parametrize("rank", range(6))
@@ -237,7 +237,9 @@ def test_the_factor_of_a_covariance_has_its_rank_and_its_product(rank):
 
 
 def test_the_factor_of_a_covariance_has_the_same_bits_on_each_processor():
-    """The largest entry is the first pivot. Two states that move against each other share one column; LAPACK's decomposition had a second of 1e-9, by rounding that differed from processor to processor."""
+    """The largest entry is the first pivot. Two states that move against each other share one column; LAPACK gave a
+    second one of 1e-9, by rounding that differed from processor to processor.
+    """
     np.testing.assert_array_equal(factor(np.array([[1.0, -1.0], [-1.0, 1.0]])), [[1.0, 0.0], [-1.0, 0.0]])
     np.testing.assert_array_equal(factor(np.array([[4.0, 2.0], [2.0, 16.0]])), [[0.5, np.sqrt(3.75)], [4.0, 0.0]])
     np.testing.assert_array_equal(factor(np.diag([4.0, 0.0, 9.0])), [[0.0, 2.0, 0.0], [0.0, 0.0, 0.0], [3.0, 0.0, 0.0]])
