@@ -44,6 +44,7 @@ from estimators.fit.recording import Recording
 from estimators.fit.uncertainty import parameter_widths
 from estimators.fold import Fold
 from estimators.log import Log
+from estimators.model.parts import Field
 from estimators.track import Track
 
 from ..conftest import data_folder
@@ -122,6 +123,10 @@ def report(name: str, seconds: float | None, more: Sequence[Path], *, fitted: bo
     twin = load_twin(name)
     log = read_log(twin, seconds)[0]
     first, second = halves(log)
+    if isinstance(twin.model.states, Field):
+        print(f"{name}: a field, whose parameters are held")
+        score(twin, log, second, "own")
+        return
     settings, words = considered(twin, first, fitted=fitted)
     print(f"{name}: {words}", flush=True)
     with tempfile.TemporaryDirectory() as folder:
