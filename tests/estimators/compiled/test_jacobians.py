@@ -5,11 +5,12 @@ import pytest
 
 from estimators.compiled.jacobians import ANALYTIC, CENTRAL, COMPLEX_STEP, complex_step_f, complex_step_h, scratch_size
 from estimators.compiled.model import compile_model
-from estimators.fold import Fold
+from estimators.fold import Fold, fold
 from estimators.log import READING, Events, Log
 from estimators.model.state_space import Input, Noise, Parameter, Row, Sensor, State, StateSpaceModel
 from estimators.models import MODELS
 from estimators.numerics.jit import jit
+from estimators.track import FAILED
 from estimators.tuning import Tuning
 
 
@@ -183,3 +184,29 @@ def test_h_of_a_linear_model_is_that_of_the_parameters_in_use(estimator):
         S = 4.0 * gain**2 + 0.25
         assert fold.track.innovation_std[0, 0] == pytest.approx(np.sqrt(S), rel=1e-12)
         assert fold.track.mean[0, 0] == pytest.approx(1.0 + 4.0 * gain / S * (3.0 - gain), rel=1e-12)
+
+
+def stopped(x, u, p, dt, out):
+    out[0] = x[0]
+    out[1] = 0.0
+
+
+def shared_flow(x, u, p, out):
+    out[0] = x[0] / x[1]
+
+
+def test_a_derivative_that_divides_by_zero_ends_no_fold():
+    """The derivative with respect to the first state has the second as divisor, which has no imaginary part there."""
+    model = StateSpaceModel(
+        name="shares", title="shares", f=stopped,
+        states=(State("flow", "1", 1.0, 1.0), State("pumps", "1", 1.0, 1.0)),
+        noises=(Noise("flow", "1/s", 1.0),), sensors=(Sensor("share", (Row("share", "1", 1.0),), h=shared_flow),),
+    )  # fmt: skip
+    H = np.zeros((1, 2))
+    target = compile_model(model).static["h_complex"][0]
+    complex_step_h(target, np.array([1.0, 0.0]), np.empty(0), np.empty(0), H, np.empty(scratch_size(2, 1)))
+    assert np.isnan(H[0, 0])
+    log = Log.of(model, start=0.0)
+    log.add("share", [1.0, 2.0], [0.5, 0.5])
+    verdicts = fold("ekf", model, Tuning.of(model), log).verdict
+    assert verdicts.tolist() == [FAILED, FAILED]
