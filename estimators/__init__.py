@@ -14,6 +14,8 @@ if TYPE_CHECKING:
     from .diagnostics.consistency import mean_nees as mean_nees
     from .diagnostics.health import HealthPolicy as HealthPolicy
     from .errors import NisusError as NisusError
+    from .fusion import covariance_intersection as covariance_intersection
+    from .fusion import fuse as fuse
     from .interface.by_name import fold as fold
     from .interface.by_name import fold_many as fold_many
     from .log import Log as Log
@@ -40,7 +42,9 @@ _HOMES = {
     "MODELS": "models",
     "NisusError": "errors",
     "Tuning": "tuning",
+    "covariance_intersection": "fusion",
     "fold_many": "interface.by_name",
+    "fuse": "fusion",
     "mean_nees": "diagnostics.consistency",
     "rk4": "model.rk4",
     **dict.fromkeys(("Field", "Input", "Jump", "Limits", "Noise", "Parameter", "Row", "Sensor", "State"), "model"),

@@ -90,3 +90,20 @@ def test_a_recorded_log_is_fitted_and_smoothed():
         error = error[np.isfinite(error)]
         spread = 4.0 / np.sqrt(2 * error.size)
         assert np.sqrt(fitted.tuning.r[k]) == pytest.approx(error.std(), rel=spread)
+
+
+def test_fused_twins_are_as_consistent_as_each():
+    """Information that is added counts the thermocouples twice: its error is beyond its band too often."""
+    found = example("two_twins").two_twins()
+    times = len(found["edge"][0])
+    assert times == 185 and {len(error) for error, _ in found.values()} == {times}
+    inside = {
+        name: np.mean(np.abs(error) <= 2.0 * np.sqrt(np.diagonal(cov, axis1=1, axis2=2)), axis=0)
+        for name, (error, cov) in found.items()
+    }
+    assert inside["edge"].min() > 0.93 and inside["thermal"].min() > 0.93 and inside["fused"].min() > 0.93
+    assert inside["added"].min() < 0.9
+    rmse = {name: np.sqrt(np.mean(error**2)) for name, (error, _) in found.items()}
+    assert rmse["fused"] < min(rmse["edge"], rmse["thermal"])
+    sizes = {name: np.linalg.det(cov) for name, (_, cov) in found.items()}
+    assert np.all(sizes["fused"] <= np.minimum(sizes["edge"], sizes["thermal"]) * (1.0 + 1e-9))

@@ -16,6 +16,7 @@ from pydantic import ValidationError
 from starlette.routing import Route
 
 from app.present.state_message import PublishedState, StateMessage, state_message, state_schema
+from estimators import fuse
 from estimators.track import DEGRADED, DIVERGED, STALE, SUSPECT, WAITING
 from tests.app.scripted import pull_all, readings, wait_for
 from tests.support import SECOND
@@ -52,6 +53,15 @@ def test_the_message_has_the_numbers_of_the_last_row(page):
     (winding,) = found["sensors"]
     assert (winding["name"], winding["accepted"], winding["rejected"], winding["dropouts"]) == ("winding", 50, 0, 0)
     assert 0.0 <= found["age_s"] < 600.0 and found["sent"].endswith("Z")
+
+
+def test_two_messages_are_fused(page):
+    """The same estimate twice has no more information than once."""
+    found = state(page, "?covariance=true")
+    fused = fuse(found, found)
+    assert fused.states == tuple(page.engine.model.state_names) and fused.agrees
+    np.testing.assert_allclose(fused.mean, last_row(page)[1], rtol=1e-12)
+    np.testing.assert_allclose(fused.cov, found["covariance"], rtol=1e-9)
 
 
 def test_rejected_and_empty_measurements_are_counted(page):
