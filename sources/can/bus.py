@@ -1,4 +1,4 @@
-"""A live CAN bus, through python-can."""
+"""A live CAN bus: opened by python-can, read in batches."""
 
 from __future__ import annotations
 
@@ -9,8 +9,9 @@ import sys
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
+from itertools import islice
 from typing import TYPE_CHECKING, Any
 
 import can
@@ -21,6 +22,7 @@ from estimators.log import Events
 from ..source import LOST_FRAMES, NEVER, Report, ignore
 from .decoder import Decoder, Expected, shown_id
 from .readers import EXTENDED, BusName
+from .sockets import FrameSocket, frame_socket
 
 MAX_READ_FRAMES = 4096  # Frames of one read; those queued beyond come with the next
 
@@ -104,6 +106,7 @@ class CanBus:
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._name = f"{interface}:{channel}"
+        self._interface = interface
         self._decoder = decoder
         self._report = report
         self._clock = clock
@@ -114,7 +117,9 @@ class CanBus:
         self._attempts = 0
         self._next_attempt = 0.0
         self._failed_before = False
-        self._bus: Any = self._connect()
+        self._bus: Any = None
+        self._socket: FrameSocket | None = None
+        self._open()
         self._monitor = MessageMonitor(f"CAN bus {self._name}", decoder, clock, report)
         self._loss = SocketLoss(f"CAN bus {self._name}", clock, report)
 
@@ -127,21 +132,34 @@ class CanBus:
         messages: list[Any] = []
         arrivals: list[int] = []
         try:
-            message = self._bus.recv(timeout)
-            while message is not None:
+            for message in islice(self._frames(timeout), MAX_READ_FRAMES):
                 messages.append(message)
                 arrivals.append(time.time_ns())
-                message = self._bus.recv(0) if len(messages) < MAX_READ_FRAMES else None
             self._failed_before = False
         except Exception as error:  # noqa: BLE001  drivers raise anything; the twin continues
             self._failed(error)
         for message in messages:
             if message.is_error_frame:
                 self._report("error frame", f"CAN bus {self._name}: error frame")
-        batch = self._decoder.decode(self._decoder.gather(messages, arrivals))
+        frames = self._decoder.gather(messages, arrivals)
+        batch = self._decoder.decode(frames) if frames.plan.size else Events.empty(self._decoder.width)
         self._monitor.note(messages)
         self._loss.note(self._bus, len(messages))
         return batch
+
+    def _open(self) -> None:
+        self._bus = self._connect()
+        self._socket = frame_socket(self._interface, self._bus)
+
+    def _frames(self, timeout: float) -> Iterator[Any]:
+        """Return the queued frames; wait up to `timeout` seconds for the first."""
+        if self._socket is not None:
+            yield from self._socket.frames(timeout)
+            return
+        bus = self._bus
+        while (message := bus.recv(timeout)) is not None:
+            yield message
+            timeout = 0
 
     def _failed(self, error: Exception) -> None:
         """Report an error. One may be a bad packet; after two in a row the bus is opened again."""
@@ -161,7 +179,7 @@ class CanBus:
             if self._closed.is_set() or self._next_attempt > self._clock():
                 return False
         try:
-            self._bus = self._connect()
+            self._open()
         except SourceError as error:
             self._attempts += 1
             wait = RECONNECT_WAITS_S[min(self._attempts, len(RECONNECT_WAITS_S) - 1)]
@@ -174,6 +192,9 @@ class CanBus:
 
     def _shut(self) -> None:
         bus, self._bus = self._bus, None
+        frames, self._socket = self._socket, None
+        if frames is not None:
+            frames.close()
         if bus is not None:
             try:
                 bus.shutdown()

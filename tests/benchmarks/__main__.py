@@ -20,7 +20,7 @@ for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
 
 def main() -> None:
     """Run the sections; no figure makes it fail."""
-    from . import false_alarms, filters, folds, page, recovery, sampling
+    from . import buses, false_alarms, filters, folds, page, recovery, sampling
     from .timing import Section, run_sections
 
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -51,6 +51,7 @@ def main() -> None:
         recovery.tuning,
         folds.defences,
         folds.blf,
+        buses.can_live,
         folds.channels,
         false_alarms.false_alarms,
         page.page,
