@@ -1,4 +1,4 @@
-"""MQTT: states, birth, last will and alerts at a broker, under PREFIX/TWIN."""
+"""MQTT: states, birth, last will and alerts at a broker, as JSON under PREFIX/TWIN or as Sparkplug B."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from estimators.errors import printable
 from ..live.outputs import OutputLink
 from ..present.state_message import StateMessage, iso_now, state_schema
 from .alerts import TIMEOUT_S, AlertMessage, secret
+from .sparkplug import Packet, SparkplugNode
 
 if TYPE_CHECKING:
     from config.output_schema import MqttSection
@@ -25,6 +26,53 @@ STATUS, BIRTH, STATE, ALERT = "status", "birth", "state", "alert"
 """Last parts of the topics."""
 
 
+class JsonTopics:
+    """Messages of one twin as JSON, under PREFIX/TWIN."""
+
+    commands: str | None = None
+    """Topic of commands to the twin; none."""
+
+    def __init__(self, prefix: str, engine: Running) -> None:
+        """Name the topics."""
+        self._engine = engine
+        self.place = f"{prefix}/{engine.twin.name}"
+
+    def will(self) -> Packet:
+        """Return the message that the broker publishes when it loses the next connection."""
+        return self.death()
+
+    def death(self) -> Packet:
+        """Return the message that ends the connection."""
+        return self._status(online=False)
+
+    def births(self) -> list[Packet]:
+        """Return the messages that begin a connection."""
+        return [Packet(f"{self.place}/{BIRTH}", self._birth(), qos=1, retain=True), self._status(online=True)]
+
+    def states(self, message: StateMessage) -> list[Packet]:
+        """Return the messages of a state."""
+        return [Packet(f"{self.place}/{STATE}", message.model_dump_json())]
+
+    def lost(self) -> None:
+        """Note the end of a connection."""
+
+    def wants_birth(self, payload: bytes) -> bool:
+        """Return whether a command requests the births again; there are no commands."""
+        return False
+
+    def _status(self, *, online: bool) -> Packet:
+        body = json.dumps({"online": online, "since": iso_now()})
+        return Packet(f"{self.place}/{STATUS}", body, qos=1, retain=True)
+
+    def _birth(self) -> str:
+        """Return names and units of all values, and the schema of the messages."""
+        model = self._engine.model
+        parts: dict[str, Any] = {"states": model.shown_states, "inputs": model.inputs}
+        names = {key: [{"name": item.name, "unit": item.unit} for item in items] for key, items in parts.items()}
+        told = {"twin": self._engine.twin.name, "since": iso_now(), **names, "sensors": list(model.sensor_names)}
+        return json.dumps(told | {"schema": state_schema()})
+
+
 class MqttOutput:
     """Publishes through a thread of paho-mqtt, which connects again for as long as the twin runs."""
 
@@ -34,15 +82,23 @@ class MqttOutput:
         """Prepare; nothing is connected yet.
 
         Raises:
-            ConfigError: If paho-mqtt or a secret is missing.
+            ConfigError: If paho-mqtt or a secret is missing, or Sparkplug does not allow the twin's name.
         """
         from sources.brokers import mqtt_client
 
         self._section, self._engine = section, engine
-        self._root = f"{section.prefix}/{engine.twin.name}"
+        self._alerts = f"{section.prefix}/{engine.twin.name}/{ALERT}"
+        self._form: JsonTopics | SparkplugNode = (
+            JsonTopics(section.prefix, engine)
+            if section.sparkplug is None
+            else SparkplugNode(section.sparkplug, engine)
+        )
+        self._ordered = threading.Lock()
+        """Held from making a message to handing it to the client, as Sparkplug numbers them."""
         password = None if section.password_env is None else secret(section.password_env)
         self.client: Any = mqtt_client(section, password, client_id=f"nisus-{engine.twin.name}")
-        self.client.will_set(f"{self._root}/{STATUS}", self._status(online=False), qos=1, retain=True)
+        self.client.on_pre_connect = self._connecting
+        self.client.on_message = self._command
         self.client.on_connect, self.client.on_disconnect = self._connected, self._disconnected
         self.client.on_connect_fail = lambda *_: self._lost("the broker does not answer")
         self.client.on_publish = self._taken
@@ -64,15 +120,13 @@ class MqttOutput:
         if not self.client.is_connected():
             return
         with self._counting:
-            if self._unsent >= MAX_UNSENT:
-                self._dropped += 1
-                late = self._dropped == 1
-            else:
-                self._unsent += 1
-                late = None
-        if late is None:
-            self.client.publish(f"{self._root}/{STATE}", message.model_dump_json(), qos=0)
-        elif late:
+            full = self._unsent >= MAX_UNSENT
+            self._dropped += full
+            first = full and self._dropped == 1
+        if not full:
+            with self._ordered:
+                self._hand_over(self._form.states(message))
+        elif first:
             text = f"output mqtt: the broker at {self._place} takes states too slowly; some are dropped"
             self._notices.count("output mqtt")
             self._notices.say(text, level="warn")
@@ -87,7 +141,7 @@ class MqttOutput:
             raise OSError(self._problem)
         with self._counting:
             self._unsent += 1
-        sent = self.client.publish(f"{self._root}/{ALERT}", alert.model_dump_json(), qos=1)
+        sent = self.client.publish(self._alerts, alert.model_dump_json(), qos=1)
         try:
             sent.wait_for_publish(TIMEOUT_S)
         except RuntimeError as error:
@@ -98,7 +152,8 @@ class MqttOutput:
     def stop(self) -> None:
         """Publish the death, and disconnect."""
         if self.client.is_connected():
-            sent = self.client.publish(f"{self._root}/{STATUS}", self._status(online=False), qos=1, retain=True)
+            with self._ordered:
+                sent = self.client.publish(*self._form.death())
             try:
                 sent.wait_for_publish(1.0)
             except (RuntimeError, ValueError):
@@ -114,35 +169,49 @@ class MqttOutput:
 
     @property
     def _place(self) -> str:
-        return f"{self._section.host}:{self._section.port}, {self._root}"
+        return f"{self._section.host}:{self._section.port}, {self._form.place}"
 
-    def _status(self, *, online: bool) -> str:
-        return json.dumps({"online": online, "since": iso_now()})
-
-    def _birth(self) -> str:
-        """Return names and units of all values, and the schema of the messages."""
-        model = self._engine.model
-        parts: dict[str, Any] = {"states": model.shown_states, "inputs": model.inputs}
-        names = {key: [{"name": item.name, "unit": item.unit} for item in items] for key, items in parts.items()}
-        told = {"twin": self._engine.twin.name, "since": iso_now(), **names, "sensors": list(model.sensor_names)}
-        return json.dumps(told | {"schema": state_schema()})
+    def _hand_over(self, packets: list[Packet]) -> None:
+        with self._counting:
+            self._unsent += len(packets)
+        for packet in packets:
+            self.client.publish(*packet)
 
     # On the thread of the client
+
+    def _connecting(self, client: Any, _data: Any) -> None:
+        with self._ordered:
+            client.will_set(*self._form.will())
 
     def _connected(self, client: Any, _data: Any, _flags: Any, reason: Any, _properties: Any) -> None:
         if reason.is_failure:
             self._lost(f"the broker refuses: {reason}")
             return
-        for part, text in ((BIRTH, self._birth()), (STATUS, self._status(online=True))):
-            client.publish(f"{self._root}/{part}", text, qos=1, retain=True)
         with self._counting:
-            self._unsent, self._dropped = 2, 0
+            self._unsent, self._dropped = 0, 0
+        if self._form.commands is not None:
+            client.subscribe(self._form.commands, qos=1)
+        with self._ordered:
+            self._hand_over(self._form.births())
         if self._reported:
             self._reported = False
             self._notices.say(f"output mqtt: connected again to {self._place}")
 
     def _disconnected(self, _client: Any, _data: Any, _flags: Any, reason: Any, _properties: Any) -> None:
+        with self._ordered:
+            self._form.lost()
         self._lost(f"the connection ended: {reason}")
+
+    def _command(self, _client: Any, _data: Any, message: Any) -> None:
+        try:
+            wanted = self._form.wants_birth(message.payload)
+        except ValueError as error:
+            text = f"output mqtt: a command at {message.topic} is ignored: {error}"
+            self._notices.report("output mqtt command", text)
+            return
+        if wanted:
+            with self._ordered:
+                self._hand_over(self._form.births())
 
     def _lost(self, text: str) -> None:
         self._problem = printable(text)
