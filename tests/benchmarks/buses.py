@@ -47,9 +47,10 @@ def can_live() -> Iterator[BenchmarkRow]:
                         sender.send(frame(256 + 2 * (k % 2), k.to_bytes(8, "little")))
                     for source, own in zip(sources, costs, strict=True):
                         batch, spent = timed(lambda source=source: source.read(0.0))  # type: ignore[misc]
-                        if batch is None or len(batch) != size:
-                            raise SourceError("multicast does not arrive on this machine")
-                        own.append(1e6 * spent / size)
+                        if batch is not None and len(batch) == size:  # Else the last ones were not there yet
+                            own.append(1e6 * spent / size)
+                if not all(costs):
+                    raise SourceError("multicast does not arrive on this machine")
                 ours, theirs = map(median, costs)
                 figures = {"ours [µs]": ours, "python-can [µs]": theirs, "ratio": theirs / ours}
                 yield BenchmarkRow(f"{size} at once", figures, (Bound("ours [µs]", 20.0),) if size > 1 else ())
