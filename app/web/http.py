@@ -19,12 +19,13 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 from pydantic import TypeAdapter, ValidationError
-from starlette.concurrency import run_in_threadpool
 from starlette.requests import ClientDisconnect, Request
 from starlette.responses import HTMLResponse, JSONResponse, PlainTextResponse, Response
 from starlette.routing import BaseRoute, Route
 
 from estimators.errors import ConfigError, NisusError, nearest, printable, quoted, shown_name
+
+from .request_threads import in_thread
 
 T = TypeVar("T")
 Runner = Callable[[Callable[[], Any]], Awaitable[Any]]
@@ -106,7 +107,7 @@ def get(
     *,
     method: str = "GET",
     refused: int = 400,
-    run: Runner = run_in_threadpool,
+    run: Runner = in_thread,
     answer: type | None = None,
 ) -> Route:
     """Return a route that calls `work` in a thread and answers with its result as JSON.
@@ -119,7 +120,7 @@ def get(
         work: A plain function; its docstring describes the endpoint.
         method: Method of the request.
         refused: Status code of an error.
-        run: Runs a call; by default in the server's threads.
+        run: Runs a call; by default in one of the threads of requests.
         answer: Model of the answer, for the description of the API.
     """
     kind, takes_request = _parameters(work), "request" in inspect.signature(work).parameters
@@ -146,7 +147,7 @@ def post(
     work: Callable[..., Any],
     *,
     status: int = 200,
-    run: Runner = run_in_threadpool,
+    run: Runner = in_thread,
     body_schema: Callable[[], dict[str, Any]] | None = None,
 ) -> Route:
     """Return a route that calls `work` in a thread with the fields of the request's JSON body; see `get`.

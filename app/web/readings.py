@@ -8,7 +8,6 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from starlette.concurrency import run_in_threadpool
 from starlette.requests import Request
 from starlette.responses import PlainTextResponse, Response
 from starlette.routing import BaseRoute, Route
@@ -18,6 +17,7 @@ from sources.messages import ACCEPTED, DUPLICATE, FIELDS, REFUSED, Messages
 
 from ..live.running_fold import Running
 from .http import Json, TooLarge, bounded_body, get, refusal
+from .request_threads import in_thread
 
 MAX_BYTES = 8 * 2**20
 """Longest body of measurements."""
@@ -45,7 +45,7 @@ def routes(engine: Running) -> list[BaseRoute]:
             return PlainTextResponse(f"Nisus: Content-Type must be one of {', '.join(READERS)}.\n", 415)
         try:
             body = await bounded_body(request, MAX_BYTES)
-            found = await run_in_threadpool(lambda: answer(source, READERS[kind](body)))
+            found = await in_thread(lambda: answer(source, READERS[kind](body)))
             return Json(found | {"stored": await stored(engine, source.accepted)})
         except TooLarge:
             return PlainTextResponse(

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from starlette.applications import Starlette
-from starlette.concurrency import run_in_threadpool
 from starlette.requests import Request
 from starlette.responses import FileResponse, PlainTextResponse, Response, StreamingResponse
 from starlette.routing import BaseRoute, Mount, Route, WebSocketRoute
@@ -43,6 +42,7 @@ from .door import Door
 from .fit_api import FitApi
 from .http import PAGE, OneAtATime, get, openapi, page_file, post
 from .metrics import metrics
+from .request_threads import in_rerun_thread, in_thread
 from .runs_api import RunsApi
 from .streams import PageStream, feed_rerun
 from .twin_json import annotations_json, audit_json, episodes_json, model_json, status_json
@@ -288,7 +288,7 @@ class PageServer:
         headers = {"Cache-Control": IMMUTABLE, "Vary": "Accept-Encoding"}
         if "gzip" in request.headers.get("accept-encoding", ""):
             return FileResponse(path, media_type=media_type, headers={**headers, "Content-Encoding": "gzip"})
-        content = await run_in_threadpool(lambda: gzip.decompress(path.read_bytes()))
+        content = await in_thread(lambda: gzip.decompress(path.read_bytes()))
         return Response(content, media_type=media_type, headers=headers)
 
     def _recordings(self) -> dict[str, Path]:
@@ -341,7 +341,7 @@ class PageServer:
         async def events() -> AsyncIterator[str]:
             sent, at = None, -np.inf
             while not self._stopping.is_set() and not await request.is_disconnected():
-                found = await run_in_threadpool(state_message, self._engine)
+                found = await in_thread(state_message, self._engine)
                 new, now = (found.time_ns, found.revision, found.health, found.cause), time.monotonic()
                 if new != sent or now - at >= HEARTBEAT_S:
                     sent, at = new, now
@@ -357,7 +357,7 @@ class PageServer:
         await browser.accept()
         layout = browser.query_params.get("layout", "1") == "1"
         palette = THEMES.get(browser.query_params.get("theme", ""), EITHER)
-        feed = await run_in_threadpool(self._rerun_feed, layout, palette)
+        feed = await in_rerun_thread(self._rerun_feed, layout, palette)
         await feed_rerun(browser, feed, self._rerun_status)
 
     def _rerun_feed(self, layout: bool, palette: Palette) -> RerunFeed:

@@ -14,7 +14,6 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from starlette.concurrency import run_in_threadpool
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from estimators.errors import ConfigError, nearest
@@ -23,6 +22,7 @@ from ..live.running_fold import Running
 from ..present.series.chart_stream import ChartQuery, ChartStream, Seconds
 from ..present.series.series import Series
 from .http import MAX_BODY_BYTES, one_line, parse
+from .request_threads import in_rerun_thread, in_thread
 from .twin_json import annotations_json, episodes_json, moment_json
 
 if TYPE_CHECKING:
@@ -65,17 +65,6 @@ async def serve(browser: WebSocket, *works: Awaitable[None]) -> list[Exception]:
         with contextlib.suppress(RuntimeError):
             await browser.close()
     return [item for item in outcomes if isinstance(item, Exception) and not isinstance(item, WebSocketDisconnect)]
-
-
-async def in_thread(work: Callable[..., Any], *arguments: Any) -> Any:
-    """Return the result of work in a thread, which is awaited also when the task is cancelled meanwhile."""
-    task = asyncio.ensure_future(run_in_threadpool(work, *arguments))
-    try:
-        return await asyncio.shield(task)
-    except asyncio.CancelledError:
-        with contextlib.suppress(Exception):
-            await task
-        raise
 
 
 @dataclass(frozen=True)
@@ -135,7 +124,7 @@ class PageStream:
             watchers.discard(refolded)
             if self._choices is not None:
                 self._choices.leave(self)
-            await run_in_threadpool(self._exchange, list(self._streams.values()), [])
+            await in_thread(self._exchange, list(self._streams.values()), [])
 
     async def _listen(self) -> None:
         while True:
@@ -317,9 +306,9 @@ async def feed_rerun(browser: WebSocket, feed: RerunFeed, status: Callable[[], d
             begun = time.monotonic()
             if begun - sent >= RERUN_STATUS_PERIOD_S:
                 sent = begun
-                await browser.send_text(json.dumps(await run_in_threadpool(status)))
+                await browser.send_text(json.dumps(await in_thread(status)))
             if drawn.is_set():
-                for message in await in_thread(feed.next):  # a long history takes a while
+                for message in await in_rerun_thread(feed.next):  # a long history takes a while
                     if isinstance(message, str):
                         await browser.send_text(message)
                     else:
@@ -332,4 +321,4 @@ async def feed_rerun(browser: WebSocket, feed: RerunFeed, status: Callable[[], d
     try:
         await serve(browser, listen(), draw())
     finally:
-        await run_in_threadpool(feed.close)
+        await in_rerun_thread(feed.close)

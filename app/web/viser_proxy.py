@@ -8,7 +8,6 @@ from contextlib import suppress
 from urllib.parse import quote, urlencode
 
 import websockets
-from starlette.concurrency import run_in_threadpool
 from starlette.requests import Request
 from starlette.responses import PlainTextResponse, Response
 from starlette.websockets import WebSocket, WebSocketDisconnect
@@ -16,6 +15,7 @@ from websockets.asyncio.client import ClientConnection, connect
 
 from ..views.viser.guarded_server import HEADER
 from .http import PAGE
+from .request_threads import in_thread
 from .streams import serve
 
 RESPONSE_HEADERS = ("content-type", "content-encoding", "etag", "last-modified", "cache-control")
@@ -50,7 +50,7 @@ class ViserProxy:
         # The page uncompressed and not from a cache, as it is changed here.
         asked = {} if path == "/" else dict(request.headers)
         try:
-            status, headers, body = await run_in_threadpool(self._fetch, path, asked)
+            status, headers, body = await in_thread(self._fetch, path, asked)
         except (OSError, http.client.HTTPException) as error:
             return PlainTextResponse(f"Nisus: the Viser pane does not answer ({error}).\n", 502)
         if path == "/":

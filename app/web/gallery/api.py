@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 from starlette.applications import Starlette
-from starlette.concurrency import run_in_threadpool
 from starlette.requests import Request
 from starlette.responses import FileResponse, PlainTextResponse, Response
 from starlette.routing import Mount, Route
@@ -18,6 +17,7 @@ from config.loader import find
 from estimators.errors import ConfigError, NisusError, quoted
 
 from ..http import PAGE, Json, TooLarge, bounded_body, get, one_line, page_file, post, refusal
+from ..request_threads import in_thread
 from .cards import picture_file, shelf
 from .dropped_logs import DroppedLogs
 from .gallery import Gallery, StartRequest
@@ -160,7 +160,7 @@ class GalleryApi:
                 raise ConfigError("offset must be the number of bytes that were sent before")
             data = await bounded_body(request, PIECE_BYTES)
             last = query.get("last") == "1"
-            name = await run_in_threadpool(self._recordings.receive, query.get("name"), int(offset), data, last=last)
+            name = await in_thread(self._recordings.receive, query.get("name"), int(offset), data, last=last)
         except TooLarge as error:
             return refusal(error, 413)
         except NisusError as error:

@@ -1,0 +1,74 @@
+"""Threads that carry out requests and messages of pages, so that the event loop waits for none of them."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from collections.abc import Callable
+from concurrent.futures import Future
+from contextlib import suppress
+from functools import partial
+from queue import SimpleQueue
+from typing import Any, TypeVar
+
+T = TypeVar("T")
+
+REQUEST_THREADS = 12
+"""Threads for requests. One page with the scene and an edit under way uses six at once; work that takes long has a
+thread or a job of its own."""
+
+
+class RequestThreads:
+    """Fixed number of daemon threads with one queue; all start with the first request.
+
+    AnyIO, which Starlette uses, starts and ends its threads with the load, two to forty of them, each with a stack and
+    heaps of its own.
+    """
+
+    def __init__(self, name: str, count: int) -> None:
+        """Prepare `count` threads of a name; nothing is started yet."""
+        self._name, self._count = name, count
+        self._queue: SimpleQueue[tuple[Future[Any], Callable[[], Any]]] = SimpleQueue()
+        self._lock = threading.Lock()
+        self._started = False
+
+    def submit(self, work: Callable[[], T]) -> Future[T]:
+        """Queue work; the result or the error is set in the future."""
+        with self._lock:
+            if not self._started:
+                self._started = True
+                for k in range(self._count):
+                    threading.Thread(target=self._serve, name=f"{self._name} {k}", daemon=True).start()
+        outcome: Future[T] = Future()
+        self._queue.put((outcome, work))
+        return outcome
+
+    async def run(self, work: Callable[..., T], *arguments: Any, **named: Any) -> T:
+        """Return the result of work in one of the threads; it is awaited also when the task is cancelled meanwhile."""
+        outcome = asyncio.wrap_future(self.submit(partial(work, *arguments, **named)))
+        try:
+            return await asyncio.shield(outcome)
+        except asyncio.CancelledError:
+            with suppress(Exception):
+                await outcome
+            raise
+
+    def _serve(self) -> None:
+        while True:
+            self._carry_out(*self._queue.get())
+
+    @staticmethod
+    def _carry_out(outcome: Future[Any], work: Callable[[], Any]) -> None:
+        if not outcome.set_running_or_notify_cancel():
+            return
+        try:
+            outcome.set_result(work())
+        except BaseException as error:  # noqa: BLE001  passed on to the request
+            outcome.set_exception(error)
+
+
+in_thread = RequestThreads("request", REQUEST_THREADS).run
+
+in_rerun_thread = RequestThreads("rerun", 1).run
+"""For the feeds of all Rerun viewers: Rerun's allocator keeps free memory for each thread that has used it, so Explore
+took 15 MB more in twelve threads."""
