@@ -1,4 +1,4 @@
-"""Format times of a log."""
+"""Format times of a log, durations and counts."""
 
 from __future__ import annotations
 
@@ -19,3 +19,8 @@ def duration_text(seconds: float) -> str:
     units = ((86400.0, "days"), (3600.0, "h"), (60.0, "min"))
     size, unit = next((entry for entry in units if seconds >= 2.0 * entry[0]), (1.0, "s"))
     return f"{seconds / size:.3g} {unit}"
+
+
+def counted(number: int, noun: str) -> str:
+    """Return a number of things: `1 reading`, `1,200 readings`."""
+    return f"{number:,} {noun}{'' if number == 1 else 's'}"

@@ -12,6 +12,7 @@ from config.yaml_files import rewrite
 from estimators.errors import ConfigError
 from estimators.log import READING, Log
 
+from ..format_time import counted
 from ..present.result import TableColumn, Topic, to_json, to_text
 from ..studies.advice.draft import check_new, hint_lines, write_draft
 from ..studies.advice.measured import AdviceProgress, Measured, digits, percent, seconds_text, without_faults
@@ -104,8 +105,9 @@ def _topics(twin: Twin, log: Log, advice: Advice) -> list[Topic]:
     for claim in advice.claims:
         claims += [f"{finding(claim)}{' *' * (claim.key in advice.because)}", f"    {details(claim)}"]
     excluded = [exclusion_text(item) for item in advice.excluded]
+    measured = f"measured on {seconds:.4g} s of its log, {counted(readings, 'reading')}"
     topics = [
-        Topic(f"{twin.name}: {twin.title}", (f"measured on {seconds:.4g} s of its log, {readings:,} readings",)),
+        Topic(f"{twin.name}: {twin.title}", (measured,)),
         Topic(f"Use {advice.estimator}, {title} ({same})", tuple(advice.reasons)),
         *([Topic("Excluded: faults of sensors", tuple(excluded))] if excluded else []),
         Topic("Findings (* decided), with their figures", tuple(claims)),

@@ -29,7 +29,7 @@ from estimators.fold_checks import check_base
 from estimators.log import Events, Log
 from sources.messages import Messages
 
-from ..format_time import duration_text, format_time
+from ..format_time import counted, duration_text, format_time
 from ..twin.twin import VERSION, Twin, restore_twin, with_version
 from .changes import difference, merged, shape
 from .fold_json import (
@@ -407,7 +407,7 @@ def continued_text(path: Path, stored: StoredTwin, now: float) -> str:
     """Return the notice of a twin that continues; `now` in s since 1970."""
     since = now - stored.written
     at = format_time(round(stored.written * 1e9))
-    line = f"continued from {path} with {len(stored.tail.events):,} events"
+    line = f"continued from {path} with {counted(len(stored.tail.events), 'event')}"
     if since < 0.0:
         line += f"; the clock of this machine was set back by {duration_text(-since)} or more since {at}"
     elif stored.closed:

@@ -72,16 +72,14 @@ def nis_json(found: NisVerdict) -> dict[str, Any]:
     }
 
 
-def what_changed(run: Revision, there: Container[int] | None = None) -> str:
+def what_changed(run: Revision, there: Container[int]) -> str:
     """Describe the changes of a run in words; a run that was loaded is named if it is among those `there`."""
     changes = in_words(run.changes, units=units_of(run.estimator, run.tuning))
     said = ": ".join(part for part in (run.why, changes) if part)
     words = said or ("as it began" if run.first and run.loaded is None else "as before")
     if run.loaded is None:
         return words
-    return (
-        f"back to {'an earlier run' if there is not None and run.loaded not in there else f'run {run.loaded}'}: {words}"
-    )
+    return f"back to {f'run {run.loaded}' if run.loaded in there else 'an earlier run'}: {words}"
 
 
 def changes_json(changes: Sequence[SettingChange]) -> list[dict[str, Any]]:

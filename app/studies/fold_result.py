@@ -42,7 +42,7 @@ from estimators.track import FAILED, HEALTH_NAMES, REASONS, TRACKING, USED, Trac
 from estimators.tuning import SHARED_ENTRY_ROWS
 from sources.source import WRONG_TIME
 
-from ..format_time import duration_text, format_time
+from ..format_time import counted, duration_text, format_time
 from ..present.export.calibration_lines import COVERAGE_HEAD, calibration_lines, coverage_rows, health_shares
 from ..present.result import Figure, Topic, plain
 from ..present.series.columns import units_by_name
@@ -420,7 +420,7 @@ def _figures(result: FoldResult) -> list[Figure]:
         found.append(Figure(title, result.nees.mean, remark=result.nees.remark))
     if scored.nis_readings:
         verdict = scored.nis_verdict
-        said = f"{verdict.said}; {scored.nis_readings} readings"
+        said = f"{verdict.said}; {counted(scored.nis_readings, 'reading')}"
         found.append(Figure("mean NIS", verdict.ratio_text, remark=said))
     without = f"without rejected measurements {scored.log_likelihood_used:.2f}" if scored.gated else ""
     found += [

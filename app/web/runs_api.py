@@ -146,7 +146,7 @@ class RunsApi:
         found, pull = rows
         status = engine.status().integrity
         bounds = status.bounds if status is not None and status.revision == found.number else None
-        about = [("run", f"{found.number}" + (f", {found.name}" if found.name else "") + f": {what_changed(found)}")]
+        about = [("run", f"{found.number}" + (f", {found.name}" if found.name else "") + f": {self._what(found)}")]
         if found.note:
             about.append(("note", found.note))
         # The running one's episodes name the most likely cause, as the page does.
@@ -166,8 +166,11 @@ class RunsApi:
             new = [item for item in other.episodes if (item.subject, item.cause) not in known]
             if new and other.number < run.number:
                 known |= {(item.subject, item.cause) for item in new}
-                found.append((f"{other.number} {other.name}".rstrip() + f": {what_changed(other)}", new))
+                found.append((f"{other.number} {other.name}".rstrip() + f": {self._what(other)}", new))
         return tuple(found)
+
+    def _what(self, run: Revision) -> str:
+        return what_changed(run, {other.number for other in self._engine.revisions.runs})
 
     def _attachment(self, number: int, rest: str) -> dict[str, str]:
         """Return the header that names a file of a run."""

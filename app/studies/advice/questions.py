@@ -20,6 +20,7 @@ from estimators.log import READING
 from estimators.model.state_space import LARGE
 from estimators.registry import checked, find_entry, unfit
 
+from ...format_time import counted
 from .measured import (
     NO,
     UNTOLD,
@@ -140,7 +141,7 @@ def consistent(measured: Measured, estimator: str, options: Options = None) -> C
     reason = f"{estimator}: {verdict.words}"
     if not size and not related:
         reason += f"; every band is right within a quarter, and no correlation is beyond {LIMITS.correlation:g}"
-        return CONSISTENT.claim(YES, nis, f"{reason} ({_counted(len(rows), 'row')})")
+        return CONSISTENT.claim(YES, nis, f"{reason} ({counted(len(rows), 'row')})")
     remedies = []
     if size:
         one = max(size, key=lambda entry: abs(np.log(entry.scale.value)))
@@ -387,8 +388,8 @@ def small(measured: Measured) -> Claim:
     flops = 4.0 * n**3 + 6.0 * m * n**2
     share = rate * flops / OPERATIONS_PER_S
     reason = (
-        f"{_counted(n, 'state')}: a covariance takes {bytes_text(8.0 * n**2)} and 4 n³ + 6 m n² = {digits(flops)} "
-        f"operations a reading of m = {_counted(m, 'row')}; at {digits(rate)} readings a second that is "
+        f"{counted(n, 'state')}: a covariance takes {bytes_text(8.0 * n**2)} and 4 n³ + 6 m n² = {digits(flops)} "
+        f"operations a reading of m = {counted(m, 'row')}; at {digits(rate)} readings a second that is "
         f"{digits(100 * share)} % of a processor of {digits(OPERATIONS_PER_S)} operations a second"
     )
     if n > LARGE:
@@ -396,10 +397,6 @@ def small(measured: Measured) -> Claim:
     if share <= MAX_PROCESSOR_SHARE:
         return SIZE.claim(YES, float(n), reason)
     return SIZE.claim(NO, share, reason, threshold=MAX_PROCESSOR_SHARE, of="of a processor for a covariance")
-
-
-def _counted(number: int, noun: str) -> str:
-    return f"{number:,} {noun}{'s' if number > 1 else ''}"
 
 
 def affordable(measured: Measured, estimator: str, options: Options = None) -> Claim:

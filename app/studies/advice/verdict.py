@@ -26,7 +26,7 @@ from estimators.fit.objective import ALONE
 from estimators.log import Log
 from estimators.registry import find_entry, unfit
 
-from ...format_time import format_time
+from ...format_time import counted, format_time
 from ...present.result import plain
 from ...twin.twin import Twin
 from .coloured_noise import COLOURED, lasting
@@ -109,7 +109,7 @@ def details(claim: Claim) -> str:
 def exclusion_text(item: Exclusion) -> str:
     """Return what was left out: `yoke, 12.0 s to 31.5 s: stuck (195 readings)`."""
     at = [format_time(round(seconds * 1e9)) for seconds in (item.start, item.end)]
-    return f"{item.row}, {at[0]} to {at[1]}: {item.cause} ({item.readings:,} readings)"
+    return f"{item.row}, {at[0]} to {at[1]}: {item.cause} ({counted(item.readings, 'reading')})"
 
 
 @dataclass

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 from estimators.diagnostics.health import MAX_ROWS_PER_READING
 from estimators.errors import NisusError, SourceError
 
+from ...format_time import counted
 from ...live.notices import Notice
 from ...live.outputs import Cursor, Pull
 from .rrd_file import DATE, NEVER, Disk, Split, part_path, surplus_parts
@@ -171,7 +172,7 @@ class Recorder:
         self._open, self._closed = None, True
         if not goes_on:
             part.release()
-        self._engine.notices.say(f"recorded {part.file.rows} rows into {part.file.path}")
+        self._engine.notices.say(f"recorded {counted(part.file.rows, 'row')} into {part.file.path}")
 
     def _reason(self, error: Exception) -> str:
         if self._open is None:

@@ -2,7 +2,7 @@
 // has everything else.
 
 import { element, setText } from "./dom.js";
-import { bracketed, compact, spaced, span, words } from "./format.js";
+import { bracketed, compact, count, spaced, span, words } from "./format.js";
 import { swatch } from "./layers.js";
 import { gone } from "./save.js";
 
@@ -70,7 +70,7 @@ export class Runs {
 
   head(subjects) {
     const select = subjects.length
-      ? element("select", { "aria-label": "State or sensor of the error", dataset: { focus: "subject" }, onchange: () => ((this.subject = select.value), this.show()) },
+      ? element("select", { "aria-label": "State or sensor of the error", title: words(this.subject), dataset: { focus: "subject" }, onchange: () => ((this.subject = select.value), this.show()) },
           ...subjects.map((fit) => element("option", { value: fit.name, selected: fit.name === this.subject }, `${words(fit.name)}${fit.against === "truth" ? "" : " (held out)"}`)))
       : null;
     const unit = bracketed(subjects.find((fit) => fit.name === this.subject)?.unit);
@@ -90,7 +90,7 @@ export class Runs {
     const cell = (key, text, title) => element("td", { class: best[key] === number ? "best" : null, title: best[key] === number ? `Best. ${title ?? ""}` : title }, text);
     const scores = score
       ? [
-          cell("nis", `${compact(score.nis / score.nis_dof, 3)}${BEYOND[score.nis_place] ?? ""}`, `Of the whole run: ${score.nis_words}; ${score.readings} measurements in ${span(score.seconds)}, ${compact(100 * (score.refused ?? 0), 2)} % rejected`),
+          cell("nis", `${compact(score.nis / score.nis_dof, 3)}${BEYOND[score.nis_place] ?? ""}`, `Of the whole run: ${score.nis_words}; ${count(score.readings, "measurement")} in ${span(score.seconds)}, ${compact(100 * (score.refused ?? 0), 2)} % rejected`),
           cell("rmse", fit ? compact(fit.rmse, 3) : "–", fit ? `${words(fit.name)}, ${fit.against}: mean error ${compact(fit.bias, 2)}${spaced(fit.unit)}, ${compact(100 * fit.coverage, 3)} % inside the 95 % band` : "Needs a known truth or a held-out sensor"),
           cell("likelihood", compact(score.log_likelihood_reading, 3), `In all ${compact(score.log_likelihood, 6)}`),
           cell("step", compact(score.step_us, 3)),

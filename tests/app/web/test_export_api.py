@@ -11,7 +11,7 @@ import pytest
 from app.cli.arguments import FoldCommand
 from app.cli.fold import fold_twin
 from app.cli.run import live_source
-from app.live.commands import Maintenance, SetTuning
+from app.live.commands import Load, Maintenance, SetTuning
 from app.present.export import track_file
 from app.twin.twin import load_twin
 from app.web.running import OpenedTwin
@@ -145,3 +145,13 @@ def test_the_report_of_a_run_is_that_of_the_page(client, session):
     first = session.engine.twin.tuning.get("Q.winding")
     assert "1: Q.winding" in text and f"Changed: Q.winding {first:.6g} → 0.5." in text
     assert "Runs of the session" in text and "as it began" in text
+
+
+def test_the_report_names_no_run_that_has_left_the_table(client, session):
+    """A run that is loaded goes on under another number."""
+    engine = session.engine
+    engine.submit(Load(1))
+    wait_for(lambda: engine.status().revision == 3)
+    assert [run.number for run in engine.revisions.runs] == [0, 2, 3]
+    text = " ".join(ParsedHtml(client.get("/api/report.html").text).text)
+    assert text.count("back to an earlier run: Q.tooth 0.5 →") == 2 and "back to run" not in text
