@@ -314,7 +314,9 @@ class CommandReceiver:
         """See `Receiver`."""
         text = alert.model_dump_json()
         try:
-            done = subprocess.run(self._command, input=text, text=True, capture_output=True, timeout=self._timeout)
+            done = subprocess.run(
+                self._command, input=text, text=True, errors="replace", capture_output=True, timeout=self._timeout
+            )
         except subprocess.TimeoutExpired:
             raise OSError(f"it did not end within {self._timeout:g} s") from None
         if done.returncode:
@@ -370,7 +372,7 @@ class Delivery:
             alert = self._waiting[0]
             try:
                 self._receiver.send(alert)
-            except OSError as error:
+            except Exception as error:  # noqa: BLE001  an answer of no protocol, or what a program prints
                 return self._failed(error)
             with self._lock:
                 # A full queue may have dropped it meanwhile.
@@ -382,13 +384,14 @@ class Delivery:
                 self._failures = 0
         return DELIVERY_PERIOD_S
 
-    def _failed(self, error: OSError) -> float:
+    def _failed(self, error: Exception) -> float:
         self._failures += 1
         pause = min(MAX_RETRY_S, 2.0 ** min(self._failures - 1, 10))
         # One line an outage; each failure is counted.
         self._notices.count("alert receiver")
         if self._failures == 1:
-            text = printable(str(error.strerror or error)).splitlines()[0][:200]
+            reason = str(getattr(error, "strerror", None) or error) or type(error).__name__
+            text = " ".join(printable(reason).split())[:200]
             self._notices.say(f"alerts: receiver {self.name} fails ({text}); they wait, and it is tried again", "warn")
         return pause
 

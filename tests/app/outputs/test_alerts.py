@@ -278,6 +278,45 @@ def test_an_answer_that_is_no_success_counts_as_a_failure_and_is_not_followed(ho
         Webhook(WebhookSection(type="webhook", url=hook.url)).send(heartbeat("motor", "tracking"))
 
 
+class Nonsense(BaseHTTPRequestHandler):
+    """Answers with bytes of no protocol."""
+
+    def do_POST(self):  # noqa: N802
+        self.rfile.read(int(self.headers["Content-Length"]))
+        self.wfile.write(b"nonsense\r\n\r\n")
+
+
+def test_a_receiver_that_answers_nonsense_fails_as_any_other(tmp_path):
+    from app.outputs.alerts import CommandReceiver, Webhook
+    from config.output_schema import CommandSection, WebhookSection
+
+    class Silent:
+        def send(self, alert):
+            raise ConnectionError
+
+    with HTTPServer(("127.0.0.1", 0), Nonsense) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        hook = Webhook(WebhookSection(type="webhook", url=f"http://127.0.0.1:{server.server_address[1]}/"))
+        program = "import os, sys; os.write(2, bytes([255])); sys.exit(int(sys.argv[1]))"
+        command = [
+            CommandReceiver(CommandSection(type="command", command=[sys.executable, "-c", program, code]), tmp_path)
+            for code in "30"
+        ]
+        said = []
+        notices = SimpleNamespace(say=lambda text, level="info": said.append(text), count=lambda key: None)
+        for receiver, reason in ((hook, "nonsense"), (command[0], "it ended with 3"), (Silent(), "ConnectionError")):
+            delivery = Delivery("ops", receiver, notices)
+            delivery.put(heartbeat("motor", "tracking"))
+            assert delivery.step() == 1.0 and delivery.step() == 2.0
+            assert delivery.failing and delivery.waiting == 1 and reason in said[-1]
+        server.shutdown()
+    assert len(said) == 3 and all("\n" not in text for text in said)
+    delivery = Delivery("ops", command[1], notices)
+    delivery.put(heartbeat("motor", "tracking"))
+    delivery.step()
+    assert (delivery.delivered, delivery.waiting) == (1, 0)
+
+
 def test_a_mute_is_asked_for_by_a_command(serve):
     page = serve(3)
     assert page.command("MuteAlerts", seconds=1e9) == (
