@@ -64,7 +64,7 @@ FOLDER_PERIOD_S = 2.0
 PIECE_BYTES = 65_536
 
 HOP_HEADERS = (
-    b"connection", b"keep-alive", b"transfer-encoding", b"upgrade", b"set-cookie", b"content-security-policy"
+    b"connection", b"keep-alive", b"transfer-encoding", b"upgrade", b"set-cookie", b"content-security-policy", b"date"
 )  # fmt: skip
 """Headers of answers that are not passed on."""
 
@@ -281,7 +281,8 @@ class Service:
         return self.state()
 
     async def _slash(self, request: Request) -> Response:
-        return RedirectResponse(f"{request.path_params['name']}/", 308)
+        # The dot: a name such as https:there would be the address of another site.
+        return RedirectResponse(f"./{request.path_params['name']}/", 308)
 
     async def _forward(self, request: Request) -> Response | _Forwarded:
         twin = self.twins.get(request.path_params["name"])
@@ -469,6 +470,9 @@ class _Forwarded(Response):
         target = quote(self._path).encode()
         query = scope["query_string"]
         headers = [(name, value) for name, value in scope["headers"] if name in REQUEST_HEADERS]
+        if any(name == b"transfer-encoding" for name, _ in scope["headers"]):  # a body of unknown length
+            headers = [item for item in headers if item[0] != b"content-length"]
+            headers += [(b"transfer-encoding", b"chunked")]
         headers += [*_credentials(self._twin, scope), (b"host", f"127.0.0.1:{self._twin.port}".encode())]
         headers += [(b"connection", b"close")]
         connection = h11.Connection(h11.CLIENT)
@@ -480,6 +484,7 @@ class _Forwarded(Response):
                     writer.write(connection.send(h11.Data(message["body"])) or b"")
                     await writer.drain()
                 if not message.get("more_body"):
+                    writer.write(connection.send(h11.EndOfMessage()) or b"")
                     break
         while (await receive())["type"] != "http.disconnect":
             pass

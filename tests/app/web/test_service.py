@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from urllib.error import HTTPError
+from urllib.parse import urljoin
 from urllib.request import ProxyHandler, Request, build_opener
 
 import pytest
@@ -144,6 +145,22 @@ def test_roles_hold_for_every_twin_and_commands_are_noted_with_their_user(served
         "POST", "/twins/north/api/command", json.dumps(edit), {"Cookie": cookie, "Content-Type": "application/json"}
     )
     assert connection.getresponse().status == 403
+    connection.close()
+
+
+def test_a_body_without_a_length_and_an_odd_name_reach_the_twin_and_no_other_site(served):
+    connection = http.client.HTTPConnection(served.url.removeprefix("http://"), timeout=PATIENCE_S)
+    headers = {"Authorization": f"Bearer {served.token}", "Content-Type": "application/x-ndjson"}
+    lines = [b'{"values": {"winding": 40.0}, "sour', b'ce": "pipe", "sequence": 1}\n', b"{broken\n"]
+    connection.request("POST", "/twins/south/api/readings", iter(lines), headers, encode_chunked=True)
+    answer = connection.getresponse()
+    counts = json.loads(answer.read())
+    assert (answer.status, counts["accepted"], counts["refused"]) == (200, 1, 1)
+    assert len(answer.msg.get_all("date")) == 1
+    connection.request("GET", "/twins/https:site.example", headers=headers)
+    answer = connection.getresponse()
+    assert (answer.status, answer.read()) == (308, b"")
+    assert urljoin(f"{served.url}/twins/x", answer.getheader("location")).startswith(f"{served.url}/twins/")
     connection.close()
 
 
