@@ -20,6 +20,7 @@ from .source import Report
 
 NO_BROKER = "no broker"  # Key of the times at which the connection was lost
 REFUSED_MESSAGE = "message refused"  # Key of messages that cannot be read
+REFUSED_TOPIC = "topic refused"  # Key of topics that the broker does not deliver
 
 UNITS = {"s": 10**9, "ms": 10**6, "us": 1000, "ns": 1}
 """Nanoseconds of the units of a time."""
@@ -169,7 +170,7 @@ class MqttSource:
             self._client.message_callback_add(name, self._callback(topics[name]))
         self.connected = threading.Event()
         """Set while the topics are subscribed to."""
-        self._client.on_subscribe = lambda *_: self.connected.set()
+        self._client.on_subscribe = self._subscribed
         self._client.connect_async(section.host, section.port, keepalive=15)
         self._client.loop_start()
 
@@ -178,6 +179,13 @@ class MqttSource:
             self._lost(f"it refuses: {reason}")
         else:
             client.subscribe([(name, self._qos) for name in self._topics])
+
+    def _subscribed(self, _client: Any, _data: Any, _number: Any, reasons: Any, _properties: Any) -> None:
+        for name, reason in zip(self._topics, reasons, strict=False):
+            if reason.is_failure:
+                text = f"the broker at {self._place} refuses the topic {name} ({reason}); check the rights of the user"
+                self._report(REFUSED_TOPIC, text)
+        self.connected.set()
 
     def _disconnected(self, _client: Any, _data: Any, _flags: Any, reason: Any, _properties: Any) -> None:
         self._lost(f"the connection ended: {reason}")
@@ -190,11 +198,12 @@ class MqttSource:
 
     def _callback(self, topic: TopicMap) -> Any:
         def arrived(_client: Any, _data: Any, message: Any) -> None:
-            # The broker sends the last retained message to each new subscriber: without a time it is of no moment.
-            if message.retain and topic.time is None and topic.values:
-                return
             try:
-                answer = self._messages.send([topic.message(message.topic, message.payload)])[0]
+                found = topic.message(message.topic, message.payload)
+                # The broker sends the last retained message to each new subscriber: without a time it is of no moment.
+                if message.retain and found.get("time") is None:
+                    return
+                answer = self._messages.send([found])[0]
                 reason = answer.reason if answer.status == REFUSED else ""
             except Exception as error:  # noqa: BLE001  no payload may end the source
                 reason = str(error)
@@ -236,13 +245,21 @@ class OpcUaSource:
             report: Receives lost connections.
 
         Raises:
-            ConfigError: If asyncua is not installed.
+            ConfigError: If asyncua is not installed, or a node id is none.
         """
         try:
-            import asyncua  # noqa: F401
+            from asyncua import ua
         except ModuleNotFoundError:
             raise ConfigError("OPC UA needs asyncua: pip install 'nisus[service]'") from None
-        self._messages, self._url, self._nodes, self._period = messages, url, dict(nodes), period
+        self._messages, self._url, self._period = messages, url, period
+        self._names: dict[str, str] = {}
+        for name, node in nodes.items():
+            try:
+                # As notifications spell it: i=85, not ns=0;i=85.
+                self._names[ua.NodeId.from_string(node).to_string()] = name
+            except Exception:  # noqa: BLE001  asyncua raises many kinds
+                text = f"source: node {quoted(node)} of {name} is no node id; it must be like ns=2;s=Tank.Level"
+                raise ConfigError(text) from None
         self._report = report
         self._last: dict[str, tuple[Any, Any]] = {}
         self.connected = threading.Event()
@@ -279,9 +296,8 @@ class OpcUaSource:
         from asyncua import Client
 
         async with Client(self._url) as client:
-            names = {node: name for name, node in self._nodes.items()}
-            subscription = await client.create_subscription(self._period * 1e3, NodeHandler(self, names))
-            await subscription.subscribe_data_change([client.get_node(node) for node in names])
+            subscription = await client.create_subscription(self._period * 1e3, NodeHandler(self, self._names))
+            await subscription.subscribe_data_change([client.get_node(node) for node in self._names])
             self.connected.set()
             while not self._stopping.is_set():
                 await self._pause(CHECK_S)

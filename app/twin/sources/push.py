@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import os
+import re
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from config.source_schema import ColumnSection, MqttSourceSection, OpcUaSourceSection, PushSection
 from config.yaml_files import Key
-from estimators.errors import ConfigError, nearest
+from estimators.errors import ConfigError, nearest, shown_name
 from estimators.model.state_space import StateSpaceModel
 from sources.pieces import VALUES
 
@@ -17,6 +18,9 @@ from .kind import Kind, Opening, blamed, failure
 if TYPE_CHECKING:
     from sources.messages import Messages
     from sources.source import Source
+
+TOPIC_FILTER = re.compile(r"(?:(?:[^#+/\x00]*|\+)/)*(?:[^#+/\x00]*|\+|#)")
+"""Topics with wildcards, as brokers take them."""
 
 MessageSection = PushSection | MqttSourceSection | OpcUaSourceSection
 
@@ -48,6 +52,10 @@ def _open_mqtt(opening: Opening) -> Source:
     section: MqttSourceSection = opening.section
     messages = _messages(opening)
     _check_names(opening, messages, {name for topic in section.topics.values() for name in topic.values}, "topics")
+    for name in section.topics:
+        if not TOPIC_FILTER.fullmatch(name):
+            rule = "+ and # must stand alone between slashes, and # at the end"
+            raise failure(opening.loaded, (*opening.key, "topics"), f"names {shown_name(name)}; {rule}")
     topics = {name: TopicMap(**topic.model_dump()) for name, topic in section.topics.items()}
     return MqttSource(
         messages,

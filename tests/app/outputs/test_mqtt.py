@@ -1,18 +1,21 @@
 """MQTT at a real broker: states and alerts out, measurements in, and a broker that goes and comes back."""
 
 import json
+from types import SimpleNamespace
 
 import jsonschema
 import pytest
+from paho.mqtt.packettypes import PacketTypes
+from paho.mqtt.reasoncodes import ReasonCode
 
 from app.outputs import Publisher
 from app.present.state_message import state_schema
 from app.twin.twin import load_twin
 from estimators.errors import ConfigError, NisusError
-from sources.brokers import TopicMap
+from sources.brokers import MqttSource, TopicMap
 from sources.messages import Messages
 from sources.source import Channel, ignore
-from tests.app.outputs.broker import Broker, Listener, needs_mosquitto
+from tests.app.outputs.broker import Broker, Listener, free_port, needs_mosquitto
 from tests.app.scripted import wait_for
 from tests.support import SECOND
 
@@ -163,6 +166,30 @@ def test_a_retained_number_without_a_time_is_of_no_moment(serve, broker, listene
     assert abs(page.get("/api/state")["states"][0]["value"] - 41.0) < 20.0
 
 
+def test_no_retained_payload_without_a_time_is_used_and_a_topic_that_is_refused_is_reported():
+    reported = []
+    source = MqttSource(
+        Messages([Channel(0, 0, "winding", ("winding",), model_units=("°C",))], width=1),
+        SimpleNamespace(host="127.0.0.1", port=free_port(), user=None, ca_file=None),
+        topics := {"plant/+": TopicMap(), "plant/t": TopicMap(values={"winding": "v"}, time="t")},
+        qos=1, password=None, client_id=None, report=lambda key, text: reported.append(text),
+    )  # fmt: skip
+    try:
+        sent = {"plant/+": {"values": {"winding": 40.0}}, "plant/t": {"v": 40.0, "t": None}}
+        for name, topic in topics.items():
+            for retain in (True, False):
+                payload = json.dumps(sent[name]).encode()
+                source._callback(topic)(None, None, SimpleNamespace(topic="plant/t", payload=payload, retain=retain))
+        assert len(source.read(0.0)) == 2
+        reasons = [ReasonCode(PacketTypes.SUBACK, identifier=code) for code in (135, 1)]
+        source._client.on_subscribe(None, None, 1, reasons, None)
+        assert [text for text in reported if "refuses" in text] == [
+            f"the broker at {source._place} refuses the topic plant/+ (Not authorized); check the rights of the user"
+        ]
+    finally:
+        source.close()
+
+
 def test_a_source_whose_broker_comes_back_goes_on(serve, broker):
     REPORTED.clear()
     page = received(serve, broker, {"plant/number": "winding"})
@@ -188,6 +215,12 @@ def test_a_source_whose_broker_comes_back_goes_on(serve, broker):
         ),
         ({"type": "mqtt", "host": "x", "topics": {"a": "winding"}, "password_env": "NISUS_NO"}, "NISUS_NO is not set"),
         ({"type": "mqtt", "host": "x", "topics": {"a": {"tme": "t"}}}, "tme"),
+        ({"type": "mqtt", "host": "x", "topics": {"a/#/b": "winding"}}, "source.topics names a/#/b; + and # must stand"),
+        ({"type": "mqtt", "host": "x", "topics": {"a+/b": "winding"}}, "source.topics names a+/b; + and # must stand"),
+        (
+            {"type": "opcua", "url": "opc.tcp://x:1", "nodes": {"winding": "Tank.Level"}},
+            "node 'Tank.Level' of winding is no node id; it must be like ns=2;s=Tank.Level",
+        ),
     ],
 )
 def test_a_source_that_cannot_be_is_refused_in_one_line(source, text, monkeypatch):

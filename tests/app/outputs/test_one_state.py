@@ -65,7 +65,7 @@ class Plant:
             self.write(-1, 0.0, ua.StatusCodes.Bad)
             self.server.start()
             self.closing.append(self.server.stop)
-            return {"type": kind, "url": url, "nodes": {"winding": f"ns={index};s=winding"}, "every": 0.01}
+            return {"type": kind, "url": url, "nodes": {"winding": f"ns=0{index};s=winding"}, "every": 0.01}
         if kind == "can":
             sensors = {"winding": {"message": "Plant", "signals": "winding"}}
             bus = {"interface": "virtual", "channel": self.channel, "dbc": str(self.folder / "plant.dbc")}
