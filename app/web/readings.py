@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import struct
 import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -12,7 +13,7 @@ from starlette.requests import Request
 from starlette.responses import PlainTextResponse, Response
 from starlette.routing import BaseRoute, Route
 
-from estimators.errors import ConfigError
+from estimators.errors import ConfigError, shown_name
 from sources.messages import ACCEPTED, DUPLICATE, FIELDS, REFUSED, Messages
 
 from ..live.running_fold import Running
@@ -21,6 +22,12 @@ from .request_threads import in_thread
 
 MAX_BYTES = 8 * 2**20
 """Longest body of measurements."""
+
+MAX_MESSAGES = 100_000
+"""Most messages of one body; a row of an Arrow batch may need no byte at all."""
+
+RECORD_BATCH = 3
+"""Type of an Arrow message with rows."""
 
 STORE_TIMEOUT_S, STORE_POLL_S = 2.0, 0.005
 """Longest wait for the store, and the time between two looks at it."""
@@ -48,9 +55,8 @@ def routes(engine: Running) -> list[BaseRoute]:
             found = await in_thread(lambda: answer(source, READERS[kind](body)))
             return Json(found | {"stored": await stored(engine, source.accepted)})
         except TooLarge:
-            return PlainTextResponse(
-                f"Nisus: a body may have {MAX_BYTES // 2**20} MB; send fewer messages at once.\n", 413
-            )
+            bounds = f"{MAX_BYTES // 2**20} MB and {MAX_MESSAGES:,} messages"
+            return PlainTextResponse(f"Nisus: a body may have {bounds}; send fewer messages at once.\n", 413)
         except ConfigError as error:
             return refusal(error)
 
@@ -71,7 +77,12 @@ def messages_of(engine: Running) -> Messages:
 
 
 def answer(source: Messages, messages: Sequence[Any]) -> dict[str, Any]:
-    """Send messages; return what became of each, and the counts."""
+    """Send messages; return what became of each, and the counts.
+
+    Raises:
+        TooLarge: If they are too many; none is sent then.
+    """
+    _check_count(len(messages))
     answers = source.send(messages)
     counts = {status: sum(item.status == status for item in answers) for status in (ACCEPTED, DUPLICATE, REFUSED)}
     items = [
@@ -112,19 +123,60 @@ def _of_lines(body: bytes) -> Sequence[Any]:
     return found
 
 
+def _check_count(messages: int) -> None:
+    if messages > MAX_MESSAGES:
+        raise TooLarge(f"a body may have {MAX_MESSAGES:,} messages; send fewer at once")
+
+
 def _of_arrow(body: bytes) -> Sequence[Any]:
     """Return the messages of a stream of Arrow batches: time, source and sequence, and a column for each value."""
     import pyarrow as pa
 
+    types, rows = pa.types, 0
+    known = (types.is_integer, types.is_floating, types.is_boolean, types.is_null, types.is_timestamp)
+    known += (types.is_string, types.is_large_string)
     try:
-        table = pa.ipc.open_stream(body).read_all()
+        if any(_is_compressed(piece.metadata.to_pybytes()) for piece in pa.ipc.MessageReader.open_stream(body)):
+            raise ConfigError("the batches are compressed; send them without compression")
+        stream, batches = pa.ipc.open_stream(body), []
+        for field in stream.schema:
+            # Nested types, views and dictionaries may name the same bytes any number of times.
+            if not any(is_it(field.type) for is_it in known):
+                name, kind = shown_name(field.name), shown_name(str(field.type))
+                raise ConfigError(f"column {name} is of type {kind}; it must have numbers, texts or times")
+        for batch in stream:
+            _check_count(rows := rows + batch.num_rows)
+            # Otherwise a length that is wrong reads the memory behind the body.
+            batch.validate(full=True)
+            batches.append(batch)
+        table = pa.Table.from_batches(batches, stream.schema)
         for k, field in enumerate(table.schema):
             if pa.types.is_timestamp(field.type):
                 table = table.set_column(k, field.name, table.column(k).cast(pa.timestamp("ns")).cast(pa.int64()))
         rows = table.to_pylist()
-    except (pa.ArrowException, ValueError, OSError) as error:
+    except (pa.ArrowException, ValueError, OSError, IndexError, struct.error) as error:
         raise ConfigError(f"the body is no stream of Arrow batches: {error}") from None
     return [_message(row) for row in rows]
+
+
+def _is_compressed(message: bytes) -> bool:
+    """Return whether the metadata of an Arrow message (a flatbuffer) tell of a batch whose buffers are compressed.
+
+    Source: Apache Arrow, format/Message.fbs: Message has header_type, header as fields 1, 2; RecordBatch compression as 3.
+    """
+
+    def place(table: int, field: int) -> int:
+        entries = table - struct.unpack_from("<i", message, table)[0]
+        (size,) = struct.unpack_from("<H", message, entries)
+        at = struct.unpack_from("<H", message, entries + 4 + 2 * field)[0] if 6 + 2 * field <= size else 0
+        return table + at if at else 0
+
+    def table_at(at: int) -> int:
+        return at + int(struct.unpack_from("<I", message, at)[0])
+
+    root = table_at(0)
+    kind, header = place(root, 1), place(root, 2)
+    return bool(kind and header) and message[kind] == RECORD_BATCH and place(table_at(header), 3) != 0
 
 
 def _message(row: Mapping[str, Any]) -> dict[str, Any]:

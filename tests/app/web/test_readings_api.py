@@ -125,12 +125,47 @@ def test_null_is_a_dropout(page):
         (b"[" * 100_000, JSON, 400, "the body is no JSON"),
         (b"arrow", ARROW, 400, "the body is no stream of Arrow batches"),
         (b"winding", "text/plain", 415, "Content-Type must be one of application/json, application/x-ndjson"),
-        (b" " * (8 * 2**20 + 1), JSON, 413, "a body may have 8 MB; send fewer messages at once"),
+        (b" " * (8 * 2**20 + 1), JSON, 413, "a body may have 8 MB and 100,000 messages; send fewer"),
     ],
 )
 def test_a_body_that_cannot_be_read_is_refused_in_one_line(page, body, kind, status, text):
     found, answer = sent(page, body, kind)
     assert found == status and text in str(answer) and str(answer).strip().count("\n") == 0
+
+
+def arrow(columns, compression=None):
+    batch = pa.record_batch(columns)
+    sink = pa.BufferOutputStream()
+    with pa.ipc.new_stream(sink, batch.schema, options=pa.ipc.IpcWriteOptions(compression=compression)) as stream:
+        stream.write_batch(batch)
+    return sink.getvalue().to_pybytes()
+
+
+def test_a_small_body_is_no_large_work_and_reads_no_memory_of_others(page):
+    bounds = "Nisus: a body may have 8 MB and 100,000 messages; send fewer messages at once.\n"
+    for body, kind in ((b"[" + b"1," * 100_000 + b"1]", JSON), (b"1\n" * 100_001, LINES)):
+        assert sent(page, body, kind) == (413, bounds)
+    body = arrow({"winding": pa.nulls(100_001)})
+    assert len(body) < 1000 and sent(page, body, ARROW) == (413, bounds)
+    for compression in ("lz4", "zstd"):
+        status, found = sent(page, arrow({"winding": np.zeros(1000)}, compression), ARROW)
+        assert (status, found) == (400, {"error": "the batches are compressed; send them without compression"})
+    for column in (pa.array([[1.0]]), pa.array(["Good"]).dictionary_encode(), pa.array(["Good"]).cast(pa.string_view())):
+        status, found = sent(page, arrow({"winding": column}), ARROW)
+        assert status == 400 and "column winding is of type " in found["error"]
+    # More rows than the buffer has.
+    honest = arrow({"winding": np.ones(7777)})
+    rows = (7777).to_bytes(8, "little")
+    assert honest.count(rows) == 2
+    status, found = sent(page, honest.replace(rows, (90_000).to_bytes(8, "little")), ARROW)
+    assert status == 400 and "expected at least 720000 byte(s)" in found["error"]
+    whole = arrow({"winding": np.ones(2)})
+    for place in range(0, len(whole), 3):
+        damaged = bytearray(whole)
+        damaged[place] ^= 0xFF
+        status, found = sent(page, bytes(damaged), ARROW)
+        # A value may have changed, or the columns: then each message is refused.
+        assert (status == 400 and "\n" not in found["error"]) or (status == 200 and len(found["items"]) <= 2)
 
 
 def test_a_line_that_is_no_json_is_refused_alone(page):
