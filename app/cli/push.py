@@ -137,7 +137,8 @@ class Twin:
         if parts.scheme not in ("http", "https") or not parts.netloc or not token:
             remedy = "give the one that `nisus run` printed, here or as NISUS_URL"
             raise ConfigError(f"{quoted(url)}: is no address of a twin with its token; {remedy}")
-        self._url = f"{parts.scheme}://{parts.netloc}/api/readings"
+        # The page of a twin among several is at /twins/NAME/.
+        self._url = f"{parts.scheme}://{parts.netloc}{parts.path.rstrip('/')}/api/readings"
         self._headers = {"Authorization": f"Bearer {token}", "Content-Type": "application/json"}
         self._opener = build_opener(ProxyHandler({}))
 

@@ -34,7 +34,7 @@ from estimators.track import HEALTH_NAMES
 from ..terminal import print_line
 from .door import Door
 from .gate import USER, User
-from .http import PAGE, get, page_file, post
+from .http import PAGE, get, page_file, post, refusal
 from .viser_proxy import couple
 
 STARTING, RUNNING, STOPPED, FAILED = "starting", "running", "stopped", "failed"
@@ -177,6 +177,7 @@ class Service:
             Route("/twins/{name}", self._slash),
             Route("/twins/{name}/{path:path}", self._forward, methods=["GET", "HEAD", "POST"]),
             WebSocketRoute("/twins/{name}/{path:path}", self._couple),
+            Route("/api/{path:path}", self._elsewhere, methods=["GET", "POST"]),
         ]
         door.add_gallery(routes, Starlette(routes=[get("/", self._page)]))
         door.show(None, audit=self)
@@ -282,7 +283,11 @@ class Service:
 
     async def _slash(self, request: Request) -> Response:
         # The dot: a name such as https:there would be the address of another site.
-        return RedirectResponse(f"./{request.path_params['name']}/", 308)
+        return RedirectResponse(f"./{quote(request.path_params['name'], safe='')}/", 308)
+
+    async def _elsewhere(self, request: Request) -> Response:
+        text = f"this is a service of several twins, whose interfaces are at /twins/NAME/{request.url.path.lstrip('/')}"
+        return refusal(ConfigError(f"{text}; NAME is one of {', '.join([*self.twins][:20])}"), 404)
 
     async def _forward(self, request: Request) -> Response | _Forwarded:
         twin = self.twins.get(request.path_params["name"])

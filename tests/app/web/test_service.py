@@ -1,6 +1,7 @@
 """A service of several twins: one page each, processes of their own, and an overview."""
 
 import http.client
+import io
 import json
 import os
 import re
@@ -10,7 +11,7 @@ import subprocess
 import sys
 import time
 from urllib.error import HTTPError
-from urllib.parse import urljoin
+from urllib.parse import unquote, urljoin
 from urllib.request import ProxyHandler, Request, build_opener
 
 import pytest
@@ -157,11 +158,27 @@ def test_a_body_without_a_length_and_an_odd_name_reach_the_twin_and_no_other_sit
     counts = json.loads(answer.read())
     assert (answer.status, counts["accepted"], counts["refused"]) == (200, 1, 1)
     assert len(answer.msg.get_all("date")) == 1
-    connection.request("GET", "/twins/https:site.example", headers=headers)
-    answer = connection.getresponse()
-    assert (answer.status, answer.read()) == (308, b"")
-    assert urljoin(f"{served.url}/twins/x", answer.getheader("location")).startswith(f"{served.url}/twins/")
+    for name in ("https:site.example", "%3Fa%2541"):
+        connection.request("GET", f"/twins/{name}", headers=headers)
+        answer = connection.getresponse()
+        assert (answer.status, answer.read()) == (308, b"")
+        place = urljoin(f"{served.url}/twins/x", answer.getheader("location"))
+        assert unquote(place) == unquote(f"{served.url}/twins/{name}/")
     connection.close()
+
+
+def test_lines_are_pushed_to_a_twin_of_the_service_by_its_address(served, monkeypatch, capsys):
+    token = TOKENS["plc"][1]
+    for place, code, text in (
+        ("/twins/south/", 0, "1 accepted"),
+        ("/twins/south", 0, "1 accepted"),
+        ("/", 2, "several twins, whose interfaces are at /twins/NAME/api/readings; NAME is one of north, south"),
+    ):
+        monkeypatch.setattr("sys.stdin", io.StringIO("winding\n40.5\n"))
+        user = token if code == 0 else served.token
+        assert main(["push", f"{served.url}{place}?token={user}"]) == code
+        found = capsys.readouterr()
+        assert text in found.out + found.err
 
 
 def test_one_twin_is_stopped_and_started_alone(served):
