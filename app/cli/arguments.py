@@ -551,8 +551,9 @@ class PushCommand(JsonOption):
     url: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="URL")] = None
     """Address of the twin, with its token, as `nisus run` printed it. Default: the environment variable NISUS_URL; a
     command line can be read by other users."""
-    time: str = "time"
-    """Column of a CSV with the time: ISO 8601 with an offset, or numbers. Without it, rows have the time of arrival."""
+    time: str | None = None
+    """Column of a CSV with the time: ISO 8601 with an offset, or numbers. Default: the column time; without it, rows
+    have the time of arrival."""
     unit: Literal["s", "ms", "us", "ns"] = "s"
     """Unit of numbers in that column, since 1970."""
     source: str | None = None

@@ -19,7 +19,7 @@ from urllib.error import HTTPError, URLError
 from urllib.parse import parse_qs, urlsplit
 from urllib.request import ProxyHandler, Request, build_opener
 
-from estimators.errors import ConfigError, quoted
+from estimators.errors import ConfigError, nearest, quoted, shown_name
 
 from ..present.result import to_json
 from ..terminal import complain
@@ -56,8 +56,9 @@ def push(arguments: Arguments) -> int:
 class Rows:
     """Lines of a stream as messages: NDJSON, or CSV whose first line has the names of its columns."""
 
-    def __init__(self, stream: Any, names: set[str], time_column: str, ns: int, source: str) -> None:
-        self._stream, self._names, self._time, self._ns, self._source = stream, names, time_column, ns, source
+    def __init__(self, stream: Any, names: set[str], time_column: str | None, ns: int, source: str) -> None:
+        self._stream, self._names, self._ns, self._source = stream, names, ns, source
+        self._time, self._timed = time_column or "time", time_column is not None
         self._columns: list[str] | None = None
         self._waiting: queue.Queue[tuple[int, str] | None] = queue.Queue(MAX_WAITING_LINES)
         threading.Thread(target=self._read, name="standard input", daemon=True).start()
@@ -91,6 +92,8 @@ class Rows:
 
     def _message(self, number: int, line: str) -> Any:
         """Return the message of a line; None if it is empty, or names the columns."""
+        if number == 1:
+            line = line.removeprefix("\ufeff")
         if not line.strip():
             return None
         if self._columns is None and line.lstrip().startswith("{"):
@@ -100,12 +103,18 @@ class Rows:
                 return quoted(line.strip())
             # A number of its own makes a repeated request harmless.
             return {"source": self._source, "sequence": number, **message} if isinstance(message, dict) else message
-        cells = next(csv.reader([line]))
+        try:
+            cells = next(csv.reader([line]))
+        except csv.Error:  # a field that is too long
+            return quoted(line.strip())
         if self._columns is None:
             self._columns = [cell.strip() for cell in cells]
             if not self._names & set(self._columns):
                 known = ", ".join(sorted(self._names))
                 raise ConfigError(f"line {number}: none of its columns is a value of the twin, which reads {known}")
+            if self._timed and self._time not in self._columns:
+                remedy = nearest(self._time, self._columns)
+                raise ConfigError(f"--time {shown_name(self._time)}: line {number} has no such column; {remedy}")
             return None
         row = dict(zip(self._columns, cells, strict=False))
         values = {name: _number(row[name]) for name in self._names & row.keys() if row[name].strip()}
@@ -134,7 +143,8 @@ class Twin:
     def __init__(self, url: str) -> None:
         parts = urlsplit(url)
         token = parse_qs(parts.query).get("token", [""])[0]
-        if parts.scheme not in ("http", "https") or not parts.netloc or not token:
+        readable = token.isascii() and token.isprintable()
+        if parts.scheme not in ("http", "https") or not parts.netloc or not (token and readable):
             remedy = "give the one that `nisus run` printed, here or as NISUS_URL"
             raise ConfigError(f"{quoted(url)}: is no address of a twin with its token; {remedy}")
         # The page of a twin among several is at /twins/NAME/.

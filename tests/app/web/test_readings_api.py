@@ -264,14 +264,25 @@ def test_lines_of_ndjson_are_sent_and_the_wrong_ones_named(page, nisus, monkeypa
         (None, "", "is no address of a twin with its token; give the one that `nisus run` printed"),
         ("http://127.0.0.1:9/?token=x", "", "no twin answers"),
         ("{host}/?token=x", "", "the twin refuses: Nisus: open the page at the address"),
+        ("http://127.0.0.1:9/?token=a%0d%0ab", "", "is no address of a twin with its token"),
+        ("http://127.0.0.1:9/?token=%e2%82%ac", "", "is no address of a twin with its token"),
         ("{url}", "t,level\n1,2\n", "line 1: none of its columns is a value of the twin, which reads winding"),
+        ("{url}", "times,winding\n1,2\n", "--time tme: line 1 has no such column; did you mean times?"),
     ],
 )
 def test_push_says_what_is_wrong_with_address_and_columns(page, nisus, monkeypatch, url, lines, text):
     monkeypatch.delenv("NISUS_URL", raising=False)
     monkeypatch.setattr("sys.stdin", io.StringIO(lines))
     given = [] if url is None else [url.format(host=page.client.origin, url=page.server.url)]
-    assert text in nisus.refuses("push", *given)
+    assert text in nisus.refuses("push", *given, *(["--time", "tme"] if "tme" in text else []))
+
+
+def test_a_mark_of_the_byte_order_is_no_letter_and_a_line_without_end_is_refused_alone(page, nisus, monkeypatch):
+    begin = BEGIN // SECOND + 130
+    text = f"\ufefft,winding\n{begin},41.0\n{'x' * 200_000}\n{begin + 1},41.5\n"
+    counts, said = pushed(page, nisus, monkeypatch, text, "--time", "t")
+    assert counts == {"accepted": 2, "duplicate": 0, "refused": 1}
+    assert said.count("\n") == 1 and "line 3: it must be an object with values" in said
 
 
 def test_lines_that_come_together_are_sent_together():
