@@ -27,7 +27,7 @@ from estimators.diagnostics.episodes import Episode, TrackedEpisode
 from estimators.errors import NisusError, SourceError
 from estimators.fold_checks import check_base
 from estimators.log import Events, Log
-from sources.messages import Messages
+from sources.messages import Messages, SentNumbers
 
 from ..format_time import counted, duration_text, format_time
 from ..twin.twin import VERSION, Twin, restore_twin, with_version
@@ -376,6 +376,7 @@ def _stored_twin(
         TrackedEpisode(tuple(each["key"]), each["at"], each["until"], Episode(*each["episode"]))
         for each in parts["episodes"]
     )
+    SentNumbers().restore(parts["numbers"])
     return StoredTwin(
         twin, tail, tuple(runs), notes, state["written"], state["closed"],
         numbers=parts["numbers"] if same_source else {},

@@ -5,6 +5,7 @@ import re
 import sqlite3
 import subprocess
 import sys
+import zlib
 from contextlib import closing
 from dataclasses import replace
 
@@ -170,9 +171,16 @@ def of_another_program(path):
         file.execute("CREATE TABLE songs (name TEXT)")
 
 
+def with_numbers_that_are_none(path):
+    with closing(sqlite3.connect(path, isolation_level=None)) as file:
+        data = b'{"plc": [[1, "x"]]}'
+        file.execute("UPDATE parts SET data = ?, crc = ? WHERE kind = 'numbers'", (data, zlib.crc32(data)))
+
+
 @pytest.mark.parametrize(
     ("spoil", "reason"),
     [
+        (with_numbers_that_are_none, "cannot be continued (ValueError: invalid literal"),
         (damaged, "is damaged; remove it, or choose another path"),
         (without_some_events, "events are missing; it is damaged; remove it, or choose another path"),
         (of_another_version, f"has format {FORMAT + 1}, this version reads {FORMAT}; remove it"),
