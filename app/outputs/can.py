@@ -6,6 +6,7 @@ age, a counter, and a checksum over identifier and content.
 
 from __future__ import annotations
 
+import re
 import struct
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -174,7 +175,8 @@ def dbc_text(section: CanOutputSection, engine: Running) -> str:
     from cantools.database import Database, Message, Signal
     from cantools.database.conversion import BaseConversion
 
-    name = engine.twin.name.replace("-", "_")
+    # Names in a DBC are those of C.
+    name = re.sub(r"[^A-Za-z0-9_]|^(?=[0-9])", "_", engine.twin.name)
     words = dict(enumerate(HEALTH_NAMES))
     messages = []
     for k, state in enumerate(engine.model.shown_states):

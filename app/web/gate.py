@@ -242,10 +242,9 @@ class Gate:
     def _address(self, scope: Scope) -> str:
         """Return the address of the client; behind a reverse proxy, the last one that it names."""
         named = Headers(scope=scope).getlist("x-forwarded-for") if self._public is not None else []
-        if named:
-            return named[-1].rpartition(",")[2].strip()
         client = scope.get("client")
-        return client[0] if client else ""
+        last = named[-1].rpartition(",")[2].split() if named else []
+        return last[0] if len(last) == 1 else client[0] if client else "unknown"
 
     def _secure(self, published: bool) -> bool:
         """Return whether a request came through TLS."""

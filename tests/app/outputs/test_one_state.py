@@ -24,6 +24,7 @@ from sources.source import ignore
 from tests.app.outputs.broker import Broker, Listener, free_port, needs_mosquitto
 from tests.app.outputs.test_alerts import state
 from tests.app.scripted import pull_all, wait_for
+from tests.conftest import ROOT
 from tests.support import SECOND
 
 BEGIN = 1_767_225_600 * SECOND
@@ -218,6 +219,18 @@ def test_frames_carry_validity_age_and_counter_and_a_checksum_that_is_the_standa
     assert struct.unpack_from("<fBBB", std) == (10.0, 0x37, 1, 50)
     (_, lost), _ = frames(1536, state(None, age_s=99.0, health="diverged"), 8)
     assert struct.unpack_from("<fBBB", lost) == (0.0, 0x58, 0, 255)
+
+
+@pytest.mark.parametrize(("name", "word"), [("ü", "_"), ("3-pump", "_3_pump"), ("fan", "fan")])
+def test_the_names_of_a_dbc_are_those_of_c(serve, tmp_path, name, word):
+    section = {"interface": "virtual", "channel": "x", "id": 1536, "dbc": str(tmp_path / "e.dbc")}
+    text = (ROOT / "config" / "twins" / "motor_winding.yaml").read_text()
+    (tmp_path / f"{name}.yaml").write_text(text)
+    page = serve()
+    page.engine.twin = load_twin(tmp_path / f"{name}.yaml", overrides={"outputs": json.dumps({"can": section})})
+    Publisher(page.engine)
+    database = cantools.database.load_file(tmp_path / "e.dbc")
+    assert [message.name for message in database.messages][0] == f"{word}_temperature_mean"
 
 
 @pytest.mark.parametrize(

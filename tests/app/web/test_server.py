@@ -7,7 +7,7 @@ import pytest
 
 from app.live.engine import Engine
 from app.web import viewer_assets as assets_module
-from app.web.gate import Gate, read_tokens
+from app.web.gate import USER, Gate, read_tokens
 from app.web.server import PageServer
 from app.web.viewer_assets import FILES, viewer_assets, viewer_version
 from estimators.errors import ConfigError
@@ -163,6 +163,26 @@ def test_a_service_on_other_addresses_has_its_own_names_only(host, origin, statu
     assert ask(gate, "/api/state", **headers)[0] == status
     if host != "127.0.0.1:9900":
         assert ask(Gate(behind, "t" * 40, 9900), "/api/state", **headers)[0] == 403
+
+
+@pytest.mark.parametrize(
+    ("named", "address"), [("1.2.3.4, 10.0.0.7", "10.0.0.7"), ("root admin 1.2.3.4", "unknown"), ("1.2.3.4, ", "unknown")]
+)
+def test_the_user_that_is_noted_cannot_be_changed_by_the_address_a_proxy_names(tmp_path, named, address):
+    found = []
+
+    async def noted(scope, receive, send):
+        found.append(scope[USER])
+        await behind(scope, receive, send)
+
+    service = Gate(
+        noted, "t" * 40, 9900, public="https://twins.example.com",
+        grants=read_tokens(tokens_file(tmp_path, f"bob tune {'b' * 20}\n")),
+    )  # fmt: skip
+    twin = Gate(noted, "u" * 40, 9901)
+    ask(service, "/api/state", host="twins.example.com", authorization="Bearer " + "b" * 20, x_forwarded_for=named)
+    ask(twin, "/api/state", host="127.0.0.1:9901", authorization="Bearer " + "u" * 40, nisus_user=" ".join(found[0]))
+    assert found == [("bob", "tune", address)] * 2
 
 
 @pytest.mark.parametrize("role", ["view", "feed", "tune", "admin"])
