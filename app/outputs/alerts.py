@@ -13,6 +13,7 @@ import os
 import smtplib
 import ssl
 import subprocess
+import tempfile
 import threading
 import time
 from collections import deque
@@ -314,14 +315,17 @@ class CommandReceiver:
         """See `Receiver`."""
         text = alert.model_dump_json()
         try:
-            done = subprocess.run(
-                self._command, input=text, text=True, errors="replace", capture_output=True, timeout=self._timeout
-            )
+            # A file, not a pipe: what the program leaves running would hold that open.
+            with tempfile.TemporaryFile() as said:
+                code = subprocess.run(
+                    self._command, input=text.encode(), stdout=subprocess.DEVNULL, stderr=said, timeout=self._timeout
+                ).returncode
+                said.seek(max(0, said.tell() - 1000) if code else 0)
+                last = (said.read(1000).decode(errors="replace").strip().splitlines() or [""])[-1]
         except subprocess.TimeoutExpired:
             raise OSError(f"it did not end within {self._timeout:g} s") from None
-        if done.returncode:
-            last = (done.stderr.strip().splitlines() or [""])[-1]
-            raise OSError(f"it ended with {done.returncode}{': ' if last else ''}{last}")
+        if code:
+            raise OSError(f"it ended with {code}{': ' if last else ''}{last}")
 
 
 def secret(name: str) -> str:

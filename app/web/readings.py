@@ -133,8 +133,8 @@ def _of_arrow(body: bytes) -> Sequence[Any]:
     import pyarrow as pa
 
     types, rows = pa.types, 0
-    known = (types.is_integer, types.is_floating, types.is_boolean, types.is_null, types.is_timestamp)
-    known += (types.is_string, types.is_large_string)
+    known = [types.is_integer, types.is_floating, types.is_boolean, types.is_null, types.is_timestamp]
+    known += [types.is_string, types.is_large_string]
     try:
         if any(_is_compressed(piece.metadata.to_pybytes()) for piece in pa.ipc.MessageReader.open_stream(body)):
             raise ConfigError("the batches are compressed; send them without compression")
@@ -162,7 +162,8 @@ def _of_arrow(body: bytes) -> Sequence[Any]:
 def _is_compressed(message: bytes) -> bool:
     """Return whether the metadata of an Arrow message (a flatbuffer) tell of a batch whose buffers are compressed.
 
-    Source: Apache Arrow, format/Message.fbs: Message has header_type, header as fields 1, 2; RecordBatch compression as 3.
+    Source: Apache Arrow, format/Message.fbs. Message has header_type and header as fields 1 and 2, RecordBatch has
+    compression as field 3.
     """
 
     def place(table: int, field: int) -> int:

@@ -3,6 +3,7 @@
 import hashlib
 import hmac
 import json
+import os
 import socketserver
 import sys
 import threading
@@ -311,10 +312,18 @@ def test_a_receiver_that_answers_nonsense_fails_as_any_other(tmp_path):
             assert delivery.failing and delivery.waiting == 1 and reason in said[-1]
         server.shutdown()
     assert len(said) == 3 and all("\n" not in text for text in said)
-    delivery = Delivery("ops", command[1], notices)
-    delivery.put(heartbeat("motor", "tracking"))
-    delivery.step()
-    assert (delivery.delivered, delivery.waiting) == (1, 0)
+    # One that leaves a program running has ended too.
+    os.mkfifo(tmp_path / "end")
+    child = "import subprocess, sys; subprocess.Popen([sys.executable, '-c', {!r}, sys.argv[1]])"
+    child = child.format("import sys; open(sys.argv[1])")
+    words = [sys.executable, "-c", child, str(tmp_path / "end")]
+    leaves = CommandReceiver(CommandSection(type="command", command=words, timeout=20), tmp_path)
+    for receiver in (command[1], leaves):
+        delivery = Delivery("ops", receiver, notices)
+        delivery.put(heartbeat("motor", "tracking"))
+        delivery.step()
+        assert (delivery.delivered, delivery.waiting) == (1, 0)
+    open(tmp_path / "end", "w").close()
 
 
 def test_a_mute_is_asked_for_by_a_command(serve):

@@ -215,8 +215,8 @@ def test_a_source_whose_broker_comes_back_goes_on(serve, broker):
         ),
         ({"type": "mqtt", "host": "x", "topics": {"a": "winding"}, "password_env": "NISUS_NO"}, "NISUS_NO is not set"),
         ({"type": "mqtt", "host": "x", "topics": {"a": {"tme": "t"}}}, "tme"),
-        ({"type": "mqtt", "host": "x", "topics": {"a/#/b": "winding"}}, "source.topics names a/#/b; + and # must stand"),
-        ({"type": "mqtt", "host": "x", "topics": {"a+/b": "winding"}}, "source.topics names a+/b; + and # must stand"),
+        ({"type": "mqtt", "host": "x", "topics": {"a/#/b": "winding"}}, "topics names a/#/b; + and # must stand"),
+        ({"type": "mqtt", "host": "x", "topics": {"a+/b": "winding"}}, "topics names a+/b; + and # must stand"),
         (
             {"type": "opcua", "url": "opc.tcp://x:1", "nodes": {"winding": "Tank.Level"}},
             "node 'Tank.Level' of winding is no node id; it must be like ns=2;s=Tank.Level",

@@ -150,7 +150,11 @@ def test_a_small_body_is_no_large_work_and_reads_no_memory_of_others(page):
     for compression in ("lz4", "zstd"):
         status, found = sent(page, arrow({"winding": np.zeros(1000)}, compression), ARROW)
         assert (status, found) == (400, {"error": "the batches are compressed; send them without compression"})
-    for column in (pa.array([[1.0]]), pa.array(["Good"]).dictionary_encode(), pa.array(["Good"]).cast(pa.string_view())):
+    for column in (
+        pa.array([[1.0]]),
+        pa.array(["Good"]).dictionary_encode(),
+        pa.array(["Good"]).cast(pa.string_view()),
+    ):
         status, found = sent(page, arrow({"winding": column}), ARROW)
         assert status == 400 and "column winding is of type " in found["error"]
     # More rows than the buffer has.

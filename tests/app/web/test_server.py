@@ -166,7 +166,8 @@ def test_a_service_on_other_addresses_has_its_own_names_only(host, origin, statu
 
 
 @pytest.mark.parametrize(
-    ("named", "address"), [("1.2.3.4, 10.0.0.7", "10.0.0.7"), ("root admin 1.2.3.4", "unknown"), ("1.2.3.4, ", "unknown")]
+    ("named", "address"),
+    [("1.2.3.4, 10.0.0.7", "10.0.0.7"), ("root admin 1.2.3.4", "unknown"), ("1.2.3.4, ", "unknown")],
 )
 def test_the_user_that_is_noted_cannot_be_changed_by_the_address_a_proxy_names(tmp_path, named, address):
     found = []
