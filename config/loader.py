@@ -167,7 +167,11 @@ def _paths_of(data: Any, there: Callable[[str], str], folder: Path) -> Iterator[
         for k, part in enumerate(section.get("parts") or ()):
             yield from of_source(part, (*key, "parts", k))
 
-    yield ("model",), file_of(data["model"])
+    model = data["model"]
+    if isinstance(model, dict):
+        yield from (((("model", key), there(model[key]))) for key in ("matrices", "fmu") if key in model)
+    else:
+        yield ("model",), file_of(model)
     if data.get("learned") is not None:
         yield ("learned",), there(data["learned"])
     yield from of_source(data.get("source"), ("source",))

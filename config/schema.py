@@ -37,6 +37,7 @@ from .fields import (
     Validity,
     refused,
 )
+from .model_schema import Model
 from .output_schema import AlertSection, OutputsSection
 from .source_schema import FaultSection, SourceSection
 
@@ -420,9 +421,10 @@ class TwinSection(Section):
     """One sentence for the gallery about the content of the example. Default: none."""
     question: Text | None = None
     """The question that this twin answers, for the gallery. Default: none."""
-    model: Text
+    model: Model
     """The model's name in the catalogue (motor_winding), or a Python file beside this one and the name of a model, or
-    of a function that returns one, in it (./pump.py:Pump)."""
+    of a function that returns one, in it (./pump.py:Pump). Or {matrices: file, states, inputs, sensors} for a linear
+    model, {fmu: file, step, ...} for an FMU."""
     parameters: Parameters = {}
     """The model's parameters by name: their values, in their units, or {value, std, correlation, widen, use}. Default:
     the model's values, held."""

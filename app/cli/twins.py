@@ -37,7 +37,7 @@ def _head(loaded: Loaded) -> dict[str, Any]:
     return {
         "name": loaded.path.stem,
         "title": config.title,
-        "model": config.model,
+        "model": config.model if isinstance(config.model, str) else config.model.file,
         "estimator": config.estimator.name,
         "source": config.source.type,
         "path": str(loaded.path),

@@ -69,6 +69,29 @@ def check_scene(loaded: Loaded, model: StateSpaceModel) -> None:
                 raise loaded.error(at, text)
 
 
+def check_stated(loaded: Loaded, model: StateSpaceModel, source: str) -> None:
+    """Refuse a YAML without the prior, process noise or sensor noise of a model whose `source` has no statistics.
+
+    Raises:
+        ConfigError: With file and line.
+    """
+    config = loaded.config
+    for state in model.states:
+        prior = config.prior.get(state.name)
+        if prior is None or prior.std is None:
+            raise loaded.error(
+                ("prior",), f"has no std of {state.name}, and {source} has none; give {state.name}: {{std}}"
+            )
+    for sensor in model.sensors:
+        section = config.sensors.get(sensor.name)
+        if section is None or section.variances is None:
+            text = f"has no std of {sensor.name}, and {source} has none; give {sensor.name}: {{std}}"
+            raise loaded.error(("sensors",), text)
+    if not config.noise:
+        example = model.state_names[-1]
+        raise loaded.error(("noise",), f"is missing, and {source} has none; give for example {example}: {{std}}")
+
+
 def one_each(loaded: Loaded, key: Key, values: tuple, rows: list[str]) -> tuple:
     """Return a value for each row, from one for all or one each."""
     if len(values) == 1:

@@ -15,6 +15,7 @@ import numpy as np
 
 from config.fields import bounds
 from config.loader import Loaded, shown_path
+from config.model_schema import FmuSection, MatricesSection, Model
 from config.schema import ParameterSection, SensorSection, TwinSection
 from config.yaml_files import Key, dotted
 from estimators.errors import ConfigError, ModelError, NisusError, nearest
@@ -30,17 +31,25 @@ from estimators.plausibility import DAY, surprise
 
 from .checks import check_named, check_names, one_each
 from .defaults import instrument_sections, parameter_sections, sensor_period
+from .fmu import fmu_model
 from .landmarks import expanded
 from .learned import load_learned
+from .matrices import matrices_model
 
 
-def find_model(loaded: Loaded, key: Key, reference: str) -> StateSpaceModel:
-    """Return the model that `reference`, the value at `key`, means: a name, or ./file.py:Name beside the YAML.
+def find_model(loaded: Loaded, key: Key, reference: Model) -> StateSpaceModel:
+    """Return the model that `reference`, the value at `key`, means.
+
+    It is a name, ./file.py:Name beside the YAML, or the section of a file of matrices or of an FMU.
 
     Raises:
         ConfigError: If there is no such model or file.
         ModelError: If the user's file fails, with its file and line.
     """
+    if isinstance(reference, MatricesSection):
+        return matrices_model(loaded, reference, _existing(loaded, (*key, "matrices"), reference.matrices))
+    if isinstance(reference, FmuSection):
+        return fmu_model(loaded, reference, _existing(loaded, (*key, "fmu"), reference.fmu))
     file, _, name = reference.rpartition(":")
     if not file and not reference.endswith(".py"):
         if reference in MODELS:
@@ -49,9 +58,7 @@ def find_model(loaded: Loaded, key: Key, reference: str) -> StateSpaceModel:
         raise loaded.error(key, f"is {reference!r}; no model of that name ships; {near}, or write ./file.py:Name")
     if not file or not name:
         raise loaded.error(key, f"is {reference!r}; name what to take from the file, as in ./pump.py:Pump")
-    path = _beside(loaded, file)
-    if not path.is_file():
-        raise loaded.error(key, f"is {reference!r}; there is no file {shown_path(path)}; it is sought beside the YAML")
+    path = _existing(loaded, key, reference, file)
     module = _import(path)
     if not hasattr(module, name):
         names = [item for item in vars(module) if not item.startswith("_")]
@@ -61,11 +68,22 @@ def find_model(loaded: Loaded, key: Key, reference: str) -> StateSpaceModel:
 
 def model_files(loaded: Loaded) -> tuple[Path, ...]:
     """Return the user's file of the model and those beside it that it imports; none for a bundled model."""
-    file = loaded.config.model.rpartition(":")[0]
+    model = loaded.config.model
+    if not isinstance(model, str):
+        return (_beside(loaded, model.file),)
+    file = model.rpartition(":")[0]
     if not file:
         return ()
     path = _beside(loaded, file)
     return (path, *imported_beside(path))
+
+
+def _existing(loaded: Loaded, key: Key, reference: str, file: str | None = None) -> Path:
+    """Return the path of a model's file, which must exist; `reference` is the value at `key`."""
+    path = _beside(loaded, reference if file is None else file)
+    if not path.is_file():
+        raise loaded.error(key, f"is {reference!r}; there is no file {shown_path(path)}; it is sought beside the YAML")
+    return path
 
 
 def _beside(loaded: Loaded, file: str) -> Path:
