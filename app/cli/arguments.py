@@ -126,8 +126,22 @@ class PageOptions:
     """Stop after this many seconds."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class ArchiveOptions:
+    """Options of a command that archives the rows of twins."""
+
+    archive: Path | None = None
+    """Archive each row of the twin, with its estimate, in Parquet files in this folder, in a folder for each twin;
+    `nisus query` reads them."""
+    archive_split: str = "64MB,1h,day"
+    """Complete a file of the archive at this size or duration, or at the end of a day (UTC, by the times of the rows).
+    A process that is killed loses the open file."""
+    archive_keep: str | None = None
+    """Remove the oldest files of a twin beyond this total size or age, or both: 20GB, 365d, or 20GB,365d."""
+
+
 @dataclass(frozen=True)
-class RunCommand(JsonOption, PageOptions, TuningOption, EstimatorOption):
+class RunCommand(JsonOption, ArchiveOptions, PageOptions, TuningOption, EstimatorOption):
     """Run a twin and show it in the browser. Without a twin: the gallery of bundled twins.
 
     An option is also taken from the environment: NISUS_RUN_PORT=8080 is --port 8080, unless that is given.
@@ -165,7 +179,7 @@ class RunCommand(JsonOption, PageOptions, TuningOption, EstimatorOption):
 
 
 @dataclass(frozen=True)
-class ServeCommand:
+class ServeCommand(ArchiveOptions):
     """Run several twins as one service on one port: an overview, the worst health first, and the page of each.
 
     Each twin is a process of its own; if it ends, it is started again. An option is also taken from the environment:
@@ -626,6 +640,23 @@ class LogCommand(JsonOption, TableOptions):
 
 
 @dataclass(frozen=True)
+class QueryCommand(JsonOption):
+    """Query an archive with SQL of DuckDB: a view for each twin, by its name, and `archive` with the rows of all.
+
+    Examples:
+      nisus query archive "SELECT count(*) FROM archive"
+      nisus query archive "SELECT health, count(*) FROM motor_can GROUP BY health" --csv
+    """
+
+    folder: Annotated[Path, tyro.conf.Positional]
+    """Folder of the archive, as given to `nisus run --archive`."""
+    sql: Annotated[str, tyro.conf.Positional]
+    """SELECT statement. Columns are those of `nisus fold --out`, and twin, revision, row and archived_ns."""
+    csv: Flag = False
+    """Print the result as CSV."""
+
+
+@dataclass(frozen=True)
 class NewCommand(JsonOption, RoleOptions, TableOptions):
     """Write NAME.yaml and NAME.py, a runnable example (a pump) or a draft from the signals of a recording.
 
@@ -682,6 +713,7 @@ COMMANDS: dict[type, str] = {
     TuningsCommand: "tunings:tunings_of",
     SchemaCommand: "new:write_schema",
     LogCommand: "log:show_log",
+    QueryCommand: "query:query",
     NewCommand: "new:new_twin",
     CompletionCommand: "completion:print_script",
 }

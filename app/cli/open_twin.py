@@ -12,6 +12,7 @@ import numpy as np
 
 from config.loader import shipped
 
+from ..outputs.archive import ArchivePlan
 from ..twin.log_reader import remarking
 from ..twin.twin import Twin, load_twin, restore_twin
 from ..views.recording.rrd_file import NEVER, Split
@@ -47,8 +48,12 @@ def opened_twin(
     overrides: Mapping[str, str] | None = None,
     speed: float | None = None,
     store: Path | None = None,
+    archive: Path | None = None,
+    split: Split = NEVER,
 ) -> OpenedTwin:
     """A twin on its source, and how to read it again when its files were changed; `store` may be a folder.
+
+    `archive` is the folder of all twins, `split` how its files are divided and kept.
 
     Raises:
         NisusError: If its YAML or its model is wrong.
@@ -61,7 +66,9 @@ def opened_twin(
     if store is not None and store.is_dir():
         store = store / f"{twin.name}.store"
     source = live_source(twin, speed)
-    return OpenedTwin(twin, source, files=twin.files, stamp=stamp_of(twin.files), again=read, store=store)
+    plan = None if archive is None else ArchivePlan(archive / twin.name, split)
+    stamp = stamp_of(twin.files)
+    return OpenedTwin(twin, source, files=twin.files, stamp=stamp, again=read, store=store, archive=plan)
 
 
 def recorded_twin(recorded: Recorded) -> Twin:

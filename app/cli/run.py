@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 __all__ = ["live_source", "run_twin"]
 
-OPTIONS_OF_TWIN = ("record", "store", "log", "set", "estimator", "tuning")  # of a twin that is named
+OPTIONS_OF_TWIN = ("record", "store", "archive", "log", "set", "estimator", "tuning")  # of a twin that is named
 
 MAX_FAILURES = 5  # failures that a run without a page prints at its end
 
@@ -60,6 +60,7 @@ def run_twin(arguments: RunCommand, workers: Sequence[Compiler] = ()) -> int:
     if arguments.json and not arguments.headless:
         raise ConfigError("--json: is the result of a run without a page; give --headless")
     split = parse_split(arguments.record_split, arguments.record_keep)
+    archived = parse_split(arguments.archive_split, arguments.archive_keep, "--archive")
     page = None if arguments.headless else page_of(arguments)
     opening, wanted, opener = None, None, FileOpener()
     if arguments.twin is not None:
@@ -71,6 +72,8 @@ def run_twin(arguments: RunCommand, workers: Sequence[Compiler] = ()) -> int:
             overrides=settings(arguments.set, arguments.estimator, arguments.tuning),
             speed=speed,
             store=arguments.store,
+            archive=arguments.archive,
+            split=archived,
         )
         opening, opener = read(), FileOpener({arguments.twin: read}, workers)
     elif page is None or any(getattr(arguments, name) for name in OPTIONS_OF_TWIN):

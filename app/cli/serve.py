@@ -20,6 +20,7 @@ from config.loader import shipped
 from estimators.errors import ConfigError, NisusError
 
 from ..terminal import EndRequest, restore, use_lines_of_json, when_asked_to_end
+from ..views.recording.rrd_file import NEVER, Split, parse_split
 from ..web.door import LOOPBACK, Door, check_port
 from ..web.gate import read_tokens
 from ..web.service import STATUS_PERIOD_S, Service, twins_of_folder
@@ -42,6 +43,8 @@ class ServiceOptions(NamedTuple):
     store: Path | None
     recordings: Path
     json: bool
+    archive: Path | None = None
+    split: Split = NEVER
 
 
 def serve(arguments: ServeCommand) -> int:
@@ -57,7 +60,9 @@ def serve(arguments: ServeCommand) -> int:
     grants = () if arguments.tokens is None else read_tokens(arguments.tokens)
     twins, folder = _named(arguments.twins)
     options = ServiceOptions(arguments.store, arguments.recordings, arguments.log_format == "json")
-    for place in (options.store, options.recordings):
+    split = parse_split(arguments.archive_split, arguments.archive_keep, "--archive")
+    options = options._replace(archive=arguments.archive, split=split)
+    for place in (options.store, options.recordings, options.archive):
         if place is not None and place.exists() and not place.is_dir():
             raise ConfigError(f"{place}: must be a folder, in which each twin has its own file")
     if loopback:
@@ -177,7 +182,7 @@ def _opened(options: ServiceOptions, name: str, path: str) -> tuple[Session, Map
     from .open_twin import FileOpener, open_session, opened_twin
 
     store = None if options.store is None else options.store / f"{name}.store"
-    read = partial(opened_twin, path, store=store)
+    read = partial(opened_twin, path, store=store, archive=options.archive, split=options.split)
     opener = FileOpener({path: read})
     opening = opener.made_ready(read())
     session = open_session(

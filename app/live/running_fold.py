@@ -265,6 +265,21 @@ class Running(ABC):
         with self._reading():
             return self._log.first + self._fold.n
 
+    @property
+    def history(self) -> int:
+        """Events that the log keeps at least."""
+        return self._history
+
+    def settled(self) -> int:
+        """Return the absolute index after the last folded event that no late measurement can change any more.
+
+        Of a horizon with many events it is at least the middle of the history, which drops its oldest events.
+        """
+        with self._reading():
+            log, n = self._log, self._fold.n
+            oldest = log.newest - round(self.twin.config.time.horizon * 1e9)
+            return log.first + max(int(np.searchsorted(log.t[:n], oldest)), n - self._history // 2)
+
     def span(self) -> tuple[int, int]:
         """Return the times of the first and the last event, ns; zeros while there is none. Never waits."""
         return self._span

@@ -15,6 +15,7 @@ from ..live.jobs import run_all
 from ..live.runs.refits import Refits
 from ..live.store import StoreWriter, open_store
 from ..outputs import Publisher
+from ..outputs.archive import Archive, ArchivePlan
 from ..terminal import complain, print_line
 from ..views.recording.rrd_file import NEVER, Split
 from ..views.recording.writer import ALL_STRETCHES, Recorder
@@ -56,7 +57,8 @@ class OpenedTwin:
     `open_source`, `base` and `horizon` are those of `Engine`; `review` is the reviewed recording, `said` the notices of
     its session, `annotations` its notes of users, `remarks` new notices, (level, text). `files` are the twin's files,
     `stamp` their state when read, and `again` reads them once more; a recording has none. `workshop` compiles its
-    filters, and stops with the engine. `store` is the file from which it continues after a restart.
+    filters, and stops with the engine. `store` is the file from which it continues after a restart,
+    `archive` where its rows are archived.
     """
 
     twin: Twin
@@ -72,6 +74,7 @@ class OpenedTwin:
     again: Callable[[], Twin] | None = None
     workshop: Workshop | None = None
     store: Path | None = None
+    archive: ArchivePlan | None = None
 
 
 class RunningTwin:
@@ -120,6 +123,7 @@ class RunningTwin:
             raise
         self.store = None if store is None else StoreWriter(self.engine, store, stored)
         self.engine.store = self.store
+        self.archive = None if opening.archive is None else Archive(self.engine, opening.archive, stored)
         if opening.said:
             self.engine.notices.restore(list(opening.said))
         if stored is None:
@@ -189,6 +193,8 @@ class RunningTwin:
             self.publisher.start()
         if self.store is not None:
             self.store.start()
+        if self.archive is not None:
+            self.archive.start()
         if self.opening.review is None:
             # A recording is over; what it had adopted is in it.
             self.refits.start()
@@ -210,6 +216,8 @@ class RunningTwin:
         self.engine.stop()
         if self.store is not None:
             self.store.stop()
+        if self.archive is not None:
+            self.archive.stop()
         self.recorder.stop()
         if self._next_line is not None:
             self._print_notices()

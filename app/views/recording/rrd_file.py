@@ -116,17 +116,24 @@ DATE = re.compile("%[YmdHMSj]")
 """Date in the name of a recording, as of strftime: local time."""
 
 
-def parse_split(text: str | None, keep: str | None = None) -> Split:
-    """Parse `1GB`, `10min` or `day`, or several of them, for example `1GB,day`; `keep` is a size or a duration.
+def parse_split(text: str | None, keep: str | None = None, option: str = "--record") -> Split:
+    """Parse `1GB`, `10min` or `day`, or several of them, for example `1GB,day`; `keep` is a size, a duration or both.
+
+    `option` begins the names of both options in messages.
 
     Raises:
         ConfigError: If one of them is wrong, or too small.
     """
-    parts = [] if text is None else [part.strip() for part in text.split(",")]
-    each = [_parse_limit("--record-split", part, f" or {DAY}") for part in parts if part != DAY]
-    kept_size, kept_seconds = (math.inf, math.inf) if keep is None else _parse_limit("--record-keep", keep)
-    size, seconds = (min([math.inf, *values]) for values in zip(*each, (math.inf, math.inf), strict=True))
-    return Split(size, seconds, DAY in parts, kept_size, kept_seconds)
+    parts, kept = ([] if each is None else [part.strip() for part in each.split(",")] for each in (text, keep))
+    each = [_parse_limit(f"{option}-split", part, f" or {DAY}") for part in parts if part != DAY]
+    size, seconds = _least(each)
+    return Split(size, seconds, DAY in parts, *_least([_parse_limit(f"{option}-keep", part) for part in kept]))
+
+
+def _least(limits: list[tuple[float, float]]) -> tuple[float, float]:
+    """Return the smallest size and the shortest time."""
+    size, seconds = (min(values) for values in zip(*limits, (math.inf, math.inf), strict=True))
+    return size, seconds
 
 
 def _parse_limit(option: str, text: str, more: str = "") -> tuple[float, float]:
