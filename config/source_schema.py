@@ -354,6 +354,9 @@ class TableSection(RecordingSection):
     """Sensors of the model and the columns that feed them."""
     inputs: dict[str, ColumnSection] = {}
     """Inputs of the model and the columns that feed them."""
+    follow: Annotated[bool, Field(strict=True)] = False
+    """Whether the files are CSV that grow, or appear in the folders that `files` names, while the twin runs: each row
+    is read once, files in the order of their names. Default: false."""
     truth: dict[str, ColumnSection] = {}
     """States whose true value the table holds. They are scored, never used. Of a field under its name: the array
     with a cell for each of its own; cells that a sensor reads are left out."""
@@ -471,6 +474,12 @@ class MergedSection(Section):
     """merged"""
     parts: Annotated[tuple[PartSection, ...], Field(min_length=1)]
     """The recordings: sections of type can_log or table, whose clocks agree."""
+
+    @model_validator(mode="after")
+    def _recorded(self) -> MergedSection:
+        if any(isinstance(part, TableSection) and part.follow for part in self.parts):
+            raise refused("relation", "have one with follow; a merged source reads recordings", "parts")
+        return self
 
 
 SourceSection = Annotated[

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
@@ -61,6 +61,20 @@ class Paced(Source, Protocol):
 
     def seek(self, t: int) -> None:
         """Move to t, ns."""
+
+
+@runtime_checkable
+class Marked(Source, Protocol):
+    """A live source that counts what it has read, and can continue there after a restart."""
+
+    mark: int
+    """Count of what was read."""
+
+    def numbers(self, mark: int) -> Mapping[str, Any]:
+        """Return the state after `mark`, for `restore`; in one thread, with rising marks."""
+
+    def restore(self, numbers: Mapping[str, Any]) -> None:
+        """Continue with the `numbers` of the source before a restart, if any, and keep them from now on."""
 
 
 def span_of(source: Source) -> tuple[int, int] | None:

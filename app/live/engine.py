@@ -313,9 +313,11 @@ class Engine(Running):
             if isinstance(item, Delivery):
                 batches.append(item.events)
                 mark = item.mark
+                if self._feeder.waits:
+                    self._feeder.taken()
             elif isinstance(item, Events):
                 batches.append(item)
-                if not self._feeder.live:
+                if self._feeder.waits:
                     self._feeder.taken()
             else:
                 self._accept(batches, mark)

@@ -58,6 +58,8 @@ class Feeder:
         self._restarted, self._finished = restarted, finished
         self.source = open_source()
         self.live = self.source.live
+        self.waits = not self.live or getattr(self.innermost, "waits", False)
+        """Whether the source waits for the engine, as files do and a bus does not."""
         self._mark = 0
         self._stop = threading.Event()
         self._room = threading.Semaphore(MAX_BATCHES_AHEAD)
@@ -90,10 +92,12 @@ class Feeder:
         mark = getattr(self.innermost, "mark", None)
         if mark is not None:
             if len(batch) or mark != self._mark:
+                if self.waits:
+                    self._room.acquire()
                 self._inbox.put(Delivery(batch, mark))
             self._mark = mark
         elif len(batch):
-            if not self.source.live:
+            if self.waits:
                 self._room.acquire()
             self._inbox.put(batch)
         return len(batch)

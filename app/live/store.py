@@ -27,7 +27,7 @@ from estimators.diagnostics.episodes import Episode, TrackedEpisode
 from estimators.errors import NisusError, SourceError
 from estimators.fold_checks import check_base
 from estimators.log import Events, Log
-from sources.messages import Messages, SentNumbers
+from sources.source import Marked
 
 from ..format_time import counted, duration_text, format_time
 from ..twin.twin import VERSION, Twin, restore_twin, with_version
@@ -376,13 +376,22 @@ def _stored_twin(
         TrackedEpisode(tuple(each["key"]), each["at"], each["until"], Episode(*each["episode"]))
         for each in parts["episodes"]
     )
-    SentNumbers().restore(parts["numbers"])
+    _check_integers(list(parts["numbers"].values()))
     return StoredTwin(
         twin, tail, tuple(runs), notes, state["written"], state["closed"],
         numbers=parts["numbers"] if same_source else {},
         episodes=episodes,
         commands=tuple(AuditEntry(**each) for each in commands),
     )  # fmt: skip
+
+
+def _check_integers(items: list[Any]) -> None:
+    """Raise ValueError or TypeError unless nested lists hold integers only."""
+    for item in items:
+        if isinstance(item, list):
+            _check_integers(item)
+        else:
+            int(item)
 
 
 def source_text(twin: Twin) -> str:
@@ -432,7 +441,7 @@ class StoreWriter:
         self._episodes: tuple[Any, tuple[TrackedEpisode, ...]] = ((), ())
         if stored is not None:
             engine.tail(self._cursor)
-        if isinstance(engine.innermost, Messages):
+        if isinstance(engine.innermost, Marked):
             engine.innermost.restore({} if stored is None else stored.numbers)
         self._asked = threading.Event()
         self._pause = WRITE_PERIOD_S
@@ -501,7 +510,7 @@ class StoreWriter:
             for name, (of, text) in now.items()
             if name not in self._written or not _is_same(of, self._written[name])
         }
-        if isinstance(source, Messages) and (tail.mark != self._mark or "numbers" not in self._written):
+        if isinstance(source, Marked) and (tail.mark != self._mark or "numbers" not in self._written):
             changed["numbers"] = json.dumps(source.numbers(tail.mark))
         elif "numbers" not in self._written:
             changed["numbers"] = "{}"

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from config.loader import Loaded
-from config.source_schema import AssetSection, CanLogSection, CanSection, RecordingSection
+from config.source_schema import AssetSection, CanLogSection, CanSection, RecordingSection, TableSection
 from config.yaml_files import Key
 from estimators.errors import SourceError
 from estimators.log import READING
@@ -52,8 +52,9 @@ class Plan:
     @property
     def recorded(self) -> bool:
         """Whether it is read from files, and so is neither a bus nor a simulation."""
-        kind = self.loaded.config.source.type
-        return SOURCES[kind].takes_log and (kind != "can" or self.log_files is not None)
+        section = self.loaded.config.source
+        live = section.type == "can" or (isinstance(section, TableSection) and section.follow)
+        return SOURCES[section.type].takes_log and (not live or self.log_files is not None)
 
     def check_files(self) -> None:
         """Open the files of the source, and close them: it takes milliseconds, while its twin takes seconds to compile.
@@ -158,7 +159,7 @@ def missing(loaded: Loaded) -> str | None:
     section = loaded.config.source
     try:
         for key, part in SOURCES[section.type].sections(section, KEY).items():
-            if isinstance(part, RecordingSection):
+            if isinstance(part, RecordingSection) and not (isinstance(part, TableSection) and part.follow):
                 find_recording(loaded, part, key, None)
             if isinstance(part, CanSection | CanLogSection):
                 find_databases(loaded, part, key)

@@ -107,14 +107,19 @@ def read_rows(path: Path, time: TimeColumn, columns: Sequence[str | TextMatch]) 
     read = read_csv if is_text(path) else _BINARY[suffix_of(path)][1]
     times = TimeReader(time)
     for chunk in read(path, time.name, columns, lambda *problem: problems.append(problem)):
-        t, known = times.read(chunk.time)
-        for row in np.flatnonzero(~known).tolist():
-            problems.append((UNDATED, int(chunk.line[row]), _undated(time, chunk.time[row])))
-        yield TableRows(chunk.line, t, known, chunk.values, chunk.blank, taken())
+        yield dated(chunk, times, time, problems)._replace(problems=taken())
     if problems:
         none = np.zeros(0, np.int64)
         nothing = np.zeros((0, len(columns)))
         yield TableRows(none, none, none.astype(np.bool_), nothing, nothing.astype(np.bool_), taken())
+
+
+def dated(chunk: Chunk, times: TimeReader, time: TimeColumn, problems: list[tuple[str, int, str]]) -> TableRows:
+    """Return the rows of a chunk with their times; rows without one are appended to the problems."""
+    t, known = times.read(chunk.time)
+    for row in np.flatnonzero(~known).tolist():
+        problems.append((UNDATED, int(chunk.line[row]), _undated(time, chunk.time[row])))
+    return TableRows(chunk.line, t, known, chunk.values, chunk.blank, ())
 
 
 def _undated(time: TimeColumn, cell: Any) -> str:

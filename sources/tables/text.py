@@ -76,6 +76,15 @@ def csv_format(path: Path) -> CsvFormat:
             head = binary.read(HEAD_BYTES)
     except OSError as error:
         raise SourceError(f"{path}: it cannot be read ({error.strerror or error}); check that it is complete") from None
+    return format_of(path, head)
+
+
+def format_of(path: Path, head: bytes) -> CsvFormat:
+    """Return the format of a CSV that begins with these bytes.
+
+    Raises:
+        SourceError: If they are not text.
+    """
     refuse_others(path, head)
     encoding = "utf-16" if head.startswith((b"\xff\xfe", b"\xfe\xff")) else _single_bytes(head)
     if encoding != "utf-16" and any(byte < 9 or 13 < byte < 32 for byte in head[:4096]):
@@ -113,9 +122,8 @@ def read_csv(
     path: Path, time: str, columns: Sequence[str | TextMatch], problem: Problem
 ) -> Generator[Chunk, None, None]:
     """Yield the rows of a CSV; a value that is not a number is missing and reported, as is a row cut short."""
-    names, delimiter, decimal, encoding = csv_format(path)
-    at_time = names.index(time)
-    places = [names.index(column_of(name)) for name in columns]
+    kind = csv_format(path)
+    names, delimiter, _, encoding = kind
     broken: tuple[int, int] | None = None
     raw: list[str] = []
     with open_text(path, encoding) as file:
@@ -148,17 +156,30 @@ def read_csv(
                         rows.append(row)
                         lines.append(reader.line_num)
             if rows:
-                values = np.empty((len(rows), len(columns)))
-                blank = np.zeros(values.shape, np.bool_)
-                for k, place in enumerate(places):
-                    cells = [row[place] for row in rows]
-                    fill(columns[k], cells, lines, values[:, k], blank[:, k], problem, decimal)
-                times = [row[at_time].strip() for row in rows]
-                if decimal == ",":
-                    times = [_with_point(cell) or cell for cell in times]
-                yield Chunk(np.array(lines), times, values, blank)
+                yield chunk_of(rows, lines, kind, time, columns, problem)
     if broken is not None:
         problem(TRUNCATED, broken[0], f"the last line has {broken[1]} cells, not {len(names)}")
+
+
+def chunk_of(
+    rows: list[list[str]],
+    lines: list[int],
+    kind: CsvFormat,
+    time: str,
+    columns: Sequence[str | TextMatch],
+    problem: Problem,
+) -> Chunk:
+    """Return the cells of rows, at these lines of a CSV, as numbers."""
+    values = np.empty((len(rows), len(columns)))
+    blank = np.zeros(values.shape, np.bool_)
+    for k, name in enumerate(columns):
+        place = kind.names.index(column_of(name))
+        fill(name, [row[place] for row in rows], lines, values[:, k], blank[:, k], problem, kind.decimal)
+    at_time = kind.names.index(time)
+    times = [row[at_time].strip() for row in rows]
+    if kind.decimal == ",":
+        times = [_with_point(cell) or cell for cell in times]
+    return Chunk(np.array(lines), times, values, blank)
 
 
 def _lines(file: TextIO, raw: list[str]) -> Iterator[str]:

@@ -10,11 +10,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from config.loader import Loaded, shown_path
-from config.source_schema import CanLogSection, CanSection, RecordingSection
+from config.source_schema import CanLogSection, CanSection, RecordingSection, TableSection
 from config.yaml_files import Key, dotted
 from estimators.errors import SourceError
 from estimators.model.state_space import StateSpaceModel
-from sources.formats import check_once
+from sources.formats import TABLES, check_once, suffix_of
 
 from ..channels import channels
 
@@ -121,20 +121,28 @@ def find_recording(
         patterns, where = section.recording, (*key, "recording")
     else:
         raise failure(loaded, key, "is a live bus, which does not end; give a recording of it with --log FILE")
-    root = _root(loaded, section)
     found: list[Path] = []
     for pattern in patterns:
-        wanted = str(Path(pattern).expanduser())
-        escaped = wanted if os.path.isabs(wanted) else os.path.join(glob.escape(str(root)), wanted)
-        matches = sorted(Path(match) for match in glob.glob(escaped, recursive=True) if Path(match).is_file())
-        exact = root / wanted  # A name with brackets in it is itself before it is a pattern.
-        if exact.is_file():
-            matches = [exact]
+        matches = matching(loaded, section, pattern)
         if not matches:
-            raise _absent(loaded, where, exact, section)
+            raise _absent(loaded, where, _root(loaded, section) / Path(pattern).expanduser(), section)
         found += matches
     check_once(found, f"{loaded.places.at(where)}: {dotted(where)}: ")
     return found
+
+
+def matching(loaded: Loaded, section: CanSection | RecordingSection, pattern: str) -> list[Path]:
+    """Return the present files of a pattern by name; of a followed folder all files whose name is that of a table."""
+    root = _root(loaded, section)
+    wanted = str(Path(pattern).expanduser())
+    exact = root / wanted  # A name with brackets in it is itself before it is a pattern.
+    if exact.is_file():
+        return [exact]
+    if exact.is_dir() and isinstance(section, TableSection) and section.follow:
+        files = [path for path in exact.iterdir() if path.is_file() and suffix_of(path) in TABLES]
+        return sorted(path for path in files if not path.name.startswith("."))
+    escaped = wanted if os.path.isabs(wanted) else os.path.join(glob.escape(str(root)), wanted)
+    return sorted(Path(match) for match in glob.glob(escaped, recursive=True) if Path(match).is_file())
 
 
 def find_databases(

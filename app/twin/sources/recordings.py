@@ -21,7 +21,7 @@ from sources.source import span_of
 
 from ...ingest import Ingest
 from .can import CAN_LOG
-from .kind import Kind, Opening, blamed, closed, find_recording
+from .kind import Kind, Opening, blamed, closed, find_recording, matching
 
 if TYPE_CHECKING:
     from sources.source import Channel, Source
@@ -115,6 +115,8 @@ def _open_table(opening: Opening) -> Source:
     from sources.tables.table import Table
 
     section: TableSection = opening.section
+    if section.follow and opening.live and opening.log_files is None:
+        return _follow(opening, section)
     files = find_recording(opening.loaded, section, opening.key, opening.log_files)
 
     def table(channels: list[Channel]) -> Table:
@@ -130,6 +132,23 @@ def _open_table(opening: Opening) -> Source:
             report=opening.report,
             horizon=opening.loaded.config.time.horizon,
         )
+
+    return blamed(opening, table)
+
+
+def _follow(opening: Opening, section: TableSection) -> Source:
+    from sources.tables.follow import FollowedTable
+    from sources.tables.times import TimeColumn
+
+    def files() -> list[Path]:
+        found = [path for pattern in section.files for path in matching(opening.loaded, section, pattern)]
+        return list(dict.fromkeys(found))
+
+    time, width, report = section.time, opening.model.width, opening.report
+
+    def table(channels: list[Channel]) -> FollowedTable:
+        column = TimeColumn(time.column, time.unit, time.format, time.zone)
+        return FollowedTable(files, time=column, time_shift=time.shift, channels=channels, width=width, report=report)
 
     return blamed(opening, table)
 

@@ -1,0 +1,298 @@
+"""Live source of CSV files that grow, and of files that appear in a folder; each row is read once."""
+
+from __future__ import annotations
+
+import csv
+import os
+import threading
+import zlib
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+
+from estimators.errors import SourceError, nearest
+from estimators.log import Events
+
+from ..formats import is_compressed
+from ..mapping import ABSENT, PRESENT, ChannelMapping
+from ..source import TRUNCATED, Channel, Report, ignore
+from ..units import heading_unit
+from .rows import dated, is_text
+from .text import HEAD_BYTES, UNREADABLE, CsvFormat, chunk_of, column_of, format_of
+from .times import TimeColumn, TimeReader
+
+POLL_S = 0.1
+"""Seconds between two looks for new rows."""
+
+PIECE_BYTES = 2**18
+"""Bytes read at once, and of the longest line."""
+
+IDENTITY_BYTES = 256
+"""First bytes by which a file is recognised; one that was written anew differs in them, or is shorter."""
+
+LEFT_OUT = "file left out"
+"""Key of files that are no tables of these columns."""
+
+
+@dataclass
+class _File:
+    """A file and how far it was read: bytes and lines; `checked` first bytes have the CRC `head`."""
+
+    inode: int
+    offset: int = 0
+    line: int = 0
+    checked: int = 0
+    head: int = 0
+    seen: tuple[int, int] = (-1, -1)
+    """Size and time of writing (ns) up to which nothing is left to read."""
+    format: CsvFormat | None = None
+    times: TimeReader | None = None
+
+    def state(self) -> list[int]:
+        """Return the position for the store."""
+        return [self.offset, self.line, self.checked, self.head]
+
+    def is_same(self, file: BinaryIO, size: int) -> bool:
+        """Return whether a file of this inode still begins as it did."""
+        file.seek(0)
+        return size >= self.offset and zlib.crc32(file.read(self.checked)) == self.head
+
+
+@dataclass
+class _Stored:
+    """Positions by inode that the store has, and later ones with the mark of each; None of a file that is gone."""
+
+    on: bool = False
+    positions: dict[int, list[int]] = field(default_factory=dict)
+    later: deque[tuple[int, int, list[int] | None]] = field(default_factory=deque)
+
+
+class FollowedTable:
+    """Reads the new rows of CSV files, in the order of their names, as they are written.
+
+    A file is known by its inode and first bytes, so one that is renamed is not read again, and one that is truncated or
+    written anew is read from its start. A last line without a line end waits for it; a cell with a line break is not
+    read. For rows and columns see `Table`.
+
+    Args:
+        files: Returns the present files in their order.
+        time: The column that holds the time.
+        time_shift: Seconds added to it.
+        channels: What feeds the model.
+        width: Value columns of an event.
+        report: Called for rows and files that cannot be used, with file and line.
+
+    Raises:
+        SourceError: If a present file lacks a column, or a unit does not convert.
+    """
+
+    live = True
+    waits = True
+
+    def __init__(
+        self,
+        files: Callable[[], Sequence[Path]],
+        *,
+        time: TimeColumn,
+        time_shift: float = 0.0,
+        channels: Iterable[Channel],
+        width: int,
+        report: Report = ignore,
+    ) -> None:
+        channels = list(channels)
+        self._list, self._time, self._width, self._report = files, time, width, report
+        self._shift = round(time_shift * 1e9)
+        self._columns = list(dict.fromkeys(name for channel in channels for name in channel.needed))
+        self._mapping = ChannelMapping(
+            [(channels, self._columns, [heading_unit(name) for name in self._columns])], width=width, report=report
+        )
+        self._files: dict[int, _File] = {}
+        self._open: tuple[int, Path, BinaryIO] | None = None
+        """Inode, path and handle of the file that was read last; if it was moved away, its rest is read from here."""
+        self._stored = _Stored()
+        self._closing = threading.Event()
+        self.mark = 0
+        """Pieces that were read."""
+        for path in files():
+            with path.open("rb") as file:
+                self._format(path, file)
+
+    def numbers(self, mark: int) -> dict[str, list[int]]:
+        """Return the positions after the first `mark` pieces, for `restore`."""
+        stored = self._stored
+        while stored.later and stored.later[0][0] <= mark:
+            _, inode, state = stored.later.popleft()
+            if state is None:
+                stored.positions.pop(inode, None)
+            else:
+                stored.positions[inode] = state
+        return {str(inode): state for inode, state in stored.positions.items()}
+
+    def restore(self, numbers: Mapping[str, Any]) -> None:
+        """Continue at the `numbers` of the source before a restart, if any, and keep them from now on."""
+        positions = {int(inode): [int(value) for value in state] for inode, state in numbers.items()}
+        self._stored = _Stored(True, positions)
+        self._files = {inode: _File(inode, *state) for inode, state in positions.items()}
+
+    def read(self, timeout: float) -> Events | None:
+        """Return the events of the next rows; none after `timeout` seconds without one."""
+        events = self._next()
+        if events is None:
+            self._closing.wait(min(timeout, POLL_S))
+            events = self._next()
+        return Events.empty(self._width) if events is None else events
+
+    def now(self) -> int | None:
+        """Return None: files have no clock."""
+        return None
+
+    def close(self) -> None:
+        """Close the file that is open."""
+        self._closing.set()
+        self._close_open()
+
+    def _next(self) -> Events | None:
+        """Return the events of the next piece of the first file that has one; None if there is none."""
+        present: list[tuple[Path, os.stat_result]] = []
+        try:
+            paths = self._list()
+        except OSError as error:
+            self._report(LEFT_OUT, f"{error.filename}: it cannot be listed ({error.strerror}); check its permissions")
+            return None
+        for path in paths:
+            with suppress(OSError):  # moved away meanwhile
+                present.append((path, path.stat()))
+        inodes = {stat.st_ino for _, stat in present}
+        if self._open is not None and self._open[0] not in inodes:
+            inode, path, handle = self._open
+            with suppress(OSError, SourceError):
+                events = self._piece(path, handle, self._files[inode])
+                if events is not None:
+                    return events
+            self._close_open()
+        for inode in [inode for inode in self._files if inode not in inodes]:
+            del self._files[inode]
+            self._note(inode, None)
+        for path, stat in present:
+            known = self._files.get(stat.st_ino)
+            if known is not None and known.seen == (stat.st_size, stat.st_mtime_ns):
+                continue
+            try:
+                events = self._of(path)
+            except (OSError, SourceError) as error:
+                cannot = f"{path}: it cannot be read ({error}); check its permissions"
+                text = f"{error}; the file is left out" if isinstance(error, SourceError) else cannot
+                self._report(LEFT_OUT, text)
+                self._files.setdefault(stat.st_ino, _File(stat.st_ino)).seen = (stat.st_size, stat.st_mtime_ns)
+                continue
+            if events is not None:
+                return events
+        return None
+
+    def _close_open(self) -> None:
+        """Close the file that was read last."""
+        if self._open is not None:
+            self._open[2].close()
+        self._open = None
+
+    def _of(self, path: Path) -> Events | None:
+        """Return the events of the next piece of a file; None if it has none."""
+        handle = path.open("rb")
+        try:
+            stat = os.fstat(handle.fileno())
+            known = self._files.get(stat.st_ino)
+            if known is None or not known.is_same(handle, stat.st_size):
+                known = self._files[stat.st_ino] = _File(stat.st_ino)
+            events = self._piece(path, handle, known)
+        except BaseException:
+            handle.close()
+            raise
+        if events is None:
+            known.seen = (stat.st_size, stat.st_mtime_ns)
+        self._close_open()
+        self._open = (stat.st_ino, path, handle)
+        return events
+
+    def _piece(self, path: Path, handle: BinaryIO, file: _File) -> Events | None:
+        """Return the events of the next complete lines; None if there are none."""
+        if file.offset < HEAD_BYTES or file.format is None:
+            file.format = self._format(path, handle)
+        handle.seek(file.offset)
+        data = handle.read(PIECE_BYTES)
+        end = data.rfind(b"\n") + 1
+        if not end and len(data) == PIECE_BYTES:
+            self._report(TRUNCATED, f"{path.name}:{file.line + 1}: the line is longer than {PIECE_BYTES} bytes")
+            end = len(data)
+        if not end or file.format is None:
+            return None
+        lines = data[:end].decode(file.format.encoding, "replace").split("\n")[:-1]
+        if file.times is None:
+            file.times = TimeReader(self._time)
+        events = self._events(path, lines, file.line, file.format, file.times)
+        file.offset, file.line = file.offset + end, file.line + len(lines)
+        file.checked = min(file.offset, IDENTITY_BYTES)
+        handle.seek(0)
+        file.head = zlib.crc32(handle.read(file.checked))
+        self.mark += 1
+        self._note(file.inode, file.state())
+        return events
+
+    def _note(self, inode: int, state: list[int] | None) -> None:
+        if self._stored.on:
+            self._stored.later.append((self.mark, inode, state))
+
+    def _format(self, path: Path, handle: BinaryIO) -> CsvFormat | None:
+        """Return the format of a file, None while its first line is not complete.
+
+        Raises:
+            SourceError: If it is no CSV, or lacks a column.
+        """
+        if is_compressed(path) or not is_text(path):
+            raise SourceError(f"{path}: only plain CSV files can be followed; read it without follow")
+        handle.seek(0)
+        head = handle.read(HEAD_BYTES)
+        if b"\n" not in head:
+            return None
+        # The last line is taken for one that is cut, and ignored.
+        found = format_of(path, head[: head.rfind(b"\n") + 1] + b"\n")
+        if found.encoding == "utf-16":
+            raise SourceError(f"{path}: is UTF-16; only UTF-8 or Windows-1252 can be followed")
+        for name in (self._time.name, *map(column_of, self._columns)):
+            if found.names.count(name) != 1:
+                times = "no column" if name not in found.names else "more than one column"
+                raise SourceError(f"{path}: there is {times} {name!r}; {nearest(name, found.names)}")
+        return found
+
+    def _events(self, path: Path, lines: list[str], before: int, kind: CsvFormat, times: TimeReader) -> Events:
+        """Return the events of the lines that follow so many lines of a file."""
+        rows, numbers = [], []
+        problems: list[tuple[str, int, str]] = []
+        for number, line in enumerate(lines, start=before + 1):
+            cells = next(csv.reader([line], delimiter=kind.delimiter), []) if line.strip() else []
+            if number == 1 or not cells:
+                continue
+            if len(cells) != len(kind.names) or line.count('"') % 2:
+                text = f"has {len(cells)} cells, not {len(kind.names)}; the row is left out"
+                problems.append((UNREADABLE, number, text))
+                continue
+            rows.append(cells)
+            numbers.append(number)
+        if not rows:
+            found = None
+        else:
+            chunk = chunk_of(rows, numbers, kind, self._time.name, self._columns, lambda *item: problems.append(item))
+            found = dated(chunk, times, self._time, problems)
+        for key, number, text in problems:
+            self._report(key, f"{path.name}:{number}: {text}")
+        if found is None:
+            return Events.empty(self._width)
+        t = found.t + self._shift
+        state = np.where(found.blank, ABSENT, PRESENT).astype(np.int8)
+        plan = np.zeros(t.size, np.int64)
+        # As those of a recording, rows that were written before the twin began have no time of arrival.
+        return self._mapping.events(plan, t, t, found.values, state, (~found.known).astype(np.int8))
