@@ -135,9 +135,9 @@ class FollowedTable:
 
     def restore(self, numbers: Mapping[str, Any]) -> None:
         """Continue at the `numbers` of the source before a restart, if any, and keep them from now on."""
-        positions = {int(inode): [int(value) for value in state] for inode, state in numbers.items()}
-        self._stored = _Stored(True, positions)
-        self._files = {inode: _File(inode, *state) for inode, state in positions.items()}
+        self._stored = _Stored(True, {int(inode): [*map(int, state)] for inode, state in numbers.items()})
+        for inode, (offset, line, checked, head) in self._stored.positions.items():
+            self._files[inode] = _File(inode, offset, line, checked, head)
 
     def read(self, timeout: float) -> Events | None:
         """Return the events of the next rows; none after `timeout` seconds without one."""
