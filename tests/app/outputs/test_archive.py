@@ -111,14 +111,14 @@ def test_the_rows_are_those_of_the_fold_of_the_same_log(tmp_path, monkeypatch):
 
 
 def test_a_row_is_written_once_no_late_measurement_can_change_it(tmp_path):
-    session, batch = Session(tmp_path), walk(3000)
-    late = np.r_[0:1500, 1501:1510, 1500, 1510:3000]
-    session.put(*(batch.select(late[k : k + 11]) for k in range(0, 3000, 11)))
+    session, batch = Session(tmp_path, split=Split(seconds=0.0)), walk(600)
+    late = np.r_[0:300, 301:310, 300, 310:600]
+    session.put(*(batch.select(late[k : k + 7]) for k in range(0, 600, 7)))
     whole = Session(tmp_path / "whole").put(batch)
     session.close()
     whole.close()
     written, expected = rows(tmp_path), rows(tmp_path / "whole")
-    assert written["row"].to_pylist() == list(range(3000))
+    assert written["row"].to_pylist() == list(range(600))
     other = ["archived_ns", "tuning_version"]
     same(written.drop_columns(other), expected.drop_columns(other))
 
