@@ -11,7 +11,9 @@ from estimators.errors import SourceError
 
 CAN_LOGS = (".asc", ".blf", ".csv", ".db", ".log", ".mf4", ".trc")  # Endings of CAN logs
 
-TABLES = (".csv", ".parquet", ".pq", ".mat", ".npz")
+BAGS = (".mcap", ".db3")  # Endings of the files of bags of ROS 2
+
+TABLES = (".csv", ".parquet", ".pq", ".mat", ".npz", *BAGS)
 """Endings of tables. A table of any other ending is read as CSV."""
 
 COMPRESSIONS = (".gz", ".bz2", ".lz4", ".zst")
@@ -34,6 +36,31 @@ def is_recording(name: str) -> bool:
     return suffix_of(Path(name)) in {*CAN_LOGS, *TABLES}
 
 
+BAG_FILE = "metadata.yaml"  # File of a folder that is a bag of ROS 2, with the names of its recordings
+
+
+def files_of(path: Path) -> list[Path]:
+    """Return the recordings of a folder that is a bag, in their order; any other path as it is.
+
+    Raises:
+        SourceError: If the bag does not name its recordings, or they are compressed as files.
+    """
+    content = path / BAG_FILE
+    if not content.is_file():
+        return [path]
+    import yaml
+
+    try:
+        info = yaml.safe_load(content.read_text(encoding="utf-8"))["rosbag2_bagfile_information"]
+        files = [path / Path(name).name for name in info["relative_file_paths"]]
+    except (OSError, ValueError, KeyError, TypeError, yaml.YAMLError):
+        raise SourceError(f"{content}: does not list the files of the bag; name its .mcap or .db3 files") from None
+    for file in files:
+        if file.suffix not in BAGS:
+            raise SourceError(f"{file}: is no {' or '.join(BAGS)}; if it is compressed, unpack it and name the file")
+    return files
+
+
 def check_once(files: Sequence[Path], where: str = "") -> None:
     """Refuse a recording that is named twice, as its measurements would count twice; `where` begins the message.
 
@@ -54,6 +81,8 @@ BEGINNINGS = {
     b"RRF": "a recording of Nisus; nisus review opens it",
     b"MDF ": "MF4; let its name end in .mf4",
     b'VERSION "': "a DBC; name it with --dbc",
+    b"\x89MCAP0": "an MCAP file; let its name end in .mcap",
+    b"#ROSBAG V": "a bag of ROS 1; rosbags-convert makes one of ROS 2",
     b"{": "JSON; export it as CSV",
     b"[{": "JSON; export it as CSV",
     b"<": "XML or HTML; export it as CSV",

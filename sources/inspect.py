@@ -21,7 +21,7 @@ from .can.readers import EXTENDED, BusName, LogSummary, Raw
 from .formats import CAN_LOGS, check_once, suffix_of
 from .source import UNDATED, Channel
 from .tables.order import Order, time_order
-from .tables.rows import TableRows, is_text, names_of, rows_of
+from .tables.rows import TableRows, is_bag, is_text, names_of, rows_of
 from .tables.text import UNREADABLE, TextMatch, csv_format, open_text
 from .tables.times import TimeColumn, TimeReader
 from .units import heading_unit, suffix_unit
@@ -314,6 +314,8 @@ def _tables(files: list[Path], time: TimeColumn) -> RecordingContents:
     times, values = [], []
     undated: list[str] = []
     order = Order(chosen, time.unit, HORIZON_NS, lambda key, text: None if text in faults else faults.append(text))
+    if is_bag(files[0]):
+        return _bags(files, time, columns, order, faults)
     for path in files:
         for rows in _rows(path, time, columns, faults, undated):
             times.append(rows.t[rows.known])
@@ -344,6 +346,30 @@ def _tables(files: list[Path], time: TimeColumn) -> RecordingContents:
     if time.unit == "s" and low <= t[0] and t[-1] <= high and t[-1] - t[0] < 0.5e9 * t.size:
         faults.append(f"column {chosen} looks like Excel's serial dates: add --time-unit excel")
     return RecordingContents(files, "table", t, columns=found, time=time, faults=faults, texts=texts, by=by)
+
+
+def _bags(
+    files: list[Path], time: TimeColumn, columns: list[str], order: Order, faults: list[str]
+) -> RecordingContents:
+    """Return the contents of bags, whose rows each have the columns of one topic."""
+    times = []
+    cells: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {name: [] for name in columns}
+    for path in files:
+        for rows in _rows(path, time, columns, faults, []):
+            times.append(rows.t)
+            order.look(path.name, rows.line, rows.t)
+            for k in np.flatnonzero(~rows.blank.all(axis=0)):
+                there = ~rows.blank[:, k]
+                cells[columns[k]].append((rows.t[there], rows.values[there, k]))
+    if not any(part.size for part in times):
+        raise SourceError("; ".join(faults) or f"{files[0]}: it has no messages; record it again")
+    order.report_late(True)
+    found = []
+    for name, parts in cells.items():
+        t, values = (np.concatenate(column) for column in zip(*parts, strict=True)) if parts else np.zeros((2, 0))
+        rank = np.argsort(t, kind="stable")
+        found.append(_series(name, suffix_unit(name), t[rank].astype(np.int64), values[rank]))
+    return RecordingContents(files, "table", np.sort(np.concatenate(times)), columns=found, time=time, faults=faults)
 
 
 def _source_of(

@@ -170,9 +170,15 @@ def _has_dimension(unit: str) -> bool:
 _HEADING = re.compile(r".+?\s*[\[(]([^\[\]()]+)[\])]\s*")
 
 
+_ELEMENT = re.compile(r"/\S+\.\S+\[[^\[\]]+\]")
+"""Element of a field of a ROS topic, whose name is no unit: /joint_states.position[arm]."""
+
+
 def heading_unit(name: object) -> str | None:
     """Return the unit in a column's heading, such as `Level [mm]` or `Level (mm)`; None if there is no known one."""
-    match = _HEADING.fullmatch(name) if isinstance(name, str) else None
+    if not isinstance(name, str) or _ELEMENT.fullmatch(name):
+        return None
+    match = _HEADING.fullmatch(name)
     if match is None or not re.search(r"[A-Za-z°%]", match[1]):
         return None
     text = match[1].strip()

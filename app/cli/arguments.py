@@ -224,7 +224,8 @@ class FoldCommand(JsonOption, PartOptions, FoldOptions):
     """
 
     out: Path | None = None
-    """Write the track to this .csv or .parquet file, or a recording to this .rrd file."""
+    """Write the track to this .csv or .parquet file, a ROS 2 bag to this .mcap file (needs `nisus[robotics]`), or a
+    recording to this .rrd file."""
     html: Path | None = None
     """Write a self-contained HTML report: scores, charts, checks, episodes, tuning."""
     plot: Path | None = None

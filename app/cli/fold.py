@@ -17,6 +17,7 @@ from estimators.smoothing.smooth import check_smooth, smooth
 from estimators.smoothing.walk import Smoothed
 
 from ..present.drawing.plot import check_plot, plot_track
+from ..present.export.bag_file import check_bag, covariances, write_bag
 from ..present.export.report import Reported, report
 from ..present.export.track_file import encoded
 from ..present.result import to_html, to_json, to_text
@@ -33,6 +34,7 @@ from ..studies.fold_result import (
     pairs_with,
     rows_of,
     smoothing_score,
+    with_covariance,
     within,
 )
 from ..studies.scores import pictures_of
@@ -49,8 +51,11 @@ def fold_twin(arguments: Arguments) -> int:
     """Run the command."""
     twin = opened(arguments)
     out = arguments.out
-    if out is not None and out.suffix not in (".csv", ".parquet", ".rrd"):
-        raise ConfigError(f"--out {out}: must end in .csv, .parquet or .rrd")
+    if out is not None and out.suffix not in (".csv", ".parquet", ".mcap", ".rrd"):
+        raise ConfigError(f"--out {out}: must end in .csv, .parquet, .mcap or .rrd")
+    bag = out is not None and out.suffix == ".mcap"
+    if out is not None and bag:
+        check_bag(out)
     recorded = out is not None and out.suffix == ".rrd"
     if out is not None and recorded and os.path.lexists(out):
         raise ConfigError(f"--out {out}: {TAKEN}")
@@ -61,8 +66,9 @@ def fold_twin(arguments: Arguments) -> int:
     prepare(twin)
     log, counts = read_log(twin, arguments.duration, blind=arguments.blind)
     known = known_states(twin, log.events)
+    kept = with_covariance(twin, log.events, twin.model.shown) if bag else []
     begun = time.perf_counter()
-    fold = fold_log(twin, log, picture=twin.picture if recorded else None, pairs=pairs_with(twin, known))
+    fold = fold_log(twin, log, picture=twin.picture if recorded else None, pairs=pairs_with(twin, kept or known))
     seconds = (time.perf_counter() - begun) / log.n
     part = rows_of(log, span_of(arguments, log.events))
     events, track = log.events.select(part), fold.track.select(part)
@@ -101,13 +107,18 @@ def fold_twin(arguments: Arguments) -> int:
 
 
 def _write(path: Path, result: FoldResult, smoothed: Smoothed | None) -> None:
-    """Write the track as a recording or a table."""
+    """Write the track as a recording, a bag or a table."""
     twin, fold = result.twin, result.fold
     found = [item.episode for item in result.episodes]
     if path.suffix == ".rrd":
         from ..views.recording.writer import write_recording
 
         write_recording(path, twin, fold.log, fold.track, pictures_of(fold), found, smoothed)
+        return
+    if path.suffix == ".mcap":
+        cov = covariances(twin.model, fold.track, fold.pairs)
+        with writing(path, "--out"), path.open("wb") as file:
+            write_bag(file, twin.name, twin.model, fold.log.events, fold.track, cov, smoothed)
         return
     table = table_of(
         twin.model, fold.log.events, fold.track, found, smoothed=smoothed,

@@ -12,6 +12,7 @@ import numpy as np
 from estimators.errors import ConfigError, nearest, quoted
 from sources.can.decoder import shown_id
 from sources.can.readers import EXTENDED, BusName
+from sources.formats import files_of
 from sources.inspect import Message, RecordingContents, SignalSeries, holes, inspect_recordings, is_table
 from sources.tables.times import SERIAL_DAYS, UNITS, TimeColumn
 
@@ -70,7 +71,7 @@ def look(files: tuple[Path, ...], options: TableOptions) -> RecordingContents:
     if options.time_zone is not None and options.time_zone not in available_timezones():
         remedy = nearest(options.time_zone, available_timezones())
         raise ConfigError(f"--time-zone {options.time_zone}: is no time zone of this machine; {remedy}")
-    files, databases = tuple(file.expanduser() for file in files), databases_of(options)
+    files, databases = tuple(one for file in files for one in files_of(file.expanduser())), databases_of(options)
     for path, _ in databases:
         if not path.is_file():
             raise ConfigError(f"--dbc {path}: there is no such file; check the path")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -136,10 +136,14 @@ def within(episodes: Sequence[Episode], events: Events) -> list[Episode]:
 def known_states(twin: Twin, events: Events) -> list[int]:
     """Return the states whose NEES is computed: those with a known truth, except a discrete mode.
 
-    None where their covariances would slow the fold down or take too much memory: many states of a filter without P.
+    None where their covariances would cost too much: many states of a filter without P.
     """
-    model = twin.model
-    found = [int(j) for j in model.shown if j != model.mode and truth_of(events, int(j))[0].size]
+    return with_covariance(twin, events, [int(j) for j in twin.model.shown if truth_of(events, int(j))[0].size])
+
+
+def with_covariance(twin: Twin, events: Events, states: Iterable[int]) -> list[int]:
+    """Return these states but a discrete mode; none where their covariances would cost too much time or memory."""
+    found = [int(j) for j in states if j != twin.model.mode]
     pairs = len(found) * (len(found) - 1) // 2
     small = pairs * len(events) * 8 <= MAX_COVARIANCE_BYTES
     keeps = find_entry(twin.estimator).family == GAUSSIAN or len(found) <= MAX_SAMPLED_STATES

@@ -13,9 +13,10 @@ import numpy as np
 
 from estimators.errors import SourceError, quoted
 
-from ..formats import suffix_of
+from ..formats import BAGS, suffix_of
 from ..source import UNDATED
 from ..worker_process import IsolatedReader, read_isolated
+from .bag import bag_names, read_bag
 from .binary import mat_names, npz_names, parquet_names, read_mat, read_npz, read_parquet
 from .text import Chunk, Problem, TextMatch, csv_format, read_csv
 from .times import TimeColumn, TimeReader
@@ -24,7 +25,9 @@ _Names = Callable[[Path, str], list[str]]
 _Read = Callable[[Path, str, Sequence[str | TextMatch], Problem], Generator[Chunk, None, None]]
 
 _BINARY: dict[str, tuple[_Names, _Read]] = {
+    ".db3": (bag_names, read_bag),
     ".mat": (mat_names, read_mat),
+    ".mcap": (bag_names, read_bag),
     ".npz": (npz_names, read_npz),
     ".parquet": (parquet_names, read_parquet),
     ".pq": (parquet_names, read_parquet),
@@ -49,6 +52,11 @@ class TableRows(NamedTuple):
 def is_text(path: Path) -> bool:
     """Return whether a table is read as a CSV, whose reader cannot crash."""
     return suffix_of(path) not in _BINARY
+
+
+def is_bag(path: Path) -> bool:
+    """Return whether a table is a bag of ROS 2, each of whose rows has the columns of one topic."""
+    return suffix_of(path) in BAGS
 
 
 def names_of(path: Path, time: str = "") -> list[str]:

@@ -14,7 +14,7 @@ from config.source_schema import CanLogSection, CanSection, RecordingSection, Ta
 from config.yaml_files import Key, dotted
 from estimators.errors import SourceError
 from estimators.model.state_space import StateSpaceModel
-from sources.formats import TABLES, check_once, suffix_of
+from sources.formats import BAG_FILE, TABLES, check_once, files_of, suffix_of
 
 from ..channels import channels
 
@@ -105,7 +105,7 @@ def find_recording(
         SourceError: If one is absent, with where it was sought and how to get it.
     """
     if log_files is not None:
-        files = [file.expanduser() for file in log_files]
+        files = [file for given in log_files for file in files_of(given.expanduser())]
         for file in files:
             if file.is_dir():
                 raise SourceError(f"--log {file}: it is a folder; name the files in it")
@@ -126,7 +126,7 @@ def find_recording(
         matches = matching(loaded, section, pattern)
         if not matches:
             raise _absent(loaded, where, _root(loaded, section) / Path(pattern).expanduser(), section)
-        found += matches
+        found += [file for match in matches for file in files_of(match)]
     check_once(found, f"{loaded.places.at(where)}: {dotted(where)}: ")
     return found
 
@@ -136,13 +136,18 @@ def matching(loaded: Loaded, section: CanSection | RecordingSection, pattern: st
     root = _root(loaded, section)
     wanted = str(Path(pattern).expanduser())
     exact = root / wanted  # A name with brackets in it is itself before it is a pattern.
-    if exact.is_file():
+    if _is_recording(exact):
         return [exact]
     if exact.is_dir() and isinstance(section, TableSection) and section.follow:
         files = [path for path in exact.iterdir() if path.is_file() and suffix_of(path) in TABLES]
         return sorted(path for path in files if not path.name.startswith("."))
     escaped = wanted if os.path.isabs(wanted) else os.path.join(glob.escape(str(root)), wanted)
-    return sorted(Path(match) for match in glob.glob(escaped, recursive=True) if Path(match).is_file())
+    return sorted(Path(match) for match in glob.glob(escaped, recursive=True) if _is_recording(Path(match)))
+
+
+def _is_recording(path: Path) -> bool:
+    """Return whether it is a file, or a folder that is a bag."""
+    return path.is_file() or (path / BAG_FILE).is_file()
 
 
 def find_databases(
