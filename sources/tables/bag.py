@@ -1,7 +1,7 @@
 """Bags of ROS 2, MCAP or SQLite: every message is a row, its numeric fields are columns.
 
-A column is the topic and the path of a field (`message_fields.py`): `/odom.twist.twist.linear.x`. `time` is the stamp of
-a message's header, or the time at which it was recorded if it has none or that is zero.
+A column is the topic and the path of a field (`message_fields.py`): `/odom.twist.twist.linear.x`. `time` is the stamp
+of a message's header, or the time at which it was recorded if it has none or that is zero.
 
 mcap reads the container, also one without an index, as a recorder leaves it that was killed; rosbags refuses these, and
 those of another profile than ros2. rosbags reads SQLite, parses the definitions of messages and decodes CDR.

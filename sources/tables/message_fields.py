@@ -28,6 +28,8 @@ ZSTD = b"\x28\xb5\x2f\xfd"  # First bytes of a message that rosbag2 has compress
 
 HEADER = "std_msgs/msg/Header"
 
+NO_VALUES = (HEADER, "std_msgs/msg/MultiArrayLayout")  # Types whose numbers are not data
+
 Test = Callable[[Any], bool]
 
 
@@ -152,7 +154,7 @@ def _fields(types: Any, kind: str, prefix: str = "", invalid: tuple[Test, ...] =
             tests = (*tests, _unknown(f"{path}_covariance"))
         if fix and name in ("latitude", "longitude", "altitude"):
             tests = (*tests, _test(f"{prefix}status.status", lambda status: status < 0))
-        if node == Nodetype.NAME and form != HEADER:
+        if node == Nodetype.NAME and form not in NO_VALUES:
             found |= _fields(types, form, f"{path}.", tests)
             if form == "geometry_msgs/msg/Quaternion":
                 found |= {f"{path}.{axis}": Field(_part(path, angle, axis), tests) for axis in AXES[3:]}

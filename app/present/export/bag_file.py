@@ -100,11 +100,9 @@ def write_bag(
     if smoothed is not None:
         states.append((channel("smoothed", JOINT_STATE), smoothed.mean, smoothed.std))
     matrix = channel("covariance", ARRAY) if cov is not None else 0
-    dimension, layout = make["std_msgs/msg/MultiArrayDimension"], make["std_msgs/msg/MultiArrayLayout"]
-    label = ",".join(names)
-    square = layout(
-        dim=[dimension(label=label, size=n, stride=n * n), dimension(label=label, size=n, stride=n)], data_offset=0
-    )
+    dimension, label = make["std_msgs/msg/MultiArrayDimension"], ",".join(names)
+    axes = [dimension(label=label, size=n, stride=stride) for stride in (n * n, n)]
+    square = make["std_msgs/msg/MultiArrayLayout"](dim=axes, data_offset=0)
     empty = np.zeros(0)
     for k, t in enumerate(events.t.tolist()):
         stamp = make["builtin_interfaces/msg/Time"](sec=t // 10**9, nanosec=t % 10**9)
