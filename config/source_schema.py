@@ -343,7 +343,8 @@ class TableSection(RecordingSection):
     """A table: CSV, Parquet, MATLAB (.mat up to version 7) or NumPy (.npz); compressed if it ends in .gz, .bz2 or .zst.
 
     Columns of a MATLAB file are its vectors by their names there: meas.Voltage. Those of a NumPy archive are its arrays
-    whose first axis is time: speed, or t2m_K[3,5] for a cell of a field.
+    whose first axis is time: speed, or t2m_K[3,5] for a cell of a field. Those of a ROS 2 bag (.mcap, .db3, or the
+    folder) are `time` and the fields of its messages: /odom.twist.twist.linear.x, /joint_states.position[elbow].
     """
 
     type: Literal["table"]

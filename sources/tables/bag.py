@@ -27,6 +27,8 @@ TIME = "time"  # Column of the times
 
 MAX_SCANNED = 1000  # Messages of a topic in which names and lengths of arrays are sought
 
+CUT = ("EndOfFile", "error")  # Errors of mcap and struct at the end of a file whose recorder was killed
+
 NEEDS = "a ROS 2 bag needs mcap and rosbags: pip install 'nisus[robotics]'"
 
 Messages = Callable[[Collection[str]], Iterator[tuple[str, str, int, bytes]]]
@@ -129,7 +131,7 @@ def read_bag(
                 if len(t) == CHUNK_ROWS:
                     yield chunk()
         except Exception as error:  # noqa: BLE001  libraries raise anything
-            end = "it ends before its index" if type(error).__name__ == "EndOfFile" else gist(error)
+            end = "it is cut short" if type(error).__name__ in CUT else gist(error)
         yield chunk()
         if end:
             raise SourceError(f"{path}: {end}; check that it is complete")
@@ -159,7 +161,7 @@ def _bag(path: Path) -> Iterator[tuple[dict[str, Declared], Messages]]:
             try:
                 opened = _indexed(file) or _streamed(path)
             except Exception as error:  # noqa: BLE001  libraries raise anything
-                raise SourceError(f"{path}: it cannot be read as MCAP ({gist(error)}); check that it is one") from None
+                raise SourceError(f"{path}: it cannot be read as MCAP ({gist(error)}); check that it is complete") from None
             yield opened
         return
     try:

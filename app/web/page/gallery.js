@@ -41,7 +41,7 @@ class Recordings {
     const key = JSON.stringify(files);
     if (key === this.key) return;
     this.key = key;
-    setText(this.where, `Kept in ${folder}. Record one on a twin's page (R), or drop a recording, a log (CSV, Parquet, MF4, BLF, ASC, candump, MAT, NPZ) or a DBC here.`);
+    setText(this.where, `Kept in ${folder}. Record one on a twin's page (R), or drop a recording, a log (CSV, Parquet, MF4, BLF, ASC, candump, MAT, NPZ, MCAP) or a DBC here.`);
     // What is asked of one file stays asked while the list is drawn anew.
     const asked = this.list.querySelector("[data-asked]")?.dataset.name;
     this.list.replaceChildren(...files.map((file) => this.item(file)));
