@@ -161,7 +161,8 @@ def _bag(path: Path) -> Iterator[tuple[dict[str, Declared], Messages]]:
             try:
                 opened = _indexed(file) or _streamed(path)
             except Exception as error:  # noqa: BLE001  libraries raise anything
-                raise SourceError(f"{path}: it cannot be read as MCAP ({gist(error)}); check that it is complete") from None
+                text = f"{path}: it cannot be read as MCAP ({gist(error)}); check that it is complete"
+                raise SourceError(text) from None
             yield opened
         return
     try:
