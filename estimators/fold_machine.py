@@ -55,7 +55,7 @@ class Machine:
         self.policy, self._pairs = policy, pairs
         # Only particle filters represent a jumping mode; the others treat it as a number.
         self.compiled = compile_model(model if estimator.family == "particle" else indicator(model))
-        self._bounds: Bounds = chi_square_bounds(model.width * max(1, policy.window))
+        self.bounds: Bounds = chi_square_bounds(model.width * max(1, policy.window))
         self.marginal = estimator.family in ("particle", "ensemble")
         reopens = tuning.reopen is not None and model.nx <= LARGE
         self.rule = doubt.rule_of(tuning.gate, tuning.gate_kind, reopens)
@@ -68,7 +68,7 @@ class Machine:
         self._in_python = model.black_box or estimator.interpreted
         if self._in_python:
             self.context = View(self.compiled, self._seen, tuning, options, pairs, self.held)
-        self.work = _scratch(estimator.work_size(options, model.nx, model.width) + 1)
+        self.work = scratch(estimator.work_size(options, model.nx, model.width) + 1)
         self.score = np.empty(WHITENED + model.ny)
 
     @cached_property
@@ -233,7 +233,7 @@ class Machine:
         asking = self._run(
             code or self.code, self._place, rule, first, start, stops, t, kind, channel, value, width,
             now.clock, now.u, now.state, now.doubt, now.edge, spare, self.work, self.score, track,
-            self.policy, self._bounds, now.evidence, [kept for _, kept, _ in blanks] if self._in_python else places,
+            self.policy, self.bounds, now.evidence, [kept for _, kept, _ in blanks] if self._in_python else places,
         )  # fmt: skip
         return int(asking)
 
@@ -311,7 +311,7 @@ def variances_of(cov: np.ndarray) -> np.ndarray:
     return variances
 
 
-def _scratch(size: int) -> np.ndarray:
+def scratch(size: int) -> np.ndarray:
     """Return `size` numbers of NaN aligned to a cache line, so that aligned vectors never cross one."""
     numbers = np.full(size + 8, np.nan)
     first = -numbers.ctypes.data % 64 // 8
