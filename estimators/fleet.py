@@ -21,11 +21,16 @@ from .errors import EstimatorError, EventError, nearest, quoted
 from .events import arrays
 from .events.batch import INPUT, READING, TICK
 from .fleet_kernel import (
+    AGE,
     CREW,
-    HEALTH,
     FLAGS,
+    HEALTH,
+    NIS_HIGH,
+    NIS_LOW,
+    NIS_MEAN,
     PLAN,
     STALE_EVENTS,
+    VERDICT,
     N,
     T,
     block_at,
@@ -42,6 +47,7 @@ from .model.state_space import LARGE, StateSpaceModel
 from .numerics.jit import threaded
 from .numerics.workspace import WORD
 from .registry import find_estimator
+from .snapshots import Base
 from .track import DIVERGED, HEALTH_NAMES, STALE, Track
 from .tuning import Tuning
 
@@ -57,8 +63,9 @@ class FleetTable(NamedTuple):
 
     seconds (N,): time of the last event, NaN before the first. mean, std (N, nx): the last estimate, in the units of
     the states. health (N,): index into `HEALTH_NAMES`. cause (N,): name of the most severe detector in alarm, or "".
-    age (N,): seconds since the last measurement, at the last event. events, stale (N,): events folded, and dropped as
-    too late.
+    age (N,): seconds since the last measurement, at the last event. verdict (N,): on the last event. nis_mean, nis_low,
+    nis_high (N,): mean NIS over the last measurements and its 95 % bounds. events, stale (N,): events folded, and
+    dropped as too late.
     """
 
     assets: Sequence[Any]
@@ -68,6 +75,10 @@ class FleetTable(NamedTuple):
     health: np.ndarray
     cause: np.ndarray
     age: np.ndarray
+    verdict: np.ndarray
+    nis_mean: np.ndarray
+    nis_low: np.ndarray
+    nis_high: np.ndarray
     events: np.ndarray
     stale: np.ndarray
 
@@ -150,7 +161,7 @@ class Fleet:
 
     def _allocate(self, start: int | None) -> None:
         """Allocate the blocks of all assets, each before its first event."""
-        model, machine = self.model, self._machines[0]
+        model = self.model
         fresh = [each.fresh() for each in self._machines]
         for each, snapshot in zip(self._machines, fresh, strict=True):
             each.begin(*each.prior, snapshot.state)
@@ -160,8 +171,9 @@ class Fleet:
         self._state_sizes = (model.nu, one.state.size, one.evidence.size, one.edge.size, len(model.sensors), rows)
         self._state = state_at(0, *self._state_sizes)
         size = self._state.end // WORD
+        self._columns = max(1, model.ny, model.nu)
         kept = self.policy.window + 2 * self.recent
-        self._block = block_at(0, size, kept, 2 * self.recent, model.width, len(model.shown))
+        self._block = block_at(0, size, kept, 2 * self.recent + 1, self._columns, len(model.shown))
         # Whole cache lines, so that two threads never write to the same one.
         words = -(-self._block.end // (8 * WORD)) * 8
         self._sizes = {"size": size, "kept": kept, "stride": WORD * words}
@@ -197,8 +209,8 @@ class Fleet:
         self.threads = min(most, threads or most)
         nu, state, evidence, edge, sensors, rows = self._state_sizes
         before = rows_before(policy.window)
-        length, ring = before + self.recent, 2 * self.recent
-        self._crews = [_crew(model, machine, length, ring, state) for _ in range(self.threads)]
+        length, ring = before + self.recent, 2 * self.recent + 1
+        self._crews = [_crew(model, machine, length, ring, self._columns, state) for _ in range(self.threads)]
         self._crew_places = np.array([[part.ctypes.data for part in crew] for crew in self._crews], np.int64)
         assert self._crew_places.shape == (self.threads, len(CREW))
         self._contexts = np.array([each.context for each in self._machines])
@@ -213,7 +225,7 @@ class Fleet:
             "rows_before": before, "soft": machine.rule.soft, "nx": len(model.shown), "nu": nu, "state": state,
             "evidence": evidence, "edge": edge, "sensors": sensors, "rows": rows, "ny": model.ny,
             "width": model.width, "work": machine.work.size,
-            "recent": self.recent, "columns": model.width, "low": low.ctypes.data,
+            "recent": self.recent, "columns": self._columns, "low": low.ctypes.data,
             "high": high.ctypes.data, "quantiles": low.size,
         }  # fmt: skip
         for name, value in values.items():
@@ -283,7 +295,7 @@ class Fleet:
         return at, given
 
     def _put(self, at: np.ndarray, batch: Any, kind: int) -> None:
-        self._added.append((at, batch.t, _RANK[kind] + batch.channel, batch.value))
+        self._added.append((at, batch.t, _RANK[kind] + batch.channel, batch.value[:, : self._columns]))
 
     def advance(self) -> int:
         """Fold all added events, each where it belongs, and return how many.
@@ -324,10 +336,27 @@ class Fleet:
             self._part(self._block.std).copy(),
             head[:, HEALTH].astype(np.int8),
             self._causes(),
-            np.where(seen, last[:, 1], np.nan),
+            np.where(seen, last[:, AGE], np.nan),
+            head[:, VERDICT].astype(np.int8),
+            *(last[:, k].copy() for k in (NIS_MEAN, NIS_LOW, NIS_HIGH)),
             head[:, N].copy(),
             head[:, STALE_EVENTS].copy(),
         )
+
+    def base(self, asset: str | int) -> Base:
+        """Return the state of one asset, from which a `Fold` of its own continues; it begins with an empty NIS window.
+
+        Raises:
+            EventError: If there is no such asset.
+        """
+        a = int(self.positions(asset)[0])
+        state, machine = self._state, self._machines[self._tuning_of[a]]
+        clock, u, own, evidence, edge, doubt = (self._now(part)[a].copy() for part in state[:6])
+        mean, cov = machine.moments(own)
+        return Base(
+            mean, cov, int(clock.view(np.int64)[0]), u, self.estimator.name, own, int(self._head[a, N]),
+            evidence=evidence, edge=edge, doubt=doubt.reshape(state.doubt.shape),
+        )  # fmt: skip
 
     def _causes(self) -> np.ndarray:
         """Return the cause of each asset's worst alarm, (assets,)."""
@@ -354,7 +383,7 @@ def _cause(mask: int, flags: int, health: int) -> str:
     return min(causes, key=lambda name: detector_of(name).severity, default="")
 
 
-def _crew(model: StateSpaceModel, machine: Machine, length: int, ring: int, state: int) -> list[np.ndarray]:
+def _crew(model: StateSpaceModel, machine: Machine, length: int, ring: int, columns: int, state: int) -> list[np.ndarray]:
     """Allocate the scratch of one thread, in the order of `CREW`."""
     track = Track.allocate(length, len(model.shown), 0, model.ny, model.width)
     return [
@@ -367,9 +396,9 @@ def _crew(model: StateSpaceModel, machine: Machine, length: int, ring: int, stat
         np.zeros(length, np.int64),
         np.full(length, READING, np.int8),
         np.zeros(length, np.int32),
-        np.full((length, model.width), np.nan),
+        np.full((length, columns), np.nan),
         np.zeros(ring, np.int64),
         np.zeros(ring, np.int64),
-        np.full((ring, model.width), np.nan),
+        np.full((ring, columns), np.nan),
         np.zeros(1, np.int64),
     ]

@@ -25,9 +25,9 @@ from .numerics.jit import address, caller, counts, flag_rows, flags, floats, i64
 from .numerics.workspace import declare_layout
 from .track import FAILED, GATED, HELD_OUT, NONE, USED, WHITENED, Track
 
-N, JUDGED, STALE_EVENTS, HEALTH, FLAGS, VERDICT, ALARMS, ADDED = range(8)
+N, JUDGED, STALE_EVENTS, HEALTH, FLAGS, VERDICT = range(6)
 """Columns of `Block.head`: events folded; judged rows ever, of which the last are kept; events dropped as stale; health,
-flags, verdict and alarms (of any row) after the last event; events accepted out of order."""
+flags and verdict after the last event."""
 
 T, AGE, NIS_MEAN, NIS_LOW, NIS_HIGH, CONSISTENCY = range(6)
 """Columns of `State.last`, of the last row: time (int64, ns) and the columns of the track of that name."""
@@ -44,7 +44,7 @@ State, state_at = declare_layout(
 
 Block, block_at = declare_layout(
     "Block", "size, kept, recent, columns, nx",
-    head="int 8", mean="nx", std="nx", now="size", snapshots="2, size", codes="int kept", nis="kept", t="int recent",
+    head="int 6", mean="nx", std="nx", now="size", snapshots="2, size", codes="int kept", nis="kept", t="int recent",
     place="int recent", value="recent, columns",
 )  # fmt: skip
 """Memory of an asset: head, last estimate, state, two snapshots, judged rows (`codes`, `nis`), and the recent events as
@@ -234,8 +234,8 @@ def _begin(block, now, e, stop, t, place, value, recent, tail_t, tail_place, tai
     newer = _to_snapshot(block, n, recent)
     older = max(0, newer - recent)
     if older > 0:
-        floor = ints(block.snapshots[older // recent % 2].ctypes.data + 8 * (block.now.size - now.sums.size - 6), 1)[0]
-        while e < stop and t[e] <= floor:
+        at = (older - 1) % ring
+        while e < stop and _precedes(t[e], place[e], value[e], block.t[at], block.place[at], block.value[at]):
             block.head[STALE_EVENTS] += 1
             e += 1
         if e == stop:
@@ -255,7 +255,6 @@ def _begin(block, now, e, stop, t, place, value, recent, tail_t, tail_place, tai
     while block.head[JUDGED] > 0 and block.codes[(block.head[JUDGED] - 1) % block.codes.size] >> _ROW_BITS >= at:
         block.head[JUDGED] -= 1
     block.head[N] = at
-    block.head[ADDED] += 1
     return e, n - at
 
 
@@ -265,7 +264,7 @@ def _fold_asset(plan, code, rule, policy, bounds, context_place, block, now, e, 
     """Fold the new events `e` to `stop` of an asset where they belong."""
     own_t, kind, channel, own_value = log
     tail_t, tail_place, tail_value = tail
-    first, recent, ring = plan.rows_before, plan.recent, 2 * plan.recent
+    first, recent, ring = plan.rows_before, plan.recent, block.t.size
     e, tail_size = _begin(block, now, e, stop, t, place, value, recent, tail_t, tail_place, tail_value)
     if e == stop:
         return
@@ -298,9 +297,7 @@ def _fold_asset(plan, code, rule, policy, bounds, context_place, block, now, e, 
     _copy(track.mean[i], block.mean)
     _copy(track.std[i], block.std)
     head = block.head
-    head[HEALTH], head[FLAGS], head[VERDICT], head[ALARMS] = track.health[i], track.flags[i], track.verdict[i], 0
-    for k in range(plan.width):
-        head[ALARMS] |= track.alarms[i, k]
+    head[HEALTH], head[FLAGS], head[VERDICT] = track.health[i], track.flags[i], track.verdict[i]
 
 
 @jit
@@ -316,7 +313,8 @@ def _fold_share(place, crew):
         counts(own[_CHANNEL], rows),
         matrix(floats(own[_VALUE], rows * plan.columns), 0, rows, plan.columns),
     )
-    ring = 2 * plan.recent
+    # One more than may be folded again: a late event that precedes it is stale.
+    ring = 2 * plan.recent + 1
     tail = (
         ints(own[_TAIL_T], ring),
         ints(own[_TAIL_PLACE], ring),

@@ -1,0 +1,112 @@
+"""Fleets against single folds: every asset has the bits of a `Fold` over its own log."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from estimators import MODELS, HealthPolicy, Log, Tuning
+from estimators.errors import EstimatorError, EventError
+from estimators.fleet import Fleet
+from estimators.fold import Fold
+from estimators.track import GATED
+
+POLICY = HealthPolicy(window=12, degraded_after=40.0, stale_after=90.0)
+"""A window short enough that it is full, and slides, in the logs of these tests."""
+
+
+def gated(model, **fields):
+    return replace(Tuning.of(model), gate=0.99, reopen=None, **fields)
+
+
+def assert_same(fleet: Fleet, position: int, fold: Fold) -> None:
+    """Assert that an asset has the state, verdict, window, detectors and health of a fold, to the last bit."""
+    table, base, wanted = fleet.table(), fleet.base(position), fold.base_here()
+    assert table.events[position] == fold.n == base.first
+    for name in ("state", "evidence", "edge", "doubt", "u", "mean", "cov"):
+        assert getattr(base, name).tobytes() == getattr(wanted, name).tobytes(), (position, name)
+    assert base.clock == wanted.clock
+    last = fold.track.select(fold.n - 1)
+    for name in ("mean", "std", "verdict", "health", "age", "nis_mean", "nis_low", "nis_high"):
+        got = np.asarray(getattr(table, name)[position])
+        assert got.tobytes() == np.asarray(getattr(last, name)).tobytes(), (position, name, got, getattr(last, name))
+
+
+def random_events(model, rng, count):
+    """Return (seconds, sensor or None for inputs or "tick", values) of one asset, in the order of time."""
+    names, t, found = model.sensor_names, 0.0, []
+    silent = rng.choice([*names, "none"])
+    bias = rng.choice([0.0, 0.0, 6.0])
+    for k in range(count):
+        t += float(rng.choice([0.0, 0.1, 0.1, 0.1, 0.1, 7.0], p=[0.1, 0.25, 0.25, 0.25, 0.1, 0.05]))
+        kind = rng.random()
+        if kind < 0.08:
+            found.append((t, "tick", None))
+        elif kind < 0.25 and model.nu:
+            found.append((t, None, rng.normal(size=model.nu)))
+        else:
+            name = str(rng.choice(names))
+            if name == silent and k > count // 2 and len(names) > 1:
+                continue
+            sensor = model.sensors[names.index(name)]
+            std = np.sqrt([row.variance for row in sensor.rows])
+            y = 20.0 + std * (rng.normal(size=len(std)) + (bias if k > count // 2 else 0.0))
+            y[rng.random(len(std)) < 0.05] = np.nan
+            y += std * 30.0 * (rng.random(len(std)) < 0.05)
+            found.append((t, name, y))
+    return found
+
+
+def shuffled(events, rng, most):
+    """Return the events in an order of arrival in which at most `most` come before one that belongs earlier."""
+    keys = np.arange(len(events)) + rng.integers(0, most + 1, len(events)) * (rng.random(len(events)) < 0.3)
+    return [events[k] for k in np.lexsort((np.arange(len(events)), keys))]
+
+
+def add(target, event, *asset):
+    t, what, values = event
+    if what == "tick":
+        target.add_ticks(t, *asset)
+    elif what is None:
+        names = [item.name for item in target.model.inputs]
+        target.add_inputs(*asset, t, **dict(zip(names, values, strict=True)))
+    else:
+        target.add(what, *asset, t, values)
+
+
+@pytest.mark.parametrize(
+    ("estimator", "name", "gate"),
+    [
+        ("kf", "motor_winding", None),
+        ("ekf", "motor_drive", "hard"),
+        ("ukf", "motor_winding", "soft"),
+        ("sr-kf", "motor_winding", "hard"),
+    ],
+)
+@pytest.mark.parametrize("threads", [1, 3])
+def test_fleet_of_random_assets_has_the_bits_of_single_folds(estimator, name, gate, threads):
+    model = MODELS[name]
+    rng = np.random.default_rng(7 + threads)
+    tunings = [Tuning.of(model) if gate is None else gated(model, gate_kind=gate)] * 12
+    tunings[5] = replace(tunings[0], r=tunings[0].r * 2.0)
+    fleet = Fleet(estimator, model, tunings, assets=12, policy=POLICY, recent=4, threads=threads)
+    logs = [Log.of(model) for _ in tunings]
+    arriving = [shuffled(random_events(model, rng, int(rng.integers(1, 150))), rng, 4) for _ in tunings]
+    verdicts: set[int] = set()
+    while any(arriving):
+        for a in rng.permutation(12):
+            taken = int(rng.choice([0, 1, 1, 2, 9]))
+            for event in arriving[a][:taken]:
+                add(fleet, event, a)
+                add(logs[a], event)
+            del arriving[a][:taken]
+        fleet.advance()
+        if rng.random() < 0.2 or not any(arriving):
+            for a, log in enumerate(logs):
+                if log.n:
+                    fold = Fold(estimator, model, tunings[a], log, policy=POLICY)
+                    fold.advance()
+                    assert_same(fleet, a, fold)
+                    verdicts |= set(fold.track.verdict.tolist())
+    assert fleet.table().stale.sum() == 0
+    assert (GATED in verdicts) == (gate == "hard")
