@@ -12,9 +12,9 @@ from typing import Any, NamedTuple
 import numba
 import numpy as np
 
-from .diagnostics.detector_state import ROW, SENSOR, TWIN
 from .diagnostics.detector_state import JOINT_MASK as AT_JOINT_MASK
 from .diagnostics.detector_state import MASK as AT_MASK
+from .diagnostics.detector_state import ROW, SENSOR, TWIN
 from .diagnostics.detectors import DETECTORS, OUTSIDE, OUTSIDE_WIDENED, SENSOR_FLAGS, detector_of
 from .diagnostics.health import HealthPolicy
 from .errors import EstimatorError, EventError, nearest, quoted
@@ -256,7 +256,8 @@ class Fleet:
             return np.array([self._index[name] for name in given.tolist()], np.int64)
         except KeyError as error:
             name = error.args[0]
-            raise EventError(f"asset {quoted(str(name))} is unknown; {nearest(str(name), self.assets[:1000])}") from None
+            known = [str(each) for each in self.assets[:1000]]
+            raise EventError(f"the fleet has no asset {quoted(str(name))}; {nearest(str(name), known)}") from None
 
     def add(self, sensor: str, asset: Any, seconds: Any, values: Any) -> None:
         """Add measurements of one sensor of any assets, in any order; `advance` folds them.
@@ -338,7 +339,9 @@ class Fleet:
             self._causes(),
             np.where(seen, last[:, AGE], np.nan),
             head[:, VERDICT].astype(np.int8),
-            *(last[:, k].copy() for k in (NIS_MEAN, NIS_LOW, NIS_HIGH)),
+            last[:, NIS_MEAN].copy(),
+            last[:, NIS_LOW].copy(),
+            last[:, NIS_HIGH].copy(),
             head[:, N].copy(),
             head[:, STALE_EVENTS].copy(),
         )
@@ -383,7 +386,9 @@ def _cause(mask: int, flags: int, health: int) -> str:
     return min(causes, key=lambda name: detector_of(name).severity, default="")
 
 
-def _crew(model: StateSpaceModel, machine: Machine, length: int, ring: int, columns: int, state: int) -> list[np.ndarray]:
+def _crew(
+    model: StateSpaceModel, machine: Machine, length: int, ring: int, columns: int, state: int
+) -> list[np.ndarray]:
     """Allocate the scratch of one thread, in the order of `CREW`."""
     track = Track.allocate(length, len(model.shown), 0, model.ny, model.width)
     return [

@@ -10,7 +10,6 @@ from __future__ import annotations
 from functools import lru_cache
 
 import numpy as np
-from llvmlite import ir
 from numba import from_dtype, prange
 from numba.extending import intrinsic
 
@@ -26,8 +25,8 @@ from .numerics.workspace import declare_layout
 from .track import FAILED, GATED, HELD_OUT, NONE, USED, WHITENED, Track
 
 N, JUDGED, STALE_EVENTS, HEALTH, FLAGS, VERDICT = range(6)
-"""Columns of `Block.head`: events folded; judged rows ever, of which the last are kept; events dropped as stale; health,
-flags and verdict after the last event."""
+"""Columns of `Block.head`: events folded; judged rows ever, of which the last are kept; events dropped as stale; then
+health, flags and verdict of the last event."""
 
 T, AGE, NIS_MEAN, NIS_LOW, NIS_HIGH, CONSISTENCY = range(6)
 """Columns of `State.last`, of the last row: time (int64, ns) and the columns of the track of that name."""
@@ -171,7 +170,9 @@ def _fold_rows(plan, code, rule, policy, bounds, context_place, block, now, m, t
     before = first - 1
     t[before] = last_t[0] if n > 0 else t[first]
     track.age[before] = last[AGE]
-    track.nis_mean[before], track.nis_low[before], track.nis_high[before] = last[NIS_MEAN], last[NIS_LOW], last[NIS_HIGH]
+    track.nis_mean[before] = last[NIS_MEAN]
+    track.nis_low[before] = last[NIS_LOW]
+    track.nis_high[before] = last[NIS_HIGH]
     track.consistency[before] = int(last[CONSISTENCY])
     oldest = _window(block, first, n, plan.window, channel, kind, track)
     stops[0] = first + m
@@ -208,7 +209,9 @@ def _fold_rows(plan, code, rule, policy, bounds, context_place, block, now, m, t
     i = first + m - 1
     last_t[0] = t[i]
     last[AGE] = track.age[i]
-    last[NIS_MEAN], last[NIS_LOW], last[NIS_HIGH] = track.nis_mean[i], track.nis_low[i], track.nis_high[i]
+    last[NIS_MEAN] = track.nis_mean[i]
+    last[NIS_LOW] = track.nis_low[i]
+    last[NIS_HIGH] = track.nis_high[i]
     last[CONSISTENCY] = track.consistency[i]
     block.head[N] = n + m
 
@@ -347,9 +350,7 @@ def _fold_share(place, crew):
             _copy(floats(words[_AT_R], plan.rows), floats(own[_R], plan.rows))
             words[_AT_R] = own[_R]
         block = block_at(plan.memory + asset * plan.stride, plan.size, plan.kept, ring, plan.columns, plan.nx)
-        now = state_at(
-            block.now.ctypes.data, plan.nu, plan.state, plan.evidence, plan.edge, plan.sensors, plan.rows
-        )
+        now = state_at(block.now.ctypes.data, plan.nu, plan.state, plan.evidence, plan.edge, plan.sensors, plan.rows)
         _fold_asset(plan, code, rule, policy, bounds, own[_CONTEXT], block, now, starts[v], starts[v + 1], t,
                     event_place, value, log, tail, stops, spare, work, score, track)  # fmt: skip
 

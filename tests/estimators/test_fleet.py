@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from estimators import MODELS, HealthPolicy, Log, Tuning
-from estimators.errors import EstimatorError, EventError
 from estimators.fleet import Fleet
 from estimators.fold import Fold
 from estimators.track import GATED
