@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from .errors import NisusError as NisusError
     from .fusion import covariance_intersection as covariance_intersection
     from .fusion import fuse as fuse
+    from .fleet import Fleet as Fleet
     from .interface.by_name import fold as fold
     from .interface.by_name import fold_many as fold_many
     from .log import Log as Log
@@ -37,6 +38,7 @@ if TYPE_CHECKING:
 
 _HOMES = {
     "ESTIMATORS": "registry",
+    "Fleet": "fleet",
     "HealthPolicy": "diagnostics.health",
     "Log": "log",
     "MODELS": "models",

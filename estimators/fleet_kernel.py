@@ -141,10 +141,10 @@ def _copy(source, target):
 @part
 def _window(block, first, n, window, channel, kind, track):
     """Write the judged rows of the window before row `first` of a track; return the row before the oldest of them."""
-    kept = block.codes.size
     oldest = first
-    for k in range(min(block.head[JUDGED], window)):
-        at = (block.head[JUDGED] - 1 - k) % kept
+    at = block.head[JUDGED] % block.codes.size
+    for _ in range(min(block.head[JUDGED], window)):
+        at = at - 1 if at > 0 else block.codes.size - 1
         code = block.codes[at]
         i = first - (n - (code >> _ROW_BITS))
         if i < 2:

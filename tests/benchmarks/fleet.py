@@ -1,7 +1,7 @@
 """`python -m tests.benchmarks.fleet [ASSETS ...]`: start and tick of a fleet, beside the bits of single folds.
 
-A tick is one measurement of every sensor of every asset: `add`, then `advance`. Times are of the clock and, as "cpu", of
-all threads together, the fewest of several ticks; the first ticks, before the window of NIS is full, are not timed.
+A tick is one measurement of every sensor of every asset: `add`, then `advance`. Times are of the clock and, as "cpu",
+of all threads together, the fewest of several ticks; the first ticks, before the window of NIS is full, are not timed.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ WARM_TICKS, TIMED_TICKS, SAMPLED = 60, 7, 5
 
 
 def _tick(fleet: Fleet, logs: dict[int, Log], k: int, rng: np.random.Generator) -> tuple[float, float, float]:
-    """Add and fold one measurement of every sensor; return seconds of `add`, and of `advance` by clock and processor."""
+    """Fold one measurement of every sensor; return seconds of `add`, and of `advance` by clock and processor."""
     model, everyone = fleet.model, np.arange(len(fleet.assets))
     t = np.full(everyone.size, float(k))
     ys = {sensor.name: 20.0 + rng.normal(size=(everyone.size, len(sensor.rows))) for sensor in model.sensors}

@@ -109,3 +109,51 @@ def test_fleet_of_random_assets_has_the_bits_of_single_folds(estimator, name, ga
                     verdicts |= set(fold.track.verdict.tolist())
     assert fleet.table().stale.sum() == 0
     assert (GATED in verdicts) == (gate == "hard")
+
+
+def test_an_event_before_the_oldest_snapshot_is_stale_and_changes_nothing():
+    model = MODELS["motor_winding"]
+    fleet = Fleet("kf", model, assets=["a", "b"], recent=3)
+    fleet.add("winding", "a", np.arange(1.0, 11.0), np.full(10, 40.0))
+    fleet.advance()
+    before = fleet.base("a").state.tobytes()
+    fleet.add("winding", "a", 5.5, 90.0)  # 10 events: snapshots before the 7th (7 s) and the 10th; the 6th is kept
+    fleet.advance()
+    table = fleet.table()
+    assert table.stale.tolist() == [1, 0] and table.events.tolist() == [10, 0]
+    assert fleet.base("a").state.tobytes() == before
+    fleet.add("winding", "a", 6.5, 40.0)
+    fleet.advance()
+    assert fleet.table().stale.tolist() == [1, 0] and fleet.table().events.tolist() == [11, 0]
+
+
+def test_table_names_the_cause_and_the_worst_come_first():
+    model = MODELS["motor_winding"]
+    fleet = Fleet("kf", model, assets=3, start=0.0)
+    rng = np.random.default_rng(3)
+    fleet.add("winding", 1, np.arange(1.0, 41.0), 35.0 + rng.normal(size=40))
+    fleet.add("winding", 2, np.arange(1.0, 41.0), 35.0 + rng.normal(size=40))
+    fleet.add_ticks(41.0, [2])
+    fleet.add_ticks(400.0, [1])
+    fleet.advance()
+    table = fleet.table()
+    assert table.cause[1] in ("silent", "stale") and table.worst(1).tolist() == [1]
+    assert table.age[1] == 360.0 and table.age[2] == 1.0 and np.isnan(table.seconds[0])
+
+
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (lambda m: Fleet("pf", m, assets=2), "Gaussian"),
+        (lambda m: Fleet("kf", m, replace(Tuning.of(m), gate=0.99), assets=2), "gate.reopen is 30 s"),
+        (lambda m: Fleet("kf", m, [Tuning.of(m)] * 3, assets=2), "3 tunings for 2 assets"),
+        (lambda m: Fleet("kf", m, assets=0), "0 assets"),
+        (lambda m: Fleet("kf", m, assets=["a", "b"]).add("winding", "c", 1.0, 2.0), 'no asset'),
+        (lambda m: Fleet("kf", m, assets=2).add("winding", 2, 1.0, 2.0), "asset is 2"),
+        (lambda m: Fleet("kf", m, assets=2).add("winding", [0, 1, 1], [1.0, 2.0], [3.0, 4.0]), "3 assets for 2 times"),
+    ],
+)  # fmt: skip
+def test_bad_arguments_are_one_line(call, words):
+    with pytest.raises((EstimatorError, EventError), match=words) as caught:
+        call(MODELS["motor_winding"])
+    assert "\n" not in str(caught.value)
