@@ -344,8 +344,9 @@ def _fold_share(place, crew):
         asset = visited[v]
         tuning = counts(plan.tunings + 4 * asset, 1)[0]
         if tuning != loaded:
-            # A copy: a soft gate writes R while a measurement is folded.
+            # A copy: a soft gate writes R while a measurement is folded. Scratch may keep F of the other parameters.
             loaded = tuning
+            work[:] = np.nan
             _copy(ints(plan.contexts + 8 * tuning * _CONTEXT_WORDS, _CONTEXT_WORDS), words)
             _copy(floats(words[_AT_R], plan.rows), floats(own[_R], plan.rows))
             words[_AT_R] = own[_R]

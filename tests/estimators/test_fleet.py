@@ -6,9 +6,12 @@ import numpy as np
 import pytest
 
 from estimators import MODELS, HealthPolicy, Log, Tuning
+from estimators.errors import EstimatorError, EventError
 from estimators.fleet import Fleet
 from estimators.fold import Fold
+from estimators.model.state_space import Parameter
 from estimators.track import GATED
+from tests.models import level_model
 
 POLICY = HealthPolicy(window=12, degraded_after=40.0, stale_after=90.0)
 """A window short enough that it is full, and slides, in the logs of these tests."""
@@ -109,6 +112,28 @@ def test_fleet_of_random_assets_has_the_bits_of_single_folds(estimator, name, ga
                     verdicts |= set(fold.track.verdict.tolist())
     assert fleet.table().stale.sum() == 0
     assert (GATED in verdicts) == (gate == "hard")
+
+
+def decay(x, u, p, dt, out):
+    out[0] = x[0] * (1.0 - p[0] * dt)
+
+
+def test_assets_of_other_parameters_share_nothing():
+    # kf keeps F of the last dt in its scratch, which the next asset of the same thread uses.
+    model = level_model(
+        {"gauge": 1.0}, 0.1, mean=5.0, f=decay, linear=True, parameters=(Parameter("rate", "1/s", 0.1, 0.0, 1.0),)
+    )
+    tunings = [Tuning.of(model).set("p.rate", rate) for rate in (0.1, 0.5, 0.9)]
+    fleet = Fleet("kf", model, tunings, assets=3, threads=1)
+    t, y = np.arange(20.0), np.sin(np.arange(20.0))
+    fleet.add("gauge", np.repeat(np.arange(3), 20), np.tile(t, 3), np.tile(y, 3))
+    fleet.advance()
+    for a, tuning in enumerate(tunings):
+        log = Log.of(model)
+        log.add("gauge", t, y)
+        fold = Fold("kf", model, tuning, log)
+        fold.advance()
+        assert_same(fleet, a, fold)
 
 
 def test_an_event_before_the_oldest_snapshot_is_stale_and_changes_nothing():
