@@ -32,7 +32,12 @@ def _tick(fleet: Fleet, logs: dict[int, Log], k: int, rng: np.random.Generator) 
     model, everyone = fleet.model, np.arange(len(fleet.assets))
     t = np.full(everyone.size, float(k))
     ys = {sensor.name: 20.0 + rng.normal(size=(everyone.size, len(sensor.rows))) for sensor in model.sensors}
-    added, _ = both(lambda: [fleet.add(name, everyone, t, y) for name, y in ys.items()])
+
+    def add() -> None:
+        for name, y in ys.items():
+            fleet.add(name, everyone, t, y)
+
+    added, _ = both(add)
     for a, log in logs.items():
         for name, y in ys.items():
             log.add(name, float(k), y[a : a + 1])
@@ -53,7 +58,8 @@ def _case(estimator: str, model: StateSpaceModel, assets: int, threads: int, bou
         fold = Fold(estimator, model, tuning, log)
         fold.advance()
         assert fold.track.mean[-1].tobytes() == table.mean[a].tobytes(), f"asset {a} differs from its fold"
-        assert fold.base_here().evidence.tobytes() == fleet.base(a).evidence.tobytes(), f"detectors of {a} differ"
+        ours, its = fleet.base(a).evidence, fold.base_here().evidence
+        assert ours is not None and its is not None and ours.tobytes() == its.tobytes(), f"detectors of {a} differ"
     figures = {
         "threads": fleet.threads, "start s": started, "add ms": added, "advance ms": folded,
         "cpu ms": spent, "cpu µs/event": spent * 1e3 / (assets * len(model.sensors)), "table ms": shown * 1e3,
