@@ -14,9 +14,9 @@ if TYPE_CHECKING:
     from .diagnostics.consistency import mean_nees as mean_nees
     from .diagnostics.health import HealthPolicy as HealthPolicy
     from .errors import NisusError as NisusError
+    from .fleet import Fleet as Fleet
     from .fusion import covariance_intersection as covariance_intersection
     from .fusion import fuse as fuse
-    from .fleet import Fleet as Fleet
     from .interface.by_name import fold as fold
     from .interface.by_name import fold_many as fold_many
     from .log import Log as Log
