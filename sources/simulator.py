@@ -106,8 +106,7 @@ class Simulator:
         ]
         # Factors of the correlation matrices, by which white noise becomes the sensor's.
         self._roots = [
-            None if sensor.correlation is None else factor(np.array(sensor.correlation))
-            for sensor in model.sensors
+            None if sensor.correlation is None else factor(np.array(sensor.correlation)) for sensor in model.sensors
         ]
         self._reported = [0] * len(self._plans)
         self._circular = np.flatnonzero(truth.circular)
