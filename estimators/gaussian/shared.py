@@ -319,12 +319,6 @@ def downdate(m, C, U, estimated, P, W):
                 s -= U[j, k] * W[j, i]
             W[k, i] = s * inverse
     subtract_squares(W, m, estimated, P)
-    mirror_rows(P, estimated)
-
-
-@inlined
-def mirror_rows(P, first):
-    """Fill the columns below the `first` rows of P with these rows."""
-    for i in range(first, P.shape[0]):
-        for j in range(first):
+    for i in range(estimated, n):
+        for j in range(estimated):
             P[i, j] = P[j, i]

@@ -4,7 +4,7 @@ The state is x (nx,) followed by upper U (nx, nx) with P = Uᵀ U, and the memor
 S are never formed, so a standard deviation of 1e-9 beside one of 1 keeps half its digits, where P would lose 1e-18
 beside 1.
 
-With considered states the factor is bordered: U = [U_e 0; U_ec U_c], U_e and U_c upper, the rows
+With considered states the factor of the tangent filters is bordered: U = [U_e 0; U_ec U_c], U_e and U_c upper, the rows
 of the estimated states first. U_c is a factor of the considered covariance, which never changes; so a step costs
 little more than one of the estimated states alone.
 """
@@ -19,6 +19,7 @@ from ..estimator import Options
 from ..numerics.jit import by_address, embedded, inlined, ints, part
 from ..numerics.linalg import (
     EPSILON,
+    add_square,
     remove,
     root,
     solve_transposed,
@@ -54,8 +55,7 @@ Conditioning, conditioning = declare_layout(
     z="2 * m",  # scratch of a weight
     V="m, m",  # scratch of a weight
     K="n, m",  # gain, where the factor is bordered
-    B="k + m, n",  # factor of the estimated states over E Kᵀ and √R Kᵀ, where it is
-    move="n",  # correction of the mean, where it is
+    B="n + m, n",  # factor of the estimated states over K √R, where it is
 )
 """Workspace of `condition` with m rows and n states whose spread has k rows."""
 
@@ -226,17 +226,17 @@ def dependent_variance(A, L, k):
 
 
 @embedded
-def condition(context, sensor, y, state, expected, Y, lost, own, innovation, innovation_std, score):
+def condition(context, sensor, y, state, expected, Y, lost, own, innovation, innovation_std, score, bordered):
     """Condition on a measurement whose prediction is `expected` (ny,), and return the verdict.
 
-    Y (k, ny) and lost are those of `triangularise_joint`, for all rows; they and `expected` are overwritten.
+    Y (k, ny) and lost are those of `triangularise_joint`, for all rows; they and `expected` are overwritten. Where the
+    factor is `bordered`, Y = U Hᵀ.
 
     Source: the array algorithm of Kailath, Sayed & Hassibi, Linear Estimation (2000), chapter 12; for sigma points,
     whose (D₊ - D₋) take the place of U Hᵀ, Arasaratnam, Haykin & Hurd (2010), doi:10.1109/TSP.2010.2056923.
     """
     n = context.nx
     x, U = moments_of(state, n)
-    bordered = context.n_considered > 0
     reading_variances(context, sensor, state, own.r)
     m = gather(context, sensor, y, own, expected, Y, lost, innovation)
     if m == 0:
@@ -270,10 +270,10 @@ def condition(context, sensor, y, state, expected, Y, lost, own, innovation, inn
     if verdict == USED and is_robust(context) and not reweigh_joint(context, m, nu, own, Y, spread, gone, A):
         verdict = FAILED
     if verdict == USED:
-        if not bordered:
-            take_over(m, nu, A, x, U)
-        elif not correct_bordered(m, nu, A, Y, gone, estimated(context), x, U, own):
-            return FAILED
+        if bordered:
+            correct_bordered(m, nu, A, own.d, Y, estimated(context), x, U, own.K, own.B, own.w)
+        else:
+            take_over(m, nu, A, estimated(context), x, U)
         wrap_mean(context, x)
         if is_adaptive(context):
             adapt(context, sensor, y, state, innovation, innovation_std, score)
@@ -281,32 +281,39 @@ def condition(context, sensor, y, state, expected, Y, lost, own, innovation, inn
 
 
 @inlined
-def take_over(m, nu, A, x, U):
-    """x ← x + Wᵀ ν̃ with the whitened ν̃, U ← U⁺, from the joint factor A."""
+def take_over(m, nu, A, estimated, x, U):
+    """x ← x + Wᵀ ν̃ with the whitened ν̃, U ← U⁺, from the joint factor A, of which the rows of W are lost.
+
+    Considered states stay, and so does their covariance: what U⁺ lacks of it, W_cᵀ W_c, is added again. Source:
+    Bierman (1977), Factorization Methods for Discrete Sequential Estimation, chapter 8.
+    """
     n = x.size
     for i in range(m):
         a = nu[i]
-        for j in range(n):
+        for j in range(estimated):
             x[j] += a * A[i, m + j]
     for i in range(n):
         for j in range(i, n):
             U[i, j] = A[m + i, m + j]
+    if estimated < n:
+        for i in range(m):
+            lost = A[i, m:]
+            for j in range(estimated):
+                lost[j] = 0.0
+            add_square(U, n, lost)
 
 
 @part
-def correct_bordered(m, nu, A, Y, lost, first, x, U, own):
+def correct_bordered(m, nu, A, d, Y, first, x, U, K, B, w):
     """Correct the `first` estimated states with the gain K = C S⁻¹, S = Aᵀ A; the others stay, and so does their U_c.
 
-        U_ec ← U_ec - Y_c Kᵀ,      U_e ← triangle of [U_e - Y_e Kᵀ; E Kᵀ; √R Kᵀ] without the square of K `lost`
+        U_ec ← U_ec - Y_c Kᵀ,      U_e ← triangle of [U_e - Y_e Kᵀ; √R Kᵀ],      Y = U Hᵀ
 
-    This is Joseph's form in factors: of tangents, Y = U Hᵀ, and the columns of the estimated states become
-    U ((I - K H)ᵀ), over the measurement's noise. `nu` (m,) is whitened; Y, E and `lost` are those of
-    `triangularise_joint`. False if there is no such triangle: nothing is corrected. Sources: Schmidt (1966),
-    Application of state-space methods to navigation problems; Bierman (1977), Factorization Methods for Discrete
-    Sequential Estimation, chapter 8.
+    This is Joseph's form in factors: the columns of the estimated states become U ((I - K H)ᵀ), over the measurement's
+    noise. `nu` (m,) is whitened. Sources: Schmidt (1966), Application of state-space methods to navigation problems;
+    Bierman (1977), Factorization Methods for Discrete Sequential Estimation, chapter 8.
     """
-    n, k_rows = U.shape[0], Y.shape[0]
-    K = own.K
+    n = U.shape[0]
     for j in range(first):
         for k in range(m):
             s = 0.0
@@ -316,41 +323,25 @@ def correct_bordered(m, nu, A, Y, lost, first, x, U, own):
                 s += Y[i, k] * U[i, j]
             K[j, k] = s
         solve_transposed(A, m, K[j])
-        own.move[j] = 0.0
         for k in range(m):
-            own.move[j] += K[j, k] * nu[k]
+            x[j] += K[j, k] * nu[k]
         solve_upper(A, m, K[j])
-    alone = first + k_rows - n
-    T, _ = take_matrix(start_of(own.B), alone + m, first)
+    T, _ = take_matrix(start_of(B), first + m, first)
     for j in range(first):
-        for i in range(first):
+        for i in range(n):
             s = U[i, j]
             for k in range(m):
                 s -= Y[i, k] * K[j, k]
-            T[i, j] = s
-        for i in range(n, k_rows):
-            s = 0.0
-            for k in range(m):
-                s += Y[i, k] * K[j, k]
-            T[first + i - n, j] = s
+            if i < first:
+                T[i, j] = s
+            else:
+                U[i, j] = s
         for k in range(m):
-            T[alone + k, j] = np.sqrt(own.d[k]) * K[j, k]
-    triangularise(T, own.w)
-    if lost.size > 0:
-        for j in range(first):
-            own.v[j] = 0.0
-            for k in range(m):
-                own.v[j] += lost[k] * K[j, k]
-        if not remove(T, first, own.v):
-            return False
-    for j in range(first):
-        x[j] += own.move[j]
-        for i in range(j + 1):
+            T[first + k, j] = np.sqrt(d[k]) * K[j, k]
+    triangularise(T, w)
+    for i in range(first):
+        for j in range(i, first):
             U[i, j] = T[i, j]
-        for i in range(first, n):
-            for k in range(m):
-                U[i, j] -= Y[i, k] * K[j, k]
-    return True
 
 
 @part

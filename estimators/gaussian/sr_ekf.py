@@ -127,10 +127,12 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     own = updating(start_of(work), context.nx, row_count(context, sensor))
     sensor_jacobian(context, sensor, x, u, own.H, own.jacobian)
     expect(context, sensor, x, u, own.expected)
+    bordered = context.n_considered > 0
     turn(U, own.H, estimated(context), 1.0, own.Y)
     return condition(
-        context, sensor, y, state, own.expected, own.Y, own.nothing, own.conditioning, innovation, innovation_std, score
-    )
+        context, sensor, y, state, own.expected, own.Y, own.nothing, own.conditioning, innovation, innovation_std,
+        score, bordered,
+    )  # fmt: skip
 
 
 SR_EKF = Estimator(

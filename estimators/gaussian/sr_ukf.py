@@ -13,13 +13,13 @@ import numpy as np
 
 from ..compiled.context import circular_rows, circular_states, estimated, expect_points, row_count, transition_points
 from ..estimator import Estimator, Options
-from ..numerics.jit import by_address, inlined, part
+from ..numerics.jit import by_address, inlined
 from ..numerics.linalg import remove, triangularise
 from ..numerics.simd_ir import padded
 from ..numerics.simd_rows import spread_points
-from ..numerics.workspace import declare_layout, size_of, start_of, take_matrix
+from ..numerics.workspace import declare_layout, size_of, start_of
 from .robust import growth, memory
-from .shared import moments_of, move_to, state_size
+from .shared import moments_of, state_size
 from .square_root import condition, conditioning, describe, moments, noise_root, settle, start
 from .ukf import UKF, deviations, tune, weights, weights_of
 
@@ -64,11 +64,12 @@ def work_size(options: Options, nx: int, ny: int) -> int:
 
 
 @inlined
-def weigh_central(central, a, deviation, lost, row):
-    """Fill `lost` with the central point's row a √|w| D₀; `row` too if w is positive."""
-    w = a * np.sqrt(abs(central))
+def weigh_central(central, a, grown, deviation, lost, row):
+    """Fill `lost` with the central point's row √|w| D₀, its `grown` entries times a; `row` too if w is positive."""
+    bare = np.sqrt(abs(central))
+    w = a * bare
     for j in range(lost.size):
-        lost[j] = w * deviation[j]
+        lost[j] = (w if j < grown else bare) * deviation[j]
         row[j] = lost[j] if central > 0.0 else 0.0
 
 
@@ -90,58 +91,16 @@ def predict(context, u, dt, index, state, work):
     deviations(own.moved, w.outer, circular_states(context), own.mean)
     good = noise_root(context, x, u, dt, state, D[2 * n + 1 :], own.scratch)
     grown = np.sqrt(growth(context, dt))
-    if estimated(context) < n:
-        good = advance_bordered(x, U, w, grown, estimated(context), own, good)
-        for i in range(n):
-            own.mean[i] = own.mean[i] if good else np.nan
-        move_to(context, own.mean, x)
-        return
-    outer = grown * np.sqrt(w.outer)
+    bare = np.sqrt(w.outer)
+    outer = grown * bare
     for i in range(1, 2 * n + 1):
         for j in range(n):
-            D[i, j] = outer * own.moved[i, j]
-    weigh_central(w.central, grown, own.moved[0], own.lost, D[0])
+            D[i, j] = (outer if j < estimated(context) else bare) * own.moved[i, j]
+    weigh_central(w.central, grown, estimated(context), own.moved[0], own.lost, D[0])
     triangularise(D, own.scratch[0])
     if w.central < 0.0 and good:
         good = remove(D, n, own.lost)
     settle(context, own.mean, D, good, state)
-
-
-@part
-def advance_bordered(x, U, w, grown, first, own, good):
-    """Fill U_ec and U_e of the propagated points, and return whether U_e exists; on entry D has Q^½ from row 2n + 1 on.
-
-    f keeps the considered states, so the deviations of opposite points k are ± spread·U[k] there. Turned by 45° as in
-    `update`, the differences of the points of U_c are a triangle in these columns, which is U_c, and beside it they are
-    the new U_ec. All other rows are zero in these columns, and their triangle in the others is U_e.
-    """
-    n = U.shape[0]
-    for i in range(first):
-        for j in range(first):
-            own.scratch[i, j] = own.D[2 * n + 1 + i, j]
-    T, _ = take_matrix(start_of(own.D), 2 * first + n + 1, first)
-    for i in range(first):
-        for j in range(first):
-            T[first + n + 1 + i, j] = own.scratch[i, j]
-    outer = grown * np.sqrt(0.5 * w.outer)
-    for k in range(n):
-        plus, minus = own.moved[1 + k], own.moved[1 + n + k]
-        for j in range(first):
-            T[1 + k, j] = outer * (plus[j] + minus[j])
-            if k < first:
-                T[1 + n + k, j] = outer * (plus[j] - minus[j])
-            else:
-                U[k, j] = outer * (plus[j] - minus[j])
-    weigh_central(w.central, grown, own.moved[0], own.lost[:first], T[0])
-    triangularise(T, own.scratch[0])
-    if w.central < 0.0:
-        good = remove(T, first, own.lost[:first]) and good
-    for i in range(first):
-        for j in range(i, first):
-            U[i, j] = T[i, j] if good else np.nan
-    for i in range(first, n):
-        own.mean[i] = x[i]
-    return good
 
 
 @inlined
@@ -172,11 +131,11 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     deviations(own.D, w.outer, circular_rows(context, sensor), own.mean)
     turn_pairs(own.D, n, w.outer, own.Y)
     lost = own.lost
-    weigh_central(w.central, 1.0, own.D[0], lost, own.Y[2 * n])
+    weigh_central(w.central, 1.0, 0, own.D[0], lost, own.Y[2 * n])
     if w.central >= 0.0:
         lost = lost[:0]
     return condition(
-        context, sensor, y, state, own.expected, own.Y, lost, own.conditioning, innovation, innovation_std, score
+        context, sensor, y, state, own.expected, own.Y, lost, own.conditioning, innovation, innovation_std, score, False
     )
 
 

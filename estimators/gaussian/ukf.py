@@ -37,7 +37,6 @@ from .shared import (
     compare,
     describe,
     downdate,
-    mirror_rows,
     moments,
     moments_of,
     move_mean,
@@ -120,12 +119,7 @@ def predict(context, u, dt, index, state, work):
     spread_points(x, own.chol_P, w.spread, own.sigma)
     transition_points(context, own.sigma, u, dt, own.D)
     deviations(own.D, w.outer, circular_states(context), own.mean)
-    # f keeps the considered states, so their mean and covariance stay.
-    first = estimated(context)
-    covariance(own.D, first, w.central, w.outer, P)
-    mirror_rows(P, first)
-    for i in range(first, n):
-        own.mean[i] = x[i]
+    covariance(own.D, w.central, w.outer, P)
     add_noise(context, x, u, dt, state, P, own.Q)
     move_to(context, own.mean, x)
 
@@ -172,7 +166,7 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     spread_points(x, own.chol_P, w.spread, own.sigma)
     expect_points(context, sensor, own.sigma, u, own.D)
     deviations(own.D, w.outer, circular_rows(context, sensor), own.mean)
-    covariance(own.D, reading.nu.size, w.central, w.outer, reading.S)
+    covariance(own.D, w.central, w.outer, reading.S)
     # The sigma deviations of the state are ± spread·U[k], so C = w·spread Σ U[k] (D₊ₖ - D₋ₖ).
     subtract_opposite(own.D, reading.nu.size, own.across)
     cross_covariance(own.chol_P, own.across, w.outer * w.spread, reading.C)

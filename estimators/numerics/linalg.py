@@ -163,6 +163,25 @@ def solve_upper(U, m, b):
         b[i] = s / U[i, i]
 
 
+@part
+def add_square(R, n, v):
+    """Overwrite upper R (leading n rows and columns) with the factor of RᵀR + v vᵀ; v (n,) is lost.
+
+    Source: Golub & Van Loan, Matrix Computations, 4th ed., 6.5.3 (Givens rotations).
+    """
+    for k in range(n):
+        if v[k] == 0.0:
+            continue
+        length = np.sqrt(R[k, k] * R[k, k] + v[k] * v[k])
+        c = R[k, k] / length
+        s = v[k] / length
+        R[k, k] = length
+        for j in range(k + 1, n):
+            a = R[k, j]
+            R[k, j] = c * a + s * v[j]
+            v[j] = c * v[j] - s * a
+
+
 @jit
 def unit_factor(A, d, m):
     """Overwrite the strictly lower triangle of A (m, m) with that of unit lower L, and its diagonal d (m,) with D's.

@@ -85,9 +85,9 @@ def _product(v: Lanes, n: Any, rows: Any, A: Any, B: Any, first: Any, w: Any, ou
 
 
 @vector_code()
-def covariance(v, D, rows, first, w, P):
-    """Leading rows of P (k, k) = those of first D₀ᵀ D₀ + w Σ Dᵢᵀ Dᵢ, from deviations D (2n+1, padded k)."""
-    _product(v, rows, sizes(v.builder, D)[0], D, D, first, w, P)
+def covariance(v, D, first, w, P):
+    """P (k, k) = first D₀ᵀ D₀ + w Σ Dᵢᵀ Dᵢ, from deviations D (2n+1, padded k)."""
+    _product(v, sizes(v.builder, P)[0], sizes(v.builder, D)[0], D, D, first, w, P)
 
 
 @vector_code()

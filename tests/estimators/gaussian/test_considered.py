@@ -241,69 +241,6 @@ def test_impossible_widths_are_refused(estimated, correlations, rule):
         joint(ranged(), estimated, correlations)
 
 
-def sigma_points(model, log, u, alpha):
-    """Mean and covariance after each event of an unscented Schmidt filter, by moments; with those of U_c first.
-
-    Source: Julier & Uhlmann (2004), doi:10.1109/JPROC.2003.823141, with the gain of the considered states zero.
-    """
-    n = model.nx
-    first = n - model.considered
-    order = np.r_[first:n, 0:first]
-    x, P, p = model.prior_mean.copy(), model.prior_cov.copy(), model.default_parameters
-    q = np.zeros(n)
-    for noise in model.noises:
-        q[model.state_names.index(noise.name)] += noise.variance
-    total = alpha**2 * n
-    weights = np.full(2 * n + 1, 0.5 / total)
-    weights[0] = 1.0 - n / total
-    cov_weights = weights + np.eye(2 * n + 1)[0] * (3.0 - alpha**2)
-
-    def images(function, rows):
-        U = np.empty((n, n))
-        U[:, order] = np.linalg.cholesky(P[np.ix_(order, order)]).T
-        points = np.vstack((x, x + np.sqrt(total) * U, x - np.sqrt(total) * U))
-        out = np.empty((2 * n + 1, rows))
-        for point, image in zip(points, out, strict=True):
-            function(point, image)
-        mean = weights @ out
-        return mean, points - x, out - mean
-
-    for k in range(log.n):
-        if k > 0:
-            x, _, D = images(lambda z, out: model.f(z, u, p, STEP, out), n)
-            P = D.T @ (cov_weights[:, None] * D) + STEP * np.diag(q)
-        sensor = model.sensors[log.events.channel[k]]
-        expected, X, D = images(lambda z, out, h=sensor.h: h(z, u, p, out), len(sensor.rows))
-        nu = log.events.value[k, : len(sensor.rows)] - expected
-        seen = np.isfinite(nu)
-        D, nu = D[:, seen], nu[seen]
-        R = np.diag([row.variance for row in sensor.rows])[np.ix_(seen, seen)]
-        S, C = D.T @ (cov_weights[:, None] * D) + R, X.T @ (cov_weights[:, None] * D)
-        K = C @ np.linalg.inv(S)
-        x[:first] += (K @ nu)[:first]
-        own = P[first:, first:].copy()
-        P = P - K @ S @ K.T
-        P[first:, first:] = own
-        yield x.copy(), P.copy()
-
-
-# The central covariance weight is 2, and -0.25, where a row is taken off the factors.
-@pytest.mark.parametrize("alpha", [1.0, 0.5])
-def test_the_bordered_factor_has_the_moments_of_the_sigma_points(alpha):
-    def curved(x, u, p, out):
-        out[0] = x[0] + 0.1 * x[0] ** 2 + p[0]
-
-    own = physics(bilinear)
-    model = joint(replace(own, sensors=(replace(own.sensors[0], h=curved), own.sensors[1])), CONSIDERED | ESTIMATED)
-    log = log_of()
-    fold = Fold("sr-ukf", model, Tuning.of(model).with_options({"alpha": alpha}), log)
-    for mean, cov in sigma_points(model, log, model.default_inputs, alpha):
-        fold.advance(1)
-        actual, P = fold.moments()
-        np.testing.assert_allclose(actual, mean, rtol=0, atol=1e-9 * np.max(np.abs(mean)))
-        np.testing.assert_allclose(P, cov, rtol=0, atol=1e-9 * np.max(np.abs(cov)))
-
-
 @pytest.mark.parametrize("estimator", ["ekf", "sr-ukf"])
 @pytest.mark.parametrize("options", [{"adapt": "Q"}, {"adapt": "R"}, {"robust": "huber"}, {"inflation": 2.0}])
 def test_options_leave_what_is_considered(estimator, options):

@@ -29,7 +29,7 @@ def points_of(x, U, spread, points):
 
 @njit
 def covariance_of(D, first, w, P):
-    covariance(D, P.shape[0], first, w, P)
+    covariance(D, first, w, P)
 
 
 @njit
