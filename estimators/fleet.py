@@ -167,8 +167,8 @@ class Fleet:
             each.begin(*each.prior, snapshot.state)
             if start is not None:
                 snapshot.clock[0] = start
-        one, rows = fresh[0], len(model.row_names)
-        self._state_sizes = (model.nu, one.state.size, one.evidence.size, one.edge.size, len(model.sensors), rows)
+        one = fresh[0]
+        self._state_sizes = (model.nu, one.state.size, one.evidence.size, one.edge.size, len(model.sensors))
         self._state = state_at(0, *self._state_sizes)
         size = self._state.end // WORD
         self._columns = max(1, model.ny, model.nu)
@@ -207,7 +207,7 @@ class Fleet:
         model, machine, policy = self.model, self._machines[0], self.policy
         most = int(numba.config.NUMBA_NUM_THREADS) if threaded() else 1
         self.threads = min(most, threads or most)
-        nu, state, evidence, edge, sensors, rows = self._state_sizes
+        nu, state, evidence, edge, sensors = self._state_sizes
         before = rows_before(policy.window)
         length, ring = before + self.recent, 2 * self.recent + 1
         self._crews = [_crew(model, machine, length, ring, self._columns, state) for _ in range(self.threads)]
@@ -223,7 +223,7 @@ class Fleet:
             "fold": fold_address(), "memory": self._memory.ctypes.data, "tunings": self._tuning_of.ctypes.data,
             "contexts": self._contexts.ctypes.data, "crews": self.threads, "crew_places": self._crew_places.ctypes.data,
             "rows_before": before, "soft": machine.rule.soft, "nx": len(model.shown), "nu": nu, "state": state,
-            "evidence": evidence, "edge": edge, "sensors": sensors, "rows": rows, "ny": model.ny,
+            "evidence": evidence, "edge": edge, "sensors": sensors, "rows": len(model.row_names), "ny": model.ny,
             "width": model.width, "work": machine.work.size,
             "recent": self.recent, "columns": self._columns, "low": low.ctypes.data,
             "high": high.ctypes.data, "quantiles": low.size,

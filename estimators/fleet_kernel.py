@@ -14,7 +14,6 @@ from numba import from_dtype, prange
 from numba.extending import intrinsic
 
 from .compiled.context import _FIELDS as CONTEXT_FIELDS
-from .compiled.context import context_at
 from .diagnostics.health import MAX_ROWS_PER_READING, Bounds, HealthPolicy
 from .estimator import Code
 from .fold_kernel import run_and_judge, run_and_judge_signature
@@ -22,7 +21,7 @@ from .gate.rejection_runs import Rule
 from .log import _ORDER, READING, RESET
 from .numerics.jit import address, caller, counts, flag_rows, flags, floats, i64, ints, jit, masks, matrix, part
 from .numerics.workspace import declare_layout
-from .track import FAILED, GATED, HELD_OUT, NONE, USED, WHITENED, Track
+from .track import FAILED, GATED, NONE, USED, WHITENED, Track
 
 N, JUDGED, STALE_EVENTS, HEALTH, FLAGS, VERDICT = range(6)
 """Columns of `Block.head`: events folded; judged rows ever, of which the last are kept; events dropped as stale; then
@@ -31,13 +30,9 @@ health, flags and verdict of the last event."""
 T, AGE, NIS_MEAN, NIS_LOW, NIS_HIGH, CONSISTENCY = range(6)
 """Columns of `State.last`, of the last row: time (int64, ns) and the columns of the track of that name."""
 
-COUNT, SUM, SQUARES, PRODUCTS, BEFORE_E = range(5)
-"""Columns of `State.sums`, of each sensor row: number of standardised innovations e, Σe, Σe², Σe e₋, and the last e."""
-
 State, state_at = declare_layout(
-    "State", "nu, state, evidence, edge, sensors, rows",
+    "State", "nu, state, evidence, edge, sensors",
     clock="int 1", u="nu", filter="state", evidence="evidence", edge="edge", doubt="sensors, 8", last="6",
-    sums="rows, 5",
 )  # fmt: skip
 """State of an asset's fold before an event; the first fields are those of `Snapshot`."""
 
@@ -165,7 +160,7 @@ def _fold_rows(plan, code, rule, policy, bounds, context_place, block, now, m, t
                work, score, track):  # fmt: skip
     """Fold and judge the m events from row `rows_before` on, as a single fold does."""
     first, n = plan.rows_before, block.head[N]
-    last, sums = now.last, now.sums
+    last = now.last
     last_t = ints(last.ctypes.data, 1)
     before = first - 1
     t[before] = last_t[0] if n > 0 else t[first]
@@ -185,9 +180,6 @@ def _fold_rows(plan, code, rule, policy, bounds, context_place, block, now, m, t
         kind[i] = READING
         track.verdict[i] = NONE
     kept = block.codes.size
-    context = context_at(context_place)
-    row_start = ints(context.row_start, plan.sensors)
-    row_count = ints(context.row_count, plan.sensors)
     for i in range(first, first + m):
         verdict = track.verdict[i]
         if verdict == USED or verdict == GATED or verdict == FAILED:
@@ -196,16 +188,6 @@ def _fold_rows(plan, code, rule, policy, bounds, context_place, block, now, m, t
             block.codes[at] = (n + i - first) << _ROW_BITS | channel[i] << _CHANNEL_BITS | (dof + 1)
             block.nis[at] = track.nis[i]
             block.head[JUDGED] += 1
-        if verdict == USED or verdict == GATED or verdict == HELD_OUT:
-            for k in range(row_count[channel[i]]):
-                e = track.innovation[i, k] / track.innovation_std[i, k]
-                if np.isfinite(e):
-                    own = sums[row_start[channel[i]] + k]
-                    own[COUNT] += 1.0
-                    own[SUM] += e
-                    own[SQUARES] += e * e
-                    own[PRODUCTS] += e * own[BEFORE_E]
-                    own[BEFORE_E] = e
     i = first + m - 1
     last_t[0] = t[i]
     last[AGE] = track.age[i]
@@ -351,7 +333,7 @@ def _fold_share(place, crew):
             _copy(floats(words[_AT_R], plan.rows), floats(own[_R], plan.rows))
             words[_AT_R] = own[_R]
         block = block_at(plan.memory + asset * plan.stride, plan.size, plan.kept, ring, plan.columns, plan.nx)
-        now = state_at(block.now.ctypes.data, plan.nu, plan.state, plan.evidence, plan.edge, plan.sensors, plan.rows)
+        now = state_at(block.now.ctypes.data, plan.nu, plan.state, plan.evidence, plan.edge, plan.sensors)
         _fold_asset(plan, code, rule, policy, bounds, own[_CONTEXT], block, now, starts[v], starts[v + 1], t,
                     event_place, value, log, tail, stops, spare, work, score, track)  # fmt: skip
 

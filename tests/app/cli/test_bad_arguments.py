@@ -31,7 +31,7 @@ REFUSED = {
     "fold lorenz63 --set estimator=zzz": f"'zzz' does not exist; choose from {', '.join(ESTIMATORS)}",
     "fold lorenz63 --set zzz=1": "zzz is not a tuning key of lorenz63; choose from ",
     "fold lorenz63 --set p.sgma=1": "did you mean p.sigma",
-    "fold lorenz63 --out track.txt": "--out track.txt: must end in .csv, .parquet or .rrd",
+    "fold lorenz63 --out track.txt": "--out track.txt: must end in .csv, .parquet, .mcap or .rrd",
     "fold motor_can --set gate.kind=sft": "gate.kind is 'sft'; it must be 'hard' or 'soft'",
     "fold motor_can --set gate.knd=soft": "gate.knd is not known; did you mean kind?",
     "fold lorenz63 --duratoin 3": "'--duratoin': `nisus fold` has no such option; did you mean --duration?",
