@@ -23,8 +23,8 @@ PARAMETERS = [item.name for item in MODEL.parameters]
 def log():
     """Two minutes of the motor, drawn from the model that the filter believes, under a load that changes.
 
-    With the noise of some seeds (4, 6 to 9) a winding_tooth that is too small explains the drift of the winding nearly as
-    well, and both are stated with odds; with that of seed 0 it does not.
+    With the noise of some seeds (4, 6 to 9) a winding_tooth that is too small explains the drift of the winding nearly
+    as well, and both are stated with odds; with that of seed 0 it does not.
     """
     inputs = {
         "i_q": stepped_input((0.0, 20.0, 70.0, 90.0), (60.0, 200.0, 120.0, 240.0)),
