@@ -14,6 +14,8 @@ from tests.chromium import find_chromium
 
 ROOT = Path(__file__).resolve().parent.parent
 
+LIVE = ROOT / "tests" / "app"
+
 DURATIONS = "nisus/durations"
 """In pytest's cache: seconds of each test, the least of all runs, so that neither compiling nor other work counts."""
 
@@ -36,8 +38,9 @@ def within(budget: float, names: list[str], took: dict[str, float]) -> set[str]:
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     for item in items:
-        if item.get_closest_marker("browser"):
-            # Chromium beside other work misses a click now and then. What fails twice is ours; once is said as "rerun".
+        if item.get_closest_marker("browser") or LIVE in item.path.parents:
+            # Chromium beside other work misses a click now and then, and a thread of a live twin is late. What fails
+            # twice is ours; once is said as "rerun".
             item.add_marker(pytest.mark.flaky(reruns=1))
     budget, cache = config.getoption("--quickest"), getattr(config, "cache", None)
     if budget is None or cache is None:

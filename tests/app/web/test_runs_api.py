@@ -27,6 +27,8 @@ def page(serve):
 def test_runs_are_listed_with_what_changed_and_scores(page):
     page.command("SetTuning", key="Q.rate", value=0.5)
     page.command("SetEstimator", name="ukf")
+    # The newest revision has a score once its first rows can be copied.
+    wait_for(lambda: page.get("/api/runs")[-1]["score"])
     listed = page.get("/api/runs")
     assert [run["number"] for run in listed] == [0, 1, 2]
     assert [run["what"] for run in listed] == [
