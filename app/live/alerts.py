@@ -55,9 +55,9 @@ class Alerts:
         """Report the rows from `before` on."""
         say, report = self._notices.say, self._notices.report
         known = {f"gated {name}" for name in self._in_alarm()}
-        for key, text in rejections(fold.model, fold.log, fold.track, before):
+        for key, text, t in rejections(fold.model, fold.log, fold.track, before):
             if key not in known:
-                report(key, text, counted=False)
+                report(key, text, counted=False, t=t)
         failed, self._failures = fold.failures > self._failures, fold.failures
         text = str(fold.failure)
         if failed and text not in self._said:
@@ -68,7 +68,7 @@ class Alerts:
         # A late measurement repeats decisions; each is reported once.
         for decision in [decision for decision in fold.decisions if decision.time > self._decided]:
             level = "info" if decision.outcome == AGREES else "warn"
-            report(f"{decision.outcome} {decision.sensor}", decision.text, level=level)
+            report(f"{decision.outcome} {decision.sensor}", decision.text, level=level, t=round(1e9 * decision.time))
             self._decided = decision.time
         recoveries, self._recoveries = self._recoveries, fold.recoveries()
         if self._recoveries > recoveries:
@@ -106,8 +106,8 @@ class Alerts:
                 self._notices.say(text, level="error", t=int(fold.log.t[rows[0]]))
 
 
-def rejections(model: StateSpaceModel, log: Log, track: Track, first: int) -> Iterator[tuple[str, str]]:
-    """Yield key and text of the last measurement that was not used, from row `first` on.
+def rejections(model: StateSpaceModel, log: Log, track: Track, first: int) -> Iterator[tuple[str, str, int]]:
+    """Yield key, text and time (ns) of the last measurement that was not used, from row `first` on.
 
     One of each verdict, and of those that the plausibility checks rejected one of each sensor and reason.
     """
@@ -117,7 +117,7 @@ def rejections(model: StateSpaceModel, log: Log, track: Track, first: int) -> It
             row = first + int(rows[-1])
             sensor = model.sensors[log.channel[row]].name
             nis = f" (NIS {track.nis[row]:.3g})" if np.isfinite(track.nis[row]) else ""
-            yield f"{VERDICT_NAMES[code]} {sensor}", f"{sensor}: measurement {what}{nis}"
+            yield f"{VERDICT_NAMES[code]} {sensor}", f"{sensor}: measurement {what}{nis}", int(log.t[row])
     last = {
         (int(log.channel[first + i]), reason): (first + i, k)
         for i, k in np.argwhere(track.screened[first:]).tolist()
@@ -126,7 +126,7 @@ def rejections(model: StateSpaceModel, log: Log, track: Track, first: int) -> It
     }
     for (sensor, reason), (i, k) in last.items():
         text = _implausible(model, sensor, k, REASONS[reason], float(log.value[i, k]))
-        yield f"{REASONS[reason]} {model.sensors[sensor].name}", text
+        yield f"{REASONS[reason]} {model.sensors[sensor].name}", text, int(log.t[i])
 
 
 def _implausible(model: StateSpaceModel, sensor: int, k: int, reason: str, value: float) -> str:

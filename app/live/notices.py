@@ -53,8 +53,10 @@ class Notices:
         self._last: dict[str, tuple[float, int]] = {}
         self._number: dict[str, int] = {}
 
-    def report(self, key: str, text: str, level: str = "warn", *, counted: bool = True, times: int = 1) -> None:
-        """Count under `key`, and add a line unless one of that key came within the last second.
+    def report(
+        self, key: str, text: str, level: str = "warn", *, counted: bool = True, times: int = 1, t: int | None = None
+    ) -> None:
+        """Count under `key`, and add a line for now or the time `t` unless one of that key came within the last second.
 
         The line has a level, "info", "warn" or "error", and stands for so many `times`. `counts` has the key unless it
         is counted better elsewhere: then `counted` is False.
@@ -69,7 +71,7 @@ class Notices:
             more = self._counts[key] - at_count - times
             self._last[key] = (self._clock(), self._counts[key])
             self._number[key] = self._next
-            self._add(level, text if more < 1 else f"{text} ({more} more before)")
+            self._add(level, text if more < 1 else f"{text} ({more} more before)", t)
 
     def count(self, key: str) -> None:
         """Count under `key` without a line."""

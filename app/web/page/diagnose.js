@@ -331,16 +331,19 @@ function decades(t, lines, most, label, ends) {
   return node;
 }
 
+const MAX_NAME = 25; // characters beside the map of correlations
+
 // Correlations from -1 to 1, by name.
 function correlations(names, matrix, label) {
   const n = names.length;
+  const written = names.map((name) => (name.length > MAX_NAME ? `…${name.slice(1 - MAX_NAME)}` : name));
   const side = Math.max(9, Math.min(44, 230 / n));
-  const room = Math.min(90, 8 + 5.6 * Math.max(...names.map((name) => name.length)));
+  const room = 8 + 5.6 * Math.max(...written.map((name) => name.length));
   const node = svg("svg", { viewBox: `0 0 ${round(room + n * side + 4)} ${round(n * side + room)}`, role: "img", "aria-label": label, class: "map" });
   matrix.forEach((row, i) => {
-    if (side >= 9) node.append(svg("text", { x: room - 4, y: round((i + 0.5) * side + 3.5), "text-anchor": "end" }, names[i]));
+    if (side >= 9) node.append(svg("text", { x: room - 4, y: round((i + 0.5) * side + 3.5), "text-anchor": "end" }, written[i]));
     const at = `${round(room + (i + 0.5) * side + 3)} ${round(n * side + 5)}`;
-    node.append(svg("text", { transform: `translate(${at}) rotate(-90)`, "text-anchor": "end" }, names[i]));
+    node.append(svg("text", { transform: `translate(${at}) rotate(-90)`, "text-anchor": "end" }, written[i]));
     row.forEach((value, j) => {
       const place = { x: round(room + j * side), y: round(i * side), width: side - 1, height: side - 1 };
       const cell = svg("rect", { ...place, class: value < 0 ? "against" : "with", "fill-opacity": value === null ? 0 : Math.abs(value) });

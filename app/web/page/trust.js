@@ -6,7 +6,7 @@ import { post } from "./session.js";
 
 // Signs beside the colours, for users who cannot distinguish them.
 export const SIGNS = {
-  waiting: "○", tracking: "●", advisory: "◆", suspect: "◐", degraded: "▲", diverged: "✖", stale: "◌", "held out": "–", screened: "⊘",
+  waiting: "…", tracking: "●", advisory: "◆", suspect: "◐", degraded: "▲", diverged: "✖", stale: "◌", "held out": "○", screened: "⊘",
 };
 const MOST_LIGHTS = 8;
 const CALM = ["tracking", "advisory", "held out", "waiting"];
@@ -158,6 +158,7 @@ export class Episodes {
     Object.assign(this, { node, link, view, charts });
     this.body = element("div", {});
     this.notices = [];
+    this.known = -1; // number of the last one
     this.held = []; // offsets of held-out sensors, in words
     this.counts = element("dl", { class: "counts", "aria-label": "Measurement counts" });
     this.change = element("ol", { "aria-live": "polite" });
@@ -169,9 +170,11 @@ export class Episodes {
     link.addEventListener("episodes", (event) => this.show(event.detail));
     link.addEventListener("notices", (event) => {
       // After a reconnection all arrive again.
-      const known = this.notices[0]?.number ?? -1;
-      const fresh = event.detail.filter((notice) => notice.number > known).reverse();
-      this.notices = [...fresh, ...this.notices].slice(0, MAX_EPISODES);
+      const fresh = event.detail.filter((notice) => notice.number > this.known);
+      this.known = Math.max(this.known, ...fresh.map((notice) => notice.number));
+      // A fold of a whole recording tells of its sensors one after another.
+      const newest = (a, b) => b.run - a.run || b.from - a.from || b.number - a.number;
+      this.notices = [...fresh, ...this.notices].sort(newest).slice(0, MAX_EPISODES);
       this.show(this.link.episodes);
     });
     link.addEventListener("status", ({ detail }) => {

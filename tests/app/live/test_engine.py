@@ -362,6 +362,7 @@ def test_failures_are_counted_by_sensor_once_however_often_they_are_folded():
     assert counts["gated"] == counts["gated force"] == 1 and "gated position" not in counts
     assert np.isfinite(pull_all(stepped.engine).track.mean).all()
     assert any("no value" in text for text in stepped.notices())
+    assert {line.t for line in stepped.engine.notices.since(0) if "rejected by the gate" in line.text} == {SECOND // 25}
 
 
 class Solver:

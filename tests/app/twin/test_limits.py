@@ -178,13 +178,18 @@ def test_what_was_refused_is_counted_told_and_kept(capsys) -> None:
     assert sorted(spikes["value_0"]) == [-300.0, 500.0, 500.0] and set(spikes["verdict"]) == {"screened"}
 
 
+REASON_SECONDS = {"duplicate": 1, "range": 2, "rate": 3}
+
+
 def test_counts_and_lines_name_sensor_value_and_rule() -> None:
     twin = twin_of(limited("range: [-40, 180]\n    rate: 5"))
     log = Log.of(twin.model)
     log.add("winding", [0, 1, 1, 2, 3], [30, 30, 30, 500, 60])
     fold = Fold("kf", twin.model, Tuning.of(twin.model), log)
     fold.advance()
-    lines = dict(rejections(twin.model, log, fold.track, 0))
+    found = list(rejections(twin.model, log, fold.track, 0))
+    lines = {key: text for key, text, _ in found}
+    assert {key: t for key, _, t in found} == {f"{what} winding": k * 10**9 for what, k in REASON_SECONDS.items()}
     assert lines["duplicate winding"].startswith("winding: 30 °C came again; it counts once: look for what")
     assert lines["range winding"].startswith("winding: 500 °C is outside -40 to 180 °C; not used: look at the sensor")
     assert lines["rate winding"].startswith("winding: 60 °C is further from the last good reading than 5 °C/s allows;")
