@@ -191,8 +191,8 @@ export class Episodes {
     const ask = async (force) => {
       setText(said, "folding …");
       const answer = await post("api/baseline", { force });
-      node.hidden = !answer.error;
-      setText(said, answer.error ?? "");
+      store.hidden = !answer.error;
+      setText(said, answer.error ?? `Stored in ${answer.file}: alarms now report changes from it.`);
       anyway.hidden = !answer.error;
     };
     const store = element("button", { type: "button", class: "go", title: "Store the statistics of these innovations as normal; alarms then report changes", onclick: () => ask(false) }, "Store baseline");

@@ -265,7 +265,8 @@ def test_a_twin_of_ones_own_stores_its_baseline(visit, tmp_path, capsys):
         stored = path.read_text().partition("commissioned:")[2]
         assert commission_twin(CommissionCommand(str(path))) == 0
         assert capsys.readouterr().out.partition("commissioned:")[2] == stored and "scale: 1.275" in stored
-        until(page, "document.querySelector('.baseline').hidden")
+        section.get_by_text("Stored in drive.yaml").wait_for()
+        assert section.get_by_role("button").count() == 0
         wait_for(lambda: session.engine.status().health == TRACKING, PATIENCE)
 
 
