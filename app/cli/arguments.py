@@ -68,6 +68,16 @@ class PartOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
+class WorkersOption:
+    """Options of a command whose folds do not depend on one another."""
+
+    jobs: int | None = None
+    """Number of processes. Default: one per processor."""
+    cluster: str | None = None
+    """Use the workers of a Dask cluster: the address of its scheduler, or local:N for N processes on this machine."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class JsonOption:
     """Option of a command with a result for scripts."""
 
@@ -311,7 +321,7 @@ class AdviseCommand(JsonOption, RoleOptions, TableOptions, LogOptions, Estimator
 
 
 @dataclass(frozen=True)
-class CompareCommand(JsonOption, PartOptions, LogOptions, TuningOption):
+class CompareCommand(JsonOption, WorkersOption, PartOptions, LogOptions, TuningOption):
     """Fold every applicable filter over the same log, in parallel, and print a table of scores.
 
     Filters that draw random members are folded with eight seeds; their figures are mean ± standard deviation of one
@@ -330,8 +340,6 @@ class CompareCommand(JsonOption, PartOptions, LogOptions, TuningOption):
     """Number of simulated logs, with consecutive seeds; figures are mean ± standard deviation over them."""
     budget: float = 20.0
     """CPU seconds for each filter; a slower filter folds a shorter span, shown in its row."""
-    jobs: int | None = None
-    """Number of processes. Default: one per processor."""
     write: Flag = False
     """Save the table as CSV: config/scores/NAME.csv for a bundled twin, else NAME.scores.csv beside the YAML."""
 
@@ -430,7 +438,7 @@ class LearnCommand(JsonOption, EstimatorOption, TwinOptions):
 
 
 @dataclass(frozen=True)
-class GuardCommand(JsonOption):
+class GuardCommand(JsonOption, WorkersOption):
     """Fold archived recordings with the accepted tunings of their twins and list figures that got worse.
 
     Without a name: the bundled twins with their bundled logs and those under NISUS_DATA. A figure is worse if it
@@ -454,12 +462,10 @@ class GuardCommand(JsonOption):
     """Reason for --accept, saved with the baseline."""
     set: Repeated = ()
     """KEY=VALUE, repeatable; see `nisus run --help`. Shows the figures under another setting."""
-    jobs: int | None = None
-    """Number of processes. Default: one per processor."""
 
 
 @dataclass(frozen=True)
-class StressCommand(JsonOption, TuningOption):
+class StressCommand(JsonOption, WorkersOption, TuningOption):
     """Inject faults into a twin and print how soon and how correctly they are detected.
 
     Tuning errors hold from the start. Sensor faults hold from one third to two thirds of the log, to show false alarms

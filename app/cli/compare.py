@@ -60,7 +60,9 @@ def _compare(arguments: Arguments, name: str) -> list[dict[str, Any]]:
     ended = False
     with progress(f"{twin.name}, {len(logs[0])} events", len(names), "filters") as advance:
         try:
-            for row in compare(name, overrides, names, logs, arguments.jobs, arguments.budget, scored):
+            for row in compare(
+                name, overrides, names, logs, arguments.budget, scored, jobs=arguments.jobs, cluster=arguments.cluster
+            ):
                 rows.append(row)
                 advance(best_text(rows))
         except KeyboardInterrupt:

@@ -26,7 +26,8 @@ def guard(arguments: Arguments) -> int:
     logs = chosen(arguments.twins, arguments.archive)
     note = printable(arguments.note).strip() if arguments.accept else None
     with progress("guard", len(logs), "recordings") as advance:
-        found = guard_all(logs, note, settings(arguments.set), arguments.jobs, advance)
+        overrides = settings(arguments.set)
+        found = guard_all(logs, note, overrides, advance, jobs=arguments.jobs, cluster=arguments.cluster)
     absent_fails = os.environ.get("CI", "").lower() in ("true", "1")
     if not arguments.set:
         for twin in dict.fromkeys(each.twin for each in logs):

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from estimators.errors import ConfigError, NisusError
+from estimators.errors import ConfigError
 from estimators.registry import find_estimator
 
 from ..present.result import to_json, to_text
-from ..studies.stress.detection import Oracle, Trial, make
-from ..studies.stress.matrix import matrix
+from ..studies.stress.detection import Trial
 from ..studies.stress.results import stress_topics
-from ..studies.stress.scenario import Bench, asset_of
+from ..studies.stress.trials import Trials, all_trials
 from ..terminal import complain
+from .options import settings
 from .prepare import opened, prepare, progress
 
 if TYPE_CHECKING:
@@ -30,42 +30,41 @@ def stress_twin(arguments: Arguments) -> int:
     for name in names:
         find_estimator(name, twin.model)
     prepare(twin)
-    first = Bench(twin, 0, arguments.duration)
-    mistakes = [
-        item
-        for item in matrix(twin.model, twin.tuning, first.events, asset=asset_of(twin, 0) is not None)
+    chosen = [
+        (k, item)
+        for k, item in enumerate(Trials(twin, arguments.duration).mistakes)
         if not arguments.only or any(text.lower() in item.key for text in arguments.only)
     ]
+    mistakes = [item for _, item in chosen]
     if not mistakes:
         raise ConfigError(f"--only {' '.join(arguments.only)}: no mistake has that in its name; see --list")
     if arguments.list:
         names = [item.name for item in mistakes]
         print(to_json(names) if arguments.json else "\n".join(names))
         return 0
-    oracle = Oracle(twin, arguments.duration)
-    trials: list[Trial] = []
-    failed: list[str] = []
+    found: dict[int, Trial | str] = {}
     title = f"{twin.name}, {len(mistakes)} mistakes"
     folds = len(mistakes) * len(names) * arguments.seeds
+    overrides = settings(arguments.set, tuning=arguments.tuning)
+    ended = False
     with progress(title, folds, "folds") as advance:
         try:
-            for seed in range(arguments.seeds):
-                bench = first if seed == 0 else Bench(twin, seed, arguments.duration)
-                for name in names:
-                    for mistake in mistakes:
-                        try:
-                            foretold = oracle.foretell(bench, mistake, name)
-                            listed = oracle.listed(first, mistake, name)
-                            trials.append(make(bench, mistake, name, foretold, listed=listed))
-                        except NisusError as error:
-                            failed.append(f"{mistake.name}, {name}, seed {seed}: {error}")
-                        advance()
+            for k, trial in all_trials(
+                arguments.twin, overrides, arguments.log, arguments.duration, chosen, names, arguments.seeds,
+                jobs=arguments.jobs, cluster=arguments.cluster,
+            ):  # fmt: skip
+                found[k] = trial
+                advance()
         except KeyboardInterrupt:
-            if not trials:
+            if not found:
                 raise
-            failed.append(f"interrupted after {len(trials)} of {folds} folds")
-            mistakes = [item for item in mistakes if any(trial.mistake == item.name for trial in trials)]
+            ended = True
+    trials = [trial for _, trial in sorted(found.items()) if isinstance(trial, Trial)]
+    failed = [text for _, text in sorted(found.items()) if isinstance(text, str)]
+    if ended:
+        failed.append(f"interrupted after {len(found)} of {folds} folds")
+        mistakes = [item for item in mistakes if any(trial.mistake == item.name for trial in trials)]
     for text in failed:
         complain(text)
     print(to_json(trials) if arguments.json else "\n".join(to_text(stress_topics(title, trials, mistakes))))
-    return 130 if len(trials) < folds and failed and failed[-1].startswith("interrupted") else 0
+    return 130 if ended else 0

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import as_completed
 from dataclasses import replace
 from typing import Any, NamedTuple
 
-import numba
 import numpy as np
 
 from estimators.diagnostics.score import Fit, score
@@ -20,7 +18,7 @@ from estimators.registry import ESTIMATORS, find_entry, find_estimator, unfit
 from estimators.track import DIVERGED
 
 from ..twin.twin import Twin, load_twin, with_held
-from .processes import beside, jobs_of
+from .processes import results
 from .scores import FilterScore, Spread, pictures_of
 
 SEEDS = 8  # folds of a filter that draws random members; others are folded once
@@ -238,36 +236,27 @@ def compare(
     overrides: Mapping[str, str],
     names: Sequence[str],
     logs: Sequence[Events],
-    jobs: int | None = None,
     budget: float = BUDGET_S,
     scored: tuple[int, int] | None = None,
+    *,
+    jobs: int | None = None,
+    cluster: str | None = None,
 ) -> Iterator[FilterScore]:
     """Fold each filter over the logs, in processes of their own; rows come as they are done.
 
     The twin is a name or path, with overrides as of `load_twin`; `logs`, `scored` and `budget`, the seconds for a
-    filter, are those of `fold_row`. `jobs` is the number of processes; None for one a processor.
+    filter, are those of `fold_row`; `jobs` and `cluster` those of `results`.
     """
-    jobs = jobs_of(jobs, len(names))
-    if jobs == 1:
-        ready = load_twin(twin, overrides=overrides)
-        threads = numba.get_num_threads()
-        numba.set_num_threads(1)
-        try:
-            yield from (fold_row(ready, name, logs, budget, scored) for name in names)
-        finally:
-            numba.set_num_threads(threads)
-        return
     given = (twin, dict(overrides), [tuple(log) for log in logs])
     # The last filters of the catalogue are the slow ones.
-    with beside(_fold, [(name, budget, scored) for name in reversed(names)], jobs, _share, given) as futures:
-        for future in as_completed(futures):
-            yield future.result()
+    calls = [(name, budget, scored) for name in reversed(names)]
+    for _, row in results(_fold, calls, jobs=jobs, cluster=cluster, begin=_share, given=given):
+        yield row
 
 
 def _share(name: str, overrides: dict[str, str], logs: list[tuple[np.ndarray, ...]]) -> None:
     _shared["twin"] = load_twin(name, overrides=overrides)
     _shared["logs"] = [Events(*columns) for columns in logs]
-    numba.set_num_threads(1)  # the processors have a filter each, and a step costs what it costs one
 
 
 def _fold(estimator: str, budget: float, scored: tuple[int, int] | None) -> FilterScore:

@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numba
 import numpy as np
 
 from config.companion_schema import AcceptedSection, FigureSection, ReferenceSection
@@ -41,7 +40,7 @@ from .baseline import (
     write_baseline,
 )
 from .compare import draws, tidy
-from .processes import beside, jobs_of
+from .processes import results
 
 SIMULATED_LOGS = 3  # logs of a simulated asset, with consecutive seeds
 
@@ -142,22 +141,17 @@ def guard_all(
     logs: Sequence[GuardedLog],
     note: str | None,
     overrides: Mapping[str, str],
-    jobs: int | None,
     advance: Callable[[], None],
+    *,
+    jobs: int | None = None,
+    cluster: str | None = None,
 ) -> list[GuardVerdict]:
-    """Guard every log, in parallel processes; `advance` is called after each. See `guard_log`."""
-    jobs = jobs_of(jobs, len(logs))
-    calls = [(guarded, note, overrides) for guarded in logs]
-    if jobs == 1:
-        found = []
-        for call in calls:
-            found.append(guard_log(*call))
-            advance()
-        return found
-    with beside(guard_log, calls, jobs, numba.set_num_threads, (1,)) as futures:
-        for future in futures:
-            future.add_done_callback(lambda _: advance())
-        return [future.result() for future in futures]
+    """Guard every log, in parallel; `advance` is called after each. See `guard_log` and `results`."""
+    found: dict[int, GuardVerdict] = {}
+    for k, verdict in results(guard_log, [(each, note, overrides) for each in logs], jobs=jobs, cluster=cluster):
+        found[k] = verdict
+        advance()
+    return [found[k] for k in range(len(logs))]
 
 
 def guard_log(guarded: GuardedLog, note: str | None = None, overrides: Mapping[str, str] | None = None) -> GuardVerdict:

@@ -1,17 +1,29 @@
-"""Parallel worker processes that end with the command, also on Ctrl-C."""
+"""Work in parallel: in processes that end with the command, also on Ctrl-C, or on a Dask cluster."""
 
 from __future__ import annotations
 
+import logging
 import multiprocessing
 import os
 import signal
+import threading
+import uuid
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor
-from contextlib import contextmanager
+from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
+from contextlib import contextmanager, suppress
+from importlib.metadata import version
 from typing import Any
+
+import numba
 
 from estimators.compiled.orphan import leave_with_parent
 from estimators.errors import ConfigError
+
+LOCAL = "local:"
+WAIT_S = 60  # for the first worker of a cluster
+
+_turn, _begun = threading.Lock(), [""]
+"""Of a worker of a cluster: one call at a time, and the work whose `begin` has been called."""
 
 
 def jobs_of(given: int | None, most: int) -> int:
@@ -25,28 +37,64 @@ def jobs_of(given: int | None, most: int) -> int:
     return min(most, given or os.cpu_count() or 1)
 
 
-@contextmanager
-def beside(
-    work: Callable[..., Any], calls: Sequence[tuple[Any, ...]], jobs: int, begin: Callable[..., None], given: Any = ()
-) -> Iterator[list[Future[Any]]]:
-    """Call `work` with each of `calls`, its arguments, in this order; yield a future for each.
+def results(
+    work: Callable[..., Any],
+    calls: Sequence[tuple[Any, ...]],
+    *,
+    jobs: int | None = None,
+    cluster: str | None = None,
+    begin: Callable[..., None] | None = None,
+    given: tuple[Any, ...] = (),
+) -> Iterator[tuple[int, Any]]:
+    """Call `work` with each of `calls`, its arguments; yield index and result of each as it is done.
 
-    There are so many processes as `jobs`; each begins with `begin`, called with `given`. Another process must find
-    `work` in a module.
+    Each process has one thread of Numba. The results are the same bits for any number of processes.
+
+    Args:
+        work: A function of a module: other processes import it.
+        calls: Arguments, begun in this order.
+        jobs: Number of processes; None for one per processor. If it is one, `work` is called in this process.
+        cluster: Address of a Dask scheduler, or `local:N` for a cluster of N processes on this machine. Calls of a
+            worker that dies are made again by another.
+        begin: Called with `given` in each process before its first call; a function of a module, too.
+        given: Its arguments.
+
+    Raises:
+        ConfigError: If a number is wrong, Dask is not installed, or the cluster does not answer or has another version.
     """
+    begin = begin or _nothing
+    if cluster is None and (jobs := jobs_of(jobs, len(calls))) == 1:
+        threads = numba.get_num_threads()
+        try:
+            _begin(begin, *given)
+            yield from ((k, work(*call)) for k, call in enumerate(calls))
+        finally:
+            numba.set_num_threads(threads)
+        return
+    if cluster is not None and jobs is not None:
+        raise ConfigError("--jobs: counts processes of this command; the cluster has its own (leave one option out)")
+    with _processes(jobs or 1, begin, given) if cluster is None else _dask(cluster, begin, given) as submit:
+        futures = {submit(work, *call): k for k, call in enumerate(calls)}
+        yield from ((futures[future], future.result()) for future in as_completed(futures))
+
+
+Submit = Callable[..., Any]
+
+
+@contextmanager
+def _processes(jobs: int, begin: Callable[..., None], given: tuple[Any, ...]) -> Iterator[Submit]:
     # Read when a process loads NumPy: threads that spin beside a small matrix would count as the work's cost.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     # Spawned: the libraries that the filters' threads come from do not survive a fork.
     context = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(jobs, mp_context=context, initializer=_begin, initargs=(begin, *given))
+    pool = ProcessPoolExecutor(jobs, mp_context=context, initializer=_begin_child, initargs=(begin, *given))
+
+    def submit(work: Callable[..., Any], *call: Any) -> Any:
+        with _deaf():
+            return pool.submit(work, *call)
+
     try:
-        # Ctrl-C is for the parent alone. What it starts inherits the mask, so that it holds while a process loads too.
-        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-        try:
-            futures = [pool.submit(work, *call) for call in calls]
-        finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, before)
-        yield futures
+        yield submit
     except BaseException:
         # The other results are not needed, and a fold may take minutes.
         pool.shutdown(wait=False, cancel_futures=True)
@@ -56,6 +104,84 @@ def beside(
     pool.shutdown()
 
 
-def _begin(begin: Callable[..., None], *given: Any) -> None:
+@contextmanager
+def _dask(address: str, begin: Callable[..., None], given: tuple[Any, ...]) -> Iterator[Submit]:
+    try:
+        from distributed import Client, LocalCluster
+    except ImportError:
+        raise ConfigError("--cluster: needs Dask; install it with `pip install 'nisus[cluster]'`") from None
+    own = None
+    with _deaf():
+        if address.startswith(LOCAL):
+            count = address.removeprefix(LOCAL)
+            if not count.isdigit() or not int(count):
+                raise ConfigError(f"--cluster {address}: give the number of processes, for example local:4")
+            own = LocalCluster(
+                n_workers=int(count), threads_per_worker=1, host="127.0.0.1", dashboard_address="127.0.0.1:0",
+                silence_logs=logging.CRITICAL,
+            )  # fmt: skip
+        try:
+            client = Client(own or address, timeout=WAIT_S, set_as_default=False)
+        except (OSError, ValueError) as error:
+            raise ConfigError(f"--cluster {address}: {error or 'no answer'}; is it a Dask scheduler's?") from None
+    executor: Executor = client.get_executor(pure=False)
+    try:
+        try:
+            client.wait_for_workers(1, timeout=WAIT_S)
+        except TimeoutError:
+            text = f"--cluster {address}: has no worker; start one with `dask worker {address} --nthreads 1`"
+            raise ConfigError(text) from None
+        # A task rather than data: it is made again if the worker that holds it dies.
+        held = client.submit(_same, (begin, given), pure=False)
+        name, ours = uuid.uuid4().hex, version("nisus")
+        yield lambda work, *call: executor.submit(_on_worker, name, ours, held, work, call)
+    finally:
+        executor.shutdown(wait=False)
+        client.close()
+        if own is not None:
+            with suppress(TimeoutError):
+                own.close(timeout=WAIT_S)
+
+
+@contextmanager
+def _deaf() -> Iterator[None]:
+    """Ctrl-C is for the parent alone: what is started inherits the mask, so that it holds while a process loads too."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _on_worker(
+    name: str, wanted: str, held: tuple[Callable[..., None], tuple[Any, ...]], work: Callable[..., Any],
+    call: tuple[Any, ...],
+) -> Any:  # fmt: skip
+    """Make a call on a worker, which may have threads and serve other commands; `begin` sets variables of a module."""
+    if version("nisus") != wanted:
+        raise ConfigError(f"--cluster: a worker has Nisus {version('nisus')}, this is {wanted}; install the same")
+    begin, given = held
+    with _turn:
+        if _begun[0] != name:
+            begin(*given)
+            _begun[0] = name
+        numba.set_num_threads(1)
+        return work(*call)
+
+
+def _same(value: Any) -> Any:
+    return value
+
+
+def _nothing() -> None:
+    pass
+
+
+def _begin_child(begin: Callable[..., None], *given: Any) -> None:
     leave_with_parent()
+    _begin(begin, *given)
+
+
+def _begin(begin: Callable[..., None], *given: Any) -> None:
     begin(*given)
+    numba.set_num_threads(1)  # the processors have a call each, and a step costs what it costs one

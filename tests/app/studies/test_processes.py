@@ -1,48 +1,88 @@
-"""Processes beside each other: what they return, and that none is left of work that is given up."""
+"""Work in parallel: what it returns, that none is left of work that is given up, and what a cluster does."""
 
+import json
 import multiprocessing
 import os
 import signal
+import subprocess
+import sys
 import time
 
+import numba
 import pytest
 
-from app.studies.processes import beside, jobs_of
+from app.studies.processes import jobs_of, results
+from app.studies.stress.trials import Trials, all_trials
+from app.twin.twin import load_twin
 from estimators.errors import ConfigError
+from tests.app.scripted import wait_for
+
+_begun: list[int] = []
 
 
-def begin() -> None:
+def begin(number: int) -> None:
     """What a process does first."""
+    _begun.append(number)
 
 
-def double(number: int) -> int:
-    return 2 * number
+def double(number: int) -> tuple[int, int, list[int]]:
+    return 2 * number, numba.get_num_threads(), list(_begun)
 
 
-def sleep(_: int) -> None:
+def sleep(marker: str) -> None:
+    open(marker, "w").close()
     time.sleep(600)
 
 
-def handled(_: int) -> bool:
+def handled() -> bool:
     return signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, ())
 
 
-def test_every_call_is_answered_in_its_place() -> None:
-    with beside(double, [(1,), (2,), (3,)], 2, begin) as futures:
-        assert [future.result() for future in futures] == [2, 4, 6]
+def die_once(marker: str) -> int:
+    if not os.path.exists(marker):
+        open(marker, "w").close()
+        os._exit(1)
+    return os.getpid()
 
 
-def test_what_is_given_up_ends() -> None:
+@pytest.fixture(scope="module")
+def scheduler(tmp_path_factory):
+    """The address of a Dask scheduler with two workers, each a process of its own; and those processes."""
+    path = tmp_path_factory.mktemp("dask")
+    at = path / "scheduler.json"
+    start = [sys.executable, "-m", "distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", "0"]
+    run = {"stderr": subprocess.DEVNULL, "cwd": path}
+    begun = [subprocess.Popen([*start, "--no-dashboard", "--scheduler-file", str(at)], **run)]
+    wait_for(at.is_file)
+    worker = [sys.executable, "-m", "distributed.cli.dask_worker", "--scheduler-file", str(at), "--host", "127.0.0.1"]
+    begun += [subprocess.Popen([*worker, "--nthreads", "2", "--no-dashboard", "--no-nanny"], **run) for _ in range(2)]
+    yield json.loads(at.read_text())["address"]
+    for process in begun:
+        process.kill()
+        process.wait()
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_every_call_is_answered_once(jobs: int) -> None:
+    before, _begun[:] = numba.get_num_threads(), []
+    found = dict(results(double, [(1,), (2,), (3,)], jobs=jobs, begin=begin, given=(7,)))
+    assert found == {k: (2 * k + 2, 1, [7]) for k in range(3)}
+    assert numba.get_num_threads() == before
+
+
+def test_what_is_given_up_ends(tmp_path) -> None:
     """Without a wait for work that has begun: the ten minutes would be over before the test."""
-    with pytest.raises(KeyboardInterrupt), beside(sleep, [(1,), (2,), (3,)], 2, begin) as futures:
-        children = multiprocessing.active_children()
-        while not futures[0].running():
-            time.sleep(0.01)
-        raise KeyboardInterrupt
-    deadline = time.monotonic() + 120
-    while not all(_gone(child.pid) for child in children):
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
+    running = results(sleep, [(str(tmp_path / str(k)),) for k in range(3)], jobs=2)
+    with pytest.raises(KeyboardInterrupt):
+        main = os.getpid()
+        signal.signal(signal.SIGALRM, lambda *_: os.kill(main, signal.SIGINT) if any(tmp_path.iterdir()) else None)
+        signal.setitimer(signal.ITIMER_REAL, 0.05, 0.05)
+        try:
+            next(running)
+        finally:
+            signal.setitimer(signal.ITIMER_REAL, 0.0)
+            children = multiprocessing.active_children()
+    wait_for(lambda: all(_gone(child.pid) for child in children), 120.0)
 
 
 def _gone(pid: int) -> bool:
@@ -55,8 +95,7 @@ def _gone(pid: int) -> bool:
 
 
 def test_ctrl_c_is_for_the_parent_alone() -> None:
-    with beside(handled, [(1,)], 1, begin) as futures:
-        assert futures[0].result()
+    assert dict(results(handled, [(), ()], jobs=2)) == {0: True, 1: True}
     assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, ())
 
 
@@ -64,3 +103,45 @@ def test_no_process_is_no_number_of_processes() -> None:
     assert jobs_of(3, 2) == 2 and jobs_of(None, 1) == 1
     with pytest.raises(ConfigError, match="--jobs 0: must be 1 or more"):
         jobs_of(0, 2)
+
+
+def test_a_cluster_answers_every_call_in_one_thread_of_each_worker(scheduler) -> None:
+    for given in (7, 8):  # the second command finds workers that have worked for the first
+        found = dict(results(double, [(k,) for k in range(8)], cluster=scheduler, begin=begin, given=(given,)))
+        assert [found[k][:2] for k in range(8)] == [(2 * k, 1) for k in range(8)]
+        assert {found[k][2][-1] for k in range(8)} == {given}
+
+
+def test_calls_of_a_worker_that_dies_are_made_again(scheduler, tmp_path) -> None:
+    found = dict(results(die_once, [(str(tmp_path / "died"),), (__file__,)], cluster=scheduler))
+    assert len(found) == 2 and (tmp_path / "died").exists()
+
+
+def test_trials_of_a_cluster_are_those_of_this_process(scheduler) -> None:
+    twin = load_twin("motor_winding")
+    chosen = [item for item in enumerate(Trials(twin, 60.0).mistakes) if item[1].name in ("R x10", "winding +5 σ")]
+    given = "motor_winding", {}, (), 60.0, chosen, ("kf", "ukf"), 1
+    here = dict(all_trials(*given, jobs=1))
+    assert len(here) == 4 and {trial.estimator for trial in here.values()} == {"kf", "ukf"}
+    # As text, in which a number that is none is itself.
+    assert repr(sorted(all_trials(*given, cluster=scheduler))) == repr(sorted(here.items()))
+
+
+def test_a_cluster_of_ones_own_ends_with_the_command() -> None:
+    before = set(multiprocessing.active_children())
+    found = dict(results(double, [(k,) for k in range(4)], cluster="local:2", begin=begin, given=(7,)))
+    assert found == {k: (2 * k, 1, [7]) for k in range(4)}
+    wait_for(lambda: not set(multiprocessing.active_children()) - before)
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        ({"cluster": "local:0"}, "--cluster local:0: give the number of processes, for example local:4"),
+        ({"cluster": "nowhere"}, "--cluster nowhere: .*; is it a Dask scheduler's?"),
+        ({"cluster": "local:2", "jobs": 2}, "--jobs: counts processes of this command"),
+    ],
+)  # fmt: skip
+def test_a_wrong_cluster_is_one_line(options, text) -> None:
+    with pytest.raises(ConfigError, match=text):
+        list(results(handled, [(), ()], **options))

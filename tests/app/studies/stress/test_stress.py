@@ -202,9 +202,10 @@ def test_a_change_of_the_asset_is_made_in_the_asset():
 
 def test_the_command_prints_a_table_or_json(nisus):
     given = ["stress", "motor_winding", "--only", "winding stuck", "R x100", "--seeds", "2", "--duration", "120"]
-    out = nisus(*given).out
+    out = nisus(*given, "--jobs", 1).out
     assert "winding stuck" in out and "2/2" in out and "0 rows wrong and green" in out
-    rows = nisus(*given, "--json").json
+    rows = nisus(*given, "--json", "--jobs", 1).json
+    assert nisus(*given, "--json", "--jobs", 2).json == rows
     made = ["R x100", "winding stuck", "winding stuck from the start"]
     assert [(row["mistake"], row["seed"]) for row in rows] == [(name, seed) for seed in (0, 1) for name in made]
     assert "Wrong, undetected and not listed\n  none" in out
