@@ -110,7 +110,7 @@ class DraftFold:
     """Fold of a whole draft, as its YAML has it, over its recording, or over the first half alone."""
 
     def __init__(self, drafted: DraftPlan, model: StateSpaceModel, split: Split, *, fitted_only: bool = False) -> None:
-        self.drafted = drafted
+        self.drafted, self.model = drafted, model
         self._sensors = [reads for item in drafted.states for reads in item.sensors]
         zero = min(int(reads.signal.series.t[0]) for reads in self._sensors)
         self._zero, self._split = zero, split

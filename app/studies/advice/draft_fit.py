@@ -272,11 +272,11 @@ def _fit_split(drafted: DraftPlan, split: Split, progress: FitProgress) -> Gener
         limit = max(one.log_likelihood for one in tried) - MARGIN
         alike = [one for one in tried if one.log_likelihood >= limit]
         plain = [one for one in alike if not one.drafted.options]
-        fitted_plan = min(plain or alike, key=lambda one: one.memory).drafted
+        best = min(plain or alike, key=lambda one: one.memory)
+        fitted_plan = best.drafted
         yield FitStep("checking on the parts left out" if split.alternate else "checking on the second half")
-        model = model_with(fitted_plan.states, fitted_plan.inputs, folder, "draft")
         with suppress(NisusError):
-            fitted_plan = replace(fitted_plan, check=DraftFold(fitted_plan, model, split).check(span))
+            fitted_plan = replace(fitted_plan, check=DraftFold(fitted_plan, best.model, split).check(span))
         return fitted_plan
 
 
