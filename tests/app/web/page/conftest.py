@@ -11,14 +11,17 @@ from tests.app.web.page.browsed import DRAWN, PATIENCE, until
 def visit(browser):
     """visit(url): a page, once it has drawn. None may ask a stranger for anything or raise an exception.
 
-    `beside` is a page whose window (cookies and storage) it shares; `asked` has the addresses that it requested.
+    `beside` is a page whose window (cookies and storage) it shares; `asked` has the addresses that it requested. The
+    scene is drawn only with `scene`: without a graphics card that takes more of the processor than all else.
     """
     contexts, wrong = [], []
 
-    def visit(url, *, beside=None, ready=DRAWN, size=(1440, 900), scheme="light"):
+    def visit(url, *, beside=None, ready=DRAWN, size=(1440, 900), scheme="light", scene=False):
         if beside is None:
             viewport = {"width": size[0], "height": size[1]}
             contexts.append(browser.new_context(viewport=viewport, color_scheme=scheme))
+            if not scene:
+                contexts[-1].add_init_script("if (location.pathname.endsWith('/viser/')) window.stop()")
         page = (contexts[-1] if beside is None else beside.context).new_page()
         page.set_default_timeout(PATIENCE * 1000)
         own = tuple(f"http://{name}:{urlsplit(url).port}/" for name in ("127.0.0.1", "localhost"))

@@ -30,7 +30,8 @@ def card(page, name):
 
 def test_two_browsers_start_switch_and_come_back(visit, tmp_path):
     with opened(tmp_path / "recordings") as session:
-        first, second = visit(session.session.url, ready=None), visit(session.session.url, ready=None)
+        first = visit(session.session.url, ready=None)
+        second = visit(session.session.url, ready=None, scene=True)
         address = first.url
         for page in (first, second):
             page.get_by_text("How do I know that my filter works?").wait_for()

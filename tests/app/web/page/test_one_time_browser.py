@@ -181,8 +181,9 @@ def shows(page, status, caption):
     wait_for(there, PATIENCE)
 
 
-def test_strip_and_scene_show_the_moment_of_the_cursor(visit, page, session):
+def test_strip_and_scene_show_the_moment_of_the_cursor(visit, session):
     """Each page has its own strip; the scene is one, and says which moment it shows."""
+    page = visit(session.url, scene=True)
     engine, view = session.engine, session.running.view
     end = float(pull_all(engine).events.t[-1]) * 1e-9
     origin = engine.span()[0]

@@ -28,7 +28,7 @@ def test_a_session_on_the_page(visit, served, tmp_path, monkeypatch, request):
     monkeypatch.chdir(tmp_path)
     session = served("motor_winding", 2.0)
     engine, twin = session.engine, session.engine.twin
-    page = visit(session.url)
+    page = visit(session.url, scene=True)
 
     # The charts draw, not only exist; and so does the scene.
     wait_for(lambda: drawn(page, "#charts")["estimate"] > 200, PATIENCE)

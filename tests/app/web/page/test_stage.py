@@ -16,6 +16,11 @@ def session():
         yield session
 
 
+@pytest.fixture
+def page(visit, session):
+    return visit(session.url, scene=True)
+
+
 def asked(session):
     """The queries of the browsers' sockets, as Viser's server knows them."""
     from app.views.viser.guarded_server import addresses
@@ -26,8 +31,7 @@ def asked(session):
 AFTER = "getComputedStyle(document.getElementById('scene'), '::after').content"
 
 
-def test_a_scene_whose_document_comes_late_is_announced(visit, session):
-    page = visit(session.url)
+def test_a_scene_whose_document_comes_late_is_announced(page):
     held = []
     page.route("**/viser/?*", lambda route: held.append(route))
     page.reload()
@@ -39,7 +43,7 @@ def test_a_scene_whose_document_comes_late_is_announced(visit, session):
 
 def test_the_scene_is_chosen_enlarged_and_opened_alone(visit, session):
     assert asked(session) == [] and session.running.view.history.n == 0
-    page = visit(session.url)
+    page = visit(session.url, scene=True)
     wait_for(lambda: asked(session) == ["theme=light"], PATIENCE)
     wait_for(lambda: session.running.view.history.n > 0, PATIENCE)
 
@@ -83,7 +87,7 @@ def test_rerun_has_a_window_of_its_own(page, session):
 
 def test_in_the_dark_the_scene_has_light_labels_on_dark(visit, session):
     """Viser draws black on white: boxes of some thousand pixels. Letters alone are a few hundred."""
-    page = visit(session.url, scheme="dark")
+    page = visit(session.url, scheme="dark", scene=True)
     wait_for(lambda: session.running.view.history.n > 0, PATIENCE)
 
     def share(least):
