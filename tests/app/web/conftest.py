@@ -1,6 +1,7 @@
 """Served engines that the tests of the API share."""
 
 import threading
+from contextlib import contextmanager
 from types import SimpleNamespace
 
 import numpy as np
@@ -11,12 +12,9 @@ from tests.app.scripted import readings, wait_for
 from tests.app.served import ServedEngine
 
 
-@pytest.fixture
-def serve(tmp_path, monkeypatch):
+@contextmanager
+def serving(folder):
     """serve(n, std): an engine behind its page, with so many measurements of a constant temperature of 40 °C."""
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    # The viewer's files are tested elsewhere; to make them takes a while.
-    monkeypatch.setattr("app.web.server.viewer_assets", lambda progress: tmp_path)
     opened = []
 
     def serve(n=0, std=1.0, **options):
@@ -27,18 +25,32 @@ def serve(tmp_path, monkeypatch):
             wait_for(lambda: opened[-1].rows() == n)
         return opened[-1]
 
-    yield serve
-    for page in opened:
-        page.stop()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_CACHE_HOME", str(folder))
+        # The viewer's files are tested elsewhere; to make them takes a while.
+        patch.setattr("app.web.server.viewer_assets", lambda progress: folder)
+        yield serve
+        for page in opened:
+            page.stop()
+
+
+def reviewing(serve, folder):
+    """An engine behind its page that reviews a recording."""
+    recording = folder / "reviewed.rrd"
+    recording.write_bytes(b"RRF2 and so on")
+    (folder / "private.rrd").write_bytes(b"nobody's business")
+    return serve(review=recording)
+
+
+@pytest.fixture
+def serve(tmp_path):
+    with serving(tmp_path) as serve:
+        yield serve
 
 
 @pytest.fixture
 def page(serve, tmp_path):
-    """An engine behind its page that reviews a recording."""
-    recording = tmp_path / "reviewed.rrd"
-    recording.write_bytes(b"RRF2 and so on")
-    (tmp_path / "private.rrd").write_bytes(b"nobody's business")
-    return serve(review=recording)
+    return reviewing(serve, tmp_path)
 
 
 @pytest.fixture

@@ -15,8 +15,29 @@ from app.web.server import PageServer
 from estimators.errors import ConfigError
 from tests.app.scripted import pull_all, readings, wait_for
 from tests.app.served import PATIENCE, SECRET
+from tests.app.web.conftest import reviewing, serving
 
 STREAM = "/rerun/stream"
+
+
+@pytest.fixture(scope="module")
+def open_page(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("door")
+    with serving(folder) as serve:
+        yield reviewing(serve, folder)
+
+
+@pytest.fixture
+def page(open_page):
+    """One page for all requests, which leave it as it is."""
+    open_page.viser.requests.clear()
+    return open_page
+
+
+@pytest.fixture
+def fresh(serve, tmp_path):
+    """A page of a test's own."""
+    return reviewing(serve, tmp_path)
 
 
 # Who is refused
@@ -201,16 +222,16 @@ def test_every_answer_forbids_to_leave_the_machine(page):
 # Viser behind it
 
 
-def test_the_scene_is_chosen_and_the_status_tells_it(page):
-    offered = json.loads(page.client.get("/api/scene").text)
+def test_the_scene_is_chosen_and_the_status_tells_it(fresh):
+    offered = json.loads(fresh.client.get("/api/scene").text)
     assert offered == [{"key": "x", "label": "x", "options": ["temperature", "rate"], "value": "temperature"}]
-    assert json.loads(page.client.post("/api/scene", {"key": "x", "value": "rate"}).text)[0]["value"] == "rate"
-    assert page.choices.values() == {"x": "rate"}
-    assert json.loads(page.client.get("/api/status").text)["scene"][0]["value"] == "rate"
+    assert json.loads(fresh.client.post("/api/scene", {"key": "x", "value": "rate"}).text)[0]["value"] == "rate"
+    assert fresh.choices.values() == {"x": "rate"}
+    assert json.loads(fresh.client.get("/api/status").text)["scene"][0]["value"] == "rate"
     for body in ({"key": "x", "value": "mass"}, {"key": "w", "value": "rate"}, {}, [], 7):
-        answer = page.client.post("/api/scene", body)
+        answer = fresh.client.post("/api/scene", body)
         assert answer.status == 400 and answer.text.count("\n") == 0 and json.loads(answer.text)["error"]
-    assert page.choices.values() == {"x": "rate"}
+    assert fresh.choices.values() == {"x": "rate"}
 
 
 def test_each_view_has_a_page_of_its_own(page):
@@ -247,7 +268,7 @@ def test_viser_messages_pass_both_ways(page):
 # The streams
 
 
-def test_a_page_gets_the_next_frames_once_it_has_drawn_the_last_ones(page):
+def test_a_page_gets_the_next_frames_once_it_has_drawn_the_last_ones(fresh):
     def message(key):
         """The next message that has a key."""
         while True:
@@ -256,12 +277,12 @@ def test_a_page_gets_the_next_frames_once_it_has_drawn_the_last_ones(page):
                 return found[key]
             assert isinstance(text, bytes) or "error" not in text
 
-    page.source.put(readings([1.0, 2.0], [40.0, 41.0]))
-    wait_for(lambda: page.rows() == 2)
-    with page.connect("/api/stream") as stream:
+    fresh.source.put(readings([1.0, 2.0], [40.0, 41.0]))
+    wait_for(lambda: fresh.rows() == 2)
+    with fresh.connect("/api/stream") as stream:
         stream.send(json.dumps({"streams": {"charts": {"columns": ["nis"]}}}))
         message("frames")
-        page.source.put(readings([3.0], [40.0]))
+        fresh.source.put(readings([3.0], [40.0]))
         stream.send(json.dumps({"drawn": True}))
         message("frames")
         for wrong in ([], {"drwan": True}, {"streams": {"charts": {"columns": ["nis"], "of": 1}}}, {"pair": ["a"]}):
@@ -297,17 +318,17 @@ class Viewer:
             self.take()
 
 
-def test_a_viewer_that_stops_reading_costs_nobody_anything(page, tmp_path):
-    state = f"/state/{page.engine.model.state_names[0]}"
-    with page.connect(STREAM) as stuck, page.connect(STREAM) as connection:
+def test_a_viewer_that_stops_reading_costs_nobody_anything(fresh, tmp_path):
+    state = f"/state/{fresh.engine.model.state_names[0]}"
+    with fresh.connect(STREAM) as stuck, fresh.connect(STREAM) as connection:
         viewer = Viewer(connection, tmp_path)
         sent = 0
         for _ in range(20):
             batch = readings((sent + np.arange(1, 2001)) * 0.001, 40 + np.zeros(2000))
-            page.source.put(batch)
+            fresh.source.put(batch)
             sent += len(batch)
             viewer.until(lambda: viewer.newest.get(state) == batch.t[-1])  # noqa: B023
-        assert len(pull_all(page.engine).events) == sent
+        assert len(pull_all(fresh.engine).events) == sent
         # The stuck one was given one picture, and asked for no other: there is no queue for it that grows.
         pictures = 0
         while True:
@@ -318,11 +339,11 @@ def test_a_viewer_that_stops_reading_costs_nobody_anything(page, tmp_path):
         assert pictures <= 1
 
 
-def test_a_viewer_that_leaves_is_forgotten(page, tmp_path):
-    page.source.put(readings([1.0], [40.0]))
-    wait_for(lambda: page.rows() == 1)
-    with page.connect(STREAM) as connection:
+def test_a_viewer_that_leaves_is_forgotten(fresh, tmp_path):
+    fresh.source.put(readings([1.0], [40.0]))
+    wait_for(lambda: fresh.rows() == 1)
+    with fresh.connect(STREAM) as connection:
         Viewer(connection, tmp_path).take()
-        wait_for(lambda: len(page.engine._cursors) == 2)
+        wait_for(lambda: len(fresh.engine._cursors) == 2)
     # What is left is the engine's own, of its episode log.
-    wait_for(lambda: len(page.engine._cursors) == 1)
+    wait_for(lambda: len(fresh.engine._cursors) == 1)
