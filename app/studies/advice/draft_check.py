@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from types import ModuleType
 from typing import NamedTuple
 
 import numpy as np
@@ -95,15 +96,26 @@ def log_of(
     return log
 
 
-def model_with(
-    states: Sequence[Moves], inputs: Sequence[tuple[str, Signal]], folder: Path, name: str
-) -> StateSpaceModel:
-    """Return the model of some states, as the draft's Python file has it, which is written to `folder`."""
-    drafted = DraftPlan(tuple(states), tuple(inputs), tuple(item.signal for item in states), ())
-    path = folder / f"{name}.py"
-    path.write_text(python_text(path.stem, "DraftState", drafted), encoding="utf-8")
-    model: StateSpaceModel = run_file(path.stem, path).DraftState
-    return model
+class ModelFiles:
+    """Models of states as the draft's Python file has them; those with the same functions share their compiled code."""
+
+    def __init__(self, folder: Path) -> None:
+        """Write the files of functions to a folder, which must outlive their use."""
+        self._folder = folder
+        self._functions: dict[str, ModuleType] = {}
+
+    def model(self, states: Sequence[Moves], inputs: Sequence[tuple[str, Signal]]) -> StateSpaceModel:
+        """Return the model of some states."""
+        drafted = DraftPlan(tuple(states), tuple(inputs), tuple(item.signal for item in states), ())
+        functions, begin, declaration = python_text("draft", "DraftState", drafted).partition("\nDraftState = ")
+        if functions not in self._functions:
+            path = self._folder / f"draft_{len(self._functions)}.py"
+            path.write_text(functions, encoding="utf-8")
+            self._functions[functions] = run_file(path.stem, path)
+        names = dict(vars(self._functions[functions]))
+        exec(begin + declaration, names)
+        model: StateSpaceModel = names["DraftState"]
+        return model
 
 
 class DraftFold:

@@ -29,9 +29,9 @@ from .draft_check import (
     ALTERNATE_PARTS,
     HALVES_DIFFER,
     DraftFold,
+    ModelFiles,
     Split,
     log_of,
-    model_with,
     split_of,
     with_options,
 )
@@ -95,7 +95,12 @@ def windows_of(item: Moves, split: Split) -> list[tuple[int, int]]:
 
 
 def fitted(
-    item: Moves, inputs: Sequence[tuple[str, Signal]], split: Split, span: float, folder: Path, progress: FitProgress
+    item: Moves,
+    inputs: Sequence[tuple[str, Signal]],
+    split: Split,
+    span: float,
+    files: ModelFiles,
+    progress: FitProgress,
 ) -> list[FittedStructure | None]:
     """Return the best structure of a state, fitted with each of `OPTIONS`; none if it cannot be fitted.
 
@@ -104,7 +109,7 @@ def fitted(
         inputs: Inputs that it follows.
         split: Parts that are fitted.
         span: Length of the recording, s, beyond which no time constant is.
-        folder: For the files of models, which must outlive their use.
+        files: Models of this draft.
         progress: Of the whole draft; once it is to stop, structures that were not begun are left out.
     """
     rated = any(reads.rate for reads in item.sensors)
@@ -113,7 +118,7 @@ def fitted(
     for smooth in (True,) if rated else (False, True):
         moving = _begun(item, smooth)
         with suppress(NisusError):
-            models[smooth] = moving, model_with([moving], inputs, folder, f"{item.name}_{smooth:d}")
+            models[smooth] = moving, files.model([moving], inputs)
 
     def best(structures: Iterable[Structure], options: Options = OPTIONS[0]) -> FittedStructure | None:
         tried = [
@@ -249,20 +254,20 @@ def _fit_split(drafted: DraftPlan, split: Split, progress: FitProgress) -> Gener
     span = float(t.max() - t.min()) * 1e-9
     drafted = replace(drafted, states=tuple(_scaled_on(item, split) for item in drafted.states))
     with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
+        files = ModelFiles(Path(name))
         choices: list[list[FittedStructure | None]] = []
         for k, item in enumerate(drafted.states):
             yield FitStep(f"fitting {item.name}, {k + 1} of {len(drafted.states)} states")
             inputs = [each for each in drafted.inputs if each[0] in item.inputs]
             early = sum(int(split.fitted(reads.signal.series.t).sum()) for reads in item.sensors)
             able = early >= MIN_VALUES and not progress.stop
-            choices.append(fitted(item, inputs, split, span, folder, progress) if able else [])
+            choices.append(fitted(item, inputs, split, span, files, progress) if able else [])
         tried: list[DraftFold] = []
         for k, one in enumerate(_combined(drafted, choices)):
             if not tried or not progress.stop:
                 yield FitStep(f"comparing filters, number {k + 1}")
                 with suppress(NisusError):  # It diverges.
-                    model = model_with(one.states, one.inputs, folder, f"draft_{k}")
+                    model = files.model(one.states, one.inputs)
                     tried.append(DraftFold(one, model, split, fitted_only=True))
                 progress.folds += 1
         if not tried:
