@@ -216,14 +216,12 @@ def test_what_is_invisible_is_exactly_what_is_not_found():
     """Foretold before they are made; of 95 % each, at most so many go otherwise as chance explains (1 in 1000)."""
     twin, names = load_twin("motor_can"), ("σ", "i_d", "coolant", "of the asset", "R x100", "silent")
     outcomes = {VISIBLE: [], INVISIBLE: [], CHANCE: []}
-    oracle = Oracle(twin, 120.0)
-    for seed in (3, 4):
-        bench = Bench(twin, seed, 120.0)
-        for mistake in matrix(twin.model, twin.tuning, bench.events, asset=True):
-            if any(text in mistake.name for text in names):
-                foretold = oracle.foretell(bench, mistake, "ekf")
-                trial = make(bench, mistake, "ekf", foretold)
-                outcomes[foretold.verdict].append(trial.outcome in (NAMED, MISNAMED))
+    bench, oracle = Bench(twin, 3, 120.0), Oracle(twin, 120.0)
+    for mistake in matrix(twin.model, twin.tuning, bench.events, asset=True):
+        if any(text in mistake.name for text in names):
+            foretold = oracle.foretell(bench, mistake, "ekf")
+            trial = make(bench, mistake, "ekf", foretold)
+            outcomes[foretold.verdict].append(trial.outcome in (NAMED, MISNAMED))
     seen, hidden = np.array(outcomes[VISIBLE]), np.array(outcomes[INVISIBLE])
     assert seen.size >= 20 and hidden.size >= 20
     for wrong in (~seen, hidden):
