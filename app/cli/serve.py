@@ -29,9 +29,8 @@ if TYPE_CHECKING:
     from ..web.session import Session
     from .arguments import ServeCommand
 
-PRELOADED = ("app.cli.serve", "app.cli.open_twin", "app.web.server", "app.views.viser.view", "app.views.rerun.rows")
+PRELOADED = ("app.cli.preloaded",)
 """Modules that the processes of the twins share: they are imported once."""
-
 
 MEMORY_PERIOD_S = 10.0
 """Between two looks at the memory, which take milliseconds."""
