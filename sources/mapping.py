@@ -203,6 +203,9 @@ class ChannelMapping:
             }
         )
         self._columns = width + max((len(c.signals) for c in self._channels if c.accuracy is not None), default=0)
+        # Kept, as a frame of a live bus is often alone: allocations would cost as much as its conversion.
+        self._counts = np.zeros((3, len(self._channels)), np.int64)
+        self._losses = tuple(self._counts)
         self._most = int(np.diff(self._tables.group).max(initial=0))
         # By sensor: a message with two ids has its channels twice here.
         self._positions = {c.index: c for c in self._channels if c.convert == "east_north"}
@@ -231,14 +234,16 @@ class ChannelMapping:
         source = np.empty(room, np.int64)
         kind, channel = np.empty(room, np.int8), np.empty(room, np.int32)
         value = np.empty((room, self._columns))
-        counts = refused, cut, unreported = np.zeros((3, len(self._channels)), np.int64)
+        refused, cut, unreported = self._losses
         n = emit(
             self._tables, plan, skip, values, state, self._width, source, kind, channel, value, refused, cut, unreported
         )
-        source = source[:n]
-        batch = Events(t[source], arrival[source], kind[:n].copy(), channel[:n].copy(), value[:n].copy())
-        if counts.any():
+        if n < room:
+            source, kind, channel, value = source[:n], kind[:n].copy(), channel[:n].copy(), value[:n].copy()
+        batch = Events(t[source], arrival[source], kind, channel, value)
+        if np.count_nonzero(self._counts):
             self._report_losses(refused, cut, unreported)
+            self._counts[:] = 0
         for item in self._positions.values():
             self._place(batch, item)
         return batch

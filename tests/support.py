@@ -1,5 +1,6 @@
 """What the tests of several rooms share: a second, logs from a few rows, all that a source gives, the same bits."""
 
+import socket
 from collections.abc import Iterable
 from typing import Any
 
@@ -12,6 +13,13 @@ from estimators.tuning import Tuning
 
 SECOND = 1_000_000_000
 """Nanoseconds."""
+
+
+def free_port(kind: socket.SocketKind = socket.SOCK_STREAM) -> int:
+    """A port of loopback that nobody uses, of TCP or UDP."""
+    with socket.socket(type=kind) as sock:
+        sock.bind(("127.0.0.1", 0))
+        return int(sock.getsockname()[1])
 
 
 def as_log(events: Events) -> Log:

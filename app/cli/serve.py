@@ -23,15 +23,14 @@ from ..terminal import EndRequest, restore, use_lines_of_json, when_asked_to_end
 from ..views.recording.rrd_file import NEVER, Split, parse_split
 from ..web.door import LOOPBACK, Door, check_port
 from ..web.gate import read_tokens
-from ..web.service import STATUS_PERIOD_S, Service, twins_of_folder
+from ..web.service import STATUS_PERIOD_S, Service, TwinFolder
 
 if TYPE_CHECKING:
     from ..web.session import Session
     from .arguments import ServeCommand
 
-PRELOADED = ("app.cli.serve", "app.cli.open_twin", "app.web.server", "app.views.viser.view", "app.views.rerun.rows")
+PRELOADED = ("app.cli.preloaded",)
 """Modules that the processes of the twins share: they are imported once."""
-
 
 MEMORY_PERIOD_S = 10.0
 """Between two looks at the memory, which take milliseconds."""
@@ -71,7 +70,7 @@ def serve(arguments: ServeCommand) -> int:
     door = Door(arguments.port, grants, host=host, public=arguments.public)
     service = Service(
         twins, partial(run_child, options), door=door, preload=PRELOADED, at_once=max(1, (os.cpu_count() or 2) // 2),
-        folder=None if folder is None else partial(twins_of_folder, folder),
+        folder=folder,
     )  # fmt: skip
     done = EndRequest()
     previous = when_asked_to_end(done.set)
@@ -89,15 +88,15 @@ def serve(arguments: ServeCommand) -> int:
     return 0
 
 
-def _named(given: tuple[str, ...]) -> tuple[dict[str, str], Path | None]:
+def _named(given: tuple[str, ...]) -> tuple[dict[str, str], TwinFolder | None]:
     """Return the twins by name, and the folder that has them, if one was given.
 
     Raises:
         ConfigError: If there are none, or two of one name.
     """
     if len(given) == 1 and Path(given[0]).is_dir():
-        folder = Path(given[0])
-        return twins_of_folder(folder), folder
+        folder = TwinFolder(Path(given[0]))
+        return folder(), folder
     if not given:
         raise ConfigError("serve: the twins are missing; give YAML files, names of bundled twins, or a folder")
     found: dict[str, str] = {}

@@ -19,7 +19,8 @@ from estimators.errors import NisusError
 from ..live.jobs import Jobs
 from ..live.outputs import OutputLink
 from ..present.state_message import StateMessage, state_message
-from .alerts import FIRING, AlertRules, Delivery, heartbeat, make_receivers
+from .alerts import FIRING, AlertRules, heartbeat
+from .receivers import Delivery, make_receivers
 
 if TYPE_CHECKING:
     from config.schema import TwinSection

@@ -10,7 +10,8 @@ from estimators.errors import printable
 
 from ..live.outputs import OutputLink
 from ..present.state_message import StateMessage, iso_now, state_schema
-from .alerts import TIMEOUT_S, AlertMessage, secret
+from .alerts import AlertMessage
+from .receivers import TIMEOUT_S, secret
 from .sparkplug import Packet, SparkplugNode
 
 if TYPE_CHECKING:

@@ -14,7 +14,7 @@ from estimators.errors import ConfigError, printable
 
 from ..live.outputs import OutputLink
 from ..present.state_message import PublishedState, StateMessage
-from .alerts import secret
+from .receivers import secret
 
 if TYPE_CHECKING:
     from config.output_schema import OpcUaSection

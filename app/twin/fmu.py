@@ -5,10 +5,10 @@ An FMU is native code, which runs with the rights of the user.
 
 from __future__ import annotations
 
-from functools import lru_cache
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
+from weakref import WeakValueDictionary
 
 import numpy as np
 
@@ -31,28 +31,20 @@ def fmu_model(loaded: Loaded, section: FmuSection, path: Path) -> StateSpaceMode
         ConfigError: With file and line, if FMPy is missing, the YAML names what the FMU lacks or lacks a noise.
         ModelError: If the FMU lacks a capability that filters need; the line names it.
     """
-    model = _model(path, sha256(path.read_bytes()).hexdigest(), section.model_dump_json(), _Places(loaded))
+    key = (path, sha256(path.read_bytes()).hexdigest(), section.model_dump_json())
+    model = _models.get(key)
+    if model is None:
+        model = _models[key] = _model(path, section, loaded)
     check_stated(loaded, model, "an FMU")
     return model
 
 
-class _Places:
-    """The YAML of a twin for errors; equal to all others, so that it is no part of a cache's key."""
-
-    def __init__(self, loaded: Loaded) -> None:
-        self.error = loaded.error
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Places)
-
-    def __hash__(self) -> int:
-        return 0
+_models: WeakValueDictionary[tuple[Path, str, str], StateSpaceModel] = WeakValueDictionary()
+"""Models in use by content of the file and section, so that one is loaded and checked once."""
 
 
-@lru_cache(maxsize=8)
-def _model(path: Path, digest: str, text: str, places: _Places) -> StateSpaceModel:
-    """Return the model of one content of a file and one section, so that it is loaded and checked once."""
-    section = FmuSection.model_validate_json(text)
+def _model(path: Path, section: FmuSection, places: Loaded) -> StateSpaceModel:
+    """Return the model of an FMU."""
     try:
         import fmpy
     except ImportError:
@@ -146,7 +138,7 @@ def _check_kind(description: Any, path: Path) -> None:
 class _Variables:
     """The real variables of an FMU, and their units."""
 
-    def __init__(self, description: Any, section: FmuSection, places: _Places) -> None:
+    def __init__(self, description: Any, section: FmuSection, places: Loaded) -> None:
         self.reals = {
             item.name: item
             for item in description.modelVariables

@@ -16,8 +16,9 @@ import ctypes
 import os
 import tempfile
 import threading
+import weakref
 from collections.abc import Callable, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -56,6 +57,8 @@ class Fmu:
         self._kept: Any = None
         self._ready: tuple[bytes, bytes] | None = None
         self._fmu = self._load(path, description)
+        # Not at the end of the process, where another thread may still be in a call.
+        weakref.finalize(self, _free, self._fmu, self._folder).atexit = False
         self._get, self._set = (
             (self._fmu.getReal, self._fmu.setReal) if self._two else (self._fmu.getFloat64, self._fmu.setFloat64)
         )
@@ -71,7 +74,7 @@ class Fmu:
         from fmpy.fmi2 import defaultCallbacks as defaults
         from fmpy.fmi3 import FMU3Model
 
-        # Removed when the process ends.
+        # Removed with the instance.
         self._folder = tempfile.TemporaryDirectory(prefix="nisus-fmu-")
         here = os.getcwd()
         try:
@@ -272,6 +275,13 @@ class Fmu:
         self._settle()
         self._fmu.getContinuousStates(self._x_at, self._x.size)
         return self._x
+
+
+def _free(fmu: Any, folder: tempfile.TemporaryDirectory) -> None:
+    """Free an instance and its library, and remove its files."""
+    with suppress(Exception):  # of FMPy, or of an FMU after a fatal error
+        fmu.freeInstance()
+    folder.cleanup()
 
 
 def _rk4(rates: Callable[[np.ndarray], np.ndarray], x: np.ndarray, dt: float) -> np.ndarray:

@@ -32,7 +32,7 @@ LOOPBACK_HOST = re.compile(r"(127\.0\.0\.1|localhost|\[::1\])(:\d{1,5})?", re.IG
 STAGE = "/viser/"
 
 OPEN_PATHS = ("/healthz", "/readyz")
-"""For supervisors of processes, which have no token; they tell nothing of the twin."""
+"""For supervisors of processes, which have no token: such a request has no `User`, and gets the status only."""
 
 REFUSED_HOST = "Nisus: this Host is not served; open the page at 127.0.0.1.\n"
 REFUSED_ORIGIN = "Nisus: requests from other sites are refused.\n"
@@ -217,11 +217,12 @@ class Gate:
         if scope["type"] == "http" and scope["path"] == "/" and scope["method"] == "GET":
             for grant in self._granted(*query.getlist("token")[:1]):
                 return self._exchange(same_site, _marked(self._cookie_of(grant), secure=self._secure(published)))
-        if scope["path"] in OPEN_PATHS or shows_token or framed or self._is_known(headers) or self._is_former(headers):
+        if shows_token or framed or self._is_known(headers) or self._is_former(headers):
             passed_on = (_single(headers, "nisus-user") or "").split(" ")
             scope[USER] = User(*passed_on) if len(passed_on) == 3 else User(SESSION, ADMIN, self._address(scope))
             return None
-        return self._refused(scope, headers)
+        refused = self._refused(scope, headers)
+        return None if scope["path"] in OPEN_PATHS else refused
 
     def _refused(self, scope: Scope, headers: Headers) -> ASGIApp | None:
         """Return the answer to a request without the session's token; None if one of a file allows it."""

@@ -44,8 +44,8 @@ QUEUE_TIMEOUT_S = 15.0
 
 RULES = {
     "float_type": "a number", "float_parsing": "a number", "int_type": "a whole number",
-    "int_parsing": "a whole number",
-    "bool_type": "true or false", "string_type": "a text", "list_type": "a list of texts",
+    "int_parsing": "a whole number", "bool_type": "true or false", "bool_parsing": "true or false",
+    "string_type": "a text", "list_type": "a list of texts",
     "tuple_type": "a list of texts", "dict_type": "an object of numbers", "none_required": "null",
 }  # fmt: skip
 """Types of pydantic's errors in words."""

@@ -13,6 +13,7 @@ from estimators.track import HEALTH_NAMES, VERDICT_NAMES
 
 from ..live.running_fold import Running
 from ..present.state_message import state_message
+from .http import refusal
 
 if TYPE_CHECKING:
     from prometheus_client.core import Metric
@@ -99,15 +100,11 @@ class TwinCollector:
 
 
 def metrics(engine: Running, states: bool = False) -> Response:
-    """Answer with the metrics of a twin and of this process, in the text format of Prometheus.
-
-    Raises:
-        ConfigError: If prometheus-client is not installed.
-    """
+    """Answer with the metrics of a twin and of this process, in Prometheus's text format; 501 without its package."""
     try:
         from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, ProcessCollector, generate_latest
     except ModuleNotFoundError:
-        raise ConfigError("metrics need prometheus-client: pip install 'nisus[service]'") from None
+        return refusal(ConfigError("metrics need prometheus-client: pip install 'nisus[service]'"), 501)
     registry: Any = CollectorRegistry()
     registry.register(TwinCollector(engine, states=states))
     ProcessCollector(registry=registry)

@@ -157,7 +157,7 @@ class PageServer:
             get("/alarms", self._alarms),
             get("/readyz", self._ready),
             get("/api/status", self._status),
-            get("/metrics", self._metrics, refused=501),
+            get("/metrics", self._metrics),
             get("/api/state", self._state, answer=StateMessage),
             get("/api/state/schema.json", state_schema),
             get("/api/openapi.json", self._openapi),

@@ -231,7 +231,7 @@ class Service:
 
     def _page(self) -> Response:
         """Answer with the overview."""
-        return page_file("gallery.html", {"boot": self.door.boot, "service": True})
+        return page_file("gallery.html", {"boot": self.door.boot, "service": True}, title="Overview")
 
     def state(self) -> dict[str, Any]:
         """Return the state of each twin, the worst first."""
@@ -245,11 +245,12 @@ class Service:
         unknown |= {"log": False, "picture": False, "missing": None, "error": None}
         return [{**unknown, "title": twin.name, **twin.card, "name": name} for name, twin in self.twins.items()]
 
-    def _ready(self) -> Response:
-        """Answer 200 once all twins that are not stopped run, else 503 with those that do not."""
+    def _ready(self, request: Request) -> Response:
+        """Answer 200 once all twins that are not stopped run, else 503; with a token also the names of the others."""
         missing = [twin.name for twin in self.twins.values() if twin.wanted and twin.state != RUNNING]
         if missing:
-            return PlainTextResponse(f"{len(missing)} twin(s) do not run: {', '.join(missing[:20])}\n", 503)
+            names = f"{len(missing)} twin(s) do not run: {', '.join(missing[:20])}"
+            return PlainTextResponse(f"{names if USER in request.scope else 'not ready'}\n", 503)
         return PlainTextResponse("ok\n")
 
     def _start(self, twin: str) -> Any:
@@ -519,7 +520,21 @@ class _Forwarded(Response):
         return begun
 
 
-def twins_of_folder(folder: Path) -> dict[str, str]:
-    """Return the paths of the YAML files of a folder by name."""
-    files = sorted(path for path in folder.glob("*") if path.suffix in (".yaml", ".yml") and path.is_file())
-    return {path.stem: str(path) for path in files}
+class TwinFolder:
+    """Folder of YAML files. Of two files of one name the first that was found is a twin, the other one line."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._known: dict[str, Path] = {}
+        self._refused: set[Path] = set()
+
+    def __call__(self) -> dict[str, str]:
+        """Return the present paths of the twins by name."""
+        files = {path for path in self._folder.glob("*") if path.suffix in (".yaml", ".yml") and path.is_file()}
+        self._known = {name: path for name, path in self._known.items() if path in files}
+        for path in sorted(files):
+            known = self._known.setdefault(path.stem, path)
+            if path != known and path not in self._refused:
+                print_line("error", f"{path}: {known.name} is a twin of this name already; rename the file")
+                self._refused.add(path)
+        return {name: str(path) for name, path in sorted(self._known.items())}

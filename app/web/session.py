@@ -78,7 +78,7 @@ def _settle(gone: threading.Event | None = None, before: Callable[[], Engine | N
     end = time.monotonic() + DISCONNECT_TIMEOUT_S
     if gone is not None:
         gone.wait(DISCONNECT_TIMEOUT_S)
-    gc.unfreeze()
+        gc.unfreeze()  # not at the first start, as a collection writes to the pages that processes of a service share
     gc.collect()
     while before is not None and before() is not None and time.monotonic() < end:
         time.sleep(0.05)

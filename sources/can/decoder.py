@@ -202,7 +202,7 @@ class Decoder:
         if self._any_slow:
             for i in np.flatnonzero(fast != frames.plan).tolist():
                 self._by_cantools(frames, i, values, state, bad)
-        if bad.any():
+        if np.count_nonzero(bad):
             self._report_undecodable(frames, bad)
         batch = self._mapping.events(frames.plan, frames.t, frames.arrival, values, state, bad)
         if self._unfed and len(batch):

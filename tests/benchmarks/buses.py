@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import socket
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,9 +15,10 @@ from sources.can.bus import CanBus, open_bus
 from sources.can.decoder import Decoder
 
 from ..sources.can.can_tools import dbc, frame, sensor
+from ..support import free_port
 from .timing import BenchmarkRow, Bound, timed
 
-GROUP, PORT = "239.74.163.9", 43998
+GROUP = "239.74.163.9"
 BATCHES = (1, 10, 200)
 """Frames queued when the bus is read; the last are few enough for the buffer of any socket."""
 
@@ -28,8 +30,10 @@ def can_live() -> Iterator[BenchmarkRow]:
     with tempfile.TemporaryDirectory() as folder:
         path = dbc(Path(folder))
 
+        port = free_port(socket.SOCK_DGRAM)
+
         def opened() -> Any:
-            return open_bus("udp_multicast", GROUP, {"port": PORT})
+            return open_bus("udp_multicast", GROUP, {"port": port})
 
         def reader(interface: str, bus: Any) -> CanBus:
             decoder = Decoder([(path, None)], [sensor(0, "ENGINE", "Temp"), sensor(1, "FIX", "Lat", "Lon")], width=2)

@@ -249,7 +249,8 @@ def published(seconds: float = 15.0, rate: float = 1000.0) -> Iterator[Benchmark
     """
     from sources.brokers import mqtt_client
 
-    from ..app.outputs.broker import MOSQUITTO, Broker, free_port
+    from ..app.outputs.broker import MOSQUITTO, Broker
+    from ..support import free_port
 
     if MOSQUITTO is None:
         raise SourceError("no mosquitto was found")

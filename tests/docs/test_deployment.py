@@ -19,8 +19,9 @@ from websockets.sync.client import connect
 from app.cli.arguments import ServeCommand
 from app.cli.main import parse
 from app.cli.options import environment_options
-from tests.app.web.test_service import PATIENCE_S, Served, all_run, free_port
+from tests.app.web.test_service import PATIENCE_S, Served, all_run
 from tests.conftest import ROOT
+from tests.support import free_port
 
 TWIN = ROOT / "config" / "twins" / "motor_winding.yaml"
 TOKEN = "b" * 24

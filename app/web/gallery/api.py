@@ -63,7 +63,7 @@ class GalleryApi:
 
     def _page(self) -> Response:
         """Answer with the page of the gallery."""
-        return page_file("gallery.html", {"boot": self._door.boot})
+        return page_file("gallery.html", {"boot": self._door.boot}, title="Gallery")
 
     def state(self) -> dict[str, Any]:
         """Return the running twin, the start under way, and the last start that failed."""

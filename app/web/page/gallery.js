@@ -153,8 +153,8 @@ function serve(twins) {
       node.querySelector(".picture").hidden = !node.querySelector(".picture svg");
       node.querySelector("h2 .name").onclick = () => node.querySelector("footer a")?.click();
     }
-    setAttribute(served.querySelector(".pill"), "data-health", health);
-    setText(served.querySelector(".pill"), runs ? health : twin.state);
+    for (const part of [node, served.querySelector(".pill")]) setAttribute(part, "data-health", health);
+    setText(served.querySelector(".pill"), !runs ? twin.state : health === "stale" && twin.age ? `stale for ${span(twin.age)}` : health);
     setText(served.querySelector(".pill + span"), cause ? ` ${cause}` : "");
     setText(served.lastElementChild, facts);
     // Buttons stay as long as they are the same, so that they keep the focus.
@@ -178,13 +178,14 @@ const view = new LogView($("log"), {
 if (settings.service) $("recordings").remove();
 const recordings = settings.service ? null : new Recordings($("recordings"), { open: (file) => files.open(file.name), drop: files.take, say: (text) => say(text, true) });
 
+const title = $("place").textContent;
 function route() {
   const name = new URLSearchParams(location.hash.slice(1)).get("log");
   document.body.dataset.view = name ? "log" : "shelf";
   $("log").hidden = !name;
   $("find").hidden = Boolean(name);
-  setText($("place"), name ? "Log" : "Gallery");
-  document.title = `${name ?? "Gallery"} · Nisus`;
+  setText($("place"), name ? "Log" : title);
+  document.title = `${name ?? title} · Nisus`;
   if (name) view.open(name);
   else view.close();
 }

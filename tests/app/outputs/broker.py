@@ -13,6 +13,8 @@ from typing import Any
 import paho.mqtt.client as paho
 import pytest
 
+from tests.support import free_port
+
 MOSQUITTO = shutil.which("mosquitto", path=f"{os.environ.get('PATH', '')}:/usr/sbin")
 
 
@@ -22,13 +24,6 @@ def needs_mosquitto() -> None:
         if os.environ.get("CI"):
             pytest.fail("mosquitto is not installed; .ci/run installs it")
         pytest.skip("mosquitto is not installed (Debian: apt install mosquitto)")
-
-
-def free_port() -> int:
-    """A TCP port of loopback that nobody uses."""
-    with socket.socket() as sock:
-        sock.bind(("127.0.0.1", 0))
-        return int(sock.getsockname()[1])
 
 
 class Broker:

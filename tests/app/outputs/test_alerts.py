@@ -7,6 +7,7 @@ import os
 import socketserver
 import sys
 import threading
+from contextlib import suppress
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from types import SimpleNamespace
 
@@ -15,10 +16,12 @@ from scipy.stats import norm
 
 from app.live.outputs import AlertMute
 from app.outputs import Publisher
-from app.outputs.alerts import MAX_WAITING_ALERTS, AlertRules, Delivery, heartbeat
+from app.outputs import receivers as sending
+from app.outputs.alerts import AlertRules, heartbeat
+from app.outputs.receivers import MAX_WAITING_ALERTS, CommandReceiver, Delivery, Webhook
 from app.present.state_message import PublishedState, StateMessage
 from app.twin.twin import load_twin
-from config.output_schema import AlertSection
+from config.output_schema import AlertSection, CommandSection, WebhookSection
 from estimators.diagnostics.episodes import Episode
 from estimators.errors import ConfigError
 from sources.source import ignore
@@ -271,9 +274,6 @@ def test_a_receiver_that_failed_gets_what_waited_in_order_and_a_full_queue_drops
 
 @pytest.mark.parametrize("code", [302, 500])
 def test_an_answer_that_is_no_success_counts_as_a_failure_and_is_not_followed(hook, code):
-    from app.outputs.alerts import Webhook
-    from config.output_schema import WebhookSection
-
     hook.code = code
     with pytest.raises(OSError, match=f"it answers {code}"):
         Webhook(WebhookSection(type="webhook", url=hook.url)).send(heartbeat("motor", "tracking"))
@@ -288,9 +288,6 @@ class Nonsense(BaseHTTPRequestHandler):
 
 
 def test_a_receiver_that_answers_nonsense_fails_as_any_other(tmp_path):
-    from app.outputs.alerts import CommandReceiver, Webhook
-    from config.output_schema import CommandSection, WebhookSection
-
     class Silent:
         def send(self, alert):
             raise ConnectionError
@@ -324,6 +321,27 @@ def test_a_receiver_that_answers_nonsense_fails_as_any_other(tmp_path):
         delivery.step()
         assert (delivery.delivered, delivery.waiting) == (1, 0)
     open(tmp_path / "end", "w").close()
+
+
+@pytest.mark.parametrize(("scheme", "first"), [("http", b"HTTP/1.1 200 OK\r\nX: "), ("https", b"\x16\x03\x03\x40\x00")])
+def test_a_receiver_that_answers_byte_by_byte_fails_after_the_timeout(monkeypatch, scheme, first):
+    monkeypatch.setattr(sending, "TIMEOUT_S", 0.3)
+
+    class Drip(socketserver.BaseRequestHandler):
+        def handle(self):
+            with suppress(OSError):
+                self.request.sendall(first)
+                for _ in range(1000):  # each byte comes in good time
+                    self.request.sendall(b"x")
+                    threading.Event().wait(0.01)
+                self.request.sendall(b"\r\n\r\n")
+
+    with socketserver.ThreadingTCPServer(("127.0.0.1", 0), Drip) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        hook = Webhook(WebhookSection(type="webhook", url=f"{scheme}://127.0.0.1:{server.server_address[1]}/"))
+        with pytest.raises(OSError, match="it has not answered within 0.3 s"):
+            hook.send(heartbeat("motor", "tracking"))
+        server.shutdown()
 
 
 def test_a_mute_is_asked_for_by_a_command(serve):

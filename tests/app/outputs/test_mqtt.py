@@ -15,9 +15,9 @@ from estimators.errors import ConfigError, NisusError
 from sources.brokers import MqttSource, TopicMap
 from sources.messages import Messages
 from sources.source import Channel, ignore
-from tests.app.outputs.broker import Broker, Listener, free_port, needs_mosquitto
+from tests.app.outputs.broker import Broker, Listener, needs_mosquitto
 from tests.app.scripted import wait_for
-from tests.support import SECOND
+from tests.support import SECOND, free_port
 
 BEGIN = 1_767_225_600 * SECOND
 ROOT = "nisus/motor_winding"

@@ -21,11 +21,11 @@ from estimators.errors import ConfigError
 from estimators.log import Log
 from estimators.track import HEALTH_NAMES
 from sources.source import ignore
-from tests.app.outputs.broker import Broker, Listener, free_port, needs_mosquitto
+from tests.app.outputs.broker import Broker, Listener, needs_mosquitto
 from tests.app.outputs.test_alerts import state
 from tests.app.scripted import pull_all, wait_for
 from tests.conftest import ROOT
-from tests.support import SECOND
+from tests.support import SECOND, free_port
 
 BEGIN = 1_767_225_600 * SECOND
 VALUES = (40.25, 41.5, 42.125, 41.75)

@@ -1,5 +1,6 @@
 """Twins whose model is an FMU: integrated as by SciPy, filtered as the same black box in Python, checked on load."""
 
+import gc
 import shutil
 import sys
 import zipfile
@@ -238,9 +239,17 @@ def test_other_files_and_other_platforms(tmp_path):
     )
 
 
+@pytest.mark.parametrize("version", [2, 3])
+def test_an_instance_is_freed_with_its_model(tmp_path, version):
+    model = twin(tmp_path, build(tmp_path, version=version)).model
+    folder = model.f.__self__._folder.name
+    assert Path(folder).is_dir() and folder in Path("/proc/self/maps").read_text()
+    del model
+    gc.collect()
+    assert not Path(folder).exists() and folder not in Path("/proc/self/maps").read_text()
+
+
 def test_the_extra_is_named(tmp_path, monkeypatch):
     file = build(tmp_path, "VANDERPOL")
-    with file.open("ab") as end:
-        end.write(b"\n")  # a file of its own: models of known files are kept
     monkeypatch.setitem(sys.modules, "fmpy", None)
     assert "box.yaml:2: model.fmu needs FMPy: pip install 'nisus[fmu]'" in refused(tmp_path, file)

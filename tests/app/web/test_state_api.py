@@ -206,6 +206,12 @@ def test_metrics_name_the_package_that_they_need(page, monkeypatch):
     assert (answer.status, "pip install 'nisus[service]'" in answer.text) == (501, True)
 
 
+def test_a_wrong_value_is_refused_with_its_rule(page):
+    answer = page.client.get("/metrics?states=all")
+    assert (answer.status, page.client.get("/metrics?states=true").status) == (400, 200)
+    assert json.loads(answer.text)["error"] == "metrics: states is 'all'; it must be true or false"
+
+
 def test_supervisors_need_no_token(serve):
     page = serve()
     host = [("Host", page.client.host)]

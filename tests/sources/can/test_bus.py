@@ -14,6 +14,7 @@ from estimators.log import Events
 from sources.can.bus import LOSS_PERIOD_S, RECONNECT_WAITS_S, CanBus, open_bus
 from sources.can.decoder import Decoder
 from tests.sources.can.can_tools import DBC, Reports, dbc, frame, sensor
+from tests.support import free_port
 
 DATA = bytes.fromhex("f4010fa000000080")
 GROUP = "239.74.163.2"
@@ -145,11 +146,11 @@ def test_error_frames_are_counted_and_give_no_event(decoder):
 @pytest.fixture
 def multicast():
     """Open real multicast buses on a port of this test, by group; they are closed at the end."""
-    opened = []
+    opened, port = [], free_port(socket.SOCK_DGRAM)
 
     def connect(group, **arguments):
         try:
-            opened.append(open_bus("udp_multicast", group, {"port": 43999}, **arguments))
+            opened.append(open_bus("udp_multicast", group, {"port": port}, **arguments))
             opened[-1].send(frame(2047, b"probe"))
         except (SourceError, can.CanError) as error:
             pytest.skip(f"no multicast here: {error}")

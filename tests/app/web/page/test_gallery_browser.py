@@ -1,6 +1,7 @@
 """The gallery in headless Chromium: choose, switch and come back, two browsers in step, recordings, files dropped."""
 
 import base64
+import re
 
 import numpy as np
 import pytest
@@ -279,10 +280,18 @@ def test_a_bundled_twin_has_no_baseline_to_store(visit, tmp_path):
         assert page.locator(".why").is_visible() and page.locator(".baseline").is_hidden()
 
 
+FRAME = """(name) => {
+  const found = getComputedStyle(document.querySelector(`.card[data-name=${name}]`));
+  return [found.borderColor, found.getPropertyValue("--frame"), found.getPropertyValue("--health-stale")];
+}"""
+
+
 def test_the_overview_of_a_service_shows_health_and_leads_to_the_page_of_each_twin(visit, tmp_path):
     text = (ROOT / "config" / "twins" / "motor_winding.yaml").read_text()
     for name in ("north", "south"):
         (tmp_path / f"{name}.yaml").write_text(text)
+    pushed = re.sub(r"source:\n  type: simulator\n(  .*\n)*", "source: {type: push}\n", text)
+    (tmp_path / "south.yaml").write_text(re.sub(r"_after: \d+", "_after: 0.2", pushed))
     (tmp_path / "torn.yaml").write_text("model: motor_winding\n")
     service = Served(tmp_path, "north.yaml", "south.yaml", "torn.yaml", "--store", "stores")
     try:
@@ -293,6 +302,11 @@ def test_the_overview_of_a_service_shows_health_and_leads_to_the_page_of_each_tw
         until(overview, f"{order} === 'torn'")
         card(overview, "torn").get_by_text("source is missing; add it").wait_for()
         card(overview, "north").get_by_text("tracking").wait_for()
+        assert (overview.title(), overview.locator("h1").inner_text()) == ("Overview · Nisus", "Overview")
+        assert service.ask("/twins/south/api/readings", {"values": {"winding": 40.0}})[0] == 200
+        card(overview, "south").get_by_text(re.compile(r"^stale for \d")).wait_for()
+        green, grey = (overview.evaluate(FRAME, name) for name in ("north", "south"))
+        assert green[0] != grey[0] and grey[1] == grey[2]
         overview.screenshot(path=tmp_path / "overview.png")
         card(overview, "north").get_by_role("link", name="Open").click()
         shows(overview, "north")

@@ -1,0 +1,297 @@
+"""Receivers of alerts: web hooks, e-mail and programs, and the queue of each.
+
+Each receiver has a queue and takes its alerts in a thread of its own pool, so that a dead one delays neither the twin
+nor the others.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import hmac
+import os
+import smtplib
+import socket
+import ssl
+import subprocess
+import tempfile
+import threading
+import time
+from collections import deque
+from collections.abc import Mapping
+from contextlib import suppress
+from email.message import EmailMessage
+from functools import partial
+from http.client import HTTPConnection, HTTPSConnection
+from pathlib import Path
+from typing import Any, Protocol
+from urllib.error import HTTPError, URLError
+from urllib.request import HTTPHandler, HTTPRedirectHandler, HTTPSHandler, Request, build_opener
+
+from config.output_schema import CommandSection, EmailSection, WebhookSection
+from estimators.errors import ConfigError, printable
+
+from ..live.jobs import Job
+from ..live.notices import Notices
+from .alerts import HEARTBEAT, AlertMessage
+
+MAX_WAITING_ALERTS = 100
+"""Alerts that wait for a receiver; then the oldest is dropped."""
+
+DELIVERY_PERIOD_S, MAX_RETRY_S = 0.2, 60.0
+"""Between two looks at the queue of a receiver, and the longest wait after it has failed."""
+
+TIMEOUT_S = 10.0
+"""Longest time for a request to a web server, and for each answer of a mail server."""
+
+
+class Receiver(Protocol):
+    """Sends alerts to one place."""
+
+    def send(self, alert: AlertMessage) -> None:
+        """Send one, within seconds.
+
+        Raises:
+            OSError: If it was not received.
+        """
+
+
+class KeptRequest(HTTPRedirectHandler):
+    """Follows no redirect: a signed alert goes to the address that was configured, or nowhere."""
+
+    def redirect_request(self, *args: Any, **more: Any) -> None:
+        """Return no request."""
+
+
+class Deadline(HTTPSHandler, HTTPHandler):
+    """Ends the connections of a request after `TIMEOUT_S`, also those on which bytes still arrive, one by one."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.sockets: list[socket.socket] = []
+        self.passed = False
+        self.timer = threading.Timer(TIMEOUT_S, self._end)
+        self.timer.daemon = True
+        self.timer.start()
+
+    def _end(self) -> None:
+        self.passed = True
+        for sock in self.sockets:
+            with suppress(OSError):
+                sock.shutdown(socket.SHUT_RDWR)
+
+    def http_open(self, request: Request) -> Any:
+        """See `HTTPHandler`."""
+        return self.do_open(partial(self._connection, PlainConnection), request)  # type: ignore[arg-type]
+
+    def https_open(self, request: Request) -> Any:
+        """See `HTTPSHandler`."""
+        return self.do_open(partial(self._connection, SecureConnection), request)  # type: ignore[arg-type]
+
+    def _connection(self, kind: type[PlainConnection], *args: Any, **more: Any) -> PlainConnection:
+        connection = kind(*args, **more)
+        connection.sockets = self.sockets
+        return connection
+
+    def end(self) -> None:
+        """Stop the clock."""
+        self.timer.cancel()
+        for sock in self.sockets:
+            sock.close()
+
+
+class PlainConnection(HTTPConnection):
+    """Connection whose socket is added to a list as soon as it is connected."""
+
+    sockets: list[socket.socket]
+
+    def connect(self) -> None:
+        """See `HTTPConnection`."""
+        super().connect()
+        self.sockets.append(self.sock.dup())  # TLS takes the first one over
+
+
+class SecureConnection(HTTPSConnection, PlainConnection):
+    """The same with TLS, whose handshake counts too."""
+
+
+class Webhook:
+    """Sends alerts by POST; the signature is that of the time, a dot, and the body."""
+
+    def __init__(self, section: WebhookSection) -> None:
+        self._url = secret(section.url[1:]) if section.url.startswith("$") else section.url
+        self._key = None if section.secret_env is None else secret(section.secret_env).encode()
+
+    def send(self, alert: AlertMessage) -> None:
+        """See `Receiver`."""
+        body, stamp = alert.model_dump_json().encode(), str(int(time.time()))
+        headers = {"Content-Type": "application/json", "User-Agent": "nisus", "X-Nisus-Timestamp": stamp}
+        if self._key is not None:
+            signature = hmac.new(self._key, stamp.encode() + b"." + body, hashlib.sha256).hexdigest()
+            headers["X-Nisus-Signature"] = f"sha256={signature}"
+        deadline = Deadline()
+        try:
+            build_opener(KeptRequest, deadline).open(Request(self._url, body, headers), timeout=TIMEOUT_S).close()
+            if deadline.passed:  # http.client takes the end of the connection for that of the header
+                raise TimeoutError
+        except HTTPError as error:
+            error.close()
+            raise OSError(f"it answers {error.code}") from None
+        except Exception as error:
+            if deadline.passed:
+                raise OSError(f"it has not answered within {TIMEOUT_S:g} s") from None
+            if isinstance(error, URLError):
+                raise OSError(str(error.reason)) from None
+            if isinstance(error, ValueError):  # an address that is none, from the environment
+                raise OSError(str(error)) from None
+            raise
+        finally:
+            deadline.end()
+
+
+class Mail:
+    """Sends alerts as e-mail."""
+
+    def __init__(self, section: EmailSection) -> None:
+        self._section = section
+        self._password = None if section.password_env is None else secret(section.password_env)
+
+    def send(self, alert: AlertMessage) -> None:
+        """See `Receiver`."""
+        section, mail = self._section, EmailMessage()
+        mail["Subject"] = f"[{alert.twin}] {alert.status}: {alert.rule}"
+        mail["From"], mail["To"] = section.sender, ", ".join(section.to)
+        lines = [alert.text, "", f"Since {alert.since}; health is {alert.health}.", f"Response: {alert.response}"]
+        mail.set_content("\n".join([*lines, alert.link or alert.guide, "", alert.model_dump_json(indent=2)]))
+        context = ssl.create_default_context()
+        try:
+            if section.security == "tls":
+                server: smtplib.SMTP = smtplib.SMTP_SSL(
+                    section.server, section.port, timeout=TIMEOUT_S, context=context
+                )
+            else:
+                server = smtplib.SMTP(section.server, section.port, timeout=TIMEOUT_S)
+            with server:
+                if section.security == "starttls":
+                    server.starttls(context=context)
+                if section.user is not None and self._password is not None:
+                    server.login(section.user, self._password)
+                server.send_message(mail)
+        except smtplib.SMTPException as error:
+            raise OSError(str(error)) from None
+
+
+class CommandReceiver:
+    """Starts a program for each alert."""
+
+    def __init__(self, section: CommandSection, folder: Path) -> None:
+        """`folder`: of the YAML."""
+        program, *arguments = section.command
+        self._command = [str(folder / program) if program.startswith("./") else program, *arguments]
+        self._timeout = section.timeout
+
+    def send(self, alert: AlertMessage) -> None:
+        """See `Receiver`."""
+        text = alert.model_dump_json()
+        try:
+            # A file, not a pipe: what the program leaves running would hold that open.
+            with tempfile.TemporaryFile() as said:
+                code = subprocess.run(
+                    self._command, input=text.encode(), stdout=subprocess.DEVNULL, stderr=said, timeout=self._timeout
+                ).returncode
+                said.seek(max(0, said.tell() - 1000) if code else 0)
+                last = (said.read(1000).decode(errors="replace").strip().splitlines() or [""])[-1]
+        except subprocess.TimeoutExpired:
+            raise OSError(f"it did not end within {self._timeout:g} s") from None
+        if code:
+            raise OSError(f"it ended with {code}{': ' if last else ''}{last}")
+
+
+def secret(name: str) -> str:
+    """Return the value of an environment variable.
+
+    Raises:
+        ConfigError: If it is not set.
+    """
+    value = os.environ.get(name)
+    if not value:
+        raise ConfigError(f"outputs: the environment variable {name} is not set; set it before the twin starts")
+    return value
+
+
+class Delivery:
+    """Queue of one receiver; `step` is a repeated job."""
+
+    def __init__(self, name: str, receiver: Receiver, notices: Notices) -> None:
+        self.name, self._receiver, self._notices = name, receiver, notices
+        self._waiting: deque[AlertMessage] = deque()
+        self._lock = threading.Lock()
+        self._failures = 0
+        self.delivered = self.dropped = 0
+
+    @property
+    def failing(self) -> bool:
+        """Whether the last attempt failed."""
+        return self._failures > 0
+
+    @property
+    def waiting(self) -> int:
+        """Alerts that wait."""
+        return len(self._waiting)
+
+    def put(self, alert: AlertMessage) -> None:
+        """Add an alert to the queue; of a full one the oldest is dropped."""
+        with self._lock:
+            if alert.status == HEARTBEAT and self._waiting:
+                return
+            if len(self._waiting) >= MAX_WAITING_ALERTS:
+                self._waiting.popleft()
+                self.dropped += 1
+            self._waiting.append(alert)
+
+    def step(self, job: Job | None = None) -> float:
+        """Send the alerts that wait, in order; return the seconds until the next call."""
+        while self._waiting and (job is None or job.wanted):
+            alert = self._waiting[0]
+            try:
+                self._receiver.send(alert)
+            except Exception as error:  # noqa: BLE001  an answer of no protocol, or what a program prints
+                return self._failed(error)
+            with self._lock:
+                # A full queue may have dropped it meanwhile.
+                if self._waiting and self._waiting[0] is alert:
+                    self._waiting.popleft()
+            self.delivered += 1
+            if self._failures:
+                self._notices.say(f"alerts: receiver {self.name} takes them again")
+                self._failures = 0
+        return DELIVERY_PERIOD_S
+
+    def _failed(self, error: Exception) -> float:
+        self._failures += 1
+        pause = min(MAX_RETRY_S, 2.0 ** min(self._failures - 1, 10))
+        # One line an outage; each failure is counted.
+        self._notices.count("alert receiver")
+        if self._failures == 1:
+            reason = str(getattr(error, "strerror", None) or error) or type(error).__name__
+            text = " ".join(printable(reason).split())[:200]
+            self._notices.say(f"alerts: receiver {self.name} fails ({text}); they wait, and it is tried again", "warn")
+        return pause
+
+
+def make_receivers(sections: Mapping[str, Any], folder: Path, mqtt: Receiver | None) -> dict[str, Receiver]:
+    """Return the receivers by name.
+
+    Raises:
+        ConfigError: If a secret is not in the environment, or there is no broker.
+    """
+    found: dict[str, Receiver] = {}
+    for name, section in sections.items():
+        if isinstance(section, WebhookSection):
+            found[name] = Webhook(section)
+        elif isinstance(section, EmailSection):
+            found[name] = Mail(section)
+        elif isinstance(section, CommandSection):
+            found[name] = CommandReceiver(section, folder)
+        elif mqtt is not None:
+            found[name] = mqtt
+    return found
