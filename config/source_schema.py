@@ -229,7 +229,8 @@ class TruthSection(Section):
     model: Text | None = None
     """Another model with the same states, inputs and sensors: a name, or file.py:Name. Default: the twin's."""
     parameters: dict[str, Number] = {}
-    """The asset's true parameters. Default: those of the twin, or of `model` if it is given."""
+    """The asset's true parameters; one that the twin estimates is constant, unless `noise` has it too. Default: those
+    of the twin, or of `model` if it is given."""
     noise: dict[str, LevelSection] = {}
     """The asset's true process noise. Default: that of the twin, or of `model` if it is given."""
     every: Count | None = None

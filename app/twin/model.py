@@ -189,7 +189,8 @@ def _assembled(model: StateSpaceModel, loaded: Loaded) -> StateSpaceModel:
             raise loaded.error(at, f"is {section.std} of {values[name]:g}; give it in the unit of the value")
         if std is not None:
             if name in config.estimate:
-                raise loaded.error(("estimate", name), "has a std in `parameters` too; give it in one place")
+                remedy = f"give it in one place, or set parameters.{name}.use to estimated"
+                raise loaded.error(("estimate", name), f"has a std in `parameters` too; {remedy}")
             considered, widened = section.use == "considered", section.widened(values[name])
             estimated[name] = JointParameter(std, section.drift, considered, widened)
     for name, section in sections.items():

@@ -325,17 +325,17 @@ def quiet_of(mistake: Mistake) -> tuple[int, ...]:
 def first_word(fold: Fold, start: int, calm: Fold | None = None, quiet: tuple[int, ...] = USABLE) -> float | None:
     """Seconds from `start` (ns) to the first row whose health is not `quiet`, once a reading has come; None without.
 
-    Where `calm`, the fold without the mistake, was not quiet either at that time, the fault is not detected.
+    Where `calm`, the fold without the mistake, had that health or a worse one at that time, the fault is not detected.
     """
-    t, ok = fold.log.t[: fold.n], np.isin(fold.track.health[: fold.n], quiet)
-    waiting = fold.track.health[: fold.n] == WAITING
-    said = ~ok & ~waiting & (t >= start)
+    t, health = fold.log.t[: fold.n], fold.track.health[: fold.n]
+    said = ~np.isin(health, (*quiet, WAITING)) & (t >= start)
     if calm is not None:
         # What holds at a time is what held before its events, and after each of them.
-        before = np.searchsorted(calm.log.t[: calm.n], t, side="left") - 1
+        before = np.maximum(np.searchsorted(calm.log.t[: calm.n], t, side="left") - 1, 0)
         after = np.searchsorted(calm.log.t[: calm.n], t, side="right")
-        wrong = np.concatenate(([0], np.cumsum(~np.isin(calm.track.health[: calm.n], quiet))))
-        said &= wrong[after] == wrong[np.maximum(before, 0)]
+        for grade in np.unique(health[said]):
+            alike = np.concatenate(([0], np.cumsum(calm.track.health[: calm.n] >= grade)))
+            said &= (health != grade) | (alike[after] == alike[before])
     rows = np.flatnonzero(said)
     return int(t[rows[0]] - start) / 1e9 if rows.size else None
 

@@ -11,6 +11,7 @@ from estimators.model.state_space import StateSpaceModel
 
 from ..channels import read_faults
 from ..checks import check_names, one_each
+from ..defaults import parameter_sections
 from ..model import find_model
 from .kind import Kind, Opening
 
@@ -34,6 +35,7 @@ def make_asset(loaded: Loaded, model: StateSpaceModel, section: AssetSection, ke
     from sources.simulator import SensorPlan, Simulator
 
     truth = section.truth
+    moved = {name: truth.parameters[name] for name in _estimated(loaded, section, model)}
     truth_model = find_model(loaded, (*key, "truth", "model"), truth.model) if truth.model else None
     if truth_model is not None:
         _check_same(loaded, (*key, "truth", "model"), truth_model, model)
@@ -53,10 +55,10 @@ def make_asset(loaded: Loaded, model: StateSpaceModel, section: AssetSection, ke
         seed=section.seed,
         step=section.step,
         duration=section.duration,
-        initial=dict(section.initial),
-        truth_parameters=dict(truth.parameters),
+        initial={**section.initial, **moved},
+        truth_parameters={name: value for name, value in truth.parameters.items() if name not in moved},
         truth_model=truth_model,
-        truth_noise={name: level.value for name, level in truth.noise.items()},
+        truth_noise={**dict.fromkeys(moved, 0.0), **{name: level.value for name, level in truth.noise.items()}},
         inputs={name: _profile(profiles) for name, profiles in section.inputs.items()},
         sensors=plans,
         truth_every=truth.every if model.grid is not None else None,
@@ -106,8 +108,21 @@ def _check_truth(loaded: Loaded, section: AssetSection, key: Key, model: StateSp
     """`model` is the asset's: the twin's own, or truth.model."""
     truth = section.truth
     parameters, noises = [item.name for item in model.parameters], [item.name for item in model.noises]
-    check_names(loaded, (*key, "truth", "parameters"), truth.parameters, parameters, "parameter", model)
+    moved = _estimated(loaded, section, model)
+    check_names(loaded, (*key, "truth", "parameters"), truth.parameters, [*parameters, *moved], "parameter", model)
+    for name in moved:
+        if name in section.initial:
+            raise loaded.error((*key, "initial", name), f"is in {dotted((*key, 'truth'))} too; give it in one place")
     check_names(loaded, (*key, "truth", "noise"), truth.noise, noises, "noise", model)
+
+
+def _estimated(loaded: Loaded, section: AssetSection, model: StateSpaceModel) -> list[str]:
+    """Return the names of true parameters that the twin estimates: states of `model`, constant in the asset."""
+    if section.truth.model is not None:
+        return []
+    sections = parameter_sections(model, loaded.config)
+    joint = {*loaded.config.estimate, *(name for name, item in sections.items() if item.use == "estimated")}
+    return [name for name in section.truth.parameters if name in joint and name in model.state_names]
 
 
 def _check_same(loaded: Loaded, key: Key, truth: StateSpaceModel, model: StateSpaceModel) -> None:

@@ -253,6 +253,44 @@ source:
     np.testing.assert_allclose(winding.value[:, 0], exact.value[:, 0], atol=1e-7)
 
 
+JOINT = """\
+model: motor_drive
+estimate: {yoke_coolant: {std: 0.01, drift: 1e-3}}
+source:
+  type: simulator
+  step: 0.5
+  duration: 5
+  TRUTH
+"""
+
+
+def test_a_true_parameter_may_be_one_that_the_twin_estimates() -> None:
+    found = events(twin_of(JOINT.replace("TRUTH", "truth: {parameters: {yoke_coolant: 0.04, tooth_yoke: 0.05}}")))
+    # The same asset, said by its state and noise.
+    spelled = (
+        "initial: {yoke_coolant: 0.04}\n  truth: {parameters: {tooth_yoke: 0.05}, noise: {yoke_coolant: {variance: 0}}}"
+    )
+    np.testing.assert_array_equal(found.value, events(twin_of(JOINT.replace("TRUTH", spelled))).value)
+    truth = of(found, TRUTH)
+    np.testing.assert_array_equal(truth.value[:, 4], 0.04)
+
+
+def test_a_true_parameter_that_drifts_begins_at_its_value() -> None:
+    drifting = "truth: {parameters: {yoke_coolant: 0.04}, noise: {yoke_coolant: {variance: 1e-8}}}"
+    found = of(events(twin_of(JOINT.replace("TRUTH", drifting))), TRUTH).value[:, 4]
+    assert 0.0 < np.std(found) < 6e-4  # a random walk: √(1e-8 · 5 s) = 2.2e-4 at its end
+    np.testing.assert_allclose(found, 0.04, atol=1.1e-3)
+
+
+def test_a_true_parameter_is_given_once() -> None:
+    both = "initial: {yoke_coolant: 0.03}\n  truth: {parameters: {yoke_coolant: 0.04}}"
+    assert refusal(JOINT.replace("TRUTH", both)) == (
+        "motor.yaml:7: source.initial.yoke_coolant is in source.truth too; give it in one place"
+    )
+    no_state = "truth: {parameters: {winding: 40}}"
+    assert "source.truth.parameters.winding is no parameter of motor_drive" in refusal(JOINT.replace("TRUTH", no_state))
+
+
 LENGTHY = """\
 model: motor_drive
 source:

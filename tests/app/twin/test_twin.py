@@ -408,9 +408,10 @@ def test_the_parameters_of_a_field_are_held(given: str) -> None:
 
 
 def test_a_width_is_added_to_a_parameter_given_as_a_number() -> None:
-    twin = load_twin("battery_pack", overrides={"parameters.r0_5.std": "10 %"})
-    assert twin.model.state_names[-1] == "r0_5_deviation" and twin.model.considered == 1
-    assert twin.model.prior_std[-1] == pytest.approx(0.1 * 0.042, rel=1e-12)
+    text = "model: motor_drive\nparameters: {yoke_coolant: 0.04}\nsource: {type: simulator}\n"
+    twin = twin_of(text, overrides={"parameters.yoke_coolant.std": "10 %"})
+    assert twin.model.state_names[-1] == "yoke_coolant_deviation" and twin.model.considered == 1
+    assert twin.model.prior_std[-1] == pytest.approx(0.1 * 0.04, rel=1e-12)
 
 
 def test_offsets_and_scales_are_parameters_of_the_instruments() -> None:

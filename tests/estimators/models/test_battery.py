@@ -140,12 +140,9 @@ def test_lost_capacity_is_found_when_it_is_estimated() -> None:
     twin = load_twin(
         "battery_pack",
         overrides={
-            "estimate": "{capacity_5: {std: 0.3}}",
+            "parameters": "{r0_5: 0.042, capacity_5: {std: 0.3, use: estimated}}",
             "noise.soc": "{variance: 1e-11}",
             "noise.v1": "{variance: 1e-7}",
-            "source.truth.parameters": "{r0_5: 0.044}",
-            "source.truth.noise.capacity_5": "{variance: 0}",
-            "source.initial.capacity_5": "2.54",
         },
     )
     log, _ = read_log(twin, None)

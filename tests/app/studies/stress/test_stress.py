@@ -14,6 +14,7 @@ from app.studies.stress.scenario import (
     accused,
     first_word,
     green_share,
+    quiet_of,
     recovery,
     said_at,
     without_truth,
@@ -22,7 +23,7 @@ from app.twin.twin import load_twin
 from estimators.diagnostics.episodes import Episode
 from estimators.log import INPUT, READING, TICK, TRUTH, Log
 from estimators.models import MODELS
-from estimators.track import DEGRADED, SUSPECT, TRACKING, WAITING
+from estimators.track import ADVISORY, DEGRADED, DIVERGED, SUSPECT, TRACKING, WAITING
 from estimators.tuning import Tuning
 from sources.faults.kinds import problem
 from tests.support import SECOND, log_of
@@ -249,6 +250,17 @@ def test_what_was_said_without_the_mistake_is_not_counted_for_it():
     calm = folded([T, T, S, T, T])
     calm.log.t[3] = calm.log.t[2]
     assert first_word(calm, 0) == 2.0 and first_word(calm, 0, calm) is None
+
+
+def test_a_grade_worse_than_without_the_mistake_is_counted_for_it():
+    calm = folded([T, ADVISORY, ADVISORY, ADVISORY, S, ADVISORY])
+    wrong = folded([T, ADVISORY, ADVISORY, S, S, DIVERGED])
+    tells = quiet_of(Mistake("bias", frozenset({"shifted"})))
+    assert first_word(wrong, 0, calm, tells) == 3.0  # suspect where only an advisory was
+    assert first_word(wrong, 4 * SECOND, calm, tells) == 1.0  # not for what was suspect anyway, but for a lost estimate
+    assert first_word(calm, 0, wrong, tells) is None
+    harmless = quiet_of(Mistake("late", frozenset()))
+    assert first_word(folded([T, T, T, ADVISORY, S]), 0, folded([T] * 5), harmless) == 4.0
 
 
 def test_a_wrong_belief_over_a_recording_is_foretold_by_what_follows(data):
