@@ -7,39 +7,31 @@ only the last estimate, two snapshots and the most recent events of each asset, 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numba
 import numpy as np
 
-from .diagnostics.detector_state import JOINT_MASK as AT_JOINT_MASK
-from .diagnostics.detector_state import MASK as AT_MASK
-from .diagnostics.detector_state import ROW, SENSOR, TWIN
-from .diagnostics.detectors import DETECTORS, OUTSIDE, OUTSIDE_WIDENED, SENSOR_FLAGS, detector_of
-from .diagnostics.health import HealthPolicy
+from .diagnostics.health import NORMALS, HealthPolicy
 from .errors import EstimatorError, EventError, nearest, quoted
 from .events import arrays
 from .events.batch import INPUT, READING, TICK
 from .fleet_kernel import (
     AGE,
     CREW,
-    FLAGS,
-    HEALTH,
     NIS_HIGH,
     NIS_LOW,
     NIS_MEAN,
     PLAN,
-    STALE_EVENTS,
-    VERDICT,
-    N,
+    ROWS,
     T,
     block_at,
-    fold_address,
     fold_assets,
     in_asset_order,
-    rows_before,
     state_at,
 )
+from .fleet_table import FleetTable, causes_of
+from .fleet_window import FLAGS, HEALTH, STALE_EVENTS, VERDICT, N
 from .fold_checks import check_pairs, check_soft, check_tuning
 from .fold_machine import Machine, scratch
 from .log import _RANK
@@ -48,44 +40,11 @@ from .numerics.jit import threaded
 from .numerics.workspace import WORD
 from .registry import find_estimator
 from .snapshots import Base
-from .track import DIVERGED, HEALTH_NAMES, STALE, Track
+from .track import Track
 from .tuning import Tuning
-
-SENSOR_MASK = (1 << SENSOR_FLAGS) - 1
-"""Bits of the flags of sensors that dropped out."""
 
 RECENT = 8
 """Default number of events of an asset among which a late one is always inserted."""
-
-
-class FleetTable(NamedTuple):
-    """One row per asset, in the order of `Fleet.assets`.
-
-    seconds (N,): time of the last event, NaN before the first. mean, std (N, nx): the last estimate, in the units of
-    the states. health (N,): index into `HEALTH_NAMES`. cause (N,): name of the most severe detector in alarm, or "".
-    age (N,): seconds since the last measurement, at the last event. verdict (N,): on the last event. nis_mean, nis_low,
-    nis_high (N,): mean NIS over the last measurements and its 95 % bounds. events, stale (N,): events folded, and
-    dropped as too late.
-    """
-
-    assets: Sequence[Any]
-    seconds: np.ndarray
-    mean: np.ndarray
-    std: np.ndarray
-    health: np.ndarray
-    cause: np.ndarray
-    age: np.ndarray
-    verdict: np.ndarray
-    nis_mean: np.ndarray
-    nis_low: np.ndarray
-    nis_high: np.ndarray
-    events: np.ndarray
-    stale: np.ndarray
-
-    def worst(self, count: int = 10) -> np.ndarray:
-        """Return the indices of the assets of worst health, the worst first, at most `count`."""
-        order: np.ndarray = np.argsort(-self.health, kind="stable")
-        return order[:count]
 
 
 class Fleet:
@@ -208,9 +167,8 @@ class Fleet:
         most = int(numba.config.NUMBA_NUM_THREADS) if threaded() else 1
         self.threads = min(most, threads or most)
         nu, state, evidence, edge, sensors = self._state_sizes
-        before = rows_before(policy.window)
-        length, ring = before + self.recent, 2 * self.recent + 1
-        self._crews = [_crew(model, machine, length, ring, self._columns, state) for _ in range(self.threads)]
+        kept, ring = self._sizes["kept"], 2 * self.recent + 1
+        self._crews = [_crew(model, machine, kept, ring, self._columns, state) for _ in range(self.threads)]
         self._crew_places = np.array([[part.ctypes.data for part in crew] for crew in self._crews], np.int64)
         assert self._crew_places.shape == (self.threads, len(CREW))
         self._contexts = np.array([each.context for each in self._machines])
@@ -220,9 +178,9 @@ class Fleet:
         plan = np.zeros(1, PLAN)
         values: dict[str, Any] = {
             **self._sizes, **policy._asdict(), **code._asdict(),
-            "fold": fold_address(), "memory": self._memory.ctypes.data, "tunings": self._tuning_of.ctypes.data,
+            "memory": self._memory.ctypes.data, "tunings": self._tuning_of.ctypes.data,
             "contexts": self._contexts.ctypes.data, "crews": self.threads, "crew_places": self._crew_places.ctypes.data,
-            "rows_before": before, "soft": machine.rule.soft, "nx": len(model.shown), "nu": nu, "state": state,
+            "soft": machine.rule.soft, "nx": len(model.shown), "nu": nu, "state": state,
             "evidence": evidence, "edge": edge, "sensors": sensors, "rows": len(model.row_names), "ny": model.ny,
             "width": model.width, "work": machine.work.size,
             "recent": self.recent, "columns": self._columns, "low": low.ctypes.data,
@@ -336,7 +294,7 @@ class Fleet:
             self._part(self._block.mean).copy(),
             self._part(self._block.std).copy(),
             head[:, HEALTH].astype(np.int8),
-            self._causes(),
+            causes_of(self.model, self._now(self._state.evidence), head[:, FLAGS], head[:, HEALTH]),
             np.where(seen, last[:, AGE], np.nan),
             head[:, VERDICT].astype(np.int8),
             last[:, NIS_MEAN].copy(),
@@ -361,36 +319,10 @@ class Fleet:
             evidence=evidence, edge=edge, doubt=doubt.reshape(state.doubt.shape),
         )  # fmt: skip
 
-    def _causes(self) -> np.ndarray:
-        """Return the cause of each asset's worst alarm, (assets,)."""
-        evidence = self._now(self._state.evidence)
-        sensors, rows = len(self.model.sensors), len(self.model.row_names)
-        masks = np.zeros(len(self.assets), np.int64)
-        for s in range(sensors):
-            masks |= evidence[:, TWIN + s * SENSOR + AT_JOINT_MASK].astype(np.int64)
-        for k in range(rows):
-            masks |= evidence[:, TWIN + sensors * SENSOR + k * ROW + AT_MASK].astype(np.int64)
-        head = self._head
-        found = np.stack([masks, head[:, FLAGS], head[:, HEALTH]], axis=1)
-        kinds, which = np.unique(found, axis=0, return_inverse=True)
-        names: np.ndarray = np.array([_cause(*kind) for kind in kinds.tolist()])
-        return names[which.ravel()]
 
-
-def _cause(mask: int, flags: int, health: int) -> str:
-    """Return the name of the most severe detector in alarm, or ""."""
-    causes = [detector.name for detector in DETECTORS if detector.bits & mask]
-    causes += ["silent"] if flags & SENSOR_MASK else []
-    causes += ["outside"] if flags & (OUTSIDE | OUTSIDE_WIDENED) else []
-    causes += [HEALTH_NAMES[health]] if health in (STALE, DIVERGED) else []
-    return min(causes, key=lambda name: detector_of(name).severity, default="")
-
-
-def _crew(
-    model: StateSpaceModel, machine: Machine, length: int, ring: int, columns: int, state: int
-) -> list[np.ndarray]:
+def _crew(model: StateSpaceModel, machine: Machine, kept: int, ring: int, columns: int, state: int) -> list[np.ndarray]:
     """Allocate the scratch of one thread, in the order of `CREW`."""
-    track = Track.allocate(length, len(model.shown), 0, model.ny, model.width)
+    track = Track.allocate(ROWS, len(model.shown), 0, model.ny, model.width)
     return [
         *track,
         np.zeros(machine.context.nbytes // WORD, np.int64),
@@ -398,12 +330,14 @@ def _crew(
         np.empty(state),
         scratch(machine.work.size),
         machine.score.copy(),
-        np.zeros(length, np.int64),
-        np.full(length, READING, np.int8),
-        np.zeros(length, np.int32),
-        np.full((length, columns), np.nan),
+        np.zeros(ROWS, np.int64),
+        np.full(ROWS, READING, np.int8),
+        np.zeros(ROWS, np.int32),
+        np.full((ROWS, columns), np.nan),
+        np.empty(columns),
+        np.empty(0),
+        np.empty((1 + NORMALS, kept)),
         np.zeros(ring, np.int64),
         np.zeros(ring, np.int64),
         np.full((ring, columns), np.nan),
-        np.zeros(1, np.int64),
     ]

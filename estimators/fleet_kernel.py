@@ -1,31 +1,28 @@
-"""The fold's loop over the new events of many assets, in one compiled call on all cores.
+"""The compiled part of `Fleet`: folds the new events of all assets on all cores, in place.
 
-The memory of an asset is one block of 64-bit words (`Block`): its state, two snapshots, and its most recent events and
-judged rows. Each thread copies the events of an asset into a log and a track of its own and calls the kernels of a
-single fold, so the results are the same bits.
+Each asset has a block of memory. A thread folds the events of a share of the assets one by one, with the same functions
+as a single fold, so the results are the same bits. These are copied into the thread's loop: handing over their
+arguments once per asset takes three times as long as an event.
 """
 
 from __future__ import annotations
-
-from functools import lru_cache
 
 import numpy as np
 from numba import from_dtype, prange
 from numba.extending import intrinsic
 
 from .compiled.context import _FIELDS as CONTEXT_FIELDS
-from .diagnostics.health import MAX_ROWS_PER_READING, Bounds, HealthPolicy
+from .compiled.context import context_at
+from .diagnostics.detector_watch import watch_row
+from .diagnostics.health import NORMALS, Bounds, HealthPolicy, judges, keep_window
 from .estimator import Code
-from .fold_kernel import run_and_judge, run_and_judge_signature
+from .fleet_window import FLAGS, HEALTH, STALE_EVENTS, VERDICT, N, has_no_baseline, return_to, slide
+from .fold_kernel import fold_event
 from .gate.rejection_runs import Rule
-from .log import _ORDER, READING, RESET
-from .numerics.jit import address, caller, counts, flag_rows, flags, floats, i64, ints, jit, masks, matrix, part
+from .log import _ORDER
+from .numerics.jit import counts, embedded, flag_rows, flags, floats, i64, ints, jit, masks, matrix, part
 from .numerics.workspace import declare_layout
-from .track import FAILED, GATED, NONE, USED, WHITENED, Track
-
-N, JUDGED, STALE_EVENTS, HEALTH, FLAGS, VERDICT = range(6)
-"""Columns of `Block.head`: events folded; judged rows ever, of which the last are kept; events dropped as stale; then
-health, flags and verdict of the last event."""
+from .track import WHITENED, Track
 
 T, AGE, NIS_MEAN, NIS_LOW, NIS_HIGH, CONSISTENCY = range(6)
 """Columns of `State.last`, of the last row: time (int64, ns) and the columns of the track of that name."""
@@ -38,16 +35,14 @@ State, state_at = declare_layout(
 
 Block, block_at = declare_layout(
     "Block", "size, kept, recent, columns, nx",
-    head="int 6", mean="nx", std="nx", now="size", snapshots="2, size", codes="int kept", nis="kept", t="int recent",
+    head="int 9", mean="nx", std="nx", now="size", snapshots="2, size", codes="int kept", nis="kept", t="int recent",
     place="int recent", value="recent, columns",
 )  # fmt: skip
-"""Memory of an asset: head, last estimate, state, two snapshots, judged rows (`codes`, `nis`), and the recent events as
-time, place in the order of a log, and values."""
-
-_ROW_BITS, _CHANNEL_BITS = 28, 14
+"""Memory of an asset: head (fleet_window.py), last estimate, state, two snapshots, judged measurements (`codes` and
+`nis`), and the recent events as time, place in the order of a log, and values."""
 
 _PLAN = """
-    memory stride visited starts count t place value tunings contexts r crews crew_places rows_before fold start predict
+    memory stride visited starts count t place value tunings contexts r crews crew_places start predict
     update describe soft never nx nu state evidence edge sensors rows ny width work window kept recent columns size
     low high quantiles
     degraded_after stale_after diverged_nis diverged_gated false_alarm_every silent_periods
@@ -56,17 +51,18 @@ PLAN = np.dtype([(name, np.float64 if k > _PLAN.index("quantiles") else np.int64
 """What the call reads: addresses and sizes; the last are limits of `HealthPolicy`."""
 
 CREW = (*Track._fields, "context", "r", "spare", "work", "score", "events_t", "kind", "channel", "events_value",
-        "tail_t", "tail_place", "tail_value", "stops")  # fmt: skip
+        "passed", "variances", "terms", "tail_t", "tail_place", "tail_value")  # fmt: skip
 """Scratch of a thread, as addresses."""
 
-_CONTEXT, _R, _SPARE, _WORK, _SCORE, _T, _KIND, _CHANNEL, _VALUE, _TAIL_T, _TAIL_PLACE, _TAIL_VALUE, _STOPS = range(
-    len(Track._fields), len(CREW)
-)
+(_CONTEXT, _R, _SPARE, _WORK, _SCORE, _T, _KIND, _CHANNEL, _VALUE, _PASSED, _VARIANCES, _TERMS, _TAIL_T, _TAIL_PLACE,
+ _TAIL_VALUE) = range(len(Track._fields), len(CREW))  # fmt: skip
 _CONTEXT_WORDS, _AT_R = len(CONTEXT_FIELDS), CONTEXT_FIELDS.index("r")
 _KINDS = np.array(_ORDER, np.int8)
 
+ROWS = 2
+"""Rows of a thread's track: the last event of the asset, and the new one."""
+
 _plan_type = from_dtype(PLAN)
-_call_fold = caller(run_and_judge_signature)
 
 
 @intrinsic
@@ -79,12 +75,7 @@ def _plan_at(typing_context, place):
     return _plan_type(i64), codegen
 
 
-def rows_before(window: int) -> int:
-    """Return how many rows of a thread's track lie before the first new one; `assess` looks back as far."""
-    return MAX_ROWS_PER_READING * window + 2
-
-
-@part
+@embedded
 def _track_at(own, rows, nx, ny, width):
     """Return the track of a thread."""
     return Track(
@@ -112,7 +103,7 @@ def _track_at(own, rows, nx, ny, width):
     )
 
 
-@part
+@embedded
 def _precedes(t, place, value, other_t, other_place, other):
     """Return whether an event comes before another in the order of a log (`sorted_order`)."""
     if t != other_t:
@@ -127,108 +118,37 @@ def _precedes(t, place, value, other_t, other_place, other):
     return False
 
 
-@part
+@embedded
 def _copy(source, target):
     for k in range(source.size):
         target[k] = source[k]
 
 
-@part
-def _window(block, first, n, window, channel, kind, track):
-    """Write the judged rows of the window before row `first` of a track; return the row before the oldest of them."""
-    oldest = first
-    at = block.head[JUDGED] % block.codes.size
-    for _ in range(min(block.head[JUDGED], window)):
-        at = at - 1 if at > 0 else block.codes.size - 1
-        code = block.codes[at]
-        i = first - (n - (code >> _ROW_BITS))
-        if i < 2:
-            break
-        dof = (code & (1 << _CHANNEL_BITS) - 1) - 1
-        channel[i] = code >> _CHANNEL_BITS & (1 << _ROW_BITS - _CHANNEL_BITS) - 1
-        track.verdict[i] = USED if dof >= 0 else GATED
-        track.dof[i] = dof
-        track.nis[i] = block.nis[at]
-        oldest = i
-    # Where the search for the window ends.
-    kind[oldest - 1] = RESET
-    return oldest - 1
+@embedded
+def _precedes_last(k, t, place, value, block, n):
+    """Return whether event k comes before event n - 1 of an asset."""
+    at = (n - 1) % block.t.size
+    return _precedes(t[k], place[k], value[k], block.t[at], block.place[at], block.value[at])
 
 
 @part
-def _fold_rows(plan, code, rule, policy, bounds, context_place, block, now, m, t, kind, channel, value, stops, spare,
-               work, score, track):  # fmt: skip
-    """Fold and judge the m events from row `rows_before` on, as a single fold does."""
-    first, n = plan.rows_before, block.head[N]
-    last = now.last
-    last_t = ints(last.ctypes.data, 1)
-    before = first - 1
-    t[before] = last_t[0] if n > 0 else t[first]
-    track.age[before] = last[AGE]
-    track.nis_mean[before] = last[NIS_MEAN]
-    track.nis_low[before] = last[NIS_LOW]
-    track.nis_high[before] = last[NIS_HIGH]
-    track.consistency[before] = int(last[CONSISTENCY])
-    oldest = _window(block, first, n, plan.window, channel, kind, track)
-    stops[0] = first + m
-    _call_fold(
-        plan.fold, code, context_place, rule, n - first, first, stops, t, kind, channel, value, plan.columns,
-        now.clock, now.u, now.filter, now.doubt, now.edge, spare, work, score, track, policy, bounds, now.evidence,
-        stops[:0],
-    )  # fmt: skip
-    for i in range(oldest, first):
-        kind[i] = READING
-        track.verdict[i] = NONE
-    kept = block.codes.size
-    for i in range(first, first + m):
-        verdict = track.verdict[i]
-        if verdict == USED or verdict == GATED or verdict == FAILED:
-            at = block.head[JUDGED] % kept
-            dof = track.dof[i] if verdict == USED else -1
-            block.codes[at] = (n + i - first) << _ROW_BITS | channel[i] << _CHANNEL_BITS | (dof + 1)
-            block.nis[at] = track.nis[i]
-            block.head[JUDGED] += 1
-    i = first + m - 1
-    last_t[0] = t[i]
-    last[AGE] = track.age[i]
-    last[NIS_MEAN] = track.nis_mean[i]
-    last[NIS_LOW] = track.nis_low[i]
-    last[NIS_HIGH] = track.nis_high[i]
-    last[CONSISTENCY] = track.consistency[i]
-    block.head[N] = n + m
+def _rewind(block, e, stop, t, place, value, recent, window, tail_t, tail_place, tail_value):
+    """Return to a snapshot before new events e to `stop`; return the first to fold, and the length of the tail.
 
-
-@part
-def _to_snapshot(block, n, recent):
-    """Return the index of the last snapshot of n events: one precedes every `recent`-th."""
-    return max(0, (n - 1) // recent * recent)
-
-
-@part
-def _begin(block, now, e, stop, t, place, value, recent, tail_t, tail_place, tail_value):
-    """Return to a snapshot if new events belong before the last; return the first event to fold, and the tail's length.
-
-    The tail holds the events after the snapshot. Events before the oldest snapshot are counted as stale.
+    The tail holds the events after the snapshot. Events before the oldest snapshot are counted as stale. There is a
+    snapshot before every `recent`-th event, and the last two are kept.
     """
     n = block.head[N]
     ring = block.t.size
-    if n == 0 or not _precedes(
-        t[e], place[e], value[e], block.t[(n - 1) % ring], block.place[(n - 1) % ring], block.value[(n - 1) % ring]
-    ):
-        return e, 0
-    newer = _to_snapshot(block, n, recent)
+    newer = max(0, (n - 1) // recent * recent)
     older = max(0, newer - recent)
-    if older > 0:
-        at = (older - 1) % ring
-        while e < stop and _precedes(t[e], place[e], value[e], block.t[at], block.place[at], block.value[at]):
-            block.head[STALE_EVENTS] += 1
-            e += 1
-        if e == stop:
-            return e, 0
+    while older > 0 and e < stop and _precedes_last(e, t, place, value, block, older):
+        block.head[STALE_EVENTS] += 1
+        e += 1
+    if e == stop:
+        return e, 0
     i = n
-    while i > older and _precedes(
-        t[e], place[e], value[e], block.t[(i - 1) % ring], block.place[(i - 1) % ring], block.value[(i - 1) % ring]
-    ):
+    while i > older and _precedes_last(e, t, place, value, block, i):
         i -= 1
     if i == n:
         return e, 0
@@ -237,52 +157,9 @@ def _begin(block, now, e, stop, t, place, value, recent, tail_t, tail_place, tai
     for k in range(at, n):
         tail_t[k - at], tail_place[k - at] = block.t[k % ring], block.place[k % ring]
         _copy(block.value[k % ring], tail_value[k - at])
-    while block.head[JUDGED] > 0 and block.codes[(block.head[JUDGED] - 1) % block.codes.size] >> _ROW_BITS >= at:
-        block.head[JUDGED] -= 1
+    return_to(at, block, window)
     block.head[N] = at
     return e, n - at
-
-
-@part
-def _fold_asset(plan, code, rule, policy, bounds, context_place, block, now, e, stop, t, place, value, log, tail, stops,
-                spare, work, score, track):  # fmt: skip
-    """Fold the new events `e` to `stop` of an asset where they belong."""
-    own_t, kind, channel, own_value = log
-    tail_t, tail_place, tail_value = tail
-    first, recent, ring = plan.rows_before, plan.recent, block.t.size
-    e, tail_size = _begin(block, now, e, stop, t, place, value, recent, tail_t, tail_place, tail_value)
-    if e == stop:
-        return
-    a = 0
-    while a < tail_size or e < stop:
-        n = block.head[N]
-        if n % recent == 0:
-            _copy(block.now, block.snapshots[n // recent % 2])
-        m = 0
-        while m < recent - n % recent and (a < tail_size or e < stop):
-            i, at = first + m, (n + m) % ring
-            if a < tail_size and (
-                e == stop or not _precedes(t[e], place[e], value[e], tail_t[a], tail_place[a], tail_value[a])
-            ):
-                block.t[at], block.place[at] = tail_t[a], tail_place[a]
-                _copy(tail_value[a], block.value[at])
-                a += 1
-            else:
-                block.t[at], block.place[at] = t[e], place[e]
-                _copy(value[e], block.value[at])
-                e += 1
-            own_t[i] = block.t[at]
-            kind[i] = _KINDS[block.place[at] >> 32]
-            channel[i] = block.place[at] & 0xFFFFFFFF
-            _copy(block.value[at], own_value[i])
-            m += 1
-        _fold_rows(plan, code, rule, policy, bounds, context_place, block, now, m, own_t, kind, channel, own_value,
-                   stops, spare, work, score, track)  # fmt: skip
-        i = first + m - 1
-    _copy(track.mean[i], block.mean)
-    _copy(track.std[i], block.std)
-    head = block.head
-    head[HEALTH], head[FLAGS], head[VERDICT] = track.health[i], track.flags[i], track.verdict[i]
 
 
 @jit
@@ -290,24 +167,21 @@ def _fold_share(place, crew):
     """Fold the new events of one thread's share of the assets."""
     plan = _plan_at(place)
     own = ints(plan.crew_places + 8 * crew * len(CREW), len(CREW))
-    rows = plan.rows_before + plan.recent
-    track = _track_at(own, rows, plan.nx, plan.ny, plan.width)
-    log = (
-        ints(own[_T], rows),
-        flags(own[_KIND], rows),
-        counts(own[_CHANNEL], rows),
-        matrix(floats(own[_VALUE], rows * plan.columns), 0, rows, plan.columns),
-    )
+    columns, recent = plan.columns, plan.recent
+    track = _track_at(own, ROWS, plan.nx, plan.ny, plan.width)
+    own_t, kind, channel = ints(own[_T], ROWS), flags(own[_KIND], ROWS), counts(own[_CHANNEL], ROWS)
+    own_value = matrix(floats(own[_VALUE], ROWS * columns), 0, ROWS, columns)
+    passed, variances = floats(own[_PASSED], columns), floats(own[_VARIANCES], 0)
+    terms = matrix(floats(own[_TERMS], (1 + NORMALS) * plan.kept), 0, 1 + NORMALS, plan.kept)
     # One more than may be folded again: a late event that precedes it is stale.
-    ring = 2 * plan.recent + 1
-    tail = (
-        ints(own[_TAIL_T], ring),
-        ints(own[_TAIL_PLACE], ring),
-        matrix(floats(own[_TAIL_VALUE], ring * plan.columns), 0, ring, plan.columns),
+    ring = 2 * recent + 1
+    tail_t, tail_place = ints(own[_TAIL_T], ring), ints(own[_TAIL_PLACE], ring)
+    tail_value = matrix(floats(own[_TAIL_VALUE], ring * columns), 0, ring, columns)
+    spare, work, score = (
+        floats(own[_SPARE], plan.state),
+        floats(own[_WORK], plan.work),
+        floats(own[_SCORE], WHITENED + plan.ny),
     )
-    spare = floats(own[_SPARE], plan.state)
-    work = floats(own[_WORK], plan.work)
-    score = floats(own[_SCORE], WHITENED + plan.ny)
     code = Code(plan.start, plan.predict, plan.update, plan.describe)
     rule = Rule(plan.soft, plan.never)
     policy = HealthPolicy(
@@ -318,10 +192,10 @@ def _fold_share(place, crew):
     visited, starts = ints(plan.visited, plan.count), ints(plan.starts, plan.count + 1)
     total = starts[plan.count]
     t, event_place = ints(plan.t, total), ints(plan.place, total)
-    value = matrix(floats(plan.value, total * plan.columns), 0, total, plan.columns)
-    stops = ints(own[_STOPS], 1)
+    value = matrix(floats(plan.value, total * columns), 0, total, columns)
     words = ints(own[_CONTEXT], _CONTEXT_WORDS)
-    loaded = -1
+    context = context_at(own[_CONTEXT])
+    normal, white, loaded = floats(0, 0), False, -1
     for v in range(crew * plan.count // plan.crews, (crew + 1) * plan.count // plan.crews):
         asset = visited[v]
         tuning = counts(plan.tunings + 4 * asset, 1)[0]
@@ -332,10 +206,57 @@ def _fold_share(place, crew):
             _copy(ints(plan.contexts + 8 * tuning * _CONTEXT_WORDS, _CONTEXT_WORDS), words)
             _copy(floats(words[_AT_R], plan.rows), floats(own[_R], plan.rows))
             words[_AT_R] = own[_R]
-        block = block_at(plan.memory + asset * plan.stride, plan.size, plan.kept, ring, plan.columns, plan.nx)
+            normal = floats(context.normal, NORMALS * plan.sensors)
+            white = has_no_baseline(normal)
+        block = block_at(plan.memory + asset * plan.stride, plan.size, plan.kept, ring, columns, plan.nx)
         now = state_at(block.now.ctypes.data, plan.nu, plan.state, plan.evidence, plan.edge, plan.sensors)
-        _fold_asset(plan, code, rule, policy, bounds, own[_CONTEXT], block, now, starts[v], starts[v + 1], t,
-                    event_place, value, log, tail, stops, spare, work, score, track)  # fmt: skip
+        head, last = block.head, now.last
+        last_t = ints(last.ctypes.data, 1)
+        e, stop, a, tail = starts[v], starts[v + 1], 0, 0
+        if head[N] > 0 and _precedes_last(e, t, event_place, value, block, head[N]):
+            e, tail = _rewind(
+                block, e, stop, t, event_place, value, recent, plan.window, tail_t, tail_place, tail_value
+            )
+        if e == stop:
+            continue
+        while a < tail or e < stop:
+            n = head[N]
+            if n % recent == 0:
+                _copy(block.now, block.snapshots[n // recent % 2])
+            at = n % ring
+            if a < tail and (
+                e == stop or not _precedes(t[e], event_place[e], value[e], tail_t[a], tail_place[a], tail_value[a])
+            ):
+                block.t[at], block.place[at] = tail_t[a], tail_place[a]
+                _copy(tail_value[a], block.value[at])
+                a += 1
+            else:
+                block.t[at], block.place[at] = t[e], event_place[e]
+                _copy(value[e], block.value[at])
+                e += 1
+            own_t[1] = block.t[at]
+            kind[1] = _KINDS[block.place[at] >> 32]
+            channel[1] = block.place[at] & 0xFFFFFFFF
+            _copy(block.value[at], own_value[1])
+            fold_event(
+                code, context, rule, 1, n, 1, own_t, kind, channel, own_value, columns,
+                now.clock, now.u, now.filter, now.doubt, now.edge, spare, work, score, track, variances, passed,
+            )  # fmt: skip
+            if judges(track.verdict[1]):
+                slide(1, n, channel[1], block, normal, white, policy, bounds, terms, track)
+            else:
+                own_t[0] = last_t[0] if n > 0 else own_t[1]
+                track.age[0], track.consistency[0] = last[AGE], int(last[CONSISTENCY])
+                track.nis_mean[0], track.nis_low[0], track.nis_high[0] = last[NIS_MEAN], last[NIS_LOW], last[NIS_HIGH]
+                keep_window(1, own_t, track)
+            watch_row(1, own_t, kind, channel, own_value, context, policy, now.evidence, track)
+            last_t[0] = own_t[1]
+            last[AGE], last[CONSISTENCY] = track.age[1], track.consistency[1]
+            last[NIS_MEAN], last[NIS_LOW], last[NIS_HIGH] = track.nis_mean[1], track.nis_low[1], track.nis_high[1]
+            head[HEALTH], head[FLAGS], head[VERDICT] = track.health[1], track.flags[1], track.verdict[1]
+            head[N] = n + 1
+        _copy(track.mean[1], block.mean)
+        _copy(track.std[1], block.std)
 
 
 @jit(parallel=True)
@@ -362,9 +283,3 @@ def in_asset_order(asset, t, place):
         if asset[i] == asset[i - 1] and (t[i] < t[i - 1] or t[i] == t[i - 1] and place[i] <= place[i - 1]):
             return False
     return True
-
-
-@lru_cache(maxsize=1)
-def fold_address() -> int:
-    """Return the address of the loop of a single fold."""
-    return address(run_and_judge, run_and_judge_signature)

@@ -17,7 +17,7 @@ from .gate.rejection_runs import forget, note, rule_type
 from .gate.soften import soften
 from .interpreted.fold_loop import MAX_PREDICT_STEPS, UNSET
 from .log import INPUT, MARK, READING, RESET, TICK, TRUTH
-from .numerics.jit import B1, F1, F2, I1, borrowed, borrowed_rows, floats, i64, inlined, ints, jit, part
+from .numerics.jit import B1, F1, F2, I1, borrowed, borrowed_rows, embedded, floats, i64, inlined, ints, jit, part
 from .plausibility import pass_on, screen_reading, screen_signature
 from .track import ANCESTORS, EFFECTIVE, GATED, MISSING, NONE, SCREENED, USED, WHITENED, borrowed_columns, track_type
 
@@ -55,6 +55,116 @@ def exchange(r, own, kept):
             r[k] = own[k]
 
 
+@embedded
+def fold_event(
+    code, context, rule, i, index, start, t, kind, channel, value, width,
+    clock, u, state, doubt, edge, spare, work, score, track, kept, passed,
+):  # fmt: skip
+    """Fold event i, of absolute index `index`, into row i of the track; see `run`.
+
+    `spare` holds the answer of the event before, if that was a query and i is not `start`. kept (rows,) and passed
+    (columns of `value`,) are scratch.
+
+    Returns:
+        Whether the event asks for a decision on its sensor.
+    """
+    nu = u.size
+    variances = value.shape[1] > width
+    mean, std, cross = track.mean, track.std, track.cross
+    innovation, innovation_std, whitened = track.innovation, track.innovation_std, track.whitened
+    screened = track.screened
+    what = kind[i]
+    for j in range(innovation.shape[1]):
+        screened[i, j] = 0
+        innovation[i, j] = np.nan
+        innovation_std[i, j] = np.nan
+        score[WHITENED + j] = np.nan
+    score[0] = np.nan
+    score[1] = 0.0
+    score[2] = np.nan
+    score[EFFECTIVE] = np.nan
+    score[ANCESTORS] = np.nan
+    verdict = NONE
+    asked = False
+    if what == READING or what == INPUT:
+        advance_to(code, context, u, clock[0], t[i], index, state, work)
+        clock[0] = t[i]
+        if what == INPUT:
+            for j in range(nu):
+                if np.isfinite(value[i, j]):
+                    u[j] = value[i, j]
+        else:
+            if variances:
+                row, rows = sensor_rows(context, channel[i])
+                r = floats(context.r, context.n_rows)[row : row + rows]
+                exchange(r, value[i, width:], kept)
+            given = floats(value[i:].ctypes.data, value.shape[1])
+            verdict = SCREENED
+            left = True
+            if screen_reading(i, t[i], channel[i], given, context, edge, screened):
+                left = pass_on(value, screened, i, passed)
+                given = passed
+            if left:
+                verdict = call_update(
+                    code.update,
+                    context,
+                    u,
+                    channel[i],
+                    given,
+                    index,
+                    state,
+                    work,
+                    innovation[i],
+                    innovation_std[i],
+                    score,
+                )
+            if verdict == GATED and rule.soft != 0:
+                verdict = soften(
+                    code,
+                    context,
+                    u,
+                    channel[i],
+                    given,
+                    index,
+                    state,
+                    work,
+                    innovation[i],
+                    innovation_std[i],
+                    score,
+                )
+            if variances:
+                for k in range(rows):
+                    r[k] = kept[k]
+            if verdict == GATED or verdict == USED:
+                beyond = score[0] > limit_of(context, channel[i], int(score[1]))
+                asked = note(doubt[channel[i]], rule.most, beyond, index, float(t[i]))
+        call_describe(code.describe, context, state, mean[i], std[i], cross[i])
+    elif what == RESET:
+        prior_mean, prior_cov = prior(context)
+        call_start(code.start, context, prior_mean, prior_cov, state)
+        forget(doubt)
+        clock[0] = t[i]
+        call_describe(code.describe, context, state, mean[i], std[i], cross[i])
+    else:
+        if clock[0] == UNSET:
+            clock[0] = t[i]
+        # Several true states at one time are one query: `spare` still holds the answer.
+        if i == start or not asks(kind[i - 1]) or t[i] != t[i - 1]:
+            for j in range(state.size):
+                spare[j] = state[j]
+            advance_to(code, context, u, clock[0], t[i], index, spare, work)
+        call_describe(code.describe, context, spare, mean[i], std[i], cross[i])
+    track.nis[i] = score[0] if verdict != MISSING else np.nan
+    track.dof[i] = int(score[1])
+    track.log_likelihood[i] = score[2]
+    track.verdict[i] = verdict
+    track.effective[i] = score[EFFECTIVE]
+    track.ancestors[i] = score[ANCESTORS]
+    for j in range(whitened.shape[1]):
+        whitened[i, j] = score[WHITENED + j]
+    return asked
+
+
 @jit
 def run(
     code, context, rule, first, start, end, t, kind, channel, value, width,
@@ -69,9 +179,7 @@ def run(
     Variances of a measurement (columns of `value` from `width` on) replace the tuned R while it is folded, in every
     filter. Rows that are rejected before the filter are NaN for it; without any row left it only predicts.
     """
-    nu = u.size
-    variances = value.shape[1] > width
-    kept = np.empty(context.n_rows if variances else 0)
+    kept = np.empty(context.n_rows if value.shape[1] > width else 0)
     passed = np.empty(value.shape[1])
     u = borrowed(u)
     state = borrowed(state)
@@ -82,100 +190,11 @@ def run(
     score = borrowed(score)
     value = borrowed_rows(value)
     track = borrowed_columns(track)
-    mean, std, cross = track.mean, track.std, track.cross
-    innovation, innovation_std, whitened = track.innovation, track.innovation_std, track.whitened
-    screened = track.screened
     for i in range(start, end):
-        what = kind[i]
-        index = first + i
-        for j in range(innovation.shape[1]):
-            screened[i, j] = 0
-            innovation[i, j] = np.nan
-            innovation_std[i, j] = np.nan
-            score[WHITENED + j] = np.nan
-        score[0] = np.nan
-        score[1] = 0.0
-        score[2] = np.nan
-        score[EFFECTIVE] = np.nan
-        score[ANCESTORS] = np.nan
-        verdict = NONE
-        asked = False
-        if what == READING or what == INPUT:
-            advance_to(code, context, u, clock[0], t[i], index, state, work)
-            clock[0] = t[i]
-            if what == INPUT:
-                for j in range(nu):
-                    if np.isfinite(value[i, j]):
-                        u[j] = value[i, j]
-            else:
-                if variances:
-                    row, rows = sensor_rows(context, channel[i])
-                    r = floats(context.r, context.n_rows)[row : row + rows]
-                    exchange(r, value[i, width:], kept)
-                given = floats(value[i:].ctypes.data, value.shape[1])
-                verdict = SCREENED
-                left = True
-                if screen_reading(i, t[i], channel[i], given, context, edge, screened):
-                    left = pass_on(value, screened, i, passed)
-                    given = passed
-                if left:
-                    verdict = call_update(
-                        code.update,
-                        context,
-                        u,
-                        channel[i],
-                        given,
-                        index,
-                        state,
-                        work,
-                        innovation[i],
-                        innovation_std[i],
-                        score,
-                    )
-                if verdict == GATED and rule.soft != 0:
-                    verdict = soften(
-                        code,
-                        context,
-                        u,
-                        channel[i],
-                        given,
-                        index,
-                        state,
-                        work,
-                        innovation[i],
-                        innovation_std[i],
-                        score,
-                    )
-                if variances:
-                    for k in range(rows):
-                        r[k] = kept[k]
-                if verdict == GATED or verdict == USED:
-                    beyond = score[0] > limit_of(context, channel[i], int(score[1]))
-                    asked = note(doubt[channel[i]], rule.most, beyond, index, float(t[i]))
-            call_describe(code.describe, context, state, mean[i], std[i], cross[i])
-        elif what == RESET:
-            prior_mean, prior_cov = prior(context)
-            call_start(code.start, context, prior_mean, prior_cov, state)
-            forget(doubt)
-            clock[0] = t[i]
-            call_describe(code.describe, context, state, mean[i], std[i], cross[i])
-        else:
-            if clock[0] == UNSET:
-                clock[0] = t[i]
-            # Several true states at one time are one query: `spare` still holds the answer.
-            if i == start or not asks(kind[i - 1]) or t[i] != t[i - 1]:
-                for j in range(state.size):
-                    spare[j] = state[j]
-                advance_to(code, context, u, clock[0], t[i], index, spare, work)
-            call_describe(code.describe, context, spare, mean[i], std[i], cross[i])
-        track.nis[i] = score[0] if verdict != MISSING else np.nan
-        track.dof[i] = int(score[1])
-        track.log_likelihood[i] = score[2]
-        track.verdict[i] = verdict
-        track.effective[i] = score[EFFECTIVE]
-        track.ancestors[i] = score[ANCESTORS]
-        for j in range(whitened.shape[1]):
-            whitened[i, j] = score[WHITENED + j]
+        asked = fold_event(
+            code, context, rule, i, first + i, start, t, kind, channel, value, width,
+            clock, u, state, doubt, edge, spare, work, score, track, kept, passed,
+        )  # fmt: skip
         if asked:
             return i
     return -1

@@ -198,56 +198,62 @@ def _health(i, now, silent, flags, state, policy, track):
     return ADVISORY if state[ADVISED_ROWS] > 0.0 or flags != 0 else TRACKING
 
 
+@embedded
+def watch_row(i, t, kind, channel, value, context, policy, state, track):
+    """Fill alarms, flags and health of row i of a track whose other columns are known; `state` evolves."""
+    sensors, rows, nu = context.n_sensors, context.n_rows, context.nu
+    width = track.alarms.shape[1]
+    expected = ints(context.expected, sensors)
+    u = floats(state.ctypes.data + 8 * (state.size - nu), nu)
+    now = t[i] * 1e-9
+    if not np.isfinite(state[BEGUN]):
+        state[BEGUN] = now
+        for s in range(sensors):
+            if expected[s] != 0:
+                sensor_part(state, s)[DUE] = now + policy.stale_after
+        state[NEXT_DUE] = now + policy.stale_after
+    for k in range(width):
+        track.alarms[i, k] = 0
+    if kind[i] == READING:
+        y = floats(value[i:].ctypes.data, value.shape[1])
+        # A sensor that reports no value has dropped out all the same.
+        if _has_value(y, sensor_rows(context, channel[i])[1]):
+            if track.verdict[i] != SCREENED:
+                state[HEARD] = 1.0
+                state[UNSETTLED] = max(state[UNSETTLED] - 1.0, 0.0)
+            if not _is_copy(i, track):
+                _test(i, now, y, channel[i], context, policy, state, track)
+        if np.isfinite(track.effective[i]):
+            _count_particles(track.effective[i], track.ancestors[i], state)
+    elif kind[i] == INPUT:
+        for k in range(nu):
+            if np.isfinite(value[i, k]):
+                u[k] = value[i, k]
+    elif kind[i] == RESET:
+        forget(state, sensors, rows, policy.window)
+    if now > state[NEXT_DUE]:
+        find_dropouts(state, sensors, now)
+    flags = 0
+    for s in range(sensors if state[SILENT_SENSORS] > 0.0 else 0):
+        if sensor_part(state, s)[SILENT] != 0.0:
+            flags |= 1 << min(s, SENSOR_FLAGS - 1)
+    silent = flags
+    if context.fitted != 0:
+        flags |= _range(i, u, context, track)
+    if state[POOR_CLOUD] != 0.0:
+        flags |= IMPOVERISHED
+    track.flags[i] = flags
+    track.health[i] = _health(i, now, silent, flags, state, policy, track)
+
+
 @part
 def watch_rows(first, last, t, kind, channel, value, context, policy, state, track):
     """Fill alarms, flags and health of rows `first` to `last` of a track whose other columns are known.
 
     `state` evolves with the rows, so the result does not depend on the pieces of a fold.
     """
-    sensors, rows, nu = context.n_sensors, context.n_rows, context.nu
     track = borrowed_columns(track)
     value = borrowed_rows(value)
     state = borrowed(state)
-    width = track.alarms.shape[1]
-    expected = ints(context.expected, sensors)
-    u = floats(state.ctypes.data + 8 * (state.size - nu), nu)
     for i in range(first, last):
-        now = t[i] * 1e-9
-        if not np.isfinite(state[BEGUN]):
-            state[BEGUN] = now
-            for s in range(sensors):
-                if expected[s] != 0:
-                    sensor_part(state, s)[DUE] = now + policy.stale_after
-            state[NEXT_DUE] = now + policy.stale_after
-        for k in range(width):
-            track.alarms[i, k] = 0
-        if kind[i] == READING:
-            y = floats(value[i:].ctypes.data, value.shape[1])
-            # A sensor that reports no value has dropped out all the same.
-            if _has_value(y, sensor_rows(context, channel[i])[1]):
-                if track.verdict[i] != SCREENED:
-                    state[HEARD] = 1.0
-                    state[UNSETTLED] = max(state[UNSETTLED] - 1.0, 0.0)
-                if not _is_copy(i, track):
-                    _test(i, now, y, channel[i], context, policy, state, track)
-            if np.isfinite(track.effective[i]):
-                _count_particles(track.effective[i], track.ancestors[i], state)
-        elif kind[i] == INPUT:
-            for k in range(nu):
-                if np.isfinite(value[i, k]):
-                    u[k] = value[i, k]
-        elif kind[i] == RESET:
-            forget(state, sensors, rows, policy.window)
-        if now > state[NEXT_DUE]:
-            find_dropouts(state, sensors, now)
-        flags = 0
-        for s in range(sensors if state[SILENT_SENSORS] > 0.0 else 0):
-            if sensor_part(state, s)[SILENT] != 0.0:
-                flags |= 1 << min(s, SENSOR_FLAGS - 1)
-        silent = flags
-        if context.fitted != 0:
-            flags |= _range(i, u, context, track)
-        if state[POOR_CLOUD] != 0.0:
-            flags |= IMPOVERISHED
-        track.flags[i] = flags
-        track.health[i] = _health(i, now, silent, flags, state, policy, track)
+        watch_row(i, t, kind, channel, value, context, policy, state, track)

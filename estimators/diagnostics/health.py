@@ -22,7 +22,7 @@ from numba import types
 
 from ..log import RESET
 from ..model.state_space import StateSpaceModel
-from ..numerics.jit import F1, borrowed, borrowed_rows, f64, i64, inlined, ints, jit, plain
+from ..numerics.jit import F1, borrowed, borrowed_rows, embedded, f64, i64, inlined, ints, jit, plain
 from ..numerics.quantiles import chi_square_quantile
 from ..numerics.simd import total as sum_of
 from ..track import DIVERGED, FAILED, GATED, TRACKING, USED, borrowed_columns
@@ -100,7 +100,7 @@ def _quantile(table, dof):
 
 
 @inlined
-def _bounds(mean, variance, dof, used, low, high):
+def window_bounds(mean, variance, dof, used, low, high):
     """Return the 95 % bounds of the mean NIS of `used` measurements, of tables of quantiles by degrees of freedom."""
     free = free_degrees(mean, variance, dof)
     return mean / free * _quantile(low, free) / used, mean / free * _quantile(high, free) / used
@@ -113,6 +113,31 @@ def _all_whole(normal):
         if not (abs(normal[k]) < MAX_EXACT and normal[k] == np.floor(normal[k])):
             return False
     return True
+
+
+@embedded
+def write_window(i, total, due, kept, used, nis_low, nis_high, policy, track):
+    """Fill windowed NIS, its bounds and consistency of row i from a window of `kept` measurements, `used` of them used.
+
+    total, due: Sum of their NIS, and its expected value.
+    """
+    track.nis_mean[i] = total / used if used > 0 else np.nan
+    track.nis_low[i] = nis_low
+    track.nis_high[i] = nis_high
+    refused = kept - used
+    track.consistency[i] = TRACKING
+    if kept >= MIN_WINDOW_EVENTS and (refused > policy.diverged_gated * kept or total > policy.diverged_nis * due):
+        track.consistency[i] = DIVERGED
+
+
+@embedded
+def keep_window(i, t, track):
+    """Fill age, windowed NIS, its bounds and consistency of a row i that is no judged measurement."""
+    track.age[i] = track.age[i - 1] + (t[i] - t[i - 1]) * 1e-9
+    track.nis_mean[i] = track.nis_mean[i - 1]
+    track.nis_low[i] = track.nis_low[i - 1]
+    track.nis_high[i] = track.nis_high[i - 1]
+    track.consistency[i] = track.consistency[i - 1]
 
 
 @jit
@@ -193,23 +218,11 @@ def assess(first, last, t, kind, channel, track, normal, policy, bounds):
             if used == 0:
                 nis_low = nis_high = np.nan
             elif dof != bounded_dof or used != bounded_used or mean != bounded_mean or variance != bounded_variance:
-                nis_low, nis_high = _bounds(mean, variance, dof, used, low, high)
+                nis_low, nis_high = window_bounds(mean, variance, dof, used, low, high)
             bounded_dof, bounded_used, bounded_mean, bounded_variance = dof, used, mean, variance
-            track.nis_mean[i] = total / used if used > 0 else np.nan
-            track.nis_low[i] = nis_low
-            track.nis_high[i] = nis_high
-            kept, refused = end - begin, end - begin - used
-            track.consistency[i] = TRACKING
-            if kept >= MIN_WINDOW_EVENTS and (
-                refused > policy.diverged_gated * kept or total > policy.diverged_nis * due
-            ):
-                track.consistency[i] = DIVERGED
+            write_window(i, total, due, end - begin, used, nis_low, nis_high, policy, track)
         else:
-            track.age[i] = track.age[i - 1] + (t[i] - t[i - 1]) * 1e-9
-            track.nis_mean[i] = track.nis_mean[i - 1]
-            track.nis_low[i] = track.nis_low[i - 1]
-            track.nis_high[i] = track.nis_high[i - 1]
-            track.consistency[i] = track.consistency[i - 1]
+            keep_window(i, t, track)
     # Used to the end: their views are not counted, and the memory would be given back.
     room[0, 0], places[0, 0] = 0.0, 0
 

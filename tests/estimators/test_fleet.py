@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from estimators import MODELS, HealthPolicy, Log, Tuning
+from estimators.diagnostics.detector_state import no_baseline
 from estimators.errors import EstimatorError, EventError
 from estimators.fleet import Fleet
 from estimators.fold import Fold
@@ -91,6 +92,9 @@ def test_fleet_of_random_assets_has_the_bits_of_single_folds(estimator, name, ga
     rng = np.random.default_rng(7 + threads)
     tunings = [Tuning.of(model) if gate is None else gated(model, gate_kind=gate)] * 12
     tunings[5] = replace(tunings[0], r=tunings[0].r * 2.0)
+    baseline = no_baseline(model)
+    baseline[:, :3] = 0.3, 1.2, 0.2  # bias, scale and correlation: sums of the expected NIS have rounding
+    tunings[7] = replace(tunings[0], baseline=baseline)
     fleet = Fleet(estimator, model, tunings, assets=12, policy=POLICY, recent=4, threads=threads)
     logs = [Log.of(model) for _ in tunings]
     arriving = [shuffled(random_events(model, rng, int(rng.integers(1, 150))), rng, 4) for _ in tunings]
@@ -134,6 +138,21 @@ def test_assets_of_other_parameters_share_nothing():
         fold = Fold("kf", model, tuning, log)
         fold.advance()
         assert_same(fleet, a, fold)
+
+
+def test_measurements_too_old_to_count_leave_the_window():
+    model, policy = MODELS["motor_winding"], POLICY._replace(window=2)
+    fleet, log = Fleet("kf", model, assets=1, policy=policy), Log.of(model)
+    # The window spans 40 events, and the last measurement of the first batch is 40 before that of the second.
+    for seconds in (np.arange(10.0), np.array([20.0])):
+        for target, asset in ((fleet, [0]), (log, [])):
+            target.add("winding", *asset, seconds, 40.0 + np.sin(seconds))
+            target.add_ticks(np.linspace(seconds[-1] + 0.1, seconds[-1] + 1.0, 39))
+        fleet.advance()
+        fold = Fold("kf", model, Tuning.of(model), log, policy=policy)
+        fold.advance()
+        assert_same(fleet, 0, fold)
+    assert fold.track.nis_mean[-1] == fold.track.nis[-40]
 
 
 def test_an_event_before_the_oldest_snapshot_is_stale_and_changes_nothing():
