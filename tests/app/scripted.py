@@ -193,7 +193,7 @@ def viewed(model, estimator="kf", view=None):
     return engine
 
 
-def wait_for(condition, seconds=60.0):
+def wait_for(condition, seconds=120.0):
     """Poll until a condition holds; what another thread does has no event to wait on."""
     import time
 

@@ -88,7 +88,7 @@ def test_where_output_is_redirected_it_says_what_it_does_before_it_is_done(monke
     monkeypatch.setattr(app.cli.prepare, "STATUS_DELAY_S", 0.0)
 
     def work():
-        end = time.monotonic() + 10.0
+        end = time.monotonic() + 60.0
         while not pipe.read and time.monotonic() < end:
             time.sleep(0.001)
         return pipe.read

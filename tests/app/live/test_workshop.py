@@ -325,7 +325,7 @@ def test_what_a_source_needs_comes_first_and_is_waited_for_alone(shop, tmp_path)
     waiting = threading.Thread(target=workshop.wait, args=("ukf",), daemon=True)
     waiting.start()
     workshop.stop()
-    waiting.join(10.0)
+    waiting.join(60.0)
     assert not waiting.is_alive()
 
 

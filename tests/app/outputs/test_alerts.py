@@ -314,7 +314,7 @@ def test_a_receiver_that_answers_nonsense_fails_as_any_other(tmp_path):
     child = "import subprocess, sys; subprocess.Popen([sys.executable, '-c', {!r}, sys.argv[1]])"
     child = child.format("import sys; open(sys.argv[1])")
     words = [sys.executable, "-c", child, str(tmp_path / "end")]
-    leaves = CommandReceiver(CommandSection(type="command", command=words, timeout=20), tmp_path)
+    leaves = CommandReceiver(CommandSection(type="command", command=words, timeout=60), tmp_path)
     for receiver in (command[1], leaves):
         delivery = Delivery("ops", receiver, notices)
         delivery.put(heartbeat("motor", "tracking"))

@@ -238,7 +238,7 @@ def test_charts_show_the_values_of_the_row_at_the_moment(visit, width):
                 decimals = max(0, 1 - int(np.floor(np.log10(half))))
                 wanted = f"{mean:.{decimals}f} ± {half:.{decimals}f}"
                 reading = page.locator(f"[aria-label='Chart of {label}'] .reading")
-                wait_for(lambda reading=reading, wanted=wanted: reading.inner_text().startswith(wanted), 20.0)
+                wait_for(lambda reading=reading, wanted=wanted: reading.inner_text().startswith(wanted), PATIENCE)
 
         for moment in (700.25, 1400.25, 3200.25):
             page.evaluate("(at) => window.nisus.view.show(0, window.nisus.charts.newest, at)", moment)
