@@ -58,14 +58,15 @@ def check_scene(loaded: Loaded, model: StateSpaceModel) -> None:
         if len(angles) != rows[name]:
             text = f"has {len(angles)} angles; {name} has {rows[name]} rows, give one for each"
             raise loaded.error(("view", "scene", "beams", name), text)
-    known = (*model.state_names, *(parameter.name for parameter in model.parameters))
+    parameters = [parameter.name for parameter in model.parameters]
     for name, place in scene.beacons.items():
         at = ("view", "scene", "beacons", name)
         if rows[name] != 1:
             raise loaded.error(at, f"is for one distance; {name} has {rows[name]} rows")
         for item in place:
-            if item not in known:
-                text = f"names {item!r}, no state or parameter of {model.name}; {nearest(item, known)}"
+            if item not in model.state_names and item not in parameters:
+                near = nearest(item, (*model.state_names, *parameters))
+                text = f"names {item!r}, no state or parameter of {model.name}; {near}"
                 raise loaded.error(at, text)
 
 

@@ -138,11 +138,12 @@ def configure(model: StateSpaceModel, loaded: Loaded) -> StateSpaceModel:
     config = loaded.config
     model = _assembled(_with_noise(with_parameters(model, loaded), loaded), loaded)
     field = isinstance(model.states, Field)
-    places = [*(() if field else model.state_names), *(item.name for item in model.inputs)]
+    states = () if field else model.state_names  # a field may have a million
+    places = [*states, *(item.name for item in model.inputs)]
     check_names(loaded, ("valid",), config.valid, places, "state or input", model)
-    check_names(loaded, ("withhold",), config.withhold, () if field else model.state_names, "state", model)
-    own = model.state_names[: model.nx - model.considered]
-    for name in model.state_names[len(own) :]:
+    check_names(loaded, ("withhold",), config.withhold, states, "state", model)
+    own = states[: model.nx - model.considered]
+    for name in states[len(own) :]:
         if name in config.prior:
             raise loaded.error(
                 ("prior", name), "is considered, so its prior is the `std` of the parameter; give it there"
