@@ -84,7 +84,8 @@ def listen(port: int, host: str = LOOPBACK) -> tuple[list[socket.socket], bool]:
 
 
 def _listener(family: socket.AddressFamily, host: str, port: int) -> socket.socket:
-    listener = socket.socket(family, socket.SOCK_STREAM)
+    # With the protocol, as asyncio sets TCP_NODELAY only then.
+    listener = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
     try:
         if os.name == "posix":
             # Otherwise a port that was just closed stays taken for a minute.

@@ -8,21 +8,26 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import http.client
 import json
 import os
 import re
+import socket
 import statistics
+import struct
 import subprocess
 import sys
 import tempfile
 import time
 import urllib.request
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from datetime import UTC, datetime
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import can
 import numpy as np
 
 from app.views.recording.reader import read_recording
@@ -242,7 +247,9 @@ def memory(edits: int = 60) -> Iterator[BenchmarkRow]:
 
 
 def published(seconds: float = 15.0, rate: float = 1000.0) -> Iterator[BenchmarkRow]:
-    """From a measurement to the state that contains it, both through an MQTT broker, with the way there and back, ms.
+    """From a measurement by MQTT, POST, CAN or OPC UA to the state that contains it, received through a broker, ms.
+
+    The twin also has the outputs OPC UA and CAN. OPC UA servers publish every 10 ms, and the last value only.
 
     Raises:
         SourceError: If there is no Mosquitto.
@@ -250,52 +257,91 @@ def published(seconds: float = 15.0, rate: float = 1000.0) -> Iterator[Benchmark
     from sources.brokers import mqtt_client
 
     from ..app.outputs.broker import MOSQUITTO, Broker
+    from ..app.outputs.test_one_state import Plant
     from ..support import free_port
 
     if MOSQUITTO is None:
         raise SourceError("no mosquitto was found")
-    with tempfile.TemporaryDirectory() as folder:
-        broker = Broker(Path(folder))
-        place = {"host": "127.0.0.1", "port": broker.port}
-        topics = {"plant/t": {"values": {"winding": "v"}, "time": "t"}}
-        source = json.dumps({"type": "mqtt", "topics": topics, "qos": 0} | place)
-        outputs = json.dumps({"every": 0, "mqtt": place, "opcua": {"port": free_port()}})
-        delays: list[float] = []
+    for kind in ("mqtt", "push", "can", "opcua"):
+        with tempfile.TemporaryDirectory() as name:
+            folder = Path(name)
+            broker = Broker(folder)
+            plant, place = Plant(folder, broker), {"host": "127.0.0.1", "port": broker.port}
+            multicast = {"interface": "udp_multicast", "channel": "239.74.163.10"}
+            bus = {**multicast, "options": {"port": free_port(socket.SOCK_DGRAM)}}
+            source = plant.source(kind) | {"mqtt": {"qos": 0}, "can": bus}.get(kind, {})
+            can_output = {**bus, "id": 1536, "dbc": str(folder / "estimate.dbc")}
+            outputs = {"every": 0, "mqtt": place, "opcua": {"port": free_port()}, "can": can_output}
+            given = {"source": json.dumps(source), "outputs": json.dumps(outputs)}
+            options = [f"--set={key}={value}" for key, value in given.items()]
+            delays: list[float] = []
 
-        def heard(_client: Any, _data: Any, message: Any) -> None:
-            now, found = time.time_ns(), json.loads(message.payload)
-            delays.append((now - found["time_ns"]) * 1e-6 if found["time_ns"] else np.nan)
+            def heard(_client: Any, _data: Any, message: Any, delays: list[float] = delays) -> None:
+                now, found = time.time_ns(), json.loads(message.payload)
+                delays.append((now - found["time_ns"]) * 1e-6 if found["time_ns"] else np.nan)
 
-        client = mqtt_client(SimpleNamespace(user=None, ca_file=None), None, client_id="")  # type: ignore[arg-type]
-        client.on_message = heard
-        try:
-            with running("motor_winding", "--set", f"source={source}", "--set", f"outputs={outputs}") as run:
-                client.connect("127.0.0.1", broker.port)
-                client.subscribe("nisus/+/state")
-                client.loop_start()
-                while not all(item["connected"] for item in run.ask("/api/alerts")["outputs"]):
-                    time.sleep(0.1)
-                for part in (3.0, seconds):  # the first part warms up
-                    delays.clear()
-                    cpu, begun, sent = run.cpu(), time.monotonic(), 0
-                    while (gone := time.monotonic() - begun) < part:
-                        while sent < gone * rate:
-                            client.publish("plant/t", json.dumps({"v": 40.0 + sent % 3, "t": time.time_ns()}))
-                            sent += 1
-                        time.sleep(0.5 / rate)
-                taken = np.array(delays)
-                figures = {
-                    "p50 [ms]": float(np.nanpercentile(taken, 50)),
-                    "p99 [ms]": float(np.nanpercentile(taken, 99)),
-                    "p99 to row [ms]": run.ask("/api/status")["latency_ms"],
-                    "sent per s": sent / seconds,
-                    "states per s": taken.size / seconds,
-                    "of a core [%]": 100.0 * (run.cpu() - cpu) / seconds,
-                }
-        finally:
-            client.loop_stop()
-            broker.stop()
-        yield BenchmarkRow("MQTT to MQTT and OPC UA", figures, (Bound("p99 [ms]", 5.0),))
+            client = mqtt_client(SimpleNamespace(user=None, ca_file=None), None, client_id="")  # type: ignore[arg-type]
+            client.on_message = heard
+            try:
+                with running("motor_winding", *options) as run, _sender(kind, plant, client, run, bus) as send:
+                    client.connect("127.0.0.1", broker.port)
+                    client.subscribe("nisus/+/state")
+                    client.loop_start()
+                    while not all(item["connected"] for item in run.ask("/api/alerts")["outputs"]):
+                        time.sleep(0.1)
+                    for part in (3.0, seconds):  # the first part warms up
+                        delays.clear()
+                        cpu, begun, sent = run.cpu(), time.monotonic(), 0
+                        while (gone := time.monotonic() - begun) < part:
+                            while sent < gone * rate and time.monotonic() - begun < part:
+                                send(40.0 + sent % 3)
+                                sent += 1
+                            time.sleep(0.5 / rate)
+                    taken = np.array(delays)
+                    figures = {
+                        "p50 [ms]": float(np.nanpercentile(taken, 50)),
+                        "p99 [ms]": float(np.nanpercentile(taken, 99)),
+                        "p99 to row [ms]": run.ask("/api/status")["latency_ms"],
+                        "sent per s": sent / seconds,
+                        "states per s": taken.size / seconds,
+                        "of a core [%]": 100.0 * (run.cpu() - cpu) / seconds,
+                    }
+            finally:
+                client.loop_stop()
+                plant.close()
+                broker.stop()
+        yield BenchmarkRow(f"{kind} to MQTT", figures, (Bound("p99 [ms]", 5.0),))
+
+
+@contextmanager
+def _sender(kind: str, plant: Any, client: Any, run: Running, bus: Any) -> Iterator[Callable[[float], object]]:
+    """Give the function that sends a measurement with the present time; of CAN the kernel's time counts."""
+    if kind == "mqtt":
+        yield lambda value: client.publish("plant/t", json.dumps({"v": value, "t": time.time()}))
+    elif kind == "push":
+        connection = http.client.HTTPConnection(run.address.removeprefix("http://"))
+        headers = run.headers | {"Content-Type": "application/json"}
+
+        def post(value: float) -> None:
+            body = json.dumps({"time": time.time_ns(), "values": {"winding": value}})
+            connection.request("POST", "/api/readings", body, headers)
+            connection.getresponse().read()
+
+        yield post
+        connection.close()
+    elif kind == "can":
+        with can.Bus(interface=bus["interface"], channel=bus["channel"], **bus["options"]) as sender:
+            yield lambda value: sender.send(
+                can.Message(arbitration_id=256, data=struct.pack("<fI", value, 0), is_extended_id=False)
+            )
+    else:
+        from asyncua import ua
+
+        def write(value: float) -> None:
+            stamp = datetime.now(UTC)
+            plant.node.write_value(ua.DataValue(ua.Variant(value), SourceTimestamp=stamp))
+
+        yield write
 
 
 PARTS: dict[str, Section] = {part.__name__: part for part in (crowd, first, slider, share, arrival, published, memory)}

@@ -1,5 +1,6 @@
 """The port of the page: access rules, served files, the Viser proxy and the streams."""
 
+import asyncio
 import json
 import socket
 import time
@@ -10,7 +11,7 @@ import pytest
 from rerun.chunk import RrdReader
 from websockets.sync.client import connect
 
-from app.web.door import Door
+from app.web.door import Door, listen
 from app.web.server import PageServer
 from estimators.errors import ConfigError
 from tests.app.scripted import pull_all, readings, wait_for
@@ -129,6 +130,27 @@ def test_localhost_is_the_same_page(page):
 def test_a_port_in_use_is_one_line(page):
     with pytest.raises(ConfigError, match=f"port {page.server.port}.* in use.* --port"):
         PageServer(page.engine, port=page.server.port, viser_port=None, secret=SECRET)
+
+
+def test_the_end_of_an_answer_does_not_wait_for_the_acknowledgement_of_its_begin():
+    """Without TCP_NODELAY each answer on a kept connection takes 40 ms."""
+    listeners, _ = listen(0)
+
+    async def option():
+        found = asyncio.get_running_loop().create_future()
+
+        def connected(_, writer):
+            found.set_result(writer.get_extra_info("socket").getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY))
+            writer.close()
+
+        async with await asyncio.start_server(connected, sock=listeners[0]):
+            _, writer = await asyncio.open_connection(*listeners[0].getsockname()[:2])
+            writer.close()
+            return await found
+
+    assert asyncio.run(option())
+    for listener in listeners:
+        listener.close()
 
 
 def test_it_listens_on_loopback_only(page):
