@@ -222,6 +222,25 @@ class ServeCommand(ArchiveOptions):
 
 
 @dataclass(frozen=True)
+class FleetCommand(JsonOption, TuningOption, EstimatorOption):
+    """Follow many assets of one twin: counts of their health, and the worst of them.
+
+    Examples:
+      nisus fleet pumps.yaml
+      nisus fleet pumps.yaml --out pumps.parquet
+    """
+
+    fleet: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FLEET")]
+    """YAML file of the fleet: its twin, assets and source."""
+    out: Path | None = None
+    """Write the table of all assets, worst first, to this .csv or .parquet file at the end."""
+    worst: int = 10
+    """Number of assets to print."""
+    duration: float | None = None
+    """Stop after this many seconds."""
+
+
+@dataclass(frozen=True)
 class FoldCommand(JsonOption, PartOptions, FoldOptions):
     """Fold the log of a twin as fast as possible and print scores, calibration and fault episodes.
 
@@ -701,6 +720,7 @@ class CompletionCommand:
 COMMANDS: dict[type, str] = {
     RunCommand: "run:run_twin",
     ServeCommand: "serve:serve",
+    FleetCommand: "fleet:run_fleet",
     FoldCommand: "fold:fold_twin",
     WhyCommand: "why:explain_change",
     ExportCommand: "export:export_filter",
