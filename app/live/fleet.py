@@ -171,6 +171,10 @@ class RunningFleet:
                 self._pending = 0
                 self.version += 1
 
+    def find(self, name: str) -> str | None:
+        """Return the name of an asset if there is one of that name; from any thread."""
+        return name if name in self._places else None
+
     def table(self) -> tuple[int, list[str], FleetTable]:
         """Return the version, the names, and the table of all assets; from any thread."""
         with self._lock:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,9 +17,12 @@ from config.problems import check_section
 from config.yaml_files import as_flow, read_text
 from estimators.errors import ConfigError, EstimatorError
 from estimators.fleet import Fleet
+from sources.tables.one_asset import rows_of_asset
+from sources.tables.text import column_of
 
+from .channels import channels
 from .source import KEY, SOURCES, Plan, plan_source
-from .sources.kind import Opening, find_recording
+from .sources.kind import Opening, matching
 from .twin import Twin, load_twin
 
 if TYPE_CHECKING:
@@ -78,8 +82,10 @@ class FleetPlan:
     def _opening(self, report: Report) -> Opening:
         return Opening(self.source.loaded, self.twin.model, self.config.source, KEY, report)
 
-    def source_of(self, asset: str) -> dict[str, str]:
-        """Return the override of a twin's YAML by which its source has the measurements of one asset.
+    def history_of(self, asset: str, folder: Path) -> dict[str, str]:
+        """Return the overrides of the twin's YAML by which its source has the measurements of one asset.
+
+        `folder` is for copies of the tables with the rows of that asset.
 
         Raises:
             ConfigError: If the source keeps none.
@@ -89,14 +95,18 @@ class FleetPlan:
             text = f"a source of type {section.type} keeps no measurements; only those of tables are folded again"
             raise ConfigError(f"{asset}: {text}")
         given = section.model_dump(mode="json", exclude_unset=True, by_alias=True)
-        files = find_recording(self.source.loaded, section, KEY, None)
+        loaded, column = self.source.loaded, given.pop("asset")
+        found = channels(loaded, section, KEY, self.twin.model)
+        columns = [section.time.column, column, *(column_of(name) for _, item in found for name in item.needed)]
+        files = [path for pattern in section.files for path in matching(loaded, section, pattern)]
+        files = rows_of_asset(list(dict.fromkeys(files)), column, asset, list(dict.fromkeys(columns)), folder)
         given |= {"files": [str(path.absolute()) for path in files], "follow": False}
         given.pop("folder", None)
-        column = given.pop("asset")
         for group in ("sensors", "inputs", "truth"):
             for channel in given.get(group, {}).values():
                 channel["only"] = {**channel.get("only", {}), column: {"text": [asset]}}
-        return {"source": as_flow(given)}
+        name = re.sub(r"[^A-Za-z0-9_-]", "_", asset).lstrip("_-") or "asset"
+        return {"source": as_flow(given), "name": as_flow(name), "title": as_flow(asset)}
 
 
 def load_fleet(path: str | os.PathLike[str], overrides: Mapping[str, str] | None = None) -> FleetPlan:

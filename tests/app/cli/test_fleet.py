@@ -70,7 +70,7 @@ def test_each_asset_has_the_values_of_a_fold_over_its_rows(ending, tmp_path, mon
     write(tmp_path / f"a.{ending}", rows[:90])
     write(tmp_path / f"b.{ending}", rows[90:])
     (tmp_path / "pumps.yaml").write_text(FLEET.format(files=f"'?.{ending}'"))
-    assert main(["fleet", "pumps.yaml", "--json", "--out", f"table.{ending}"]) == 0
+    assert main(["fleet", "pumps.yaml", "--headless", "--json", "--out", f"table.{ending}"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert found["assets"] == 5 and sum(found["counts"].values()) == 5
     table = {row["asset"]: row for row in (dict(zip(found["columns"], row, strict=True)) for row in found["rows"])}
@@ -91,7 +91,7 @@ def test_the_worst_assets_and_the_counts_are_printed(tmp_path, monkeypatch, caps
     monkeypatch.chdir(tmp_path)
     write(tmp_path / "a.csv", pump_rows())
     (tmp_path / "pumps.yaml").write_text(FLEET.format(files="a.csv"))
-    assert main(["fleet", "pumps.yaml", "--worst", "2"]) == 0
+    assert main(["fleet", "pumps.yaml", "--headless", "--worst", "2"]) == 0
     text = capsys.readouterr().out
     assert "5 assets, 181 events." in text and "Worst 2 assets" in text
     worst = text.split("Worst 2 assets")[1].splitlines()[2:]
@@ -154,12 +154,17 @@ def test_a_tuning_that_fleets_cannot_have_names_the_twin(tmp_path, monkeypatch):
         load_fleet("pumps.yaml", {"gate": "0.99"}).fleet(1)
 
 
-def test_the_source_of_one_asset_is_a_table_of_its_rows(tmp_path, monkeypatch):
+@pytest.mark.parametrize("ending", ["csv", "parquet"])
+def test_the_history_of_an_asset_is_a_table_of_its_rows(ending, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    rows = pump_rows()
-    write(tmp_path / "a.csv", rows)
-    (tmp_path / "pumps.yaml").write_text(FLEET.format(files="a.csv"))
-    twin = load_twin("motor_winding", overrides=load_fleet("pumps.yaml").source_of("pump 3"))
+    rows = sorted([*pump_rows(), (1.0, "pump 30", 1.0)])
+    write(tmp_path / f"a.{ending}", rows)
+    (tmp_path / "pumps.yaml").write_text(FLEET.format(files=f"a.{ending}"))
+    (folder := tmp_path / "copies").mkdir()
+    twin = load_twin("motor_winding", overrides=load_fleet("pumps.yaml").history_of("pump 3", folder))
+    assert (twin.name, twin.title) == ("pump_3", "pump 3")
+    (copy,) = folder.iterdir()
+    assert copy.stat().st_size < (tmp_path / f"a.{ending}").stat().st_size
     source = twin.open_source(lambda key, text: None)
     found = []
     while (batch := source.read(1.0)) is not None:
