@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from collections import Counter
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,8 @@ from estimators.log import BEFORE, TICK, Events
 from sources.source import NO_ASSET, AssetEvents, Report
 
 from ..twin.fleet import FleetPlan
+from ..twin.twin import Twin
+from .running_fold import Keeper
 
 FIRST_ROOM = 256
 """Assets for which there is room at the start, unless their number is given; it is doubled as they come."""
@@ -45,6 +48,7 @@ class RunningFleet:
         """
         given = plan.config.assets
         self.plan, self._report = plan, report
+        self.store: Keeper | None = None
         self.counts: Counter[str] = Counter()
         """Reports by key."""
         self.names: list[str] = list(given) if isinstance(given, tuple) else []
@@ -67,6 +71,11 @@ class RunningFleet:
         self._stopping = threading.Event()
         self.source = plan.open(self.note)
         self._thread = threading.Thread(target=self._run, name="fleet", daemon=True)
+
+    @property
+    def twin(self) -> Twin:
+        """The twin of each asset, with the source of the fleet."""
+        return replace(self.plan.twin, loaded=self.plan.source.loaded)
 
     def note(self, key: str, text: str) -> None:
         """Count and pass on a report of the source."""

@@ -17,6 +17,7 @@ from estimators.track import HEALTH_NAMES
 
 from ..live.fleet import RunningFleet
 from ..present.fleet_table import counts_of, histogram, matching, ordered, units_of, value_columns
+from . import readings
 from .http import get, page_file
 from .metrics import exposed
 
@@ -53,7 +54,7 @@ class FleetApi:
 
     def routes(self) -> list[BaseRoute]:
         """Return the routes."""
-        return [get("/api/fleet", self.rows), get("/metrics", self.metrics)]
+        return [get("/api/fleet", self.rows), get("/metrics", self.metrics), *readings.routes(self._running)]
 
     def page(self, boot: str) -> Response:
         """Answer with the overview."""
