@@ -343,6 +343,22 @@ class Fleet:
             head[:, STALE_EVENTS].copy(),
         )
 
+    def state(self, part: slice) -> bytes:
+        """Return the state of some assets by position, for `restore`; events that were not folded yet are not in it."""
+        return self._memory[part].tobytes()
+
+    def restore(self, first: int, state: bytes) -> None:
+        """Take over the `state` of assets of another fleet of this model, estimator and tuning, from a position on.
+
+        Raises:
+            EstimatorError: If it is not of such a fleet, or of more assets than there are.
+        """
+        words = self._memory.shape[1]
+        count, rest = divmod(len(state), WORD * words)
+        if rest or first + count > len(self.assets):
+            raise EstimatorError(f"fleet: {len(state)} bytes are no state of assets of {WORD * words} bytes each")
+        self._memory[first : first + count] = np.frombuffer(state).reshape(count, words)
+
     def base(self, asset: str | int) -> Base:
         """Return the state of one asset, from which a `Fold` of its own continues; it begins with an empty NIS window.
 

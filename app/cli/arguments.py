@@ -244,6 +244,9 @@ class FleetCommand(JsonOption, ServiceOptions, TuningOption, EstimatorOption):
     """Write the table of all assets, worst first, to this .csv or .parquet file at the end."""
     worst: int = 10
     """Number of assets to print."""
+    store: Path | None = None
+    """Keep the state of the fleet in this file (in a folder: FLEET.store), with the position in the source, and
+    continue from it after a restart or a kill."""
     recordings: Path = Path("recordings")
     """Folder of recordings, with a folder for each asset; created when needed."""
 

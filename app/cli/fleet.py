@@ -47,7 +47,10 @@ def run_fleet(arguments: FleetCommand) -> int:
     door = None if arguments.headless else door_of(arguments)
     plan.check_files()
     compile_for(plan.twin)
-    running = attend(None, lambda: RunningFleet(plan, remarking(lambda *_: None)), "compiling the fleet, once")
+    report, store = remarking(lambda *_: None), arguments.store
+    if store is not None and store.is_dir():
+        store = store / f"{plan.name}.store"
+    running = attend(None, lambda: RunningFleet(plan, report, store=store), "compiling the fleet, once")
     if door is None:
         _fold(running, arguments.duration)
     else:
