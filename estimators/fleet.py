@@ -15,7 +15,7 @@ import numpy as np
 from .diagnostics.health import NORMALS, HealthPolicy
 from .errors import EstimatorError, EventError, nearest, quoted
 from .events import arrays
-from .events.batch import INPUT, READING, TICK
+from .events.batch import INPUT, READING, TICK, Events
 from .fleet_kernel import (
     AGE,
     CREW,
@@ -61,6 +61,7 @@ class Fleet:
         policy: HealthPolicy | None = None,
         recent: int = RECENT,
         threads: int | None = None,
+        expected: np.ndarray | None = None,
     ) -> None:
         """Allocate the memory of all assets.
 
@@ -74,6 +75,7 @@ class Fleet:
             recent: Late events are inserted among the last `recent` events of their asset, and up to twice as many; an
                 event before those is dropped and counted as stale.
             threads: Threads that fold; None for all.
+            expected: Sensors that must report, (sensors,) of bool; None for those that have reported.
 
         Raises:
             EstimatorError: If the estimator does not exist, does not apply or is not Gaussian, a size does not fit, or
@@ -96,11 +98,13 @@ class Fleet:
         if len(given) not in (1, count):
             raise EstimatorError(f"fleet: {len(given)} tunings for {count} assets; give one, or one per asset")
         distinct = {id(each): each for each in given}
+        self._expected = expected
         self._machines = [self._machine(each) for each in distinct.values()]
         places = {key: k for k, key in enumerate(distinct)}
         self._tuning_of = np.zeros(count, np.int32)
         if len(given) > 1:
             self._tuning_of[:] = [places[id(each)] for each in given]
+        self._first = given[0], start
         self._allocate(None if start is None else int(arrays.nanoseconds("start", start)[0]))
         self._plan = self._planned(threads)
         self._added: list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]] = []
@@ -116,7 +120,9 @@ class Fleet:
         if tuning.gate is not None and tuning.gate_kind == "soft":
             check_soft(self.estimator, options)
         pairs = check_pairs(None, self.model)
-        return Machine(self.estimator, options, self.model, tuning, pairs, self.policy, prior=None, expected=None)
+        return Machine(
+            self.estimator, options, self.model, tuning, pairs, self.policy, prior=None, expected=self._expected
+        )
 
     def _allocate(self, start: int | None) -> None:
         """Allocate the blocks of all assets, each before its first event."""
@@ -237,6 +243,39 @@ class Fleet:
         at, seconds = self._pair(asset, seconds)
         self._put(at, arrays.inputs(self.model, seconds, inputs), INPUT)
 
+    def add_events(self, asset: Any, events: Events) -> None:
+        """Add the events of a source, each of its asset; others than measurements, inputs and queries are left out.
+
+        Args:
+            asset: Names or positions of the assets, (N,).
+            events: N events; times are ns.
+
+        Raises:
+            EventError: If there is no such asset.
+        """
+        at, kept = self.positions(asset), np.isin(events.kind, (READING, INPUT, TICK))
+        events = events.select(kept)
+        self._added.append((at[kept], events.t, _RANK[events.kind] + events.channel, events.value[:, : self._columns]))
+
+    def extend(self, assets: int | Sequence[str]) -> None:
+        """Append assets, each before its first event, with the tuning of the first one.
+
+        Args:
+            assets: Names of the assets; or their number, if the fleet's are numbers.
+        """
+        tuning, start = self._first
+        more = Fleet(
+            self.estimator.name, self.model, tuning, assets=assets, start=start, policy=self.policy,
+            recent=self.recent, threads=1, expected=self._expected,
+        )  # fmt: skip
+        before = self.assets
+        count = len(before) + len(more.assets)
+        self.assets = range(count) if isinstance(before, range) else [*before, *more.assets]
+        self._index = None
+        self._memory = np.concatenate([self._memory, more._memory])
+        self._tuning_of = np.concatenate([self._tuning_of, more._tuning_of])
+        self._plan["memory"], self._plan["tunings"] = self._memory.ctypes.data, self._tuning_of.ctypes.data
+
     def add_ticks(self, seconds: Any, asset: Any = None) -> None:
         """Add queries, of all assets by default: the estimate and health of silent assets become those of that time."""
         at, seconds = self._pair(np.arange(len(self.assets)) if asset is None else asset, seconds)
@@ -303,6 +342,22 @@ class Fleet:
             head[:, N].copy(),
             head[:, STALE_EVENTS].copy(),
         )
+
+    def state(self, part: slice) -> bytes:
+        """Return the state of some assets by position, for `restore`; events that were not folded yet are not in it."""
+        return self._memory[part].tobytes()
+
+    def restore(self, first: int, state: bytes) -> None:
+        """Take over the `state` of assets of another fleet of this model, estimator and tuning, from a position on.
+
+        Raises:
+            EstimatorError: If it is not of such a fleet, or of more assets than there are.
+        """
+        words = self._memory.shape[1]
+        count, rest = divmod(len(state), WORD * words)
+        if rest or first + count > len(self.assets):
+            raise EstimatorError(f"fleet: {len(state)} bytes are no state of assets of {WORD * words} bytes each")
+        self._memory[first : first + count] = np.frombuffer(state).reshape(count, words)
 
     def base(self, asset: str | int) -> Base:
         """Return the state of one asset, from which a `Fold` of its own continues; it begins with an empty NIS window.

@@ -70,7 +70,8 @@ class TopicMap:
     """Where the payloads of a topic have their values; paths are dotted, "" is the whole payload.
 
     `values` has the path by name; without any the payload is a message itself (see `Messages`). `unit` is that of a
-    time in numbers. Where the value at `quality` is not one of `good`, all values are missing.
+    time in numbers. Where the value at `quality` is not one of `good`, all values are missing. `asset` is the level of
+    the topic with the name of the asset, counted from 0; None if there is none.
     """
 
     values: Mapping[str, str] = field(default_factory=dict)
@@ -79,6 +80,7 @@ class TopicMap:
     quality: str | None = None
     good: Sequence[str] = ()
     sequence: str | None = None
+    asset: int | None = None
 
     def message(self, topic: str, payload: bytes) -> dict[str, Any]:
         """Return the message of a payload.
@@ -93,14 +95,16 @@ class TopicMap:
             body = json.loads(payload, parse_constant=lambda _: None)
         except (ValueError, RecursionError):
             raise ValueError("the payload is no JSON and no number") from None
+        asset = {} if self.asset is None else {"asset": topic.split("/")[self.asset]}
         if not self.values:
             if not isinstance(body, dict):
                 raise ValueError('the payload must be an object such as {"values": {"NAME": 1.2}}')
-            return {"source": topic, **body}
+            return {"source": topic, **body, **asset}
         good = self.quality is None or str(at_path(body, self.quality)) in self.good
         found: dict[str, Any] = {
             "source": topic,
             "values": {name: at_path(body, path) if good else None for name, path in self.values.items()},
+            **asset,
         }
         if self.time is not None:
             found["time"] = as_time(at_path(body, self.time), self.unit)
@@ -212,7 +216,7 @@ class MqttSource:
 
         return arrived
 
-    def read(self, timeout: float) -> Events | None:
+    def read(self, timeout: float) -> Any:
         """Return the events of the next messages."""
         return self._messages.read(timeout)
 

@@ -230,6 +230,18 @@ class ChannelMapping:
             state: Same shape: PRESENT, ABSENT or SHORT.
             skip: (n,), nonzero for rows to leave out.
         """
+        return self.placed(plan, t, arrival, values, state, skip)[0]
+
+    def placed(
+        self,
+        plan: np.ndarray,
+        t: np.ndarray,
+        arrival: np.ndarray,
+        values: np.ndarray,
+        state: np.ndarray,
+        skip: np.ndarray,
+    ) -> tuple[Events, np.ndarray]:
+        """Return the events of rows of values as `events` does, and the row of each."""
         room = plan.size * self._most
         source = np.empty(room, np.int64)
         kind, channel = np.empty(room, np.int8), np.empty(room, np.int32)
@@ -246,7 +258,7 @@ class ChannelMapping:
             self._counts[:] = 0
         for item in self._positions.values():
             self._place(batch, item)
-        return batch
+        return batch, source
 
     def _report_losses(self, refused: np.ndarray, cut: np.ndarray, unreported: np.ndarray) -> None:
         for k, channel in enumerate(self._channels):

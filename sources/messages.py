@@ -16,7 +16,7 @@ from estimators.errors import nearest, quoted, shown_name
 from estimators.log import Events
 
 from .mapping import ABSENT, PRESENT, ChannelMapping
-from .source import Channel, Report, ignore
+from .source import AssetEvents, Channel, Report, ignore
 from .tables.text import TextMatch, column_of
 from .tables.times import ns_of_iso
 
@@ -25,6 +25,12 @@ ACCEPTED, DUPLICATE, REFUSED = "accepted", "duplicate", "refused"
 
 FIELDS = ("time", "values", "source", "sequence")
 """Fields of a message."""
+
+ASSET = "asset"
+"""Field with the name of the asset, of messages to a fleet."""
+
+MAX_NAME = 200
+"""Longest name of a sender or an asset."""
 
 MAX_WAITING = 200_000
 """Messages that may wait to be read; further ones are refused, so that the sender repeats them."""
@@ -47,11 +53,12 @@ class Answer(NamedTuple):
 
 
 class Rows(NamedTuple):
-    """Messages as rows: times (n,) in ns; values and their state (n, columns), see `ChannelMapping`."""
+    """Messages as rows: times (n,) in ns; values and their state (n, columns), see `ChannelMapping`; assets (n,)."""
 
     t: np.ndarray
     values: np.ndarray
     state: np.ndarray
+    asset: np.ndarray
 
 
 class SentNumbers:
@@ -97,6 +104,7 @@ class Messages:
         channels: What feeds the model; their signals are names of values.
         width: Value columns of an event.
         report: Receives measurements that a condition rejects.
+        assets: Whether each message has the name of its asset, as `"asset": "pump 3"`; `read` returns `AssetEvents`.
 
     Raises:
         SourceError: If a unit does not convert to the model's.
@@ -104,9 +112,13 @@ class Messages:
 
     live = True
 
-    def __init__(self, channels: Iterable[Channel], *, width: int, report: Report = ignore) -> None:
+    def __init__(
+        self, channels: Iterable[Channel], *, width: int, report: Report = ignore, assets: bool = False
+    ) -> None:
         channels = list(channels)
-        self._width = width
+        self._width, self._assets = width, assets
+        self.fields = (*FIELDS, ASSET) if assets else FIELDS
+        """Fields of a message."""
         self._columns = list(dict.fromkeys(name for channel in channels for name in channel.needed))
         self.names = tuple(dict.fromkeys(map(column_of, self._columns)))
         """Names of the values that the twin reads."""
@@ -148,7 +160,8 @@ class Messages:
                 answers.append(answer)
             taken = np.array([answer.status == ACCEPTED for answer in answers], np.bool_)
             if taken.any():
-                rows = Rows(t[taken], values[taken], state[taken])
+                names = [item[ASSET] if self._assets and ok else "" for item, ok in zip(messages, taken, strict=True)]
+                rows = Rows(t[taken], values[taken], state[taken], np.array(names, object)[taken])
                 self._room -= rows.t.size
                 self._waiting.put(rows)
         return answers
@@ -158,8 +171,12 @@ class Messages:
         if not isinstance(message, Mapping) or not isinstance(message.get("values"), Mapping):
             return Answer(REFUSED, 'it must be an object with values, such as {"values": {"NAME": 1.2}}')
         for name in message:
-            if name not in FIELDS:
-                return Answer(REFUSED, f"{shown_name(str(name))} is not known; {nearest(str(name), FIELDS)}")
+            if name not in self.fields:
+                return Answer(REFUSED, f"{shown_name(str(name))} is not known; {nearest(str(name), self.fields)}")
+        if self._assets:
+            asset = message.get(ASSET)
+            if not isinstance(asset, str) or not 0 < len(asset) <= MAX_NAME:
+                return Answer(REFUSED, f"asset is {_shown(asset)}; it must be a text of 1 to {MAX_NAME} letters")
         if message.get("time") is not None:
             found = _ns(message["time"])
             if isinstance(found, str):
@@ -168,8 +185,8 @@ class Messages:
         number, sender = message.get("sequence"), message.get("source", "")
         if number is not None and (type(number) is not int or not 0 <= number < 2**63):
             return Answer(REFUSED, f"sequence is {_shown(number)}; it must be a whole number from 0 on")
-        if not isinstance(sender, str) or len(sender) > 200:
-            return Answer(REFUSED, f"source is {_shown(sender)}; it must be a text of at most 200 letters")
+        if not isinstance(sender, str) or len(sender) > MAX_NAME:
+            return Answer(REFUSED, f"source is {_shown(sender)}; it must be a text of at most {MAX_NAME} letters")
         given = message["values"]
         if not given:
             return Answer(REFUSED, f"values is empty; give one of {', '.join(self.names[:8])}")
@@ -218,12 +235,13 @@ class Messages:
         self._sent.restore(numbers)
         self._stored.restore(numbers)
 
-    def read(self, timeout: float) -> Events | None:
+    def read(self, timeout: float) -> Any:
         """Return the events of the next messages; none after `timeout` seconds without one."""
         try:
             found = [self._waiting.get(timeout=timeout)]
         except queue.Empty:
-            return Events.empty(self._width)
+            none = Events.empty(self._width)
+            return AssetEvents(none, np.zeros(0, np.int64), ()) if self._assets else none
         while not self._waiting.empty():
             found.append(self._waiting.get())
         rows = Rows(*map(np.concatenate, zip(*found, strict=True)))
@@ -235,7 +253,12 @@ class Messages:
                 self._newest = latest, time.monotonic_ns()
         plan, skip = np.zeros(rows.t.size, np.int64), np.zeros(rows.t.size, np.int8)
         # What was buffered on its way, or is history, arrives at once: its arrival would tell nothing of its clock.
-        return self._mapping.events(plan, rows.t, rows.t, rows.values, rows.state, skip)
+        events, row = self._mapping.placed(plan, rows.t, rows.t, rows.values, rows.state, skip)
+        if not self._assets:
+            return events
+        codes: dict[str, int] = {}
+        code = np.array([codes.setdefault(name, len(codes)) for name in rows.asset.tolist()], np.int64)
+        return AssetEvents(events, code[row], tuple(codes))
 
     def now(self) -> int | None:
         """Return the present time by the clock of the senders, ns: that of the newest message and its age."""

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from estimators.log import Events
 
 Report = Callable[[str, str], None]
@@ -17,7 +19,16 @@ NEVER = "never seen"  # Key of messages, signals and columns that channels need 
 WRONG_TIME = "wrong time"  # Key of events that are rejected for their time
 UNDATED = "undated row"  # Key of rows of a table without a time
 UNASSIGNED = "row of no sensor"  # Key of rows without a value in the column that names their source
+NO_ASSET = "row of no asset"  # Key of rows and messages without the name of an asset, or with one that is not known
 TRUNCATED = "truncated file"  # Key of incomplete files
+
+
+class AssetEvents(NamedTuple):
+    """Events of several assets: that of each event is `names[code]`, `code` of shape (N,)."""
+
+    events: Events
+    code: np.ndarray
+    names: Sequence[str]
 
 
 class Source(Protocol):

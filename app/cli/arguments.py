@@ -188,8 +188,24 @@ class RunCommand(JsonOption, ArchiveOptions, PageOptions, TuningOption, Estimato
     """Print the notices of the twin and errors on standard error, as lines of text or of JSON."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class ServiceOptions:
+    """Options of a command that serves pages of several twins."""
+
+    port: int = 9900
+    """Port of the overview; 0 picks a free one."""
+    host: str = "127.0.0.1"
+    """IP address to listen on; any other than a loopback address needs --tokens."""
+    public: str | None = None
+    """Address at which a reverse proxy offers the service, https://HOST; needs --tokens."""
+    tokens: Path | None = None
+    """File of tokens for users and programs, a line NAME ROLE TOKEN each; roles are view, feed, tune and admin."""
+    duration: float | None = None
+    """Stop after this many seconds."""
+
+
 @dataclass(frozen=True)
-class ServeCommand(ArchiveOptions):
+class ServeCommand(ArchiveOptions, ServiceOptions):
     """Run several twins as one service on one port: an overview, the worst health first, and the page of each.
 
     Each twin is a process of its own; if it ends, it is started again. An option is also taken from the environment:
@@ -203,22 +219,36 @@ class ServeCommand(ArchiveOptions):
 
     twins: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
     """YAML files, names of bundled twins, or one folder of YAML files, which is watched."""
-    port: int = 9900
-    """Port of the overview; 0 picks a free one."""
-    host: str = "127.0.0.1"
-    """IP address to listen on; any other than a loopback address needs --tokens."""
-    public: str | None = None
-    """Address at which a reverse proxy offers the service, https://HOST; needs --tokens."""
-    tokens: Path | None = None
-    """File of tokens for users and programs, a line NAME ROLE TOKEN each; roles are view, feed, tune and admin."""
     store: Path | None = None
     """Folder in which each twin keeps its state, TWIN.store, and continues from it after a restart or a kill."""
     recordings: Path = Path("recordings")
     """Folder of recordings, with a folder for each twin; created when needed."""
     log_format: Literal["text", "json"] = "text"
     """Form of the lines on standard error: notices of the twins, and processes that end."""
-    duration: float | None = None
-    """Stop after this many seconds."""
+
+
+@dataclass(frozen=True)
+class FleetCommand(JsonOption, ServiceOptions, TuningOption, EstimatorOption):
+    """Follow many assets of one twin, and show them in the browser: the worst health first, and the page of each.
+
+    Examples:
+      nisus fleet pumps.yaml
+      nisus fleet pumps.yaml --headless --out pumps.parquet
+    """
+
+    fleet: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FLEET")]
+    """YAML file of the fleet: its twin, assets and source."""
+    headless: Flag = False
+    """Run without a page, to the end of the source, and print the worst assets (--json: all, as JSON)."""
+    out: Path | None = None
+    """Write the table of all assets, worst first, to this .csv or .parquet file at the end."""
+    worst: int = 10
+    """Number of assets to print."""
+    store: Path | None = None
+    """Keep the state of the fleet in this file (in a folder: FLEET.store), with the position in the source, and
+    continue from it after a restart or a kill."""
+    recordings: Path = Path("recordings")
+    """Folder of recordings, with a folder for each asset; created when needed."""
 
 
 @dataclass(frozen=True)
@@ -701,6 +731,7 @@ class CompletionCommand:
 COMMANDS: dict[type, str] = {
     RunCommand: "run:run_twin",
     ServeCommand: "serve:serve",
+    FleetCommand: "fleet:run_fleet",
     FoldCommand: "fold:fold_twin",
     WhyCommand: "why:explain_change",
     ExportCommand: "export:export_filter",

@@ -9,7 +9,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -22,22 +22,26 @@ from estimators.errors import ConfigError, NisusError
 from ..terminal import EndRequest, restore, use_lines_of_json, when_asked_to_end
 from ..views.recording.rrd_file import NEVER, Split, parse_split
 from ..web.door import LOOPBACK, Door, check_port
-from ..web.gate import read_tokens
+from ..web.gate import Grant, read_tokens
 from ..web.service import STATUS_PERIOD_S, Service, TwinFolder
 
 if TYPE_CHECKING:
     from ..web.session import Session
-    from .arguments import ServeCommand
+    from .arguments import ServeCommand, ServiceOptions
 
 PRELOADED = ("app.cli.preloaded",)
 """Modules that the processes of the twins share: they are imported once."""
+
+
+OpenTwin = Callable[[str, str], "tuple[Session, Mapping[str, Any]]"]
+"""Opens a twin, given its name and path; returns its session and its card in the overview."""
 
 MEMORY_PERIOD_S = 10.0
 """Between two looks at the memory, which take milliseconds."""
 
 
-class ServiceOptions(NamedTuple):
-    """What all twins of a service have in common."""
+class TwinPlaces(NamedTuple):
+    """Files that all twins of a service have in common."""
 
     store: Path | None
     recordings: Path
@@ -50,34 +54,56 @@ def serve(arguments: ServeCommand) -> int:
     """Run the command."""
     if arguments.log_format == "json":
         use_lines_of_json()
+    grants = _grants(arguments)
+    twins, folder = _named(arguments.twins)
+    options = TwinPlaces(arguments.store, arguments.recordings, arguments.log_format == "json")
+    split = parse_split(arguments.archive_split, arguments.archive_keep, "--archive")
+    options = options._replace(archive=arguments.archive, split=split)
+    for place in (options.store, options.recordings, options.archive):
+        if place is not None and place.exists() and not place.is_dir():
+            raise ConfigError(f"{place}: must be a folder, in which each twin has its own file")
+    door = door_of(arguments, grants)
+    service = Service(
+        twins, partial(run_child, partial(_opened, options), options.json), door=door, preload=PRELOADED,
+        at_once=max(1, (os.cpu_count() or 2) // 2),
+        folder=folder,
+    )  # fmt: skip
+    return serve_until_end(service, f"{len(twins)} twin(s)", arguments.duration)
+
+
+def _grants(arguments: ServiceOptions) -> tuple[Grant, ...]:
+    """Return the tokens of the users, who are needed where others can reach the service."""
     loopback = _is_loopback(arguments.host)
     if arguments.tokens is None and not (loopback and arguments.public is None):
         where = f"--host {arguments.host}" if not loopback else f"--public {arguments.public}"
         raise ConfigError(f"{where}: others can reach it; give --tokens FILE, which has a token for each user")
     if arguments.public is not None and not _is_site(arguments.public):
         raise ConfigError(f"--public {arguments.public}: must be like https://twins.example.com, without a path")
-    grants = () if arguments.tokens is None else read_tokens(arguments.tokens)
-    twins, folder = _named(arguments.twins)
-    options = ServiceOptions(arguments.store, arguments.recordings, arguments.log_format == "json")
-    split = parse_split(arguments.archive_split, arguments.archive_keep, "--archive")
-    options = options._replace(archive=arguments.archive, split=split)
-    for place in (options.store, options.recordings, options.archive):
-        if place is not None and place.exists() and not place.is_dir():
-            raise ConfigError(f"{place}: must be a folder, in which each twin has its own file")
+    return () if arguments.tokens is None else read_tokens(arguments.tokens)
+
+
+def door_of(arguments: ServiceOptions, grants: tuple[Grant, ...] | None = None) -> Door:
+    """Return the door of a service.
+
+    Raises:
+        ConfigError: If the port is not free, or others can reach it without tokens.
+    """
+    grants = _grants(arguments) if grants is None else grants
+    loopback = _is_loopback(arguments.host)
     if loopback:
         check_port(arguments.port)
     host = LOOPBACK if loopback else arguments.host
-    door = Door(arguments.port, grants, host=host, public=arguments.public)
-    service = Service(
-        twins, partial(run_child, options), door=door, preload=PRELOADED, at_once=max(1, (os.cpu_count() or 2) // 2),
-        folder=folder,
-    )  # fmt: skip
+    return Door(arguments.port, grants, host=host, public=arguments.public)
+
+
+def serve_until_end(service: Service, what: str, duration: float | None) -> int:
+    """Serve until the duration is over, or the program is asked to end."""
     done = EndRequest()
     previous = when_asked_to_end(done.set)
-    end = time.monotonic() + (arguments.duration or float("inf"))
+    end = time.monotonic() + (duration or float("inf"))
     try:
         service.start()
-        print(f"Nisus serves {len(twins)} twin(s) at\n\n    {door.url}\n\nCtrl-C ends it.", flush=True)
+        print(f"Nisus serves {what} at\n\n    {service.door.url}\n\nCtrl-C ends it.", flush=True)
         while time.monotonic() < end and not done.wait(min(1.0, end - time.monotonic())):
             pass
     except KeyboardInterrupt:
@@ -127,7 +153,7 @@ def _is_site(text: str) -> bool:
     return parts.scheme in ("http", "https") and bool(parts.netloc) and not (parts.path or parts.query)
 
 
-def run_child(options: ServiceOptions, name: str, path: str, pipe: Connection) -> None:
+def run_child(open_: OpenTwin, json: bool, name: str, path: str, pipe: Connection) -> None:
     """Run one twin in this process until it is asked to stop, or the service has ended."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to the service, which stops this process
     done = threading.Event()
@@ -135,10 +161,10 @@ def run_child(options: ServiceOptions, name: str, path: str, pipe: Connection) -
     running: list[bool] = []
     ending: list[bool] = []
     gc.freeze()
-    if options.json:
+    if json:
         use_lines_of_json()
     try:
-        session, card = _opened(options, name, path)
+        session, card = open_(name, path)
         session.start()
     except NisusError as error:
         pipe.send(("failed", str(error).splitlines()[0]))
@@ -172,7 +198,7 @@ def _take(pipe: Connection, session: Session, done: threading.Event) -> None:
         session.engine.audit.add(*content)
 
 
-def _opened(options: ServiceOptions, name: str, path: str) -> tuple[Session, Mapping[str, Any]]:
+def _opened(options: TwinPlaces, name: str, path: str) -> tuple[Session, Mapping[str, Any]]:
     from dataclasses import asdict
 
     from ..web.gallery.cards import card_of

@@ -196,6 +196,27 @@ class Store:
                 self._file.execute("DELETE FROM parts WHERE kind = ? AND at <= ?", (COMMANDS, oldest))
         self._rows = rows
 
+    def read_blocks(self) -> dict[tuple[str, int], bytes]:
+        """Return the blocks of `write_blocks` by kind and number.
+
+        Raises:
+            SourceError: If the file is damaged.
+        """
+        found = {}
+        with self._failing():
+            for kind, at, _, crc, data in self._file.execute("SELECT * FROM parts"):
+                if zlib.crc32(data) != crc:
+                    raise self._error(DAMAGED)
+                found[kind, at] = data
+        return found
+
+    def write_blocks(self, blocks: Mapping[tuple[str, int], bytes]) -> None:
+        """Replace blocks of bytes, each with a kind and a number, in one transaction; raises as `write`."""
+        self._check_file()
+        with self._failing(), self._transaction():
+            for (kind, at), data in blocks.items():
+                self._put(kind, at, 0, data)
+
     def close(self) -> None:
         """Close the file."""
         with suppress(sqlite3.Error):

@@ -101,11 +101,16 @@ class TwinCollector:
 
 def metrics(engine: Running, states: bool = False) -> Response:
     """Answer with the metrics of a twin and of this process, in Prometheus's text format; 501 without its package."""
+    return exposed(TwinCollector(engine, states=states))
+
+
+def exposed(collector: Any) -> Response:
+    """Answer with the metrics of a collector and of this process, as `metrics`."""
     try:
         from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, ProcessCollector, generate_latest
     except ModuleNotFoundError:
         return refusal(ConfigError("metrics need prometheus-client: pip install 'nisus[service]'"), 501)
     registry: Any = CollectorRegistry()
-    registry.register(TwinCollector(engine, states=states))
+    registry.register(collector)
     ProcessCollector(registry=registry)
     return Response(generate_latest(registry), media_type=CONTENT_TYPE_LATEST)

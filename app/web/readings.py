@@ -7,16 +7,17 @@ import json
 import struct
 import time
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, Protocol
 
 from starlette.requests import Request
 from starlette.responses import PlainTextResponse, Response
 from starlette.routing import BaseRoute, Route
 
 from estimators.errors import ConfigError, shown_name
-from sources.messages import ACCEPTED, DUPLICATE, FIELDS, REFUSED, Messages
+from sources.messages import ACCEPTED, DUPLICATE, REFUSED, Messages
 
-from ..live.running_fold import Running
+from ..live.running_fold import Keeper
+from ..twin.twin import Twin
 from .http import Json, TooLarge, bounded_body, get, refusal
 from .request_threads import in_thread
 
@@ -33,8 +34,24 @@ STORE_TIMEOUT_S, STORE_POLL_S = 2.0, 0.005
 """Longest wait for the store, and the time between two looks at it."""
 
 
-def routes(engine: Running) -> list[BaseRoute]:
-    """Return the routes of a running twin."""
+class Receiver(Protocol):
+    """A running twin or fleet, whose source may take messages."""
+
+    @property
+    def source(self) -> Any:
+        """Its source."""
+
+    @property
+    def store(self) -> Keeper | None:
+        """Where it keeps its state."""
+
+    @property
+    def twin(self) -> Twin:
+        """The twin."""
+
+
+def routes(engine: Receiver) -> list[BaseRoute]:
+    """Return the routes of a running twin or fleet."""
 
     def names() -> dict[str, Any]:
         """Return names and units of the values that the twin reads."""
@@ -52,7 +69,7 @@ def routes(engine: Running) -> list[BaseRoute]:
             return PlainTextResponse(f"Nisus: Content-Type must be one of {', '.join(READERS)}.\n", 415)
         try:
             body = await bounded_body(request, MAX_BYTES)
-            found = await in_thread(lambda: answer(source, READERS[kind](body)))
+            found = await in_thread(lambda: answer(source, READERS[kind](body, source.fields)))
             return Json(found | {"stored": await stored(engine, source.accepted)})
         except TooLarge:
             bounds = f"{MAX_BYTES // 2**20} MB and {MAX_MESSAGES:,} messages"
@@ -63,8 +80,8 @@ def routes(engine: Running) -> list[BaseRoute]:
     return [get("/api/readings", names, refused=409), Route("/api/readings", send, methods=["POST"])]
 
 
-def messages_of(engine: Running) -> Messages:
-    """Return the source of messages of a running twin.
+def messages_of(engine: Receiver) -> Messages:
+    """Return the source of messages of a running twin or fleet.
 
     Raises:
         ConfigError: If its source is of another type.
@@ -92,7 +109,7 @@ def answer(source: Messages, messages: Sequence[Any]) -> dict[str, Any]:
     return counts | {"items": items}
 
 
-async def stored(engine: Running, mark: int) -> bool:
+async def stored(engine: Receiver, mark: int) -> bool:
     """Wait until the store has the messages up to a mark; return whether it does, at once without a store."""
     store, end = engine.store, time.monotonic() + STORE_TIMEOUT_S
     while store is not None and (found := store.has(mark)) is not None:
@@ -103,7 +120,7 @@ async def stored(engine: Running, mark: int) -> bool:
     return False
 
 
-def _of_json(body: bytes) -> Sequence[Any]:
+def _of_json(body: bytes, fields: Sequence[str]) -> Sequence[Any]:
     try:
         found = json.loads(body)
     except (ValueError, RecursionError):
@@ -111,7 +128,7 @@ def _of_json(body: bytes) -> Sequence[Any]:
     return found if isinstance(found, list) else [found]
 
 
-def _of_lines(body: bytes) -> Sequence[Any]:
+def _of_lines(body: bytes, fields: Sequence[str]) -> Sequence[Any]:
     """Return the messages of NDJSON; a line that is no JSON is refused alone."""
     found: list[Any] = []
     for line in body.splitlines():
@@ -128,8 +145,8 @@ def _check_count(messages: int) -> None:
         raise TooLarge(f"a body may have {MAX_MESSAGES:,} messages; send fewer at once")
 
 
-def _of_arrow(body: bytes) -> Sequence[Any]:
-    """Return the messages of a stream of Arrow batches: time, source and sequence, and a column for each value."""
+def _of_arrow(body: bytes, fields: Sequence[str]) -> Sequence[Any]:
+    """Return the messages of a stream of Arrow batches: the fields of a message, and a column for each value."""
     import pyarrow as pa
 
     types, rows = pa.types, 0
@@ -156,7 +173,7 @@ def _of_arrow(body: bytes) -> Sequence[Any]:
         rows = table.to_pylist()
     except (pa.ArrowException, ValueError, OSError, IndexError, struct.error) as error:
         raise ConfigError(f"the body is no stream of Arrow batches: {error}") from None
-    return [_message(row) for row in rows]
+    return [_message(row, fields) for row in rows]
 
 
 def _is_compressed(message: bytes) -> bool:
@@ -180,15 +197,15 @@ def _is_compressed(message: bytes) -> bool:
     return bool(kind and header) and message[kind] == RECORD_BATCH and place(table_at(header), 3) != 0
 
 
-def _message(row: Mapping[str, Any]) -> dict[str, Any]:
+def _message(row: Mapping[str, Any], fields: Sequence[str]) -> dict[str, Any]:
     """Return a message of a row; a null is no value, as rows of one batch may come from several sensors."""
-    head = {name: row[name] for name in FIELDS if name != "values" and row.get(name) is not None}
-    return head | {"values": {name: value for name, value in row.items() if name not in FIELDS and value is not None}}
+    head = {name: row[name] for name in fields if name != "values" and row.get(name) is not None}
+    return head | {"values": {name: value for name, value in row.items() if name not in fields and value is not None}}
 
 
-READERS: dict[str, Callable[[bytes], Sequence[Any]]] = {
+READERS: dict[str, Callable[[bytes, Sequence[str]], Sequence[Any]]] = {
     "application/json": _of_json,
     "application/x-ndjson": _of_lines,
     "application/vnd.apache.arrow.stream": _of_arrow,
 }
-"""By the type of a body."""
+"""By the type of a body; they take the body and the fields of a message."""

@@ -14,16 +14,17 @@ import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
+from multiprocessing import forkserver
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 from urllib.parse import quote
 
 import h11
 from starlette.applications import Starlette
 from starlette.requests import Request
 from starlette.responses import PlainTextResponse, RedirectResponse, Response
-from starlette.routing import Mount, Route, WebSocketRoute
+from starlette.routing import BaseRoute, Mount, Route, WebSocketRoute
 from starlette.staticfiles import StaticFiles
 from starlette.types import Receive, Scope, Send
 from starlette.websockets import WebSocket
@@ -35,6 +36,7 @@ from ..terminal import print_line
 from .door import Door
 from .gate import USER, User
 from .http import PAGE, get, page_file, post, refusal
+from .request_threads import in_thread
 from .viser_proxy import couple
 
 STARTING, RUNNING, STOPPED, FAILED = "starting", "running", "stopped", "failed"
@@ -60,6 +62,12 @@ STEADY_S = 30.0
 
 FOLDER_PERIOD_S = 2.0
 """Seconds between two looks at the folder of twins."""
+
+MAX_OPENED = 4
+"""Twins that run because their page was opened."""
+
+MAX_OPENING_S, OPENING_POLL_S = 30.0, 0.01
+"""Longest wait of a page that is opened for its twin, and between two looks."""
 
 PIECE_BYTES = 65_536
 
@@ -132,6 +140,19 @@ Child = Callable[[str, str, Connection], None]
 """Runs a twin, given its name, path and a pipe, in a process of its own."""
 
 
+class Overview(Protocol):
+    """Overview of many more twins than run: each is started when its page is opened."""
+
+    def routes(self) -> list[BaseRoute]:
+        """Return its routes."""
+
+    def page(self, boot: str) -> Response:
+        """Answer with its page."""
+
+    def find(self, name: str) -> str | None:
+        """Return the path of the twin of a name, None if there is none."""
+
+
 class Service:
     """Starts the processes of twins, watches them, and serves their overview and pages."""
 
@@ -144,6 +165,7 @@ class Service:
         folder: Callable[[], Mapping[str, str]] | None = None,
         preload: Sequence[str] = (),
         at_once: int = 2,
+        overview: Overview | None = None,
     ) -> None:
         """Add the routes to the door; nothing runs yet.
 
@@ -154,9 +176,11 @@ class Service:
             folder: Returns the twins of a folder, which are added and removed as its files are.
             preload: Modules that the processes share.
             at_once: Twins that start at the same time.
+            overview: In place of the gallery, and of the twins.
         """
         self.door, self._child, self._folder, self._at_once = door, child, folder, at_once
         self.twins = {name: ServedTwin(name, path) for name, path in twins.items()}
+        self._overview = overview
         self._changing = threading.RLock()
         self._stopping = threading.Event()
         self._looked = time.monotonic()
@@ -170,10 +194,7 @@ class Service:
             get("/readyz", self._ready),
             Mount("/page", StaticFiles(directory=PAGE)),
             get("/api/session", self.state),
-            get("/api/gallery", self._cards),
-            post("/api/gallery/start", self._start, status=202),
-            post("/api/gallery/stop", self._stop, status=202),
-            post("/api/gallery/restart", self._restart, status=202),
+            *(self._gallery() if overview is None else overview.routes()),
             Route("/twins/{name}", self._slash),
             Route("/twins/{name}/{path:path}", self._forward, methods=["GET", "HEAD", "POST"]),
             WebSocketRoute("/twins/{name}/{path:path}", self._couple),
@@ -186,6 +207,8 @@ class Service:
 
     def start(self) -> None:
         """Begin."""
+        if self._overview is not None and self._context.get_start_method() == "forkserver":
+            forkserver.ensure_running()  # so that it has the modules when the first page is opened
         self.door.start()
         self._thread.start()
 
@@ -229,8 +252,18 @@ class Service:
 
     # Requests
 
+    def _gallery(self) -> list[BaseRoute]:
+        return [
+            get("/api/gallery", self._cards),
+            post("/api/gallery/start", self._start, status=202),
+            post("/api/gallery/stop", self._stop, status=202),
+            post("/api/gallery/restart", self._restart, status=202),
+        ]
+
     def _page(self) -> Response:
         """Answer with the overview."""
+        if self._overview is not None:
+            return self._overview.page(self.door.boot)
         return page_file("gallery.html", {"boot": self.door.boot, "service": True}, title="Overview")
 
     def state(self) -> dict[str, Any]:
@@ -247,7 +280,8 @@ class Service:
 
     def _ready(self, request: Request) -> Response:
         """Answer 200 once all twins that are not stopped run, else 503; with a token also the names of the others."""
-        missing = [twin.name for twin in self.twins.values() if twin.wanted and twin.state != RUNNING]
+        watched = self.twins.values() if self._overview is None else ()
+        missing = [twin.name for twin in watched if twin.wanted and twin.state != RUNNING]
         if missing:
             names = f"{len(missing)} twin(s) do not run: {', '.join(missing[:20])}"
             return PlainTextResponse(f"{names if USER in request.scope else 'not ready'}\n", 503)
@@ -292,10 +326,40 @@ class Service:
 
     async def _forward(self, request: Request) -> Response | _Forwarded:
         twin = self.twins.get(request.path_params["name"])
+        if self._overview is not None and not request.path_params["path"]:
+            twin = await self._opened(request.path_params["name"])
         if twin is None or not twin.port:
             reason = "is no twin of this service" if twin is None else f"is {twin.state}"
+            if twin is not None and self._overview is not None and twin.text:
+                reason = f"cannot be opened: {twin.text}"
             return PlainTextResponse(f"Nisus: {request.path_params['name']} {reason}.\n", 404 if twin is None else 503)
         return _Forwarded(twin, "/" + request.path_params["path"])
+
+    async def _opened(self, name: str) -> ServedTwin | None:
+        """Return the twin of a page that is opened, once it runs or has failed; None if there is none."""
+        twin = await in_thread(lambda: self._ask_for(name))
+        end = time.monotonic() + MAX_OPENING_S
+        while twin is not None and twin.state == STARTING and time.monotonic() < end:
+            await asyncio.sleep(OPENING_POLL_S)
+        return twin
+
+    def _ask_for(self, name: str) -> ServedTwin | None:
+        """Return a twin that runs or starts on demand; those whose pages were opened first make room."""
+        assert self._overview is not None
+        path = self._overview.find(name)
+        with self._changing:
+            twin = self.twins.pop(name, None)
+            if path is None or (twin is not None and not twin.wanted):
+                if twin is not None:
+                    self.twins[name] = twin
+                return twin
+            for other in list(self.twins.values())[: max(0, len(self.twins) + 1 - MAX_OPENED)]:
+                other.wanted = False
+                self._ask_to_stop(other)
+            self.twins[name] = twin or ServedTwin(name, path)  # the one that was asked for last is last
+            if twin is None:
+                self._begin(self.twins[name])
+            return self.twins[name]
 
     async def _couple(self, browser: WebSocket) -> None:
         twin = self.twins.get(browser.path_params["name"])
@@ -393,6 +457,11 @@ class Service:
         if twin.pipe is not None:
             twin.pipe.close()
         twin.process, twin.pipe, twin.port, twin.report = None, None, 0, {}
+        if self._overview is not None:  # opened on demand, and again when its page is asked for
+            twin.state = FAILED if twin.wanted else STOPPED
+            twin.text = twin.text or (f"ended by {_signal_name(-code)}" if code < 0 else f"ended with status {code}")
+            del self.twins[twin.name]
+            return
         if not twin.wanted:
             twin.state, twin.text = STOPPED, ""
             print_line("info", "stopped", twin=twin.name)

@@ -21,7 +21,7 @@ from estimators.errors import SourceError
 from ..formats import is_compressed, suffix_of
 from ..worker_process import gist
 from .message_fields import Declared, Field, Topic, topics_of
-from .text import CHUNK_ROWS, UNREADABLE, Chunk, Problem, TextMatch, column_of
+from .text import CHUNK_ROWS, UNREADABLE, Chunk, Column, Problem, column_of
 
 TIME = "time"  # Column of the times
 
@@ -70,9 +70,7 @@ def _first(topics: dict[str, Topic], wanted: set[str], messages: Messages) -> It
                 return
 
 
-def read_bag(
-    path: Path, time: str, columns: Sequence[str | TextMatch], problem: Problem
-) -> Generator[Chunk, None, None]:
+def read_bag(path: Path, time: str, columns: Sequence[Column], problem: Problem) -> Generator[Chunk, None, None]:
     """Yield the messages of the topics of these columns; what a message does not have is blank.
 
     Raises:
@@ -100,8 +98,8 @@ def read_bag(
         topics = topics_of(path, declared)
         picks: dict[str, list[tuple[int, Field, str]]] = {}
         for k, column in enumerate(columns):
-            if isinstance(column, TextMatch):
-                text = f"{column.column} holds numbers, not text such as {column.texts[0]!r}; give a number"
+            if not isinstance(column, str):
+                text = f"{column.column} holds numbers, not text; give a number"
                 raise SourceError(f"{path}: {text}")
             name, _, key = column_of(column).partition(".")
             field = topics[name].fields.get(key)

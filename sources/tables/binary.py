@@ -26,7 +26,7 @@ from estimators.errors import SourceError
 from ..formats import is_compressed, open_binary
 from ..source import TRUNCATED
 from ..worker_process import memory_error, memory_limit
-from .text import CHUNK_ROWS, Chunk, Problem, TextMatch, column_of, fill
+from .text import CHUNK_ROWS, Chunk, Column, Problem, TextCodes, TextMatch, column_of, fill
 
 CHUNK_VALUES = 65_536
 """Values of a chunk of a NumPy archive; a row of a field has thousands."""
@@ -74,9 +74,7 @@ def parquet_names(path: Path, time: str = "") -> list[str]:
         return list(pyarrow.parquet.read_schema(_content(path)).names)
 
 
-def read_parquet(
-    path: Path, time: str, columns: Sequence[str | TextMatch], problem: Problem
-) -> Generator[Chunk, None, None]:
+def read_parquet(path: Path, time: str, columns: Sequence[Column], problem: Problem) -> Generator[Chunk, None, None]:
     """Yield the rows of a Parquet file; null is blank, and text is read as in a CSV."""
     import pyarrow
     import pyarrow.parquet
@@ -94,28 +92,36 @@ def read_parquet(
             values = np.empty((n, len(columns)))
             blank = np.zeros(values.shape, np.bool_)
             lines = list(range(row, row + n))
+            words: tuple[str, ...] = ()
             for k, name in enumerate(columns):
                 column = batch.column(column_of(name))
-                if isinstance(name, TextMatch) or pyarrow.types.is_dictionary(column.type):
+                if not isinstance(name, str) or pyarrow.types.is_dictionary(column.type):
                     column = column.cast(pyarrow.string())
                 blank[:, k] = column.is_null().to_numpy(zero_copy_only=False)
+                if isinstance(name, TextCodes):
+                    coded = column.dictionary_encode()
+                    words = tuple(coded.dictionary.to_pylist())
+                    values[:, k] = coded.indices.fill_null(-1).to_numpy(zero_copy_only=False)
+                    continue
                 if pyarrow.types.is_string(column.type) or pyarrow.types.is_large_string(column.type):
                     cells = [item or "" for item in column.to_pylist()]
                     fill(name, cells, lines, values[:, k], blank[:, k], problem)
                 else:
                     numbers = column.cast(pyarrow.float64(), safe=False)
                     values[:, k] = numbers.to_numpy(zero_copy_only=False)
-            yield Chunk(np.array(lines), batch.column(time), values, blank)
+            yield Chunk(np.array(lines), batch.column(time), values, blank, words)
             row += n
         if row - 1 != file.metadata.num_rows:
             problem(TRUNCATED, row, f"{row - 1} of {file.metadata.num_rows} rows are there")
 
 
-def _numeric(path: Path, columns: Sequence[str | TextMatch]) -> list[str]:
+def _numeric(path: Path, columns: Sequence[Column]) -> list[str]:
     """Return the columns; raises SourceError if one is to be compared as text."""
     for name in columns:
         if isinstance(name, TextMatch):
             raise SourceError(f"{path}: {name.column} holds numbers, not text such as {name.texts[0]!r}; give a number")
+        if isinstance(name, TextCodes):
+            raise SourceError(f"{path}: {name.column} holds numbers, not names of assets; give a CSV or Parquet file")
     return [column_of(name) for name in columns]
 
 
@@ -157,9 +163,7 @@ def _collect(name: str, value: Any, found: dict[str, np.ndarray]) -> None:
         found[name] = value
 
 
-def read_mat(
-    path: Path, time: str, columns: Sequence[str | TextMatch], problem: Problem
-) -> Generator[Chunk, None, None]:
+def read_mat(path: Path, time: str, columns: Sequence[Column], problem: Problem) -> Generator[Chunk, None, None]:
     """Yield the rows of the vectors; NaN is a missing value; raises SourceError if their lengths differ."""
     found = _vectors(path)
     for name in _numeric(path, columns):
@@ -201,9 +205,7 @@ def _declared(path: Path) -> dict[str, tuple[tuple[int, ...], np.dtype]]:
     return found
 
 
-def read_npz(
-    path: Path, time: str, columns: Sequence[str | TextMatch], problem: Problem
-) -> Generator[Chunk, None, None]:
+def read_npz(path: Path, time: str, columns: Sequence[Column], problem: Problem) -> Generator[Chunk, None, None]:
     """Yield the rows of the arrays; NaN is a missing value; raises SourceError if their lengths differ."""
     declared = _declared(path)
     picks: dict[str, tuple[list[int], list[int]]] = {}

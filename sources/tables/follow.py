@@ -1,4 +1,4 @@
-"""Live source of CSV files that grow, and of files that appear in a folder; each row is read once."""
+"""Source of CSV files that grow, and of tables that appear in a folder; each row is read once, as it comes."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import os
 import threading
 import zlib
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,12 +18,12 @@ import numpy as np
 from estimators.errors import SourceError, nearest
 from estimators.log import Events
 
-from ..formats import is_compressed
+from ..formats import is_compressed, suffix_of
 from ..mapping import ABSENT, PRESENT, ChannelMapping
-from ..source import TRUNCATED, Channel, Report, ignore
+from ..source import NEVER, NO_ASSET, TRUNCATED, AssetEvents, Channel, Report, ignore
 from ..units import heading_unit
-from .rows import dated, is_text
-from .text import HEAD_BYTES, UNREADABLE, CsvFormat, chunk_of, column_of, format_of
+from .rows import TableRows, dated, is_text, names_of, rows_of
+from .text import HEAD_BYTES, UNREADABLE, Column, CsvFormat, TextCodes, chunk_of, column_of, format_of
 from .times import TimeColumn, TimeReader
 
 POLL_S = 0.1
@@ -38,10 +38,16 @@ IDENTITY_BYTES = 256
 LEFT_OUT = "file left out"
 """Key of files that are no tables of these columns."""
 
+PARQUET_END = b"PAR1"
+"""Last bytes of a complete Parquet file."""
+
 
 @dataclass
 class _File:
-    """A file and how far it was read: bytes and lines; `checked` first bytes have the CRC `head`."""
+    """A file and how far it was read: bytes and lines; `checked` first bytes have the CRC `head`.
+
+    `rows` are those to come of a file that is no plain CSV.
+    """
 
     inode: int
     offset: int = 0
@@ -52,6 +58,7 @@ class _File:
     """Size and time of writing (ns) up to which nothing is left to read."""
     format: CsvFormat | None = None
     times: TimeReader | None = None
+    rows: Iterator[TableRows | None] | None = None
 
     def state(self) -> list[int]:
         """Return the position for the store."""
@@ -73,11 +80,11 @@ class _Stored:
 
 
 class FollowedTable:
-    """Reads the new rows of CSV files, in the order of their names, as they are written.
+    """Reads the new rows of tables, in the order of their names: of plain CSV files as they are written.
 
     A file is known by its inode and first bytes, so one that is renamed is not read again, and one that is truncated or
     written anew is read from its start. A last line without a line end waits for it; a cell with a line break is not
-    read. For rows and columns see `Table`.
+    read. Parquet and other formats are read once they are complete. For rows and columns see `Table`.
 
     Args:
         files: Returns the present files in their order.
@@ -86,12 +93,13 @@ class FollowedTable:
         channels: What feeds the model.
         width: Value columns of an event.
         report: Called for rows and files that cannot be used, with file and line.
+        asset: The column with the name of each row's asset; `read` then returns `AssetEvents`.
+        ends: Whether the files are complete: the source ends after their last row.
 
     Raises:
         SourceError: If a present file lacks a column, or a unit does not convert.
     """
 
-    live = True
     waits = True
 
     def __init__(
@@ -103,11 +111,20 @@ class FollowedTable:
         channels: Iterable[Channel],
         width: int,
         report: Report = ignore,
+        asset: str | None = None,
+        ends: bool = False,
     ) -> None:
         channels = list(channels)
+        self.live = not ends
+        self._ends, self._asset = ends, asset
         self._list, self._time, self._width, self._report = files, time, width, report
         self._shift = round(time_shift * 1e9)
         self._columns = list(dict.fromkeys(name for channel in channels for name in channel.needed))
+        self._read_columns: list[Column] = [*self._columns, *([] if asset is None else [TextCodes(asset)])]
+        self._fed = {name: channel.name for channel in channels for name in channel.needed}
+        self._valueless = set(range(len(self._columns)))
+        nothing = Events.empty(width)
+        self._nothing = nothing if asset is None else AssetEvents(nothing, np.zeros(0, np.int64), ())
         self._mapping = ChannelMapping(
             [(channels, self._columns, [heading_unit(name) for name in self._columns])], width=width, report=report
         )
@@ -118,9 +135,14 @@ class FollowedTable:
         self._closing = threading.Event()
         self.mark = 0
         """Pieces that were read."""
+        whole = False
         for path in files():
-            with path.open("rb") as file:
-                self._format(path, file)
+            if _is_plain(path):
+                with path.open("rb") as file:
+                    self._format(path, file)
+            elif not whole:  # the others when they are read: each takes a moment
+                whole = True
+                self._check(path, names_of(path))
 
     def numbers(self, mark: int) -> dict[str, list[int]]:
         """Return the positions after the first `mark` pieces, for `restore`."""
@@ -139,13 +161,20 @@ class FollowedTable:
         for inode, (offset, line, checked, head) in self._stored.positions.items():
             self._files[inode] = _File(inode, offset, line, checked, head)
 
-    def read(self, timeout: float) -> Events | None:
-        """Return the events of the next rows; none after `timeout` seconds without one."""
+    def read(self, timeout: float) -> Any:
+        """Return the events of the next rows; none after `timeout` seconds without one; None at the end."""
         events = self._next()
+        if events is None and self._ends:
+            for k in self._valueless if self.mark else ():
+                name = self._columns[k]
+                text = f"column {str(name)!r} has no value in any row, so {self._fed[name]} has no values"
+                self._report(NEVER, text)
+            self._valueless.clear()
+            return None
         if events is None:
             self._closing.wait(min(timeout, POLL_S))
             events = self._next()
-        return Events.empty(self._width) if events is None else events
+        return self._nothing if events is None else events
 
     def now(self) -> int | None:
         """Return None: files have no clock."""
@@ -155,8 +184,11 @@ class FollowedTable:
         """Close the file that is open."""
         self._closing.set()
         self._close_open()
+        for file in self._files.values():
+            if file.rows is not None:
+                file.rows.close()  # type: ignore[attr-defined]
 
-    def _next(self) -> Events | None:
+    def _next(self) -> Any:
         """Return the events of the next piece of the first file that has one; None if there is none."""
         present: list[tuple[Path, os.stat_result]] = []
         try:
@@ -200,7 +232,7 @@ class FollowedTable:
             self._open[2].close()
         self._open = None
 
-    def _of(self, path: Path) -> Events | None:
+    def _of(self, path: Path) -> Any:
         """Return the events of the next piece of a file; None if it has none."""
         handle = path.open("rb")
         try:
@@ -218,29 +250,64 @@ class FollowedTable:
         self._open = (stat.st_ino, path, handle)
         return events
 
-    def _piece(self, path: Path, handle: BinaryIO, file: _File) -> Events | None:
-        """Return the events of the next complete lines; None if there are none."""
+    def _piece(self, path: Path, handle: BinaryIO, file: _File) -> Any:
+        """Return the events of the next complete lines or rows; None if there are none."""
+        if not _is_plain(path):
+            return self._rows(path, handle, file)
         if file.offset < HEAD_BYTES or file.format is None:
             file.format = self._format(path, handle)
         handle.seek(file.offset)
         data = handle.read(PIECE_BYTES)
         end = data.rfind(b"\n") + 1
+        cut = self._ends and end < len(data) < PIECE_BYTES  # a last line without a line end
+        end = len(data) if cut else end
         if not end and len(data) == PIECE_BYTES:
             self._report(TRUNCATED, f"{path.name}:{file.line + 1}: the line is longer than {PIECE_BYTES} bytes")
             end = len(data)
         if not end or file.format is None:
             return None
-        lines = data[:end].decode(file.format.encoding, "replace").split("\n")[:-1]
+        lines = data[:end].decode(file.format.encoding, "replace").split("\n")[: None if cut else -1]
         if file.times is None:
             file.times = TimeReader(self._time)
         events = self._events(path, lines, file.line, file.format, file.times)
-        file.offset, file.line = file.offset + end, file.line + len(lines)
-        file.checked = min(file.offset, IDENTITY_BYTES)
+        self._advance(handle, file, file.offset + end, file.line + len(lines))
+        return events
+
+    def _rows(self, path: Path, handle: BinaryIO, file: _File) -> Any:
+        """Return the events of the next rows of a file that is no plain CSV; None if there are none."""
+        size = os.fstat(handle.fileno()).st_size
+        if file.rows is None:
+            if suffix_of(path) in (".parquet", ".pq") and not is_compressed(path) and not self._ends:
+                handle.seek(max(0, size - len(PARQUET_END)))
+                if handle.read() != PARQUET_END:
+                    return None  # it is still being written
+            self._check(path, names_of(path))
+            file.rows = rows_of(path, self._time, self._read_columns, lambda: POLL_S)
+        try:
+            for found in file.rows:
+                if found is None:
+                    return self._nothing
+                fresh = found.line > file.line
+                found = found._replace(known=found.known & fresh)
+                events = self._batch(path, found)
+                if fresh.any():
+                    self._advance(handle, file, 0, int(found.line[-1]))
+                    return events
+        except SourceError:
+            file.rows = None
+            raise
+        file.rows = None
+        self._advance(handle, file, size, file.line)
+        return None
+
+    def _advance(self, handle: BinaryIO, file: _File, offset: int, line: int) -> None:
+        """Note how far a file was read."""
+        file.offset, file.line = offset, line
+        file.checked = min(offset or os.fstat(handle.fileno()).st_size, IDENTITY_BYTES)
         handle.seek(0)
         file.head = zlib.crc32(handle.read(file.checked))
         self.mark += 1
         self._note(file.inode, file.state())
-        return events
 
     def _note(self, inode: int, state: list[int] | None) -> None:
         if self._stored.on:
@@ -252,8 +319,6 @@ class FollowedTable:
         Raises:
             SourceError: If it is no CSV, or lacks a column.
         """
-        if is_compressed(path) or not is_text(path):
-            raise SourceError(f"{path}: only plain CSV files can be followed; read it without follow")
         handle.seek(0)
         head = handle.read(HEAD_BYTES)
         if b"\n" not in head:
@@ -262,13 +327,21 @@ class FollowedTable:
         found = format_of(path, head[: head.rfind(b"\n") + 1] + b"\n")
         if found.encoding == "utf-16":
             raise SourceError(f"{path}: is UTF-16; only UTF-8 or Windows-1252 can be followed")
-        for name in (self._time.name, *map(column_of, self._columns)):
-            if found.names.count(name) != 1:
-                times = "no column" if name not in found.names else "more than one column"
-                raise SourceError(f"{path}: there is {times} {name!r}; {nearest(name, found.names)}")
+        self._check(path, found.names)
         return found
 
-    def _events(self, path: Path, lines: list[str], before: int, kind: CsvFormat, times: TimeReader) -> Events:
+    def _check(self, path: Path, names: Sequence[str]) -> None:
+        """Refuse a file that lacks a column, or has it twice.
+
+        Raises:
+            SourceError: Naming file and column.
+        """
+        for name in (self._time.name, *map(column_of, self._read_columns)):
+            if names.count(name) != 1:
+                times = "no column" if name not in names else "more than one column"
+                raise SourceError(f"{path}: there is {times} {name!r}; {nearest(name, names)}")
+
+    def _events(self, path: Path, lines: list[str], before: int, kind: CsvFormat, times: TimeReader) -> Any:
         """Return the events of the lines that follow so many lines of a file."""
         rows, numbers = [], []
         problems: list[tuple[str, int, str]] = []
@@ -285,14 +358,36 @@ class FollowedTable:
         if not rows:
             found = None
         else:
-            chunk = chunk_of(rows, numbers, kind, self._time.name, self._columns, lambda *item: problems.append(item))
+            columns = self._read_columns
+            chunk = chunk_of(rows, numbers, kind, self._time.name, columns, lambda *item: problems.append(item))
             found = dated(chunk, times, self._time, problems)
         for key, number, text in problems:
             self._report(key, f"{path.name}:{number}: {text}")
-        if found is None:
-            return Events.empty(self._width)
-        t = found.t + self._shift
-        state = np.where(found.blank, ABSENT, PRESENT).astype(np.int8)
+        return self._nothing if found is None else self._batch(path, found)
+
+    def _batch(self, path: Path, found: TableRows) -> Any:
+        """Return the events of rows."""
+        for key, number, text in found.problems:
+            self._report(key, f"{path.name}:{number}: {text}")
+        t, known, width = found.t + self._shift, found.known, len(self._columns)
+        values, blank = np.ascontiguousarray(found.values[:, :width]), found.blank[:, :width]
+        if self._valueless:
+            self._valueless -= set(np.flatnonzero(np.isfinite(values[known]).any(axis=0)).tolist())
+        if self._asset is not None:
+            nameless = found.blank[:, -1]
+            for number in found.line[known & nameless]:
+                text = f"{self._asset} is empty, so the row is of no asset and is left out"
+                self._report(NO_ASSET, f"{path.name}:{number}: {text}")
+            known = known & ~nameless
+        state = np.where(blank, ABSENT, PRESENT).astype(np.int8)
         plan = np.zeros(t.size, np.int64)
         # As those of a recording, rows that were written before the twin began have no time of arrival.
-        return self._mapping.events(plan, t, t, found.values, state, (~found.known).astype(np.int8))
+        events, row = self._mapping.placed(plan, t, t, values, state, (~known).astype(np.int8))
+        if self._asset is None:
+            return events
+        return AssetEvents(events, found.values[row, -1].astype(np.int64), found.words)
+
+
+def _is_plain(path: Path) -> bool:
+    """Return whether a file is a CSV that can be read as it grows."""
+    return is_text(path) and not is_compressed(path)

@@ -18,11 +18,11 @@ from ..source import UNDATED
 from ..worker_process import IsolatedReader, read_isolated
 from .bag import bag_names, read_bag
 from .binary import mat_names, npz_names, parquet_names, read_mat, read_npz, read_parquet
-from .text import Chunk, Problem, TextMatch, csv_format, read_csv
+from .text import Chunk, Column, Problem, csv_format, read_csv
 from .times import TimeColumn, TimeReader
 
 _Names = Callable[[Path, str], list[str]]
-_Read = Callable[[Path, str, Sequence[str | TextMatch], Problem], Generator[Chunk, None, None]]
+_Read = Callable[[Path, str, Sequence[Column], Problem], Generator[Chunk, None, None]]
 
 _BINARY: dict[str, tuple[_Names, _Read]] = {
     ".db3": (bag_names, read_bag),
@@ -38,7 +38,7 @@ _BINARY: dict[str, tuple[_Names, _Read]] = {
 class TableRows(NamedTuple):
     """Rows of a table: line (or row) of each, time (ns) and whether it is known, values (n, columns), mask of blanks.
 
-    `problems` are those found on the way: key, line, text.
+    `problems` are those found on the way: key, line, text. `words`: see `Chunk`.
     """
 
     line: np.ndarray
@@ -47,6 +47,7 @@ class TableRows(NamedTuple):
     values: np.ndarray
     blank: np.ndarray
     problems: tuple[tuple[str, int, str], ...]
+    words: tuple[str, ...] = ()
 
 
 def is_text(path: Path) -> bool:
@@ -75,7 +76,7 @@ def names_of(path: Path, time: str = "") -> list[str]:
 
 
 def rows_of(
-    path: Path, time: TimeColumn, columns: Sequence[str | TextMatch], timeout: Callable[[], float]
+    path: Path, time: TimeColumn, columns: Sequence[Column], timeout: Callable[[], float]
 ) -> Iterator[TableRows | None]:
     """Yield the rows of a table, some thousands at once; None where none came within `timeout()` seconds.
 
@@ -103,7 +104,7 @@ def _about(path: Path, error: SourceError) -> SourceError:
     return error if known else SourceError(f"{path}: it cannot be read ({error}); check that it is complete")
 
 
-def read_rows(path: Path, time: TimeColumn, columns: Sequence[str | TextMatch]) -> Iterator[TableRows]:
+def read_rows(path: Path, time: TimeColumn, columns: Sequence[Column]) -> Iterator[TableRows]:
     """Yield the rows of a table in this process."""
     problems: list[tuple[str, int, str]] = []
 
@@ -127,7 +128,7 @@ def dated(chunk: Chunk, times: TimeReader, time: TimeColumn, problems: list[tupl
     t, known = times.read(chunk.time)
     for row in np.flatnonzero(~known).tolist():
         problems.append((UNDATED, int(chunk.line[row]), _undated(time, chunk.time[row])))
-    return TableRows(chunk.line, t, known, chunk.values, chunk.blank, ())
+    return TableRows(chunk.line, t, known, chunk.values, chunk.blank, (), chunk.words)
 
 
 def _undated(time: TimeColumn, cell: Any) -> str:

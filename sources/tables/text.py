@@ -36,6 +36,16 @@ class TextMatch(NamedTuple):
         return f"{self.column} = {' or '.join(self.texts)}"
 
 
+class TextCodes(NamedTuple):
+    """Column of a table whose values are positions of the texts of `column` in `Chunk.words`."""
+
+    column: str
+
+
+Column = str | TextMatch | TextCodes
+"""Column of the reader: numbers of a column of the file, or what its texts are."""
+
+
 class CsvFormat(NamedTuple):
     """Columns of a CSV, the delimiter of its cells, the decimal sign of its numbers, and its encoding."""
 
@@ -48,13 +58,15 @@ class CsvFormat(NamedTuple):
 class Chunk(NamedTuple):
     """TableRows of a table: the raw time column, the values (n, columns), and a mask of blank ones.
 
-    `line` is the line (CSV) or row (other formats) of each, counted from 1.
+    `line` is the line (CSV) or row (other formats) of each, counted from 1. `words` are the texts of the column that is
+    read as `TextCodes`, each once.
     """
 
     line: np.ndarray
     time: Any
     values: np.ndarray
     blank: np.ndarray
+    words: tuple[str, ...] = ()
 
 
 def open_text(path: Path, encoding: str = "utf-8-sig") -> TextIO:
@@ -118,9 +130,7 @@ def has_rows(path: Path) -> bool:
     return True  # What is wrong with the file is reported when its rows are read.
 
 
-def read_csv(
-    path: Path, time: str, columns: Sequence[str | TextMatch], problem: Problem
-) -> Generator[Chunk, None, None]:
+def read_csv(path: Path, time: str, columns: Sequence[Column], problem: Problem) -> Generator[Chunk, None, None]:
     """Yield the rows of a CSV; a value that is not a number is missing and reported, as is a row cut short."""
     kind = csv_format(path)
     names, delimiter, _, encoding = kind
@@ -166,20 +176,26 @@ def chunk_of(
     lines: list[int],
     kind: CsvFormat,
     time: str,
-    columns: Sequence[str | TextMatch],
+    columns: Sequence[Column],
     problem: Problem,
 ) -> Chunk:
     """Return the cells of rows, at these lines of a CSV, as numbers."""
     values = np.empty((len(rows), len(columns)))
     blank = np.zeros(values.shape, np.bool_)
+    codes: dict[str, int] = {}
     for k, name in enumerate(columns):
         place = kind.names.index(column_of(name))
+        if isinstance(name, TextCodes):
+            cells = [row[place].strip() for row in rows]
+            values[:, k] = [codes.setdefault(cell, len(codes)) for cell in cells]
+            blank[:, k] = [not cell for cell in cells]
+            continue
         fill(name, [row[place] for row in rows], lines, values[:, k], blank[:, k], problem, kind.decimal)
     at_time = kind.names.index(time)
     times = [row[at_time].strip() for row in rows]
     if kind.decimal == ",":
         times = [_with_point(cell) or cell for cell in times]
-    return Chunk(np.array(lines), times, values, blank)
+    return Chunk(np.array(lines), times, values, blank, tuple(codes))
 
 
 def _lines(file: TextIO, raw: list[str]) -> Iterator[str]:
@@ -198,9 +214,9 @@ def _with_point(cell: str) -> str | None:
     return text.replace(".", "").replace(",", ".") if _COMMA.fullmatch(text) else None
 
 
-def column_of(name: str | TextMatch) -> str:
+def column_of(name: Column) -> str:
     """Return the column of the file that a column of the reader is made of."""
-    return name.column if isinstance(name, TextMatch) else name
+    return name if isinstance(name, str) else name.column
 
 
 def _number(cell: str) -> float:

@@ -10,6 +10,7 @@ from estimators.diagnostics.detector_state import no_baseline
 from estimators.errors import EstimatorError, EventError
 from estimators.fleet import Fleet
 from estimators.fold import Fold
+from estimators.log import READING, TRUTH, Events
 from estimators.model.state_space import Parameter
 from estimators.track import GATED
 from tests.models import level_model
@@ -153,6 +154,37 @@ def test_measurements_too_old_to_count_leave_the_window():
         fold.advance()
         assert_same(fleet, 0, fold)
     assert fold.track.nis_mean[-1] == fold.track.nis[-40]
+
+
+def test_a_fleet_that_is_extended_has_the_bits_of_one_that_was_as_large_from_the_start():
+    model, rng = MODELS["motor_winding"], np.random.default_rng(5)
+    grown, whole = Fleet("kf", model, assets=2, recent=3), Fleet("kf", model, assets=7, recent=3)
+    for round_ in range(3):
+        at, t = rng.integers(0, len(grown.assets), 40), 1.7e9 + np.sort(rng.random(40)) * 20.0 + 20.0 * round_
+        ns = np.rint(t * 1e9).astype(np.int64)
+        y = 40.0 + rng.normal(size=(40, 1))
+        events = Events(ns, ns, np.zeros(40, np.int8), np.zeros(40, np.int32), y)
+        whole.add("winding", at, t, y)
+        grown.add_events(at, events)
+        whole.advance()
+        grown.advance()
+        if round_ < 2:
+            grown.extend([1, 4][round_])
+    assert grown.assets == whole.assets == range(7)
+    for mine, its in zip(grown.table()[1:], whole.table()[1:], strict=True):
+        assert mine.tobytes() == its.tobytes()
+    named = Fleet("kf", model, assets=["a"])
+    named.extend(["b"])
+    named.add("winding", "b", 1.0, 40.0)
+    assert named.advance() == 1 and named.table().events.tolist() == [0, 1]
+
+
+def test_true_states_are_not_added():
+    model = MODELS["motor_winding"]
+    fleet, t = Fleet("kf", model, assets=1), np.array([1, 2], np.int64)
+    events = Events(t, t, np.array([TRUTH, READING], np.int8), np.zeros(2, np.int32), np.full((2, model.width), 40.0))
+    fleet.add_events([0, 0], events)
+    assert fleet.advance() == 1
 
 
 def test_an_event_before_the_oldest_snapshot_is_stale_and_changes_nothing():

@@ -7,6 +7,7 @@ import re
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
+from config.fleet_schema import ASSET_LEVEL, FleetMqttSection, FleetPushSection
 from config.source_schema import ColumnSection, MqttSourceSection, OpcUaSourceSection, PushSection
 from config.yaml_files import Key
 from estimators.errors import ConfigError, nearest, shown_name
@@ -34,7 +35,9 @@ def _messages(opening: Opening) -> Messages:
         )
         raise failure(opening.loaded, opening.key, text)
     named = replace(opening, section=with_channels(opening.section, opening.model))
-    return blamed(named, lambda channels: Messages(channels, width=opening.model.width, report=opening.report))
+    width, report = opening.model.width, opening.report
+    assets = isinstance(opening.section, FleetPushSection | FleetMqttSection)
+    return blamed(named, lambda channels: Messages(channels, width=width, report=report, assets=assets))
 
 
 def _password(name: str | None) -> str | None:
@@ -52,11 +55,17 @@ def _open_mqtt(opening: Opening) -> Source:
     section: MqttSourceSection = opening.section
     messages = _messages(opening)
     _check_names(opening, messages, {name for topic in section.topics.values() for name in topic.values}, "topics")
-    for name in section.topics:
+    topics: dict[str, TopicMap] = {}
+    for name, topic in section.topics.items():
+        levels = name.split("/")
+        asset = levels.index(ASSET_LEVEL) if isinstance(section, FleetMqttSection) else None
+        name = name if asset is None else "/".join([*levels[:asset], "+", *levels[asset + 1 :]])
         if not TOPIC_FILTER.fullmatch(name):
             rule = "+ and # must stand alone between slashes, and # at the end"
             raise failure(opening.loaded, (*opening.key, "topics"), f"names {shown_name(name)}; {rule}")
-    topics = {name: TopicMap(**topic.model_dump()) for name, topic in section.topics.items()}
+        if name in topics:
+            raise failure(opening.loaded, (*opening.key, "topics"), f"has {name} twice; name each topic once")
+        topics[name] = TopicMap(**topic.model_dump(), asset=asset)
     return MqttSource(
         messages,
         section,

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from config.fleet_schema import FleetTableSection
 from config.source_schema import CanLogSection, MergedSection, TableSection
 from config.yaml_files import Key
 from estimators.errors import SourceError
@@ -115,7 +116,7 @@ def _open_table(opening: Opening) -> Source:
     from sources.tables.table import Table
 
     section: TableSection = opening.section
-    if section.follow and opening.live and opening.log_files is None:
+    if isinstance(section, FleetTableSection) or (section.follow and opening.live and opening.log_files is None):
         return _follow(opening, section)
     files = find_recording(opening.loaded, section, opening.key, opening.log_files)
 
@@ -140,15 +141,21 @@ def _follow(opening: Opening, section: TableSection) -> Source:
     from sources.tables.follow import FollowedTable
     from sources.tables.times import TimeColumn
 
+    recorded = [] if section.follow else find_recording(opening.loaded, section, opening.key, None)
+    asset = section.asset if isinstance(section, FleetTableSection) else None
+
     def files() -> list[Path]:
         found = [path for pattern in section.files for path in matching(opening.loaded, section, pattern)]
-        return list(dict.fromkeys(found))
+        return recorded or list(dict.fromkeys(found))
 
     time, width, report = section.time, opening.model.width, opening.report
 
     def table(channels: list[Channel]) -> FollowedTable:
         column = TimeColumn(time.column, time.unit, time.format, time.zone)
-        return FollowedTable(files, time=column, time_shift=time.shift, channels=channels, width=width, report=report)
+        return FollowedTable(
+            files, time=column, time_shift=time.shift, channels=channels, width=width, report=report,
+            asset=asset, ends=not section.follow,
+        )  # fmt: skip
 
     return blamed(opening, table)
 

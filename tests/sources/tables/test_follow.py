@@ -1,8 +1,11 @@
 """Files that grow, are rotated or appear in a folder: each row is read once, as from the whole file."""
 
+import io
 import os
 
 import numpy as np
+import pyarrow
+import pyarrow.parquet
 import pytest
 
 from app.twin.twin import load_twin
@@ -171,7 +174,7 @@ def test_a_restart_from_a_store_takes_no_row_twice(tmp_path):
 @pytest.mark.parametrize(
     ("more", "text"),
     [
-        ("files: log.parquet, follow: true", "only plain CSV files can be followed"),
+        ("files: log.parquet, follow: true", "log.parquet: it cannot be read as Parquet"),
         ("files: bad.csv, follow: true", "motor.yaml:2: source.sensors.winding: .*there is no column 'w'"),
         ("files: log.csv, follow: 3", "motor.yaml:2: source.follow"),
     ],
@@ -184,6 +187,39 @@ def test_what_cannot_be_followed_is_one_line(tmp_path, monkeypatch, more, text):
     with pytest.raises(NisusError, match=text) as caught:
         twin_of(yaml(more)).plan.check_files()
     assert "\n" not in str(caught.value)
+
+
+def test_parquet_files_are_read_once_they_are_complete(tmp_path):
+    """Each once, after a restart in the middle of one from the next row on."""
+    whole = [(float(t), 40.0 + t % 7) for t in range(10_000)]
+
+    def written(rows):
+        sink = io.BytesIO()
+        t, w = zip(*rows, strict=True)
+        pyarrow.parquet.write_table(pyarrow.table({"t": t, "w": w}), sink)
+        return sink.getvalue()
+
+    first, second = written(whole[:9_000]), written(whole[9_000:])
+    (tmp_path / "day1.parquet").write_bytes(first)
+    source = followed(tmp_path, pattern="*.parquet")
+    source.restore({})
+    found = []
+    while len(found) < 5_000:
+        found += times(source.read(0.1))
+    kept = source.numbers(source.mark)
+    source.close()
+    again = followed(tmp_path, said := [], pattern="*.parquet")
+    again.restore(kept)
+    while len(found) < 9_000:
+        found += times(again.read(0.1))
+    (tmp_path / "day2.parquet").write_bytes(second[:-100])
+    assert not len(again.read(0.0)) and not said
+    (tmp_path / "day2.parquet").write_bytes(second)
+    while len(found) < 10_000:
+        found += times(again.read(0.1))
+    assert not len(again.read(0.0)) and not said
+    again.close()
+    assert found == [*range(10_000)]
 
 
 def test_a_merged_source_follows_nothing(tmp_path, monkeypatch):

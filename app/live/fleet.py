@@ -1,0 +1,273 @@
+"""A fleet that runs: its source is read and folded in a thread; others read the table."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import replace
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from estimators.errors import NisusError, SourceError, quoted
+from estimators.fleet import FleetTable
+from estimators.log import BEFORE, TICK, Events
+from sources.source import NO_ASSET, AssetEvents, Marked, Report
+
+from ..twin.fleet import FleetPlan
+from ..twin.twin import Twin
+from .fold_json import tuning_to_json
+from .running_fold import Keeper
+from .store import Store
+
+FIRST_ROOM = 256
+"""Assets for which there is room at the start, unless their number is given; it is doubled as they come."""
+
+MAX_PENDING = 500_000
+"""Events that are folded at once while a table is read to its end."""
+
+READ_S = 0.1
+"""Longest wait for measurements, s."""
+
+BLOCK = 1024
+"""Assets whose state is one block of the store; only blocks that have changed are written."""
+
+STORE_PERIOD_S, STORE_SHARE = 1.0, 0.1
+"""Shortest time between two transactions of the store, and the share of time that they may take."""
+
+TICKS_PER_DELAY = 4
+"""Checks for silent assets in the time after which one is degraded."""
+
+
+class RunningFleet:
+    """Reads the source of a fleet, folds it, and answers with the table of its assets."""
+
+    def __init__(
+        self, plan: FleetPlan, report: Report, *, threads: int | None = None, store: Path | None = None
+    ) -> None:
+        """Compile the filter, open the source, and continue from the store.
+
+        Args:
+            plan: The fleet.
+            report: Called as report(key, text) for what cannot be used; counted in `counts`.
+            threads: Threads that fold; None for all.
+            store: File in which the state of the fleet is kept with the position in its source; None for none.
+
+        Raises:
+            NisusError: If the estimator is not for fleets, the source cannot be opened, or the store is of another
+                fleet.
+        """
+        given = plan.config.assets
+        self.plan, self._report = plan, report
+        self.store: Keeper | None = None
+        self.counts: Counter[str] = Counter()
+        """Reports by key."""
+        self.names: list[str] = list(given) if isinstance(given, tuple) else []
+        """Names of the assets; only appended to."""
+        self._places = {name: k for k, name in enumerate(self.names)}
+        self._most = given if isinstance(given, int) else len(self.names) if self.names else None
+        self.fleet = plan.fleet(self._most or FIRST_ROOM, threads)
+        self._last = np.full(len(self.fleet.assets), BEFORE, np.int64)
+        self._newest = self._looked = BEFORE
+        self._silence = round(plan.twin.policy.degraded_after * 1e9)
+        self._pending = 0
+        self.version = 0
+        """Increases with each fold."""
+        self.ended = False
+        """Whether the source has ended."""
+        self.failure = ""
+        """Why the source failed."""
+        self._lock = threading.Lock()
+        self._shown: tuple[int, FleetTable] | None = None
+        self._stopping = threading.Event()
+        self.source = plan.open(self.note)
+        self._thread = threading.Thread(target=self._run, name="fleet", daemon=True)
+        self._changed: set[int] = set()
+        self._due = 0.0
+        self._store = None if store is None else Store(store)
+        if self._store is not None:
+            try:
+                self._continue(self._store)
+            except BaseException:
+                self._store.close()
+                self.source.close()
+                raise
+
+    @property
+    def twin(self) -> Twin:
+        """The twin of each asset, with the source of the fleet."""
+        return replace(self.plan.twin, loaded=self.plan.source.loaded)
+
+    def note(self, key: str, text: str) -> None:
+        """Count and pass on a report of the source."""
+        self.counts[key] += 1
+        self._report(key, text)
+
+    def start(self) -> None:
+        """Read and fold in a thread of its own."""
+        self._thread.start()
+
+    def run(self, go_on: Callable[[], bool] = lambda: True) -> None:
+        """Read and fold in this thread until the source ends, or `go_on` returns False."""
+        while go_on() and self.step():
+            pass
+        self._fold()
+
+    def stop(self) -> None:
+        """Stop, and close the source."""
+        self._stopping.set()
+        if self._thread.is_alive():
+            self._thread.join()
+        self.source.close()
+        if self._store is not None:
+            self._store.close()
+
+    def _run(self) -> None:
+        try:
+            self.run(lambda: not self._stopping.is_set())
+        except NisusError as error:
+            self.failure = str(error)
+            self.note("failed", f"source failed: {error}")
+
+    def step(self) -> bool:
+        """Read the next events and fold what waits; return False at the end of the source."""
+        batch: Any = self.source.read(READ_S)
+        if batch is None:
+            self._query(self._newest, 0)
+            self._fold()
+            self.ended = True
+            self.version += 1
+            self._keep(at_once=True)
+            return False
+        if len(batch.code):
+            self._add(batch)
+        now = self.source.now()
+        self._query(self._newest if now is None else now, self._silence // TICKS_PER_DELAY)
+        if self._pending and (self.source.live or self._pending >= MAX_PENDING):
+            self._fold()
+            self._keep()
+        return True
+
+    def _add(self, batch: AssetEvents) -> None:
+        used = np.unique(batch.code)
+        places = np.full(len(batch.names), -1)
+        for code in used.tolist():
+            places[code] = self._place(batch.names[code])
+        at = places[batch.code]
+        known = at >= 0
+        events = batch.events
+        if not known.all():
+            at, events = at[known], events.select(known)
+        with self._lock:
+            self.fleet.add_events(at, events)
+        self._changed.update(np.unique(at // BLOCK).tolist())
+        np.maximum.at(self._last, at, events.t)
+        self._newest = max(self._newest, int(events.t.max(initial=BEFORE)))
+        self._pending += at.size
+
+    def _place(self, name: str) -> int:
+        """Return the position of an asset, a new one for a new name; -1 if it is refused."""
+        place = self._places.get(name)
+        if place is not None:
+            return place
+        if self._most is not None and len(self.names) >= self._most:
+            rule = "is not among assets" if isinstance(self.plan.config.assets, tuple) else f"is beyond {self._most}"
+            self.note(NO_ASSET, f"{self.plan.path.name}: asset {quoted(name)} {rule}; add it to assets")
+            return -1
+        if len(self.names) == len(self.fleet.assets):
+            with self._lock:
+                self.fleet.extend(len(self.names))
+            self._last = np.concatenate([self._last, np.full(self._last.size, BEFORE)])
+        place = self._places[name] = len(self.names)
+        self.names.append(name)
+        return place
+
+    def _query(self, now: int, period: int) -> None:
+        """Add a query of the assets that were silent for long, if the last look is `period` ns ago."""
+        if now == BEFORE or now - self._looked < period:
+            return
+        self._looked = now
+        silent = np.flatnonzero((self._last > BEFORE) & (self._last < now - self._silence))
+        if silent.size:
+            with self._lock:
+                self.fleet.add_events(silent, self._ticks(now, silent.size))
+            self._changed.update(np.unique(silent // BLOCK).tolist())
+            self._last[silent] = now
+            self._pending += silent.size
+
+    def _ticks(self, t: int, count: int) -> Events:
+        times, width = np.full(count, t), self.plan.twin.model.width
+        kind, channel = np.full(count, TICK, np.int8), np.zeros(count, np.int32)
+        return Events(times, times, kind, channel, np.full((count, width), np.nan))
+
+    def _identity(self) -> dict[str, Any]:
+        """Return what a store must have been written with."""
+        plan, model, given = self.plan, self.plan.twin.model, self.plan.config.assets
+        names = [model.name, *model.state_names, *model.row_names, *(given if isinstance(given, tuple) else ())]
+        tuning = tuning_to_json(plan.twin.tuning, plan.twin.estimator)
+        return {"version": version("nisus"), "tuning": tuning, "policy": [*plan.twin.policy], "names of": names}
+
+    def _keep(self, at_once: bool = False) -> None:
+        """Write what has changed to the store, with the position in the source; all events are folded."""
+        begun = time.monotonic()
+        if self._store is None or (begun < self._due and not at_once):
+            return
+        source = self.source
+        state = self._identity() | {"newest": self._newest, "looked": self._looked, "counts": self.counts}
+        position = source.numbers(source.mark) if isinstance(source, Marked) else {}
+        state |= {"names": self.names, "source": position}
+        blocks = {("state", 0): json.dumps(state).encode()}
+        for number in sorted(self._changed):
+            part = slice(number * BLOCK, min(len(self.names), (number + 1) * BLOCK))
+            blocks["assets", number] = self.fleet.state(part)
+            blocks["last", number] = self._last[part].tobytes()
+        self._store.write_blocks(blocks)
+        self._changed.clear()
+        self._due = begun + max(STORE_PERIOD_S, (time.monotonic() - begun) / STORE_SHARE)
+
+    def _continue(self, store: Store) -> None:
+        blocks = store.read_blocks()
+        state: dict[str, Any] = json.loads(blocks.get(("state", 0), b"{}"))
+        if state:
+            for key, value in self._identity().items():
+                if state.get(key) != value:
+                    what = "another version of Nisus" if key == "version" else "another model, tuning or assets"
+                    raise SourceError(f"store {store.path}: was written with {what}; remove it, or choose another path")
+            for name in state["names"]:
+                self._place(name)
+            for (kind, number), data in blocks.items():
+                if kind == "assets":
+                    self.fleet.restore(number * BLOCK, data)
+                elif kind == "last":
+                    times = np.frombuffer(data, np.int64)
+                    self._last[number * BLOCK : number * BLOCK + times.size] = times
+            self._newest, self._looked = state["newest"], state["looked"]
+            self.counts.update(state["counts"])
+        if isinstance(self.source, Marked):
+            self.source.restore(state.get("source", {}))
+
+    def _fold(self) -> None:
+        if self._pending:
+            with self._lock:
+                self.fleet.advance()
+                self._pending = 0
+                self.version += 1
+
+    def find(self, name: str) -> str | None:
+        """Return the name of an asset if there is one of that name; from any thread."""
+        return name if name in self._places else None
+
+    def table(self) -> tuple[int, list[str], FleetTable]:
+        """Return the version, the names, and the table of all assets; from any thread."""
+        with self._lock:
+            if self._shown is None or self._shown[0] != self.version:
+                self._shown = self.version, self.fleet.table()
+            version, table = self._shown
+            names = self.names[:]
+        count = len(names)
+        return version, names, FleetTable(names, *(column[:count] for column in table[1:]))

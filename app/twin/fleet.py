@@ -1,0 +1,138 @@
+"""A fleet: its YAML, the twin of its assets, and their source."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from config.fleet_schema import FleetSection, FleetTableSection
+from config.loader import shipped
+from config.problems import check_section
+from config.yaml_files import as_flow, read_text
+from estimators.errors import ConfigError, EstimatorError
+from estimators.fleet import Fleet
+from sources.tables.one_asset import rows_of_asset
+from sources.tables.text import column_of
+
+from .channels import channels
+from .source import KEY, SOURCES, Plan, plan_source
+from .sources.kind import Opening, matching
+from .twin import Twin, load_twin
+
+if TYPE_CHECKING:
+    from sources.source import Report, Source
+
+
+@dataclass(frozen=True)
+class FleetPlan:
+    """A checked fleet; no file of its source has been read."""
+
+    path: Path
+    config: FleetSection
+    twin: Twin
+    """Twin of each asset, with the source of its own YAML."""
+    source: Plan
+    """Source of the fleet."""
+
+    @property
+    def name(self) -> str:
+        """Short name."""
+        return self.path.stem
+
+    @property
+    def ends(self) -> bool:
+        """Whether the source ends."""
+        section = self.config.source
+        return isinstance(section, FleetTableSection) and not section.follow
+
+    def fleet(self, assets: int, threads: int | None = None) -> Fleet:
+        """Return an empty fleet of so many assets.
+
+        Raises:
+            EstimatorError: If the estimator is not for fleets.
+        """
+        twin, sensors = self.twin, np.arange(len(self.twin.model.sensors))
+        expected = np.isin(sensors, () if self.ends else self.source.fed)  # as `Twin.expected`
+        try:
+            return Fleet(
+                twin.estimator, twin.model, twin.tuning, assets=assets, policy=twin.policy,
+                threads=threads, expected=expected,
+            )  # fmt: skip
+        except EstimatorError as error:
+            raise ConfigError(f"{self.source.loaded.places.at(('twin',))}: twin {twin.name}: {error}") from None
+
+    def open(self, report: Report) -> Source:
+        """Open the source, whose `read` returns `AssetEvents`.
+
+        Raises:
+            SourceError: If it cannot be opened, with the remedy.
+        """
+        return SOURCES[self.config.source.type].open(self._opening(report))
+
+    def check_files(self) -> None:
+        """Open the files of the source, and close them; raises as `open`."""
+        SOURCES[self.config.source.type].files(self._opening(lambda *_: None))
+
+    def _opening(self, report: Report) -> Opening:
+        return Opening(self.source.loaded, self.twin.model, self.config.source, KEY, report)
+
+    def history_of(self, asset: str, folder: Path) -> dict[str, str]:
+        """Return the overrides of the twin's YAML by which its source has the measurements of one asset.
+
+        `folder` is for copies of the tables with the rows of that asset.
+
+        Raises:
+            ConfigError: If the source keeps none.
+        """
+        section = self.config.source
+        if not isinstance(section, FleetTableSection):
+            text = f"a source of type {section.type} keeps no measurements; only those of tables are folded again"
+            raise ConfigError(f"{asset}: {text}")
+        given = section.model_dump(mode="json", exclude_unset=True, by_alias=True)
+        loaded, column = self.source.loaded, given.pop("asset")
+        found = channels(loaded, section, KEY, self.twin.model)
+        columns = [section.time.column, column, *(column_of(name) for _, item in found for name in item.needed)]
+        files = [path for pattern in section.files for path in matching(loaded, section, pattern)]
+        files = rows_of_asset(list(dict.fromkeys(files)), column, asset, list(dict.fromkeys(columns)), folder)
+        given |= {"files": [str(path.absolute()) for path in files], "follow": False}
+        given.pop("folder", None)
+        for group in ("sensors", "inputs", "truth"):
+            for channel in given.get(group, {}).values():
+                channel["only"] = {**channel.get("only", {}), column: {"text": [asset]}}
+        name = re.sub(r"[^A-Za-z0-9_-]", "_", asset).lstrip("_-") or "asset"
+        return {"source": as_flow(given), "name": as_flow(name), "title": as_flow(asset)}
+
+
+def load_fleet(path: str | os.PathLike[str], overrides: Mapping[str, str] | None = None) -> FleetPlan:
+    """Read and check a fleet's YAML, and put its twin together.
+
+    Args:
+        path: The YAML file.
+        overrides: The command line's `--set KEY=VALUE` for the twin.
+
+    Raises:
+        ConfigError: If the YAML, the twin or an override breaks a rule.
+        ModelError: If the model's file fails.
+    """
+    path = Path(path).expanduser()
+    text = read_text(path, "nisus fleet --help")
+    section, _, places = check_section(FleetSection, text, path, "a fleet is a mapping with twin and source")
+    named = section.twin
+    if named not in shipped():
+        named = str(path.parent / Path(named).expanduser())
+        if not Path(named).is_file():
+            rule = "there is no such file or bundled twin; check the path, or see `nisus twins`"
+            raise ConfigError(f"{places.at(('twin',))}: twin is {section.twin!r}; {rule}")
+    twin = load_twin(named, overrides=overrides)
+    config = twin.config.model_copy(update={"source": section.source, "faults": ()})
+    loaded = replace(twin.loaded, config=config, path=path, text=text, places=places, version=None, without=None)
+    plan = plan_source(loaded, twin.model, None)
+    if plan.brings_variances:
+        raise loaded.error(KEY, "has sensors with accuracy; a fleet uses the tuned R: leave accuracy out")
+    return FleetPlan(path, section, twin, plan)

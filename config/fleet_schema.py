@@ -1,0 +1,58 @@
+"""The schema of a fleet's YAML: a twin, its assets, and the source of their measurements."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import Field, model_validator
+
+from .fields import Count, Section, Text, Texts, refused
+from .source_schema import MqttSourceSection, PushSection, TableSection
+
+ASSET_LEVEL = "{asset}"
+"""Level of an MQTT topic that is the name of the asset."""
+
+
+class FleetTableSection(TableSection):
+    """Tables (CSV or Parquet) with the measurements of many assets."""
+
+    asset: Text
+    """Column with the name of each row's asset."""
+
+
+class FleetPushSection(PushSection):
+    """Messages with the field `asset`, which other programs send with POST /api/readings."""
+
+
+class FleetMqttSection(MqttSourceSection):
+    """Topics of an MQTT broker, in which `{asset}` stands for the level with the name of the asset."""
+
+    @model_validator(mode="after")
+    def _named(self) -> FleetMqttSection:
+        for topic in self.topics:
+            if topic.split("/").count(ASSET_LEVEL) != 1:
+                text = (
+                    f"names {topic!r}; one of its levels must be {ASSET_LEVEL}, as in plant/{ASSET_LEVEL}/temperature"
+                )
+                raise refused("relation", text, "topics")
+        return self
+
+
+class FleetSection(Section):
+    """Many assets of one twin."""
+
+    twin: Text
+    """Name of a bundled twin, or path to a YAML file, relative to this file. Model, tuning and estimator are its own;
+    its source, outputs and faults are not used."""
+    assets: Texts | Count | None = None
+    """Names of the assets, from which others are refused; or how many there may be, named by the source in the order of
+    their first measurements. Default: as many as the source names."""
+    source: Annotated[FleetTableSection | FleetPushSection | FleetMqttSection, Field(discriminator="type")]
+    """Source of the measurements: its `type` is table, push or mqtt, with the keys of that source in a twin."""
+
+    @model_validator(mode="after")
+    def _once(self) -> FleetSection:
+        if isinstance(self.assets, tuple) and len(set(self.assets)) < len(self.assets):
+            twice = next(name for name in self.assets if self.assets.count(name) > 1)
+            raise refused("relation", f"names {twice!r} twice; name each asset once", "assets")
+        return self

@@ -1,0 +1,173 @@
+"""`nisus fleet` on tables: every asset has the values of a fold over its own rows."""
+
+import json
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.csv
+import pyarrow.parquet
+import pytest
+
+from app.cli.main import main
+from app.live.fleet import RunningFleet
+from app.twin.fleet import load_fleet
+from app.twin.twin import load_twin
+from estimators import Log
+from estimators.errors import NisusError
+from estimators.fold import Fold
+from estimators.log import Events
+from estimators.track import HEALTH_NAMES, VERDICT_NAMES
+
+FLEET = """twin: motor_winding
+source:
+  type: table
+  files: {files}
+  time: {{column: time}}
+  asset: pump
+  sensors:
+    winding: {{columns: temperature}}
+"""
+
+
+def pump_rows(seed=3, assets=5, count=40):
+    """Time (s), asset and temperature of rows in the order of time; one asset is silent after half of them."""
+    rng = np.random.default_rng(seed)
+    names = [f"pump {k}" for k in range(assets)]
+    rows = []
+    for k in range(count):
+        for name in names:
+            y = 40.0 + 2.0 * float(rng.normal()) + 8.0 * (name == names[1]) * k / count
+            if name != names[2] or k < count // 2:
+                rows.append((2.0 * k + round(float(rng.random()), 3), name, round(y, 3)))
+    return sorted(rows)
+
+
+def write(path, rows):
+    columns = [list(column) for column in zip(*rows, strict=True)]
+    table = pa.table(dict(zip(("time", "pump", "temperature"), columns, strict=True)))
+    (pyarrow.csv.write_csv if path.suffix == ".csv" else pyarrow.parquet.write_table)(table, path)
+
+
+def folded(rows, asset, until):
+    """The last row of a fold over the rows of one asset, which is queried at the end if it was silent for long."""
+    twin = load_twin("motor_winding")
+    own = [(t, y) for t, name, y in rows if name == asset]
+    t = np.array([round(t * 1e9) for t, _ in own])
+    log = Log.of(twin.model)
+    count = t.size
+    log.extend(Events(t, t, np.zeros(count, np.int8), np.zeros(count, np.int32), np.array([[y] for _, y in own])))
+    if until - own[-1][0] > twin.policy.degraded_after:
+        log.add_ticks(until)
+    fold = Fold("kf", twin.model, twin.tuning, log, policy=twin.policy, expected=np.zeros(1, np.bool_))
+    fold.advance()
+    return fold.track.select(fold.n - 1), fold.n
+
+
+@pytest.mark.parametrize("ending", ["csv", "parquet"])
+def test_each_asset_has_the_values_of_a_fold_over_its_rows(ending, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    rows = pump_rows()
+    write(tmp_path / f"a.{ending}", rows[:90])
+    write(tmp_path / f"b.{ending}", rows[90:])
+    (tmp_path / "pumps.yaml").write_text(FLEET.format(files=f"'?.{ending}'"))
+    assert main(["fleet", "pumps.yaml", "--headless", "--json", "--out", f"table.{ending}"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["assets"] == 5 and sum(found["counts"].values()) == 5
+    table = {row["asset"]: row for row in (dict(zip(found["columns"], row, strict=True)) for row in found["rows"])}
+    for asset, row in table.items():
+        last, events = folded(rows, asset, rows[-1][0])
+        assert row["events"] == events and row["stale"] == 0
+        assert (row["health"], row["verdict"]) == (HEALTH_NAMES[last.health], VERDICT_NAMES[last.verdict])
+        got = [row[name] for name in ("temperature", "temperature_std", "rate", "rate_std", "nis_mean", "age")]
+        assert got == [last.mean[0], last.std[0], last.mean[1], last.std[1], last.nis_mean, last.age]
+    health = [HEALTH_NAMES.index(row["health"]) for row in table.values()]
+    assert health == sorted(health, reverse=True) and table["pump 2"]["health"] == "stale"
+    read = pyarrow.csv.read_csv if ending == "csv" else pyarrow.parquet.read_table
+    written = read(f"table.{ending}").to_pydict()
+    assert written["asset"] == list(table) and written["temperature"] == [row["temperature"] for row in table.values()]
+
+
+def test_the_worst_assets_and_the_counts_are_printed(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    write(tmp_path / "a.csv", pump_rows())
+    (tmp_path / "pumps.yaml").write_text(FLEET.format(files="a.csv"))
+    assert main(["fleet", "pumps.yaml", "--headless", "--worst", "2"]) == 0
+    text = capsys.readouterr().out
+    assert "5 assets, 181 events." in text and "Worst 2 assets" in text
+    worst = text.split("Worst 2 assets")[1].splitlines()[2:]
+    assert len(worst) == 2 and worst[0].split()[:4] == ["pump", "2", "stale", "stale"]
+
+
+@pytest.mark.parametrize(
+    ("assets", "names", "refused"),
+    [("2", ["pump 0", "pump 1"], "is beyond 2"), ("[pump 4, pump 9]", ["pump 4", "pump 9"], "is not among assets")],
+)
+def test_other_assets_are_refused_and_counted(assets, names, refused, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    rows = [(float(t), f"pump {k}", 40.0) for t in range(3) for k in range(5)]
+    write(tmp_path / "a.csv", rows)
+    (tmp_path / "pumps.yaml").write_text(FLEET.format(files="a.csv") + f"assets: {assets}\n")
+    said = []
+    running = RunningFleet(load_fleet("pumps.yaml"), lambda key, text: said.append(text), threads=1)
+    running.run()
+    _, found, table = running.table()
+    running.stop()
+    assert found == names and table.events.sum() == 3 * len(set(names) & {name for _, name, _ in rows})
+    assert f"pumps.yaml: asset 'pump 2' {refused}; add it to assets" in said
+    assert running.counts["row of no asset"] == len(said)
+
+
+@pytest.mark.parametrize(
+    ("change", "line"),
+    [
+        ({"twin: motor_winding": "twin: motor_windig"}, "pumps.yaml:1: twin is 'motor_windig'; there is no such file"),
+        ({"twin: motor_winding": "twin: motor_winding\nasets: 3"}, "pumps.yaml:2: asets is not known; did you mean"),
+        ({"twin: motor_winding": "twin: motor_winding\nassets: [a, a]"}, "pumps.yaml:2: assets names 'a' twice"),
+        ({"twin: motor_winding": "twin: motor_winding\nassets: 0"}, "pumps.yaml:2: assets"),
+        ({"  asset: pump\n": ""}, "source.asset is missing"),
+        ({"asset: pump": "asset: pum"}, "there is no column 'pum'; did you mean pump?"),
+        ({"winding:": "windng:"}, "pumps.yaml:8: source.sensors"),
+        ({"files: a.csv": "files: b.csv"}, "pumps.yaml:4: source.files is not there"),
+        ({"temperature}": "temperature, accuracy: {std: s}}"}, "leave accuracy out"),
+    ],
+)  # fmt: skip
+def test_a_wrong_file_is_one_line(change, line, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    write(tmp_path / "a.csv", pump_rows(count=2))
+    text = FLEET.format(files="a.csv")
+    for before, after in change.items():
+        assert before in text
+        text = text.replace(before, after)
+    (tmp_path / "pumps.yaml").write_text(text)
+    assert main(["fleet", "pumps.yaml"]) == 2
+    said = capsys.readouterr().err.strip()
+    assert line in said and "\n" not in said and "pumps.yaml" in said
+
+
+def test_a_tuning_that_fleets_cannot_have_names_the_twin(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "pumps.yaml").write_text(FLEET.format(files="a.csv"))
+    plan = load_fleet("pumps.yaml", {"estimator": "pf"})
+    with pytest.raises(NisusError, match=r"pumps.yaml:1: twin motor_winding: fleet: estimator pf .* Gaussian filter"):
+        plan.fleet(1)
+    with pytest.raises(NisusError, match=r"set gate.reopen to null"):
+        load_fleet("pumps.yaml", {"gate": "0.99"}).fleet(1)
+
+
+@pytest.mark.parametrize("ending", ["csv", "parquet"])
+def test_the_history_of_an_asset_is_a_table_of_its_rows(ending, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    rows = sorted([*pump_rows(), (1.0, "pump 30", 1.0)])
+    write(tmp_path / f"a.{ending}", rows)
+    (tmp_path / "pumps.yaml").write_text(FLEET.format(files=f"a.{ending}"))
+    (folder := tmp_path / "copies").mkdir()
+    twin = load_twin("motor_winding", overrides=load_fleet("pumps.yaml").history_of("pump 3", folder))
+    assert (twin.name, twin.title) == ("pump_3", "pump 3")
+    (copy,) = folder.iterdir()
+    assert copy.stat().st_size < (tmp_path / f"a.{ending}").stat().st_size
+    source = twin.open_source(lambda key, text: None)
+    found = []
+    while (batch := source.read(1.0)) is not None:
+        found += batch.value[:, 0].tolist()
+    source.close()
+    assert found == [y for _, name, y in rows if name == "pump 3"]

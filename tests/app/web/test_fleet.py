@@ -1,0 +1,134 @@
+"""The overview of a fleet: parts of the table in any order, metrics, and the page of an asset on demand."""
+
+import http.client
+import os
+import re
+import subprocess
+import sys
+from urllib.request import ProxyHandler, Request, build_opener
+
+import numpy as np
+import pytest
+from playwright.sync_api import expect
+
+from app.live.fleet import RunningFleet
+from app.twin.fleet import load_fleet
+from app.web.fleet import FleetApi, id_of
+from estimators.errors import ConfigError
+from estimators.track import HEALTH_NAMES
+from tests.app.cli.test_fleet import FLEET, pump_rows, write
+from tests.conftest import ROOT
+
+PATIENCE_S = 120.0
+
+
+@pytest.fixture(scope="module")
+def fleet(tmp_path_factory):
+    """A folder with the YAML of a fleet of 60 assets and their rows."""
+    folder = tmp_path_factory.mktemp("fleet")
+    write(folder / "a.csv", pump_rows(assets=60, count=12))
+    (folder / "pumps.yaml").write_text(FLEET.format(files="a.csv"))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def running(fleet):
+    found = RunningFleet(load_fleet(fleet / "pumps.yaml"), lambda key, text: None, threads=1)
+    found.run()
+    yield found
+    found.stop()
+
+
+def test_parts_of_the_table_are_in_order(running):
+    api = FleetApi(running)
+    _, names, table = running.table()
+    answer = api.rows(first=0, count=60)
+    assert answer["found"] == answer["assets"] == len(answer["rows"]) == 60
+    health = [HEALTH_NAMES.index(row["health"]) for row in answer["rows"]]
+    assert health == sorted(health, reverse=True)
+    assert answer["counts"] == {name: int((table.health == k).sum()) for k, name in enumerate(HEALTH_NAMES)}
+    assert [*answer["counts"]] == [*HEALTH_NAMES[::-1]]
+    by_value = api.rows(first=5, count=7, sort="temperature", down=False)
+    wanted = [names[k] for k in np.argsort(table.mean[:, 0])][5:12]
+    assert [row["asset"] for row in by_value["rows"]] == wanted and by_value["first"] == 5
+    assert [row["values"][0] for row in by_value["rows"]] == pytest.approx(np.sort(table.mean[:, 0])[5:12], rel=1e-5)
+    assert [row["asset"] for row in api.rows(sort="asset", down=False)["rows"]] == sorted(names)[:50]
+    assert api.rows(version=answer["version"]) == {"version": answer["version"]}
+
+
+def test_assets_are_found_by_words_and_health(running):
+    api = FleetApi(running)
+    found = api.rows(find="PUMP 1", count=60)
+    assert {row["asset"] for row in found["rows"]} == {f"pump {k}" for k in range(60) if "1" in str(k)}
+    assert found["found"] == 15 and found["assets"] == 60
+    worst = api.rows(health="stale", count=60)
+    assert [row["asset"] for row in worst["rows"]] == [] or {row["health"] for row in worst["rows"]} == {"stale"}
+    assert sum(api.rows(health=name)["found"] for name in HEALTH_NAMES) == 60
+    assert api.rows(first=1000)["rows"] == [] and api.rows(count=10**9)["found"] == 60
+
+
+def test_histograms_count_every_asset(running):
+    answer = FleetApi(running).rows(column="rate_std")
+    _, _, table = running.table()
+    assert sum(answer["histogram"]["counts"]) == 60
+    assert answer["histogram"]["low"] >= table.std[:, 1].min() and answer["histogram"]["high"] <= table.std[:, 1].max()
+
+
+@pytest.mark.parametrize(
+    ("query", "text"),
+    [({"sort": "temp"}, "sort is 'temp'"), ({"column": "x"}, "column is 'x'"), ({"health": "bad"}, "health is 'bad'")],
+)
+def test_a_wrong_query_is_one_line(running, query, text):
+    with pytest.raises(ConfigError, match=text):
+        FleetApi(running).rows(**query)
+
+
+def test_metrics_have_a_series_for_each_health_and_none_for_an_asset(running):
+    text = FleetApi(running).metrics().body.decode()
+    found = re.findall(r'nisus_fleet_assets{fleet="pumps",health="(\w+)"} (\S+)', text)
+    counts = {name: int(float(number)) for name, number in found}
+    assert counts == FleetApi(running).rows()["counts"] and sum(counts.values()) == 60
+    events = float(running.table()[2].events.sum())
+    assert "pump 1" not in text and f'nisus_fleet_events_total{{fleet="pumps"}} {events}' in text
+
+
+def test_ids_of_assets_are_one_part_of_a_path(running):
+    api = FleetApi(running)
+    assert id_of("pump 3", 3) == "pump 3" and id_of("hall/pump", 7) == "@7" and id_of("..", 1) == "@1"
+    assert api.find("pump 3") == "pump 3" and api.find("@7") == running.names[7]
+    assert api.find("pump 99") is None and api.find("@99") is None
+
+
+def test_the_page_lists_the_worst_first_and_a_click_opens_the_history_of_an_asset(fleet, browser):
+    run = subprocess.Popen(
+        [sys.executable, "-m", "app.cli.main", "fleet", "pumps.yaml", "--port", "0"],
+        cwd=fleet, text=True, stdout=subprocess.PIPE, env=os.environ | {"PYTHONPATH": str(ROOT)},
+    )  # fmt: skip
+    try:
+        assert run.stdout is not None
+        address = re.compile(r"http://127.0.0.1:\d+/\?token=\S+")
+        url = next(found.group() for line in run.stdout if (found := address.search(line)))
+        site, _, token = url.partition("/?token=")
+        opener = build_opener(ProxyHandler({}))
+        page = browser.new_context(viewport={"width": 1440, "height": 900}).new_page()
+        errors: list[str] = []
+        page.on("pageerror", lambda error: errors.append(str(error)))
+        page.set_default_timeout(PATIENCE_S * 1e3)
+        page.goto(url)
+        expect(page.locator("#rows a").first).to_be_visible(timeout=PATIENCE_S * 1e3)
+        expect(page.locator("#state")).to_contain_text("source has ended", timeout=PATIENCE_S * 1e3)
+        assert page.locator("#rows a").count() < 60  # those in view
+        page.fill("#find", "pump 31")
+        expect(page.locator("#rows a")).to_have_count(1)
+        page.locator("#rows a").click()
+        page.wait_for_url("**/twins/pump%2031/")
+        expect(page.locator("#trust")).to_contain_text("pump_31", timeout=PATIENCE_S * 1e3)
+        request = Request(f"{site}/twins/pump%2031/api/state", headers={"Authorization": f"Bearer {token}"})
+        with opener.open(request, timeout=PATIENCE_S) as answer:
+            assert answer.status == http.client.OK and b'"twin":"pump_31"' in answer.read()
+        assert errors == []
+        page.close()
+    finally:
+        run.terminate()
+        run.wait(PATIENCE_S)
+        run.stdout.close()
