@@ -5,14 +5,13 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from scipy.optimize import brentq
 from scipy.stats import false_discovery_control, norm
 
 from .errors import EstimatorError
 
 MIN_ASSETS = 8
 """Assets whose spread can be told."""
-
-BISECTIONS = 60
 
 QUARTILE = float(norm.ppf(0.75))
 """Median of the magnitude of a standard normal variable."""
@@ -92,10 +91,8 @@ def _spread(x: np.ndarray, s: np.ndarray) -> tuple[float, float]:
         centre = float(x[np.searchsorted(total, 0.5 * total[-1])])
         return centre, float(np.median(np.abs(x - centre) / width)) - QUARTILE
 
-    low, high = 0.0, float(np.ptp(x)) / QUARTILE
-    if excess(low)[1] <= 0.0:
-        return excess(low)[0], 0.0
-    for _ in range(BISECTIONS):
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if excess(middle)[1] > 0.0 else (low, middle)
-    return excess(high)[0], high
+    if excess(0.0)[1] <= 0.0:
+        return excess(0.0)[0], 0.0
+    most = float(np.ptp(x)) / QUARTILE
+    spread = float(brentq(lambda t: excess(t)[1], 0.0, most, xtol=1e-12 * most))
+    return excess(spread)[0], spread

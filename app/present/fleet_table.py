@@ -9,6 +9,7 @@ import numpy as np
 
 from estimators.fleet import FleetTable
 from estimators.model.state_space import StateSpaceModel
+from estimators.siblings import MIN_ASSETS, Siblings, siblings
 from estimators.track import HEALTH_NAMES, VERDICT_NAMES
 
 from .result import Cell, TableColumn, Topic
@@ -79,6 +80,15 @@ def histogram(values: np.ndarray) -> dict[str, Any] | None:
         low, high = low - 0.5, high + 0.5
     counts, edges = np.histogram(np.clip(finite, low, high), BINS, (low, high))
     return {"low": float(edges[0]), "high": float(edges[-1]), "counts": counts.tolist()}
+
+
+def siblings_of(model: StateSpaceModel, table: FleetTable, column: str) -> Siblings | None:
+    """Compare the assets in a state; None for other columns and for angles, and if there are too few assets."""
+    for k, state in enumerate(model.shown_states):
+        if state.name == column and not state.circular:
+            if np.count_nonzero(np.isfinite(table.mean[:, k])) >= MIN_ASSETS:
+                return siblings(table.mean[:, k], table.std[:, k])
+    return None
 
 
 def arrow_table(model: StateSpaceModel, table: FleetTable, order: np.ndarray | None = None) -> Any:

@@ -13,10 +13,11 @@ from starlette.routing import BaseRoute
 
 from estimators.errors import ConfigError, nearest
 from estimators.fleet import FleetTable
+from estimators.siblings import Siblings
 from estimators.track import HEALTH_NAMES
 
 from ..live.fleet import RunningFleet
-from ..present.fleet_table import counts_of, histogram, matching, ordered, units_of, value_columns
+from ..present.fleet_table import counts_of, histogram, matching, ordered, siblings_of, units_of, value_columns
 from . import readings
 from .http import get, page_file
 from .metrics import exposed
@@ -42,6 +43,8 @@ class _Order(NamedTuple):
     down: bool
     find: str
     health: str
+    differs: str
+    """State in which they differ from the others, or empty."""
 
 
 class FleetApi:
@@ -50,6 +53,7 @@ class FleetApi:
     def __init__(self, running: RunningFleet) -> None:
         self._running = running
         self._orders: OrderedDict[_Order, np.ndarray] = OrderedDict()
+        self._siblings: tuple[tuple[int, str], Siblings | None] = ((-1, ""), None)
         self._lock = threading.Lock()
 
     def routes(self) -> list[BaseRoute]:
@@ -74,12 +78,14 @@ class FleetApi:
         find: str = "",
         health: str = "",
         column: str = "",
+        differs: bool = False,
         version: int = -1,
     ) -> dict[str, Any]:
         """Return a part of the table of all assets, in an order, with counts by health and a histogram of a column.
 
-        `sort` is health, asset, or a column; `find` words in the name of an asset; `health` one grade. Of a `version`
-        that is the present one, only that is answered.
+        `sort` is health, asset, or a column; `find` words in the name of an asset; `health` one grade; `differs` asks
+        for those that differ from the others in `column`, a state. Of a `version` that is the present one, only that is
+        answered.
         """
         running, model = self._running, self._running.plan.twin.model
         present, names, table = running.table()
@@ -87,20 +93,24 @@ class FleetApi:
             return {"version": present}
         columns = value_columns(model, table)
         column = column or next(iter(columns))
-        for key, value, known in (
+        for key, value, valid in (
             ("sort", sort, ("health", "asset", *columns)),
             ("column", column, (*columns,)),
             ("health", health or HEALTH_NAMES[0], HEALTH_NAMES),
         ):
-            if value not in known:
-                raise ConfigError(f"{key} is {value!r}; {nearest(value, known)}")
-        order = self._order(_Order(present, sort, down, find, health), names, table)
+            if value not in valid:
+                raise ConfigError(f"{key} is {value!r}; {nearest(value, valid)}")
+        known = self._siblings_of(present, table, column)
+        wanted = _Order(present, sort, down, find, health, column if differs else "")
+        order = self._order(wanted, names, table, known)
         part = order[max(0, first) : max(0, first) + min(max(0, count), MAX_ROWS)]
         return {
             "version": present, "ended": running.ended, "failure": running.failure, "counts": counts_of(table),
             "assets": len(names), "found": order.size, "first": max(0, first),
             "refused": sum(running.counts.values()), "stale": int(table.stale.sum()),
             "column": column, "histogram": histogram(np.asarray(columns[column], float)),
+            "siblings": None if known is None else
+            {"mean": _short(known.mean), "std": _short(known.std), "differ": int(known.differs.sum())},
             "rows": [self._row(table, place) for place in part.tolist()],
         }  # fmt: skip
 
@@ -117,13 +127,21 @@ class FleetApi:
             "values": [*map(_short, numbers)],
         }
 
-    def _order(self, wanted: _Order, names: list[str], table: FleetTable) -> np.ndarray:
+    def _siblings_of(self, version: int, table: FleetTable, column: str) -> Siblings | None:
+        with self._lock:
+            if self._siblings[0] != (version, column):
+                self._siblings = (version, column), siblings_of(self._running.plan.twin.model, table, column)
+            return self._siblings[1]
+
+    def _order(self, wanted: _Order, names: list[str], table: FleetTable, known: Siblings | None) -> np.ndarray:
         with self._lock:
             found = self._orders.get(wanted)
             if found is None:
                 found = ordered(self._running.plan.twin.model, table, wanted.sort, wanted.down)
                 if wanted.health:
                     found = found[table.health[found] == HEALTH_NAMES.index(wanted.health)]
+                if wanted.differs:
+                    found = found[known.differs[found]] if known is not None else found[:0]
                 found = self._orders[wanted] = matching(names, wanted.find, found)
             self._orders.move_to_end(wanted)
             while len(self._orders) > MAX_ORDERS:

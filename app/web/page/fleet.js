@@ -12,7 +12,7 @@ const MAX_STATES = 4; // columns of states; the distribution has all
 const settings = JSON.parse(document.body.dataset.settings);
 const states = settings.states.slice(0, MAX_STATES);
 const nx = settings.states.length;
-const query = { sort: "health", down: true, find: "", health: "", column: settings.columns[0] };
+const query = { sort: "health", down: true, find: "", health: "", column: settings.columns[0], differs: false };
 let answer = null;
 let asking = null;
 let again = false;
@@ -84,16 +84,17 @@ function fail(text) {
 
 const stateText = () => (answer ? ["", count(answer.assets, "asset"), answer.ended ? "source has ended" : "live", answer.stale ? `${count(answer.stale, "late event")} dropped` : null, answer.refused ? count(answer.refused, "problem") : null].filter(Boolean).join(" · ") : "");
 
-function draw({ rows, first, found, assets, counts, histogram, failure }) {
+function draw({ rows, first, found, assets, counts, histogram, siblings, failure }) {
   const focused = document.activeElement?.closest("#rows a")?.getAttribute("href");
   $("rows").style.height = `${found * ROW}px`;
   $("rows").replaceChildren(...rows.map((row, k) => item(row, first + k)));
   if (focused) [...$("rows").children].find((node) => node.getAttribute("href") === focused)?.focus({ preventScroll: true });
   $("none").hidden = found > 0;
-  setText($("none"), assets ? "No asset of that name and health." : "No measurements yet.");
+  setText($("none"), assets ? "No asset of that kind." : "No measurements yet.");
   for (const head of $("heads").children) setAttribute(head, "aria-sort", head.dataset.sort && head.dataset.sort === query.sort ? (query.down ? "descending" : "ascending") : null);
   grades(counts, assets);
   distribution(histogram);
+  beside(siblings);
   fail(failure);
 }
 
@@ -151,9 +152,27 @@ function distribution(found) {
     element("div", { class: "ends" }, element("span", {}, compact(found.low)), element("span", {}, unit), element("span", {}, compact(found.high))));
 }
 
+// Assets that differ from the others in the state of the distribution; a click shows them alone.
+function beside(found) {
+  const unit = settings.units[query.column] ?? "";
+  $("siblings").hidden = !found;
+  if (!found) return;
+  setText($("spread"), `From asset to asset: ${withDeviation(found.mean, found.std)}${unit ? ` ${unit}` : ""}`);
+  setText($("differ"), query.differs ? "Show all assets" : `${count(found.differ, "asset")} differ${found.differ === 1 ? "s" : ""}`);
+  setAttribute($("differ"), "aria-pressed", String(query.differs));
+  $("differ").disabled = !found.differ && !query.differs;
+}
+
+$("differ").addEventListener("click", () => {
+  query.differs = !query.differs;
+  $("window").scrollTop = 0;
+  ask(true);
+});
+
 $("column").replaceChildren(...settings.columns.map((name) => element("option", { value: name }, name.replace(/_std$/, " σ").replaceAll("_", " "))));
 $("column").addEventListener("change", () => {
   query.column = $("column").value;
+  query.differs = false;
   ask(true);
 });
 $("find").addEventListener("input", () => {

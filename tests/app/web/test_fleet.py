@@ -5,6 +5,7 @@ import os
 import re
 import subprocess
 import sys
+from types import SimpleNamespace
 from urllib.request import ProxyHandler, Request, build_opener
 
 import numpy as np
@@ -15,6 +16,7 @@ from app.live.fleet import RunningFleet
 from app.twin.fleet import load_fleet
 from app.web.fleet import FleetApi, id_of
 from estimators.errors import ConfigError
+from estimators.siblings import siblings
 from estimators.track import HEALTH_NAMES
 from tests.app.cli.test_fleet import FLEET, pump_rows, write
 from tests.conftest import ROOT
@@ -65,6 +67,23 @@ def test_assets_are_found_by_words_and_health(running):
     assert [row["asset"] for row in worst["rows"]] == [] or {row["health"] for row in worst["rows"]} == {"stale"}
     assert sum(api.rows(health=name)["found"] for name in HEALTH_NAMES) == 60
     assert api.rows(first=1000)["rows"] == [] and api.rows(count=10**9)["found"] == 60
+
+
+def test_assets_that_differ_from_the_others_are_told(running):
+    _, names, table = running.table()
+    mean = table.mean.copy()
+    mean[7, 0] += 40.0
+    api, known = FleetApi(running), siblings(mean[:, 0], table.std[:, 0])
+    changed = table._replace(mean=mean)
+    shown = SimpleNamespace(table=lambda: (running.table()[0] + 1, names, changed), plan=running.plan, ended=True,
+                            failure="", counts={})  # fmt: skip
+    answer = FleetApi(shown).rows(differs=True)
+    wanted = {names[k] for k in np.flatnonzero(known.differs)}
+    assert {row["asset"] for row in answer["rows"]} == wanted and names[7] in wanted
+    assert answer["found"] == answer["siblings"]["differ"] == len(wanted) < answer["assets"] == 60
+    assert answer["siblings"]["mean"] == pytest.approx(known.mean, rel=1e-5)
+    assert answer["siblings"]["std"] == pytest.approx(known.std, rel=1e-5)
+    assert api.rows(column="nis")["siblings"] is None and api.rows(column="nis", differs=True)["rows"] == []
 
 
 def test_histograms_count_every_asset(running):
