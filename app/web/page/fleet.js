@@ -107,7 +107,7 @@ function item({ asset, id, health, cause, values }, place) {
     element("b", { role: "cell", title: asset }, asset),
     element("span", { class: "pill", role: "cell", dataset: { health } }, health),
     element("span", { class: "cause faint", role: "cell" }, cause === health ? "" : cause),
-    ...states.map((name, k) => number(withDeviation(values[k] ?? NaN, values[nx + k] ?? NaN))),
+    ...states.map((name, k) => number(withDeviation(values[k] ?? NaN, 2 * (values[nx + k] ?? NaN)), "estimate ± 2σ")),
     number(compact(nis, 3), Number.isFinite(low) ? `95 % bounds ${compact(low, 3)} to ${compact(high, 3)}` : null),
     number(Number.isFinite(age) ? span(age) : "–"),
   );
@@ -154,10 +154,9 @@ function distribution(found) {
 
 // Assets that differ from the others in the state of the distribution; a click shows them alone.
 function beside(found) {
-  const unit = settings.units[query.column] ?? "";
   $("siblings").hidden = !found;
   if (!found) return;
-  setText($("spread"), `From asset to asset: ${withDeviation(found.mean, found.std)}${unit ? ` ${unit}` : ""}`);
+  setText($("spread"), `Asset to asset ${withDeviation(found.mean, 2 * found.std, settings.units[query.column])}`);
   setText($("differ"), query.differs ? "Show all assets" : `${count(found.differ, "asset")} differ${found.differ === 1 ? "s" : ""}`);
   setAttribute($("differ"), "aria-pressed", String(query.differs));
   $("differ").disabled = !found.differ && !query.differs;
