@@ -39,7 +39,7 @@ def siblings(mean: np.ndarray, std: np.ndarray, *, rate: float = 0.05) -> Siblin
     The true value x_i of asset i is N(m, t²) unless the asset differs, and its estimate is N(x_i, s_i²). A few assets
     that differ hardly change m and t: m is the median weighted with 1 / sqrt(t² + s_i²), and t solves
 
-        median of |mean_i - m| / sqrt(t² + s_i²) = 0.6745
+        median of abs(mean_i - m) / sqrt(t² + s_i²) = 0.6745
 
     as Paule and Mandel solve for the mean square; t is 0 if the estimates differ by no more than their own deviations
     tell. The p-values of the assets are corrected for their number: of the assets that are reported, a share `rate` are

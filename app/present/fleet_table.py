@@ -12,6 +12,7 @@ from estimators.model.state_space import StateSpaceModel
 from estimators.siblings import MIN_ASSETS, Siblings, siblings
 from estimators.track import HEALTH_NAMES, VERDICT_NAMES
 
+from ..format_time import counted
 from .result import Cell, TableColumn, Topic
 
 BINS = 40
@@ -117,7 +118,7 @@ def arrow_table(model: StateSpaceModel, table: FleetTable, order: np.ndarray | N
 def fleet_topics(model: StateSpaceModel, table: FleetTable, worst: int) -> list[Topic]:
     """Return the counts by health and the worst assets as text."""
     total, stale = len(table.assets), int(table.stale.sum())
-    sentences = [f"{total:,} assets, {int(table.events.sum()):,} events."]
+    sentences = [f"{counted(total, 'asset')}, {counted(int(table.events.sum()), 'event')}."]
     if stale:
         sentences.append(f"{stale:,} events were too late to be inserted and were dropped; sort the rows by time.")
     counts = counts_of(table)

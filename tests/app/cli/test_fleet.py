@@ -102,7 +102,7 @@ def test_the_worst_assets_and_the_counts_are_printed(tmp_path, monkeypatch, caps
     ("assets", "names", "refused"),
     [("2", ["pump 0", "pump 1"], "is beyond 2"), ("[pump 4, pump 9]", ["pump 4", "pump 9"], "is not among assets")],
 )
-def test_other_assets_are_refused_and_counted(assets, names, refused, tmp_path, monkeypatch):
+def test_other_assets_are_refused_and_counted(assets, names, refused, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     rows = [(float(t), f"pump {k}", 40.0) for t in range(3) for k in range(5)]
     write(tmp_path / "a.csv", rows)
@@ -115,6 +115,9 @@ def test_other_assets_are_refused_and_counted(assets, names, refused, tmp_path, 
     assert found == names and table.events.sum() == 3 * len(set(names) & {name for _, name, _ in rows})
     assert f"pumps.yaml: asset 'pump 2' {refused}; add it to assets" in said
     assert running.counts["row of no asset"] == len(said)
+    assert main(["fleet", "pumps.yaml", "--headless"]) == 0
+    told = [line for line in capsys.readouterr().err.splitlines() if "pumps.yaml" in line]
+    assert told == [f"nisus: {said[0]}"]  # once, however many there are
 
 
 @pytest.mark.parametrize(
