@@ -69,10 +69,14 @@ class Running:
 
     def ask(self, path: str, body: Any = None) -> Any:
         """Return an answer of the API."""
+        return json.loads(self.text(path, body))
+
+    def text(self, path: str, body: Any = None) -> str:
+        """Return an answer as text."""
         data = None if body is None else json.dumps(body).encode()
         headers = self.headers | ({"Content-Type": "application/json"} if data else {})
         with urllib.request.urlopen(urllib.request.Request(self.address + path, data, headers)) as answer:
-            return json.loads(answer.read())
+            return str(answer.read().decode())
 
     @property
     def readings(self) -> int:

@@ -5,6 +5,9 @@ shown and hidden, recordings started and stopped. A line a minute has memory, th
 process; the end has their slopes with standard errors, from the minute in which the history is full: until then each
 event adds its row to the log, the track and what shows them. `--history` is its length in events.
 
+With `--service` as well, the same without a page: 100 measurements a second, recorded, archived and scraped as metrics,
+where recordings and archive are split and removed as they grow; disk use is watched, too.
+
 With `--seconds 3600`, the default: an hour at 1 kHz of the worst mix of faults, as fast as possible. The engine runs
 without a page on a simulated asset; every few seconds of the asset's time some faults of all kinds begin, which last
 for some seconds. At the end every event must be accounted for, memory must have stayed flat once the history was full,
@@ -19,6 +22,7 @@ import sys
 import tempfile
 import threading
 import time
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -83,6 +87,12 @@ class Watched(NamedTuple):
 WATCHED = (Watched("memory", "MB", 15.0), Watched("threads", "", 1.0), Watched("handles", "", 2.0))
 """Resident memory (RSS) of the server process alone, without browser and compilers."""
 
+WATCHED_SERVICE = (*WATCHED, Watched("disk", "MB", 5.0))
+KEPT_MB = 10  # of recordings, and of the archive
+SPLIT = "2min"
+SERVICE_STEP = 0.03  # seconds between the asset's steps, each of three readings
+SCRAPE_PERIOD_S = 10.0
+
 EDIT_PERIOD_S, EXPLORE_PERIOD_S, RECORDING_PERIOD_S = 20.0, 120.0, 90.0
 SAMPLE_PERIOD_S = 1.0
 ACTION_TIMEOUT_MS = 600_000  # of a click, on a busy machine without a graphics card
@@ -118,12 +128,18 @@ def slope(minutes: np.ndarray, values: np.ndarray) -> tuple[float, float]:
 class PageSoak:
     """A server with a page that is used: edits, Explore and recordings, each with a period of its own."""
 
+    watched: tuple[Watched, ...] = WATCHED
+
     def __init__(self, run: Running, page: Any, folder: Path, history: int) -> None:
         self.run, self.page, self.folder, self.history = run, page, folder, history
         self.full: int | None = None
         """Minute by which the history was full."""
         self.samples: list[tuple[float, ...]] = []
         self.edits = self.recordings = self.explored = 0
+
+    def done(self) -> dict[str, int]:
+        """Return how often each thing was done."""
+        return {"edits": self.edits, "Explore": self.explored, "recordings": self.recordings}
 
     def figures(self) -> tuple[float, ...]:
         """Return memory, threads and handles of the server."""
@@ -146,23 +162,21 @@ class PageSoak:
     def use(self, minutes: float) -> None:
         """Use the page, and print a line a minute: the median of its seconds."""
         begun, minute, kept = time.monotonic(), list[tuple[float, ...]](), 0
-        print("  min  RSS [MB]  threads  handles  edits  Explore  recordings  rows kept")
+        heads = [f"{item.name} [{item.unit}]" if item.unit else item.name for item in self.watched]
+        print("  min", *(f"{head:>11s}" for head in (*heads, *self.done(), "rows kept")))
         while (seconds := time.monotonic() - begun) < 60.0 * minutes:
             self.act(seconds)
             minute.append(self.figures())
             if seconds >= MINUTE_S * (len(self.samples) + 1):
                 self.samples.append(tuple(np.median(minute, axis=0)))
                 minute.clear()
-                memory, threads, handles = self.samples[-1]
                 rows = self.run.ask("/api/status")["counts"]["readings"]
                 if self.full is None and rows < kept:
                     self.full = len(self.samples)  # the oldest have been dropped
                 kept = rows
-                print(
-                    f"  {len(self.samples):3d}  {memory:8.1f}  {threads:7.0f}  {handles:7.0f}  {self.edits:5d}  "
-                    f"{self.explored:7d}  {self.recordings:10d}  {rows:9,d}",
-                    flush=True,
-                )
+                cells = [f"{value:11.1f}" for value in self.samples[-1]]
+                cells += [f"{count:11,d}" for count in (*self.done().values(), rows)]
+                print(f"  {len(self.samples):3d}", *cells, flush=True)
             time.sleep(SAMPLE_PERIOD_S)
 
     def verdict(self) -> list[str]:
@@ -175,7 +189,7 @@ class PageSoak:
         if minutes.size < MIN_MINUTES:
             return [f"{minutes.size} minutes after the start settled are too few for a slope; {MIN_MINUTES} are needed"]
         whole = minutes.size // CYCLE_MINUTES * CYCLE_MINUTES
-        for item, values in zip(WATCHED, np.array(self.samples)[late].T, strict=True):
+        for item, values in zip(self.watched, np.array(self.samples)[late].T, strict=True):
             cycles = (column[:whole].reshape(-1, CYCLE_MINUTES).mean(axis=1) for column in (minutes, values))
             rate, error = slope(*cycles)
             unit = f"{item.unit}/h".lstrip()
@@ -191,6 +205,50 @@ def soak_page(minutes: float, history: int) -> list[str]:
         with running(TWIN, "--recordings", name, "--set", f"history={history}") as run, opened(run) as (page, _):
             page.set_default_timeout(ACTION_TIMEOUT_MS)
             soak = PageSoak(run, page, Path(name), history)
+            soak.use(minutes)
+            return soak.verdict()
+
+
+class ServiceSoak(PageSoak):
+    """A server without a page, with recordings, an archive and metrics."""
+
+    watched = WATCHED_SERVICE
+
+    def __init__(self, run: Running, folder: Path, history: int) -> None:
+        super().__init__(run, None, folder, history)
+        self.scrapes = 0
+
+    def done(self) -> dict[str, int]:
+        """Return the number of scrapes, and of files."""
+        return {"scrapes": self.scrapes, "files": len(self._sizes())}
+
+    def figures(self) -> tuple[float, ...]:
+        """Return memory, threads and handles of the server, and what its files take."""
+        return *super().figures(), 1e-6 * sum(self._sizes())
+
+    def act(self, seconds: float) -> None:
+        """Scrape the metrics when that is due."""
+        if seconds >= SCRAPE_PERIOD_S * (self.scrapes + 1):
+            self.scrapes += 1
+            assert "nisus_" in self.run.text("/metrics?states=true")
+
+    def _sizes(self) -> list[int]:
+        """Sizes of all files that are there; one may be removed meanwhile."""
+        found = []
+        for path in self.folder.rglob("*"):
+            with suppress(FileNotFoundError):
+                found += [path.stat().st_size] if path.is_file() else []
+        return found
+
+
+def soak_service(minutes: float, history: int) -> list[str]:
+    """Run it, and return what falls short."""
+    with tempfile.TemporaryDirectory() as name:
+        record = [f"--record={name}/run.rrd", f"--record-split={SPLIT}", f"--record-keep={KEPT_MB}MB"]
+        archive = [f"--archive={name}/archive", f"--archive-split={SPLIT}", f"--archive-keep={KEPT_MB}MB"]
+        settings = [f"--set=history={history}", f"--set=source.asset.step={SERVICE_STEP}"]
+        with running(TWIN, "--recordings", name, *record, *archive, *settings) as run:
+            soak = ServiceSoak(run, Path(name), history)
             soak.use(minutes)
             return soak.verdict()
 
@@ -328,9 +386,10 @@ def main() -> int:
     parser.add_argument("--seconds", type=float, default=3600.0, help="of the asset")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--history", type=int, default=HISTORY_EVENTS, help="events that the twin with a page keeps")
+    parser.add_argument("--service", action="store_true", help="with --minutes: without a page, with files and metrics")
     given = parser.parse_args()
     if given.minutes is not None:
-        wrong = soak_page(given.minutes, given.history)
+        wrong = (soak_service if given.service else soak_page)(given.minutes, given.history)
         for text in wrong:
             print(f"FALLS SHORT: {text}")
         return 1 if wrong else 0
