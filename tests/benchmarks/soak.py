@@ -171,7 +171,7 @@ class PageSoak:
                 self.samples.append(tuple(np.median(minute, axis=0)))
                 minute.clear()
                 rows = self.run.ask("/api/status")["counts"]["readings"]
-                if self.full is None and rows < kept:
+                if self.full is None and (rows < kept or rows >= self.history):
                     self.full = len(self.samples)  # the oldest have been dropped
                 kept = rows
                 cells = [f"{value:11.1f}" for value in self.samples[-1]]
