@@ -145,7 +145,7 @@ def _dask(address: str, begin: Callable[..., None], given: tuple[Any, ...]) -> I
 
 @contextmanager
 def _deaf() -> Iterator[None]:
-    """Ctrl-C is for the parent alone: what is started inherits the mask, so that it holds while a process loads too."""
+    """Block Ctrl-C for processes that are started here: they inherit the mask, also while they load."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield

@@ -36,7 +36,7 @@ DIGITS = 6
 
 
 class _Order(NamedTuple):
-    """What an order of the assets depends on."""
+    """Version of the table, and the settings that determine an order of its assets."""
 
     version: int
     sort: str
