@@ -351,7 +351,7 @@ def test_failures_are_counted_by_sensor_once_however_often_they_are_folded():
         value[:, 0] = [y for _, _, y in readings]
         return Events(t, t.copy(), np.full(t.size, READING, np.int8), channel, value)
 
-    stepped.put(batch((0.01, force, np.nan), (0.02, force, np.nan), (0.03, position, np.nan), (0.04, force, 1e9)))
+    stepped.put(batch((0.01, force, np.nan), (0.02, force, 1e9), (0.03, position, np.nan), (0.04, force, np.nan)))
     stepped.put(batch((0.05, force, np.nan), (0.06, position, 0.0)))
     stepped.put(batch((0.015, position, np.nan)))
     stepped.submit(commands.SetTuning("R.position", 1e-6))
@@ -362,7 +362,7 @@ def test_failures_are_counted_by_sensor_once_however_often_they_are_folded():
     assert counts["gated"] == counts["gated force"] == 1 and "gated position" not in counts
     assert np.isfinite(pull_all(stepped.engine).track.mean).all()
     assert any("no value" in text for text in stepped.notices())
-    assert {line.t for line in stepped.engine.notices.since(0) if "rejected by the gate" in line.text} == {SECOND // 25}
+    assert {line.t for line in stepped.engine.notices.since(0) if "rejected by the gate" in line.text} == {SECOND // 50}
 
 
 class Solver:
