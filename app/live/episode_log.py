@@ -200,11 +200,10 @@ class EpisodeLog:
         begun, over = _changes(before, self.tracker.entries, again)
         say = partial(self._engine.notices.say, passage=passage)
         track, t = self.tracker.track, self.tracker.events.t
-        states = {name: state for name, (state, _) in self._engine.status().sensors.items()}
-        leading = self.summary.leading(states)
         health = int(track.health[-1])
         if health != self._health:
             self._health = health
+            leading = self.summary.leading({name: state for name, (state, _) in self._engine.status().sensors.items()})
             text = f"health: {HEALTH_NAMES[health]}"
             estimated = estimated_rows(track.select(slice(-1, None)))[0]
             if health not in (WAITING, TRACKING) and leading is not None and estimated:
