@@ -475,7 +475,7 @@ class TwinSection(Section):
     history: Count = 200_000
     """Events that are kept, and folded again when the tuning changes; older ones are dropped. Default: 200,000."""
     source: SourceSection
-    """Source of the measurements; its `type` is simulator, can, can_log, table, merged, push, mqtt or opcua."""
+    """Source of the measurements; its `type` is simulator, can, can_log, table, merged, push, mqtt, opcua or modbus."""
     faults: tuple[FaultSection, ...] = ()
     """Faults that are injected into the source: a list of {kind, sensor, input, start, end, size, rate, ...}. They act
     in this order, after those of a simulator. Default: none."""

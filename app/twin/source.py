@@ -18,7 +18,7 @@ from .channels import channels, read_faults
 from .sources.asset import SIMULATOR
 from .sources.can import CAN, CAN_LOG, make_player
 from .sources.kind import Kind, Opening, find_databases, find_recording
-from .sources.push import MQTT, OPC_UA, PUSH
+from .sources.push import MODBUS, MQTT, OPC_UA, PUSH
 from .sources.recordings import MERGED, TABLE
 
 if TYPE_CHECKING:
@@ -177,5 +177,6 @@ SOURCES: dict[str, Kind] = {
     "push": PUSH,
     "mqtt": MQTT,
     "opcua": OPC_UA,
+    "modbus": MODBUS,
 }
 """By the `type` of the section."""

@@ -1,4 +1,4 @@
-"""Sources of messages: those that other programs send, and those of an MQTT broker or an OPC UA server."""
+"""Sources of messages: those that other programs send, and those of a broker, a server or a device."""
 
 from __future__ import annotations
 
@@ -8,7 +8,13 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from config.fleet_schema import ASSET_LEVEL, FleetMqttSection, FleetPushSection
-from config.source_schema import ColumnSection, MqttSourceSection, OpcUaSourceSection, PushSection
+from config.source_schema import (
+    ColumnSection,
+    ModbusSourceSection,
+    MqttSourceSection,
+    OpcUaSourceSection,
+    PushSection,
+)
 from config.yaml_files import Key
 from estimators.errors import ConfigError, nearest, shown_name
 from estimators.model.state_space import StateSpaceModel
@@ -23,7 +29,10 @@ if TYPE_CHECKING:
 TOPIC_FILTER = re.compile(r"(?:(?:[^#+/\x00]*|\+)/)*(?:[^#+/\x00]*|\+|#)")
 """Topics with wildcards, as brokers take them."""
 
-MessageSection = PushSection | MqttSourceSection | OpcUaSourceSection
+MAX_REGISTERS = 65_536
+"""Registers of a table of a Modbus device."""
+
+MessageSection = PushSection | MqttSourceSection | OpcUaSourceSection | ModbusSourceSection
 
 
 def _messages(opening: Opening) -> Messages:
@@ -86,6 +95,29 @@ def _open_opcua(opening: Opening) -> Source:
     return OpcUaSource(messages, section.url, section.nodes, period=section.every, report=opening.report)
 
 
+def _open_modbus(opening: Opening) -> Source:
+    from sources.modbus import ModbusSource, Register
+
+    section: ModbusSourceSection = opening.section
+    messages = _messages(opening)
+    _check_names(opening, messages, set(section.registers), "registers")
+    registers = {name: Register(**item.model_dump()) for name, item in section.registers.items()}
+    for name, item in registers.items():
+        last = MAX_REGISTERS - item.size
+        if item.address > last:
+            text = f"is {item.address}; a {item.type} has {item.size} registers, so it is at most {last}"
+            raise failure(opening.loaded, (*opening.key, "registers", name, "address"), text)
+    return ModbusSource(
+        messages,
+        registers,
+        host=section.host,
+        port=section.port,
+        device=section.device,
+        period=section.every,
+        report=opening.report,
+    )
+
+
 def _check_names(opening: Opening, messages: Messages, named: set[str], key: str) -> None:
     """Refuse names of values that feed nothing."""
     for name in sorted(named - set(messages.names)):
@@ -113,3 +145,4 @@ def _sections(section: MessageSection, key: Key) -> dict[Key, Any]:
 PUSH = Kind(_messages, sections=_sections, takes_log=False, kernels=(VALUES,))
 MQTT = Kind(_open_mqtt, sections=_sections, takes_log=False, kernels=(VALUES,))
 OPC_UA = Kind(_open_opcua, sections=_sections, takes_log=False, kernels=(VALUES,))
+MODBUS = Kind(_open_modbus, sections=_sections, takes_log=False, kernels=(VALUES,))

@@ -221,6 +221,14 @@ def test_a_source_whose_broker_comes_back_goes_on(serve, broker):
             {"type": "opcua", "url": "opc.tcp://x:1", "nodes": {"winding": "Tank.Level"}},
             "node 'Tank.Level' of winding is no node id; it must be like ns=2;s=Tank.Level",
         ),
+        (
+            {"type": "modbus", "host": "x", "registers": {"windng": 1}},
+            "registers names 'windng', no value of this twin",
+        ),
+        (
+            {"type": "modbus", "host": "x", "registers": {"winding": {"address": 65535, "type": "float32"}}},
+            "registers.winding.address is 65535; a float32 has 2 registers, so it is at most 65534",
+        ),
     ],
 )
 def test_a_source_that_cannot_be_is_refused_in_one_line(source, text, monkeypatch):

@@ -1,0 +1,175 @@
+"""Source of the registers of a Modbus TCP device, which are asked for again and again."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+from estimators.errors import ConfigError, printable
+from estimators.log import Events
+
+from .brokers import NO_BROKER, REFUSED_MESSAGE, RETRY_S
+from .messages import REFUSED, Messages
+from .source import Report
+
+NO_REGISTER = "no register"  # Key of registers that the device does not give
+ANSWER_TIMEOUT_S = 1.0
+
+BIT_TABLES = ("coil", "discrete")
+MAX_COUNT = {"holding": 125, "input": 125, "coil": 2000, "discrete": 2000}
+"""Most registers or bits of a request, by table (Modbus Application Protocol 1.1b3, sections 6.1 to 6.4)."""
+
+SIZES = {"int16": 1, "uint16": 1, "int32": 2, "uint32": 2, "int64": 4, "uint64": 4, "float32": 2, "float64": 4}
+"""Registers of a number, by its type."""
+
+
+class Register(NamedTuple):
+    """Where a device has a value: first address from 0, table, type of number, and order of its registers."""
+
+    address: int
+    table: str = "holding"
+    type: str = "uint16"
+    words: str = "big"
+
+    @property
+    def size(self) -> int:
+        """Registers, or bits, of the value."""
+        return 1 if self.table in BIT_TABLES else SIZES[self.type]
+
+
+class Block(NamedTuple):
+    """Registers of a table that one request reads: those from `first` on, below `end`."""
+
+    table: str
+    first: int
+    end: int
+    names: tuple[str, ...]
+
+
+def blocks_of(registers: Mapping[str, Register]) -> list[Block]:
+    """Return the requests: values that are adjacent are read together, so that they are of one moment."""
+    found: list[Block] = []
+    for name, item in sorted(registers.items(), key=lambda pair: (pair[1].table, pair[1].address)):
+        end, last = item.address + item.size, found[-1] if found else None
+        joins = last is not None and last.table == item.table and item.address <= last.end
+        if last is not None and joins and end - last.first <= MAX_COUNT[item.table]:
+            found[-1] = last._replace(end=max(last.end, end), names=(*last.names, name))
+        else:
+            found.append(Block(item.table, item.address, end, (name,)))
+    return found
+
+
+class ModbusSource:
+    """Live source of the registers of a device. What the device does not give is missing."""
+
+    live = True
+
+    def __init__(
+        self,
+        messages: Messages,
+        registers: Mapping[str, Register],
+        *,
+        host: str,
+        port: int,
+        device: int,
+        period: float,
+        report: Report,
+    ) -> None:
+        """Connect in a thread of its own; a device that is not there is waited for.
+
+        Args:
+            messages: Takes the values.
+            registers: By the name of the value.
+            host: Name or address of the device.
+            port: Its port.
+            device: Its number behind a gateway (unit identifier).
+            period: Seconds between two readings.
+            report: Receives lost connections and refused registers.
+
+        Raises:
+            ConfigError: If pymodbus is not installed.
+        """
+        try:
+            from pymodbus.client import ModbusTcpClient
+        except ModuleNotFoundError:
+            raise ConfigError("Modbus needs pymodbus: pip install 'nisus[service]'") from None
+        logging.getLogger("pymodbus").addHandler(logging.NullHandler())  # what it logs is reported here, in one line
+        self._messages, self._registers, self._report = messages, registers, report
+        self._place, self._device, self._period = f"{host}:{port}", device, period
+        self._client: Any = ModbusTcpClient(host, port=port, timeout=ANSWER_TIMEOUT_S, retries=0)
+        self._ask = {
+            "holding": self._client.read_holding_registers,
+            "input": self._client.read_input_registers,
+            "coil": self._client.read_coils,
+            "discrete": self._client.read_discrete_inputs,
+        }
+        self._blocks = blocks_of(registers)
+        self.connected = threading.Event()
+        """Set while the device answers."""
+        self._stopping = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="Modbus source", daemon=True)
+        self._thread.start()
+
+    def _run(self) -> None:
+        """Read until the source is closed; connect again after a failure."""
+        while not self._stopping.is_set():
+            try:
+                if not self._client.connect():
+                    raise ConnectionError("it does not answer")
+                self._poll()
+            except Exception as error:  # noqa: BLE001  no device may end the source
+                why = printable(str(error) or type(error).__name__)
+                text = f"no measurements from the device at {self._place}: {why}; it is tried again"
+                self._report(NO_BROKER, text)
+            self.connected.clear()
+            self._client.close()
+            self._stopping.wait(RETRY_S)
+
+    def _poll(self) -> None:
+        """Read all blocks each period; their values count at the moment of the last answer."""
+        due = time.monotonic()
+        while not self._stopping.wait(max(0.0, due - time.monotonic())):
+            values: dict[str, float | None] = {}
+            for block in self._blocks:
+                values |= self._read(block)
+            # One message: a vector of several blocks stays one measurement.
+            answer = self._messages.send([{"source": f"modbus {self._place}", "values": values}])[0]
+            if answer.status == REFUSED:
+                self._report(REFUSED_MESSAGE, f"registers of {self._place}: {answer.reason}; they are not used")
+            self.connected.set()
+            # A device that is slower than the period is read without pause, but not several times in a row.
+            due = max(due + self._period, time.monotonic())
+
+    def _read(self, block: Block) -> dict[str, float | None]:
+        answer = self._ask[block.table](block.first, count=block.end - block.first, device_id=self._device)
+        if not answer.isError():
+            return {name: self._value(self._registers[name], block, answer) for name in block.names}
+        where = f"{block.table} {block.first} to {block.end - 1}"
+        text = f"the device at {self._place} does not give {', '.join(block.names)} ({where}): {answer}"
+        self._report(NO_REGISTER, f"{printable(text)}; check address, table and device")
+        return dict.fromkeys(block.names)
+
+    def _value(self, item: Register, block: Block, answer: Any) -> float:
+        at = item.address - block.first
+        if item.table in BIT_TABLES:
+            return float(answer.bits[at])
+        kind = self._client.DATATYPE[item.type.upper()]
+        words = answer.registers[at : at + item.size]
+        return float(self._client.convert_from_registers(words, kind, word_order=item.words))
+
+    def read(self, timeout: float) -> Events | None:
+        """Return the events of the next values."""
+        return self._messages.read(timeout)
+
+    def now(self) -> int | None:
+        """Return the present time by the clock of this machine, ns."""
+        return self._messages.now()
+
+    def close(self) -> None:
+        """Disconnect."""
+        self._stopping.set()
+        self._client.close()
+        self._thread.join(2.0 * ANSWER_TIMEOUT_S)
