@@ -20,7 +20,7 @@ for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
 
 def main() -> None:
     """Run the sections; no figure makes it fail."""
-    from . import buses, false_alarms, filters, folds, page, recovery, sampling
+    from . import buses, cluster, false_alarms, filters, folds, page, recovery, sampling
     from .timing import Section, run_sections
 
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -53,6 +53,8 @@ def main() -> None:
         folds.blf,
         buses.can_live,
         folds.channels,
+        cluster.tasks,
+        cluster.spread_folds,
         false_alarms.false_alarms,
         page.page,
     ]

@@ -1,0 +1,90 @@
+"""Work in processes and on a Dask cluster: cost of a task, and folds that are spread over workers."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Iterator
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from app.studies.processes import results
+from app.twin.twin import load_twin
+from estimators.errors import NisusError
+from estimators.fold import Fold
+from estimators.log import Log
+
+from .folds import DEFAULT_TWIN, REFOLD_READINGS, endless_log
+from .timing import BenchmarkRow
+
+WAYS: dict[str, dict[str, Any]] = {
+    "one process": {"jobs": 1},
+    "2 processes": {"jobs": 2},
+    "4 processes": {"jobs": 4},
+    "Dask, 2 workers": {"cluster": "local:2"},
+    "Dask, 4 workers": {"cluster": "local:4"},
+}
+
+FEW, MANY = 50, 550
+"""Tasks without work; the cost of one is the difference, in which the start of the workers cancels."""
+
+FOLDS = 48
+READINGS = 2 * REFOLD_READINGS
+"""Measurements of a fold, so that it takes more than 0.1 s."""
+
+_shared: dict[str, Any] = {}
+
+
+def tasks() -> Iterator[BenchmarkRow]:
+    """A task without work, in processes and on a Dask cluster on this machine: ms by the clock."""
+    for name, way in WAYS.items():
+        took = [_spent(_nothing, [()] * count, way)[0] for count in (FEW, MANY)]
+        yield BenchmarkRow(name, {"per task [ms]": 1e3 * (took[1] - took[0]) / (MANY - FEW), "start [s]": took[0]})
+
+
+def spread_folds() -> Iterator[BenchmarkRow]:
+    """Folds of one log with 48 tunings, from the first result to the last: seconds by the clock, and times faster.
+
+    Raises:
+        NisusError: If the tracks are not the same bits everywhere.
+    """
+    calls = [(0.01 + 0.001 * k,) for k in range(FOLDS)]
+    wanted, alone = None, np.nan
+    for name, way in WAYS.items():
+        whole, span, found = _spent(_fold, calls, way, begin=_share)
+        wanted, alone = (found, span) if wanted is None else (wanted, alone)
+        if found != wanted:
+            raise NisusError(f"{name}: other bits than in one process")
+        figures = {"folds [s]": span, "times faster": alone / span, "with start [s]": whole}
+        yield BenchmarkRow(name, figures, remark=f"{os.cpu_count()} cores" if way.get("jobs") == 1 else "")
+
+
+def _spent(work: Any, calls: list[tuple[Any, ...]], way: dict[str, Any], **more: Any) -> tuple[float, float, list[Any]]:
+    """Return the seconds of all calls with the start, those from the first result on, and the results in order."""
+    begun, first, found = perf_counter(), 0.0, {}
+    for k, result in results(work, calls, **way, **more):
+        first = first or perf_counter()
+        found[k] = result
+    ended = perf_counter()
+    # The first result comes when each worker has begun another call.
+    return ended - begun, (ended - first) * len(calls) / (len(calls) - 1), [found[k] for k in sorted(found)]
+
+
+def _nothing() -> None:
+    pass
+
+
+def _share() -> None:
+    twin = load_twin(DEFAULT_TWIN)
+    _shared.update(twin=twin, log=endless_log(twin, READINGS))
+    _fold(0.01)
+
+
+def _fold(noise: float) -> str:
+    twin, log = _shared["twin"], _shared["log"]
+    assert isinstance(log, Log)
+    fold = Fold("ekf", twin.model, twin.tuning.set(twin.tuning.items()[0].key, noise), log, pairs=twin.pairs)
+    fold.advance()
+    return hashlib.sha256(fold.track.mean.tobytes() + fold.track.std.tobytes()).hexdigest()
