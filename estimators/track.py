@@ -101,10 +101,10 @@ class Track(NamedTuple):
         return int(self.nis.size)
 
 
-def estimated_rows(track: Track) -> np.ndarray:
-    """Return the mask (n,) of rows whose estimate is finite in all states."""
+def estimated_rows(track: Track, first: int = 0) -> np.ndarray:
+    """Return the mask (n - first,) of rows from `first` on whose estimate is finite in all states."""
     # A sum is finite only if all terms are, and takes a third of the time of `all` along so few columns.
-    return np.asarray(np.isfinite(np.einsum("ij->i", track.mean) + np.einsum("ij->i", track.std)))
+    return np.asarray(np.isfinite(np.einsum("ij->i", track.mean[first:]) + np.einsum("ij->i", track.std[first:])))
 
 
 # As in log.py: `len` counts rows, not columns.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, cast, runtime_checkable
 
 if TYPE_CHECKING:
     import numpy as np
@@ -49,7 +49,6 @@ class Source(Protocol):
         """Close files and buses."""
 
 
-@runtime_checkable
 class Paced(Source, Protocol):
     """A source with controls of its time, from any thread while another reads."""
 
@@ -101,7 +100,8 @@ def is_endless(source: Source) -> bool:
 def controls_of(source: Source) -> Paced | None:
     """Return the controls of a source's time, also of one behind faults; None if it sets its own pace."""
     inner = getattr(source, "inner", source)
-    return inner if isinstance(inner, Paced) else None
+    # Asked for every batch; `isinstance` of a protocol would look up each of its names, which takes 20 µs.
+    return cast(Paced, inner) if hasattr(inner, "set_speed") else None
 
 
 @dataclass(frozen=True)

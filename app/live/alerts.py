@@ -84,7 +84,7 @@ class Alerts:
         track, log, known = fold.track, fold.log, self._lost
         if not fold.n:
             return None
-        fresh = estimated_rows(track.select(slice(min(before, fold.n - 1), fold.n)))
+        fresh = estimated_rows(track, min(before, fold.n - 1))
         if fresh[-1]:
             return None
         if known is not None and known[0] < log.first + before and not fresh.any():

@@ -151,7 +151,10 @@ class Jobs:
         """Prepare; jobs wait until `start`. Failures go to `notices`; `name` is that of the threads, numbered."""
         self._notices, self._name, self._clock = notices, name, clock
         self._limit, self._niceness = threads, niceness
-        self._wake = threading.Condition()
+        lock = threading.Lock()
+        self._wake, self._earlier = threading.Condition(lock), threading.Condition(lock)
+        self._led = False
+        """Whether a thread waits at `_earlier` until the next job is due; the others wait at `_wake` for a notice."""
         self._queue: list[tuple[float, int, Job]] = []
         self._order = itertools.count()
         self._under_way: dict[Job, threading.Thread] = {}
@@ -198,6 +201,7 @@ class Jobs:
             for job in (*self._under_way, *(job for _, _, job in self._queue)):
                 job.cancel()
             self._wake.notify_all()
+            self._earlier.notify_all()
         end = time.monotonic() + STOP_TIMEOUT_S
         for thread in self._threads:
             thread.join(max(0.0, end - time.monotonic()))
@@ -219,9 +223,11 @@ class Jobs:
 
     def _put(self, job: Job, delay: float) -> None:
         with self._wake:
-            heapq.heappush(self._queue, (self._clock() + delay, next(self._order), job))
+            entry = (self._clock() + delay, next(self._order), job)
+            heapq.heappush(self._queue, entry)
             self._hire()
-            self._wake.notify()
+            if self._queue[0] is entry:
+                (self._earlier if self._led else self._wake).notify()
 
     def _hire(self) -> None:
         """Start the threads that the pool lacks, if jobs wait."""
@@ -245,10 +251,17 @@ class Jobs:
         while True:
             with self._wake:
                 while not self._stopping and not self._is_due():
-                    self._wake.wait(max(0.0, self._queue[0][0] - self._clock()) if self._queue else None)
+                    if self._queue and not self._led:
+                        self._led = True
+                        self._earlier.wait(max(0.0, self._queue[0][0] - self._clock()))
+                        self._led = False
+                    else:
+                        self._wake.wait()
                 if self._stopping:
                     return
                 job = self._take()
+                if self._queue and not self._led:
+                    self._wake.notify()
             self._carry_out(job)
             with self._wake:
                 if threading.current_thread() not in self._threads:

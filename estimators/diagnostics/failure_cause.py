@@ -35,9 +35,9 @@ class Estimate(NamedTuple):
 
 def failures(track: Track, first: int = 0) -> np.ndarray:
     """Return the rows from `first` on with a failed measurement (or rejected without a NIS) or no finite estimate."""
-    rows = track.select(slice(first, len(track)))
-    failed = (rows.verdict == FAILED) | (rows.verdict == GATED) & ~np.isfinite(rows.nis)
-    return first + np.flatnonzero(~estimated_rows(rows) | failed)
+    verdict = track.verdict[first:]
+    failed = (verdict == FAILED) | (verdict == GATED) & ~np.isfinite(track.nis[first:])
+    return first + np.flatnonzero(~estimated_rows(track, first) | failed)
 
 
 def cause(

@@ -64,6 +64,11 @@ def addresses(server: viser.ViserServer) -> list[str]:
     return [urlsplit(there.request.path).query for there in connections if there.request is not None]
 
 
+def when_connected(server: viser.ViserServer, call: Callable[[], object]) -> None:
+    """Call when a browser has connected; `addresses` has it then."""
+    server._websock_server.on_client_connect(lambda _: call())  # Viser's own comes only with the first camera
+
+
 @contextmanager
 def unprinted() -> Iterator[None]:
     """Suppress Viser's output: an address that answers 403, and that it stopped."""

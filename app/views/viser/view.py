@@ -13,7 +13,7 @@ from estimators.diagnostics.references import shown_track
 
 from ...live.running_fold import Running
 from ...present.drawing.colors import THEMES
-from .guarded_server import addresses, guarded_server, unprinted
+from .guarded_server import addresses, guarded_server, unprinted, when_connected
 from .scene import History
 from .stage import FIELD_SCENES, Stage
 
@@ -53,7 +53,9 @@ class ViserView:
         self._past: tuple[int, int] | None = None
         """Last event of the past that the history has, and its revision; None while it follows the newest row."""
         self._tuning, self._turned, self._drawn = engine.tuning, -EDIT_REST_S, -MAX_EDIT_WAIT_S
-        self._stop = threading.Event()
+        self._stop, self._come = False, threading.Event()
+        """The second is set when a browser connects, or to stop."""
+        when_connected(self.server, self._come.set)
         self._thread = threading.Thread(target=self._run, name="viser view", daemon=True)
 
     def start(self) -> None:
@@ -62,7 +64,8 @@ class ViserView:
 
     def stop(self) -> None:
         """Stop drawing and the server."""
-        self._stop.set()
+        self._stop = True
+        self._come.set()
         if self._thread.is_alive():
             self._thread.join()
         self._rest()
@@ -132,11 +135,16 @@ class ViserView:
 
     def _run(self) -> None:
         due = time.monotonic()
-        while not self._stop.wait(FRAME_PERIOD_S / 2):
+        while True:
+            self._come.clear()
             there = addresses(self.server)
+            if self._stop:
+                return
             if not there:
                 self._rest()
+                self._come.wait()
                 continue
+            self._come.wait(FRAME_PERIOD_S / 2)
             now = time.monotonic()
             if now >= due and not self._waits(now):
                 self._drawn, begun = now, time.thread_time()
