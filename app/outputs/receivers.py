@@ -41,7 +41,7 @@ DELIVERY_PERIOD_S, MAX_RETRY_S = 0.2, 60.0
 """Between two looks at the queue of a receiver, and the longest wait after it has failed."""
 
 TIMEOUT_S = 10.0
-"""Longest time for a request to a web server, and for each answer of a mail server."""
+"""Longest time of a request to a web server, or of the exchange with a mail server."""
 
 
 class Receiver(Protocol):
@@ -62,11 +62,10 @@ class KeptRequest(HTTPRedirectHandler):
         """Return no request."""
 
 
-class Deadline(HTTPSHandler, HTTPHandler):
-    """Ends the connections of a request after `TIMEOUT_S`, also those on which bytes still arrive, one by one."""
+class Deadline:
+    """Ends connections after `TIMEOUT_S`, also those on which bytes still arrive, one by one."""
 
     def __init__(self) -> None:
-        super().__init__()
         self.sockets: list[socket.socket] = []
         self.passed = False
         self.timer = threading.Timer(TIMEOUT_S, self._end)
@@ -79,6 +78,20 @@ class Deadline(HTTPSHandler, HTTPHandler):
             with suppress(OSError):
                 sock.shutdown(socket.SHUT_RDWR)
 
+    def end(self) -> None:
+        """Stop the clock."""
+        self.timer.cancel()
+        for sock in self.sockets:
+            sock.close()
+
+
+class RequestDeadline(HTTPSHandler, HTTPHandler):
+    """Connections of a request, which end at the deadline."""
+
+    def __init__(self, deadline: Deadline) -> None:
+        super().__init__()
+        self._deadline = deadline
+
     def http_open(self, request: Request) -> Any:
         """See `HTTPHandler`."""
         return self.do_open(partial(self._connection, PlainConnection), request)  # type: ignore[arg-type]
@@ -89,14 +102,8 @@ class Deadline(HTTPSHandler, HTTPHandler):
 
     def _connection(self, kind: type[PlainConnection], *args: Any, **more: Any) -> PlainConnection:
         connection = kind(*args, **more)
-        connection.sockets = self.sockets
+        connection.sockets = self._deadline.sockets
         return connection
-
-    def end(self) -> None:
-        """Stop the clock."""
-        self.timer.cancel()
-        for sock in self.sockets:
-            sock.close()
 
 
 class PlainConnection(HTTPConnection):
@@ -130,7 +137,9 @@ class Webhook:
             headers["X-Nisus-Signature"] = f"sha256={signature}"
         deadline = Deadline()
         try:
-            build_opener(KeptRequest, deadline).open(Request(self._url, body, headers), timeout=TIMEOUT_S).close()
+            build_opener(KeptRequest, RequestDeadline(deadline)).open(
+                Request(self._url, body, headers), timeout=TIMEOUT_S
+            ).close()
             if deadline.passed:  # http.client takes the end of the connection for that of the header
                 raise TimeoutError
         except HTTPError as error:
@@ -148,6 +157,21 @@ class Webhook:
             deadline.end()
 
 
+class PlainMail(smtplib.SMTP):
+    """Connection to a mail server, whose socket is added to a list as soon as it is connected."""
+
+    sockets: list[socket.socket]
+
+    def _get_socket(self, *args: Any) -> socket.socket:
+        sock: socket.socket = super()._get_socket(*args)  # type: ignore[misc]
+        self.sockets.append(sock.dup())
+        return sock
+
+
+class SecureMail(smtplib.SMTP_SSL, PlainMail):
+    """The same with TLS, whose handshake counts too."""
+
+
 class Mail:
     """Sends alerts as e-mail."""
 
@@ -162,22 +186,23 @@ class Mail:
         mail["From"], mail["To"] = section.sender, ", ".join(section.to)
         lines = [alert.text, "", f"Since {alert.since}; health is {alert.health}.", f"Response: {alert.response}"]
         mail.set_content("\n".join([*lines, alert.link or alert.guide, "", alert.model_dump_json(indent=2)]))
-        context = ssl.create_default_context()
+        context, deadline = ssl.create_default_context(), Deadline()
+        kind = SecureMail if section.security == "tls" else PlainMail
+        given: dict[str, Any] = {"context": context} if section.security == "tls" else {}
+        # A class of its own for each mail: the constructor connects, so the list cannot be given afterwards.
+        connected = type(kind.__name__, (kind,), {"sockets": deadline.sockets})
         try:
-            if section.security == "tls":
-                server: smtplib.SMTP = smtplib.SMTP_SSL(
-                    section.server, section.port, timeout=TIMEOUT_S, context=context
-                )
-            else:
-                server = smtplib.SMTP(section.server, section.port, timeout=TIMEOUT_S)
-            with server:
+            with connected(section.server, section.port, timeout=TIMEOUT_S, **given) as server:
                 if section.security == "starttls":
                     server.starttls(context=context)
                 if section.user is not None and self._password is not None:
                     server.login(section.user, self._password)
                 server.send_message(mail)
-        except smtplib.SMTPException as error:
-            raise OSError(str(error)) from None
+        except OSError as error:  # smtplib's own among them
+            text = f"it has not answered within {TIMEOUT_S:g} s" if deadline.passed else str(error)
+            raise OSError(text) from None
+        finally:
+            deadline.end()
 
 
 class CommandReceiver:

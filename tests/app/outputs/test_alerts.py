@@ -18,10 +18,10 @@ from app.live.outputs import AlertMute
 from app.outputs import Publisher
 from app.outputs import receivers as sending
 from app.outputs.alerts import AlertRules, heartbeat
-from app.outputs.receivers import MAX_WAITING_ALERTS, CommandReceiver, Delivery, Webhook
+from app.outputs.receivers import MAX_WAITING_ALERTS, CommandReceiver, Delivery, Mail, Webhook
 from app.present.state_message import PublishedState, StateMessage
 from app.twin.twin import load_twin
-from config.output_schema import AlertSection, CommandSection, WebhookSection
+from config.output_schema import AlertSection, CommandSection, EmailSection, WebhookSection
 from estimators.diagnostics.episodes import Episode
 from estimators.errors import ConfigError
 from sources.source import ignore
@@ -323,7 +323,15 @@ def test_a_receiver_that_answers_nonsense_fails_as_any_other(tmp_path):
     open(tmp_path / "end", "w").close()
 
 
-@pytest.mark.parametrize(("scheme", "first"), [("http", b"HTTP/1.1 200 OK\r\nX: "), ("https", b"\x16\x03\x03\x40\x00")])
+@pytest.mark.parametrize(
+    ("scheme", "first"),
+    [
+        ("http", b"HTTP/1.1 200 OK\r\nX: "),
+        ("https", b"\x16\x03\x03\x40\x00"),
+        ("smtp", b"220 "),
+        ("smtps", b"\x16\x03\x03\x40\x00"),
+    ],
+)
 def test_a_receiver_that_answers_byte_by_byte_fails_after_the_timeout(monkeypatch, scheme, first):
     monkeypatch.setattr(sending, "TIMEOUT_S", 0.3)
 
@@ -338,9 +346,15 @@ def test_a_receiver_that_answers_byte_by_byte_fails_after_the_timeout(monkeypatc
 
     with socketserver.ThreadingTCPServer(("127.0.0.1", 0), Drip) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
-        hook = Webhook(WebhookSection(type="webhook", url=f"{scheme}://127.0.0.1:{server.server_address[1]}/"))
+        port = server.server_address[1]
+        if scheme.startswith("smtp"):
+            security = "tls" if scheme == "smtps" else "none"
+            place = {"server": "127.0.0.1", "port": port, "security": security}
+            receiver = Mail(EmailSection(type="email", to="ops@plant", sender="nisus@plant", **place))
+        else:
+            receiver = Webhook(WebhookSection(type="webhook", url=f"{scheme}://127.0.0.1:{port}/"))
         with pytest.raises(OSError, match="it has not answered within 0.3 s"):
-            hook.send(heartbeat("motor", "tracking"))
+            receiver.send(heartbeat("motor", "tracking"))
         server.shutdown()
 
 
