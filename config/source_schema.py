@@ -477,6 +477,12 @@ class RegisterSection(Section):
     words: Literal["big", "little"] = "big"
     """Order of the registers of a longer number: big if the first one has its highest bits. Default: big."""
 
+    @model_validator(mode="after")
+    def _bit(self) -> RegisterSection:
+        if self.table in ("coil", "discrete") and {"type", "words"} & self.model_fields_set:
+            raise refused("relation", f"is {self.table}, a bit; leave type and words out, or read a register", "table")
+        return self
+
 
 def _register(value: Any) -> Any:
     return {"address": value} if isinstance(value, int) else value

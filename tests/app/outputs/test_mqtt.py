@@ -229,6 +229,10 @@ def test_a_source_whose_broker_comes_back_goes_on(serve, broker):
             {"type": "modbus", "host": "x", "registers": {"winding": {"address": 65535, "type": "float32"}}},
             "registers.winding.address is 65535; a float32 has 2 registers, so it is at most 65534",
         ),
+        (
+            {"type": "modbus", "host": "x", "registers": {"winding": {"address": 4, "table": "coil", "words": "big"}}},
+            "source.registers.winding.table is coil, a bit; leave type and words out, or read a register",
+        ),
     ],
 )
 def test_a_source_that_cannot_be_is_refused_in_one_line(source, text, monkeypatch):
