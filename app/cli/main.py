@@ -11,7 +11,6 @@ import operator
 import os
 import sys
 from collections.abc import Sequence
-from importlib.metadata import version
 from typing import Annotated, Any
 
 import tyro
@@ -92,6 +91,8 @@ def _answered(arguments: Sequence[str]) -> int:
     """Run the command that the arguments name; an error is one line."""
     try:
         if arguments and arguments[0] == "--version":
+            from importlib.metadata import version
+
             print(f"nisus {version('nisus')}")
             return 0
         if arguments and arguments[0] == "--complete":
