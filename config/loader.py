@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +15,7 @@ from estimators.errors import ConfigError, nearest
 from .problems import report, shown
 from .schema import ParameterSection, TwinSection, as_gate
 from .tunings import Version, find_version, keep_options, overlay
-from .yaml_files import Key, ValuePlaces, dotted, parse, read_text, shown_path, with_values
-
-TWINS = Path(str(resources.files("config"))) / "twins"  # Folder of the twins that ship
+from .yaml_files import TWINS, Key, ValuePlaces, dotted, parse, read_text, shipped, shown_path, with_values
 
 
 @dataclass(frozen=True)
@@ -39,11 +36,6 @@ class Loaded:
     def error(self, key: Key, text: str) -> ConfigError:
         """Return an error about the value at `key`, which `text` goes on to describe."""
         return ConfigError(f"{self.places.at(key)}: {dotted(key)} {text}")
-
-
-def shipped() -> list[str]:
-    """Return the names of the bundled twins."""
-    return sorted(path.stem for path in TWINS.glob("*.yaml"))
 
 
 def find(name: str | os.PathLike[str]) -> Path:

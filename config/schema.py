@@ -488,6 +488,9 @@ class TwinSection(Section):
     """Contents of the page."""
 
 
+TwinSection.model_rebuild()  # on import, as several threads may need it first
+
+
 def json_schema() -> dict[str, Any]:
     """Return the schema, with a description of every key."""
     schema = TwinSection.model_json_schema(mode="validation")

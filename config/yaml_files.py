@@ -17,6 +17,8 @@ import yaml
 
 from estimators.errors import ConfigError
 
+TWINS = Path(__file__).resolve().parent / "twins"  # Folder of the twins that ship
+
 Key = tuple[str | int, ...]
 MERGE = "<<"  # Key whose value is a mapping, or a list of these, with defaults for the keys beside it
 MAX_VALUES = 100_000  # A twin has a few hundred values; nested aliases could otherwise ask for billions
@@ -47,6 +49,11 @@ for _name, _pattern, _first in (
 ):
     for _loader in (_Loader, _QuickLoader):
         _loader.add_implicit_resolver(_TAG + _name, re.compile(f"^(?:{_pattern})$"), _first)
+
+
+def shipped() -> list[str]:
+    """Return the names of the bundled twins."""
+    return sorted(path.stem for path in TWINS.glob("*.yaml"))
 
 
 @dataclass

@@ -11,16 +11,9 @@ from config.yaml_files import writing
 from estimators.diagnostics.episodes import episodes
 from estimators.diagnostics.score import score
 from estimators.errors import ConfigError
-from estimators.interface.table import table_of
 from estimators.registry import find_estimator
-from estimators.smoothing.smooth import check_smooth, smooth
-from estimators.smoothing.walk import Smoothed
 
-from ..present.drawing.plot import check_plot, plot_track
-from ..present.export.bag_file import check_bag, covariances, write_bag
-from ..present.export.report import Reported, report
-from ..present.export.track_file import encoded
-from ..present.result import to_html, to_json, to_text
+from ..present.result import to_json, to_text
 from ..studies.fold_result import (
     FoldResult,
     calibration_of,
@@ -44,6 +37,8 @@ from .options import span_of
 from .prepare import attend, fold_log, opened, prepare
 
 if TYPE_CHECKING:
+    from estimators.smoothing.walk import Smoothed
+
     from .arguments import FoldCommand as Arguments
 
 
@@ -55,13 +50,19 @@ def fold_twin(arguments: Arguments) -> int:
         raise ConfigError(f"--out {out}: must end in .csv, .parquet, .mcap or .rrd")
     bag = out is not None and out.suffix == ".mcap"
     if out is not None and bag:
+        from ..present.export.bag_file import check_bag
+
         check_bag(out)
     recorded = out is not None and out.suffix == ".rrd"
     if out is not None and recorded and os.path.lexists(out):
         raise ConfigError(f"--out {out}: {TAKEN}")
     if arguments.plot is not None:
+        from ..present.drawing.plot import check_plot, plot_track
+
         check_plot(arguments.plot)
     if arguments.smooth:
+        from estimators.smoothing.smooth import check_smooth, smooth
+
         check_smooth(find_estimator(twin.estimator, twin.model), twin.model, twin.tuning.options)
     prepare(twin)
     log, counts = read_log(twin, arguments.duration, blind=arguments.blind)
@@ -90,6 +91,9 @@ def fold_twin(arguments: Arguments) -> int:
     if out is not None:
         _write(out, result, smoothed)
     if arguments.html is not None:
+        from ..present.export.report import Reported, report
+        from ..present.result import to_html
+
         run = Reported(
             twin, twin.estimator, twin.tuning, events, track, pictures,
             [item.episode for item in result.episodes], fold.marginal,
@@ -116,10 +120,16 @@ def _write(path: Path, result: FoldResult, smoothed: Smoothed | None) -> None:
         write_recording(path, twin, fold.log, fold.track, pictures_of(fold), found, smoothed)
         return
     if path.suffix == ".mcap":
+        from ..present.export.bag_file import covariances, write_bag
+
         cov = covariances(twin.model, fold.track, fold.pairs)
         with writing(path, "--out"), path.open("wb") as file:
             write_bag(file, twin.name, twin.model, fold.log.events, fold.track, cov, smoothed)
         return
+    from estimators.interface.table import table_of
+
+    from ..present.export.track_file import encoded
+
     table = table_of(
         twin.model, fold.log.events, fold.track, found, smoothed=smoothed,
         tuning_version=twin.tuning.version, tuning=twin.tuning.name, model_version=fold.log.version,

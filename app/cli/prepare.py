@@ -6,10 +6,9 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from rich.console import Console
 
 from estimators.fold import Fold
 from estimators.log import Log
@@ -23,6 +22,9 @@ from ..live.workshop import Workshop
 from ..terminal import complain, messages_file
 from ..twin.twin import Twin, load_twin
 from .options import settings
+
+if TYPE_CHECKING:
+    from rich.console import Console
 
 STATUS_DELAY_S = 1.0  # seconds before the line appears; loading from the cache takes less
 
@@ -201,6 +203,8 @@ LINE_PERIOD_S = 5.0  # seconds between two lines where output is no terminal
 
 
 def _console() -> Console:
+    from rich.console import Console
+
     return Console(file=messages_file())
 
 

@@ -5,18 +5,26 @@ from __future__ import annotations
 from itertools import takewhile
 from typing import TYPE_CHECKING, Any
 
-from config.loader import Loaded, find, load, shipped, shown_path
-from config.yaml_files import writing
-
-from ..present.result import to_json
-from ..studies.scores import printed, read_scores
+from config.yaml_files import TWINS, parse, read_text, shipped, shown_path, writing
 
 if TYPE_CHECKING:
+    from config.loader import Loaded
+
     from .arguments import TwinsCommand as Arguments
 
 
 def show_twins(arguments: Arguments) -> int:
-    """Run the command."""
+    """Run the command. The list needs titles only, without the schema of a twin, which takes longer than all else."""
+    if not (arguments.name or arguments.picture or arguments.json):
+        for name in shipped():
+            path = TWINS / f"{name}.yaml"
+            data, _ = parse(read_text(path, "nisus twins"), shown_path(path))
+            print(f"{name:<16} {data.get('title', '')}")
+        return 0
+    from config.loader import load
+
+    from ..present.result import to_json
+
     if arguments.picture:
         drawn = [_draw(name) for name in (shipped() if arguments.name is None else [arguments.name])]
         print(to_json(drawn) if arguments.json else "\n".join(drawn))
@@ -24,11 +32,8 @@ def show_twins(arguments: Arguments) -> int:
     if arguments.name is not None:
         loaded = load(arguments.name)
         print(to_json(_json(loaded)) if arguments.json else "\n".join(described(loaded)))
-    elif arguments.json:
-        print(to_json([_head(load(name)) for name in shipped()]))
     else:
-        for name in shipped():
-            print(f"{name:<16} {load(name).config.title or ''}")
+        print(to_json([_head(load(name)) for name in shipped()]))
     return 0
 
 
@@ -46,6 +51,8 @@ def _head(loaded: Loaded) -> dict[str, Any]:
 
 def _json(loaded: Loaded) -> dict[str, Any]:
     """Return head, leading comment of the YAML, and scores: figures as numbers, texts as they are."""
+    from ..studies.scores import read_scores
+
     numbers = [{key: _number(cell) for key, cell in line.items()} for line in read_scores(loaded.path)]
     return {**_head(loaded), "description": "\n".join(_prose(loaded)), "scores": numbers}
 
@@ -66,6 +73,8 @@ def _prose(loaded: Loaded) -> list[str]:
 
 def _draw(name: str) -> str:
     """Draw the gallery picture of a twin from its log, and return its path."""
+    from config.loader import find
+
     from ..present.drawing.card import picture_of
     from ..twin.log_reader import read_log
     from ..twin.twin import load_twin
@@ -87,6 +96,8 @@ def _draw(name: str) -> str:
 
 def described(loaded: Loaded) -> list[str]:
     """Return title, leading comment of the YAML, and scores as lines of text."""
+    from ..studies.scores import printed, read_scores
+
     name = loaded.path.stem
     scores = read_scores(loaded.path)
     table = printed(name, scores) if scores else [f"No scores yet; to write them: nisus compare {name} --write"]

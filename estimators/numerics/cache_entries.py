@@ -16,8 +16,10 @@ from pathlib import Path
 from typing import Any
 
 import numba
+from llvmlite import binding
 from numba import config
-from numba.core import bytecode, caching
+from numba.core import bytecode, caching, codegen, dispatcher
+from numba.core.runtime import rtsys
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 """The folder of the packages; a file outside it, such as a user's model, is found by its path."""
@@ -110,6 +112,71 @@ class EntryFiles(caching.IndexDataCacheFile):  # type: ignore[misc]
         """Leave the files, which are replaced as the code is compiled again."""
 
 
+class EntryLibrary(codegen.JITCodeLibrary):  # type: ignore[misc]
+    """Machine code, whose bitcode is parsed when other code links it: half of the time of loading an entry.
+
+    Numba takes from the bitcode also which functions there are. Here `EntryResults` knows.
+    """
+
+    _bitcode: bytes | None = None
+
+    @classmethod
+    def _unserialize(cls, codegen: Any, state: Any) -> Any:
+        name, _, (code, bitcode) = state
+        library = codegen.create_library(name)
+        library._bitcode = bitcode
+        library.enable_object_caching()
+        library._set_compiled_object(code)
+        library._finalize_final_module()
+        return library
+
+    def _get_module_for_linking(self) -> Any:
+        if self._bitcode is not None:
+            self._shared_module, self._bitcode = binding.parse_bitcode(self._bitcode), None
+            self._codegen._engine._load_defined_symbols(self._shared_module)
+        return super()._get_module_for_linking()
+
+
+class EntryResults(caching.CompileResultCacheImpl):  # type: ignore[misc]
+    """Compiled functions from entries."""
+
+    def rebuild(self, target_context: Any, payload: Any) -> Any:
+        """Return a compiled function; some have no wrapper for Python."""
+        (_, _, (code, _)), described, *_ = payload
+        defined = target_context.codegen()._engine._defined_symbols
+        defined.add(described.llvm_func_name)
+        if f"{described.llvm_cpython_wrapper_name}\0".encode() in code:
+            defined.add(described.llvm_cpython_wrapper_name)
+        return super().rebuild(target_context, payload)
+
+
+class FunctionEntries(caching.FunctionCache):  # type: ignore[misc]
+    """Entries of one function, set up when it is first compiled: a start needs two dozen of hundreds of functions.
+
+    Code from the cache needs addresses of Numba's runtime and of its hash secret, but not its tables of types and
+    functions, which take 0.3 s and 40 MB: compiling fills them itself.
+    """
+
+    _impl_class = EntryResults
+
+    def __init__(self, function: Any) -> None:
+        self._py_func = function
+
+    def __getattr__(self, name: str) -> Any:
+        if "_impl" in vars(self):
+            raise AttributeError(name)
+        super().__init__(self._py_func)
+        return getattr(self, name)
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        """Return a compiled function, None if it is not in the cache."""
+        from numba.cpython import hashing  # noqa: F401
+
+        rtsys.initialize(target_context)
+        with self._guard_against_spurious_io_errors():
+            return self._load_overload(sig, target_context)
+
+
 def use_entries() -> None:
     """Make Numba keep its cache in such entries, in this process.
 
@@ -119,6 +186,8 @@ def use_entries() -> None:
     """
     bytecode.FunctionIdentity._unique_ids = itertools.count(int.from_bytes(os.urandom(6), "big"))
     caching.IndexDataCacheFile = EntryFiles
+    dispatcher.FunctionCache = FunctionEntries  # type: ignore[attr-defined]
+    codegen.JITCPUCodegen._library_class = EntryLibrary
     # Numba's own locators serve functions that are in no file, as in a notebook.
     others = [found for found in caching.CompileResultCacheImpl._locator_classes if found is not ContentLocator]
     caching.CompileResultCacheImpl._locator_classes = [ContentLocator, *others]

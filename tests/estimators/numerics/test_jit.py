@@ -108,6 +108,35 @@ def test_closures_that_two_processes_compiled_are_told_apart_by_a_third(tmp_path
     assert run(2, 4) == [one, two]
 
 
+LINKED = """
+from estimators.numerics.jit import f64, jit
+
+@jit
+def inner(a):
+    return 3.0 * a
+
+@jit
+def outer(a):
+    return inner(a) + 1.0
+"""
+
+
+def test_code_from_the_cache_needs_no_tables_of_numba_and_is_linked_into_new_code(tmp_path):
+    """`numba.np.linalg` is imported with the tables, which fill when something is compiled."""
+    (tmp_path / "linked.py").write_text(LINKED)
+
+    def run(code: str) -> list[str]:
+        environment = os.environ | {"PYTHONPATH": f"{ROOT}:{tmp_path}", "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+        code = f"import sys, linked; filled = lambda: 'numba.np.linalg' in sys.modules; {code}"
+        return subprocess.run(
+            [sys.executable, "-c", code], env=environment, capture_output=True, text=True
+        ).stdout.split()
+
+    assert run("linked.inner.compile((linked.f64,)); print(linked.inner(2.0), filled())") == ["6.0", "True"]
+    found = "print(linked.inner(2.0), filled(), linked.outer(2.0), linked.inner.stats.cache_hits.total(), filled())"
+    assert run(found) == ["6.0", "False", "7.0", "1", "True"]
+
+
 def test_a_function_for_addresses_names_its_python_form_when_called():
     """Without the wrapper a call from Python would end the process."""
 
