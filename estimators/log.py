@@ -95,12 +95,12 @@ class Log:
         return log
 
     def _allocate(self, capacity: int, columns: int) -> None:
-        # Filled, not empty, so that memory is allocated now and stays flat while the log fills.
-        self.t = np.full(capacity, 0, np.int64)
-        self.arrival = np.full(capacity, 0, np.int64)
-        self.kind = np.full(capacity, 0, np.int8)
-        self.channel = np.full(capacity, 0, np.int32)
-        self.value = np.full((capacity, columns), np.nan)
+        # Not filled: the system gives memory to the rows that have events, a tenth of the capacity of most twins.
+        self.t = np.empty(capacity, np.int64)
+        self.arrival = np.empty(capacity, np.int64)
+        self.kind = np.empty(capacity, np.int8)
+        self.channel = np.empty(capacity, np.int32)
+        self.value = np.empty((capacity, columns))
 
     @property
     def capacity(self) -> int:
@@ -270,6 +270,7 @@ class Log:
         for new, column in zip(self._columns()[:4], old, strict=False):
             new[: self.n] = column[: self.n]
         self.value[: self.n, :wide] = old[4][: self.n]
+        self.value[: self.n, wide:] = np.nan
 
     def drop_front(self, count: int) -> None:
         """Drop the oldest `count` events; events before the last of these are stale from now on."""

@@ -76,15 +76,15 @@ class Track(NamedTuple):
 
     @staticmethod
     def allocate(rows: int, nx: int, pairs: int, ny: int, width: int | None = None) -> Track:
-        """Allocate columns for `rows` events, filled so that their memory is committed at once."""
-        matrix = [np.full((rows, k), np.nan) for k in (nx, nx, pairs, ny, ny)]
-        vectors = [np.full(rows, np.nan) for _ in range(2)]
-        codes = [np.zeros(rows, np.int32), np.zeros(rows, np.int8)]
-        windowed = [np.full(rows, np.nan) for _ in range(4)]
-        health = [np.zeros(rows, np.int8) for _ in range(2)]
-        evidence = [np.full((rows, ny), np.nan), np.zeros((rows, width or ny), np.int32), np.zeros(rows, np.int64)]
-        screened = np.zeros((rows, ny), np.int8)
-        particles = [np.full(rows, np.nan) for _ in range(2)]
+        """Allocate columns for `rows` events; a row has values, and memory, once its event is folded."""
+        matrix = [np.empty((rows, k)) for k in (nx, nx, pairs, ny, ny)]
+        vectors = [np.empty(rows) for _ in range(2)]
+        codes = [np.empty(rows, np.int32), np.empty(rows, np.int8)]
+        windowed = [np.empty(rows) for _ in range(4)]
+        health = [np.empty(rows, np.int8) for _ in range(2)]
+        evidence = [np.empty((rows, ny)), np.empty((rows, width or ny), np.int32), np.empty(rows, np.int64)]
+        screened = np.empty((rows, ny), np.int8)
+        particles = [np.empty(rows) for _ in range(2)]
         columns: list[Any] = [*matrix, *vectors, *codes, *windowed, *health, *evidence, screened, *particles]
         return Track(*columns)
 

@@ -70,7 +70,7 @@ class Field(Sequence[State]):
             raise ModelError(f"field {self.name}: spacing is {self.spacing}; give one positive number, or one an axis")
         if self.means and len(self.means) != len(self):
             raise ModelError(f"field {self.name}: means has {len(self.means)} entries; give {len(self)}, or none")
-        if not (np.all(np.isfinite(self.prior_mean)) and self.std > 0 and np.isfinite(self.std)):
+        if not (np.all(np.isfinite(self.means or self.mean)) and self.std > 0 and np.isfinite(self.std)):
             raise ModelError(f"field {self.name}: the prior must be finite, and its std positive; it is {self.std}")
         if self.shown and not (0 <= min(self.shown) and max(self.shown) < len(self)):
             raise ModelError(f"field {self.name}: shown names a cell outside 0 to {len(self) - 1}")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import hashlib
 import os
+from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 
@@ -23,6 +24,11 @@ def cache_folder() -> Path:
     Bundled models are excluded, as each is compiled by itself.
     """
     base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    return base / "nisus" / "numba" / _digest_of_sources()
+
+
+@cache
+def _digest_of_sources() -> str:
     digest = hashlib.sha256(version("numba").encode())
     package = Path(__file__).parent.parent
     for path in sorted(package.rglob("*.py")):
@@ -31,7 +37,7 @@ def cache_folder() -> Path:
             digest.update(_without_prose(source))
         elif (b"jit" in source or b"intrinsic" in source) and package / "models" not in path.parents:
             digest.update(source)
-    return base / "nisus" / "numba" / digest.hexdigest()[:16]
+    return digest.hexdigest()[:16]
 
 
 def _without_prose(source: bytes) -> bytes:

@@ -19,7 +19,7 @@ import numba
 from llvmlite import binding
 from numba import config
 from numba.core import bytecode, caching, codegen, dispatcher
-from numba.core.runtime import rtsys
+from numba.core.runtime import _nrt_python
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 """The folder of the packages; a file outside it, such as a user's model, is found by its path."""
@@ -150,6 +150,15 @@ class EntryResults(caching.CompileResultCacheImpl):  # type: ignore[misc]
         return super().rebuild(target_context, payload)
 
 
+@functools.cache
+def _declare_runtime() -> None:
+    """Tell LLVM where Numba's runtime is; `rtsys.initialize` also compiles functions, which loads all of LLVM: 18 MB."""
+    from numba.cpython import hashing  # noqa: F401  tells the address of the hash secret
+
+    for name, address in _nrt_python.c_helpers.items():
+        binding.add_symbol(name if name.startswith("_") else f"NRT_{name}", address)
+
+
 class FunctionEntries(caching.FunctionCache):  # type: ignore[misc]
     """Entries of one function, set up when it is first compiled: a start needs two dozen of hundreds of functions.
 
@@ -170,9 +179,7 @@ class FunctionEntries(caching.FunctionCache):  # type: ignore[misc]
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """Return a compiled function, None if it is not in the cache."""
-        from numba.cpython import hashing  # noqa: F401
-
-        rtsys.initialize(target_context)
+        _declare_runtime()
         with self._guard_against_spurious_io_errors():
             return self._load_overload(sig, target_context)
 

@@ -13,7 +13,6 @@ Source: Godsill, Doucet & West (2004), doi:10.1198/016214504000000151.
 from __future__ import annotations
 
 import numpy as np
-from scipy.spatial.distance import cdist
 
 from ..compiled.context import add_process_noise, steps_of, transition_points
 from ..diagnostics.references import wrapped
@@ -161,6 +160,8 @@ class TrajectoriesBack:
         forward, Qs = self._moved(X, u, dt)
         if not self._varies and not self._circular.any():
             L = np.linalg.cholesky(Qs[0])
+            from scipy.spatial.distance import cdist  # takes longer to import than this module
+
             return cdist(np.linalg.solve(L, at.T).T, np.linalg.solve(L, forward.T).T, "sqeuclidean")
         inverse = np.linalg.inv(Qs)
         log_det = np.linalg.slogdet(Qs)[1]

@@ -339,3 +339,10 @@ def test_before_the_start_is_stale():
     batch = Events.concat([Events.one(k * SECOND, 0, READING, 0, 0.1, WIDTH) for k in (9, 10, 11)], WIDTH)
     assert log.extend(batch) == (0, 1)
     assert log.copy().extend(batch) == (1, 1)
+
+
+def test_measurements_before_the_first_with_a_variance_have_none():
+    log = Log(1, capacity=8)
+    log.extend(Events.one(1, 1, READING, 0, 5.0, 1))
+    log.extend(Events.one(2, 2, READING, 0, 6.0, 1)._replace(value=np.array([[6.0, 0.25]])))
+    np.testing.assert_array_equal(log.events.value, [[5.0, np.nan], [6.0, 0.25]])

@@ -177,9 +177,8 @@ class History:
         self.n = 0
         shapes = {"value": (width,), "mean": (nx,), "std": (nx,)}
         kinds = {"t": np.int64, "kind": np.int8, "channel": np.int32, "verdict": np.int8}
-        # Filled, not empty: memory is allocated now and stays flat.
         self._columns = {
-            name: np.full((2 * limit, *shapes.get(name, ())), 0, kinds.get(name, np.float64)) for name in _COLUMNS
+            name: np.zeros((2 * limit, *shapes.get(name, ())), kinds.get(name, np.float64)) for name in _COLUMNS
         }
 
     def column(self, name: str) -> np.ndarray:
