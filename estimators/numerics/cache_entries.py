@@ -152,7 +152,7 @@ class EntryResults(caching.CompileResultCacheImpl):  # type: ignore[misc]
 
 @functools.cache
 def _declare_runtime() -> None:
-    """Tell LLVM where Numba's runtime is; `rtsys.initialize` also compiles functions, which loads all of LLVM: 18 MB."""
+    """Tell LLVM where Numba's runtime is. `rtsys.initialize` also compiles functions, for which LLVM takes 18 MB."""
     from numba.cpython import hashing  # noqa: F401  tells the address of the hash secret
 
     for name, address in _nrt_python.c_helpers.items():

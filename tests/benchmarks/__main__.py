@@ -53,6 +53,7 @@ def main() -> None:
         folds.blf,
         buses.can_live,
         folds.channels,
+        folds.starts,
         cluster.tasks,
         cluster.spread_folds,
         false_alarms.false_alarms,

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from functools import lru_cache, partial
 from pathlib import Path
+from time import perf_counter
 from types import FunctionType
 from typing import Any
 
@@ -250,6 +252,27 @@ def channels() -> Iterator[BenchmarkRow]:
                 }  # fmt: skip
                 bounds = (Bound("all [s]", 10.0), Bound("cold [s]", 27.0)) if count == max(CHANNELS) else ()
                 yield BenchmarkRow(f"{count:,} {'of one family' if family else 'sensors'}", figures, bounds)
+
+
+STARTS = (("twins", 0.4), ("fold motor_winding", 1.0))  # Commands, and the seconds that they may take
+
+
+def starts(times: int = 5) -> Iterator[BenchmarkRow]:
+    """Commands from their start to their end, with compiled code in the cache: medians, s."""
+    for words, bound in STARTS:
+        found = []
+        for _ in range(times + 1):
+            begun = perf_counter()
+            process = subprocess.Popen(
+                [sys.executable, "-m", "app.cli.main", *words.split()],
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.DEVNULL,
+            )
+            _, _, used = os.wait4(process.pid, 0)
+            found.append((perf_counter() - begun, used.ru_utime + used.ru_stime))
+        clock, processor = np.median(found[1:], axis=0)
+        figures = {"clock [s]": clock, "processor [s]": processor}
+        yield BenchmarkRow(f"nisus {words}", figures, (Bound("clock [s]", bound),))
 
 
 def wheels() -> list[Channel]:
