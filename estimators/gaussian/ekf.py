@@ -8,8 +8,11 @@ from ..compiled.context import estimated, expect, options, row_count, transition
 from ..compiled.jacobians import scratch_size, sensor_jacobian, state_jacobian
 from ..estimator import Estimator, Options
 from ..model.state_space import StateSpaceModel
-from ..numerics.jit import by_address, embedded, inlined
-from ..numerics.linalg import congruence, solve_transposed
+from ..numerics.jit import by_address, embedded, inlined, part
+from ..numerics.linalg import congruence, mirror, solve_transposed
+from ..numerics.simd import dot
+from ..numerics.simd_ir import LANES
+from ..numerics.simd_rows import multiply_rows
 from ..numerics.workspace import declare_layout, size_of, start_of
 from ..track import FAILED, USED
 from ..tuning import Tuning
@@ -113,11 +116,19 @@ def sparse_product(P, H, C):
 @embedded
 def linearise(context, sensor, x, u, P, reading, H, scratch):
     """Fill ŷ = h(x), H = dh/dx (ny, nx), C = P Hᵀ and S = H P Hᵀ."""
-    C, S = reading.C, reading.S
-    n, m = C.shape
     sensor_jacobian(context, sensor, x, u, H, scratch)
     expect(context, sensor, x, u, reading.nu)
-    if estimated(context) < n:
+    project(P, H, estimated(context), reading.C, reading.S, reading.W)
+
+
+@embedded
+def project(P, H, estimated, C, S, W):
+    """C = P Hᵀ (nx, ny) and S = H C (ny, ny); `estimated` states are not considered; W as for `downdate`."""
+    n, m = C.shape
+    if n >= LANES:
+        project_rows(P, H, C, S, W)
+        return
+    if estimated < n:
         sparse_product(P, H, C)
     else:
         for i in range(n):
@@ -134,15 +145,32 @@ def linearise(context, sensor, x, u, P, reading, H, scratch):
             S[k, i] = s
 
 
+@part
+def project_rows(P, H, C, S, W):
+    """As `project`, in whole vectors; zeros of H are skipped."""
+    n, m = C.shape
+    multiply_rows(H, m, n, P, 0, W)
+    for i in range(n):
+        for k in range(m):
+            C[i, k] = W[k, i]
+    if m >= LANES:
+        multiply_rows(H, m, n, C, 1, S)
+    else:
+        for k in range(m):
+            for i in range(k + 1):
+                S[k, i] = dot(n, H[k], W[i])
+    mirror(S)
+
+
 @inlined
 def correct(context, m, own, x, P):
     """x ← x + K ν;  P by the Joseph form, or as P - K S Kᵀ."""
     reading = own.reading
     C, chol_S = reading.C, reading.chol_S
     if options(context)[JOSEPH] != 0.0:
-        gain(m, C, chol_S, estimated(context), own.K)
+        gain(m, C, chol_S, estimated(context), own.K, reading.W)
         move_mean(m, C, chol_S, reading.nu, estimated(context), x)
-        joseph(m, reading.d, C, own.H, own.K, P, own.N)
+        joseph(m, reading.d, C, own.H, own.K, P, own.N, reading.W, reading.B)
     else:
         move_mean(m, C, chol_S, reading.nu, estimated(context), x)
         downdate(m, C, chol_S, estimated(context), P, reading.W)

@@ -148,7 +148,7 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     if m == ny:
         K = found.K
     else:
-        gain(m, reading.C, reading.chol_S, n, K)
+        gain(m, reading.C, reading.chol_S, n, K, reading.W)
     for i in range(n):
         for k in range(m):
             x[i] += K[i, k] * reading.raw[k]
@@ -157,7 +157,7 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
         copy(found.after, P)
         phase[0] = AFTER
         return verdict
-    joseph(m, reading.d, reading.C, own.H, K, P, own.N)
+    joseph(m, reading.d, reading.C, own.H, K, P, own.N, reading.W, reading.B)
     phase[0] = MOVING
     if settled(found.after, P):
         copy(found.after, P)

@@ -14,8 +14,9 @@ from ..compiled.verdict import verdict_of
 from ..estimator import Options
 from ..numerics.jit import by_address, inlined, ints, part
 from ..numerics.linalg import EPSILON, cholesky, mirror, solve_transposed, solve_unit, solve_upper, wrap
-from ..numerics.simd_ir import padded
-from ..numerics.simd_rows import subtract_squares
+from ..numerics.simd import add_scaled, scaled
+from ..numerics.simd_ir import LANES, padded
+from ..numerics.simd_rows import multiply_rows, subtract_product, subtract_squares
 from ..numerics.workspace import declare_layout, start_of, take_matrix, take_vector
 from ..track import FAILED, MISSING, USED, WHITENED
 from .robust import forget, is_robust, reweigh
@@ -91,12 +92,13 @@ Reading, reading_of = declare_layout(
     "Reading",
     "n, m",
     padded,
-    W="m, padded(n)",  # scratch of `downdate`
+    W="m, padded(n)",  # scratch of covariance and gain
     nu="m",  # predicted measurement, then innovation ν, then whitened, S^-½ ν
     r="m",  # variances of all rows, as they are in use
     S="m, m",  # covariance of the predicted measurement, then of the innovation
     chol_S="m, m",  # upper, chol_Sᵀ chol_S = S
     C="n, m",  # covariance of state and predicted measurement
+    B="m, n = C",  # scratch of the Joseph form
     raw="m",  # innovation, not whitened
     d="m",  # variances of the finite rows, made independent
     z="2 * m",  # scratch of a weight
@@ -246,13 +248,42 @@ def admit_weighted(context, sensor, m, reading, score):
 
 
 @inlined
-def gain(m, C, U, estimated, K):
-    """K = C S⁻¹ for the leading m columns, with S = Uᵀ U; zero beyond the `estimated` rows."""
-    for i in range(C.shape[0]):
-        for j in range(m):
-            K[i, j] = C[i, j] if i < estimated else 0.0
-        solve_transposed(U, m, K[i])
-        solve_upper(U, m, K[i])
+def gain(m, C, U, estimated, K, W):
+    """K = C S⁻¹ for the leading m columns, with S = Uᵀ U; zero beyond the `estimated` rows; W as for `downdate`."""
+    if C.shape[0] >= LANES:
+        gain_rows(m, C, U, estimated, K, W)
+    else:
+        for i in range(C.shape[0]):
+            for j in range(m):
+                K[i, j] = C[i, j] if i < estimated else 0.0
+            solve_transposed(U, m, K[i])
+            solve_upper(U, m, K[i])
+
+
+@part
+def gain_rows(m, C, U, estimated, K, W):
+    """As `gain`, in whole vectors."""
+    n, width = C.shape[0], W.shape[1]
+    whiten(m, C, U, estimated, W)
+    for k in range(m - 1, -1, -1):
+        for j in range(k + 1, m):
+            add_scaled(width, -U[k, j], W[j], W[k])
+        scaled(width, 1.0 / U[k, k], W[k], W[k])
+    for i in range(n):
+        for k in range(m):
+            K[i, k] = W[k, i]
+
+
+@part
+def whiten(m, C, U, estimated, W):
+    """W = U⁻ᵀ Cᵀ for the leading m columns of C; zero beyond its `estimated` rows."""
+    width = W.shape[1]
+    for k in range(m):
+        for i in range(width):
+            W[k, i] = C[i, k] if i < estimated else 0.0
+        for j in range(k):
+            add_scaled(width, -U[j, k], W[j], W[k])
+        scaled(width, 1.0 / U[k, k], W[k], W[k])
 
 
 @inlined
@@ -265,13 +296,26 @@ def move_mean(m, C, U, nu, estimated, x):
 
 
 @part
-def joseph(m, d, C, H, K, P, N):
-    """P ← (I - K H) P (I - K H)ᵀ + K R Kᵀ, in O(n² m); C = P Hᵀ, R = diag(d), N (nx, nx) is scratch.
+def joseph(m, d, C, H, K, P, N, W, B):
+    """P ← (I - K H) P (I - K H)ᵀ + K R Kᵀ, in O(n² m); C = P Hᵀ, R = diag(d).
 
-    Symmetric and positive semidefinite whatever the gain. Source: Bucy & Joseph (1968), Filtering for Stochastic
-    Processes with Applications to Guidance.
+    Symmetric and positive semidefinite whatever the gain. Scratch: N (nx, nx), W as for `downdate`, and B (m or more,
+    nx), which may take the place of C. Source: Bucy & Joseph (1968), Filtering for Stochastic Processes with
+    Applications to Guidance.
     """
     n = P.shape[0]
+    if n >= LANES:
+        # As N - K (N H - K R)ᵀ with N = (P - K Cᵀ)ᵀ.
+        for k in range(m):
+            for i in range(n):
+                W[k, i] = K[i, k]
+        subtract_product(P, C, n, m, W, 0, N)
+        multiply_rows(H, m, n, N, 0, B)
+        for k in range(m):
+            add_scaled(n, -d[k], W[k], B[k])
+        subtract_product(N, K, n, m, B, 1, P)
+        mirror(P)
+        return
     for i in range(n):
         for j in range(n):
             N[i, j] = P[i, j]
@@ -311,13 +355,16 @@ def downdate(m, C, U, estimated, P, W):
     Processes and Filtering Theory, 8.4.
     """
     n = P.shape[0]
-    for k in range(m):
-        inverse = 1.0 / U[k, k]
-        for i in range(n):
-            s = C[i, k]
-            for j in range(k):
-                s -= U[j, k] * W[j, i]
-            W[k, i] = s * inverse
+    if n >= LANES:
+        whiten(m, C, U, n, W)
+    else:
+        for k in range(m):
+            inverse = 1.0 / U[k, k]
+            for i in range(n):
+                s = C[i, k]
+                for j in range(k):
+                    s -= U[j, k] * W[j, i]
+                W[k, i] = s * inverse
     subtract_squares(W, m, estimated, P)
     for i in range(estimated, n):
         for j in range(estimated):

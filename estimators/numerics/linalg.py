@@ -10,6 +10,8 @@ from __future__ import annotations
 import numpy as np
 
 from .jit import embedded, inlined, jit, part
+from .simd_ir import LANES
+from .simd_rows import multiply_rows
 
 EPSILON = float(np.finfo(float).eps)
 
@@ -215,6 +217,15 @@ def congruence(F, rows, P, T):
     n = P.shape[0]
     if rows < n:
         bordered_congruence(F, rows, P, T)
+        return
+    if n >= LANES:
+        FP, PF = T[:n], T[n:]
+        multiply_rows(F, n, n, P, 0, FP)
+        for i in range(n):
+            for j in range(n):
+                PF[j, i] = FP[i, j]
+        multiply_rows(F, n, n, PF, 1, P)
+        mirror(P)
         return
     for i in range(n):
         for j in range(n):

@@ -1,21 +1,23 @@
-"""Vector code for small matrices with rows padded to full vectors, for the unscented filters.
+"""Vector code for small matrices with rows padded to full vectors, for the Gaussian filters.
 
 Padding is never part of a result.
 
 Measured on a shared x86-64 machine against plain Numba loops, for 2, 4, 7, 16 and 48 states: a covariance of sigma
 points takes 6 ns for 17, 16 for 99, 37 for 463, 310 for 2,640 and 8,000 for 65,000; a factor 11 ns for 16, 33 for 48,
-61 for 125, 300 for 700 and 3,900 for 10,900.
+61 for 125, 300 for 700 and 3,900 for 10,900. With the products in blocks a step of the Kalman filter takes 1.1 µs for 1.6
+with 8 states, 3.2 for 13.9 with 24 and 9.8 for 84 with 48.
 """
 
 from __future__ import annotations
 
+import functools
 import math
 from typing import Any
 
 from numba import types
 from numba.core import cgutils
 
-from .simd_ir import F64, LANES, Lanes, integer, sizes, steps, vector_code
+from .simd_ir import F64, I64, LANES, Lanes, integer, sizes, steps, vector_code
 
 
 @vector_code()
@@ -175,3 +177,80 @@ def spread_points(v, x, U, spread, points):
             to = builder.add(builder.mul(builder.add(loop.index, integer(1)), width), at)
             v.store(builder.fadd(centre, d), points.data, to)
             v.store(builder.fsub(centre, d), points.data, builder.add(to, half))
+
+
+def _multiply(v: Lanes, A: Any, rows: Any, count: Any, B: Any, base: Any, out: Any, lower: Any) -> None:
+    """Write out = A B, or base - A B, in blocks of four rows and one or two vectors that stay in registers.
+
+    The last block of rows and of columns overlaps the one before it instead of being shorter.
+    """
+    builder = v.builder
+    lower = builder.icmp_signed("!=", lower, integer(0))
+
+    def least(a: Any, b: Any) -> Any:
+        return builder.select(builder.icmp_signed("<", a, b), a, b)
+
+    n = least(sizes(builder, B)[1], sizes(builder, out)[1])
+
+    def row_of(array: Any, row: Any) -> Any:
+        return builder.gep(array.data, [builder.mul(row, sizes(builder, array)[1])])
+
+    def block(i: Any, at: Any, height: int, vectors: int) -> None:
+        columns = [builder.add(at, integer(LANES * c)) for c in range(vectors)]
+        rows = [builder.add(i, integer(r)) for r in range(height)]
+        left = [row_of(A, row) for row in rows]
+        sums = [[v.variable() for _ in columns] for _ in rows]
+        for row, mine in zip(rows, sums, strict=True):
+            for column, one in zip(columns, mine, strict=True):
+                builder.store(v.constant(0.0) if base is None else v.load(row_of(base, row), column), one)
+        with cgutils.for_range(builder, count) as loop:
+            entries = [builder.gep(row, [loop.index]) for row in left]
+            used = cgutils.true_bit
+            if base is None:
+                # Twice the bits, so without the sign: 0 for zeros only.
+                bits = [builder.load(builder.bitcast(entry, I64.as_pointer())) for entry in entries]
+                used = builder.icmp_unsigned(
+                    "!=", builder.shl(functools.reduce(builder.or_, bits), integer(1)), integer(0)
+                )
+            with builder.if_then(used):
+                row = row_of(B, loop.index)
+                values = [v.load(row, column) for column in columns]
+                for entry, mine in zip(entries, sums, strict=True):
+                    number = builder.load(entry)
+                    weight = v.spread(number if base is None else builder.fneg(number))
+                    for value, one in zip(values, mine, strict=True):
+                        v.multiply_add_to(one, weight, value)
+        for row, mine in zip(rows, sums, strict=True):
+            for column, one in zip(columns, mine, strict=True):
+                v.store(builder.load(one), row_of(out, row), column)
+
+    def blocks(height: int, vectors: int) -> None:
+        last = builder.sub(n, integer(LANES * vectors))
+        with steps(builder, 0, rows, height) as row:
+            i = least(row, builder.sub(rows, integer(height)))
+            end = builder.select(lower, builder.add(i, integer(height)), n)
+            with steps(builder, 0, end, LANES * vectors) as column:
+                block(i, least(column, last), height, vectors)
+
+    with builder.if_else(builder.icmp_signed("<", rows, integer(4))) as cases:
+        for case, height in zip(cases, (1, 4), strict=True):
+            with case, builder.if_else(builder.icmp_signed("<", n, integer(2 * LANES))) as widths:
+                for width, vectors in zip(widths, (1, 2), strict=True):
+                    with width:
+                        blocks(height, vectors)
+
+
+@vector_code()
+def multiply_rows(v, A, rows, count, B, lower, out):
+    """Leading rows of out (rows or more, n) = A B over `count` columns of A and rows of B (count or more, n).
+
+    B or out may be wider than n, which is 8 or more. Zeros of A are skipped. If `lower`, entries above the diagonal are
+    undefined.
+    """
+    _multiply(v, A, rows, count, B, None, out, lower)
+
+
+@vector_code()
+def subtract_product(v, base, A, rows, count, B, lower, out):
+    """Leading rows of out (rows or more, n) = base - A B; otherwise as `multiply_rows`."""
+    _multiply(v, A, rows, count, B, base, out, lower)

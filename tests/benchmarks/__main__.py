@@ -20,7 +20,7 @@ for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
 
 def main() -> None:
     """Run the sections; no figure makes it fail."""
-    from . import buses, cluster, false_alarms, filters, folds, page, recovery, sampling
+    from . import buses, cluster, eigen, false_alarms, filters, folds, page, recovery, sampling
     from .timing import Section, run_sections
 
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -35,6 +35,8 @@ def main() -> None:
         filters.step_alone,
         filters.considered,
         filters.beside_stone_soup,
+        filters.beside_fast_kalman,
+        eigen.beside_eigen,
         filters.growing_n,
         filters.growing_m,
         filters.gaussian_family,

@@ -285,6 +285,31 @@ def beside_stone_soup() -> Iterator[BenchmarkRow]:
         )
 
 
+def beside_fast_kalman() -> Iterator[BenchmarkRow]:
+    """A Kalman filter step beside fast-kalman's (C++), n=2 m=1: processor time, medians, interleaved."""
+    import kalman
+
+    theirs = kalman.LinearKalmanFilter(
+        2, 1, x=[35.0, 0.0], P=[25.0, 0.0, 0.0, 1.0], F=[1.0, 1.0, 0.0, 1.0], Q=[0.01, 0.0, 0.0, 0.001],
+        H=[1.0, 0.0], R=[4.0],
+    )  # fmt: skip
+    y = np.full(STEPS, 36.0)
+
+    def each() -> None:
+        for _ in range(STEPS):
+            theirs.update([36.0])
+
+    motor = MODELS["motor_winding"]
+    log = noisy_log(motor, STEPS)
+    for name, ours, call, remark in (
+        ("history, update", folding("kf", motor, log), each, "its innovation and NIS in each step, as here"),
+        ("step alone, update_many", alone("kf", motor), lambda: theirs.update_many(y), "its last estimate only"),
+    ):
+        pair = compare(ours, call, steps=(STEPS, STEPS), repetitions=REPETITIONS)
+        figures = {"Nisus [µs]": pair.ours * 1e6, "fast-kalman [µs]": pair.theirs * 1e6, "ratio": pair.ratio}
+        yield BenchmarkRow(name, figures, (Bound("ratio", 1.5, at_least=True),), remark)
+
+
 def growing_n() -> Iterator[BenchmarkRow]:
     """A step against n (ring of n states, every third measured): µs, which grow as n³ where matrices dominate."""
     for n in (2, 4, 8, 16, 24, 32, 48):

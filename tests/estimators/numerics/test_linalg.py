@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from numba import njit
 
 from estimators.numerics.linalg import (
     cholesky,
@@ -20,6 +21,11 @@ from estimators.numerics.linalg import (
 SIZES = (1, 2, 3, 5, 8, 16, 33)
 # LAPACK's bound for these algorithms is n ε cond(A), relative; the matrices below have a condition of 1e2 to 1e4.
 TOLERANCE = 1e-10
+
+
+@njit
+def congruence_of(F, rows, P, T):
+    congruence(F, rows, P, T)
 
 
 def spd(rng, n):
@@ -103,7 +109,7 @@ def test_congruence(n, sparse):
     P = spd(rng, n)
     F = rng.normal(0, 1, (n, n)) * (rng.random((n, n)) < (0.4 if sparse else 1.0))
     expected = F @ P @ F.T
-    congruence(F, n, P, np.full((2 * n, n), np.nan))
+    congruence_of(F, n, P, np.full((2 * n, n), np.nan))
     np.testing.assert_allclose(P, expected, rtol=0, atol=1e-13 * n * max(1.0, np.abs(expected).max()))
     np.testing.assert_array_equal(P, P.T)
 
@@ -116,7 +122,7 @@ def test_congruence_of_a_bordered_matrix(n, rows):
     F = np.eye(n)
     F[:rows] = rng.normal(0, 1, (rows, n))
     expected = F @ P @ F.T
-    congruence(F, rows, P, np.full((2 * n, n), np.nan))
+    congruence_of(F, rows, P, np.full((2 * n, n), np.nan))
     np.testing.assert_allclose(P, expected, rtol=0, atol=1e-13 * n * max(1.0, np.abs(expected).max()))
     np.testing.assert_array_equal(P, P.T)
 

@@ -5,7 +5,15 @@ import pytest
 from numba import njit
 
 from estimators.numerics.simd_ir import padded
-from estimators.numerics.simd_rows import covariance, cross_covariance, factor, spread_points, subtract_squares
+from estimators.numerics.simd_rows import (
+    covariance,
+    cross_covariance,
+    factor,
+    multiply_rows,
+    spread_points,
+    subtract_product,
+    subtract_squares,
+)
 
 ORDERS = (1, 2, 3, 4, 5, 7, 8, 9, 13, 16, 24)
 
@@ -40,6 +48,12 @@ def cross_covariance_of(U, across, w, C):
 @njit
 def without_squares(n, m, W, P):
     subtract_squares(W, m, P.shape[0], P)
+
+
+@njit
+def products(base, A, rows, B, out, difference):
+    multiply_rows(A, rows, B.shape[0], B, 0, out)
+    subtract_product(base, A, rows, B.shape[0], B, base.shape[0], difference)
 
 
 @pytest.mark.parametrize("n", ORDERS)
@@ -99,3 +113,20 @@ def test_squares_are_subtracted_and_what_is_symmetric_stays_so(n, m):
     np.testing.assert_allclose(P, expected, rtol=0, atol=1e-15 * 20 * (n + m))
     np.testing.assert_array_equal(P, P.T)
     assert np.all(room[n * n :] == 5.0), "it wrote behind the matrix"
+
+
+@pytest.mark.parametrize("n", [8, 9, 15, 16, 17, 24, 33])
+@pytest.mark.parametrize("m", [1, 3, 4, 6, 9])
+def test_products_in_blocks(n, m):
+    """The leading rows alone are written, and of a difference the lower triangle if that is asked for."""
+    rng = np.random.default_rng(n)
+    A, B, base = rng.standard_normal((m + 1, m + 2)), rng.standard_normal((m, n)), rng.standard_normal((m, n))
+    A[rng.random(A.shape) < 0.5] = 0.0
+    out, difference = np.full((m + 1, padded(n)), 1e77), np.full((m + 1, n), 1e77)
+    products(base, A, m, B, out, difference)
+    expected = A[:m, :m] @ B
+    np.testing.assert_allclose(out[:m, :n], expected, rtol=0, atol=1e-13)
+    np.testing.assert_array_equal(out[m], 1e77)
+    np.testing.assert_array_equal(out[:, n:], 1e77)
+    np.testing.assert_allclose(np.tril(difference[:m]), np.tril(base - expected), rtol=0, atol=1e-13)
+    np.testing.assert_array_equal(difference[m], 1e77)
