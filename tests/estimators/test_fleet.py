@@ -119,6 +119,56 @@ def test_fleet_of_random_assets_has_the_bits_of_single_folds(estimator, name, ga
     assert (GATED in verdicts) == (gate == "hard")
 
 
+def faulty_events(model, rng, count):
+    """Return random events with runs of rejections: one sensor is off for a time, and all of them for another."""
+    events = random_events(model, rng, count)
+    begin, length = int(rng.integers(5, count // 2)), int(rng.integers(5, count))
+    off, all_off = str(rng.choice(model.sensor_names)), rng.random() < 0.4
+    shift = float(rng.choice([50.0, 400.0]))
+    return [
+        (t, what, values + shift)
+        if what in model.sensor_names and begin <= k < begin + length and (all_off or what == off)
+        else (t, what, values)
+        for k, (t, what, values) in enumerate(events)
+    ]
+
+
+@pytest.mark.parametrize(
+    ("estimator", "name", "kind"), [("kf", "motor_winding", "hard"), ("ekf", "motor_drive", "hard")]
+)
+@pytest.mark.parametrize("threads", [1, 3])
+def test_decisions_on_rejected_sensors_are_those_of_single_folds(estimator, name, kind, threads):
+    model, rng, count = MODELS[name], np.random.default_rng(17 + threads), 10
+    tunings = [replace(Tuning.of(model), gate=0.99, gate_kind=kind, reopen=4.0)] * count
+    tunings[3] = replace(tunings[0], reopen=12.0)
+    tunings[4] = replace(tunings[0], gate=None)
+    fleet = Fleet(estimator, model, tunings, assets=count, policy=POLICY, recent=4, threads=threads)
+    logs = [Log.of(model) for _ in tunings]
+    arriving = [shuffled(faulty_events(model, rng, int(rng.integers(60, 400))), rng, 4) for _ in tunings]
+    outcomes: set[str] = set()
+    while any(arriving):
+        for a in range(count):
+            taken = int(rng.choice([0, 1, 2, 9, 60]))
+            for event in arriving[a][:taken]:
+                add(fleet, event, a)
+                add(logs[a], event)
+            del arriving[a][:taken]
+        fleet.advance()
+        if rng.random() < 0.1:  # the records continue in another fleet
+            part, former = slice(2, 7), fleet
+            fleet.restore(2, former.state(part))
+    for a, log in enumerate(logs):
+        fold = Fold(estimator, model, tunings[a], log, policy=POLICY)
+        fold.advance()
+        assert_same(fleet, a, fold)
+        assert [each._replace(text="") for each in fleet.decisions(a)] == [
+            each._replace(text="") for each in fold.decisions[-64:]
+        ]
+        outcomes |= {each.outcome for each in fold.decisions}
+    assert fleet.table().stale.sum() == 0
+    assert {"isolated", "reopened"} & outcomes and "believed" in outcomes
+
+
 def decay(x, u, p, dt, out):
     out[0] = x[0] * (1.0 - p[0] * dt)
 
@@ -221,7 +271,7 @@ def test_table_names_the_cause_and_the_worst_come_first():
     ("call", "words"),
     [
         (lambda m: Fleet("pf", m, assets=2), "Gaussian"),
-        (lambda m: Fleet("kf", m, replace(Tuning.of(m), gate=0.99), assets=2), "gate.reopen is 30 s"),
+        (lambda m: Fleet("kf", m, replace(Tuning.of(m), gate=0.99), assets=2, recent=0), "gate.reopen is 30 s"),
         (lambda m: Fleet("kf", m, [Tuning.of(m)] * 3, assets=2), "3 tunings for 2 assets"),
         (lambda m: Fleet("kf", m, assets=0), "0 assets"),
         (lambda m: Fleet("kf", m, assets=["a", "b"]).add("winding", "c", 1.0, 2.0), 'no asset'),
