@@ -48,6 +48,7 @@ from .model.state_space import LARGE, StateSpaceModel
 from .numerics.jit import threaded
 from .numerics.workspace import WORD
 from .registry import find_estimator
+from .siblings import siblings
 from .snapshots import Base, Snapshot
 from .track import Track
 from .tuning import Tuning
@@ -84,7 +85,8 @@ class Fleet:
             tuning: One for all assets, or one per asset (assets may share the same object); None for the model's.
             assets: Names of the assets, or their number.
             values: Values (assets,) by key of the tuning (`Q.NAME`, `R.NAME`, `p.NAME`), in its units, where assets
-                differ from the shared tuning; of many assets they take less time and memory than tunings of their own.
+                differ from the shared tuning, NaN where they do not; of many assets they take less time and memory than
+                tunings of their own.
             start: Time at which the prior holds, s; None for that of an asset's first event.
             policy: Thresholds of health.
             recent: Late events are inserted among the last `recent` events of their asset, and up to twice as many; an
@@ -176,7 +178,7 @@ class Fleet:
         self._state = state_at(0, *self._state_sizes)
         size = self._state.end // WORD
         self._columns = max(1, model.ny, model.nu)
-        kept, ring, slots = self.policy.window + 2 * self.recent, 2 * self.recent + 1, 2 if self.recent else 0
+        kept, ring, slots = self.policy.window + max(1, 2 * self.recent), 2 * self.recent + 1, 2 if self.recent else 0
         self._block = block_at(0, size, kept, ring, slots, self._columns, len(model.shown))
         # Whole cache lines, so that two threads never write to the same one.
         words = -(-self._block.end // (8 * WORD)) * 8
@@ -346,6 +348,30 @@ class Fleet:
         if self._gates is not None:
             self._gates.extend(len(more.assets))
         self._point()
+
+    def sibling_prior(self, *states: str) -> Moments:
+        """Return the model's prior with mean and spread of some states over the assets: the prior of a new asset.
+
+        The spread is that of the true values, without the errors of the estimates (empirical Bayes, see `siblings`).
+
+        Args:
+            states: Names of states that are constant or alike in all assets, such as an estimated parameter or a bias.
+
+        Raises:
+            EstimatorError: If there is no such state, or fewer than 8 assets have an estimate.
+        """
+        mean, cov = (part.copy() for part in self._machines[SHARED].prior)
+        shown = [state.name for state in self.model.shown_states]
+        for name in states:
+            if name not in shown:
+                raise EstimatorError(f"fleet: {self.model.name} has no state {quoted(name)}; {nearest(name, shown)}")
+            k, j = shown.index(name), self.model.state_names.index(name)
+            seen = self._head[:, N] > 0
+            found = siblings(self._part(self._block.mean)[seen, k], self._part(self._block.std)[seen, k])
+            mean[j] = found.mean
+            cov[j, :] = cov[:, j] = 0.0
+            cov[j, j] = found.std**2
+        return mean, cov
 
     def set_prior(self, asset: Any, prior: Moments) -> None:
         """Give assets that have no events yet another prior, such as that of `sibling_prior`.

@@ -11,7 +11,7 @@ from .fleet_memory import FIRST, LAST, NEXT, PINNED, REWOUND, N, Record, record_
 from .fleet_record import FREE, record_sizes
 from .fold_machine import Machine
 from .gate.isolation import MAX_COMPARED_EVENTS, MAX_DECISIONS, Decision, decide
-from .gate.rejection_runs import RUN, SINCE
+from .gate.rejection_runs import RUN, SINCE, fresh
 from .log import _ORDER, Events, Log
 from .model.state_space import StateSpaceModel
 from .numerics.workspace import WORD, size_of, view
@@ -29,7 +29,9 @@ class AssetFold:
         self.model: StateSpaceModel = machine.model
         self.log, self.gate_limits = log, machine.gate_limits
         self._machine, self._now, self._begun = machine, now, begun
-        self._track, _ = machine.run_apart(log, 0, log.n, begun.copy())
+        # Rows do not depend on the record of rejections, which would ask for decisions and end the loop.
+        begun = begun.copy()._replace(doubt=fresh(len(self.model.sensors)))
+        self._track, _ = machine.run_apart(log, 0, log.n, begun)
 
     @property
     def track(self) -> Track:

@@ -23,6 +23,7 @@ from .fleet_memory import (
     ASKED,
     CONSISTENCY,
     FLAGS,
+    FLOOR,
     HEALTH,
     NIS_HIGH,
     NIS_LOW,
@@ -181,9 +182,10 @@ def _resume(record, tail_t, tail_place, tail_value):
 
 
 @part
-def _stop(record, n, a, tail, tail_t, tail_place, tail_value):
+def _stop(record, n, oldest, a, tail, tail_t, tail_place, tail_value):
     """Keep the rest of the tail until the decision after event n - 1 has been taken."""
     record.head[ASKED] = n
+    record.head[FLOOR] = oldest
     record.head[TAIL] = tail - a
     for k in range(a, tail):
         record.tail_t[k - a], record.tail_place[k - a] = tail_t[k], tail_place[k]
@@ -263,8 +265,11 @@ def _fold_share(place, crew):
         e, stop, a, tail = begins[v], ends[v], 0, 0
         record_place = records[asset] if reopens else 0
         record = record_at(record_place, plan.size, slots, ring, rows, columns)
+        # Event of the block's oldest snapshot; while a tail is folded again, it does not follow from the event count.
+        oldest = snapshots_of(head, head[N], recent)[1] if recent > 0 else 0
         if record_place != 0:
             tail = _resume(record, tail_t, tail_place, tail_value)
+            oldest = record.head[FLOOR] if tail > 0 else oldest
         if tail == 0 and head[N] > 0 and _precedes_last(order[e], t, event_place, value, block, head[N]):
             e, tail = _rewind(
                 block, e, stop, order, t, event_place, value, recent, plan.window, tail_t, tail_place, tail_value
@@ -276,12 +281,15 @@ def _fold_share(place, crew):
         while a < tail or e < stop:
             n = head[N]
             if n == 0 or (n + head[PHASE]) % max(1, recent) == 0:
-                if reopens and rule.most > 0:
-                    record_place = before_snapshot(
-                        asset, block, recent, records, free, slots, rows,
-                        plan.nu, plan.state, plan.evidence, plan.edge, plan.sensors,
-                    )  # fmt: skip
-                    record = record_at(record_place, plan.size, slots, ring, rows, columns)
+                newer = snapshots_of(head, n, recent)[0] if recent > 0 else 0
+                if newer > oldest:
+                    if reopens and rule.most > 0:
+                        record_place = before_snapshot(
+                            asset, block, oldest, newer, recent, records, free, slots, rows,
+                            plan.nu, plan.state, plan.evidence, plan.edge, plan.sensors,
+                        )  # fmt: skip
+                        record = record_at(record_place, plan.size, slots, ring, rows, columns)
+                    oldest = newer
                 if recent > 0:
                     copy(block.now, block.snapshots[slot_of(head, n, recent)])
             at = n % ring
@@ -321,9 +329,9 @@ def _fold_share(place, crew):
             head[N] = n + 1
             if asks:
                 if record_place == 0:
-                    record_place = take(asset, block, recent, records, free, slots, rows)
+                    record_place = take(asset, block, oldest, recent, records, free, slots, rows)
                     record = record_at(record_place, plan.size, slots, ring, rows, columns)
-                _stop(record, n + 1, a, tail, tail_t, tail_place, tail_value)
+                _stop(record, n + 1, oldest, a, tail, tail_t, tail_place, tail_value)
                 asked[v] |= ASKED_FLAG
                 break
         if moved:

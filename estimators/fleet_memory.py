@@ -27,14 +27,14 @@ Block, block_at = declare_layout(
 """Memory of an asset: head, last estimate, state, judged measurements (`nis` and `codes`), the recent events as time,
 place in the order of a log, and values, and two snapshots, or none where late events are dropped."""
 
-FIRST, PINNED, ASKED, TAIL, NEXT, LAST, REWOUND = range(7)
+FIRST, PINNED, ASKED, TAIL, FLOOR, NEXT, LAST, REWOUND = range(8)
 """Columns of `Record.head`: number of its first event; event after the last decision that changed the state, and after
-the last decision; late events that are yet to be folded again; snapshots ever taken, and event of the last; event to
-which the asset was rewound, -1 for none."""
+the last decision; late events that are yet to be folded again, and event of the block's oldest snapshot meanwhile;
+snapshots ever taken, and event of the last; event to which the asset was rewound, -1 for none."""
 
 Record, record_at = declare_layout(
     "Record", "size, slots, ring, rows, columns",
-    head="int 7", at="int slots", snapshots="slots, size", tail_t="int ring", tail_place="int ring",
+    head="int 8", at="int slots", snapshots="slots, size", tail_t="int ring", tail_place="int ring",
     tail_value="ring, columns", t="int rows", place="int rows", value="rows, columns",
 )  # fmt: skip
 """Events of an asset of which a sensor is being rejected, as far back as a decision on it compares (gate/isolation.py),

@@ -8,7 +8,7 @@ decision can go back beyond the snapshots of the block.
 
 from __future__ import annotations
 
-from .fleet_memory import ASKED, FIRST, LAST, NEXT, PHASE, PINNED, REWOUND, TAIL, N, record_at, state_at
+from .fleet_memory import ASKED, FIRST, FLOOR, LAST, NEXT, PHASE, PINNED, REWOUND, N, record_at, state_at
 from .gate.isolation import MAX_COMPARED_EVENTS
 from .gate.rejection_runs import RUN
 from .numerics.jit import embedded, ints, part
@@ -68,20 +68,19 @@ def append(record, n, t, place, value):
 
 
 @part
-def take(asset, block, recent, records, free, slots, rows):
-    """Give an asset a free record, with its events since the older snapshot; return its address."""
+def take(asset, block, oldest, recent, records, free, slots, rows):
+    """Give an asset a free record, with its events since the oldest snapshot of its block; return its address."""
     place = free[free[0]]
     free[0] -= 1
     records[asset] = place
     head, ring = block.head, block.t.size
     record = record_at(place, block.now.size, slots, ring, rows, block.value.shape[1])
-    _, older = snapshots_of(head, head[N], recent)
-    record.head[FIRST] = older
-    record.head[PINNED] = record.head[ASKED] = record.head[TAIL] = record.head[NEXT] = 0
+    record.head[:] = 0
+    record.head[FIRST] = record.head[FLOOR] = oldest
     record.head[REWOUND] = -1
     record.at[:] = -1
-    store(record, older, block.snapshots[slot_of(head, older, recent)])
-    for k in range(older, head[N]):
+    store(record, oldest, block.snapshots[slot_of(head, oldest, recent)])
+    for k in range(oldest, head[N]):
         append(record, k, block.t[k % ring], block.place[k % ring], block.value[k % ring])
     return place
 
@@ -110,19 +109,18 @@ def _rejects(state, nu, size, evidence, edge, sensors):
 
 
 @part
-def before_snapshot(asset, block, recent, records, free, slots, rows, nu, size, evidence, edge, sensors):
-    """Take or return the record of an asset before the older snapshot of its block is overwritten; return its address.
+def before_snapshot(
+    asset, block, oldest, newer, recent, records, free, slots, rows, nu, size, evidence, edge, sensors
+):  # fmt: skip
+    """Take or return the record of an asset before the oldest snapshot of its block is overwritten; return its address.
 
-    Snapshots of the record are farther apart than those of the block.
+    `oldest` and `newer` are the events of the block's snapshots. Those of the record are farther apart.
     """
     head = block.head
     n, place = head[N], records[asset]
-    newer, _ = snapshots_of(head, n, recent)
-    if newer == 0 and place == 0:
-        return place
     needed = _rejects(block.snapshots[slot_of(head, newer, recent)], nu, size, evidence, edge, sensors)
     if place == 0:
-        return take(asset, block, recent, records, free, slots, rows) if needed else place
+        return take(asset, block, oldest, recent, records, free, slots, rows) if needed else place
     record = record_at(place, block.now.size, slots, block.t.size, rows, block.value.shape[1])
     own = record.head
     if not needed and newer >= max(own[PINNED], own[ASKED]) and own[REWOUND] < 0 and free[0] < 2 * FREE:

@@ -26,7 +26,8 @@ class AssetTunings:
 
         Args:
             machine: Machine of the shared tuning.
-            values: Values (assets,) by key of the tuning (`Q.NAME`, `R.NAME`, `p.NAME`), in the units of `Tuning`.
+            values: Values (assets,) by key of the tuning (`Q.NAME`, `R.NAME`, `p.NAME`), in the units of `Tuning`;
+                NaN is the shared value.
             assets: Names of the assets, for messages.
 
         Raises:
@@ -57,15 +58,16 @@ class AssetTunings:
             raise EstimatorError(
                 f"fleet: {quoted(key)} is the same for all assets; those of Q, R and p may differ from asset to asset"
             )
-        if not column.size:
+        own = ~np.isnan(column)
+        if not own.any():
             return
         # The extremes: where these are in range, so are the others.
-        for k in (int(np.argmax(~np.isfinite(column))), int(np.argmin(column)), int(np.argmax(column))):
+        for k in (int(np.nanargmin(column)), int(np.nanargmax(column))):
             try:
                 tuning.set(key, float(column[k]))
             except ConfigError as error:
                 raise EstimatorError(f"fleet: asset {assets[k]}: {error}") from None
-        self.columns[group][:, tuning.rows_of(key)] = column[:, None]
+        self.columns[group][np.ix_(own, tuning.rows_of(key))] = column[own, None]
 
     def _point(self, name: str, column: np.ndarray) -> None:
         """Set a field of all contexts to the addresses of the rows of an array."""
