@@ -139,6 +139,9 @@ def load_fleet(path: str | os.PathLike[str], overrides: Mapping[str, str] | None
     plan = plan_source(loaded, twin.model, None)
     if plan.brings_variances:
         raise loaded.error(KEY, "has sensors with accuracy; a fleet uses the tuned R: leave accuracy out")
+    if section.late == 0 and twin.tuning.gate is not None and twin.tuning.reopen is not None:
+        rule = "decisions on a rejected sensor need snapshots: give 1 or more, or set gate.reopen to null"
+        raise ConfigError(f"{places.at(('late',))}: late is 0, and the gate of {twin.name} reopens; {rule}")
     assets = section.assets if isinstance(section.assets, tuple) else None
     values = asset_values(section.tunings, path, places, twin.tuning, assets)
     if isinstance(section.assets, int) and len(values.names) > section.assets:
