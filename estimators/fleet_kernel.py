@@ -25,6 +25,8 @@ from .fleet_memory import (
     FLAGS,
     FLOOR,
     HEALTH,
+    IN_WINDOW,
+    JUDGED,
     NIS_HIGH,
     NIS_LOW,
     NIS_MEAN,
@@ -131,6 +133,24 @@ def _prefetch(place, end):
     """Ask for the memory from an address to another: while it arrives, another asset is folded."""
     for at in range(place, end, 64):
         _prefetch_line(at)
+
+
+@part
+def _prefetch_slots(block, recent):
+    """Ask for the slots of a block that its next event reads or writes; its head has arrived."""
+    head = block.head
+    n, at = head[N], head[N] % block.t.size
+    _prefetch_line(block.t.ctypes.data + 8 * at)
+    _prefetch_line(block.place.ctypes.data + 8 * at)
+    _prefetch_line(block.value.ctypes.data + 8 * at * block.value.shape[1])
+    kept = block.codes.size
+    newest = head[JUDGED] % kept
+    oldest = newest - head[IN_WINDOW]
+    _prefetch_line(block.codes.ctypes.data + 8 * newest)
+    _prefetch_line(block.codes.ctypes.data + 8 * (oldest if oldest >= 0 else oldest + kept))
+    if recent > 0 and (n + head[PHASE]) % recent == 0:
+        place = block.snapshots.ctypes.data + 8 * block.now.size * slot_of(head, n, recent)
+        _prefetch(place, place + 8 * block.now.size)
 
 
 @embedded
@@ -241,9 +261,12 @@ def _fold_share(place, crew):
         if reopens and free[0] == 0:
             break
         asset = visited[v]
+        if v + 2 < last_of_share:
+            following = plan.memory + visited[v + 2] * plan.stride
+            _prefetch(following, following + plan.hot)
         if v + 1 < last_of_share:
             following = plan.memory + visited[v + 1] * plan.stride
-            _prefetch(following, following + plan.hot)
+            _prefetch_slots(block_at(following, plan.size, plan.kept, ring, plan.slots, columns, plan.nx), recent)
         tuning = counts(plan.tunings + 4 * asset, 1)[0]
         if tuning != loaded:
             # A copy: a soft gate writes R while a measurement is folded. Scratch may keep F of the other parameters.
@@ -270,7 +293,11 @@ def _fold_share(place, crew):
         if record_place != 0:
             tail = _resume(record, tail_t, tail_place, tail_value)
             oldest = record.head[FLOOR] if tail > 0 else oldest
-        if tail == 0 and head[N] > 0 and _precedes_last(order[e], t, event_place, value, block, head[N]):
+        # The time of the last event is at hand; the event itself lies in memory that is rarely needed.
+        if (
+            tail == 0 and head[N] > 0 and t[order[e]] <= last_t[0]
+            and _precedes_last(order[e], t, event_place, value, block, head[N])
+        ):  # fmt: skip
             e, tail = _rewind(
                 block, e, stop, order, t, event_place, value, recent, plan.window, tail_t, tail_place, tail_value
             )
