@@ -6,7 +6,7 @@ from typing import Annotated
 
 from pydantic import Field, model_validator
 
-from .fields import Count, Section, Text, Texts, refused
+from .fields import Count, Number, Section, Text, Texts, refused
 from .source_schema import MqttSourceSection, PushSection, TableSection
 
 ASSET_LEVEL = "{asset}"
@@ -38,6 +38,25 @@ class FleetMqttSection(MqttSourceSection):
         return self
 
 
+class AssetTuningsSection(Section):
+    """Values of the tuning that differ from asset to asset; those of the twin hold for the others."""
+
+    file: Text | None = None
+    """CSV with a row for each asset, relative to this file. Its columns are `asset` and keys of the tuning, such as
+    p.resistance, R.winding or Q.temperature; a unit may follow, as in p.resistance [mOhm]. Default: none."""
+    asset: Text = "asset"
+    """Column of `file` with the name of each row's asset. Default: asset."""
+    values: dict[str, dict[str, Number]] = {}
+    """Values by asset and key of the tuning, in its units, for example {pump 3: {p.resistance: 0.5}}; they take
+    precedence over `file`. Default: none."""
+
+    @model_validator(mode="after")
+    def _some(self) -> AssetTuningsSection:
+        if self.file is None and not self.values:
+            raise refused("absent", "has neither file nor values; give one of them")
+        return self
+
+
 class FleetSection(Section):
     """Many assets of one twin."""
 
@@ -47,6 +66,12 @@ class FleetSection(Section):
     assets: Texts | Count | None = None
     """Names of the assets, from which others are refused; or how many there may be, named by the source in the order of
     their first measurements. Default: as many as the source names."""
+    tunings: AssetTuningsSection | None = None
+    """Values of the tuning by asset: {file, asset, values}. Assets that are named here are listed from the start.
+    Default: the twin's for all."""
+    late: Annotated[int, Field(strict=True, ge=0, le=4096)] = 8
+    """Events of an asset among which a late one is inserted. 0 drops late events, and an asset takes half of the
+    memory. Default: 8."""
     source: Annotated[FleetTableSection | FleetPushSection | FleetMqttSection, Field(discriminator="type")]
     """Source of the measurements: its `type` is table, push or mqtt, with the keys of that source in a twin."""
 

@@ -1,50 +1,63 @@
 """Many assets of one model, each with its own fold; one compiled call folds all new measurements on all cores.
 
 Each asset's estimate, verdicts, detectors and health are the bits of a `Fold` over its own log. No history is kept:
-only the last estimate, two snapshots and the most recent events of each asset, into which late events are inserted.
+only the last estimate, two snapshots and the most recent events of each asset, into which late events are inserted; and
+of an asset with a rejected sensor the events since the first rejection, for decisions on the sensor.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numba
 import numpy as np
 
+from .compiled.context import context_type
 from .diagnostics.health import NORMALS, HealthPolicy
 from .errors import EstimatorError, EventError, nearest, quoted
 from .events import arrays
 from .events.batch import INPUT, READING, TICK, Events
-from .fleet_kernel import (
+from .fleet_gate import FleetGates
+from .fleet_kernel import ASKED_FLAG, CREW, PLAN, REWOUND_FLAG, ROWS, fold_assets
+from .fleet_memory import (
     AGE,
-    CREW,
+    FLAGS,
+    HEALTH,
     NIS_HIGH,
     NIS_LOW,
     NIS_MEAN,
-    PLAN,
-    ROWS,
+    PHASE,
+    STALE_EVENTS,
+    VERDICT,
+    N,
     T,
     block_at,
-    fold_assets,
-    in_asset_order,
     state_at,
 )
+from .fleet_order import arrange
+from .fleet_record import record_sizes
 from .fleet_table import FleetTable, causes_of
-from .fleet_window import FLAGS, HEALTH, STALE_EVENTS, VERDICT, N
-from .fold_checks import check_pairs, check_soft, check_tuning
-from .fold_machine import Machine, scratch
+from .fleet_tunings import AssetTunings
+from .fold_checks import check_pairs, check_prior, check_soft, check_tuning
+from .fold_kernel import compiled
+from .fold_machine import Machine, Moments, scratch
+from .gate.isolation import Decision
 from .log import _RANK
 from .model.state_space import LARGE, StateSpaceModel
 from .numerics.jit import threaded
 from .numerics.workspace import WORD
 from .registry import find_estimator
-from .snapshots import Base
+from .siblings import siblings
+from .snapshots import Base, Snapshot
 from .track import Track
 from .tuning import Tuning
 
 RECENT = 8
 """Default number of events of an asset among which a late one is always inserted."""
+
+SHARED = 0
+"""Index of the context of the shared tuning, or of the first one."""
 
 
 class Fleet:
@@ -57,6 +70,7 @@ class Fleet:
         tuning: Tuning | Sequence[Tuning] | None = None,
         *,
         assets: int | Sequence[str],
+        values: Mapping[str, Any] | None = None,
         start: float | None = None,
         policy: HealthPolicy | None = None,
         recent: int = RECENT,
@@ -70,16 +84,20 @@ class Fleet:
             model: Model of all assets; compiled on first use.
             tuning: One for all assets, or one per asset (assets may share the same object); None for the model's.
             assets: Names of the assets, or their number.
+            values: Values (assets,) by key of the tuning (`Q.NAME`, `R.NAME`, `p.NAME`), in its units, where assets
+                differ from the shared tuning, NaN where they do not; of many assets they take less time and memory than
+                tunings of their own.
             start: Time at which the prior holds, s; None for that of an asset's first event.
             policy: Thresholds of health.
             recent: Late events are inserted among the last `recent` events of their asset, and up to twice as many; an
-                event before those is dropped and counted as stale.
+                event before those is dropped and counted as stale. 0 drops every late event, and needs no snapshots,
+                which take half of the memory.
             threads: Threads that fold; None for all.
             expected: Sensors that must report, (sensors,) of bool; None for those that have reported.
 
         Raises:
-            EstimatorError: If the estimator does not exist, does not apply or is not Gaussian, a size does not fit, or
-                a gate decides on its sensors (`reopen`), for which an asset's history would be needed.
+            EstimatorError: If the estimator does not exist, does not apply or is not Gaussian, a size or a value does
+                not fit, or a gate decides on its sensors (`reopen`) and `recent` is 0.
             EventError: If `start` is not finite or beyond ±146 years.
         """
         self.estimator, self.model = find_estimator(estimator, model), model
@@ -91,69 +109,107 @@ class Fleet:
         self.assets: Sequence[Any] = range(assets) if isinstance(assets, int) else list(assets)
         self._index: dict[str, int] | None = None
         count = len(self.assets)
-        if count < 1 or not 1 <= recent <= 4096:
-            raise EstimatorError(f"fleet: {count} assets, recent is {recent}; both must be positive, recent up to 4096")
+        if count < 1 or not 0 <= recent <= 4096:
+            raise EstimatorError(
+                f"fleet: {count} assets, recent is {recent}; assets must be positive, recent 0 to 4096"
+            )
         self.policy, self.recent = policy or HealthPolicy(), recent
         given = [Tuning.of(model)] if tuning is None else [tuning] if isinstance(tuning, Tuning) else list(tuning)
         if len(given) not in (1, count):
             raise EstimatorError(f"fleet: {len(given)} tunings for {count} assets; give one, or one per asset")
-        distinct = {id(each): each for each in given}
+        if values and len(given) > 1:
+            raise EstimatorError("fleet: values and a tuning per asset; give one shared tuning, or no values")
         self._expected = expected
-        self._machines = [self._machine(each) for each in distinct.values()]
+        distinct = {id(each): each for each in given}
+        self._machines = {k: self._machine(each) for k, each in enumerate(distinct.values())}
+        """Machines by context; those of contexts with values of their own are made on demand."""
         places = {key: k for k, key in enumerate(distinct)}
         self._tuning_of = np.zeros(count, np.int32)
         if len(given) > 1:
             self._tuning_of[:] = [places[id(each)] for each in given]
-        self._first = given[0], start
+        self._contexts = np.concatenate([np.array([each.context]).view(np.int64) for each in self._machines.values()])
+        self._contexts = self._contexts.reshape(len(self._machines), -1)
+        self._rules = np.array([each.rule for each in self._machines.values()], np.int64)
+        self._valued: list[tuple[int, AssetTunings]] = []
+        if values:
+            self._add_values(AssetTunings(self._machines[SHARED], values, self.assets))
+            self._tuning_of[:] = 1 + np.arange(count)
+        self._shared, self._start = given[0], start
         self._allocate(None if start is None else int(arrays.nanoseconds("start", start)[0]))
         self._plan = self._planned(threads)
         self._added: list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]] = []
 
-    def _machine(self, tuning: Tuning) -> Machine:
+    def _machine(self, tuning: Tuning, prior: Moments | None = None) -> Machine:
         check_tuning(tuning, self.model)
         options = self.estimator.complete_for(self.model, tuning.options)
-        if tuning.gate is not None and tuning.reopen is not None:
+        if tuning.gate is not None and tuning.reopen is not None and self.recent == 0:
             raise EstimatorError(
-                f"fleet: gate.reopen is {tuning.reopen:g} s; a fleet keeps no history from which to decide on a "
-                "rejected sensor: set gate.reopen to null"
+                f"fleet: gate.reopen is {tuning.reopen:g} s, and recent is 0; decisions on a rejected sensor need "
+                "snapshots: make recent positive, or set gate.reopen to null"
             )
         if tuning.gate is not None and tuning.gate_kind == "soft":
             check_soft(self.estimator, options)
         pairs = check_pairs(None, self.model)
         return Machine(
-            self.estimator, options, self.model, tuning, pairs, self.policy, prior=None, expected=self._expected
+            self.estimator, options, self.model, tuning, pairs, self.policy, prior=prior, expected=self._expected
         )
+
+    def _add_values(self, valued: AssetTunings) -> None:
+        """Append the contexts of assets with values of their own."""
+        count = len(valued.contexts)
+        self._valued.append((len(self._contexts), valued))
+        self._contexts = np.concatenate([self._contexts, valued.contexts])
+        self._rules = np.concatenate([self._rules, np.tile(self._rules[SHARED], (count, 1))])
+
+    def _machine_of(self, asset: int) -> Machine:
+        """Return the machine of an asset."""
+        k = int(self._tuning_of[asset])
+        if k in self._machines:
+            return self._machines[k]
+        first, valued = next(each for each in reversed(self._valued) if each[0] <= k)
+        return self._machine(valued.tuning(k - first))
 
     def _allocate(self, start: int | None) -> None:
         """Allocate the blocks of all assets, each before its first event."""
         model = self.model
-        fresh = [each.fresh() for each in self._machines]
-        for each, snapshot in zip(self._machines, fresh, strict=True):
-            each.begin(*each.prior, snapshot.state)
-            if start is not None:
-                snapshot.clock[0] = start
-        one = fresh[0]
+        machine = self._machines[SHARED]
+        one = machine.fresh()
         self._state_sizes = (model.nu, one.state.size, one.evidence.size, one.edge.size, len(model.sensors))
         self._state = state_at(0, *self._state_sizes)
         size = self._state.end // WORD
         self._columns = max(1, model.ny, model.nu)
-        kept = self.policy.window + 2 * self.recent
-        self._block = block_at(0, size, kept, 2 * self.recent + 1, self._columns, len(model.shown))
+        kept, ring, slots = self.policy.window + max(1, 2 * self.recent), 2 * self.recent + 1, 2 if self.recent else 0
+        self._block = block_at(0, size, kept, ring, slots, self._columns, len(model.shown))
         # Whole cache lines, so that two threads never write to the same one.
         words = -(-self._block.end // (8 * WORD)) * 8
-        self._sizes = {"size": size, "kept": kept, "stride": WORD * words}
+        self._sizes = {"size": size, "kept": kept, "slots": slots, "stride": WORD * words, "hot": self._block.codes.at}
         self._memory = np.zeros((len(self.assets), words))
-        states = np.zeros((len(fresh), size))
-        for line, snapshot in zip(states, fresh, strict=True):
-            line[: sum(part.size for part in snapshot)] = np.concatenate(
-                [snapshot.clock.view(float), *(part.ravel() for part in snapshot[1:])]
-            )
-            last = self._state.last.at // WORD
-            line[last + 2 : last + 5], line[last + 5] = np.nan, 1.0
-        own = self._part(self._block.now)
-        own[:] = states[0] if len(states) == 1 else states[self._tuning_of]
+        self._part(self._block.head).view(np.int64)[:, PHASE] = np.arange(len(self.assets)) % max(1, self.recent)
         self._part(self._block.mean)[:] = np.nan
         self._part(self._block.std)[:] = np.nan
+        states = np.array([self._begun(k, start) for k in range(len(self._contexts))])
+        self._part(self._block.now)[:] = states[0] if len(states) == 1 else states[self._tuning_of]
+
+    def _begun(self, k: int, start: int | None) -> np.ndarray:
+        """Return the numbers of the state before the first event, of the context k."""
+        machine = self._machines.get(k, self._machines[SHARED])
+        line, fresh = np.zeros(self._sizes["size"]), machine.fresh()
+        if fresh.state.size != self._state_sizes[1]:
+            raise EstimatorError(
+                "fleet: options of a tuning change the size of the filter's state; it must be the same"
+            )
+        if k in self._machines:
+            machine.begin(*machine.prior, fresh.state)
+        else:
+            compiled()[2](machine.code, self._contexts[k].view(context_type.dtype)[0], *machine.prior, fresh.state)
+        if start is not None:
+            fresh.clock[0] = start
+        line[: sum(part.size for part in fresh)] = np.concatenate(
+            [fresh.clock.view(float), *(part.ravel() for part in fresh[1:])]
+        )
+        last = self._state.last.at // WORD
+        line[last + 2 : last + 5], line[last + 5] = np.nan, 1.0
+        return line
 
     def _part(self, part: Any, within: int = 0) -> np.ndarray:
         """Return a field of all blocks as a view (assets, numbers)."""
@@ -169,7 +225,7 @@ class Fleet:
 
     def _planned(self, threads: int | None) -> np.ndarray:
         """Make the plan of the compiled call, except for its events."""
-        model, machine, policy = self.model, self._machines[0], self.policy
+        model, machine, policy = self.model, self._machines[SHARED], self.policy
         most = int(numba.config.NUMBA_NUM_THREADS) if threaded() else 1
         self.threads = min(most, threads or most)
         nu, state, evidence, edge, sensors = self._state_sizes
@@ -177,7 +233,11 @@ class Fleet:
         self._crews = [_crew(model, machine, kept, ring, self._columns, state) for _ in range(self.threads)]
         self._crew_places = np.array([[part.ctypes.data for part in crew] for crew in self._crews], np.int64)
         assert self._crew_places.shape == (self.threads, len(CREW))
-        self._contexts = np.array([each.context for each in self._machines])
+        gates = FleetGates(
+            len(self.assets), self.threads, self.recent, self._sizes["size"], self._columns, self._snapshot
+        ) if self._rules[:, 1].any() else None  # fmt: skip
+        self._gates: FleetGates | None = gates
+        record_slots, record_rows = record_sizes(max(1, self.recent))
         low, high = machine.bounds
         self._held = low, high
         code = machine.code
@@ -185,8 +245,11 @@ class Fleet:
         values: dict[str, Any] = {
             **self._sizes, **policy._asdict(), **code._asdict(),
             "memory": self._memory.ctypes.data, "tunings": self._tuning_of.ctypes.data,
-            "contexts": self._contexts.ctypes.data, "crews": self.threads, "crew_places": self._crew_places.ctypes.data,
-            "soft": machine.rule.soft, "nx": len(model.shown), "nu": nu, "state": state,
+            "contexts": self._contexts.ctypes.data, "rules": self._rules.ctypes.data,
+            "crews": self.threads, "crew_places": self._crew_places.ctypes.data,
+            "records": 0 if gates is None else gates.places.ctypes.data,
+            "free": 0 if gates is None else gates.free.ctypes.data,
+            "record_slots": record_slots, "record_rows": record_rows, "nx": len(model.shown), "nu": nu, "state": state,
             "evidence": evidence, "edge": edge, "sensors": sensors, "rows": len(model.row_names), "ny": model.ny,
             "width": model.width, "work": machine.work.size,
             "recent": self.recent, "columns": self._columns, "low": low.ctypes.data,
@@ -257,24 +320,96 @@ class Fleet:
         events = events.select(kept)
         self._added.append((at[kept], events.t, _RANK[events.kind] + events.channel, events.value[:, : self._columns]))
 
-    def extend(self, assets: int | Sequence[str]) -> None:
-        """Append assets, each before its first event, with the tuning of the first one.
+    def extend(self, assets: int | Sequence[str], values: Mapping[str, Any] | None = None) -> None:
+        """Append assets, each before its first event, with the shared tuning, or that of the first one.
 
         Args:
             assets: Names of the assets; or their number, if the fleet's are numbers.
+            values: Values of their own, by key of the tuning.
+
+        Raises:
+            EstimatorError: If a value does not fit.
         """
-        tuning, start = self._first
         more = Fleet(
-            self.estimator.name, self.model, tuning, assets=assets, start=start, policy=self.policy,
-            recent=self.recent, threads=1, expected=self._expected,
+            self.estimator.name, self.model, self._shared, assets=assets, values=values, start=self._start,
+            policy=self.policy, recent=self.recent, threads=1, expected=self._expected,
         )  # fmt: skip
         before = self.assets
         count = len(before) + len(more.assets)
         self.assets = range(count) if isinstance(before, range) else [*before, *more.assets]
         self._index = None
+        more._head[:, PHASE] = np.arange(len(before), count) % max(1, self.recent)
         self._memory = np.concatenate([self._memory, more._memory])
-        self._tuning_of = np.concatenate([self._tuning_of, more._tuning_of])
-        self._plan["memory"], self._plan["tunings"] = self._memory.ctypes.data, self._tuning_of.ctypes.data
+        tuning_of = more._tuning_of
+        for _, valued in more._valued:
+            tuning_of = tuning_of + np.int32(len(self._contexts) - 1)
+            self._add_values(valued)
+        self._tuning_of = np.concatenate([self._tuning_of, tuning_of])
+        if self._gates is not None:
+            self._gates.extend(len(more.assets))
+        self._point()
+
+    def sibling_prior(self, *states: str) -> Moments:
+        """Return the model's prior with mean and spread of some states over the assets: the prior of a new asset.
+
+        The spread is that of the true values, without the errors of the estimates (empirical Bayes, see `siblings`).
+
+        Args:
+            states: Names of states that are constant or alike in all assets, such as an estimated parameter or a bias.
+
+        Raises:
+            EstimatorError: If there is no such state, or fewer than 8 assets have an estimate.
+        """
+        mean, cov = (part.copy() for part in self._machines[SHARED].prior)
+        shown = [state.name for state in self.model.shown_states]
+        for name in states:
+            if name not in shown:
+                raise EstimatorError(f"fleet: {self.model.name} has no state {quoted(name)}; {nearest(name, shown)}")
+            k, j = shown.index(name), self.model.state_names.index(name)
+            seen = self._head[:, N] > 0
+            found = siblings(self._part(self._block.mean)[seen, k], self._part(self._block.std)[seen, k])
+            mean[j] = found.mean
+            cov[j, :] = cov[:, j] = 0.0
+            cov[j, j] = found.std**2
+        return mean, cov
+
+    def set_prior(self, asset: Any, prior: Moments) -> None:
+        """Give assets that have no events yet another prior, such as that of `sibling_prior`.
+
+        Args:
+            asset: Names or positions of the assets, (N,) or one.
+            prior: Mean (nx,) and covariance (nx, nx), in place of the model's.
+
+        Raises:
+            EventError: If there is no such asset.
+            EstimatorError: If an asset has events, or the prior does not fit the model.
+        """
+        at = self.positions(asset)
+        given = check_prior(prior, self.model, self.estimator)
+        if np.any(seen := self._head[at, N] > 0):
+            name = self.assets[int(at[np.argmax(seen)])]
+            raise EstimatorError(f"fleet: asset {name} has events; a prior can only be given before the first")
+        start = None if self._start is None else int(arrays.nanoseconds("start", self._start)[0])
+        for k in np.unique(self._tuning_of[at]).tolist():
+            mine = at[self._tuning_of[at] == k]
+            machine = self._machine(self._machine_of(int(mine[0])).tuning, given)
+            new = len(self._contexts)
+            self._machines[new] = machine
+            self._contexts = np.concatenate([self._contexts, np.array([machine.context]).view(np.int64)[None]])
+            self._rules = np.concatenate([self._rules, [machine.rule]])
+            self._tuning_of[mine] = new
+            self._part(self._block.now)[mine] = self._begun(new, start)
+        self._point()
+
+    def _point(self) -> None:
+        """Write the addresses of arrays that may have moved into the plan."""
+        for name, column in (
+            ("memory", self._memory), ("tunings", self._tuning_of), ("contexts", self._contexts),
+            ("rules", self._rules),
+        ):  # fmt: skip
+            self._plan[name] = column.ctypes.data
+        if self._gates is not None:
+            self._plan["records"] = self._gates.places.ctypes.data
 
     def add_ticks(self, seconds: Any, asset: Any = None) -> None:
         """Add queries, of all assets by default: the estimate and health of silent assets become those of that time."""
@@ -308,18 +443,57 @@ class Fleet:
         asset, t, place, value = (np.ascontiguousarray(column) for column in columns)
         if not len(t):
             return 0
-        if not in_asset_order(asset, t, place):
-            order = np.lexsort((*value.T[::-1], place, t, asset))
-            asset, t, place, value = asset[order], t[order], place[order], value[order]
-        starts = np.flatnonzero(np.concatenate(([True], asset[1:] != asset[:-1])))
-        visited = asset[starts]
-        starts = np.append(starts, t.size)
-        given = {"visited": visited, "starts": starts, "t": t, "place": place, "value": value}
+        numbers = np.empty((4, t.size + 1), np.int64)
+        order, spare, visited, starts = numbers
+        scratch_of_assets = np.empty(len(self.assets), np.int64)
+        found = arrange(asset, t, place, value, scratch_of_assets, order, spare, visited, starts)
+        given = {"order": order, "t": t, "place": place, "value": value}
         for name, column in given.items():
             self._plan[name] = column.ctypes.data
-        self._plan["count"] = visited.size
-        fold_assets(self._plan.ctypes.data, self.threads)
+        self._plan["events"] = t.size
+        visited, begins, ends = visited[:found], starts[:found].copy(), starts[1 : found + 1].copy()
+        while visited.size:
+            unfinished, asked = np.ones(visited.size, np.int8), np.zeros(visited.size, np.int8)
+            given = {
+                "visited": visited, "begins": begins, "ends": ends, "unfinished": unfinished, "asked": asked
+            }  # fmt: skip
+            for name, column in given.items():
+                self._plan[name] = column.ctypes.data
+            self._plan["count"] = visited.size
+            if self._gates is not None:
+                self._gates.refill()
+            fold_assets(self._plan.ctypes.data, self.threads)
+            if self._gates is None:
+                break
+            for v in np.flatnonzero(asked).tolist():
+                self._decide(int(visited[v]), int(asked[v]))
+            left = np.flatnonzero(unfinished)
+            visited, begins, ends = visited[left], begins[left], ends[left]
         return int(t.size)
+
+    def _decide(self, asset: int, asked: int) -> None:
+        """Decide on the sensor of an asset where the compiled loop stopped for it."""
+        assert self._gates is not None
+        if asked & REWOUND_FLAG:
+            self._gates.rewound(asset)
+        if asked & ASKED_FLAG:
+            state = self._part(self._block.now)[asset]
+            self._gates.decide(asset, self._head[asset], state, self._machine_of(asset))
+
+    def _snapshot(self, state: np.ndarray) -> Snapshot:
+        """Return the numbers of a state as a snapshot, as views."""
+        parts = [state[part.at // WORD : part.at // WORD + int(np.prod(part.shape))] for part in self._state[:6]]
+        clock, u, own, evidence, edge, doubt = parts
+        return Snapshot(clock.view(np.int64), u, own, evidence, edge, doubt.reshape(self._state.doubt.shape))
+
+    def decisions(self, asset: Any) -> list[Decision]:
+        """Return the latest decisions on rejected sensors of an asset; see `Fold.decisions`.
+
+        Raises:
+            EventError: If there is no such asset.
+        """
+        at = int(self.positions(asset)[0])
+        return [] if self._gates is None else self._gates.decisions(at)
 
     def table(self) -> FleetTable:
         """Return the state of all assets as of their last event."""
@@ -345,7 +519,9 @@ class Fleet:
 
     def state(self, part: slice) -> bytes:
         """Return the state of some assets by position, for `restore`; events that were not folded yet are not in it."""
-        return self._memory[part].tobytes()
+        first, last, _ = part.indices(len(self.assets))
+        records = [] if self._gates is None else self._gates.state(first, last)
+        return b"".join([np.int64(last - first).tobytes(), self._memory[first:last].tobytes(), *records])
 
     def restore(self, first: int, state: bytes) -> None:
         """Take over the `state` of assets of another fleet of this model, estimator and tuning, from a position on.
@@ -354,10 +530,16 @@ class Fleet:
             EstimatorError: If it is not of such a fleet, or of more assets than there are.
         """
         words = self._memory.shape[1]
-        count, rest = divmod(len(state), WORD * words)
-        if rest or first + count > len(self.assets):
+        count = int(np.frombuffer(state[:WORD], np.int64)[0]) if len(state) >= WORD else -1
+        end = WORD * (1 + count * words)
+        fits = count >= 0 and first + count <= len(self.assets) and end <= len(state)
+        if fits and self._gates is not None:
+            fits = self._gates.restore(first, count, state[end:])
+        elif len(state) != end:
+            fits = False
+        if not fits:
             raise EstimatorError(f"fleet: {len(state)} bytes are no state of assets of {WORD * words} bytes each")
-        self._memory[first : first + count] = np.frombuffer(state).reshape(count, words)
+        self._memory[first : first + count] = np.frombuffer(state[WORD:end]).reshape(count, words)
 
     def base(self, asset: str | int) -> Base:
         """Return the state of one asset, from which a `Fold` of its own continues; it begins with an empty NIS window.
@@ -366,12 +548,11 @@ class Fleet:
             EventError: If there is no such asset.
         """
         a = int(self.positions(asset)[0])
-        state, machine = self._state, self._machines[self._tuning_of[a]]
-        clock, u, own, evidence, edge, doubt = (self._now(part)[a].copy() for part in state[:6])
-        mean, cov = machine.moments(own)
+        now = self._snapshot(self._part(self._block.now)[a]).copy()
+        mean, cov = self._machines[SHARED].moments(now.state)
         return Base(
-            mean, cov, int(clock.view(np.int64)[0]), u, self.estimator.name, own, int(self._head[a, N]),
-            evidence=evidence, edge=edge, doubt=doubt.reshape(state.doubt.shape),
+            mean, cov, int(now.clock[0]), now.u, self.estimator.name, now.state, int(self._head[a, N]),
+            evidence=now.evidence, edge=now.edge, doubt=now.doubt,
         )  # fmt: skip
 
 

@@ -8,7 +8,9 @@ arguments once per asset takes three times as long as an event.
 from __future__ import annotations
 
 import numpy as np
-from numba import from_dtype, prange
+from llvmlite import ir
+from numba import from_dtype, prange, types
+from numba.core import cgutils
 from numba.extending import intrinsic
 
 from .compiled.context import _FIELDS as CONTEXT_FIELDS
@@ -16,35 +18,40 @@ from .compiled.context import context_at
 from .diagnostics.detector_watch import watch_row
 from .diagnostics.health import NORMALS, Bounds, HealthPolicy, judges, keep_window
 from .estimator import Code
-from .fleet_window import FLAGS, HEALTH, STALE_EVENTS, VERDICT, N, has_no_baseline, return_to, slide
+from .fleet_memory import (
+    AGE,
+    ASKED,
+    CONSISTENCY,
+    FLAGS,
+    FLOOR,
+    HEALTH,
+    IN_WINDOW,
+    JUDGED,
+    NIS_HIGH,
+    NIS_LOW,
+    NIS_MEAN,
+    PHASE,
+    STALE_EVENTS,
+    TAIL,
+    VERDICT,
+    N,
+    block_at,
+    record_at,
+    state_at,
+)
+from .fleet_order import precedes
+from .fleet_record import append, before_snapshot, copy, cut, free_records, slot_of, snapshots_of, take
+from .fleet_window import has_no_baseline, return_to, slide
 from .fold_kernel import fold_event
 from .gate.rejection_runs import Rule
 from .log import _ORDER
 from .numerics.jit import counts, embedded, flag_rows, flags, floats, i64, ints, jit, masks, matrix, part
-from .numerics.workspace import declare_layout
 from .track import WHITENED, Track
 
-T, AGE, NIS_MEAN, NIS_LOW, NIS_HIGH, CONSISTENCY = range(6)
-"""Columns of `State.last`, of the last row: time (int64, ns) and the columns of the track of that name."""
-
-State, state_at = declare_layout(
-    "State", "nu, state, evidence, edge, sensors",
-    clock="int 1", u="nu", filter="state", evidence="evidence", edge="edge", doubt="sensors, 8", last="6",
-)  # fmt: skip
-"""State of an asset's fold before an event; the first fields are those of `Snapshot`."""
-
-Block, block_at = declare_layout(
-    "Block", "size, kept, recent, columns, nx",
-    head="int 9", mean="nx", std="nx", now="size", snapshots="2, size", codes="int kept", nis="kept", t="int recent",
-    place="int recent", value="recent, columns",
-)  # fmt: skip
-"""Memory of an asset: head (fleet_window.py), last estimate, state, two snapshots, judged measurements (`codes` and
-`nis`), and the recent events as time, place in the order of a log, and values."""
-
 _PLAN = """
-    memory stride visited starts count t place value tunings contexts r crews crew_places start predict
-    update describe soft never nx nu state evidence edge sensors rows ny width work window kept recent columns size
-    low high quantiles
+    memory stride visited begins ends unfinished asked count order t place value events tunings contexts rules crews
+    crew_places records free start predict update describe nx nu state evidence edge sensors rows ny width work window
+    kept recent columns size slots hot record_slots record_rows low high quantiles
     degraded_after stale_after diverged_nis diverged_gated false_alarm_every silent_periods
 """.split()
 PLAN = np.dtype([(name, np.float64 if k > _PLAN.index("quantiles") else np.int64) for k, name in enumerate(_PLAN)])
@@ -58,6 +65,9 @@ CREW = (*Track._fields, "context", "r", "spare", "work", "score", "events_t", "k
  _TAIL_VALUE) = range(len(Track._fields), len(CREW))  # fmt: skip
 _CONTEXT_WORDS, _AT_R = len(CONTEXT_FIELDS), CONTEXT_FIELDS.index("r")
 _KINDS = np.array(_ORDER, np.int8)
+
+ASKED_FLAG, REWOUND_FLAG = 1, 2
+"""Bits of `asked`: the asset's last event asks for a decision on its sensor; an asset with a record was rewound."""
 
 ROWS = 2
 """Rows of a thread's track: the last event of the asset, and the new one."""
@@ -103,68 +113,112 @@ def _track_at(own, rows, nx, ny, width):
     )
 
 
-@embedded
-def _precedes(t, place, value, other_t, other_place, other):
-    """Return whether an event comes before another in the order of a log (`sorted_order`)."""
-    if t != other_t:
-        return t < other_t
-    if place != other_place:
-        return place < other_place
-    for k in range(value.size):
-        if value[k] < other[k] or np.isnan(other[k]) and not np.isnan(value[k]):
-            return True
-        if value[k] > other[k] or np.isnan(value[k]) and not np.isnan(other[k]):
-            return False
-    return False
+@intrinsic
+def _prefetch_line(typing_context, place):
+    """Ask for the cache line at an address, which will be written."""
+
+    def codegen(lowering, builder, signature, given):
+        word = ir.IntType(32)
+        pointer = builder.inttoptr(given[0], ir.IntType(8).as_pointer())
+        kind = ir.FunctionType(ir.VoidType(), [pointer.type, word, word, word])
+        function = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0i8")
+        builder.call(function, [pointer, word(1), word(3), word(1)])
+        return lowering.get_dummy_value()
+
+    return types.void(i64), codegen
 
 
 @embedded
-def _copy(source, target):
-    for k in range(source.size):
-        target[k] = source[k]
+def _prefetch(place, end):
+    """Ask for the memory from an address to another: while it arrives, another asset is folded."""
+    for at in range(place, end, 64):
+        _prefetch_line(at)
+
+
+@part
+def _prefetch_slots(block, recent):
+    """Ask for the slots of a block that its next event reads or writes; its head has arrived."""
+    head = block.head
+    n, at = head[N], head[N] % block.t.size
+    _prefetch_line(block.t.ctypes.data + 8 * at)
+    _prefetch_line(block.place.ctypes.data + 8 * at)
+    _prefetch_line(block.value.ctypes.data + 8 * at * block.value.shape[1])
+    kept = block.codes.size
+    newest = head[JUDGED] % kept
+    oldest = newest - head[IN_WINDOW]
+    _prefetch_line(block.codes.ctypes.data + 8 * newest)
+    _prefetch_line(block.codes.ctypes.data + 8 * (oldest if oldest >= 0 else oldest + kept))
+    if recent > 0 and (n + head[PHASE]) % recent == 0:
+        place = block.snapshots.ctypes.data + 8 * block.now.size * slot_of(head, n, recent)
+        _prefetch(place, place + 8 * block.now.size)
 
 
 @embedded
 def _precedes_last(k, t, place, value, block, n):
     """Return whether event k comes before event n - 1 of an asset."""
     at = (n - 1) % block.t.size
-    return _precedes(t[k], place[k], value[k], block.t[at], block.place[at], block.value[at])
+    return precedes(t[k], place[k], value[k], block.t[at], block.place[at], block.value[at])
 
 
 @part
-def _rewind(block, e, stop, t, place, value, recent, window, tail_t, tail_place, tail_value):
+def _rewind(block, e, stop, order, t, place, value, recent, window, tail_t, tail_place, tail_value):
     """Return to a snapshot before new events e to `stop`; return the first to fold, and the length of the tail.
 
     The tail holds the events after the snapshot. Events before the oldest snapshot are counted as stale. There is a
-    snapshot before every `recent`-th event, and the last two are kept.
+    snapshot before every `recent`-th event, and the last two are kept; none is where `recent` is 0.
     """
     n = block.head[N]
     ring = block.t.size
-    newer = max(0, (n - 1) // recent * recent)
-    older = max(0, newer - recent)
-    while older > 0 and e < stop and _precedes_last(e, t, place, value, block, older):
+    newer, older = snapshots_of(block.head, n, recent) if recent > 0 else (n, n)
+    while older > 0 and e < stop and _precedes_last(order[e], t, place, value, block, older):
         block.head[STALE_EVENTS] += 1
         e += 1
     if e == stop:
         return e, 0
     i = n
-    while i > older and _precedes_last(e, t, place, value, block, i):
+    while i > older and _precedes_last(order[e], t, place, value, block, i):
         i -= 1
     if i == n:
         return e, 0
     at = newer if i >= newer else older
-    _copy(block.snapshots[at // recent % 2], block.now)
+    copy(block.snapshots[slot_of(block.head, at, recent)], block.now)
     for k in range(at, n):
         tail_t[k - at], tail_place[k - at] = block.t[k % ring], block.place[k % ring]
-        _copy(block.value[k % ring], tail_value[k - at])
+        copy(block.value[k % ring], tail_value[k - at])
     return_to(at, block, window)
     block.head[N] = at
     return e, n - at
 
 
+@part
+def _resume(record, tail_t, tail_place, tail_value):
+    """Fetch the rest of the tail where folding stopped for a decision; return its length."""
+    tail = record.head[TAIL]
+    for k in range(tail):
+        tail_t[k], tail_place[k] = record.tail_t[k], record.tail_place[k]
+        copy(record.tail_value[k], tail_value[k])
+    record.head[TAIL] = 0
+    return tail
+
+
+@part
+def _stop(record, n, oldest, a, tail, tail_t, tail_place, tail_value):
+    """Keep the rest of the tail until the decision after event n - 1 has been taken."""
+    record.head[ASKED] = n
+    record.head[FLOOR] = oldest
+    record.head[TAIL] = tail - a
+    for k in range(a, tail):
+        record.tail_t[k - a], record.tail_place[k - a] = tail_t[k], tail_place[k]
+        copy(tail_value[k], record.tail_value[k - a])
+
+
 @jit
 def _fold_share(place, crew):
-    """Fold the new events of one thread's share of the assets."""
+    """Fold the new events of one thread's share of the assets.
+
+    An asset stops after an event that asks for a decision on its sensor, and the share when no record is free for the
+    next asset; what is unfinished is folded by another call.
+    """
     plan = _plan_at(place)
     own = ints(plan.crew_places + 8 * crew * len(CREW), len(CREW))
     columns, recent = plan.columns, plan.recent
@@ -183,62 +237,107 @@ def _fold_share(place, crew):
         floats(own[_SCORE], WHITENED + plan.ny),
     )
     code = Code(plan.start, plan.predict, plan.update, plan.describe)
-    rule = Rule(plan.soft, plan.never)
+    rule = Rule(0, 0)
     policy = HealthPolicy(
         plan.window, plan.degraded_after, plan.stale_after, plan.diverged_nis, plan.diverged_gated,
         plan.false_alarm_every, plan.silent_periods,
     )  # fmt: skip
     bounds = Bounds(floats(plan.low, plan.quantiles), floats(plan.high, plan.quantiles))
-    visited, starts = ints(plan.visited, plan.count), ints(plan.starts, plan.count + 1)
-    total = starts[plan.count]
-    t, event_place = ints(plan.t, total), ints(plan.place, total)
-    value = matrix(floats(plan.value, total * columns), 0, total, columns)
+    visited, unfinished, asked = (
+        ints(plan.visited, plan.count), flags(plan.unfinished, plan.count), flags(plan.asked, plan.count)
+    )  # fmt: skip
+    begins, ends, order = ints(plan.begins, plan.count), ints(plan.ends, plan.count), ints(plan.order, plan.events)
+    t, event_place = ints(plan.t, plan.events), ints(plan.place, plan.events)
+    value = matrix(floats(plan.value, plan.events * columns), 0, plan.events, columns)
+    reopens = plan.records != 0
+    records = ints(plan.records, 0)
+    free = free_records(plan.free, crew)
+    slots, rows = plan.record_slots, plan.record_rows
     words = ints(own[_CONTEXT], _CONTEXT_WORDS)
     context = context_at(own[_CONTEXT])
     normal, white, loaded = floats(0, 0), False, -1
-    for v in range(crew * plan.count // plan.crews, (crew + 1) * plan.count // plan.crews):
+    last_of_share = (crew + 1) * plan.count // plan.crews
+    for v in range(crew * plan.count // plan.crews, last_of_share):
+        if reopens and free[0] == 0:
+            break
         asset = visited[v]
+        if v + 2 < last_of_share:
+            following = plan.memory + visited[v + 2] * plan.stride
+            _prefetch(following, following + plan.hot)
+        if v + 1 < last_of_share:
+            following = plan.memory + visited[v + 1] * plan.stride
+            _prefetch_slots(block_at(following, plan.size, plan.kept, ring, plan.slots, columns, plan.nx), recent)
         tuning = counts(plan.tunings + 4 * asset, 1)[0]
         if tuning != loaded:
             # A copy: a soft gate writes R while a measurement is folded. Scratch may keep F of the other parameters.
             loaded = tuning
             work[:] = np.nan
-            _copy(ints(plan.contexts + 8 * tuning * _CONTEXT_WORDS, _CONTEXT_WORDS), words)
-            _copy(floats(words[_AT_R], plan.rows), floats(own[_R], plan.rows))
+            copy(ints(plan.contexts + 8 * tuning * _CONTEXT_WORDS, _CONTEXT_WORDS), words)
+            copy(floats(words[_AT_R], plan.rows), floats(own[_R], plan.rows))
             words[_AT_R] = own[_R]
             normal = floats(context.normal, NORMALS * plan.sensors)
+            rules = ints(plan.rules + 16 * tuning, 2)
+            rule = Rule(rules[0], rules[1])
             white = has_no_baseline(normal)
-        block = block_at(plan.memory + asset * plan.stride, plan.size, plan.kept, ring, columns, plan.nx)
+        block = block_at(
+            plan.memory + asset * plan.stride, plan.size, plan.kept, ring, plan.slots, columns, plan.nx
+        )  # fmt: skip
         now = state_at(block.now.ctypes.data, plan.nu, plan.state, plan.evidence, plan.edge, plan.sensors)
         head, last = block.head, now.last
         last_t = ints(last.ctypes.data, 1)
-        e, stop, a, tail = starts[v], starts[v + 1], 0, 0
-        if head[N] > 0 and _precedes_last(e, t, event_place, value, block, head[N]):
+        e, stop, a, tail = begins[v], ends[v], 0, 0
+        record_place = records[asset] if reopens else 0
+        record = record_at(record_place, plan.size, slots, ring, rows, columns)
+        # Event of the block's oldest snapshot; while a tail is folded again, it does not follow from the event count.
+        oldest = snapshots_of(head, head[N], recent)[1] if recent > 0 else 0
+        if record_place != 0:
+            tail = _resume(record, tail_t, tail_place, tail_value)
+            oldest = record.head[FLOOR] if tail > 0 else oldest
+        # The time of the last event is at hand; the event itself lies in memory that is rarely needed.
+        if (
+            tail == 0 and head[N] > 0 and t[order[e]] <= last_t[0]
+            and _precedes_last(order[e], t, event_place, value, block, head[N])
+        ):  # fmt: skip
             e, tail = _rewind(
-                block, e, stop, t, event_place, value, recent, plan.window, tail_t, tail_place, tail_value
+                block, e, stop, order, t, event_place, value, recent, plan.window, tail_t, tail_place, tail_value
             )
-        if e == stop:
-            continue
+            if record_place != 0 and tail > 0:
+                cut(record, head[N])
+                asked[v] |= REWOUND_FLAG
+        moved = a < tail or e < stop
         while a < tail or e < stop:
             n = head[N]
-            if n % recent == 0:
-                _copy(block.now, block.snapshots[n // recent % 2])
+            if n == 0 or (n + head[PHASE]) % max(1, recent) == 0:
+                newer = snapshots_of(head, n, recent)[0] if recent > 0 else 0
+                if newer > oldest:
+                    if reopens and rule.most > 0:
+                        record_place = before_snapshot(
+                            asset, block, oldest, newer, recent, records, free, slots, rows,
+                            plan.nu, plan.state, plan.evidence, plan.edge, plan.sensors,
+                        )  # fmt: skip
+                        record = record_at(record_place, plan.size, slots, ring, rows, columns)
+                    oldest = newer
+                if recent > 0:
+                    copy(block.now, block.snapshots[slot_of(head, n, recent)])
             at = n % ring
+            i = order[min(e, stop - 1)]
             if a < tail and (
-                e == stop or not _precedes(t[e], event_place[e], value[e], tail_t[a], tail_place[a], tail_value[a])
+                e == stop or not precedes(t[i], event_place[i], value[i], tail_t[a], tail_place[a], tail_value[a])
             ):
                 block.t[at], block.place[at] = tail_t[a], tail_place[a]
-                _copy(tail_value[a], block.value[at])
+                copy(tail_value[a], block.value[at])
                 a += 1
             else:
-                block.t[at], block.place[at] = t[e], event_place[e]
-                _copy(value[e], block.value[at])
+                block.t[at], block.place[at] = t[i], event_place[i]
+                copy(value[i], block.value[at])
                 e += 1
+            if record_place != 0:
+                append(record, n, block.t[at], block.place[at], block.value[at])
             own_t[1] = block.t[at]
             kind[1] = _KINDS[block.place[at] >> 32]
             channel[1] = block.place[at] & 0xFFFFFFFF
-            _copy(block.value[at], own_value[1])
-            fold_event(
+            copy(block.value[at], own_value[1])
+            asks = fold_event(
                 code, context, rule, 1, n, 1, own_t, kind, channel, own_value, columns,
                 now.clock, now.u, now.filter, now.doubt, now.edge, spare, work, score, track, variances, passed,
             )  # fmt: skip
@@ -255,8 +354,18 @@ def _fold_share(place, crew):
             last[NIS_MEAN], last[NIS_LOW], last[NIS_HIGH] = track.nis_mean[1], track.nis_low[1], track.nis_high[1]
             head[HEALTH], head[FLAGS], head[VERDICT] = track.health[1], track.flags[1], track.verdict[1]
             head[N] = n + 1
-        _copy(track.mean[1], block.mean)
-        _copy(track.std[1], block.std)
+            if asks:
+                if record_place == 0:
+                    record_place = take(asset, block, oldest, recent, records, free, slots, rows)
+                    record = record_at(record_place, plan.size, slots, ring, rows, columns)
+                _stop(record, n + 1, oldest, a, tail, tail_t, tail_place, tail_value)
+                asked[v] |= ASKED_FLAG
+                break
+        if moved:
+            copy(track.mean[1], block.mean)
+            copy(track.std[1], block.std)
+        begins[v] = e
+        unfinished[v] = a < tail or e < stop
 
 
 @jit(parallel=True)
@@ -272,14 +381,3 @@ def fold_assets(place, crews):
         _fold_on_threads(place, crews)
     else:
         _fold_share(place, 0)
-
-
-@jit
-def in_asset_order(asset, t, place):
-    """Return whether events are strictly ordered by asset, time and place."""
-    for i in range(1, t.size):
-        if asset[i] < asset[i - 1]:
-            return False
-        if asset[i] == asset[i - 1] and (t[i] < t[i - 1] or t[i] == t[i - 1] and place[i] <= place[i - 1]):
-            return False
-    return True

@@ -17,14 +17,10 @@ from .diagnostics.health import (
     window_bounds,
     write_window,
 )
+from .fleet_memory import DOF, IN_WINDOW, JUDGED, USED_IN_WINDOW
 from .numerics.jit import embedded, part
 from .numerics.simd import total as sum_of
 from .track import USED
-
-N, JUDGED, IN_WINDOW, USED_IN_WINDOW, DOF, STALE_EVENTS, HEALTH, FLAGS, VERDICT = range(9)
-"""Columns of `Block.head`: events folded; judged measurements ever, of which the last are kept; those in the window,
-those of them that were used, and the degrees of freedom of these; events dropped as stale; then health, flags and
-verdict of the last event."""
 
 _ROW_BITS, _CHANNEL_BITS = 28, 14
 

@@ -195,12 +195,13 @@ class Tuning:
         return self._changed(**entry)
 
     def rows_of(self, key: str) -> np.ndarray:
-        """Return the indices of the rows that an entry `R...` sets.
+        """Return the indices that an entry sets in its array: the rows of `R...`, or the places in `q` or `p`.
 
         Raises:
             ConfigError: If there is no such entry.
         """
-        return np.atleast_1d(np.arange(self.r.size)[self._locate(key)[1]])
+        group, index = self._locate(key)
+        return np.atleast_1d(np.arange(getattr(self, group).size)[index])
 
     def with_options(self, options: Mapping[str, float]) -> Tuning:
         """Return a new tuning with other estimator options."""

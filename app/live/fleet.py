@@ -67,11 +67,11 @@ class RunningFleet:
         self.store: Keeper | None = None
         self.counts: Counter[str] = Counter()
         """Reports by key."""
-        self.names: list[str] = list(given) if isinstance(given, tuple) else []
+        self.names: list[str] = list(plan.values.names)
         """Names of the assets; only appended to."""
         self._places = {name: k for k, name in enumerate(self.names)}
-        self._most = given if isinstance(given, int) else len(self.names) if self.names else None
-        self.fleet = plan.fleet(self._most or FIRST_ROOM, threads)
+        self._most = given if isinstance(given, int) else len(given) if given else None
+        self.fleet = plan.fleet(self._most or max(FIRST_ROOM, len(self.names)), threads)
         self._last = np.full(len(self.fleet.assets), BEFORE, np.int64)
         self._newest = self._looked = BEFORE
         self._silence = round(plan.twin.policy.degraded_after * 1e9)
@@ -210,7 +210,8 @@ class RunningFleet:
         plan, model, given = self.plan, self.plan.twin.model, self.plan.config.assets
         names = [model.name, *model.state_names, *model.row_names, *(given if isinstance(given, tuple) else ())]
         tuning = tuning_to_json(plan.twin.tuning, plan.twin.estimator)
-        return {"version": version("nisus"), "tuning": tuning, "policy": [*plan.twin.policy], "names of": names}
+        own = {"late": plan.config.late, "values": {k: repr(v.tolist()) for k, v in plan.values.columns.items()}}
+        return {"version": version("nisus"), "tuning": tuning, "policy": [*plan.twin.policy], "names of": names} | own
 
     def _keep(self, at_once: bool = False) -> None:
         """Write what has changed to the store, with the position in the source; all events are folded."""

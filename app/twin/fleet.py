@@ -21,6 +21,7 @@ from sources.tables.one_asset import rows_of_asset
 from sources.tables.text import column_of
 
 from .channels import channels
+from .fleet_tunings import AssetValues, asset_values
 from .source import KEY, SOURCES, Plan, plan_source
 from .sources.kind import Opening, matching
 from .twin import Twin, load_twin
@@ -39,6 +40,8 @@ class FleetPlan:
     """Twin of each asset, with the source of its own YAML."""
     source: Plan
     """Source of the fleet."""
+    values: AssetValues
+    """Names of the assets that are known before their measurements, and values of their tunings."""
 
     @property
     def name(self) -> str:
@@ -61,8 +64,8 @@ class FleetPlan:
         expected = np.isin(sensors, () if self.ends else self.source.fed)  # as `Twin.expected`
         try:
             return Fleet(
-                twin.estimator, twin.model, twin.tuning, assets=assets, policy=twin.policy,
-                threads=threads, expected=expected,
+                twin.estimator, twin.model, twin.tuning, assets=assets, values=self.values.padded(assets),
+                policy=twin.policy, recent=self.config.late, threads=threads, expected=expected,
             )  # fmt: skip
         except EstimatorError as error:
             raise ConfigError(f"{self.source.loaded.places.at(('twin',))}: twin {twin.name}: {error}") from None
@@ -106,7 +109,8 @@ class FleetPlan:
             for channel in given.get(group, {}).values():
                 channel["only"] = {**channel.get("only", {}), column: {"text": [asset]}}
         name = re.sub(r"[^A-Za-z0-9_-]", "_", asset).lstrip("_-") or "asset"
-        return {"source": as_flow(given), "name": as_flow(name), "title": as_flow(asset)}
+        own = {key: repr(value) for key, value in self.values.of(asset).items()}
+        return {"source": as_flow(given), "name": as_flow(name), "title": as_flow(asset), **own}
 
 
 def load_fleet(path: str | os.PathLike[str], overrides: Mapping[str, str] | None = None) -> FleetPlan:
@@ -135,4 +139,12 @@ def load_fleet(path: str | os.PathLike[str], overrides: Mapping[str, str] | None
     plan = plan_source(loaded, twin.model, None)
     if plan.brings_variances:
         raise loaded.error(KEY, "has sensors with accuracy; a fleet uses the tuned R: leave accuracy out")
-    return FleetPlan(path, section, twin, plan)
+    if section.late == 0 and twin.tuning.gate is not None and twin.tuning.reopen is not None:
+        rule = "decisions on a rejected sensor need snapshots: give 1 or more, or set gate.reopen to null"
+        raise ConfigError(f"{places.at(('late',))}: late is 0, and the gate of {twin.name} reopens; {rule}")
+    assets = section.assets if isinstance(section.assets, tuple) else None
+    values = asset_values(section.tunings, path, places, twin.tuning, assets)
+    if isinstance(section.assets, int) and len(values.names) > section.assets:
+        rule = f"there may be {section.assets}; enlarge assets"
+        raise ConfigError(f"{places.at(('tunings',))}: tunings names {len(values.names)} assets; {rule}")
+    return FleetPlan(path, section, twin, plan, values)

@@ -119,6 +119,59 @@ def test_fleet_of_random_assets_has_the_bits_of_single_folds(estimator, name, ga
     assert (GATED in verdicts) == (gate == "hard")
 
 
+def faulty_events(model, rng, count):
+    """Return random events with runs of rejections: one sensor is off for a time, and all of them for another."""
+    events = random_events(model, rng, count)
+    begin, length = int(rng.integers(5, count // 2)), int(rng.integers(5, count))
+    off, all_off = str(rng.choice(model.sensor_names)), rng.random() < 0.4
+    shift = float(rng.choice([50.0, 400.0]))
+    return [
+        (t, what, values + shift)
+        if what in model.sensor_names and begin <= k < begin + length and (all_off or what == off)
+        else (t, what, values)
+        for k, (t, what, values) in enumerate(events)
+    ]
+
+
+@pytest.mark.parametrize(
+    ("estimator", "name", "kind", "recent"),
+    [("kf", "motor_winding", "hard", 4), ("ekf", "motor_drive", "hard", 1), ("ekf", "motor_drive", "soft", 4)],
+)
+@pytest.mark.parametrize("threads", [1, 3])
+def test_decisions_on_rejected_sensors_are_those_of_single_folds(estimator, name, kind, recent, threads):
+    model, rng, count = MODELS[name], np.random.default_rng(17 + threads), 7
+    tunings = [replace(Tuning.of(model), gate=0.99, gate_kind=kind, reopen=4.0)] * count
+    tunings[3] = replace(tunings[0], gate=0.999, reopen=30.0)
+    tunings[4] = replace(tunings[0], gate=None)
+    fleet = Fleet(estimator, model, tunings, assets=count, policy=POLICY, recent=recent, threads=threads)
+    logs = [Log.of(model) for _ in tunings]
+    # The longest is longer than a record.
+    lengths = [*rng.integers(60, 400, count - 1), 1600 if estimator == "ekf" else 200]
+    arriving = [shuffled(faulty_events(model, rng, int(length)), rng, recent) for length in lengths]
+    outcomes: set[str] = set()
+    while any(arriving):
+        for a in range(count):
+            taken = int(rng.choice([0, 1, 2, 9, 60]))
+            for event in arriving[a][:taken]:
+                add(fleet, event, a)
+                add(logs[a], event)
+            del arriving[a][:taken]
+        fleet.advance()
+        if rng.random() < 0.1 and threads > 1:
+            former, fleet = fleet, Fleet(estimator, model, tunings, assets=count, policy=POLICY, recent=recent)
+            for part in (slice(0, 3), slice(3, count)):
+                fleet.restore(part.start, former.state(part))
+    for a, log in enumerate(logs):
+        fold = Fold(estimator, model, tunings[a], log, policy=POLICY)
+        fold.advance()
+        assert_same(fleet, a, fold)
+        # The state of a fleet has what the next decisions need, not those that were taken.
+        assert threads > 1 or str(fleet.decisions(a)) == str(fold.decisions[-64:])
+        outcomes |= {each.outcome for each in fold.decisions}
+    assert fleet.table().stale.sum() == 0
+    assert {"isolated", "doubted"} <= outcomes and {"believed", "reopened"} & outcomes
+
+
 def decay(x, u, p, dt, out):
     out[0] = x[0] * (1.0 - p[0] * dt)
 
@@ -139,6 +192,80 @@ def test_assets_of_other_parameters_share_nothing():
         fold = Fold("kf", model, tuning, log)
         fold.advance()
         assert_same(fleet, a, fold)
+
+
+@pytest.mark.parametrize("recent", [0, 4])
+@pytest.mark.parametrize(("estimator", "name"), [("kf", "decay"), ("ekf", "motor_drive")])
+def test_values_of_each_asset_are_those_of_a_tuning_of_its_own(estimator, name, recent):
+    rng, count = np.random.default_rng(3), 9
+    model = MODELS.get(name) or level_model(
+        {"gauge": 1.0}, 0.1, mean=5.0, f=decay, linear=True, parameters=(Parameter("rate", "1/s", 0.1, 0.0, 1.0),)
+    )
+    base = replace(Tuning.of(model), gate=0.99, reopen=4.0 if recent else None)
+    items = [item for item in base.items() if item.value > 0.0]
+    values = {item.key: item.value * (1.0 + 0.5 * rng.random(count)) for item in items}
+    for column in values.values():
+        column[2] = np.nan  # the shared value
+    tunings = [base] * count
+    for item in items:
+        values[item.key] = np.minimum(values[item.key], item.high)
+        for a, value in enumerate(values[item.key]):
+            tunings[a] = tunings[a] if np.isnan(value) else tunings[a].set(item.key, value)
+    early = {key: column[:6] for key, column in values.items()}
+    fleet = Fleet(estimator, model, base, assets=6, values=early, policy=POLICY, recent=recent, threads=2)
+    fleet.extend(2, {key: column[6:8] for key, column in values.items()})
+    fleet.extend(1)
+    tunings[8] = base
+    logs = [Log.of(model) for _ in tunings]
+    for a, log in enumerate(logs):
+        for event in faulty_events(model, rng, 150):
+            add(fleet, event, a)
+            add(log, event)
+        fleet.advance()
+    for a, log in enumerate(logs):
+        fold = Fold(estimator, model, tunings[a], log, policy=POLICY)
+        fold.advance()
+        assert_same(fleet, a, fold)
+        assert bool(fleet.decisions(a)) == bool(fold.decisions)
+
+
+def test_without_recent_events_late_ones_are_dropped_and_an_asset_is_half_as_large():
+    model = MODELS["motor_drive"]
+    small, large = (Fleet("ekf", model, assets=2, recent=recent) for recent in (0, 8))
+    for target in (small, large):
+        target.add(model.sensor_names[0], 1, [1.0, 2.0, 4.0], [1.0, 2.0, 3.0])
+        target.advance()
+        target.add(model.sensor_names[0], 1, [3.0, 5.0], [1.0, 2.0])
+        target.advance()
+    assert small.table().stale.tolist() == [0, 1] and large.table().stale.tolist() == [0, 0]
+    assert small.table().events[1] == 4 and small.nbytes < 0.5 * large.nbytes
+
+
+def test_a_new_asset_begins_from_the_spread_of_its_siblings():
+    model, rng = MODELS["motor_winding"], np.random.default_rng(2)
+    fleet, levels = Fleet("kf", model, assets=40), 40.0 + 3.0 * rng.normal(size=40)
+    t, state = np.tile(np.arange(60.0), 40), model.shown_states[0].name
+    fleet.add("winding", np.repeat(np.arange(40), 60), t, np.repeat(levels, 60) + 0.1 * rng.normal(size=2400))
+    fleet.advance()
+    mean, cov = fleet.sibling_prior(state)
+    # Standard errors of a median and of a median deviation of 40 values.
+    assert abs(mean[0] - 40.0) < 4 * 1.25 * 3.0 / 40**0.5 and abs(cov[0, 0] ** 0.5 - 3.0) < 4 * 1.17 * 3.0 / 40**0.5
+    with pytest.raises(EstimatorError, match="asset 3 has events"):
+        fleet.set_prior([3], (mean, cov))
+    with pytest.raises(EstimatorError, match="no state 'windng'"):
+        fleet.sibling_prior("windng")
+    fleet.extend(2)
+    fleet.set_prior([41], (mean, cov))
+    log = Log.of(model)
+    for target, asset in ((fleet, [41]), (log, [])):
+        target.add("winding", *asset, [1.0, 2.0, 3.0], [38.0, 39.0, 38.5])
+    fleet.add("winding", 40, 1.0, 38.0)
+    fleet.advance()
+    fold = Fold("kf", model, Tuning.of(model), log, prior=(mean, cov))
+    fold.advance()
+    assert_same(fleet, 41, fold)
+    alone = Fold("kf", model, Tuning.of(model), Log.of(model))
+    assert fold.track.mean[0].tobytes() != alone.prior[0].tobytes() and fleet.table().events[40] == 1
 
 
 def test_measurements_too_old_to_count_leave_the_window():
@@ -221,9 +348,14 @@ def test_table_names_the_cause_and_the_worst_come_first():
     ("call", "words"),
     [
         (lambda m: Fleet("pf", m, assets=2), "Gaussian"),
-        (lambda m: Fleet("kf", m, replace(Tuning.of(m), gate=0.99), assets=2), "gate.reopen is 30 s"),
+        (lambda m: Fleet("kf", m, replace(Tuning.of(m), gate=0.99), assets=2, recent=0), "gate.reopen is 30 s"),
         (lambda m: Fleet("kf", m, [Tuning.of(m)] * 3, assets=2), "3 tunings for 2 assets"),
         (lambda m: Fleet("kf", m, assets=0), "0 assets"),
+        (lambda m: Fleet("kf", m, assets=2, values={"R.winding": [1.0]}), "R.winding has shape"),
+        (lambda m: Fleet("kf", m, assets=["a", "b"], values={"R.winding": [1.0, -1.0]}), "asset b: R.winding is -1"),
+        (lambda m: Fleet("kf", m, assets=2, values={"R.windin": [1.0, 1.0]}), "R.windin is not a tuning key"),
+        (lambda m: Fleet("kf", m, assets=2, values={"use.winding": [1.0, 0.0]}), "same for all assets"),
+        (lambda m: Fleet("kf", m, [Tuning.of(m)] * 2, assets=2, values={"R.winding": [1.0, 2.0]}), "values and a"),
         (lambda m: Fleet("kf", m, assets=["a", "b"]).add("winding", "c", 1.0, 2.0), 'no asset'),
         (lambda m: Fleet("kf", m, assets=2).add("winding", 2, 1.0, 2.0), "asset is 2"),
         (lambda m: Fleet("kf", m, assets=2).add("winding", [0, 1, 1], [1.0, 2.0], [3.0, 4.0]), "3 assets for 2 times"),

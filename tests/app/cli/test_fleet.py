@@ -153,8 +153,10 @@ def test_a_tuning_that_fleets_cannot_have_names_the_twin(tmp_path, monkeypatch):
     plan = load_fleet("pumps.yaml", {"estimator": "pf"})
     with pytest.raises(NisusError, match=r"pumps.yaml:1: twin motor_winding: fleet: estimator pf .* Gaussian filter"):
         plan.fleet(1)
-    with pytest.raises(NisusError, match=r"set gate.reopen to null"):
-        load_fleet("pumps.yaml", {"gate": "0.99"}).fleet(1)
+    (tmp_path / "pumps.yaml").write_text(f"{FLEET.format(files='a.csv')}late: 0\n")
+    with pytest.raises(NisusError, match=r"pumps.yaml:9: late is 0, .*set gate.reopen to null"):
+        load_fleet("pumps.yaml", {"gate": "0.99"})
+    assert load_fleet("pumps.yaml").fleet(1).recent == 0
 
 
 @pytest.mark.parametrize("ending", ["csv", "parquet"])

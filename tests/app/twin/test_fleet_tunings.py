@@ -1,0 +1,107 @@
+"""Values of tunings by asset in a fleet's YAML: each asset equals a fold with that tuning; mistakes are one line."""
+
+import json
+
+import numpy as np
+import pytest
+
+from app.live.fleet import RunningFleet
+from app.twin.fleet import load_fleet
+from app.twin.twin import load_twin
+from estimators import Log
+from estimators.errors import ConfigError
+from estimators.fold import Fold
+from sources.source import NO_ASSET
+
+ASSETS = ("a", "b", "pump 3")
+
+
+def write(folder, table=None, **more):
+    """Write a fleet of motor windings; return its path."""
+    lines = ["time,pump,temperature"]
+    lines += [f"{k},{asset},{40 + k + j}" for k in range(20) for j, asset in enumerate(ASSETS)]
+    (folder / "data.csv").write_text("\n".join(lines) + "\n")
+    if table is not None:
+        (folder / "tunings.csv").write_text(table)
+    source = {
+        "type": "table", "files": "data.csv", "time": {"column": "time"}, "asset": "pump",
+        "sensors": {"winding": {"columns": "temperature"}},
+    }  # fmt: skip
+    path = folder / "pumps.yaml"
+    path.write_text(json.dumps({"twin": "motor_winding", "source": source, **more}, indent=1))
+    return path
+
+
+def estimates(path):
+    """Fold a fleet; return its table by asset, and the reports."""
+    said: list[str] = []
+    running = RunningFleet(load_fleet(path), lambda key, text: said.append(key), threads=1)
+    running.run()
+    running.stop()
+    _, names, table = running.table()
+    return {name: table.mean[k] for k, name in enumerate(names)}, said
+
+
+def folded(asset, **values):
+    """Return the last estimate of a fold of one asset with a tuning of its own."""
+    twin = load_twin("motor_winding", overrides={key.replace("_", "."): str(value) for key, value in values.items()})
+    log, j = Log.of(twin.model), ASSETS.index(asset)
+    log.add("winding", np.arange(20.0), 40.0 + np.arange(20.0) + j)
+    fold = Fold(twin.estimator, twin.model, twin.tuning, log, policy=twin.policy)
+    fold.advance()
+    return fold.track.mean[-1]
+
+
+def test_each_asset_has_the_estimates_of_its_own_tuning(tmp_path):
+    table = "pump;R.winding [degC**2];Q.temperature\npump 3;4,5;0,2\nb;9;0,03\n"
+    tunings = {"file": "tunings.csv", "asset": "pump", "values": {"b": {"R.winding": 16.0}}}
+    found, _ = estimates(write(tmp_path, table, tunings=tunings))
+    wanted = {
+        "a": folded("a"),
+        "b": folded("b", R_winding=16.0, Q_temperature=0.03),
+        "pump 3": folded("pump 3", R_winding=4.5, Q_temperature=0.2),
+    }
+    assert {name: mean.tobytes() for name, mean in found.items()} == {k: v.tobytes() for k, v in wanted.items()}
+    assert len({mean.tobytes() for mean in wanted.values()}) == 3
+
+
+def test_the_page_of_an_asset_has_its_tuning(tmp_path):
+    plan = load_fleet(write(tmp_path, tunings={"values": {"b": {"R.winding": 16.0}}}))
+    page = load_twin("motor_winding", overrides=plan.history_of("b", tmp_path))
+    assert page.tuning.get("R.winding") == 16.0
+    assert load_twin("motor_winding", overrides=plan.history_of("a", tmp_path)).tuning.get("R.winding") != 16.0
+
+
+def test_named_assets_are_listed_before_they_report_and_others_are_still_taken(tmp_path):
+    found, said = estimates(write(tmp_path, tunings={"values": {"z": {"R.winding": 16.0}}}))
+    assert list(found) == ["z", *ASSETS] and np.isnan(found["z"]).all() and NO_ASSET not in said
+
+
+@pytest.mark.parametrize(
+    ("table", "more", "words"),
+    [
+        ("asset,R.windin\na,1\n", {}, r"tunings.csv:1: R.windin is not a tuning key of motor_winding; .*R.winding"),
+        ("asset,gate\na,1\n", {}, r"tunings.csv:1: 'gate' is no value of Q, R or p"),
+        ("pump,R.winding\na,1\n", {}, r"tunings.csv:1: has no column 'asset'"),
+        ("asset,R.winding [V]\na,1\n", {}, r"tunings.csv:1: R.winding: .*V"),
+        ("asset,R.winding\na,1\nb,\n", {}, r"tunings.csv:3: asset b: R.winding is missing; give a number"),
+        ("asset,R.winding\na,1\nb,much\n", {}, r"tunings.csv:3: asset b: R.winding is 'much'; give a number"),
+        ("asset,R.winding\na,1\nb,-2\n", {}, r"tunings.csv:3: asset b: R.winding is -2; a variance must be positive"),
+        ("asset,R.winding\na,1\na,2\n", {}, r"tunings.csv:3: asset 'a' has a row already"),
+        ("asset,R.winding\na\n", {}, r"tunings.csv:2: the row has 1 cells and the heading 2"),
+        ("asset,R.winding\n,1\n", {}, r"tunings.csv:2: the row names no asset"),
+        ("", {}, r"tunings.csv:1: has no column 'asset'"),
+        ("asset,R.winding\na,1\nc,1\n", {"assets": ["a", "b"]}, r"tunings.csv:3: asset 'c' is not among assets"),
+        ("asset,R.winding\na,1\nc,1\n", {"assets": 1}, r"pumps.yaml:\d+: tunings names 2 assets; there may be 1"),
+        (None, {"tunings": {"file": "t.csv"}}, r"pumps.yaml:\d+: tunings.file is 't.csv'; there is no such file"),
+        (None, {"tunings": {}}, r"tunings has neither file nor values"),
+        (None, {"tunings": {"values": {"a": {"R.x": 1.0}}}}, r"pumps.yaml:\d+: R.x is not a tuning key"),
+        (None, {"tunings": {"values": {"a": {"R.winding": "much"}}}}, r"pumps.yaml:\d+: .*R.winding is 'much'"),
+        (None, {"tunings": {"values": {"a": {"R.winding": -1.0}}}}, r"pumps.yaml:\d+: asset a: R.winding is -1"),
+    ],
+)
+def test_mistakes_are_one_line_with_its_place(table, more, words, tmp_path):
+    given = {"tunings": {"file": "tunings.csv"}} if table is not None else {}
+    with pytest.raises(ConfigError, match=words) as caught:
+        load_fleet(write(tmp_path, table, **{**given, **more}))
+    assert "\n" not in str(caught.value)
