@@ -17,6 +17,7 @@ from config.problems import check_section
 from config.yaml_files import as_flow, read_text
 from estimators.errors import ConfigError, EstimatorError
 from estimators.fleet import Fleet
+from sources.source import Partition
 from sources.tables.one_asset import rows_of_asset
 from sources.tables.text import column_of
 
@@ -51,6 +52,11 @@ class FleetPlan:
         section = self.config.source
         return isinstance(section, FleetTableSection) and not section.follow
 
+    @property
+    def reads_files(self) -> bool:
+        """Whether its source is tables, of which each process reads all rows."""
+        return isinstance(self.config.source, FleetTableSection)
+
     def fleet(self, assets: int, threads: int | None = None) -> Fleet:
         """Return an empty fleet of so many assets.
 
@@ -67,20 +73,28 @@ class FleetPlan:
         except EstimatorError as error:
             raise ConfigError(f"{self.source.loaded.places.at(('twin',))}: twin {twin.name}: {error}") from None
 
-    def open(self, report: Report) -> Source:
+    def open(self, report: Report, partition: Partition = Partition(), *, stored: bool = False) -> Source:
         """Open the source, whose `read` returns `AssetEvents`.
+
+        Args:
+            report: Called for what cannot be used.
+            partition: Assets whose messages are read; of tables all rows are.
+            stored: Whether the state of the fleet is kept; the source is then to be given its own with `restore`.
 
         Raises:
             SourceError: If it cannot be opened, with the remedy.
         """
-        return SOURCES[self.config.source.type].open(self._opening(report))
+        opening = self._opening(report)
+        return SOURCES[self.config.source.type].open(replace(opening, partition=partition, stored=stored))
 
     def check_files(self) -> None:
         """Open the files of the source, and close them; raises as `open`."""
         SOURCES[self.config.source.type].files(self._opening(lambda *_: None))
 
     def _opening(self, report: Report) -> Opening:
-        return Opening(self.source.loaded, self.twin.model, self.config.source, KEY, report)
+        given = self.config.assets
+        assets = given if isinstance(given, tuple) else ()
+        return Opening(self.source.loaded, self.twin.model, self.config.source, KEY, report, assets=assets)
 
     def history_of(self, asset: str, folder: Path) -> dict[str, str]:
         """Return the overrides of the twin's YAML by which its source has the measurements of one asset.
