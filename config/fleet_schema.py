@@ -13,6 +13,10 @@ ASSET_LEVEL = "{asset}"
 """Level of an MQTT topic that is the name of the asset."""
 
 
+MAX_PROCESSES = 64
+"""Most processes of a fleet."""
+
+
 class FleetTableSection(TableSection):
     """Tables (CSV or Parquet) with the measurements of many assets."""
 
@@ -47,6 +51,8 @@ class FleetSection(Section):
     assets: Texts | Count | None = None
     """Names of the assets, from which others are refused; or how many there may be, named by the source in the order of
     their first measurements. Default: as many as the source names."""
+    processes: Annotated[int, Field(strict=True, ge=1, le=MAX_PROCESSES)] = 1
+    """Processes over which the assets are spread by their names, each with a store of its own. Default: 1."""
     source: Annotated[FleetTableSection | FleetPushSection | FleetMqttSection, Field(discriminator="type")]
     """Source of the measurements: its `type` is table, push or mqtt, with the keys of that source in a twin."""
 
@@ -55,4 +61,7 @@ class FleetSection(Section):
         if isinstance(self.assets, tuple) and len(set(self.assets)) < len(self.assets):
             twice = next(name for name in self.assets if self.assets.count(name) > 1)
             raise refused("relation", f"names {twice!r} twice; name each asset once", "assets")
+        if isinstance(self.assets, int) and self.processes > 1:
+            text = f"is {self.assets} for {self.processes} processes; name the assets, or leave it out"
+            raise refused("relation", text, "assets")
         return self

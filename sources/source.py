@@ -43,6 +43,10 @@ class Partition(NamedTuple):
         return self.processes == 1 or zlib.crc32(asset.encode("utf-8", "replace")) % self.processes == self.number
 
 
+WHOLE = Partition()
+"""All assets."""
+
+
 class Source(Protocol):
     """A source of events in their order of arrival.
 

@@ -17,7 +17,7 @@ import numpy as np
 from estimators.errors import NisusError, SourceError, quoted
 from estimators.fleet import FleetTable
 from estimators.log import BEFORE
-from sources.source import NO_ASSET, Acknowledging, AssetEvents, Marked, Partition, Report, ignore
+from sources.source import NO_ASSET, WHOLE, Acknowledging, AssetEvents, Marked, Partition, Report, ignore
 
 from ..twin.fleet import FleetPlan
 from ..twin.twin import Twin
@@ -63,7 +63,7 @@ class RunningFleet:
         *,
         threads: int | None = None,
         store: Path | None = None,
-        partition: Partition = Partition(),
+        partition: Partition = WHOLE,
     ) -> None:
         """Compile the filter, open the source, and continue from the store.
 

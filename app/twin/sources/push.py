@@ -69,7 +69,9 @@ def _open_mqtt(opening: Opening) -> Source:
     part = opening.partition
     by_hand = opening.stored and section.client_id is not None and section.qos > 0
     if by_hand and section.qos == 2:
-        raise failure(opening.loaded, (*opening.key, "qos"), "is 2; a fleet with --store takes each message of qos 1 once")
+        raise failure(
+            opening.loaded, (*opening.key, "qos"), "is 2; a fleet with --store takes each message of qos 1 once"
+        )
     for name, topic in section.topics.items():
         levels = name.split("/")
         asset = levels.index(ASSET_LEVEL) if isinstance(section, FleetMqttSection) else None
@@ -80,15 +82,20 @@ def _open_mqtt(opening: Opening) -> Source:
         if name in topics:
             raise failure(opening.loaded, (*opening.key, "topics"), f"has {name} twice; name each topic once")
         topics[name] = TopicMap(**topic.model_dump(), asset=asset)
-        own = [item for item in opening.assets if part.has(item) and not set(item) & set("+#/")]
-        subscribed += ["/".join([*levels[:asset], item, *levels[asset + 1 :]]) for item in own] if own else [name]
+        if asset is None or not opening.assets:
+            subscribed.append(name)
+        else:
+            own = [item for item in opening.assets if part.has(item) and not set(item) & set("+#/")]
+            subscribed += ["/".join([*levels[:asset], item, *levels[asset + 1 :]]) for item in own]
     return MqttSource(
         messages,
         section,
         topics,
         qos=section.qos,
         password=_password(section.password_env),
-        client_id=f"{section.client_id}-{part.number}" if section.client_id and part.processes > 1 else section.client_id,
+        client_id=f"{section.client_id}-{part.number}"
+        if section.client_id and part.processes > 1
+        else section.client_id,
         report=opening.report,
         wanted=part.has,
         subscribed=subscribed,
