@@ -10,6 +10,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from functools import partial
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -190,12 +191,13 @@ def run_child(open_: OpenTwin, json: bool, name: str, path: str, pipe: Connectio
         served, card, report = open_(name, path)
         served.start()
     except NisusError as error:
-        pipe.send(("failed", str(error).splitlines()[0]))
+        with suppress(OSError):  # the service has ended
+            pipe.send(("failed", str(error).splitlines()[0]))
         sys.exit(2)
     running.append(True)
     assert served.door is not None
-    pipe.send(("ready", (served.door.port, served.door.token, card)))
     try:
+        pipe.send(("ready", (served.door.port, served.door.token, card)))
         memory, measured = 0, -MEMORY_PERIOD_S
         while not (ending or done.is_set()):
             if time.monotonic() - measured > MEMORY_PERIOD_S:
@@ -207,7 +209,8 @@ def run_child(open_: OpenTwin, json: bool, name: str, path: str, pipe: Connectio
         while pipe.poll(0.1):
             _take(pipe, served, done)
     except NisusError as error:
-        pipe.send(("failed", str(error).splitlines()[0]))
+        with suppress(OSError):
+            pipe.send(("failed", str(error).splitlines()[0]))
         sys.exit(2)
     except (EOFError, OSError):  # the service has ended
         pass

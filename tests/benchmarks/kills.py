@@ -230,7 +230,6 @@ FLEET_TOPIC = {"values": {"winding": "v"}, "time": "t", "sequence": "n"}
 def run_fleet_part(folder: Path, expected: int) -> None:
     """Run the processes of a fleet until this one is killed; write the table once it has all events."""
     supervisor.FIRST_RETRY_S = supervisor.MAX_RETRY_S = 0.1
-    supervisor.ServedTwin.wait = 0.1
     overrides = {"time.degraded_after": LONG_S, "time.stale_after": LONG_S}
     plan = load_fleet(folder / "pumps.yaml", overrides)
     processes = plan.config.processes

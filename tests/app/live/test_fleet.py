@@ -31,6 +31,7 @@ from sources.brokers import TopicMap
 from sources.source import Partition
 from tests.app.cli.test_fleet import FLEET, write
 from tests.app.outputs.broker import Broker, Listener, needs_mosquitto
+from tests.benchmarks.kills import FleetRun, survive_fleet
 from tests.conftest import ROOT
 
 BEGIN, SECOND = 1_767_225_600 * 10**9, 10**9
@@ -360,3 +361,8 @@ def test_messages_go_to_the_process_of_their_asset_and_the_table_is_that_of_all(
     servers[0].stop()
     fleet.stop()
     whole.stop()
+
+
+def test_killed_processes_leave_the_table_of_one_that_was_not(tmp_path):
+    needs_mosquitto()
+    survive_fleet(2, tmp_path, FleetRun(assets=8, rounds=60, seconds=2.0, parents=2))
