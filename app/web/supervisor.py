@@ -238,11 +238,12 @@ class Supervisor:
     def begin(self, twin: ServedTwin) -> None:
         """Start the process of a twin that has none; `changing` is held."""
         ours, its = self._context.Pipe()
-        twin.process = self._context.Process(target=self._child, args=(twin.name, twin.path, its), name=twin.name)
+        process = self._context.Process(target=self._child, args=(twin.name, twin.path, its), name=twin.name)
         twin.pipe, twin.state, twin.refused = ours, STARTING, False
         twin.began = twin.heard = time.monotonic()
         twin.starts += 1
-        twin.process.start()
+        process.start()
+        twin.process = process  # not before: one that was not started cannot be waited for
         its.close()
 
     def _note_end(self, twin: ServedTwin) -> None:

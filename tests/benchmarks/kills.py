@@ -224,7 +224,7 @@ FLEET_BEGIN = 1_767_225_600 * 10**9
 LONG_S = "1e6"
 """Longer than the run: no asset is silent, so the table does not depend on the clock."""
 
-FLEET_TOPIC = {"values": {"winding": "v"}, "time": "t", "sequence": "n"}
+FLEET_TOPIC: dict[str, Any] = {"values": {"winding": "v"}, "time": "t", "sequence": "n"}
 
 
 def run_fleet_part(folder: Path, expected: int) -> None:
@@ -238,7 +238,7 @@ def run_fleet_part(folder: Path, expected: int) -> None:
     fleet.start()
     done = EndRequest()
     when_asked_to_end(done.set)
-    told: list[int] = []
+    told: list[int | None] = []
     while not done.wait(0.1):
         pids = [part.twin.process.pid for part in fleet._parts if part.twin.process is not None and part.twin.port]
         if pids != told:

@@ -327,6 +327,12 @@ def test_a_broker_keeps_what_was_not_stored(tmp_path, monkeypatch):
     last = folded([40.0 + k for k in range(70)])
     assert again.table()[2].mean.tobytes() == np.tile(last.mean, (len(own), 1)).tobytes()
     again.stop()
+    with pytest.raises(NisusError, match=r"was written with another number of processes; remove it"):
+        RunningFleet(plan, lambda *_: None, threads=1, store=store)
+    with pytest.raises(NisusError, match=r"source.qos is 2; set it to 1"):
+        path = tmp_path / "pumps.yaml"
+        path.write_text(json.dumps({"twin": "motor_winding", "source": mqtt(broker.port, qos=2)}))
+        RunningFleet(load_fleet(path), lambda *_: None, threads=1, store=tmp_path / "new.store")
     listener.stop()
     broker.stop()
 
