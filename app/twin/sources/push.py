@@ -69,9 +69,11 @@ def _open_mqtt(opening: Opening) -> Source:
     part = opening.partition
     by_hand = opening.stored and section.client_id is not None and section.qos > 0
     if by_hand and section.qos == 2:
-        raise failure(
-            opening.loaded, (*opening.key, "qos"), "is 2; a fleet with --store takes each message of qos 1 once"
-        )
+        rule = "is 2; set it to 1: a fleet with --store takes each of its messages once"
+        raise failure(opening.loaded, (*opening.key, "qos"), rule)
+    client_id = section.client_id
+    if client_id is not None and part.processes > 1:
+        client_id = f"{client_id}-{part.number}"
     for name, topic in section.topics.items():
         levels = name.split("/")
         asset = levels.index(ASSET_LEVEL) if isinstance(section, FleetMqttSection) else None
@@ -93,9 +95,7 @@ def _open_mqtt(opening: Opening) -> Source:
         topics,
         qos=section.qos,
         password=_password(section.password_env),
-        client_id=f"{section.client_id}-{part.number}"
-        if section.client_id and part.processes > 1
-        else section.client_id,
+        client_id=client_id,
         report=opening.report,
         wanted=part.has,
         subscribed=subscribed,
