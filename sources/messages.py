@@ -67,8 +67,8 @@ class Rows(NamedTuple):
 class SentNumbers:
     """Sequence numbers of messages by sender, as ranges; of at most so many senders."""
 
-    def __init__(self, senders: int = MAX_SENDERS) -> None:
-        self._senders = senders
+    def __init__(self, senders: int | None = None) -> None:
+        self._senders = MAX_SENDERS if senders is None else senders
         self._ranges: OrderedDict[str, list[list[int]]] = OrderedDict()
 
     def add(self, sender: str, number: int) -> bool:
