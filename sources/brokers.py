@@ -3,19 +3,24 @@
 from __future__ import annotations
 
 import asyncio
+import base64
 import json
+import queue
 import socket
 import threading
-from collections.abc import Mapping, Sequence
+import zlib
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from decimal import Decimal, InvalidOperation
 from typing import Any, Protocol
 
+import numpy as np
+
 from estimators.errors import ConfigError, printable, quoted
 from estimators.log import Events
 
-from .messages import LATEST, REFUSED, Messages
+from .messages import LATEST, MAX_WAITING, REFUSED, Messages
 from .source import Report
 
 NO_BROKER = "no broker"  # Key of the times at which the connection was lost
@@ -27,6 +32,19 @@ UNITS = {"s": 10**9, "ms": 10**6, "us": 1000, "ns": 1}
 
 MAX_PAYLOAD_BYTES = 64 * 1024
 """Largest payload of a topic; a message takes a hundred bytes."""
+
+WINDOW = 32_767
+"""Messages of QoS 1 that a broker sends before the first is acknowledged. A store is written several times for as many,
+and a packet id, of which there are 65,535, is never in use twice."""
+
+MAX_TOPICS = 500
+"""Topics of one request to subscribe."""
+
+MAX_BATCH = 20_000
+"""Messages that are decoded at once."""
+
+NO_EXPIRY_S = 2**32 - 1
+"""Expiry of a session of MQTT 5 that is kept until the broker's own limit."""
 
 RETRY_S, CHECK_S, STOP_TIMEOUT_S = 1.0, 1.0, 2.0
 
@@ -40,8 +58,12 @@ class BrokerSection(Protocol):
     ca_file: str | None
 
 
-def mqtt_client(section: BrokerSection, password: str | None, *, client_id: str, persistent: bool = False) -> Any:
+def mqtt_client(
+    section: BrokerSection, password: str | None, *, client_id: str, persistent: bool = False, by_hand: bool = False
+) -> Any:
     """Return a client of paho-mqtt that connects again by itself; `persistent` keeps its session at the broker.
+
+    With `by_hand` it is one of MQTT 5, whose messages are acknowledged with its `ack`.
 
     Raises:
         ConfigError: If paho-mqtt is not installed.
@@ -51,7 +73,10 @@ def mqtt_client(section: BrokerSection, password: str | None, *, client_id: str,
     except ModuleNotFoundError:
         raise ConfigError("MQTT needs paho-mqtt: pip install 'nisus[service]'") from None
     api = paho.CallbackAPIVersion.VERSION2  # type: ignore[attr-defined]
-    client = paho.Client(api, client_id=client_id, clean_session=not persistent)
+    if by_hand:
+        client = paho.Client(api, client_id=client_id, protocol=paho.MQTTv5, manual_ack=True)
+    else:
+        client = paho.Client(api, client_id=client_id, clean_session=not persistent)
     client.reconnect_delay_set(RETRY_S, 30.0)
     # An error of a callback would end the thread of the client, and with it all messages.
     client.suppress_exceptions = True
@@ -138,8 +163,36 @@ def as_time(value: Any, unit: str) -> Any:
     return max(-LATEST, min(ns, LATEST))
 
 
+class TakenPackets:
+    """Packets of QoS 1 by id, each until the broker uses its id again, to recognise those that are sent again.
+
+    A broker sends a packet again with its id and the mark of a duplicate if it got no acknowledgement. It may also have
+    got it, and used the id for another packet that never arrived: that has another checksum.
+    """
+
+    def __init__(self) -> None:
+        self._checksums: dict[int, int] = {}
+
+    def add(self, packet: Any) -> bool:
+        """Note a packet; return whether it is new."""
+        checksum = zlib.crc32(packet.payload, zlib.crc32(packet.topic.encode()))
+        if packet.dup and self._checksums.get(packet.mid) == checksum:
+            return False
+        self._checksums[packet.mid] = checksum
+        return True
+
+    def state(self) -> str:
+        """Return ids and checksums as text, for `restore`."""
+        return base64.b64encode(np.array([*self._checksums.items()], "<u4").tobytes()).decode()
+
+    def restore(self, state: str) -> None:
+        """Take over the `state` of another."""
+        pairs = np.frombuffer(base64.b64decode(state), "<u4").reshape(-1, 2)
+        self._checksums = dict(pairs.tolist())
+
+
 class MqttSource:
-    """Live source of the topics of an MQTT broker."""
+    """Live source of the topics of an MQTT broker; payloads are decoded in the thread that reads."""
 
     live = True
 
@@ -153,6 +206,9 @@ class MqttSource:
         password: str | None,
         client_id: str | None,
         report: Report,
+        wanted: Callable[[str], bool] = lambda _: True,
+        subscribed: Sequence[str] | None = None,
+        by_hand: bool = False,
     ) -> None:
         """Connect in a thread of its own; a broker that is not there is waited for.
 
@@ -164,10 +220,16 @@ class MqttSource:
             password: Of the user.
             client_id: With one, the broker keeps messages of QoS 1 while the twin is away.
             report: Receives lost connections and payloads that cannot be read.
+            wanted: Returns whether messages of an asset are used; by default all are.
+            subscribed: Filters to subscribe to in place of those of `topics`, of which each is a part.
+            by_hand: Acknowledge messages once they have been stored, see `Acknowledging`; connect after `restore`.
         """
-        self._messages, self._topics, self._qos, self._report = messages, topics, qos, report
-        self._place = f"{section.host}:{section.port}"
-        self._client = mqtt_client(section, password, client_id=client_id or "", persistent=client_id is not None)
+        self._messages, self._qos, self._report, self._wanted = messages, qos, report, wanted
+        self._subscribed_to = [*topics] if subscribed is None else [*subscribed]
+        self._place, self._section = f"{section.host}:{section.port}", section
+        self._client = mqtt_client(
+            section, password, client_id=client_id or "", persistent=client_id is not None, by_hand=by_hand
+        )
         self._client.on_connect, self._client.on_disconnect = self._connected, self._disconnected
         self._client.on_connect_fail = lambda *_: self._lost("it does not answer")
         for name in topics:
@@ -175,21 +237,43 @@ class MqttSource:
         self.connected = threading.Event()
         """Set while the topics are subscribed to."""
         self._client.on_subscribe = self._subscribed
-        self._client.connect_async(section.host, section.port, keepalive=15)
+        self._requests: dict[int | None, list[str]] = {}
+        self._waiting: queue.SimpleQueue[tuple[TopicMap, Any]] = queue.SimpleQueue()
+        self._by_hand, self._packets = by_hand, TakenPackets()
+        self._unstored: dict[int, None] = {}
+        """Ids of packets that were read, but not acknowledged, in their order."""
+        if not by_hand:
+            self._connect()
+
+    def _connect(self) -> None:
+        host, port = self._section.host, self._section.port
+        if self._by_hand:
+            from paho.mqtt.packettypes import PacketTypes
+            from paho.mqtt.properties import Properties
+
+            kept = Properties(PacketTypes.CONNECT)
+            kept.SessionExpiryInterval, kept.ReceiveMaximum = NO_EXPIRY_S, WINDOW
+            self._client.connect_async(host, port, keepalive=15, clean_start=False, properties=kept)
+        else:
+            self._client.connect_async(host, port, keepalive=15)
         self._client.loop_start()
 
     def _connected(self, client: Any, _data: Any, _flags: Any, reason: Any, _properties: Any) -> None:
         if reason.is_failure:
             self._lost(f"it refuses: {reason}")
-        else:
-            client.subscribe([(name, self._qos) for name in self._topics])
+            return
+        self._requests.clear()
+        for at in range(0, len(self._subscribed_to), MAX_TOPICS):
+            names = self._subscribed_to[at : at + MAX_TOPICS]
+            self._requests[client.subscribe([(name, self._qos) for name in names])[1]] = names
 
-    def _subscribed(self, _client: Any, _data: Any, _number: Any, reasons: Any, _properties: Any) -> None:
-        for name, reason in zip(self._topics, reasons, strict=False):
+    def _subscribed(self, _client: Any, _data: Any, number: Any, reasons: Any, _properties: Any) -> None:
+        for name, reason in zip(self._requests.pop(number, self._subscribed_to), reasons, strict=False):
             if reason.is_failure:
                 text = f"the broker at {self._place} refuses the topic {name} ({reason}); check the rights of the user"
                 self._report(REFUSED_TOPIC, text)
-        self.connected.set()
+        if not self._requests:
+            self.connected.set()
 
     def _disconnected(self, _client: Any, _data: Any, _flags: Any, reason: Any, _properties: Any) -> None:
         self._lost(f"the connection ended: {reason}")
@@ -201,24 +285,84 @@ class MqttSource:
         )
 
     def _callback(self, topic: TopicMap) -> Any:
-        def arrived(_client: Any, _data: Any, message: Any) -> None:
-            try:
-                found = topic.message(message.topic, message.payload)
-                # The broker sends the last retained message to each new subscriber: without a time it is of no moment.
-                if message.retain and found.get("time") is None:
-                    return
-                answer = self._messages.send([found])[0]
-                reason = answer.reason if answer.status == REFUSED else ""
-            except Exception as error:  # noqa: BLE001  no payload may end the source
-                reason = str(error)
-            if reason:
-                self._report(REFUSED_MESSAGE, f"{printable(message.topic)[:100]}: {printable(reason)}; it is not used")
+        def arrived(client: Any, _data: Any, packet: Any) -> None:
+            foreign = topic.asset is not None and not self._wanted(packet.topic.split("/")[topic.asset])
+            if not foreign and self._waiting.qsize() < MAX_WAITING:
+                self._waiting.put((topic, packet))
+                return
+            if self._by_hand and packet.qos:
+                client.ack(packet.mid, packet.qos)
+            if not foreign:
+                self._refuse(packet, "too many messages wait")
 
         return arrived
 
     def read(self, timeout: float) -> Any:
         """Return the events of the next messages."""
-        return self._messages.read(timeout)
+        found: list[tuple[TopicMap, Any]] = []
+        with suppress(queue.Empty):
+            found.append(self._waiting.get(timeout=timeout))
+            while len(found) < MAX_BATCH:
+                found.append(self._waiting.get_nowait())
+        decoded = [item for item in found if self._is_new(item[1])]
+        pairs = [(packet, message) for topic, packet in decoded if (message := self._decoded(topic, packet))]
+        answers = self._messages.send([message for _, message in pairs]) if pairs else []
+        for (packet, _), answer in zip(pairs, answers, strict=True):
+            if answer.status == REFUSED:
+                self._refuse(packet, answer.reason)
+        return self._messages.read(0.0)
+
+    def _is_new(self, packet: Any) -> bool:
+        """Return whether a packet is used; one that was stored before is acknowledged again."""
+        if not self._by_hand or not packet.qos:
+            return True
+        if self._packets.add(packet):
+            self._unstored[packet.mid] = None
+            return True
+        if packet.mid not in self._unstored:
+            self._client.ack(packet.mid, packet.qos)
+        return False
+
+    def _decoded(self, topic: TopicMap, packet: Any) -> dict[str, Any] | None:
+        """Return the message of a packet; None if it has none."""
+        try:
+            found = topic.message(packet.topic, packet.payload)
+        except Exception as error:  # noqa: BLE001  no payload may end the source
+            self._refuse(packet, str(error))
+            return None
+        # The broker sends the last retained message to each new subscriber: without a time it is of no moment.
+        return None if packet.retain and found.get("time") is None else found
+
+    def _refuse(self, packet: Any, reason: str) -> None:
+        self._report(REFUSED_MESSAGE, f"{printable(packet.topic)[:100]}: {printable(reason)}; it is not used")
+
+    @property
+    def mark(self) -> int:
+        """Messages that were accepted and read."""
+        return self._messages.mark
+
+    def numbers(self, mark: int) -> dict[str, Any]:
+        """See `Marked`."""
+        numbers = self._messages.numbers(mark)
+        return {"senders": numbers, "packets": self._packets.state()} if self._by_hand else numbers
+
+    def restore(self, numbers: Mapping[str, Any]) -> None:
+        """See `Marked`."""
+        self._messages.restore(numbers.get("senders", {}) if self._by_hand else numbers)
+        if self._by_hand:
+            self._packets.restore(numbers.get("packets", ""))
+            self._connect()
+
+    @property
+    def unacknowledged(self) -> float:
+        """See `Acknowledging`."""
+        return len(self._unstored) / WINDOW
+
+    def acknowledge(self) -> None:
+        """See `Acknowledging`."""
+        for mid in self._unstored:
+            self._client.ack(mid, 1)
+        self._unstored.clear()
 
     def now(self) -> int | None:
         """Return the present time by the clock of the senders, ns."""

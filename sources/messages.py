@@ -41,6 +41,9 @@ MAX_GAPS = 1024
 MAX_SENDERS = 1024
 """Senders whose sequence numbers are remembered; the one that was silent longest is forgotten first."""
 
+MAX_FLEET_SENDERS = 1_000_000
+"""The same of a fleet, in which each topic of an asset is a sender."""
+
 LATEST = 2**62
 """Times must be below it, ns: the year 2116."""
 
@@ -62,16 +65,17 @@ class Rows(NamedTuple):
 
 
 class SentNumbers:
-    """Sequence numbers of messages by sender, as ranges."""
+    """Sequence numbers of messages by sender, as ranges; of at most so many senders."""
 
-    def __init__(self) -> None:
+    def __init__(self, senders: int | None = None) -> None:
+        self._senders = MAX_SENDERS if senders is None else senders
         self._ranges: OrderedDict[str, list[list[int]]] = OrderedDict()
 
     def add(self, sender: str, number: int) -> bool:
         """Note a number; return whether it is new."""
         ranges = self._ranges.setdefault(sender, [])
         self._ranges.move_to_end(sender)
-        if len(self._ranges) > MAX_SENDERS:
+        if len(self._ranges) > self._senders:
             self._ranges.popitem(last=False)
         k = bisect_right(ranges, number, key=lambda item: item[0])
         if k and number <= ranges[k - 1][1]:
@@ -133,7 +137,8 @@ class Messages:
         )
         self._waiting: queue.SimpleQueue[Rows] = queue.SimpleQueue()
         self._room = MAX_WAITING
-        self._sent, self._stored = SentNumbers(), SentNumbers()
+        senders = MAX_FLEET_SENDERS if assets else MAX_SENDERS
+        self._sent, self._stored = SentNumbers(senders), SentNumbers(senders)
         self._unstored: deque[tuple[int, str, int]] = deque()
         """Count of messages until each numbered one that is not in `_stored` yet, its sender and number."""
         self.accepted = 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, cast, runtime_checkable
@@ -29,6 +30,21 @@ class AssetEvents(NamedTuple):
     events: Events
     code: np.ndarray
     names: Sequence[str]
+
+
+class Partition(NamedTuple):
+    """Assets of one of several processes: those for which crc32(name in UTF-8) mod `processes` is `number`."""
+
+    number: int = 0
+    processes: int = 1
+
+    def has(self, asset: str) -> bool:
+        """Return whether an asset is one of them."""
+        return self.processes == 1 or zlib.crc32(asset.encode("utf-8", "replace")) % self.processes == self.number
+
+
+WHOLE = Partition()
+"""All assets."""
 
 
 class Source(Protocol):
@@ -85,6 +101,18 @@ class Marked(Source, Protocol):
 
     def restore(self, numbers: Mapping[str, Any]) -> None:
         """Continue with the `numbers` of the source before a restart, if any, and keep them from now on."""
+
+
+@runtime_checkable
+class Acknowledging(Marked, Protocol):
+    """A source whose broker delivers each message again until it is acknowledged."""
+
+    @property
+    def unacknowledged(self) -> float:
+        """Share of the messages without acknowledgement after which the broker sends no more, 0 to 1."""
+
+    def acknowledge(self) -> None:
+        """Acknowledge all that was read: it has been stored; in the thread that reads."""
 
 
 def span_of(source: Source) -> tuple[int, int] | None:

@@ -10,10 +10,11 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from functools import partial
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 from urllib.parse import urlsplit
 
 from config.loader import shipped
@@ -23,7 +24,8 @@ from ..terminal import EndRequest, restore, use_lines_of_json, when_asked_to_end
 from ..views.recording.rrd_file import NEVER, Split, parse_split
 from ..web.door import LOOPBACK, Door, check_port
 from ..web.gate import Grant, read_tokens
-from ..web.service import STATUS_PERIOD_S, Service, TwinFolder
+from ..web.service import Service, TwinFolder
+from ..web.supervisor import STATUS_PERIOD_S
 
 if TYPE_CHECKING:
     from ..web.session import Session
@@ -33,8 +35,30 @@ PRELOADED = ("app.cli.preloaded",)
 """Modules that the processes of the twins share: they are imported once."""
 
 
-OpenTwin = Callable[[str, str], "tuple[Session, Mapping[str, Any]]"]
-"""Opens a twin, given its name and path; returns its session and its card in the overview."""
+class Served(Protocol):
+    """What the process of a twin, or of a part of a fleet, runs."""
+
+    @property
+    def door(self) -> Door | None:
+        """Its port."""
+
+    def start(self) -> object:
+        """Begin."""
+
+    def stop(self) -> None:
+        """Stop."""
+
+
+class Opened(NamedTuple):
+    """What runs, its card in the overview, and its state for that."""
+
+    served: Served
+    card: Mapping[str, Any]
+    report: Callable[[], Mapping[str, Any]]
+
+
+OpenTwin = Callable[[str, str], Opened]
+"""Opens a twin, given its name and path."""
 
 MEMORY_PERIOD_S = 10.0
 """Between two looks at the memory, which take milliseconds."""
@@ -164,41 +188,46 @@ def run_child(open_: OpenTwin, json: bool, name: str, path: str, pipe: Connectio
     if json:
         use_lines_of_json()
     try:
-        session, card = open_(name, path)
-        session.start()
+        served, card, report = open_(name, path)
+        served.start()
     except NisusError as error:
-        pipe.send(("failed", str(error).splitlines()[0]))
+        with suppress(OSError):  # the service has ended
+            pipe.send(("failed", str(error).splitlines()[0]))
         sys.exit(2)
     running.append(True)
-    assert session.door is not None
-    pipe.send(("ready", (session.door.port, session.door.token, card)))
+    assert served.door is not None
     try:
+        pipe.send(("ready", (served.door.port, served.door.token, card)))
         memory, measured = 0, -MEMORY_PERIOD_S
         while not (ending or done.is_set()):
             if time.monotonic() - measured > MEMORY_PERIOD_S:
                 memory, measured = _memory(), time.monotonic()
-            pipe.send(("report", _report(session) | {"memory": memory}))
+            pipe.send(("report", {**report(), "memory": memory}))
             if pipe.poll(STATUS_PERIOD_S):
-                _take(pipe, session, done)
+                _take(pipe, served, done)
         # A request that stops it is noted after it was carried out.
         while pipe.poll(0.1):
-            _take(pipe, session, done)
+            _take(pipe, served, done)
+    except NisusError as error:
+        with suppress(OSError):
+            pipe.send(("failed", str(error).splitlines()[0]))
+        sys.exit(2)
     except (EOFError, OSError):  # the service has ended
         pass
     finally:
-        session.stop()
+        served.stop()
 
 
-def _take(pipe: Connection, session: Session, done: threading.Event) -> None:
+def _take(pipe: Connection, served: Any, done: threading.Event) -> None:
     """Carry out a message of the service: (kind, content)."""
     kind, content = pipe.recv()
     if kind == "stop":
         done.set()
-    elif kind == "audit" and session.running is not None:
-        session.engine.audit.add(*content)
+    elif kind == "audit" and served.running is not None:
+        served.engine.audit.add(*content)
 
 
-def _opened(options: TwinPlaces, name: str, path: str) -> tuple[Session, Mapping[str, Any]]:
+def _opened(options: TwinPlaces, name: str, path: str) -> Opened:
     from dataclasses import asdict
 
     from ..web.gallery.cards import card_of
@@ -214,10 +243,10 @@ def _opened(options: TwinPlaces, name: str, path: str) -> tuple[Session, Mapping
         opening, StartRequest(path), opener, page=Page(0, False, overview="../../"),
         recordings=options.recordings / name, printed=True,
     )  # fmt: skip
-    return session, asdict(card_of(path, opening.twin))
+    return Opened(session, asdict(card_of(path, opening.twin)), partial(report_of, session))
 
 
-def _report(session: Session) -> dict[str, Any]:
+def report_of(session: Session) -> dict[str, Any]:
     """Return what the overview shows of a twin."""
     from estimators.track import HEALTH_NAMES
 

@@ -16,13 +16,13 @@ import numpy as np
 
 from estimators.errors import NisusError, SourceError, quoted
 from estimators.fleet import FleetTable
-from estimators.log import BEFORE, TICK, Events
-from sources.source import NO_ASSET, AssetEvents, Marked, Report
+from estimators.log import BEFORE
+from sources.source import NO_ASSET, WHOLE, Acknowledging, AssetEvents, Marked, Partition, Report, ignore
 
 from ..twin.fleet import FleetPlan
 from ..twin.twin import Twin
 from .fold_json import tuning_to_json
-from .running_fold import Keeper
+from .silent_assets import SilentAssets
 from .store import Store
 
 FIRST_ROOM = 256
@@ -43,12 +43,27 @@ STORE_PERIOD_S, STORE_SHARE = 1.0, 0.1
 TICKS_PER_DELAY = 4
 """Checks for silent assets in the time after which one is degraded."""
 
+MAX_UNACKNOWLEDGED = 0.5
+"""Share of the messages that a broker sends without acknowledgement after which the store is written at once."""
+
+CHANGED = {"version": "another version of Nisus", "partition": "another number of processes"}
+"""Reason for which a store is refused, by the part of its identity."""
+
+UNKNOWN, FOREIGN = -1, -2
+"""In place of the position of an asset: it is refused, or another process has it."""
+
 
 class RunningFleet:
     """Reads the source of a fleet, folds it, and answers with the table of its assets."""
 
     def __init__(
-        self, plan: FleetPlan, report: Report, *, threads: int | None = None, store: Path | None = None
+        self,
+        plan: FleetPlan,
+        report: Report,
+        *,
+        threads: int | None = None,
+        store: Path | None = None,
+        partition: Partition = WHOLE,
     ) -> None:
         """Compile the filter, open the source, and continue from the store.
 
@@ -57,21 +72,24 @@ class RunningFleet:
             report: Called as report(key, text) for what cannot be used; counted in `counts`.
             threads: Threads that fold; None for all.
             store: File in which the state of the fleet is kept with the position in its source; None for none.
+            partition: The assets that are folded; other processes have the others.
 
         Raises:
             NisusError: If the estimator is not for fleets, the source cannot be opened, or the store is of another
                 fleet.
         """
         given = plan.config.assets
-        self.plan, self._report = plan, report
-        self.store: Keeper | None = None
+        plan = replace(plan, values=plan.values.only(partition.has))
+        self.plan, self.partition, self._report = plan, partition, report
         self.counts: Counter[str] = Counter()
         """Reports by key."""
+        self._given = frozenset(given) if isinstance(given, tuple) else None
         self.names: list[str] = list(plan.values.names)
         """Names of the assets; only appended to."""
         self._places = {name: k for k, name in enumerate(self.names)}
-        self._most = given if isinstance(given, int) else len(given) if given else None
+        self._most = given if isinstance(given, int) else len(self.names) if self._given is not None else None
         self.fleet = plan.fleet(self._most or max(FIRST_ROOM, len(self.names)), threads)
+        self._silent = SilentAssets(self.fleet)
         self._last = np.full(len(self.fleet.assets), BEFORE, np.int64)
         self._newest = self._looked = BEFORE
         self._silence = round(plan.twin.policy.degraded_after * 1e9)
@@ -85,18 +103,35 @@ class RunningFleet:
         self._lock = threading.Lock()
         self._shown: tuple[int, FleetTable] | None = None
         self._stopping = threading.Event()
-        self.source = plan.open(self.note)
         self._thread = threading.Thread(target=self._run, name="fleet", daemon=True)
         self._changed: set[int] = set()
-        self._due = 0.0
+        self._due, self._asked, self._kept = 0.0, False, -1
         self._store = None if store is None else Store(store)
-        if self._store is not None:
-            try:
+        try:
+            # Each process reads all rows of tables; one reports those that cannot be used.
+            reads_all = plan.reads_files and partition.number > 0
+            self.source = plan.open(ignore if reads_all else self.note, partition, stored=store is not None)
+            if self._store is not None:
                 self._continue(self._store)
-            except BaseException:
+        except BaseException:
+            if self._store is not None:
                 self._store.close()
+            if hasattr(self, "source"):
                 self.source.close()
-                raise
+            raise
+
+    @property
+    def store(self) -> RunningFleet | None:
+        """What keeps its state, see `Keeper`; None without a store."""
+        return None if self._store is None else self
+
+    def ask(self) -> None:
+        """See `Keeper`."""
+        self._asked = True
+
+    def has(self, mark: int) -> bool | None:
+        """See `Keeper`."""
+        return None if self.failure else self._kept >= mark
 
     @property
     def twin(self) -> Twin:
@@ -117,6 +152,7 @@ class RunningFleet:
         while go_on() and self.step():
             pass
         self._fold()
+        self._keep()
 
     def stop(self) -> None:
         """Stop, and close the source."""
@@ -138,47 +174,51 @@ class RunningFleet:
         """Read the next events and fold what waits; return False at the end of the source."""
         batch: Any = self.source.read(READ_S)
         if batch is None:
-            self._query(self._newest, 0)
             self._fold()
+            self._query(self._newest, 0)
             self.ended = True
             self.version += 1
             self._keep(at_once=True)
             return False
         if len(batch.code):
             self._add(batch)
-        now = self.source.now()
-        self._query(self._newest if now is None else now, self._silence // TICKS_PER_DELAY)
         if self._pending and (self.source.live or self._pending >= MAX_PENDING):
             self._fold()
+        if not self._pending:
+            now = self.source.now()
+            self._query(self._newest if now is None else now, self._silence // TICKS_PER_DELAY)
             self._keep()
         return True
 
     def _add(self, batch: AssetEvents) -> None:
+        """Add the events of its own assets, and count those of all: all processes fold at the same rows of a table."""
         used = np.unique(batch.code)
-        places = np.full(len(batch.names), -1)
+        places = np.full(len(batch.names), UNKNOWN)
         for code in used.tolist():
             places[code] = self._place(batch.names[code])
-        at = places[batch.code]
-        known = at >= 0
-        events = batch.events
-        if not known.all():
-            at, events = at[known], events.select(known)
+        at, events = places[batch.code], batch.events
+        self._newest = max(self._newest, int(events.t[at != UNKNOWN].max(initial=BEFORE)))
+        self._pending += int(np.count_nonzero(at != UNKNOWN))
+        own = at >= 0
+        if not own.all():
+            at, events = at[own], events.select(own)
         with self._lock:
+            self._silent.put_back(np.unique(at))
             self.fleet.add_events(at, events)
         self._changed.update(np.unique(at // BLOCK).tolist())
         np.maximum.at(self._last, at, events.t)
-        self._newest = max(self._newest, int(events.t.max(initial=BEFORE)))
-        self._pending += at.size
 
     def _place(self, name: str) -> int:
-        """Return the position of an asset, a new one for a new name; -1 if it is refused."""
+        """Return the position of an asset, a new one for a new name; UNKNOWN if it is refused, or FOREIGN."""
         place = self._places.get(name)
         if place is not None:
             return place
+        if not self.partition.has(name):
+            return FOREIGN if self._given is None or name in self._given else UNKNOWN
         if self._most is not None and len(self.names) >= self._most:
-            rule = "is not among assets" if isinstance(self.plan.config.assets, tuple) else f"is beyond {self._most}"
+            rule = f"is beyond {self._most}" if self._given is None else "is not among assets"
             self.note(NO_ASSET, f"{self.plan.path.name}: asset {quoted(name)} {rule}; add it to assets")
-            return -1
+            return UNKNOWN
         if len(self.names) == len(self.fleet.assets):
             with self._lock:
                 self.fleet.extend(len(self.names))
@@ -188,47 +228,49 @@ class RunningFleet:
         return place
 
     def _query(self, now: int, period: int) -> None:
-        """Add a query of the assets that were silent for long, if the last look is `period` ns ago."""
+        """Show the assets that have been silent for long as of now, if the last look is `period` ns ago."""
         if now == BEFORE or now - self._looked < period:
             return
         self._looked = now
         silent = np.flatnonzero((self._last > BEFORE) & (self._last < now - self._silence))
         if silent.size:
             with self._lock:
-                self.fleet.add_events(silent, self._ticks(now, silent.size))
-            self._changed.update(np.unique(silent // BLOCK).tolist())
-            self._last[silent] = now
-            self._pending += silent.size
-
-    def _ticks(self, t: int, count: int) -> Events:
-        times, width = np.full(count, t), self.plan.twin.model.width
-        kind, channel = np.full(count, TICK, np.int8), np.zeros(count, np.int32)
-        return Events(times, times, kind, channel, np.full((count, width), np.nan))
+                self._silent.query(silent, now)
+                self.version += 1
 
     def _identity(self) -> dict[str, Any]:
         """Return what a store must have been written with."""
         plan, model, given = self.plan, self.plan.twin.model, self.plan.config.assets
         names = [model.name, *model.state_names, *model.row_names, *(given if isinstance(given, tuple) else ())]
         tuning = tuning_to_json(plan.twin.tuning, plan.twin.estimator)
+        known = {"version": version("nisus"), "partition": [*self.partition], "tuning": tuning}
         own = {"late": plan.config.late, "values": {k: repr(v.tolist()) for k, v in plan.values.columns.items()}}
-        return {"version": version("nisus"), "tuning": tuning, "policy": [*plan.twin.policy], "names of": names} | own
+        return known | {"policy": [*plan.twin.policy], "names of": names} | own
 
     def _keep(self, at_once: bool = False) -> None:
         """Write what has changed to the store, with the position in the source; all events are folded."""
-        begun = time.monotonic()
-        if self._store is None or (begun < self._due and not at_once):
+        begun, source = time.monotonic(), self.source
+        if self._store is None:
             return
-        source = self.source
-        state = self._identity() | {"newest": self._newest, "looked": self._looked, "counts": self.counts}
-        position = source.numbers(source.mark) if isinstance(source, Marked) else {}
-        state |= {"names": self.names, "source": position}
+        urgent = at_once or self._asked
+        if isinstance(source, Acknowledging):
+            urgent = urgent or source.unacknowledged > MAX_UNACKNOWLEDGED
+        mark = source.mark if isinstance(source, Marked) else 0
+        if (begun < self._due and not urgent) or (mark == self._kept and not self._changed and not at_once):
+            return
+        self._asked = False
+        state = self._identity() | {"newest": self._newest, "counts": self.counts, "names": self.names}
+        state["source"] = source.numbers(mark) if isinstance(source, Marked) else {}
         blocks = {("state", 0): json.dumps(state).encode()}
         for number in sorted(self._changed):
             part = slice(number * BLOCK, min(len(self.names), (number + 1) * BLOCK))
-            blocks["assets", number] = self.fleet.state(part)
+            blocks["assets", number] = self._silent.state(part)
             blocks["last", number] = self._last[part].tobytes()
         self._store.write_blocks(blocks)
         self._changed.clear()
+        self._kept = mark
+        if isinstance(source, Acknowledging):
+            source.acknowledge()
         self._due = begun + max(STORE_PERIOD_S, (time.monotonic() - begun) / STORE_SHARE)
 
     def _continue(self, store: Store) -> None:
@@ -237,7 +279,7 @@ class RunningFleet:
         if state:
             for key, value in self._identity().items():
                 if state.get(key) != value:
-                    what = "another version of Nisus" if key == "version" else "another model, tuning or assets"
+                    what = CHANGED.get(key, "another model, tuning or assets")
                     raise SourceError(f"store {store.path}: was written with {what}; remove it, or choose another path")
             for name in state["names"]:
                 self._place(name)
@@ -247,7 +289,7 @@ class RunningFleet:
                 elif kind == "last":
                     times = np.frombuffer(data, np.int64)
                     self._last[number * BLOCK : number * BLOCK + times.size] = times
-            self._newest, self._looked = state["newest"], state["looked"]
+            self._newest = state["newest"]
             self.counts.update(state["counts"])
         if isinstance(self.source, Marked):
             self.source.restore(state.get("source", {}))

@@ -62,6 +62,12 @@ def ordered(model: StateSpaceModel, table: FleetTable, sort: str = "health", dow
     return np.argsort(-values if down else values, kind="stable")
 
 
+def in_name_order(table: FleetTable) -> FleetTable:
+    """Return a table with its assets in the order of their names, which is the same for any number of processes."""
+    order = np.argsort(np.array(table.assets, object), kind="stable")
+    return FleetTable([table.assets[k] for k in order.tolist()], *(column[order] for column in table[1:]))
+
+
 def matching(names: Sequence[str], words: str, within: np.ndarray) -> np.ndarray:
     """Return those of the positions `within` whose asset has all words of a search in its name."""
     wanted = words.lower().split()

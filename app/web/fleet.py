@@ -21,6 +21,7 @@ from ..present.fleet_table import counts_of, histogram, matching, ordered, sibli
 from . import readings
 from .http import get, page_file
 from .metrics import exposed
+from .partitions import PartitionedFleet
 
 if TYPE_CHECKING:
     from prometheus_client.core import Metric
@@ -50,7 +51,7 @@ class _Order(NamedTuple):
 class FleetApi:
     """Answers with parts of the table of a running fleet."""
 
-    def __init__(self, running: RunningFleet) -> None:
+    def __init__(self, running: RunningFleet | PartitionedFleet) -> None:
         self._running = running
         self._orders: OrderedDict[_Order, np.ndarray] = OrderedDict()
         self._siblings: tuple[tuple[int, str], Siblings | None] = ((-1, ""), None)
@@ -58,7 +59,8 @@ class FleetApi:
 
     def routes(self) -> list[BaseRoute]:
         """Return the routes."""
-        return [get("/api/fleet", self.rows), get("/metrics", self.metrics), *readings.routes(self._running)]
+        take = self._running.take if isinstance(self._running, PartitionedFleet) else None
+        return [get("/api/fleet", self.rows), get("/metrics", self.metrics), *readings.routes(self._running, take)]
 
     def page(self, boot: str) -> Response:
         """Answer with the overview."""
@@ -172,7 +174,7 @@ def _short(value: float) -> float | None:
 class _Collector:
     """Metrics of a fleet, made anew for each scrape: a series for each grade of health, none for an asset."""
 
-    def __init__(self, running: RunningFleet) -> None:
+    def __init__(self, running: RunningFleet | PartitionedFleet) -> None:
         self._running = running
 
     def collect(self) -> Iterator[Metric]:

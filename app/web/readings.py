@@ -6,7 +6,7 @@ import asyncio
 import json
 import struct
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from typing import Any, Protocol
 
 from starlette.requests import Request
@@ -14,7 +14,7 @@ from starlette.responses import PlainTextResponse, Response
 from starlette.routing import BaseRoute, Route
 
 from estimators.errors import ConfigError, shown_name
-from sources.messages import ACCEPTED, DUPLICATE, REFUSED, Messages
+from sources.messages import ACCEPTED, DUPLICATE, REFUSED, Answer, Messages
 
 from ..live.running_fold import Keeper
 from ..twin.twin import Twin
@@ -50,13 +50,22 @@ class Receiver(Protocol):
         """The twin."""
 
 
-def routes(engine: Receiver) -> list[BaseRoute]:
-    """Return the routes of a running twin or fleet."""
+Take = Callable[[Sequence[Any]], Awaitable[dict[str, Any]]]
+"""Takes messages, and answers what became of them."""
+
+
+def routes(engine: Receiver, take: Take | None = None) -> list[BaseRoute]:
+    """Return the routes of a running twin or fleet; `take` takes messages in place of its source."""
 
     def names() -> dict[str, Any]:
         """Return names and units of the values that the twin reads."""
         source = messages_of(engine)
         return {"values": [{"name": name, "unit": source.units.get(name)} for name in source.names]}
+
+    async def taken(messages: Sequence[Any]) -> dict[str, Any]:
+        source = messages_of(engine)
+        found = await in_thread(lambda: answer(source, messages))
+        return found | {"stored": await stored(engine, source.accepted)}
 
     async def send(request: Request) -> Response:
         """Take measurements; answer what became of each."""
@@ -69,8 +78,9 @@ def routes(engine: Receiver) -> list[BaseRoute]:
             return PlainTextResponse(f"Nisus: Content-Type must be one of {', '.join(READERS)}.\n", 415)
         try:
             body = await bounded_body(request, MAX_BYTES)
-            found = await in_thread(lambda: answer(source, READERS[kind](body, source.fields)))
-            return Json(found | {"stored": await stored(engine, source.accepted)})
+            messages = await in_thread(lambda: READERS[kind](body, source.fields))
+            _check_count(len(messages))
+            return Json(await (take or taken)(messages))
         except TooLarge:
             bounds = f"{MAX_BYTES // 2**20} MB and {MAX_MESSAGES:,} messages"
             return PlainTextResponse(f"Nisus: a body may have {bounds}; send fewer messages at once.\n", 413)
@@ -100,7 +110,11 @@ def answer(source: Messages, messages: Sequence[Any]) -> dict[str, Any]:
         TooLarge: If they are too many; none is sent then.
     """
     _check_count(len(messages))
-    answers = source.send(messages)
+    return summary(source.send(messages))
+
+
+def summary(answers: Sequence[Answer]) -> dict[str, Any]:
+    """Return what became of each message, and the counts."""
     counts = {status: sum(item.status == status for item in answers) for status in (ACCEPTED, DUPLICATE, REFUSED)}
     items = [
         {"index": k, "status": item.status} | ({"reason": item.reason} if item.reason else {})

@@ -4,30 +4,52 @@ A process runs a twin with a store and is fed at 1 kHz through a pipe; some meas
 random moments (SIGKILL), and another one continues. After each kill the store is read: it must be complete, and have
 every measurement that was sent a second before the kill. At the end the events of all processes are folded in one go:
 each stored state of the filter must be that of the undisturbed fold, bit for bit. It exits with 1 if anything is wrong.
+
+With `--fleet` the processes of a fleet and their parent are killed while messages are published to a broker, some of
+them twice: at the end the table of all assets must be that of one process without kills.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import select
+import signal
 import struct
 import subprocess
 import sys
 import tempfile
 import threading
 import time
+from collections.abc import Callable
+from contextlib import suppress
+from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
+import pyarrow.parquet
 
+from app.cli.fleet import FLEET_PRELOADED, open_partition
+from app.cli.serve import run_child
+from app.live.fleet import RunningFleet
 from app.live.store import Store, read_store
+from app.present.fleet_table import arrow_table, in_name_order
+from app.terminal import EndRequest, when_asked_to_end
+from app.twin.fleet import load_fleet
 from app.twin.twin import Twin, load_twin
+from app.web import supervisor
+from app.web.partitions import PartitionedFleet
+from app.web.readings import messages_of
 from app.web.running import OpenedTwin, RunningTwin
 from estimators.fold import Fold
 from estimators.log import READING, Events, Log
 from estimators.snapshots import Base
+from sources.brokers import TopicMap, mqtt_client
+from sources.messages import ACCEPTED
+from tests.app.outputs.broker import Broker
 from tests.conftest import ROOT
 
 PERIOD_S = 0.001
@@ -177,17 +199,171 @@ def survive(
     return line
 
 
+class FleetRun(NamedTuple):
+    """A fleet of MQTT messages that are published while its processes are killed."""
+
+    assets: int = 40
+    rounds: int = 600
+    """Measurements of each asset, one a round."""
+    seconds: float = 600.0
+    processes: int = 2
+    parents: int = 10
+    """Each of so many kills is that of the parent."""
+
+    def messages(self, k: int) -> list[tuple[str, str]]:
+        """Return topics and payloads of a round; each 20th is published twice."""
+        rng = np.random.default_rng([1, k])
+        found = []
+        for j in range(self.assets):
+            body = {"v": round(40.0 + float(rng.normal()), 3), "t": FLEET_BEGIN + k * 10**9 + j, "n": k}
+            found += [(f"plant/pump {j}", json.dumps(body))] * (2 if (k * self.assets + j) % 20 == 0 else 1)
+        return found
+
+
+FLEET_BEGIN = 1_767_225_600 * 10**9
+LONG_S = "1e6"
+"""Longer than the run: no asset is silent, so the table does not depend on the clock."""
+
+FLEET_TOPIC: dict[str, Any] = {"values": {"winding": "v"}, "time": "t", "sequence": "n"}
+
+
+def run_fleet_part(folder: Path, expected: int) -> None:
+    """Run the processes of a fleet until this one is killed; write the table once it has all events."""
+    supervisor.FIRST_RETRY_S = supervisor.MAX_RETRY_S = 0.1
+    overrides = {"time.degraded_after": LONG_S, "time.stale_after": LONG_S}
+    plan = load_fleet(folder / "pumps.yaml", overrides)
+    processes = plan.config.processes
+    opened = partial(open_partition, folder / "pumps.yaml", overrides, processes, folder / "fleet.store")
+    fleet = PartitionedFleet(plan, lambda *_: None, partial(run_child, opened, False), preload=FLEET_PRELOADED)
+    fleet.start()
+    done = EndRequest()
+    when_asked_to_end(done.set)
+    told: list[int | None] = []
+    while not done.wait(0.1):
+        pids = [part.twin.process.pid for part in fleet._parts if part.twin.process is not None and part.twin.port]
+        if pids != told:
+            told = pids
+            print("pids", *pids, flush=True)
+        table = in_name_order(fleet.table()[2])
+        if int(table.events.sum()) >= expected:
+            pyarrow.parquet.write_table(arrow_table(plan.twin.model, table), folder / "table.part")
+            (folder / "table.part").rename(folder / "table.parquet")
+    fleet.stop()
+
+
+def undisturbed(folder: Path, run: FleetRun) -> bytes:
+    """Return the table of one process that gets each message once, as bytes of Parquet."""
+    path = folder / "one.yaml"
+    path.write_text(json.dumps({"twin": "motor_winding", "source": {"type": "push"}}))
+    overrides = {"time.degraded_after": LONG_S, "time.stale_after": LONG_S}
+    fleet = RunningFleet(load_fleet(path, overrides), lambda *_: None, threads=1)
+    topic = TopicMap(**FLEET_TOPIC, asset=1)
+    for k in range(run.rounds):
+        sent = [topic.message(name, text.encode()) for name, text in dict.fromkeys(run.messages(k))]
+        assert {item.status for item in messages_of(fleet).send(sent)} == {ACCEPTED}
+        fleet.step()
+    table = arrow_table(fleet.plan.twin.model, in_name_order(fleet.table()[2]))
+    fleet.stop()
+    pyarrow.parquet.write_table(table, folder / "one.parquet")
+    return (folder / "one.parquet").read_bytes()
+
+
+class FleetParent:
+    """The process that starts those of a fleet; it says which run."""
+
+    def __init__(self, folder: Path, expected: int) -> None:
+        command = [sys.executable, "-m", "tests.benchmarks.kills", "--fed", str(folder), "--fleet"]
+        command += ["--kills", str(expected)]
+        self.process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True)
+        self.pids: list[int] = []
+        threading.Thread(target=self._listen, daemon=True).start()
+
+    def _listen(self) -> None:
+        assert self.process.stdout is not None
+        for line in self.process.stdout:
+            if line.startswith("pids"):
+                self.pids = [*map(int, line.split()[1:])]
+
+    def kill(self) -> None:
+        """Kill it alone; its processes notice that."""
+        self.process.kill()
+        self.process.wait()
+
+
+def survive_fleet(
+    kills: int, folder: Path, run: FleetRun, seed: int = 1, report: Callable[[str], None] = lambda line: None
+) -> str:
+    """Publish the messages of a fleet while its processes are killed; return a line of results.
+
+    Raises:
+        AssertionError: If the table is not that of the undisturbed process, to the last bit.
+    """
+    wanted, expected = undisturbed(folder, run), run.assets * run.rounds
+    broker = Broker(folder, "max_queued_messages 0\nmax_inflight_messages 0\n")
+    source = {"type": "mqtt", "host": "127.0.0.1", "port": broker.port, "client_id": "kills",
+              "topics": {"plant/{asset}": FLEET_TOPIC}}  # fmt: skip
+    fleet = {"twin": "motor_winding", "processes": run.processes, "source": source}
+    (folder / "pumps.yaml").write_text(json.dumps(fleet))
+    parent, rng = FleetParent(folder, expected), np.random.default_rng(seed)
+    publisher = mqtt_client(SimpleNamespace(user=None, ca_file=None), None, client_id="")
+    publisher.max_queued_messages_set(0)
+    publisher.connect("127.0.0.1", broker.port)
+    publisher.loop_start()
+    while len(parent.pids) < run.processes:  # subscribed from now on, also while they are dead
+        time.sleep(0.05)
+    killed, parents, published, begun = 0, 0, 0, time.monotonic()
+    due = np.sort(rng.uniform(0.0, run.seconds, kills))
+    while published < run.rounds or killed < kills:
+        now = time.monotonic() - begun
+        while published < min(run.rounds, now / run.seconds * run.rounds):
+            for name, text in run.messages(published):
+                publisher.publish(name, text, qos=1)
+            published += 1
+        if killed < kills and now > due[killed] and parent.pids:
+            if killed % run.parents == run.parents - 1:
+                parent.kill()
+                parent, parents = FleetParent(folder, expected), parents + 1
+            else:
+                with suppress(ProcessLookupError):
+                    os.kill(parent.pids[int(rng.integers(len(parent.pids)))], signal.SIGKILL)
+                parent.pids = []
+            killed += 1
+            report(f"kill {killed} at {now:.1f} s, after {published} rounds")
+        time.sleep(0.01)
+    while not (folder / "table.parquet").exists():
+        time.sleep(0.05)
+    found = (folder / "table.parquet").read_bytes()
+    parent.process.terminate()
+    parent.process.wait()
+    publisher.disconnect()
+    publisher.loop_stop()
+    broker.stop()
+    line = f"{expected} messages of {run.assets} assets in {run.processes} processes, {killed} kills"
+    line += f", {parents} of them of the parent: the table is"
+    assert found == wanted, f"{line} another than that of one process without kills"
+    return f"{line} that of one process without kills, bit for bit"
+
+
 def main() -> int:
     """Run the benchmark, or one of its processes."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--kills", type=int, default=200)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--fed", type=Path, help=argparse.SUPPRESS)
+    parser.add_argument("--fleet", action="store_true", help="kill the processes of a fleet, and their parent")
+    parser.add_argument("--seconds", type=float, default=600.0, help="length of the stream of a fleet")
     given = parser.parse_args()
+    if given.fed is not None and given.fleet:
+        run_fleet_part(given.fed, given.kills)
+        return 0
     if given.fed is not None:
         run_fed(given.fed)
     with tempfile.TemporaryDirectory() as folder:
         try:
+            if given.fleet:
+                run = FleetRun(seconds=given.seconds)
+                print(survive_fleet(given.kills, Path(folder), run, given.seed, lambda line: print(line, flush=True)))
+                return 0
             print(survive(given.kills, Path(folder), given.seed, report=lambda line: print(line, flush=True)))
         except AssertionError as error:
             print(f"wrong: {error}")

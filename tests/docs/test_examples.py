@@ -107,3 +107,8 @@ def test_fused_twins_are_as_consistent_as_each():
     assert rmse["fused"] < min(rmse["edge"], rmse["thermal"])
     sizes = {name: np.linalg.det(cov) for name, (_, cov) in found.items()}
     assert np.all(sizes["fused"] <= np.minimum(sizes["edge"], sizes["thermal"]) * (1.0 + 1e-9))
+
+
+def test_the_script_of_a_package_that_is_not_installed_compiles():
+    path = EXAMPLES / "kafka_to_fleet.py"
+    compile(path.read_text(), str(path), "exec")

@@ -65,6 +65,15 @@ def _open_mqtt(opening: Opening) -> Source:
     messages = _messages(opening)
     _check_names(opening, messages, {name for topic in section.topics.values() for name in topic.values}, "topics")
     topics: dict[str, TopicMap] = {}
+    subscribed: list[str] = []
+    part = opening.partition
+    by_hand = opening.stored and section.client_id is not None and section.qos > 0
+    if by_hand and section.qos == 2:
+        rule = "is 2; set it to 1: a fleet with --store takes each of its messages once"
+        raise failure(opening.loaded, (*opening.key, "qos"), rule)
+    client_id = section.client_id
+    if client_id is not None and part.processes > 1:
+        client_id = f"{client_id}-{part.number}"
     for name, topic in section.topics.items():
         levels = name.split("/")
         asset = levels.index(ASSET_LEVEL) if isinstance(section, FleetMqttSection) else None
@@ -75,14 +84,22 @@ def _open_mqtt(opening: Opening) -> Source:
         if name in topics:
             raise failure(opening.loaded, (*opening.key, "topics"), f"has {name} twice; name each topic once")
         topics[name] = TopicMap(**topic.model_dump(), asset=asset)
+        if asset is None or not opening.assets:
+            subscribed.append(name)
+        else:
+            own = [item for item in opening.assets if part.has(item) and not set(item) & set("+#/")]
+            subscribed += ["/".join([*levels[:asset], item, *levels[asset + 1 :]]) for item in own]
     return MqttSource(
         messages,
         section,
         topics,
         qos=section.qos,
         password=_password(section.password_env),
-        client_id=section.client_id,
+        client_id=client_id,
         report=opening.report,
+        wanted=part.has,
+        subscribed=subscribed,
+        by_hand=by_hand,
     )
 
 

@@ -1,5 +1,6 @@
 """Fleets of messages, by HTTP and MQTT: each asset has the values of a fold over its own messages."""
 
+import asyncio
 import io
 import json
 import os
@@ -7,6 +8,8 @@ import signal
 import subprocess
 import sys
 import time
+import zlib
+from types import SimpleNamespace
 
 import numpy as np
 import pyarrow as pa
@@ -14,16 +17,21 @@ import pytest
 
 import app.live.fleet as live
 from app.live.fleet import RunningFleet
+from app.present.fleet_table import in_name_order
 from app.twin.fleet import load_fleet
 from app.twin.twin import load_twin
+from app.web.partitions import PartitionedFleet, PartitionServer
 from app.web.readings import READERS, answer, messages_of
 from estimators import Log
 from estimators.errors import NisusError
 from estimators.fold import Fold
 from estimators.log import Events
 from estimators.track import HEALTH_NAMES, USABLE
+from sources.brokers import TopicMap
+from sources.source import Partition
 from tests.app.cli.test_fleet import FLEET, write
 from tests.app.outputs.broker import Broker, Listener, needs_mosquitto
+from tests.benchmarks.kills import FleetRun, survive_fleet
 from tests.conftest import ROOT
 
 BEGIN, SECOND = 1_767_225_600 * 10**9, 10**9
@@ -199,3 +207,168 @@ def test_a_fleet_that_was_killed_continues_to_the_same_bits(ending, tmp_path, mo
     with pytest.raises(NisusError, match=r"fleet.store: was written with another model, tuning or assets; remove it"):
         plan = load_fleet("pumps.yaml", {"R.winding": "9"})
         RunningFleet(plan, lambda *_: None, threads=1, store=tmp_path / "fleet.store")
+
+
+def same(mine, its):
+    """Whether two tables have the same assets and the same bits."""
+    pairs = zip(mine[1:], its[1:], strict=True)
+    return mine.assets == its.assets and all(a.astype(b.dtype).tobytes() == b.tobytes() for a, b in pairs)
+
+
+def test_partitions_of_tables_have_the_bits_of_one_process(tmp_path, monkeypatch):
+    """Also late rows, which are dropped at the same folds, and silent assets, by the newest time of all."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(live, "MAX_PENDING", 500)
+    monkeypatch.setattr("sources.tables.follow.PIECE_BYTES", 2**13)
+    rng = np.random.default_rng(2)
+    rows = [
+        (float(t if (t, k) != (90, 5) else 3.5), f"pump {k}", round(40.0 + float(rng.normal()), 3))
+        for t in range(100)
+        for k in range(30)
+        if not (k % 7 == 3 and t > 40)
+    ]
+    write(tmp_path / "a.csv", rows)
+    (tmp_path / "pumps.yaml").write_text(FLEET.format(files="a.csv"))
+    plan, tables = load_fleet("pumps.yaml"), []
+    for partition in (Partition(), *(Partition(k, 3) for k in range(3))):
+        fleet = RunningFleet(plan, lambda *_: None, threads=1, partition=partition)
+        fleet.run()
+        assert all(zlib.crc32(name.encode()) % partition.processes == partition.number for name in fleet.names)
+        tables.append(fleet.table()[2])
+        fleet.stop()
+    whole, *parts = tables
+    names = [name for part in parts for name in part.assets]
+    merged = type(whole)(names, *map(np.concatenate, zip(*(part[1:] for part in parts), strict=True)))
+    assert len(names) == 30 and whole.stale.sum() == 1 and "stale" in {HEALTH_NAMES[k] for k in whole.health}
+    assert same(in_name_order(merged), in_name_order(whole))
+
+
+def mqtt(port, **more):
+    topics = {"plant/{asset}": {"values": {"winding": "v"}, "time": "t"}}
+    return {"type": "mqtt", "host": "127.0.0.1", "port": port, "topics": topics, "client_id": "pumps", **more}
+
+
+def packet(mid, k, asset="a", dup=False):
+    payload = json.dumps({"v": 40.0 + k, "t": BEGIN + k * SECOND}).encode()
+    return SimpleNamespace(mid=mid, topic=f"plant/{asset}", payload=payload, dup=dup, qos=1, retain=False)
+
+
+def test_packets_that_are_sent_again_count_once(tmp_path, monkeypatch):
+    """Before and after they are stored, after a restart, and with an id that the broker has used again."""
+    monkeypatch.setattr(live, "STORE_PERIOD_S", 1e9)
+
+    topic = TopicMap(values={"winding": "v"}, time="t", asset=1)
+
+    def opened():
+        fleet, _ = running(tmp_path, mqtt(1))
+        fleet.stop()
+        fleet = RunningFleet(fleet.plan, lambda *_: None, threads=1, store=tmp_path / "fleet.store")
+        fleet._due = 1e18  # it is written when the test says so
+        acknowledged, arrived = [], fleet.source._callback(topic)
+        monkeypatch.setattr(fleet.source._client, "ack", lambda mid, qos: acknowledged.append(mid))
+        return fleet, acknowledged, lambda *packets: [arrived(fleet.source._client, None, each) for each in packets]
+
+    fleet, acknowledged, arrive = opened()
+    arrive(packet(1, 0), packet(2, 1))
+    fleet.step()
+    fleet._keep(at_once=True)
+    assert acknowledged == [1, 2]
+    arrive(packet(3, 2), packet(3, 2, dup=True))
+    fleet.step()
+    arrive(packet(3, 2, dup=True), packet(2, 1, dup=True))
+    fleet.step()
+    assert acknowledged == [1, 2, 2] and fleet.table()[2].events.tolist() == [3]
+    fleet.stop()  # without the store: packet 3 is lost with the process, and sent again
+    fleet, acknowledged, arrive = opened()
+    assert fleet.table()[2].events.tolist() == [2]
+    arrive(packet(2, 1, dup=True), packet(3, 2, dup=True), packet(1, 3, dup=True))
+    fleet.step()
+    assert acknowledged == [2] and fleet.table()[2].events.tolist() == [4]
+    fleet._keep(at_once=True)
+    assert acknowledged == [2, 3, 1]
+    last = folded([40.0, 41.0, 42.0, 43.0])
+    assert fleet.table()[2].mean[0].tobytes() == last.mean.tobytes()
+    fleet.stop()
+
+
+def test_a_broker_keeps_what_was_not_stored(tmp_path, monkeypatch):
+    needs_mosquitto()
+    monkeypatch.setattr(live, "STORE_PERIOD_S", 1e9)
+    broker = Broker(tmp_path)
+    listener = Listener(broker)
+    named = ["pump 3", "pump 4", "pump 5"]
+    before, _ = running(tmp_path, mqtt(broker.port), assets=named)
+    before.stop()
+    plan, store, part = before.plan, tmp_path / "fleet.store", Partition(0, 2)
+    fleet = RunningFleet(plan, lambda *_: None, threads=1, store=store, partition=part)
+    own = [name for name in named if zlib.crc32(name.encode()) % 2 == 0]
+    assert fleet.names == own and 0 < len(own) < 3 and fleet.source.connected.wait(60.0)
+
+    def publish(first, last):
+        for k in range(first, last):
+            for name in named:
+                listener.publish(f"plant/{name}", {"v": 40.0 + k, "t": BEGIN + k * SECOND})
+
+    def step_until(fleet, count):
+        while fleet.table()[2].events.min(initial=10**9) < count:
+            fleet.step()
+
+    publish(0, 30)
+    step_until(fleet, 30)
+    fleet._keep(at_once=True)
+    publish(30, 60)
+    step_until(fleet, 60)
+    fleet.stop()  # as with a kill: nothing was stored or acknowledged since
+    publish(60, 70)
+    again = RunningFleet(plan, lambda *_: None, threads=1, store=store, partition=part)
+    assert again.table()[2].events.tolist() == [30] * len(own)
+    step_until(again, 70)
+    assert again.table()[2].events.tolist() == [70] * len(own)
+    last = folded([40.0 + k for k in range(70)])
+    assert again.table()[2].mean.tobytes() == np.tile(last.mean, (len(own), 1)).tobytes()
+    again.stop()
+    with pytest.raises(NisusError, match=r"was written with another number of processes; remove it"):
+        RunningFleet(plan, lambda *_: None, threads=1, store=store)
+    with pytest.raises(NisusError, match=r"source.qos is 2; set it to 1"):
+        path = tmp_path / "pumps.yaml"
+        path.write_text(json.dumps({"twin": "motor_winding", "source": mqtt(broker.port, qos=2)}))
+        RunningFleet(load_fleet(path), lambda *_: None, threads=1, store=tmp_path / "new.store")
+    listener.stop()
+    broker.stop()
+
+
+def test_messages_go_to_the_process_of_their_asset_and_the_table_is_that_of_all(tmp_path):
+    whole, _ = running(tmp_path, {"type": "push"}, processes=2)
+    sent = [message(k, f"pump {j}", 40.0 + k + j) for k in range(6) for j in range(9)]
+    answer(messages_of(whole), sent)
+    whole.step()
+    fleet = PartitionedFleet(whole.plan, lambda *_: None, lambda *_: None)
+    servers = []
+    for k, part in enumerate(fleet._parts):
+        own = RunningFleet(whole.plan, lambda *_: None, threads=1, partition=Partition(k, 2), store=tmp_path / f"{k}")
+        servers.append(PartitionServer(own))
+        servers[-1].start()
+        part.twin.port, part.twin.token = servers[-1].door.port, servers[-1].door.token
+    numbered = [{**item, "source": "plc", "sequence": k} for k, item in enumerate(sent)]
+    found = asyncio.run(fleet.take([*numbered, {"values": {"winding": 1.0}}]))
+    assert (found["accepted"], found["refused"], found["stored"]) == (54, 1, True)
+    assert [item["index"] for item in found["items"] if item["status"] == "refused"] == [54]
+    assert asyncio.run(fleet.take(numbered))["duplicate"] == 54
+    while fleet.table()[2].events.sum() < 54:
+        pass
+    assert same(in_name_order(fleet.table()[2]), in_name_order(whole.table()[2]))
+    assert fleet.find("pump 3") and not fleet.ended
+    servers[1].stop()
+    fleet._parts[1].twin.port = 0
+    found = asyncio.run(fleet.take([message(9, f"pump {j}", 40.0) for j in range(9)]))
+    here = [zlib.crc32(f"pump {j}".encode()) % 2 == 0 for j in range(9)]
+    assert [item["status"] == "accepted" for item in found["items"]] == here and not found["stored"]
+    assert "is starting; send it again" in found["items"][here.index(False)]["reason"]
+    servers[0].stop()
+    fleet.stop()
+    whole.stop()
+
+
+def test_killed_processes_leave_the_table_of_one_that_was_not(tmp_path):
+    needs_mosquitto()
+    survive_fleet(2, tmp_path, FleetRun(assets=8, rounds=60, seconds=2.0, parents=2))

@@ -29,11 +29,11 @@ def needs_mosquitto() -> None:
 class Broker:
     """A Mosquitto that may be stopped and started again at its port."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, more: str = "") -> None:
         self.port = free_port()
         self.settings = folder / "mosquitto.conf"
         self.settings.write_text(
-            f"listener {self.port} 127.0.0.1\nallow_anonymous true\npersistence false\nset_tcp_nodelay true\n"
+            f"listener {self.port} 127.0.0.1\nallow_anonymous true\npersistence false\nset_tcp_nodelay true\n{more}"
         )
         self.start()
 
