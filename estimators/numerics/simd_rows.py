@@ -4,8 +4,8 @@ Padding is never part of a result.
 
 Measured on a shared x86-64 machine against plain Numba loops, for 2, 4, 7, 16 and 48 states: a covariance of sigma
 points takes 6 ns for 17, 16 for 99, 37 for 463, 310 for 2,640 and 8,000 for 65,000; a factor 11 ns for 16, 33 for 48,
-61 for 125, 300 for 700 and 3,900 for 10,900. With the products in blocks a step of the Kalman filter takes 1.1 µs for 1.6
-with 8 states, 3.2 for 13.9 with 24 and 9.8 for 84 with 48.
+61 for 125, 300 for 700 and 3,900 for 10,900. With the products in blocks a step of the Kalman filter takes 1.1 µs for
+1.6 with 8 states, 3.2 for 13.9 with 24 and 9.8 for 84 with 48.
 """
 
 from __future__ import annotations
