@@ -73,13 +73,13 @@ def beside_eigen() -> Iterator[BenchmarkRow]:
         for _ in range(ROUNDS):
             lines = subprocess.run([program, str(REPETITIONS)], capture_output=True, text=True, check=True).stdout
             for line in lines.splitlines():
-                n, m, is_joseph, *theirs = line.split()
-                case = int(n), int(m), is_joseph == "1"
+                size, rows, form, wanted, theirs = line.split()
+                case = int(size), int(rows), form == "1"
                 _ours(*case, 1)
                 trace, spent = _ours(*case, REPETITIONS * 64 // case[0] ** 2)
-                if not np.isclose(trace, float(theirs[0]), rtol=1e-10):
-                    raise ValueError(f"the traces differ: {trace} and {theirs[0]}")
-                pairs.setdefault(case, []).append((spent, float(theirs[1])))
+                if not np.isclose(trace, float(wanted), rtol=1e-10):
+                    raise ValueError(f"the traces differ: {trace} and {wanted}")
+                pairs.setdefault(case, []).append((spent, float(theirs)))
     for (n, m, is_joseph), rounds in pairs.items():
         figures = {
             "Nisus [ns]": median(a for a, _ in rounds),
