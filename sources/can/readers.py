@@ -13,7 +13,7 @@ from contextlib import suppress
 from io import TextIOWrapper
 from itertools import islice
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -21,6 +21,9 @@ from estimators.errors import SourceError
 
 from ..formats import suffix_of
 from ..units import second_ns
+
+if TYPE_CHECKING:
+    from .blf import FrameBlock
 
 FIRST_CHUNK_FRAMES = 256  # Frames of the first chunk, so that it arrives at once
 MAX_TIME_S = 2.0**62 / 1e9  # Distance of a valid time from 1970, s
@@ -52,10 +55,16 @@ def read_messages(path: Path, wanted: frozenset[int] | None, longest: int) -> It
     Raises:
         SourceError: If nothing can be read.
     """
+    import can
+
+    from .blf import BlfBlocks, FrameBlock
+
     _correct_readers()
     warned = _Warnings()
     logging.getLogger("can").handlers = [warned]
     reader = open_reader(path)
+    if isinstance(reader, can.BLFReader):
+        reader.__class__ = BlfBlocks
     lines = _Lines(reader.file) if isinstance(getattr(reader, "file", None), TextIOWrapper) else None
     if lines is not None:
         reader.file = lines
@@ -68,9 +77,13 @@ def read_messages(path: Path, wanted: frozenset[int] | None, longest: int) -> It
         size = FIRST_CHUNK_FRAMES
         while True:
             chunk: list[Any] = []
+            block: FrameBlock | None = None
             try:
                 # One by one, so that frames before the fault are kept.
                 for message in islice(messages, size):
+                    if isinstance(message, FrameBlock):
+                        block = message
+                        break
                     chunk.append(message)
             except SourceError:
                 raise
@@ -78,10 +91,14 @@ def read_messages(path: Path, wanted: frozenset[int] | None, longest: int) -> It
                 fault = " ".join(str(error).split())[:160] or type(error).__name__
             count += len(chunk)
             errors += sum(message.is_error_frame for message in chunk)
-            raw, lost = _columns(chunk, wanted, longest, buses, seen)
-            broken += lost
-            yield raw
-            if fault or len(chunk) < size:
+            if chunk or block is None:
+                raw, lost = _columns(chunk, wanted, longest, buses, seen)
+                broken += lost
+                yield raw
+            if block is not None:
+                count += block.total
+                yield _selected(block, wanted, longest, buses, seen)
+            elif fault or len(chunk) < size:
                 break
             size = CHUNK_FRAMES
         fault = fault or (lines.fault if lines is not None else "") or warned.fault or _missing_end(path, reader)
@@ -273,6 +290,26 @@ def _columns(
         len(messages),
     )
     return raw, broken
+
+
+def _selected(
+    block: FrameBlock,
+    wanted: frozenset[int] | None,
+    longest: int,
+    buses: dict[BusName, int],
+    seen: Counter[tuple[BusName, int]],
+) -> Raw:
+    """Return the wanted frames of a block; as `_columns`."""
+    codes, counts = np.unique((block.bus << 32) + block.key, return_counts=True)
+    for code, count in zip(codes.tolist(), counts.tolist(), strict=True):
+        seen[code >> 32, code & 0xFFFFFFFF] += count
+    rows = np.arange(block.key.size) if wanted is None else np.flatnonzero(np.isin(block.key, list(wanted)))
+    numbers, inverse = np.unique(block.bus[rows], return_inverse=True)
+    places = np.array([buses.setdefault(number, len(buses)) for number in numbers.tolist()], np.int64)
+    data = np.zeros((rows.size, longest), np.uint8)
+    data[:, :8] = block.data[rows, :longest]
+    length = np.minimum(block.length[rows], longest)
+    return Raw(block.t[rows], block.key[rows], places[inverse], length, data, tuple(buses), block.total)
 
 
 def _missing_end(path: Path, reader: Any) -> str:

@@ -165,7 +165,7 @@ def test_flipped_tables_are_read_or_refused(tmp_path, name):
 
 
 def test_a_reader_that_dies_leaves_what_it_gave(tmp_path, messages, monkeypatch):  # noqa: F811
-    path, other = tmp_path / "a.blf", tmp_path / "b.log"
+    path, other = tmp_path / "a.log", tmp_path / "b.log"
     write(path, messages)
     write(other, messages[:10])
     monkeypatch.setattr(can_log, "read_messages", readers_that_fail.frames_then_abort)
@@ -175,10 +175,10 @@ def test_a_reader_that_dies_leaves_what_it_gave(tmp_path, messages, monkeypatch)
     assert len(got) == sum(k % 3 != 2 for k in range(256)) and log.frames == 256
     assert reports.counts["truncated file"] == 1
     assert reports.texts["truncated file"] == (
-        "a.blf: the file is damaged (its reader was ended by SIGABRT); 256 frames were read"
+        "a.log: the file is damaged (its reader was ended by SIGABRT); 256 frames were read"
     )
     monkeypatch.setattr(can_log, "read_messages", readers_that_fail.abort_at_once)
-    with pytest.raises(SourceError, match=r"a\.blf: it cannot be read as BLF \(its reader was ended by SIGABRT\)"):
+    with pytest.raises(SourceError, match=r"a\.log: it cannot be read as LOG \(its reader was ended by SIGABRT\)"):
         read_all(CanLog([path], decoder_of(tmp_path)))
 
 
