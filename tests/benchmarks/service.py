@@ -48,7 +48,8 @@ def measure(count: int, seconds: float, folder: Path) -> list[str]:
         service.wait(all_run, patience_s=60.0 + START_S * count)
         print(f"{count} twins run after {time.monotonic() - begun:.0f} s")
         time.sleep(5.0)
-        before, since, again = service.twins(), time.monotonic(), []
+        before, since = service.twins(), time.monotonic()
+        again: list[float] = []
         killed: set[str] = set()
         while (left := since + seconds - time.monotonic()) > 0.0:
             time.sleep(min(left, KILL_PERIOD_S / 2))
