@@ -166,9 +166,9 @@ class RunningFleet:
     def _run(self) -> None:
         try:
             self.run(lambda: not self._stopping.is_set())
-        except NisusError as error:
-            self.failure = str(error)
-            self.note("failed", f"source failed: {error}")
+        except Exception as error:  # noqa: BLE001  the overview stays, and says why nothing is folded any more
+            self.failure = str(error) if isinstance(error, NisusError) else f"{type(error).__name__}: {error}"
+            self.note("failed", f"source failed: {self.failure}")
 
     def step(self) -> bool:
         """Read the next events and fold what waits; return False at the end of the source."""
@@ -285,7 +285,7 @@ class RunningFleet:
                 self._place(name)
             for (kind, number), data in blocks.items():
                 if kind == "assets":
-                    self.fleet.restore(number * BLOCK, data)
+                    self._silent.restore(number * BLOCK, data)
                 elif kind == "last":
                     times = np.frombuffer(data, np.int64)
                     self._last[number * BLOCK : number * BLOCK + times.size] = times

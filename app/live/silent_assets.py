@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from itertools import groupby
+
 import numpy as np
 
 from estimators.fleet import Fleet
 from estimators.log import TICK, Events
+
+LENGTH_BYTES = 8
 
 
 class SilentAssets:
@@ -17,21 +21,17 @@ class SilentAssets:
 
     def __init__(self, fleet: Fleet) -> None:
         self._fleet = fleet
-        self._places = np.zeros(0, np.int64)
-        self._states = np.zeros((0, 0), np.uint8)
-        """State of each after its last event, (silent, bytes)."""
+        self._states: dict[int, bytes] = {}
+        """State of each after its last event, by position."""
 
     def query(self, places: np.ndarray, t: int) -> None:
         """Show the estimate and health of assets (rising positions) at a time, ns. All events must be folded."""
-        self.put_back(places)
-        parts = [self._fleet.state(slice(run[0], run[-1] + 1)) for run in _runs(places)]
-        states = np.frombuffer(b"".join(parts), np.uint8).reshape(places.size, -1)
-        if self._places.size:
-            places_now = np.concatenate([self._places, places])
-            order = np.argsort(places_now, kind="stable")
-            self._places, self._states = places_now[order], np.concatenate([self._states, states])[order]
-        else:
-            self._places, self._states = places, states
+        for place in places.tolist():
+            known = self._states.get(place)
+            if known is None:
+                self._states[place] = self._fleet.state(slice(place, place + 1))
+            else:
+                self._fleet.restore(place, known)
         times, none = np.full(places.size, t), np.zeros(places.size, np.int32)
         missing = np.full((places.size, self._fleet.model.width), np.nan)
         self._fleet.add_events(places, Events(times, times, np.full(places.size, TICK, np.int8), none, missing))
@@ -39,27 +39,34 @@ class SilentAssets:
 
     def put_back(self, places: np.ndarray) -> None:
         """Put back the state of those of some assets that are silent: they have new events."""
-        if not self._places.size:
-            return
-        chosen = np.isin(self._places, places)
-        states = self._states[chosen]
-        at = 0
-        for run in _runs(self._places[chosen]):
-            self._fleet.restore(int(run[0]), states[at : at + run.size].tobytes())
-            at += run.size
-        self._places, self._states = self._places[~chosen], self._states[~chosen]
+        if self._states:
+            for place in places.tolist():
+                state = self._states.pop(place, None)
+                if state is not None:
+                    self._fleet.restore(place, state)
 
     def state(self, part: slice) -> bytes:
-        """Return the state of assets as `Fleet.state` does, that of silent ones after their last event."""
-        data = self._fleet.state(part)
-        mine = (self._places >= part.start) & (self._places < part.stop)
-        if not mine.any():
-            return data
-        rows = np.frombuffer(data, np.uint8).reshape(part.stop - part.start, -1).copy()
-        rows[self._places[mine] - part.start] = self._states[mine]
-        return rows.tobytes()
+        """Return the states of assets, that of silent ones after their last event, for `restore`."""
+        pieces: list[bytes] = []
+        for silent, group in groupby(range(part.start, part.stop), self._states.__contains__):
+            places = list(group)
+            runs = (
+                [self._states[k] for k in places] if silent else [self._fleet.state(slice(places[0], places[-1] + 1))]
+            )
+            counts = [1] * len(places) if silent else [len(places)]
+            for count, state in zip(counts, runs, strict=True):
+                pieces += [np.array([count, len(state)], np.int64).tobytes(), state]
+        return b"".join(pieces)
 
+    def restore(self, first: int, data: bytes) -> None:
+        """Take over the `state` of assets from a position on.
 
-def _runs(places: np.ndarray) -> list[np.ndarray]:
-    """Split rising positions where one is left out."""
-    return np.split(places, np.flatnonzero(np.diff(places) != 1) + 1) if places.size else []
+        Raises:
+            EstimatorError: If it is not of a fleet of this model, estimator and tuning.
+        """
+        at = 0
+        while at < len(data):
+            count, size = np.frombuffer(data, np.int64, 2, at).tolist()
+            at += 2 * LENGTH_BYTES
+            self._fleet.restore(first, data[at : at + size])
+            first, at = first + count, at + size
