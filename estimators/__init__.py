@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from .diagnostics.consistency import mean_nees as mean_nees
     from .diagnostics.health import HealthPolicy as HealthPolicy
     from .errors import NisusError as NisusError
-    from .fleet import Fleet as Fleet
+    from .fleet.fleet import Fleet as Fleet
     from .fusion import covariance_intersection as covariance_intersection
     from .fusion import fuse as fuse
     from .interface.by_name import fold as fold
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 _HOMES = {
     "ESTIMATORS": "registry",
-    "Fleet": "fleet",
+    "Fleet": "fleet.fleet",
     "HealthPolicy": "diagnostics.health",
     "Log": "log",
     "MODELS": "models",

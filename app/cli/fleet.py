@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from config.yaml_files import writing
 from estimators.errors import ConfigError
-from estimators.fleet import FleetTable
+from estimators.fleet.table import FleetTable
 from sources.source import Partition
 
 from ..live.fleet import RunningFleet

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from estimators.errors import NisusError, SourceError, quoted
-from estimators.fleet import FleetTable
+from estimators.fleet.table import FleetTable
 from estimators.log import BEFORE
 from sources.source import NO_ASSET, WHOLE, Acknowledging, AssetEvents, Marked, Partition, Report, ignore
 

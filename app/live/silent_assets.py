@@ -6,7 +6,7 @@ from itertools import groupby
 
 import numpy as np
 
-from estimators.fleet import Fleet
+from estimators.fleet.fleet import Fleet
 from estimators.log import TICK, Events
 
 LENGTH_BYTES = 8

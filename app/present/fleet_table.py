@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from estimators.fleet import FleetTable
+from estimators.fleet.siblings import MIN_ASSETS, Siblings, siblings
+from estimators.fleet.table import FleetTable
 from estimators.model.state_space import StateSpaceModel
-from estimators.siblings import MIN_ASSETS, Siblings, siblings
 from estimators.track import HEALTH_NAMES, VERDICT_NAMES
 
 from ..format_time import counted

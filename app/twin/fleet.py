@@ -16,7 +16,7 @@ from config.loader import shipped
 from config.problems import check_section
 from config.yaml_files import as_flow, read_text
 from estimators.errors import ConfigError, EstimatorError
-from estimators.fleet import Fleet
+from estimators.fleet.fleet import Fleet
 from sources.source import WHOLE, Partition
 from sources.tables.one_asset import rows_of_asset
 from sources.tables.text import column_of

@@ -12,7 +12,7 @@ import numpy as np
 from config.fleet_schema import AssetTuningsSection
 from config.yaml_files import ValuePlaces, shown_path
 from estimators.errors import ConfigError, SourceError, nearest, quoted
-from estimators.fleet_tunings import GROUPS
+from estimators.fleet.tunings import GROUPS
 from estimators.tuning import Tuning
 from sources.tables.text import csv_format, open_text
 from sources.units import conversion, heading_unit

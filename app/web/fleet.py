@@ -12,8 +12,8 @@ from starlette.responses import Response
 from starlette.routing import BaseRoute
 
 from estimators.errors import ConfigError, nearest
-from estimators.fleet import FleetTable
-from estimators.siblings import Siblings
+from estimators.fleet.siblings import Siblings
+from estimators.fleet.table import FleetTable
 from estimators.track import HEALTH_NAMES
 
 from ..live.fleet import RunningFleet

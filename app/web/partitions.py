@@ -22,7 +22,7 @@ from starlette.responses import Response
 from starlette.routing import BaseRoute, Route
 
 from estimators.errors import SourceError
-from estimators.fleet import FleetTable
+from estimators.fleet.table import FleetTable
 from sources.messages import ASSET, REFUSED, Answer
 from sources.source import Partition, Report
 

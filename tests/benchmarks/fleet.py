@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from estimators import MODELS, Log, Tuning
-from estimators.fleet import RECENT, Fleet
+from estimators.fleet.fleet import RECENT, Fleet
 from estimators.fold import Fold
 from estimators.model.state_space import StateSpaceModel
 from estimators.numerics.jit import threaded

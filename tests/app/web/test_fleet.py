@@ -16,7 +16,7 @@ from app.live.fleet import RunningFleet
 from app.twin.fleet import load_fleet
 from app.web.fleet import FleetApi, id_of
 from estimators.errors import ConfigError
-from estimators.siblings import siblings
+from estimators.fleet.siblings import siblings
 from estimators.track import HEALTH_NAMES
 from tests.app.cli.test_fleet import FLEET, pump_rows, write
 from tests.conftest import ROOT

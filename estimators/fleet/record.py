@@ -8,10 +8,10 @@ decision can go back beyond the snapshots of the block.
 
 from __future__ import annotations
 
-from .fleet_memory import ASKED, FIRST, FLOOR, LAST, NEXT, PHASE, PINNED, REWOUND, N, record_at, state_at
-from .gate.isolation import MAX_COMPARED_EVENTS
-from .gate.rejection_runs import RUN
-from .numerics.jit import embedded, ints, part
+from ..gate.isolation import MAX_COMPARED_EVENTS
+from ..gate.rejection_runs import RUN
+from ..numerics.jit import embedded, ints, part
+from .memory import ASKED, FIRST, FLOOR, LAST, NEXT, PHASE, PINNED, REWOUND, N, record_at, state_at
 
 SPACING = 256
 """Least number of events between two snapshots of a record, unless more than so many are recent."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from .numerics.jit import embedded, jit, part
+from ..numerics.jit import embedded, jit, part
 
 
 @embedded

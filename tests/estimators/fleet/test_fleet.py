@@ -8,7 +8,7 @@ import pytest
 from estimators import MODELS, HealthPolicy, Log, Tuning
 from estimators.diagnostics.detector_state import no_baseline
 from estimators.errors import EstimatorError, EventError
-from estimators.fleet import Fleet
+from estimators.fleet.fleet import Fleet
 from estimators.fold import Fold
 from estimators.log import READING, TRUTH, Events
 from estimators.model.state_space import Parameter

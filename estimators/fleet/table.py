@@ -7,10 +7,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .diagnostics.detector_state import JOINT_MASK, MASK, ROW, SENSOR, TWIN
-from .diagnostics.detectors import DETECTORS, OUTSIDE, OUTSIDE_WIDENED, SENSOR_FLAGS, detector_of
-from .model.state_space import StateSpaceModel
-from .track import DIVERGED, HEALTH_NAMES, STALE
+from ..diagnostics.detector_state import JOINT_MASK, MASK, ROW, SENSOR, TWIN
+from ..diagnostics.detectors import DETECTORS, OUTSIDE, OUTSIDE_WIDENED, SENSOR_FLAGS, detector_of
+from ..model.state_space import StateSpaceModel
+from ..track import DIVERGED, HEALTH_NAMES, STALE
 
 SENSOR_MASK = (1 << SENSOR_FLAGS) - 1
 """Bits of the flags of sensors that dropped out."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from .numerics.workspace import declare_layout
+from ..numerics.workspace import declare_layout
 
 N, JUDGED, IN_WINDOW, USED_IN_WINDOW, DOF, STALE_EVENTS, HEALTH, FLAGS, VERDICT, PHASE = range(10)
 """Columns of `Block.head`: events folded; judged measurements ever, of which the last are kept; those in the window,

@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from .compiled.context import _FIELDS
-from .compiled.jacobians import constant_rows
-from .errors import ConfigError, EstimatorError, quoted
-from .fold_machine import Machine
-from .tuning import Tuning
+from ..compiled.context import _FIELDS
+from ..compiled.jacobians import constant_rows
+from ..errors import ConfigError, EstimatorError, quoted
+from ..fold_machine import Machine
+from ..tuning import Tuning
 
 GROUPS = {"Q": "q", "R": "r", "p": "p"}
 """Fields of a tuning whose values may differ from asset to asset, by the first part of their keys."""

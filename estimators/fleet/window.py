@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from .diagnostics.health import (
+from ..diagnostics.health import (
     JUDGED_MEAN,
     MAX_ROWS_PER_READING,
     MEAN,
@@ -17,10 +17,10 @@ from .diagnostics.health import (
     window_bounds,
     write_window,
 )
-from .fleet_memory import DOF, IN_WINDOW, JUDGED, USED_IN_WINDOW
-from .numerics.jit import embedded, part
-from .numerics.simd import total as sum_of
-from .track import USED
+from ..numerics.jit import embedded, part
+from ..numerics.simd import total as sum_of
+from ..track import USED
+from .memory import DOF, IN_WINDOW, JUDGED, USED_IN_WINDOW
 
 _ROW_BITS, _CHANNEL_BITS = 28, 14
 

@@ -13,12 +13,17 @@ from numba import from_dtype, prange, types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from .compiled.context import _FIELDS as CONTEXT_FIELDS
-from .compiled.context import context_at
-from .diagnostics.detector_watch import watch_row
-from .diagnostics.health import NORMALS, Bounds, HealthPolicy, judges, keep_window
-from .estimator import Code
-from .fleet_memory import (
+from ..compiled.context import _FIELDS as CONTEXT_FIELDS
+from ..compiled.context import context_at
+from ..diagnostics.detector_watch import watch_row
+from ..diagnostics.health import NORMALS, Bounds, HealthPolicy, judges, keep_window
+from ..estimator import Code
+from ..fold_kernel import fold_event
+from ..gate.rejection_runs import Rule
+from ..log import _ORDER
+from ..numerics.jit import counts, embedded, flag_rows, flags, floats, i64, ints, jit, masks, matrix, part
+from ..track import WHITENED, Track
+from .memory import (
     AGE,
     ASKED,
     CONSISTENCY,
@@ -39,14 +44,9 @@ from .fleet_memory import (
     record_at,
     state_at,
 )
-from .fleet_order import precedes
-from .fleet_record import append, before_snapshot, copy, cut, free_records, slot_of, snapshots_of, take
-from .fleet_window import has_no_baseline, return_to, slide
-from .fold_kernel import fold_event
-from .gate.rejection_runs import Rule
-from .log import _ORDER
-from .numerics.jit import counts, embedded, flag_rows, flags, floats, i64, ints, jit, masks, matrix, part
-from .track import WHITENED, Track
+from .order import precedes
+from .record import append, before_snapshot, copy, cut, free_records, slot_of, snapshots_of, take
+from .window import has_no_baseline, return_to, slide
 
 _PLAN = """
     memory stride visited begins ends unfinished asked count order t place value events tunings contexts rules crews

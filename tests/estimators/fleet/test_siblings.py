@@ -6,7 +6,7 @@ from scipy.stats import norm
 
 from estimators import Fleet
 from estimators.errors import EstimatorError
-from estimators.siblings import siblings
+from estimators.fleet.siblings import siblings
 from tests.models import level_model
 
 

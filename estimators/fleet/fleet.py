@@ -13,14 +13,26 @@ from typing import Any
 import numba
 import numpy as np
 
-from .compiled.context import context_type
-from .diagnostics.health import NORMALS, HealthPolicy
-from .errors import EstimatorError, EventError, nearest, quoted
-from .events import arrays
-from .events.batch import INPUT, READING, TICK, Events
-from .fleet_gate import FleetGates
-from .fleet_kernel import ASKED_FLAG, CREW, PLAN, REWOUND_FLAG, ROWS, fold_assets
-from .fleet_memory import (
+from ..compiled.context import context_type
+from ..diagnostics.health import NORMALS, HealthPolicy
+from ..errors import EstimatorError, EventError, nearest, quoted
+from ..events import arrays
+from ..events.batch import INPUT, READING, TICK, Events
+from ..fold_checks import check_pairs, check_prior, check_soft, check_tuning
+from ..fold_kernel import compiled
+from ..fold_machine import Machine, Moments, scratch
+from ..gate.isolation import Decision
+from ..log import _RANK
+from ..model.state_space import LARGE, StateSpaceModel
+from ..numerics.jit import threaded
+from ..numerics.workspace import WORD
+from ..registry import find_estimator
+from ..snapshots import Base, Snapshot
+from ..track import Track
+from ..tuning import Tuning
+from .gate import FleetGates
+from .kernel import ASKED_FLAG, CREW, PLAN, REWOUND_FLAG, ROWS, fold_assets
+from .memory import (
     AGE,
     FLAGS,
     HEALTH,
@@ -35,23 +47,11 @@ from .fleet_memory import (
     block_at,
     state_at,
 )
-from .fleet_order import arrange
-from .fleet_record import record_sizes
-from .fleet_table import FleetTable, causes_of
-from .fleet_tunings import AssetTunings
-from .fold_checks import check_pairs, check_prior, check_soft, check_tuning
-from .fold_kernel import compiled
-from .fold_machine import Machine, Moments, scratch
-from .gate.isolation import Decision
-from .log import _RANK
-from .model.state_space import LARGE, StateSpaceModel
-from .numerics.jit import threaded
-from .numerics.workspace import WORD
-from .registry import find_estimator
+from .order import arrange
+from .record import record_sizes
 from .siblings import siblings
-from .snapshots import Base, Snapshot
-from .track import Track
-from .tuning import Tuning
+from .table import FleetTable, causes_of
+from .tunings import AssetTunings
 
 RECENT = 8
 """Default number of events of an asset among which a late one is always inserted."""

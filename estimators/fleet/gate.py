@@ -7,16 +7,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .fleet_memory import FIRST, LAST, NEXT, PINNED, REWOUND, N, Record, record_at
-from .fleet_record import FREE, record_sizes
-from .fold_machine import Machine
-from .gate.isolation import MAX_COMPARED_EVENTS, MAX_DECISIONS, Decision, decide
-from .gate.rejection_runs import RUN, SINCE, fresh
-from .log import _ORDER, Events, Log
-from .model.state_space import StateSpaceModel
-from .numerics.workspace import WORD, size_of, view
-from .snapshots import Snapshot, Story
-from .track import Track
+from ..fold_machine import Machine
+from ..gate.isolation import MAX_COMPARED_EVENTS, MAX_DECISIONS, Decision, decide
+from ..gate.rejection_runs import RUN, SINCE, fresh
+from ..log import _ORDER, Events, Log
+from ..model.state_space import StateSpaceModel
+from ..numerics.workspace import WORD, size_of, view
+from ..snapshots import Snapshot, Story
+from ..track import Track
+from .memory import FIRST, LAST, NEXT, PINNED, REWOUND, N, Record, record_at
+from .record import FREE, record_sizes
 
 _KINDS = np.array(_ORDER, np.int8)
 

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.optimize import brentq
 from scipy.stats import false_discovery_control, norm
 
-from .errors import EstimatorError
+from ..errors import EstimatorError
 
 MIN_ASSETS = 8
 """Assets whose spread can be told."""

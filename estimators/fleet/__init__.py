@@ -1,0 +1,1 @@
+"""Many assets of one model, folded by one compiled call."""
