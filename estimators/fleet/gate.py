@@ -16,7 +16,7 @@ from ..numerics.workspace import WORD, size_of, view
 from ..snapshots import Snapshot, Story
 from ..track import Track
 from .memory import FIRST, LAST, NEXT, PINNED, REWOUND, N, Record, record_at
-from .record import FREE, record_sizes
+from .record import FREE, MAX_FREE, record_sizes
 
 _KINDS = np.array(_ORDER, np.int8)
 
@@ -81,7 +81,7 @@ class FleetGates:
         self._words = size_of(record_at, *self._sizes)
         self.places = np.zeros(count, np.int64)
         """Address of the record of each asset, 0 for none, (assets,)."""
-        self.free = np.zeros((crews, 2 * FREE + 1), np.int64)
+        self.free = np.zeros((crews, MAX_FREE + 1), np.int64)
         """Free records of each thread: their number, then their addresses."""
         self._records: dict[int, np.ndarray] = {}
         self._decisions: dict[int, list[Decision]] = {}

@@ -19,6 +19,9 @@ SPACING = 256
 FREE = 64
 """Free records for each thread at the start of a call."""
 
+MAX_FREE = 4096
+"""Records that assets return to a thread at most before those are given to others."""
+
 
 def record_sizes(recent: int) -> tuple[int, int]:
     """Return the numbers of snapshots and of events in a record."""
@@ -123,7 +126,7 @@ def before_snapshot(
         return take(asset, block, oldest, recent, records, free, slots, rows) if needed else place
     record = record_at(place, block.now.size, slots, block.t.size, rows, block.value.shape[1])
     own = record.head
-    if not needed and newer >= max(own[PINNED], own[ASKED]) and own[REWOUND] < 0 and free[0] < 2 * FREE:
+    if not needed and newer >= max(own[PINNED], own[ASKED]) and own[REWOUND] < 0 and free[0] < MAX_FREE:
         free[0] += 1
         free[free[0]] = place
         records[asset] = 0
@@ -136,4 +139,4 @@ def before_snapshot(
 @embedded
 def free_records(place, crew):
     """Return the free records of a thread: their number, then their addresses."""
-    return ints(place + 8 * crew * (2 * FREE + 1), 2 * FREE + 1)
+    return ints(place + 8 * crew * (MAX_FREE + 1), MAX_FREE + 1)

@@ -172,6 +172,21 @@ def test_decisions_on_rejected_sensors_are_those_of_single_folds(estimator, name
     assert {"isolated", "doubted"} <= outcomes and {"believed", "reopened"} & outcomes
 
 
+def test_records_of_rejections_that_are_over_are_given_back():
+    """Those of all assets at once, which are more than a thread keeps for the next ones."""
+    model, count = MODELS["motor_winding"], 300
+    tuning = replace(Tuning.of(model), gate=0.99, gate_kind="hard", reopen=4.0)
+    fleet = Fleet("kf", model, tuning, assets=count, policy=POLICY, recent=4, threads=1)
+    sizes = [len(fleet.state(slice(None)))]
+    for k in range(80):
+        values = np.full(count, 1e4 if 20 <= k < 23 else 30.0)
+        fleet.add("winding", np.arange(count), np.full(count, 0.5 * k), values)
+        fleet.advance()
+        sizes.append(len(fleet.state(slice(None))))
+    assert max(sizes) > sizes[0]
+    assert sizes[-1] == sizes[0]
+
+
 def decay(x, u, p, dt, out):
     out[0] = x[0] * (1.0 - p[0] * dt)
 
