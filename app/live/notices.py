@@ -147,13 +147,15 @@ class Audit:
     """Audit log of a running twin; any thread may add to it and read it."""
 
     def __init__(self, revision: Callable[[], int]) -> None:
-        self._revision = revision
+        self.revision = revision
         self._lock = threading.Lock()
         self._entries: deque[AuditEntry] = deque(maxlen=MAX_COMMANDS)
         self._next = self._changes = 0
 
-    def add(self, user: str, role: str, address: str, path: str, body: Mapping[str, Any]) -> None:
-        """Note a request that was carried out."""
+    def add(
+        self, user: str, role: str, address: str, path: str, body: Mapping[str, Any], revision: int | None = None
+    ) -> None:
+        """Note a request that was carried out; `revision` was shown when it arrived, by default that of now."""
         with self._lock:
             last, gesture = self._entries[-1] if self._entries else None, body.get("gesture")
             number = self._next
@@ -162,7 +164,7 @@ class Audit:
             ):  # fmt: skip
                 number = self._entries.pop().number
             self._next, self._changes = number + 1, self._changes + 1
-            revision = self._revision()
+            revision = self.revision() if revision is None else revision
             self._entries.append(
                 AuditEntry(number, time.time(), user, role, address, path, body, revision, self._changes)
             )

@@ -141,8 +141,13 @@ class FormerSessions:
 class Auditor(Protocol):
     """Takes the requests that changed something."""
 
-    def add(self, user: str, role: str, address: str, path: str, body: Mapping[str, Any]) -> None:
-        """Note a request that was carried out."""
+    def revision(self) -> int | None:
+        """Return the revision that is shown; None if there are several twins."""
+
+    def add(
+        self, user: str, role: str, address: str, path: str, body: Mapping[str, Any], revision: int | None = None
+    ) -> None:
+        """Note a request that was carried out; `revision` was shown when it arrived, by default that of now."""
 
 
 class ShownApplication:
@@ -328,6 +333,8 @@ class Door:
 async def _audited(audit: Auditor, application: ASGIApp, scope: Scope, receive: Receive, send: Send) -> None:
     """Serve a request, and note it if it was carried out; of its body only an object in JSON."""
     body = bytearray()
+    # By the time of the answer the history may have been folded again with what it changed.
+    revision = audit.revision()
 
     async def receive_and_keep() -> Message:
         message = await receive()
@@ -345,7 +352,7 @@ async def _audited(audit: Auditor, application: ASGIApp, scope: Scope, receive: 
             if len(body) > MAX_NOTED_BYTES:
                 fields = {"command": fields.get("command"), "bytes": len(body)}
             user = scope.get(USER) or User(SESSION, "", "")
-            audit.add(user.name, user.role, user.address, scope["path"], fields)
+            audit.add(user.name, user.role, user.address, scope["path"], fields, revision)
         await send(message)
 
     await application(scope, receive_and_keep, send_and_note)

@@ -108,7 +108,12 @@ class Service:
         self._supervisor.stop()
         self.door.stop()
 
-    def add(self, user: str, role: str, address: str, path: str, body: Mapping[str, Any]) -> None:
+    def revision(self) -> None:
+        """A service has twins, of which each has its revisions."""
+
+    def add(
+        self, user: str, role: str, address: str, path: str, body: Mapping[str, Any], revision: int | None = None
+    ) -> None:
         """Pass a request that starts or stops a twin on to the audit log of that."""
         twin = self.twins.get(str(body.get("twin", "")))
         if twin is not None and path.startswith("/api/gallery/"):

@@ -241,6 +241,16 @@ def test_every_answer_forbids_to_leave_the_machine(page):
         assert {"default-src", "connect-src", "script-src", "frame-ancestors"} <= rules.keys()
 
 
+def test_a_command_is_noted_with_the_revision_that_its_user_saw(serve, monkeypatch):
+    page = serve(20)
+    submit = page.engine.submit
+    # The answer takes longer than the refold: on a slow machine it may.
+    monkeypatch.setattr(page.engine, "submit", lambda command: page.refolded(lambda: submit(command)))
+    for value in (0.5, 0.25):
+        assert page.command("SetTuning", key="Q.temperature", value=value) is None
+    assert [(entry["body"]["value"], entry["revision"]) for entry in page.get("/api/audit")] == [(0.5, 0), (0.25, 1)]
+
+
 # Viser behind it
 
 
