@@ -18,13 +18,13 @@ from typing import Any
 import numba
 from llvmlite import binding
 from numba import config
-from numba.core import bytecode, caching, codegen, dispatcher
+from numba.core import bytecode, caching, codegen, compiler, dispatcher
 from numba.core.runtime import _nrt_python
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 """The folder of the packages; a file outside it, such as a user's model, is found by its path."""
 
-ENTRY_FORMAT = 2
+ENTRY_FORMAT = 3
 """To be increased when entries that an earlier version wrote are not to be read."""
 
 DIGEST_SIZE = hashlib.sha256().digest_size
@@ -123,8 +123,11 @@ class EntryLibrary(codegen.JITCodeLibrary):  # type: ignore[misc]
     @classmethod
     def _unserialize(cls, codegen: Any, state: Any) -> Any:
         name, _, (code, bitcode) = state
-        library = codegen.create_library(name)
+        library = codegen.create_library(name) if code else LinkedLibrary(codegen, name)
         library._bitcode = bitcode
+        if not code:
+            library._finalized = True
+            return library
         library.enable_object_caching()
         library._set_compiled_object(code)
         library._finalize_final_module()
@@ -137,12 +140,59 @@ class EntryLibrary(codegen.JITCodeLibrary):  # type: ignore[misc]
         return super()._get_module_for_linking()
 
 
+class LinkedLibrary(EntryLibrary):
+    """Bitcode of a function that only compiled functions call: they link it, optimise it and make machine code of it.
+
+    Numba does both for each function by itself, too, which takes a quarter of the compile time of a filter.
+    """
+
+    @property
+    def codegen(self) -> Any:
+        """What is to be told the environment of the function, which exceptions alone need."""
+        return self
+
+    def set_env(self, name: str, environment: Any) -> None:
+        """Do nothing, see `codegen`."""
+
+    def get_pointer_to_function(self, name: str) -> int:
+        """Return 0: there is no such machine code."""
+        self._ensure_finalized()
+        return 0
+
+    def _optimize_final_module(self) -> None:
+        """Leave that to what links it."""
+
+    def _finalize_final_module(self) -> None:
+        self._finalize_dynamic_globals()
+        self._finalized = True
+
+    def serialize_using_object_code(self) -> tuple[str, str, tuple[bytes, bytes]]:
+        """Return what `EntryLibrary` reads."""
+        return self.name, "object", (b"", self._get_module_for_linking().as_bitcode())
+
+    def _get_module_for_linking(self) -> Any:
+        if self._bitcode is not None:
+            self._shared_module, self._bitcode = binding.parse_bitcode(self._bitcode), None
+        return super()._get_module_for_linking()
+
+
+class Linked(compiler.Compiler):  # type: ignore[misc]
+    """Compiles a function that only compiled functions call."""
+
+    def compile_extra(self, func: Any) -> Any:
+        """Compile into a `LinkedLibrary`."""
+        self.state.library = LinkedLibrary(self.state.targetctx.codegen(), func.__qualname__)
+        return super().compile_extra(func)
+
+
 class EntryResults(caching.CompileResultCacheImpl):  # type: ignore[misc]
     """Compiled functions from entries."""
 
     def rebuild(self, target_context: Any, payload: Any) -> Any:
         """Return a compiled function; some have no wrapper for Python."""
         (_, _, (code, _)), described, *_ = payload
+        if not code:
+            return super().rebuild(target_context, payload)
         defined = target_context.codegen()._engine._defined_symbols
         defined.add(described.llvm_func_name)
         if f"{described.llvm_cpython_wrapper_name}\0".encode() in code:

@@ -21,7 +21,7 @@ from numba.experimental.function_type import _get_jit_address
 from numba.extending import intrinsic, lower_builtin, overload, register_jitable
 
 from .cache import cache_folder
-from .cache_entries import use_entries
+from .cache_entries import Linked, use_entries
 
 F1 = types.float64[::1]
 F2 = types.Array(types.float64, 2, "C")
@@ -76,12 +76,14 @@ def by_address(function: Callable[..., Any]) -> Any:
     return made
 
 
-part: Callable[[Callable[..., Any]], Any] = register_jitable(cache=True, nogil=True, error_model="numpy")
+part: Callable[[Callable[..., Any]], Any] = register_jitable(
+    cache=True, nogil=True, error_model="numpy", pipeline_class=Linked
+)
 """`jit` for functions that only compiled functions call, without the wrapper for Python, which takes a third of the
 compile time. Called from Python, the function runs as plain Python."""
 
 embedded: Callable[[Callable[..., Any]], Any] = register_jitable(
-    cache=True, nogil=True, error_model="numpy", forceinline=True
+    cache=True, nogil=True, error_model="numpy", forceinline=True, pipeline_class=Linked
 )
 """`part` for a long helper in the steps of several filters: compiled once, and copied into each caller by LLVM.
 

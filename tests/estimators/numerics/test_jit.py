@@ -70,6 +70,42 @@ def test_entries_saved_at_once_are_kept_apart(tmp_path):
     assert edited.load(keys[0]) is None
 
 
+PARTS = """
+import sys
+from estimators.numerics.jit import jit, part
+
+@part
+def cubed(x):
+    return x * x * x
+
+@jit
+def one(x):
+    return 1.0 + cubed(x)
+
+@jit
+def two(x):
+    return 2.0 + cubed(x)
+
+print({"one": one, "two": two}[sys.argv[1]](3.0))
+"""
+
+
+def test_a_part_has_no_machine_code_of_its_own_and_is_linked_from_the_cache(tmp_path):
+    script = tmp_path / "parts.py"
+    script.write_text(PARTS)
+    environment = {key: value for key, value in os.environ.items() if key != "NUMBA_CACHE_DIR"}
+    environment |= {"XDG_CACHE_HOME": str(tmp_path), "PYTHONPATH": str(ROOT)}
+    for name, expected in (("one", "28.0"), ("two", "29.0")):
+        run = subprocess.run(
+            [sys.executable, script, name], env=environment, capture_output=True, text=True, check=True
+        )
+        assert (run.stdout.strip(), run.stderr) == (expected, "")
+        # The entry of the first process serves the second.
+        (cubed,) = tmp_path.rglob("*cubed*.nbc")
+        (whole,) = tmp_path.rglob(f"*.{name}-*.nbc")
+        assert [b"\x7fELF" in path.read_bytes() for path in (cubed, whole)] == [False, True]
+
+
 CLOSURES = """
 import math
 from estimators.model.wrapping import as_inner
