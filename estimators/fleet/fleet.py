@@ -34,12 +34,14 @@ from .gate import FleetGates
 from .kernel import ASKED_FLAG, CREW, PLAN, REWOUND_FLAG, ROWS, fold_assets
 from .memory import (
     AGE,
+    CONSISTENCY,
     FLAGS,
     HEALTH,
     NIS_HIGH,
     NIS_LOW,
     NIS_MEAN,
     PHASE,
+    SINCE,
     STALE_EVENTS,
     VERDICT,
     N,
@@ -208,7 +210,7 @@ class Fleet:
             [fresh.clock.view(float), *(part.ravel() for part in fresh[1:])]
         )
         last = self._state.last.at // WORD
-        line[last + 2 : last + 5], line[last + 5] = np.nan, 1.0
+        line[last + NIS_MEAN : last + CONSISTENCY], line[last + CONSISTENCY] = np.nan, 1.0
         return line
 
     def _part(self, part: Any, within: int = 0) -> np.ndarray:
@@ -500,10 +502,11 @@ class Fleet:
         head = self._head
         last = self._now(self._state.last)
         seen = head[:, N] > 0
-        t = np.ascontiguousarray(last[:, T]).view(np.int64)
+        t, since = np.ascontiguousarray(last[:, [T, SINCE]].T).view(np.int64) * 1e-9
         return FleetTable(
             self.assets,
-            np.where(seen, t * 1e-9, np.nan),
+            np.where(seen, t, np.nan),
+            np.where(seen, since, np.nan),
             self._part(self._block.mean).copy(),
             self._part(self._block.std).copy(),
             head[:, HEALTH].astype(np.int8),

@@ -29,6 +29,7 @@ from .memory import (
     CONSISTENCY,
     FLAGS,
     FLOOR,
+    GRADE,
     HEALTH,
     IN_WINDOW,
     JUDGED,
@@ -36,10 +37,12 @@ from .memory import (
     NIS_LOW,
     NIS_MEAN,
     PHASE,
+    SINCE,
     STALE_EVENTS,
     TAIL,
     VERDICT,
     N,
+    T,
     block_at,
     record_at,
     state_at,
@@ -284,7 +287,7 @@ def _fold_share(place, crew):
         )  # fmt: skip
         now = state_at(block.now.ctypes.data, plan.nu, plan.state, plan.evidence, plan.edge, plan.sensors)
         head, last = block.head, now.last
-        last_t = ints(last.ctypes.data, 1)
+        times = ints(last.ctypes.data, 2)
         e, stop, a, tail = begins[v], ends[v], 0, 0
         record_place = records[asset] if reopens else 0
         record = record_at(record_place, plan.size, slots, ring, rows, columns)
@@ -295,7 +298,7 @@ def _fold_share(place, crew):
             oldest = record.head[FLOOR] if tail > 0 else oldest
         # The time of the last event is at hand; the event itself lies in memory that is rarely needed.
         if (
-            tail == 0 and head[N] > 0 and t[order[e]] <= last_t[0]
+            tail == 0 and head[N] > 0 and t[order[e]] <= times[T]
             and _precedes_last(order[e], t, event_place, value, block, head[N])
         ):  # fmt: skip
             e, tail = _rewind(
@@ -344,12 +347,14 @@ def _fold_share(place, crew):
             if judges(track.verdict[1]):
                 slide(1, n, channel[1], block, normal, white, policy, bounds, terms, track)
             else:
-                own_t[0] = last_t[0] if n > 0 else own_t[1]
+                own_t[0] = times[T] if n > 0 else own_t[1]
                 track.age[0], track.consistency[0] = last[AGE], int(last[CONSISTENCY])
                 track.nis_mean[0], track.nis_low[0], track.nis_high[0] = last[NIS_MEAN], last[NIS_LOW], last[NIS_HIGH]
                 keep_window(1, own_t, track)
             watch_row(1, own_t, kind, channel, own_value, context, policy, now.evidence, track)
-            last_t[0] = own_t[1]
+            times[T] = own_t[1]
+            if n == 0 or track.health[1] != int(last[GRADE]):
+                times[SINCE], last[GRADE] = own_t[1], track.health[1]
             last[AGE], last[CONSISTENCY] = track.age[1], track.consistency[1]
             last[NIS_MEAN], last[NIS_LOW], last[NIS_HIGH] = track.nis_mean[1], track.nis_low[1], track.nis_high[1]
             head[HEALTH], head[FLAGS], head[VERDICT] = track.health[1], track.flags[1], track.verdict[1]

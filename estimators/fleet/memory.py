@@ -10,12 +10,13 @@ those of them that were used, and the degrees of freedom of these; events droppe
 verdict of the last event; events by which the asset's snapshots come early, so that not all assets take theirs at
 once."""
 
-T, AGE, NIS_MEAN, NIS_LOW, NIS_HIGH, CONSISTENCY = range(6)
-"""Columns of `State.last`, of the last row: time (int64, ns) and the columns of the track of that name."""
+T, SINCE, AGE, NIS_MEAN, NIS_LOW, NIS_HIGH, CONSISTENCY, GRADE = range(8)
+"""Columns of `State.last`, of the last row: its time and that from which on health is as it is there (int64, ns), the
+columns of the track of that name, and health."""
 
 State, state_at = declare_layout(
     "State", "nu, state, evidence, edge, sensors",
-    clock="int 1", u="nu", filter="state", evidence="evidence", edge="edge", doubt="sensors, 8", last="6",
+    clock="int 1", u="nu", filter="state", evidence="evidence", edge="edge", doubt="sensors, 8", last="8",
 )  # fmt: skip
 """State of an asset's fold before an event; the first fields are those of `Snapshot`."""
 

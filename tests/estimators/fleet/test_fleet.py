@@ -34,6 +34,8 @@ def assert_same(fleet: Fleet, position: int, fold: Fold) -> None:
     for name in ("mean", "std", "verdict", "health", "age", "nis_mean", "nis_low", "nis_high"):
         got = np.asarray(getattr(table, name)[position])
         assert got.tobytes() == np.asarray(getattr(last, name)).tobytes(), (position, name, got, getattr(last, name))
+    others = np.flatnonzero(fold.track.health != last.health)
+    assert table.since[position] == fold.log.t[others[-1] + 1 if others.size else 0] * 1e-9
 
 
 def random_events(model, rng, count):
