@@ -15,6 +15,7 @@ from types import FunctionType
 from typing import Any
 
 import numpy as np
+from numba.extending import register_jitable
 
 from app.studies.stress.scenario import plain_log
 from app.twin.log_reader import read_log
@@ -168,6 +169,8 @@ def bare_kernel() -> Any:
     Left are predict, update, describe, NIS and its window.
     """
     own = {**fold_kernel.__dict__, "screen_reading": _nothing_to_refuse, "note": _nothing_to_note}
+    event = FunctionType(fold_kernel.fold_event.__code__, own, "fold_event")
+    own["fold_event"] = register_jitable(error_model="numpy", forceinline=True)(event)
     loop = jit_brief(cache=False)(FunctionType(fold_kernel.run.py_func.__code__, own, "run"))
 
     @jit_brief(cache=False)
