@@ -72,6 +72,13 @@ def pytest_configure(config: pytest.Config) -> None:
         config.pluginmanager.register(Durations(config), "durations")
 
 
+def pytest_terminal_summary(terminalreporter: Any) -> None:
+    """Print why the first try of a test failed that was tried again."""
+    for report in terminalreporter.stats.get("rerun", ()):
+        terminalreporter.section(f"first try of {report.nodeid}")
+        terminalreporter.line(report.longreprtext)
+
+
 def absent(reason: str) -> None:
     """Skip, and say why; under CI=true fail instead, so that a green run has tested everything."""
     if os.environ.get("CI", "").lower() in ("true", "1"):
