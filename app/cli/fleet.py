@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import tempfile
 import time
 from collections.abc import Mapping
@@ -12,17 +13,20 @@ from typing import TYPE_CHECKING
 from config.yaml_files import writing
 from estimators.errors import ConfigError
 from estimators.fleet.table import FleetTable
-from sources.source import Partition
+from sources.source import WHOLE, Partition, Report
 
 from ..live.fleet import RunningFleet
+from ..outputs.fleet_archive import FleetArchive, history_of
+from ..outputs.parts import ArchivePlan
 from ..present.export.track_file import encoded
 from ..present.fleet_table import arrow_table, counts_of, fleet_topics, in_name_order, ordered
 from ..present.result import to_json, to_text
 from ..terminal import EndRequest, restore, when_asked_to_end
 from ..twin.fleet import FleetPlan, load_fleet
 from ..twin.log_reader import remarking
+from ..views.recording.rrd_file import parse_split
 from ..web.fleet import FleetApi
-from ..web.partitions import PartitionedFleet, PartitionServer, store_of, threads_of
+from ..web.partitions import PartitionedFleet, PartitionServer, path_of, threads_of
 from ..web.service import Service
 from .options import settings
 from .prepare import attend, compile_for
@@ -59,15 +63,21 @@ def run_fleet(arguments: FleetCommand) -> int:
     report, store = remarking(lambda *_: None), arguments.store
     if store is not None and store.is_dir():
         store = store / f"{plan.name}.store"
+    archive = None
+    if arguments.archive is not None:
+        if plan.reads_files:
+            raise ConfigError("--archive: the source is tables, which are kept already; leave it out")
+        split = parse_split(arguments.archive_split, arguments.archive_keep, "--archive")
+        archive = ArchivePlan(arguments.archive / plan.name, split)
     running: RunningFleet | PartitionedFleet
     if plan.config.processes > 1:
-        opened = partial(open_partition, arguments.fleet, overrides, plan.config.processes, store)
+        opened = partial(open_partition, arguments.fleet, overrides, plan.config.processes, store, archive)
         child = partial(run_child, opened, False)
         running = attend(None, lambda: PartitionedFleet(plan, report, child, preload=FLEET_PRELOADED), COMPILING)
     else:
-        running = attend(None, lambda: RunningFleet(plan, report, store=store), COMPILING)
+        running = attend(None, lambda: _running(plan, report, store, archive), COMPILING)
     if door is not None:
-        _serve(running, door, arguments, overrides)
+        _serve(running, door, arguments, overrides, archive)
     else:
         _fold(running, arguments.duration)
     _, _, table = running.table()
@@ -105,10 +115,15 @@ def _fold(running: RunningFleet | PartitionedFleet, duration: float | None) -> N
 
 
 def _serve(
-    running: RunningFleet | PartitionedFleet, door: Door, arguments: FleetCommand, overrides: Mapping[str, str]
+    running: RunningFleet | PartitionedFleet,
+    door: Door,
+    arguments: FleetCommand,
+    overrides: Mapping[str, str],
+    archive: ArchivePlan | None,
 ) -> None:
     """Serve the overview and pages of assets until the duration is over, or the program is asked to end."""
-    opened = partial(_opened, arguments.fleet, overrides, arguments.recordings)
+    folders = None if archive is None else folders_of(archive, running.plan.config.processes)
+    opened = partial(_opened, arguments.fleet, overrides, arguments.recordings, folders)
     overview = FleetApi(running)
     service = Service({}, partial(run_child, opened, False), door=door, preload=FLEET_PRELOADED, overview=overview)
     running.start()
@@ -118,21 +133,49 @@ def _serve(
         running.stop()
 
 
+def _running(
+    plan: FleetPlan, report: Report, store: Path | None, archive: ArchivePlan | None, partition: Partition = WHOLE
+) -> RunningFleet:
+    """Return the part of a fleet that one process folds, with its store and archive."""
+    threads = None if partition == WHOLE else threads_of(partition.processes)
+    own = None if store is None else path_of(store, partition)
+    running = RunningFleet(plan, report, threads=threads, store=own, partition=partition)
+    if archive is not None:
+        archive = archive._replace(folder=path_of(archive.folder, partition))
+        running.archive = FleetArchive(archive, plan.twin.model, running.names, running.note)
+    return running
+
+
 def open_partition(
-    fleet: Path, overrides: Mapping[str, str], processes: int, store: Path | None, name: str, number: str
+    fleet: Path,
+    overrides: Mapping[str, str],
+    processes: int,
+    store: Path | None,
+    archive: ArchivePlan | None,
+    name: str,
+    number: str,
 ) -> Opened:
     """Open the partition of a fleet that has a number."""
     plan, partition = load_fleet(fleet, overrides, processes), Partition(int(number), processes)
-    running = RunningFleet(
-        plan, remarking(lambda *_: None), threads=threads_of(processes), store=store_of(store, partition),
-        partition=partition,
-    )  # fmt: skip
+    running = _running(plan, remarking(lambda *_: None), store, archive, partition)
     served = PartitionServer(running)
     return Opened(served, {}, served.report)
 
 
-def _opened(fleet: Path, overrides: Mapping[str, str], recordings: Path, name: str, asset: str) -> Opened:
+def folders_of(archive: ArchivePlan, processes: int) -> list[Path]:
+    """Return the folders of a fleet's archive, one for each process, also of earlier runs with more of them."""
+    numbers = itertools.takewhile(
+        lambda k: k < processes or path_of(archive.folder, Partition(k)).is_dir(), itertools.count()
+    )
+    return [path_of(archive.folder, Partition(k)) for k in numbers]
+
+
+def _opened(
+    fleet: Path, overrides: Mapping[str, str], recordings: Path, folders: list[Path] | None, name: str, asset: str
+) -> Opened:
     """Open the history of an asset."""
+    import pyarrow.parquet
+
     from ..web.gallery.gallery import StartRequest
     from ..web.session import Page
     from .open_twin import FileOpener, open_session, opened_twin
@@ -141,7 +184,15 @@ def _opened(fleet: Path, overrides: Mapping[str, str], recordings: Path, name: s
 
     def read() -> OpenedTwin:
         plan = load_fleet(fleet, overrides)
-        history = plan.history_of(asset, Path(folder.name))
+        if folders is None:
+            history = plan.history_of(asset, Path(folder.name))
+        else:
+            rows = history_of(folders, asset, plan.twin.config.history)
+            if rows is None:
+                raise ConfigError(f"{asset}: the archive has no measurements of it yet")
+            file = Path(folder.name) / "history.parquet"
+            pyarrow.parquet.write_table(rows, file)
+            history = plan.archived(asset, file)
         return opened_twin(str(plan.twin.path), overrides={**overrides, **history})
 
     opener = FileOpener({asset: read})

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -109,7 +109,7 @@ class FleetPlan:
         """
         section = self.config.source
         if not isinstance(section, FleetTableSection):
-            text = f"a source of type {section.type} keeps no measurements; only those of tables are folded again"
+            text = f"a source of type {section.type} keeps no measurements; give --archive FOLDER to keep them"
             raise ConfigError(f"{asset}: {text}")
         given = section.model_dump(mode="json", exclude_unset=True, by_alias=True)
         loaded, column = self.source.loaded, given.pop("asset")
@@ -122,9 +122,28 @@ class FleetPlan:
         for group in ("sensors", "inputs", "truth"):
             for channel in given.get(group, {}).values():
                 channel["only"] = {**channel.get("only", {}), column: {"text": [asset]}}
+        return self._overrides(asset, given)
+
+    def archived(self, asset: str, file: Path) -> dict[str, str]:
+        """Return the overrides of the twin's YAML by which its source is a file with the archived rows of one asset."""
+        model = self.twin.model
+
+        def only(event: str, channel: int, columns: Iterable[str]) -> dict[str, Any]:
+            return {"columns": [*columns], "only": {"event": {"text": [event]}, "channel": channel}}
+
+        given = {"type": "table", "files": [str(file.absolute())], "time": {"column": "t_ns", "unit": "ns"}}
+        sensors = {
+            sensor.name: only("reading", k, (f"value_{row}" for row in range(len(sensor.rows))))
+            for k, sensor in enumerate(model.sensors)
+        }
+        inputs = {name: only("input", 0, [f"value_{k}"]) for k, name in enumerate(model.input_names)}
+        return self._overrides(asset, given | {"sensors": sensors, "inputs": inputs})
+
+    def _overrides(self, asset: str, source: Mapping[str, Any]) -> dict[str, str]:
+        """Return the overrides of the twin's YAML for one asset with its own tuning and a source."""
         name = re.sub(r"[^A-Za-z0-9_-]", "_", asset).lstrip("_-") or "asset"
         own = {key: repr(value) for key, value in self.values.of(asset).items()}
-        return {"source": as_flow(given), "name": as_flow(name), "title": as_flow(asset), **own}
+        return {"source": as_flow(source), "name": as_flow(name), "title": as_flow(asset), **own}
 
 
 def load_fleet(
