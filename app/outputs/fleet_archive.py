@@ -119,7 +119,7 @@ class FleetArchive:
             try:
                 self._journal.write(rows_of(self._model, self._names, at, events))
             except BaseException:
-                self._journal.cut()
+                self._journal.abandon()
                 self._journal = None
                 raise
             with self._lock:
@@ -197,10 +197,8 @@ class Journal:
         self._file.flush()
         self._end = self._file.tell()
 
-    def cut(self) -> None:
-        """Close it with the rows that were written as a whole."""
-        with suppress(OSError):
-            self._file.truncate(self._end)
+    def abandon(self) -> None:
+        """Close it after a failure; the rows before that are read."""
         with suppress(OSError):
             self._file.close()
 

@@ -184,6 +184,8 @@ def test_files_end_with_the_day_and_with_their_size(tmp_path):
     daily = Written(tmp_path / "a", parse_split("day", None)).put(DAY_S - 10).put(DAY_S)
     assert [path.name for path in parts_of(daily.folder)] == ["2026-01-01-000001.parquet"]
     assert daily.values() == [*map(float, range(DAY_S - 10, DAY_S + 10))]
+    endless = Written(tmp_path / "d", Split()).put(DAY_S - 10).put(DAY_S)
+    assert parts_of(endless.folder) == [] and len(endless.values()) == 20
     small = Written(tmp_path / "b", Split(size=100.0)).put(0).put(10)
     assert len(parts_of(small.folder)) == 2 and not [*small.folder.glob("*.arrows")]
     kept = Written(tmp_path / "c", Split(size=100.0, kept_bytes=1.0)).put(0).put(10)
