@@ -16,12 +16,13 @@ from estimators.fleet.table import FleetTable
 from sources.source import WHOLE, Partition, Report
 
 from ..live.fleet import RunningFleet
+from ..outputs.fleet import FleetPublisher
 from ..outputs.fleet_archive import FleetArchive, history_of
 from ..outputs.parts import ArchivePlan
 from ..present.export.track_file import encoded
 from ..present.fleet_table import arrow_table, counts_of, fleet_topics, in_name_order, ordered
 from ..present.result import to_json, to_text
-from ..terminal import EndRequest, restore, when_asked_to_end
+from ..terminal import EndRequest, complain, restore, when_asked_to_end
 from ..twin.fleet import FleetPlan, load_fleet
 from ..twin.log_reader import remarking
 from ..views.recording.rrd_file import parse_split
@@ -76,10 +77,18 @@ def run_fleet(arguments: FleetCommand) -> int:
         running = attend(None, lambda: PartitionedFleet(plan, report, child, preload=FLEET_PRELOADED), COMPILING)
     else:
         running = attend(None, lambda: _running(plan, report, store, archive), COMPILING)
-    if door is not None:
-        _serve(running, door, arguments, overrides, archive)
-    else:
-        _fold(running, arguments.duration)
+    page = None if door is None else f"http://127.0.0.1:{door.port}"
+    publisher = None if plan.ends else FleetPublisher(running, page=page)
+    if publisher is not None:
+        publisher.start()
+    try:
+        if door is not None:
+            _serve(running, door, arguments, overrides, archive)
+        else:
+            _fold(running, arguments.duration)
+    finally:
+        if publisher is not None:
+            publisher.stop()
     _, _, table = running.table()
     if not len(table.assets) or not table.events.any():
         place = plan.source.loaded.places.at(("source",))
@@ -142,7 +151,12 @@ def _running(
     running = RunningFleet(plan, report, threads=threads, store=own, partition=partition)
     if archive is not None:
         archive = archive._replace(folder=path_of(archive.folder, partition))
-        running.archive = FleetArchive(archive, plan.twin.model, running.names, running.note)
+
+        def say(key: str, text: str) -> None:
+            complain(text)
+            running.note(key, text)
+
+        running.archive = FleetArchive(archive, plan.twin.model, running.names, say)
     return running
 
 

@@ -22,6 +22,7 @@ from sources.tables.one_asset import rows_of_asset
 from sources.tables.text import column_of
 
 from .channels import channels
+from .checks import check_receivers
 from .fleet_tunings import AssetValues, asset_values
 from .source import KEY, SOURCES, Plan, plan_source
 from .sources.kind import Opening, matching
@@ -185,6 +186,7 @@ def load_fleet(
     if section.late == 0 and twin.tuning.gate is not None and twin.tuning.reopen is not None:
         rule = "decisions on a rejected sensor need snapshots: give 1 or more, or set gate.reopen to null"
         raise ConfigError(f"{places.at(('late',))}: late is 0, and the gate of {twin.name} reopens; {rule}")
+    check_receivers(loaded, section.outputs, section.alerts)
     assets = section.assets if isinstance(section.assets, tuple) else None
     values = asset_values(section.tunings, path, places, twin.tuning, assets)
     if isinstance(section.assets, int) and len(values.names) > section.assets:
