@@ -84,7 +84,7 @@ class FleetPublisher:
                 if names:
                     self._alert(names, table)
             except Exception as error:  # noqa: BLE001  no library or broken table may end the thread of all outputs
-                self.notices.report("outputs", f"outputs: {type(error).__name__}: {error}", level="error")
+                self.notices.report("engine error", f"outputs: {type(error).__name__}: {error}", level="error")
             self._print()
 
     def _alert(self, names: Sequence[str], table: FleetTable) -> None:

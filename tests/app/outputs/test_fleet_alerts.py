@@ -111,8 +111,8 @@ def test_many_assets_are_one_message_and_further_ones_wait_for_the_next():
     assert (last.status, last.recovered, last.value, last.id) == ("resolved", ("pump 0",), 0.0, first.id)
     assert last.text == "no asset is degraded or worse any longer; 1 asset recovered"
     assert rules.at(9000.0, *[good] * 301) is None
-    rules.at(9001.0, bad)
-    assert rules.at(9002.0, bad).id != first.id
+    rules.at(9001.0, bad, *[good] * 300)
+    assert rules.at(9002.0, bad, *[good] * 300).id != first.id
 
 
 def test_an_asset_that_recovers_before_it_was_in_a_message_is_in_none():
