@@ -125,9 +125,15 @@ class Publisher:
         section, rules = twin.config.outputs, twin.config.alerts
         mqtt = None
         if section.mqtt is not None:
-            from .mqtt import MqttOutput
+            from .mqtt import JsonTopics, MqttOutput
+            from .sparkplug import SparkplugNode
 
-            mqtt = MqttOutput(section.mqtt, self._engine)
+            form = (
+                JsonTopics(section.mqtt.prefix, twin.name, lambda: self._engine.model)
+                if section.mqtt.sparkplug is None
+                else SparkplugNode(section.mqtt.sparkplug, self._engine)
+            )
+            mqtt = MqttOutput(section.mqtt, twin.name, form, notices)
         outputs: list[Output] = [] if mqtt is None else [mqtt]
         if section.opcua is not None:
             from .opcua import OpcUaOutput

@@ -13,18 +13,20 @@ from estimators.track import HEALTH_NAMES
 
 from ..live.jobs import Jobs
 from ..live.notices import Notices
+from ..present.fleet_state import ChangedAssets, asset_message
 from ..terminal import print_line
 from .fleet_alerts import FleetRules
 from .receivers import Deliveries
 
 if TYPE_CHECKING:
     from ..twin.fleet import FleetPlan
+    from .mqtt import MqttOutput
 
 HEALTH_RULE = FleetAlertSection(health="degraded")
 """Rule of a fleet that has receivers and no rules."""
 
-DELIVERY_PERIOD_S = 0.2
-"""Between two looks at the queues of receivers."""
+DELIVERY_PERIOD_S, POLL_S = 0.2, 0.002
+"""Between two looks at the queues of receivers, and at a connection that takes no state."""
 
 
 class TabledFleet(Protocol):
@@ -55,7 +57,14 @@ class FleetPublisher:
         self.notices = Notices(time.time_ns)
         self._next_line = 0
         folder = plan.path.absolute().parent
-        self._deliveries = Deliveries(section.receivers, folder, None, self.notices)
+        self._mqtt: MqttOutput | None = None
+        self._changed, self._connections = ChangedAssets(), 0
+        if section.mqtt is not None:
+            from .mqtt import JsonTopics, MqttOutput
+
+            form = JsonTopics(section.mqtt.prefix, plan.name, lambda: plan.twin.model, of_assets=True)
+            self._mqtt = MqttOutput(section.mqtt, plan.name, form, self.notices)
+        self._deliveries = Deliveries(section.receivers, folder, self._mqtt, self.notices)
         self._rules = FleetRules(rules or (HEALTH_RULE,), plan.name, link=page)
         self._jobs = Jobs(self.notices, "output", threads=max(1, len(self._deliveries.queues)), niceness=0)
         self._stopping = threading.Event()
@@ -63,7 +72,9 @@ class FleetPublisher:
 
     def start(self) -> None:
         """Connect and begin to publish."""
-        if not self._deliveries.queues:
+        if self._mqtt is not None:
+            self._mqtt.start()
+        elif not self._deliveries.queues:
             return
         self._deliveries.run(self._jobs, DELIVERY_PERIOD_S)
         self._jobs.start()
@@ -75,17 +86,37 @@ class FleetPublisher:
         if self._thread.is_alive():
             self._thread.join(2.0)
         self._jobs.stop()
+        if self._mqtt is not None:
+            self._mqtt.stop()
         self._print()
 
     def _run(self) -> None:
-        while not self._stopping.wait(self._section.every):
+        due = time.monotonic()
+        while not self._stopping.wait(max(0.0, due - time.monotonic())):
+            due = time.monotonic() + self._section.every
             try:
                 _, names, table = self._fleet.table()
                 if names:
-                    self._alert(names, table)
+                    if self._deliveries.queues:
+                        self._alert(names, table)
+                    if self._mqtt is not None:
+                        self._publish(self._mqtt, names, table, due)
             except Exception as error:  # noqa: BLE001  no library or broken table may end the thread of all outputs
                 self.notices.report("engine error", f"outputs: {type(error).__name__}: {error}", level="error")
             self._print()
+
+    def _publish(self, mqtt: MqttOutput, names: Sequence[str], table: FleetTable, due: float) -> None:
+        """Publish the states that have changed, as many as the connection takes until the next table is due."""
+        if mqtt.connections != self._connections:  # what was on its way is lost, and the broker may have none
+            self._changed, self._connections = ChangedAssets(), mqtt.connections
+        self._changed.look(table)
+        while mqtt.link().connected and not self._stopping.is_set():
+            places = self._changed.take(room := mqtt.room)
+            for place in places:
+                mqtt.publish(asset_message(self._fleet.plan.twin, names[place], table, place))
+            if (room and len(places) < room) or time.monotonic() >= due:
+                return
+            self._stopping.wait(POLL_S)
 
     def _alert(self, names: Sequence[str], table: FleetTable) -> None:
         """Put the alerts that are due into the queues of their receivers."""
