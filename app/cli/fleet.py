@@ -4,20 +4,22 @@ from __future__ import annotations
 
 import itertools
 import tempfile
+import threading
 import time
 from collections.abc import Mapping
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from config.yaml_files import writing
-from estimators.errors import ConfigError
+from estimators.errors import ConfigError, NisusError
 from estimators.fleet.table import FleetTable
 from sources.source import WHOLE, Partition, Report
 
 from ..live.fleet import RunningFleet
 from ..outputs.fleet import FleetPublisher
-from ..outputs.fleet_archive import FleetArchive, history_of
+from ..outputs.fleet_archive import AssetHistory, FleetArchive
 from ..outputs.parts import ArchivePlan
 from ..present.export.track_file import encoded
 from ..present.fleet_table import arrow_table, counts_of, fleet_topics, in_name_order, ordered
@@ -42,6 +44,9 @@ FLEET_PRELOADED = (*PRELOADED, __name__, "pyarrow.dataset", "pyarrow.parquet")
 """Modules that the processes of a fleet and its pages share."""
 
 COMPILING = "compiling the fleet, once"
+
+FOLLOW_PERIOD_S, FOLLOW_SHARE = 2.0, 0.05
+"""Shortest time between two looks of an asset's page into the archive, and the share of time that they may take."""
 
 LOOK_PERIOD_S = 0.1
 """Seconds between two looks whether all partitions have ended."""
@@ -184,29 +189,59 @@ def folders_of(archive: ArchivePlan, processes: int) -> list[Path]:
     return [path_of(archive.folder, Partition(k)) for k in numbers]
 
 
+def follow(history: AssetHistory, folder: Path, most: int) -> threading.Event:
+    """Write the rows of an asset into files of a folder, now at most so many, and then in a thread until it is ended.
+
+    Raises:
+        ConfigError: If there are none.
+        SourceError: If a file of the archive is damaged.
+    """
+    import pyarrow.parquet
+
+    numbers, ended = itertools.count(), threading.Event()
+
+    def write() -> bool:
+        rows = history.read(most)
+        if rows is not None:
+            pyarrow.parquet.write_table(rows, folder / f"{next(numbers):08d}.parquet")
+        return rows is not None
+
+    def go_on() -> None:
+        pause = FOLLOW_PERIOD_S
+        while not ended.wait(pause):
+            begun = time.monotonic()
+            with suppress(NisusError, OSError):  # at the end of the process, the folder is removed
+                write()
+            pause = max(FOLLOW_PERIOD_S, (time.monotonic() - begun) / FOLLOW_SHARE)
+
+    if not write():
+        raise ConfigError("the archive has no measurements of it yet")
+    threading.Thread(target=go_on, name="archive", daemon=True).start()
+    return ended
+
+
 def _opened(
     fleet: Path, overrides: Mapping[str, str], recordings: Path, folders: list[Path] | None, name: str, asset: str
 ) -> Opened:
     """Open the history of an asset."""
-    import pyarrow.parquet
-
     from ..web.gallery.gallery import StartRequest
     from ..web.session import Page
     from .open_twin import FileOpener, open_session, opened_twin
 
     folder = tempfile.TemporaryDirectory(prefix="nisus-")  # removed at the end of the process
 
+    following: list[threading.Event] = []
+
     def read() -> OpenedTwin:
         plan = load_fleet(fleet, overrides)
         if folders is None:
             history = plan.history_of(asset, Path(folder.name))
         else:
-            rows = history_of(folders, asset, plan.twin.config.history)
-            if rows is None:
-                raise ConfigError(f"{asset}: the archive has no measurements of it yet")
-            file = Path(folder.name) / "history.parquet"
-            pyarrow.parquet.write_table(rows, file)
-            history = plan.archived(asset, file)
+            place = Path(tempfile.mkdtemp(dir=folder.name))
+            history = plan.archived(asset, place)
+            for ended in following:  # of a page that is opened anew
+                ended.set()
+            following[:] = [follow(AssetHistory(folders, asset), place, plan.twin.config.history)]
         return opened_twin(str(plan.twin.path), overrides={**overrides, **history})
 
     opener = FileOpener({asset: read})

@@ -250,33 +250,44 @@ def read_journal(path: Path) -> Any:
     return pa.Table.from_batches(batches) if batches else None
 
 
-def history_of(folders: Sequence[Path], asset: str, most: int) -> Any:
-    """Return the rows of one asset in the order of time as a pyarrow.Table; None if there are none.
+class AssetHistory:
+    """Archived rows of one asset, each of which is read once."""
 
-    Args:
-        folders: Folders of the fleet, one for each process.
-        asset: Name of the asset.
-        most: Rows after which older files are not read.
+    def __init__(self, folders: Sequence[Path], asset: str) -> None:
+        """`folders`: those of the fleet, one for each process."""
+        self._folders, self._asset = folders, asset
+        self._read: dict[Path, tuple[int, int]] = {}
+        """Number of the last file of a folder, and how many rows of it were read."""
 
-    Raises:
-        SourceError: If a file is damaged.
-    """
-    import pyarrow as pa
+    def read(self, most: int) -> Any:
+        """Return the rows since the last call in the order of time as a pyarrow.Table; None if there are none.
 
-    found = []
-    for folder in folders:
-        left = most
-        for rows in _pieces(folder, asset):
-            found.append(rows)
-            left -= rows.num_rows
-            if left <= 0:
-                break
-    table = pa.concat_tables(found[::-1]) if found else None
-    return None if table is None or not table.num_rows else table.sort_by("t_ns")
+        Args:
+            most: Rows of a folder after which older files are not read.
+
+        Raises:
+            SourceError: If a file is damaged.
+        """
+        import pyarrow as pa
+
+        found = []
+        for folder in self._folders:
+            left, (last, seen) = most, self._read.get(folder, (0, 0))
+            for number, rows in _pieces(folder, self._asset, last):
+                # A journal that was completed has the rows of an asset in the same order.
+                fresh = rows.slice(seen) if number == last else rows
+                if number >= self._read.get(folder, (0, 0))[0]:
+                    self._read[folder] = number, rows.num_rows
+                found.append(fresh)
+                left -= fresh.num_rows
+                if left <= 0:
+                    break
+        table = pa.concat_tables(found[::-1]) if found else None
+        return None if table is None or not table.num_rows else table.sort_by("t_ns")
 
 
-def _pieces(folder: Path, asset: str) -> Iterator[Any]:
-    """Yield the rows of an asset in each file, the newest first."""
+def _pieces(folder: Path, asset: str, first: int) -> Iterator[tuple[int, Any]]:
+    """Yield number and rows of an asset of each file, the newest first; those from the number `first` on."""
     import pyarrow.compute as pc
 
     # Journals first: one that is completed meanwhile is then among the files.
@@ -285,10 +296,12 @@ def _pieces(folder: Path, asset: str) -> Iterator[Any]:
     complete = {number_of(path) for path in parts}
     for number, table in sorted(journals.items(), reverse=True):
         if table is not None and number not in complete:
-            yield table.filter(pc.equal(table["asset"], asset))
+            yield number, table.filter(pc.equal(table["asset"], asset))
     for path in reversed(parts):
+        if number_of(path) < first:
+            return
         with suppress(FileNotFoundError):  # removed as surplus
-            yield _rows_of_part(path, asset)
+            yield number_of(path), _rows_of_part(path, asset)
 
 
 def _rows_of_part(path: Path, asset: str) -> Any:

@@ -125,14 +125,15 @@ class FleetPlan:
                 channel["only"] = {**channel.get("only", {}), column: {"text": [asset]}}
         return self._overrides(asset, given)
 
-    def archived(self, asset: str, file: Path) -> dict[str, str]:
-        """Return the overrides of the twin's YAML by which its source is a file with the archived rows of one asset."""
+    def archived(self, asset: str, folder: Path) -> dict[str, str]:
+        """Return the overrides of the twin's YAML by which it follows the archived rows of one asset in a folder."""
         model = self.twin.model
 
         def only(event: str, channel: int, columns: Iterable[str]) -> dict[str, Any]:
             return {"columns": [*columns], "only": {"event": {"text": [event]}, "channel": channel}}
 
-        given = {"type": "table", "files": [str(file.absolute())], "time": {"column": "t_ns", "unit": "ns"}}
+        given: dict[str, Any] = {"type": "table", "files": [str(folder.absolute() / "*.parquet")], "follow": True}
+        given["time"] = {"column": "t_ns", "unit": "ns"}
         sensors = {
             sensor.name: only("reading", k, (f"value_{row}" for row in range(len(sensor.rows))))
             for k, sensor in enumerate(model.sensors)
@@ -144,7 +145,15 @@ class FleetPlan:
         """Return the overrides of the twin's YAML for one asset with its own tuning and a source."""
         name = re.sub(r"[^A-Za-z0-9_-]", "_", asset).lstrip("_-") or "asset"
         own = {key: repr(value) for key, value in self.values.of(asset).items()}
-        return {"source": as_flow(source), "name": as_flow(name), "title": as_flow(asset), **own}
+        # The outputs are those of the fleet.
+        return {
+            "outputs": "{}",
+            "alerts": "[]",
+            "source": as_flow(source),
+            "name": as_flow(name),
+            "title": as_flow(asset),
+            **own,
+        }
 
 
 def load_fleet(

@@ -12,7 +12,7 @@ import pytest
 from app.cli.fleet import folders_of
 from app.live.fleet import RunningFleet
 from app.outputs import fleet_archive as archives
-from app.outputs.fleet_archive import FleetArchive, history_of, read_journal
+from app.outputs.fleet_archive import AssetHistory, FleetArchive, read_journal
 from app.outputs.parts import ArchivePlan, parts_of
 from app.twin.fleet import load_fleet
 from app.twin.twin import load_twin
@@ -57,12 +57,13 @@ def messages(seed=1, assets=7, count=60):
 
 def folded(fleet, asset, folders, tmp_path):
     """The last row of the fold over the archived rows of an asset, read as its page does."""
-    file = tmp_path / "history.parquet"
-    pq.write_table(history_of(folders, asset, 10**6), file)
-    twin = load_twin("motor_can", overrides=fleet.plan.archived(asset, file))
+    (folder := tmp_path / asset).mkdir()
+    rows = AssetHistory(folders, asset).read(10**6)
+    pq.write_table(rows, folder / "0.parquet")
+    twin = load_twin("motor_can", overrides=fleet.plan.archived(asset, folder))
     source, log = twin.open_source(lambda *_: None), Log.of(twin.model)
-    while (batch := source.read(1.0)) is not None:
-        log.extend(batch)
+    while log.n < rows.num_rows:
+        log.extend(source.read(1.0))
     source.close()
     expected = np.isin(np.arange(len(twin.model.sensors)), fleet.plan.source.fed)
     fold = Fold(twin.estimator, twin.model, twin.tuning, log, policy=twin.policy, expected=expected)
@@ -101,7 +102,7 @@ def test_each_process_has_a_folder_of_its_own_and_all_are_read(tmp_path):
         fleet.stop()
     assert [folder.name for folder in folders] == ["drives", "drives.1"]
     assert folders_of(plan, 1) == folders  # of an earlier run with two
-    counts = [history_of(folders, f"drive {a}", 10**6).num_rows for a in range(7)]
+    counts = [AssetHistory(folders, f"drive {a}").read(10**6).num_rows for a in range(7)]
     tables = [pq.read_table(parts_of(folder)[0]) for folder in folders]
     assert sum(counts) == sum(table.num_rows for table in tables) and min(counts) > 0
     assert not set(tables[0]["asset"].to_pylist()) & set(tables[1]["asset"].to_pylist())
@@ -175,7 +176,7 @@ def test_a_journal_of_a_killed_process_is_completed_up_to_its_last_whole_batch(t
     (part,) = parts_of(again.folder)
     journal.write_bytes(content)  # killed after the file was complete, and before its journal was removed
     again.archive._journal.close()
-    assert history_of([again.folder], "pump 3", 100)["value_0"].to_pylist() == [3.0, 8.0, 13.0, 18.0, 33.0, 38.0]
+    assert AssetHistory([again.folder], "pump 3").read(100)["value_0"].to_pylist() == [3.0, 8.0, 13.0, 18.0, 33.0, 38.0]
     archives.complete_journals(again.folder)
     assert len(parts_of(again.folder)) == 2 and part.exists() and len(again.values()) == 30
 
@@ -203,12 +204,36 @@ def test_the_rows_of_an_asset_are_in_one_or_two_groups_of_a_file_and_old_files_a
     read = []
     groups = pq.ParquetFile.read_row_groups
     monkeypatch.setattr(pq.ParquetFile, "read_row_groups", lambda file, k: read.append(len(k)) or groups(file, k))
-    found = history_of([written.folder], "pump 2", 10**6)["value_0"].to_pylist()
+    found = AssetHistory([written.folder], "pump 2").read(10**6)["value_0"].to_pylist()
     assert found == [*map(float, range(2, 3000, 5))]
     assert len(read) == len(parts) and sum(read) < sum(pq.ParquetFile(path).num_row_groups for path in parts) / 2
-    last = history_of([written.folder], "pump 2", 1)["value_0"].to_pylist()
+    last = AssetHistory([written.folder], "pump 2").read(1)["value_0"].to_pylist()
     assert last == found[-len(last) :] and len(last) < len(found)
-    assert history_of([written.folder], "pump 9", 10**6) is None
+    assert AssetHistory([written.folder], "pump 9").read(10**6) is None
+
+
+def test_each_row_of_an_asset_is_read_once_while_files_are_completed(tmp_path):
+    rng, written = np.random.default_rng(5), Written(tmp_path, Split())
+    history, found, files = AssetHistory([written.folder], "pump 2"), [], set()
+    for k in range(0, 600, 10):
+        written.put(k)
+        if rng.random() < 0.2:
+            written.archive._finish()
+        if rng.random() < 0.5 and (rows := history.read(10**6)) is not None:
+            found += rows["value_0"].to_pylist()
+        files.add(len(parts_of(written.folder)))
+    found += written.put(600) and history.read(10**6)["value_0"].to_pylist()
+    assert history.read(10**6) is None and len(files) > 5
+    assert found == [*map(float, range(2, 610, 5))]
+
+
+def test_the_page_of_an_asset_has_no_outputs_of_the_twin(tmp_path):
+    own = load_twin("motor_winding").loaded.text + "\noutputs: {mqtt: {host: broker}}\n"
+    (tmp_path / "own.yaml").write_text(own)
+    (tmp_path / "pumps.yaml").write_text("{twin: own.yaml, source: {type: push}}")
+    plan = load_fleet(tmp_path / "pumps.yaml")
+    assert plan.twin.config.outputs.mqtt is not None
+    assert load_twin(plan.twin.path, overrides=plan.archived("a", tmp_path)).config.outputs.mqtt is None
 
 
 def test_a_folder_that_cannot_be_written_is_one_report_and_loses_nothing(tmp_path, monkeypatch):

@@ -14,7 +14,7 @@ import pytest
 from playwright.sync_api import expect
 
 from app.live.fleet import RunningFleet
-from app.outputs.fleet_archive import history_of
+from app.outputs.fleet_archive import AssetHistory
 from app.outputs.parts import parts_of
 from app.twin.fleet import load_fleet
 from app.web.fleet import FleetApi, id_of
@@ -178,7 +178,7 @@ def test_a_click_opens_an_asset_of_messages_from_the_archive(tmp_path, browser):
         while ask("/api/readings", sent[1:])["refused"]:
             pass
         folders = [tmp_path / "archive" / name for name in ("pumps", "pumps.1")]
-        while (found := history_of(folders, "pump 3", 1000)) is None or found.num_rows < 60:
+        while (found := AssetHistory(folders, "pump 3").read(1000)) is None or found.num_rows < 60:
             pass
         page = browser.new_context(viewport={"width": 1440, "height": 900}).new_page()
         page.set_default_timeout(PATIENCE_S * 1e3)
@@ -188,6 +188,12 @@ def test_a_click_opens_an_asset_of_messages_from_the_archive(tmp_path, browser):
         expect(page.locator("#trust")).to_contain_text("pump_3", timeout=PATIENCE_S * 1e3)
         while (state := ask("/twins/pump%203/api/state"))["sensors"][0]["accepted"] < 60:
             pass
-        assert state["time_ns"] == max(item["time"] for item in sent if item["asset"] == "pump 3")
+        last = max(item["time"] for item in sent)
+        assert state["time_ns"] >= max(item["time"] for item in sent if item["asset"] == "pump 3")
+        more = [{"time": last + 10**9, "asset": "pump 3", "values": {"winding": 40.0}}]
+        assert ask("/api/readings", more)["accepted"]
+        while (state := ask("/twins/pump%203/api/state"))["sensors"][0]["accepted"] < 61:
+            pass  # the open page follows
+        assert state["time_ns"] >= last + 10**9
         page.close()
     assert all(map(parts_of, folders)) and not [*(tmp_path / "archive").glob("*/*.arrows")]
