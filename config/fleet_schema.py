@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from .fields import Count, Number, Section, Text, Texts, refused
+from .fields import Count, Duration, Number, Section, Text, Texts, refused
+from .output_schema import DelayOrNone, MqttSection, ReceiverSection
 from .source_schema import MqttSourceSection, PushSection, TableSection
 
 ASSET_LEVEL = "{asset}"
@@ -61,6 +62,48 @@ class AssetTuningsSection(Section):
         return self
 
 
+class FleetAlertSection(Section):
+    """A rule for alerts on the health of the assets. Those in alarm at a moment are one message."""
+
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$")] | None = None
+    """Name of the rule. Default: its condition, as in health-degraded."""
+    health: Literal["advisory", "suspect", "degraded", "diverged", "stale"]
+    """Health from which on an asset is in alarm: degraded includes diverged and stale."""
+    after: DelayOrNone = 1.0
+    """Seconds for which an asset must be so. Default: 1."""
+    clear: DelayOrNone = 10.0
+    """Seconds of better health after which an asset has recovered. Default: 10."""
+    group: DelayOrNone = 10.0
+    """Least seconds between two messages; what changes meanwhile is in the next. Default: 10."""
+    repeat: Duration | Literal["never"] = 3600.0
+    """Seconds after which a message is repeated while assets are in alarm. Default: 3600."""
+    to: Texts | None = None
+    """Names of receivers. Default: all."""
+
+    @property
+    def title(self) -> str:
+        """Name of the rule, or its condition."""
+        return self.name or f"health-{self.health}"
+
+
+class FleetOutputsSection(Section):
+    """Where the estimates of all assets are published, and who receives alerts. Nothing is published by default."""
+
+    every: Duration = 1.0
+    """Seconds between two states of an asset that are published, if it has changed. Default: 1."""
+    mqtt: MqttSection | None = None
+    """MQTT broker to which states are published, {host, port, prefix, ...}; topics are PREFIX/FLEET/ASSET/state.
+    Default: none."""
+    receivers: dict[Text, ReceiverSection] = {}
+    """Receivers of alerts, by name. Default: none."""
+
+    @model_validator(mode="after")
+    def _plain(self) -> FleetOutputsSection:
+        if self.mqtt is not None and self.mqtt.sparkplug is not None:
+            raise refused("relation", "has sparkplug, which is for single twins; leave it out", "mqtt")
+        return self
+
+
 class FleetSection(Section):
     """Many assets of one twin."""
 
@@ -80,6 +123,10 @@ class FleetSection(Section):
     """Processes over which the assets are spread by their names, each with a store of its own. Default: 1."""
     source: Annotated[FleetTableSection | FleetPushSection | FleetMqttSection, Field(discriminator="type")]
     """Source of the measurements: its `type` is table, push or mqtt, with the keys of that source in a twin."""
+    outputs: FleetOutputsSection = FleetOutputsSection()
+    """Where estimates are published, and who receives alerts: {mqtt, receivers}. Default: nowhere but the page."""
+    alerts: tuple[FleetAlertSection, ...] = ()
+    """Rules for alerts, as in [{health: degraded, after: 60}]. Default: {health: degraded} if there are receivers."""
 
     @model_validator(mode="after")
     def _once(self) -> FleetSection:

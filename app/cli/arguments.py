@@ -142,10 +142,10 @@ class ArchiveOptions:
 
     archive: Path | None = None
     """Archive each row of the twin, with its estimate, in Parquet files in this folder, in a folder for each twin;
-    `nisus query` reads them."""
+    `nisus query` reads them. A process that is killed loses the open file."""
     archive_split: str = "64MB,1h,day"
-    """Complete a file of the archive at this size or duration, or at the end of a day (UTC, by the times of the rows).
-    A process that is killed loses the open file."""
+    """Complete a file of the archive at this size or duration, or at the end of a day (UTC, by the times of the
+    rows)."""
     archive_keep: str | None = None
     """Remove the oldest files of a twin beyond this total size or age, or both: 20GB, 365d, or 20GB,365d."""
 
@@ -228,7 +228,7 @@ class ServeCommand(ArchiveOptions, ServiceOptions):
 
 
 @dataclass(frozen=True)
-class FleetCommand(JsonOption, ServiceOptions, TuningOption, EstimatorOption):
+class FleetCommand(JsonOption, ArchiveOptions, ServiceOptions, TuningOption, EstimatorOption):
     """Follow many assets of one twin, and show them in the browser: the worst health first, and the page of each.
 
     Examples:
@@ -249,6 +249,9 @@ class FleetCommand(JsonOption, ServiceOptions, TuningOption, EstimatorOption):
     store: Path | None = None
     """Keep the state of the fleet in this file (in a folder: FLEET.store), with the position in the source, and
     continue from it after a restart or a kill."""
+    archive: Path | None = field(default=None, kw_only=True)
+    """Keep the measurements of push and mqtt in Parquet files in this folder, in a folder for each fleet, so that each
+    asset has a page of its own; `nisus query` reads them."""
     recordings: Path = Path("recordings")
     """Folder of recordings, with a folder for each asset; created when needed."""
 

@@ -2,27 +2,34 @@
 
 from __future__ import annotations
 
+import itertools
 import tempfile
+import threading
 import time
 from collections.abc import Mapping
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from config.yaml_files import writing
-from estimators.errors import ConfigError
+from estimators.errors import ConfigError, NisusError
 from estimators.fleet.table import FleetTable
-from sources.source import Partition
+from sources.source import WHOLE, Partition, Report
 
 from ..live.fleet import RunningFleet
+from ..outputs.fleet import FleetPublisher
+from ..outputs.fleet_archive import AssetHistory, FleetArchive
+from ..outputs.parts import ArchivePlan
 from ..present.export.track_file import encoded
 from ..present.fleet_table import arrow_table, counts_of, fleet_topics, in_name_order, ordered
 from ..present.result import to_json, to_text
-from ..terminal import EndRequest, restore, when_asked_to_end
+from ..terminal import EndRequest, complain, restore, when_asked_to_end
 from ..twin.fleet import FleetPlan, load_fleet
 from ..twin.log_reader import remarking
+from ..views.recording.rrd_file import parse_split
 from ..web.fleet import FleetApi
-from ..web.partitions import PartitionedFleet, PartitionServer, store_of, threads_of
+from ..web.partitions import PartitionedFleet, PartitionServer, path_of, threads_of
 from ..web.service import Service
 from .options import settings
 from .prepare import attend, compile_for
@@ -37,6 +44,9 @@ FLEET_PRELOADED = (*PRELOADED, __name__, "pyarrow.dataset", "pyarrow.parquet")
 """Modules that the processes of a fleet and its pages share."""
 
 COMPILING = "compiling the fleet, once"
+
+FOLLOW_PERIOD_S, FOLLOW_SHARE = 2.0, 0.05
+"""Shortest time between two looks of an asset's page into the archive, and the share of time that they may take."""
 
 LOOK_PERIOD_S = 0.1
 """Seconds between two looks whether all partitions have ended."""
@@ -59,17 +69,31 @@ def run_fleet(arguments: FleetCommand) -> int:
     report, store = remarking(lambda *_: None), arguments.store
     if store is not None and store.is_dir():
         store = store / f"{plan.name}.store"
+    archive = None
+    if arguments.archive is not None:
+        if plan.reads_files:
+            raise ConfigError("--archive: the source is tables, which are kept already; leave it out")
+        split = parse_split(arguments.archive_split, arguments.archive_keep, "--archive")
+        archive = ArchivePlan(arguments.archive / plan.name, split)
     running: RunningFleet | PartitionedFleet
     if plan.config.processes > 1:
-        opened = partial(open_partition, arguments.fleet, overrides, plan.config.processes, store)
+        opened = partial(open_partition, arguments.fleet, overrides, plan.config.processes, store, archive)
         child = partial(run_child, opened, False)
         running = attend(None, lambda: PartitionedFleet(plan, report, child, preload=FLEET_PRELOADED), COMPILING)
     else:
-        running = attend(None, lambda: RunningFleet(plan, report, store=store), COMPILING)
-    if door is not None:
-        _serve(running, door, arguments, overrides)
-    else:
-        _fold(running, arguments.duration)
+        running = attend(None, lambda: _running(plan, report, store, archive), COMPILING)
+    page = None if door is None else f"http://127.0.0.1:{door.port}"
+    publisher = None if plan.ends else FleetPublisher(running, page=page)
+    if publisher is not None:
+        publisher.start()
+    try:
+        if door is not None:
+            _serve(running, door, arguments, overrides, archive)
+        else:
+            _fold(running, arguments.duration)
+    finally:
+        if publisher is not None:
+            publisher.stop()
     _, _, table = running.table()
     if not len(table.assets) or not table.events.any():
         place = plan.source.loaded.places.at(("source",))
@@ -105,10 +129,15 @@ def _fold(running: RunningFleet | PartitionedFleet, duration: float | None) -> N
 
 
 def _serve(
-    running: RunningFleet | PartitionedFleet, door: Door, arguments: FleetCommand, overrides: Mapping[str, str]
+    running: RunningFleet | PartitionedFleet,
+    door: Door,
+    arguments: FleetCommand,
+    overrides: Mapping[str, str],
+    archive: ArchivePlan | None,
 ) -> None:
     """Serve the overview and pages of assets until the duration is over, or the program is asked to end."""
-    opened = partial(_opened, arguments.fleet, overrides, arguments.recordings)
+    folders = None if archive is None else folders_of(archive, running.plan.config.processes)
+    opened = partial(_opened, arguments.fleet, overrides, arguments.recordings, folders)
     overview = FleetApi(running)
     service = Service({}, partial(run_child, opened, False), door=door, preload=FLEET_PRELOADED, overview=overview)
     running.start()
@@ -118,20 +147,82 @@ def _serve(
         running.stop()
 
 
+def _running(
+    plan: FleetPlan, report: Report, store: Path | None, archive: ArchivePlan | None, partition: Partition = WHOLE
+) -> RunningFleet:
+    """Return the part of a fleet that one process folds, with its store and archive."""
+    threads = None if partition == WHOLE else threads_of(partition.processes)
+    own = None if store is None else path_of(store, partition)
+    running = RunningFleet(plan, report, threads=threads, store=own, partition=partition)
+    if archive is not None:
+        archive = archive._replace(folder=path_of(archive.folder, partition))
+
+        def say(key: str, text: str) -> None:
+            complain(text)
+            running.note(key, text)
+
+        running.archive = FleetArchive(archive, plan.twin.model, running.names, say)
+    return running
+
+
 def open_partition(
-    fleet: Path, overrides: Mapping[str, str], processes: int, store: Path | None, name: str, number: str
+    fleet: Path,
+    overrides: Mapping[str, str],
+    processes: int,
+    store: Path | None,
+    archive: ArchivePlan | None,
+    name: str,
+    number: str,
 ) -> Opened:
     """Open the partition of a fleet that has a number."""
     plan, partition = load_fleet(fleet, overrides, processes), Partition(int(number), processes)
-    running = RunningFleet(
-        plan, remarking(lambda *_: None), threads=threads_of(processes), store=store_of(store, partition),
-        partition=partition,
-    )  # fmt: skip
+    running = _running(plan, remarking(lambda *_: None), store, archive, partition)
     served = PartitionServer(running)
     return Opened(served, {}, served.report)
 
 
-def _opened(fleet: Path, overrides: Mapping[str, str], recordings: Path, name: str, asset: str) -> Opened:
+def folders_of(archive: ArchivePlan, processes: int) -> list[Path]:
+    """Return the folders of a fleet's archive, one for each process, also of earlier runs with more of them."""
+    numbers = itertools.takewhile(
+        lambda k: k < processes or path_of(archive.folder, Partition(k)).is_dir(), itertools.count()
+    )
+    return [path_of(archive.folder, Partition(k)) for k in numbers]
+
+
+def follow(history: AssetHistory, folder: Path, most: int) -> threading.Event:
+    """Write the rows of an asset into files of a folder, now at most so many, and then in a thread until it is ended.
+
+    Raises:
+        ConfigError: If there are none.
+        SourceError: If a file of the archive is damaged.
+    """
+    import pyarrow.parquet
+
+    numbers, ended = itertools.count(), threading.Event()
+
+    def write() -> bool:
+        rows = history.read(most)
+        if rows is not None:
+            pyarrow.parquet.write_table(rows, folder / f"{next(numbers):08d}.parquet")
+        return rows is not None
+
+    def go_on() -> None:
+        pause = FOLLOW_PERIOD_S
+        while not ended.wait(pause):
+            begun = time.monotonic()
+            with suppress(NisusError, OSError):  # at the end of the process, the folder is removed
+                write()
+            pause = max(FOLLOW_PERIOD_S, (time.monotonic() - begun) / FOLLOW_SHARE)
+
+    if not write():
+        raise ConfigError("the archive has no measurements of it yet")
+    threading.Thread(target=go_on, name="archive", daemon=True).start()
+    return ended
+
+
+def _opened(
+    fleet: Path, overrides: Mapping[str, str], recordings: Path, folders: list[Path] | None, name: str, asset: str
+) -> Opened:
     """Open the history of an asset."""
     from ..web.gallery.gallery import StartRequest
     from ..web.session import Page
@@ -139,9 +230,18 @@ def _opened(fleet: Path, overrides: Mapping[str, str], recordings: Path, name: s
 
     folder = tempfile.TemporaryDirectory(prefix="nisus-")  # removed at the end of the process
 
+    following: list[threading.Event] = []
+
     def read() -> OpenedTwin:
         plan = load_fleet(fleet, overrides)
-        history = plan.history_of(asset, Path(folder.name))
+        if folders is None:
+            history = plan.history_of(asset, Path(folder.name))
+        else:
+            place = Path(tempfile.mkdtemp(dir=folder.name))
+            history = plan.archived(asset, place)
+            for ended in following:  # of a page that is opened anew
+                ended.set()
+            following[:] = [follow(AssetHistory(folders, asset), place, plan.twin.config.history)]
         return opened_twin(str(plan.twin.path), overrides={**overrides, **history})
 
     opener = FileOpener({asset: read})

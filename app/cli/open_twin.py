@@ -12,7 +12,7 @@ import numpy as np
 
 from config.loader import shipped
 
-from ..outputs.archive import ArchivePlan
+from ..outputs.parts import ArchivePlan
 from ..twin.log_reader import remarking
 from ..twin.twin import Twin, load_twin, restore_twin
 from ..views.recording.rrd_file import NEVER, Split

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from estimators.errors import ConfigError, nearest
 
-from ..outputs.archive import parts_of
+from ..outputs.parts import parts_of
 from ..present.result import Topic, to_json, to_text
 
 if TYPE_CHECKING:

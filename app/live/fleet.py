@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
@@ -24,6 +24,9 @@ from ..twin.twin import Twin
 from .fold_json import tuning_to_json
 from .silent_assets import SilentAssets
 from .store import Store
+
+if TYPE_CHECKING:
+    from estimators.log import Events
 
 FIRST_ROOM = 256
 """Assets for which there is room at the start, unless their number is given; it is doubled as they come."""
@@ -51,6 +54,19 @@ CHANGED = {"version": "another version of Nisus", "partition": "another number o
 
 UNKNOWN, FOREIGN = -1, -2
 """In place of the position of an asset: it is refused, or another process has it."""
+
+
+class EventSink(Protocol):
+    """Takes the events of a fleet."""
+
+    def put(self, at: np.ndarray, events: Events) -> None:
+        """Take events of the assets at the positions `at` (N,), at once."""
+
+    def start(self) -> None:
+        """Begin."""
+
+    def stop(self) -> None:
+        """End, with all events that were taken."""
 
 
 class RunningFleet:
@@ -105,6 +121,9 @@ class RunningFleet:
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name="fleet", daemon=True)
         self._changed: set[int] = set()
+        self._unarchived: list[tuple[np.ndarray, Events]] = []
+        self.archive: EventSink | None = None
+        """What keeps the events; None for nothing. It is started and stopped with the fleet."""
         self._due, self._asked, self._kept = 0.0, False, -1
         self._store = None if store is None else Store(store)
         try:
@@ -149,6 +168,8 @@ class RunningFleet:
 
     def run(self, go_on: Callable[[], bool] = lambda: True) -> None:
         """Read and fold in this thread until the source ends, or `go_on` returns False."""
+        if self.archive is not None:
+            self.archive.start()
         while go_on() and self.step():
             pass
         self._fold()
@@ -162,6 +183,8 @@ class RunningFleet:
         self.source.close()
         if self._store is not None:
             self._store.close()
+        if self.archive is not None:
+            self.archive.stop()
 
     def _run(self) -> None:
         try:
@@ -205,6 +228,8 @@ class RunningFleet:
         with self._lock:
             self._silent.put_back(np.unique(at))
             self.fleet.add_events(at, events)
+        if self.archive is not None:
+            self._unarchived.append((at, events))
         self._changed.update(np.unique(at // BLOCK).tolist())
         np.maximum.at(self._last, at, events.t)
 
@@ -251,6 +276,7 @@ class RunningFleet:
         """Write what has changed to the store, with the position in the source; all events are folded."""
         begun, source = time.monotonic(), self.source
         if self._store is None:
+            self._hand_over()
             return
         urgent = at_once or self._asked
         if isinstance(source, Acknowledging):
@@ -269,9 +295,18 @@ class RunningFleet:
         self._store.write_blocks(blocks)
         self._changed.clear()
         self._kept = mark
+        # Not before: after a kill, messages that are not in the store come again.
+        self._hand_over()
         if isinstance(source, Acknowledging):
             source.acknowledge()
         self._due = begun + max(STORE_PERIOD_S, (time.monotonic() - begun) / STORE_SHARE)
+
+    def _hand_over(self) -> None:
+        """Pass the events that count to the archive."""
+        if self.archive is not None:
+            for at, events in self._unarchived:
+                self.archive.put(at, events)
+            self._unarchived.clear()
 
     def _continue(self, store: Store) -> None:
         blocks = store.read_blocks()

@@ -19,8 +19,8 @@ from estimators.errors import NisusError
 from ..live.jobs import Jobs
 from ..live.outputs import OutputLink
 from ..present.state_message import StateMessage, state_message
-from .alerts import FIRING, AlertRules, heartbeat
-from .receivers import Delivery, make_receivers
+from .alerts import AlertRules
+from .receivers import Deliveries
 
 if TYPE_CHECKING:
     from config.schema import TwinSection
@@ -61,8 +61,7 @@ class Parts(NamedTuple):
     config: TwinSection
     outputs: tuple[Output, ...]
     rules: AlertRules
-    deliveries: dict[str, Delivery]
-    heartbeats: dict[str, float]
+    deliveries: Deliveries
     jobs: Jobs
 
 
@@ -83,7 +82,6 @@ class Publisher:
         self._parts = self._make()
         self._grown, self._stopping = threading.Event(), threading.Event()
         self._thread = threading.Thread(target=self._run, name="outputs", daemon=True)
-        self._beats: dict[str, float] = {}
 
     def start(self) -> None:
         """Connect and begin to publish."""
@@ -111,7 +109,7 @@ class Publisher:
             "outputs": [{"name": item.name} | item.link()._asdict() for item in parts.outputs],
             "receivers": [
                 {name: getattr(item, name) for name in ("name", "failing", "waiting", "delivered", "dropped")}
-                for item in parts.deliveries.values()
+                for item in parts.deliveries.queues.values()
             ],
             "alerts": [
                 {"id": item.id, "rule": item.rule.title, "subject": item.finding.subject, "since": item.since}
@@ -127,9 +125,15 @@ class Publisher:
         section, rules = twin.config.outputs, twin.config.alerts
         mqtt = None
         if section.mqtt is not None:
-            from .mqtt import MqttOutput
+            from .mqtt import JsonTopics, MqttOutput
+            from .sparkplug import SparkplugNode
 
-            mqtt = MqttOutput(section.mqtt, self._engine)
+            form = (
+                JsonTopics(section.mqtt.prefix, twin.name, lambda: self._engine.model)
+                if section.mqtt.sparkplug is None
+                else SparkplugNode(section.mqtt.sparkplug, self._engine)
+            )
+            mqtt = MqttOutput(section.mqtt, twin.name, form, notices)
         outputs: list[Output] = [] if mqtt is None else [mqtt]
         if section.opcua is not None:
             from .opcua import OpcUaOutput
@@ -139,14 +143,11 @@ class Publisher:
             from .can import CanOutput
 
             outputs.append(CanOutput(section.can, self._engine, twin.path.absolute().parent))
-        receivers = make_receivers(section.receivers, twin.path.absolute().parent, mqtt)
-        if receivers and not rules:
+        deliveries = Deliveries(section.receivers, twin.path.absolute().parent, mqtt, notices)
+        if deliveries.queues and not rules:
             rules = (HEALTH_RULE,)
-        deliveries = {name: Delivery(name, item, notices) for name, item in receivers.items()}
-        beats = {name: getattr(item, "heartbeat", None) for name, item in section.receivers.items()}
-        heartbeats = {name: period for name, period in beats.items() if period is not None}
-        jobs = Jobs(notices, "output", threads=1 + len(deliveries), niceness=0)
-        return Parts(twin.config, tuple(outputs), AlertRules(rules, link=self._page), deliveries, heartbeats, jobs)
+        jobs = Jobs(notices, "output", threads=1 + len(deliveries.queues), niceness=0)
+        return Parts(twin.config, tuple(outputs), AlertRules(rules, link=self._page), deliveries, jobs)
 
     def _begin(self) -> None:
         parts = self._parts
@@ -154,10 +155,9 @@ class Publisher:
             output.start()
         if parts.outputs:
             self._engine.grown |= {self._grown.set}
-        if parts.deliveries:
+        if parts.deliveries.queues:
             parts.jobs.run("alerts", lambda job: self._look(parts), every=RULES_PERIOD_S)
-        for delivery in parts.deliveries.values():
-            parts.jobs.run(f"alerts to {delivery.name}", delivery.step, every=RULES_PERIOD_S)
+        parts.deliveries.run(parts.jobs, RULES_PERIOD_S)
         parts.jobs.start()
 
     def _end(self) -> None:
@@ -210,13 +210,5 @@ class Publisher:
         """Put the alerts that are due into the queues of their receivers."""
         message = state_message(self._engine)
         for rule, alert in parts.rules.look(self._engine, message):
-            self._engine.notices.say(
-                f"alert {alert.status}: {alert.text}", level="warn" if alert.status == FIRING else "info"
-            )
-            for name in rule.to or parts.deliveries:
-                parts.deliveries[name].put(alert)
-        now = time.monotonic()
-        for name, period in parts.heartbeats.items():
-            if now - self._beats.get(name, -np.inf) >= period:
-                self._beats[name] = now
-                parts.deliveries[name].put(heartbeat(message.twin, message.health))
+            parts.deliveries.put(alert, rule.to)
+        parts.deliveries.beat(message.twin, message.health)

@@ -6,22 +6,20 @@ Files are written under another name and renamed when they are complete, so a ki
 
 from __future__ import annotations
 
-import os
 import threading
 import time
 from contextlib import suppress
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from functools import partial
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from estimators.errors import SourceError
 from estimators.events.batch import MAINTENANCE
 from estimators.interface.table import table_of
 
 from ..live.history_copy import last_written
 from ..live.outputs import Pull
-from ..views.recording.rrd_file import Disk, Split
+from .parts import DAY_NS, GROUP_ROWS, ArchivePlan, Part, parts_of, remove_surplus
 
 if TYPE_CHECKING:
     from ..live.running_fold import Running, StoredTwin
@@ -31,21 +29,6 @@ PERIOD_S, IDLE_PERIOD_S = 0.05, 1.0
 
 RETRY_PERIOD_S = 10.0
 """Seconds to the next attempt after a failure."""
-
-GROUP_ROWS = 8192
-"""Rows that are written at once; fewer only at the end of a file."""
-
-OPEN = ".open"
-"""Ending of the file that is being written."""
-
-DAY_NS = 86_400 * 10**9
-
-
-class ArchivePlan(NamedTuple):
-    """Folder of one twin, whose name is the twin's in the archive, and the limits of files and folder."""
-
-    folder: Path
-    split: Split
 
 
 class Archive:
@@ -57,10 +40,12 @@ class Archive:
         self._cursor = engine.cursor(follows_log=True)
         self._next, self._versions = 0, _Versions()
         self._begin = 0 if stored is None else stored.tail.first
-        self._part: _Part | None = None
+        self._part: Part | None = None
         self._failed = False
         self._stopping, self._grown = threading.Event(), threading.Event()
         self._stored = stored
+        report = partial(engine.notices.report, counted=False)
+        self._remove_surplus = partial(remove_surplus, plan.folder, plan.split, report)
         self._thread = threading.Thread(target=self._run, name="archive", daemon=True)
 
     def start(self) -> None:
@@ -127,7 +112,7 @@ class Archive:
         if end == cursor.next and self._part is None:
             return
         if self._part is None:
-            self._part = _Part(self._folder)
+            self._part = Part(self._folder)
             self._remove_surplus()
         due = closing or time.monotonic() - self._part.begun >= self._split.seconds
         if not due and 0 <= end - cursor.next < min(GROUP_ROWS, engine.history // 4):
@@ -161,7 +146,7 @@ class Archive:
             if self._part is not None and self._part.writer is not None and self._part.writer.schema != table.schema:
                 self._finish()
             if self._part is None:
-                self._part = _Part(self._folder)
+                self._part = Part(self._folder)
             self._part.write(table, pull.first + start, int(events.t[start]), day)
             if self._part.size >= self._split.size:
                 self._finish()
@@ -210,23 +195,6 @@ class Archive:
             if part.first is not None:
                 self._next = self._cursor.next = part.first
 
-    def _remove_surplus(self) -> None:
-        """Remove the oldest files beyond the size and age that are kept; the last one stays."""
-        kept, split = 0.0, self._split
-        for path in parts_of(self._folder)[::-1]:
-            try:
-                stat = path.stat()
-                old = bool(kept) and (
-                    kept + stat.st_size > split.kept_bytes or time.time() - stat.st_mtime > split.kept_seconds
-                )
-                kept += stat.st_size
-                if old:
-                    path.unlink()
-            except OSError as error:
-                self._engine.notices.report(
-                    "kept archive", f"{path}: it cannot be removed ({error.strerror})", counted=False
-                )
-
 
 class _Versions:
     """Version of the model before a row, counted from the maintenance events before it."""
@@ -245,92 +213,3 @@ class _Versions:
         begun = bool(rows.size) and int(events.t[rows[0]]) in times
         self._changes += [(first + int(k), int(events.t[k])) for k in rows]
         return self._first + len(times) - begun
-
-
-def parts_of(folder: Path) -> list[Path]:
-    """Return the complete files of a twin in the order of writing."""
-    found = [path for path in folder.glob("*-*.parquet") if path.stem.rpartition("-")[2].isdigit()]
-    return sorted(found, key=_number)
-
-
-def _number(path: Path) -> int:
-    return int(path.stem.rpartition("-")[2])
-
-
-class _Part:
-    """File that is being written."""
-
-    def __init__(self, folder: Path) -> None:
-        """Open it under a number that is not taken.
-
-        Raises:
-            OSError: If that is not possible.
-            SourceError: If the disk is nearly full, or another process writes into the folder.
-        """
-        folder.mkdir(parents=True, exist_ok=True)
-        for left in folder.glob(f"*{OPEN}"):
-            with left.open("rb") as file:
-                if not _lock(file):
-                    raise SourceError("another process writes into it; choose another folder")
-            left.unlink(missing_ok=True)  # of a process that was killed
-        if Disk(folder).free() < 0:
-            raise SourceError("the disk is nearly full; free some space")
-        self._number = max(map(_number, parts_of(folder)), default=0) + 1
-        self._path = folder / f"{self._number:06d}.parquet{OPEN}"
-        self._file = self._path.open("xb")
-        _lock(self._file)
-        self.writer: Any = None
-        self.begun = time.monotonic()
-        self.first: int | None = None
-        """Absolute index of its first row; None while there is none."""
-        self.day: int | None = None
-        self._t = 0
-
-    @property
-    def size(self) -> int:
-        """Bytes so far."""
-        return self._file.tell()
-
-    def write(self, table: Any, first: int, t: int, day: int) -> None:
-        """Append rows, the first of which has this absolute index and time, ns; `day` is that of all its rows."""
-        import pyarrow.parquet
-
-        if self.writer is None:
-            self.first, self.day, self._t = first, day, t
-            self.writer = pyarrow.parquet.ParquetWriter(self._file, table.schema, compression="zstd")
-        self.writer.write_table(table)
-
-    def close(self) -> None:
-        """Complete the file and give it its name: the day of its first row, and its number."""
-        if self.writer is None:
-            self.abandon()
-            return
-        self.writer.close()
-        self._file.flush()
-        os.fsync(self._file.fileno())
-        day = np.datetime64(self._t // DAY_NS, "D")
-        self._path.rename(self._path.with_name(f"{day}-{self._number:06d}.parquet"))
-        self._file.close()
-
-    def abandon(self) -> None:
-        """Remove the file."""
-        with suppress(Exception):  # the writer writes the end of the file
-            if self.writer is not None:
-                self.writer.close()
-        with suppress(OSError):
-            self._file.close()
-        with suppress(OSError):
-            self._path.unlink(missing_ok=True)
-
-
-def _lock(file: Any) -> bool:
-    """Lock a file for this process; return whether no other one has it."""
-    try:
-        import fcntl
-    except ImportError:  # Windows, where an open file cannot be removed
-        return True
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        return False
-    return True

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import threading
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from estimators.errors import printable
@@ -16,27 +17,39 @@ from .sparkplug import Packet, SparkplugNode
 
 if TYPE_CHECKING:
     from config.output_schema import MqttSection
+    from estimators.model.state_space import StateSpaceModel
 
     from ..live.notices import Notices
-    from ..live.running_fold import Running
 
 MAX_UNSENT = 100
 """States that the connection has not taken; with more, a broker that reads too slowly loses some."""
+
+ESCAPES = {ord(mark): f"%{ord(mark):02X}" for mark in "%+#/\0"}
+"""Characters of the name of an asset that cannot be in a level of a topic, and the escape."""
 
 STATUS, BIRTH, STATE, ALERT = "status", "birth", "state", "alert"
 """Last parts of the topics."""
 
 
 class JsonTopics:
-    """Messages of one twin as JSON, under PREFIX/TWIN."""
+    """Messages of one twin as JSON, under PREFIX/TWIN; or of the assets of a fleet, under PREFIX/FLEET/ASSET."""
 
     commands: str | None = None
     """Topic of commands to the twin; none."""
 
-    def __init__(self, prefix: str, engine: Running) -> None:
-        """Name the topics."""
-        self._engine = engine
-        self.place = f"{prefix}/{engine.twin.name}"
+    def __init__(
+        self, prefix: str, name: str, model: Callable[[], StateSpaceModel], *, of_assets: bool = False
+    ) -> None:
+        """Name the topics.
+
+        Args:
+            prefix: First part of the topics.
+            name: Name of the twin or fleet.
+            model: Returns its present model.
+            of_assets: Whether states are those of assets. They are retained, as one is published when it changes.
+        """
+        self._name, self._model, self._of_assets = name, model, of_assets
+        self.place = f"{prefix}/{name}"
 
     def will(self) -> Packet:
         """Return the message that the broker publishes when it loses the next connection."""
@@ -52,7 +65,8 @@ class JsonTopics:
 
     def states(self, message: StateMessage) -> list[Packet]:
         """Return the messages of a state."""
-        return [Packet(f"{self.place}/{STATE}", message.model_dump_json())]
+        place = f"{self.place}/{message.twin.translate(ESCAPES)}" if self._of_assets else self.place
+        return [Packet(f"{place}/{STATE}", message.model_dump_json(), retain=self._of_assets)]
 
     def lost(self) -> None:
         """Note the end of a connection."""
@@ -67,10 +81,10 @@ class JsonTopics:
 
     def _birth(self) -> str:
         """Return names and units of all values, and the schema of the messages."""
-        model = self._engine.model
+        model = self._model()
         parts: dict[str, Any] = {"states": model.shown_states, "inputs": model.inputs}
         names = {key: [{"name": item.name, "unit": item.unit} for item in items] for key, items in parts.items()}
-        told = {"twin": self._engine.twin.name, "since": iso_now(), **names, "sensors": list(model.sensor_names)}
+        told = {"twin": self._name, "since": iso_now(), **names, "sensors": list(model.sensor_names)}
         return json.dumps(told | {"schema": state_schema()})
 
 
@@ -79,25 +93,26 @@ class MqttOutput:
 
     name = "mqtt"
 
-    def __init__(self, section: MqttSection, engine: Running) -> None:
+    def __init__(self, section: MqttSection, name: str, form: JsonTopics | SparkplugNode, notices: Notices) -> None:
         """Prepare; nothing is connected yet.
 
+        Args:
+            section: The broker.
+            name: Name of the twin or fleet.
+            form: Its messages.
+            notices: Where problems are reported.
+
         Raises:
-            ConfigError: If paho-mqtt or a secret is missing, or Sparkplug does not allow the twin's name.
+            ConfigError: If paho-mqtt or a secret is missing.
         """
         from sources.brokers import mqtt_client
 
-        self._section, self._engine = section, engine
-        self._alerts = f"{section.prefix}/{engine.twin.name}/{ALERT}"
-        self._form: JsonTopics | SparkplugNode = (
-            JsonTopics(section.prefix, engine)
-            if section.sparkplug is None
-            else SparkplugNode(section.sparkplug, engine)
-        )
+        self._section, self._form, self._notices = section, form, notices
+        self._alerts = f"{section.prefix}/{name}/{ALERT}"
         self._ordered = threading.Lock()
         """Held from making a message to handing it to the client, as Sparkplug numbers them."""
         password = None if section.password_env is None else secret(section.password_env)
-        self.client: Any = mqtt_client(section, password, client_id=f"nisus-{engine.twin.name}")
+        self.client: Any = mqtt_client(section, password, client_id=f"nisus-{name}")
         self.client.on_pre_connect = self._connecting
         self.client.on_message = self._command
         self.client.on_connect, self.client.on_disconnect = self._connected, self._disconnected
@@ -105,16 +120,20 @@ class MqttOutput:
         self.client.on_publish = self._taken
         self._unsent, self._dropped, self._counting = 0, 0, threading.Lock()
         self._problem = "not connected yet"
+        self.connections = 0
+        """How often it was connected."""
         self._reported = False
-
-    @property
-    def _notices(self) -> Notices:
-        return self._engine.notices
 
     def start(self) -> None:
         """See `Output`."""
         self.client.connect_async(self._section.host, self._section.port, keepalive=15)
         self.client.loop_start()
+
+    @property
+    def room(self) -> int:
+        """Number of states that the connection takes now."""
+        with self._counting:
+            return max(0, MAX_UNSENT - self._unsent) if self.client.is_connected() else 0
 
     def publish(self, message: StateMessage) -> None:
         """See `Output`."""
@@ -190,6 +209,7 @@ class MqttOutput:
             return
         with self._counting:
             self._unsent, self._dropped = 0, 0
+        self.connections += 1
         if self._form.commands is not None:
             client.subscribe(self._form.commands, qos=1)
         with self._ordered:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import hmac
+import math
 import os
 import smtplib
 import socket
@@ -17,7 +18,7 @@ import tempfile
 import threading
 import time
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from email.message import EmailMessage
 from functools import partial
@@ -30,9 +31,9 @@ from urllib.request import HTTPHandler, HTTPRedirectHandler, HTTPSHandler, Reque
 from config.output_schema import CommandSection, EmailSection, WebhookSection
 from estimators.errors import ConfigError, printable
 
-from ..live.jobs import Job
+from ..live.jobs import Job, Jobs
 from ..live.notices import Notices
-from .alerts import HEARTBEAT, AlertMessage
+from .alerts import FIRING, HEARTBEAT, AlertMessage, heartbeat
 
 MAX_WAITING_ALERTS = 100
 """Alerts that wait for a receiver; then the oldest is dropped."""
@@ -301,6 +302,49 @@ class Delivery:
             text = " ".join(printable(reason).split())[:200]
             self._notices.say(f"alerts: receiver {self.name} fails ({text}); they wait, and it is tried again", "warn")
         return pause
+
+
+class Deliveries:
+    """Queues of all receivers, and their messages that a twin or fleet runs."""
+
+    def __init__(self, sections: Mapping[str, Any], folder: Path, mqtt: Receiver | None, notices: Notices) -> None:
+        """Make the receivers.
+
+        Args:
+            sections: Receivers of the YAML by name.
+            folder: Folder of the YAML.
+            mqtt: Receiver of type mqtt.
+            notices: Where alerts and failures are reported.
+
+        Raises:
+            ConfigError: If a secret is not in the environment.
+        """
+        self._notices = notices
+        self.queues = {
+            name: Delivery(name, item, notices) for name, item in make_receivers(sections, folder, mqtt).items()
+        }
+        periods = {name: getattr(item, "heartbeat", None) for name, item in sections.items()}
+        self._periods = {name: period for name, period in periods.items() if period is not None}
+        self._beats: dict[str, float] = {}
+
+    def put(self, alert: AlertMessage, to: Sequence[str] | None) -> None:
+        """Report an alert, and add it to the queues of the receivers of these names; None for all."""
+        self._notices.say(f"alert {alert.status}: {alert.text}", level="warn" if alert.status == FIRING else "info")
+        for name in to or self.queues:
+            self.queues[name].put(alert)
+
+    def beat(self, twin: str, health: str) -> None:
+        """Add the messages that it runs, where they are due."""
+        now = time.monotonic()
+        for name, period in self._periods.items():
+            if now - self._beats.get(name, -math.inf) >= period:
+                self._beats[name] = now
+                self.queues[name].put(heartbeat(twin, health))
+
+    def run(self, jobs: Jobs, every: float) -> None:
+        """Deliver in threads of a pool."""
+        for queue in self.queues.values():
+            jobs.run(f"alerts to {queue.name}", queue.step, every=every)
 
 
 def make_receivers(sections: Mapping[str, Any], folder: Path, mqtt: Receiver | None) -> dict[str, Receiver]:

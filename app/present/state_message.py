@@ -14,6 +14,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from estimators.diagnostics.detectors import CALENDAR_FROM_S
+from estimators.model.parts import State
 from estimators.track import DEGRADED, GATED, HEALTH_NAMES, MISSING, SUSPECT, USABLE, USED
 
 from ..live.running_fold import Running
@@ -108,23 +109,10 @@ def state_message(engine: Running, *, covariance: bool = False) -> StateMessage:
     levels = {} if status.integrity is None else status.integrity.bounds
     reason = "" if health in PUBLISHED else status.cause or f"the twin is {HEALTH_NAMES[health]}"
     states = []
-    for j, state in enumerate(model.shown_states):
-        mean, std = float(status.mean[j]), float(status.std[j])
-        why = reason or status.withheld.get(state.name, "")
-        if not why and not (math.isfinite(mean) and math.isfinite(std)):
-            why = "the estimate is not a number"
+    for state, mean, std in zip(model.shown_states, status.mean.tolist(), status.std.tolist(), strict=True):
         level = levels.get(state.name)
-        states.append(
-            PublishedState(
-                name=state.name,
-                unit=state.unit,
-                value=None if why else mean,
-                std=None if why else std,
-                protection_level=None if why or level is None else _number(level.bound),
-                valid=not why,
-                reason=why,
-            )
-        )
+        why = reason or status.withheld.get(state.name, "")
+        states.append(published_state(state, mean, std, why, None if level is None else level.bound))
     inputs = [_input(item, float(value)) for item, value in zip(model.inputs, status.inputs, strict=True)]
     sensors = [
         PublishedSensor(
@@ -134,7 +122,7 @@ def state_message(engine: Running, *, covariance: bool = False) -> StateMessage:
             accepted=int(counts[USED]),
             rejected=int(counts[GATED]),
             dropouts=int(counts[MISSING]),
-            nis=_number(nis),
+            nis=number_or_none(nis),
         )
         for name, used, counts, nis in zip(
             model.sensor_names, tuning.used, status.sensor_rows, status.sensor_nis, strict=True
@@ -142,12 +130,11 @@ def state_message(engine: Running, *, covariance: bool = False) -> StateMessage:
     ]
     valid = all(item.valid for item in states)
     P = engine.belief(status.t).cov if covariance and valid else None
-    seconds = status.t * 1e-9 if status.t is not None else 0.0
     return StateMessage(
         twin=engine.twin.name,
         estimator=status.estimator,
         time_ns=status.t,
-        time=iso(status.t) if status.t is not None and seconds >= CALENDAR_FROM_S else None,
+        time=calendar_time(status.t),
         sent=iso_now(),
         age_s=None if status.t is None else max(0.0, time.monotonic() - status.heard),
         revision=status.revision,
@@ -157,13 +144,41 @@ def state_message(engine: Running, *, covariance: bool = False) -> StateMessage:
         cause=status.cause,
         estimate_valid=valid,
         inputs_valid=all(item.valid for item in inputs),
-        nis=_number(status.nis.ratio),
+        nis=number_or_none(status.nis.ratio),
         states=tuple(states),
         inputs=tuple(inputs),
         sensors=tuple(sensors),
         covariance=None if P is None else tuple(map(tuple, P.tolist())),
         covariance_of=None if P is None else tuple(model.state_names),
     )
+
+
+def published_state(state: State, mean: float, std: float, reason: str, level: float | None = None) -> PublishedState:
+    """Return one state of a message.
+
+    Args:
+        state: The state.
+        mean: Its estimate.
+        std: Its standard deviation.
+        reason: Why it is not valid, "" if nothing is known against it.
+        level: Its protection level; None if it is not known.
+    """
+    if not reason and not (math.isfinite(mean) and math.isfinite(std)):
+        reason = "the estimate is not a number"
+    return PublishedState(
+        name=state.name,
+        unit=state.unit,
+        value=None if reason else mean,
+        std=None if reason else std,
+        protection_level=None if reason or level is None else number_or_none(level),
+        valid=not reason,
+        reason=reason,
+    )
+
+
+def calendar_time(t: int | None) -> str | None:
+    """Return a time in ns as ISO 8601, None unless it is of a calendar."""
+    return iso(t) if t is not None and t * 1e-9 >= CALENDAR_FROM_S else None
 
 
 def state_schema() -> dict[str, Any]:
@@ -176,10 +191,11 @@ def _input(item: Any, value: float) -> PublishedInput:
     why = "" if math.isfinite(value) else "the input is not a number"
     if not why and not low <= value <= high:
         why = f"outside {low:.4g} to {high:.4g}, where the model was fitted"
-    return PublishedInput(name=item.name, unit=item.unit, value=_number(value), valid=not why, reason=why)
+    return PublishedInput(name=item.name, unit=item.unit, value=number_or_none(value), valid=not why, reason=why)
 
 
-def _number(value: float) -> float | None:
+def number_or_none(value: float) -> float | None:
+    """Return a number, None unless it is finite."""
     return float(value) if np.isfinite(value) else None
 
 

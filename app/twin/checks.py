@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
+from config.fleet_schema import FleetAlertSection, FleetOutputsSection
 from config.loader import Loaded
+from config.output_schema import AlertSection, OutputsSection
 from config.yaml_files import Key
 from estimators.diagnostics.detectors import ALARM_NAMES, CAUSES
 from estimators.diagnostics.episodes.baseline import Normal
@@ -158,18 +161,35 @@ def check_outputs(loaded: Loaded, model: StateSpaceModel) -> None:
         ConfigError: With file and line, and the near names.
     """
     outputs, states = loaded.config.outputs, [state.name for state in model.shown_states]
-    for name, section in outputs.receivers.items():
-        if section.type == "mqtt" and outputs.mqtt is None:
-            raise loaded.error(("outputs", "receivers", name), "is of type mqtt; give the broker under outputs.mqtt")
+    check_receivers(loaded, outputs, loaded.config.alerts)
     for k, rule in enumerate(loaded.config.alerts):
         for key, given, known, kind in (
             ("state", (rule.state,) if rule.state else (), states, f"state of {model.name}"),
             ("episode", rule.episode or (), ("all", *CAUSES), "cause of an episode"),
-            ("to", rule.to or (), tuple(outputs.receivers), "receiver under outputs.receivers"),
         ):
-            for name in given:
-                if name not in known:
-                    near = nearest(name, known) if known else "there is none"
-                    raise loaded.error(("alerts", k, key), f"names {name!r}, no {kind}; {near}")
-        if not outputs.receivers:
+            _check_names(loaded, ("alerts", k, key), given, known, kind)
+
+
+def check_receivers(
+    loaded: Loaded, outputs: OutputsSection | FleetOutputsSection, rules: Sequence[AlertSection | FleetAlertSection]
+) -> None:
+    """Refuse rules of alerts, of a twin or a fleet, that name no receiver.
+
+    Raises:
+        ConfigError: With file and line, and the near names.
+    """
+    for name, section in outputs.receivers.items():
+        if section.type == "mqtt" and outputs.mqtt is None:
+            raise loaded.error(("outputs", "receivers", name), "is of type mqtt; give the broker under outputs.mqtt")
+    for k, rule in enumerate(rules):
+        receivers = tuple(outputs.receivers)
+        _check_names(loaded, ("alerts", k, "to"), rule.to or (), receivers, "receiver under outputs.receivers")
+        if not receivers:
             raise loaded.error(("alerts", k), "has no receiver; name one under outputs.receivers")
+
+
+def _check_names(loaded: Loaded, key: Key, given: Sequence[str], known: Sequence[str], kind: str) -> None:
+    for name in given:
+        if name not in known:
+            near = nearest(name, known) if known else "there is none"
+            raise loaded.error(key, f"names {name!r}, no {kind}; {near}")

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -22,6 +22,7 @@ from sources.tables.one_asset import rows_of_asset
 from sources.tables.text import column_of
 
 from .channels import channels
+from .checks import check_receivers
 from .fleet_tunings import AssetValues, asset_values
 from .source import KEY, SOURCES, Plan, plan_source
 from .sources.kind import Opening, matching
@@ -109,7 +110,7 @@ class FleetPlan:
         """
         section = self.config.source
         if not isinstance(section, FleetTableSection):
-            text = f"a source of type {section.type} keeps no measurements; only those of tables are folded again"
+            text = f"a source of type {section.type} keeps no measurements; give --archive FOLDER to keep them"
             raise ConfigError(f"{asset}: {text}")
         given = section.model_dump(mode="json", exclude_unset=True, by_alias=True)
         loaded, column = self.source.loaded, given.pop("asset")
@@ -122,9 +123,37 @@ class FleetPlan:
         for group in ("sensors", "inputs", "truth"):
             for channel in given.get(group, {}).values():
                 channel["only"] = {**channel.get("only", {}), column: {"text": [asset]}}
+        return self._overrides(asset, given)
+
+    def archived(self, asset: str, folder: Path) -> dict[str, str]:
+        """Return the overrides of the twin's YAML by which it follows the archived rows of one asset in a folder."""
+        model = self.twin.model
+
+        def only(event: str, channel: int, columns: Iterable[str]) -> dict[str, Any]:
+            return {"columns": [*columns], "only": {"event": {"text": [event]}, "channel": channel}}
+
+        given: dict[str, Any] = {"type": "table", "files": [str(folder.absolute() / "*.parquet")], "follow": True}
+        given["time"] = {"column": "t_ns", "unit": "ns"}
+        sensors = {
+            sensor.name: only("reading", k, (f"value_{row}" for row in range(len(sensor.rows))))
+            for k, sensor in enumerate(model.sensors)
+        }
+        inputs = {name: only("input", 0, [f"value_{k}"]) for k, name in enumerate(model.input_names)}
+        return self._overrides(asset, given | {"sensors": sensors, "inputs": inputs})
+
+    def _overrides(self, asset: str, source: Mapping[str, Any]) -> dict[str, str]:
+        """Return the overrides of the twin's YAML for one asset with its own tuning and a source."""
         name = re.sub(r"[^A-Za-z0-9_-]", "_", asset).lstrip("_-") or "asset"
         own = {key: repr(value) for key, value in self.values.of(asset).items()}
-        return {"source": as_flow(given), "name": as_flow(name), "title": as_flow(asset), **own}
+        # The outputs are those of the fleet.
+        return {
+            "outputs": "{}",
+            "alerts": "[]",
+            "source": as_flow(source),
+            "name": as_flow(name),
+            "title": as_flow(asset),
+            **own,
+        }
 
 
 def load_fleet(
@@ -166,6 +195,7 @@ def load_fleet(
     if section.late == 0 and twin.tuning.gate is not None and twin.tuning.reopen is not None:
         rule = "decisions on a rejected sensor need snapshots: give 1 or more, or set gate.reopen to null"
         raise ConfigError(f"{places.at(('late',))}: late is 0, and the gate of {twin.name} reopens; {rule}")
+    check_receivers(loaded, section.outputs, section.alerts)
     assets = section.assets if isinstance(section.assets, tuple) else None
     values = asset_values(section.tunings, path, places, twin.tuning, assets)
     if isinstance(section.assets, int) and len(values.names) > section.assets:

@@ -41,9 +41,9 @@ TIMEOUT_S = 30.0
 TABLE_PATH, READINGS_PATH = "/api/table", "/api/readings"
 
 
-def store_of(store: Path | None, partition: Partition) -> Path | None:
-    """Return the store of a partition: that of the fleet, with the number of each process but the first."""
-    return store if store is None or not partition.number else store.with_name(f"{store.name}.{partition.number}")
+def path_of(path: Path, partition: Partition) -> Path:
+    """Return the store or archive of a partition: that of the fleet, with the number of each process but the first."""
+    return path.with_name(f"{path.name}.{partition.number}") if partition.number else path
 
 
 def threads_of(processes: int) -> int:

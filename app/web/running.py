@@ -15,7 +15,8 @@ from ..live.jobs import run_all
 from ..live.runs.refits import Refits
 from ..live.store import StoreWriter, open_store
 from ..outputs import Publisher
-from ..outputs.archive import Archive, ArchivePlan
+from ..outputs.archive import Archive
+from ..outputs.parts import ArchivePlan
 from ..terminal import complain, print_line
 from ..views.recording.rrd_file import NEVER, Split
 from ..views.recording.writer import ALL_STRETCHES, Recorder

@@ -10,7 +10,7 @@ import numpy as np
 from ..diagnostics.detector_state import JOINT_MASK, MASK, ROW, SENSOR, TWIN
 from ..diagnostics.detectors import DETECTORS, OUTSIDE, OUTSIDE_WIDENED, SENSOR_FLAGS, detector_of
 from ..model.state_space import StateSpaceModel
-from ..track import DIVERGED, HEALTH_NAMES, STALE
+from ..track import DEGRADED, DIVERGED, HEALTH_NAMES, STALE
 
 SENSOR_MASK = (1 << SENSOR_FLAGS) - 1
 """Bits of the flags of sensors that dropped out."""
@@ -73,4 +73,6 @@ def _cause(mask: int, flags: int, health: int) -> str:
     causes += ["silent"] if flags & SENSOR_MASK else []
     causes += ["outside"] if flags & (OUTSIDE | OUTSIDE_WIDENED) else []
     causes += [HEALTH_NAMES[health]] if health in (STALE, DIVERGED) else []
+    if health == DEGRADED and not any(detector_of(name).grade == HEALTH_NAMES[DEGRADED] for name in causes):
+        causes.append("silent")  # for `degraded_after`, of sensors that have no period, or need not report
     return min(causes, key=lambda name: detector_of(name).severity, default="")

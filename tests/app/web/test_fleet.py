@@ -1,10 +1,11 @@
 """The overview of a fleet: parts of the table in any order, metrics, and the page of an asset on demand."""
 
-import http.client
+import json
 import os
 import re
 import subprocess
 import sys
+from contextlib import contextmanager
 from types import SimpleNamespace
 from urllib.request import ProxyHandler, Request, build_opener
 
@@ -13,6 +14,8 @@ import pytest
 from playwright.sync_api import expect
 
 from app.live.fleet import RunningFleet
+from app.outputs.fleet_archive import AssetHistory
+from app.outputs.parts import parts_of
 from app.twin.fleet import load_fleet
 from app.web.fleet import FleetApi, id_of
 from estimators.errors import ConfigError
@@ -118,17 +121,35 @@ def test_ids_of_assets_are_one_part_of_a_path(running):
     assert api.find("pump 99") is None and api.find("@99") is None
 
 
-def test_the_page_lists_the_worst_first_and_a_click_opens_the_history_of_an_asset(fleet, browser):
+@contextmanager
+def served(folder, *options):
+    """The address of a served fleet, and a function that sends a request and returns the answer's body."""
     run = subprocess.Popen(
-        [sys.executable, "-m", "app.cli.main", "fleet", "pumps.yaml", "--port", "0"],
-        cwd=fleet, text=True, stdout=subprocess.PIPE, env=os.environ | {"PYTHONPATH": str(ROOT)},
+        [sys.executable, "-m", "app.cli.main", "fleet", "pumps.yaml", "--port", "0", *options],
+        cwd=folder, text=True, stdout=subprocess.PIPE, env=os.environ | {"PYTHONPATH": str(ROOT)},
     )  # fmt: skip
     try:
         assert run.stdout is not None
         address = re.compile(r"http://127.0.0.1:\d+/\?token=\S+")
         url = next(found.group() for line in run.stdout if (found := address.search(line)))
         site, _, token = url.partition("/?token=")
-        opener = build_opener(ProxyHandler({}))
+        headers, opener = {"Authorization": f"Bearer {token}"}, build_opener(ProxyHandler({}))
+
+        def ask(path, messages=None):
+            body = None if messages is None else json.dumps(messages).encode()
+            request = Request(f"{site}{path}", body, headers | {"Content-Type": "application/json"})
+            with opener.open(request, timeout=PATIENCE_S) as answer:
+                return json.loads(answer.read())
+
+        yield url, ask
+    finally:
+        run.terminate()
+        run.wait(PATIENCE_S)
+        run.stdout.close()
+
+
+def test_the_page_lists_the_worst_first_and_a_click_opens_the_history_of_an_asset(fleet, browser):
+    with served(fleet) as (url, ask):
         page = browser.new_context(viewport={"width": 1440, "height": 900}).new_page()
         errors: list[str] = []
         page.on("pageerror", lambda error: errors.append(str(error)))
@@ -142,12 +163,37 @@ def test_the_page_lists_the_worst_first_and_a_click_opens_the_history_of_an_asse
         page.locator("#rows a").click()
         page.wait_for_url("**/twins/pump%2031/")
         expect(page.locator("#trust")).to_contain_text("pump_31", timeout=PATIENCE_S * 1e3)
-        request = Request(f"{site}/twins/pump%2031/api/state", headers={"Authorization": f"Bearer {token}"})
-        with opener.open(request, timeout=PATIENCE_S) as answer:
-            assert answer.status == http.client.OK and b'"twin":"pump_31"' in answer.read()
+        assert ask("/twins/pump%2031/api/state")["twin"] == "pump_31"
         assert errors == []
         page.close()
-    finally:
-        run.terminate()
-        run.wait(PATIENCE_S)
-        run.stdout.close()
+
+
+def test_a_click_opens_an_asset_of_messages_from_the_archive(tmp_path, browser):
+    (tmp_path / "pumps.yaml").write_text("{twin: motor_winding, source: {type: push}, processes: 2}")
+    begin, rows = 1_767_225_600 * 10**9, pump_rows(count=60)
+    with served(tmp_path, "--archive", "archive") as (url, ask):
+        sent = [{"time": begin + round(t * 1e9), "asset": name, "values": {"winding": y}} for t, name, y in rows]
+        while ask("/api/readings", sent[:1])["refused"]:  # a process starts
+            pass
+        while ask("/api/readings", sent[1:])["refused"]:
+            pass
+        folders = [tmp_path / "archive" / name for name in ("pumps", "pumps.1")]
+        while (found := AssetHistory(folders, "pump 3").read(1000)) is None or found.num_rows < 60:
+            pass
+        page = browser.new_context(viewport={"width": 1440, "height": 900}).new_page()
+        page.set_default_timeout(PATIENCE_S * 1e3)
+        page.goto(url)
+        page.get_by_role("row", name="pump 3").click()
+        page.wait_for_url("**/twins/pump%203/")
+        expect(page.locator("#trust")).to_contain_text("pump_3", timeout=PATIENCE_S * 1e3)
+        while (state := ask("/twins/pump%203/api/state"))["sensors"][0]["accepted"] < 60:
+            pass
+        last = max(item["time"] for item in sent)
+        assert state["time_ns"] >= max(item["time"] for item in sent if item["asset"] == "pump 3")
+        more = [{"time": last + 10**9, "asset": "pump 3", "values": {"winding": 40.0}}]
+        assert ask("/api/readings", more)["accepted"]
+        while (state := ask("/twins/pump%203/api/state"))["sensors"][0]["accepted"] < 61:
+            pass  # the open page follows
+        assert state["time_ns"] >= last + 10**9
+        page.close()
+    assert all(map(parts_of, folders)) and not [*(tmp_path / "archive").glob("*/*.arrows")]

@@ -12,7 +12,7 @@ from estimators.fleet.fleet import Fleet
 from estimators.fold import Fold
 from estimators.log import READING, TRUTH, Events
 from estimators.model.state_space import Parameter
-from estimators.track import GATED
+from estimators.track import GATED, HEALTH_NAMES
 from tests.models import level_model
 
 POLICY = HealthPolicy(window=12, degraded_after=40.0, stale_after=90.0)
@@ -359,6 +359,19 @@ def test_table_names_the_cause_and_the_worst_come_first():
     table = fleet.table()
     assert table.cause[1] in ("silent", "stale") and table.worst(1).tolist() == [1]
     assert table.age[1] == 360.0 and table.age[2] == 1.0 and np.isnan(table.seconds[0])
+
+
+def test_a_degraded_asset_whose_sensors_need_not_report_is_silent():
+    model, policy = MODELS["motor_winding"], HealthPolicy()
+    fleet = Fleet("kf", model, assets=2, start=0.0, expected=np.zeros(1, np.bool_))
+    fleet.add("winding", 0, [1.0, 2.0], [35.0, 35.0])  # too few for a period
+    fleet.add("winding", 1, np.arange(1.0, 301.0), np.full(300, 35.0))  # suspect for another reason before
+    fleet.add_ticks(2.0 + policy.degraded_after + 1.0, [0])
+    fleet.add_ticks(300.0 + policy.degraded_after + 1.0, [1])
+    fleet.advance()
+    table = fleet.table()
+    assert [HEALTH_NAMES[k] for k in table.health] == ["degraded", "degraded"]
+    assert table.cause.tolist() == ["silent", "stuck"]
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,130 @@
+"""The estimates and alerts of a fleet for other programs, from a thread of their own."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Protocol
+
+from config.fleet_schema import FleetAlertSection
+from estimators.fleet.table import FleetTable
+from estimators.track import HEALTH_NAMES
+
+from ..live.jobs import Jobs
+from ..live.notices import Notices
+from ..present.fleet_state import ChangedAssets, asset_message
+from ..terminal import print_line
+from .fleet_alerts import FleetRules
+from .receivers import Deliveries
+
+if TYPE_CHECKING:
+    from ..twin.fleet import FleetPlan
+    from .mqtt import MqttOutput
+
+HEALTH_RULE = FleetAlertSection(health="degraded")
+"""Rule of a fleet that has receivers and no rules."""
+
+DELIVERY_PERIOD_S, POLL_S = 0.2, 0.002
+"""Between two looks at the queues of receivers, and at a connection that takes no state."""
+
+
+class TabledFleet(Protocol):
+    """A running fleet, in one process or several."""
+
+    plan: FleetPlan
+
+    def table(self) -> tuple[int, list[str], FleetTable]:
+        """Return the version, the names, and the table of all assets."""
+
+
+class FleetPublisher:
+    """Outputs and alerts of a running fleet, as its YAML asks for them."""
+
+    def __init__(self, fleet: TabledFleet, *, page: str | None = None) -> None:
+        """Prepare; nothing is connected yet.
+
+        Args:
+            fleet: The running fleet.
+            page: Address of its overview, without the token; None without one.
+
+        Raises:
+            NisusError: If a package or a secret is missing.
+        """
+        plan = fleet.plan
+        section, rules = plan.config.outputs, plan.config.alerts
+        self._fleet, self._section = fleet, section
+        self.notices = Notices(time.time_ns)
+        self._next_line = 0
+        folder = plan.path.absolute().parent
+        self._mqtt: MqttOutput | None = None
+        self._changed, self._connections = ChangedAssets(), 0
+        if section.mqtt is not None:
+            from .mqtt import JsonTopics, MqttOutput
+
+            form = JsonTopics(section.mqtt.prefix, plan.name, lambda: plan.twin.model, of_assets=True)
+            self._mqtt = MqttOutput(section.mqtt, plan.name, form, self.notices)
+        self._deliveries = Deliveries(section.receivers, folder, self._mqtt, self.notices)
+        self._rules = FleetRules(rules or (HEALTH_RULE,), plan.name, link=page)
+        self._jobs = Jobs(self.notices, "output", threads=max(1, len(self._deliveries.queues)), niceness=0)
+        self._stopping = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="outputs", daemon=True)
+
+    def start(self) -> None:
+        """Connect and begin to publish."""
+        if self._mqtt is not None:
+            self._mqtt.start()
+        elif not self._deliveries.queues:
+            return
+        self._deliveries.run(self._jobs, DELIVERY_PERIOD_S)
+        self._jobs.start()
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Disconnect."""
+        self._stopping.set()
+        if self._thread.is_alive():
+            self._thread.join(2.0)
+        self._jobs.stop()
+        if self._mqtt is not None:
+            self._mqtt.stop()
+        self._print()
+
+    def _run(self) -> None:
+        due = time.monotonic()
+        while not self._stopping.wait(max(0.0, due - time.monotonic())):
+            due = time.monotonic() + self._section.every
+            try:
+                _, names, table = self._fleet.table()
+                if names:
+                    if self._deliveries.queues:
+                        self._alert(names, table)
+                    if self._mqtt is not None:
+                        self._publish(self._mqtt, names, table, due)
+            except Exception as error:  # noqa: BLE001  no library or broken table may end the thread of all outputs
+                self.notices.report("engine error", f"outputs: {type(error).__name__}: {error}", level="error")
+            self._print()
+
+    def _publish(self, mqtt: MqttOutput, names: Sequence[str], table: FleetTable, due: float) -> None:
+        """Publish the states that have changed, as many as the connection takes until the next table is due."""
+        if mqtt.connections != self._connections:  # what was on its way is lost, and the broker may have none
+            self._changed, self._connections = ChangedAssets(), mqtt.connections
+        self._changed.look(table)
+        while mqtt.link().connected and not self._stopping.is_set():
+            places = self._changed.take(room := mqtt.room)
+            for place in places:
+                mqtt.publish(asset_message(self._fleet.plan.twin, names[place], table, place))
+            if (room and len(places) < room) or time.monotonic() >= due:
+                return
+            self._stopping.wait(POLL_S)
+
+    def _alert(self, names: Sequence[str], table: FleetTable) -> None:
+        """Put the alerts that are due into the queues of their receivers."""
+        for rule, alert in self._rules.look(names, table):
+            self._deliveries.put(alert, rule.to)
+        self._deliveries.beat(self._fleet.plan.name, HEALTH_NAMES[table.health.max()])
+
+    def _print(self) -> None:
+        for line in self.notices.since(self._next_line):
+            print_line(line.level, line.text)
+            self._next_line = line.number + 1

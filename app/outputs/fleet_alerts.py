@@ -1,0 +1,165 @@
+"""Alerts on the health of many assets: those in alarm at a moment are one message, not one each."""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from config.fleet_schema import FleetAlertSection
+from estimators.diagnostics.detectors import anchor
+from estimators.errors import printable
+from estimators.fleet.table import FleetTable
+from estimators.track import HEALTH_NAMES, TRACKING
+
+from ..format_time import counted
+from ..present.export.alarm_guide import advice
+from ..present.state_message import iso_now
+from .alerts import FIRING, REPEATED, RESOLVED, AlertMessage
+
+MAX_LISTED, MAX_NAMED = 100, 5
+"""Assets in the lists of a message, and in its text."""
+
+
+class AssetInAlarm(BaseModel):
+    """One asset in alarm."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    asset: str
+    health: str
+    cause: str = Field(description="name of the most severe detector in alarm, or empty")
+
+
+class FleetAlertMessage(AlertMessage):
+    """Alert of a rule for the assets of a fleet. Lists have at most 100 assets, the new and the worst first."""
+
+    value: float | None = Field(description="number of assets in alarm")
+    assets: tuple[AssetInAlarm, ...] = Field(description="assets in alarm")
+    fired: tuple[str, ...] = Field(description="those that are new since the last message")
+    recovered: tuple[str, ...] = Field(description="assets that have recovered since the last message")
+
+
+class FleetRule:
+    """Assets of a fleet that are in alarm by one rule; not for several threads at once.
+
+    An asset is in alarm once its health has been bad for `after`, until it has been better for `clear`. It is among
+    `fired` of one message and, at its end, among `recovered` of another.
+    """
+
+    def __init__(self, rule: FleetAlertSection, fleet: str, link: str | None) -> None:
+        """`fleet`: its name; `link`: address of the overview, without the token."""
+        self.rule, self._fleet, self._link = rule, fleet, link
+        self._level = HEALTH_NAMES.index(rule.health)
+        self._begun = self._seen = np.zeros(0)
+        self._alarm = np.zeros(0, np.bool_)
+        self._told = np.zeros(0, np.bool_)
+        """Whether the last message had an asset in alarm."""
+        self._sent = -np.inf
+        self._since = self._id = ""
+
+    def look(self, names: Sequence[str], table: FleetTable, now: float) -> FleetAlertMessage | None:
+        """Return the message to send now, if any.
+
+        Args:
+            names: Names of the assets; only appended to.
+            table: Their states.
+            now: Monotonic time, s.
+        """
+        more = len(names) - self._begun.size
+        self._begun = np.append(self._begun, np.full(more, np.nan))
+        self._seen = np.append(self._seen, np.full(more, np.nan))
+        self._alarm, self._told = (np.append(known, np.zeros(more, np.bool_)) for known in (self._alarm, self._told))
+        rule, bad = self.rule, table.health >= self._level
+        self._begun[bad & np.isnan(self._begun)] = now
+        self._seen[bad] = now
+        over = ~bad & (now - self._seen >= rule.clear)
+        self._begun[over] = np.nan
+        self._alarm = (self._alarm & ~over) | (bad & (now - self._begun >= rule.after))
+        fired, recovered = self._alarm & ~self._told, self._told & ~self._alarm
+        changed, waited = bool(fired.any() or recovered.any()), now - self._sent
+        again = rule.repeat != "never" and self._alarm.any() and waited >= rule.repeat
+        if not (again or (changed and waited >= rule.group)):
+            return None
+        if not self._told.any():
+            self._since = iso_now()
+            self._id = hashlib.sha256(f"{self._fleet}|{rule.title}|{self._since}".encode()).hexdigest()[:16]
+        self._sent, self._told = now, self._alarm.copy()
+        return self._message(names, table, fired, recovered)
+
+    def _message(
+        self, names: Sequence[str], table: FleetTable, fired: np.ndarray, recovered: np.ndarray
+    ) -> FleetAlertMessage:
+        count = int(self._alarm.sum())
+        listed = [
+            AssetInAlarm(asset=names[k], health=HEALTH_NAMES[table.health[k]], cause=str(table.cause[k]))
+            for k in _worst(self._alarm, fired, table)
+        ]
+        new, better = ([names[k] for k in _worst(mask, mask, table)] for mask in (fired, recovered))
+        leading = listed[0] if listed else None
+        guide = self.rule.health if leading is None else leading.cause or leading.health
+        first = [
+            f"{item.asset} ({', '.join(dict.fromkeys((item.health, item.cause or item.health)))})"
+            for item in listed[:MAX_NAMED]
+        ]
+        if leading is None:
+            text = f"no asset is {self.rule.health} or worse any longer"
+        else:
+            text = f"{counted(count, 'asset')} {self.rule.health} or worse, {int(fired.sum())} new: {', '.join(first)}"
+            text += f" and {count - len(first):,} more" if count > len(first) else ""
+        if recovered.any():
+            text += f"; {counted(int(recovered.sum()), 'asset')} recovered"
+        rest: dict[str, Any] = dict.fromkeys(("std", "limit", "probability"))
+        return FleetAlertMessage(
+            twin=self._fleet,
+            id=self._id,
+            status=FIRING if fired.any() else REPEATED if count else RESOLVED,  # type: ignore[arg-type]
+            rule=self.rule.title,
+            subject=leading.asset if leading is not None and count == 1 else counted(count, "asset"),
+            text=printable(text),
+            health=HEALTH_NAMES[table.health[self._alarm].max(initial=TRACKING)],
+            since=self._since,
+            sent=iso_now(),
+            value=float(count),
+            unit="assets",
+            guide=f"docs/alarms.md#{anchor(guide)}",
+            link=self._link,
+            response=advice(guide, "Response"),
+            assets=tuple(listed),
+            fired=tuple(new),
+            recovered=tuple(better),
+            **rest,
+        )
+
+
+class FleetRules:
+    """Rules of a fleet."""
+
+    def __init__(
+        self,
+        rules: Sequence[FleetAlertSection],
+        fleet: str,
+        *,
+        link: str | None = None,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """`fleet`: its name; `link`: address of the overview, without the token; `clock` returns seconds."""
+        self._rules, self._clock = [FleetRule(rule, fleet, link) for rule in rules], clock
+
+    def look(self, names: Sequence[str], table: FleetTable) -> list[tuple[FleetAlertSection, FleetAlertMessage]]:
+        """Return the messages to send now, each with its rule."""
+        now = self._clock()
+        found = ((item.rule, item.look(names, table, now)) for item in self._rules)
+        return [(rule, message) for rule, message in found if message is not None]
+
+
+def _worst(mask: np.ndarray, new: np.ndarray, table: FleetTable) -> list[int]:
+    """Return the positions of a mask, the new ones and then the worst health first, at most `MAX_LISTED`."""
+    places = np.flatnonzero(mask)
+    order = np.lexsort((-table.health[places].astype(int), ~new[places]))  # stable
+    found: list[int] = places[order][:MAX_LISTED].tolist()
+    return found

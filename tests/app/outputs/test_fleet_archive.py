@@ -1,0 +1,274 @@
+"""The archive of a fleet has each measurement once, and the fold of an asset's rows is the fleet's estimate."""
+
+import json
+import time
+from itertools import pairwise
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from app.cli.fleet import folders_of
+from app.live.fleet import RunningFleet
+from app.outputs import fleet_archive as archives
+from app.outputs.fleet_archive import AssetHistory, FleetArchive, read_journal
+from app.outputs.parts import ArchivePlan, parts_of
+from app.twin.fleet import load_fleet
+from app.twin.twin import load_twin
+from app.views.recording.rrd_file import Split, parse_split
+from app.web.readings import messages_of
+from estimators.fold import Fold
+from estimators.log import Events, Log
+from sources.source import WHOLE, Partition
+
+BEGIN, SECOND, DAY_S = 1_767_225_600 * 10**9, 10**9, 86_400
+SPLIT = parse_split("64MB,1h,day", None, "--archive")
+MODEL = load_twin("motor_can").model
+
+
+def started(folder, *, store=None, partition=WHOLE, split=SPLIT):
+    """A fleet of pushed messages whose archive is written by the test."""
+    path = folder / "drives.yaml"
+    path.write_text(json.dumps({"twin": "motor_can", "source": {"type": "push"}}))
+    plan = ArchivePlan(folder / "archive" / "drives", split)
+    fleet = RunningFleet(load_fleet(path), lambda *_: None, threads=1, store=store, partition=partition)
+    fleet.archive = FleetArchive(plan, fleet.twin.model, fleet.names, fleet.note)
+    return fleet, messages_of(fleet)
+
+
+def messages(seed=1, assets=7, count=60):
+    """Measurements and inputs of several assets, some missing, some a little late."""
+    rng = np.random.default_rng(seed)
+    rows = [sensor.name for sensor in MODEL.sensors]
+    found = []
+    for k in range(count):
+        for a in range(assets):
+            values = {name: float(rng.normal()) for name in rows}
+            if rng.random() < 0.1:
+                values[rows[0]] = None  # missing
+            if rng.random() < 0.3:
+                values |= {name: float(rng.random()) for name in MODEL.input_names}
+            found.append({"time": BEGIN + k * SECOND // 10, "asset": f"drive {a}", "values": values})
+    for k in rng.choice(len(found) - assets, len(found) // 14, replace=False):  # late by one tick
+        found[k], found[k + assets] = found[k + assets], found[k]
+    return found
+
+
+def folded(fleet, asset, folders, tmp_path):
+    """The last row of the fold over the archived rows of an asset, read as its page does."""
+    (folder := tmp_path / asset).mkdir()
+    rows = AssetHistory(folders, asset).read(10**6)
+    pq.write_table(rows, folder / "0.parquet")
+    twin = load_twin("motor_can", overrides=fleet.plan.archived(asset, folder))
+    source, log = twin.open_source(lambda *_: None), Log.of(twin.model)
+    while log.n < rows.num_rows:
+        log.extend(source.read(1.0))
+    source.close()
+    expected = np.isin(np.arange(len(twin.model.sensors)), fleet.plan.source.fed)
+    fold = Fold(twin.estimator, twin.model, twin.tuning, log, policy=twin.policy, expected=expected)
+    fold.advance()
+    return fold.track.select(fold.n - 1)
+
+
+@pytest.mark.parametrize("closing", [False, True], ids=["journal", "complete"])
+def test_the_fold_of_archived_rows_has_the_bits_of_the_fleet(closing, tmp_path):
+    fleet, source = started(tmp_path)
+    for part in np.array_split(np.array(messages(), object), 9):
+        assert {item.status for item in source.send(part.tolist())} == {"accepted"}
+        fleet.step()
+        fleet.archive.look()
+    _, names, table = fleet.table()
+    fleet.archive.look(closing=closing)
+    folders = [tmp_path / "archive" / "drives"]
+    assert bool(parts_of(folders[0])) == closing and table.stale.sum() == 0
+    for k, asset in enumerate(names):
+        last = folded(fleet, asset, folders, tmp_path)
+        assert last.mean.tobytes() == table.mean[k].tobytes() and last.std.tobytes() == table.std[k].tobytes()
+        assert (last.health, last.verdict) == (table.health[k], table.verdict[k])
+        assert last.nis_mean.tobytes() == table.nis_mean[k].tobytes()
+    fleet.stop()
+
+
+def test_each_process_has_a_folder_of_its_own_and_all_are_read(tmp_path):
+    sent, plan = messages(count=3), ArchivePlan(tmp_path / "archive" / "drives", SPLIT)
+    folders = folders_of(plan, 2)
+    for number, folder in enumerate(folders):
+        fleet, source = started(tmp_path, partition=Partition(number, 2))
+        fleet.archive._folder = folder
+        source.send(sent)
+        fleet.step()
+        fleet.archive.look(closing=True)
+        fleet.stop()
+    assert [folder.name for folder in folders] == ["drives", "drives.1"]
+    assert folders_of(plan, 1) == folders  # of an earlier run with two
+    counts = [AssetHistory(folders, f"drive {a}").read(10**6).num_rows for a in range(7)]
+    tables = [pq.read_table(parts_of(folder)[0]) for folder in folders]
+    assert sum(counts) == sum(table.num_rows for table in tables) and min(counts) > 0
+    assert not set(tables[0]["asset"].to_pylist()) & set(tables[1]["asset"].to_pylist())
+
+
+def test_messages_that_come_again_after_a_kill_are_archived_once(tmp_path):
+    store, sent = tmp_path / "drives.store", messages(count=12)
+    fleet, source = started(tmp_path, store=store)
+    source.send(sent[:40])
+    fleet._due = 0.0
+    fleet.step()  # with a transaction
+    fleet._due = time.monotonic() + 1000.0
+    source.send(sent[40:60])
+    fleet.step()  # without: these messages are not stored
+    fleet.archive.look()
+    fleet.archive._journal._file.close()  # as the end of the process does
+    fleet._store.close()
+    again, source = started(tmp_path, store=store)
+    source.send(sent[40:])
+    again._due = 0.0
+    again.step()
+    again.archive.look(closing=True)
+    parts = parts_of(tmp_path / "archive" / "drives")
+    found = pa.concat_tables([pq.read_table(path) for path in parts])
+    assert found.num_rows == again.table()[2].events.sum()
+    keys = found.select(["asset", "t_ns", "event", "channel"]).group_by(["asset", "t_ns", "event", "channel"])
+    assert keys.aggregate([]).num_rows == found.num_rows
+    again.stop()
+
+
+class Written:
+    """An archive of one sensor without a thread."""
+
+    def __init__(self, folder, split=SPLIT):
+        self.model, self.said, self.names = load_twin("motor_winding").model, [], [f"pump {k}" for k in range(5)]
+        self.folder = folder / "pumps"
+        self.archive = FleetArchive(
+            ArchivePlan(self.folder, split), self.model, self.names, lambda _, text: self.said.append(text)
+        )
+
+    def put(self, first, count=10):
+        """Put rows at consecutive seconds, whose value is their number."""
+        number = np.arange(first, first + count)
+        t = BEGIN + number * SECOND
+        zero = np.zeros(count, np.int32)
+        self.archive.put(number % 5, Events(t, t, zero.astype(np.int8), zero, number[:, None].astype(float)))
+        self.archive.look()
+        return self
+
+    def values(self):
+        """The values in the archive, those of its journals included."""
+        tables = [pq.read_table(path) for path in parts_of(self.folder)]
+        tables += filter(None, map(read_journal, self.folder.glob("*.arrows")))
+        return sorted(pa.concat_tables(tables)["value_0"].to_pylist())
+
+
+def test_a_journal_of_a_killed_process_is_completed_up_to_its_last_whole_batch(tmp_path):
+    written = Written(tmp_path).put(0).put(10).put(20)
+    (journal,) = written.folder.glob("*.arrows")
+    content = journal.read_bytes()
+    written.archive._journal._file.close()
+    sizes = []
+    for end in range(0, len(content), 37):
+        journal.write_bytes(content[:end])
+        table = read_journal(journal)
+        sizes.append(0 if table is None else table.num_rows)
+    assert set(sizes) == {0, 10, 20} and all(one <= two for one, two in pairwise(sizes))
+    again = Written(tmp_path).put(30)
+    assert again.values() == [*map(float, range(20)), *map(float, range(30, 40))]
+    assert again.said == [] and len(parts_of(again.folder)) == 1
+    (part,) = parts_of(again.folder)
+    journal.write_bytes(content)  # killed after the file was complete, and before its journal was removed
+    again.archive._journal.close()
+    assert AssetHistory([again.folder], "pump 3").read(100)["value_0"].to_pylist() == [3.0, 8.0, 13.0, 18.0, 33.0, 38.0]
+    archives.complete_journals(again.folder)
+    assert len(parts_of(again.folder)) == 2 and part.exists() and len(again.values()) == 30
+
+
+def test_files_end_with_the_day_and_with_their_size(tmp_path):
+    daily = Written(tmp_path / "a", parse_split("day", None)).put(DAY_S - 10).put(DAY_S)
+    assert [path.name for path in parts_of(daily.folder)] == ["2026-01-01-000001.parquet"]
+    assert daily.values() == [*map(float, range(DAY_S - 10, DAY_S + 10))]
+    endless = Written(tmp_path / "d", Split()).put(DAY_S - 10).put(DAY_S)
+    assert parts_of(endless.folder) == [] and len(endless.values()) == 20
+    small = Written(tmp_path / "b", Split(size=100.0)).put(0).put(10)
+    assert len(parts_of(small.folder)) == 2 and not [*small.folder.glob("*.arrows")]
+    kept = Written(tmp_path / "c", Split(size=100.0, kept_bytes=1.0)).put(0).put(10)
+    assert kept.values() == [*map(float, range(10, 20))]
+
+
+def test_the_rows_of_an_asset_are_in_one_or_two_groups_of_a_file_and_old_files_are_left(tmp_path, monkeypatch):
+    monkeypatch.setattr("app.outputs.parts.GROUP_ROWS", 100)
+    written = Written(tmp_path, Split(size=30_000.0))
+    for k in range(0, 3000, 500):
+        written.put(k, 500)
+    written.archive.look(closing=True)
+    parts = parts_of(written.folder)
+    assert len(parts) >= 2
+    read = []
+    groups = pq.ParquetFile.read_row_groups
+    monkeypatch.setattr(pq.ParquetFile, "read_row_groups", lambda file, k: read.append(len(k)) or groups(file, k))
+    found = AssetHistory([written.folder], "pump 2").read(10**6)["value_0"].to_pylist()
+    assert found == [*map(float, range(2, 3000, 5))]
+    assert len(read) == len(parts) and sum(read) < sum(pq.ParquetFile(path).num_row_groups for path in parts) / 2
+    last = AssetHistory([written.folder], "pump 2").read(1)["value_0"].to_pylist()
+    assert last == found[-len(last) :] and len(last) < len(found)
+    assert AssetHistory([written.folder], "pump 9").read(10**6) is None
+
+
+def test_each_row_of_an_asset_is_read_once_while_files_are_completed(tmp_path):
+    rng, written = np.random.default_rng(5), Written(tmp_path, Split())
+    history, found, files = AssetHistory([written.folder], "pump 2"), [], set()
+    for k in range(0, 600, 10):
+        written.put(k)
+        if rng.random() < 0.2:
+            written.archive._finish()
+        if rng.random() < 0.5 and (rows := history.read(10**6)) is not None:
+            found += rows["value_0"].to_pylist()
+        files.add(len(parts_of(written.folder)))
+    found += written.put(600) and history.read(10**6)["value_0"].to_pylist()
+    assert history.read(10**6) is None and len(files) > 5
+    assert found == [*map(float, range(2, 610, 5))]
+
+
+def test_the_page_of_an_asset_has_no_outputs_of_the_twin(tmp_path):
+    own = load_twin("motor_winding").loaded.text + "\noutputs: {mqtt: {host: broker}}\n"
+    (tmp_path / "own.yaml").write_text(own)
+    (tmp_path / "pumps.yaml").write_text("{twin: own.yaml, source: {type: push}}")
+    plan = load_fleet(tmp_path / "pumps.yaml")
+    assert plan.twin.config.outputs.mqtt is not None
+    assert load_twin(plan.twin.path, overrides=plan.archived("a", tmp_path)).config.outputs.mqtt is None
+
+
+def test_a_folder_that_cannot_be_written_is_one_report_and_loses_nothing(tmp_path, monkeypatch):
+    (tmp_path / "pumps").write_text("")
+    written = Written(tmp_path).put(0).put(10)
+    assert len(written.said) == 1 and written.said[0].startswith(f"archive {tmp_path / 'pumps'}: cannot be written")
+    (tmp_path / "pumps").unlink()
+    written.put(20)
+    flush = archives.Journal.write
+
+    def full(journal, table):
+        journal._file.write(b"half of a batch")
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(archives.Journal, "write", full)
+    written.put(30)
+    monkeypatch.setattr(archives.Journal, "write", flush)
+    written.put(40).archive.look(closing=True)
+    assert written.values() == [*map(float, range(50))]
+    assert len(written.said) == 2 and "No space left on device" in written.said[1]
+
+
+def test_rows_beyond_those_that_may_wait_are_dropped_and_counted(tmp_path, monkeypatch):
+    monkeypatch.setattr(archives, "MAX_WAITING", 25)
+    (tmp_path / "pumps").write_text("")
+    written = Written(tmp_path).put(0).put(10).put(20)
+    (tmp_path / "pumps").unlink()
+    written.archive.look()
+    assert written.said[1:] == [f"archive {written.folder}: 10 rows were dropped; the disk is too slow"]
+    assert written.values() == [*map(float, range(20))]
+
+
+def test_two_processes_do_not_write_into_one_folder(tmp_path):
+    first = Written(tmp_path).put(0)
+    second = Written(tmp_path).put(10)
+    assert "another process writes into it" in second.said[0]
+    first.archive.look(closing=True)
+    assert second.put(20).values() == [*map(float, range(30))]
