@@ -18,7 +18,7 @@ from ..numerics.simd import WIDE, add_scaled, combine_rows, spread_rows
 from ..numerics.simd_ir import LANES
 from ..numerics.workspace import declare_layout, share, start_of
 from .localisation import localised, reached
-from .shared import CREWS, OWN, ROTATE
+from .shared import CREWS, INFLATION, OWN, ROTATE
 
 
 @jit
@@ -243,6 +243,22 @@ def rotate_members(seed, index, T, W):
     for i in range(N):
         for j in range(N):
             T[i, j] = W[i, j]
+
+
+@jit
+def transform_members(context, index, a, X, rest):
+    """x̄ + A ← x̄ + (T + 1 wᵀ) A for all states, with T (N, N) and v = √(N - 1) w of the analysis; rotate and inflate."""
+    N = X.shape[0]
+    T, W, v = a.T, a.W, a.v
+    given = numbers(context)
+    if given[OWN] > 0.0:
+        rotate_members(context.seed, index, T, W)
+    # W = T + 1 wᵀ, by which x̄ + W A are the members
+    for i in range(N):
+        for j in range(N):
+            W[i, j] = given[INFLATION] * T[i, j] + v[j] / np.sqrt(N - 1.0)
+        W[i, N] = 1.0
+    transform_all(X, W, int(given[CREWS]), rest)
 
 
 @jit

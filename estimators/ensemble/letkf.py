@@ -22,8 +22,8 @@ from ..numerics.symmetric import gram
 from ..numerics.workspace import declare_layout, share, size_of, start_of
 from ..track import FAILED, USED
 from .analysis import begin_analysis, find_places, reconsider, work_size
-from .blocks import ROTATION, block_at, load, rotate, store
-from .etkf import transform_members
+from .blocks import ROTATION, block_at, load, rotate, store, transform_members
+from .etkf import symmetric_transform
 from .localisation import localised, prepare, reached
 from .shared import (
     CREWS,
@@ -175,7 +175,9 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
         gram(a.Z, X.shape[0], m, a.U)
         transform_locally(context, sensor, X, a, given[INFLATION], int(given[CREWS]), rest)
         rotate(context, index, X, a, rest)
-    elif not transform_members(context, index, m, a, X, rest):
+    elif symmetric_transform(m, a):
+        transform_members(context, index, a, X, rest)
+    else:
         return FAILED
     reconsider(context, index, X)
     finish(context, index, X, rest)
