@@ -82,6 +82,12 @@ def scaled(v, n, a, x, out):
     in_vectors(v, n, lambda v, i: v.store(v.builder.fmul(v.spread(a), v.load(x.data, i)), out.data, i))
 
 
+@vector_code()
+def square_roots(v, n, x, out):
+    """out[:n] = √x[:n]."""
+    in_vectors(v, n, lambda v, i: v.store(v.unary("sqrt", v.load(x.data, i)), out.data, i))
+
+
 def _combining(rows: int) -> Any:
     @vector_code()
     def combine(v, count, weights, apart, x, stride, n, out, width):
