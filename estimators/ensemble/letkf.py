@@ -60,7 +60,6 @@ Local, local_at = declare_layout(
     across="ny * N",
     near="int ny",
     own="int ny",
-    aligning=f"{LANES}",
 )
 """Scratch of a crew: a block before and after; t = Z a of the rows near it, and their factors x in the correction; the
 root of their tapers, and of those near a group of `LANES` states; matrices and vectors of a group, of order `side`, the
