@@ -95,6 +95,19 @@ def added(v, n, x, y, out):
 
 
 @vector_code()
+def weigh_squares(v, n, e, weight, shift, log_w, out):
+    """log_w[:n] -= weight e[:n]², and out[:n] = e[:n] - shift, which may be e."""
+
+    def write(v: Lanes, i: Any) -> None:
+        builder, own = v.builder, v.load(e.data, i)
+        square = builder.fmul(builder.fmul(v.spread(weight), own), own)
+        v.store(builder.fsub(v.load(log_w.data, i), square), log_w.data, i)
+        v.store(builder.fsub(own, v.spread(shift)), out.data, i)
+
+    in_vectors(v, n, write)
+
+
+@vector_code()
 def square_roots(v, n, x, out):
     """out[:n] = √x[:n]."""
     in_vectors(v, n, lambda v, i: v.store(v.unary("sqrt", v.load(x.data, i)), out.data, i))
