@@ -25,6 +25,7 @@ from ..numerics.linalg import solve_transposed, solve_upper, wrap
 from ..numerics.normal_score import student_score
 from ..numerics.random import key_of, normal
 from ..numerics.simd import WIDE, add_scaled, dot
+from ..numerics.simd_ir import LANES
 from ..numerics.symmetric import factor, gram
 from ..numerics.workspace import (
     after,
@@ -88,6 +89,8 @@ def work_size(options: Options, nx: int, ny: int, task: int = 0) -> int:
         size_of(regression_at, N, WIDE),
         task,
     )
+    # A crew's arrays may begin at its first whole cache line.
+    crew += LANES
     return size_of(analysis_at, N, ny, side_of(options, ny)) + crews(N * nx, THREADED_FROM) * crew
 
 

@@ -14,11 +14,11 @@ from ..compiled.context import options as numbers
 from ..estimator import Option
 from ..numerics.jit import jit, matrix
 from ..numerics.random import key_of, normal
-from ..numerics.simd import WIDE, add_scaled, combine_rows, spread_rows
+from ..numerics.simd import WIDE, add_scaled, added, combine_rows, copied, spread_rows
 from ..numerics.simd_ir import LANES
-from ..numerics.workspace import declare_layout, share, start_of
+from ..numerics.workspace import declare_layout, line_from, share, start_of
 from .localisation import localised, reached
-from .shared import CREWS, OWN, ROTATE
+from .shared import CREWS, INFLATION, OWN, ROTATE
 
 
 @jit
@@ -56,8 +56,7 @@ def load(X, first, count, width, block):
         mean[j] = 0.0
     for i in range(N):
         row = block[i]
-        for j in range(count):
-            row[j] = X[i, first + j]
+        copied(count, X[i, first:], row)
         for j in range(count, width):
             row[j] = 0.0
         # About the first member, so that a spread far below the size of the numbers keeps its digits.
@@ -77,8 +76,7 @@ def store(X, first, count, block):
     """Copy a block back."""
     N = X.shape[0]
     for i in range(N):
-        for j in range(count):
-            X[i, first + j] = block[N, j] + block[i, j]
+        added(count, block[N], block[i], X[i, first:])
 
 
 @jit
@@ -88,7 +86,7 @@ def transform(X, W, crew, crews, scratch):
     blocks = blocks_of(n)
     for b in range(crew * blocks // crews, (crew + 1) * blocks // crews):
         first, count, width = block_at(b, n)
-        block, out, _ = transform_at(start_of(scratch), N, width)
+        block, out, _ = transform_at(line_from(start_of(scratch)), N, width)
         load(X, first, count, width, block)
         for i in range(N):
             if count == width:
@@ -145,7 +143,7 @@ def regress(context, sensor, X, places, ZT, B, serial, inflation, crew, crews, s
         how_many = blocks_of(n)
     for e in range(crew * how_many // crews, (crew + 1) * how_many // crews):
         first, count, width = block_at(blocks[e] if local else e, n)
-        block, forecast, c, reach, _ = regression_at(start_of(scratch), N, width)
+        block, forecast, c, reach, _ = regression_at(line_from(start_of(scratch)), N, width)
         load(X, first, count, width, block)
         seen = block
         if not serial:
@@ -243,6 +241,22 @@ def rotate_members(seed, index, T, W):
     for i in range(N):
         for j in range(N):
             T[i, j] = W[i, j]
+
+
+@jit
+def transform_members(context, index, a, X, rest):
+    """x̄ + A ← x̄ + (T + 1 wᵀ) A for all states, with T (N, N) and v = √(N - 1) w of the analysis; rotate and inflate."""
+    N = X.shape[0]
+    T, W, v = a.T, a.W, a.v
+    given = numbers(context)
+    if given[OWN] > 0.0:
+        rotate_members(context.seed, index, T, W)
+    # W = T + 1 wᵀ, by which x̄ + W A are the members
+    for i in range(N):
+        for j in range(N):
+            W[i, j] = given[INFLATION] * T[i, j] + v[j] / np.sqrt(N - 1.0)
+        W[i, N] = 1.0
+    transform_all(X, W, int(given[CREWS]), rest)
 
 
 @jit

@@ -5,7 +5,8 @@ For one row with variance r, s = C_yy + r and gain K = ρ C_xy / s:
     x̄ ← x̄ + K (y - ȳ),   aᵢ ← aᵢ - α K (h(xᵢ) - ȳ),   α = 1 / (1 + √(r / s))
 
 Later rows are corrected like states, tapered by their distance from the current row. So the rows are assimilated among
-themselves first; then every state goes through the sequence by itself.
+themselves first; then every state goes through the sequence by itself. Without a taper all states go through the same
+sequence of combinations of members, so that one combination stands for many rows.
 
 Source: Whitaker & Hamill (2002), doi:10.1175/1520-0493(2002)130<1913:EDAWPO>2.0.CO;2, equation 13 for α; the rows
 first, then the states: Anderson & Collins (2007), doi:10.1175/JTECH2049.1.
@@ -17,11 +18,11 @@ import numpy as np
 
 from ..compiled.context import options as numbers
 from ..numerics.jit import jit
-from ..numerics.simd import add_scaled
+from ..numerics.simd import add_scaled, combine, dot
 from ..track import USED
 from .analysis import begin_analysis, find_places, reconsider, work_size
-from .blocks import ROTATION, regress_all, rotate
-from .localisation import between_rows, prepare
+from .blocks import ROTATION, regress_all, rotate, transform_members
+from .localisation import between_rows, localised, prepare
 from .shared import (
     CREWS,
     INFLATION,
@@ -47,21 +48,43 @@ def row_by_row(context, sensor, m, a):
     taper = between_rows(context, sensor)
     for k in range(m):
         z = ZT[k]
-        s = 1.0
-        for i in range(N):
-            s += z[i] * z[i]
+        s = 1.0 + dot(N, z, z)
         alpha = 1.0 / (1.0 + np.sqrt(1.0 / s))
         for i in range(N):
             B[k, i] = -alpha * z[i] / s
         B[k, N] = d[k] / (s * np.sqrt(N - 1.0))
         for j in range(k + 1, m):
-            dot = 0.0
-            for i in range(N):
-                dot += ZT[j, i] * z[i]
-            if taper.size > 0:
-                dot *= taper[rows[j], rows[k]]
-            d[j] -= dot * d[k] / s
-            add_scaled(N, -alpha * dot / s, z, ZT[j])
+            near = taper[rows[j], rows[k]] if taper.size > 0 else 1.0
+            if near > 0.0:
+                coefficient = near * dot(N, ZT[j], z) / s
+                d[j] -= coefficient * d[k]
+                add_scaled(N, -alpha * coefficient, z, ZT[j])
+
+
+@jit
+def row_transform(m, a):
+    """Fill T and v = √(N - 1) w: after all rows, in their order and without taper, x̄ + (T + 1 wᵀ) A are the members.
+
+    A row changes the anomalies of states and later rows alike, A ← (I - α z zᵀ / s) A; hence, from its forecast z⁰, d⁰,
+
+        z = T z⁰,  d = d⁰ - vᵀ z⁰,  v ← v + Tᵀ z d / s,  T ← T - α z (Tᵀ z)ᵀ / s
+    """
+    ZT, T, v = a.ZT, a.T, a.v
+    N = ZT.shape[1]
+    z, back = a.W[0], a.W[1]
+    for i in range(N):
+        v[i] = 0.0
+        for j in range(N):
+            T[i, j] = 1.0 if i == j else 0.0
+    for k in range(m):
+        for i in range(N):
+            z[i] = dot(N, T[i], ZT[k])
+        combine(N, z, 1, T[0], N, N, back, 0)
+        s = 1.0 + dot(N, z, z)
+        add_scaled(N, (a.d[k] - dot(N, v, ZT[k])) / s, back, v)
+        alpha = 1.0 / (1.0 + np.sqrt(1.0 / s))
+        for i in range(N):
+            add_scaled(N, -alpha * z[i] / s, back, T[i])
 
 
 @jit
@@ -76,11 +99,16 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
         return verdict
     index = next_draw(context, state)
     given = numbers(context)
-    # First the rows among themselves, for zₖ and dₖ; then every state: aᵢ ← aᵢ - α K zₖᵢ, x̄ ← x̄ + K dₖ.
-    row_by_row(context, sensor, m, a)
-    find_places(m, a.rows, a.places)
-    regress_all(context, sensor, X, a.places, a.ZT, a.B, True, given[INFLATION], int(given[CREWS]), rest)
-    rotate(context, index, X, a, rest)
+    # A row takes 2 N operations per state, a transform N².
+    if localised(context) or 2 * m < X.shape[0]:
+        # First the rows among themselves, for zₖ and dₖ; then every state: aᵢ ← aᵢ - α K zₖᵢ, x̄ ← x̄ + K dₖ.
+        row_by_row(context, sensor, m, a)
+        find_places(m, a.rows, a.places)
+        regress_all(context, sensor, X, a.places, a.ZT, a.B, True, given[INFLATION], int(given[CREWS]), rest)
+        rotate(context, index, X, a, rest)
+    else:
+        row_transform(m, a)
+        transform_members(context, index, a, X, rest)
     reconsider(context, index, X)
     finish(context, index, X, rest)
     return USED

@@ -16,17 +16,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..compiled.context import options as numbers
 from ..numerics.jit import jit
 from ..numerics.simd import add_scaled
 from ..numerics.symmetric import gram, symmetric_eigen
 from ..track import FAILED, USED
 from .analysis import begin_analysis, reconsider, work_size
-from .blocks import ROTATION, rotate_members, transform_all
+from .blocks import ROTATION, transform_members
 from .shared import (
-    CREWS,
-    INFLATION,
-    OWN,
     describe,
     ensemble_filter,
     finish,
@@ -97,26 +93,6 @@ def symmetric_transform(m, a):
 
 
 @jit
-def transform_members(context, index, m, a, X, rest):
-    """x̄ + A ← x̄ + (T + 1 wᵀ) A for all states; return False, without any change, if a number is not finite."""
-    N = X.shape[0]
-    T, W, v = a.T, a.W, a.v
-    # T = (I + Z Zᵀ)^(-1/2),  w = (I + Z Zᵀ)⁻¹ Z d / √(N - 1)
-    if not symmetric_transform(m, a):
-        return False
-    given = numbers(context)
-    if given[OWN] > 0.0:
-        rotate_members(context.seed, index, T, W)
-    # W = T + 1 wᵀ, by which x̄ + W A are the members
-    for i in range(N):
-        for j in range(N):
-            W[i, j] = given[INFLATION] * T[i, j] + v[j] / np.sqrt(N - 1.0)
-        W[i, N] = 1.0
-    transform_all(X, W, int(given[CREWS]), rest)
-    return True
-
-
-@jit
 def update(context, u, sensor, y, index, state, work, innovation, innovation_std, score):
     """Condition the ensemble on a measurement; see the module's equations.
 
@@ -129,8 +105,10 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     if verdict != USED:
         return verdict
     index = next_draw(context, state)
-    if not transform_members(context, index, m, a, X, rest):
+    # T = (I + Z Zᵀ)^(-1/2),  w = (I + Z Zᵀ)⁻¹ Z d / √(N - 1)
+    if not symmetric_transform(m, a):
         return FAILED
+    transform_members(context, index, a, X, rest)
     reconsider(context, index, X)
     finish(context, index, X, rest)
     return USED

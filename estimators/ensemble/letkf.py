@@ -15,15 +15,18 @@ from numba import prange
 
 from ..compiled.context import context_at, place_of
 from ..compiled.context import options as numbers
-from ..numerics.inverse_root import root_action, scratch_of
+from ..numerics.inverse_root import action_at, root_action
 from ..numerics.jit import jit, matrix
-from ..numerics.simd import WIDE, add_scaled, dot, scaled
+from ..numerics.simd import WIDE, add_scaled, square_roots
+from ..numerics.simd_ir import LANES
+from ..numerics.simd_lanes import scale_rows, weighted_gram
+from ..numerics.simd_rows import multiply_rows, subtract_product
 from ..numerics.symmetric import gram
-from ..numerics.workspace import declare_layout, share, size_of, start_of
+from ..numerics.workspace import declare_layout, line_from, share, size_of, start_of
 from ..track import FAILED, USED
 from .analysis import begin_analysis, find_places, reconsider, work_size
-from .blocks import ROTATION, block_at, load, rotate, store
-from .etkf import transform_members
+from .blocks import ROTATION, block_at, load, rotate, store, transform_members
+from .etkf import symmetric_transform
 from .localisation import localised, prepare, reached
 from .shared import (
     CREWS,
@@ -41,59 +44,93 @@ from .shared import (
 Local, local_at = declare_layout(
     "Local",
     "N, ny, side",
-    scratch_of,
+    action_at,
     block=f"(N + 1) * {WIDE}",
-    z="ny, N",
-    d="ny",
+    moved=f"(N + 1) * {WIDE}",
+    t=f"ny * {WIDE}",
+    x=f"ny * {WIDE}",
+    roots=f"ny, {WIDE}",
+    own_roots=f"ny, {LANES}",
+    G=f"side * side, {LANES}",
+    b=f"side, {LANES}",
+    g=f"side, {LANES}",
+    gain=f"{LANES}",
+    action="Action(at, side)",
+    z="ny * N",
+    across="ny * N",
     near="int ny",
-    roots="ny",
-    values="side",
-    t="side",
-    g="side",
-    a="N",
-    G="side * side",
-    actions="scratch_of(side)",
+    own="int ny",
 )
-"""Scratch of a crew: a block; anomalies z and innovations d of the rows near a state, times the root of the taper,
-their indices and these roots; vectors for `root_action` of length `side`, the smaller of N and ny; one state's
-anomalies a, a Gram matrix, and the scratch of `root_action`."""
+"""Scratch of a crew: a block before and after; t = Z a of the rows near it, and their factors x in the correction; the
+root of their tapers, and of those near a group of `LANES` states; matrices and vectors of a group, of order `side`, the
+smaller of N and ny; the anomalies z (rows, N) of the rows near the block, and their transpose; indices of the rows near
+the block, and among these of those near the group."""
 
 
 @jit
-def local_transform(p, z, d, G, a, values, t, g, scratch):
-    """Transform the anomalies a (N,) of one state by (I + Z Zᵀ)^(-1/2), from the p rows z near it.
+def near_block(e, starts, entry_rows, tapers, places, near, roots):
+    """Find the finite rows near a block and the roots of their tapers; return how many there are."""
+    count = 0
+    for entry in range(starts[e], starts[e + 1]):
+        k = places[entry_rows[entry]]
+        if k >= 0:
+            near[count] = k
+            square_roots(WIDE, tapers[entry], roots[count])
+            count += 1
+    return count
 
-    Only the transform's action on one vector is needed: with t = Zᵀ a,
-    a ← a - Z φ(Zᵀ Z) t and x̄ gains tᵀ (I + Zᵀ Z)⁻¹ d / √(N - 1); φ as in `symmetric_transform` of etkf.py.
 
-    Args:
-        p: Rows near the state.
-        z: Their whitened anomalies times √taper, (p, N).
-        d: Their whitened innovation times √taper, (p,); is destroyed.
-        G: Holds Zᵀ Z (p, p) if p < N; is destroyed.
-        a: Anomalies of the state (N,).
-        values: Scratch (side,), side = min(p, N).
-        t: Scratch (side,).
-        g: Scratch (side,).
-        scratch: For `root_action`.
+@jit
+def near_group(count, at, roots, own, own_roots):
+    """Find among the rows near a block those near its `LANES` states from `at` on; return how many there are."""
+    p = 0
+    for q in range(count):
+        reaches = False
+        for lane in range(LANES):
+            root = roots[q, at + lane]
+            own_roots[p, lane] = root
+            reaches = reaches or root > 0.0
+        if reaches:
+            own[p] = q
+            p += 1
+    return p
 
-    Returns:
-        The gain of the mean; NaN if a number is not finite.
+
+@jit
+def transform_group(at, p, room, z, t, x, block, d, C):
+    """Find the transform of `LANES` states of a block, from `at` on, from the p rows near them.
+
+    Of each state with the anomalies a (N,) only the transform's action on one vector is needed: with t = Z a,
+    a ← a - Zᵀ φ(Z Zᵀ) t and x̄ gains tᵀ (I + Z Zᵀ)⁻¹ d / √(N - 1), Z (p, N) times √taper; φ as in `symmetric_transform`
+    of etkf.py. With N rows or more, a ← (I + Zᵀ Z)^(-1/2) a is smaller.
+
+    On return x holds √taper φ(Z Zᵀ) t by rows, or the block its new anomalies; and the mean has its gain.
     """
-    N = a.size
+    N = block.shape[0] - 1
+    own, roots, G, b, g, gain = room.own, room.own_roots, room.G, room.b, room.g, room.gain
     if p < N:
+        scale_rows(p, own, room.near, roots, C, d, t, at, G, b, g)
+        root_action(G, p, b, g, False, room.action, gain)
         for k in range(p):
-            t[k] = dot(N, z[k], a)
-        gain = root_action(G, p, values, t, d, False, scratch)
+            for lane in range(LANES):
+                x[own[k], at + lane] = roots[k, lane] * b[k, lane]
+    else:
+        for i in range(N):
+            for lane in range(LANES):
+                g[i, lane] = 0.0
+                b[i, lane] = block[i, at + lane]
         for k in range(p):
-            add_scaled(N, -t[k], z[k], a)
-        return gain / np.sqrt(N - 1.0)
-    gram(z, p, N, G)
-    for i in range(N):
-        g[i] = 0.0
-    for k in range(p):
-        add_scaled(N, d[k], z[k], g)
-    return root_action(G, N, values, a, g, True, scratch) / np.sqrt(N - 1.0)
+            innovation = d[room.near[own[k]]]
+            for lane in range(LANES):
+                roots[k, lane] *= roots[k, lane]
+            for i in range(N):
+                add_scaled(LANES, z[own[k], i] * innovation, roots[k], g[i])
+        weighted_gram(p, own, roots, z, N, G)
+        root_action(G, N, b, g, True, room.action, gain)
+        for i in range(N):
+            for lane in range(LANES):
+                block[i, at + lane] = b[i, lane]
+    add_scaled(LANES, 1.0 / np.sqrt(N - 1.0), gain, block[N, at:])
 
 
 @jit
@@ -102,42 +139,41 @@ def transform_columns(context, sensor, X, places, ZT, d, C, inflation, crew, cre
     N, n = X.shape
     ny = places.size
     blocks, starts, entry_rows, tapers = reached(context, sensor)
-    room = local_at(start_of(scratch), N, ny, min(ny, N))
-    z, d_near, near, roots, values, t, g, a = room.z, room.d, room.near, room.roots, room.values, room.t, room.g, room.a
+    room = local_at(line_from(start_of(scratch)), N, ny, min(ny, N))
+    near = room.near
     for e in range(crew * blocks.size // crews, (crew + 1) * blocks.size // crews):
         first, count, width = block_at(blocks[e], n)
-        block = matrix(room.block, 0, N + 1, width)
+        block, moved = matrix(room.block, 0, N + 1, width), matrix(room.moved, 0, N + 1, width)
+        rows = near_block(e, starts, entry_rows, tapers, places, near, room.roots)
+        if rows == 0:
+            continue
         load(X, first, count, width, block)
-        for j in range(count):
-            p = 0
-            most = 0.0
-            for entry in range(starts[e], starts[e + 1]):
-                k = places[entry_rows[entry]]
-                taper = tapers[entry, j]
-                if k >= 0 and taper > 0.0:
-                    root = np.sqrt(taper)
-                    near[p] = k
-                    d_near[p] = root * d[k]
-                    roots[p] = root
-                    scaled(N, root, ZT[k], z[p])
-                    most = max(most, taper)
-                    p += 1
-            if p == 0:
-                continue
-            order = min(p, N)
-            G = matrix(room.G, 0, order, order)
-            if p < N:
-                for k in range(p):
-                    for i in range(p):
-                        G[k, i] = roots[k] * roots[i] * C[near[k], near[i]]
+        z, across = matrix(room.z, 0, rows, N), matrix(room.across, 0, N, rows)
+        t, x = matrix(room.t, 0, rows, width), matrix(room.x, 0, rows, width)
+        for k in range(rows):
             for i in range(N):
-                a[i] = block[i, j]
-            gain = local_transform(p, z, d_near, G, a, values, t, g, room.actions)
-            factor = 1.0 + (inflation - 1.0) * most
-            for i in range(N):
-                block[i, j] = factor * a[i]
-            block[N, j] += gain
-        store(X, first, count, block)
+                z[k, i] = ZT[near[k], i]
+                across[i, k] = z[k, i]
+            for j in range(width):
+                x[k, j] = 0.0
+        multiply_rows(z, rows, N, block, 0, t)
+        for at in range(0, width, LANES):
+            p = near_group(rows, at, room.roots, room.own, room.own_roots)
+            if p > 0:
+                transform_group(at, p, room, z, t, x, block, d, C)
+        subtract_product(block, across, N, rows, x, 0, moved)
+        for j in range(width):
+            moved[N, j] = block[N, j]
+        if inflation != 1.0:
+            for j in range(width):
+                most = 0.0
+                for entry in range(starts[e], starts[e + 1]):
+                    if places[entry_rows[entry]] >= 0:
+                        most = max(most, tapers[entry, j])
+                factor = 1.0 + (inflation - 1.0) * most
+                for i in range(N):
+                    moved[i, j] *= factor
+        store(X, first, count, moved)
 
 
 @jit(parallel=True)
@@ -175,7 +211,9 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
         gram(a.Z, X.shape[0], m, a.U)
         transform_locally(context, sensor, X, a, given[INFLATION], int(given[CREWS]), rest)
         rotate(context, index, X, a, rest)
-    elif not transform_members(context, index, m, a, X, rest):
+    elif symmetric_transform(m, a):
+        transform_members(context, index, a, X, rest)
+    else:
         return FAILED
     reconsider(context, index, X)
     finish(context, index, X, rest)

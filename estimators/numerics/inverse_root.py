@@ -1,12 +1,13 @@
-"""What (I + A)^(-1/2) makes of one vector, for symmetric positive semidefinite A, without eigenvectors.
+"""What (I + A)^(-1/2) makes of a vector, for symmetric positive semidefinite A, without eigenvectors: eight at a time.
 
 A = Hᵀ T H with H a product of reflections and T tridiagonal; and the inverse root is a sum of resolvents,
 
     (I + T)^(-1/2) ≈ Σ_k w_k ((1 + σ_k) I + T)⁻¹,
 
 to the last bit with a dozen or two of them: the trapezoidal rule on an integral that elliptic functions have smoothed.
-Each is a tridiagonal system, and all are solved side by side in simd_ir. Turning the vector by the rotations of a QL
-iteration takes ten times as long.
+Each is a tridiagonal system. Turning the vector by the rotations of a QL iteration takes ten times as long.
+
+Every number depends on the matrix of its lane alone (see simd_lanes.py), but for the number of resolvents.
 
 Source: Hale, Higham & Trefethen (2008), Computing A^α, log(A), and related matrix functions by contour integrals,
 doi:10.1137/070700607, method 3, with the real form of its elliptic functions; these by Jacobi's theta functions (NIST
@@ -15,18 +16,21 @@ Digital Library of Mathematical Functions, 22.2 and 20.2).
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
-from numba.core import cgutils
 from scipy.special import ellipk, ellipkm1
 
 from .jit import jit
-from .simd import add_scaled, dot
-from .simd_ir import LANES, integer, vector_code
-from .symmetric import begin, tridiagonal
-from .workspace import layout
+from .simd_ir import LANES, integer, steps, vector_code
+from .simd_lanes import LaneRows, find_reflection, lane_dot, multiply, reflect, reflect_back, subtract
+from .workspace import declare_layout
 
-_BLOCKS = 18
-"""The finest rule has this many vectors of resolvents; it is good up to `_UP_TO[-1]`."""
+_GROUP = 4
+"""Resolvents that are computed at a time, so that the divisions of one do not wait for those of another."""
+
+_RULES = 35
+"""The finest rule has this many groups of resolvents and one more; it is good up to `_UP_TO[-1]`."""
 
 _EPSILON = 2.3e-16
 
@@ -56,11 +60,11 @@ def _rule(count: int, condition: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _rules() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """For 1, 2, … vectors of resolvents: the largest 1 + λ at which they are good to the last bit, shifts, weights."""
+    """For 2, 3, … groups of resolvents: the largest 1 + λ at which they are good to the last bit, shifts, weights."""
     # The rule's error is 4 exp(-2 π² count / log(16 condition)), nearly.
-    counts = LANES * (np.arange(_BLOCKS) + 1)
+    counts = _GROUP * (np.arange(_RULES) + 2)
     up_to = np.exp(counts / 1.86) / 16.0
-    shifts, weights = np.zeros((2, _BLOCKS, counts[-1]))
+    shifts, weights = np.zeros((2, _RULES, counts[-1]))
     for k, (count, condition) in enumerate(zip(counts, up_to, strict=True)):
         shifts[k, :count], weights[k, :count] = _rule(int(count), float(condition))
     return up_to, shifts, weights
@@ -68,116 +72,153 @@ def _rules() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 _UP_TO, _SHIFTS, _WEIGHTS = _rules()
 _SHRINKS = _WEIGHTS / (1.0 + _SHIFTS)
-_NO_SHIFT, _ONE = np.zeros(LANES), np.eye(LANES)[0]
+_NO_SHIFT, _ONE = np.zeros(1), np.ones(1)
 
 
-@layout
-def scratch_of(n: int) -> int:
-    """Numbers of scratch that `root_action` takes at order n."""
-    return n * (4 + 3 * LANES) + LANES
+Action, action_at = declare_layout(
+    "Action",
+    "n",
+    d=f"n, {LANES}",
+    e=f"n + 1, {LANES}",
+    inverses=f"n, {LANES}",
+    w=f"n, {LANES}",
+    x=f"n, {LANES}",
+    largest=f"{LANES}",
+    rest=f"{_GROUP} * (2 * n + 1), {LANES}",
+)
+"""Scratch of `root_action` at order n or below: T, the reflections, two vectors, and factors of resolvents."""
 
 
 @vector_code()
-def resolve(v, n, d, e, b, blocks, shifts, weights, scratch, out):
-    """out[:n] = Σ_k weights[k] (T + shifts[k] I)⁻¹ b, T tridiagonal with diagonal d[:n], and e[1:n] beside it.
+def _largest_row(v, n, d, e, largest):
+    """The largest sum of absolute values of a row of T (n, n); no eigenvalue is larger (Gershgorin)."""
+    builder = v.builder
+    d, e, largest = LaneRows(v, d), LaneRows(v, e), LaneRows(v, largest)
+    most = v.variable()
+    builder.store(v.constant(0.0), most)
+    with steps(builder, 0, n) as i:
+        beside = builder.fadd(v.unary("fabs", e[i]), v.unary("fabs", e[builder.add(i, integer(1))]))
+        total, found = builder.fadd(v.unary("fabs", d[i]), beside), builder.load(most)
+        # Unordered, so that a number that is no number stays.
+        builder.store(builder.select(builder.fcmp_unordered("<=", total, found), found, total), most)
+    largest[integer(0)] = builder.load(most)
 
-    By elimination without exchanges, which is stable where all T + shifts[k] I are positive definite; `LANES` shifts at
-    a time, which is what `blocks` counts. e[0] must be 0. `scratch` holds (3 n + 1) LANES numbers.
-    """
-    builder, lanes, zero = v.builder, integer(LANES), v.constant(0.0)
-    factors = scratch.data
-    values = builder.gep(factors, [builder.mul(builder.add(n, integer(1)), lanes)])
-    sums = builder.gep(values, [builder.mul(n, lanes)])
-    inverse, y = v.variable(), v.variable()
-    with cgutils.for_range(builder, n) as loop:
-        v.store(zero, sums, builder.mul(loop.index, lanes))
-    v.store(zero, factors, builder.mul(n, lanes))
-    with cgutils.for_range(builder, blocks) as block:
-        at = builder.mul(block.index, lanes)
-        shift, weight = v.load(shifts.data, at), v.load(weights.data, at)
-        builder.store(zero, inverse)
-        builder.store(zero, y)
-        with cgutils.for_range(builder, n) as loop:
-            i, to = loop.index, builder.mul(loop.index, lanes)
-            beside = v.entry(e.data, i)
-            factor = builder.fmul(beside, builder.load(inverse))
-            minus = builder.fneg(factor)
-            pivot = v.multiply_add(minus, beside, builder.fadd(v.entry(d.data, i), shift))
-            value = v.multiply_add(minus, builder.load(y), builder.fmul(weight, v.entry(b.data, i)))
-            inverted = builder.fdiv(v.constant(1.0), pivot)
-            builder.store(inverted, inverse)
-            builder.store(value, y)
-            v.store(factor, factors, to)
-            v.store(builder.fmul(value, inverted), values, to)
-        builder.store(zero, y)
-        with cgutils.for_range(builder, n) as loop:
-            to = builder.mul(builder.sub(builder.sub(n, integer(1)), loop.index), lanes)
-            factor = builder.fneg(v.load(factors, builder.add(to, lanes)))
-            x = v.multiply_add(factor, builder.load(y), v.load(values, to))
-            builder.store(x, y)
-            v.store(builder.fadd(v.load(sums, to), x), sums, to)
-    with cgutils.for_range(builder, n) as loop:
-        total = v.sum_of(v.load(sums, builder.mul(loop.index, lanes)))
-        builder.store(total, builder.gep(out.data, [loop.index]))
+
+@vector_code()
+def _shift(v, n, d, by, factor):
+    """d[:n] += 1 + factor by[0]."""
+    d, by = LaneRows(v, d), LaneRows(v, by)
+    added = v.multiply_add(v.spread(factor), by[integer(0)], v.constant(1.0))
+    with steps(v.builder, 0, n) as i:
+        d[i] = v.builder.fadd(d[i], added)
+
+
+def _resolving(group: int) -> Any:
+    @vector_code()
+    def resolve(v, n, d, e, b, count, shifts, weights, scratch, out):
+        """out[:n] = Σ_k weights[k] (T + shifts[k] I)⁻¹ b, T tridiagonal with diagonal d[:n], and e[1:n] beside it.
+
+        By elimination without exchanges, which is stable where all T + shifts[k] I are positive definite; `group`
+        shifts at a time, of `count`. e[0] must be 0. `scratch` holds group (2 n + 1) rows.
+        """
+        builder, zero, one = v.builder, v.constant(0.0), v.constant(1.0)
+        own, beside, right, out = (LaneRows(v, array) for array in (d, e, b, out))
+        factors = LaneRows(v, scratch)
+        values = builder.mul(builder.add(n, integer(1)), integer(group))
+        inverses, ys = ([v.variable() for _ in range(group)] for _ in range(2))
+        with steps(builder, 0, n) as i:
+            out[i] = zero
+        for s in range(group):
+            factors[builder.add(builder.mul(n, integer(group)), integer(s))] = zero
+        with steps(builder, 0, count, group) as first:
+            shift, weight = (
+                [v.entry(array.data, builder.add(first, integer(s))) for s in range(group)]
+                for array in (shifts, weights)
+            )
+            for one_of in (*inverses, *ys):
+                builder.store(zero, one_of)
+            with steps(builder, 0, n) as i:
+                side, diagonal, target = beside[i], own[i], right[i]
+                to = builder.mul(i, integer(group))
+                for s in range(group):
+                    factor = builder.fmul(side, builder.load(inverses[s]))
+                    minus = builder.fneg(factor)
+                    pivot = v.multiply_add(minus, side, builder.fadd(diagonal, shift[s]))
+                    value = v.multiply_add(minus, builder.load(ys[s]), builder.fmul(weight[s], target))
+                    inverted = builder.fdiv(one, pivot)
+                    builder.store(inverted, inverses[s])
+                    builder.store(value, ys[s])
+                    at = builder.add(to, integer(s))
+                    factors[at] = factor
+                    factors[builder.add(values, at)] = builder.fmul(value, inverted)
+            for y in ys:
+                builder.store(zero, y)
+            with steps(builder, 0, n) as back:
+                i = builder.sub(builder.sub(n, integer(1)), back)
+                to = builder.mul(i, integer(group))
+                total = out[i]
+                for s in range(group):
+                    at = builder.add(to, integer(s))
+                    factor = builder.fneg(factors[builder.add(at, integer(group))])
+                    x = v.multiply_add(factor, builder.load(ys[s]), factors[builder.add(values, at)])
+                    builder.store(x, ys[s])
+                    total = builder.fadd(total, x)
+                out[i] = total
+
+    return resolve
+
+
+_resolve, _resolve_one = _resolving(_GROUP), _resolving(1)
 
 
 @jit
-def root_action(A, n, d, b, g, inverse_root, scratch):
+def root_action(A, n, b, g, inverse_root, room, product):
     """b ← f(A) b for symmetric positive semidefinite A, f(λ) = 1/√(1+λ) or (1 - 1/√(1+λ)) / λ.
 
     The second is Σ w_k / ((1 + σ_k) (1 + λ + σ_k)), from the first's values at 0 and at λ, without a difference.
 
     Args:
-        A: Symmetric, at least (n, n), rows contiguous; is destroyed.
+        A: Symmetric matrices, entry (i, j) in row i n + j, of which j ≥ i is read: (n², LANES). Is destroyed.
         n: Order.
-        d: Scratch (n,).
-        b: A vector (n,).
-        g: Another, destroyed.
+        b: Vectors (n, LANES).
+        g: Others, destroyed.
         inverse_root: Whether f is the first, or else the second.
-        scratch: `scratch_of` numbers.
-
-    Returns:
-        bᵀ (I + A)⁻¹ g of the b given; NaN if a number is not finite.
+        room: Scratch, `Action` of order n or above.
+        product: Gets bᵀ (I + A)⁻¹ g of the b given (LANES,); NaN if a number is not finite.
     """
-    half = scratch[2 * n : 3 * n]
-    tridiagonal(A, n, d, half, scratch)
-    e = scratch[:n]
-    x = scratch[3 * n : 4 * n]
-    rest = scratch[4 * n :]
+    d, e, inverses, w, x, largest, rest, _ = room
+    for lane in range(LANES):
+        e[0, lane] = 0.0
+        e[n, lane] = 0.0
     for k in range(n - 2):
-        if half[k] != 0.0:
-            _reflect(A, n, k, half[k], b)
-            _reflect(A, n, k, half[k], g)
-    # No eigenvalue is larger than the largest sum of a row (Gershgorin).
-    largest = 0.0
-    finite = True
-    for k in range(n):
-        row = abs(d[k]) + abs(e[k]) + (abs(e[k + 1]) if k + 1 < n else 0.0)
-        finite = finite and row < np.inf
-        largest = max(largest, row)
-    if not finite:
-        return np.nan
+        find_reflection(n, k, A, d, e, inverses)
+        multiply(n, k, A, w)
+        reflect(n, k, A, inverses, w, b, g)
+        subtract(n, k, A, w)
+    for lane in range(LANES):
+        for k in range(max(n - 2, 0), n):
+            d[k, lane] = A[k * n + k, lane]
+        if n > 1:
+            e[n - 1, lane] = A[(n - 2) * n + n - 1, lane]
+    _largest_row(n, d, e, largest)
+    most = 0.0
+    for lane in range(LANES):
+        if largest[lane] < np.inf:
+            most = max(most, largest[lane])
     # Rounding left T's eigenvalues off by so much; none may come out below 0.
-    for k in range(n):
-        d[k] += 1.0 + 4.0 * _EPSILON * largest
+    _shift(n, d, largest, 4.0 * _EPSILON)
     rule = 0
-    while rule < _BLOCKS - 1 and _UP_TO[rule] < 1.0 + largest:
+    while rule < _RULES - 1 and _UP_TO[rule] < 1.0 + most:
         rule += 1
-    resolve(n, d, e, g, 1, _NO_SHIFT, _ONE, rest, x)
-    product = dot(n, b, x)
+    _resolve_one(n, d, e, g, 1, _NO_SHIFT, _ONE, rest, x)
+    lane_dot(n, b, x, product)
+    for lane in range(LANES):
+        if not largest[lane] < np.inf:
+            product[lane] = np.nan
     weights = _WEIGHTS[rule] if inverse_root else _SHRINKS[rule]
-    resolve(n, d, e, b, rule + 1, _SHIFTS[rule], weights, rest, x)
+    _resolve(n, d, e, b, _GROUP * (rule + 2), _SHIFTS[rule], weights, rest, x)
     for k in range(n):
-        b[k] = x[k]
+        for lane in range(LANES):
+            b[k, lane] = x[k, lane]
     for k in range(n - 3, -1, -1):
-        if half[k] != 0.0:
-            _reflect(A, n, k, half[k], b)
-    return product
-
-
-@jit
-def _reflect(A, n, k, half, x):
-    """x ← (I - v vᵀ / half) x, with v of row k."""
-    first = begin(k)
-    v, own = A[k, first:], x[first:]
-    add_scaled(n - first, -dot(n - first, v, own) / half, v, own)
+        reflect_back(n, k, A, inverses, b)

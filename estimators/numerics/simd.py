@@ -82,21 +82,59 @@ def scaled(v, n, a, x, out):
     in_vectors(v, n, lambda v, i: v.store(v.builder.fmul(v.spread(a), v.load(x.data, i)), out.data, i))
 
 
-def _combining(rows: int) -> Any:
+@vector_code()
+def copied(v, n, x, out):
+    """out[:n] = x[:n]."""
+    in_vectors(v, n, lambda v, i: v.store(v.load(x.data, i), out.data, i))
+
+
+@vector_code()
+def added(v, n, x, y, out):
+    """out[:n] = x[:n] + y[:n]."""
+    in_vectors(v, n, lambda v, i: v.store(v.builder.fadd(v.load(x.data, i), v.load(y.data, i)), out.data, i))
+
+
+@vector_code()
+def weigh_squares(v, n, e, weight, shift, log_w, out):
+    """log_w[:n] -= weight e[:n]², and out[:n] = e[:n] - shift, which may be e."""
+
+    def write(v: Lanes, i: Any) -> None:
+        builder, own = v.builder, v.load(e.data, i)
+        square = builder.fmul(builder.fmul(v.spread(weight), own), own)
+        v.store(builder.fsub(v.load(log_w.data, i), square), log_w.data, i)
+        v.store(builder.fsub(own, v.spread(shift)), out.data, i)
+
+    in_vectors(v, n, write)
+
+
+@vector_code()
+def square_roots(v, n, x, out):
+    """out[:n] = √x[:n]."""
+    in_vectors(v, n, lambda v, i: v.store(v.unary("sqrt", v.load(x.data, i)), out.data, i))
+
+
+def _combining(rows: int, subtract: bool = False) -> Any:
     @vector_code()
     def combine(v, count, weights, apart, x, stride, n, out, width):
-        """out[i·width :][:n] = Σ_k weights[k·apart + i] x[k·stride :][:n], k < count, for i < rows: 1 or 4."""
+        """out[i·width :][:n] = Σ_k weights[k·apart + i] x[k·stride :][:n], k < count, for i < rows: 1 or 4.
+
+        Where it subtracts, out loses the sum, term by term.
+        """
 
         def write(v: Lanes, at: Any) -> None:
             builder = v.builder
+            to = [builder.gep(out.data, [builder.mul(width, integer(i))]) for i in range(rows)]
             sums = [v.variable() for _ in range(rows)]
+            for total, row in zip(sums, to, strict=True):
+                builder.store(v.load(row, at) if subtract else v.constant(0.0), total)
             with cgutils.for_range(builder, count) as loop:
                 weight = builder.gep(weights.data, [builder.mul(loop.index, apart)])
                 value = v.load(builder.gep(x.data, [builder.mul(loop.index, stride)]), at)
+                value = builder.fneg(value) if subtract else value
                 for i, total in enumerate(sums):
                     v.multiply_add_to(total, v.entry(weight, integer(i)), value)
-            for i, total in enumerate(sums):
-                v.store(builder.load(total), builder.gep(out.data, [builder.mul(width, integer(i))]), at)
+            for total, row in zip(sums, to, strict=True):
+                v.store(builder.load(total), row, at)
 
         in_vectors(v, n, write)
 
@@ -104,6 +142,7 @@ def _combining(rows: int) -> Any:
 
 
 combine, combine_four = _combining(1), _combining(4)
+subtract_one, subtract_four = _combining(1, subtract=True), _combining(4, subtract=True)
 
 
 @vector_code()

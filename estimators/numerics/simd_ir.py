@@ -131,6 +131,12 @@ class Lanes:
         kind = ir.FunctionType(self.kind, [self.kind] * 3)
         return self.builder.call(cgutils.get_or_insert_function(self.builder.module, kind, name), [a, b, c])
 
+    def unary(self, name: str, x: Any) -> Any:
+        """Return LLVM's function of one number, such as sqrt or fabs, of each number of a vector."""
+        name = f"llvm.{name}.v{LANES}f64" if self.wide else f"llvm.{name}.f64"
+        kind = ir.FunctionType(self.kind, [self.kind])
+        return self.builder.call(cgutils.get_or_insert_function(self.builder.module, kind, name), [x])
+
     def first(self, count: Any) -> Any:
         """Return the mask of a vector's first `count` numbers (all of them where there are more)."""
         lanes = ir.Constant(ir.VectorType(I64, LANES), list(range(LANES)))

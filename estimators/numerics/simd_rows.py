@@ -17,7 +17,7 @@ from typing import Any
 from numba import types
 from numba.core import cgutils
 
-from .simd_ir import F64, I64, LANES, Lanes, integer, sizes, steps, vector_code
+from .simd_ir import I64, LANES, Lanes, integer, sizes, steps, vector_code
 
 
 @vector_code()
@@ -130,10 +130,6 @@ def factor(v, P, U):
     good = cgutils.alloca_once_value(builder, cgutils.true_bit)
     zero, one = one_number.constant(0.0), one_number.constant(1.0)
 
-    def root(x: Any) -> Any:
-        kind = cgutils.ir.FunctionType(F64, [F64])
-        return builder.call(cgutils.get_or_insert_function(builder.module, kind, "llvm.sqrt.f64"), [x])
-
     with cgutils.for_range(builder, n) as loop, steps(builder, 0, width, LANES) as at:
         row = builder.gep(P.data, [builder.mul(loop.index, n)])
         value = v.load_first(row, at, v.first(builder.sub(n, at)))
@@ -147,7 +143,7 @@ def factor(v, P, U):
         builder.store(builder.and_(builder.load(good), builder.and_(positive, finite)), good)
         # The next pivot waits for a division only; the root is not in its way.
         inverse = builder.fneg(builder.fdiv(one, pivot))
-        scale = v.spread(builder.fdiv(one, root(pivot)))
+        scale = v.spread(builder.fdiv(one, one_number.unary("sqrt", pivot)))
         begin = builder.and_(k, integer(-LANES))
         with steps(builder, builder.add(k, integer(1)), n) as i:
             multiple = v.spread(builder.fmul(builder.load(builder.gep(row, [i])), inverse))

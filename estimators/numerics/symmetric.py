@@ -12,11 +12,14 @@ from __future__ import annotations
 import numpy as np
 
 from .jit import jit
-from .simd import add_outer, add_scaled, combine, combine_four, dot, rotate
+from .simd import add_outer, add_scaled, combine, combine_four, dot, rotate, subtract_four, subtract_one
 from .simd_ir import LANES
 
 _SWEEPS = 60
 """Iterations for one eigenvalue; two are usual, so this many mean that a number is not finite."""
+
+_PANEL = 32
+"""Rows of a panel of the Cholesky factor."""
 
 _NOTHING = 1e-300
 """Below this a sum of squares may have lost its numbers to underflow: a row that small is zero."""
@@ -43,21 +46,34 @@ def gram(Z, count, n, G):
 def factor(A, n, U):
     """Upper U with Uᵀ U = I + A for the leading n rows of symmetric A; False if I + A is not positive definite.
 
-    Source: Golub & Van Loan, Matrix Computations, 4th ed., algorithm 4.2.2 (outer product form).
+    Rows below a panel of rows are read and written once per panel.
+
+    Source: Golub & Van Loan, Matrix Computations, 4th ed., algorithms 4.2.2 (outer product form) and 4.2.4 (blocks).
     """
+    width = U.shape[1]
     for k in range(n):
         for j in range(n):
             U[k, j] = A[k, j] if j >= k else 0.0
         U[k, k] += 1.0
-    for k in range(n):
-        pivot = U[k, k]
-        if not (pivot > 0.0 and pivot < np.inf):
-            return False
-        scale = 1.0 / np.sqrt(pivot)
-        for j in range(k, n):
-            U[k, j] *= scale
-        for i in range(k + 1, n):
-            add_scaled(n - i, -U[k, i], U[k, i:], U[i, i:])
+    for first in range(0, n, _PANEL):
+        last = min(first + _PANEL, n)
+        for k in range(first, last):
+            pivot = U[k, k]
+            if not (pivot > 0.0 and pivot < np.inf):
+                return False
+            scale = 1.0 / np.sqrt(pivot)
+            for j in range(k, n):
+                U[k, j] *= scale
+            for i in range(k + 1, last):
+                add_scaled(n - i, -U[k, i], U[k, i:], U[i, i:])
+        fours = last + (n - last) // 4 * 4
+        for i in range(last, fours, 4):
+            subtract_four(last - first, U[first, i:], width, U[first, i:], width, n - i, U[i, i:], width)
+            for k in range(1, 4):
+                for j in range(k):
+                    U[i + k, i + j] = 0.0
+        for i in range(fours, n):
+            subtract_one(last - first, U[first, i:], width, U[first, i:], width, n - i, U[i, i:], width)
     return True
 
 

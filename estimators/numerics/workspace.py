@@ -154,6 +154,12 @@ def after(work, end):
     return floats(end, work.size - used)
 
 
+@layout
+def line_from(at: int) -> int:
+    """Return the first address from `at` on that begins a cache line, so that no vector lies in two of them."""
+    return (at + 63) // 64 * 64
+
+
 @jit
 def share(work, crew, crews):
     """The part of a scratch array that belongs to one of several crews."""

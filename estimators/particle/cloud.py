@@ -24,11 +24,11 @@ from ..model.state_space import StateSpaceModel
 from ..numerics.jit import ints, jit, matrix, threaded
 from ..numerics.linalg import wrap
 from ..numerics.peaks import Peak, peaks_of
-from ..numerics.simd import dot, exp_minus, total, weighted
+from ..numerics.simd import copied, dot, exp_minus, total, weighted
 from ..numerics.workspace import WORD, declare_layout, layout, size_of, start_of, view
 from ..track import ANCESTORS, EFFECTIVE
 from ..tuning import Tuning
-from .resampling import SCHEME_NAMES, take_ancestors
+from .resampling import SCHEME_NAMES
 
 DRAWS, SETTLED, EQUAL, ESS, RECOVERIES, RESAMPLED, ORIGINS, GENERATIONS = range(8)
 """Head of the state: number of predictions and updates; whether mean and covariance are up to date; whether all weights
@@ -250,13 +250,6 @@ def begin_lineage(context, state):
 
 
 @jit
-def inherit(context, ancestors, state):
-    """Give children the origin of their ancestors (N,)."""
-    lineage = own_cloud(context, state).lineage
-    take_ancestors(ancestors, matrix(lineage, 0, lineage.size, 1))
-
-
-@jit
 def count_origins(context, state):
     """Count one more measurement used; every `LAG` of them, count the origins and begin anew."""
     state[GENERATIONS] += 1.0
@@ -333,8 +326,7 @@ def add_members(circular, w, records, reference, D, sums):
             if circular[j] != 0.0:
                 for i in range(n):
                     d[i] = wrap(d[i])
-        for i in range(n):
-            D[nx, i] = w[first + i]
+        copied(n, w[first:], D[nx])
         add_chunk(D, n, nx, sums)
         if own:
             for k in range(n):

@@ -41,7 +41,7 @@ from ..numerics.jit import ints, jit
 from ..numerics.linalg import wrap
 from ..numerics.normal_score import add_tails
 from ..numerics.random import fill_normals, key_of
-from ..numerics.simd import all_finite, exp_minus
+from ..numerics.simd import added, all_finite, copied, exp_minus, weigh_squares
 from ..numerics.workspace import declare_layout
 from ..track import FAILED, MISSING, USED
 from ..tuning import Tuning
@@ -172,9 +172,7 @@ def propagate_block(context, u, dt, sensor, y, key, value, state, work, number):
                     noise_root(context, records[begin + i], u, dt, L, room.spare)
                 add_noise(L, z[i * noises :], forward[i])
         if all_finite(count * nx, forward):
-            for i in range(count):
-                for j in range(nx):
-                    records[begin + i, j] = forward[i, j]
+            copied(count * nx, forward[0], records[begin])
         else:
             lost += _settle_finite(forward, records[begin : begin + count], log_w[begin : begin + count])
         if angles:
@@ -226,14 +224,17 @@ def weigh_block(context, u, dt, sensor, y, key, value, state, work, number):
             # Row `row` moves up to k ≤ row.
             d = D[k]
             weight = 0.0 if correlated else 0.5 / r[row]
-            for i in range(count):
-                e = D[row, i]
-                if circular[row] != 0:
-                    e = wrap(e)
-                if correlated:
-                    expected[i, k] = e
-                d[i] = about(e, reference[row], circular[row])
-                joint[begin + i] -= weight * e * e
+            if circular[row] != 0 or correlated:
+                for i in range(count):
+                    e = D[row, i]
+                    if circular[row] != 0:
+                        e = wrap(e)
+                    if correlated:
+                        expected[i, k] = e
+                    d[i] = about(e, reference[row], circular[row])
+                    joint[begin + i] -= weight * e * e
+            else:
+                weigh_squares(count, D[row], weight, reference[row], joint[begin:], d)
             k += 1
         if correlated:
             for i in range(count):
@@ -247,21 +248,21 @@ def weigh_block(context, u, dt, sensor, y, key, value, state, work, number):
                 D[m + 1, i] = 1.0
         else:
             exp_minus(count, log_w[begin:], 0.0, D[m + 1])
-        for i in range(count):
-            w = D[m + 1, i]
-            density = joint[begin + i] + log_w[begin + i]
-            # A density that is NaN, or an expectation: the particle is out, and out of the sums.
-            if not -np.inf < density < np.inf:
-                density = -np.inf
-                for k in range(m):
-                    if not np.isfinite(D[k, i]):
-                        w = 0.0
-                        D[k, i] = 0.0
-            joint[begin + i] = density
-            D[m, i] = w
-            if density > top:
-                top = density
-                sums[3] = begin + i
+        copied(count, D[m + 1], D[m])
+        added(count, joint[begin:], log_w[begin:], joint[begin:])
+        # A density that is NaN, or an expectation: the particle is out, and out of the sums.
+        if not all_finite(count, joint[begin:]):
+            for i in range(count):
+                if not -np.inf < joint[begin + i] < np.inf:
+                    joint[begin + i] = -np.inf
+                    for k in range(m):
+                        if not np.isfinite(D[k, i]):
+                            D[m, i] = 0.0
+                            D[k, i] = 0.0
+        for i in range(begin, begin + count):
+            if joint[i] > top:
+                top = joint[i]
+                sums[3] = i
         if not own:
             k = 0
             for row in range(ny):

@@ -11,6 +11,7 @@ Source: Douc & Cappé (2005), Comparison of resampling schemes for particle filt
 from __future__ import annotations
 
 import numpy as np
+from numba import prange
 
 from ..numerics.jit import jit
 from ..numerics.random import unit, word
@@ -90,39 +91,36 @@ def drawn_children(scheme, key, w, total, children):
 
 
 @jit
-def ancestors_of(children, ancestors):
-    """Fill `ancestors` (N,) int64 with each child's parent: siblings side by side, families in the members' order.
+def ancestors_of(children, first, ancestors):
+    """Fill `ancestors` int64 with each child's parent, who are the members from `first` on.
 
-    In this order neighbouring members descend from neighbours, so that the strata of the next systematic or stratified
-    resampling keep dividing the cloud evenly; with children wherever there is room these two schemes lose most of their
-    advantage over multinomial resampling.
+    Siblings stand side by side, families in the members' order: so neighbouring members descend from neighbours, and
+    the strata of the next systematic or stratified resampling keep dividing the cloud evenly; with children wherever
+    there is room these two schemes lose most of their advantage over multinomial resampling.
     """
     n = ancestors.size
     k = 0
-    for i in range(n):
+    for i in range(children.size):
         count = min(int(children[i]), n - k)
+        parent = first + i
         if k + 4 <= n:
             # Four are written always and count if due: a branch on a random number is guessed wrong half the time. What
             # is too many is written over by the next families.
-            ancestors[k] = i
-            ancestors[k + 1] = i
-            ancestors[k + 2] = i
-            ancestors[k + 3] = i
+            ancestors[k] = parent
+            ancestors[k + 1] = parent
+            ancestors[k + 2] = parent
+            ancestors[k + 3] = parent
             for c in range(4, count):
-                ancestors[k + c] = i
+                ancestors[k + c] = parent
         else:
             for c in range(count):
-                ancestors[k + c] = i
+                ancestors[k + c] = parent
         k += max(count, 0)
 
 
 @jit
-def take_ancestors(ancestors, rows):
-    """Replace each row (N, k) by its ancestor's, in place; `ancestors` (N,) never falls.
-
-    Later ancestors are copied from the front, earlier ones from the end: since ancestors never fall, none is
-    overwritten before its last child is copied, neither within a pass nor by the other.
-    """
+def take_later(ancestors, rows):
+    """Replace each row (N, k) by its ancestor's, in place, where that stands behind it; see `take_ancestors`."""
     n, width = rows.shape
     flat = rows.reshape(n * width)
     for k in range(n):
@@ -130,8 +128,49 @@ def take_ancestors(ancestors, rows):
         if parent > k:
             for j in range(width):
                 flat[k * width + j] = flat[parent * width + j]
+
+
+@jit
+def take_earlier(ancestors, rows):
+    """Replace each row (N, k) by its ancestor's, in place, where that stands before it; see `take_ancestors`."""
+    n, width = rows.shape
+    flat = rows.reshape(n * width)
     for k in range(n - 1, -1, -1):
         parent = ancestors[k]
         if parent < k:
             for j in range(width):
                 flat[k * width + j] = flat[parent * width + j]
+
+
+@jit
+def take_ancestors(ancestors, rows):
+    """Replace each row (N, k) by its ancestor's, in place; `ancestors` (N,) never falls.
+
+    Later ancestors are copied from the front, earlier ones from the end: since ancestors never fall, none is
+    overwritten before its last child is copied, neither within a pass nor by the other, so that both may run at once.
+    """
+    take_later(ancestors, rows)
+    take_earlier(ancestors, rows)
+
+
+@jit(parallel=True)
+def _take_on_threads(ancestors, records, lineage):
+    for task in prange(4):
+        if task == 0:
+            take_later(ancestors, records)
+        elif task == 1:
+            take_earlier(ancestors, lineage)
+        elif task == 2:
+            take_earlier(ancestors, records)
+        else:
+            take_later(ancestors, lineage)
+
+
+@jit
+def descend(ancestors, records, lineage, threads):
+    """Apply `take_ancestors` to the records (N, k) and the lineage (N, 1), on one thread or several."""
+    if threads:
+        _take_on_threads(ancestors, records, lineage)
+    else:
+        take_ancestors(ancestors, records)
+        take_ancestors(ancestors, lineage)

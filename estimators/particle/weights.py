@@ -22,7 +22,7 @@ from ..compiled.context import context_at, context_type, place_of
 from ..compiled.context import options as numbers
 from ..estimator import Options
 from ..model.state_space import StateSpaceModel
-from ..numerics.jit import F1, address, caller, f64, i64, ints, jit
+from ..numerics.jit import F1, address, caller, f64, i64, ints, jit, matrix
 from ..numerics.simd import exp_minus
 from ..numerics.workspace import (
     WORD,
@@ -47,13 +47,12 @@ from .cloud import (
     count_of,
     count_origins,
     finish_moments,
-    inherit,
     members,
     own_cloud,
     sums_size,
     weigh_equally,
 )
-from .resampling import STRATIFIED, ancestors_of, drawn_children, strata_children, take_ancestors
+from .resampling import STRATIFIED, ancestors_of, descend, drawn_children, points_below, strata_children
 
 NORMALISE, CHILDREN, COMMIT, OWN = range(4)
 """Places of the phases below among those that `prepare` lays down; a filter's own phases follow."""
@@ -89,8 +88,8 @@ CloudScratch, work_at = declare_layout(
     sums_size,
     blocks_of,
     block_size,
-    ancestors="int n",  # once particles are drawn by the weights
-    w="n = ancestors",  # weights
+    ancestors="int n",
+    w="n",  # weights
     joint="n",  # joint log weights
     sums="sums_size(nx, ny)",
     L="nx, nx",  # a root
@@ -200,15 +199,19 @@ def normalise_block(context, u, dt, sensor, y, key, value, state, work, number):
 
 @jit
 def children_block(context, u, dt, sensor, y, key, value, state, work, number):
-    """Children of the members by systematic or stratified resampling; `value` turns a weight into points."""
+    """Children of the members by systematic or stratified resampling, and their ancestors.
+
+    `value` turns a weight into points.
+    """
     n = count_of(context)
     shared = work_of(context, work)
     first, last = range_of(number, n)
     after = n if last == n else shared.strata[number + 1]
     scheme = int(numbers(context)[SCHEME])
-    strata_children(
-        scheme, key, shared.w[first:last], shared.strata[number], float(after), value, shared.joint[first:last]
-    )
+    before, children = shared.strata[number], shared.joint[first:last]
+    strata_children(scheme, key, shared.w[first:last], before, float(after), value, children)
+    own = shared.ancestors[int(points_below(scheme, key, before)) : int(points_below(scheme, key, float(after)))]
+    ancestors_of(children, first, own)
 
 
 @jit
@@ -300,31 +303,30 @@ def keep_or_resample(context, key, log_sum, state, work):
 
 
 @jit
-def children_of(context, key, state, work):
-    """Return the number of children of each particle (N,), in the place of the joint weights."""
+def draw_ancestors(context, key, state, work):
+    """Draw the parent of each child by the weights of `normalise`; the joint weights are scratch."""
     n = count_of(context)
     shared = work_of(context, work)
     whole = shared.sums[0]
     scheme = int(numbers(context)[SCHEME])
     if scheme > STRATIFIED:
         drawn_children(scheme, key, shared.w, whole, shared.joint)
-        return shared.joint
+        ancestors_of(shared.joint, 0, shared.ancestors)
+        return
     scale = n / whole
     begun = 0.0
     for b in range(shared.strata.size):
         shared.strata[b] = min(begun * scale, float(n))
         begun += block_of(context, shared, b).sums[0]
     _over_weights(CHILDREN, context, key, scale, state, work)
-    return shared.joint
 
 
 @jit
 def resample(context, key, state, work):
     """Replace the particles by children drawn by the weights of `normalise`, siblings side by side, weights equal."""
-    children = children_of(context, key, state, work)
-    ancestors = work_of(context, work).ancestors
-    ancestors_of(children, ancestors)
-    take_ancestors(ancestors, own_cloud(context, state).records)
-    inherit(context, ancestors, state)
+    draw_ancestors(context, key, state, work)
+    cloud = own_cloud(context, state)
+    lineage = matrix(cloud.lineage, 0, cloud.lineage.size, 1)
+    descend(work_of(context, work).ancestors, cloud.records, lineage, numbers(context)[THREADS] != 0.0)
     weigh_equally(context, state)
     state[RESAMPLED] += 1.0

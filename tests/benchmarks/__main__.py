@@ -46,6 +46,7 @@ def main() -> None:
         sampling.beside_dapper,
         sampling.thermal_cycles,
         sampling.growing_ensembles,
+        sampling.many_rows,
         sampling.large_states,
         folds.growing_history,
         folds.refold,

@@ -285,6 +285,38 @@ def test_localised_analyses_equal_dense_ones(name, dense, radius, members):
     np.testing.assert_allclose(after[:, far], before[:, far], rtol=0, atol=1e-14)
 
 
+@pytest.mark.parametrize("members", [2, 5, 19, 33])
+@pytest.mark.parametrize("radius", [2.5, 9.0, 19.9])
+def test_letkf_of_many_rows_equals_a_dense_one(members, radius):
+    """40 rows, of which 5, 17 or 39 are near a state: fewer than members, as many, and more; some are missing.
+
+    Eigenvalues are up to some thousands, and relative rounding of dozens of ε is multiplied by them: 1e-10.
+    """
+    rng = np.random.default_rng(members)
+    y = LORENZ96.prior_mean + rng.standard_normal(40)
+    y[[4, 5, 31]] = np.nan
+    seen = np.flatnonzero(np.isfinite(y))
+    before, after, _ = analysed("letkf", LORENZ96, {"members": members, "radius": radius}, 0, y)
+    apart = np.abs(np.arange(40)[:, None] - seen)
+    tapers = gaspari_cohn(np.minimum(apart, 40 - apart), radius)
+    expected = dense_letkf(before, y[seen], None, np.eye(40)[seen], 1.0, tapers, None)
+    np.testing.assert_allclose(after, expected, rtol=0, atol=1e-10)
+
+
+@pytest.mark.parametrize("members", [2, 7, 14, 15, 40])
+@pytest.mark.parametrize("inflation", [1.0, 1.2])
+def test_ensrf_without_radius_is_serial(members, inflation):
+    """Members, not only moments: 7 rows one after the other on all states, where a transform replaces them and not.
+
+    Rounding of 7 rows and up to 40 members, in numbers of order 1: within 1e-12.
+    """
+    before, after, _ = analysed("ensrf", RING, {"members": members, "inflation": inflation}, 0, Y)
+    H = np.eye(40)[list(READ)][SEEN]
+    expected = dense_ensrf(before, Y[SEEN], None, H, 0.5, np.ones((40, SEEN.size)), np.ones((SEEN.size, SEEN.size)))
+    mean = expected.mean(0)
+    np.testing.assert_allclose(after, mean + inflation * (expected - mean), rtol=0, atol=1e-12)
+
+
 def near_the_end(x, u, p, out):
     out[0] = x[36]
 

@@ -31,9 +31,11 @@ def test_numbers_that_are_not_finite_are_told():
     assert not symmetric_eigen(A.copy(), 3, np.empty(3), np.empty((3, 3)), np.empty(9))
     assert not factor(A, 3, np.empty((3, 3)))
     assert not factor(-2 * np.eye(3), 3, np.empty((3, 3)))
+    # Behind the first panel of rows.
+    assert not factor(np.diag([0.0] * 39 + [-2.0]), 40, np.empty((40, 40)))
 
 
-@pytest.mark.parametrize("n", ORDERS)
+@pytest.mark.parametrize("n", (*ORDERS, 70, 99))
 def test_gram_factor_and_solve(n):
     rng = np.random.default_rng(n)
     Z, B = rng.standard_normal((5, n)), rng.standard_normal((n, 9))

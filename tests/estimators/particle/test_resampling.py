@@ -10,9 +10,10 @@ from estimators.particle.resampling import (
     STRATIFIED,
     SYSTEMATIC,
     ancestors_of,
+    descend,
     drawn_children,
+    points_below,
     strata_children,
-    take_ancestors,
 )
 
 SCHEMES = (SYSTEMATIC, STRATIFIED, RESIDUAL, MULTINOMIAL)
@@ -73,6 +74,21 @@ def test_any_split_gives_the_same_total(scheme, weights):
         assert np.array_equal(children(scheme, weights, draw), children(scheme, weights, draw, cuts=(20,)))
 
 
+@pytest.mark.parametrize("scheme", (SYSTEMATIC, STRATIFIED))
+def test_runs_fill_the_ancestors_of_their_own_points(scheme, weights):
+    """Runs from the last to the first, as threads may do them: all as NumPy repeats members by their children."""
+    cuts = (0, 7, 8, 31, N)
+    scale = N / weights.sum()
+    for draw in range(20):
+        key, counts = np.uint64(key_of(7, draw, scheme)), children(scheme, weights, draw, cuts=cuts[1:-1])
+        points = [float(np.sum(weights[:a])) * scale for a in cuts[:-1]] + [float(N)]
+        begins = [int(points_below(scheme, key, point)) for point in points]
+        ancestors = np.full(N, -1)
+        for k in reversed(range(4)):
+            ancestors_of(counts[cuts[k] : cuts[k + 1]], cuts[k], ancestors[begins[k] : begins[k + 1]])
+        np.testing.assert_array_equal(ancestors, np.repeat(np.arange(N), counts.astype(int)))
+
+
 @pytest.mark.parametrize("scheme", SCHEMES)
 def test_weightless_particles_have_no_children(scheme):
     w = np.zeros(N)
@@ -91,10 +107,13 @@ def test_children_stand_in_the_order_of_their_ancestors(n, width):
     for counts in every:
         rows, ancestors = rng.normal(size=(n, width)), np.full(n, -1)
         expected = np.repeat(rows, counts.astype(int), axis=0)
-        ancestors_of(counts.astype(float), ancestors)
+        ancestors_of(counts.astype(float), 0, ancestors)
         assert np.array_equal(ancestors, np.repeat(np.arange(n), counts.astype(int)))
-        take_ancestors(ancestors, rows)
-        assert np.array_equal(rows, expected)
+        lineage, copy = rows[:, :1].copy(), rows.copy()
+        for threads in (False, True):
+            rows[:], lineage[:] = copy, copy[:, :1]
+            descend(ancestors, rows, lineage, threads)
+            assert np.array_equal(rows, expected) and np.array_equal(lineage, expected[:, :1])
 
 
 @pytest.mark.parametrize("scheme", (SYSTEMATIC, STRATIFIED, RESIDUAL))
