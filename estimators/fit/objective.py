@@ -186,10 +186,11 @@ class Objective:
         """Return the objective."""
         return float(self.terms(x).sum()) - self.penalty(x)
 
-    def slopes(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def slopes(self, x: np.ndarray, here: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Return the terms (n,) at a point, and their derivatives (k, n), by differences into the ranges.
 
         Those of the last points are kept: a round begins, and the curvature is taken, where the round before ended.
+        `here` has the terms where they are known.
         """
         known = self.recent.get(x.tobytes())
         if known is not None:
@@ -198,8 +199,11 @@ class Objective:
         for k, (_, high) in enumerate(self.limits):
             if x[k] + steps[k] > high:
                 steps[k] = -steps[k]
-        points = [x, *(x + step * unit for step, unit in zip(steps, np.eye(x.size), strict=True))]
-        here, *moved = self.all_terms(points)
+        points = [x + step * unit for step, unit in zip(steps, np.eye(x.size), strict=True)]
+        if here is None:
+            here, *moved = self.all_terms([x, *points])
+        else:
+            moved = self.all_terms(points)
         found = here, np.array([(there - here) / step for there, step in zip(moved, steps, strict=True)])
         while len(self.recent) >= RECENT_POINTS:
             del self.recent[next(iter(self.recent))]
@@ -210,9 +214,9 @@ class Objective:
         """Return the objective and its gradient (k,)."""
         return self.slope_and_scores(x)[:2]
 
-    def slope_and_scores(self, x: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-        """Return the objective, its gradient (k,), and the derivatives of its terms (k, n)."""
-        here, scores = self.slopes(x)
+    def slope_and_scores(self, x: np.ndarray, here: np.ndarray | None = None) -> tuple[float, np.ndarray, np.ndarray]:
+        """Return the objective, its gradient (k,), and the derivatives of its terms (k, n); `here` as `slopes`."""
+        here, scores = self.slopes(x, here)
         slope = scores.sum(axis=1) - self.precision * (x - self.start)
         return float(here.sum()) - self.penalty(x), slope, scores
 
@@ -311,10 +315,8 @@ def quasi_newton(
         gained, best = 0.0, 0
         if promised >= PRECISION:
             points = [np.clip(x + scale * share * step, low, high) for share in SHARES]
-            found = [
-                float(terms.sum()) - objective.penalty(point)
-                for point, terms in zip(points, objective.all_terms(points), strict=True)
-            ]
+            tried = objective.all_terms(points)
+            found = [float(terms.sum()) - objective.penalty(point) for point, terms in zip(points, tried, strict=True)]
             best = int(np.argmax(found))
             gained = found[best] - value
             if gained <= 0.0 and scale == 1.0:
@@ -325,7 +327,7 @@ def quasi_newton(
             moved, before = points[best] - x, slope
             x = points[best]
             objective.report(x, gained)
-            value, slope, scores = objective.slope_and_scores(x)
+            value, slope, scores = objective.slope_and_scores(x, tried[best])
             H = _updated(H, moved, before - slope)
         ended = ended + 1 if gained < min(RESOLUTION, MIN_SHARE * promised) or promised < PRECISION else 0
         if ended == 2 or (ended and fresh):
