@@ -24,6 +24,7 @@ from .judge import POWERS, FitVerdict, Tempered, Worth, tempered
 from .objective import ALONE, SEARCH_FOLDS, SHARES, FitProgress, Go, Objective, maximise, polished, search
 from .recording import BLOCKS, Recording, held_out_rows, until_last_fitted, without_queries, without_stuck
 from .uncertainty import (
+    NEARBY,
     LikelihoodCurvature,
     ParameterWidths,
     Z,
@@ -200,9 +201,11 @@ def fit(
         rest = np.delete(np.arange(start.size), reset)
         # With some entries at fixed values, the curvature of the others is a part of the one before.
         H = np.linalg.inv(shape.cov)[np.ix_(rest, rest)]
-        x, value = search(kept, start[rest]) if alone else maximise(kept, start[rest], H)
+        before, x = x[rest], start[rest]
+        x, value = search(kept, x) if alone else maximise(kept, x, H)
+        near = np.all(np.abs(x - before) < NEARBY * shape.deviation[rest])
         expect(x.size, 0)
-        shape = curvature(kept, x)
+        shape = curvature(kept, x, H if near else None)
         identified = _identified(kept, shape)
 
     def setting_at(point: np.ndarray) -> Setting:
