@@ -35,6 +35,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -317,26 +318,23 @@ def quasi_newton(
             break
         step = _step(H, slope, np.maximum(low - x, -MAX_CHANGE * unit), np.minimum(high - x, MAX_CHANGE * unit))
         promised = float(slope @ step - 0.5 * step @ H @ step)
-        gained, best = 0.0, 0
+        gained = 0.0
         if promised >= PRECISION:
             # Near the maximum the parabola holds, and one fold is enough.
             near = promised < NEAR and scale == 1.0
-            points, tried, found = _along(objective, x, step, [1.0] if near else [scale * share for share in SHARES])
-            more = _more_shares((found[0] - value) / promised) if near else []
-            if more:
-                others = _along(objective, x, step, more)
-                points, tried, found = (one + two for one, two in zip((points, tried, found), others, strict=True))
-            best = int(np.argmax(found))
-            gained = found[best] - value
+            found = _along(objective, x, step, [1.0] if near else [scale * share for share in SHARES])
+            if near:
+                found += _along(objective, x, step, _more_shares((found[0].value - value) / promised))
+            best = max(found, key=lambda item: item.value)
+            gained = best.value - value
             if gained <= 0.0 and scale == 1.0:
                 scale = SHARES[-1] ** 2
                 continue
         scale = 1.0
         if gained > 0.0:
-            moved, before = points[best] - x, slope
-            x = points[best]
+            moved, before, x = best.x - x, slope, best.x
             objective.report(x, gained)
-            value, slope, scores = objective.slope_and_scores(x, tried[best])
+            value, slope, scores = objective.slope_and_scores(x, best.terms)
             scored, seen = _outer(objective, scores), float(moved @ (before - slope))
             agrees = seen / AGREEMENT < float(moved @ scored @ moved) < seen * AGREEMENT
             H = _updated(scored if agrees else H, moved, before - slope)
@@ -356,14 +354,20 @@ def _more_shares(ratio: float) -> list[float]:
     return [share for share in SHARES if share > 1.0] if ratio > MAX_RATIO else []
 
 
-def _along(
-    objective: Objective, x: np.ndarray, step: np.ndarray, shares: Sequence[float]
-) -> tuple[list[np.ndarray], list[np.ndarray], list[float]]:
-    """Return the points at shares of a step (k,) within the ranges, their terms, and the objective there."""
+class _Tried(NamedTuple):
+    """A point (k,), the terms of the objective there (n,), and its value."""
+
+    x: np.ndarray
+    terms: np.ndarray
+    value: float
+
+
+def _along(objective: Objective, x: np.ndarray, step: np.ndarray, shares: Sequence[float]) -> list[_Tried]:
+    """Return the objective at shares of a step (k,), within the ranges."""
     low, high = np.array(objective.limits).T
     points = [np.clip(x + share * step, low, high) for share in shares]
     terms = objective.all_terms(points)
-    return points, terms, [float(own.sum()) - objective.penalty(at) for own, at in zip(terms, points, strict=True)]
+    return [_Tried(at, own, float(own.sum()) - objective.penalty(at)) for at, own in zip(points, terms, strict=True)]
 
 
 def polished(objective: Objective, x: np.ndarray, cov: np.ndarray) -> np.ndarray:

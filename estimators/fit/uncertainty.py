@@ -126,7 +126,7 @@ def curvature(objective: Objective, x: np.ndarray, known: np.ndarray | None = No
     centre = np.clip(x, low + steps, high - steps)
     correlation = _scaled(outer if known is None else known)
     # The largest that chance leaves of a correlation, at two standard errors.
-    chance = 2.0 / np.sqrt(max(1, np.count_nonzero(np.any(scores != 0.0, axis=0))))
+    chance = 2.0 / max(1, int(np.count_nonzero(np.any(scores != 0.0, axis=0)))) ** 0.5
     pairs = [
         (i, j) for i in range(k) for j in range(i)
         if known is None and abs(correlation[i, j]) + chance > MAX_CORRELATION
