@@ -243,7 +243,8 @@ def run_and_judge(
             clock, u, state, doubt, edge, spare, work, score, track,
         )  # fmt: skip
         end = stops[k] if asking < 0 else asking + 1
-        judge(start, end, t, kind, channel, value, context, policy, bounds, evidence, track)
+        if policy.window > 0:
+            judge(start, end, t, kind, channel, value, context, policy, bounds, evidence, track)
         if asking >= 0:
             return asking
         if k < places.size:

@@ -36,7 +36,8 @@ class HealthPolicy(NamedTuple):
     """Limits of a twin's health.
 
     Attributes:
-        window: Measurements that are averaged; a reset begins a new window.
+        window: Measurements that are averaged; a reset begins a new window. With 0 a fold judges no rows: it runs no
+            detectors, and health and alarms stay undefined.
         degraded_after: Seconds without a measurement after which the twin is degraded.
         stale_after: Seconds without a measurement after which it is stale.
         diverged_nis: Multiple of the expected NIS (of the baseline, where that is larger) from which it has diverged.

@@ -27,6 +27,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.special import ndtr
 
+from ..diagnostics.health import HealthPolicy
 from ..diagnostics.references import held_out_references, references
 from ..diagnostics.score import log_density
 from ..errors import EstimatorError, nearest, quoted
@@ -181,11 +182,13 @@ def _weighted(estimator: str, setting: Setting, recordings: list[Recording]) -> 
 
 
 def track_of(estimator: str, setting: Setting, recording: Recording, without: int | None = None) -> Track:
-    """Return the track of a recording; the sensor `without` is held out."""
+    """Return the track of a recording without alarms and health; the sensor `without` is held out."""
     tuning, prior = setting
     if without is not None:
         tuning = tuning.set(f"use.{tuning.model.sensor_names[without]}", False)
-    fold = Fold(estimator, tuning.model, tuning, recording.log, base=recording.base, prior=prior)
+    fold = Fold(
+        estimator, tuning.model, tuning, recording.log, base=recording.base, prior=prior, policy=HealthPolicy(window=0)
+    )
     fold.advance()
     return fold.track
 

@@ -20,10 +20,11 @@ from ..registry import find_estimator
 from ..tuning import Tuning
 from .aims import LIKELIHOOD, WITNESSES, aim_of, sensors_in_turn
 from .entries import DIGITS, PLAIN_DIGITS, Setting, Skipped, TuningEntry, entries_of, with_values
-from .judge import POWERS, FitVerdict, Tempered, Worth, tempered, worths
+from .judge import POWERS, FitVerdict, Tempered, Worth, tempered
 from .objective import ALONE, SEARCH_FOLDS, SHARES, FitProgress, Go, Objective, maximise, polished, search
 from .recording import BLOCKS, Recording, held_out_rows, until_last_fitted, without_queries, without_stuck
 from .uncertainty import (
+    NEARBY,
     LikelihoodCurvature,
     ParameterWidths,
     Z,
@@ -165,8 +166,10 @@ def fit(
         estimator, tuning, tuple(entries), tuple(lean), aim=aimed, go=count, progress=progress, penalised=penalised
     )
     alone = find_estimator(estimator, tuning.model).family in ALONE
-    judging = len(recordings) * (2 if not blocks else 1 + len(POWERS))
-    judging *= 1 + len(sensors_in_turn(Setting(tuning, None), whole))
+    settings = 2 if not blocks else 1 + len(POWERS)
+    # Sensors are held out in turn at the start and at the chosen point, unless they are the aim.
+    in_turn = (settings if aimed.sensors else 2) * len(sensors_in_turn(Setting(tuning, None), whole))
+    judging = len(recordings) * (settings + in_turn)
 
     def expect(k: int, steps: int) -> None:
         """Estimate the folds to come: a maximisation over k entries, its curvature, and the judgement."""
@@ -198,9 +201,11 @@ def fit(
         rest = np.delete(np.arange(start.size), reset)
         # With some entries at fixed values, the curvature of the others is a part of the one before.
         H = np.linalg.inv(shape.cov)[np.ix_(rest, rest)]
-        x, value = search(kept, start[rest]) if alone else maximise(kept, start[rest], H)
+        before, x = x[rest], start[rest]
+        x, value = search(kept, x) if alone else maximise(kept, x, H)
+        near = np.all(np.abs(x - before) < NEARBY * shape.deviation[rest])
         expect(x.size, 0)
-        shape = curvature(kept, x)
+        shape = curvature(kept, x, H if near else None)
         identified = _identified(kept, shape)
 
     def setting_at(point: np.ndarray) -> Setting:
@@ -210,10 +215,9 @@ def fit(
 
     progress.expect(judging)
     progress.judging = True
-    chosen = tempered(
-        kept, x, shape, setting_at, lambda settings: worths(estimator, settings, whole, count, aimed), aim=aimed,
-        powers=POWERS if blocks and x.size and penalised else (1.0,),
-    )  # fmt: skip
+    powers = POWERS if blocks and x.size and penalised else (1.0,)
+    chosen = tempered(kept, x, shape, setting_at, whole, powers=powers)
+    progress.expect(0)
     widths = None
     if considered:
         progress.expect(len(recordings) * (1 + 2 * len(considered)))

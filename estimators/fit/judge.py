@@ -140,8 +140,43 @@ def worths(
     Raises:
         Cancelled: If `go` returns False.
     """
-    sensors = sensors_in_turn(settings[0], list(recordings))
-    jobs = [(setting, record, s) for setting in settings for record in recordings for s in (None, *sensors)]
+    found = worths_in_use(estimator, settings, recordings, go, aim)
+    return with_sensors(estimator, settings, found, recordings, go)
+
+
+def worths_in_use(
+    estimator: str, settings: Sequence[Setting], recordings: Sequence[Recording], go: Go, aim: Aim | None = None
+) -> list[Worth]:
+    """Return the same without the sensors held out in turn, a fold of each recording."""
+    tracks = _tracks(estimator, settings, recordings, [None], go)
+    found = []
+    for setting, (own,) in zip(settings, tracks, strict=True):
+        folded = list(zip(recordings, own, strict=True))
+        found.append(Worth(*(_part(setting, folded, aim or Aim(), part) for part in (False, True))))
+    return found
+
+
+def with_sensors(
+    estimator: str, settings: Sequence[Setting], found: Sequence[Worth], recordings: Sequence[Recording], go: Go
+) -> list[Worth]:
+    """Return the scores of settings with those of the sensors held out in turn, a fold of each recording for each."""
+    sensors = sensors_in_turn(settings[0], list(recordings)) if settings else []
+    tracks = _tracks(estimator, settings, recordings, sensors, go)
+    parts = [
+        [_in_turn(setting, sensors, own, recordings, part) for part in (False, True)]
+        for setting, own in zip(settings, tracks, strict=True)
+    ]
+    return [
+        Worth(worth.fitted._replace(sensors=fitted), worth.held_out._replace(sensors=held_out))
+        for worth, (fitted, held_out) in zip(found, parts, strict=True)
+    ]
+
+
+def _tracks(
+    estimator: str, settings: Sequence[Setting], recordings: Sequence[Recording], without: Sequence[int | None], go: Go
+) -> list[list[list[Track]]]:
+    """Return the tracks by setting, sensor held out, and recording."""
+    jobs = [(setting, record, s) for setting in settings for s in without for record in recordings]
 
     def run(job: tuple[Setting, Recording, int | None]) -> Track:
         setting, record, s = job
@@ -150,13 +185,9 @@ def worths(
             raise Cancelled
         return track
 
-    alone = find_estimator(estimator, settings[0].tuning.model).family in ALONE
+    alone = bool(settings) and find_estimator(estimator, settings[0].tuning.model).family in ALONE
     tracks = iter(each(run, jobs, None if alone else "threads"))
-    found = []
-    for setting in settings:
-        folded = [(record, [next(tracks) for _ in (None, *sensors)]) for record in recordings]
-        found.append(Worth(*(_part(setting, sensors, folded, aim or Aim(), part) for part in (False, True))))
-    return found
+    return [[[next(tracks) for _ in recordings] for _ in without] for _ in settings]
 
 
 def gain(before: np.ndarray, after: np.ndarray) -> tuple[float, float]:
@@ -169,15 +200,13 @@ def gain(before: np.ndarray, after: np.ndarray) -> tuple[float, float]:
     return float(difference.mean()), float(means.std(ddof=1) / np.sqrt(GAIN_BATCHES))
 
 
-def _part(
-    setting: Setting, sensors: list[int], folded: list[tuple[Recording, list[Track]]], aim: Aim, held_out: bool
-) -> PartScore:
-    """Return the scores of the fitted or the held-out part of folded recordings."""
+def _part(setting: Setting, folded: list[tuple[Recording, Track]], aim: Aim, held_out: bool) -> PartScore:
+    """Return the scores of the fitted or the held-out part of folded recordings, without sensors in turn."""
     model, gate = setting.tuning.model, setting.tuning.gate
     terms, aimed, normal, tracks = [], [], [], []
-    # Sensors in turn, withheld rows and true states: references by name.
-    groups: tuple[dict[str, list[Reference]], ...] = ({}, {}, {})
-    for record, (track, *others) in folded:
+    # Withheld rows and true states: references by name.
+    groups: tuple[dict[str, list[Reference]], ...] = ({}, {})
+    for record, track in folded:
         log = record.log
         part = record.held_out == held_out
         reading, truth = log.kind[: log.n] == READING, log.kind[: log.n] == TRUTH
@@ -186,23 +215,14 @@ def _part(
         used = part & (track.verdict == USED)
         normal.append((track.innovation[used] / track.innovation_std[used]).ravel())
         tracks.append(track.select(part))
-        found = [
-            (0, item.finite())
-            for s, other in zip(sensors, others, strict=True)
-            for item in held_out_references(model, log.events, other, s)
-        ]
-        found += [(2 if item.truth else 1, item) for item in references(model, log.events, track)]
-        for group, item in found:
-            kept = part[item.rows]
-            if kept.any():
-                own = item._replace(error=item.error[kept], std=item.std[kept])
-                groups[group].setdefault(item.name, []).append(own)
+        for item in references(model, log.events, track):
+            _collect(groups[item.truth], item, part)
     every, inside = np.concatenate(terms), np.concatenate(normal)
     inside = inside[np.isfinite(inside)]
     nis = np.array([mean_nis(track, gate) for track in tracks])
     finite = np.isfinite(nis)
     weights = np.array([len(track) for track in tracks])[finite]
-    in_turn, withheld, states = ({name: _prediction(items) for name, items in group.items()} for group in groups)
+    withheld, states = ({name: _prediction(items) for name, items in group.items()} for group in groups)
     return PartScore(
         every.size,
         float(every.mean()) if every.size else np.nan,
@@ -210,11 +230,30 @@ def _part(
         float(np.mean(np.abs(inside) <= Z)) if inside.size else np.nan,
         every,
         np.concatenate(aimed),
-        in_turn,
+        {},
         withheld,
         states,
-        _correlations(setting, [(record, track) for record, (track, *_) in folded], held_out),
+        _correlations(setting, folded, held_out),
     )
+
+
+def _in_turn(
+    setting: Setting, sensors: Sequence[int], tracks: list[list[Track]], recordings: Sequence[Recording], held_out: bool
+) -> dict[str, PredictionScore]:
+    """Return the scores of the sensors held out in turn, by row, on the fitted or the held-out part."""
+    group: dict[str, list[Reference]] = {}
+    for s, own in zip(sensors, tracks, strict=True):
+        for record, track in zip(recordings, own, strict=True):
+            for item in held_out_references(setting.tuning.model, record.log.events, track, s):
+                _collect(group, item.finite(), record.held_out == held_out)
+    return {name: _prediction(items) for name, items in group.items()}
+
+
+def _collect(group: dict[str, list[Reference]], item: Reference, part: np.ndarray) -> None:
+    """Add the errors of a reference at the events of a part (n,), if there are any."""
+    kept = part[item.rows]
+    if kept.any():
+        group.setdefault(item.name, []).append(item._replace(error=item.error[kept], std=item.std[kept]))
 
 
 def _correlations(setting: Setting, folded: list[tuple[Recording, Track]], held_out: bool) -> dict[str, float]:
@@ -265,7 +304,7 @@ def verdict(before: Worth, after: Worth, aim: Aim, *, changed: bool = True) -> F
     elif aim.kind in UNITS and mean * other.aimed.size < MIN_TOTAL_GAIN:
         reasons.append(f"negligible gain: {mean * other.aimed.size:.2g} nats in total")
     # The references must not be predicted worse; without any, each sensor in turn stands in for them.
-    groups = {"withheld": "sensor", "states": "true state"} if one.withheld or one.states else {"sensors": "sensor"}
+    groups = {"withheld": "sensor", "states": "true state"} if _has_references(before) else {"sensors": "sensor"}
     against = [
         reason
         for group, kind in groups.items()
@@ -274,6 +313,11 @@ def verdict(before: Worth, after: Worth, aim: Aim, *, changed: bool = True) -> F
     ]
     reasons += against
     return FitVerdict(not reasons, mean, error, tuple(reasons), each, not against)
+
+
+def _has_references(worth: Worth) -> bool:
+    """Return whether the held-out part has true states, or sensors that the twin never uses."""
+    return bool(worth.held_out.withheld or worth.held_out.states)
 
 
 def _pairs(
@@ -336,27 +380,52 @@ def tempered(
     x: np.ndarray,
     shape: LikelihoodCurvature,
     setting: Callable[[np.ndarray], Setting],
-    judged: Callable[[Sequence[Setting]], list[Worth]],
+    recordings: Sequence[Recording],
     *,
-    aim: Aim,
     powers: Sequence[float] = POWERS,
 ) -> Tempered:
     """Choose the power.
+
+    Sensors are held out in turn only where that can decide: their folds are most of the cost.
 
     Args:
         objective: The objective.
         x: Its maximum, (k,).
         shape: Its curvature there.
         setting: Setting to fold at a point.
-        judged: Scores of settings.
-        aim: Aim of the fit.
+        recordings: With the truth, where it is known.
         powers: Powers to try, from 1 on, falling.
     """
-    found = [at_power(objective, x, shape, power) for power in powers]
-    own, *others = judged([setting(objective.start), *(setting(point) for point, _ in found)])
-    verdicts = [verdict(own, other, aim, changed=x.size > 0) for other in others]
-    k = _chosen(own, others, verdicts, aim)
-    return Tempered(powers[k], *found[k], own, others[k], verdicts[k])
+    aim, estimator, go = objective.aim, objective.estimator, objective.go
+    points = [at_power(objective, x, shape, power) for power in powers]
+    settings = [setting(objective.start), *(setting(point) for point, _ in points)]
+    found = worths_in_use(estimator, settings, recordings, go, aim)
+    complete: set[int] = set()
+
+    def complete_those(wanted: Sequence[int]) -> None:
+        missing = [k for k in wanted if k not in complete]
+        complete.update(missing)
+        more = with_sensors(estimator, [settings[k] for k in missing], [found[k] for k in missing], recordings, go)
+        for k, worth in zip(missing, more, strict=True):
+            found[k] = worth
+
+    def judged(k: int) -> FitVerdict:
+        return verdict(found[0], found[1 + k], aim, changed=x.size > 0)
+
+    def harmless(k: int) -> bool:
+        # Without sensors in turn there are fewer reasons against it.
+        if judged(k).harmless and not _has_references(found[0]):
+            complete_those((0, 1 + k))
+        return judged(k).harmless
+
+    if aim.kind in (CRPS, ERROR) or (aim.kind == WITNESSES and not _has_references(found[0])):
+        complete_those(range(len(found)))
+    if aim.kind == LIKELIHOOD:
+        k = _largest_harmless(found[1:], [judged(k).gain for k in range(len(points))], harmless)
+    else:
+        k = _chosen(found[0], found[1:], [judged(k) for k in range(len(points))], aim)
+    complete_those((0, 1 + k))
+    return Tempered(powers[k], *points[k], found[0], found[1 + k], judged(k))
 
 
 def at_power(
@@ -372,19 +441,20 @@ def at_power(
     return np.clip(start + cov @ (power * H @ (x - start)), low, high), cov
 
 
-def _chosen(own: Worth, others: Sequence[Worth], verdicts: Sequence[FitVerdict], aim: Aim) -> int:
-    """Return the index of the power; 0 (power 1, whose reasons are reported) if none qualifies.
+def _largest_harmless(others: Sequence[Worth], gains: Sequence[float], harmless: Callable[[int], bool]) -> int:
+    """Return the index of the largest harmless power that is as good as the best; 0 (power 1) if none is harmless.
 
-    For the likelihood all harmless fits qualify, since a proposed one may win by chance when several powers are tried.
+    All harmless fits qualify, since a proposed one may win by chance when several powers are tried.
     """
-    if aim.kind == LIKELIHOOD:
-        qualified = [k for k, item in enumerate(verdicts) if item.harmless]
-    else:
-        qualified = [k for k, item in enumerate(verdicts) if item.proposed]
-        qualified = [k for k in qualified if _in_band(own, others[k])] or qualified
+    best = next((k for k in sorted(range(len(gains)), key=lambda k: -gains[k]) if harmless(k)), 0)
+    return next((k for k in range(len(gains)) if _as_good(others[k], others[best]) and harmless(k)), 0)
+
+
+def _chosen(own: Worth, others: Sequence[Worth], verdicts: Sequence[FitVerdict], aim: Aim) -> int:
+    """Return the index of a power with which the fit is proposed; 0 (power 1, whose reasons are reported) if none."""
+    qualified = [k for k, item in enumerate(verdicts) if item.proposed]
+    qualified = [k for k in qualified if _in_band(own, others[k])] or qualified
     best = max(qualified, key=lambda k: verdicts[k].gain, default=0)
-    if aim.kind == LIKELIHOOD:
-        return next((k for k in qualified if _as_good(others[k], others[best])), 0)
     return next((k for k in reversed(qualified) if _as_good(others[k], others[best])), 0) if aim.weights else best
 
 

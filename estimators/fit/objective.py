@@ -9,13 +9,15 @@ density (diagnostics/score.py). A failed measurement and a failed fold cost more
 back there. A filter that draws uses the tuning's seed at every point: common random numbers, without which a difference
 of two points is mostly chance.
 
-Folds are the cost. A gradient takes one per entry, so the steps are those of a quasi-Newton method: its curvature
-starts as Σ s sᵀ of the scores s of single measurements (Berndt, Hall, Hall & Hausman 1974, Annals of Economic and
-Social Measurement 3, 653) and has a damped BFGS update after each step. A step goes to the maximum of the parabola
-within the ranges. Several shares of it are tried at once, a fold each, since the curvature far from the optimum does
-not tell how far it holds, and rejected measurements make the objective rough. Where a step gains nothing the curvature
-is taken from the scores again. They end where the parabola promises less than `PRECISION`, or where two steps in a row
-gain nothing.
+Folds are the cost. A gradient takes one per entry, so the steps are those of a quasi-Newton method. Its curvature is
+Σ s sᵀ of the scores s of single measurements (Berndt, Hall, Hall & Hausman 1974, Annals of Economic and Social
+Measurement 3, 653) with a damped BFGS update by the last step. If the model is wrong the scores are correlated, and
+their curvature is wrong, too: where it differs from the change of the slope along the step by more than `AGREEMENT`,
+the curvature before the step has the update instead. A step goes to the maximum of the parabola within the ranges. Near
+the maximum it is tried alone; further away several shares of it are tried at once, a fold each, since the curvature far
+from the optimum does not tell how far it holds, and rejected measurements make the objective rough. Where a step gains
+nothing the curvature is taken from the scores again. They end where the parabola promises less than `PRECISION`, or
+where two steps in a row gain nothing.
 
 Parameters bend the objective: along their curved valleys these steps end too early, so a search with parameters is by
 L-BFGS-B, in rounds of a few steps whose units are the deviations by the scores.
@@ -33,6 +35,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -57,9 +60,12 @@ ROUND_STEPS = 15  # Steps per round
 GRADIENT = 0.02  # Gradient at the maximum, in deviations of an estimate: half its square is the remaining gain, in nats
 RESOLUTION = 0.05  # Nats of gain below which a step that falls short of its promise counts as failed, and a round ends
 MIN_SHARE = 0.25  # Share of the promised gain of which a step falls short then
+MAX_RATIO = 1.2  # Ratio of gain and promise above which a longer step is tried
 PRECISION = 1e-3  # Nats of promised gain below which it ends: a twentieth of a deviation of one entry
 MAX_CHANGE = 2.0  # Largest change of an entry in one step, in logarithms or deviations
+NEAR = 3.0  # Nats of promised gain below which a step is tried alone at first: two and a half deviations of one entry
 SHARES = (2.0, 1.0, 0.3, 0.08)  # Shares of a step that are tried at once
+AGREEMENT = 1.5  # Factor within which the curvatures along a step by the scores and by the slopes agree
 DAMPING = 0.2  # Least share of the present curvature that an update leaves along its step
 MIN_EIGENVALUE = 1e-10  # Share of the largest eigenvalue of a scaled curvature below which it counts as that share
 RECENT_POINTS = 2  # Last points whose derivatives are kept
@@ -186,10 +192,11 @@ class Objective:
         """Return the objective."""
         return float(self.terms(x).sum()) - self.penalty(x)
 
-    def slopes(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def slopes(self, x: np.ndarray, here: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Return the terms (n,) at a point, and their derivatives (k, n), by differences into the ranges.
 
         Those of the last points are kept: a round begins, and the curvature is taken, where the round before ended.
+        `here` has the terms where they are known.
         """
         known = self.recent.get(x.tobytes())
         if known is not None:
@@ -198,8 +205,11 @@ class Objective:
         for k, (_, high) in enumerate(self.limits):
             if x[k] + steps[k] > high:
                 steps[k] = -steps[k]
-        points = [x, *(x + step * unit for step, unit in zip(steps, np.eye(x.size), strict=True))]
-        here, *moved = self.all_terms(points)
+        points = [x + step * unit for step, unit in zip(steps, np.eye(x.size), strict=True)]
+        if here is None:
+            here, *moved = self.all_terms([x, *points])
+        else:
+            moved = self.all_terms(points)
         found = here, np.array([(there - here) / step for there, step in zip(moved, steps, strict=True)])
         while len(self.recent) >= RECENT_POINTS:
             del self.recent[next(iter(self.recent))]
@@ -210,9 +220,9 @@ class Objective:
         """Return the objective and its gradient (k,)."""
         return self.slope_and_scores(x)[:2]
 
-    def slope_and_scores(self, x: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-        """Return the objective, its gradient (k,), and the derivatives of its terms (k, n)."""
-        here, scores = self.slopes(x)
+    def slope_and_scores(self, x: np.ndarray, here: np.ndarray | None = None) -> tuple[float, np.ndarray, np.ndarray]:
+        """Return the objective, its gradient (k,), and the derivatives of its terms (k, n); `here` as `slopes`."""
+        here, scores = self.slopes(x, here)
         slope = scores.sum(axis=1) - self.precision * (x - self.start)
         return float(here.sum()) - self.penalty(x), slope, scores
 
@@ -308,25 +318,26 @@ def quasi_newton(
             break
         step = _step(H, slope, np.maximum(low - x, -MAX_CHANGE * unit), np.minimum(high - x, MAX_CHANGE * unit))
         promised = float(slope @ step - 0.5 * step @ H @ step)
-        gained, best = 0.0, 0
+        gained = 0.0
         if promised >= PRECISION:
-            points = [np.clip(x + scale * share * step, low, high) for share in SHARES]
-            found = [
-                float(terms.sum()) - objective.penalty(point)
-                for point, terms in zip(points, objective.all_terms(points), strict=True)
-            ]
-            best = int(np.argmax(found))
-            gained = found[best] - value
+            # Near the maximum the parabola holds, and one fold is enough.
+            near = promised < NEAR and scale == 1.0
+            found = _along(objective, x, step, [1.0] if near else [scale * share for share in SHARES])
+            if near:
+                found += _along(objective, x, step, _more_shares((found[0].value - value) / promised))
+            best = max(found, key=lambda item: item.value)
+            gained = best.value - value
             if gained <= 0.0 and scale == 1.0:
                 scale = SHARES[-1] ** 2
                 continue
         scale = 1.0
         if gained > 0.0:
-            moved, before = points[best] - x, slope
-            x = points[best]
+            moved, before, x = best.x - x, slope, best.x
             objective.report(x, gained)
-            value, slope, scores = objective.slope_and_scores(x)
-            H = _updated(H, moved, before - slope)
+            value, slope, scores = objective.slope_and_scores(x, best.terms)
+            scored, seen = _outer(objective, scores), float(moved @ (before - slope))
+            agrees = seen / AGREEMENT < float(moved @ scored @ moved) < seen * AGREEMENT
+            H = _updated(scored if agrees else H, moved, before - slope)
         ended = ended + 1 if gained < min(RESOLUTION, MIN_SHARE * promised) or promised < PRECISION else 0
         if ended == 2 or (ended and fresh):
             break
@@ -334,6 +345,29 @@ def quasi_newton(
         if fresh:
             H = _outer(objective, scores)
     return x, value
+
+
+def _more_shares(ratio: float) -> list[float]:
+    """Return the further shares of a step to try, by the ratio of its gain to the promised one."""
+    if ratio < MIN_SHARE:
+        return [share for share in SHARES if share < 1.0]
+    return [share for share in SHARES if share > 1.0] if ratio > MAX_RATIO else []
+
+
+class _Tried(NamedTuple):
+    """A point (k,), the terms of the objective there (n,), and its value."""
+
+    x: np.ndarray
+    terms: np.ndarray
+    value: float
+
+
+def _along(objective: Objective, x: np.ndarray, step: np.ndarray, shares: Sequence[float]) -> list[_Tried]:
+    """Return the objective at shares of a step (k,), within the ranges."""
+    low, high = np.array(objective.limits).T
+    points = [np.clip(x + share * step, low, high) for share in shares]
+    terms = objective.all_terms(points)
+    return [_Tried(at, own, float(own.sum()) - objective.penalty(at)) for at, own in zip(points, terms, strict=True)]
 
 
 def polished(objective: Objective, x: np.ndarray, cov: np.ndarray) -> np.ndarray:

@@ -52,6 +52,12 @@ SCORE_BATCHES = 40  # Batches of time whose scores are summed
 MIN_CURVATURE = 1e-8
 """Share of the largest eigenvalue of H, in units of its diagonal, below which there is no curvature."""
 
+MAX_CORRELATION = 0.1
+"""Correlation of two entries' scores, with two standard errors, up to which it is not checked by second derivatives: an
+error of that size changes a deviation by half a percent."""
+
+NEARBY = 0.5  # Deviations within which the correlations of a curvature hold
+
 MAX_MISFIT = 0.2  # Share by which the drop at the end of an interval may differ from that of a parabola, in its root
 
 MIN_LOOSENESS = 0.1
@@ -82,9 +88,7 @@ class LikelihoodCurvature(NamedTuple):
     @property
     def correlation(self) -> np.ndarray:
         """Correlation of the estimates (k, k)."""
-        root = np.sqrt(np.diag(self.cov))
-        found: np.ndarray = self.cov / np.outer(root, root)
-        return found
+        return _scaled(self.cov)
 
     @property
     def lines(self) -> np.ndarray:
@@ -94,12 +98,21 @@ class LikelihoodCurvature(NamedTuple):
 
 
 def curvature_points(k: int) -> int:
-    """Return the number of points that the curvature of k entries takes."""
-    return 2 + 3 * k + k * (k - 1)
+    """Return the number of points that the curvature of k entries takes at most."""
+    return 1 + 2 * k + k * (k - 1)
 
 
-def curvature(objective: Objective, x: np.ndarray) -> LikelihoodCurvature:
-    """Return the curvature at a maximum x (k,)."""
+def curvature(objective: Objective, x: np.ndarray, known: np.ndarray | None = None) -> LikelihoodCurvature:
+    """Return the curvature at a maximum x (k,).
+
+    The second derivatives of two entries take two folds, so they are taken only of those that can be correlated. That
+    of others follows from the diagonal and from the correlation of their scores, which is below `MAX_CORRELATION`.
+
+    Args:
+        objective: The objective.
+        x: Its maximum.
+        known: Curvature H at a point nearby (k, k), whose correlations hold here.
+    """
     k = x.size
     _, scores = objective.slopes(x)
     precision = objective.precision
@@ -111,22 +124,36 @@ def curvature(objective: Objective, x: np.ndarray) -> LikelihoodCurvature:
     # The points stay within the range: at its edge they are about a point inside.
     steps = np.minimum(1.0 / np.sqrt(np.diag(outer)), (high - low) / 4.0)
     centre = np.clip(x, low + steps, high - steps)
-    pairs = [(i, j) for i in range(k) for j in range(i)]
+    correlation = _scaled(outer if known is None else known)
+    # The largest that chance leaves of a correlation, at two standard errors.
+    chance = 2.0 / max(1, int(np.count_nonzero(np.any(scores != 0.0, axis=0)))) ** 0.5
+    pairs = [
+        (i, j) for i in range(k) for j in range(i)
+        if known is None and abs(correlation[i, j]) + chance > MAX_CORRELATION
+    ]  # fmt: skip
     unit = np.diag(steps)
     points = [centre]
     points += [centre + sign * unit[i] for i in range(k) for sign in (1.0, -1.0)]
     points += [centre + sign * (unit[i] + unit[j]) for i, j in pairs for sign in (1.0, -1.0)]
     values = np.array([terms.sum() for terms in objective.all_terms(points)])
     middle, single, double = values[0], values[1 : 1 + 2 * k].reshape(k, 2), values[1 + 2 * k :].reshape(-1, 2)
-    H = np.diag((2.0 * middle - single.sum(axis=1)) / steps**2)
+    diagonal = (2.0 * middle - single.sum(axis=1)) / steps**2 + precision
+    H = correlation * np.sqrt(np.outer(diagonal, diagonal)) if np.all(diagonal > 0.0) else np.diag(diagonal)
     for (i, j), both in zip(pairs, double, strict=True):
         mixed = both.sum() - single[i].sum() - single[j].sum() + 2.0 * middle
         H[i, j] = H[j, i] = -mixed / (2.0 * steps[i] * steps[j])
-    cov = _inverse(H + np.diag(precision))
+    cov = _inverse(H)
     if cov is None:
         # Without curvature at this width, the outer product is positive definite in any case.
         cov = np.linalg.inv(outer)
     return LikelihoodCurvature(cov, _widened(cov, scores, precision))
+
+
+def _scaled(matrix: np.ndarray) -> np.ndarray:
+    """Return a positive definite matrix (k, k) scaled to a diagonal of ones."""
+    root = np.sqrt(np.diag(matrix))
+    found: np.ndarray = matrix / np.outer(root, root)
+    return found
 
 
 def _inverse(H: np.ndarray) -> np.ndarray | None:

@@ -215,7 +215,8 @@ def run_and_judge(judge: Any, context: Any, code: Any, place: int, *given: Any) 
     for k, stop in enumerate(stops.tolist()):
         asking = run(code, context, rule, first, start, stop, *rest)
         end = stop if asking < 0 else asking + 1
-        judge(start, end, t, kind, channel, value, context.context, policy, bounds, evidence, track)
+        if policy.window > 0:
+            judge(start, end, t, kind, channel, value, context.context, policy, bounds, evidence, track)
         if asking >= 0:
             return asking
         if k < len(kept):

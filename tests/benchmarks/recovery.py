@@ -235,7 +235,7 @@ def lines(case: Case, found: Recovered) -> list[str]:
     return text
 
 
-SIZES = ((10_000, 3.0), (100_000, 30.0))
+SIZES = ((10_000, 1.5), (100_000, 15.0))
 """Readings, and seconds of each of two processors within which seven noises should be fitted to them."""
 
 PUBLISHED = (("LowLevelParticleFilters.jl", 0.017676814), ("FilterPy, there", 6.390492916))

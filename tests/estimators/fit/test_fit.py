@@ -9,14 +9,18 @@ from scipy.linalg import solve_triangular
 from scipy.optimize import brentq, minimize
 from scipy.stats import binom
 
+from estimators.diagnostics.health import HealthPolicy
 from estimators.errors import ConfigError
-from estimators.fit.entries import entries_of
+from estimators.fit.aims import track_of
+from estimators.fit.entries import Setting, entries_of
 from estimators.fit.fit import fit
 from estimators.fit.judge import POWERS
-from estimators.fit.objective import Cancelled, FitProgress, Objective
+from estimators.fit.objective import SHARES, Cancelled, FitProgress, Objective, quasi_newton
 from estimators.fit.recording import Recording, held_out_rows, without_queries
+from estimators.fold import Fold
 from estimators.log import READING, Log
 from estimators.model.state_space import Noise, Parameter, Row, Sensor, State, StateSpaceModel
+from estimators.track import Track
 from estimators.tuning import Tuning
 from tests.benchmarks.recovery import CASES, recover
 
@@ -215,6 +219,32 @@ def test_derivatives_at_the_last_points_are_not_folded_again(ys):
     # An objective with an entry fixed is another one.
     assert objective.pinned([0], here).slopes(here[1:])[1].shape[0] == 1 and sum(folds) == 2 * 3 + 2
     assert before[0] is before[2] and before[1] is before[3] and not np.array_equal(before[0][1], before[1][1])
+
+
+def test_a_step_does_not_fold_the_point_again_that_it_has_tried(ys):
+    tuning, log, points = Tuning.of(MODEL), log_of(ys), []
+    entries, _ = entries_of("kf", tuning, [log], ("Q", "R"))
+    objective = Objective("kf", tuning, tuple(entries), (Recording(log, 1.0, np.zeros(log.n, bool)),))
+    terms = objective.terms
+    object.__setattr__(objective, "terms", lambda x: points.append(x.tobytes()) or terms(x))
+    quasi_newton(objective, objective.start)
+    assert len(set(points)) == len(points) > 2 * (2 + len(SHARES))
+
+
+@pytest.mark.parametrize("estimator", ["kf", "filterpy-kf"])
+def test_a_fold_that_judges_no_rows_is_the_same_bits_in_all_other_columns(ys, estimator):
+    log, setting = log_of(ys), Setting(Tuning.of(MODEL).set("gate", 0.9), None)
+    fold = Fold(estimator, MODEL, setting.tuning, log)
+    fold.advance()
+    found = track_of(estimator, setting, Recording(log))
+    judged = {"age", "nis_mean", "nis_low", "nis_high", "consistency", "health", "alarms", "flags"}
+    for name, here, there in zip(Track._fields, found, fold.track, strict=True):
+        assert name in judged or np.array_equal(here, there, equal_nan=True), name
+    quiet = Fold(estimator, MODEL, setting.tuning, log, policy=HealthPolicy(window=0))
+    before = quiet.evidence
+    quiet.advance()
+    assert np.array_equal(quiet.evidence, before, equal_nan=True)
+    assert not np.array_equal(fold.evidence, before, equal_nan=True)
 
 
 def test_a_stopped_fit_judges_the_best_point_so_far(ys):
