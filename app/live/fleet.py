@@ -17,6 +17,7 @@ import numpy as np
 from estimators.errors import NisusError, SourceError, quoted
 from estimators.fleet.table import FleetTable
 from estimators.log import BEFORE
+from estimators.track import STALE
 from sources.source import NO_ASSET, WHOLE, Acknowledging, AssetEvents, Marked, Partition, Report, ignore
 
 from ..twin.fleet import FleetPlan
@@ -336,6 +337,14 @@ class RunningFleet:
                 self._pending = 0
                 self.version += 1
 
+    def _dated(self, table: FleetTable) -> FleetTable:
+        """Date the health of silent assets by their silence: their state is put back before each query."""
+        silent, policy = self._silent.places, self.plan.twin.policy
+        by_query = silent[table.since[silent] == table.seconds[silent]]
+        limit = np.where(table.health[by_query] == STALE, policy.stale_after, policy.degraded_after)
+        table.since[by_query] = np.minimum(self._last[by_query] * 1e-9 + limit, table.seconds[by_query])
+        return table
+
     def find(self, name: str) -> str | None:
         """Return the name of an asset if there is one of that name; from any thread."""
         return name if name in self._places else None
@@ -344,7 +353,7 @@ class RunningFleet:
         """Return the version, the names, and the table of all assets; from any thread."""
         with self._lock:
             if self._shown is None or self._shown[0] != self.version:
-                self._shown = self.version, self.fleet.table()
+                self._shown = self.version, self._dated(self.fleet.table())
             version, table = self._shown
             names = self.names[:]
         count = len(names)

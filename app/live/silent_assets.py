@@ -24,6 +24,11 @@ class SilentAssets:
         self._states: dict[int, bytes] = {}
         """State of each after its last event, by position."""
 
+    @property
+    def places(self) -> np.ndarray:
+        """Positions of the assets that are silent."""
+        return np.fromiter(self._states, np.int64, len(self._states))
+
     def query(self, places: np.ndarray, t: int) -> None:
         """Show the estimate and health of assets (rising positions) at a time, ns. All events must be folded."""
         for place in places.tolist():

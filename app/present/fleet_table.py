@@ -33,13 +33,15 @@ def value_columns(model: StateSpaceModel, table: FleetTable) -> dict[str, np.nda
     names = [state.name for state in model.shown_states]
     columns = dict(zip(names, table.mean.T, strict=True))
     columns |= {f"{name}_std": column for name, column in zip(names, table.std.T, strict=True)}
-    return columns | {"nis": table.nis_mean, "age": table.age, "seconds": table.seconds, "events": table.events}
+    lasting = table.seconds - table.since
+    rest = {"nis": table.nis_mean, "age": table.age, "lasting": lasting, "seconds": table.seconds}
+    return columns | rest | {"events": table.events}
 
 
 def units_of(model: StateSpaceModel) -> dict[str, str]:
     """Return the unit of each column of `value_columns` that has one."""
     units = {state.name: state.unit for state in model.shown_states}
-    return units | {f"{name}_std": unit for name, unit in units.items()} | {"age": "s", "seconds": "s"}
+    return units | {f"{name}_std": unit for name, unit in units.items()} | dict.fromkeys(("age", "lasting", "seconds"), "s")
 
 
 def ordered(model: StateSpaceModel, table: FleetTable, sort: str = "health", down: bool = True) -> np.ndarray:
@@ -102,8 +104,8 @@ def arrow_table(model: StateSpaceModel, table: FleetTable, order: np.ndarray | N
     """Return a pyarrow.Table with a row for each asset, in an order.
 
     Columns: `asset`, `health` and `cause` (or null); `NAME` and `NAME_std` for each state; `nis_mean`, `nis_low`,
-    `nis_high`; `seconds` of the last event, `age` of the last measurement, `verdict` on the last event; `events` folded
-    and `stale`, those dropped as too late.
+    `nis_high`; `seconds` of the last event, `since` when health is what it is, `age` of the last measurement, `verdict`
+    on the last event; `events` folded and `stale`, those dropped as too late.
     """
     import pyarrow as pa
 
@@ -115,7 +117,8 @@ def arrow_table(model: StateSpaceModel, table: FleetTable, order: np.ndarray | N
     }
     for k, state in enumerate(model.shown_states):
         columns |= {state.name: table.mean[part, k], f"{state.name}_std": table.std[part, k]}
-    columns |= {name: getattr(table, name)[part] for name in ("nis_mean", "nis_low", "nis_high", "seconds", "age")}
+    names = ("nis_mean", "nis_low", "nis_high", "seconds", "since", "age")
+    columns |= {name: getattr(table, name)[part] for name in names}
     columns["verdict"] = np.array(VERDICT_NAMES)[table.verdict[part]]
     columns |= {"events": table.events[part], "stale": table.stale[part]}
     return pa.table({name: np.ascontiguousarray(c) if isinstance(c, np.ndarray) else c for name, c in columns.items()})

@@ -118,7 +118,7 @@ class FleetApi:
 
     def _row(self, table: FleetTable, place: int) -> dict[str, Any]:
         numbers = [*table.mean[place], *table.std[place], table.nis_mean[place], table.nis_low[place],
-                   table.nis_high[place], table.age[place]]  # fmt: skip
+                   table.nis_high[place], table.seconds[place] - table.since[place], table.age[place]]  # fmt: skip
         health, cause = HEALTH_NAMES[table.health[place]], str(table.cause[place])
         asset = str(table.assets[place])
         return {

@@ -31,7 +31,7 @@ $("theme").addEventListener("click", () => {
 
 // Columns: name of the order, heading, and whether it holds numbers.
 const heads = [
-  ["asset", "Asset"], ["health", "Health"], [null, "Cause"],
+  ["asset", "Asset"], ["health", "Health"], ["lasting", "For", true], [null, "Cause"],
   ...states.map((name) => [name, `${name.replaceAll("_", " ")} ${bracketed(settings.units[name])}`, true]),
   ["nis", "NIS", true], ["age", "Age", true],
 ];
@@ -100,12 +100,13 @@ function draw({ rows, first, found, assets, counts, histogram, siblings, failure
 
 function item({ asset, id, health, cause, values }, place) {
   const at = 2 * nx;
-  const [nis, low, high, age] = values.slice(at).map((value) => value ?? NaN);
+  const [nis, low, high, lasting, age] = values.slice(at).map((value) => value ?? NaN);
   const number = (text, title) => element("span", { class: "number", role: "cell", title }, text);
   const node = element(
     "a", { class: "asset", role: "row", href: `twins/${encodeURIComponent(id)}/` },
     element("b", { role: "cell", title: asset }, asset),
     element("span", { class: "pill", role: "cell", dataset: { health } }, health),
+    number(Number.isFinite(lasting) ? span(lasting) : "–", `${health} since then`),
     element("span", { class: "cause faint", role: "cell" }, cause === health ? "" : cause),
     ...states.map((name, k) => number(withDeviation(values[k] ?? NaN, 2 * (values[nx + k] ?? NaN)), "estimate ± 2σ")),
     number(compact(nis, 3), Number.isFinite(low) ? `95 % bounds ${compact(low, 3)} to ${compact(high, 3)}` : null),

@@ -26,7 +26,7 @@ from estimators import Log
 from estimators.errors import NisusError
 from estimators.fold import Fold
 from estimators.log import Events
-from estimators.track import HEALTH_NAMES, USABLE
+from estimators.track import HEALTH_NAMES, STALE, USABLE
 from sources.brokers import TopicMap
 from sources.source import Partition
 from tests.app.cli.test_fleet import FLEET, write
@@ -241,6 +241,8 @@ def test_partitions_of_tables_have_the_bits_of_one_process(tmp_path, monkeypatch
     merged = type(whole)(names, *map(np.concatenate, zip(*(part[1:] for part in parts), strict=True)))
     assert len(names) == 30 and whole.stale.sum() == 1 and "stale" in {HEALTH_NAMES[k] for k in whole.health}
     assert same(in_name_order(merged), in_name_order(whole))
+    # Whenever that was looked at.
+    assert set(whole.since[whole.health == STALE]) == {40.0 + plan.twin.policy.stale_after}
 
 
 def mqtt(port, **more):
