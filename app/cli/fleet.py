@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from config.yaml_files import writing
 from estimators.errors import ConfigError, NisusError
@@ -189,33 +189,25 @@ def folders_of(archive: ArchivePlan, processes: int) -> list[Path]:
     return [path_of(archive.folder, Partition(k)) for k in numbers]
 
 
-def follow(history: AssetHistory, folder: Path, most: int) -> threading.Event:
-    """Write the rows of an asset into files of a folder, now at most so many, and then in a thread until it is ended.
-
-    Raises:
-        ConfigError: If there are none.
-        SourceError: If a file of the archive is damaged.
-    """
+def follow(history: AssetHistory, rows: Any, folder: Path, most: int) -> threading.Event:
+    """Write rows of an asset into a file of a folder, and later ones into others, in a thread until it is ended."""
     import pyarrow.parquet
 
     numbers, ended = itertools.count(), threading.Event()
 
-    def write() -> bool:
-        rows = history.read(most)
+    def write(rows: Any) -> None:
         if rows is not None:
             pyarrow.parquet.write_table(rows, folder / f"{next(numbers):08d}.parquet")
-        return rows is not None
 
     def go_on() -> None:
         pause = FOLLOW_PERIOD_S
         while not ended.wait(pause):
             begun = time.monotonic()
             with suppress(NisusError, OSError):  # at the end of the process, the folder is removed
-                write()
+                write(history.read(most))
             pause = max(FOLLOW_PERIOD_S, (time.monotonic() - begun) / FOLLOW_SHARE)
 
-    if not write():
-        raise ConfigError("the archive has no measurements of it yet")
+    write(rows)
     threading.Thread(target=go_on, name="archive", daemon=True).start()
     return ended
 
@@ -238,10 +230,14 @@ def _opened(
             history = plan.history_of(asset, Path(folder.name))
         else:
             place = Path(tempfile.mkdtemp(dir=folder.name))
-            history = plan.archived(asset, place)
+            known, most = AssetHistory(folders, asset), plan.twin.config.history
+            rows = known.read(most)
+            if rows is None:
+                raise ConfigError("the archive has no measurements of it yet")
             for ended in following:  # of a page that is opened anew
                 ended.set()
-            following[:] = [follow(AssetHistory(folders, asset), place, plan.twin.config.history)]
+            following[:] = [follow(known, rows, place, most)]
+            history = plan.archived(asset, place, (rows["t_ns"][-1].as_py() - rows["t_ns"][0].as_py()) * 1e-9)
         return opened_twin(str(plan.twin.path), overrides={**overrides, **history})
 
     opener = FileOpener({asset: read})

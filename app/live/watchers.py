@@ -165,14 +165,15 @@ MAX_LATENCIES = 4096
 
 
 class Latency:
-    """Recent times from arrival to row, ms."""
+    """Recent times from arrival to row, ms, of measurements since the start; a history has none."""
 
     def __init__(self) -> None:
+        self._begun = time.time_ns()
         self._recent: deque[float] = deque(maxlen=MAX_LATENCIES)
 
     def note(self, batch: Events) -> None:
         """Note a batch that was folded."""
-        arrivals = batch.arrival[batch.kind == READING][-MAX_LATENCIES:]
+        arrivals = batch.arrival[(batch.kind == READING) & (batch.arrival >= self._begun)][-MAX_LATENCIES:]
         self._recent.extend(((time.time_ns() - arrivals) * 1e-6).tolist())
 
     def percentile(self, percent: float) -> float | None:

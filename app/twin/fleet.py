@@ -32,6 +32,10 @@ if TYPE_CHECKING:
     from sources.source import Report, Source
 
 
+WINDOWS_S = (60, 300, 900, 3600, 21_600, 86_400)
+"""Widths of the charts of an asset, s."""
+
+
 @dataclass(frozen=True)
 class FleetPlan:
     """A checked fleet; no file of its source has been read."""
@@ -125,8 +129,11 @@ class FleetPlan:
                 channel["only"] = {**channel.get("only", {}), column: {"text": [asset]}}
         return self._overrides(asset, given)
 
-    def archived(self, asset: str, folder: Path) -> dict[str, str]:
-        """Return the overrides of the twin's YAML by which it follows the archived rows of one asset in a folder."""
+    def archived(self, asset: str, folder: Path, span: float = 0.0) -> dict[str, str]:
+        """Return the overrides of the twin's YAML by which it follows the archived rows of one asset in a folder.
+
+        Charts begin with the `span` of these rows, s, rounded up, or the last day.
+        """
         model = self.twin.model
 
         def only(event: str, channel: int, columns: Iterable[str]) -> dict[str, Any]:
@@ -139,7 +146,8 @@ class FleetPlan:
             for k, sensor in enumerate(model.sensors)
         }
         inputs = {name: only("input", 0, [f"value_{k}"]) for k, name in enumerate(model.input_names)}
-        return self._overrides(asset, given | {"sensors": sensors, "inputs": inputs})
+        window = next((width for width in WINDOWS_S if width >= span), WINDOWS_S[-1])
+        return {"view.window": str(window)} | self._overrides(asset, given | {"sensors": sensors, "inputs": inputs})
 
     def _overrides(self, asset: str, source: Mapping[str, Any]) -> dict[str, str]:
         """Return the overrides of the twin's YAML for one asset with its own tuning and a source."""

@@ -233,7 +233,7 @@ def run_fleet_part(folder: Path, expected: int) -> None:
     overrides = {"time.degraded_after": LONG_S, "time.stale_after": LONG_S}
     plan = load_fleet(folder / "pumps.yaml", overrides)
     processes = plan.config.processes
-    opened = partial(open_partition, folder / "pumps.yaml", overrides, processes, folder / "fleet.store")
+    opened = partial(open_partition, folder / "pumps.yaml", overrides, processes, folder / "fleet.store", None)
     fleet = PartitionedFleet(plan, lambda *_: None, partial(run_child, opened, False), preload=FLEET_PRELOADED)
     fleet.start()
     done = EndRequest()

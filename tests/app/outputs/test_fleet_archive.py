@@ -233,7 +233,15 @@ def test_the_page_of_an_asset_has_no_outputs_of_the_twin(tmp_path):
     (tmp_path / "pumps.yaml").write_text("{twin: own.yaml, source: {type: push}}")
     plan = load_fleet(tmp_path / "pumps.yaml")
     assert plan.twin.config.outputs.mqtt is not None
-    assert load_twin(plan.twin.path, overrides=plan.archived("a", tmp_path)).config.outputs.mqtt is None
+    page = load_twin(plan.twin.path, overrides=plan.archived("a", tmp_path)).config
+    assert page.outputs.mqtt is None and page.view.window == 60.0
+
+
+@pytest.mark.parametrize(("span", "window"), [(60.0, 60.0), (61.0, 300.0), (7e4, 86_400.0), (1e9, 86_400.0)])
+def test_the_page_of_an_asset_begins_with_its_history(span, window, tmp_path):
+    (tmp_path / "pumps.yaml").write_text("{twin: motor_winding, source: {type: push}}")
+    overrides = load_fleet(tmp_path / "pumps.yaml").archived("a", tmp_path, span)
+    assert load_twin("motor_winding", overrides=overrides).config.view.window == window
 
 
 def test_a_folder_that_cannot_be_written_is_one_report_and_loses_nothing(tmp_path, monkeypatch):
