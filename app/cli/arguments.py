@@ -68,13 +68,19 @@ class PartOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class WorkersOption:
+class ClusterOption:
+    """Option of a command whose folds may run on other machines."""
+
+    cluster: str | None = None
+    """Use the workers of a Dask cluster: the address of its scheduler, or local:N for N processes on this machine."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class WorkersOption(ClusterOption):
     """Options of a command whose folds do not depend on one another."""
 
     jobs: int | None = None
     """Number of processes. Default: one per processor."""
-    cluster: str | None = None
-    """Use the workers of a Dask cluster: the address of its scheduler, or local:N for N processes on this machine."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -320,7 +326,7 @@ class ExportCommand(JsonOption, FoldOptions):
 
 
 @dataclass(frozen=True)
-class CheckCommand(JsonOption, FoldOptions):
+class CheckCommand(JsonOption, ClusterOption, FoldOptions):
     """Print a checklist of what could be wrong with a twin without being detected.
 
     Linearity, size, shape of the posterior, observability, the smallest visible fault of every sensor, input and
@@ -380,7 +386,7 @@ class CompareCommand(JsonOption, WorkersOption, PartOptions, LogOptions, TuningO
 
 
 @dataclass(frozen=True)
-class TuneCommand(JsonOption, PartOptions, EstimatorOption, TwinOptions):
+class TuneCommand(JsonOption, ClusterOption, PartOptions, EstimatorOption, TwinOptions):
     """Fit noises, parameters and options to recordings, and propose the result if it predicts held-out data better.
 
     Each recording is divided into blocks of time, and every third is held out to judge the fit. So are each sensor in

@@ -9,8 +9,10 @@ from config.yaml_files import writing
 from ..present.result import to_html, to_json, to_text
 from ..studies.check import Checked, check, figures, topics
 from ..studies.checklist import checklist
+from ..studies.cluster_executor import executor_of
 from ..twin.log_reader import read_log
-from .prepare import attend, prepared
+from ..twin.twin import with_held
+from .prepare import attend, overrides_of, prepared
 
 if TYPE_CHECKING:
     from .arguments import CheckCommand as Arguments
@@ -20,7 +22,9 @@ def check_twin(arguments: Arguments) -> int:
     """Run the command."""
     twin = prepared(arguments)
     log, counts = read_log(twin, arguments.duration)
-    checked: Checked = attend(twin.model, lambda: check(twin, log, counts), "checking")
+    given = overrides_of(arguments)
+    with executor_of(arguments.cluster, twin, with_held(twin), arguments.twin, given) as executor:
+        checked: Checked = attend(twin.model, lambda: check(twin, log, counts, executor=executor), "checking")
     lines = checklist(checked)
     parts = topics(checked, lines)
     if arguments.html is not None:

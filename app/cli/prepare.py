@@ -35,8 +35,12 @@ def opened(arguments: Any) -> Twin:
     Raises:
         NisusError: If its YAML or its model is wrong.
     """
-    overrides = settings(arguments.set, getattr(arguments, "estimator", None), getattr(arguments, "tuning", None))
-    return load_twin(arguments.twin, log_files=arguments.log or None, overrides=overrides)
+    return load_twin(arguments.twin, log_files=arguments.log or None, overrides=overrides_of(arguments))
+
+
+def overrides_of(arguments: Any) -> dict[str, str]:
+    """Return the overrides of `--set`, `--estimator` and `--tuning`."""
+    return settings(arguments.set, getattr(arguments, "estimator", None), getattr(arguments, "tuning", None))
 
 
 def prepared(arguments: Any) -> Twin:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable, Sequence
+from concurrent.futures import Executor
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,6 +24,7 @@ from ..live.tunings.tuning_yaml import tuning_yaml
 from ..live.tunings.versions import apply_tuning, check_free, keep, settings_of, version_text, widths_of
 from ..present.result import to_text
 from ..present.runs_json import fit_json
+from ..studies.cluster_executor import executor_of
 from ..studies.fold_result import rows_of
 from ..studies.tune import fit_text, heading, sections, window_json, window_topics, windows_verdict
 from ..terminal import complain
@@ -81,9 +84,11 @@ def tune_twin(arguments: Arguments) -> int:
             considered=width_priors(twin.config, held.model, wanted),
             penalised=not plain,
             progress=state,
+            executor=executor,
         )
 
-    found: Fitted = _attend_fit(twin, work, state, "fitting")
+    with _executor(arguments, twin, held) as executor:
+        found: Fitted = _attend_fit(twin, work, state, "fitting")
     if arguments.json:
         print(json.dumps({"twin": twin.name, **fit_json(found)}, allow_nan=False))
     else:
@@ -93,6 +98,11 @@ def tune_twin(arguments: Arguments) -> int:
         return 1
     _save(arguments, twin, found, arguments.log or (f"{twin.name}, its own log",))
     return 0
+
+
+def _executor(arguments: Arguments, twin: Twin, held: Twin) -> AbstractContextManager[Executor | str]:
+    overrides = settings(arguments.set, arguments.estimator)
+    return executor_of(arguments.cluster, twin, held, arguments.twin, overrides)
 
 
 def _attend_fit(
@@ -203,6 +213,7 @@ def tune_windows(arguments: Arguments, wanted: Sequence[str], windows: str, bloc
                 bounds=bounds_of(twin.config, twin.model),
                 blocks=blocks,
                 progress=state,
+                executor=executor,
             ):
                 # Its rows are many and not needed here.
                 found.append((k, refit._replace(lived=refit.lived.select(slice(0, 0)).copy())))
@@ -211,7 +222,8 @@ def tune_windows(arguments: Arguments, wanted: Sequence[str], windows: str, bloc
             if state.stop:
                 return
 
-    _attend_fit(twin, work, state, "fitting window after window", lambda: f"window {len(found) + 1}: ")
+    with _executor(arguments, twin, with_held(twin)) as executor:
+        _attend_fit(twin, work, state, "fitting window after window", lambda: f"window {len(found) + 1}: ")
     origins = [int(item.log.t[0]) for item in given]
     ends = [int(item.log.t[item.log.n - 1]) for item in given]
     if arguments.json:

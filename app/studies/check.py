@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -86,8 +87,14 @@ class Checked:
         return health_of(self.fold.log.events, self.fold.track, self.fold.policy)
 
 
-def check(twin: Twin, log: Log, counts: Counter[str]) -> Checked:
+def check(twin: Twin, log: Log, counts: Counter[str], *, executor: Executor | str | None = "threads") -> Checked:
     """Compute all measures of a twin over a log.
+
+    Args:
+        twin: The twin.
+        log: Its log.
+        counts: Numbers of dropped measurements, by reason.
+        executor: Where the faults are folded, nearly all of the work; see `sensitivity`.
 
     Raises:
         NisusError: If the twin's own filter does not run.
@@ -103,7 +110,9 @@ def check(twin: Twin, log: Log, counts: Counter[str]) -> Checked:
     measured = Measured(twin, log)
     readings = int(np.sum(log.kind[: log.n] == READING))
     covariance = fold.estimator.family not in ("particle", "ensemble")
-    present, *onsets = sensitivities(twin.estimator, model, tuning, log, false_alarm=twin.policy.false_alarm_every)
+    present, *onsets = sensitivities(
+        twin.estimator, model, tuning, log, false_alarm=twin.policy.false_alarm_every, executor=executor
+    )
     return Checked(
         twin=twin,
         log=log,

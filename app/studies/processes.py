@@ -9,7 +9,7 @@ import signal
 import threading
 import uuid
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
+from concurrent.futures import Executor, Future, ProcessPoolExecutor, as_completed
 from contextlib import contextmanager, suppress
 from importlib.metadata import version
 from typing import Any
@@ -73,28 +73,61 @@ def results(
         return
     if cluster is not None and jobs is not None:
         raise ConfigError("--jobs: counts processes of this command; the cluster has its own (leave one option out)")
-    with _processes(jobs or 1, begin, given) if cluster is None else _dask(cluster, begin, given) as submit:
-        futures = {submit(work, *call): k for k, call in enumerate(calls)}
+    with _processes(jobs or 1, begin, given) if cluster is None else dask(cluster, begin, given) as pool:
+        futures = {pool.submit(work, *call): k for k, call in enumerate(calls)}
         yield from ((futures[future], future.result()) for future in as_completed(futures))
 
 
-Submit = Callable[..., Any]
+class _Deaf:
+    """Processes of this machine, which do not hear Ctrl-C."""
+
+    def __init__(self, pool: Executor) -> None:
+        self._pool = pool
+
+    def submit(self, work: Callable[..., Any], *call: Any) -> Future[Any]:
+        """Submit a call, for which a process may be started."""
+        with _deaf():
+            return self._pool.submit(work, *call)
+
+
+class Cluster:
+    """Workers of a Dask cluster."""
+
+    def __init__(self, client: Any, begin: Callable[..., None], given: tuple[Any, ...]) -> None:
+        """Take a client; `begin` is called with `given` on each worker before its first call."""
+        self._client, self._executor = client, client.get_executor(pure=False)
+        self._name, self._version, self._begin = uuid.uuid4().hex, version("nisus"), self.hold((begin, given))
+
+    def submit(self, work: Callable[..., Any], *call: Any) -> Future[Any]:
+        """Submit a call; another worker makes it again if one dies. Its arguments may be held."""
+        found: Future[Any] = self._executor.submit(_on_worker, self._name, self._version, self._begin, work, *call)
+        return found
+
+    def hold(self, value: Any) -> Any:
+        """Send a value to the cluster: to each worker with its first call that has it among its arguments."""
+        # A task rather than data: it is made again if the worker that holds it dies.
+        return self._client.submit(_same, value, pure=False)
+
+    def workers(self) -> int:
+        """Return the present number of workers."""
+        return len(self._client.nthreads())
+
+    def close(self) -> None:
+        """Leave the cluster without waiting for calls."""
+        self._executor.shutdown(wait=False)
+        self._client.close()
 
 
 @contextmanager
-def _processes(jobs: int, begin: Callable[..., None], given: tuple[Any, ...]) -> Iterator[Submit]:
+def _processes(jobs: int, begin: Callable[..., None], given: tuple[Any, ...]) -> Iterator[_Deaf]:
     # Read when a process loads NumPy: threads that spin beside a small matrix would count as the work's cost.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     # Spawned: the libraries that the filters' threads come from do not survive a fork.
     context = multiprocessing.get_context("spawn")
     pool = ProcessPoolExecutor(jobs, mp_context=context, initializer=_begin_child, initargs=(begin, *given))
 
-    def submit(work: Callable[..., Any], *call: Any) -> Any:
-        with _deaf():
-            return pool.submit(work, *call)
-
     try:
-        yield submit
+        yield _Deaf(pool)
     except BaseException:
         # The other results are not needed, and a fold may take minutes.
         pool.shutdown(wait=False, cancel_futures=True)
@@ -105,7 +138,8 @@ def _processes(jobs: int, begin: Callable[..., None], given: tuple[Any, ...]) ->
 
 
 @contextmanager
-def _dask(address: str, begin: Callable[..., None], given: tuple[Any, ...]) -> Iterator[Submit]:
+def dask(address: str, begin: Callable[..., None], given: tuple[Any, ...]) -> Iterator[Cluster]:
+    """Context manager: the workers of a cluster; for the arguments and errors see `results`."""
     try:
         from distributed import Client, LocalCluster
     except ImportError:
@@ -124,20 +158,16 @@ def _dask(address: str, begin: Callable[..., None], given: tuple[Any, ...]) -> I
             client = Client(own or address, timeout=WAIT_S, set_as_default=False)
         except (OSError, ValueError) as error:
             raise ConfigError(f"--cluster {address}: {error or 'no answer'}; is it a Dask scheduler's?") from None
-    executor: Executor = client.get_executor(pure=False)
+    workers = Cluster(client, begin, given)
     try:
         try:
             client.wait_for_workers(1, timeout=WAIT_S)
         except TimeoutError:
             text = f"--cluster {address}: has no worker; start one with `dask worker {address} --nthreads 1`"
             raise ConfigError(text) from None
-        # A task rather than data: it is made again if the worker that holds it dies.
-        held = client.submit(_same, (begin, given), pure=False)
-        name, ours = uuid.uuid4().hex, version("nisus")
-        yield lambda work, *call: executor.submit(_on_worker, name, ours, held, work, call)
+        yield workers
     finally:
-        executor.shutdown(wait=False)
-        client.close()
+        workers.close()
         if own is not None:
             with suppress(TimeoutError):
                 own.close(timeout=WAIT_S)
@@ -155,7 +185,7 @@ def _deaf() -> Iterator[None]:
 
 def _on_worker(
     name: str, wanted: str, held: tuple[Callable[..., None], tuple[Any, ...]], work: Callable[..., Any],
-    call: tuple[Any, ...],
+    *call: Any,
 ) -> Any:  # fmt: skip
     """Make a call on a worker, which may have threads and serve other commands; `begin` sets variables of a module."""
     if version("nisus") != wanted:

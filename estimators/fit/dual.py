@@ -13,6 +13,7 @@ estimate as known; Plett (2006), doi:10.1016/j.jpowsour.2006.06.004, for both on
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import Executor
 from typing import NamedTuple
 
 import numpy as np
@@ -64,6 +65,7 @@ def walk(
     blocks: int = BLOCKS,
     go: Go = lambda folds: True,
     progress: FitProgress | None = None,
+    executor: Executor | str | None = "threads",
 ) -> Iterator[WindowFit]:
     """Go through a log window after window, as a running twin does that adopts every proposal.
 
@@ -81,6 +83,7 @@ def walk(
         blocks: As `fit`.
         go: As `fit`.
         progress: As `fit`, of the present window; with its `stop` set, that window is the last.
+        executor: As `fit`.
 
     Yields:
         Each window; the next one is folded with its proposal.
@@ -121,6 +124,7 @@ def walk(
                 blocks=blocks,
                 go=go,
                 progress=progress,
+                executor=executor,
             )
         except NisusError as error:
             reason = str(error)

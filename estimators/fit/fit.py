@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -113,6 +114,7 @@ def fit(
     penalised: bool = True,
     go: Go = lambda folds: True,
     progress: FitProgress | None = None,
+    executor: Executor | str | None = "threads",
 ) -> Fitted:
     """Fit entries of a tuning to recordings.
 
@@ -131,6 +133,9 @@ def fit(
             do not identify, with the full weight of the likelihood.
         go: Called from any thread with the number of folds done since; returns whether to continue.
         progress: Kept up to date from any thread; with its `stop` set, the best point so far is judged and returned.
+        executor: Where the points of the search and of the intervals are folded: "threads", an Executor, or None to
+            fold one after the other. The results are the same bits. An Executor of processes needs a model that can be
+            pickled.
 
     Raises:
         Cancelled: If `go` returns False.
@@ -163,7 +168,15 @@ def fit(
     lean = [until_last_fitted(item) for item in lean]
     aimed = aim_of(aim, estimator, Setting(tuning, None), lean, tuple(predict))
     objective = Objective(
-        estimator, tuning, tuple(entries), tuple(lean), aim=aimed, go=count, progress=progress, penalised=penalised
+        estimator,
+        tuning,
+        tuple(entries),
+        tuple(lean),
+        aim=aimed,
+        go=count,
+        progress=progress,
+        penalised=penalised,
+        executor=executor,
     )
     alone = find_estimator(estimator, tuning.model).family in ALONE
     settings = 2 if not blocks else 1 + len(POWERS)

@@ -35,6 +35,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -105,6 +106,22 @@ class FitProgress:
         self.expected = self.folds + more
 
 
+Point = tuple[tuple[TuningEntry, ...], tuple[float, ...]]  # Entries and their values
+
+
+def terms_at(estimator: str, tuning: Tuning, recordings: Sequence[Recording], aim: Aim, point: Point) -> np.ndarray:
+    """Return the weighted score of each event at a point, all recordings in one row."""
+    setting = with_values(tuning, *point)
+    found = []
+    for recording in recordings:
+        try:
+            values = recording.weight * aim.terms(estimator, setting, recording)
+        except NisusError:
+            values = np.full(recording.log.n, FAILED_FOLD / recording.log.n)
+        found.append(np.where(recording.held_out, 0.0, values))
+    return np.concatenate(found)
+
+
 @dataclass(frozen=True)
 class Objective:
     """Objective over the entries, about the tuning, over the recordings; `fixed` are held at their values `at`."""
@@ -120,7 +137,13 @@ class Objective:
     progress: FitProgress = field(default_factory=FitProgress)
     penalised: bool = True
     executor: Executor | str | None = "threads"
+    work: Callable[[Point], np.ndarray] = field(init=False, repr=False, compare=False)
     recent: dict[bytes, tuple[np.ndarray, np.ndarray]] = field(default_factory=dict, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        """Bind the recordings to the work, which an Executor of processes sends to each of them once."""
+        work = partial(terms_at, self.estimator, self.tuning, self.recordings, self.aim)
+        object.__setattr__(self, "work", work)
 
     @property
     def start(self) -> np.ndarray:
@@ -160,22 +183,12 @@ class Objective:
 
     def setting(self, x: np.ndarray) -> Setting:
         """Return tuning and prior at a point."""
-        items, values = (*self.entries, *self.fixed), (*x.tolist(), *self.at)
-        return with_values(self.tuning, items, [i.outward(v) for i, v in zip(items, values, strict=True)])
+        return with_values(self.tuning, *self._values(x))
 
-    def terms(self, x: np.ndarray) -> np.ndarray:
-        """Return the weighted score of each event, all recordings in one row."""
-        setting = self.setting(x)
-        found = []
-        for recording in self.recordings:
-            try:
-                values = recording.weight * self.aim.terms(self.estimator, setting, recording)
-            except NisusError:
-                values = np.full(recording.log.n, FAILED_FOLD / recording.log.n)
-            found.append(np.where(recording.held_out, 0.0, values))
-        if not self.go(self.aim.folds * len(found)):
-            raise Cancelled
-        return np.concatenate(found)
+    def _values(self, x: np.ndarray) -> Point:
+        """Return the entries, those held too, and their values at a point."""
+        items, values = (*self.entries, *self.fixed), (*x.tolist(), *self.at)
+        return items, tuple(item.outward(value) for item, value in zip(items, values, strict=True))
 
     def report(self, x: np.ndarray, gained: float) -> None:
         """Report a better point and its gain over the last one."""
@@ -184,13 +197,20 @@ class Objective:
         progress.values |= {item.key: (item.start, item.outward(v)) for item, v in zip(self.entries, x, strict=True)}
 
     def all_terms(self, points: Sequence[np.ndarray]) -> list[np.ndarray]:
-        """Return the terms at several points, computed concurrently."""
-        alone = find_estimator(self.estimator, self.tuning.model).family in ALONE
-        return each(self.terms, points, None if alone else self.executor)
+        """Return the weighted score of each event, all recordings in one row, at several points; in the executor."""
+        alone = self.executor == "threads" and find_estimator(self.estimator, self.tuning.model).family in ALONE
+        values = [self._values(x) for x in points]
+        found = each(self.work, values, None if alone else self.executor, self._count)
+        # An Executor may return views of a message, which NumPy sums in another order where they are not aligned.
+        return [np.require(terms, requirements="A") for terms in found]
+
+    def _count(self) -> None:
+        if not self.go(self.folds):
+            raise Cancelled
 
     def value(self, x: np.ndarray) -> float:
         """Return the objective."""
-        return float(self.terms(x).sum()) - self.penalty(x)
+        return float(self.all_terms([x])[0].sum()) - self.penalty(x)
 
     def slopes(self, x: np.ndarray, here: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Return the terms (n,) at a point, and their derivatives (k, n), by differences into the ranges.

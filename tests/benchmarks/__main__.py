@@ -59,6 +59,7 @@ def main() -> None:
         folds.starts,
         cluster.tasks,
         cluster.spread_folds,
+        cluster.searches,
         false_alarms.false_alarms,
         page.page,
     ]

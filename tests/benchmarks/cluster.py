@@ -4,15 +4,20 @@ from __future__ import annotations
 
 import hashlib
 import os
+from collections import Counter
 from collections.abc import Iterator
 from time import perf_counter
 from typing import Any
 
 import numpy as np
 
+from app.studies.check import check
+from app.studies.cluster_executor import executor_of
 from app.studies.processes import results
-from app.twin.twin import load_twin
+from app.twin.twin import load_twin, with_held
 from estimators.errors import NisusError
+from estimators.fit.fit import fit
+from estimators.fit.recording import Recording
 from estimators.fold import Fold
 from estimators.log import Log
 
@@ -31,6 +36,9 @@ FEW, MANY = 50, 550
 """Tasks without work; the cost of one is the difference, in which the start of the workers cancels."""
 
 FOLDS = 48
+SEARCHED = REFOLD_READINGS
+"""Measurements of a fit."""
+
 READINGS = 2 * REFOLD_READINGS
 """Measurements of a fold, so that it takes more than 0.1 s."""
 
@@ -59,6 +67,32 @@ def spread_folds() -> Iterator[BenchmarkRow]:
             raise NisusError(f"{name}: other bits than in one process")
         figures = {"folds [s]": span, "times faster": alone / span, "with start [s]": whole}
         yield BenchmarkRow(name, figures, remark=f"{os.cpu_count()} cores" if way.get("jobs") == 1 else "")
+
+
+def searches() -> Iterator[BenchmarkRow]:
+    """Fit and check of one twin: seconds by the clock, and times faster than in threads of one process.
+
+    Raises:
+        NisusError: If the fits are not the same bits everywhere.
+    """
+    twin = load_twin(DEFAULT_TWIN)
+    held, log, counts = with_held(twin), endless_log(twin, SEARCHED), Counter[str]()
+    wanted: list[str] = []
+    alone: list[float] = []
+    for name, cluster in {"threads": None, "Dask, 2 workers": "local:2", "Dask, 4 workers": "local:4"}.items():
+        with executor_of(cluster, twin, held, DEFAULT_TWIN, {}) as executor:
+            took = []
+            for _ in range(2):  # the first one loads the twin on the workers
+                begun = perf_counter()
+                found = fit("ekf", held.tuning, [Recording(log)], blocks=0, executor=executor)
+                fitted = perf_counter()
+                check(twin, log.copy(), counts, executor=executor)
+                took = [fitted - begun, perf_counter() - fitted]
+        wanted, alone = wanted or [repr(found.lines)], alone or took
+        if repr(found.lines) != wanted[0]:
+            raise NisusError(f"{name}: other bits than in threads")
+        figures = {"fit [s]": took[0], "times faster": alone[0] / took[0]}
+        yield BenchmarkRow(name, {**figures, "check [s]": took[1], "check faster": alone[1] / took[1]})
 
 
 def _spent(work: Any, calls: list[tuple[Any, ...]], way: dict[str, Any], **more: Any) -> tuple[float, float, list[Any]]:

@@ -269,11 +269,27 @@ def start(
     return Start.of(name, replace(tuning, gate=None), still, base, at, note)
 
 
-def each(work: Callable[[T], R], items: Iterable[T], executor: Executor | str | None) -> list[R]:
-    """Map a function over items: in threads (a fold releases the interpreter), or one by one with None."""
+def each(
+    work: Callable[[T], R],
+    items: Iterable[T],
+    executor: Executor | str | None,
+    done: Callable[[], None] = lambda: None,
+) -> list[R]:
+    """Map a function over items: in threads (a fold releases the interpreter), in an Executor, or one by one with None.
+
+    Args:
+        work: The function; an Executor of processes needs one of a module, or a partial of one.
+        items: Its arguments.
+        executor: "threads", an Executor, or None.
+        done: Called after each result, in their order; calls that have not begun are cancelled if it raises.
+    """
     own: Any = ThreadPoolExecutor(THREADS) if executor == "threads" else nullcontext(executor)
+    found = []
     with own as pool:
-        return list(map(work, items) if pool is None else pool.map(work, items))
+        for result in map(work, items) if pool is None else pool.map(work, items):
+            found.append(result)
+            done()
+    return found
 
 
 SENSOR, INPUT_, PARAMETER = KINDS = ("sensor", "input", "parameter")

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from concurrent.futures import Executor
 from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -208,7 +209,7 @@ def sensitivity(
     tests = fault_tests(model, tuning, begun.log, track, every=false_alarm, detection=detection, bank=bank)
     constant = [nudge.kind in KINDS for nudge in nudges].count(True)
     own = _for_alarms(begun, estimator, tuning, sum(nudge.kind in BY_ALARMS for nudge in nudges))
-    faults = each(lambda nudge: _undetectable(begun, own, nudge, tests), nudges, executor)
+    faults = each(partial(_undetectable, begun, own, tests), nudges, executor)
     bias, cause = np.zeros(track.std.shape), np.full(track.std.shape, -1)
     for k, fault in enumerate(faults):
         worse = fault.error > bias
@@ -276,17 +277,19 @@ def sensitivities(
 
 def _remembered(begun: Start, executor: Executor | str | None) -> int:
     """Return the number of events from the prior after which its errors are forgotten; all if one never is."""
+    states = [int(j) for j in np.flatnonzero(begun.tuning.model.prior_std > 0.0)]
+    found = each(partial(_events_of, begun), states, executor)
+    return min(begun.log.n, max([MIN_CHECKED_EVENTS, *found]))
+
+
+def _events_of(begun: Start, j: int) -> int:
+    """Return the number of events from the prior after which an error of state j is forgotten."""
     model, scale = begun.tuning.model, begun.tuning.model.prior_std
     uncertain = scale[model.shown] > 0.0
-
-    def events(j: int) -> int:
-        nudge = Nudge(PRIOR, model.state_names[j], "", STEP * scale[j], -np.inf, np.inf, scale[j])
-        left = np.abs(begun.respond(nudge).states[:, uncertain]) * scale[j] / scale[model.shown][uncertain]
-        rows = np.flatnonzero(~(left <= MAX_PRIOR_SHARE).all(axis=1))
-        return int(rows[-1]) + 2 if rows.size else 1
-
-    found = each(events, [int(j) for j in np.flatnonzero(scale > 0.0)], executor)
-    return min(begun.log.n, max([MIN_CHECKED_EVENTS, *found]))
+    nudge = Nudge(PRIOR, model.state_names[j], "", STEP * scale[j], -np.inf, np.inf, scale[j])
+    left = np.abs(begun.respond(nudge).states[:, uncertain]) * scale[j] / scale[model.shown][uncertain]
+    rows = np.flatnonzero(~(left <= MAX_PRIOR_SHARE).all(axis=1))
+    return int(rows[-1]) + 2 if rows.size else 1
 
 
 def _for_alarms(begun: Start, estimator: str, tuning: Tuning, nudges: int) -> Start:
@@ -300,7 +303,7 @@ def _for_alarms(begun: Start, estimator: str, tuning: Tuning, nudges: int) -> St
     return Start.of(estimator, replace(tuning, gate=None), begun.log, begun.base._replace(state=None))
 
 
-def _undetectable(begun: Start, own: Start, nudge: Nudge, tests: FaultTests) -> UndetectableFault:
+def _undetectable(begun: Start, own: Start, tests: FaultTests, nudge: Nudge) -> UndetectableFault:
     """Return the undetectable sizes of a nudge of any kind; `own`: with the twin's own filter, for alarms."""
     if nudge.kind in BY_ALARMS:
         return _undetectable_by_alarms(own, nudge)

@@ -1,11 +1,8 @@
 """Work in parallel: what it returns, that none is left of work that is given up, and what a cluster does."""
 
-import json
 import multiprocessing
 import os
 import signal
-import subprocess
-import sys
 import time
 
 import numba
@@ -43,23 +40,6 @@ def die_once(marker: str) -> int:
         open(marker, "w").close()
         os._exit(1)
     return os.getpid()
-
-
-@pytest.fixture(scope="module")
-def scheduler(tmp_path_factory):
-    """The address of a Dask scheduler with two workers, each a process of its own; and those processes."""
-    path = tmp_path_factory.mktemp("dask")
-    at = path / "scheduler.json"
-    start = [sys.executable, "-m", "distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", "0"]
-    run = {"stderr": subprocess.DEVNULL, "cwd": path}
-    begun = [subprocess.Popen([*start, "--no-dashboard", "--scheduler-file", str(at)], **run)]
-    wait_for(at.is_file)
-    worker = [sys.executable, "-m", "distributed.cli.dask_worker", "--scheduler-file", str(at), "--host", "127.0.0.1"]
-    begun += [subprocess.Popen([*worker, "--nthreads", "2", "--no-dashboard", "--no-nanny"], **run) for _ in range(2)]
-    yield json.loads(at.read_text())["address"]
-    for process in begun:
-        process.kill()
-        process.wait()
 
 
 @pytest.mark.parametrize("jobs", [1, 2])

@@ -1,0 +1,161 @@
+"""Folds of one twin on a cluster: the bits of one process, for any tasks and workers; what is sent; an end early."""
+
+import pickle
+from collections import Counter
+from concurrent.futures import Executor, Future, ProcessPoolExecutor
+from multiprocessing import get_context
+
+import numpy as np
+import pytest
+
+from app.present.result import to_json
+from app.present.runs_json import fit_json
+from app.studies import cluster_executor
+from app.studies.check import check, figures
+from app.studies.checklist import checklist
+from app.studies.cluster_executor import ClusterExecutor, executor_of, functions_of, packed, unpacked
+from app.twin.log_reader import read_log
+from app.twin.twin import load_twin, with_held
+from estimators.fit.fit import fit
+from estimators.fit.objective import Cancelled
+from estimators.fit.recording import Recording
+from estimators.tuning import Tuning
+from tests.app.studies.test_processes import die_once
+from tests.estimators.fit.test_fit import MODEL, log_of, simulated
+
+NAME, OVERRIDES = "motor_winding", {"R.winding": "0.2"}
+
+
+@pytest.fixture(scope="module")
+def twin():
+    return load_twin(NAME, overrides=OVERRIDES)
+
+
+@pytest.fixture(scope="module")
+def log(twin):
+    return read_log(twin, 300.0)[0]
+
+
+def fitted(twin, log, **options):
+    return fit(twin.estimator, with_held(twin).tuning, [Recording(log.copy())], **options)
+
+
+def bits(found):
+    return repr(fit_json(found)), found.correlation.tobytes(), found.after.held_out.terms.tobytes()
+
+
+def checked(twin, log, **options):
+    found = check(twin, log.copy(), Counter(), **options)
+    told = figures(found, checklist(found))
+    # The seconds of a step, and the answers that follow from them, are measured.
+    return {key: value for key, value in told.items() if key not in ("dimension", "checklist")}
+
+
+@pytest.mark.parametrize("task", [1e-9, 0.1, 1e9], ids=["one call a task", "0.1 s", "one task a worker"])
+def test_a_fit_on_a_cluster_is_the_same_bits(scheduler, twin, log, task, monkeypatch):
+    monkeypatch.setattr(cluster_executor, "TASK_S", task)
+    with executor_of(scheduler, twin, with_held(twin), NAME, OVERRIDES) as executor:
+        found = fitted(twin, log, executor=executor)
+    assert bits(found) == bits(fitted(twin, log)) == bits(fitted(twin, log, executor=None))
+
+
+def test_a_check_on_a_cluster_is_the_same_bits(scheduler, twin, log):
+    with executor_of(scheduler, twin, with_held(twin), NAME, OVERRIDES) as executor:
+        found = checked(twin, log, executor=executor)
+    assert len(found) > 8 and to_json(found) == to_json(checked(twin, log))
+
+
+def test_any_executor_does_for_a_model_of_functions_of_a_module():
+    ys = log_of(simulated(3, 300))
+    with ProcessPoolExecutor(2, get_context("spawn")) as executor:
+        found = fit("kf", Tuning.of(MODEL), [Recording(ys)], blocks=0, executor=executor)
+    assert bits(found) == bits(fit("kf", Tuning.of(MODEL), [Recording(ys)], blocks=0))
+
+
+def test_a_worker_that_dies_costs_a_retry(scheduler, twin, tmp_path):
+    with executor_of(scheduler, twin, with_held(twin), NAME, OVERRIDES) as executor:
+        assert isinstance(executor, Executor)
+        found = list(executor.map(die_once, [str(tmp_path / "died"), __file__]))
+    assert len(found) == 2 and (tmp_path / "died").exists()
+
+
+class Here:
+    """A cluster of one worker that is this process and begins no call by itself."""
+
+    def __init__(self) -> None:
+        self.futures: list[Future] = []
+        self.sent: list[bytes] = []
+
+    def submit(self, work, *call):
+        self.futures.append(Future())
+        self.call = work, call
+        return self.futures[-1]
+
+    def hold(self, value):
+        self.sent.append(value[1])
+        return value
+
+    def workers(self):
+        return 1
+
+
+def test_a_function_is_sent_once_and_calls_that_have_not_begun_are_cancelled():
+    cluster = Here()
+    executor = ClusterExecutor(cluster, [])
+    results = executor.map(divmod, [7, 8, 9], [2, 3, 4])
+    executor.map(divmod, [1], [1])
+    assert len(cluster.sent) == 1 and len(cluster.futures) == 4
+    work, (sent, items) = cluster.call
+    cluster.futures[0].set_result(work(sent, [(7, 2)]))
+    assert items == [(1, 1)] and next(results) == (3, 1)
+    results.close()
+    assert [future.cancelled() for future in cluster.futures] == [False, True, True, False]
+
+
+def draws(seed: int) -> np.ndarray:
+    return np.random.default_rng(seed).normal(size=10_001)
+
+
+class Wire(Here):
+    """A cluster whose messages have a header of two bytes, as Dask's may: the numbers after it are not aligned."""
+
+    def submit(self, work, *call):
+        parts: list[pickle.PickleBuffer] = []
+        message = pickle.dumps(work(*call), 5, buffer_callback=parts.append)
+        moved = [memoryview(bytearray(b"\0\0" + part.raw().tobytes()))[2:] for part in parts]
+        future: Future = Future()
+        future.set_result(pickle.loads(message, buffers=moved))
+        return future
+
+
+def test_arrays_of_a_cluster_have_the_sums_of_this_process():
+    """NumPy sums an array that is not aligned in pieces of 8,192 numbers, which rounds differently."""
+    found = list(ClusterExecutor(Wire(), []).map(draws, range(16)))
+    assert [values.sum() for values in found] == [draws(seed).sum() for seed in range(16)]
+
+
+def test_a_cancelled_fit_ends(scheduler, twin, log):
+    with executor_of(scheduler, twin, with_held(twin), NAME, OVERRIDES) as executor, pytest.raises(Cancelled):
+        fitted(twin, log, executor=executor, go=lambda folds: False)
+
+
+def test_functions_are_sent_as_their_places_and_arrays_are_aligned():
+    other = load_twin("motor_can")
+    functions = functions_of(other.model)
+    # Those of sensors are local functions, which cannot be pickled.
+    assert any("<locals>" in function.__qualname__ for function in functions)
+    data = packed((1, other.model, np.arange(9.0)), functions)
+    _, model, values = unpacked(data, functions)
+    assert model == other.model and model.f is other.model.f and values.flags.aligned
+    assert unpacked(data, list(reversed(functions)))[1].f is not other.model.f
+
+
+def test_without_a_cluster_the_folds_run_in_threads(twin):
+    with executor_of(None, twin, twin, NAME, OVERRIDES) as executor:
+        assert executor == "threads"
+
+
+@pytest.mark.parametrize("command", ["check", "tune"])
+def test_the_commands_take_a_cluster(nisus, command):
+    done = nisus.run(command, NAME, "--duration", 60, "--cluster", "nowhere")
+    assert done.status == 2 and "--cluster nowhere: " in done.err and done.err.count("\n") == 1
