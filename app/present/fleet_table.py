@@ -41,7 +41,11 @@ def value_columns(model: StateSpaceModel, table: FleetTable) -> dict[str, np.nda
 def units_of(model: StateSpaceModel) -> dict[str, str]:
     """Return the unit of each column of `value_columns` that has one."""
     units = {state.name: state.unit for state in model.shown_states}
-    return units | {f"{name}_std": unit for name, unit in units.items()} | dict.fromkeys(("age", "lasting", "seconds"), "s")
+    return (
+        units
+        | {f"{name}_std": unit for name, unit in units.items()}
+        | dict.fromkeys(("age", "lasting", "seconds"), "s")
+    )
 
 
 def ordered(model: StateSpaceModel, table: FleetTable, sort: str = "health", down: bool = True) -> np.ndarray:
