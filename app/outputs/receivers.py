@@ -79,6 +79,10 @@ class Deadline:
             with suppress(OSError):
                 sock.shutdown(socket.SHUT_RDWR)
 
+    def missed(self, error: Exception) -> bool:
+        """Return whether an error is that of the deadline, or of the timeout of a socket, which a handshake has too."""
+        return self.passed or isinstance(getattr(error, "reason", error), TimeoutError)
+
     def end(self) -> None:
         """Stop the clock."""
         self.timer.cancel()
@@ -147,7 +151,7 @@ class Webhook:
             error.close()
             raise OSError(f"it answers {error.code}") from None
         except Exception as error:
-            if deadline.passed:
+            if deadline.missed(error):
                 raise OSError(f"it has not answered within {TIMEOUT_S:g} s") from None
             if isinstance(error, URLError):
                 raise OSError(str(error.reason)) from None
@@ -200,7 +204,7 @@ class Mail:
                     server.login(section.user, self._password)
                 server.send_message(mail)
         except OSError as error:  # smtplib's own among them
-            text = f"it has not answered within {TIMEOUT_S:g} s" if deadline.passed else str(error)
+            text = f"it has not answered within {TIMEOUT_S:g} s" if deadline.missed(error) else str(error)
             raise OSError(text) from None
         finally:
             deadline.end()
