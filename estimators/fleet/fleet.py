@@ -13,13 +13,11 @@ from typing import Any
 import numba
 import numpy as np
 
-from ..compiled.context import context_type
 from ..diagnostics.health import NORMALS, HealthPolicy
 from ..errors import EstimatorError, EventError, nearest, quoted
 from ..events import arrays
 from ..events.batch import INPUT, READING, TICK, Events
 from ..fold_checks import check_pairs, check_prior, check_soft, check_tuning
-from ..fold_kernel import compiled
 from ..fold_machine import Machine, Moments, scratch
 from ..gate.isolation import Decision
 from ..log import _RANK
@@ -31,7 +29,7 @@ from ..snapshots import Base, Snapshot
 from ..track import Track
 from ..tuning import Tuning
 from .gate import FleetGates
-from .kernel import ASKED_FLAG, CREW, PLAN, REWOUND_FLAG, ROWS, fold_assets
+from .kernel import ASKED_FLAG, CREW, PLAN, REWOUND_FLAG, ROWS, begin_assets, fold_assets
 from .memory import (
     AGE,
     CONSISTENCY,
@@ -189,21 +187,17 @@ class Fleet:
         self._part(self._block.head).view(np.int64)[:, PHASE] = np.arange(len(self.assets)) % max(1, self.recent)
         self._part(self._block.mean)[:] = np.nan
         self._part(self._block.std)[:] = np.nan
-        states = np.array([self._begun(k, start) for k in range(len(self._contexts))])
+        states = self._begun(slice(None), machine.prior, start)
         self._part(self._block.now)[:] = states[0] if len(states) == 1 else states[self._tuning_of]
 
-    def _begun(self, k: int, start: int | None) -> np.ndarray:
-        """Return the numbers of the state before the first event, of the context k."""
-        machine = self._machines.get(k, self._machines[SHARED])
-        line, fresh = np.zeros(self._sizes["size"]), machine.fresh()
-        if fresh.state.size != self._state_sizes[1]:
+    def _begun(self, contexts: slice, prior: Moments, start: int | None) -> np.ndarray:
+        """Return the numbers of the state before the first event of some contexts, (contexts, numbers)."""
+        machine, size = self._machines[SHARED], self._state_sizes[1]
+        if any(each.fresh().state.size != size for each in self._machines.values()):
             raise EstimatorError(
                 "fleet: options of a tuning change the size of the filter's state; it must be the same"
             )
-        if k in self._machines:
-            machine.begin(*machine.prior, fresh.state)
-        else:
-            compiled()[2](machine.code, self._contexts[k].view(context_type.dtype)[0], *machine.prior, fresh.state)
+        fresh, line = machine.fresh(), np.zeros(self._sizes["size"])
         if start is not None:
             fresh.clock[0] = start
         line[: sum(part.size for part in fresh)] = np.concatenate(
@@ -211,7 +205,12 @@ class Fleet:
         )
         last = self._state.last.at // WORD
         line[last + NIS_MEAN : last + CONSISTENCY], line[last + CONSISTENCY] = np.nan, 1.0
-        return line
+        given = self._contexts[contexts]
+        lines, states = np.tile(line, (len(given), 1)), np.empty((len(given), size))
+        begin_assets(machine.code, given, *map(np.ascontiguousarray, prior), states)
+        at = self._state.filter.at // WORD
+        lines[:, at : at + size] = states
+        return lines
 
     def _part(self, part: Any, within: int = 0) -> np.ndarray:
         """Return a field of all blocks as a view (assets, numbers)."""
@@ -400,7 +399,7 @@ class Fleet:
             self._contexts = np.concatenate([self._contexts, np.array([machine.context]).view(np.int64)[None]])
             self._rules = np.concatenate([self._rules, [machine.rule]])
             self._tuning_of[mine] = new
-            self._part(self._block.now)[mine] = self._begun(new, start)
+            self._part(self._block.now)[mine] = self._begun(slice(new, None), given, start)
         self._point()
 
     def _point(self) -> None:

@@ -17,11 +17,11 @@ from ..compiled.context import _FIELDS as CONTEXT_FIELDS
 from ..compiled.context import context_at
 from ..diagnostics.detector_watch import watch_row
 from ..diagnostics.health import NORMALS, Bounds, HealthPolicy, judges, keep_window
-from ..estimator import Code
+from ..estimator import Code, call_start
 from ..fold_kernel import fold_event
 from ..gate.rejection_runs import Rule
 from ..log import _ORDER
-from ..numerics.jit import counts, embedded, flag_rows, flags, floats, i64, ints, jit, masks, matrix, part
+from ..numerics.jit import borrowed, counts, embedded, flag_rows, flags, floats, i64, ints, jit, masks, matrix, part
 from ..track import WHITENED, Track
 from .memory import (
     AGE,
@@ -371,6 +371,13 @@ def _fold_share(place, crew):
             copy(track.std[1], block.std)
         begins[v] = e
         unfinished[v] = a < tail or e < stop
+
+
+@jit
+def begin_assets(code, contexts, mean, cov, states):
+    """Fill the filter's state before the first event, states (N, numbers), by contexts (N, fields) of one prior."""
+    for k in range(contexts.shape[0]):
+        call_start(code.start, context_at(contexts[k].ctypes.data), mean, cov, borrowed(states[k]))
 
 
 @jit(parallel=True)
