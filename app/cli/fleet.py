@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from config.yaml_files import writing
-from estimators.errors import ConfigError, NisusError
+from estimators.errors import ConfigError, NisusError, SourceError
 from estimators.fleet.table import FleetTable
 from sources.source import WHOLE, Partition, Report
 
@@ -82,7 +82,7 @@ def run_fleet(arguments: FleetCommand) -> int:
         running = attend(None, lambda: PartitionedFleet(plan, report, child, preload=FLEET_PRELOADED), COMPILING)
     else:
         running = attend(None, lambda: _running(plan, report, store, archive), COMPILING)
-    page = None if door is None else f"http://127.0.0.1:{door.port}"
+    page = None if door is None else arguments.public or f"http://127.0.0.1:{door.port}"
     publisher = None if plan.ends else FleetPublisher(running, page=page)
     if publisher is not None:
         publisher.start()
@@ -97,7 +97,11 @@ def run_fleet(arguments: FleetCommand) -> int:
     _, _, table = running.table()
     if not len(table.assets) or not table.events.any():
         place = plan.source.loaded.places.at(("source",))
-        raise ConfigError(f"{place}: the source has no values for any sensor; check the channel maps")
+        if plan.ends:
+            raise ConfigError(f"{place}: the source has no values for any sensor; check the channel maps")
+        if door is None or out is not None:
+            raise SourceError(f"{place}: no measurement arrived; check that its senders run")
+        return 0
     table = in_name_order(table)
     if out is not None:
         _write(out, plan, table)

@@ -1,6 +1,7 @@
 """`nisus fleet` on tables: every asset has the values of a fold over its own rows."""
 
 import json
+import socket
 
 import numpy as np
 import pyarrow as pa
@@ -147,6 +148,28 @@ def test_a_wrong_file_is_one_line(change, line, tmp_path, monkeypatch, capsys):
     assert main(["fleet", "pumps.yaml"]) == 2
     said = capsys.readouterr().err.strip()
     assert line in said and "\n" not in said and "pumps.yaml" in said
+
+
+def test_a_live_source_without_measurements_is_told_from_wrong_channels(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "pumps.yaml").write_text("twin: motor_winding\nsource: {type: push}\n")
+    assert main(["fleet", "pumps.yaml", "--headless", "--duration", "0.01"]) == 2
+    assert capsys.readouterr().err == "nisus: pumps.yaml:2: no measurement arrived; check that its senders run\n"
+
+
+def test_a_broker_that_is_not_there_is_told_once(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    pytest.importorskip("paho.mqtt")
+    with socket.socket() as taken:  # bound and not listening: connections are refused
+        taken.bind(("127.0.0.1", 0))
+        place = f"127.0.0.1, port: {taken.getsockname()[1]}"
+        topics = "{'plant/{asset}/t': winding}"
+        (tmp_path / "pumps.yaml").write_text(
+            f"{{twin: motor_winding, source: {{type: mqtt, host: {place}, topics: {topics}}}}}"
+        )
+        assert main(["fleet", "pumps.yaml", "--headless", "--duration", "0.5"]) == 2
+    told = [line for line in capsys.readouterr().err.splitlines() if "no measurements from the broker at" in line]
+    assert len(told) == 1 and told[0].endswith("it is tried again")
 
 
 def test_a_tuning_that_fleets_cannot_have_names_the_twin(tmp_path, monkeypatch):

@@ -89,9 +89,11 @@ def test_messages_have_the_asset_as_a_field_in_any_form(kind, tmp_path):
 def test_messages_without_the_name_of_an_asset_are_refused(tmp_path):
     fleet, said = running(tmp_path, {"type": "push"}, assets=["a"])
     source = messages_of(fleet)
-    wrong = [{"values": {"winding": 1.0}}, message(0, "", 1.0), message(0, 7, 1.0), message(0, "x" * 201, 1.0)]
+    wrong = [{"values": {"winding": 1.0}}, message(0, "", 1.0), message(0, 7, 1.0), message(0, "x" * 201, 1.0),
+             json.loads(json.dumps(message(0, "\ud800", 1.0)))]  # fmt: skip
     found = answer(source, [*wrong, message(0, "a", 41.0), message(0, "stranger", 41.0)])
-    assert found["refused"] == 4 and "asset is" in found["items"][0]["reason"]
+    assert found["refused"] == 5 and "asset is" in found["items"][0]["reason"]
+    assert found["items"][4]["reason"] == r"asset is '\ud800', which has half of a surrogate pair"
     fleet.step()
     assert fleet.table()[1] == ["a"] and fleet.table()[2].events.tolist() == [1]
     assert said == ["pumps.yaml: asset 'stranger' is not among assets; add it to assets"]
