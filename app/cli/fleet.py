@@ -17,7 +17,7 @@ from estimators.errors import ConfigError, NisusError, SourceError
 from estimators.fleet.table import FleetTable
 from sources.source import WHOLE, Partition, Report
 
-from ..live.fleet import RunningFleet
+from ..live.fleet import STOPPED, STORE, RunningFleet
 from ..outputs.fleet import FleetPublisher
 from ..outputs.fleet_archive import AssetHistory, FleetArchive
 from ..outputs.parts import ArchivePlan
@@ -66,7 +66,8 @@ def run_fleet(arguments: FleetCommand) -> int:
     door = None if arguments.headless else door_of(arguments)
     plan.check_files()
     compile_for(plan.twin)
-    report, store = remarking(lambda *_: None), arguments.store
+    store = arguments.store
+    report = remarking(print_problem)
     if store is not None and store.is_dir():
         store = store / f"{plan.name}.store"
     archive = None
@@ -151,6 +152,12 @@ def _serve(
         running.stop()
 
 
+def print_problem(key: str, text: str) -> None:
+    """Print a report of a running fleet that is not one of many alike."""
+    if key in (STORE, STOPPED):
+        complain(text)
+
+
 def _running(
     plan: FleetPlan, report: Report, store: Path | None, archive: ArchivePlan | None, partition: Partition = WHOLE
 ) -> RunningFleet:
@@ -180,7 +187,7 @@ def open_partition(
 ) -> Opened:
     """Open the partition of a fleet that has a number."""
     plan, partition = load_fleet(fleet, overrides, processes), Partition(int(number), processes)
-    running = _running(plan, remarking(lambda *_: None), store, archive, partition)
+    running = _running(plan, remarking(print_problem), store, archive, partition)
     served = PartitionServer(running)
     return Opened(served, {}, served.report)
 
