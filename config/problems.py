@@ -62,9 +62,10 @@ def report(error: ValidationError, data: Any, places: ValuePlaces) -> ConfigErro
     """Return one ConfigError with a line for each of the first problems."""
     found: dict[tuple, str] = {}  # One line a key: pydantic repeats itself for each kind that a value might have been.
     problems = error.errors(include_url=False)
-    for problem in problems:
-        key, value = _locate(problem["loc"], data)
-        if problem["type"] == "too_short" and value != [] and len(problems) > 1:
+    located = [_locate(problem["loc"], data) for problem in problems]
+    for problem, (key, value) in zip(problems, located, strict=True):
+        entries = isinstance(value, list) and any(other[: len(key)] == key != other for other, _ in located)
+        if entries or (problem["type"] == "too_short" and value != [] and len(problems) > 1):
             continue  # Its entries are there and have problems of their own.
         place = (key, problem["loc"][-1] if problem["type"] == "missing" else None)
         found.setdefault(place, _line(problem, key, value, places))
@@ -142,6 +143,16 @@ _RULES = {
 }
 """Rules by pydantic's type of error, or its first word; braces are filled from the context of the error."""
 
+_PATTERNS = {
+    "^(https?": "give an address such as https://HOST/PATH, or $NAME, the environment variable that holds it",
+    "^opc": "give an address such as opc.tcp://HOST:4840",
+    r"^[^\s/]": "give a host name or an IP address, without spaces and slashes",
+    "^[^+#": "leave out the characters + and #",
+    "^[^+/#": "leave out the characters +, / and #",
+    "^[A-Za-z_]": "use letters, digits and _, and begin with a letter or _",
+}
+"""Rules by the beginning of the pattern that a text breaks."""
+
 
 def _rule(kind: str, context: dict[str, Any], text: str, value: Any) -> str:
     if kind == "greater_than":
@@ -151,5 +162,8 @@ def _rule(kind: str, context: dict[str, Any], text: str, value: Any) -> str:
     if kind == "literal_error":
         words = re.findall(r"'([^']*)'", context["expected"])
         return nearest(str(value), words) if len(words) > MAX_LISTED_WORDS else f"it must be {context['expected']}"
+    if kind == "string_pattern_mismatch":
+        found = (text for begin, text in _PATTERNS.items() if context["pattern"].startswith(begin))
+        return next(found, _RULES[kind])
     rule = _RULES.get(kind) or _RULES.get(kind.split("_")[0])
     return text[:1].lower() + text[1:] if rule is None else rule.format(**context)

@@ -182,6 +182,9 @@ class Messages:
             asset = message.get(ASSET)
             if not isinstance(asset, str) or not 0 < len(asset) <= MAX_NAME:
                 return Answer(REFUSED, f"asset is {_shown(asset)}; it must be a text of 1 to {MAX_NAME} letters")
+            # JSON has them, UTF-8 not, and so neither Parquet files nor addresses.
+            if not asset.isascii() and any("\ud800" <= letter <= "\udfff" for letter in asset):
+                return Answer(REFUSED, f"asset is {ascii(asset)[:MAX_NAME]}, which has half of a surrogate pair")
         if message.get("time") is not None:
             found = _ns(message["time"])
             if isinstance(found, str):

@@ -13,11 +13,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from config.yaml_files import writing
-from estimators.errors import ConfigError, NisusError
+from estimators.errors import ConfigError, NisusError, SourceError
 from estimators.fleet.table import FleetTable
 from sources.source import WHOLE, Partition, Report
 
-from ..live.fleet import RunningFleet
+from ..live.fleet import STOPPED, STORE, RunningFleet
 from ..outputs.fleet import FleetPublisher
 from ..outputs.fleet_archive import AssetHistory, FleetArchive
 from ..outputs.parts import ArchivePlan
@@ -66,7 +66,8 @@ def run_fleet(arguments: FleetCommand) -> int:
     door = None if arguments.headless else door_of(arguments)
     plan.check_files()
     compile_for(plan.twin)
-    report, store = remarking(lambda *_: None), arguments.store
+    store = arguments.store
+    report = remarking(print_problem)
     if store is not None and store.is_dir():
         store = store / f"{plan.name}.store"
     archive = None
@@ -82,7 +83,7 @@ def run_fleet(arguments: FleetCommand) -> int:
         running = attend(None, lambda: PartitionedFleet(plan, report, child, preload=FLEET_PRELOADED), COMPILING)
     else:
         running = attend(None, lambda: _running(plan, report, store, archive), COMPILING)
-    page = None if door is None else f"http://127.0.0.1:{door.port}"
+    page = None if door is None else arguments.public or f"http://127.0.0.1:{door.port}"
     publisher = None if plan.ends else FleetPublisher(running, page=page)
     if publisher is not None:
         publisher.start()
@@ -97,7 +98,11 @@ def run_fleet(arguments: FleetCommand) -> int:
     _, _, table = running.table()
     if not len(table.assets) or not table.events.any():
         place = plan.source.loaded.places.at(("source",))
-        raise ConfigError(f"{place}: the source has no values for any sensor; check the channel maps")
+        if plan.ends:
+            raise ConfigError(f"{place}: the source has no values for any sensor; check the channel maps")
+        if door is None or out is not None:
+            raise SourceError(f"{place}: no measurement arrived; check that its senders run")
+        return 0
     table = in_name_order(table)
     if out is not None:
         _write(out, plan, table)
@@ -147,6 +152,12 @@ def _serve(
         running.stop()
 
 
+def print_problem(key: str, text: str) -> None:
+    """Print a report of a running fleet that is not one of many alike."""
+    if key in (STORE, STOPPED):
+        complain(text)
+
+
 def _running(
     plan: FleetPlan, report: Report, store: Path | None, archive: ArchivePlan | None, partition: Partition = WHOLE
 ) -> RunningFleet:
@@ -176,7 +187,7 @@ def open_partition(
 ) -> Opened:
     """Open the partition of a fleet that has a number."""
     plan, partition = load_fleet(fleet, overrides, processes), Partition(int(number), processes)
-    running = _running(plan, remarking(lambda *_: None), store, archive, partition)
+    running = _running(plan, remarking(print_problem), store, archive, partition)
     served = PartitionServer(running)
     return Opened(served, {}, served.report)
 

@@ -24,7 +24,7 @@ from ..twin.fleet import FleetPlan
 from ..twin.twin import Twin
 from .fold_json import tuning_to_json
 from .silent_assets import SilentAssets
-from .store import Store
+from .store import RETRY_PERIOD_S, Store
 
 if TYPE_CHECKING:
     from estimators.log import Events
@@ -52,6 +52,9 @@ MAX_UNACKNOWLEDGED = 0.5
 
 CHANGED = {"version": "another version of Nisus", "partition": "another number of processes"}
 """Reason for which a store is refused, by the part of its identity."""
+
+STORE, STOPPED = "store", "failed"
+"""Keys of reports that the store cannot be written, or is again, and that nothing is folded any more."""
 
 UNKNOWN, FOREIGN = -1, -2
 """In place of the position of an asset: it is refused, or another process has it."""
@@ -126,6 +129,8 @@ class RunningFleet:
         self.archive: EventSink | None = None
         """What keeps the events; None for nothing. It is started and stopped with the fleet."""
         self._due, self._asked, self._kept = 0.0, False, -1
+        self._unwritten = False
+        """Whether the store could not be written at the last attempt."""
         self._store = None if store is None else Store(store)
         try:
             # Each process reads all rows of tables; one reports those that cannot be used.
@@ -151,7 +156,7 @@ class RunningFleet:
 
     def has(self, mark: int) -> bool | None:
         """See `Keeper`."""
-        return None if self.failure else self._kept >= mark
+        return None if self.failure or self._unwritten else self._kept >= mark
 
     @property
     def twin(self) -> Twin:
@@ -192,7 +197,7 @@ class RunningFleet:
             self.run(lambda: not self._stopping.is_set())
         except Exception as error:  # noqa: BLE001  the overview stays, and says why nothing is folded any more
             self.failure = str(error) if isinstance(error, NisusError) else f"{type(error).__name__}: {error}"
-            self.note("failed", f"source failed: {self.failure}")
+            self.note(STOPPED, f"the fleet stands still: {self.failure}")
 
     def step(self) -> bool:
         """Read the next events and fold what waits; return False at the end of the source."""
@@ -276,12 +281,14 @@ class RunningFleet:
     def _keep(self, at_once: bool = False) -> None:
         """Write what has changed to the store, with the position in the source; all events are folded."""
         begun, source = time.monotonic(), self.source
-        if self._store is None:
+        if self._store is None or self._unwritten:  # rather than wait in memory for as long as that lasts
             self._hand_over()
+        if self._store is None:
             return
         urgent = at_once or self._asked
         if isinstance(source, Acknowledging):
             urgent = urgent or source.unacknowledged > MAX_UNACKNOWLEDGED
+        urgent = at_once if self._unwritten else urgent
         mark = source.mark if isinstance(source, Marked) else 0
         if (begun < self._due and not urgent) or (mark == self._kept and not self._changed and not at_once):
             return
@@ -293,7 +300,18 @@ class RunningFleet:
             part = slice(number * BLOCK, min(len(self.names), (number + 1) * BLOCK))
             blocks["assets", number] = self._silent.state(part)
             blocks["last", number] = self._last[part].tobytes()
-        self._store.write_blocks(blocks)
+        try:
+            self._store.write_blocks(blocks)
+        except SourceError as error:
+            if at_once:
+                raise
+            if not self._unwritten:
+                self.note(STORE, f"{error}; the fleet goes on without it, and tries again")
+            self._unwritten, self._due = True, begun + RETRY_PERIOD_S
+            return
+        if self._unwritten:
+            self._unwritten = False
+            self._report(STORE, f"store {self._store.path}: it is written again")
         self._changed.clear()
         self._kept = mark
         # Not before: after a kill, messages that are not in the store come again.

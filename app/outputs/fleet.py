@@ -34,6 +34,10 @@ class TabledFleet(Protocol):
 
     plan: FleetPlan
 
+    @property
+    def failure(self) -> str:
+        """Why it stands still, or a part of it; empty if it does not."""
+
     def table(self) -> tuple[int, list[str], FleetTable]:
         """Return the version, the names, and the table of all assets."""
 
@@ -122,7 +126,8 @@ class FleetPublisher:
         """Put the alerts that are due into the queues of their receivers."""
         for rule, alert in self._rules.look(names, table):
             self._deliveries.put(alert, rule.to)
-        self._deliveries.beat(self._fleet.plan.name, HEALTH_NAMES[table.health.max()])
+        if not self._fleet.failure:  # a fleet that stands still does not tell that it runs
+            self._deliveries.beat(self._fleet.plan.name, HEALTH_NAMES[table.health.max()])
 
     def _print(self) -> None:
         for line in self.notices.since(self._next_line):

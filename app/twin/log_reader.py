@@ -13,6 +13,7 @@ from estimators.errors import ConfigError, SourceError
 from estimators.fold import Fold
 from estimators.late import inflated
 from estimators.log import TRUTH, Log
+from sources.brokers import NO_BROKER, REFUSED_MESSAGE, REFUSED_TOPIC
 from sources.source import LOST_FRAMES, NEVER, NO_ASSET, TRUNCATED, UNASSIGNED, UNDATED, WRONG_TIME, is_endless
 from sources.tables.order import REMARKS as ORDER
 from sources.tables.text import UNREADABLE
@@ -26,7 +27,9 @@ if TYPE_CHECKING:
 
 REMARKS = (*ORDER, NEVER, TRUNCATED, CLOCK_MOVED)
 
-ONCE_PRINTED_KEYS = (WRONG_TIME, LOST_FRAMES, UNDATED, UNREADABLE, UNASSIGNED, NO_ASSET)
+BROKERS = (NO_BROKER, REFUSED_MESSAGE, REFUSED_TOPIC)
+
+ONCE_PRINTED_KEYS = (WRONG_TIME, LOST_FRAMES, UNDATED, UNREADABLE, UNASSIGNED, NO_ASSET, *BROKERS)
 """Warnings printed once, since there may be one per row, or one with another share every few seconds."""
 
 

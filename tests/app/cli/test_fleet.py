@@ -1,6 +1,7 @@
 """`nisus fleet` on tables: every asset has the values of a fold over its own rows."""
 
 import json
+import socket
 
 import numpy as np
 import pyarrow as pa
@@ -127,6 +128,13 @@ def test_other_assets_are_refused_and_counted(assets, names, refused, tmp_path, 
         ({"twin: motor_winding": "twin: motor_winding\nasets: 3"}, "pumps.yaml:2: asets is not known; did you mean"),
         ({"twin: motor_winding": "twin: motor_winding\nassets: [a, a]"}, "pumps.yaml:2: assets names 'a' twice"),
         ({"twin: motor_winding": "twin: motor_winding\nassets: 0"}, "pumps.yaml:2: assets"),
+        ({"twin: motor_winding": "twin: motor_winding\nassets: [a, '']"}, "pumps.yaml:2: assets[1] is ''; it must not"),
+        ({"twin: motor_winding": "twin: motor_winding\noutputs: {mqtt: {host: a, prefix: 'a/#'}}"},
+         "outputs.mqtt.prefix is 'a/#'; leave out the characters + and #"),
+        ({"twin: motor_winding": "twin: motor_winding\noutputs: {mqtt: {host: 'a b'}}"},
+         "outputs.mqtt.host is 'a b'; give a host name or an IP address"),
+        ({"twin: motor_winding": "twin: motor_winding\noutputs: {receivers: {a: {type: webhook, url: 'ftp://x'}}}"},
+         "outputs.receivers.a.url is 'ftp://x'; give an address such as https://HOST/PATH"),
         ({"twin: motor_winding": "twin: motor_winding\nprocesses: 2\nassets: 3"}, "assets is 3 for 2 processes; name"),
         ({"twin: motor_winding": "twin: motor_winding\nprocesses: 0"}, "pumps.yaml:2: processes"),
         ({"  asset: pump\n": ""}, "source.asset is missing"),
@@ -147,6 +155,28 @@ def test_a_wrong_file_is_one_line(change, line, tmp_path, monkeypatch, capsys):
     assert main(["fleet", "pumps.yaml"]) == 2
     said = capsys.readouterr().err.strip()
     assert line in said and "\n" not in said and "pumps.yaml" in said
+
+
+def test_a_live_source_without_measurements_is_told_from_wrong_channels(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "pumps.yaml").write_text("twin: motor_winding\nsource: {type: push}\n")
+    assert main(["fleet", "pumps.yaml", "--headless", "--duration", "0.01"]) == 2
+    assert capsys.readouterr().err == "nisus: pumps.yaml:2: no measurement arrived; check that its senders run\n"
+
+
+def test_a_broker_that_is_not_there_is_told_once(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    pytest.importorskip("paho.mqtt")
+    with socket.socket() as taken:  # bound and not listening: connections are refused
+        taken.bind(("127.0.0.1", 0))
+        place = f"127.0.0.1, port: {taken.getsockname()[1]}"
+        topics = "{'plant/{asset}/t': winding}"
+        (tmp_path / "pumps.yaml").write_text(
+            f"{{twin: motor_winding, source: {{type: mqtt, host: {place}, topics: {topics}}}}}"
+        )
+        assert main(["fleet", "pumps.yaml", "--headless", "--duration", "0.5"]) == 2
+    told = [line for line in capsys.readouterr().err.splitlines() if "no measurements from the broker at" in line]
+    assert len(told) == 1 and told[0].endswith("it is tried again")
 
 
 def test_a_tuning_that_fleets_cannot_have_names_the_twin(tmp_path, monkeypatch):

@@ -23,7 +23,7 @@ from app.twin.twin import load_twin
 from app.web.partitions import PartitionedFleet, PartitionServer
 from app.web.readings import READERS, answer, messages_of
 from estimators import Log
-from estimators.errors import NisusError
+from estimators.errors import NisusError, SourceError
 from estimators.fold import Fold
 from estimators.log import Events
 from estimators.track import HEALTH_NAMES, STALE, USABLE
@@ -89,9 +89,11 @@ def test_messages_have_the_asset_as_a_field_in_any_form(kind, tmp_path):
 def test_messages_without_the_name_of_an_asset_are_refused(tmp_path):
     fleet, said = running(tmp_path, {"type": "push"}, assets=["a"])
     source = messages_of(fleet)
-    wrong = [{"values": {"winding": 1.0}}, message(0, "", 1.0), message(0, 7, 1.0), message(0, "x" * 201, 1.0)]
+    wrong = [{"values": {"winding": 1.0}}, message(0, "", 1.0), message(0, 7, 1.0), message(0, "x" * 201, 1.0),
+             json.loads(json.dumps(message(0, "\ud800", 1.0)))]  # fmt: skip
     found = answer(source, [*wrong, message(0, "a", 41.0), message(0, "stranger", 41.0)])
-    assert found["refused"] == 4 and "asset is" in found["items"][0]["reason"]
+    assert found["refused"] == 5 and "asset is" in found["items"][0]["reason"]
+    assert found["items"][4]["reason"] == r"asset is '\ud800', which has half of a surrogate pair"
     fleet.step()
     assert fleet.table()[1] == ["a"] and fleet.table()[2].events.tolist() == [1]
     assert said == ["pumps.yaml: asset 'stranger' is not among assets; add it to assets"]
@@ -207,6 +209,43 @@ def test_a_fleet_that_was_killed_continues_to_the_same_bits(ending, tmp_path, mo
     with pytest.raises(NisusError, match=r"fleet.store: was written with another model, tuning or assets; remove it"):
         plan = load_fleet("pumps.yaml", {"R.winding": "9"})
         RunningFleet(plan, lambda *_: None, threads=1, store=tmp_path / "fleet.store")
+
+
+def test_a_store_on_a_full_disk_is_tried_again_while_the_fleet_goes_on(tmp_path, monkeypatch):
+    full, archived = [False], []
+    write_blocks = live.Store.write_blocks
+
+    def write_or_fail(store, blocks):
+        if full[0]:
+            raise SourceError("the disk is full")
+        write_blocks(store, blocks)
+
+    monkeypatch.setattr(live.Store, "write_blocks", write_or_fail)
+    monkeypatch.setattr(live, "STORE_PERIOD_S", 0.0)
+    monkeypatch.setattr(live, "STORE_SHARE", 1e9)
+    monkeypatch.setattr(live, "RETRY_PERIOD_S", 0.0)
+    first, said = running(tmp_path, {"type": "push"})
+    path = tmp_path / "fleet.store"
+    fleet = RunningFleet(first.plan, lambda key, text: said.append(text), threads=1, store=path)
+    fleet.archive = SimpleNamespace(put=lambda at, events: archived.append(len(events)), stop=lambda: None)
+    source = messages_of(fleet)
+    for k in range(6):
+        full[0] = 1 < k < 5
+        first.source.send([message(k, "a", 40.0 + k)])
+        source.send([message(k, "a", 40.0 + k)])
+        assert first.step() and fleet.step()
+        assert fleet.has(source.accepted) is (None if full[0] else True)
+    assert said == [
+        "the disk is full; the fleet goes on without it, and tries again",
+        f"store {path}: it is written again",
+    ]
+    assert archived == [1] * 6 and fleet.failure == ""
+    assert same(fleet.table()[2], first.table()[2])
+    fleet.stop()
+    again = RunningFleet(first.plan, lambda *_: None, threads=1, store=path)
+    assert same(again.table()[2], first.table()[2])
+    again.stop()
+    first.stop()
 
 
 def same(mine, its):

@@ -169,6 +169,28 @@ def test_silent_assets_are_one_alert_of_a_receiver_which_is_resolved(tmp_path, c
     assert "alert firing: 3 assets degraded or worse, 3 new: pump 2 (degraded, silent)" in capsys.readouterr().err
 
 
+def test_a_fleet_that_stands_still_does_not_tell_that_it_runs(tmp_path):
+    fleet = started(tmp_path, {"every": 0.01, "receivers": {"log": {"type": "webhook", "url": "http://127.0.0.1:1"}}})
+    publisher, source, beats = FleetPublisher(fleet), messages_of(fleet), []
+    publisher._deliveries.beat = lambda *_: beats.append(1)
+    source.send([{"asset": "a", "values": {"winding": 40.0}}])
+    fleet.step()
+    publisher.start()
+    try:
+        wait_for(lambda: len(beats) > 3)
+        fleet.step = lambda: 1 / 0
+        fleet.start()
+        wait_for(lambda: fleet.failure)
+        before = len(beats)
+        looks = []
+        fleet.table, table = (lambda: looks.append(1) or table()), fleet.table
+        wait_for(lambda: len(looks) > 3)
+    finally:
+        publisher.stop()
+        fleet.stop()
+    assert len(beats) <= before + 1  # one look may be under way
+
+
 @pytest.mark.parametrize(
     ("outputs", "alerts", "text"),
     [

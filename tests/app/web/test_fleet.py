@@ -1,5 +1,6 @@
 """The overview of a fleet: parts of the table in any order, metrics, and the page of an asset on demand."""
 
+import itertools
 import json
 import os
 import re
@@ -148,6 +149,13 @@ def served(folder, *options):
         run.stdout.close()
 
 
+@pytest.fixture(scope="module")
+def overview(fleet):
+    """The address of the overview of a served fleet."""
+    with served(fleet) as (url, _):
+        yield url
+
+
 def test_the_page_lists_the_worst_first_and_a_click_opens_the_history_of_an_asset(fleet, browser):
     with served(fleet) as (url, ask):
         page = browser.new_context(viewport={"width": 1440, "height": 900}).new_page()
@@ -166,6 +174,38 @@ def test_the_page_lists_the_worst_first_and_a_click_opens_the_history_of_an_asse
         assert ask("/twins/pump%2031/api/state")["twin"] == "pump_31"
         assert errors == []
         page.close()
+
+
+@pytest.mark.parametrize("width", [1440, 1000, 700])
+def test_the_overview_is_within_its_bounds_at_any_width(width, fleet, browser, overview):
+    page = browser.new_context(viewport={"width": width, "height": 800}).new_page()
+    page.set_default_timeout(PATIENCE_S * 1e3)
+    page.goto(overview)
+    expect(page.locator("#rows a").first).to_be_visible()
+
+    def box(selector):
+        found = page.locator(selector).bounding_box()
+        return found["x"], found["y"], found["x"] + found["width"], found["y"] + found["height"]
+
+    left, top, right, bottom = box("#trust")
+    for item in ("#find", "#theme", "#place"):
+        x, y, end, below = box(item)
+        assert left <= x and end <= right and top <= y and below <= bottom, item
+    edges = {  # of the headings, and of the cells of the first row
+        place: page.locator(f"{place} > *").evaluate_all(
+            "all => all.map((e) => e.getBoundingClientRect()).map((b) => b.width ? [b.left, b.right] : [])"
+        )
+        for place in ("#heads", "#rows a:first-child")
+    }  # fmt: skip
+    heads, cells = edges.values()
+    shown = [k for k, edge in enumerate(heads) if edge]
+    assert shown == [k for k, edge in enumerate(cells) if edge] and {0, 1} < {*shown}
+    for k in shown:
+        assert heads[k][0] == cells[k][0] or heads[k][1] == cells[k][1]  # texts at the left, numbers at the right
+    ends = [heads[k] for k in shown]
+    assert all(one[1] <= next_one[0] for one, next_one in itertools.pairwise(ends)) and ends[-1][1] <= width
+    assert page.locator("aside").evaluate("node => node.scrollHeight <= node.clientHeight")
+    page.close()
 
 
 def test_a_click_opens_an_asset_of_messages_from_the_archive(tmp_path, browser):
