@@ -57,14 +57,14 @@ def page(serve, tmp_path):
 def halted(monkeypatch):
     """Fits halt at their first gain: `reached` is set then, and they go on once `released` is set."""
     reached, released = threading.Event(), threading.Event()
-    terms = Objective.terms
+    terms = Objective.all_terms
 
-    def waiting(self, x):
+    def waiting(self, points):
         if self.progress.gain > 0.0:
             reached.set()
             assert released.wait(300.0)
-        return terms(self, x)
+        return terms(self, points)
 
-    monkeypatch.setattr(Objective, "terms", waiting)
+    monkeypatch.setattr(Objective, "all_terms", waiting)
     yield SimpleNamespace(reached=reached, released=released)
     released.set()
