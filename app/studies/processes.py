@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import multiprocessing
 import os
@@ -20,7 +21,7 @@ from estimators.compiled.orphan import leave_with_parent
 from estimators.errors import ConfigError
 
 LOCAL = "local:"
-WAIT_S = 60  # for the first worker of a cluster
+WAIT_S, CONNECT_S = 60, 10  # for the first worker of a cluster, and for its scheduler
 
 _turn, _begun = threading.Lock(), [""]
 """Of a worker of a cluster: one call at a time, and the work whose `begin` has been called."""
@@ -142,9 +143,21 @@ def dask(address: str, begin: Callable[..., None], given: tuple[Any, ...]) -> It
     """Context manager: the workers of a cluster; for the arguments and errors see `results`."""
     try:
         from distributed import Client, LocalCluster
+        from distributed.comm import connect
     except ImportError:
         raise ConfigError("--cluster: needs Dask; install it with `pip install 'nisus[cluster]'`") from None
     own = None
+
+    async def knock() -> None:
+        (await connect(address, timeout=0.9 * CONNECT_S)).abort()
+
+    if not address.startswith(LOCAL):
+        # A Client that does not connect waits for its loop, which has ended, for two minutes when it is deleted.
+        try:
+            asyncio.run(asyncio.wait_for(knock(), CONNECT_S))
+        except (OSError, ValueError, TypeError) as error:
+            reason = str(error).splitlines()[0] if str(error) else "no answer"
+            raise ConfigError(f"--cluster {address}: {reason}; is it a Dask scheduler's?") from None
     with _deaf():
         if address.startswith(LOCAL):
             count = address.removeprefix(LOCAL)
@@ -154,10 +167,7 @@ def dask(address: str, begin: Callable[..., None], given: tuple[Any, ...]) -> It
                 n_workers=int(count), threads_per_worker=1, host="127.0.0.1", dashboard_address="127.0.0.1:0",
                 silence_logs=logging.CRITICAL,
             )  # fmt: skip
-        try:
-            client = Client(own or address, timeout=WAIT_S, set_as_default=False)
-        except (OSError, ValueError) as error:
-            raise ConfigError(f"--cluster {address}: {error or 'no answer'}; is it a Dask scheduler's?") from None
+        client = Client(own or address, timeout=WAIT_S, set_as_default=False)
     workers = Cluster(client, begin, given)
     try:
         try:

@@ -1,6 +1,10 @@
 """Folds of one twin on a cluster: the bits of one process, for any tasks and workers; what is sent; an end early."""
 
+import os
 import pickle
+import socket
+import subprocess
+import sys
 from collections import Counter
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from multiprocessing import get_context
@@ -16,11 +20,13 @@ from app.studies.checklist import checklist
 from app.studies.cluster_executor import ClusterExecutor, executor_of, functions_of, packed, unpacked
 from app.twin.log_reader import read_log
 from app.twin.twin import load_twin, with_held
+from estimators.errors import ConfigError
 from estimators.fit.fit import fit
 from estimators.fit.objective import Cancelled
 from estimators.fit.recording import Recording
 from estimators.tuning import Tuning
 from tests.app.studies.test_processes import die_once
+from tests.conftest import ROOT
 from tests.estimators.fit.test_fit import MODEL, log_of, simulated
 
 NAME, OVERRIDES = "motor_winding", {"R.winding": "0.2"}
@@ -159,3 +165,25 @@ def test_without_a_cluster_the_folds_run_in_threads(twin):
 def test_the_commands_take_a_cluster(nisus, command):
     done = nisus.run(command, NAME, "--duration", 60, "--cluster", "nowhere")
     assert done.status == 2 and "--cluster nowhere: " in done.err and done.err.count("\n") == 1
+
+
+def test_a_wrong_address_ends_the_command():
+    """A Client of Dask that does not connect waits two minutes for its own end."""
+    command = [sys.executable, "-m", "app.cli.main", "check", "motor_winding", "--cluster", "http://x"]
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    done = subprocess.run(command, env=environment, text=True, capture_output=True, timeout=90)
+    assert done.returncode == 2 and done.stderr.startswith("nisus: --cluster http://x: unknown address scheme")
+    assert done.stderr.count("\n") == 1
+
+
+def test_a_server_of_another_kind_is_told(twin, monkeypatch):
+    monkeypatch.setattr("app.studies.processes.CONNECT_S", 0.5)
+    with socket.socket() as silent:
+        silent.bind(("127.0.0.1", 0))
+        silent.listen()
+        address = f"127.0.0.1:{silent.getsockname()[1]}"
+        with (
+            pytest.raises(ConfigError, match=f"--cluster {address}: .*; is it a Dask scheduler's"),
+            executor_of(address, twin, twin, NAME, {}),
+        ):
+            pass
