@@ -2,6 +2,7 @@
 
 import json
 import struct
+import time
 import uuid
 from datetime import UTC, datetime, timedelta
 
@@ -12,6 +13,7 @@ import pytest
 from asyncua import ua
 from asyncua.sync import Client, Server
 
+from app.live.feeder import READ_TIMEOUT_S
 from app.outputs import Publisher
 from app.outputs.can import checksum, frames
 from app.outputs.opcua import STATUS_CODES, values_of
@@ -103,6 +105,9 @@ class Plant:
                 self.device.give(100, struct.pack(">f", value))
                 wait_for(lambda value=value: value in finite_values(page))
             self.device.stop()
+            # An answer that was on its way is folded within the time that the engine waits for a source.
+            wait_for(lambda: not page.engine.source.inner.connected.is_set())
+            time.sleep(10.0 * READ_TIMEOUT_S)
         else:
             bus = can.Bus(interface="virtual", channel=self.channel)
             for k, value in enumerate(VALUES):
