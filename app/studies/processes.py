@@ -21,6 +21,7 @@ from estimators.compiled.orphan import leave_with_parent
 from estimators.errors import ConfigError
 
 LOCAL = "local:"
+MAX_LOCAL = 256  # Processes of a cluster on this machine
 WAIT_S, CONNECT_S = 60, 10  # for the first worker of a cluster, and for its scheduler
 
 _turn, _begun = threading.Lock(), [""]
@@ -161,8 +162,8 @@ def dask(address: str, begin: Callable[..., None], given: tuple[Any, ...]) -> It
     with _deaf():
         if address.startswith(LOCAL):
             count = address.removeprefix(LOCAL)
-            if not count.isdigit() or not int(count):
-                raise ConfigError(f"--cluster {address}: give the number of processes, for example local:4")
+            if not count.isdecimal() or not 0 < int(count) <= MAX_LOCAL:
+                raise ConfigError(f"--cluster {address}: give 1 to {MAX_LOCAL} processes, for example local:4")
             own = LocalCluster(
                 n_workers=int(count), threads_per_worker=1, host="127.0.0.1", dashboard_address="127.0.0.1:0",
                 silence_logs=logging.CRITICAL,
