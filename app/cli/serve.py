@@ -25,7 +25,7 @@ from ..views.recording.rrd_file import NEVER, Split, parse_split
 from ..web.door import LOOPBACK, Door, check_port
 from ..web.gate import Grant, read_tokens
 from ..web.service import Service, TwinFolder
-from ..web.supervisor import STATUS_PERIOD_S
+from ..web.supervisor import STATUS_PERIOD_S, forget_safe_path
 
 if TYPE_CHECKING:
     from ..web.session import Session
@@ -180,6 +180,7 @@ def _is_site(text: str) -> bool:
 def run_child(open_: OpenTwin, json: bool, name: str, path: str, pipe: Connection) -> None:
     """Run one twin in this process until it is asked to stop, or the service has ended."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to the service, which stops this process
+    forget_safe_path()
     done = threading.Event()
     when_asked_to_end(lambda: os._exit(0) if not running else ending.append(True))
     running: list[bool] = []

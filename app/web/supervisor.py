@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import multiprocessing
+import os
 import signal
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from multiprocessing import forkserver
 from multiprocessing.connection import Connection, wait
@@ -101,6 +102,29 @@ Child = Callable[[str, str, Connection], None]
 """Runs a twin, given its name, path and a pipe, in a process of its own."""
 
 
+SAFE_PATH, OURS = "PYTHONSAFEPATH", "nisus"
+"""Variable with which Python leaves the working directory out of its path, and its value if Nisus has set it."""
+
+
+@contextmanager
+def _safe_path() -> Iterator[None]:
+    """Start processes that do not import from the working directory, where a file may have the name of a library."""
+    unset = SAFE_PATH not in os.environ
+    if unset:
+        os.environ[SAFE_PATH] = OURS
+    try:
+        yield
+    finally:
+        if unset:
+            del os.environ[SAFE_PATH]
+
+
+def forget_safe_path() -> None:
+    """In such a process: let the programs that it starts import as they are used to."""
+    if os.environ.get(SAFE_PATH) == OURS:
+        del os.environ[SAFE_PATH]
+
+
 class Supervisor:
     """Starts the processes of twins, or of parts of a fleet, and watches them."""
 
@@ -141,7 +165,8 @@ class Supervisor:
     def start(self) -> None:
         """Begin."""
         if self._on_demand and self._context.get_start_method() == "forkserver":
-            forkserver.ensure_running()  # so that it has the modules when the first page is opened
+            with _safe_path():
+                forkserver.ensure_running()  # so that it has the modules when the first page is opened
         self._thread.start()
 
     def stop(self) -> None:
@@ -242,7 +267,8 @@ class Supervisor:
         twin.pipe, twin.state, twin.refused = ours, STARTING, False
         twin.began = twin.heard = time.monotonic()
         twin.starts += 1
-        process.start()
+        with _safe_path():
+            process.start()
         twin.process = process  # not before: one that was not started cannot be waited for
         its.close()
 

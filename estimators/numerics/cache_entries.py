@@ -148,7 +148,7 @@ class LinkedLibrary(EntryLibrary):
 
     @property
     def codegen(self) -> Any:
-        """What is to be told the environment of the function, which exceptions alone need."""
+        """Receiver of the environment of the function, which exceptions alone need."""
         return self
 
     def set_env(self, name: str, environment: Any) -> None:

@@ -26,13 +26,17 @@ TOKENS = {"ann": ("view", "a" * 20), "bob": ("tune", "b" * 20), "plc": ("feed", 
 OPENER = build_opener(ProxyHandler({}))
 
 
+AS_INSTALLED = "import sys; del sys.path[0]; from app.cli.main import main; sys.exit(main())"
+"""A console script does not have the working directory in its path."""
+
+
 class Served:
     """A running `nisus serve`, and requests to it."""
 
     def __init__(self, folder, *arguments, **variables):
         self.folder = folder
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "app.cli.main", "serve", *arguments],
+            [sys.executable, "-c", AS_INSTALLED, "serve", *arguments],
             cwd=folder, text=True, stdout=subprocess.PIPE, stderr=(folder / "lines").open("w"),
             env=os.environ | {"PYTHONPATH": str(ROOT), "NISUS_SERVE_PORT": "0"} | variables,
         )  # fmt: skip
@@ -90,6 +94,8 @@ def served(tmp_path_factory):
         source = "source: {type: push}\n" if name == "south" else "source:\n  type: simulator\n"
         (folder / f"{name}.yaml").write_text(re.sub(r"source:\n  type: simulator\n(  .*\n)*", source, text))
     write_tokens(folder)
+    # A file of the user's own with the name of a library: the processes of twins do not import it.
+    (folder / "click.py").write_text("raise RuntimeError('this is not click')\n")
     running = Served(
         folder, "north.yaml", "south.yaml", "--tokens", "tokens", "--store", "stores", "--log-format", "json"
     )
