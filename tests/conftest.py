@@ -23,6 +23,8 @@ DURATIONS = "nisus/durations"
 def pytest_addoption(parser: pytest.Parser) -> None:
     text = "run only the quickest tests, as many as take so many seconds together by earlier runs, and all new ones"
     parser.addoption("--quickest", type=float, metavar="SECONDS", help=text)
+    text = "pages send and receive so much later: a browser test that asks before an answer can be there fails always"
+    parser.addoption("--lag", type=float, default=0.0, metavar="SECONDS", help=text)
 
 
 def within(budget: float, names: list[str], took: dict[str, float]) -> set[str]:

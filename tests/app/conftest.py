@@ -12,11 +12,40 @@ from app.cli.main import main
 from config.loader import TWINS
 from tests.chromium import launched
 
+LATE = """(() => {
+    const { send } = WebSocket.prototype;
+    WebSocket.prototype.send = function (data) {
+        setTimeout(() => this.readyState === WebSocket.OPEN && send.call(this, data), LAG);
+    };
+    for (const name of ["onopen", "onmessage", "onclose"]) {
+        const { set } = Object.getOwnPropertyDescriptor(WebSocket.prototype, name);
+        Object.defineProperty(WebSocket.prototype, name, {
+            set(taken) { set.call(this, (event) => setTimeout(() => taken.call(this, event), LAG)); },
+        });
+    }
+    const { fetch } = window;
+    window.fetch = async (...what) => {
+        const answer = await fetch(...what);
+        await new Promise((resolve) => setTimeout(resolve, LAG));
+        return answer;
+    };
+})()"""
+
 
 @pytest.fixture(scope="module")
-def browser(chromium: str) -> Iterator[Any]:
-    """Chromium, as Playwright drives it; each test opens a page of its own in it."""
+def browser(chromium: str, pytestconfig: pytest.Config) -> Iterator[Any]:
+    """Chromium, as Playwright drives it; each test opens a page of its own in it. `--lag` makes its pages late."""
+    lag = 1e3 * pytestconfig.getoption("--lag")
     with launched(chromium) as started:
+        punctual = started.new_context
+
+        def late(**options: Any) -> Any:
+            context = punctual(**options)
+            context.add_init_script(LATE.replace("LAG", f"{lag:g}"))
+            return context
+
+        if lag:
+            started.new_context = late
         yield started
 
 

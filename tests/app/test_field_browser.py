@@ -39,7 +39,8 @@ def engine(tmp_path):
 def page(browser, engine):
     view = ViserView(engine, secret="s3cret")
     view.start()
-    page = browser.new_page(viewport={"width": 900, "height": 1300}, extra_http_headers={HEADER: "s3cret"})
+    context = browser.new_context(viewport={"width": 900, "height": 1300}, extra_http_headers={HEADER: "s3cret"})
+    page = context.new_page()
     page.set_default_timeout(PATIENCE * 1000)
     errors = []
     page.on("pageerror", lambda error: errors.append(str(error)))

@@ -134,7 +134,7 @@ if (model.recorded) link.addEventListener("status", folded);
 view.addEventListener("change", () => location.hash && !arriving && history.replaceState(null, "", location.pathname));
 
 const turn = (name) => middle.show(middle.chosen === name ? "charts-panel" : name);
-const xy = new XY($("xy"), model, link, view, charts);
+const xy = (window.nisus.xy = new XY($("xy"), model, link, view, charts));
 xy.saving = saving;
 let stages = false;
 middle.show("charts-panel");

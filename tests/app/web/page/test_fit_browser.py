@@ -32,7 +32,7 @@ def fitted(page):
     """The fit's answer, once it is there."""
     before = page.evaluate("window.nisus.tune.fit.told?.number ?? 0")
     page.locator("#fit-begin").click()
-    wait_for(lambda: page.evaluate("window.nisus.tune.fit.told.number ?? 0") == before + 1, PATIENCE)
+    wait_for(lambda: page.evaluate("window.nisus.tune.fit.told?.number ?? 0") == before + 1, PATIENCE)
     wait_for(lambda: page.locator("#fit-panel .progress").is_hidden(), PATIENCE)
     assert verdict(page) is not None
     return json.loads(page.evaluate("JSON.stringify(window.nisus.tune.fit.told)"))

@@ -87,6 +87,7 @@ def test_a_session_on_the_page(visit, served, tmp_path, monkeypatch, request):
     # Time: pause, go on, look at a part, follow again.
     page.get_by_label("Pause or continue").click()
     wait_for(lambda: engine.status().paused, PATIENCE)
+    until(page, "window.nisus.link.status.paused")  # as its user sees, before it is pressed again
     page.keyboard.press("Escape")
     chart = page.locator(".u-over").first.bounding_box()
     page.mouse.move(chart["x"] + 100, chart["y"] + 20)

@@ -9,7 +9,7 @@ import pytest
 
 from app.live.commands import SetTuning
 from tests.app.scripted import pull_all, wait_for
-from tests.app.web.page.browsed import PATIENCE, running
+from tests.app.web.page.browsed import PATIENCE, running, until
 
 pytestmark = pytest.mark.browser
 
@@ -108,6 +108,8 @@ def test_two_states_against_each_other(page, session, tmp_path):
 
     def outlined():
         """Whether the file has the ellipses: they are asked for anew whenever another time is shown."""
+        # Else it is saved over and over, and of a page that saves ten files on end Chromium takes no more.
+        until(page, "window.nisus.xy.belief && window.nisus.xy.stream.x.length > 0")
         path = saved(page, "Save the chart of two states", "SVG", tmp_path)
         roots.append(ElementTree.fromstring(path.read_text(encoding="utf-8")))
         return len(curves_of(roots[-1])) == 3

@@ -120,7 +120,7 @@ def counted(page):
 @pytest.mark.parametrize("scene", ["drawn", "empty", "late", "never drawn"])
 def test_the_scene_is_hidden_until_it_is_drawn(browser, scene):
     """By a test's own clock: five drawings show it once no more are added, any after 4 s, or 20 s alone."""
-    page = browser.new_page()
+    page = browser.new_context().new_page()
     page.clock.install(time=0)
     page.clock.pause_at(1000)
     page.set_content("<p>axes</p>")
