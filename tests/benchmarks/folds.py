@@ -125,7 +125,7 @@ def smoothing() -> Iterator[BenchmarkRow]:
     for name in SMOOTHERS:
         fold = Fold(name, CAR, Tuning.of(CAR), log)
         folded, smoothed = medians([partial(again, fold), partial(smooth, fold)], 5)
-        yield BenchmarkRow(name, {"fold [s]": folded, "smooth [s]": smoothed}, (Bound("smooth [s]", 0.3),))
+        yield BenchmarkRow(name, {"fold [s]": folded, "smooth [s]": smoothed}, (Bound("smooth [s]", 0.15),))
     peers: dict[str, Callable[[np.ndarray], None]] = {"FilterPy": filterpy_rts, "statsmodels": statsmodels_smoother}
     for name, peer in peers.items():
         (spent,) = medians([partial(peer, ys[:SHORT])], 3)
@@ -179,11 +179,12 @@ def bare_kernel() -> Any:
         clock, u, state, doubt, edge, spare, work, score, track, policy, bounds, evidence, places,
     ):  # fmt: skip
         context = context_at(place)
+        kept, passed = np.empty(context.n_rows), np.empty(value.shape[1])
         normal = floats(context.normal, NORMALS * context.n_sensors)
         for k in range(stops.size):
             loop(
                 code, context, rule, first, start, stops[k], t, kind, channel, value, width,
-                clock, u, state, doubt, edge, spare, work, score, track,
+                clock, u, state, doubt, edge, spare, work, score, track, kept, passed,
             )  # fmt: skip
             assess(start, stops[k], t, kind, channel, track, normal, policy, bounds)
             start = stops[k]
