@@ -17,7 +17,7 @@ from .gate.rejection_runs import forget, note, rule_type
 from .gate.soften import soften
 from .interpreted.fold_loop import MAX_PREDICT_STEPS, UNSET
 from .log import INPUT, MARK, READING, RESET, TICK, TRUTH
-from .numerics.jit import B1, F1, F2, I1, borrowed, borrowed_rows, embedded, floats, i64, inlined, ints, jit, part
+from .numerics.jit import B1, F1, F2, I1, borrowed, embedded, floats, i64, inlined, ints, jit, part
 from .plausibility import pass_on, screen_reading, screen_signature
 from .track import ANCESTORS, EFFECTIVE, GATED, MISSING, NONE, SCREENED, USED, WHITENED, borrowed_columns, track_type
 
@@ -168,7 +168,7 @@ def fold_event(
 @jit
 def run(
     code, context, rule, first, start, end, t, kind, channel, value, width,
-    clock, u, state, doubt, edge, spare, work, score, track,
+    clock, u, state, doubt, edge, spare, work, score, track, kept, passed,
 ):  # fmt: skip
     """Fold events `start` to `end`: update clock (1,), u (nu,) and state in place, and fill one track row per event.
 
@@ -177,19 +177,13 @@ def run(
 
     A tick, a truth or a mark is a query: it is answered from a copy of the state, so it never changes the estimate.
     Variances of a measurement (columns of `value` from `width` on) replace the tuned R while it is folded, in every
-    filter. Rows that are rejected before the filter are NaN for it; without any row left it only predicts.
+    filter. Rows that are rejected before the filter are NaN for it; without any row left it only predicts. kept (rows,)
+    and passed (columns of `value`,) are scratch.
     """
-    kept = np.empty(context.n_rows if value.shape[1] > width else 0)
-    passed = np.empty(value.shape[1])
-    u = borrowed(u)
-    state = borrowed(state)
-    spare = borrowed(spare)
-    edge = borrowed(edge)
-    doubt = borrowed_rows(doubt)
-    work = borrowed(work)
-    score = borrowed(score)
-    value = borrowed_rows(value)
-    track = borrowed_columns(track)
+    t, kind, channel, value = borrowed(t), borrowed(kind), borrowed(channel), borrowed(value)
+    clock, u, state, doubt = borrowed(clock), borrowed(u), borrowed(state), borrowed(doubt)
+    edge, spare, work, score = borrowed(edge), borrowed(spare), borrowed(work), borrowed(score)
+    kept, passed, track = borrowed(kept), borrowed(passed), borrowed_columns(track)
     for i in range(start, end):
         asked = fold_event(
             code, context, rule, i, first + i, start, t, kind, channel, value, width,
@@ -237,10 +231,12 @@ def run_and_judge(
     address, as finding the type of a record takes as long as ten steps.
     """
     context = context_at(context_place)
+    kept = np.empty(context.n_rows if value.shape[1] > width else 0)
+    passed = np.empty(value.shape[1])
     for k in range(stops.size):
         asking = run(
             code, context, rule, first, start, stops[k], t, kind, channel, value, width,
-            clock, u, state, doubt, edge, spare, work, score, track,
+            clock, u, state, doubt, edge, spare, work, score, track, kept, passed,
         )  # fmt: skip
         end = stops[k] if asking < 0 else asking + 1
         if policy.window > 0:
@@ -258,7 +254,7 @@ _log = (I1, B1, I4, F2)
 begin_signature = types.void(code_type, context_type, F1, F2, F1)
 judge_signature = types.void(i64, i64, *_log, context_type, policy_type, bounds_type, F1, track_type)
 _state = I1, F1, F1, F2, F1, F1, F1, F1, track_type
-run_signature = i64(code_type, context_type, rule_type, i64, i64, i64, *_log, i64, *_state)
+run_signature = i64(code_type, context_type, rule_type, i64, i64, i64, *_log, i64, *_state, F1, F1)
 run_and_judge_signature = i64(
     code_type, i64, rule_type, i64, i64, I1, *_log, i64, *_state, policy_type, bounds_type, F1, I1
 )

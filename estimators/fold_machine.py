@@ -201,7 +201,7 @@ class Machine:
         return self._call(self.rule, log.first, start, stop, *columns, now, spare, track, blanks=blanks)
 
     def run_apart(
-        self, log: Log, start: int, stop: int, now: Snapshot, code: Code | None = None
+        self, log: Log, start: int, stop: int, now: Snapshot, code: Code | None = None, judged: bool = True
     ) -> tuple[Track, np.ndarray]:
         """Fold events into a separate track, without decisions on sensors.
 
@@ -211,6 +211,7 @@ class Machine:
             stop: The event after the last.
             now: Snapshot before `start`; becomes the one before `stop`.
             code: Functions to use in place of the filter's.
+            judged: Whether windows, alarms and health of the rows are filled, which does not change the estimate.
 
         Returns:
             The track, and the state from which the last query was answered.
@@ -219,21 +220,23 @@ class Machine:
         within = slice(start, stop)
         columns = log.t[within], log.kind[within], log.channel[within], log.value[within], log.width
         spare, rule = np.empty_like(now.state), self.rule._replace(most=0)
-        self._call(rule, log.first + start, 0, stop - start, *columns, now, spare, track, code)
+        policy = self.policy if judged else self.policy._replace(window=0)
+        self._call(rule, log.first + start, 0, stop - start, *columns, now, spare, track, code, policy=policy)
         return track, spare
 
     def _call(
         self, rule: doubt.Rule, first: int, start: int, stop: int, t: np.ndarray, kind: np.ndarray,
         channel: np.ndarray, value: np.ndarray, width: int, now: Snapshot, spare: np.ndarray, track: Track,
-        code: Code | None = None, blanks: Sequence[Blank] = (),
+        code: Code | None = None, blanks: Sequence[Blank] = (), policy: HealthPolicy | None = None,
     ) -> int:  # fmt: skip
         """Call `fold_kernel.run_and_judge`."""
         stops = np.array([*(at for at, _, _ in blanks), stop], np.int64)
         places = np.array([place for _, _, place in blanks], np.int64)
+        kept = [blank for _, blank, _ in blanks] if self._in_python else places
         asking = self._run(
             code or self.code, self._place, rule, first, start, stops, t, kind, channel, value, width,
             now.clock, now.u, now.state, now.doubt, now.edge, spare, self.work, self.score, track,
-            self.policy, self.bounds, now.evidence, [kept for _, kept, _ in blanks] if self._in_python else places,
+            policy or self.policy, self.bounds, now.evidence, kept,
         )  # fmt: skip
         return int(asking)
 

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import types
 
-from .numerics.jit import B1, F1, F2, I1, borrowed, borrowed_rows, counts, flag_rows, flags, ints, masks, part
+from .numerics.jit import B1, F1, F2, I1, borrowed, part
 
 NONE, USED, GATED, HELD_OUT, MISSING, FAILED, SCREENED = range(7)
 """Verdict on an event: not a measurement; used; rejected by the gate; held out and scored; no finite row; failed, as S
@@ -119,27 +119,26 @@ track_type = types.NamedTuple(
 @part
 def borrowed_columns(track):
     """Return the same columns, not reference-counted."""
-    n, width = track.alarms.shape
     return Track(
-        borrowed_rows(track.mean),
-        borrowed_rows(track.std),
-        borrowed_rows(track.cross),
-        borrowed_rows(track.innovation),
-        borrowed_rows(track.innovation_std),
+        borrowed(track.mean),
+        borrowed(track.std),
+        borrowed(track.cross),
+        borrowed(track.innovation),
+        borrowed(track.innovation_std),
         borrowed(track.nis),
         borrowed(track.log_likelihood),
-        counts(track.dof.ctypes.data, n),
-        flags(track.verdict.ctypes.data, n),
+        borrowed(track.dof),
+        borrowed(track.verdict),
         borrowed(track.age),
         borrowed(track.nis_mean),
         borrowed(track.nis_low),
         borrowed(track.nis_high),
-        flags(track.consistency.ctypes.data, n),
-        flags(track.health.ctypes.data, n),
-        borrowed_rows(track.whitened),
-        masks(track.alarms.ctypes.data, n, width),
-        ints(track.flags.ctypes.data, n),
-        flag_rows(track.screened.ctypes.data, n, track.screened.shape[1]),
+        borrowed(track.consistency),
+        borrowed(track.health),
+        borrowed(track.whitened),
+        borrowed(track.alarms),
+        borrowed(track.flags),
+        borrowed(track.screened),
         borrowed(track.effective),
         borrowed(track.ancestors),
     )

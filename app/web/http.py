@@ -92,12 +92,15 @@ def one_line(text: str) -> str:
 def page_file(name: str, settings: Mapping[str, Any], **parts: str) -> Response:
     """Answer with an HTML file of the page, with its settings in an attribute of the body, and other parts by name.
 
-    In an attribute, not in a script: the security policy allows no inline scripts.
+    In an attribute, not in a script: the security policy allows no inline scripts. Scripts and styles of a page behind
+    a service are those of its `overview`, so a browser that knows them does not fetch them for each twin.
     """
     text = (PAGE / name).read_text()
     parts |= {"head": (PAGE / "head.html").read_text().rstrip(), "settings": html.escape(json.dumps(dict(settings)))}
     for key, part in parts.items():
         text = text.replace(f"{{{{{key}}}}}", part)
+    if settings.get("overview"):
+        text = text.replace('="page/', f'="{settings["overview"]}page/')
     return HTMLResponse(text)
 
 

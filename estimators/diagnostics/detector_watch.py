@@ -6,7 +6,7 @@ import numpy as np
 
 from ..compiled.context import sensor_rows, sensor_variances
 from ..log import INPUT, READING, RESET
-from ..numerics.jit import borrowed, borrowed_rows, embedded, floats, inlined, ints, part
+from ..numerics.jit import borrowed, embedded, floats, inlined, ints, part
 from ..track import (
     ADVISORY,
     DEGRADED,
@@ -252,8 +252,7 @@ def watch_rows(first, last, t, kind, channel, value, context, policy, state, tra
 
     `state` evolves with the rows, so the result does not depend on the pieces of a fold.
     """
-    track = borrowed_columns(track)
-    value = borrowed_rows(value)
-    state = borrowed(state)
+    t, kind, channel, value = borrowed(t), borrowed(kind), borrowed(channel), borrowed(value)
+    state, track = borrowed(state), borrowed_columns(track)
     for i in range(first, last):
         watch_row(i, t, kind, channel, value, context, policy, state, track)

@@ -22,7 +22,7 @@ from numba import types
 
 from ..log import RESET
 from ..model.state_space import StateSpaceModel
-from ..numerics.jit import F1, borrowed, borrowed_rows, embedded, f64, i64, inlined, ints, jit, plain
+from ..numerics.jit import F1, borrowed, embedded, f64, i64, inlined, jit, plain
 from ..numerics.quantiles import chi_square_quantile
 from ..numerics.simd import total as sum_of
 from ..track import DIVERGED, FAILED, GATED, TRACKING, USED, borrowed_columns
@@ -150,13 +150,13 @@ def assess(first, last, t, kind, channel, track, normal, policy, bounds):
     `normal` (sensors · NORMALS,): expected NIS of each sensor, see `normal_nis`.
     """
     window = policy.window
-    track = borrowed_columns(track)
+    t, kind, channel, track = borrowed(t), borrowed(kind), borrowed(channel), borrowed_columns(track)
     low, high = borrowed(bounds.low), borrowed(bounds.high)
     # The window lies at `begin` to `end`, the oldest first: row, degrees of freedom (-1 if rejected), and `terms` (0 if
     # rejected): NIS, then `NORMALS`. It moves up, and back to the start when it reaches the end.
     room, places = np.empty((1 + NORMALS, 2 * window)), np.empty((2, 2 * window), np.int64)
-    terms = borrowed_rows(room)
-    rows, dofs = ints(places.ctypes.data, 2 * window), ints(places[1:].ctypes.data, 2 * window)
+    terms = borrowed(room)
+    rows, dofs = borrowed(places[0]), borrowed(places[1])
     begin = window
     end = window
     row = first - 1

@@ -223,16 +223,23 @@ def _stack_vector(like: Any, entries: Any) -> Any:
     return made
 
 
-@part
-def borrowed(vector):
-    """Return a view of the float64s without reference counts."""
-    return floats(vector.ctypes.data, vector.size)
+@intrinsic
+def _data_of(typing_context: Any, array: Any) -> Any:
+    """Return a pointer to the first element of an array."""
+
+    def codegen(context: Any, builder: Any, signature: Any, given: Any) -> Any:
+        return context.make_array(array)(context, builder, given[0]).data
+
+    return types.CPointer(array.dtype)(array), codegen
 
 
 @part
-def borrowed_rows(matrix):
-    """Return a view of the matrix without reference counts."""
-    return carray(_to_float(matrix.ctypes.data), matrix.shape)
+def borrowed(array):
+    """Return a view of a contiguous array without reference counts, which each call counts up and down.
+
+    The array itself must be used, or belong to a caller, for as long as the view.
+    """
+    return carray(_data_of(array), array.shape)
 
 
 @lower_builtin(operator.truediv, types.complex128, types.complex128)

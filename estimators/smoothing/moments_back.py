@@ -20,7 +20,7 @@ from ..fold import Fold
 from ..fold_kernel import advance_to, asks
 from ..interpreted.fold_loop import UNSET
 from ..log import INPUT, RESET
-from ..numerics.jit import B1, F1, F2, I1, i64, inlined, ints, jit
+from ..numerics.jit import B1, F1, F2, I1, borrowed, i64, inlined, ints, jit
 from ..numerics.workspace import size_of
 from ..snapshots import Snapshot
 from .notes import STAYED, StepNote, changed, copy, cut, join_moments, step_at, step_back, step_layout, widened
@@ -146,6 +146,10 @@ def backward(context, first, kind, tape, own, earlier, later, work, mean, std, c
             before and after it; NaN where no step relates them.
     """
     n = context.nx
+    kind, mean, std, cross, lag = borrowed(kind), borrowed(mean), borrowed(std), borrowed(cross), borrowed(lag)
+    earlier = Moments(borrowed(earlier.x), borrowed(earlier.P))
+    later = Moments(borrowed(later.x), borrowed(later.P))
+    work = borrowed(work)
     T, S, Q = work[0], work[1], work[2]
     x = np.empty(n)
     for i in range(kind.size - 1, -1, -1):
@@ -193,7 +197,8 @@ class MomentsBack:
         """See `Notes`."""
         self._recorder.begin(row)
         noting = now._replace(state=self._recorder.around(now.state))
-        _, spare = self._machine.run_apart(self._log, part.start, part.stop, noting, code=self._recorder.code)
+        code = self._recorder.code
+        _, spare = self._machine.run_apart(self._log, part.start, part.stop, noting, code, judged=False)
         now.state[:] = noting.state[:-1]
         return spare[:-1]
 

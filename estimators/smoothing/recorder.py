@@ -31,6 +31,7 @@ from ..estimator import (
     start_signature,
     update_signature,
 )
+from ..gaussian.kf import constant_jacobian, kept
 from ..gaussian.shared import moments_of
 from ..gaussian.ukf import deviations, weights_of
 from ..numerics.jit import address, floats, inlined, ints, jit
@@ -56,12 +57,12 @@ COVARIANCE, FACTOR, MEMBERS = range(3)
 class CrossScratch(NamedTuple):
     """Scratch of the cross-covariance.
 
-    F (n, n) is df/dx with the scratch of a Jacobian; chol_P (n, padded n) is upper, chol_Pᵀ chol_P = P; sigma
+    `kept` is df/dx, with the scratch of a Jacobian; chol_P (n, padded n) is upper, chol_Pᵀ chol_P = P; sigma
     (2n + 1, padded n) are the sigma points; D the same through f, then their deviations from the mean; `across`
     (n, padded n) are the differences between opposite ones, in the place of the first of each pair.
     """
 
-    F: Any
+    kept: Any
     jacobian: Any
     chol_P: Any
     sigma: Any
@@ -74,8 +75,8 @@ class CrossScratch(NamedTuple):
 @layout
 def crossing(at, n):
     """Lay it out."""
-    F, at = take_matrix(at, n, n)
-    jacobian, at = take_vector(at, scratch_size(n, n))
+    F = kept(at, n)
+    jacobian, at = take_vector(F.end, scratch_size(n, n))
     chol_P, at = take_matrix(at, n, padded(n))
     sigma, at = take_matrix(at, 2 * n + 1, padded(n))
     _, second = take_vector(at, padded(n))
@@ -165,14 +166,16 @@ def covariance_of(context, state, holds, x, P):
 def by_tangent(context, rule, x, u, dt, P, own, C):
     """C (nx, nx) = P Fᵀ."""
     n = x.size
-    # That of a linear model is found where its filter finds it: differences round differently at each x.
-    at = floats(context.prior_mean, n) if rule == CONSTANT else x
-    state_jacobian(context, at, u, dt, own.F, own.jacobian)
+    F = own.kept.F
+    if rule == CONSTANT:
+        constant_jacobian(context, u, dt, own.kept, own.jacobian)
+    else:
+        state_jacobian(context, x, u, dt, F, own.jacobian)
     for i in range(n):
         for j in range(n):
             s = 0.0
             for k in range(n):
-                s += P[i, k] * own.F[j, k]
+                s += P[i, k] * F[j, k]
             C[i, j] = s
 
 

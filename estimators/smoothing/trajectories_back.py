@@ -90,7 +90,7 @@ class TrajectoriesBack:
         spare = now.state.copy()
         for i in range(part.start, part.stop):
             query = self._log.kind[i] in QUERIES or part.state >= 0
-            _, answer = self._machine.run_apart(self._log, i, i + 1, now)
+            _, answer = self._machine.run_apart(self._log, i, i + 1, now, judged=False)
             if query:
                 spare = answer
             self._states[row + i - part.start] = spare if query else now.state

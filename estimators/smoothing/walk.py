@@ -162,7 +162,7 @@ class Walk:
         """Fold events; return the state that answered the last query."""
         if row is not None:
             return self._notes.take(part, now, row)
-        return self._machine.run_apart(self._log, part.start, part.stop, now)[1]
+        return self._machine.run_apart(self._log, part.start, part.stop, now, judged=False)[1]
 
 
 class Smoothed(NamedTuple):

@@ -53,7 +53,7 @@ def main() -> None:
         folds.smoothing,
         recovery.tuning,
         folds.defences,
-        folds.blf,
+        folds.can_logs,
         buses.can_live,
         folds.channels,
         folds.starts,

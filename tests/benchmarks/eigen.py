@@ -12,7 +12,7 @@ import numpy as np
 
 from estimators.gaussian.ekf import project, updating
 from estimators.gaussian.shared import downdate, factor, gain, joseph
-from estimators.numerics.jit import borrowed, borrowed_rows, jit
+from estimators.numerics.jit import borrowed, jit
 from estimators.numerics.simd import scaled
 from estimators.numerics.workspace import size_of, start_of
 
@@ -27,7 +27,7 @@ FOLDERS = ("/usr/include/eigen3", "/usr/local/include/eigen3", "/opt/homebrew/in
 @jit
 def _update(repetitions, is_joseph, before, H, P, work):
     # As in the fold: reference-counted arrays cost more than the filter.
-    before, H, P, work = borrowed_rows(before), borrowed_rows(H), borrowed_rows(P), borrowed(work)
+    before, H, P, work = borrowed(before), borrowed(H), borrowed(P), borrowed(work)
     m, n = H.shape
     own = updating(start_of(work), n, m)
     reading = own.reading

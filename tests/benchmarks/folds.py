@@ -32,6 +32,8 @@ from estimators.smoothing.smooth import smooth
 from estimators.tuning import Tuning
 from sources.can.decoder import Decoder
 from sources.can.log import CanLog
+from sources.can.mf4 import read_mf4
+from sources.can.readers import Raw, read_messages
 from sources.source import Channel
 
 from ..conftest import data_folder
@@ -125,7 +127,7 @@ def smoothing() -> Iterator[BenchmarkRow]:
     for name in SMOOTHERS:
         fold = Fold(name, CAR, Tuning.of(CAR), log)
         folded, smoothed = medians([partial(again, fold), partial(smooth, fold)], 5)
-        yield BenchmarkRow(name, {"fold [s]": folded, "smooth [s]": smoothed}, (Bound("smooth [s]", 0.3),))
+        yield BenchmarkRow(name, {"fold [s]": folded, "smooth [s]": smoothed}, (Bound("smooth [s]", 0.15),))
     peers: dict[str, Callable[[np.ndarray], None]] = {"FilterPy": filterpy_rts, "statsmodels": statsmodels_smoother}
     for name, peer in peers.items():
         (spent,) = medians([partial(peer, ys[:SHORT])], 3)
@@ -179,11 +181,12 @@ def bare_kernel() -> Any:
         clock, u, state, doubt, edge, spare, work, score, track, policy, bounds, evidence, places,
     ):  # fmt: skip
         context = context_at(place)
+        kept, passed = np.empty(context.n_rows), np.empty(value.shape[1])
         normal = floats(context.normal, NORMALS * context.n_sensors)
         for k in range(stops.size):
             loop(
                 code, context, rule, first, start, stops[k], t, kind, channel, value, width,
-                clock, u, state, doubt, edge, spare, work, score, track,
+                clock, u, state, doubt, edge, spare, work, score, track, kept, passed,
             )  # fmt: skip
             assess(start, stops[k], t, kind, channel, track, normal, policy, bounds)
             start = stops[k]
@@ -294,21 +297,53 @@ def wheels() -> list[Channel]:
     ]
 
 
-def blf() -> Iterator[BenchmarkRow]:
-    """Reading a BLF file: one minute of a RAV4, 98,800 frames, of which the wheel speeds are decoded, seconds."""
-    folder = data_folder() / "can_comma2k19_rav4"
+def imu() -> list[Channel]:
+    """Return the channels of an inertial sensor and of a vehicle speed."""
+    return [
+        Channel(READING, 0, "imu", ("AccelerationY", "AngularRateX"), "gnss_imu"),
+        Channel(READING, 1, "speed", ("S01PID0D_VehicleSpeed",), "OBD_RX"),
+    ]
+
+
+def can_logs() -> Iterator[BenchmarkRow]:
+    """Reading CAN logs: BLF, one minute of a RAV4 (wheel speeds), and MF4, 40 minutes of a logger (IMU and OBD)."""
+    rav4, css = "can_comma2k19_rav4", "can_css_imu100_obd2"
+    dbcs = [("canmod-gps.dbc", 2), ("OBD-v4.4.dbc", 1)]
+    yield _read_log("BLF", rav4, "*.blf", [("toyota_2017.dbc", 0)], wheels())
+    yield _read_log("MF4", css, "session_00000164/*.MF4", dbcs, imu())
+
+
+def _read_log(
+    name: str, recording: str, pattern: str, dbcs: list[tuple[str, int]], channels: list[Channel]
+) -> BenchmarkRow:
+    """Time the files of a recording by the clock, and by the processor with reader and decoder in this process.
+
+    The first of several rounds loads the reader's libraries, and is not counted.
+    """
+    folder = data_folder() / recording
     if not folder.exists():
-        raise SourceError(f"no recording in {folder}; set NISUS_DATA to the folder that holds can_comma2k19_rav4")
-    counts = {}
+        raise SourceError(f"no recording in {folder}; set NISUS_DATA to the folder that holds {recording}")
+    files, counts = sorted(folder.glob(pattern)), {}
+
+    def decoder() -> Decoder:
+        return Decoder([(folder / "dbc" / file, bus) for file, bus in dbcs], channels, width=2)
 
     def read() -> None:
-        decoder = Decoder([(folder / "dbc" / "toyota_2017.dbc", 0)], wheels(), width=1)
-        source = CanLog([folder / "rav4_2018-08-02_seg40.blf"], decoder)
+        source = CanLog(files, decoder())
         events = 0
         while (batch := source.read(1.0)) is not None:
             events += len(batch)
-        counts["frames"], counts["readings"] = source.frames, events
+        counts["frames"], counts["events"] = source.frames, events
         source.close()
 
-    clock, processor = np.median([both(read) for _ in range(3)], axis=0)
-    yield BenchmarkRow("RAV4", {**counts, "clock [s]": clock, "processor [s]": processor}, (Bound("clock [s]", 0.1),))
+    def read_here() -> None:
+        own = decoder()
+        for path in files:
+            for item in (read_mf4 if path.suffix == ".MF4" else read_messages)(path, own.wanted, own.longest):
+                if isinstance(item, Raw):
+                    own.decode(own.frames_of(item))
+
+    clock = np.median([both(read)[0] for _ in range(6)][1:])
+    processor = np.median([seconds(read_here) for _ in range(6)][1:])
+    figures = {"clock [s]": clock, "processor [s]": processor, "frames/s": counts["frames"] / clock}
+    return BenchmarkRow(name, {**counts, **figures}, (Bound("frames/s", 1e6, at_least=True),))

@@ -33,6 +33,8 @@ import numpy as np
 from app.views.recording.reader import read_recording
 from estimators.errors import SourceError
 from estimators.log import READING
+from tests.app.cli.test_fleet import FLEET, pump_rows
+from tests.app.cli.test_fleet import write as write_table
 from tests.chromium import find_chromium, launched
 
 from .timing import BenchmarkRow, Bound, Section, run_sections
@@ -55,11 +57,13 @@ SLIDER = """async (value) => {
 
 
 class Running:
-    """`nisus run` in its own process."""
+    """`nisus run`, or another command with a page, in its own process."""
 
-    def __init__(self, twin: str, *arguments: str, cache: Path | None = None) -> None:
+    def __init__(
+        self, twin: str, *arguments: str, cache: Path | None = None, words: tuple[str, ...] = ("run", "--no-browser")
+    ) -> None:
         environment = dict(os.environ) if cache is None else {**os.environ, "XDG_CACHE_HOME": str(cache)}
-        command = [sys.executable, "-m", "app.cli.main", "run", twin, "--port", "0", "--no-browser", *arguments]
+        command = [sys.executable, "-m", "app.cli.main", *words, twin, "--port", "0", *arguments]
         self.begun = time.monotonic()
         self._process = subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True)
         assert self._process.stdout is not None
@@ -148,6 +152,39 @@ def first() -> Iterator[BenchmarkRow]:
             figures["first curve [s]"] = time.monotonic() - run.begun
         bounds = Bound("estimate [s]", 12.0), Bound("charts [s]", 1.5), Bound("first curve [s]", 20.0)
         yield BenchmarkRow("motor_can", figures, bounds)
+
+
+ASSETS, ROWS, CLICKS = 200, 720, 8
+
+
+def asset() -> Iterator[BenchmarkRow]:
+    """From a click in the overview of a fleet to the charts of the asset with all its rows, seconds."""
+    path = find_chromium()
+    if path is None:
+        raise SourceError("no Chromium was found")
+    took = []
+    with tempfile.TemporaryDirectory() as folder:
+        write_table(Path(folder) / "pumps.csv", pump_rows(assets=ASSETS, count=ROWS))
+        fleet = Path(folder) / "pumps.yaml"
+        fleet.write_text(FLEET.format(files="pumps.csv"))
+        run = Running(str(fleet), words=("fleet",))
+        try:
+            with launched(path) as browser:
+                page = browser.new_context(viewport={"width": 1440, "height": 900}).new_page()
+                for k in range(CLICKS + 1):
+                    page.goto(run.url)
+                    page.locator("#rows a").nth(k).wait_for()
+                    time.sleep(1.0)
+                    page.locator("#rows a").nth(k).click()
+                    page.wait_for_url("**/twins/*/", wait_until="commit")
+                    while not page.evaluate("window.nisus?.drawn > 0"):
+                        pass
+                    took.append(page.evaluate("performance.now()") / 1e3)  # since the navigation began
+        finally:
+            run.stop()
+    # The first also waits until the processes of pages can start.
+    figures = {"median [s]": statistics.median(took[1:]), "shortest [s]": min(took[1:]), "first [s]": took[0]}
+    yield BenchmarkRow(f"{ASSETS} assets, {ROWS} rows", figures, (Bound("median [s]", 1.0),))
 
 
 def slider() -> Iterator[BenchmarkRow]:
@@ -355,7 +392,8 @@ def _sender(kind: str, plant: Any, client: Any, run: Running, bus: Any) -> Itera
         yield write
 
 
-PARTS: dict[str, Section] = {part.__name__: part for part in (crowd, first, slider, share, arrival, published, memory)}
+_PARTS = (crowd, first, slider, share, arrival, published, memory, asset)
+PARTS: dict[str, Section] = {part.__name__: part for part in _PARTS}
 
 
 def page() -> Iterator[BenchmarkRow]:

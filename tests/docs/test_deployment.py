@@ -76,7 +76,7 @@ def test_nginx_adds_tls_and_the_audit_log_has_the_address_of_the_client(folder):
                 return answer.headers, answer.read().decode()
 
         headers, page = ask("/twins/pump/")
-        assert 'src="page/page.js"' in page and f"wss://localhost:{public}" in headers["content-security-policy"]
+        assert 'src="../../page/page.js"' in page and f"wss://localhost:{public}" in headers["content-security-policy"]
         ask("/twins/pump/api/command", {"command": "SetTuning", "key": "Q.temperature", "value": 0.5}, Origin=site)
         (entry,) = json.loads(ask("/twins/pump/api/audit")[1])
         assert (entry["user"], entry["address"], entry["body"]["value"]) == ("bob", "127.0.0.1", 0.5)

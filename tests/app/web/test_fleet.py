@@ -172,6 +172,10 @@ def test_the_page_lists_the_worst_first_and_a_click_opens_the_history_of_an_asse
         page.wait_for_url("**/twins/pump%2031/")
         expect(page.locator("#trust")).to_contain_text("pump_31", timeout=PATIENCE_S * 1e3)
         assert ask("/twins/pump%2031/api/state")["twin"] == "pump_31"
+        # The scripts are those of the overview: a browser fetches them once, not for each asset.
+        loaded = page.evaluate("performance.getEntriesByType('resource').map((one) => new URL(one.name).pathname)")
+        scripts = [path for path in loaded if path.endswith((".js", ".css"))]
+        assert "/page/page.js" in scripts and all(path.startswith("/page/") for path in scripts)
         assert errors == []
         page.close()
 

@@ -108,8 +108,8 @@ def served(tmp_path_factory):
 def test_each_twin_has_its_page_behind_one_port(served):
     for name in ("north", "south"):
         status, page = served.ask(f"/twins/{name}/")
-        assert status == 200 and 'src="page/page.js"' in page
-        assert served.ask(f"/twins/{name}/page/page.js")[0] == 200
+        assert status == 200 and 'src="../../page/page.js"' in page
+        assert served.ask("/page/page.js")[0] == 200
         assert served.ask(f"/twins/{name}/api/state")[1]["twin"] == name
     assert served.ask("/twins/east/api/state") == (404, "Nisus: east is no twin of this service.\n")
     headers = {"Authorization": f"Bearer {served.token}"}
