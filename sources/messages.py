@@ -55,6 +55,10 @@ class Answer(NamedTuple):
     reason: str = ""
 
 
+FULL = Answer(REFUSED, "too many messages wait; send it again")
+CLOSED = Answer(REFUSED, "nothing is folded any more; send it again after a restart")
+
+
 class Rows(NamedTuple):
     """Messages as rows: times (n,) in ns; values and their state (n, columns), see `ChannelMapping`; assets (n,)."""
 
@@ -146,6 +150,8 @@ class Messages:
         self.mark = 0
         """Of these, messages that were read."""
         self._stores = False
+        self.closed = False
+        """Whether it takes no messages any more."""
         self._sending = threading.Lock()
         self._newest: tuple[int, int] | None = None
 
@@ -158,7 +164,7 @@ class Messages:
         answers = []
         with self._sending:
             for row, message in enumerate(messages):
-                answer = Answer(REFUSED, "too many messages wait; send it again") if row >= self._room else None
+                answer = CLOSED if self.closed else FULL if row >= self._room else None
                 answer = answer or self._take(message, t[row : row + 1], values[row], state[row])
                 answer = answer or self._number(message)
                 self.accepted += answer.status == ACCEPTED
@@ -274,7 +280,9 @@ class Messages:
         return None if newest is None else newest[0] + time.monotonic_ns() - newest[1]
 
     def close(self) -> None:
-        """Do nothing: the source has neither file nor connection."""
+        """Refuse all further messages, which nobody would read."""
+        with self._sending:
+            self.closed = True
 
 
 def _ns(value: Any) -> int | str:

@@ -198,6 +198,7 @@ class RunningFleet:
         except Exception as error:  # noqa: BLE001  the overview stays, and says why nothing is folded any more
             self.failure = str(error) if isinstance(error, NisusError) else f"{type(error).__name__}: {error}"
             self.note(STOPPED, f"the fleet stands still: {self.failure}")
+            self.source.close()  # senders and brokers keep what would not be folded
 
     def step(self) -> bool:
         """Read the next events and fold what waits; return False at the end of the source."""

@@ -50,6 +50,9 @@ class Overview(Protocol):
     def find(self, name: str) -> str | None:
         """Return the path of the twin of a name, None if there is none."""
 
+    def unready(self) -> str:
+        """Return why it is not ready, or empty."""
+
 
 class Service:
     """Starts the processes of twins, watches them, and serves their overview and pages."""
@@ -159,13 +162,15 @@ class Service:
         return [{**unknown, "title": twin.name, **twin.card, "name": name} for name, twin in self.twins.items()]
 
     def _ready(self, request: Request) -> Response:
-        """Answer 200 once all twins that are not stopped run, else 503; with a token also the names of the others."""
-        watched = self.twins.values() if self._overview is None else ()
-        missing = [twin.name for twin in watched if twin.wanted and twin.state != RUNNING]
-        if missing:
-            names = f"{len(missing)} twin(s) do not run: {', '.join(missing[:20])}"
-            return PlainTextResponse(f"{names if USER in request.scope else 'not ready'}\n", 503)
+        """Answer 200 once all twins that are not stopped run, or the overview is ready, else 503; why with a token."""
+        reason = self._unready() if self._overview is None else self._overview.unready()
+        if reason:
+            return PlainTextResponse(f"{reason if USER in request.scope else 'not ready'}\n", 503)
         return PlainTextResponse("ok\n")
+
+    def _unready(self) -> str:
+        missing = [twin.name for twin in self.twins.values() if twin.wanted and twin.state != RUNNING]
+        return f"{len(missing)} twin(s) do not run: {', '.join(missing[:20])}" if missing else ""
 
     def _start(self, twin: str) -> Any:
         """Begin to start a stopped twin."""

@@ -20,8 +20,10 @@ from app.live.fleet import RunningFleet
 from app.present.fleet_table import in_name_order
 from app.twin.fleet import load_fleet
 from app.twin.twin import load_twin
+from app.web.fleet import FleetApi
 from app.web.partitions import PartitionedFleet, PartitionServer
-from app.web.readings import READERS, answer, messages_of
+from app.web.readings import READERS, messages_of, send_to, summary
+from app.web.supervisor import RUNNING, STARTING
 from estimators import Log
 from estimators.errors import NisusError, SourceError
 from estimators.fold import Fold
@@ -76,7 +78,7 @@ def test_messages_have_the_asset_as_a_field_in_any_form(kind, tmp_path):
         body = "\n".join(map(json.dumps, sent)).encode()
     else:
         body = json.dumps(sent).encode()
-    assert answer(source, READERS[kind](body, source.fields))["accepted"] == 12
+    assert summary(source.send(READERS[kind](body, source.fields)))["accepted"] == 12
     assert fleet.step()
     _, names, table = fleet.table()
     assert names == ["a", "b/c"]
@@ -91,7 +93,7 @@ def test_messages_without_the_name_of_an_asset_are_refused(tmp_path):
     source = messages_of(fleet)
     wrong = [{"values": {"winding": 1.0}}, message(0, "", 1.0), message(0, 7, 1.0), message(0, "x" * 201, 1.0),
              json.loads(json.dumps(message(0, "\ud800", 1.0)))]  # fmt: skip
-    found = answer(source, [*wrong, message(0, "a", 41.0), message(0, "stranger", 41.0)])
+    found = summary(source.send([*wrong, message(0, "a", 41.0), message(0, "stranger", 41.0)]))
     assert found["refused"] == 5 and "asset is" in found["items"][0]["reason"]
     assert found["items"][4]["reason"] == r"asset is '\ud800', which has half of a surrogate pair"
     fleet.step()
@@ -248,6 +250,27 @@ def test_a_store_on_a_full_disk_is_tried_again_while_the_fleet_goes_on(tmp_path,
     first.stop()
 
 
+def test_a_fleet_that_stands_still_refuses_messages_and_is_not_ready(tmp_path, monkeypatch):
+    """Also those that it had accepted, but neither folded nor stored."""
+    fleet, said = running(tmp_path, {"type": "push"})
+    fleet._store = SimpleNamespace(path="fleet.store", write_blocks=lambda blocks: None, close=lambda: None)
+    api = FleetApi(fleet)
+    assert api.unready() == "no measurement has arrived"
+
+    def send(k):
+        found = asyncio.run(send_to(fleet, [message(k, "a", 40.0)]))
+        return found["items"][0]["status"], found["items"][0].get("reason", ""), found["stored"]
+
+    fleet.start()
+    assert send(0) == ("accepted", "", True)
+    assert api.unready() == ""
+    monkeypatch.setattr(fleet.fleet, "advance", lambda: 1 / 0)
+    assert send(1) == ("refused", refused := "nothing is folded any more; send it again after a restart", False)
+    assert send(2) == ("refused", refused, False)
+    assert api.unready() == "ZeroDivisionError: division by zero" and api.unready() in said[-1]
+    fleet.stop()
+
+
 def same(mine, its):
     """Whether two tables have the same assets and the same bits."""
     pairs = zip(mine[1:], its[1:], strict=True)
@@ -381,7 +404,7 @@ def test_a_broker_keeps_what_was_not_stored(tmp_path, monkeypatch):
 def test_messages_go_to_the_process_of_their_asset_and_the_table_is_that_of_all(tmp_path):
     whole, _ = running(tmp_path, {"type": "push"}, processes=2)
     sent = [message(k, f"pump {j}", 40.0 + k + j) for k in range(6) for j in range(9)]
-    answer(messages_of(whole), sent)
+    messages_of(whole).send(sent)
     whole.step()
     fleet = PartitionedFleet(whole.plan, lambda *_: None, lambda *_: None)
     servers = []
@@ -399,8 +422,12 @@ def test_messages_go_to_the_process_of_their_asset_and_the_table_is_that_of_all(
         pass
     assert same(in_name_order(fleet.table()[2]), in_name_order(whole.table()[2]))
     assert fleet.find("pump 3") and not fleet.ended
+    fleet._parts[0].twin.state = RUNNING
+    assert FleetApi(fleet).unready() == "starting: pumps 2 of 2"
+    fleet._parts[1].twin.state = RUNNING
+    assert FleetApi(fleet).unready() == ""
     servers[1].stop()
-    fleet._parts[1].twin.port = 0
+    fleet._parts[1].twin.state, fleet._parts[1].twin.port = STARTING, 0
     found = asyncio.run(fleet.take([message(9, f"pump {j}", 40.0) for j in range(9)]))
     here = [zlib.crc32(f"pump {j}".encode()) % 2 == 0 for j in range(9)]
     assert [item["status"] == "accepted" for item in found["items"]] == here and not found["stored"]
