@@ -172,7 +172,7 @@ def _running(
             complain(text)
             running.note(key, text)
 
-        running.archive = FleetArchive(archive, plan.twin.model, running.names, say)
+        running.archive = FleetArchive(archive, plan.twin.model, running.names, say, running.archived)
     return running
 
 
