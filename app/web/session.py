@@ -60,8 +60,8 @@ SWITCH_INTERVAL_S = 0.0005
 class Page:
     """Port of the page, whether to open it in a browser, and tokens of other programs.
 
-    `public` is the address at which a reverse proxy offers it. `overview` is the address of the overview of a service, of
-    which this twin is one; it then has no gallery, and `site` is its own address there.
+    `public` is the address at which a reverse proxy offers it. `overview` is the address of the overview of a service,
+    of which this twin is one; it then has no gallery, and `site` is its own address there.
     """
 
     port: int
