@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from estimators.errors import nearest, quoted, shown_name
+from estimators.errors import is_blank, nearest, quoted, shown_name
 from estimators.log import Events
 
 from .mapping import ABSENT, PRESENT, ChannelMapping
@@ -191,6 +191,8 @@ class Messages:
             # JSON has them, UTF-8 not, and so neither Parquet files nor addresses.
             if not asset.isascii() and any("\ud800" <= letter <= "\udfff" for letter in asset):
                 return Answer(REFUSED, f"asset is {ascii(asset)[:MAX_NAME]}, which has half of a surrogate pair")
+            if is_blank(asset):
+                return Answer(REFUSED, f"asset is {_shown(asset)}, which is blank; give it a visible name")
         if message.get("time") is not None:
             found = _ns(message["time"])
             if isinstance(found, str):

@@ -18,13 +18,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 from urllib.parse import quote
 
 from config.loader import shipped
-from estimators.errors import ConfigError, NisusError
+from estimators.errors import ConfigError, NisusError, is_blank, quoted
 
 from ..terminal import EndRequest, restore, use_lines_of_json, when_asked_to_end
 from ..views.recording.rrd_file import NEVER, Split, parse_split
 from ..web.door import LOOPBACK, Door, check_port
 from ..web.gate import NEEDS_TOKENS, Grant, grants_of
-from ..web.service import Service, TwinFolder
+from ..web.service import BLANK, Service, TwinFolder
 from ..web.supervisor import STATUS_PERIOD_S, forget_safe_path
 
 if TYPE_CHECKING:
@@ -154,6 +154,8 @@ def _named(given: tuple[str, ...]) -> tuple[dict[str, str], TwinFolder | None]:
             raise ConfigError(f"{text}: is a folder; give it alone, or files")
         if text not in shipped() and not Path(text).is_file():
             raise ConfigError(f"{text}: there is no such file or bundled twin; check the path")
+        if is_blank(name):
+            raise ConfigError(f"{quoted(text)}: {BLANK}")
         if name in found:
             raise ConfigError(f"{text}: a twin is called {name} already; rename the file")
         found[name] = text
@@ -230,8 +232,9 @@ def _opened(options: TwinPlaces, name: str, path: str) -> Opened:
     read = partial(opened_twin, path, store=store, archive=options.archive, split=options.split)
     opener = FileOpener({path: read})
     opening = opener.made_ready(read())
+    page = Page(0, False, overview="../../", site=f"{options.site}/twins/{quote(name, safe='')}")
     session = open_session(
-        opening, StartRequest(path), opener, page=Page(0, False, overview="../../", site=f"{options.site}/twins/{quote(name, safe='')}"),
+        opening, StartRequest(path), opener, page=page,
         recordings=options.recordings / name, printed=True,
     )  # fmt: skip
     return Opened(session, asdict(card_of(path, opening.twin)), partial(report_of, session))

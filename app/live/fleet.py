@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
-from estimators.errors import NisusError, SourceError, quoted
+from estimators.errors import NisusError, SourceError, is_blank, quoted
 from estimators.fleet.table import FleetTable
 from estimators.log import BEFORE
 from estimators.track import STALE
@@ -251,6 +251,9 @@ class RunningFleet:
         place = self._places.get(name)
         if place is not None:
             return place
+        if is_blank(name):
+            self.note(NO_ASSET, f"{self.plan.path.name}: asset {quoted(name)} is blank; name it in the source")
+            return UNKNOWN
         if not self.partition.has(name):
             return FOREIGN if self._given is None or name in self._given else UNKNOWN
         if self._most is not None and len(self.names) >= self._most:

@@ -93,10 +93,12 @@ def test_messages_without_the_name_of_an_asset_are_refused(tmp_path):
     fleet, said = running(tmp_path, {"type": "push"}, assets=["a"])
     source = messages_of(fleet)
     wrong = [{"values": {"winding": 1.0}}, message(0, "", 1.0), message(0, 7, 1.0), message(0, "x" * 201, 1.0),
+             message(0, "\u200b\t ", 1.0),
              json.loads(json.dumps(message(0, "\ud800", 1.0)))]  # fmt: skip
     found = summary(source.send([*wrong, message(0, "a", 41.0), message(0, "stranger", 41.0)]))
-    assert found["refused"] == 5 and "asset is" in found["items"][0]["reason"]
-    assert found["items"][4]["reason"] == r"asset is '\ud800', which has half of a surrogate pair"
+    assert found["refused"] == 6 and "asset is" in found["items"][0]["reason"]
+    assert found["items"][4]["reason"] == r"asset is '\u200b\t ', which is blank; give it a visible name"
+    assert found["items"][5]["reason"] == r"asset is '\ud800', which has half of a surrogate pair"
     fleet.step()
     assert fleet.table()[1] == ["a"] and fleet.table()[2].events.tolist() == [1]
     assert said == ["pumps.yaml: asset 'stranger' is not among assets; add it to assets"]
@@ -150,6 +152,15 @@ def test_topics_that_do_not_name_an_asset_are_one_line(topics, text, tmp_path):
     with pytest.raises(NisusError) as caught:
         running(tmp_path, {"type": "mqtt", "host": "127.0.0.1", "port": 1, "topics": topics})
     assert text in str(caught.value) and "\n" not in str(caught.value) and "pumps.yaml:1" in str(caught.value)
+
+
+def test_a_password_that_is_not_set_is_one_line_with_its_place(tmp_path, monkeypatch):
+    monkeypatch.delenv("NISUS_NO_SECRET", raising=False)
+    more = {"user": "a", "password_env": "NISUS_NO_SECRET"}
+    with pytest.raises(NisusError) as caught:
+        running(tmp_path, {"type": "mqtt", "host": "a", "topics": {"{asset}/t": "winding"}, **more})
+    rule = "is NISUS_NO_SECRET, an environment variable that is not set; set it before the start"
+    assert str(caught.value) == f"{tmp_path / 'pumps.yaml'}:1: source.password_env {rule}"
 
 
 KILLED = """
