@@ -165,7 +165,7 @@ def test_a_wrong_file_is_one_line(change, line, tmp_path, monkeypatch, capsys):
         assert before in text
         text = text.replace(before, after)
     (tmp_path / "pumps.yaml").write_text(text)
-    assert main(["fleet", "pumps.yaml"]) == 2
+    assert main(["fleet", "pumps.yaml", "--port", "0"]) == 2
     said = capsys.readouterr().err.strip()
     assert line in said and "\n" not in said and "pumps.yaml" in said
 
