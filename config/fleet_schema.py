@@ -6,6 +6,8 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
+from estimators.errors import is_blank
+
 from .fields import Count, Duration, Number, Section, Text, Texts, refused
 from .output_schema import DelayOrNone, MqttSection, ReceiverSection
 from .source_schema import MqttSourceSection, PushSection, TableSection
@@ -133,6 +135,8 @@ class FleetSection(Section):
         if isinstance(self.assets, tuple) and len(set(self.assets)) < len(self.assets):
             twice = next(name for name in self.assets if self.assets.count(name) > 1)
             raise refused("relation", f"names {twice!r} twice; name each asset once", "assets")
+        if isinstance(self.assets, tuple) and (blank := [name for name in self.assets if is_blank(name)]):
+            raise refused("relation", f"names {blank[0]!r}, which is blank; give it a visible name", "assets")
         if isinstance(self.assets, int) and self.processes > 1:
             text = f"is {self.assets} for {self.processes} processes; name the assets, or leave it out"
             raise refused("relation", text, "assets")

@@ -52,6 +52,11 @@ def shown_name(name: str) -> str:
     return name if 0 < len(name) <= MAX_QUOTED_CHARACTERS and name.isprintable() else quoted(name)
 
 
+def is_blank(name: str) -> bool:
+    """Return whether nothing of a name can be seen, as of white space."""
+    return not any(letter.isprintable() and not letter.isspace() for letter in name)
+
+
 def digits(value: float, sign: str = "") -> str:
     """Format a number with three digits, with an exponent only where that is shorter: `2,280`, `0.0375`, `1.8e+10`.
 

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from estimators.errors import nearest, quoted, shown_name
+from estimators.errors import is_blank, nearest, quoted, shown_name
 from estimators.log import Events
 
 from .mapping import ABSENT, PRESENT, ChannelMapping
@@ -53,6 +53,10 @@ class Answer(NamedTuple):
 
     status: str
     reason: str = ""
+
+
+FULL = Answer(REFUSED, "too many messages wait; send it again")
+CLOSED = Answer(REFUSED, "nothing is folded any more; send it again after a restart")
 
 
 class Rows(NamedTuple):
@@ -146,6 +150,8 @@ class Messages:
         self.mark = 0
         """Of these, messages that were read."""
         self._stores = False
+        self.closed = False
+        """Whether it takes no messages any more."""
         self._sending = threading.Lock()
         self._newest: tuple[int, int] | None = None
 
@@ -158,7 +164,7 @@ class Messages:
         answers = []
         with self._sending:
             for row, message in enumerate(messages):
-                answer = Answer(REFUSED, "too many messages wait; send it again") if row >= self._room else None
+                answer = CLOSED if self.closed else FULL if row >= self._room else None
                 answer = answer or self._take(message, t[row : row + 1], values[row], state[row])
                 answer = answer or self._number(message)
                 self.accepted += answer.status == ACCEPTED
@@ -185,6 +191,8 @@ class Messages:
             # JSON has them, UTF-8 not, and so neither Parquet files nor addresses.
             if not asset.isascii() and any("\ud800" <= letter <= "\udfff" for letter in asset):
                 return Answer(REFUSED, f"asset is {ascii(asset)[:MAX_NAME]}, which has half of a surrogate pair")
+            if is_blank(asset):
+                return Answer(REFUSED, f"asset is {_shown(asset)}, which is blank; give it a visible name")
         if message.get("time") is not None:
             found = _ns(message["time"])
             if isinstance(found, str):
@@ -274,7 +282,9 @@ class Messages:
         return None if newest is None else newest[0] + time.monotonic_ns() - newest[1]
 
     def close(self) -> None:
-        """Do nothing: the source has neither file nor connection."""
+        """Refuse all further messages, which nobody would read."""
+        with self._sending:
+            self.closed = True
 
 
 def _ns(value: Any) -> int | str:

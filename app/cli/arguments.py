@@ -138,6 +138,8 @@ class PageOptions:
     """Print the URL without opening a browser."""
     tokens: Path | None = None
     """File of tokens for other programs, a line NAME ROLE TOKEN each; roles are view, feed, tune and admin."""
+    public: str | None = None
+    """Address at which a reverse proxy offers the page, https://HOST; needs --tokens."""
     duration: float | None = None
     """Stop after this many seconds."""
 

@@ -83,7 +83,7 @@ def run_fleet(arguments: FleetCommand) -> int:
         running = attend(None, lambda: PartitionedFleet(plan, report, child, preload=FLEET_PRELOADED), COMPILING)
     else:
         running = attend(None, lambda: _running(plan, report, store, archive), COMPILING)
-    page = None if door is None else arguments.public or f"http://127.0.0.1:{door.port}"
+    page = None if door is None else door.site
     publisher = None if plan.ends else FleetPublisher(running, page=page)
     if publisher is not None:
         publisher.start()
@@ -172,7 +172,7 @@ def _running(
             complain(text)
             running.note(key, text)
 
-        running.archive = FleetArchive(archive, plan.twin.model, running.names, say)
+        running.archive = FleetArchive(archive, plan.twin.model, running.names, say, running.archived)
     return running
 
 

@@ -16,7 +16,7 @@ from ..terminal import complain, use_lines_of_json
 from ..views.recording.rrd_file import TAKEN, check_date, parse_split
 from ..web.door import check_port
 from ..web.gallery.gallery import StartRequest
-from ..web.gate import read_tokens
+from ..web.gate import grants_of
 from ..web.session import Page, Session
 from .open_twin import FileOpener, live_source, open_session, opened_review, opened_twin
 from .options import settings
@@ -38,8 +38,8 @@ MAX_FAILURES = 5  # failures that a run without a page prints at its end
 
 def page_of(arguments: PageOptions) -> Page:
     """Return the page that the options describe."""
-    grants = () if arguments.tokens is None else read_tokens(arguments.tokens)
-    return Page(arguments.port, not arguments.no_browser, grants)
+    grants = grants_of(arguments.tokens, arguments.public)
+    return Page(arguments.port, not arguments.no_browser, grants, public=arguments.public)
 
 
 def run_twin(arguments: RunCommand, workers: Sequence[Compiler] = ()) -> int:

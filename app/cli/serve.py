@@ -15,16 +15,16 @@ from functools import partial
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
-from urllib.parse import urlsplit
+from urllib.parse import quote
 
 from config.loader import shipped
-from estimators.errors import ConfigError, NisusError
+from estimators.errors import ConfigError, NisusError, is_blank, quoted
 
 from ..terminal import EndRequest, restore, use_lines_of_json, when_asked_to_end
 from ..views.recording.rrd_file import NEVER, Split, parse_split
 from ..web.door import LOOPBACK, Door, check_port
-from ..web.gate import Grant, read_tokens
-from ..web.service import Service, TwinFolder
+from ..web.gate import NEEDS_TOKENS, Grant, grants_of
+from ..web.service import BLANK, Service, TwinFolder
 from ..web.supervisor import STATUS_PERIOD_S, forget_safe_path
 
 if TYPE_CHECKING:
@@ -65,13 +65,14 @@ MEMORY_PERIOD_S = 10.0
 
 
 class TwinPlaces(NamedTuple):
-    """Files that all twins of a service have in common."""
+    """Files that all twins of a service have in common, and the address of its overview."""
 
     store: Path | None
     recordings: Path
     json: bool
     archive: Path | None = None
     split: Split = NEVER
+    site: str = ""
 
 
 def serve(arguments: ServeCommand) -> int:
@@ -87,6 +88,7 @@ def serve(arguments: ServeCommand) -> int:
         if place is not None and place.exists() and not place.is_dir():
             raise ConfigError(f"{place}: must be a folder, in which each twin has its own file")
     door = door_of(arguments, grants)
+    options = options._replace(site=door.site)
     service = Service(
         twins, partial(run_child, partial(_opened, options), options.json), door=door, preload=PRELOADED,
         at_once=max(1, (os.cpu_count() or 2) // 2),
@@ -97,13 +99,9 @@ def serve(arguments: ServeCommand) -> int:
 
 def _grants(arguments: ServiceOptions) -> tuple[Grant, ...]:
     """Return the tokens of the users, who are needed where others can reach the service."""
-    loopback = _is_loopback(arguments.host)
-    if arguments.tokens is None and not (loopback and arguments.public is None):
-        where = f"--host {arguments.host}" if not loopback else f"--public {arguments.public}"
-        raise ConfigError(f"{where}: others can reach it; give --tokens FILE, which has a token for each user")
-    if arguments.public is not None and not _is_site(arguments.public):
-        raise ConfigError(f"--public {arguments.public}: must be like https://twins.example.com, without a path")
-    return () if arguments.tokens is None else read_tokens(arguments.tokens)
+    if arguments.tokens is None and not _is_loopback(arguments.host):
+        raise ConfigError(f"--host {arguments.host}: {NEEDS_TOKENS}")
+    return grants_of(arguments.tokens, arguments.public)
 
 
 def door_of(arguments: ServiceOptions, grants: tuple[Grant, ...] | None = None) -> Door:
@@ -156,6 +154,8 @@ def _named(given: tuple[str, ...]) -> tuple[dict[str, str], TwinFolder | None]:
             raise ConfigError(f"{text}: is a folder; give it alone, or files")
         if text not in shipped() and not Path(text).is_file():
             raise ConfigError(f"{text}: there is no such file or bundled twin; check the path")
+        if is_blank(name):
+            raise ConfigError(f"{quoted(text)}: {BLANK}")
         if name in found:
             raise ConfigError(f"{text}: a twin is called {name} already; rename the file")
         found[name] = text
@@ -167,14 +167,6 @@ def _is_loopback(host: str) -> bool:
         return host == "localhost" or ipaddress.ip_address(host).is_loopback
     except ValueError:
         raise ConfigError(f"--host {host}: must be an IP address, such as 0.0.0.0 for all of this machine") from None
-
-
-def _is_site(text: str) -> bool:
-    try:
-        parts = urlsplit(text)
-    except ValueError:
-        return False
-    return parts.scheme in ("http", "https") and bool(parts.netloc) and not (parts.path or parts.query)
 
 
 def run_child(open_: OpenTwin, json: bool, name: str, path: str, pipe: Connection) -> None:
@@ -240,8 +232,9 @@ def _opened(options: TwinPlaces, name: str, path: str) -> Opened:
     read = partial(opened_twin, path, store=store, archive=options.archive, split=options.split)
     opener = FileOpener({path: read})
     opening = opener.made_ready(read())
+    page = Page(0, False, overview="../../", site=f"{options.site}/twins/{quote(name, safe='')}")
     session = open_session(
-        opening, StartRequest(path), opener, page=Page(0, False, overview="../../"),
+        opening, StartRequest(path), opener, page=page,
         recordings=options.recordings / name, printed=True,
     )  # fmt: skip
     return Opened(session, asdict(card_of(path, opening.twin)), partial(report_of, session))

@@ -6,7 +6,8 @@ import json
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
@@ -14,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
-from estimators.errors import NisusError, SourceError, quoted
+from estimators.errors import NisusError, SourceError, is_blank, quoted
 from estimators.fleet.table import FleetTable
 from estimators.log import BEFORE
 from estimators.track import STALE
@@ -65,6 +66,9 @@ class EventSink(Protocol):
 
     def put(self, at: np.ndarray, events: Events) -> None:
         """Take events of the assets at the positions `at` (N,), at once."""
+
+    def written(self, rows: Sequence[tuple[np.ndarray, Events]]) -> AbstractContextManager[Mapping[str, Any]]:
+        """Write events for a transaction of the store in this context; yield what that must have."""
 
     def start(self) -> None:
         """Begin."""
@@ -131,6 +135,8 @@ class RunningFleet:
         self._due, self._asked, self._kept = 0.0, False, -1
         self._unwritten = False
         """Whether the store could not be written at the last attempt."""
+        self.archived: Mapping[str, Any] | None = None
+        """What the store has of the archive; None without it."""
         self._store = None if store is None else Store(store)
         try:
             # Each process reads all rows of tables; one reports those that cannot be used.
@@ -198,6 +204,7 @@ class RunningFleet:
         except Exception as error:  # noqa: BLE001  the overview stays, and says why nothing is folded any more
             self.failure = str(error) if isinstance(error, NisusError) else f"{type(error).__name__}: {error}"
             self.note(STOPPED, f"the fleet stands still: {self.failure}")
+            self.source.close()  # senders and brokers keep what would not be folded
 
     def step(self) -> bool:
         """Read the next events and fold what waits; return False at the end of the source."""
@@ -234,7 +241,7 @@ class RunningFleet:
         with self._lock:
             self._silent.put_back(np.unique(at))
             self.fleet.add_events(at, events)
-        if self.archive is not None:
+        if self.archive is not None and at.size:
             self._unarchived.append((at, events))
         self._changed.update(np.unique(at // BLOCK).tolist())
         np.maximum.at(self._last, at, events.t)
@@ -244,6 +251,9 @@ class RunningFleet:
         place = self._places.get(name)
         if place is not None:
             return place
+        if is_blank(name):
+            self.note(NO_ASSET, f"{self.plan.path.name}: asset {quoted(name)} is blank; name it in the source")
+            return UNKNOWN
         if not self.partition.has(name):
             return FOREIGN if self._given is None or name in self._given else UNKNOWN
         if self._most is not None and len(self.names) >= self._most:
@@ -295,13 +305,16 @@ class RunningFleet:
         self._asked = False
         state = self._identity() | {"newest": self._newest, "counts": self.counts, "names": self.names}
         state["source"] = source.numbers(mark) if isinstance(source, Marked) else {}
-        blocks = {("state", 0): json.dumps(state).encode()}
+        blocks: dict[tuple[str, int], bytes] = {}
         for number in sorted(self._changed):
             part = slice(number * BLOCK, min(len(self.names), (number + 1) * BLOCK))
             blocks["assets", number] = self._silent.state(part)
             blocks["last", number] = self._last[part].tobytes()
+        rows, self._unarchived = self._unarchived, []
         try:
-            self._store.write_blocks(blocks)
+            # Before: a kill loses no row that the store has. Messages that it has not come again.
+            with nullcontext(self.archived) if self.archive is None else self.archive.written(rows) as state["archive"]:
+                self._store.write_blocks(blocks | {("state", 0): json.dumps(state).encode()})
         except SourceError as error:
             if at_once:
                 raise
@@ -314,14 +327,12 @@ class RunningFleet:
             self._report(STORE, f"store {self._store.path}: it is written again")
         self._changed.clear()
         self._kept = mark
-        # Not before: after a kill, messages that are not in the store come again.
-        self._hand_over()
         if isinstance(source, Acknowledging):
             source.acknowledge()
         self._due = begun + max(STORE_PERIOD_S, (time.monotonic() - begun) / STORE_SHARE)
 
     def _hand_over(self) -> None:
-        """Pass the events that count to the archive."""
+        """Pass the events to the archive, without the store."""
         if self.archive is not None:
             for at, events in self._unarchived:
                 self.archive.put(at, events)
@@ -343,7 +354,7 @@ class RunningFleet:
                 elif kind == "last":
                     times = np.frombuffer(data, np.int64)
                     self._last[number * BLOCK : number * BLOCK + times.size] = times
-            self._newest = state["newest"]
+            self._newest, self.archived = state["newest"], state.get("archive")
             self.counts.update(state["counts"])
         if isinstance(self.source, Marked):
             self.source.restore(state.get("source", {}))

@@ -19,6 +19,7 @@ from estimators.errors import NisusError
 from ..live.jobs import Jobs
 from ..live.outputs import OutputLink
 from ..present.state_message import StateMessage, state_message
+from ..twin.secrets import secrets_of
 from .alerts import AlertRules
 from .receivers import Deliveries
 
@@ -123,6 +124,7 @@ class Publisher:
     def _make(self) -> Parts:
         twin, notices = self._engine.twin, self._engine.notices
         section, rules = twin.config.outputs, twin.config.alerts
+        secrets = secrets_of(section, twin.loaded.places)
         mqtt = None
         if section.mqtt is not None:
             from .mqtt import JsonTopics, MqttOutput
@@ -133,17 +135,17 @@ class Publisher:
                 if section.mqtt.sparkplug is None
                 else SparkplugNode(section.mqtt.sparkplug, self._engine)
             )
-            mqtt = MqttOutput(section.mqtt, twin.name, form, notices)
+            mqtt = MqttOutput(section.mqtt, twin.name, form, notices, secrets)
         outputs: list[Output] = [] if mqtt is None else [mqtt]
         if section.opcua is not None:
             from .opcua import OpcUaOutput
 
-            outputs.append(OpcUaOutput(section.opcua, self._engine))
+            outputs.append(OpcUaOutput(section.opcua, self._engine, secrets))
         if section.can is not None:
             from .can import CanOutput
 
             outputs.append(CanOutput(section.can, self._engine, twin.path.absolute().parent))
-        deliveries = Deliveries(section.receivers, twin.path.absolute().parent, mqtt, notices)
+        deliveries = Deliveries(section.receivers, twin.path.absolute().parent, mqtt, notices, secrets)
         if deliveries.queues and not rules:
             rules = (HEALTH_RULE,)
         jobs = Jobs(notices, "output", threads=1 + len(deliveries.queues), niceness=0)

@@ -15,6 +15,7 @@ from ..live.jobs import Jobs
 from ..live.notices import Notices
 from ..present.fleet_state import ChangedAssets, asset_message
 from ..terminal import print_line
+from ..twin.secrets import secrets_of
 from .fleet_alerts import FleetRules
 from .receivers import Deliveries
 
@@ -61,14 +62,15 @@ class FleetPublisher:
         self.notices = Notices(time.time_ns)
         self._next_line = 0
         folder = plan.path.absolute().parent
+        secrets = secrets_of(section, plan.source.loaded.places)
         self._mqtt: MqttOutput | None = None
         self._changed, self._connections = ChangedAssets(), 0
         if section.mqtt is not None:
             from .mqtt import JsonTopics, MqttOutput
 
             form = JsonTopics(section.mqtt.prefix, plan.name, lambda: plan.twin.model, of_assets=True)
-            self._mqtt = MqttOutput(section.mqtt, plan.name, form, self.notices)
-        self._deliveries = Deliveries(section.receivers, folder, self._mqtt, self.notices)
+            self._mqtt = MqttOutput(section.mqtt, plan.name, form, self.notices, secrets)
+        self._deliveries = Deliveries(section.receivers, folder, self._mqtt, self.notices, secrets)
         self._rules = FleetRules(rules or (HEALTH_RULE,), plan.name, link=page)
         self._jobs = Jobs(self.notices, "output", threads=max(1, len(self._deliveries.queues)), niceness=0)
         self._stopping = threading.Event()

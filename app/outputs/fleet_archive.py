@@ -1,16 +1,18 @@
 """Archive of a fleet: the measurements of all assets in Parquet files, and the history of one asset from them.
 
-Rows are appended to a journal once per second. A journal that is complete becomes a Parquet file whose rows are in the
-order of the assets, so that the rows of one asset are in one or two groups of each file. A killed process leaves its
-journal, which the next one completes.
+Rows are appended to a journal once per second, or before each transaction of the fleet's store, which has the length of
+the journal. A journal that is complete becomes a Parquet file whose rows are in the order of the assets, so that the
+rows of one asset are in one or two groups of each file. A killed process leaves its journal, which the next one cuts to
+the length in the store, as the rows behind come again, and completes.
 """
 
 from __future__ import annotations
 
+import os
 import threading
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -34,25 +36,42 @@ MAX_WAITING = 2_000_000
 JOURNAL = ".arrows"
 """Ending of a journal: a stream of Arrow batches, named by the number of its Parquet file."""
 
+STORE = b"store"
+"""Key in the metadata of a journal: the id of the store that has its length."""
+
 
 class FleetArchive:
-    """Writes the events of a fleet from a thread of its own, so that the fold never waits for the disk."""
+    """Writes the events of a fleet from a thread of its own, so that the fold waits for the disk only with a store."""
 
-    def __init__(self, plan: ArchivePlan, model: StateSpaceModel, names: Sequence[str], report: Report) -> None:
+    def __init__(
+        self,
+        plan: ArchivePlan,
+        model: StateSpaceModel,
+        names: Sequence[str],
+        report: Report,
+        stored: Mapping[str, Any] | None = None,
+    ) -> None:
         """Prepare; nothing is written yet.
 
         Args:
             plan: Folder, and the limits of its files.
             model: Model of the assets.
             names: Names of the assets by position; may grow.
-            report: Called as report(key, text) for what cannot be written, from the thread of the archive.
+            report: Called as report(key, text) for what cannot be written, also from the thread of the archive.
+            stored: What the store had of `written`; empty or None without it.
         """
         self._folder, self._split = plan
         self._model, self._names, self._report = model, names, report
+        self._stored: dict[str, Any] = {"store": os.urandom(8).hex(), "number": 0, "end": 0} | dict(stored or {})
+        """Id of the store, number of the journal that was written with it last, and its length."""
         self._waiting: list[tuple[np.ndarray, Events]] = []
         self._count = self._dropped = 0
         self._lock = threading.Lock()
         self._journal: Journal | None = None
+        self._writing = threading.Lock()
+        """Held while the journal changes, and until the store has its length."""
+        self._ended: list[Path] = []
+        """Journals that become Parquet files."""
         self._begun = self._failed = False
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name="archive", daemon=True)
@@ -82,19 +101,42 @@ class FleetArchive:
             pause = self.look()
         self.look(closing=True)
 
+    @contextmanager
+    def written(self, rows: Sequence[tuple[np.ndarray, Events]]) -> Iterator[Mapping[str, Any]]:
+        """Append events of assets at positions (N,) to the journal, for a transaction of the store in this context.
+
+        Yields what the transaction must have: a process that continues from it cuts the journal there. Rows that cannot
+        be written wait, as with `put`.
+        """
+        with self._writing:
+            try:
+                self._begin()
+                if rows:
+                    self._append(rows, self._stored["store"])
+                    assert self._journal is not None
+                    self._stored |= {"number": self._journal.number, "end": self._journal.sync()}
+            except Exception as error:  # noqa: BLE001  as in `look`
+                self._fail(error)
+                for at, events in rows:
+                    self.put(at, events)
+            yield self._stored
+
     def look(self, *, closing: bool = False) -> float:
         """Write the rows that wait, and with `closing` complete the file; return the seconds to the next time."""
         try:
-            if not self._begun:
-                self._begun = True
-                complete_journals(self._folder)
-            self._write(closing)
+            with self._writing:
+                self._begin()
+                self._write()
+                journal, split = self._journal, self._split
+                if journal is not None and (closing or journal.size >= split.size or journal.age >= split.seconds):
+                    self._end()
+            if self._ended:
+                while self._ended:
+                    complete_journal(self._ended[0])
+                    del self._ended[0]
+                remove_surplus(self._folder, self._split, self._report)
         except Exception as error:  # noqa: BLE001  whatever a file system does, the fleet goes on
-            if not self._failed:
-                reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
-                text = f"archive {self._folder}: cannot be written ({reason}); the fleet goes on, and tries again"
-                self._report("archive", text)
-            self._failed = True
+            self._fail(error)
             return RETRY_PERIOD_S
         with self._lock:
             dropped, self._dropped = self._dropped, 0
@@ -103,39 +145,51 @@ class FleetArchive:
         self._failed = False
         return WRITE_PERIOD_S
 
-    def _write(self, closing: bool) -> None:
+    def _fail(self, error: Exception) -> None:
+        if not self._failed:
+            reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
+            text = f"archive {self._folder}: cannot be written ({reason}); the fleet goes on, and tries again"
+            self._report("archive", text)
+        self._failed = True
+
+    def _begin(self) -> None:
+        """Cut the journal of a process before this one, and complete all."""
+        if not self._begun:
+            complete_journals(self._folder, self._stored)
+            self._begun = True
+
+    def _write(self) -> None:
         with self._lock:
             rows = self._waiting[:]
-        split = self._split
         if rows:
-            at, events = np.concatenate([at for at, _ in rows]), Events.concat([e for _, e in rows], self._model.width)
-            day = int(events.t.max()) // DAY_NS
-            if self._journal is not None and split.daily and day > self._journal.day:
-                self._finish()
-            if self._journal is None:
-                complete_journals(self._folder)  # one that failed
-                remove_surplus(self._folder, split, self._report)
-                self._journal = Journal(self._folder, day)
-            try:
-                self._journal.write(rows_of(self._model, self._names, at, events))
-            except BaseException:
-                self._journal.abandon()
-                self._journal = None
-                raise
+            self._append(rows, "")
             with self._lock:
                 del self._waiting[: len(rows)]
-                self._count -= len(events)
-        journal = self._journal
-        if journal is not None and (closing or journal.size >= split.size or journal.age >= split.seconds):
-            self._finish()
+                self._count -= sum(len(events) for _, events in rows)
 
-    def _finish(self) -> None:
-        """Complete the journal, and remove the oldest files beyond the limits."""
+    def _append(self, rows: Sequence[tuple[np.ndarray, Events]], store: str) -> None:
+        """Write rows to the journal of a store, or of none; that of a new day or of another store is a new one."""
+        at, events = np.concatenate([at for at, _ in rows]), Events.concat([e for _, e in rows], self._model.width)
+        day = int(events.t.max()) // DAY_NS
+        known = self._journal
+        if known is not None and (known.store != store or (self._split.daily and day > known.day)):
+            self._end()
+        if self._journal is None:
+            self._journal = Journal(self._folder, day, store)
+        try:
+            self._journal.write(rows_of(self._model, self._names, at, events))
+        except BaseException:
+            self._journal.abandon()
+            self._ended.append(self._journal.path)
+            self._journal = None
+            raise
+
+    def _end(self) -> None:
+        """End the journal."""
         assert self._journal is not None
         self._journal.close()
+        self._ended.append(self._journal.path)
         self._journal = None
-        complete_journals(self._folder)
-        remove_surplus(self._folder, self._split, self._report)
 
 
 def rows_of(model: StateSpaceModel, names: Sequence[str], at: np.ndarray, events: Events) -> Any:
@@ -162,20 +216,26 @@ def rows_of(model: StateSpaceModel, names: Sequence[str], at: np.ndarray, events
 class Journal:
     """Rows of a file that is not complete, in the order of arrival."""
 
-    def __init__(self, folder: Path, day: int) -> None:
-        """Open it under the number of the next Parquet file; `day` is that of its first rows.
+    def __init__(self, folder: Path, day: int, store: str) -> None:
+        """Open it under the number of the next Parquet file.
+
+        Args:
+            folder: Of the archive.
+            day: That of its first rows.
+            store: Id of the store that has its length, or empty.
 
         Raises:
             OSError: If that is not possible.
-            SourceError: If another process writes into the folder.
         """
         folder.mkdir(parents=True, exist_ok=True)
-        number = max(map(number_of, parts_of(folder)), default=0) + 1
-        self._file = (folder / f"{number:06d}{JOURNAL}").open("xb")
+        taken = [*map(number_of, parts_of(folder)), *(int(path.stem) for path in folder.glob(f"*{JOURNAL}"))]
+        self.number = max(taken, default=0) + 1
+        self.path = folder / f"{self.number:06d}{JOURNAL}"
+        self._file = self.path.open("xb")
         lock(self._file)
         self._writer: Any = None
         self._begun, self._end = time.monotonic(), 0
-        self.day = day
+        self.day, self.store = day, store
 
     @property
     def size(self) -> int:
@@ -192,10 +252,15 @@ class Journal:
         import pyarrow as pa
 
         if self._writer is None:
-            self._writer = pa.ipc.new_stream(self._file, table.schema)
+            self._writer = pa.ipc.new_stream(self._file, table.schema.with_metadata({STORE: self.store}))
         self._writer.write_table(table)
         self._file.flush()
         self._end = self._file.tell()
+
+    def sync(self) -> int:
+        """Have the rows on the disk, as those of a store are, and return the size."""
+        os.fsync(self._file.fileno())
+        return self._end
 
     def abandon(self) -> None:
         """Close it after a failure; the rows before that are read."""
@@ -208,42 +273,59 @@ class Journal:
         self._file.close()
 
 
-def complete_journals(folder: Path) -> None:
-    """Make a Parquet file of each journal, with its rows in the order of the assets.
+def complete_journals(folder: Path, stored: Mapping[str, Any] | None = None) -> None:
+    """Make a Parquet file of each journal; those of a store are cut to the length that it has.
+
+    Args:
+        folder: Of the archive.
+        stored: See `FleetArchive.written`.
 
     Raises:
         OSError: If that is not possible.
         SourceError: If the disk is nearly full, or another process writes into the folder.
     """
+    for path in sorted(folder.glob(f"*{JOURNAL}")):
+        complete_journal(path, stored)
+
+
+def complete_journal(path: Path, stored: Mapping[str, Any] | None = None) -> None:
+    """Make a Parquet file of a journal, with its rows in the order of the assets; see `complete_journals`."""
     import pyarrow.compute as pc
 
-    for path in sorted(folder.glob(f"*{JOURNAL}")):
-        with path.open("rb") as file:
-            if not lock(file):
-                raise SourceError("another process writes into it; choose another folder")
-            table = read_journal(path)
-            complete = int(path.stem) in map(number_of, parts_of(folder))  # the process ended before the journal's end
-            if table is not None and not complete:
-                t = int(table["t_ns"][0].as_py())
-                part = Part(folder)
-                try:
-                    order = pc.sort_indices(table, sort_keys=[("asset", "ascending")])  # stable
-                    part.write(table.take(order), 0, t, t // DAY_NS)
-                    part.close()
-                except BaseException:
-                    part.abandon()
-                    raise
-            path.unlink()
+    folder, number = path.parent, int(path.stem)
+    with path.open("rb") as file:
+        if not lock(file):
+            raise SourceError("another process writes into it; choose another folder")
+        table = read_journal(path)
+        if table is not None and stored is not None:
+            own = (table.schema.metadata or {}).get(STORE, b"").decode()
+            if own == stored["store"] and number >= stored["number"]:
+                table = read_journal(path, stored["end"] if number == stored["number"] else 0)
+        complete = number in map(number_of, parts_of(folder))  # the process ended before the journal's end
+        if table is not None and not complete:
+            table, t = table.replace_schema_metadata(), int(table["t_ns"][0].as_py())
+            part = Part(folder, number)
+            try:
+                order = pc.sort_indices(table, sort_keys=[("asset", "ascending")])  # stable
+                part.write(table.take(order), 0, t, t // DAY_NS)
+                part.close()
+            except BaseException:
+                part.abandon()
+                raise
+        path.unlink()
 
 
-def read_journal(path: Path) -> Any:
-    """Return the rows of a journal, which may be written to at present, as a pyarrow.Table; None without any."""
+def read_journal(path: Path, end: int | None = None) -> Any:
+    """Return the rows of a journal, which may be written to at present, as a pyarrow.Table; None without any.
+
+    With `end` its first bytes are read, to the end of a batch.
+    """
     import pyarrow as pa
 
     batches = []
     try:
         with path.open("rb") as file, pa.ipc.open_stream(file) as stream:
-            while True:
+            while end is None or file.tell() < end:
                 batches.append(stream.read_next_batch())
     except (StopIteration, OSError, pa.ArrowInvalid):  # the end, or a batch that is not complete
         pass

@@ -11,8 +11,9 @@ from estimators.errors import printable
 
 from ..live.outputs import OutputLink
 from ..present.state_message import StateMessage, iso_now, state_schema
+from ..twin.secrets import Secrets
 from .alerts import AlertMessage
-from .receivers import TIMEOUT_S, secret
+from .receivers import TIMEOUT_S
 from .sparkplug import Packet, SparkplugNode
 
 if TYPE_CHECKING:
@@ -93,7 +94,9 @@ class MqttOutput:
 
     name = "mqtt"
 
-    def __init__(self, section: MqttSection, name: str, form: JsonTopics | SparkplugNode, notices: Notices) -> None:
+    def __init__(
+        self, section: MqttSection, name: str, form: JsonTopics | SparkplugNode, notices: Notices, secrets: Secrets
+    ) -> None:
         """Prepare; nothing is connected yet.
 
         Args:
@@ -101,9 +104,10 @@ class MqttOutput:
             name: Name of the twin or fleet.
             form: Its messages.
             notices: Where problems are reported.
+            secrets: See `secrets_of`.
 
         Raises:
-            ConfigError: If paho-mqtt or a secret is missing.
+            ConfigError: If paho-mqtt is missing.
         """
         from sources.brokers import mqtt_client
 
@@ -111,7 +115,7 @@ class MqttOutput:
         self._alerts = f"{section.prefix}/{name}/{ALERT}"
         self._ordered = threading.Lock()
         """Held from making a message to handing it to the client, as Sparkplug numbers them."""
-        password = None if section.password_env is None else secret(section.password_env)
+        password = None if section.password_env is None else secrets[section.password_env]
         self.client: Any = mqtt_client(section, password, client_id=f"nisus-{name}")
         self.client.on_pre_connect = self._connecting
         self.client.on_message = self._command

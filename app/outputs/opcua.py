@@ -14,7 +14,7 @@ from estimators.errors import ConfigError, printable
 
 from ..live.outputs import OutputLink
 from ..present.state_message import PublishedState, StateMessage
-from .receivers import secret
+from ..twin.secrets import Secrets
 
 if TYPE_CHECKING:
     from config.output_schema import OpcUaSection
@@ -43,11 +43,11 @@ class OpcUaOutput:
 
     name = "opcua"
 
-    def __init__(self, section: OpcUaSection, engine: Running) -> None:
+    def __init__(self, section: OpcUaSection, engine: Running, secrets: Secrets) -> None:
         """Prepare; the port is not open yet.
 
         Raises:
-            ConfigError: If asyncua or the password is missing.
+            ConfigError: If asyncua is missing.
         """
         try:
             import asyncua  # noqa: F401
@@ -55,7 +55,7 @@ class OpcUaOutput:
             raise ConfigError("OPC UA needs asyncua: pip install 'nisus[service]'") from None
         logging.getLogger("asyncua").setLevel(logging.CRITICAL)
         self._section, self._engine = section, engine
-        self._password = None if section.password_env is None else secret(section.password_env)
+        self._password = None if section.password_env is None else secrets[section.password_env]
         self._loop = asyncio.new_event_loop()
         self._stopping, self._fresh = asyncio.Event(), asyncio.Event()
         self._message: StateMessage | None = None

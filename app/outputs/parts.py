@@ -61,8 +61,12 @@ def remove_surplus(folder: Path, split: Split, report: Report) -> None:
 class Part:
     """File that is being written."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, number: int | None = None) -> None:
         """Open it under a number that is not taken.
+
+        Args:
+            folder: Of the archive.
+            number: Its number; None for the next one.
 
         Raises:
             OSError: If that is not possible.
@@ -76,7 +80,7 @@ class Part:
             left.unlink(missing_ok=True)  # of a process that was killed
         if Disk(folder).free() < 0:
             raise SourceError("the disk is nearly full; free some space")
-        self._number = max(map(number_of, parts_of(folder)), default=0) + 1
+        self._number = number or max(map(number_of, parts_of(folder)), default=0) + 1
         self._path = folder / f"{self._number:06d}.parquet{OPEN}"
         self._file = self._path.open("xb")
         lock(self._file)

@@ -9,7 +9,6 @@ from __future__ import annotations
 import hashlib
 import hmac
 import math
-import os
 import smtplib
 import socket
 import ssl
@@ -29,10 +28,11 @@ from urllib.error import HTTPError, URLError
 from urllib.request import HTTPHandler, HTTPRedirectHandler, HTTPSHandler, Request, build_opener
 
 from config.output_schema import CommandSection, EmailSection, WebhookSection
-from estimators.errors import ConfigError, printable
+from estimators.errors import printable
 
 from ..live.jobs import Job, Jobs
 from ..live.notices import Notices
+from ..twin.secrets import NO_SECRETS, Secrets
 from .alerts import FIRING, HEARTBEAT, AlertMessage, heartbeat
 
 MAX_WAITING_ALERTS = 100
@@ -129,9 +129,9 @@ class SecureConnection(HTTPSConnection, PlainConnection):
 class Webhook:
     """Sends alerts by POST; the signature is that of the time, a dot, and the body."""
 
-    def __init__(self, section: WebhookSection) -> None:
-        self._url = secret(section.url[1:]) if section.url.startswith("$") else section.url
-        self._key = None if section.secret_env is None else secret(section.secret_env).encode()
+    def __init__(self, section: WebhookSection, secrets: Secrets = NO_SECRETS) -> None:
+        self._url = secrets[section.url[1:]] if section.url.startswith("$") else section.url
+        self._key = None if section.secret_env is None else secrets[section.secret_env].encode()
 
     def send(self, alert: AlertMessage) -> None:
         """See `Receiver`."""
@@ -180,9 +180,9 @@ class SecureMail(smtplib.SMTP_SSL, PlainMail):
 class Mail:
     """Sends alerts as e-mail."""
 
-    def __init__(self, section: EmailSection) -> None:
+    def __init__(self, section: EmailSection, secrets: Secrets = NO_SECRETS) -> None:
         self._section = section
-        self._password = None if section.password_env is None else secret(section.password_env)
+        self._password = None if section.password_env is None else secrets[section.password_env]
 
     def send(self, alert: AlertMessage) -> None:
         """See `Receiver`."""
@@ -234,18 +234,6 @@ class CommandReceiver:
             raise OSError(f"it did not end within {self._timeout:g} s") from None
         if code:
             raise OSError(f"it ended with {code}{': ' if last else ''}{last}")
-
-
-def secret(name: str) -> str:
-    """Return the value of an environment variable.
-
-    Raises:
-        ConfigError: If it is not set.
-    """
-    value = os.environ.get(name)
-    if not value:
-        raise ConfigError(f"outputs: the environment variable {name} is not set; set it before the twin starts")
-    return value
 
 
 class Delivery:
@@ -311,7 +299,9 @@ class Delivery:
 class Deliveries:
     """Queues of all receivers, and their messages that a twin or fleet runs."""
 
-    def __init__(self, sections: Mapping[str, Any], folder: Path, mqtt: Receiver | None, notices: Notices) -> None:
+    def __init__(
+        self, sections: Mapping[str, Any], folder: Path, mqtt: Receiver | None, notices: Notices, secrets: Secrets
+    ) -> None:
         """Make the receivers.
 
         Args:
@@ -319,14 +309,11 @@ class Deliveries:
             folder: Folder of the YAML.
             mqtt: Receiver of type mqtt.
             notices: Where alerts and failures are reported.
-
-        Raises:
-            ConfigError: If a secret is not in the environment.
+            secrets: See `secrets_of`.
         """
         self._notices = notices
-        self.queues = {
-            name: Delivery(name, item, notices) for name, item in make_receivers(sections, folder, mqtt).items()
-        }
+        made = make_receivers(sections, folder, mqtt, secrets)
+        self.queues = {name: Delivery(name, item, notices) for name, item in made.items()}
         periods = {name: getattr(item, "heartbeat", None) for name, item in sections.items()}
         self._periods = {name: period for name, period in periods.items() if period is not None}
         self._beats: dict[str, float] = {}
@@ -351,18 +338,16 @@ class Deliveries:
             jobs.run(f"alerts to {queue.name}", queue.step, every=every)
 
 
-def make_receivers(sections: Mapping[str, Any], folder: Path, mqtt: Receiver | None) -> dict[str, Receiver]:
-    """Return the receivers by name.
-
-    Raises:
-        ConfigError: If a secret is not in the environment, or there is no broker.
-    """
+def make_receivers(
+    sections: Mapping[str, Any], folder: Path, mqtt: Receiver | None, secrets: Secrets
+) -> dict[str, Receiver]:
+    """Return the receivers by name."""
     found: dict[str, Receiver] = {}
     for name, section in sections.items():
         if isinstance(section, WebhookSection):
-            found[name] = Webhook(section)
+            found[name] = Webhook(section, secrets)
         elif isinstance(section, EmailSection):
-            found[name] = Mail(section)
+            found[name] = Mail(section, secrets)
         elif isinstance(section, CommandSection):
             found[name] = CommandReceiver(section, folder)
         elif mqtt is not None:

@@ -11,7 +11,7 @@ import numpy as np
 
 from config.fleet_schema import AssetTuningsSection
 from config.yaml_files import ValuePlaces, shown_path
-from estimators.errors import ConfigError, SourceError, nearest, quoted
+from estimators.errors import ConfigError, SourceError, is_blank, nearest, quoted
 from estimators.fleet.tunings import GROUPS
 from estimators.tuning import Tuning
 from sources.tables.text import csv_format, open_text
@@ -79,6 +79,9 @@ def asset_values(
             _check_key(key, tuning, place)
             cells.setdefault(asset, {})[key] = (value, place)
     names = tuple(cells if assets is None else assets)
+    if blank := [asset for asset in cells if is_blank(asset)]:
+        place = next((where for _, where in cells[blank[0]].values()), shown_path(path))
+        raise ConfigError(f"{place}: asset {quoted(blank[0])} is blank; give it a visible name")
     known = set(names)
     for asset, own in cells.items():
         if asset not in known:

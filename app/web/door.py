@@ -201,6 +201,7 @@ class Door:
         host: str = LOOPBACK,
         public: str | None = None,
         overview: str | None = None,
+        site: str | None = None,
     ) -> None:
         """Take the port; 0 takes a free one.
 
@@ -210,12 +211,15 @@ class Door:
             host: Address to listen on.
             public: Address, https://HOST, at which a reverse proxy offers the page.
             overview: Address of the overview of a service, which passes requests on to this port.
+            site: Address of the page at that service.
 
         Raises:
             ConfigError: If the port is not free.
         """
         self.sockets, localhost = listen(port, host)
         self.port = int(self.sockets[0].getsockname()[1])
+        self.site = site or public or f"http://{LOOPBACK}:{self.port}"
+        """Address of the page for users, without the token."""
         self.token = secrets.token_urlsafe(32)
         self._shown = ShownApplication(self._no_twin, uuid.uuid4().hex)
         self._page: ASGIApp | None = None

@@ -150,6 +150,12 @@ class FleetApi:
                 self._orders.popitem(last=False)
         return found
 
+    def unready(self) -> str:
+        """Return why the assets are not followed, not yet or not any more; empty if they are."""
+        running = self._running
+        reason = running.failure or (running.starting if isinstance(running, PartitionedFleet) else "")
+        return reason or ("" if running.table()[2].events.any() else "no measurement has arrived")
+
     def metrics(self) -> Response:
         """Answer with the counts of assets by health in the text format of Prometheus."""
         return exposed(_Collector(self._running))

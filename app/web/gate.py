@@ -20,6 +20,7 @@ import threading
 from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import NamedTuple
+from urllib.parse import urlsplit
 
 from starlette.datastructures import Headers, MutableHeaders, QueryParams
 from starlette.responses import HTMLResponse, PlainTextResponse, RedirectResponse
@@ -30,6 +31,9 @@ from estimators.errors import ConfigError, nearest, shown_name
 LOOPBACK_HOST = re.compile(r"(127\.0\.0\.1|localhost|\[::1\])(:\d{1,5})?", re.IGNORECASE)
 
 STAGE = "/viser/"
+
+NEEDS_TOKENS = "others can reach it; give --tokens FILE, which has a token for each user"
+"""Rule of addresses other than this machine's."""
 
 OPEN_PATHS = ("/healthz", "/readyz")
 """For supervisors of processes, which have no token: such a request has no `User`, and gets the status only."""
@@ -81,6 +85,27 @@ USER = "nisus.user"
 
 SESSION = "session"
 """Name of a user who has the session's own token, such as that of the page."""
+
+
+def grants_of(tokens: Path | None, public: str | None) -> tuple[Grant, ...]:
+    """Return the tokens of a file, which a page with a public address needs.
+
+    Raises:
+        ConfigError: If there is none, the address is no site, or the file cannot be used.
+    """
+    if public is not None and tokens is None:
+        raise ConfigError(f"--public {public}: {NEEDS_TOKENS}")
+    if public is not None and not _is_site(public):
+        raise ConfigError(f"--public {public}: must be like https://twins.example.com, without a path")
+    return () if tokens is None else read_tokens(tokens)
+
+
+def _is_site(text: str) -> bool:
+    try:
+        parts = urlsplit(text)
+    except ValueError:
+        return False
+    return parts.scheme in ("http", "https") and bool(parts.netloc) and not (parts.path or parts.query)
 
 
 def read_tokens(path: Path) -> tuple[Grant, ...]:

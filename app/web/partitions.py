@@ -33,7 +33,7 @@ from . import readings
 from .door import Door
 from .http import Json
 from .request_threads import in_thread
-from .supervisor import FAILED, Child, ServedTwin, Supervisor
+from .supervisor import FAILED, RUNNING, Child, ServedTwin, Supervisor
 
 TIMEOUT_S = 30.0
 """Longest wait for the answer of a process."""
@@ -175,6 +175,12 @@ class PartitionedFleet:
         """Why a partition does not run, or empty."""
         failed = [part.twin for part in self._parts if part.twin.state == FAILED]
         return f"{failed[0].name}: {failed[0].text}" if failed else ""
+
+    @property
+    def starting(self) -> str:
+        """The partitions that do not run yet, or empty."""
+        waiting = [part.twin.name for part in self._parts if part.twin.state != RUNNING]
+        return f"starting: {', '.join(waiting)}" if waiting else ""
 
     @property
     def counts(self) -> Counter[str]:

@@ -14,7 +14,7 @@ from starlette.responses import PlainTextResponse, Response
 from starlette.routing import BaseRoute, Route
 
 from estimators.errors import ConfigError, shown_name
-from sources.messages import ACCEPTED, DUPLICATE, REFUSED, Answer, Messages
+from sources.messages import ACCEPTED, CLOSED, DUPLICATE, REFUSED, Answer, Messages
 
 from ..live.running_fold import Keeper
 from ..twin.twin import Twin
@@ -62,11 +62,6 @@ def routes(engine: Receiver, take: Take | None = None) -> list[BaseRoute]:
         source = messages_of(engine)
         return {"values": [{"name": name, "unit": source.units.get(name)} for name in source.names]}
 
-    async def taken(messages: Sequence[Any]) -> dict[str, Any]:
-        source = messages_of(engine)
-        found = await in_thread(lambda: answer(source, messages))
-        return found | {"stored": await stored(engine, source.accepted)}
-
     async def send(request: Request) -> Response:
         """Take measurements; answer what became of each."""
         kind = request.headers.get("content-type", "").partition(";")[0].strip()
@@ -80,7 +75,7 @@ def routes(engine: Receiver, take: Take | None = None) -> list[BaseRoute]:
             body = await bounded_body(request, MAX_BYTES)
             messages = await in_thread(lambda: READERS[kind](body, source.fields))
             _check_count(len(messages))
-            return Json(await (take or taken)(messages))
+            return Json(await (take(messages) if take else send_to(engine, messages)))
         except TooLarge:
             bounds = f"{MAX_BYTES // 2**20} MB and {MAX_MESSAGES:,} messages"
             return PlainTextResponse(f"Nisus: a body may have {bounds}; send fewer messages at once.\n", 413)
@@ -103,14 +98,14 @@ def messages_of(engine: Receiver) -> Messages:
     return source
 
 
-def answer(source: Messages, messages: Sequence[Any]) -> dict[str, Any]:
-    """Send messages; return what became of each, and the counts.
-
-    Raises:
-        TooLarge: If they are too many; none is sent then.
-    """
-    _check_count(len(messages))
-    return summary(source.send(messages))
+async def send_to(engine: Receiver, messages: Sequence[Any]) -> dict[str, Any]:
+    """Send messages; return what became of each, the counts, and whether the store has them."""
+    source = messages_of(engine)
+    answers = await in_thread(lambda: source.send(messages))
+    kept = await stored(engine, source.accepted)
+    if source.closed and not kept:  # meanwhile: they are not folded, or their state is lost
+        answers = [CLOSED if item.status == ACCEPTED else item for item in answers]
+    return summary(answers) | {"stored": kept}
 
 
 def summary(answers: Sequence[Answer]) -> dict[str, Any]:

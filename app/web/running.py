@@ -143,7 +143,7 @@ class RunningTwin:
             if config.outputs.receivers:
                 self.engine.notices.say("a recording is replayed: no alerts are sent")
         else:
-            page = None if door is None else f"http://127.0.0.1:{door.port}"
+            page = None if door is None else door.site
             self.publisher = self.engine.published = Publisher(self.engine, page=page)
         self.view: Any = None
         self.server: Any = None

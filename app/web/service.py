@@ -20,7 +20,7 @@ from starlette.routing import BaseRoute, Mount, Route, WebSocketRoute
 from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocket
 
-from estimators.errors import ConfigError, nearest, quoted
+from estimators.errors import ConfigError, is_blank, nearest, quoted
 
 from ..terminal import print_line
 from .door import Door
@@ -30,6 +30,9 @@ from .http import PAGE, get, page_file, post, refusal
 from .request_threads import in_thread
 from .supervisor import FAILED, FIRST_RETRY_S, RUNNING, STARTING, STOPPED, Child, ServedTwin, Supervisor
 from .viser_proxy import couple
+
+BLANK = "a twin has the name of its file, which is blank; rename it"
+"""Rule of a file whose name cannot be seen."""
 
 MAX_OPENED = 4
 """Twins that run because their page was opened."""
@@ -49,6 +52,9 @@ class Overview(Protocol):
 
     def find(self, name: str) -> str | None:
         """Return the path of the twin of a name, None if there is none."""
+
+    def unready(self) -> str:
+        """Return why it is not ready, or empty."""
 
 
 class Service:
@@ -159,13 +165,15 @@ class Service:
         return [{**unknown, "title": twin.name, **twin.card, "name": name} for name, twin in self.twins.items()]
 
     def _ready(self, request: Request) -> Response:
-        """Answer 200 once all twins that are not stopped run, else 503; with a token also the names of the others."""
-        watched = self.twins.values() if self._overview is None else ()
-        missing = [twin.name for twin in watched if twin.wanted and twin.state != RUNNING]
-        if missing:
-            names = f"{len(missing)} twin(s) do not run: {', '.join(missing[:20])}"
-            return PlainTextResponse(f"{names if USER in request.scope else 'not ready'}\n", 503)
+        """Answer 200 once all twins that are not stopped run, or the overview is ready, else 503; why with a token."""
+        reason = self._unready() if self._overview is None else self._overview.unready()
+        if reason:
+            return PlainTextResponse(f"{reason if USER in request.scope else 'not ready'}\n", 503)
         return PlainTextResponse("ok\n")
+
+    def _unready(self) -> str:
+        missing = [twin.name for twin in self.twins.values() if twin.wanted and twin.state != RUNNING]
+        return f"{len(missing)} twin(s) do not run: {', '.join(missing[:20])}" if missing else ""
 
     def _start(self, twin: str) -> Any:
         """Begin to start a stopped twin."""
@@ -265,8 +273,10 @@ class TwinFolder:
         files = {path for path in self._folder.glob("*") if path.suffix in (".yaml", ".yml") and path.is_file()}
         self._known = {name: path for name, path in self._known.items() if path in files}
         for path in sorted(files):
-            known = self._known.setdefault(path.stem, path)
-            if path != known and path not in self._refused:
-                print_line("error", f"{path}: {known.name} is a twin of this name already; rename the file")
+            blank = is_blank(path.stem)
+            known = path if blank else self._known.setdefault(path.stem, path)
+            if (blank or path != known) and path not in self._refused:
+                rule = BLANK if blank else f"{known.name} is a twin of this name already; rename the file"
+                print_line("error", f"{quoted(str(path)) if blank else path}: {rule}")
                 self._refused.add(path)
         return {name: str(path) for name, path in sorted(self._known.items())}

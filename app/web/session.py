@@ -60,13 +60,16 @@ SWITCH_INTERVAL_S = 0.0005
 class Page:
     """Port of the page, whether to open it in a browser, and tokens of other programs.
 
-    `overview` is the address of the overview of a service, of which this twin is one; it then has no gallery.
+    `public` is the address at which a reverse proxy offers it. `overview` is the address of the overview of a service,
+    of which this twin is one; it then has no gallery, and `site` is its own address there.
     """
 
     port: int
     open_browser: bool
     grants: tuple[Grant, ...] = ()
     overview: str | None = None
+    public: str | None = None
+    site: str | None = None
 
 
 def _settle(gone: threading.Event | None = None, before: Callable[[], Engine | None] | None = None) -> None:
@@ -149,7 +152,7 @@ class Session:
         """Notes of users on the twins that ran before, by twin and log."""
         self.threads: list[SessionThread] = []
         if page is not None:
-            self.door = Door(page.port, page.grants, overview=page.overview)
+            self.door = Door(page.port, page.grants, public=page.public, overview=page.overview, site=page.site)
         try:
             if opening is not None:
                 self.running = self.prepared(opening)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
@@ -16,10 +15,11 @@ from config.source_schema import (
     PushSection,
 )
 from config.yaml_files import Key
-from estimators.errors import ConfigError, nearest, shown_name
+from estimators.errors import nearest, shown_name
 from estimators.model.state_space import StateSpaceModel
 from sources.pieces import VALUES
 
+from ..secrets import secret
 from .kind import Kind, Opening, blamed, failure
 
 if TYPE_CHECKING:
@@ -49,15 +49,6 @@ def _messages(opening: Opening) -> Messages:
     return blamed(named, lambda channels: Messages(channels, width=width, report=report, assets=assets))
 
 
-def _password(name: str | None) -> str | None:
-    if name is None:
-        return None
-    value = os.environ.get(name)
-    if not value:
-        raise ConfigError(f"source: the environment variable {name} is not set; set it before the twin starts")
-    return value
-
-
 def _open_mqtt(opening: Opening) -> Source:
     from sources.brokers import MqttSource, TopicMap
 
@@ -71,6 +62,8 @@ def _open_mqtt(opening: Opening) -> Source:
     if by_hand and section.qos == 2:
         rule = "is 2; set it to 1: a fleet with --store takes each of its messages once"
         raise failure(opening.loaded, (*opening.key, "qos"), rule)
+    variable, key = section.password_env, (*opening.key, "password_env")
+    password = None if variable is None else secret(variable, key, opening.loaded.places)
     client_id = section.client_id
     if client_id is not None and part.processes > 1:
         client_id = f"{client_id}-{part.number}"
@@ -94,7 +87,7 @@ def _open_mqtt(opening: Opening) -> Source:
         section,
         topics,
         qos=section.qos,
-        password=_password(section.password_env),
+        password=password,
         client_id=client_id,
         report=opening.report,
         wanted=part.has,

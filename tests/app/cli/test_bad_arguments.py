@@ -43,6 +43,7 @@ REFUSED = {
     "fld lorenz63": "fld: there is no such command; did you mean fold",
     "--versoin": "--versoin: there is no such option; did you mean --version?",
     "run motor_can --json": "--json: is the result of a run without a page; give --headless",
+    "run motor_can --public https://a.example": "--public https://a.example: others can reach it; give --tokens FILE",
     "run motor_can --port abc": "--port 'abc': must be a whole number",
     "run motor_can --port=9e3": "--port '9e3': must be a whole number",
     "run motor_can --duration 5s": f"--duration {NOT_LONG}",

@@ -121,6 +121,18 @@ def test_other_assets_are_refused_and_counted(assets, names, refused, tmp_path, 
     assert told == [f"nisus: {said[0]}"]  # once, however many there are
 
 
+def test_rows_of_a_blank_name_are_of_no_asset(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    write(tmp_path / "a.csv", [(0.0, "pump", 40.0), (1.0, "\u200b", 40.0), (2.0, "pump", 40.0)])
+    (tmp_path / "pumps.yaml").write_text(FLEET.format(files="a.csv"))
+    said = []
+    running = RunningFleet(load_fleet("pumps.yaml"), lambda key, text: said.append(text), threads=1)
+    running.run()
+    assert running.names == ["pump"] and running.table()[2].events.sum() == 2
+    assert said == ["pumps.yaml: asset '\\u200b' is blank; name it in the source"]
+    running.stop()
+
+
 @pytest.mark.parametrize(
     ("change", "line"),
     [
@@ -128,6 +140,7 @@ def test_other_assets_are_refused_and_counted(assets, names, refused, tmp_path, 
         ({"twin: motor_winding": "twin: motor_winding\nasets: 3"}, "pumps.yaml:2: asets is not known; did you mean"),
         ({"twin: motor_winding": "twin: motor_winding\nassets: [a, a]"}, "pumps.yaml:2: assets names 'a' twice"),
         ({"twin: motor_winding": "twin: motor_winding\nassets: 0"}, "pumps.yaml:2: assets"),
+        ({"twin: motor_winding": "twin: motor_winding\nassets: [a, ' ']"}, "assets names ' ', which is blank; give"),
         ({"twin: motor_winding": "twin: motor_winding\nassets: [a, '']"}, "pumps.yaml:2: assets[1] is ''; it must not"),
         ({"twin: motor_winding": "twin: motor_winding\noutputs: {mqtt: {host: a, prefix: 'a/#'}}"},
          "outputs.mqtt.prefix is 'a/#'; leave out the characters + and #"),
@@ -152,7 +165,7 @@ def test_a_wrong_file_is_one_line(change, line, tmp_path, monkeypatch, capsys):
         assert before in text
         text = text.replace(before, after)
     (tmp_path / "pumps.yaml").write_text(text)
-    assert main(["fleet", "pumps.yaml"]) == 2
+    assert main(["fleet", "pumps.yaml", "--port", "0"]) == 2
     said = capsys.readouterr().err.strip()
     assert line in said and "\n" not in said and "pumps.yaml" in said
 

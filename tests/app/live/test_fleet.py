@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 import zlib
+from contextlib import nullcontext
 from types import SimpleNamespace
 
 import numpy as np
@@ -20,8 +21,10 @@ from app.live.fleet import RunningFleet
 from app.present.fleet_table import in_name_order
 from app.twin.fleet import load_fleet
 from app.twin.twin import load_twin
+from app.web.fleet import FleetApi
 from app.web.partitions import PartitionedFleet, PartitionServer
-from app.web.readings import READERS, answer, messages_of
+from app.web.readings import READERS, messages_of, send_to, summary
+from app.web.supervisor import RUNNING, STARTING
 from estimators import Log
 from estimators.errors import NisusError, SourceError
 from estimators.fold import Fold
@@ -76,7 +79,7 @@ def test_messages_have_the_asset_as_a_field_in_any_form(kind, tmp_path):
         body = "\n".join(map(json.dumps, sent)).encode()
     else:
         body = json.dumps(sent).encode()
-    assert answer(source, READERS[kind](body, source.fields))["accepted"] == 12
+    assert summary(source.send(READERS[kind](body, source.fields)))["accepted"] == 12
     assert fleet.step()
     _, names, table = fleet.table()
     assert names == ["a", "b/c"]
@@ -90,10 +93,12 @@ def test_messages_without_the_name_of_an_asset_are_refused(tmp_path):
     fleet, said = running(tmp_path, {"type": "push"}, assets=["a"])
     source = messages_of(fleet)
     wrong = [{"values": {"winding": 1.0}}, message(0, "", 1.0), message(0, 7, 1.0), message(0, "x" * 201, 1.0),
+             message(0, "\u200b\t ", 1.0),
              json.loads(json.dumps(message(0, "\ud800", 1.0)))]  # fmt: skip
-    found = answer(source, [*wrong, message(0, "a", 41.0), message(0, "stranger", 41.0)])
-    assert found["refused"] == 5 and "asset is" in found["items"][0]["reason"]
-    assert found["items"][4]["reason"] == r"asset is '\ud800', which has half of a surrogate pair"
+    found = summary(source.send([*wrong, message(0, "a", 41.0), message(0, "stranger", 41.0)]))
+    assert found["refused"] == 6 and "asset is" in found["items"][0]["reason"]
+    assert found["items"][4]["reason"] == r"asset is '\u200b\t ', which is blank; give it a visible name"
+    assert found["items"][5]["reason"] == r"asset is '\ud800', which has half of a surrogate pair"
     fleet.step()
     assert fleet.table()[1] == ["a"] and fleet.table()[2].events.tolist() == [1]
     assert said == ["pumps.yaml: asset 'stranger' is not among assets; add it to assets"]
@@ -147,6 +152,15 @@ def test_topics_that_do_not_name_an_asset_are_one_line(topics, text, tmp_path):
     with pytest.raises(NisusError) as caught:
         running(tmp_path, {"type": "mqtt", "host": "127.0.0.1", "port": 1, "topics": topics})
     assert text in str(caught.value) and "\n" not in str(caught.value) and "pumps.yaml:1" in str(caught.value)
+
+
+def test_a_password_that_is_not_set_is_one_line_with_its_place(tmp_path, monkeypatch):
+    monkeypatch.delenv("NISUS_NO_SECRET", raising=False)
+    more = {"user": "a", "password_env": "NISUS_NO_SECRET"}
+    with pytest.raises(NisusError) as caught:
+        running(tmp_path, {"type": "mqtt", "host": "a", "topics": {"{asset}/t": "winding"}, **more})
+    rule = "is NISUS_NO_SECRET, an environment variable that is not set; set it before the start"
+    assert str(caught.value) == f"{tmp_path / 'pumps.yaml'}:1: source.password_env {rule}"
 
 
 KILLED = """
@@ -228,6 +242,7 @@ def test_a_store_on_a_full_disk_is_tried_again_while_the_fleet_goes_on(tmp_path,
     path = tmp_path / "fleet.store"
     fleet = RunningFleet(first.plan, lambda key, text: said.append(text), threads=1, store=path)
     fleet.archive = SimpleNamespace(put=lambda at, events: archived.append(len(events)), stop=lambda: None)
+    fleet.archive.written = lambda rows: nullcontext([fleet.archive.put(*row) for row in rows])
     source = messages_of(fleet)
     for k in range(6):
         full[0] = 1 < k < 5
@@ -246,6 +261,27 @@ def test_a_store_on_a_full_disk_is_tried_again_while_the_fleet_goes_on(tmp_path,
     assert same(again.table()[2], first.table()[2])
     again.stop()
     first.stop()
+
+
+def test_a_fleet_that_stands_still_refuses_messages_and_is_not_ready(tmp_path, monkeypatch):
+    """Also those that it had accepted, but neither folded nor stored."""
+    fleet, said = running(tmp_path, {"type": "push"})
+    fleet._store = SimpleNamespace(path="fleet.store", write_blocks=lambda blocks: None, close=lambda: None)
+    api = FleetApi(fleet)
+    assert api.unready() == "no measurement has arrived"
+
+    def send(k):
+        found = asyncio.run(send_to(fleet, [message(k, "a", 40.0)]))
+        return found["items"][0]["status"], found["items"][0].get("reason", ""), found["stored"]
+
+    fleet.start()
+    assert send(0) == ("accepted", "", True)
+    assert api.unready() == ""
+    monkeypatch.setattr(fleet.fleet, "advance", lambda: 1 / 0)
+    assert send(1) == ("refused", refused := "nothing is folded any more; send it again after a restart", False)
+    assert send(2) == ("refused", refused, False)
+    assert api.unready() == "ZeroDivisionError: division by zero" and api.unready() in said[-1]
+    fleet.stop()
 
 
 def same(mine, its):
@@ -381,7 +417,7 @@ def test_a_broker_keeps_what_was_not_stored(tmp_path, monkeypatch):
 def test_messages_go_to_the_process_of_their_asset_and_the_table_is_that_of_all(tmp_path):
     whole, _ = running(tmp_path, {"type": "push"}, processes=2)
     sent = [message(k, f"pump {j}", 40.0 + k + j) for k in range(6) for j in range(9)]
-    answer(messages_of(whole), sent)
+    messages_of(whole).send(sent)
     whole.step()
     fleet = PartitionedFleet(whole.plan, lambda *_: None, lambda *_: None)
     servers = []
@@ -399,8 +435,12 @@ def test_messages_go_to_the_process_of_their_asset_and_the_table_is_that_of_all(
         pass
     assert same(in_name_order(fleet.table()[2]), in_name_order(whole.table()[2]))
     assert fleet.find("pump 3") and not fleet.ended
+    fleet._parts[0].twin.state = RUNNING
+    assert FleetApi(fleet).unready() == "starting: pumps 2 of 2"
+    fleet._parts[1].twin.state = RUNNING
+    assert FleetApi(fleet).unready() == ""
     servers[1].stop()
-    fleet._parts[1].twin.port = 0
+    fleet._parts[1].twin.state, fleet._parts[1].twin.port = STARTING, 0
     found = asyncio.run(fleet.take([message(9, f"pump {j}", 40.0) for j in range(9)]))
     here = [zlib.crc32(f"pump {j}".encode()) % 2 == 0 for j in range(9)]
     assert [item["status"] == "accepted" for item in found["items"]] == here and not found["stored"]

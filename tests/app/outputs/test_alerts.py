@@ -395,10 +395,26 @@ def test_a_rule_that_means_nothing_is_refused_in_one_line(outputs, alerts, text)
     assert text in str(error.value) and "\n" not in str(error.value)
 
 
-def test_a_secret_that_is_not_set_is_named(serve, monkeypatch):
+@pytest.mark.parametrize(
+    ("outputs", "key"),
+    [
+        ("receivers:\n    ops:\n      type: webhook\n      url: $NISUS_NO_SECRET", "receivers.ops.url"),
+        (
+            "receivers:\n    ops:\n      {type: webhook, url: http://a,\n      secret_env: NISUS_NO_SECRET}",
+            "receivers.ops.secret_env",
+        ),
+        ("mqtt:\n    host: a\n    user: a\n    password_env: NISUS_NO_SECRET", "mqtt.password_env"),
+        ("opcua:\n    port: 4840\n    user: a\n    password_env: NISUS_NO_SECRET", "opcua.password_env"),
+    ],
+)
+def test_a_secret_that_is_not_set_is_one_line_with_its_place(serve, outputs, key, tmp_path, monkeypatch):
     monkeypatch.delenv("NISUS_NO_SECRET", raising=False)
-    twin = started({"ops": {"type": "webhook", "url": "$NISUS_NO_SECRET"}})
+    text = load_twin("motor_winding").loaded.text.rstrip() + f"\noutputs:\n  {outputs}\n"
+    (tmp_path / "pump.yaml").write_text(text)
     page = serve()
-    page.engine.twin = twin
-    with pytest.raises(ConfigError, match="the environment variable NISUS_NO_SECRET is not set"):
+    page.engine.twin = load_twin(tmp_path / "pump.yaml")
+    with pytest.raises(ConfigError) as caught:
         Publisher(page.engine)
+    line = text.splitlines().index(next(line for line in text.splitlines() if "NO_SECRET" in line)) + 1
+    rule = "is NISUS_NO_SECRET, an environment variable that is not set; set it before the start"
+    assert str(caught.value) == f"{tmp_path / 'pump.yaml'}:{line}: outputs.{key} {rule}"

@@ -1,7 +1,6 @@
 """The archive of a fleet has each measurement once, and the fold of an asset's rows is the fleet's estimate."""
 
 import json
-import time
 from itertools import pairwise
 
 import numpy as np
@@ -10,6 +9,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from app.cli.fleet import folders_of
+from app.live import fleet as live
 from app.live.fleet import RunningFleet
 from app.outputs import fleet_archive as archives
 from app.outputs.fleet_archive import AssetHistory, FleetArchive, read_journal
@@ -29,11 +29,12 @@ MODEL = load_twin("motor_can").model
 
 def started(folder, *, store=None, partition=WHOLE, split=SPLIT):
     """A fleet of pushed messages whose archive is written by the test."""
+    folder.mkdir(exist_ok=True)
     path = folder / "drives.yaml"
     path.write_text(json.dumps({"twin": "motor_can", "source": {"type": "push"}}))
     plan = ArchivePlan(folder / "archive" / "drives", split)
     fleet = RunningFleet(load_fleet(path), lambda *_: None, threads=1, store=store, partition=partition)
-    fleet.archive = FleetArchive(plan, fleet.twin.model, fleet.names, fleet.note)
+    fleet.archive = FleetArchive(plan, fleet.twin.model, fleet.names, fleet.note, fleet.archived)
     return fleet, messages_of(fleet)
 
 
@@ -108,29 +109,76 @@ def test_each_process_has_a_folder_of_its_own_and_all_are_read(tmp_path):
     assert not set(tables[0]["asset"].to_pylist()) & set(tables[1]["asset"].to_pylist())
 
 
-def test_messages_that_come_again_after_a_kill_are_archived_once(tmp_path):
-    store, sent = tmp_path / "drives.store", messages(count=12)
+@pytest.mark.parametrize("killed", ["before the transaction", "after", "and completed", "and a journal of none"])
+def test_rows_of_a_store_are_archived_once_whenever_it_is_killed(killed, tmp_path, monkeypatch):
+    """Neither lost, as those of the last second, nor twice, as those whose messages come again."""
+    store, sent, folder = tmp_path / "drives.store", messages(count=24), tmp_path / "archive" / "drives"
+    monkeypatch.setattr(live, "STORE_PERIOD_S", 1e9)
+
+    def kill(fleet):
+        if fleet.archive._journal is not None:
+            fleet.archive._journal._file.close()  # as the end of the process does
+        fleet._store.close()
+
+    def steps(fleet, source, parts):
+        for part in parts:
+            fleet._due = 0.0
+            source.send(part)
+            fleet.step()
+
+    parts = [part.tolist() for part in np.array_split(np.array(sent, object), 6)]
     fleet, source = started(tmp_path, store=store)
-    source.send(sent[:40])
-    fleet._due = 0.0
-    fleet.step()  # with a transaction
-    fleet._due = time.monotonic() + 1000.0
-    source.send(sent[40:60])
-    fleet.step()  # without: these messages are not stored
-    fleet.archive.look()
-    fleet.archive._journal._file.close()  # as the end of the process does
-    fleet._store.close()
+    steps(fleet, source, parts[:3])
+    if killed == "and completed":
+        fleet.archive.look(closing=True)
+    if killed != "before the transaction":
+        kill(fleet)
+    if killed == "and a journal of none":
+        other, its = started(tmp_path)
+        steps(other, its, [parts[5]])
+        other.archive.look()
+        other.archive._journal._file.close()
+    if killed == "before the transaction":
+        monkeypatch.setattr(fleet._store, "write_blocks", lambda blocks: 1 / 0)
+        with pytest.raises(ZeroDivisionError):
+            steps(fleet, source, parts[3:4])
+        kill(fleet)
     again, source = started(tmp_path, store=store)
-    source.send(sent[40:])
-    again._due = 0.0
-    again.step()
-    again.archive.look(closing=True)
-    parts = parts_of(tmp_path / "archive" / "drives")
-    found = pa.concat_tables([pq.read_table(path) for path in parts])
-    assert found.num_rows == again.table()[2].events.sum()
-    keys = found.select(["asset", "t_ns", "event", "channel"]).group_by(["asset", "t_ns", "event", "channel"])
-    assert keys.aggregate([]).num_rows == found.num_rows
-    again.stop()
+    steps(again, source, parts[3:5] if killed == "and a journal of none" else parts[3:])
+    again.archive.look()
+    kill(again)
+    last, source = started(tmp_path, store=store)
+    last.archive.look(closing=True)
+    found = pa.concat_tables([pq.read_table(path) for path in parts_of(folder)])
+    rows = ["asset", "t_ns", "event", "channel"]
+    assert found.select(rows).group_by(rows).aggregate([]).num_rows == found.num_rows
+    whole, source = started(tmp_path / "whole")
+    steps(whole, source, parts)
+    assert found.num_rows == whole.table()[2].events.sum()
+    assert sum(AssetHistory([folder], f"drive {a}").read(10**6).num_rows for a in range(7)) == found.num_rows
+    for each in (last, whole):
+        each.stop()
+
+
+def test_rows_of_a_store_wait_while_the_archive_cannot_be_written(tmp_path, monkeypatch):
+    monkeypatch.setattr(live, "STORE_PERIOD_S", 0.0)
+    monkeypatch.setattr(live, "STORE_SHARE", 1e9)
+    (tmp_path / "archive").mkdir()
+    (tmp_path / "archive" / "drives").write_text("")
+    fleet, source = started(tmp_path, store=tmp_path / "drives.store")
+    for part in np.array_split(np.array(messages(count=6), object), 3):
+        source.send(part.tolist())
+        fleet.step()
+    assert fleet.counts["archive"] == 1 and fleet.has(source.accepted)
+    (tmp_path / "archive" / "drives").unlink()
+    source.send(messages(seed=2, assets=1, count=1))
+    fleet.step()
+    fleet.archive.look(closing=True)
+    found = [pq.read_table(path).num_rows for path in parts_of(tmp_path / "archive" / "drives")]
+    assert len(found) == 2 and sum(found) == sum(
+        column.sum() for column in (fleet.table()[2].events, fleet.table()[2].stale)
+    )
+    fleet.stop()
 
 
 class Written:
@@ -218,7 +266,7 @@ def test_each_row_of_an_asset_is_read_once_while_files_are_completed(tmp_path):
     for k in range(0, 600, 10):
         written.put(k)
         if rng.random() < 0.2:
-            written.archive._finish()
+            written.archive.look(closing=True)
         if rng.random() < 0.5 and (rows := history.read(10**6)) is not None:
             found += rows["value_0"].to_pylist()
         files.add(len(parts_of(written.folder)))

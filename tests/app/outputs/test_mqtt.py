@@ -213,7 +213,10 @@ def test_a_source_whose_broker_comes_back_goes_on(serve, broker):
             {"type": "mqtt", "host": "x", "topics": {"a": "windng"}},
             "names 'windng', no value of this twin; did you mean",
         ),
-        ({"type": "mqtt", "host": "x", "topics": {"a": "winding"}, "password_env": "NISUS_NO"}, "NISUS_NO is not set"),
+        (
+            {"type": "mqtt", "host": "x", "topics": {"a": "winding"}, "password_env": "NISUS_NO"},
+            "source.password_env is NISUS_NO, an environment variable that is not set",
+        ),
         ({"type": "mqtt", "host": "x", "topics": {"a": {"tme": "t"}}}, "tme"),
         ({"type": "mqtt", "host": "x", "topics": {"a/#/b": "winding"}}, "topics names a/#/b; + and # must stand"),
         ({"type": "mqtt", "host": "x", "topics": {"a+/b": "winding"}}, "topics names a+/b; + and # must stand"),

@@ -90,6 +90,7 @@ def test_named_assets_are_listed_before_they_report_and_others_are_still_taken(t
         ("asset,R.winding\na,1\na,2\n", {}, r"tunings.csv:3: asset 'a' has a row already"),
         ("asset,R.winding\na\n", {}, r"tunings.csv:2: the row has 1 cells and the heading 2"),
         ("asset,R.winding\n,1\n", {}, r"tunings.csv:2: the row names no asset"),
+        (None, {"tunings": {"values": {" ": {"R.winding": 1.0}}}}, r"pumps.yaml:\d+: asset ' ' is blank; give it a"),
         ("", {}, r"tunings.csv:1: has no column 'asset'"),
         ("asset,R.winding\na,1\nc,1\n", {"assets": ["a", "b"]}, r"tunings.csv:3: asset 'c' is not among assets"),
         ("asset,R.winding\na,1\nc,1\n", {"assets": 1}, r"pumps.yaml:\d+: tunings names 2 assets; there may be 1"),

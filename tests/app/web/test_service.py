@@ -240,9 +240,30 @@ def test_a_folder_is_watched_and_a_twin_that_cannot_start_is_one_line(tmp_path):
             assert running.ask("/readyz", token=token) == (503, "not ready\n")
         (folder / "bad.yaml").unlink()
         (folder / "good.yml").write_text("model: motor_winding\n")
-        running.wait(lambda twins: list(twins) == ["good"] and "good.yml" in running.lines())
+        (folder / "\u200b .yaml").write_text("model: motor_winding\n")
+        running.wait(lambda twins: list(twins) == ["good"] and running.lines().count("rename") == 2)
+        assert r"twins/\u200b .yaml': a twin has the name of its file, which is blank; rename it" in running.lines()
         assert running.lines().count("twins/good.yml: good.yaml is a twin of this name already; rename the file") == 1
         assert running.twins()["good"]["starts"] == 1
+    finally:
+        running.stop()
+
+
+@pytest.mark.parametrize("public", [None, "https://twins.example.com"])
+def test_alerts_link_to_the_page_of_the_twin_at_the_service(public, tmp_path):
+    program = "import sys; open('alerts', 'a').write(sys.stdin.read() + chr(10))"
+    log = json.dumps({"receivers": {"log": {"type": "command", "command": [sys.executable, "-c", program]}}})
+    text = (ROOT / "config" / "twins" / "motor_winding.yaml").read_text()
+    always = "alerts: [{state: temperature, above: -1000, after: 0}]"
+    (tmp_path / "pump 1.yaml").write_text(f"{text}\noutputs: {log}\n{always}\n")
+    write_tokens(tmp_path)
+    running = Served(tmp_path, "pump 1.yaml", "--tokens", "tokens", *(["--public", public] if public else []))
+    try:
+        running.wait(lambda _: (tmp_path / "alerts").exists())
+        alert = json.loads((tmp_path / "alerts").read_text().splitlines()[0])
+        assert alert["link"] == f"{public or running.url}/twins/pump%201/alarms#limit-of-a-state"
+        # A link has no token.
+        assert running.ask(alert["link"].removeprefix(public or running.url))[0] == 200
     finally:
         running.stop()
 
@@ -252,12 +273,15 @@ def test_a_folder_is_watched_and_a_twin_that_cannot_start_is_one_line(tmp_path):
     [
         ([], "the twins are missing; give YAML files"),
         (["motor_winding", "motor_winding"], "a twin is called motor_winding already"),
+        ([" .yaml"], "' .yaml': a twin has the name of its file, which is blank; rename it"),
         (["nothing.yaml"], "there is no such file or bundled twin"),
         (["motor_winding", "--host", "0.0.0.0"], "--host 0.0.0.0: others can reach it; give --tokens FILE"),
         (["motor_winding", "--public", "https://a.example"], "others can reach it; give --tokens FILE"),
         (["motor_winding", "--host", "example.com"], "must be an IP address"),
     ],
 )
-def test_a_service_that_cannot_be_is_one_line(capsys, arguments, line):
+def test_a_service_that_cannot_be_is_one_line(capsys, arguments, line, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / " .yaml").write_text("model: motor_winding\n")
     assert main(["serve", *arguments]) == 2
     assert line in capsys.readouterr().err

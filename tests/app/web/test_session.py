@@ -31,3 +31,15 @@ def test_free_blocks_between_used_ones_are_returned(monkeypatch):
     session.Session(None, page=None).run(record=None, duration=0.5, until_finished=False)
     # Of each free block of 16,000 bytes two whole pages of 4,096 at least.
     assert before[0] - resident() > 0.9 * (COUNT // 2) * 2 * 4096
+
+
+def test_the_address_of_a_page_is_that_of_its_proxy_or_service():
+    pages = (
+        session.Page(0, False),
+        session.Page(0, False, public="https://a.example"),
+        session.Page(0, False, site="x/y"),
+    )
+    doors = [session.Session(None, page=page).door for page in pages]
+    assert [door.site for door in doors] == [f"http://127.0.0.1:{doors[0].port}", "https://a.example", "x/y"]
+    for door in doors:
+        door.stop()

@@ -222,15 +222,17 @@ Y = np.array([1.0, 2.0, -1.0, np.nan, 3.0, 0.5, -2.0, np.nan, 1.5])
 SEEN = np.flatnonzero(np.isfinite(Y))
 
 
+def ring_taper(a, b, length, radius):
+    """By brute force: over all ways round a circle that may be within the radius, relative to distance 0."""
+    turns = length * np.arange(-20, 21)
+    total = gaspari_cohn(np.abs((a[:, None] - b[None])[..., None] + turns), radius).sum(-1)
+    return total / gaspari_cohn(np.abs(turns), radius).sum()
+
+
 def ring_tapers(radius):
-    """Between states and rows, and between rows, by brute force: the short way round a circle of length 20."""
+    """Between states and rows, and between rows, on a circle of length 20."""
     at, rows = 0.5 * np.arange(40), 0.5 * np.array(READ)[SEEN]
-
-    def taper(a, b):
-        d = np.abs(a[:, None] - b[None])
-        return gaspari_cohn(np.minimum(d, 20 - d), radius)
-
-    return taper(at, rows), taper(rows, rows)
+    return ring_taper(at, rows, 20.0, radius), ring_taper(rows, rows, 20.0, radius)
 
 
 def dense_enkf(X, y, v, H, r, to_states, between):
@@ -272,7 +274,7 @@ def dense_letkf(X, y, v, H, r, to_states, between):
 
 
 @pytest.mark.parametrize(("name", "dense"), [("enkf", dense_enkf), ("ensrf", dense_ensrf), ("letkf", dense_letkf)])
-@pytest.mark.parametrize("radius", [0.6, 4.0, 9.0])
+@pytest.mark.parametrize("radius", [0.6, 4.0, 9.0, 13.0, 19.9, 41.0, 150.0])
 @pytest.mark.parametrize("members", [4, 12])
 def test_localised_analyses_equal_dense_ones(name, dense, radius, members):
     before, after, _ = analysed(name, RING, {"members": members, "radius": radius}, 0, Y)
@@ -286,9 +288,11 @@ def test_localised_analyses_equal_dense_ones(name, dense, radius, members):
 
 
 @pytest.mark.parametrize("members", [2, 5, 19, 33])
-@pytest.mark.parametrize("radius", [2.5, 9.0, 19.9])
+@pytest.mark.parametrize("radius", [2.5, 9.0, 19.9, 31.0, 39.0, 85.0])
 def test_letkf_of_many_rows_equals_a_dense_one(members, radius):
-    """40 rows, of which 5, 17 or 39 are near a state: fewer than members, as many, and more; some are missing.
+    """40 rows, of which 5, 17, 39 or all are near a state: fewer than members, as many, and more; some are missing.
+
+    With a radius beyond the way round, tapers by the short way alone make the innovation covariance indefinite.
 
     Eigenvalues are up to some thousands, and relative rounding of dozens of ε is multiplied by them: 1e-10.
     """
@@ -297,10 +301,27 @@ def test_letkf_of_many_rows_equals_a_dense_one(members, radius):
     y[[4, 5, 31]] = np.nan
     seen = np.flatnonzero(np.isfinite(y))
     before, after, _ = analysed("letkf", LORENZ96, {"members": members, "radius": radius}, 0, y)
-    apart = np.abs(np.arange(40)[:, None] - seen)
-    tapers = gaspari_cohn(np.minimum(apart, 40 - apart), radius)
+    tapers = ring_taper(np.arange(40), seen, 40, radius)
     expected = dense_letkf(before, y[seen], None, np.eye(40)[seen], 1.0, tapers, None)
     np.testing.assert_allclose(after, expected, rtol=0, atol=1e-10)
+
+
+@pytest.mark.parametrize("radius", [3.0, 5.0, 5.5, 9.0, 26.0, 79.0])
+@pytest.mark.parametrize("axes", [1, 2])
+def test_tapers_of_rings_are_positive_definite_at_any_radius(axes, radius):
+    """By brute force, on a cylinder or a torus of 10 by 12, with places several turns away."""
+    periods = np.array([10.0, 12.0 if axes == 2 else np.inf])
+    rng = np.random.default_rng(axes)
+    places = rng.uniform(0.0, 12.0, (60, 2))
+    turned = places + np.where(np.isfinite(periods), rng.integers(-3, 4, (60, 2)), 0) * np.array([10.0, 12.0])
+    found = localisation.taper_between(turned[:, None], places[None], periods, radius)
+    shifts = [np.arange(-20, 21) * length if np.isfinite(length) else np.zeros(1) for length in periods]
+    ways = np.stack(np.meshgrid(*shifts, indexing="ij"), -1).reshape(-1, 2)
+    apart = places[:, None] - places[None]
+    at_0 = gaspari_cohn(np.linalg.norm(ways, axis=-1), radius).sum()
+    expected = sum(gaspari_cohn(np.linalg.norm(apart + way, axis=-1), radius) for way in ways) / at_0
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)
+    assert np.linalg.eigvalsh(found).min() > -1e-12
 
 
 @pytest.mark.parametrize("members", [2, 7, 14, 15, 40])
