@@ -94,14 +94,15 @@ def fold_event(
                 if np.isfinite(value[i, j]):
                     u[j] = value[i, j]
         else:
+            sensor = np.int64(channel[i])  # int32 would be a second type, and compile every callee twice
             if variances:
-                row, rows = sensor_rows(context, channel[i])
+                row, rows = sensor_rows(context, sensor)
                 r = floats(context.r, context.n_rows)[row : row + rows]
                 exchange(r, value[i, width:], kept)
             given = floats(value[i:].ctypes.data, value.shape[1])
             verdict = SCREENED
             left = True
-            if screen_reading(i, t[i], channel[i], given, context, edge, screened):
+            if screen_reading(i, t[i], sensor, given, context, edge, screened):
                 left = pass_on(value, screened, i, passed)
                 given = passed
             if left:
@@ -109,7 +110,7 @@ def fold_event(
                     code.update,
                     context,
                     u,
-                    channel[i],
+                    sensor,
                     given,
                     index,
                     state,
@@ -123,7 +124,7 @@ def fold_event(
                     code,
                     context,
                     u,
-                    channel[i],
+                    sensor,
                     given,
                     index,
                     state,
@@ -136,8 +137,8 @@ def fold_event(
                 for k in range(rows):
                     r[k] = kept[k]
             if verdict == GATED or verdict == USED:
-                beyond = score[0] > limit_of(context, channel[i], int(score[1]))
-                asked = note(doubt[channel[i]], rule.most, beyond, index, float(t[i]))
+                beyond = score[0] > limit_of(context, sensor, int(score[1]))
+                asked = note(doubt[sensor], rule.most, beyond, index, float(t[i]))
         call_describe(code.describe, context, state, mean[i], std[i], cross[i])
     elif what == RESET:
         prior_mean, prior_cov = prior(context)
@@ -265,10 +266,16 @@ run_and_judge_signature = i64(
 
 
 @lru_cache(maxsize=1)
-def compiled() -> tuple[Any, ...]:
-    """Return the entry points, compiled for their only signatures or loaded from the cache."""
-    functions = (run_and_judge, judge, begin, screen_reading)
-    signatures = (run_and_judge_signature, judge_signature, begin_signature, screen_signature)
-    for function, signature in zip(functions, signatures, strict=True):
-        function.compile(signature.args)
-    return functions
+def compiled() -> tuple[Any, Any]:
+    """Return `run_and_judge` and `begin`, compiled for their only signatures or loaded from the cache."""
+    run_and_judge.compile(run_and_judge_signature.args)
+    begin.compile(begin_signature.args)
+    return run_and_judge, begin
+
+
+@lru_cache(maxsize=1)
+def compiled_judge() -> Any:
+    """Return `judge` for the loop in Python, compiled or loaded from the cache with what else that calls."""
+    judge.compile(judge_signature.args)
+    screen_reading.compile(screen_signature.args)
+    return judge

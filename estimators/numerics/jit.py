@@ -9,7 +9,7 @@ from __future__ import annotations
 import operator
 import os
 from collections.abc import Callable
-from functools import lru_cache, partial
+from functools import cached_property, lru_cache, partial
 from typing import Any
 
 import numba
@@ -47,11 +47,37 @@ numba.config.LOOP_VECTORIZE = 0
 # library reads this when it is loaded, which `threaded` does.
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
-jit = partial(njit, cache=True, nogil=True, error_model="numpy", no_cfunc_wrapper=True)
+jit_once = partial(njit, cache=True, nogil=True, error_model="numpy", no_cfunc_wrapper=True)
 """Numba's njit as used here: cached, without the GIL, and with IEEE division (zero divisors give inf, no error).
 
 Of the two wrappers that Numba compiles around each function, the one for C is left out, as nothing calls it.
 """
+
+
+class TwoForms(CPUDispatcher):  # type: ignore[misc]
+    """Compiled function with machine code for calls from Python, and bitcode alone for compiled callers."""
+
+    @cached_property
+    def linked(self) -> Any:
+        """What compiled callers link, see `Linked`."""
+        made = jit_once(pipeline_class=Linked)(self.py_func)
+        made._cache.linked = True
+        return made
+
+    @property
+    def _numba_type_(self) -> Any:
+        """Type of the function for a compiled caller."""
+        return self.linked._numba_type_
+
+
+def jit(function: Any = None, **options: Any) -> Any:
+    """`jit_once` for functions that Python and compiled code call; each compiles its own form when it first does."""
+    if options:
+        return jit_once(**options)
+    made = jit_once(function)
+    made.__class__ = TwoForms
+    return made
+
 
 jit_brief = partial(njit, cache=True, error_model="numpy", no_cfunc_wrapper=True)
 """`jit` with the GIL, for calls of microseconds that run no model function: after releasing the GIL, a thread waits for
@@ -71,7 +97,7 @@ def by_address(function: Callable[..., Any]) -> Any:
 
     Not for a function that is also compiled by `jit`, as the cache does not distinguish the two.
     """
-    made = jit(no_cpython_wrapper=True)(function)
+    made = jit_once(no_cpython_wrapper=True)(function)
     made.__class__ = AddressOnly
     return made
 
@@ -89,7 +115,7 @@ embedded: Callable[[Callable[..., Any]], Any] = register_jitable(
 
 `inlined` would compile it again in each caller; for a short helper that is cheaper than a unit of its own."""
 
-inlined = partial(jit, inline="always")
+inlined = partial(jit_once, inline="always")
 """`jit` for helpers that stand inside a filter's step: a call that hands over context and arrays costs 50 to 100 ns."""
 
 

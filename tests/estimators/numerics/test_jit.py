@@ -173,6 +173,24 @@ def test_code_from_the_cache_needs_no_tables_of_numba_and_is_linked_into_new_cod
     assert run(found) == ["6.0", "False", "7.0", "1", "True"]
 
 
+def test_a_caller_links_a_function_without_machine_code_of_its_own(tmp_path):
+    """The entries of both forms are in the cache at once, and the other form runs in Python from there."""
+    (tmp_path / "linked.py").write_text(LINKED)
+
+    def run(code: str) -> list[str]:
+        environment = os.environ | {"PYTHONPATH": f"{ROOT}:{tmp_path}", "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+        code = f"from linked import inner, outer; {code}"
+        return subprocess.run(
+            [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
+        ).stdout.split()
+
+    assert run("print(outer(2.0), len(inner.overloads), len(inner.linked.overloads))") == ["7.0", "0", "1"]
+    assert run("print(inner(2.0), inner.stats.cache_hits.total())") == ["6.0", "0"]
+    hits = "inner.stats.cache_hits.total(), inner.linked.stats.cache_hits.total()"
+    assert run(f"print(inner(2.0), outer(2.0), {hits})") == ["6.0", "7.0", "1", "0"]
+    assert len(list((tmp_path / "cache").rglob("linked.inner*.nbc"))) == 2
+
+
 def test_a_function_for_addresses_names_its_python_form_when_called():
     """Without the wrapper a call from Python would end the process."""
 
