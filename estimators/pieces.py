@@ -55,7 +55,7 @@ def function_of(piece: Piece) -> tuple[Any, tuple[Any, ...]]:
     if piece.of == LOOP:
         return (
             (judge.linked, judge_signature.args),
-            (run.linked, run_signature.args),
+            (run, run_signature.args),
             (run_and_judge, run_and_judge_signature.args),
             (begin, begin_signature.args),
         )[piece.place]

@@ -29,7 +29,7 @@ from numba.core.untyped_passes import TranslateByteCode
 from ..model.check import uncompilable
 from ..model.state_space import StateSpaceModel
 from ..numerics.helpers import source_digest, with_helpers
-from ..numerics.jit import address, jit, jit_once, plain
+from ..numerics.jit import address, jit, plain
 from .context import call_h_rows
 
 MIN_SHARED = 16
@@ -70,7 +70,7 @@ class ModelCode:
             ModelError: If it cannot be compiled.
         """
         try:
-            dispatcher = jit_once(with_helpers(plain(function)))
+            dispatcher = jit(with_helpers(plain(function)))
             self.address(dispatcher, signature)
         except NumbaError as error:
             raise uncompilable(self._model, what, function, error) from None

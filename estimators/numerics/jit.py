@@ -47,7 +47,7 @@ numba.config.LOOP_VECTORIZE = 0
 # library reads this when it is loaded, which `threaded` does.
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
-jit_once = partial(njit, cache=True, nogil=True, error_model="numpy", no_cfunc_wrapper=True)
+jit = partial(njit, cache=True, nogil=True, error_model="numpy", no_cfunc_wrapper=True)
 """Numba's njit as used here: cached, without the GIL, and with IEEE division (zero divisors give inf, no error).
 
 Of the two wrappers that Numba compiles around each function, the one for C is left out, as nothing calls it.
@@ -60,7 +60,7 @@ class TwoForms(CPUDispatcher):  # type: ignore[misc]
     @cached_property
     def linked(self) -> Any:
         """What compiled callers link, see `Linked`."""
-        made = jit_once(pipeline_class=Linked)(self.py_func)
+        made = jit(pipeline_class=Linked)(self.py_func)
         made._cache.linked = True
         return made
 
@@ -70,11 +70,9 @@ class TwoForms(CPUDispatcher):  # type: ignore[misc]
         return self.linked._numba_type_
 
 
-def jit(function: Any = None, **options: Any) -> Any:
-    """`jit_once` for functions that Python and compiled code call; each compiles its own form when it first does."""
-    if options:
-        return jit_once(**options)
-    made = jit_once(function)
+def linkable(function: Callable[..., Any]) -> Any:
+    """`jit` for functions of filters that Python calls, too, or tests do: each form is compiled when first needed."""
+    made = jit(function)
     made.__class__ = TwoForms
     return made
 
@@ -97,7 +95,7 @@ def by_address(function: Callable[..., Any]) -> Any:
 
     Not for a function that is also compiled by `jit`, as the cache does not distinguish the two.
     """
-    made = jit_once(no_cpython_wrapper=True)(function)
+    made = jit(no_cpython_wrapper=True)(function)
     made.__class__ = AddressOnly
     return made
 
@@ -115,7 +113,7 @@ embedded: Callable[[Callable[..., Any]], Any] = register_jitable(
 
 `inlined` would compile it again in each caller; for a short helper that is cheaper than a unit of its own."""
 
-inlined = partial(jit_once, inline="always")
+inlined = partial(jit, inline="always")
 """`jit` for helpers that stand inside a filter's step: a call that hands over context and arrays costs 50 to 100 ns."""
 
 

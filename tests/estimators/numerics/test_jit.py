@@ -145,9 +145,9 @@ def test_closures_that_two_processes_compiled_are_told_apart_by_a_third(tmp_path
 
 
 LINKED = """
-from estimators.numerics.jit import f64, jit
+from estimators.numerics.jit import f64, jit, linkable
 
-@jit
+@linkable
 def inner(a):
     return 3.0 * a
 
