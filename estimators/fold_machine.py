@@ -17,7 +17,7 @@ from .diagnostics.health import Bounds, HealthPolicy, chi_square_bounds
 from .errors import ModelError
 from .estimator import Code, Estimator, Options
 from .events.maintenance import without
-from .fold_kernel import compiled
+from .fold_kernel import compiled, compiled_judge
 from .gate import rejection_runs as doubt
 from .gate.isolation import widening
 from .interpreted import fold_loop
@@ -79,12 +79,11 @@ class Machine:
     @cached_property
     def _run(self) -> Callable:
         """The loop over events, compiled or loaded from the cache at first use."""
-        run, judge, _, _ = compiled()
-        return partial(fold_loop.run_and_judge, judge, self.context) if self._in_python else run
+        return partial(fold_loop.run_and_judge, compiled_judge(), self.context) if self._in_python else compiled()[0]
 
     @cached_property
     def _begin(self) -> Callable:
-        return fold_loop.begin if self._in_python else compiled()[2]
+        return fold_loop.begin if self._in_python else compiled()[1]
 
     def _see(self, expected: np.ndarray | None, prior: Moments | None) -> np.void:
         """Make the context of this model and tuning; `held` keeps the arrays that it points to."""

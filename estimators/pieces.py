@@ -44,8 +44,8 @@ def pieces_of(name: str) -> list[Piece]:
     if name == SMOOTHER:
         return [Piece(SMOOTHER, place) for place in range(len(PIECES))]
     if name == LOOP:
-        return [Piece(LOOP, 0), Piece(LOOP, 1), Piece(LOOP, 2, (0, 1)), Piece(LOOP, 3), Piece(LOOP, 4)]
-    return [] if ESTIMATORS[name].interpreted else [Piece(name, place) for place in range(4)]
+        return [Piece(LOOP, 0), Piece(LOOP, 1), Piece(LOOP, 2, (0, 1)), Piece(LOOP, 3)]
+    return [Piece(name, place) for place in range(2 if ESTIMATORS[name].interpreted else 4)]
 
 
 def function_of(piece: Piece) -> tuple[Any, tuple[Any, ...]]:
@@ -54,12 +54,13 @@ def function_of(piece: Piece) -> tuple[Any, tuple[Any, ...]]:
         return PIECES[piece.place]
     if piece.of == LOOP:
         return (
-            (judge, judge_signature.args),
+            (judge.linked, judge_signature.args),
             (run, run_signature.args),
             (run_and_judge, run_and_judge_signature.args),
             (begin, begin_signature.args),
-            (screen_reading, screen_signature.args),
         )[piece.place]
+    if ESTIMATORS[piece.of].interpreted:
+        return ((judge, judge_signature.args), (screen_reading, screen_signature.args))[piece.place]
     start, predict, update, describe = ESTIMATORS[piece.of].functions
     return (
         (update, update_signature.args),

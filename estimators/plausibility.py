@@ -19,7 +19,7 @@ from numba import types
 from .compiled.context import circular_rows, context_type, sensor_rows
 from .model.parts import RATE_NOISE_STDS, Stuck
 from .model.state_space import StateSpaceModel
-from .numerics.jit import F1, floats, i64, inlined, ints, jit, part
+from .numerics.jit import F1, floats, i64, inlined, ints, linkable, part
 from .numerics.linalg import wrap
 from .track import DUPLICATE, RANGE, RATE, REASONS, REPEATED, SATURATED
 
@@ -156,7 +156,7 @@ def _reasons(now, y, circular, at, a_day, limit, state, times):
     return bits
 
 
-@jit
+@linkable
 def screen_reading(i, now, s, y, context, state, screened):
     """Fill row i of `screened` (N, ny) with the bits of the limits that each row of measurement y violates.
 
@@ -208,7 +208,7 @@ def reasons_by_sensor(sensors: int, channel: np.ndarray, screened: np.ndarray) -
     return np.stack(counts, axis=1)
 
 
-@jit
+@linkable
 def pass_on(value, screened, i, out):
     """Copy measurement i to `out` with NaN in the rejected rows; return whether any row is left."""
     left = False

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from ..numerics.jit import complexes, floats, ints, jit
+from ..numerics.jit import complexes, floats, ints, linkable
 from ..numerics.linalg import wrap
 from ..numerics.workspace import layout
 from .context import (
@@ -40,7 +40,7 @@ _COMPLEX_STEP = 1e-20
 _CENTRAL_STEP = 6e-6  # about the cube root of the rounding error, where truncation and rounding balance
 
 
-@jit
+@linkable
 def complex_step_f(target, x, u, p, dt, J, scratch):
     """Fill J (nx, nx) with df/dx of the complex function at address `target`."""
     n = x.size
@@ -56,7 +56,7 @@ def complex_step_f(target, x, u, p, dt, J, scratch):
             J[i, j] = out[i].imag / _COMPLEX_STEP
 
 
-@jit
+@linkable
 def complex_step_h(target, x, u, p, J, scratch):
     """Fill J (ny, nx) with dh/dx of the complex function at address `target`."""
     n = x.size
@@ -96,7 +96,7 @@ def constant_rows(
     return H, mode, made
 
 
-@jit
+@linkable
 def state_jacobian(context, x, u, dt, F, scratch):
     """Fill F (nx, nx) with df/dx at x; `scratch` has `scratch_size` numbers."""
     if context.F_mode == ANALYTIC:
@@ -128,7 +128,7 @@ def state_jacobian(context, x, u, dt, F, scratch):
                 F[i, j] = difference / (above - below)
 
 
-@jit
+@linkable
 def sensor_jacobian(context, sensor, x, u, H, scratch):
     """Fill H (ny, nx) with dh/dx of one sensor at x; `scratch` has `scratch_size` numbers."""
     mode = ints(context.H_mode, context.n_sensors)[sensor]

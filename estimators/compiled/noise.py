@@ -165,7 +165,7 @@ def independent_rows(context, sensor, y, r, L, d):
         The number m of finite rows.
     """
     ny = r.size
-    m = 0
+    m = np.int64(0)  # a literal would be a second type, and compile `unit_factor` twice
     for i in range(ny):
         if np.isfinite(y[i]):
             d[m] = r[i]

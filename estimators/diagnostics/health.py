@@ -22,7 +22,7 @@ from numba import types
 
 from ..log import RESET
 from ..model.state_space import StateSpaceModel
-from ..numerics.jit import F1, borrowed, embedded, f64, i64, inlined, jit, plain
+from ..numerics.jit import F1, borrowed, embedded, f64, i64, inlined, linkable, plain
 from ..numerics.quantiles import chi_square_quantile
 from ..numerics.simd import total as sum_of
 from ..track import DIVERGED, FAILED, GATED, TRACKING, USED, borrowed_columns
@@ -141,7 +141,7 @@ def keep_window(i, t, track):
     track.consistency[i] = track.consistency[i - 1]
 
 
-@jit
+@linkable
 def assess(first, last, t, kind, channel, track, normal, policy, bounds):
     """Fill age, windowed NIS, its bounds and consistency of rows `first` to `last` of a track.
 

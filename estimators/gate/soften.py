@@ -18,7 +18,7 @@ from ..compiled.context import sensor_rows
 from ..compiled.noise import independent_rows
 from ..compiled.verdict import limit_of
 from ..estimator import call_update
-from ..numerics.jit import floats, jit, part
+from ..numerics.jit import floats, linkable, part
 from ..numerics.linalg import solve_unit
 from ..track import GATED, LOG_LIKELIHOOD, USED
 
@@ -26,7 +26,7 @@ GATE_MARGIN = 1e-9
 """Relative margin of a softened NIS below the gate, against rounding."""
 
 
-@jit
+@linkable
 def inflation(context, sensor, y, innovation, nis, m):
     """Return the factor w of R with which the NIS of a measurement is at most that of the gate.
 

@@ -20,11 +20,12 @@ from llvmlite import binding
 from numba import config
 from numba.core import bytecode, caching, codegen, compiler, dispatcher
 from numba.core.runtime import _nrt_python
+from numba.core.typing import templates
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 """The folder of the packages; a file outside it, such as a user's model, is found by its path."""
 
-ENTRY_FORMAT = 3
+ENTRY_FORMAT = 4
 """To be increased when entries that an earlier version wrote are not to be read."""
 
 DIGEST_SIZE = hashlib.sha256().digest_size
@@ -120,6 +121,14 @@ class EntryLibrary(codegen.JITCodeLibrary):  # type: ignore[misc]
 
     _bitcode: bytes | None = None
 
+    def _optimize_functions(self, module: Any) -> None:
+        """Optimise the functions of a module; Numba makes passes for each function that is only declared, too."""
+        module.data_layout = self._codegen._data_layout
+        for function in module.functions:
+            if not function.is_declaration:
+                passes, builder = self._codegen._function_pass_manager()
+                passes.run(function, builder)
+
     @classmethod
     def _unserialize(cls, codegen: Any, state: Any) -> Any:
         name, _, (code, bitcode) = state
@@ -180,7 +189,8 @@ class Linked(compiler.Compiler):  # type: ignore[misc]
     """Compiles a function that only compiled functions call."""
 
     def compile_extra(self, func: Any) -> Any:
-        """Compile into a `LinkedLibrary`."""
+        """Compile into a `LinkedLibrary`, without wrappers for Python and C."""
+        self.state.flags.no_cpython_wrapper = self.state.flags.no_cfunc_wrapper = True
         self.state.library = LinkedLibrary(self.state.targetctx.codegen(), func.__qualname__)
         return super().compile_extra(func)
 
@@ -218,8 +228,15 @@ class FunctionEntries(caching.FunctionCache):  # type: ignore[misc]
 
     _impl_class = EntryResults
 
+    linked = False
+    """Whether the entries are bitcode alone, see `Linked`."""
+
     def __init__(self, function: Any) -> None:
         self._py_func = function
+
+    def _index_key(self, sig: Any, codegen: Any) -> tuple[Any, ...]:
+        """Return the key of an entry, which of one function differs for the two kinds."""
+        return (*super()._index_key(sig, codegen), self.linked)
 
     def __getattr__(self, name: str) -> Any:
         if "_impl" in vars(self):
@@ -245,6 +262,11 @@ def use_entries() -> None:
     caching.IndexDataCacheFile = EntryFiles
     dispatcher.FunctionCache = FunctionEntries  # type: ignore[attr-defined]
     codegen.JITCPUCodegen._library_class = EntryLibrary
+    # Numba's own functions, such as `np.empty`, are called by compiled code alone.
+    decorator = templates._OverloadFunctionTemplate._get_jit_decorator
+    templates._OverloadFunctionTemplate._get_jit_decorator = lambda template: functools.partial(
+        decorator(template), pipeline_class=Linked
+    )
     # Numba's own locators serve functions that are in no file, as in a notebook.
     others = [found for found in caching.CompileResultCacheImpl._locator_classes if found is not ContentLocator]
     caching.CompileResultCacheImpl._locator_classes = [ContentLocator, *others]

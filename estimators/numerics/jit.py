@@ -9,7 +9,7 @@ from __future__ import annotations
 import operator
 import os
 from collections.abc import Callable
-from functools import lru_cache, partial
+from functools import cached_property, lru_cache, partial
 from typing import Any
 
 import numba
@@ -52,6 +52,30 @@ jit = partial(njit, cache=True, nogil=True, error_model="numpy", no_cfunc_wrappe
 
 Of the two wrappers that Numba compiles around each function, the one for C is left out, as nothing calls it.
 """
+
+
+class TwoForms(CPUDispatcher):  # type: ignore[misc]
+    """Compiled function with machine code for calls from Python, and bitcode alone for compiled callers."""
+
+    @cached_property
+    def linked(self) -> Any:
+        """What compiled callers link, see `Linked`."""
+        made = jit(pipeline_class=Linked)(self.py_func)
+        made._cache.linked = True
+        return made
+
+    @property
+    def _numba_type_(self) -> Any:
+        """Type of the function for a compiled caller."""
+        return self.linked._numba_type_
+
+
+def linkable(function: Callable[..., Any]) -> Any:
+    """`jit` for functions of filters that Python calls, too, or tests do: each form is compiled when first needed."""
+    made = jit(function)
+    made.__class__ = TwoForms
+    return made
+
 
 jit_brief = partial(njit, cache=True, error_model="numpy", no_cfunc_wrapper=True)
 """`jit` with the GIL, for calls of microseconds that run no model function: after releasing the GIL, a thread waits for

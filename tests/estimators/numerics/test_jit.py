@@ -145,9 +145,9 @@ def test_closures_that_two_processes_compiled_are_told_apart_by_a_third(tmp_path
 
 
 LINKED = """
-from estimators.numerics.jit import f64, jit
+from estimators.numerics.jit import f64, jit, linkable
 
-@jit
+@linkable
 def inner(a):
     return 3.0 * a
 
@@ -171,6 +171,24 @@ def test_code_from_the_cache_needs_no_tables_of_numba_and_is_linked_into_new_cod
     assert run("linked.inner.compile((linked.f64,)); print(linked.inner(2.0), filled())") == ["6.0", "True"]
     found = "print(linked.inner(2.0), filled(), linked.outer(2.0), linked.inner.stats.cache_hits.total(), filled())"
     assert run(found) == ["6.0", "False", "7.0", "1", "True"]
+
+
+def test_a_caller_links_a_function_without_machine_code_of_its_own(tmp_path):
+    """The entries of both forms are in the cache at once, and the other form runs in Python from there."""
+    (tmp_path / "linked.py").write_text(LINKED)
+
+    def run(code: str) -> list[str]:
+        environment = os.environ | {"PYTHONPATH": f"{ROOT}:{tmp_path}", "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+        code = f"from linked import inner, outer; {code}"
+        return subprocess.run(
+            [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
+        ).stdout.split()
+
+    assert run("print(outer(2.0), len(inner.overloads), len(inner.linked.overloads))") == ["7.0", "0", "1"]
+    assert run("print(inner(2.0), inner.stats.cache_hits.total())") == ["6.0", "0"]
+    hits = "inner.stats.cache_hits.total(), inner.linked.stats.cache_hits.total()"
+    assert run(f"print(inner(2.0), outer(2.0), {hits})") == ["6.0", "7.0", "1", "0"]
+    assert len(list((tmp_path / "cache").rglob("linked.inner*.nbc"))) == 2
 
 
 def test_a_function_for_addresses_names_its_python_form_when_called():
