@@ -1,6 +1,7 @@
 """Dual estimation of a running twin: proposed, adopted, dismissed, said; the engine goes on whatever comes of it."""
 
 import shutil
+import signal
 from functools import partial
 
 import numpy as np
@@ -259,12 +260,22 @@ def test_without_a_page_it_is_in_the_recording(tmp_path):
     assert again.tuning.get("R.winding") == session.engine.tuning.get("R.winding") < 10.0
 
 
-def test_without_a_page_it_is_said_on_the_terminal(tmp_path, capsys):
+def test_without_a_page_it_is_said_on_the_terminal(tmp_path, capsys, monkeypatch):
     path = tmp_path / "winding.yaml"
     shutil.copy(TWINS / "motor_winding.yaml", path)
     section = "{entries: [R.winding], every: 10 s, window: 20 s, adopt: if better}"
-    given = {"refit": section, "R.winding": "100", "source.duration": "120"}
+    given = {"refit": section, "R.winding": "100", "source.duration": "2400"}
     sets = [word for key, value in given.items() for word in ("--set", f"{key}={value}")]
+    become, seen = Refits._become, set()
+
+    def heard(refits, number, state, *words, **more):
+        become(refits, number, state, *words, **more)
+        seen.add(state)
+        if {ADOPTED, NOTHING} <= seen:
+            seen.clear()
+            signal.raise_signal(signal.SIGTERM)  # a fit takes as long as it takes, and the run would last 240 s
+
+    monkeypatch.setattr(Refits, "_become", heard)
     assert main(["run", str(path), "--headless", "--speed", "10", *sets]) == 0
     said = capsys.readouterr().err
     assert "adopted by rule as tuning version refit-" in said and "nothing better" in said
