@@ -56,6 +56,7 @@ class FleetApi:
         self._orders: OrderedDict[_Order, np.ndarray] = OrderedDict()
         self._siblings: tuple[tuple[int, str], Siblings | None] = ((-1, ""), None)
         self._lock = threading.Lock()
+        self._arrived = False
 
     def routes(self) -> list[BaseRoute]:
         """Return the routes."""
@@ -154,7 +155,8 @@ class FleetApi:
         """Return why the assets are not followed, not yet or not any more; empty if they are."""
         running = self._running
         reason = running.failure or (running.starting if isinstance(running, PartitionedFleet) else "")
-        return reason or ("" if running.table()[2].events.any() else "no measurement has arrived")
+        self._arrived = self._arrived or bool(running.table()[2].events.any())
+        return reason or ("" if self._arrived else "no measurement has arrived")
 
     def metrics(self) -> Response:
         """Answer with the counts of assets by health in the text format of Prometheus."""
