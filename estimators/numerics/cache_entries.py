@@ -121,14 +121,6 @@ class EntryLibrary(codegen.JITCodeLibrary):  # type: ignore[misc]
 
     _bitcode: bytes | None = None
 
-    def _optimize_functions(self, module: Any) -> None:
-        """Optimise the functions of a module; Numba makes passes for each function that is only declared, too."""
-        module.data_layout = self._codegen._data_layout
-        for function in module.functions:
-            if not function.is_declaration:
-                passes, builder = self._codegen._function_pass_manager()
-                passes.run(function, builder)
-
     @classmethod
     def _unserialize(cls, codegen: Any, state: Any) -> Any:
         name, _, (code, bitcode) = state
