@@ -81,6 +81,7 @@ class FleetRule:
             now: Monotonic time, s.
         """
         new = names[self._begun.size :]
+        # Told before a restart: in alarm until it is certain that they have recovered.
         known = np.array([self._absent.pop(name, 0) is None for name in new], np.bool_)
         self._names = names
         self._begun = np.append(self._begun, np.where(known, -np.inf, np.nan))
