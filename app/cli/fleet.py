@@ -84,7 +84,7 @@ def run_fleet(arguments: FleetCommand) -> int:
     else:
         running = attend(None, lambda: _running(plan, report, store, archive), COMPILING)
     page = None if door is None else door.site
-    publisher = None if plan.ends else FleetPublisher(running, page=page)
+    publisher = None if plan.ends else FleetPublisher(running, page=page, store=store)
     if publisher is not None:
         publisher.start()
     try:

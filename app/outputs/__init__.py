@@ -9,6 +9,7 @@ import threading
 import time
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
@@ -20,6 +21,7 @@ from ..live.jobs import Jobs
 from ..live.outputs import OutputLink
 from ..present.state_message import StateMessage, state_message
 from ..twin.secrets import secrets_of
+from .alert_store import AlertStore
 from .alerts import AlertRules
 from .receivers import Deliveries
 
@@ -69,18 +71,22 @@ class Parts(NamedTuple):
 class Publisher:
     """Outputs and alerts of one running twin, as its YAML asks for them."""
 
-    def __init__(self, engine: Running, *, page: str | None = None) -> None:
+    def __init__(self, engine: Running, *, page: str | None = None, store: Path | None = None) -> None:
         """Prepare; nothing is connected yet.
 
         Args:
             engine: The running twin.
             page: Address of its page, without the token; None without one.
+            store: File of its state, beside which the open alerts are kept; None for none.
 
         Raises:
             NisusError: If a package or a secret is missing.
         """
         self._engine, self._page = engine, page
         self._parts = self._make()
+        self._store = AlertStore(store, engine.twin.name, engine.notices)
+        self.problem = ""
+        """Why alerts are not kept, once it has started; empty if they are, or without a store."""
         self._grown, self._stopping = threading.Event(), threading.Event()
         self._thread = threading.Thread(target=self._run, name="outputs", daemon=True)
 
@@ -97,6 +103,7 @@ class Publisher:
         if self._thread.is_alive():
             self._thread.join(2.0)
         self._end()
+        self._store.close(self._parts.rules, self._parts.deliveries)
 
     @property
     def outputs(self) -> tuple[Output, ...]:
@@ -158,6 +165,7 @@ class Publisher:
         if parts.outputs:
             self._engine.grown |= {self._grown.set}
         if parts.deliveries.queues:
+            self.problem = self._store.open(parts.rules, parts.deliveries)
             parts.jobs.run("alerts", lambda job: self._look(parts), every=RULES_PERIOD_S)
         parts.deliveries.run(parts.jobs, RULES_PERIOD_S)
         parts.jobs.start()
@@ -199,6 +207,9 @@ class Publisher:
             return
         self._end()
         self._engine.grown -= {self._grown.set}
+        before = self._parts
+        parts.rules.restore(before.rules.state(), 0.0)
+        parts.deliveries.restore(before.deliveries.waiting())
         self._parts = parts
         self._begin()
 
@@ -211,6 +222,5 @@ class Publisher:
     def _look(self, parts: Parts) -> None:
         """Put the alerts that are due into the queues of their receivers."""
         message = state_message(self._engine)
-        for rule, alert in parts.rules.look(self._engine, message):
-            parts.deliveries.put(alert, rule.to)
+        self._store.send(parts.rules, parts.deliveries, parts.rules.look(self._engine, message))
         parts.deliveries.beat(message.twin, message.health)

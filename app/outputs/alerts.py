@@ -9,14 +9,15 @@ import hashlib
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from config.fleet_schema import FleetAlertSection
 from config.output_schema import AlertSection
 from estimators.diagnostics.detectors import anchor
 from estimators.errors import printable
-from estimators.track import HEALTH_NAMES
+from estimators.track import HEALTH_NAMES, WAITING
 
 from ..present.export.alarm_guide import advice
 from ..present.state_message import StateMessage, iso_now
@@ -27,6 +28,10 @@ if TYPE_CHECKING:
 SCHEMA: Literal["nisus.alert/1"] = "nisus.alert/1"
 
 FIRING, REPEATED, RESOLVED, HEARTBEAT = "firing", "repeated", "resolved", "heartbeat"
+
+SETTLE_S = 10.0
+"""Seconds after a restart, or of an estimate that is known again, until a condition that does not hold counts towards
+`clear`: the log is folded again, and episodes are sought in it."""
 
 GUIDES = LIMIT_GUIDE, NIS_GUIDE, LOST_GUIDE = "limit of a state", "nis above its limit", "loss of the twin"
 """Headings in docs/alarms.md of alerts that are no health and no cause of an episode."""
@@ -110,6 +115,15 @@ def tail(over: float, std: float) -> float:
     return 0.5 * math.erfc(-over / (std * math.sqrt(2.0)))
 
 
+Rule = TypeVar("Rule", AlertSection, FleetAlertSection)
+
+
+def numbered(rules: Sequence[Rule]) -> dict[tuple[str, str], Rule]:
+    """Return rules by their number among those of the same title, and title."""
+    titles = [rule.title for rule in rules]
+    return {(str(titles[:k].count(rule.title)), rule.title): rule for k, rule in enumerate(rules)}
+
+
 class OpenAlert:
     """A condition from its beginning until its end is certain. Times are monotonic, s."""
 
@@ -119,16 +133,21 @@ class OpenAlert:
         self.since = iso_now()
         self.id = hashlib.sha256("|".join((*key, self.since)).encode()).hexdigest()[:16]
         self.sent: float | None = None
+        self.removed = False
+        """Whether its rule is no longer in the YAML."""
 
 
 class AlertRules:
     """Decides which alerts to send; not for several threads at once."""
 
+    message = AlertMessage
+    """Type of the messages."""
+
     def __init__(
         self, rules: Sequence[AlertSection], *, link: str | None = None, clock: Callable[[], float] = time.monotonic
     ) -> None:
         """`link`: address of the page, without the token; `clock` returns seconds."""
-        self._rules, self._link, self._clock = tuple(rules), link, clock
+        self._rules, self._link, self._clock = numbered(rules), link, clock
         self._open: dict[tuple[str, ...], OpenAlert] = {}
         self._version: int | None = None
         self._maintained = -math.inf
@@ -147,16 +166,21 @@ class AlertRules:
         if self._version is not None and message.model_version > self._version:
             self._maintained = now
         self._version = message.model_version
-        for k, rule in enumerate(self._rules):
+        holding: set[tuple[str, ...]] = set()
+        for name, rule in self._rules.items():
             for found in findings(rule, engine, message):
-                key = str(k), rule.title, found.subject, found.key
+                key = *name, found.subject, found.key
                 entry = self._open.setdefault(key, OpenAlert(key, rule, found, now))
-                entry.finding, entry.seen = found, now
+                entry.rule, entry.finding, entry.seen = rule, found, now
+                holding.add(key)
         muted = engine.mute is not None and engine.mute.active
         for place, entry in list(self._open.items()):
             rule = entry.rule
             quiet = muted or now - self._maintained < rule.maintenance
-            lasts = entry.seen == now
+            lasts = place in holding
+            known = message.health != HEALTH_NAMES[WAITING] if rule.lost is None else message.age_s is not None
+            if not (lasts or known):
+                entry.seen = max(entry.seen, now + SETTLE_S)
             over = not lasts and now - entry.seen >= rule.clear
             if over and (entry.sent is None or not quiet):
                 del self._open[place]
@@ -170,15 +194,41 @@ class AlertRules:
                     due.append((rule, self._message(entry, FIRING if first else REPEATED, message)))
         return due
 
+    def state(self) -> list[Any]:
+        """Return the open alerts, for JSON."""
+        now = self._clock()
+        return [
+            {"key": key, "rule": entry.rule.model_dump(mode="json", exclude_unset=True), "finding": entry.finding,
+             "id": entry.id, "since": entry.since, "sent": now - entry.sent}
+            for key, entry in self._open.items() if entry.sent is not None
+        ]  # fmt: skip
+
+    def restore(self, state: Sequence[Any], ago: float) -> None:
+        """Continue with the open alerts of `state`, which was returned some seconds `ago`.
+
+        That of a rule which is no longer there is resolved.
+        """
+        now, found = self._clock(), {}
+        for item in state:
+            key, rule = tuple(map(str, item["key"])), AlertSection.model_validate(item["rule"])
+            entry = found[key] = OpenAlert(key, rule, Finding(*item["finding"]), now)
+            entry.id, entry.since, entry.sent = str(item["id"]), str(item["since"]), now - ago - item["sent"]
+            entry.begun, entry.seen = -math.inf, now + SETTLE_S
+            entry.removed = key[:2] not in self._rules
+        self._open.update(found)
+
     def _message(self, entry: OpenAlert, status: Any, message: StateMessage) -> AlertMessage:
         found, place = entry.finding, anchor(entry.finding.guide)
+        text = printable(found.text)
+        if status == RESOLVED:
+            text = f"the rule {entry.rule.title} was removed: {text}" if entry.removed else f"no longer: {text}"
         return AlertMessage(
             twin=message.twin,
             id=entry.id,
             status=status,
             rule=entry.rule.title,
             subject=found.subject,
-            text=printable(found.text) if status != RESOLVED else f"no longer: {printable(found.text)}",
+            text=text,
             health=message.health,
             since=entry.since,
             sent=iso_now(),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
 from config.fleet_schema import FleetAlertSection
@@ -16,6 +17,7 @@ from ..live.notices import Notices
 from ..present.fleet_state import ChangedAssets, asset_message
 from ..terminal import print_line
 from ..twin.secrets import secrets_of
+from .alert_store import AlertStore
 from .fleet_alerts import FleetRules
 from .receivers import Deliveries
 
@@ -46,12 +48,13 @@ class TabledFleet(Protocol):
 class FleetPublisher:
     """Outputs and alerts of a running fleet, as its YAML asks for them."""
 
-    def __init__(self, fleet: TabledFleet, *, page: str | None = None) -> None:
+    def __init__(self, fleet: TabledFleet, *, page: str | None = None, store: Path | None = None) -> None:
         """Prepare; nothing is connected yet.
 
         Args:
             fleet: The running fleet.
             page: Address of its overview, without the token; None without one.
+            store: File of its state, beside which the open alerts are kept; None for none.
 
         Raises:
             NisusError: If a package or a secret is missing.
@@ -72,6 +75,7 @@ class FleetPublisher:
             self._mqtt = MqttOutput(section.mqtt, plan.name, form, self.notices, secrets)
         self._deliveries = Deliveries(section.receivers, folder, self._mqtt, self.notices, secrets)
         self._rules = FleetRules(rules or (HEALTH_RULE,), plan.name, link=page)
+        self._store = AlertStore(store, plan.name, self.notices)
         self._jobs = Jobs(self.notices, "output", threads=max(1, len(self._deliveries.queues)), niceness=0)
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name="outputs", daemon=True)
@@ -82,6 +86,8 @@ class FleetPublisher:
             self._mqtt.start()
         elif not self._deliveries.queues:
             return
+        if self._deliveries.queues:
+            self._store.open(self._rules, self._deliveries)
         self._deliveries.run(self._jobs, DELIVERY_PERIOD_S)
         self._jobs.start()
         self._thread.start()
@@ -92,6 +98,7 @@ class FleetPublisher:
         if self._thread.is_alive():
             self._thread.join(2.0)
         self._jobs.stop()
+        self._store.close(self._rules, self._deliveries)
         if self._mqtt is not None:
             self._mqtt.stop()
         self._print()
@@ -126,8 +133,7 @@ class FleetPublisher:
 
     def _alert(self, names: Sequence[str], table: FleetTable) -> None:
         """Put the alerts that are due into the queues of their receivers."""
-        for rule, alert in self._rules.look(names, table):
-            self._deliveries.put(alert, rule.to)
+        self._store.send(self._rules, self._deliveries, self._rules.look(names, table))
         if not self._fleet.failure:  # a fleet that stands still does not tell that it runs
             self._deliveries.beat(self._fleet.plan.name, HEALTH_NAMES[table.health.max()])
 

@@ -256,6 +256,12 @@ class Delivery:
         """Alerts that wait."""
         return len(self._waiting)
 
+    @property
+    def alerts(self) -> list[AlertMessage]:
+        """Alerts that wait, the oldest first."""
+        with self._lock:
+            return list(self._waiting)
+
     def put(self, alert: AlertMessage) -> None:
         """Add an alert to the queue; of a full one the oldest is dropped."""
         with self._lock:
@@ -318,10 +324,30 @@ class Deliveries:
         self._periods = {name: period for name, period in periods.items() if period is not None}
         self._beats: dict[str, float] = {}
 
-    def put(self, alert: AlertMessage, to: Sequence[str] | None) -> None:
-        """Report an alert, and add it to the queues of the receivers of these names; None for all."""
+    def names(self, to: Sequence[str] | None) -> list[str]:
+        """Return the names of the receivers that are meant by `to` of a rule, which may be of an earlier YAML."""
+        return [name for name in self.queues if to is None or name in to]
+
+    def counts(self) -> list[tuple[int, int]]:
+        """Return how many alerts each receiver has taken, and lost."""
+        return [(queue.delivered, queue.dropped) for queue in self.queues.values()]
+
+    def waiting(self) -> list[tuple[str, AlertMessage]]:
+        """Return the alerts that wait, each with the name of its receiver."""
+        return [
+            (name, alert) for name, queue in self.queues.items() for alert in queue.alerts if alert.status != HEARTBEAT
+        ]
+
+    def restore(self, waiting: Sequence[tuple[str, AlertMessage]]) -> None:
+        """Add alerts that waited in an earlier process, or under an earlier YAML."""
+        for name, alert in waiting:
+            if name in self.queues:
+                self.queues[name].put(alert)
+
+    def put(self, alert: AlertMessage, names: Sequence[str]) -> None:
+        """Report an alert, and add it to the queues of the receivers of these names."""
         self._notices.say(f"alert {alert.status}: {alert.text}", level="warn" if alert.status == FIRING else "info")
-        for name in to or self.queues:
+        for name in names:
             self.queues[name].put(alert)
 
     def beat(self, twin: str, health: str) -> None:

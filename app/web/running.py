@@ -144,7 +144,7 @@ class RunningTwin:
                 self.engine.notices.say("a recording is replayed: no alerts are sent")
         else:
             page = None if door is None else door.site
-            self.publisher = self.engine.published = Publisher(self.engine, page=page)
+            self.publisher = self.engine.published = Publisher(self.engine, page=page, store=opening.store)
         self.view: Any = None
         self.server: Any = None
         self.gone: threading.Event | None = None
@@ -192,6 +192,8 @@ class RunningTwin:
         self.engine.start()
         if self.publisher is not None:
             self.publisher.start()
+            if self.publisher.problem and self._next_line is None:
+                complain(self.publisher.problem)
         if self.store is not None:
             self.store.start()
         if self.archive is not None:

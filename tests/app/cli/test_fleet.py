@@ -177,6 +177,15 @@ def test_a_live_source_without_measurements_is_told_from_wrong_channels(tmp_path
     assert capsys.readouterr().err == "nisus: pumps.yaml:2: no measurement arrived; check that its senders run\n"
 
 
+def test_open_alerts_of_a_fleet_are_kept_beside_its_store(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    receivers = "outputs: {receivers: {ops: {type: command, command: [cat]}}}"
+    (tmp_path / "pumps.yaml").write_text(f"twin: motor_winding\nsource: {{type: push}}\n{receivers}\n")
+    assert main(["fleet", "pumps.yaml", "--headless", "--duration", "0.1", "--store", "."]) == 2
+    assert (tmp_path / "pumps.store.alerts").exists()
+    capsys.readouterr()
+
+
 def test_a_broker_that_is_not_there_is_told_once(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     pytest.importorskip("paho.mqtt")

@@ -1,0 +1,400 @@
+"""Open alerts are kept over a restart: the same id, told once, repeated when it is due, and resolved in the end."""
+
+import json
+import signal
+import sqlite3
+import subprocess
+import sys
+import zlib
+from contextlib import closing
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from app.live.notices import Notices
+from app.live.store import FORMAT
+from app.outputs import Publisher, alert_store
+from app.outputs.alert_store import AlertStore
+from app.outputs.alerts import SETTLE_S
+from app.outputs.fleet import FleetPublisher
+from app.outputs.fleet_alerts import MAX_ABSENCE_S
+from app.outputs.receivers import Deliveries
+from app.twin.fleet import load_fleet
+from app.twin.secrets import NO_SECRETS
+from config.output_schema import WebhookSection
+from estimators.errors import SourceError
+from sources.source import ignore
+from tests.app.outputs import test_fleet_alerts as of_fleets
+from tests.app.outputs.test_alerts import Looked, episode, send, started, state
+from tests.app.scripted import wait_for
+from tests.conftest import ROOT
+
+BAD = {"health": "degraded", "cause": "yoke is silent"}
+
+
+def restarted(before, ago, at=0.0, make=Looked, **rule):
+    """Rules of another process, `ago` seconds after those before were kept; its clock begins anywhere."""
+    after = make(**rule)
+    after.now = at
+    after.rules.restore(json.loads(json.dumps(before.rules.state())), ago)
+    return after
+
+
+def test_an_open_alert_is_repeated_when_it_is_due_and_resolved_after_a_restart():
+    rule = {"health": "suspect", "after": 2.0, "repeat": 60.0, "clear": 5.0}
+    before = Looked(**rule)
+    assert before.at(0.0, **BAD) == [] and not before.rules.state()
+    (first,) = before.messages(3.0, **BAD)
+    before.now = 13.0
+    after = restarted(before, 20.0, **rule, at=1000.0)  # 30 s after the first message
+    (known,) = after.rules.open
+    assert (known.id, known.since, known.finding.text) == (first.id, first.since, "degraded: yoke is silent")
+    assert after.at(1000.2, **BAD) == after.at(1029.9, **BAD) == []
+    (again,) = after.messages(1030.0, **BAD)
+    assert (again.status, again.id, again.since) == ("repeated", first.id, first.since)
+    (last,) = restarted(after, 0.0, **rule).messages(SETTLE_S + 5.0)
+    assert (last.status, last.id) == ("resolved", first.id) and last.text == "no longer: degraded: yoke is silent"
+    # After hours without a process it is repeated at once.
+    assert restarted(after, 7200.0, **rule).at(0.2, **BAD) == ["repeated"]
+
+
+def test_nothing_is_resolved_before_the_estimate_is_known_again():
+    """The filter may be compiled for minutes, and episodes are sought in the rows that are folded again."""
+    rule = {"health": "suspect", "after": 0.0, "clear": 0.0}
+    before = Looked(**rule)
+    assert before.at(0.0, **BAD) == ["firing"]
+    after = restarted(before, 0.0, **rule)
+    assert after.at(0.2, health="waiting") == after.at(300.0, health="waiting") == []
+    assert after.at(309.9) == after.at(310.0, **BAD) == [] and after.at(310.2) == ["resolved"]
+    lost = Looked(lost=30.0, after=0.0, clear=0.0)
+    assert lost.at(0.0, age_s=31.0) == ["firing"]
+    after = restarted(lost, 0.0, lost=30.0, after=0.0, clear=0.0)
+    assert after.at(60.0, age_s=None, health="waiting") == after.at(69.0, age_s=0.1, health="waiting") == []
+    assert after.at(70.0, age_s=0.1, health="waiting") == ["resolved"]
+    # In a run, too.
+    running = Looked(**rule)
+    assert running.at(0.0, **BAD) == ["firing"] and running.at(9.0, health="waiting") == []
+    assert running.at(18.0) == [] and running.at(19.0) == ["resolved"]
+
+
+def test_the_alerts_of_episodes_and_of_rules_that_were_removed_are_resolved():
+    before = Looked(episode=["stuck"], after=0.0, clear=0.0)
+    before.episodes = [episode("yoke"), episode("winding", start=4.0)]
+    yoke, winding = before.messages(0.0)
+    after = restarted(before, 1.0, episode=["stuck"], after=0.0, clear=0.0)
+    after.episodes = before.episodes[1:]
+    assert after.messages(0.2) == []
+    (last,) = after.messages(SETTLE_S)
+    assert (last.id, last.status, last.subject) == (yoke.id, "resolved", "yoke")
+    other = restarted(after, 0.0, health="suspect", after=0.0)
+    assert [item.id for item in other.rules.open] == [winding.id]
+    (last,) = other.messages(SETTLE_S)
+    assert (last.id, last.status, last.rule) == (winding.id, "resolved", "episode")
+    assert last.text == "the rule episode was removed: winding: it is stuck"
+
+
+def test_assets_in_alarm_are_known_after_a_restart_in_any_order():
+    rule = {"health": "degraded", "after": 5.0, "clear": 10.0, "group": 0.0, "repeat": 3600.0}
+    bad, good = "degraded", "tracking"
+    before = of_fleets.Looked(**rule)
+    assert before.at(0.0, bad, bad, good, bad) is None
+    first = before.at(5.0, bad, bad, good, bad)
+    before.now = 105.0
+    after = restarted(before, 500.0, at=50.0, make=of_fleets.Looked, **rule)
+
+    def at(t, **health):
+        """Look at assets that come in another order than before."""
+        after.now = t
+        names = [name.replace("_", " ") for name in health]
+        table = of_fleets.table(list(health.values()))._replace(assets=names)
+        found = after.rules.look(names, table)
+        return found[0][1] if found else None
+
+    # Parts of the fleet start one after another; one does not report any more.
+    assert at(50.0, pump_1=bad) is None
+    assert at(60.0, pump_1=bad, pump_2=good, pump_0=good) is None
+    # One has recovered 10 s after that, which waits for the other one, or for the next message.
+    assert at(85.0, pump_1=bad, pump_2=good, pump_0=good) is None
+    assert at(90.0, pump_1=bad, pump_2=bad, pump_0=good) is None
+    message = at(95.0, pump_1=bad, pump_2=bad, pump_0=good)
+    assert (message.status, message.id, message.since) == ("firing", first.id, first.since)
+    assert (message.fired, message.recovered, message.value) == (("pump 2",), ("pump 0",), 3.0)
+    message = at(50.0 + MAX_ABSENCE_S, pump_1=bad, pump_2=bad, pump_0=good)
+    assert (message.status, message.id, message.value) == ("repeated", first.id, 2.0)
+    assert message.recovered == ("pump 3",) and message.text.endswith("; 1 asset recovered")
+    assert at(200.0, pump_1=good, pump_2=good, pump_0=good).status == "resolved"
+    assert not after.rules.state()
+    # An asset that is new, before any other is known again, belongs to the same alert.
+    after = restarted(before, 0.0, make=of_fleets.Looked, **rule)
+    assert at(0.0, pump_9=bad) is None and at(5.0, pump_9=bad).id == first.id
+
+
+def test_a_fleet_repeats_and_resolves_after_a_restart():
+    rule = {"health": "degraded", "after": 0.0, "clear": 0.0, "group": 0.0, "repeat": 60.0}
+    before = of_fleets.Looked(**rule)
+    first = before.at(0.0, "degraded", "tracking")
+    after = restarted(before, 40.0, make=of_fleets.Looked, **rule)
+    assert after.at(0.0, "degraded", "tracking") is None and after.at(19.0, "degraded", "tracking") is None
+    again = after.at(20.0, "degraded", "tracking")
+    assert (again.status, again.id, again.fired) == ("repeated", first.id, ())
+    # Without the state of the assets, nothing is known of one that has not reported.
+    later = restarted(after, 0.0, make=of_fleets.Looked, **rule)
+    assert later.at(0.0, "waiting", "waiting") is None and later.at(50.0, "waiting", "tracking") is None
+    assert later.at(59.0, "tracking", "tracking") is None
+    last = later.at(50.0 + SETTLE_S, "tracking", "tracking")
+    assert (last.status, last.id, last.recovered) == ("resolved", first.id, ("pump 0",))
+    other = restarted(after, 0.0, make=of_fleets.Looked, health="stale", group=0.0)
+    assert other.at(0.0, "degraded", "tracking") is None
+    last = other.at(SETTLE_S + 10.0, "degraded", "tracking")
+    assert (last.status, last.id, last.text) == ("resolved", first.id, "the rule health-degraded was removed")
+    assert not other.rules.state()
+
+
+class Receiver:
+    """Takes alerts unless it is dead."""
+
+    def __init__(self):
+        self.dead, self.got = False, []
+
+    def send(self, alert):
+        if self.dead:
+            raise OSError("refused")
+        self.got.append(alert)
+
+
+class Process:
+    """Rules, receivers and file of one process; its threads are those of the test."""
+
+    def __init__(self, folder, monkeypatch, owner="motor", make=Looked, dead=False, **rule):
+        self.receiver = Receiver()
+        self.receiver.dead = dead
+        monkeypatch.setattr("app.outputs.receivers.make_receivers", lambda *_: {"ops": self.receiver})
+        self.notices = Notices(lambda: 0)
+        section = WebhookSection(type="webhook", url="http://127.0.0.1:9/")
+        self.deliveries = Deliveries({"ops": section}, folder, None, self.notices, NO_SECRETS)
+        self.looked = make(**rule)
+        self.store = AlertStore(folder / "motor.store", owner, self.notices)
+        self.problem = self.store.open(self.looked.rules, self.deliveries)
+
+    def look(self, t, **fields):
+        self.looked.now = t
+        due = self.looked.rules.look(self.looked.engine, state(**fields))
+        self.store.send(self.looked.rules, self.deliveries, due)
+        return self
+
+    def deliver(self):
+        self.deliveries.queues["ops"].step()
+        return [(alert.status, alert.id) for alert in self.receiver.got]
+
+    def kill(self):
+        """End as a killed process does: nothing more is written."""
+        self.store._store.close()
+
+    def said(self):
+        return [line.text for line in self.notices.since(0)]
+
+
+RULE = {"health": "suspect", "after": 0.0, "clear": 0.0}
+
+
+def test_an_alert_is_stored_before_it_is_sent_and_told_once(tmp_path, monkeypatch):
+    first = Process(tmp_path, monkeypatch, dead=True, **RULE).look(0.0, **BAD)
+    assert first.deliver() == []
+    first.kill()
+    # Its receiver was dead: the next process sends it. A kill before the next look sends it again, with its id.
+    second = Process(tmp_path, monkeypatch, **RULE)
+    ((status, number),) = second.deliver()
+    assert status == "firing"
+    second.kill()
+    third = Process(tmp_path, monkeypatch, **RULE)
+    assert third.deliver() == [("firing", number)]
+    third.look(0.2, **BAD)
+    third.kill()
+    # From then on it was told; the cause has gone meanwhile.
+    fourth = Process(tmp_path, monkeypatch, **RULE).look(0.2)
+    assert fourth.deliver() == []
+    fourth.look(SETTLE_S)
+    assert fourth.deliver() == [("resolved", number)]
+    fourth.store.close(fourth.looked.rules, fourth.deliveries)
+    fifth = Process(tmp_path, monkeypatch, **RULE).look(0.0).look(100.0)
+    assert fifth.deliver() == [] and fifth.said() == []
+
+
+def rewritten(sql):
+    def spoil(path):
+        with closing(sqlite3.connect(path, isolation_level=None)) as file:
+            file.execute(sql)
+
+    return spoil
+
+
+@pytest.mark.parametrize(
+    ("spoil", "reason"),
+    [
+        (lambda path: path.write_text("a: text\n" * 1000), "is no store of Nisus; choose another path"),
+        (rewritten(f"PRAGMA user_version={FORMAT + 1}"), f"has format {FORMAT + 1}, this version reads {FORMAT}; rem"),
+        (rewritten("UPDATE parts SET crc = 1"), "is damaged; remove it, or choose another path"),
+        (
+            rewritten(f"UPDATE parts SET data = x'7b7d', crc = {zlib.crc32(b'{}')}"),
+            "cannot be continued (KeyError); remove it",
+        ),
+    ],
+)
+def test_a_file_that_cannot_be_used_is_one_line_and_alerts_are_sent(tmp_path, monkeypatch, spoil, reason):
+    path = tmp_path / "motor.store.alerts"
+    Process(tmp_path, monkeypatch, **RULE).look(0.0, **BAD).kill()
+    spoil(path)
+    before = path.read_bytes()[100:]
+    process = Process(tmp_path, monkeypatch, **RULE)
+    (line,) = process.said()
+    assert line.startswith(f"store {path}: {reason}") and line == process.problem and "\n" not in line
+    assert line.endswith("; alerts are not kept over a restart")
+    assert [status for status, _ in process.look(0.0, **BAD).deliver()] == ["firing"]
+    process.store.close(process.looked.rules, process.deliveries)
+    assert path.read_bytes()[100:] == before
+
+
+def test_a_file_of_another_twin_or_in_use_is_left_alone(tmp_path, monkeypatch):
+    first = Process(tmp_path, monkeypatch, **RULE).look(0.0, **BAD)
+    assert "another process uses it" in Process(tmp_path, monkeypatch, **RULE).problem
+    first.kill()
+    assert "motor.store.alerts: is of motor; remove it" in Process(tmp_path, monkeypatch, "pump", **RULE).problem
+    assert not list(tmp_path.glob("other*"))
+    none = AlertStore(None, "motor", first.notices)
+    assert none.open(first.looked.rules, first.deliveries) == ""
+
+
+def test_alerts_are_sent_while_the_disk_is_full(tmp_path, monkeypatch):
+    monkeypatch.setattr(alert_store, "RETRY_PERIOD_S", 0.0)
+    process = Process(tmp_path, monkeypatch, **RULE)
+    write, full = process.store._store.write_blocks, [True]
+
+    def write_or_fail(blocks):
+        if full[0]:
+            raise SourceError("the disk is full")
+        write(blocks)
+
+    process.store._store.write_blocks = write_or_fail
+    full[0] = False
+    process.look(0.0)
+    full[0] = True
+    process.look(0.2, **BAD)
+    full[0] = False
+    process.look(0.4, **BAD).kill()
+    ((status, number),) = process.deliver()
+    assert status == "firing"
+    lines = [line for line in process.said() if line.startswith(("the disk", "store"))]
+    assert lines == [
+        "the disk is full; alerts are sent without it, and it is tried again",
+        f"store {tmp_path / 'motor.store.alerts'}: it is written again",
+    ]
+    after = Process(tmp_path, monkeypatch, **RULE).look(SETTLE_S)
+    assert after.deliver() == [("firing", number), ("resolved", number)]  # neither was known to be delivered
+
+
+RUN = """
+import os, signal, sys, json, time
+from pathlib import Path
+from app.twin.twin import load_twin
+from app.web.running import OpenedTwin, RunningTwin
+from sources.source import ignore
+
+folder, first, value, count = Path(sys.argv[1]), int(sys.argv[2]), float(sys.argv[3]), int(sys.argv[4])
+program = "import sys; open(sys.argv[1], 'a').write(sys.stdin.read() + chr(10))"
+command = [sys.executable, "-c", program, str(folder / "alerts")]
+twin = load_twin("motor_winding", overrides={
+    "source": "{type: push}", "time.tick": "1000",
+    "outputs": json.dumps({"receivers": {"log": {"type": "command", "command": command}}}),
+    "alerts": "[{state: temperature, above: 45, after: 0, clear: 0}]",
+})
+running = RunningTwin(OpenedTwin(twin, lambda report: twin.open_source(ignore), store=folder / "a.store"), door=None)
+running.start()
+source = running.engine.innermost
+for k in range(first, first + 60):
+    source.send([{"time": (1767225600 + k) * 10**9, "values": {"winding": value}}])
+while True:
+    time.sleep(0.05)
+    file = folder / "alerts"
+    told = file.read_text().count("\\n") if file.exists() else 0
+    taken = sum(queue.delivered for queue in running.publisher._parts.deliveries.queues.values())
+    if told >= count and source.accepted and running.store.has(source.accepted) and (taken or not first):
+        time.sleep(1.0)  # the queue without it is stored after the next look
+        os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def test_a_yaml_that_is_saved_while_an_alert_is_open_does_not_begin_it_again(serve, tmp_path, monkeypatch):
+    monkeypatch.setattr("app.outputs.alerts.SETTLE_S", 0.0)
+    program = "import sys; open(sys.argv[1], 'a').write(sys.stdin.read() + chr(10))"
+    receivers = {"log": {"type": "command", "command": [sys.executable, "-c", program, str(tmp_path / "alerts")]}}
+    rule = "{state: temperature, above: 45, after: 0, clear: 0}"
+    twin = started(receivers, f"[{rule}]")
+    page = serve(twin=twin, behind=lambda _: twin.open_source(ignore))
+    publisher = page.engine.published = Publisher(page.engine)
+
+    def told():
+        file = tmp_path / "alerts"
+        return [json.loads(line) for line in file.read_text().splitlines()] if file.exists() else []
+
+    publisher.start()
+    try:
+        for k in range(30):
+            send(page, k, 50.0)
+        wait_for(lambda: len(told()) == 1)
+        first, page.engine.twin = publisher._parts, started(receivers, f"[{{health: stale}}, {rule}]")
+        wait_for(lambda: publisher._parts is not first)
+        for k in range(30, 80):
+            send(page, k, 40.0)
+        wait_for(lambda: len(told()) == 2)
+    finally:
+        publisher.stop()
+    assert [alert["status"] for alert in told()] == ["firing", "resolved"]
+    assert told()[0]["id"] == told()[1]["id"]
+
+
+def test_a_killed_process_is_followed_by_one_that_resolves_its_alert(tmp_path):
+    for arguments in (("0", "50.0", "1"), ("60", "40.0", "2")):
+        ended = subprocess.run(
+            [sys.executable, "-c", RUN, str(tmp_path), *arguments],
+            cwd=ROOT, text=True, capture_output=True, timeout=300,
+        )  # fmt: skip
+        assert ended.returncode == -signal.SIGKILL, ended.stderr
+    told = [json.loads(line) for line in (tmp_path / "alerts").read_text().splitlines()]
+    assert [alert["status"] for alert in told] == ["firing", "resolved"]
+    assert told[0]["id"] == told[1]["id"] and told[0]["since"] == told[1]["since"]
+
+
+def test_a_fleet_whose_assets_are_folded_elsewhere_resolves_after_a_restart(tmp_path, monkeypatch):
+    """As the process of a fleet in several, which has the table alone, and the file of alerts."""
+    monkeypatch.setattr("app.outputs.fleet_alerts.SETTLE_S", 0.0)
+    program = "import sys; open(sys.argv[1], 'a').write(sys.stdin.read() + '\\n')"
+    command = [sys.executable, "-c", program, str(tmp_path / "alerts")]
+    outputs = {"every": 0.02, "receivers": {"log": {"type": "command", "command": command}}}
+    given = {"twin": "motor_winding", "source": {"type": "push"}, "outputs": outputs, "processes": 2}
+    given["alerts"] = [{"health": "degraded", "after": 0, "clear": 0, "group": 0}]
+    (tmp_path / "pumps.yaml").write_text(json.dumps(given))
+    plan = load_fleet(tmp_path / "pumps.yaml")
+
+    def told():
+        file = tmp_path / "alerts"
+        return [json.loads(line) for line in file.read_text().splitlines()] if file.exists() else []
+
+    def run(names, health, count):
+        table = of_fleets.table(health)._replace(assets=names)
+        fleet = SimpleNamespace(plan=plan, failure="", table=lambda: (1, names, table))
+        publisher = FleetPublisher(fleet, store=tmp_path / "pumps.store")
+        publisher.start()
+        try:
+            wait_for(lambda: len(told()) == count)
+        finally:
+            publisher.stop()
+
+    run(["a", "b", "c"], ["degraded", "tracking", "stale"], 1)
+    run(["c", "a", "b", "d"], ["tracking", "tracking", "tracking", "degraded"], 2)
+    run(["d", "b", "c", "a"], ["tracking"] * 4, 3)
+    alerts = told()
+    assert [alert["status"] for alert in alerts] == ["firing", "firing", "resolved"]
+    assert len({alert["id"] for alert in alerts}) == 1
+    assert (alerts[1]["fired"], alerts[1]["recovered"]) == (["d"], ["c", "a"])
+    assert not np.isin(["a", "b", "c"], alerts[2]["recovered"]).any()
