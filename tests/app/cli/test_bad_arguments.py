@@ -45,7 +45,7 @@ REFUSED = {
     "run motor_can --json": "--json: is the result of a run without a page; give --headless",
     "run motor_can --public https://a.example": "--public https://a.example: others can reach it; give --tokens FILE",
     **{
-        f"run motor_can --tokens t --public {site}": f"--public {site}: must be like https://twins.example.com, in lower"
+        f"run motor_can --tokens t --public {site}": f"--public {site}: must be like https://twins.example.com, in"
         for site in ("https://A.example", "https://a.example:443", "http://a.example:80", "https://a.example/b")
     },
     **{
