@@ -112,9 +112,8 @@ class FleetArchive:
             try:
                 self._begin()
                 if rows:
-                    self._append(rows, self._stored["store"])
-                    assert self._journal is not None
-                    self._stored |= {"number": self._journal.number, "end": self._journal.sync()}
+                    journal = self._append(rows, self._stored["store"])
+                    self._stored |= {"number": journal.number, "end": journal.size}
             except Exception as error:  # noqa: BLE001  as in `look`
                 self._fail(error)
                 for at, events in rows:
@@ -167,7 +166,7 @@ class FleetArchive:
                 del self._waiting[: len(rows)]
                 self._count -= sum(len(events) for _, events in rows)
 
-    def _append(self, rows: Sequence[tuple[np.ndarray, Events]], store: str) -> None:
+    def _append(self, rows: Sequence[tuple[np.ndarray, Events]], store: str) -> Journal:
         """Write rows to the journal of a store, or of none; that of a new day or of another store is a new one."""
         at, events = np.concatenate([at for at, _ in rows]), Events.concat([e for _, e in rows], self._model.width)
         day = int(events.t.max()) // DAY_NS
@@ -175,7 +174,7 @@ class FleetArchive:
         if known is not None and (known.store != store or (self._split.daily and day > known.day)):
             self._end()
         if self._journal is None:
-            self._journal = Journal(self._folder, day, store)
+            self._journal = Journal(self._folder, day, store, self._stored["number"])
         try:
             self._journal.write(rows_of(self._model, self._names, at, events))
         except BaseException:
@@ -183,6 +182,7 @@ class FleetArchive:
             self._ended.append(self._journal.path)
             self._journal = None
             raise
+        return self._journal
 
     def _end(self) -> None:
         """End the journal."""
@@ -216,20 +216,22 @@ def rows_of(model: StateSpaceModel, names: Sequence[str], at: np.ndarray, events
 class Journal:
     """Rows of a file that is not complete, in the order of arrival."""
 
-    def __init__(self, folder: Path, day: int, store: str) -> None:
+    def __init__(self, folder: Path, day: int, store: str, last: int) -> None:
         """Open it under the number of the next Parquet file.
 
         Args:
             folder: Of the archive.
             day: That of its first rows.
             store: Id of the store that has its length, or empty.
+            last: Number of the last journal of the store, also in a folder that has been emptied since.
 
         Raises:
             OSError: If that is not possible.
         """
         folder.mkdir(parents=True, exist_ok=True)
-        taken = [*map(number_of, parts_of(folder)), *(int(path.stem) for path in folder.glob(f"*{JOURNAL}"))]
-        self.number = max(taken, default=0) + 1
+        # Journals first: one that is completed meanwhile is then among the files.
+        taken = [last, *(int(path.stem) for path in folder.glob(f"*{JOURNAL}")), *map(number_of, parts_of(folder))]
+        self.number = max(taken) + 1
         self.path = folder / f"{self.number:06d}{JOURNAL}"
         self._file = self.path.open("xb")
         lock(self._file)
@@ -248,24 +250,23 @@ class Journal:
         return time.monotonic() - self._begun
 
     def write(self, table: Any) -> None:
-        """Append rows."""
+        """Append rows; those of a store are then on the disk, as those in the store are."""
         import pyarrow as pa
 
         if self._writer is None:
             self._writer = pa.ipc.new_stream(self._file, table.schema.with_metadata({STORE: self.store}))
         self._writer.write_table(table)
         self._file.flush()
+        if self.store:
+            os.fsync(self._file.fileno())
         self._end = self._file.tell()
 
-    def sync(self) -> int:
-        """Have the rows on the disk, as those of a store are, and return the size."""
-        os.fsync(self._file.fileno())
-        return self._end
-
     def abandon(self) -> None:
-        """Close it after a failure; the rows before that are read."""
+        """Close it after a failure; the rows before that are read, not those that failed, as they are written again."""
         with suppress(OSError):
             self._file.close()
+        with suppress(OSError):
+            os.truncate(self.path, self._end)
 
     def close(self) -> None:
         """End the stream."""

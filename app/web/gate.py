@@ -20,7 +20,6 @@ import threading
 from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import NamedTuple
-from urllib.parse import urlsplit
 
 from starlette.datastructures import Headers, MutableHeaders, QueryParams
 from starlette.responses import HTMLResponse, PlainTextResponse, RedirectResponse
@@ -29,6 +28,12 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from estimators.errors import ConfigError, nearest, shown_name
 
 LOOPBACK_HOST = re.compile(r"(127\.0\.0\.1|localhost|\[::1\])(:\d{1,5})?", re.IGNORECASE)
+
+SITE = re.compile(r"(https?)://(?:[a-z0-9._-]+|\[[0-9a-f:]+\])(?::([1-9][0-9]{0,4}))?")
+"""An origin as browsers name it; groups: scheme and port."""
+
+PORTS = {"http": 80, "https": 443}
+"""Ports that browsers leave out."""
 
 STAGE = "/viser/"
 
@@ -42,7 +47,7 @@ REFUSED_HOST = "Nisus: this Host is not served; open the page at 127.0.0.1.\n"
 REFUSED_ORIGIN = "Nisus: requests from other sites are refused.\n"
 REFUSED_TOKEN = "Nisus: open the page at the address, with its token, that `nisus run` printed.\n"
 
-FORWARD = '<!doctype html><meta http-equiv="refresh" content="0;url=/"><title>Nisus</title>'
+FORWARD = '<!doctype html><meta http-equiv="refresh" content="0;url=./"><title>Nisus</title>'
 
 COMMON_HEADERS = {
     "x-content-type-options": "nosniff",
@@ -96,16 +101,15 @@ def grants_of(tokens: Path | None, public: str | None) -> tuple[Grant, ...]:
     if public is not None and tokens is None:
         raise ConfigError(f"--public {public}: {NEEDS_TOKENS}")
     if public is not None and not _is_site(public):
-        raise ConfigError(f"--public {public}: must be like https://twins.example.com, without a path")
+        rule = "must be like https://twins.example.com, in lower case, without a path or the default port"
+        raise ConfigError(f"--public {public}: {rule}")
     return () if tokens is None else read_tokens(tokens)
 
 
 def _is_site(text: str) -> bool:
-    try:
-        parts = urlsplit(text)
-    except ValueError:
-        return False
-    return parts.scheme in ("http", "https") and bool(parts.netloc) and not (parts.path or parts.query)
+    """Return whether browsers name an origin like this; every request from another one is refused."""
+    found = SITE.fullmatch(text)
+    return found is not None and int(found[2] or 1) < 2**16 and int(found[2] or 1) != PORTS[found[1]]
 
 
 def read_tokens(path: Path) -> tuple[Grant, ...]:
@@ -320,7 +324,8 @@ class Gate:
             "referrer-policy": "no-referrer",
         }
         # After a link on another page, the strict cookie would not be sent along a redirect.
-        return RedirectResponse("/", 303, headers) if same_site else HTMLResponse(FORWARD, headers=headers)
+        # Relative: a reverse proxy may offer the page below a path.
+        return RedirectResponse("./", 303, headers) if same_site else HTMLResponse(FORWARD, headers=headers)
 
 
 def _marked(cookie: str, *, secure: bool = False) -> str:

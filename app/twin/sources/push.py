@@ -62,8 +62,7 @@ def _open_mqtt(opening: Opening) -> Source:
     if by_hand and section.qos == 2:
         rule = "is 2; set it to 1: a fleet with --store takes each of its messages once"
         raise failure(opening.loaded, (*opening.key, "qos"), rule)
-    variable, key = section.password_env, (*opening.key, "password_env")
-    password = None if variable is None else secret(variable, key, opening.loaded.places)
+    password = _password(opening)
     client_id = section.client_id
     if client_id is not None and part.processes > 1:
         client_id = f"{client_id}-{part.number}"
@@ -94,6 +93,17 @@ def _open_mqtt(opening: Opening) -> Source:
         subscribed=subscribed,
         by_hand=by_hand,
     )
+
+
+def _password(opening: Opening) -> str | None:
+    variable, key = opening.section.password_env, (*opening.key, "password_env")
+    return None if variable is None else secret(variable, key, opening.loaded.places)
+
+
+def _check_secrets(opening: Opening) -> None:
+    """Miss the password of a fleet once, not in each of its processes; commands on recordings of a twin need none."""
+    if isinstance(opening.section, FleetMqttSection):
+        _password(opening)
 
 
 def _open_opcua(opening: Opening) -> Source:
@@ -153,6 +163,6 @@ def _sections(section: MessageSection, key: Key) -> dict[Key, Any]:
 
 
 PUSH = Kind(_messages, sections=_sections, takes_log=False, kernels=(VALUES,))
-MQTT = Kind(_open_mqtt, sections=_sections, takes_log=False, kernels=(VALUES,))
+MQTT = Kind(_open_mqtt, sections=_sections, takes_log=False, kernels=(VALUES,), files=_check_secrets)
 OPC_UA = Kind(_open_opcua, sections=_sections, takes_log=False, kernels=(VALUES,))
 MODBUS = Kind(_open_modbus, sections=_sections, takes_log=False, kernels=(VALUES,))

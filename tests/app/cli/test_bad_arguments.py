@@ -44,6 +44,14 @@ REFUSED = {
     "--versoin": "--versoin: there is no such option; did you mean --version?",
     "run motor_can --json": "--json: is the result of a run without a page; give --headless",
     "run motor_can --public https://a.example": "--public https://a.example: others can reach it; give --tokens FILE",
+    **{
+        f"run motor_can --tokens t --public {site}": f"--public {site}: must be like https://twins.example.com, in"
+        for site in ("https://A.example", "https://a.example:443", "http://a.example:80", "https://a.example/b")
+    },
+    **{
+        f"serve motor_can --tokens t --public '{site}'": f"--public {site}: must be like https://twins.example.com"
+        for site in ("https://u:p@a.example", "https://a.example#b", "https://a .example", "https://a.example:65536")
+    },
     "run motor_can --port abc": "--port 'abc': must be a whole number",
     "run motor_can --port=9e3": "--port '9e3': must be a whole number",
     "run motor_can --duration 5s": f"--duration {NOT_LONG}",

@@ -161,6 +161,8 @@ def test_a_password_that_is_not_set_is_one_line_with_its_place(tmp_path, monkeyp
         running(tmp_path, {"type": "mqtt", "host": "a", "topics": {"{asset}/t": "winding"}, **more})
     rule = "is NISUS_NO_SECRET, an environment variable that is not set; set it before the start"
     assert str(caught.value) == f"{tmp_path / 'pumps.yaml'}:1: source.password_env {rule}"
+    with pytest.raises(NisusError, match="NISUS_NO_SECRET"):  # before any process is started
+        load_fleet(tmp_path / "pumps.yaml", processes=2).check_files()
 
 
 KILLED = """

@@ -328,3 +328,72 @@ def test_two_processes_do_not_write_into_one_folder(tmp_path):
     assert "another process writes into it" in second.said[0]
     first.archive.look(closing=True)
     assert second.put(20).values() == [*map(float, range(30))]
+
+
+def test_rows_whose_write_fails_late_are_archived_once(tmp_path, monkeypatch):
+    """A disk may refuse at `fsync` what it took, or take at `close` what it refused."""
+    monkeypatch.setattr(live, "STORE_PERIOD_S", 0.0)
+    monkeypatch.setattr(live, "STORE_SHARE", 1e9)
+    fleet, source = started(tmp_path, store=tmp_path / "drives.store")
+    synced = archives.os.fsync
+
+    def full(file):
+        raise OSError(28, "No space left on device")
+
+    for k, part in enumerate(np.array_split(np.array(messages(count=8), object), 4)):
+        monkeypatch.setattr(archives.os, "fsync", full if k in (0, 2) else synced)
+        source.send(part.tolist())
+        fleet.step()
+    fleet.archive.look(closing=True)
+    assert fleet.counts["archive"] == 1
+    table = fleet.table()[2]
+    found = [pq.read_table(path).num_rows for path in parts_of(tmp_path / "archive" / "drives")]
+    assert sum(found) == table.events.sum() + table.stale.sum()
+    fleet.stop()
+
+
+def test_a_journal_that_begins_while_another_is_completed_has_a_number_of_its_own(tmp_path, monkeypatch):
+    """Of two files of one number, the second would be removed as complete."""
+    written = Written(tmp_path).put(0)
+    written.archive._end()
+    ended = written.archive._ended
+
+    def meanwhile(folder):
+        found = parts_of(folder)
+        if ended:
+            archives.complete_journal(ended.pop())
+        return found
+
+    with monkeypatch.context() as patch:
+        patch.setattr(archives, "parts_of", meanwhile)
+        written.put(10)
+    written.archive.look(closing=True)
+    assert written.said == [] and written.values() == [*map(float, range(20))]
+
+
+def test_a_journal_in_a_folder_that_was_emptied_is_cut_as_in_the_old_one(tmp_path, monkeypatch):
+    """Its number is not among those of the journals that the store has whole."""
+    monkeypatch.setattr(live, "STORE_PERIOD_S", 0.0)
+    store, folder, sent = tmp_path / "drives.store", tmp_path / "archive" / "drives", messages(count=8)
+    monkeypatch.setattr(live, "STORE_SHARE", 1e9)
+    fleet, source = started(tmp_path, store=store)
+    for part in (sent[:14], sent[14:28]):
+        source.send(part)
+        fleet.step()
+        fleet.archive.look(closing=True)
+    for path in folder.iterdir():
+        path.unlink()
+    monkeypatch.setattr(fleet._store, "write_blocks", lambda blocks: 1 / 0)
+    source.send(sent[28:])
+    with pytest.raises(ZeroDivisionError):
+        fleet.step()
+    fleet.archive._journal._file.close()  # as the end of the process does
+    fleet._store.close()
+    again, source = started(tmp_path, store=store)
+    source.send(sent[28:])
+    again.step()
+    again.archive.look(closing=True)
+    found = pa.concat_tables([pq.read_table(path) for path in parts_of(folder)])
+    found = found.select(["asset", "t_ns", "event", "channel"])
+    assert found.num_rows and found.group_by(found.column_names).aggregate([]).num_rows == found.num_rows
+    again.stop()
