@@ -86,7 +86,16 @@ class BlackBox:
                 parts = [_call(function, X, *rest)]
             else:
                 pieces = np.array_split(X, max(1, min(_workers(pool), len(X))))
-                futures = [pool.submit(_call, self._sent[id(function)], piece, *rest) for piece in pieces]
+                calls = [(_call, self._sent[id(function)], piece, *rest) for piece in pieces]
+                try:
+                    futures = [pool.submit(*call) for call in calls]
+                except BrokenExecutor:
+                    if pool is executor:
+                        raise
+                    # A worker was killed after the last call, for want of memory, say: not the function's failure.
+                    _pool.cache_clear()
+                    pool = _pool(executor)
+                    futures = [pool.submit(*call) for call in calls]
                 parts = [future.result() for future in futures]
         except (Exception, SystemExit) as error:  # noqa: BLE001  the user's own function may raise anything
             at = place(function, error)

@@ -15,6 +15,7 @@ from threading import Lock
 import numpy as np
 import pytest
 
+from estimators.compiled.black_box import _pool
 from estimators.compiled.model import compile_model
 from estimators.errors import EstimatorError, ModelError
 from estimators.fold import Fold, fold
@@ -374,6 +375,22 @@ def alive(pid):
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
     except OSError:
         return False
+
+
+def test_workers_that_were_killed_between_two_calls_are_replaced():
+    box = compile_model(replace(BOX, executor="processes"))
+    X = np.random.default_rng(0).normal(0, 1, (31, 2))
+    u, p = np.array([0.3]), np.array([0.7, 0.2])
+    expected = box.f_block(X, u, p, 0.1)
+    pool = _pool("processes")
+    for worker in list(pool._processes.values()):
+        worker.kill()
+    deadline = time.monotonic() + 60.0
+    while not pool._broken:
+        assert time.monotonic() < deadline, "the pool does not notice"
+        time.sleep(0.01)
+    np.testing.assert_array_equal(box.f_block(X, u, p, 0.1), expected)
+    assert _pool("processes") is not pool
 
 
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks at processes as Linux shows them")
