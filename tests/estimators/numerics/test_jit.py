@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from pathlib import Path
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
@@ -157,16 +158,19 @@ def outer(a):
 """
 
 
+def printed(folder: Path, code: str) -> list[str]:
+    """What a process prints that has `LINKED` as a module `linked`, and the cache of the processes before it."""
+    (folder / "linked.py").write_text(LINKED)
+    environment = os.environ | {"PYTHONPATH": f"{ROOT}:{folder}", "NUMBA_CACHE_DIR": str(folder / "cache")}
+    command = [sys.executable, "-c", code]
+    return subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout.split()
+
+
 def test_code_from_the_cache_needs_no_tables_of_numba_and_is_linked_into_new_code(tmp_path):
     """`numba.np.linalg` is imported with the tables, which fill when something is compiled."""
-    (tmp_path / "linked.py").write_text(LINKED)
 
     def run(code: str) -> list[str]:
-        environment = os.environ | {"PYTHONPATH": f"{ROOT}:{tmp_path}", "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
-        code = f"import sys, linked; filled = lambda: 'numba.np.linalg' in sys.modules; {code}"
-        return subprocess.run(
-            [sys.executable, "-c", code], env=environment, capture_output=True, text=True
-        ).stdout.split()
+        return printed(tmp_path, f"import sys, linked; filled = lambda: 'numba.np.linalg' in sys.modules; {code}")
 
     assert run("linked.inner.compile((linked.f64,)); print(linked.inner(2.0), filled())") == ["6.0", "True"]
     found = "print(linked.inner(2.0), filled(), linked.outer(2.0), linked.inner.stats.cache_hits.total(), filled())"
@@ -175,14 +179,9 @@ def test_code_from_the_cache_needs_no_tables_of_numba_and_is_linked_into_new_cod
 
 def test_a_caller_links_a_function_without_machine_code_of_its_own(tmp_path):
     """The entries of both forms are in the cache at once, and the other form runs in Python from there."""
-    (tmp_path / "linked.py").write_text(LINKED)
 
     def run(code: str) -> list[str]:
-        environment = os.environ | {"PYTHONPATH": f"{ROOT}:{tmp_path}", "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
-        code = f"from linked import inner, outer; {code}"
-        return subprocess.run(
-            [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
-        ).stdout.split()
+        return printed(tmp_path, f"from linked import inner, outer; {code}")
 
     assert run("print(outer(2.0), len(inner.overloads), len(inner.linked.overloads))") == ["7.0", "0", "1"]
     assert run("print(inner(2.0), inner.stats.cache_hits.total())") == ["6.0", "0"]
