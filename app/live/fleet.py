@@ -136,7 +136,7 @@ class RunningFleet:
         self._unwritten = False
         """Whether the store could not be written at the last attempt."""
         self.archived: Mapping[str, Any] | None = None
-        """What the store has of the archive; None without it."""
+        """Numbers of the archive that the store has; None without a store, or without an archive in it."""
         self._store = None if store is None else Store(store)
         try:
             # Each process reads all rows of tables; one reports those that cannot be used.
