@@ -22,7 +22,7 @@ from .plausibility import pass_on, screen_reading, screen_signature
 from .track import ANCESTORS, EFFECTIVE, GATED, MISSING, NONE, SCREENED, USED, WHITENED, borrowed_columns, track_type
 
 
-@part
+@embedded
 def advance_to(code, context, u, clock, t, index, state, work):
     """Predict from the clock to time t, in steps of at most `max_step`.
 

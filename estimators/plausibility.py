@@ -19,7 +19,7 @@ from numba import types
 from .compiled.context import circular_rows, context_type, sensor_rows
 from .model.parts import RATE_NOISE_STDS, Stuck
 from .model.state_space import StateSpaceModel
-from .numerics.jit import F1, floats, i64, inlined, ints, linkable, part
+from .numerics.jit import F1, embedded, floats, i64, inlined, ints, linkable_embedded
 from .numerics.linalg import wrap
 from .track import DUPLICATE, RANGE, RATE, REASONS, REPEATED, SATURATED
 
@@ -120,7 +120,7 @@ def _is_duplicate(now, y, s, first, count, within, begin, state, times):
     return True
 
 
-@part
+@embedded
 def _repeats(now, y, at, a_day, limit, state, times):
     """Return whether a row has repeated its value for too long."""
     if not np.isfinite(state[at + _RUN]) or abs(y - state[at + _RUN]) > limit[_HALF]:
@@ -134,7 +134,7 @@ def _repeats(now, y, at, a_day, limit, state, times):
     return limit[_SURPRISE] > 0.0 and length * limit[_SURPRISE] >= math.log(max(a_day, math.e))
 
 
-@part
+@embedded
 def _reasons(now, y, circular, at, a_day, limit, state, times):
     """Return the bits of the limits that a row of a measurement violates."""
     bits = 0
@@ -156,7 +156,7 @@ def _reasons(now, y, circular, at, a_day, limit, state, times):
     return bits
 
 
-@linkable
+@linkable_embedded
 def screen_reading(i, now, s, y, context, state, screened):
     """Fill row i of `screened` (N, ny) with the bits of the limits that each row of measurement y violates.
 
@@ -208,7 +208,7 @@ def reasons_by_sensor(sensors: int, channel: np.ndarray, screened: np.ndarray) -
     return np.stack(counts, axis=1)
 
 
-@linkable
+@linkable_embedded
 def pass_on(value, screened, i, out):
     """Copy measurement i to `out` with NaN in the rejected rows; return whether any row is left."""
     left = False

@@ -32,7 +32,7 @@ from ..numerics.jit import (
     inlined,
     ints,
     jit,
-    linkable,
+    linkable_embedded,
     matrix,
     part,
 )
@@ -365,7 +365,7 @@ though timestamps are whole nanoseconds. `max_step` bounds the error of integrat
 """
 
 
-@linkable
+@linkable_embedded
 def steps_of(dt: float, max_step: float) -> int:
     """Return the smallest number of equal steps over `dt` seconds of at most `max_step`, within `SLACK` of a step."""
     return max(1, int(math.ceil(dt / max_step - SLACK)))

@@ -47,20 +47,24 @@ numba.config.LOOP_VECTORIZE = 0
 # library reads this when it is loaded, which `threaded` does.
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
-jit = partial(njit, cache=True, nogil=True, error_model="numpy", no_cfunc_wrapper=True)
+jit = partial(njit, cache=True, nogil=True, error_model="numpy", forceinline=False, no_cfunc_wrapper=True)
 """Numba's njit as used here: cached, without the GIL, and with IEEE division (zero divisors give inf, no error).
 
-Of the two wrappers that Numba compiles around each function, the one for C is left out, as nothing calls it.
+Of the two wrappers that Numba compiles around each function, the one for C is left out, as nothing calls it. Where
+`forceinline` is not given, a function has that of the caller which is compiled first: so a step's time depended on the
+order in which filters were compiled, by 15 %.
 """
 
 
 class TwoForms(CPUDispatcher):  # type: ignore[misc]
     """Compiled function with machine code for calls from Python, and bitcode alone for compiled callers."""
 
+    forceinline = False
+
     @cached_property
     def linked(self) -> Any:
         """What compiled callers link, see `Linked`."""
-        made = jit(pipeline_class=Linked)(self.py_func)
+        made = jit(pipeline_class=Linked, forceinline=self.forceinline)(self.py_func)
         made._cache.linked = True
         return made
 
@@ -70,14 +74,18 @@ class TwoForms(CPUDispatcher):  # type: ignore[misc]
         return self.linked._numba_type_
 
 
-def linkable(function: Callable[..., Any]) -> Any:
+def linkable(function: Callable[..., Any], forceinline: bool = False) -> Any:
     """`jit` for functions of filters that Python calls, too, or tests do: each form is compiled when first needed."""
     made = jit(function)
-    made.__class__ = TwoForms
+    made.__class__, made.forceinline = TwoForms, forceinline
     return made
 
 
-jit_brief = partial(njit, cache=True, error_model="numpy", no_cfunc_wrapper=True)
+linkable_embedded = partial(linkable, forceinline=True)
+"""`linkable` for what each event needs, which is copied into its compiled callers, as with `embedded`."""
+
+
+jit_brief = partial(njit, cache=True, error_model="numpy", forceinline=False, no_cfunc_wrapper=True)
 """`jit` with the GIL, for calls of microseconds that run no model function: after releasing the GIL, a thread waits for
 it behind others."""
 
@@ -101,7 +109,7 @@ def by_address(function: Callable[..., Any]) -> Any:
 
 
 part: Callable[[Callable[..., Any]], Any] = register_jitable(
-    cache=True, nogil=True, error_model="numpy", pipeline_class=Linked
+    cache=True, nogil=True, error_model="numpy", forceinline=False, pipeline_class=Linked
 )
 """`jit` for functions that only compiled functions call, without the wrapper for Python, which takes a third of the
 compile time. Called from Python, the function runs as plain Python."""
@@ -173,7 +181,7 @@ _to_mask = _pointer_to(types.int32)
 _to_complex = _pointer_to(types.complex128)
 
 
-@part
+@embedded
 def floats(target, n):
     """Return the n float64s at an address as an array without reference counts, which cost more than the filter."""
     return carray(_to_float(target), (n,))
@@ -209,7 +217,7 @@ def masks(target, rows, columns):
     return carray(_to_mask(target), (rows, columns))
 
 
-@part
+@embedded
 def matrix(vector, start, rows, columns):
     """Return a view of `vector` from `start` on as a matrix (NumPy's reshape costs 50 ns here)."""
     return carray(_to_float(vector.ctypes.data + 8 * start), (rows, columns))

@@ -3,13 +3,16 @@
 import os
 import subprocess
 import sys
+import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
+from numba.core.targetconfig import ConfigStack
+from numba.extending import intrinsic
 
 from estimators.numerics.cache_entries import EntryFiles
-from estimators.numerics.jit import by_address
+from estimators.numerics.jit import by_address, embedded, f64, jit, linkable, linkable_embedded, part
 from tests.conftest import ROOT
 
 LOADED = """
@@ -188,6 +191,36 @@ def test_a_caller_links_a_function_without_machine_code_of_its_own(tmp_path):
     hits = "inner.stats.cache_hits.total(), inner.linked.stats.cache_hits.total()"
     assert run(f"print(inner(2.0), outer(2.0), {hits})") == ["6.0", "7.0", "1", "0"]
     assert len(list((tmp_path / "cache").rglob("linked.inner*.nbc"))) == 2
+
+
+KINDS = [(jit, False), (linkable, False), (part, False), (embedded, True), (linkable_embedded, True)]
+
+
+@pytest.mark.parametrize(("kind", "copied"), KINDS)
+@pytest.mark.parametrize("caller", [embedded, jit])
+def test_what_llvm_must_copy_does_not_follow_from_the_first_caller(kind, copied, caller):
+    """Numba hands `forceinline` on to what it compiles for a caller, and the cache keeps that for all others."""
+    flags, new = [], float(time.time_ns())  # A number of its own in the closure: it is not in the cache.
+
+    @intrinsic
+    def note(typing_context, a):
+        flags.append(ConfigStack().top().forceinline)
+        return a(a), lambda context, builder, signature, given: given[0]
+
+    @kind
+    def inner(a):
+        return note(a) + new
+
+    @caller
+    def first(a):
+        return inner(a)
+
+    @jit
+    def outer(a):
+        return first(a) + new
+
+    assert outer(1.0) == 1.0 + 2.0 * new
+    assert set(flags) == {copied}
 
 
 def test_a_function_for_addresses_names_its_python_form_when_called():
