@@ -8,19 +8,7 @@ import numpy as np
 
 from .errors import EventError
 from .events import arrays
-from .events.batch import (
-    BEFORE,
-    INPUT,
-    KIND_NAMES,
-    MAINTENANCE,
-    MARK,
-    READING,
-    RESET,
-    TICK,
-    TRUTH,
-    Events,
-    truth_of,
-)
+from .events.batch import BEFORE, INPUT, KIND_NAMES, MAINTENANCE, MARK, READING, RESET, TICK, TRUTH, Events, truth_of
 from .events.checks import EventLayout, admitted
 from .events.maintenance import versions_dropped
 
