@@ -6,7 +6,8 @@ import io
 import json
 import signal
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from datetime import UTC, datetime
 from queue import Empty, SimpleQueue
 from typing import Any, TextIO, cast
@@ -41,7 +42,7 @@ class EndRequest:
 
 
 def when_asked_to_end(end: Callable[[], Any]) -> Mapping[int, Any]:
-    """Call `end`, which must take no lock, when one of them comes; gives what handled them before, for `restore`.
+    """Call `end`, which must take no lock, when one of them comes; gives what handled them before.
 
     One that is ignored stays so: who started the program with `nohup` wants it to outlive the terminal.
     """
@@ -53,10 +54,22 @@ def when_asked_to_end(end: Callable[[], Any]) -> Mapping[int, Any]:
     }
 
 
-def restore(previous: Mapping[int, Any]) -> None:
-    """Handle them as before."""
-    for number, handler in previous.items():
-        signal.signal(number, handler)
+@contextmanager
+def until_asked_to_end(stop: Callable[[], Any] = lambda: None) -> Iterator[EndRequest]:
+    """Context manager: yield the request to end; Ctrl-C ends the block, too. `stop` is called at its end, in any case.
+
+    After `stop` the signals are handled as before.
+    """
+    done = EndRequest()
+    previous = when_asked_to_end(done.set)
+    try:
+        yield done
+    except KeyboardInterrupt:
+        pass
+    finally:
+        stop()
+        for number, handler in previous.items():
+            signal.signal(number, handler)
 
 
 def complain(text: object) -> None:

@@ -8,19 +8,7 @@ import numpy as np
 
 from .errors import EventError
 from .events import arrays
-from .events.batch import (
-    BEFORE,
-    INPUT,
-    KIND_NAMES,
-    MAINTENANCE,
-    MARK,
-    READING,
-    RESET,
-    TICK,
-    TRUTH,
-    Events,
-    truth_of,
-)
+from .events.batch import BEFORE, INPUT, KIND_NAMES, MAINTENANCE, MARK, READING, RESET, TICK, TRUTH, Events, truth_of
 from .events.checks import EventLayout, admitted
 from .events.maintenance import versions_dropped
 
@@ -326,18 +314,7 @@ def sorted_order(events: Events) -> np.ndarray:
     return order
 
 
-def maintenance_times(log: Log) -> np.ndarray:
-    """Return the times (ns) of maintenance in the log, ascending."""
-    return np.unique(log.t[: log.n][log.kind[: log.n] == MAINTENANCE])
-
-
 def model_version_at(log: Log, t: int) -> int:
     """Return the version of the model at time t, ns."""
-    return log.version + int(np.searchsorted(maintenance_times(log), t, side="right"))
-
-
-def last_maintenance(log: Log, t: int) -> int | None:
-    """Return the time (ns) of the last maintenance at or before t in the log; None if there is none."""
-    times = maintenance_times(log)
-    k = int(np.searchsorted(times, t, side="right"))
-    return int(times[k - 1]) if k else None
+    times = np.unique(log.t[: log.n][log.kind[: log.n] == MAINTENANCE])
+    return log.version + int(np.searchsorted(times, t, side="right"))

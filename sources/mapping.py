@@ -219,8 +219,8 @@ class ChannelMapping:
         values: np.ndarray,
         state: np.ndarray,
         skip: np.ndarray,
-    ) -> Events:
-        """Return the events of rows of values.
+    ) -> tuple[Events, np.ndarray]:
+        """Return the events of rows of values, and the row of each.
 
         Args:
             plan: Group of each row, (n,); -1 for none.
@@ -230,18 +230,6 @@ class ChannelMapping:
             state: Same shape: PRESENT, ABSENT or SHORT.
             skip: (n,), nonzero for rows to leave out.
         """
-        return self.placed(plan, t, arrival, values, state, skip)[0]
-
-    def placed(
-        self,
-        plan: np.ndarray,
-        t: np.ndarray,
-        arrival: np.ndarray,
-        values: np.ndarray,
-        state: np.ndarray,
-        skip: np.ndarray,
-    ) -> tuple[Events, np.ndarray]:
-        """Return the events of rows of values as `events` does, and the row of each."""
         room = plan.size * self._most
         source = np.empty(room, np.int64)
         kind, channel = np.empty(room, np.int8), np.empty(room, np.int32)

@@ -269,7 +269,7 @@ class Messages:
                 self._newest = latest, time.monotonic_ns()
         plan, skip = np.zeros(rows.t.size, np.int64), np.zeros(rows.t.size, np.int8)
         # What was buffered on its way, or is history, arrives at once: its arrival would tell nothing of its clock.
-        events, row = self._mapping.placed(plan, rows.t, rows.t, rows.values, rows.state, skip)
+        events, row = self._mapping.events(plan, rows.t, rows.t, rows.values, rows.state, skip)
         if not self._assets:
             return events
         codes: dict[str, int] = {}

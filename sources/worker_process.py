@@ -137,8 +137,8 @@ def serve(lifeline: int) -> None:
                 answers.send((FAULT, NisusError(gist(error))))
 
 
-def gist(error: BaseException) -> str:
-    """Return an error's message in one short line."""
+def gist(error: object) -> str:
+    """Return the message of an error, or its type if it has none, in one short line."""
     return " ".join(str(error).split())[:160] or type(error).__name__
 
 

@@ -15,7 +15,7 @@ from typing import NamedTuple
 from PIL import Image, ImageDraw
 from playwright.sync_api import Browser, Page
 
-from app.cli.run import live_source
+from app.cli.open_twin import live_source
 from app.live.commands import InjectFault, Pause, SetEstimator, SetTunings
 from app.twin.twin import load_twin
 from app.web.running import OpenedTwin

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from estimators.errors import ConfigError
 
 from ..present.result import to_json
-from ..terminal import EndRequest, complain, restore, when_asked_to_end
+from ..terminal import complain, until_asked_to_end
 from ..twin.twin import Twin, load_twin
 from .options import settings
 
@@ -94,14 +94,8 @@ def _logger(path: Path) -> Any:
 
 def _play(player: Any, duration: float | None) -> None:
     """Send frames until the asset ends, the time is up, or a signal arrives."""
-    done = EndRequest()
-    previous = when_asked_to_end(done.set)
     end = time.monotonic() + duration if duration is not None else float("inf")
-    try:
+    with until_asked_to_end() as done:
         player.start()
         while not player.finished and (left := end - time.monotonic()) > 0 and not done.wait(min(0.2, left)):
             pass
-    except KeyboardInterrupt:
-        pass
-    finally:
-        restore(previous)

@@ -24,7 +24,7 @@ from ..outputs.parts import ArchivePlan
 from ..present.export.track_file import encoded
 from ..present.fleet_table import arrow_table, counts_of, fleet_topics, in_name_order, ordered
 from ..present.result import to_json, to_text
-from ..terminal import EndRequest, complain, restore, when_asked_to_end
+from ..terminal import complain, until_asked_to_end
 from ..twin.fleet import FleetPlan, load_fleet
 from ..twin.log_reader import remarking
 from ..views.recording.rrd_file import parse_split
@@ -115,10 +115,8 @@ def run_fleet(arguments: FleetCommand) -> int:
 
 def _fold(running: RunningFleet | PartitionedFleet, duration: float | None) -> None:
     """Read and fold until the source or the duration ends, or the program is asked to end."""
-    done = EndRequest()
-    previous = when_asked_to_end(done.set)
     end = time.monotonic() + (duration or float("inf"))
-    try:
+    with until_asked_to_end(running.stop) as done:
         if isinstance(running, RunningFleet):
             running.run(lambda: time.monotonic() < end and not done.wait(0.0))
         else:
@@ -126,11 +124,6 @@ def _fold(running: RunningFleet | PartitionedFleet, duration: float | None) -> N
             while time.monotonic() < end and not (done.wait(LOOK_PERIOD_S) or running.has_ended()):
                 pass
             running.table()
-    except KeyboardInterrupt:
-        pass
-    finally:
-        running.stop()
-        restore(previous)
 
 
 def _serve(

@@ -18,7 +18,7 @@ from ..web.door import check_port
 from ..web.gallery.gallery import StartRequest
 from ..web.gate import grants_of
 from ..web.session import Page, Session
-from .open_twin import FileOpener, live_source, open_session, opened_review, opened_twin
+from .open_twin import FileOpener, open_session, opened_review, opened_twin
 from .options import settings
 from .prepare import prepare
 
@@ -26,10 +26,8 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from ..live.compilers import Compiler
-    from .arguments import PageOptions, RunCommand
-
-
-__all__ = ["live_source", "run_twin"]
+    from ..web.running import OpenedTwin
+    from .arguments import PageOptions, ReviewCommand, RunCommand
 
 OPTIONS_OF_TWIN = ("record", "store", "archive", "log", "set", "estimator", "tuning")  # of a twin that is named
 
@@ -107,11 +105,6 @@ def run_twin(arguments: RunCommand, workers: Sequence[Compiler] = ()) -> int:
                 complain(text)
         return 2 if failed else 0
     return 0
-
-
-if TYPE_CHECKING:
-    from ..web.running import OpenedTwin
-    from .arguments import ReviewCommand
 
 
 def open_review(path: Path, page: Page | None, recordings: Path = Path()) -> tuple[Session, OpenedTwin]:

@@ -20,7 +20,7 @@ from urllib.parse import quote
 from config.loader import shipped
 from estimators.errors import ConfigError, NisusError, is_blank, quoted
 
-from ..terminal import EndRequest, restore, use_lines_of_json, when_asked_to_end
+from ..terminal import until_asked_to_end, use_lines_of_json, when_asked_to_end
 from ..views.recording.rrd_file import NEVER, Split, parse_split
 from ..web.door import LOOPBACK, Door, check_port
 from ..web.gate import NEEDS_TOKENS, Grant, grants_of
@@ -120,19 +120,12 @@ def door_of(arguments: ServiceOptions, grants: tuple[Grant, ...] | None = None) 
 
 def serve_until_end(service: Service, what: str, duration: float | None) -> int:
     """Serve until the duration is over, or the program is asked to end."""
-    done = EndRequest()
-    previous = when_asked_to_end(done.set)
     end = time.monotonic() + (duration or float("inf"))
-    try:
+    with until_asked_to_end(service.stop) as done:
         service.start()
         print(f"Nisus serves {what} at\n\n    {service.door.url}\n\nCtrl-C ends it.", flush=True)
         while time.monotonic() < end and not done.wait(min(1.0, end - time.monotonic())):
             pass
-    except KeyboardInterrupt:
-        pass
-    finally:
-        service.stop()
-        restore(previous)
     return 0
 
 

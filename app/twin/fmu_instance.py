@@ -56,7 +56,8 @@ class Fmu:
         self._x_at, self._rate_at = (array.ctypes.data_as(number) for array in (self._x, self._rate))
         self._kept: Any = None
         self._ready: tuple[bytes, bytes] | None = None
-        self._fmu = self._load(path, description)
+        with self._blamed("cannot be loaded", "export it for this machine"):
+            self._fmu = self._load(path, description)
         # Not at the end of the process, where another thread may still be in a call.
         weakref.finalize(self, _free, self._fmu, self._folder).atexit = False
         self._get, self._set = (
@@ -96,17 +97,12 @@ class Fmu:
                 fmu.instantiate(callbacks=self._callbacks)
             else:
                 fmu.instantiate(logMessage=lambda *_: None)
-        except ModelError:
-            raise
-        except Exception as error:  # noqa: BLE001  FMPy raises bare exceptions
-            text = " ".join(str(error).split()) or type(error).__name__
-            raise ModelError(f"{self._name}: it cannot be loaded: {text}; export it for this machine") from None
         finally:
             os.chdir(here)  # FMPy leaves the folder of a library that fails to load as the working directory.
         return fmu
 
     @contextmanager
-    def _blamed(self, what: str) -> Any:
+    def _blamed(self, what: str, remedy: str = "correct its start values") -> Any:
         """Name the FMU in errors of its calls."""
         try:
             yield
@@ -114,7 +110,7 @@ class Fmu:
             raise
         except Exception as error:  # noqa: BLE001  FMPy raises bare exceptions
             text = " ".join(str(error).split()) or type(error).__name__
-            raise ModelError(f"{self._name}: it {what}: {text}; correct its start values") from None
+            raise ModelError(f"{self._name}: it {what}: {text}; {remedy}") from None
 
     def start(self) -> np.ndarray:
         """Return the states (nx,) after initialisation, and check what a filter needs.

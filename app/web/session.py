@@ -22,7 +22,7 @@ from estimators.errors import SourceError
 
 from ..live.commands import Record
 from ..live.jobs import run_all
-from ..terminal import EndRequest, complain, restore, when_asked_to_end
+from ..terminal import complain, until_asked_to_end
 from ..views.recording.rrd_file import NEVER, Split
 from .door import Door
 from .gate import Grant
@@ -272,10 +272,14 @@ class Session:
         Raises:
             NisusError: If the page cannot be served, or, in the end, that `record` could not be written.
         """
-        done = EndRequest()
         opening: BrowserPage | None = None
-        previous = when_asked_to_end(done.set)
-        try:
+
+        def stop() -> None:
+            if opening is not None:
+                opening.close()
+            self.stop()
+
+        with until_asked_to_end(stop) as done:
             if record is not None:
                 # Before the first event: commands wait for the fold, and a fold may never return.
                 self.engine.submit(Record(record))
@@ -297,13 +301,6 @@ class Session:
                 if opening is not None and self.door is not None and self.door.entered.is_set():
                     opening.close()
                     opening = None
-        except KeyboardInterrupt:
-            pass
-        finally:
-            if opening is not None:
-                opening.close()
-            self.stop()
-            restore(previous)
         if record is not None and self.recorder.failure:
             raise SourceError(self.recorder.failure)
 

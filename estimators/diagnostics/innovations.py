@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import chdtr, chdtrc, fdtr, fdtrc, ndtr, ndtri
+from scipy.special import chdtr, chdtrc, ndtr, ndtri
 
 from ..log import READING, Events
 from ..numerics.quantiles import chi_square_quantile, normal_quantile
@@ -201,15 +201,14 @@ def _expected(g: np.ndarray, m: np.ndarray) -> np.ndarray:
 
 
 class WhitenessTest(NamedTuple):
-    """A statistic, its p-value, and the degrees of freedom of its distribution.
+    """A statistic, its p-value, and the degrees of freedom of its chi-square distribution.
 
-    `dof` has one number for a chi-square, two (numerator, denominator) for an F. Statistic and p-value are NaN if the
-    series is too short, or constant.
+    Statistic and p-value are NaN if the series is too short, or constant.
     """
 
     statistic: float
     p_value: float
-    dof: tuple[int, ...]
+    dof: int
 
 
 def ljung_box(innovations: np.ndarray, lags: int | None = None) -> WhitenessTest:
@@ -237,9 +236,9 @@ def ljung_box(innovations: np.ndarray, lags: int | None = None) -> WhitenessTest
     pairs = np.array([np.sum(there[k:] & there[:-k]) for k in range(1, lags + 1)])
     r = autocorrelation(innovations, lags).r
     if not np.all(np.isfinite(r)) or not np.all(pairs):
-        return WhitenessTest(np.nan, np.nan, (lags,))
+        return WhitenessTest(np.nan, np.nan, lags)
     statistic = float(n * (n + 2) * np.sum(r**2 / pairs))
-    return WhitenessTest(statistic, float(chdtrc(lags, statistic)), (lags,))
+    return WhitenessTest(statistic, float(chdtrc(lags, statistic)), lags)
 
 
 def jarque_bera(innovations: np.ndarray) -> WhitenessTest:
@@ -256,31 +255,7 @@ def jarque_bera(innovations: np.ndarray) -> WhitenessTest:
     z = z - np.mean(z) if z.size else z
     variance = float(np.mean(z**2)) if z.size else 0.0
     if not variance > 0.0:
-        return WhitenessTest(np.nan, np.nan, (2,))
+        return WhitenessTest(np.nan, np.nan, 2)
     skewness, kurtosis = np.mean(z**3) / variance**1.5, np.mean(z**4) / variance**2
     statistic = float(z.size * (skewness**2 / 6.0 + (kurtosis - 3.0) ** 2 / 24.0))
-    return WhitenessTest(statistic, float(chdtrc(2, statistic)), (2,))
-
-
-def heteroscedasticity(innovations: np.ndarray) -> WhitenessTest:
-    """Test whether the last third of a series has another variance than the first ("breakvar"), two-sided.
-
-    H = Σ e_t² of the last h / Σ e_t² of the first h,  h = T / 3;  (n_first / n_last) H is F(n_last, n_first),
-
-    n_first and n_last being the numbers of finite values; about zero, not about their mean.
-
-    Args:
-        innovations: Standardised innovations, (T,); NaN is a missing one.
-
-    Source: Harvey, Forecasting, Structural Time Series Models and the Kalman Filter (1989), 5.4.2.
-    """
-    third = round(len(innovations) / 3)
-    first, last = innovations[:third], innovations[len(innovations) - third :]
-    n_first, n_last = int(np.isfinite(first).sum()), int(np.isfinite(last).sum())
-    before = float(np.nansum(first**2))
-    if min(n_first, n_last) < 2 or not before > 0.0:
-        return WhitenessTest(np.nan, np.nan, (n_last, n_first))
-    statistic = float(np.nansum(last**2)) / before
-    ratio = statistic * n_first / n_last
-    tails = fdtr(n_last, n_first, ratio), fdtrc(n_last, n_first, ratio)
-    return WhitenessTest(statistic, 2.0 * float(min(tails)), (n_last, n_first))
+    return WhitenessTest(statistic, float(chdtrc(2, statistic)), 2)

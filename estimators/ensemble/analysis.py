@@ -8,14 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..compiled.context import (
-    circular_rows,
-    estimated,
-    expect,
-    prior,
-    sensor_rows,
-    sensor_variances,
-)
+from ..compiled.context import circular_rows, estimated, expect, prior, sensor_rows, sensor_variances
 from ..compiled.noise import has_correlated_rows, independent_rows, lost_root
 from ..compiled.verdict import verdict_of
 from ..estimator import Options
@@ -27,25 +20,11 @@ from ..numerics.random import key_of, normal
 from ..numerics.simd import WIDE, add_scaled, dot
 from ..numerics.simd_ir import LANES
 from ..numerics.symmetric import factor, gram
-from ..numerics.workspace import (
-    after,
-    declare_layout,
-    size_of,
-    start_of,
-)
+from ..numerics.workspace import after, declare_layout, size_of, start_of
 from ..track import FAILED, MISSING, WHITENED
 from .blocks import regression_at, transform_at
 from .localisation import between_rows, crews, localised
-from .shared import (
-    CONSIDER,
-    THREADED_FROM,
-    column_mean,
-    count_ranks,
-    covariance,
-    ensemble,
-    forecast_at,
-    members,
-)
+from .shared import CONSIDER, THREADED_FROM, column_mean, count_ranks, covariance, ensemble, forecast_at, members
 
 
 def side_of(options: Options, ny: int) -> int:

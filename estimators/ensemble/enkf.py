@@ -28,18 +28,7 @@ from ..track import USED
 from .analysis import begin_analysis, find_places, work_size
 from .blocks import regress_all, transform_all
 from .localisation import localised, prepare
-from .shared import (
-    CREWS,
-    INFLATION,
-    PERTURB,
-    RADIUS,
-    describe,
-    ensemble_filter,
-    finish,
-    next_draw,
-    predict,
-    start,
-)
+from .shared import CREWS, INFLATION, PERTURB, RADIUS, describe, ensemble_filter, finish, next_draw, predict, start
 
 
 @jit

@@ -23,17 +23,7 @@ from ..track import USED
 from .analysis import begin_analysis, find_places, reconsider, work_size
 from .blocks import ROTATION, regress_all, rotate, transform_members
 from .localisation import between_rows, localised, prepare
-from .shared import (
-    CREWS,
-    INFLATION,
-    RADIUS,
-    describe,
-    ensemble_filter,
-    finish,
-    next_draw,
-    predict,
-    start,
-)
+from .shared import CREWS, INFLATION, RADIUS, describe, ensemble_filter, finish, next_draw, predict, start
 
 
 @jit

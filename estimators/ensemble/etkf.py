@@ -22,14 +22,7 @@ from ..numerics.symmetric import gram, symmetric_eigen
 from ..track import FAILED, USED
 from .analysis import begin_analysis, reconsider, work_size
 from .blocks import ROTATION, transform_members
-from .shared import (
-    describe,
-    ensemble_filter,
-    finish,
-    next_draw,
-    predict,
-    start,
-)
+from .shared import describe, ensemble_filter, finish, next_draw, predict, start
 
 
 @jit

@@ -28,18 +28,7 @@ from .analysis import begin_analysis, find_places, reconsider, work_size
 from .blocks import ROTATION, block_at, load, rotate, store, transform_members
 from .etkf import symmetric_transform
 from .localisation import localised, prepare, reached
-from .shared import (
-    CREWS,
-    INFLATION,
-    RADIUS,
-    describe,
-    ensemble_filter,
-    finish,
-    members,
-    next_draw,
-    predict,
-    start,
-)
+from .shared import CREWS, INFLATION, RADIUS, describe, ensemble_filter, finish, members, next_draw, predict, start
 
 Local, local_at = declare_layout(
     "Local",

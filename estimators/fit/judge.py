@@ -36,17 +36,7 @@ from ..diagnostics.sensitivity.responses import each
 from ..log import READING, TRUTH
 from ..registry import find_estimator
 from ..track import USED, Track
-from .aims import (
-    CRPS,
-    ERROR,
-    LIKELIHOOD,
-    WITNESSES,
-    Aim,
-    crps,
-    densities,
-    sensors_in_turn,
-    track_of,
-)
+from .aims import CRPS, ERROR, LIKELIHOOD, WITNESSES, Aim, crps, densities, sensors_in_turn, track_of
 from .entries import Setting
 from .objective import ALONE, Cancelled, Go, Objective
 from .recording import Recording

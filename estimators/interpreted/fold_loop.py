@@ -19,19 +19,7 @@ from ..gate.soften import inflation
 from ..log import INPUT, MARK, READING, RESET, TICK, TRUTH
 from ..plausibility import pass_on, screen_reading
 from ..snapshots import Snapshot
-from ..track import (
-    ANCESTORS,
-    EFFECTIVE,
-    FAILED,
-    GATED,
-    LOG_LIKELIHOOD,
-    MISSING,
-    NONE,
-    SCREENED,
-    USED,
-    WHITENED,
-    Track,
-)
+from ..track import ANCESTORS, EFFECTIVE, FAILED, GATED, LOG_LIKELIHOOD, MISSING, NONE, SCREENED, USED, WHITENED, Track
 
 UNSET = int(np.iinfo(np.int64).min)
 """Clock before the first event. The first event sets it, as the prior holds at that time."""

@@ -22,16 +22,7 @@ from ..estimator import Estimator
 from ..numerics.jit import jit
 from ..numerics.random import ONE, key_of, normal
 from ..track import FAILED, MISSING, USED
-from .cloud import (
-    DRAW,
-    OPTIONS,
-    RESAMPLE,
-    count_of,
-    describe,
-    own_cloud,
-    own_covariance,
-    score_cloud,
-)
+from .cloud import DRAW, OPTIONS, RESAMPLE, count_of, describe, own_cloud, own_covariance, score_cloud
 from .draws import reconsider, recover, start
 from .innovation import finite_rows
 from .proposals import (
@@ -47,18 +38,7 @@ from .proposals import (
     settle_draw,
 )
 from .resampling import take_ancestors
-from .weights import (
-    add_up,
-    block_of,
-    keep,
-    members_own,
-    normalise,
-    phases,
-    range_of,
-    resample,
-    sweep,
-    work_of,
-)
+from .weights import add_up, block_of, keep, members_own, normalise, phases, range_of, resample, sweep, work_of
 
 
 @jit

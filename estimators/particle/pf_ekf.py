@@ -17,15 +17,7 @@ from ..estimator import Estimator
 from ..numerics.jit import inlined, jit
 from ..numerics.random import ONE, key_of, normal
 from ..track import FAILED, MISSING, USED
-from .cloud import (
-    DRAW,
-    RESAMPLE,
-    count_of,
-    describe,
-    own_cloud,
-    own_covariance,
-    score_cloud,
-)
+from .cloud import DRAW, RESAMPLE, count_of, describe, own_cloud, own_covariance, score_cloud
 from .draws import reconsider, recover, start
 from .innovation import finite_rows
 from .proposals import (

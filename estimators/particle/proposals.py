@@ -45,18 +45,7 @@ from .cloud import (
 )
 from .draws import jump, jump_key, recover
 from .innovation import about, first_residual, log_density, predicted, score_rows
-from .weights import (
-    NO_KEY,
-    OWN,
-    add_up,
-    all_lost,
-    block_of,
-    members_own,
-    range_of,
-    sweep,
-    work_of,
-    work_sized,
-)
+from .weights import NO_KEY, OWN, add_up, all_lost, block_of, members_own, range_of, sweep, work_of, work_sized
 
 MOVE, EXPECT, PROPOSE = range(OWN, OWN + 3)
 """Phases: N(x, P) one step on; its prediction of the measurement; the filter's own draw."""

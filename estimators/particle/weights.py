@@ -24,14 +24,7 @@ from ..estimator import Options
 from ..model.state_space import StateSpaceModel
 from ..numerics.jit import F1, address, caller, f64, i64, ints, jit, matrix
 from ..numerics.simd import exp_minus
-from ..numerics.workspace import (
-    WORD,
-    declare_layout,
-    layout,
-    size_of,
-    start_of,
-    take_matrix,
-)
+from ..numerics.workspace import WORD, declare_layout, layout, size_of, start_of, take_matrix
 from .cloud import (
     BLOCK,
     CHUNK,

@@ -204,7 +204,7 @@ class Decoder:
                 self._by_cantools(frames, i, values, state, bad)
         if np.count_nonzero(bad):
             self._report_undecodable(frames, bad)
-        batch = self._mapping.events(frames.plan, frames.t, frames.arrival, values, state, bad)
+        batch, _ = self._mapping.events(frames.plan, frames.t, frames.arrival, values, state, bad)
         if self._unfed and len(batch):
             self._unfed = {item for item in self._unfed if not _valued(batch, self.width, *item)}
         return batch

@@ -21,6 +21,7 @@ from estimators.errors import SourceError
 
 from ..formats import suffix_of
 from ..units import second_ns
+from ..worker_process import gist
 
 if TYPE_CHECKING:
     from .blf import FrameBlock
@@ -88,7 +89,7 @@ def read_messages(path: Path, wanted: frozenset[int] | None, longest: int) -> It
             except SourceError:
                 raise
             except Exception as error:  # noqa: BLE001  as above
-                fault = " ".join(str(error).split())[:160] or type(error).__name__
+                fault = gist(error)
             count += len(chunk)
             errors += sum(message.is_error_frame for message in chunk)
             if chunk or block is None:
@@ -369,5 +370,5 @@ class LogSummary(NamedTuple):
 
 def unreadable(path: Path, reason: object) -> SourceError:
     """Return the error of a file of which nothing can be read."""
-    gist = " ".join(str(reason).split())[:160] or type(reason).__name__
-    return SourceError(f"{path}: it cannot be read as {suffix_of(path)[1:].upper()} ({gist}); check that it is one")
+    kind = suffix_of(path)[1:].upper()
+    return SourceError(f"{path}: it cannot be read as {kind} ({gist(reason)}); check that it is one")

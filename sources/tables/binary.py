@@ -25,7 +25,7 @@ from estimators.errors import SourceError
 
 from ..formats import is_compressed, open_binary
 from ..source import TRUNCATED
-from ..worker_process import memory_error, memory_limit
+from ..worker_process import gist, memory_error, memory_limit
 from .text import CHUNK_ROWS, Chunk, Column, Problem, TextCodes, TextMatch, column_of, fill
 
 CHUNK_VALUES = 65_536
@@ -42,8 +42,7 @@ def _readable(path: Path, kind: str) -> Iterator[None]:
     except (SourceError, MemoryError):
         raise
     except Exception as error:  # noqa: BLE001
-        gist = " ".join(str(error).split())[:160] or type(error).__name__
-        raise SourceError(f"{path}: it cannot be read as {kind} ({gist}); check that it is complete") from None
+        raise SourceError(f"{path}: it cannot be read as {kind} ({gist(error)}); check that it is complete") from None
 
 
 def _content(path: Path) -> Any:

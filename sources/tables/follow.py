@@ -382,7 +382,7 @@ class FollowedTable:
         state = np.where(blank, ABSENT, PRESENT).astype(np.int8)
         plan = np.zeros(t.size, np.int64)
         # As those of a recording, rows that were written before the twin began have no time of arrival.
-        events, row = self._mapping.placed(plan, t, t, values, state, (~known).astype(np.int8))
+        events, row = self._mapping.events(plan, t, t, values, state, (~known).astype(np.int8))
         if self._asset is None:
             return events
         return AssetEvents(events, found.values[row, -1].astype(np.int64), found.words)

@@ -138,7 +138,7 @@ class Table:
                 self._report(UNASSIGNED, f"{path.name}:{line}: {text}")
         state = np.where(rows.blank, ABSENT, PRESENT).astype(np.int8)
         plan = np.zeros(t.size, np.int64)
-        return self._mapping.events(plan, t, t, rows.values, state, (~used).astype(np.int8))
+        return self._mapping.events(plan, t, t, rows.values, state, (~used).astype(np.int8))[0]
 
     def _never(self, name: str | TextMatch) -> str:
         fed = ", ".join(channel.name for channel in self._channels if name in channel.needed)

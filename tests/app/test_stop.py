@@ -8,7 +8,7 @@ import threading
 
 import pytest
 
-from app.cli.run import live_source
+from app.cli.open_twin import live_source
 from app.live.jobs import run_all
 from app.twin.twin import load_twin
 from app.views.recording.reader import finished, read_recording

@@ -6,7 +6,7 @@ import pytest
 from estimators.compiled.model import compile_model
 from estimators.events.maintenance import maintained, model_versions
 from estimators.fold import fold
-from estimators.log import INPUT, MAINTENANCE, READING, TICK, Events, Log, last_maintenance, model_version_at
+from estimators.log import INPUT, MAINTENANCE, READING, TICK, Events, Log, model_version_at
 from estimators.models import MODELS
 from estimators.tuning import Tuning
 from tests.support import SECOND, folded
@@ -108,8 +108,6 @@ def test_versions_count_times_not_states():
     expected = 1 + (t >= 101 * SECOND + HALF) + (t >= 201 * SECOND + HALF)
     np.testing.assert_array_equal(versions, expected)
     assert [model_version_at(log, s * SECOND) for s in (0, 101, 102, 250)] == [1, 1, 2, 3]
-    assert last_maintenance(log, 101 * SECOND) is None
-    assert last_maintenance(log, 150 * SECOND) == 101 * SECOND + HALF
 
 
 @pytest.mark.parametrize("count", [50, 100, 101, 102, 103, 104, 150, 203, 204, 205, 303])

@@ -7,13 +7,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from config.fleet_schema import ASSET_LEVEL, FleetMqttSection, FleetPushSection
-from config.source_schema import (
-    ColumnSection,
-    ModbusSourceSection,
-    MqttSourceSection,
-    OpcUaSourceSection,
-    PushSection,
-)
+from config.source_schema import ColumnSection, ModbusSourceSection, MqttSourceSection, OpcUaSourceSection, PushSection
 from config.yaml_files import Key
 from estimators.errors import nearest, shown_name
 from estimators.model.state_space import StateSpaceModel

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from concurrent.futures import Executor
 from typing import NamedTuple
 
 import numpy as np
@@ -11,7 +10,6 @@ from ...fold import Fold
 from ...log import READING, Log
 from ...model.state_space import LARGE, StateSpaceModel
 from ...registry import find_entry, unfit
-from ...snapshots import Base
 from ...track import GATED, USED, Track
 from ...tuning import Tuning
 from ..calibration import LIMITS, standardised
@@ -170,22 +168,13 @@ class Linearity(NamedTuple):
     text: str
 
 
-def linearity(
-    model: StateSpaceModel,
-    tuning: Tuning,
-    log: Log,
-    *,
-    base: Base | None = None,
-    executor: Executor | str | None = "threads",
-) -> Linearity:
+def linearity(model: StateSpaceModel, tuning: Tuning, log: Log) -> Linearity:
     """Fold a log with the extended and the unscented Kalman filter.
 
     Args:
         model: Of at most 64 states, to which both apply.
         tuning: As the twin's, without the options of its filter.
         log: The events; it must not grow meanwhile (give a copy).
-        base: Where the log starts, if older events were dropped.
-        executor: As `sensitivity`.
 
     Raises:
         EstimatorError: As `Fold`.
@@ -197,11 +186,11 @@ def linearity(
     plain = tuning.with_options({})
 
     def run(name: str) -> Fold:
-        fold = Fold(name, model, plain, log, base=base)
+        fold = Fold(name, model, plain, log)
         fold.advance()
         return fold
 
-    straight, curved = each(run, (LINEARISED, UNSCENTED), executor)
+    straight, curved = each(run, (LINEARISED, UNSCENTED), "threads")
     states = _states(straight, curved)
     rows, whiteness = _rows(straight, curved)
     passes = all(item.most <= LIMITS.bias for item in (*states, *rows))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from concurrent.futures import Executor
 from typing import NamedTuple
 
 import numpy as np
@@ -12,7 +11,6 @@ from ...fold import Fold
 from ...log import READING, Log
 from ...model.state_space import StateSpaceModel
 from ...registry import find_estimator
-from ...snapshots import Base
 from ...track import HELD_OUT
 from ...tuning import Tuning
 from ..calibration import BANDS, calibrations
@@ -75,15 +73,7 @@ def worse(rms: float, floor: float) -> bool:
     return bool(rms > (1.0 + WORSE_MARGIN) * floor)
 
 
-def held_out(
-    estimator: str,
-    model: StateSpaceModel,
-    tuning: Tuning,
-    log: Log,
-    *,
-    base: Base | None = None,
-    executor: Executor | str | None = "threads",
-) -> HeldOut:
+def held_out(estimator: str, model: StateSpaceModel, tuning: Tuning, log: Log) -> HeldOut:
     """Fold the log without each sensor that reports, without all, and as it is.
 
     Args:
@@ -91,8 +81,6 @@ def held_out(
         model: The model.
         tuning: As the twin's; sensors that it holds out remain so.
         log: The events; it must not grow meanwhile (give a copy).
-        base: Where the log starts, if older events were dropped.
-        executor: As `sensitivity`.
 
     Raises:
         EstimatorError: As `Fold`.
@@ -106,13 +94,12 @@ def held_out(
     without = [tuning.set(f"use.{model.sensor_names[s]}", False) for s in reporting]
 
     def run(other: Tuning) -> Fold:
-        fold = Fold(estimator, model, other, log, base=base)
+        fold = Fold(estimator, model, other, log)
         fold.advance()
         fold.finish()
         return fold
 
-    if find_estimator(estimator, model).family in MONTE_CARLO_FAMILIES:
-        executor = None
+    executor = None if find_estimator(estimator, model).family in MONTE_CARLO_FAMILIES else "threads"
     filtered, floor, *folds = each(run, [tuning, none, *without], executor)
     open_rows = _score(floor).held_out
     rows: list[HeldOutPrediction] = []

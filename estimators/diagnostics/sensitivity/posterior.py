@@ -16,7 +16,6 @@ from ...log import READING, Log
 from ...model.state_space import StateSpaceModel
 from ...numerics.peaks import Peak
 from ...registry import find_entry, unfit
-from ...snapshots import Base
 from ...track import GATED, USED, Track
 from ...tuning import Tuning
 from ..calibration import standardised
@@ -73,7 +72,7 @@ class Tail(NamedTuple):
         return self.n >= MIN_TAIL_MEASUREMENTS and self.kurtosis > HEAVY_KURTOSIS
 
 
-def peaks(estimator: str, model: StateSpaceModel, tuning: Tuning, log: Log, *, base: Base | None = None) -> Peaks:
+def peaks(estimator: str, model: StateSpaceModel, tuning: Tuning, log: Log) -> Peaks:
     """Fold the first part of a log with two particle filters, and count the peaks of their clouds.
 
     Args:
@@ -81,7 +80,6 @@ def peaks(estimator: str, model: StateSpaceModel, tuning: Tuning, log: Log, *, b
         model: Model with at most 12 states.
         tuning: Tuning with the options of that filter.
         log: The events; it must not grow meanwhile (give a copy).
-        base: Where the log starts, if older events were dropped.
 
     Raises:
         EstimatorError: As `Fold`.
@@ -96,7 +94,7 @@ def peaks(estimator: str, model: StateSpaceModel, tuning: Tuning, log: Log, *, b
     # Right after a measurement: later, process noise separates duplicated particles.
     stops = np.flatnonzero(log.kind[:end] == READING) + 1
     stops = stops[np.unique(np.linspace(0, stops.size - 1, min(stops.size, MAX_LOOKS)).round().astype(int))]
-    folds = [Fold(estimator, model, replace(tuning, seed=tuning.seed + k), log, base=base) for k in range(2)]
+    folds = [Fold(estimator, model, replace(tuning, seed=tuning.seed + k), log) for k in range(2)]
     counts = []
     for stop in stops:
         for fold in folds:

@@ -116,7 +116,7 @@ RECORDED = """
 import sys, time
 sys.path.insert(0, {root!r})
 from pathlib import Path
-from app.cli.run import live_source
+from app.cli.open_twin import live_source
 from app.live.commands import Annotate, DeleteAnnotation, Record
 from app.twin.twin import load_twin
 from app.web.running import OpenedTwin

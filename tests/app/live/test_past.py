@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from app.cli.run import live_source
+from app.cli.open_twin import live_source
 from app.live.commands import SetTuning
 from app.live.engine import Engine
 from app.twin.twin import load_twin

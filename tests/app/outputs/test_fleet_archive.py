@@ -1,7 +1,6 @@
 """The archive of a fleet has each measurement once, and the fold of an asset's rows is the fleet's estimate."""
 
 import json
-from itertools import pairwise
 
 import numpy as np
 import pyarrow as pa
@@ -12,18 +11,18 @@ from app.cli.fleet import folders_of
 from app.live import fleet as live
 from app.live.fleet import RunningFleet
 from app.outputs import fleet_archive as archives
-from app.outputs.fleet_archive import AssetHistory, FleetArchive, read_journal
+from app.outputs.fleet_archive import AssetHistory, FleetArchive
 from app.outputs.parts import ArchivePlan, parts_of
 from app.twin.fleet import load_fleet
 from app.twin.twin import load_twin
 from app.views.recording.rrd_file import Split, parse_split
 from app.web.readings import messages_of
 from estimators.fold import Fold
-from estimators.log import Events, Log
+from estimators.log import Log
 from sources.source import WHOLE, Partition
+from tests.app.outputs.written_archive import BEGIN, SECOND, SPLIT, Written
 
-BEGIN, SECOND, DAY_S = 1_767_225_600 * 10**9, 10**9, 86_400
-SPLIT = parse_split("64MB,1h,day", None, "--archive")
+DAY_S = 86_400
 MODEL = load_twin("motor_can").model
 
 
@@ -181,54 +180,6 @@ def test_rows_of_a_store_wait_while_the_archive_cannot_be_written(tmp_path, monk
     fleet.stop()
 
 
-class Written:
-    """An archive of one sensor without a thread."""
-
-    def __init__(self, folder, split=SPLIT):
-        self.model, self.said, self.names = load_twin("motor_winding").model, [], [f"pump {k}" for k in range(5)]
-        self.folder = folder / "pumps"
-        self.archive = FleetArchive(
-            ArchivePlan(self.folder, split), self.model, self.names, lambda _, text: self.said.append(text)
-        )
-
-    def put(self, first, count=10):
-        """Put rows at consecutive seconds, whose value is their number."""
-        number = np.arange(first, first + count)
-        t = BEGIN + number * SECOND
-        zero = np.zeros(count, np.int32)
-        self.archive.put(number % 5, Events(t, t, zero.astype(np.int8), zero, number[:, None].astype(float)))
-        self.archive.look()
-        return self
-
-    def values(self):
-        """The values in the archive, those of its journals included."""
-        tables = [pq.read_table(path) for path in parts_of(self.folder)]
-        tables += filter(None, map(read_journal, self.folder.glob("*.arrows")))
-        return sorted(pa.concat_tables(tables)["value_0"].to_pylist())
-
-
-def test_a_journal_of_a_killed_process_is_completed_up_to_its_last_whole_batch(tmp_path):
-    written = Written(tmp_path).put(0).put(10).put(20)
-    (journal,) = written.folder.glob("*.arrows")
-    content = journal.read_bytes()
-    written.archive._journal._file.close()
-    sizes = []
-    for end in range(0, len(content), 37):
-        journal.write_bytes(content[:end])
-        table = read_journal(journal)
-        sizes.append(0 if table is None else table.num_rows)
-    assert set(sizes) == {0, 10, 20} and all(one <= two for one, two in pairwise(sizes))
-    again = Written(tmp_path).put(30)
-    assert again.values() == [*map(float, range(20)), *map(float, range(30, 40))]
-    assert again.said == [] and len(parts_of(again.folder)) == 1
-    (part,) = parts_of(again.folder)
-    journal.write_bytes(content)  # killed after the file was complete, and before its journal was removed
-    again.archive._journal.close()
-    assert AssetHistory([again.folder], "pump 3").read(100)["value_0"].to_pylist() == [3.0, 8.0, 13.0, 18.0, 33.0, 38.0]
-    archives.complete_journals(again.folder)
-    assert len(parts_of(again.folder)) == 2 and part.exists() and len(again.values()) == 30
-
-
 def test_files_end_with_the_day_and_with_their_size(tmp_path):
     daily = Written(tmp_path / "a", parse_split("day", None)).put(DAY_S - 10).put(DAY_S)
     assert [path.name for path in parts_of(daily.folder)] == ["2026-01-01-000001.parquet"]
@@ -322,14 +273,6 @@ def test_rows_beyond_those_that_may_wait_are_dropped_and_counted(tmp_path, monke
     assert written.values() == [*map(float, range(20))]
 
 
-def test_two_processes_do_not_write_into_one_folder(tmp_path):
-    first = Written(tmp_path).put(0)
-    second = Written(tmp_path).put(10)
-    assert "another process writes into it" in second.said[0]
-    first.archive.look(closing=True)
-    assert second.put(20).values() == [*map(float, range(30))]
-
-
 def test_rows_whose_write_fails_late_are_archived_once(tmp_path, monkeypatch):
     """A disk may refuse at `fsync` what it took, or take at `close` what it refused."""
     monkeypatch.setattr(live, "STORE_PERIOD_S", 0.0)
@@ -350,25 +293,6 @@ def test_rows_whose_write_fails_late_are_archived_once(tmp_path, monkeypatch):
     found = [pq.read_table(path).num_rows for path in parts_of(tmp_path / "archive" / "drives")]
     assert sum(found) == table.events.sum() + table.stale.sum()
     fleet.stop()
-
-
-def test_a_journal_that_begins_while_another_is_completed_has_a_number_of_its_own(tmp_path, monkeypatch):
-    """Of two files of one number, the second would be removed as complete."""
-    written = Written(tmp_path).put(0)
-    written.archive._end()
-    ended = written.archive._ended
-
-    def meanwhile(folder):
-        found = parts_of(folder)
-        if ended:
-            archives.complete_journal(ended.pop())
-        return found
-
-    with monkeypatch.context() as patch:
-        patch.setattr(archives, "parts_of", meanwhile)
-        written.put(10)
-    written.archive.look(closing=True)
-    assert written.said == [] and written.values() == [*map(float, range(20))]
 
 
 def test_a_journal_in_a_folder_that_was_emptied_is_cut_as_in_the_old_one(tmp_path, monkeypatch):

@@ -5,7 +5,7 @@ import re
 import numpy as np
 import pytest
 
-from app.cli.run import live_source
+from app.cli.open_twin import live_source
 from app.live.commands import Annotate, SetTuning
 from app.present.export.report import Reported, report
 from app.present.export.track_file import rows_of_run

@@ -10,7 +10,7 @@ import pytest
 
 from app.cli.arguments import FoldCommand
 from app.cli.fold import fold_twin
-from app.cli.run import live_source
+from app.cli.open_twin import live_source
 from app.live.commands import Load, Maintenance, SetTuning
 from app.present.export import track_file
 from app.twin.twin import load_twin

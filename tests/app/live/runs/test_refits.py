@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from app.cli.main import main
-from app.cli.open_twin import recorded_twin
-from app.cli.run import live_source
+from app.cli.open_twin import live_source, recorded_twin
 from app.live.commands import Record, SetTuning
 from app.live.runs.refits import ADOPTED, BROKEN, DISMISSED, FITTING, NOTHING, OFFERED, OUTDATED, Refits
 from app.twin.twin import load_twin

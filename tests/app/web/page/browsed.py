@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from app.cli.run import live_source
+from app.cli.open_twin import live_source
 from app.twin.twin import load_twin
 from app.web.running import OpenedTwin
 from app.web.session import Page, Session
