@@ -8,6 +8,7 @@ import multiprocessing
 import os
 import time
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from itertools import chain, groupby, zip_longest
 
 from app.twin.twin import load_twin
 from config.loader import shipped
@@ -30,16 +31,25 @@ def compile_one(twin_name: str, estimator: str | None) -> tuple[str, float]:
     return estimator or twin_name, time.process_time() - begun
 
 
+def family(estimator: str) -> str:
+    return ESTIMATORS[estimator].family
+
+
 def jobs() -> list[tuple[str, str | None]]:
-    """A twin for each filter, the smallest that it applies to; then the models, one twin of each."""
+    """A twin for each filter, the smallest that it applies to, and one twin of each model.
+
+    Two processes that compile what they share at once compile it twice. So the first filter, with the loop of all, is
+    compiled beside the models, and then the families take turns, the filters late in the catalogue first.
+    """
     twins = {name: load_twin(name).model for name in shipped()}
     small = sorted(twins, key=lambda name: twins[name].nx)
+    families = groupby(sorted(reversed(ESTIMATORS), key=family), key=family)
+    turns = chain.from_iterable(zip_longest(*(list(keys) for _, keys in families)))
     filters = [
-        (next(name for name in small if unfit(entry, twins[name]) is None), key) for key, entry in ESTIMATORS.items()
+        (next(name for name in small if unfit(ESTIMATORS[key], twins[name]) is None), key) for key in turns if key
     ]
     models = {twins[name].name: name for name in small}
-    # Those late in the catalogue take longest.
-    return [*reversed(filters), *((name, None) for name in models.values())]
+    return [filters[0], *((name, None) for name in models.values()), *filters[1:]]
 
 
 def main() -> None:
