@@ -3,13 +3,14 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-# A file's tests stay on one worker, which keeps what they share (servers, recordings, folded logs).
-PYTEST := $(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile
+# A file's tests stay on one worker, which keeps what they share (servers, recordings, folded logs). Two processors have
+# work for four workers, as many tests wait for a process, a browser or a clock.
+PYTEST := $(BIN)/python -m pytest --numprocesses 4 --dist loadfile
 
 # Tests of what is written in vector instructions, which LLVM splits where a processor's vectors are shorter.
 VECTORS := simd simd_rows linalg inverse_root symmetric
 
-.PHONY: run test fast generic versions bench shots docs size clean
+.PHONY: run test types warm fast generic versions lowest newest bench shots docs size clean
 
 run: $(VENV)/.installed
 	$(BIN)/nisus run motor_can
@@ -17,11 +18,16 @@ run: $(VENV)/.installed
 test: $(VENV)/.installed-dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/mypy
-	$(BIN)/python -m tests.warm
+	$(MAKE) --jobs types docs warm
 	$(BIN)/nisus guard --junit guard.xml
-	$(BIN)/python -m sphinx -q -W --keep-going -b html docs build/docs
 	$(PYTEST)
+
+types: $(VENV)/.installed-dev
+	$(BIN)/mypy
+
+# Compiles what tests share; types and guides are checked beside it, each on one processor.
+warm: $(VENV)/.installed-dev
+	$(BIN)/python -m tests.warm
 
 # The quickest tests, so many that they take 100 s of a processor by the runs before; all, if there was none.
 fast: $(VENV)/.installed-dev
@@ -32,8 +38,10 @@ generic: $(VENV)/.installed-dev
 	NUMBA_CPU_NAME=generic $(PYTEST) -q $(VECTORS:%=tests/estimators/numerics/test_%.py)
 
 # The lowest versions that pyproject.toml allows on the oldest Python here, and the newest on the newest.
-versions: $(VENV)/.installed-dev
-	$(BIN)/python -m tests.versions
+versions: lowest newest
+
+lowest newest: $(VENV)/.installed-dev
+	$(BIN)/python -m tests.versions $@
 
 bench: $(VENV)/.installed-dev
 	$(BIN)/python -m tests.benchmarks

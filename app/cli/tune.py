@@ -15,6 +15,7 @@ from config.yaml_files import shown_path, writing
 from estimators.errors import ConfigError, printable
 from estimators.fit.aims import CRPS, ERROR, LIKELIHOOD
 from estimators.fit.dual import WindowFit, tail, walk
+from estimators.fit.entries import check_key
 from estimators.fit.fit import Fitted, fit
 from estimators.fit.objective import FitProgress
 from estimators.fit.recording import BLOCKS, Recording
@@ -64,7 +65,7 @@ def tune_twin(arguments: Arguments) -> int:
         return tune_windows(arguments, wanted, arguments.windows, blocks)
     if arguments.every is not None:
         raise ConfigError("--every: is the time between the ends of two --windows; give both")
-    twin, recordings = _recordings(arguments)
+    twin, recordings = _recordings(arguments, wanted)
     aim = arguments.aim or (LIKELIHOOD if plain else natural_aim(twin.config))
     held = with_held(twin)
     prepare(held)
@@ -132,12 +133,12 @@ def _save(arguments: Arguments, twin: Twin, found: Fitted, fitted_on: Sequence[s
         complain(f"{shown_path(keep(twin, arguments.keep, version_text(twin, settings)))}: kept")
 
 
-def _recordings(arguments: Arguments) -> tuple[Twin, list[Recording]]:
+def _recordings(arguments: Arguments, wanted: Sequence[str]) -> tuple[Twin, list[Recording]]:
     """Return the twin, and its recordings, simulated logs, or own log."""
     overrides = settings(arguments.set, arguments.estimator)
     if not arguments.log:
         twin = load_twin(arguments.twin, overrides=overrides)
-        prepare(twin)
+        _prepare_fit(arguments, wanted, twin)
         logs = read_logs(twin, arguments.twin, overrides, arguments.logs, arguments.duration)
         return twin, [_part(arguments, twin, Recording(log)) for log in logs]
     if arguments.logs != 1:
@@ -145,10 +146,18 @@ def _recordings(arguments: Arguments) -> tuple[Twin, list[Recording]]:
     named = [_named(text) for text in arguments.log]
     check_once([file.expanduser() for files, _ in named for file in files], "--log ")
     twins = [load_twin(arguments.twin, log_files=files, overrides=overrides) for files, _ in named]
-    prepare(twins[0])
+    _prepare_fit(arguments, wanted, twins[0])
     logs = [read_log(twin, arguments.duration)[0] for twin in twins]
     recordings = [Recording(log, weight) for log, (_, weight) in zip(logs, named, strict=True)]
     return twins[0], [_part(arguments, twins[0], item) for item in recordings]
+
+
+def _prepare_fit(arguments: Arguments, wanted: Sequence[str], twin: Twin) -> None:
+    """Compile the twin's filter and model. Keys of no entry are refused before, as compiling can take a minute."""
+    fitted = with_held(twin) if arguments.windows is None else twin
+    for key in wanted:
+        check_key(twin.estimator, fitted.tuning, key)
+    prepare(twin)
 
 
 def _part(arguments: Arguments, twin: Twin, recording: Recording) -> Recording:
@@ -193,7 +202,7 @@ def tune_windows(arguments: Arguments, wanted: Sequence[str], windows: str, bloc
         raise ConfigError(
             f"--aim {arguments.aim}: cannot be used with --windows, which are fitted by likelihood; omit it"
         )
-    twin, given = _recordings(arguments)
+    twin, given = _recordings(arguments, wanted)
     if any(item.weight != 1.0 for item in given):
         raise ConfigError("--log: with --windows each recording follows the one before; leave the weights out")
 

@@ -103,3 +103,9 @@ def test_a_wrong_argument_is_one_line(command, nisus, tmp_path, monkeypatch):
     monkeypatch.setattr("app.studies.guard.guard_log", lambda *_: pytest.fail("it was folded"))
     assert REFUSED[command] in nisus.refuses(*shlex.split(command))
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("more", ["", "--windows 60"])
+def test_an_unknown_entry_is_refused_before_anything_is_compiled(more, nisus, monkeypatch):
+    monkeypatch.setattr("app.cli.tune.prepare", lambda twin: pytest.fail("it was compiled"))
+    assert "p.nosuch is no entry" in nisus.refuses("tune", "motor_bench", "--fit", "p.nosuch", *more.split())
