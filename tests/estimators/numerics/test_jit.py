@@ -12,7 +12,7 @@ from numba.core.targetconfig import ConfigStack
 from numba.extending import intrinsic
 
 from estimators.numerics.cache_entries import EntryFiles
-from estimators.numerics.jit import by_address, embedded, f64, jit, linkable, linkable_embedded, part
+from estimators.numerics.jit import by_address, embedded, jit, linkable, linkable_embedded, part
 from tests.conftest import ROOT
 
 LOADED = """
