@@ -8,9 +8,11 @@ import multiprocessing
 import os
 import signal
 import threading
+import time
 import uuid
+import warnings
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Executor, Future, ProcessPoolExecutor, as_completed
+from concurrent.futures import CancelledError, Executor, Future, ProcessPoolExecutor, as_completed
 from contextlib import contextmanager, suppress
 from importlib.metadata import version
 from typing import Any
@@ -22,7 +24,10 @@ from estimators.errors import ConfigError
 
 LOCAL = "local:"
 MAX_LOCAL = 256  # Processes of a cluster on this machine
-WAIT_S, CONNECT_S = 60, 10  # for the first worker of a cluster, and for its scheduler
+WAIT_S, CONNECT_S = 60, 10  # for a worker of a cluster, and for its scheduler
+WATCH_S = 5.0  # seconds between two looks whether a cluster has a worker
+
+_REMEDY = "give the address of a Dask scheduler, as in tcp://127.0.0.1:8786, or local:4 for four processes here"
 
 _turn, _begun = threading.Lock(), [""]
 """Of a worker of a cluster: one call at a time, and the work whose `begin` has been called."""
@@ -62,7 +67,8 @@ def results(
         given: Its arguments.
 
     Raises:
-        ConfigError: If a number is wrong, Dask is not installed, or the cluster does not answer or has another version.
+        ConfigError: If a number is wrong, Dask is not installed, or the cluster does not answer, has another version,
+            or loses its scheduler or its workers.
     """
     begin = begin or _nothing
     if cluster is None and (jobs := jobs_of(jobs, len(calls))) == 1:
@@ -99,6 +105,7 @@ class Cluster:
         """Take a client; `begin` is called with `given` on each worker before its first call."""
         self._client, self._executor = client, client.get_executor(pure=False)
         self._name, self._version, self._begin = uuid.uuid4().hex, version("nisus"), self.hold((begin, given))
+        self._closed, self.deserted = threading.Event(), False
 
     def submit(self, work: Callable[..., Any], *call: Any) -> Future[Any]:
         """Submit a call; another worker makes it again if one dies. Its arguments may be held."""
@@ -114,8 +121,21 @@ class Cluster:
         """Return the present number of workers."""
         return len(self._client.nthreads())
 
+    def watch(self) -> None:
+        """Cancel all calls once there has been no worker for `WAIT_S`, since nothing else would end them."""
+        seen = time.monotonic()
+        while not self._closed.wait(WATCH_S):
+            with suppress(Exception):  # of a lost connection, which ends the calls by itself
+                if self.workers():
+                    seen = time.monotonic()
+                elif time.monotonic() - seen > WAIT_S:
+                    self.deserted = True
+                    self._client.close()
+                    return
+
     def close(self) -> None:
         """Leave the cluster without waiting for calls."""
+        self._closed.set()
         self._executor.shutdown(wait=False)
         self._client.close()
 
@@ -145,8 +165,11 @@ def dask(address: str, begin: Callable[..., None], given: tuple[Any, ...]) -> It
     try:
         from distributed import Client, LocalCluster
         from distributed.comm import connect
+        from distributed.scheduler import KilledWorker
     except ImportError:
         raise ConfigError("--cluster: needs Dask; install it with `pip install 'nisus[cluster]'`") from None
+    logging.getLogger("distributed.client").setLevel(logging.CRITICAL)  # a lost connection is an error of the command
+    warnings.filterwarnings("ignore", "Sending large graph")  # a long log, which is sent once to each worker
     own = None
 
     async def knock() -> None:
@@ -158,7 +181,7 @@ def dask(address: str, begin: Callable[..., None], given: tuple[Any, ...]) -> It
             asyncio.run(asyncio.wait_for(knock(), CONNECT_S))
         except (OSError, ValueError, TypeError) as error:
             reason = str(error).splitlines()[0] if str(error) else "no answer"
-            raise ConfigError(f"--cluster {address}: {reason}; is it a Dask scheduler's?") from None
+            raise ConfigError(f"--cluster {address}: {reason}; {_REMEDY}") from None
     with _deaf():
         if address.startswith(LOCAL):
             count = address.removeprefix(LOCAL)
@@ -170,13 +193,22 @@ def dask(address: str, begin: Callable[..., None], given: tuple[Any, ...]) -> It
             )  # fmt: skip
         client = Client(own or address, timeout=WAIT_S, set_as_default=False)
     workers = Cluster(client, begin, given)
+    start = f"start one with `dask worker {address} --nthreads 1`"
     try:
         try:
             client.wait_for_workers(1, timeout=WAIT_S)
         except TimeoutError:
-            text = f"--cluster {address}: has no worker; start one with `dask worker {address} --nthreads 1`"
-            raise ConfigError(text) from None
+            raise ConfigError(f"--cluster {address}: has no worker; {start}") from None
+        threading.Thread(target=workers.watch, name="cluster", daemon=True).start()
         yield workers
+    except KilledWorker as error:
+        text = f"{error.allowed_failures + 1} workers died in one call; is their memory enough? See their logs"
+        raise ConfigError(f"--cluster {address}: {text}") from None
+    except CancelledError:
+        if workers.deserted:
+            raise ConfigError(f"--cluster {address}: has had no worker for {WAIT_S} s; {start}") from None
+        text = "the connection to the scheduler is lost; see its log, and run the command again"
+        raise ConfigError(f"--cluster {address}: {text}") from None
     finally:
         workers.close()
         if own is not None:

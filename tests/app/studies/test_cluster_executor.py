@@ -108,14 +108,30 @@ class Here:
 def test_a_function_is_sent_once_and_calls_that_have_not_begun_are_cancelled():
     cluster = Here()
     executor = ClusterExecutor(cluster, [])
+    results = executor.map(divmod, [7], [2])
+    work, (sent, items) = cluster.call
+    cluster.futures[0].set_result((1.0, work(sent, items)[1]))
+    assert list(results) == [(3, 1)]
     results = executor.map(divmod, [7, 8, 9], [2, 3, 4])
     executor.map(divmod, [1], [1])
-    assert len(cluster.sent) == 1 and len(cluster.futures) == 4
+    assert len(cluster.sent) == 1 and len(cluster.futures) == 5
     work, (sent, items) = cluster.call
-    cluster.futures[0].set_result(work(sent, [(7, 2)]))
+    cluster.futures[1].set_result(work(sent, [(7, 2)]))
     assert items == [(1, 1)] and next(results) == (3, 1)
     results.close()
-    assert [future.cancelled() for future in cluster.futures] == [False, True, True, False]
+    assert [future.cancelled() for future in cluster.futures] == [False, False, True, True, False]
+
+
+def test_the_first_call_tells_how_many_make_a_task():
+    """Of a function that is called in one `map` alone, such as the faults of a check."""
+    cluster = Here()
+    results = ClusterExecutor(cluster, []).map(divmod, range(40), [3] * 40)
+    assert len(cluster.futures) == 1
+    work, (sent, items) = cluster.call
+    cluster.futures[0].set_result((0.01, work(sent, items)[1]))
+    assert next(results) == (0, 0) and len(cluster.futures) == 1 + 4  # 0.1 s each
+    work, (sent, items) = cluster.call
+    assert items == [(k, 3) for k in range(31, 40)]
 
 
 def draws(seed: int) -> np.ndarray:
@@ -185,7 +201,7 @@ def test_a_server_of_another_kind_is_told(twin, monkeypatch):
         silent.listen()
         address = f"127.0.0.1:{silent.getsockname()[1]}"
         with (
-            pytest.raises(ConfigError, match=f"--cluster {address}: .*; is it a Dask scheduler's"),
+            pytest.raises(ConfigError, match=f"--cluster {address}: .*; give the address of a Dask scheduler"),
             executor_of(address, twin, twin, NAME, {}),
         ):
             pass

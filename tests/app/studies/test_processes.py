@@ -120,7 +120,7 @@ def test_a_cluster_of_ones_own_ends_with_the_command() -> None:
         ({"cluster": "local:0"}, "--cluster local:0: give 1 to 256 processes, for example local:4"),
         ({"cluster": "local:1000"}, "--cluster local:1000: give 1 to 256 processes, for example local:4"),
         ({"cluster": "local:²"}, "--cluster local:²: give 1 to 256 processes, for example local:4"),
-        ({"cluster": "nowhere"}, "--cluster nowhere: .*; is it a Dask scheduler's?"),
+        ({"cluster": "nowhere"}, "--cluster nowhere: .*; give the address of a Dask scheduler"),
         ({"cluster": "local:2", "jobs": 2}, "--jobs: counts processes of this command"),
     ],
 )  # fmt: skip
