@@ -7,6 +7,7 @@ import logging
 import multiprocessing
 import os
 import signal
+import socket
 import threading
 import time
 import uuid
@@ -14,13 +15,13 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import CancelledError, Executor, Future, ProcessPoolExecutor, as_completed
 from contextlib import contextmanager, suppress
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
 import numba
 
 from estimators.compiled.orphan import leave_with_parent
-from estimators.errors import ConfigError
+from estimators.errors import ConfigError, NisusError
 
 LOCAL = "local:"
 MAX_LOCAL = 256  # Processes of a cluster on this machine
@@ -104,12 +105,12 @@ class Cluster:
     def __init__(self, client: Any, begin: Callable[..., None], given: tuple[Any, ...]) -> None:
         """Take a client; `begin` is called with `given` on each worker before its first call."""
         self._client, self._executor = client, client.get_executor(pure=False)
-        self._name, self._version, self._begin = uuid.uuid4().hex, version("nisus"), self.hold((begin, given))
-        self._closed, self.deserted = threading.Event(), False
+        self._command = uuid.uuid4().hex, version("nisus"), os.getcwd()
+        self._begin, self._closed, self.deserted = self.hold((begin, given)), threading.Event(), False
 
     def submit(self, work: Callable[..., Any], *call: Any) -> Future[Any]:
         """Submit a call; another worker makes it again if one dies. Its arguments may be held."""
-        found: Future[Any] = self._executor.submit(_on_worker, self._name, self._version, self._begin, work, *call)
+        found: Future[Any] = self._executor.submit(_on_worker, self._command, self._begin, work, *call)
         return found
 
     def hold(self, value: Any) -> Any:
@@ -130,7 +131,7 @@ class Cluster:
                     seen = time.monotonic()
                 elif time.monotonic() - seen > WAIT_S:
                     self.deserted = True
-                    self._client.close()
+                    self._executor.shutdown(wait=False)
                     return
 
     def close(self) -> None:
@@ -199,6 +200,13 @@ def dask(address: str, begin: Callable[..., None], given: tuple[Any, ...]) -> It
             client.wait_for_workers(1, timeout=WAIT_S)
         except TimeoutError:
             raise ConfigError(f"--cluster {address}: has no worker; {start}") from None
+        # Without Nisus a worker ends at its first call, and a scheduler answers none.
+        found = {f"the worker {at}": it for at, it in client.run(version, "nisus", on_error="return").items()}
+        with suppress(PackageNotFoundError):
+            found["its scheduler"] = client.run_on_scheduler(version, "nisus")
+        lacking = [name for name in (*found, "its scheduler") if not isinstance(found.get(name), str)]
+        if lacking:
+            raise ConfigError(f"--cluster {address}: {lacking[0]} has no Nisus; install {version('nisus')} there")
         threading.Thread(target=workers.watch, name="cluster", daemon=True).start()
         yield workers
     except KilledWorker as error:
@@ -206,7 +214,8 @@ def dask(address: str, begin: Callable[..., None], given: tuple[Any, ...]) -> It
         raise ConfigError(f"--cluster {address}: {text}") from None
     except CancelledError:
         if workers.deserted:
-            raise ConfigError(f"--cluster {address}: has had no worker for {WAIT_S} s; {start}") from None
+            text = f"has had no worker for {WAIT_S} s; see their logs, or {start}"
+            raise ConfigError(f"--cluster {address}: {text}") from None
         text = "the connection to the scheduler is lost; see its log, and run the command again"
         raise ConfigError(f"--cluster {address}: {text}") from None
     finally:
@@ -227,16 +236,23 @@ def _deaf() -> Iterator[None]:
 
 
 def _on_worker(
-    name: str, wanted: str, held: tuple[Callable[..., None], tuple[Any, ...]], work: Callable[..., Any],
+    command: tuple[str, str, str], held: tuple[Callable[..., None], tuple[Any, ...]], work: Callable[..., Any],
     *call: Any,
 ) -> Any:  # fmt: skip
     """Make a call on a worker, which may have threads and serve other commands; `begin` sets variables of a module."""
+    name, wanted, folder = command
     if version("nisus") != wanted:
         raise ConfigError(f"--cluster: a worker has Nisus {version('nisus')}, this is {wanted}; install the same")
     begin, given = held
     with _turn:
+        with suppress(OSError):  # relative paths, which are not found if the folder is not there
+            os.chdir(folder)
         if _begun[0] != name:
-            begin(*given)
+            try:
+                begin(*given)
+            except NisusError as error:
+                text = "workers need the files of the twin at the same path"
+                raise ConfigError(f"--cluster: a worker of {socket.gethostname()} fails: {error}; {text}") from None
             _begun[0] = name
         numba.set_num_threads(1)
         return work(*call)

@@ -20,10 +20,12 @@ from app.studies.checklist import checklist
 from app.studies.cluster_executor import ClusterExecutor, executor_of, functions_of, packed, unpacked
 from app.twin.log_reader import read_log
 from app.twin.twin import load_twin, with_held
+from estimators.diagnostics.sensitivity import gramian
 from estimators.errors import ConfigError
 from estimators.fit.fit import fit
 from estimators.fit.objective import Cancelled
 from estimators.fit.recording import Recording
+from estimators.log import Log
 from estimators.tuning import Tuning
 from tests.app.studies.test_processes import die_once
 from tests.conftest import ROOT
@@ -76,6 +78,48 @@ def test_any_executor_does_for_a_model_of_functions_of_a_module():
     with ProcessPoolExecutor(2, get_context("spawn")) as executor:
         found = fit("kf", Tuning.of(MODEL), [Recording(ys)], blocks=0, executor=executor)
     assert bits(found) == bits(fit("kf", Tuning.of(MODEL), [Recording(ys)], blocks=0))
+
+
+def both_report() -> Log:
+    log = log_of(simulated(3, 300))
+    log.add("silent", np.arange(300) + 0.5, simulated(4, 300))
+    return log
+
+
+class Counting(Executor):
+    """Makes calls here, and counts them."""
+
+    def __init__(self) -> None:
+        self.calls = 0
+
+    def map(self, fn, *iterables, timeout=None, chunksize=1):
+        for items in zip(*iterables, strict=True):
+            self.calls += 1
+            yield fn(*items)
+
+
+def test_every_fold_of_a_fit_is_made_in_its_executor():
+    executor = Counting()
+    options = {"wanted": ("Q", "R"), "considered": {"rate": 0.05, "offset": 1.0}}
+    found = fit("kf", Tuning.of(MODEL), [Recording(both_report())], executor=executor, **options)
+    assert found.widths is not None and len(found.after.held_out.sensors) == 2
+    assert executor.calls == found.folds  # of one recording
+
+
+def test_judgement_and_widths_in_processes_are_the_same_bits():
+    options = {"considered": {"rate": 0.05, "offset": 1.0}}
+    with ProcessPoolExecutor(2, get_context("spawn")) as executor:
+        found = fit("kf", Tuning.of(MODEL), [Recording(both_report())], executor=executor, **options)
+    here = fit("kf", Tuning.of(MODEL), [Recording(both_report())], executor=None, **options)
+    assert bits(found) == bits(here) and found.widths.envelope == here.widths.envelope
+    assert found.widths.std.tobytes() == here.widths.std.tobytes()
+
+
+def test_a_gramian_in_processes_is_the_same_bits():
+    given = "kf", MODEL, Tuning.of(MODEL), log_of(simulated(3, 300))
+    with ProcessPoolExecutor(2, get_context("spawn")) as executor:
+        found = gramian(*given, executor=executor)
+    assert len(found.windows) == 8 and repr(found) == repr(gramian(*given, executor=None))
 
 
 def test_a_worker_that_dies_costs_a_retry(scheduler, twin, tmp_path):
