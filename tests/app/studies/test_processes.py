@@ -134,20 +134,21 @@ def test_a_worker_without_nisus_is_one_line(scheduler, monkeypatch) -> None:
         list(results(handled, [()], cluster=scheduler))
 
 
-def test_a_cluster_that_is_lost_is_one_line(tmp_path, monkeypatch) -> None:
+def test_a_cluster_that_has_no_worker_left_is_one_line(tmp_path, monkeypatch) -> None:
     monkeypatch.setattr(processes, "WATCH_S", 0.1)
-    marker = tmp_path / "begun"
-    with started(tmp_path, 1) as (address, (scheduler, worker)):
-        with pytest.raises(ConfigError, match="has had no worker for 0.5 s; .* start one with `dask worker tcp://"):
-            for _ in lost(address, marker):
-                monkeypatch.setattr(processes, "WAIT_S", 0.5)
-                worker.kill()
-        monkeypatch.undo()
-    marker.unlink()
-    with started(tmp_path, 1) as (address, (scheduler, worker)):
+    text = "has had no worker for 0.5 s; .* start one with `dask worker tcp://"
+    with started(tmp_path, 1) as (address, (_, worker)), pytest.raises(ConfigError, match=text):
+        for _ in lost(address, tmp_path / "begun"):
+            monkeypatch.setattr(processes, "WAIT_S", 0.5)
+            worker.kill()
+
+
+def test_a_scheduler_that_is_lost_is_one_line(tmp_path, capfd) -> None:
+    with started(tmp_path, 1) as (address, (scheduler, _)):
         with pytest.raises(ConfigError, match=f"--cluster {address}: the connection to the scheduler is lost"):
-            for _ in lost(address, marker):
+            for _ in lost(address, tmp_path / "begun"):
                 scheduler.kill()
+    assert capfd.readouterr().err == ""  # nor does Dask add its own
 
 
 def lost(address: str, marker: Path) -> Iterator[None]:
