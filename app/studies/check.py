@@ -94,7 +94,7 @@ def check(twin: Twin, log: Log, counts: Counter[str], *, executor: Executor | st
         twin: The twin.
         log: Its log.
         counts: Numbers of dropped measurements, by reason.
-        executor: Where the faults are folded, nearly all of the work; see `sensitivity`.
+        executor: Where faults and the Gramian are folded, nearly all of the work; see `sensitivity`.
 
     Raises:
         NisusError: If the twin's own filter does not run.
@@ -107,7 +107,7 @@ def check(twin: Twin, log: Log, counts: Counter[str], *, executor: Executor | st
         span = float(log.t[fold.n - 1] - log.t[0]) * 1e-9
         log.n = fold.log.n = fold.n
     fold.finish()
-    measured = Measured(twin, log)
+    measured = Measured(twin, log, executor=executor)
     readings = int(np.sum(log.kind[: log.n] == READING))
     covariance = fold.estimator.family not in ("particle", "ensemble")
     present, *onsets = sensitivities(

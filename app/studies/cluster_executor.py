@@ -77,15 +77,23 @@ class ClusterExecutor(Executor):
         key = (fn.func, *map(id, fn.args)) if isinstance(fn, partial) else fn
         if key not in self._sent:
             self._sent[key] = fn, self._cluster.hold((uuid.uuid4().hex, packed(fn, self._functions)))
+        # The first calls, one a worker, measure how long one takes.
+        first = len(items) if key in self._seconds else max(1, self._cluster.workers())
+        return self._results(key, self._tasks(key, items[:first]), items[first:])
+
+    def _tasks(self, key: Any, items: list[tuple[Any, ...]]) -> list[Future[Any]]:
         share = -(-len(items) // max(1, self._cluster.workers()))
         count = max(1, min(share, round(TASK_S / max(self._seconds.get(key, TASK_S), 1e-6))))
         parts = [items[k : k + count] for k in range(0, len(items), count)]
-        return self._results(key, [self._cluster.submit(_calls, self._sent[key][1], part) for part in parts])
+        return [self._cluster.submit(_calls, self._sent[key][1], part) for part in parts]
 
-    def _results(self, key: Any, futures: list[Future[Any]]) -> Iterator[Any]:
+    def _results(self, key: Any, futures: list[Future[Any]], rest: list[tuple[Any, ...]]) -> Iterator[Any]:
         try:
             for future in futures:
                 self._seconds[key], found = future.result()
+                if rest:
+                    futures += self._tasks(key, rest)
+                    rest = []
                 yield from pickle.loads(found)
         finally:
             for future in futures:

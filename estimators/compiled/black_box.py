@@ -10,7 +10,7 @@ import pickle
 from collections.abc import Callable
 from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor, ThreadPoolExecutor
 from functools import lru_cache
-from multiprocessing import get_context
+from multiprocessing import current_process, get_context
 from typing import Any
 
 import numba
@@ -80,12 +80,15 @@ class BlackBox:
 
     def _run(self, what: str, function: Callable, X: np.ndarray, columns: int, *rest: Any) -> np.ndarray:
         executor = self.model.executor
-        pool = _pool(executor) if isinstance(executor, str) else executor
+        # A worker of a Dask cluster may have no processes of its own.
+        here = executor == "processes" and current_process().daemon
+        pool = None if here else _pool(executor) if isinstance(executor, str) else executor
+        # Of a number that does not depend on where they run: blocks of another size may round differently.
+        pieces = [X] if executor is None else np.array_split(X, max(1, min(_workers(pool), len(X))))
         try:
             if pool is None:
-                parts = [_call(function, X, *rest)]
+                parts = [_call(function, piece, *rest) for piece in pieces]
             else:
-                pieces = np.array_split(X, max(1, min(_workers(pool), len(X))))
                 calls = [(_call, self._sent[id(function)], piece, *rest) for piece in pieces]
                 try:
                     futures = [pool.submit(*call) for call in calls]
@@ -100,10 +103,9 @@ class BlackBox:
         except (Exception, SystemExit) as error:  # noqa: BLE001  the user's own function may raise anything
             at = place(function, error)
             said = f"a block of {len(X)} states: {type(error).__name__}: {' '.join(str(error).split()) or 'no message'}"
-            here = pool is None or isinstance(pool, ThreadPoolExecutor)
-            remedy = _remedy(error, None if here else self._sent[id(function)])
+            sent = pool is not None and not isinstance(pool, ThreadPoolExecutor)
+            remedy = _remedy(error, self._sent[id(function)] if sent else None)
             raise ModelError(f"{at}model {self.model.name}: {what} fails on {said}; {remedy}") from error
-        pieces = [X] if pool is None else pieces
         for piece, part in zip(pieces, parts, strict=True):
             if part.shape != (len(piece), columns):
                 raise ModelError(
@@ -162,7 +164,7 @@ def _pool(kind: str) -> Executor:
     return ProcessPoolExecutor(count, get_context("spawn"), initializer=leave_with_parent)
 
 
-def _workers(pool: Executor) -> int:
+def _workers(pool: Executor | None) -> int:
     return int(getattr(pool, "_max_workers", numba.config.NUMBA_NUM_THREADS))
 
 

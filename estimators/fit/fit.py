@@ -133,9 +133,8 @@ def fit(
             do not identify, with the full weight of the likelihood.
         go: Called from any thread with the number of folds done since; returns whether to continue.
         progress: Kept up to date from any thread; with its `stop` set, the best point so far is judged and returned.
-        executor: Where the points of the search and of the intervals are folded: "threads", an Executor, or None to
-            fold one after the other. The results are the same bits. An Executor of processes needs a model that can be
-            pickled.
+        executor: Where recordings are folded: "threads", an Executor, or None to fold one after the other. The results
+            are the same bits. An Executor of processes needs a model that can be pickled.
 
     Raises:
         Cancelled: If `go` returns False.
@@ -234,7 +233,9 @@ def fit(
     widths = None
     if considered:
         progress.expect(len(recordings) * (1 + 2 * len(considered)))
-        widths = parameter_widths(estimator, setting_at(chosen.x), lean, considered, aim=aimed, go=count)
+        widths = parameter_widths(
+            estimator, setting_at(chosen.x), lean, considered, aim=aimed, go=count, executor=executor
+        )
     lines, correlation = _lines(objective.entries, kept, x, value, shape, chosen, identified)
     return Fitted(
         estimator=estimator,

@@ -25,6 +25,8 @@ Sources: Grünwald & van Ommen (2017), doi:10.1214/17-BA1085, for a power learnt
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Executor
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -32,13 +34,11 @@ import numpy as np
 from ..diagnostics.innovations import mean_nis
 from ..diagnostics.intervals import correlation_interval
 from ..diagnostics.references import Reference, held_out_references, references
-from ..diagnostics.sensitivity.responses import each
 from ..log import READING, TRUTH
-from ..registry import find_estimator
 from ..track import USED, Track
 from .aims import CRPS, ERROR, LIKELIHOOD, WITNESSES, Aim, crps, densities, sensors_in_turn, track_of
 from .entries import Setting
-from .objective import ALONE, Cancelled, Go, Objective
+from .objective import Go, Objective, each_folded
 from .recording import Recording
 from .uncertainty import LikelihoodCurvature, Z
 
@@ -90,7 +90,8 @@ class PartScore(NamedTuple):
     @property
     def log_likelihood(self) -> float:
         """Log density of all its measurements, nats."""
-        return float(self.terms.sum())
+        # As `Objective.all_terms`: those of an Executor may not be aligned.
+        return float(np.require(self.terms, requirements="A").sum())
 
 
 class Worth(NamedTuple):
@@ -98,6 +99,9 @@ class Worth(NamedTuple):
 
     fitted: PartScore
     held_out: PartScore
+
+
+Worths = tuple[dict[str, PredictionScore], dict[str, PredictionScore]]  # Of the fitted and the held-out part, by row
 
 
 class FitVerdict(NamedTuple):
@@ -130,54 +134,73 @@ def worths(
     Raises:
         Cancelled: If `go` returns False.
     """
-    found = worths_in_use(estimator, settings, recordings, go, aim)
-    return with_sensors(estimator, settings, found, recordings, go)
+    given = tuple(settings), tuple(recordings)
+    found = worths_in_use(estimator, *given, go, aim)
+    return with_sensors(estimator, *given, found, range(len(found)), go)
 
 
 def worths_in_use(
-    estimator: str, settings: Sequence[Setting], recordings: Sequence[Recording], go: Go, aim: Aim | None = None
+    estimator: str,
+    settings: tuple[Setting, ...],
+    recordings: tuple[Recording, ...],
+    go: Go,
+    aim: Aim | None = None,
+    executor: Executor | str | None = "threads",
 ) -> list[Worth]:
     """Return the same without the sensors held out in turn, a fold of each recording."""
-    tracks = _tracks(estimator, settings, recordings, [None], go)
-    found = []
-    for setting, (own,) in zip(settings, tracks, strict=True):
-        folded = list(zip(recordings, own, strict=True))
-        found.append(Worth(*(_part(setting, folded, aim or Aim(), part) for part in (False, True))))
-    return found
+    work = partial(_in_use, estimator, settings, recordings, aim or Aim())
+    folds, model = len(recordings), settings[0].tuning.model
+    return each_folded(work, range(len(settings)), folds, estimator, model, executor=executor, go=go)
 
 
 def with_sensors(
-    estimator: str, settings: Sequence[Setting], found: Sequence[Worth], recordings: Sequence[Recording], go: Go
+    estimator: str,
+    settings: tuple[Setting, ...],
+    recordings: tuple[Recording, ...],
+    found: Sequence[Worth],
+    wanted: Sequence[int],
+    go: Go,
+    executor: Executor | str | None = "threads",
 ) -> list[Worth]:
-    """Return the scores of settings with those of the sensors held out in turn, a fold of each recording for each."""
-    sensors = sensors_in_turn(settings[0], list(recordings)) if settings else []
-    tracks = _tracks(estimator, settings, recordings, sensors, go)
-    parts = [
-        [_in_turn(setting, sensors, own, recordings, part) for part in (False, True)]
-        for setting, own in zip(settings, tracks, strict=True)
-    ]
-    return [
-        Worth(worth.fitted._replace(sensors=fitted), worth.held_out._replace(sensors=held_out))
-        for worth, (fitted, held_out) in zip(found, parts, strict=True)
-    ]
+    """Return the scores `found` of the settings `wanted`, by index, with those of the sensors held out in turn.
+
+    Each sensor takes a fold of each recording.
+    """
+    model = settings[0].tuning.model
+    sensors = sensors_in_turn(settings[0], list(recordings))
+    # An Executor of processes sends them once, whichever settings are wanted.
+    work = partial(_in_turn, estimator, settings, recordings)
+    items = [(k, s) for k in wanted for s in sensors]
+    parts = iter(each_folded(work, items, len(recordings), estimator, model, executor=executor, go=go))
+    completed = []
+    for k in wanted:
+        held: Worths = {}, {}
+        for _ in sensors:
+            for all_rows, rows in zip(held, next(parts), strict=True):
+                all_rows.update(rows)
+        completed.append(Worth(*(part._replace(sensors=rows) for part, rows in zip(found[k], held, strict=True))))
+    return completed
 
 
-def _tracks(
-    estimator: str, settings: Sequence[Setting], recordings: Sequence[Recording], without: Sequence[int | None], go: Go
-) -> list[list[list[Track]]]:
-    """Return the tracks by setting, sensor held out, and recording."""
-    jobs = [(setting, record, s) for setting in settings for s in without for record in recordings]
+def _in_use(estimator: str, settings: Sequence[Setting], recordings: Sequence[Recording], aim: Aim, k: int) -> Worth:
+    """Return the scores of setting k without sensors in turn."""
+    folded = [(record, track_of(estimator, settings[k], record)) for record in recordings]
+    return Worth(*(_part(settings[k], folded, aim, part) for part in (False, True)))
 
-    def run(job: tuple[Setting, Recording, int | None]) -> Track:
-        setting, record, s = job
-        track = track_of(estimator, setting, record, without=s)
-        if not go(1):
-            raise Cancelled
-        return track
 
-    alone = bool(settings) and find_estimator(estimator, settings[0].tuning.model).family in ALONE
-    tracks = iter(each(run, jobs, None if alone else "threads"))
-    return [[[next(tracks) for _ in recordings] for _ in without] for _ in settings]
+def _in_turn(
+    estimator: str, settings: Sequence[Setting], recordings: Sequence[Recording], item: tuple[int, int]
+) -> Worths:
+    """Return the scores of a sensor held out, by row, with setting k: on the fitted and on the held-out part."""
+    k, s = item
+    found: tuple[dict[str, list[Reference]], ...] = {}, {}
+    for record in recordings:
+        track = track_of(estimator, settings[k], record, without=s)
+        for reference in held_out_references(settings[k].tuning.model, record.log.events, track, s):
+            for group, part in zip(found, (False, True), strict=True):
+                _collect(group, reference.finite(), record.held_out == part)
+    fitted, held_out = ({name: _prediction(items) for name, items in group.items()} for group in found)
+    return fitted, held_out
 
 
 def gain(before: np.ndarray, after: np.ndarray) -> tuple[float, float]:
@@ -225,18 +248,6 @@ def _part(setting: Setting, folded: list[tuple[Recording, Track]], aim: Aim, hel
         states,
         _correlations(setting, folded, held_out),
     )
-
-
-def _in_turn(
-    setting: Setting, sensors: Sequence[int], tracks: list[list[Track]], recordings: Sequence[Recording], held_out: bool
-) -> dict[str, PredictionScore]:
-    """Return the scores of the sensors held out in turn, by row, on the fitted or the held-out part."""
-    group: dict[str, list[Reference]] = {}
-    for s, own in zip(sensors, tracks, strict=True):
-        for record, track in zip(recordings, own, strict=True):
-            for item in held_out_references(setting.tuning.model, record.log.events, track, s):
-                _collect(group, item.finite(), record.held_out == held_out)
-    return {name: _prediction(items) for name, items in group.items()}
 
 
 def _collect(group: dict[str, list[Reference]], item: Reference, part: np.ndarray) -> None:
@@ -388,14 +399,15 @@ def tempered(
     """
     aim, estimator, go = objective.aim, objective.estimator, objective.go
     points = [at_power(objective, x, shape, power) for power in powers]
-    settings = [setting(objective.start), *(setting(point) for point, _ in points)]
-    found = worths_in_use(estimator, settings, recordings, go, aim)
+    settings = (setting(objective.start), *(setting(point) for point, _ in points))
+    given = settings, tuple(recordings)
+    found = worths_in_use(estimator, *given, go, aim, objective.executor)
     complete: set[int] = set()
 
     def complete_those(wanted: Sequence[int]) -> None:
         missing = [k for k in wanted if k not in complete]
         complete.update(missing)
-        more = with_sensors(estimator, [settings[k] for k in missing], [found[k] for k in missing], recordings, go)
+        more = with_sensors(estimator, *given, found, missing, go, objective.executor)
         for k, worth in zip(missing, more, strict=True):
             found[k] = worth
 

@@ -31,17 +31,18 @@ Wright, Numerical Optimization (2006), procedure 18.2, for the damped update.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Executor
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
 from ..diagnostics.sensitivity.responses import each
 from ..errors import NisusError
+from ..model.state_space import StateSpaceModel
 from ..registry import find_estimator
 from ..tuning import Tuning
 from .aims import Aim
@@ -74,6 +75,8 @@ SEARCH_FOLDS = 60  # Most folds per entry of a search without derivatives
 PLAIN_SHARE = 1e-9  # Share of the weak prior's precision that keeps matrices regular where there is none
 POLISH_STEPS = 30  # Most steps to the exact maximum
 POLISHED = 1e-6  # Step, in deviations, that ends them
+T = TypeVar("T")
+R = TypeVar("R")
 Go = Callable[[int], bool]  # Callback with the number of folds done since the last call; returns whether to continue
 
 
@@ -120,6 +123,30 @@ def terms_at(estimator: str, tuning: Tuning, recordings: Sequence[Recording], ai
             values = np.full(recording.log.n, FAILED_FOLD / recording.log.n)
         found.append(np.where(recording.held_out, 0.0, values))
     return np.concatenate(found)
+
+
+def each_folded(
+    work: Callable[[T], R],
+    items: Iterable[T],
+    folds: int,
+    estimator: str,
+    model: StateSpaceModel,
+    *,
+    executor: Executor | str | None,
+    go: Go,
+) -> list[R]:
+    """Map a function that folds recordings over items, see `each`; `folds` of each item are counted.
+
+    Raises:
+        Cancelled: If `go` returns False.
+    """
+    alone = executor == "threads" and find_estimator(estimator, model).family in ALONE
+
+    def count() -> None:
+        if not go(folds):
+            raise Cancelled
+
+    return each(work, items, None if alone else executor, count)
 
 
 @dataclass(frozen=True)
@@ -198,15 +225,12 @@ class Objective:
 
     def all_terms(self, points: Sequence[np.ndarray]) -> list[np.ndarray]:
         """Return the weighted score of each event, all recordings in one row, at several points; in the executor."""
-        alone = self.executor == "threads" and find_estimator(self.estimator, self.tuning.model).family in ALONE
         values = [self._values(x) for x in points]
-        found = each(self.work, values, None if alone else self.executor, self._count)
+        found = each_folded(
+            self.work, values, self.folds, self.estimator, self.tuning.model, executor=self.executor, go=self.go
+        )
         # An Executor may return views of a message, which NumPy sums in another order where they are not aligned.
         return [np.require(terms, requirements="A") for terms in found]
-
-    def _count(self) -> None:
-        if not self.go(self.folds):
-            raise Cancelled
 
     def value(self, x: np.ndarray) -> float:
         """Return the objective."""

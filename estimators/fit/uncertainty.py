@@ -32,18 +32,18 @@ doi:10.2307/2347496, for the profile.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from concurrent.futures import Executor
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 
 from ..diagnostics.references import references
-from ..diagnostics.sensitivity.responses import each
 from ..log import INPUT
-from ..registry import find_estimator
 from ..track import USED, Track
 from .aims import MAX_ERROR, WITNESSES, Aim, correlation_time, track_of
 from .entries import Setting
-from .objective import ALONE, Cancelled, Go, Objective, quasi_newton
+from .objective import Go, Objective, each_folded, quasi_newton
 from .recording import Recording
 
 Z = 1.959963984540054  # Half-width of a 95 % interval, in deviations
@@ -279,6 +279,7 @@ def parameter_widths(
     *,
     aim: Aim | None = None,
     go: Go = lambda folds: True,
+    executor: Executor | str | None = "threads",
 ) -> ParameterWidths:
     """Return the uncertainty of parameters of a tuning by recordings, 2 k + 1 folds of each.
 
@@ -289,6 +290,7 @@ def parameter_widths(
         prior: Standard deviation of each parameter without data, in its unit.
         aim: Aim of the fit: with `WITNESSES` the references take part.
         go: Callback, see `Go`.
+        executor: Where they are folded, see `fit`.
 
     Raises:
         Cancelled: If `go` returns False.
@@ -301,24 +303,14 @@ def parameter_widths(
     ends = np.array([(known[name].low, known[name].high) for name in names], float).reshape(-1, 2)
     below, above = (np.clip(centre + sign * WIDTH_STEP * D, *ends.T) for sign in (-1.0, 1.0))
     points = [(name, value) for name, pair in zip(names, zip(below, above, strict=True), strict=True) for value in pair]
-    jobs = [(record, point) for record in recordings for point in (None, *points)]
-
-    def run(job: tuple[Recording, tuple[str, float] | None]) -> Track:
-        record, point = job
-        tuning = setting.tuning if point is None else setting.tuning.set(f"p.{point[0]}", float(point[1]))
-        track = track_of(estimator, setting._replace(tuning=tuning), record)
-        if not go(1):
-            raise Cancelled
-        return track
-
-    alone = find_estimator(estimator, model).family in ALONE
-    tracks = iter(each(run, jobs, None if alone else "threads"))
+    items = [(k, point) for k in range(len(recordings)) for point in (None, *points)]
+    work = partial(_residuals_at, estimator, setting, tuple(recordings), aim)
+    folded = iter(each_folded(work, items, 1, estimator, model, executor=executor, go=go))
     values, slopes = [], []
     envelope: dict[str, tuple[float, float]] = {}
     for record in recordings:
-        own, *moved = (next(tracks) for _ in range(1 + len(points)))
-        z, scale = _residuals(setting, record, own, aim)
-        others = [_residuals(setting, record, track, aim)[0] for track in moved]
+        z, scale, ranges = next(folded)
+        others = [next(folded)[0] for _ in points]
         columns = [(up - low) / (b - a) for low, up, a, b in zip(others[::2], others[1::2], below, above, strict=True)]
         Z = np.stack(columns, axis=-1) * D / scale[..., None] if names else np.zeros((*z.shape, 0))
         z = z / scale
@@ -326,13 +318,32 @@ def parameter_widths(
         root = np.sqrt(record.weight * _weights(z))
         values.append(np.where(kept, root * z, 0.0))
         slopes.append(np.where(kept[..., None], root[:, None] * Z, 0.0))
-        _extend(envelope, record, own, setting)
+        for name, (low, high) in ranges.items():
+            least, most = envelope.get(name, (np.inf, -np.inf))
+            envelope[name] = min(least, low), max(most, high)
     G, information, score, inflation = _godambe(values, slopes)
     cov = np.linalg.inv(information + np.eye(len(names)))
     step = np.linalg.solve(G / inflation + np.eye(len(names)), score / inflation)
     cov = D[:, None] * (cov + np.outer(step, step)) * D
     std = np.sqrt(np.diag(cov))
     return ParameterWidths(names, std, cov / np.outer(std, std), D, inflation, envelope)
+
+
+def _residuals_at(
+    estimator: str,
+    setting: Setting,
+    recordings: Sequence[Recording],
+    aim: Aim,
+    item: tuple[int, tuple[str, float] | None],
+) -> tuple[np.ndarray, np.ndarray, dict[str, tuple[float, float]]]:
+    """Return the residuals of recording k with a parameter at a value; for None, at the setting, its ranges, too."""
+    k, point = item
+    record, tuning = recordings[k], setting.tuning
+    if point is not None:
+        tuning = tuning.set(f"p.{point[0]}", float(point[1]))
+    track = track_of(estimator, setting._replace(tuning=tuning), record)
+    ranges = _ranges(record, track, setting) if point is None else {}
+    return *_residuals(setting, record, track, aim), ranges
 
 
 def _residuals(setting: Setting, record: Recording, track: Track, aim: Aim) -> tuple[np.ndarray, np.ndarray]:
@@ -371,18 +382,15 @@ def _weights(z: np.ndarray) -> np.ndarray:
     return found
 
 
-def _extend(envelope: dict[str, tuple[float, float]], record: Recording, track: Track, setting: Setting) -> None:
-    """Extend the range of each shown state and input by the fitted events of a recording."""
+def _ranges(record: Recording, track: Track, setting: Setting) -> dict[str, tuple[float, float]]:
+    """Return the range of each shown state and input over the fitted events of a recording."""
     held = record.held_out if record.held_out.size else np.zeros(record.log.n, bool)
     model, log = setting.tuning.model, record.log
     series = {state.name: track.mean[~held, k] for k, state in enumerate(model.shown_states)}
     inputs = log.value[: log.n][(log.kind[: log.n] == INPUT) & ~held]
     series |= {item.name: inputs[:, k] for k, item in enumerate(model.inputs)}
-    for name, column in series.items():
-        column = column[np.isfinite(column)]
-        if column.size:
-            low, high = envelope.get(name, (np.inf, -np.inf))
-            envelope[name] = min(low, float(column.min())), max(high, float(column.max()))
+    finite = {name: column[np.isfinite(column)] for name, column in series.items()}
+    return {name: (float(column.min()), float(column.max())) for name, column in finite.items() if column.size}
 
 
 def _godambe(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -98,12 +99,16 @@ class AdviceProgress:
 
 @dataclass
 class Measured:
-    """A twin with a log, and its cached measurements; `excluded` readings of the recording are missing in the log."""
+    """A twin with a log, and its cached measurements; `excluded` readings of the recording are missing in the log.
+
+    `executor` is that of the Gramian, see `gramian`.
+    """
 
     twin: Twin
     log: Log
     excluded: tuple[Exclusion, ...] = ()
     progress: AdviceProgress = field(default_factory=AdviceProgress)
+    executor: Executor | str | None = "threads"
     _folds: dict[tuple[str, tuple[tuple[str, float], ...]], TimedFold] = field(default_factory=dict)
 
     @cached_property
@@ -125,7 +130,7 @@ class Measured:
         if unfit(find_entry(name), self.twin.model):
             name = stand_in("pf", self.twin.model)[0]
         tuning = self.twin.tuning.with_options(self.twin.options_of(name))
-        return gramian(name, self.twin.model, tuning, self.log)
+        return gramian(name, self.twin.model, tuning, self.log, executor=self.executor)
 
     @cached_property
     def peaks(self) -> Peaks:

@@ -21,6 +21,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import Executor
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -29,12 +30,11 @@ from ...fold import Fold
 from ...log import Log
 from ...model.state_space import StateSpaceModel
 from ...snapshots import Base
-from ...track import USED
+from ...track import USED, Track
 from ...tuning import Tuning
 from .responses import (
     STEP,
     Nudge,
-    Response,
     Start,
     astray,
     digits,
@@ -157,27 +157,38 @@ def gramian(
     if reason:
         return Gramian(name, reason, note, None, ())
     spans = list(zip(begins, [*begins[1:], log.n], bases, strict=True))
-    parts = [(begin, log.n, bases[0]), *(span for span in spans if windows and span[1] > span[0])]
-    views = each(lambda part: _view(name, model, tuning, log, *part), parts, executor)
+    spans = [(begin, log.n, bases[0]), *(span for span in spans if windows and span[1] > span[0])]
+    parts = tuple(_part(log, *span) for span in spans)
+    tracks = each(partial(_track, name, tuning, parts), range(len(parts)), executor)
+    begun = [Start(name, tuning, *part, 0, "", track) for part, track in zip(parts, tracks, strict=True)]
+    items = [(k, j) for k in range(len(parts)) for j in range(model.nx)]
+    responses = iter(each(partial(_response, begun), items, executor))
+    views = [_view(one, [next(responses) for _ in range(model.nx)]) for one in begun]
     if any(view.beyond for view in views):
         note = "; ".join(filter(None, [note, nonlinear_note(name, tuning, "the Gramian is unreliable")]))
     return Gramian(name, "", note, views[0], tuple(views[1:]))
 
 
-def _view(
-    estimator: str, model: StateSpaceModel, tuning: Tuning, log: Log, begin: int, end: int, base: Base
-) -> GramianView:
+def _part(log: Log, begin: int, end: int, base: Base) -> tuple[Log, Base]:
     part = log.copy()
     part.n = end
     if begin:
         part.drop_front(begin)
-    begun = Start.of(estimator, tuning, part, base)
-    used = begun.track.verdict == USED
-    responses = [_response(begun, j, std) for j, std in enumerate(model.prior_std.tolist())]
-    g = information([response.whitened[used] for response in responses])
+    return part.copy(), base  # without the room of the others, since processes send it
+
+
+def _track(estimator: str, tuning: Tuning, parts: Sequence[tuple[Log, Base]], k: int) -> Track:
+    """Return the track of part k."""
+    return Start.of(estimator, tuning, *parts[k]).track
+
+
+def _view(begun: Start, responses: Sequence[tuple[np.ndarray, np.ndarray]]) -> GramianView:
+    """Return the information of a part by the responses to each state."""
+    model, part = begun.tuning.model, begun.log
+    g = information([whitened for whitened, _ in responses])
     # Of a state that is certain at first there is no share.
     scale = np.where(model.prior_std > 0.0, model.prior_std, np.inf)[model.shown]
-    influence = np.array([response.states[-1] / scale for response in responses])
+    influence = np.array([states / scale for _, states in responses])
     values, vectors = np.linalg.eigh(g)
     left = np.clip(1.0 - values, MIN_VARIANCE_SHARE, 1.0)
     # A state that is certain at first cannot be nudged.
@@ -209,14 +220,21 @@ def _view(
 FORGOTTEN = "every state forgets its prior"
 
 
-def _response(begun: Start, j: int, std: float) -> Response:
-    """Return the response to one prior deviation of state j."""
+def _response(begun: Sequence[Start], item: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the response of part k to one prior deviation of state j: `whitened` where used, and `states` at its end.
+
+    All of a `Response` would be most of what a process sends.
+    """
+    one, j = begun[item[0]], item[1]
+    std = one.tuning.model.prior_std[j]
     tracks = []
     for size in (-STEP, STEP):
-        mean = begun.base.mean.copy()
+        mean = one.base.mean.copy()
         mean[j] += size * std
-        tracks.append(begun.refold(base=begun.base._replace(mean=mean)))
-    return Response(*(change / (2.0 * STEP) for change in begun.moved(tracks[1], tracks[0])))
+        tracks.append(one.refold(base=one.base._replace(mean=mean)))
+    moved = one.moved(tracks[1], tracks[0])
+    used = one.track.verdict == USED
+    return moved.whitened[used] / (2.0 * STEP), moved.states[-1] / (2.0 * STEP)
 
 
 def _in_words(weights: np.ndarray, model: StateSpaceModel, left: float) -> str:

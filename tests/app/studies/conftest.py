@@ -1,26 +1,39 @@
 """A Dask scheduler with workers, as a site has them."""
 
 import json
+import os
 import subprocess
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
 
 import pytest
 
 from tests.app.scripted import wait_for
 
 
-@pytest.fixture(scope="module")
-def scheduler(tmp_path_factory):
-    """The address of a Dask scheduler with two workers, each a process of its own; and those processes."""
-    path = tmp_path_factory.mktemp("dask")
+@contextmanager
+def started(path: Path, workers: int, **environment: str) -> Iterator[tuple[str, list[subprocess.Popen]]]:
+    """A Dask scheduler and workers in a folder: its address, and the processes, that of the scheduler first."""
     at = path / "scheduler.json"
     start = [sys.executable, "-m", "distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", "0"]
-    run = {"stderr": subprocess.DEVNULL, "cwd": path}
+    run = {"stderr": subprocess.DEVNULL, "cwd": path, "env": os.environ | environment}
     begun = [subprocess.Popen([*start, "--no-dashboard", "--scheduler-file", str(at)], **run)]
     wait_for(at.is_file)
     worker = [sys.executable, "-m", "distributed.cli.dask_worker", "--scheduler-file", str(at), "--host", "127.0.0.1"]
-    begun += [subprocess.Popen([*worker, "--nthreads", "2", "--no-dashboard", "--no-nanny"], **run) for _ in range(2)]
-    yield json.loads(at.read_text())["address"]
-    for process in begun:
-        process.kill()
-        process.wait()
+    options = ["--nthreads", "2", "--no-dashboard", "--no-nanny"]
+    begun += [subprocess.Popen([*worker, *options], **run) for _ in range(workers)]
+    try:
+        yield json.loads(at.read_text())["address"], begun
+    finally:
+        for process in begun:
+            process.kill()
+            process.wait()
+
+
+@pytest.fixture(scope="module")
+def scheduler(tmp_path_factory):
+    """The address of a Dask scheduler with two workers, each a process of its own."""
+    with started(tmp_path_factory.mktemp("dask"), 2) as (address, _):
+        yield address

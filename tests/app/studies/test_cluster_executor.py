@@ -20,10 +20,12 @@ from app.studies.checklist import checklist
 from app.studies.cluster_executor import ClusterExecutor, executor_of, functions_of, packed, unpacked
 from app.twin.log_reader import read_log
 from app.twin.twin import load_twin, with_held
+from estimators.diagnostics.sensitivity import gramian
 from estimators.errors import ConfigError
 from estimators.fit.fit import fit
 from estimators.fit.objective import Cancelled
 from estimators.fit.recording import Recording
+from estimators.log import Log
 from estimators.tuning import Tuning
 from tests.app.studies.test_processes import die_once
 from tests.conftest import ROOT
@@ -78,6 +80,48 @@ def test_any_executor_does_for_a_model_of_functions_of_a_module():
     assert bits(found) == bits(fit("kf", Tuning.of(MODEL), [Recording(ys)], blocks=0))
 
 
+def both_report() -> Log:
+    log = log_of(simulated(3, 300))
+    log.add("silent", np.arange(300) + 0.5, simulated(4, 300))
+    return log
+
+
+class Counting(Executor):
+    """Makes calls here, and counts them."""
+
+    def __init__(self) -> None:
+        self.calls = 0
+
+    def map(self, fn, *iterables, timeout=None, chunksize=1):
+        for items in zip(*iterables, strict=True):
+            self.calls += 1
+            yield fn(*items)
+
+
+def test_every_fold_of_a_fit_is_made_in_its_executor():
+    executor = Counting()
+    options = {"wanted": ("Q", "R"), "considered": {"rate": 0.05, "offset": 1.0}}
+    found = fit("kf", Tuning.of(MODEL), [Recording(both_report())], executor=executor, **options)
+    assert found.widths is not None and len(found.after.held_out.sensors) == 2
+    assert executor.calls == found.folds  # of one recording
+
+
+def test_judgement_and_widths_in_processes_are_the_same_bits():
+    options = {"considered": {"rate": 0.05, "offset": 1.0}}
+    with ProcessPoolExecutor(2, get_context("spawn")) as executor:
+        found = fit("kf", Tuning.of(MODEL), [Recording(both_report())], executor=executor, **options)
+    here = fit("kf", Tuning.of(MODEL), [Recording(both_report())], executor=None, **options)
+    assert bits(found) == bits(here) and found.widths.envelope == here.widths.envelope
+    assert found.widths.std.tobytes() == here.widths.std.tobytes()
+
+
+def test_a_gramian_in_processes_is_the_same_bits():
+    given = "kf", MODEL, Tuning.of(MODEL), log_of(simulated(3, 300))
+    with ProcessPoolExecutor(2, get_context("spawn")) as executor:
+        found = gramian(*given, executor=executor)
+    assert len(found.windows) == 8 and repr(found) == repr(gramian(*given, executor=None))
+
+
 def test_a_worker_that_dies_costs_a_retry(scheduler, twin, tmp_path):
     with executor_of(scheduler, twin, with_held(twin), NAME, OVERRIDES) as executor:
         assert isinstance(executor, Executor)
@@ -108,14 +152,30 @@ class Here:
 def test_a_function_is_sent_once_and_calls_that_have_not_begun_are_cancelled():
     cluster = Here()
     executor = ClusterExecutor(cluster, [])
+    results = executor.map(divmod, [7], [2])
+    work, (sent, items) = cluster.call
+    cluster.futures[0].set_result((1.0, work(sent, items)[1]))
+    assert list(results) == [(3, 1)]
     results = executor.map(divmod, [7, 8, 9], [2, 3, 4])
     executor.map(divmod, [1], [1])
-    assert len(cluster.sent) == 1 and len(cluster.futures) == 4
+    assert len(cluster.sent) == 1 and len(cluster.futures) == 5
     work, (sent, items) = cluster.call
-    cluster.futures[0].set_result(work(sent, [(7, 2)]))
+    cluster.futures[1].set_result(work(sent, [(7, 2)]))
     assert items == [(1, 1)] and next(results) == (3, 1)
     results.close()
-    assert [future.cancelled() for future in cluster.futures] == [False, True, True, False]
+    assert [future.cancelled() for future in cluster.futures] == [False, False, True, True, False]
+
+
+def test_the_first_call_tells_how_many_make_a_task():
+    """Of a function that is called in one `map` alone, such as the faults of a check."""
+    cluster = Here()
+    results = ClusterExecutor(cluster, []).map(divmod, range(40), [3] * 40)
+    assert len(cluster.futures) == 1
+    work, (sent, items) = cluster.call
+    cluster.futures[0].set_result((0.01, work(sent, items)[1]))
+    assert next(results) == (0, 0) and len(cluster.futures) == 1 + 4  # 0.1 s each
+    work, (sent, items) = cluster.call
+    assert items == [(k, 3) for k in range(31, 40)]
 
 
 def draws(seed: int) -> np.ndarray:
@@ -185,7 +245,7 @@ def test_a_server_of_another_kind_is_told(twin, monkeypatch):
         silent.listen()
         address = f"127.0.0.1:{silent.getsockname()[1]}"
         with (
-            pytest.raises(ConfigError, match=f"--cluster {address}: .*; is it a Dask scheduler's"),
+            pytest.raises(ConfigError, match=f"--cluster {address}: .*; give the address of a Dask scheduler"),
             executor_of(address, twin, twin, NAME, {}),
         ):
             pass

@@ -3,16 +3,22 @@
 import multiprocessing
 import os
 import signal
+import sys
 import time
+from collections.abc import Iterator
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
 
 import numba
 import pytest
 
+from app.studies import processes
 from app.studies.processes import jobs_of, results
 from app.studies.stress.trials import Trials, all_trials
 from app.twin.twin import load_twin
 from estimators.errors import ConfigError
 from tests.app.scripted import wait_for
+from tests.app.studies.conftest import started
 
 _begun: list[int] = []
 
@@ -97,6 +103,69 @@ def test_calls_of_a_worker_that_dies_are_made_again(scheduler, tmp_path) -> None
     assert list(found) == [0] and found[0] != os.getpid() and (tmp_path / "died").exists()
 
 
+def die(*_: object) -> None:
+    os._exit(1)
+
+
+def missing(*_: object) -> None:
+    raise ConfigError("pump.yaml: there is no such file")
+
+
+def lacks(name: str) -> str:
+    """As `version`, with Nisus where the tests run alone."""
+    if "dask_worker" in sys.argv[0]:
+        raise PackageNotFoundError(name)
+    return version(name)
+
+
+def test_relative_paths_are_those_of_the_command(scheduler) -> None:
+    assert dict(results(os.getcwd, [()], cluster=scheduler)) == {0: os.getcwd()}
+
+
+def test_a_worker_without_the_files_of_the_twin_is_one_line(scheduler) -> None:
+    text = "a worker of .* fails: pump.yaml: there is no such file; workers need the files of the twin at the same path"
+    with pytest.raises(ConfigError, match=text):
+        list(results(handled, [()], cluster=scheduler, begin=missing))
+
+
+def test_a_worker_without_nisus_is_one_line(scheduler, monkeypatch) -> None:
+    monkeypatch.setattr(processes, "version", lacks)
+    with pytest.raises(ConfigError, match=f"the worker tcp://.* has no Nisus; install {version('nisus')} there"):
+        list(results(handled, [()], cluster=scheduler))
+
+
+def test_a_cluster_that_has_no_worker_left_is_one_line(tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr(processes, "WATCH_S", 0.1)
+    text = "has had no worker for 0.5 s; .* start one with `dask worker tcp://"
+    with started(tmp_path, 1) as (address, (_, worker)), pytest.raises(ConfigError, match=text):
+        for _ in lost(address, tmp_path / "begun"):
+            monkeypatch.setattr(processes, "WAIT_S", 0.5)
+            worker.kill()
+
+
+def test_a_scheduler_that_is_lost_is_one_line(tmp_path, capfd) -> None:
+    with started(tmp_path, 1) as (address, (scheduler, _)):
+        with pytest.raises(ConfigError, match=f"--cluster {address}: the connection to the scheduler is lost"):
+            for _ in lost(address, tmp_path / "begun"):
+                scheduler.kill()
+    assert capfd.readouterr().err == ""  # nor does Dask add its own
+
+
+def lost(address: str, marker: Path) -> Iterator[None]:
+    """Yield when a call of ten minutes has begun, and wait for it then."""
+    with processes.dask(address, handled, ()) as cluster:
+        future = cluster.submit(sleep, str(marker))
+        wait_for(marker.exists)
+        yield
+        future.result()
+
+
+def test_a_call_that_kills_workers_is_one_line(tmp_path) -> None:
+    with started(tmp_path, 1, DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES="0") as (address, _):
+        with pytest.raises(ConfigError, match="1 workers died in one call; is their memory enough"):
+            list(results(die, [()], cluster=address))
+
+
 def test_trials_of_a_cluster_are_those_of_this_process(scheduler) -> None:
     twin = load_twin("motor_winding")
     chosen = [item for item in enumerate(Trials(twin, 60.0).mistakes) if item[1].name in ("R x10", "winding +5 σ")]
@@ -120,7 +189,7 @@ def test_a_cluster_of_ones_own_ends_with_the_command() -> None:
         ({"cluster": "local:0"}, "--cluster local:0: give 1 to 256 processes, for example local:4"),
         ({"cluster": "local:1000"}, "--cluster local:1000: give 1 to 256 processes, for example local:4"),
         ({"cluster": "local:²"}, "--cluster local:²: give 1 to 256 processes, for example local:4"),
-        ({"cluster": "nowhere"}, "--cluster nowhere: .*; is it a Dask scheduler's?"),
+        ({"cluster": "nowhere"}, "--cluster nowhere: .*; give the address of a Dask scheduler, as in .*, or local:4"),
         ({"cluster": "local:2", "jobs": 2}, "--jobs: counts processes of this command"),
     ],
 )  # fmt: skip

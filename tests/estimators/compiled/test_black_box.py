@@ -1,6 +1,7 @@
 """Black-box models: the same answers as compiled ones, on any executor; what they may not do is one
 clear line; and a process that is killed leaves no workers behind."""
 
+import os
 import re
 import signal
 import subprocess
@@ -11,10 +12,13 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from threading import Lock
+from types import SimpleNamespace
 
+import numba
 import numpy as np
 import pytest
 
+from estimators.compiled import black_box
 from estimators.compiled.black_box import _pool
 from estimators.compiled.model import compile_model
 from estimators.errors import EstimatorError, ModelError
@@ -100,6 +104,23 @@ def test_an_executor_gets_pieces():
     u, p = np.array([0.3]), np.array([0.7, 0.2])
     np.testing.assert_array_equal(box.f_block(X, u, p, 0.1), f_block(X, u, p, 0.1))
     assert sorted(sizes) == [10, 10, 11]
+
+
+def test_a_worker_that_may_have_no_processes_calls_the_same_pieces_itself(monkeypatch):
+    """A worker of Dask is a daemon. Blocks of another size may round differently."""
+    pieces = []
+
+    def watched(X, u, p, dt):
+        pieces.append((len(X), os.getpid()))
+        return f_block(X, u, p, dt)
+
+    monkeypatch.setattr(black_box, "current_process", lambda: SimpleNamespace(daemon=True))
+    monkeypatch.setattr(numba.config, "NUMBA_NUM_THREADS", 4)
+    box = compile_model(replace(BOX, f=watched, executor="processes"))
+    pieces.clear()
+    X = np.random.default_rng(0).normal(0, 1, (31, 2))
+    box.f_block(X, np.array([0.3]), np.array([0.7, 0.2]), 0.1)
+    assert pieces == [(size, os.getpid()) for size in (8, 8, 8, 7)]
 
 
 def test_one_state_at_a_time_for_the_simulator():
