@@ -3,9 +3,8 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-# A file's tests stay on one worker, which keeps what they share (servers, recordings, folded logs). Two processors have
-# work for four workers, as many tests wait for a process, a browser or a clock.
-PYTEST := $(BIN)/python -m pytest --numprocesses 4 --dist loadfile
+# A file's tests stay on one worker, which keeps what they share (servers, recordings, folded logs).
+PYTEST := $(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile
 
 # Tests of what is written in vector instructions, which LLVM splits where a processor's vectors are shorter.
 VECTORS := simd simd_rows linalg inverse_root symmetric
