@@ -20,7 +20,7 @@ for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
 
 def main() -> None:
     """Run the sections; no figure makes it fail."""
-    from . import buses, cluster, eigen, false_alarms, filters, folds, page, recovery, sampling
+    from . import buses, cluster, eigen, false_alarms, filters, folds, page, recovery, sampling, siblings
     from .timing import Section, run_sections
 
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -60,6 +60,7 @@ def main() -> None:
         cluster.tasks,
         cluster.spread_folds,
         cluster.searches,
+        siblings.found_siblings,
         false_alarms.false_alarms,
         page.page,
     ]
