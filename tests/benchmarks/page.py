@@ -29,6 +29,7 @@ from typing import Any
 
 import can
 import numpy as np
+import pyarrow.parquet
 
 from app.views.recording.reader import read_recording
 from estimators.errors import SourceError
@@ -193,6 +194,64 @@ def asset() -> Iterator[BenchmarkRow]:
     # The first also waits until the processes of pages can start.
     figures = {"median [s]": statistics.median(took[1:]), "shortest [s]": min(took[1:]), "first [s]": took[0]}
     yield BenchmarkRow(f"{ASSETS} assets, {ROWS} rows", figures, (Bound("median [s]", 1.0),))
+
+
+MANY, MANY_ROWS, NEW_TABLES = 100_000, 20, 5
+
+
+def overview() -> Iterator[BenchmarkRow]:
+    """The overview of a fleet whose tables appear in a folder: first view, what it loads while all assets change."""
+    path = find_chromium()
+    if path is None:
+        raise SourceError("no Chromium was found")
+    names = np.array([f"pump {k}" for k in range(MANY)])
+    rng = np.random.default_rng(3)
+    with tempfile.TemporaryDirectory() as folder:
+        tables = Path(folder) / "tables"
+        tables.mkdir()
+
+        def appear(first: int, rows: int) -> None:
+            t = np.repeat(np.arange(first, first + rows), MANY) + rng.random(rows * MANY)
+            columns = {"time": t, "pump": np.tile(names, rows), "temperature": 40.0 + 2.0 * rng.normal(size=t.size)}
+            pyarrow.parquet.write_table(pyarrow.table(columns), tables / ".new")
+            (tables / ".new").rename(tables / f"{first:06d}.parquet")
+
+        appear(0, MANY_ROWS)
+        fleet = Path(folder) / "pumps.yaml"
+        fleet.write_text(FLEET.format(files="tables") + "  follow: true\n")
+        run = Running(str(fleet), words=("fleet",))
+        try:
+            while run.ask("/api/fleet")["assets"] < MANY:
+                time.sleep(0.2)
+            time.sleep(2.0)
+            with launched(path) as browser:
+                page = browser.new_context(viewport={"width": 1440, "height": 900}).new_page()
+                loaded: list[float] = []
+                network = page.context.new_cdp_session(page)
+                network.on("Network.dataReceived", lambda data: loaded.append(data["encodedDataLength"]))
+                network.send("Network.enable")
+                begun = time.monotonic()
+                page.goto(run.url, wait_until="commit")
+                page.locator("#rows a").nth(10).wait_for()
+                figures = {"first view [s]": time.monotonic() - begun}
+                page.wait_for_timeout(2000.0)
+                loaded.clear()
+                begun = time.monotonic()
+                for k in range(NEW_TABLES):
+                    appear(MANY_ROWS + k, 1)
+                    page.wait_for_timeout(2000.0)
+                figures["kB/s"] = sum(loaded) / 1e3 / (time.monotonic() - begun)
+                begun = time.monotonic()
+                page.locator("#rows a").nth(3).click()
+                page.wait_for_url("**/twins/*/", wait_until="commit")
+                while not page.evaluate("window.nisus?.drawn > 0"):
+                    pass
+                figures["history [s]"] = time.monotonic() - begun
+                figures["resident [MB]"] = run.resident()
+        finally:
+            run.stop()
+    bounds = Bound("first view [s]", 2.0), Bound("kB/s", 20.0), Bound("history [s]", 1.0)
+    yield BenchmarkRow(f"{MANY:,} assets", figures, bounds)
 
 
 def slider() -> Iterator[BenchmarkRow]:
@@ -400,7 +459,7 @@ def _sender(kind: str, plant: Any, client: Any, run: Running, bus: Any) -> Itera
         yield write
 
 
-_PARTS = (crowd, first, slider, share, arrival, published, memory, asset)
+_PARTS = (crowd, first, slider, share, arrival, published, memory, asset, overview)
 PARTS: dict[str, Section] = {part.__name__: part for part in _PARTS}
 
 
