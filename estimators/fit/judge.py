@@ -204,11 +204,13 @@ def _in_turn(
 
 
 def gain(before: np.ndarray, after: np.ndarray) -> tuple[float, float]:
-    """Return the mean of after less before (n,), and its standard error from batches of time."""
+    """Return the mean of after less before (n,), and its standard error from batches of time: NaN of none."""
     difference = after - before
     n = difference.size
+    if n == 0:
+        return 0.0, np.nan
     if n < 2 * GAIN_BATCHES:
-        return float(difference.mean()) if n else 0.0, float(difference.std() / np.sqrt(max(1, n - 1)))
+        return float(difference.mean()), float(difference.std() / np.sqrt(max(1, n - 1)))
     means = np.array([batch.mean() for batch in np.array_split(difference, GAIN_BATCHES)])
     return float(difference.mean()), float(means.std(ddof=1) / np.sqrt(GAIN_BATCHES))
 

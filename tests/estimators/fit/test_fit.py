@@ -3,6 +3,8 @@
 The walk x_k = a x_k-1 + w, y_k = x_k + v has y ~ N(H m, H P Hᵀ + R) as a whole, with no filter anywhere.
 """
 
+import warnings
+
 import numpy as np
 import pytest
 from scipy.linalg import solve_triangular
@@ -14,7 +16,7 @@ from estimators.errors import ConfigError
 from estimators.fit.aims import track_of
 from estimators.fit.entries import Setting, entries_of
 from estimators.fit.fit import fit
-from estimators.fit.judge import POWERS
+from estimators.fit.judge import POWERS, gain
 from estimators.fit.objective import SHARES, Cancelled, FitProgress, Objective, quasi_newton
 from estimators.fit.recording import Recording, held_out_rows, without_queries
 from estimators.fold import Fold
@@ -309,3 +311,12 @@ def test_a_fit_makes_the_nis_of_another_log_as_uncertain_as_its_readings_do(reco
     # to zero: its interval spans a factor of 22, over which the NIS is no linear function of its logarithm.
     others = np.delete(recovered.wider, 4)
     np.testing.assert_allclose(others, np.sqrt(2.0), rtol=0.15)
+
+
+def test_the_gain_of_no_measurements_has_no_error_and_no_warning():
+    """As where no block is held out; NumPy would warn of the deviation of nothing."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        mean, error = gain(np.empty(0), np.empty(0))
+    assert mean == 0.0 and np.isnan(error)
+    assert gain(np.zeros(3), np.array([1.0, 2.0, 3.0])) == (2.0, pytest.approx(np.sqrt(2.0 / 3.0) / np.sqrt(2.0)))
