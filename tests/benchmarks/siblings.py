@@ -13,6 +13,7 @@ import numpy as np
 
 from estimators import Fleet
 from estimators.fleet.siblings import siblings
+from estimators.fleet.table import FleetTable
 from tests.models import level_model
 
 from .timing import BenchmarkRow
@@ -32,8 +33,8 @@ def found_siblings() -> Iterator[BenchmarkRow]:
         yield _days(path)
 
 
-def _simulated(shift: float) -> BenchmarkRow:
-    """Levels that differ by 0.5 (1 σ); those of the planted assets are off by `shift`."""
+def planted_fleet(shift: float) -> tuple[FleetTable, np.ndarray]:
+    """Return the table of a fleet and its planted assets; levels differ by 0.5 (1 σ), theirs are off by `shift`."""
     rng = np.random.default_rng(3)
     level = 20.0 + 0.5 * rng.normal(size=COUNT)
     planted = rng.permutation(COUNT)[:PLANTED]
@@ -42,7 +43,11 @@ def _simulated(shift: float) -> BenchmarkRow:
     for step in range(MEASUREMENTS):
         fleet.add("gauge", np.arange(COUNT), np.full(COUNT, 0.1 * step), level + rng.normal(size=COUNT))
         fleet.advance()
-    table = fleet.table()
+    return fleet.table(), planted
+
+
+def _simulated(shift: float) -> BenchmarkRow:
+    table, planted = planted_fleet(shift)
     found = siblings(table.mean[:, 0], table.std[:, 0], rate=0.05)
     reported = np.flatnonzero(found.differs)
     right = np.intersect1d(reported, planted).size

@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from estimators import Fleet
 from estimators.errors import EstimatorError
 from estimators.fleet.siblings import siblings
-from tests.models import level_model
+from tests.benchmarks.siblings import planted_fleet
 
 
 def test_mean_and_spread_are_those_of_the_true_values() -> None:
@@ -53,16 +52,8 @@ def test_the_rate_of_false_discoveries_is_the_one_asked_for() -> None:
 
 def test_faults_of_a_fleet_are_found() -> None:
     """10,000 assets whose true levels differ by 0.5, of which 50 are off by 3.5, estimated from 30 measurements."""
-    rng, count, steps = np.random.default_rng(3), 10_000, 30
-    model = level_model({"gauge": 1.0}, 1e-12, mean=20.0, std=10.0)
-    level = 20.0 + 0.5 * rng.normal(size=count)
-    wrong = rng.permutation(count)[:50]
-    level[wrong] += 3.5
-    fleet = Fleet("ekf", model, assets=count)
-    for step in range(steps):
-        fleet.add("gauge", np.arange(count), np.full(count, 0.1 * step), level + rng.normal(size=count))
-        fleet.advance()
-    table = fleet.table()
+    table, wrong = planted_fleet(3.5)
+    count = len(table.mean)
     found = siblings(table.mean[:, 0], table.std[:, 0], rate=0.05)
     reported = np.flatnonzero(found.differs)
     # Off by 3.5, in deviations: the power of a test at the least p-value that is reported.
