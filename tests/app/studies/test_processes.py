@@ -17,8 +17,8 @@ from app.studies.processes import jobs_of, results
 from app.studies.stress.trials import Trials, all_trials
 from app.twin.twin import load_twin
 from estimators.errors import ConfigError
-from tests.app.scripted import wait_for
 from tests.app.studies.conftest import started
+from tests.waiting import wait_for
 
 _begun: list[int] = []
 
@@ -68,7 +68,7 @@ def test_what_is_given_up_ends(tmp_path) -> None:
         finally:
             signal.setitimer(signal.ITIMER_REAL, 0.0)
             children = multiprocessing.active_children()
-    wait_for(lambda: all(_gone(child.pid) for child in children), 120.0)
+    wait_for(lambda: all(_gone(child.pid) for child in children))
 
 
 def _gone(pid: int) -> bool:
