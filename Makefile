@@ -24,6 +24,7 @@ lint: $(VENV)/.installed-dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+	$(BIN)/python -m tests.size --check
 
 # The quickest tests, so many that they take 100 s of a processor by the runs before; all, if there was none.
 fast: $(VENV)/.installed-dev
@@ -56,7 +57,7 @@ shots: $(VENV)/.installed-dev
 docs: $(VENV)/.installed-dev
 	$(BIN)/python -m sphinx -q -W --keep-going -b html docs build/docs
 
-# Lines and files per package; of another revision: `python -m tests.size REVISION`.
+# Files, lines and tokens per package, and their budgets; of another revision: `python -m tests.size REVISION`.
 size: $(VENV)/.installed-dev
 	$(BIN)/python -m tests.size
 

@@ -1,66 +1,164 @@
-"""`python -m tests.size [REVISION]`: files and lines per package, of the working tree or of a git revision."""
+"""Files, lines and tokens per package, and the budgets in pyproject.toml that cap lines and tokens."""
 
 from __future__ import annotations
 
-import ast
+import argparse
 import io
+import re
 import subprocess
 import sys
 import tokenize
+import tomllib
 from collections import Counter
-from pathlib import PurePosixPath
+from concurrent.futures import ProcessPoolExecutor
+from itertools import repeat
+from pathlib import Path, PurePosixPath
 
-COLUMNS = ("files", "lines", "code", "imports", "docstrings", "comments", "blank")
+COLUMNS = ("files", "lines", "tokens", "code", "imports", "docstrings", "comments", "blank")
+CAPPED = ("lines", "tokens")
+LAYOUT = (tokenize.NEWLINE, tokenize.NL, tokenize.INDENT, tokenize.DEDENT, tokenize.ENDMARKER)
+# Python 3.12 and later split an f-string into tokens.
+FSTRING_START, FSTRING_END = (getattr(tokenize, name, None) for name in ("FSTRING_START", "FSTRING_END"))
+JAVASCRIPT = re.compile(r"""(//.*|/\*[\s\S]*?\*/)|"(?:\\.|[^"\\\n])*"|'(?:\\.|[^'\\\n])*'|\d[\w.]*|[\w$]+|\S""")
 
 
-def count(source: str) -> Counter[str]:
-    """Count the lines of a Python file by kind; each line counts once, in the order of `kinds` below."""
-    tree = ast.parse(source)
-    imports, docstrings = set[int](), set[int]()
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Import | ast.ImportFrom):
-            imports |= {*range(node.lineno, (node.end_lineno or node.lineno) + 1)}
-        elif isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str):
-            docstrings |= {*range(node.lineno, (node.end_lineno or node.lineno) + 1)}
-    tokens = list(tokenize.generate_tokens(io.StringIO(source).readline))
-    comments = {token.start[0] for token in tokens if token.type == tokenize.COMMENT}
-    ignored = (tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.ENDMARKER)
-    code = {line for token in tokens if token.type not in ignored for line in range(token.start[0], token.end[0] + 1)}
-    lines = len(source.splitlines())
-    kinds = {"imports": imports, "docstrings": docstrings, "code": code, "comments": comments}
-    found, seen = Counter(files=1, lines=lines), set[int]()
+def count_python(source: str) -> Counter[str]:
+    """Count the tokens of a Python file, and its lines by kind.
+
+    Tokens are those of `tokenize` without comments, docstrings and layout; an f-string is one token, as in Python 3.11.
+    A line of several kinds counts once, as the first of import, docstring, code and comment.
+    """
+    kinds: dict[str, set[int]] = {kind: set() for kind in ("imports", "docstrings", "code", "comments")}
+    statement: list[tokenize.TokenInfo] = []
+    tokens, in_fstring = 0, 0
+    for token in tokenize.generate_tokens(io.StringIO(source).readline):
+        if token.type == tokenize.COMMENT:
+            kinds["comments"].add(token.start[0])
+        elif token.type not in LAYOUT:
+            statement.append(token)
+            tokens += not in_fstring
+            in_fstring += (token.type == FSTRING_START) - (token.type == FSTRING_END)
+        elif token.type == tokenize.NEWLINE and statement:
+            rows = range(statement[0].start[0], statement[-1].end[0] + 1)
+            if statement[0].string in ("import", "from"):
+                kinds["imports"].update(rows)
+            elif all(part.type == tokenize.STRING and part.string[0] in "\"'r" for part in statement):
+                kinds["docstrings"].update(rows)
+                tokens -= len(statement)
+            elif len(rows) == 1:
+                kinds["code"].update(rows)
+            else:
+                kinds["code"].update(*(range(part.start[0], part.end[0] + 1) for part in statement))
+            statement = []
+    found, seen = Counter(files=1, lines=len(source.splitlines()), tokens=tokens), set[int]()
     for kind, numbers in kinds.items():
         found[kind] = len(numbers - seen)
         seen |= numbers
-    found["blank"] = lines - len(seen)
+    found["blank"] = found["lines"] - len(seen)
     return found
 
 
-def sources(revision: str | None) -> dict[PurePosixPath, str]:
-    """Return the text of every Python file that git tracks, by its path."""
+def count_javascript(source: str) -> Counter[str]:
+    """Count the tokens of a JavaScript file, and its lines by kind.
 
-    def git(*words: str) -> str:
-        return subprocess.run(["git", *words], capture_output=True, text=True, check=True).stdout
+    Tokens are, outside comments, strings in single or double quotes, numbers, words, and every other character except
+    white space. Template strings and regular expressions are not recognised: their words and characters count.
+    """
+    code = JAVASCRIPT.sub(lambda part: re.sub(".", " ", part[1]) if part[1] else part[0], source)
+    lines, written, n_code = len(source.splitlines()), *(len(re.findall(r"(?m)^.*\S", text)) for text in (source, code))
+    tokens = len(JAVASCRIPT.findall(code))
+    return Counter(files=1, lines=lines, tokens=tokens, code=n_code, comments=written - n_code, blank=lines - written)
 
-    if revision is None:
-        paths = [path for path in git("ls-files", "*.py").splitlines() if not path.startswith("docs/")]
-        return {PurePosixPath(path): open(path, encoding="utf-8").read() for path in paths}
-    paths = [path for path in git("ls-tree", "-r", "--name-only", revision).splitlines() if path.endswith(".py")]
-    return {PurePosixPath(path): git("show", f"{revision}:{path}") for path in paths if not path.startswith("docs/")}
+
+COUNT = {".py": count_python, ".js": count_javascript}
 
 
-def main(revision: str | None = None) -> None:
-    """Print the table: packages, the product without tests, and tests."""
-    packages: dict[str, Counter[str]] = {}
-    for path, text in sources(revision).items():
-        parts = path.parts[:-1]
-        counted = count(text)
-        for name in {"/".join(parts[:2]), "tests" if parts[0] == "tests" else "product"}:
-            packages.setdefault(name, Counter()).update(counted)
-    totals = [packages.pop(name) for name in ("product", "tests") if name in packages]
+def git(*words: str) -> str:
+    """Return the output of a git command."""
+    return subprocess.run(["git", *words], capture_output=True, encoding="utf-8", check=True).stdout
+
+
+def read(path: str, revision: str | None) -> str:
+    """Return the text of a file of a git revision, or of the working tree."""
+    return git("show", f"{revision}:{path}") if revision else Path(path).read_text(encoding="utf-8")
+
+
+def count_file(path: PurePosixPath, revision: str | None) -> Counter[str]:
+    """Count the tokens of a file, and its lines by kind."""
+    return COUNT[path.suffix](read(str(path), revision))
+
+
+def count_all(revision: str | None) -> dict[PurePosixPath, Counter[str]]:
+    """Count every file that git tracks in a revision, or in the working tree with new files that are not ignored."""
+    listing = ("ls-tree", "-r", "--name-only", revision) if revision else ("ls-files", "-co", "--exclude-standard")
+    names = [PurePosixPath(name) for name in git(*listing, "-z").split("\0")]
+    paths = [path for path in names if path.suffix in COUNT and (revision or Path(path).is_file())]
+    with ProcessPoolExecutor() as pool:  # 6 s of a processor
+        return dict(zip(paths, pool.map(count_file, paths, repeat(revision), chunksize=16)))
+
+
+def print_packages(counted: dict[PurePosixPath, Counter[str]]) -> None:
+    """Print the packages, and the sums of the Python of the product, without guides, and of the tests."""
+    packages, totals = dict[str, Counter[str]](), {"product": Counter[str](), "tests": Counter[str]()}
+    for path, found in counted.items():
+        depth = 2 if path.suffix == ".py" else 4
+        packages.setdefault("/".join(path.parent.parts[:depth]), Counter()).update(found)
+        if path.suffix == ".py" and path.parts[0] != "docs":
+            totals["tests" if path.parts[0] == "tests" else "product"].update(found)
     print(f"{'':<28}" + "".join(f"{column:>12}" for column in COLUMNS))
-    for name, counted in [*sorted(packages.items()), *zip(("product", "tests"), totals, strict=True)]:
-        print(f"{name:<28}" + "".join(f"{counted[column]:>12,}" for column in COLUMNS))
+    for name, found in [*sorted(packages.items()), *totals.items()]:
+        print(f"{name:<28}" + "".join(f"{found[column]:>12,}" for column in COLUMNS))
+
+
+def print_budgets(sizes: dict[str, Counter[str]], budgets: dict[str, dict[str, int]]) -> None:
+    """Print the lines and tokens of every budget, and how many more there may be."""
+    print(f"{'':<28}" + "".join(f"{column:>12}{'budget':>12}{'room':>12}" for column in CAPPED))
+    for name, budget in budgets.items():
+        rows = [(sizes[name][column], budget[column], budget[column] - sizes[name][column]) for column in CAPPED]
+        print(f"{name:<28}" + "".join(f"{figure:>12,}" for row in rows for figure in row))
+
+
+def lower(name: str, budget: dict[str, int], size: Counter[str]) -> None:
+    """Lower a budget in pyproject.toml to the present figures, where these are lower."""
+    path = Path("pyproject.toml")
+    figures = ", ".join(f"{column} = {min(budget[column], size[column])}" for column in CAPPED)
+    pattern = rf'(?m)^("{re.escape(name)}" *= *){{.*?}}'
+    path.write_text(re.sub(pattern, rf"\1{{ {figures} }}", path.read_text(encoding="utf-8")), encoding="utf-8")
+
+
+def main(*words: str) -> None:
+    """Print packages and budgets, check budgets, or lower them; `words` are the command line."""
+    parser = argparse.ArgumentParser(prog="python -m tests.size", description=__doc__)
+    choice = parser.add_mutually_exclusive_group()
+    choice.add_argument("revision", nargs="?", help="git revision to count instead of the working tree")
+    choice.add_argument("--check", action="store_true", help="print only the budgets; fail if one is exceeded")
+    choice.add_argument("--lower", nargs="*", metavar="NAME", help="lower these budgets, or all, to present figures")
+    args = parser.parse_args(words)
+    counted, text = count_all(args.revision), read("pyproject.toml", args.revision)
+    budgets = tomllib.loads(text).get("tool", {}).get("nisus", {}).get("size", {})
+    sizes, problems = {name: Counter[str]() for name in budgets}, list[str]()
+    for path, found in counted.items():
+        if names := [name for name in budgets if path.is_relative_to(name)]:
+            sizes[max(names, key=len)].update(found)
+        else:
+            problems.append(f"{path}: in no budget of [tool.nisus.size]; move it to a package that has one")
+    problems += [
+        f"{name}: {sizes[name][column]:,} {column}, budget {most:,} in pyproject.toml; "
+        "delete, or raise the budget only as far as an issue states"
+        for name, budget in budgets.items()
+        for column, most in budget.items()
+        if sizes[name][column] > most
+    ]
+    if args.lower is not None:
+        for name in args.lower or budgets:
+            lower(name, budgets[name], sizes[name])
+        return
+    if not args.check:
+        print_packages(counted)
+        print()
+    print_budgets(sizes, budgets)
+    if args.check and problems:
+        sys.exit("\n".join(problems))
 
 
 if __name__ == "__main__":
