@@ -4,6 +4,9 @@ VENV := .venv
 BIN := $(VENV)/bin
 VERSIONS := tests/constraints.txt
 
+# Written byte code: tests start many processes, each of which would compile the package and pytest's assertions.
+unexport PYTHONDONTWRITEBYTECODE
+
 # Workers get stretches of tests that follow each other, and share what a file's tests share (servers, folded logs).
 PYTEST := $(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist worksteal
 
