@@ -99,12 +99,6 @@ class FleetOutputsSection(Section):
     receivers: dict[Text, ReceiverSection] = {}
     """Receivers of alerts, by name. Default: none."""
 
-    @model_validator(mode="after")
-    def _plain(self) -> FleetOutputsSection:
-        if self.mqtt is not None and self.mqtt.sparkplug is not None:
-            raise refused("relation", "has sparkplug, which is for single twins; leave it out", "mqtt")
-        return self
-
 
 class FleetSection(Section):
     """Many assets of one twin."""
