@@ -252,8 +252,6 @@ class FleetCommand(JsonOption, ArchiveOptions, ServiceOptions, TuningOption, Est
     """Write the table of all assets, worst first, to this .csv or .parquet file at the end."""
     worst: int = 10
     """Number of assets to print."""
-    processes: int | None = None
-    """Spread the assets over so many processes, each with a store of its own; default: `processes` of the YAML."""
     store: Path | None = None
     """Keep the state of the fleet in this file (in a folder: FLEET.store), with the position in the source, and
     continue from it after a restart or a kill."""
