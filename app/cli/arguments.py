@@ -723,22 +723,6 @@ class NewCommand(JsonOption, RoleOptions, TableOptions):
     """Recordings whose signals become sensors."""
 
 
-@dataclass(frozen=True)
-class CompletionCommand:
-    """Print the script that completes commands, options, twins and filters in a shell.
-
-    bash: add `source <(nisus completion bash)` to ~/.bashrc. zsh: add `source <(nisus completion zsh)` to ~/.zshrc,
-    after `compinit`. fish: nisus completion fish > ~/.config/fish/completions/nisus.fish
-
-    Examples:
-      nisus completion bash
-      nisus completion fish
-    """
-
-    shell: Annotated[Literal["bash", "zsh", "fish"], tyro.conf.Positional]
-    """Name of the shell."""
-
-
 COMMANDS: dict[type, str] = {
     RunCommand: "run:run_twin",
     ServeCommand: "serve:serve",
@@ -764,7 +748,6 @@ COMMANDS: dict[type, str] = {
     LogCommand: "log:show_log",
     QueryCommand: "query:query",
     NewCommand: "new:new_twin",
-    CompletionCommand: "completion:print_script",
 }
 """Module and function of every command, imported when the command runs."""
 
