@@ -16,10 +16,6 @@ ASSET_LEVEL = "{asset}"
 """Level of an MQTT topic that is the name of the asset."""
 
 
-MAX_PROCESSES = 64
-"""Most processes of a fleet."""
-
-
 class FleetTableSection(TableSection):
     """Tables (CSV or Parquet) with the measurements of many assets."""
 
@@ -99,12 +95,6 @@ class FleetOutputsSection(Section):
     receivers: dict[Text, ReceiverSection] = {}
     """Receivers of alerts, by name. Default: none."""
 
-    @model_validator(mode="after")
-    def _plain(self) -> FleetOutputsSection:
-        if self.mqtt is not None and self.mqtt.sparkplug is not None:
-            raise refused("relation", "has sparkplug, which is for single twins; leave it out", "mqtt")
-        return self
-
 
 class FleetSection(Section):
     """Many assets of one twin."""
@@ -121,8 +111,6 @@ class FleetSection(Section):
     late: Annotated[int, Field(strict=True, ge=0, le=4096)] = 8
     """Events of an asset among which a late one is inserted. 0 drops late events, and an asset takes half of the
     memory. Default: 8."""
-    processes: Annotated[int, Field(strict=True, ge=1, le=MAX_PROCESSES)] = 1
-    """Processes over which the assets are spread by their names, each with a store of its own. Default: 1."""
     source: Annotated[FleetTableSection | FleetPushSection | FleetMqttSection, Field(discriminator="type")]
     """Source of the measurements: its `type` is table, push or mqtt, with the keys of that source in a twin."""
     outputs: FleetOutputsSection = FleetOutputsSection()
@@ -137,7 +125,4 @@ class FleetSection(Section):
             raise refused("relation", f"names {twice!r} twice; name each asset once", "assets")
         if isinstance(self.assets, tuple) and (blank := [name for name in self.assets if is_blank(name)]):
             raise refused("relation", f"names {blank[0]!r}, which is blank; give it a visible name", "assets")
-        if isinstance(self.assets, int) and self.processes > 1:
-            text = f"is {self.assets} for {self.processes} processes; name the assets, or leave it out"
-            raise refused("relation", text, "assets")
         return self

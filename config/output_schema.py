@@ -145,9 +145,6 @@ class MqttSection(BrokerSection):
 
     prefix: Annotated[str, Field(pattern=r"^[^+#\x00]+$")] = "nisus"
     """First part of the topics. Default: nisus."""
-    sparkplug: Annotated[str, Field(pattern=r"^[^+/#\x00]+$")] | None = None
-    """Group of Sparkplug B 3.0. The state is then published as metrics of its edge node TWIN, in place of the topics
-    state, birth and status. Default: none."""
 
 
 class OpcUaSection(Section):

@@ -6,10 +6,11 @@ import asyncio
 import base64
 import json
 import queue
+import re
 import socket
 import threading
 import zlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from decimal import Decimal, InvalidOperation
@@ -26,6 +27,9 @@ from .source import Report
 NO_BROKER = "no broker"  # Key of the times at which the connection was lost
 REFUSED_MESSAGE = "message refused"  # Key of messages that cannot be read
 REFUSED_TOPIC = "topic refused"  # Key of topics that the broker does not deliver
+
+SHARED = re.compile(r"^\$share/[^/]+/")
+"""Begins the filter of a shared subscription, but not the topics of its messages."""
 
 UNITS = {"s": 10**9, "ms": 10**6, "us": 1000, "ns": 1}
 """Nanoseconds of the units of a time."""
@@ -206,7 +210,6 @@ class MqttSource:
         password: str | None,
         client_id: str | None,
         report: Report,
-        wanted: Callable[[str], bool] = lambda _: True,
         subscribed: Sequence[str] | None = None,
         by_hand: bool = False,
     ) -> None:
@@ -220,11 +223,10 @@ class MqttSource:
             password: Of the user.
             client_id: With one, the broker keeps messages of QoS 1 while the twin is away.
             report: Receives lost connections and payloads that cannot be read.
-            wanted: Returns whether messages of an asset are used; by default all are.
             subscribed: Filters to subscribe to in place of those of `topics`, of which each is a part.
             by_hand: Acknowledge messages once they have been stored, see `Acknowledging`; connect after `restore`.
         """
-        self._messages, self._qos, self._report, self._wanted = messages, qos, report, wanted
+        self._messages, self._qos, self._report = messages, qos, report
         self._subscribed_to = [*topics] if subscribed is None else [*subscribed]
         self._place, self._section = f"{section.host}:{section.port}", section
         self._client = mqtt_client(
@@ -232,8 +234,8 @@ class MqttSource:
         )
         self._client.on_connect, self._client.on_disconnect = self._connected, self._disconnected
         self._client.on_connect_fail = lambda *_: self._lost("it does not answer")
-        for name in topics:
-            self._client.message_callback_add(name, self._callback(topics[name]))
+        for name, topic in topics.items():
+            self._client.message_callback_add(SHARED.sub("", name), self._callback(topic))
         self.connected = threading.Event()
         """Set while the topics are subscribed to."""
         self._client.on_subscribe = self._subscribed
@@ -286,14 +288,12 @@ class MqttSource:
 
     def _callback(self, topic: TopicMap) -> Any:
         def arrived(client: Any, _data: Any, packet: Any) -> None:
-            foreign = topic.asset is not None and not self._wanted(packet.topic.split("/")[topic.asset])
-            if not foreign and self._waiting.qsize() < MAX_WAITING:
+            if self._waiting.qsize() < MAX_WAITING:
                 self._waiting.put((topic, packet))
                 return
             if self._by_hand and packet.qos:
                 client.ack(packet.mid, packet.qos)
-            if not foreign:
-                self._refuse(packet, "too many messages wait")
+            self._refuse(packet, "too many messages wait")
 
         return arrived
 

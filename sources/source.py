@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, cast, runtime_checkable
@@ -30,21 +29,6 @@ class AssetEvents(NamedTuple):
     events: Events
     code: np.ndarray
     names: Sequence[str]
-
-
-class Partition(NamedTuple):
-    """Assets of one of several processes: those for which crc32(name in UTF-8) mod `processes` is `number`."""
-
-    number: int = 0
-    processes: int = 1
-
-    def has(self, asset: str) -> bool:
-        """Return whether an asset is one of them."""
-        return self.processes == 1 or zlib.crc32(asset.encode("utf-8", "replace")) % self.processes == self.number
-
-
-WHOLE = Partition()
-"""All assets."""
 
 
 class Source(Protocol):

@@ -252,8 +252,6 @@ class FleetCommand(JsonOption, ArchiveOptions, ServiceOptions, TuningOption, Est
     """Write the table of all assets, worst first, to this .csv or .parquet file at the end."""
     worst: int = 10
     """Number of assets to print."""
-    processes: int | None = None
-    """Spread the assets over so many processes, each with a store of its own; default: `processes` of the YAML."""
     store: Path | None = None
     """Keep the state of the fleet in this file (in a folder: FLEET.store), with the position in the source, and
     continue from it after a restart or a kill."""
@@ -725,22 +723,6 @@ class NewCommand(JsonOption, RoleOptions, TableOptions):
     """Recordings whose signals become sensors."""
 
 
-@dataclass(frozen=True)
-class CompletionCommand:
-    """Print the script that completes commands, options, twins and filters in a shell.
-
-    bash: add `source <(nisus completion bash)` to ~/.bashrc. zsh: add `source <(nisus completion zsh)` to ~/.zshrc,
-    after `compinit`. fish: nisus completion fish > ~/.config/fish/completions/nisus.fish
-
-    Examples:
-      nisus completion bash
-      nisus completion fish
-    """
-
-    shell: Annotated[Literal["bash", "zsh", "fish"], tyro.conf.Positional]
-    """Name of the shell."""
-
-
 COMMANDS: dict[type, str] = {
     RunCommand: "run:run_twin",
     ServeCommand: "serve:serve",
@@ -766,7 +748,6 @@ COMMANDS: dict[type, str] = {
     LogCommand: "log:show_log",
     QueryCommand: "query:query",
     NewCommand: "new:new_twin",
-    CompletionCommand: "completion:print_script",
 }
 """Module and function of every command, imported when the command runs."""
 

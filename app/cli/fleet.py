@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any
 from config.yaml_files import writing
 from estimators.errors import ConfigError, NisusError, SourceError
 from estimators.fleet.table import FleetTable
-from sources.source import WHOLE, Partition, Report
 
 from ..live.fleet import STOPPED, STORE, RunningFleet
 from ..outputs.fleet import FleetPublisher
@@ -29,15 +28,15 @@ from ..twin.fleet import FleetPlan, load_fleet
 from ..twin.log_reader import remarking
 from ..views.recording.rrd_file import parse_split
 from ..web.fleet import FleetApi
-from ..web.partitions import PartitionedFleet, PartitionServer, path_of, threads_of
 from ..web.service import Service
 from .options import settings
 from .prepare import attend, compile_for
-from .serve import PRELOADED, Opened, door_of, report_of, run_child, serve_until_end
+from .serve import PRELOADED, door_of, run_child, serve_until_end
 
 if TYPE_CHECKING:
     from ..web.door import Door
     from ..web.running import OpenedTwin
+    from ..web.session import Session
     from .arguments import FleetCommand
 
 FLEET_PRELOADED = (*PRELOADED, __name__, "pyarrow.dataset", "pyarrow.parquet")
@@ -47,9 +46,6 @@ COMPILING = "compiling the fleet, once"
 
 FOLLOW_PERIOD_S, FOLLOW_SHARE = 2.0, 0.05
 """Shortest time between two looks of an asset's page into the archive, and the share of time that they may take."""
-
-LOOK_PERIOD_S = 0.1
-"""Seconds between two looks whether all partitions have ended."""
 
 
 def run_fleet(arguments: FleetCommand) -> int:
@@ -62,7 +58,7 @@ def run_fleet(arguments: FleetCommand) -> int:
     if arguments.json and not arguments.headless:
         raise ConfigError("--json: is the result of a run without a page; give --headless")
     overrides = settings(arguments.set, arguments.estimator, arguments.tuning)
-    plan = load_fleet(arguments.fleet, overrides, arguments.processes)
+    plan = load_fleet(arguments.fleet, overrides)
     door = None if arguments.headless else door_of(arguments)
     plan.check_files()
     compile_for(plan.twin)
@@ -76,13 +72,14 @@ def run_fleet(arguments: FleetCommand) -> int:
             raise ConfigError("--archive: the source is tables, which are kept already; leave it out")
         split = parse_split(arguments.archive_split, arguments.archive_keep, "--archive")
         archive = ArchivePlan(arguments.archive / plan.name, split)
-    running: RunningFleet | PartitionedFleet
-    if plan.config.processes > 1:
-        opened = partial(open_partition, arguments.fleet, overrides, plan.config.processes, store, archive)
-        child = partial(run_child, opened, False)
-        running = attend(None, lambda: PartitionedFleet(plan, report, child, preload=FLEET_PRELOADED), COMPILING)
-    else:
-        running = attend(None, lambda: _running(plan, report, store, archive), COMPILING)
+    running = attend(None, lambda: RunningFleet(plan, report, store=store), COMPILING)
+    if archive is not None:
+
+        def say(key: str, text: str) -> None:
+            complain(text)
+            running.note(key, text)
+
+        running.archive = FleetArchive(archive, plan.twin.model, running.names, say, running.archived)
     page = None if door is None else door.site
     publisher = None if plan.ends else FleetPublisher(running, page=page, store=store)
     if publisher is not None:
@@ -113,29 +110,23 @@ def run_fleet(arguments: FleetCommand) -> int:
     return 0
 
 
-def _fold(running: RunningFleet | PartitionedFleet, duration: float | None) -> None:
+def _fold(running: RunningFleet, duration: float | None) -> None:
     """Read and fold until the source or the duration ends, or the program is asked to end."""
     end = time.monotonic() + (duration or float("inf"))
     with until_asked_to_end(running.stop) as done:
-        if isinstance(running, RunningFleet):
-            running.run(lambda: time.monotonic() < end and not done.wait(0.0))
-        else:
-            running.start()
-            while time.monotonic() < end and not (done.wait(LOOK_PERIOD_S) or running.has_ended()):
-                pass
-            running.table()
+        running.run(lambda: time.monotonic() < end and not done.wait(0.0))
 
 
 def _serve(
-    running: RunningFleet | PartitionedFleet,
+    running: RunningFleet,
     door: Door,
     arguments: FleetCommand,
     overrides: Mapping[str, str],
     archive: ArchivePlan | None,
 ) -> None:
     """Serve the overview and pages of assets until the duration is over, or the program is asked to end."""
-    folders = None if archive is None else folders_of(archive, running.plan.config.processes)
-    opened = partial(_opened, arguments.fleet, overrides, arguments.recordings, folders)
+    archived = None if archive is None else archive.folder
+    opened = partial(_opened, arguments.fleet, overrides, arguments.recordings, archived)
     overview = FleetApi(running)
     service = Service({}, partial(run_child, opened, False), door=door, preload=FLEET_PRELOADED, overview=overview)
     running.start()
@@ -149,48 +140,6 @@ def print_problem(key: str, text: str) -> None:
     """Print a report of a running fleet that is not one of many alike."""
     if key in (STORE, STOPPED):
         complain(text)
-
-
-def _running(
-    plan: FleetPlan, report: Report, store: Path | None, archive: ArchivePlan | None, partition: Partition = WHOLE
-) -> RunningFleet:
-    """Return the part of a fleet that one process folds, with its store and archive."""
-    threads = None if partition == WHOLE else threads_of(partition.processes)
-    own = None if store is None else path_of(store, partition)
-    running = RunningFleet(plan, report, threads=threads, store=own, partition=partition)
-    if archive is not None:
-        archive = archive._replace(folder=path_of(archive.folder, partition))
-
-        def say(key: str, text: str) -> None:
-            complain(text)
-            running.note(key, text)
-
-        running.archive = FleetArchive(archive, plan.twin.model, running.names, say, running.archived)
-    return running
-
-
-def open_partition(
-    fleet: Path,
-    overrides: Mapping[str, str],
-    processes: int,
-    store: Path | None,
-    archive: ArchivePlan | None,
-    name: str,
-    number: str,
-) -> Opened:
-    """Open the partition of a fleet that has a number."""
-    plan, partition = load_fleet(fleet, overrides, processes), Partition(int(number), processes)
-    running = _running(plan, remarking(print_problem), store, archive, partition)
-    served = PartitionServer(running)
-    return Opened(served, {}, served.report)
-
-
-def folders_of(archive: ArchivePlan, processes: int) -> list[Path]:
-    """Return the folders of a fleet's archive, one for each process, also of earlier runs with more of them."""
-    numbers = itertools.takewhile(
-        lambda k: k < processes or path_of(archive.folder, Partition(k)).is_dir(), itertools.count()
-    )
-    return [path_of(archive.folder, Partition(k)) for k in numbers]
 
 
 def follow(history: AssetHistory, rows: Any, folder: Path, most: int) -> threading.Event:
@@ -217,8 +166,8 @@ def follow(history: AssetHistory, rows: Any, folder: Path, most: int) -> threadi
 
 
 def _opened(
-    fleet: Path, overrides: Mapping[str, str], recordings: Path, folders: list[Path] | None, name: str, asset: str
-) -> Opened:
+    fleet: Path, overrides: Mapping[str, str], recordings: Path, archived: Path | None, name: str, asset: str
+) -> tuple[Session, Mapping[str, Any]]:
     """Open the history of an asset."""
     from ..web.gallery.gallery import StartRequest
     from ..web.session import Page
@@ -230,11 +179,11 @@ def _opened(
 
     def read() -> OpenedTwin:
         plan = load_fleet(fleet, overrides)
-        if folders is None:
+        if archived is None:
             history = plan.history_of(asset, Path(folder.name))
         else:
             place = Path(tempfile.mkdtemp(dir=folder.name))
-            known, most = AssetHistory(folders, asset), plan.twin.config.history
+            known, most = AssetHistory(archived, asset), plan.twin.config.history
             rows = known.read(most)
             if rows is None:
                 raise ConfigError("the archive has no measurements of it yet")
@@ -249,7 +198,7 @@ def _opened(
         opener.made_ready(read()), StartRequest(asset), opener, page=Page(0, False, overview="../../"),
         recordings=recordings / name,
     )  # fmt: skip
-    return Opened(session, {}, partial(report_of, session))
+    return session, {}
 
 
 def _write(path: Path, plan: FleetPlan, table: FleetTable) -> None:

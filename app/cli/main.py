@@ -8,8 +8,10 @@ import functools
 import gc
 import importlib
 import inspect
+import io
 import operator
 import os
+import re
 import sys
 from collections.abc import Sequence
 from typing import Annotated, Any
@@ -24,7 +26,11 @@ from .options import check_options, environment_options
 
 HEAD = """Keep a digital twin in step with its asset: fold, tune, check and watch it.
 
-`nisus COMMAND --help` describes a command, with examples. `nisus completion bash` (zsh, fish) completes words."""
+`nisus COMMAND --help` describes a command, with examples. `nisus --tyro-print-completion bash` prints a script that
+completes words."""
+
+COMPLETION, SHELLS = "--tyro-print-completion", ("bash", "zsh")
+"""Option of tyro, the library of the command line, and the shells for which it prints a script."""
 
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)  # errors of a device that takes no more output
 
@@ -53,7 +59,7 @@ def _imported(name: str) -> Any:
 
 
 def parse(arguments: Sequence[str]) -> Any:
-    """Return the command that the arguments name, or exit with its help.
+    """Return the command that the arguments name, or exit with its help or the script of a shell.
 
     Raises:
         ConfigError: If the command or an option does not exist, or a value must be a number and is not.
@@ -66,15 +72,25 @@ def parse(arguments: Sequence[str]) -> Any:
             given += environment_options(name, command, given, os.environ)
         check_options(name, command, given)
         return tyro.cli(command, args=given, prog=f"nisus {name}", description=described(command))
-    if name not in ("-h", "--help"):
+    if name not in ("-h", "--help", COMPLETION):
         kind = "option" if name.startswith("-") else "command"
-        names = ["--help", "--version"] if name.startswith("-") else list(NAMES)
+        names = ["--help", "--version", COMPLETION] if name.startswith("-") else list(NAMES)
         raise ConfigError(f"{shown_name(name)}: there is no such {kind}; {nearest(name, names)}")
     named: list[Any] = [
         Annotated[command, tyro.conf.subcommand(name, description=described(command).split("\n")[0])]
         for name, command in NAMES.items()
     ]
-    return tyro.cli(functools.reduce(operator.or_, named), args=["--help"], prog="nisus", description=HEAD)
+    show = functools.partial(tyro.cli, functools.reduce(operator.or_, named), prog="nisus", description=HEAD)
+    if name != COMPLETION:
+        return show(args=["--help"])
+    if (shell := arguments[1] if len(arguments) == 2 else "") not in SHELLS:
+        raise ConfigError(f"{COMPLETION}: give one of {', '.join(SHELLS)}")
+    printed = io.StringIO()
+    with contextlib.redirect_stdout(printed), contextlib.suppress(SystemExit):
+        show(args=[COMPLETION, shell])
+    # Each line of a description would be a word that completes.
+    print(re.sub("^COMPLETION_SPEC = .*", lambda spec: spec[0].replace(r"\n", " "), printed.getvalue(), flags=re.M))
+    sys.exit()
 
 
 def described(command: type) -> str:
@@ -107,11 +123,6 @@ def _answered(arguments: Sequence[str]) -> int:
             from importlib.metadata import version
 
             print(f"nisus {version('nisus')}")
-            return 0
-        if arguments and arguments[0] == "--complete":
-            from .completion import candidates
-
-            print("".join(f"{word}\n" for word in candidates(arguments[1:])), end="")
             return 0
         return carry_out(parse(arguments))
     except NisusError as error:

@@ -14,7 +14,7 @@ from contextlib import suppress
 from functools import partial
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple
 from urllib.parse import quote
 
 from config.loader import shipped
@@ -35,30 +35,8 @@ PRELOADED = ("app.cli.preloaded",)
 """Modules that the processes of the twins share: they are imported once."""
 
 
-class Served(Protocol):
-    """What the process of a twin, or of a part of a fleet, runs."""
-
-    @property
-    def door(self) -> Door | None:
-        """Its port."""
-
-    def start(self) -> object:
-        """Begin."""
-
-    def stop(self) -> None:
-        """Stop."""
-
-
-class Opened(NamedTuple):
-    """What runs, its card in the overview, and its state for that."""
-
-    served: Served
-    card: Mapping[str, Any]
-    report: Callable[[], Mapping[str, Any]]
-
-
-OpenTwin = Callable[[str, str], Opened]
-"""Opens a twin, given its name and path."""
+OpenTwin = Callable[[str, str], "tuple[Session, Mapping[str, Any]]"]
+"""Opens a twin, given its name and path; returns its session and its card in the overview."""
 
 MEMORY_PERIOD_S = 10.0
 """Between two looks at the memory, which take milliseconds."""
@@ -174,46 +152,42 @@ def run_child(open_: OpenTwin, json: bool, name: str, path: str, pipe: Connectio
     if json:
         use_lines_of_json()
     try:
-        served, card, report = open_(name, path)
-        served.start()
+        session, card = open_(name, path)
+        session.start()
     except NisusError as error:
         with suppress(OSError):  # the service has ended
             pipe.send(("failed", str(error).splitlines()[0]))
         sys.exit(2)
     running.append(True)
-    assert served.door is not None
+    assert session.door is not None
     try:
-        pipe.send(("ready", (served.door.port, served.door.token, card)))
+        pipe.send(("ready", (session.door.port, session.door.token, card)))
         memory, measured = 0, -MEMORY_PERIOD_S
         while not (ending or done.is_set()):
             if time.monotonic() - measured > MEMORY_PERIOD_S:
                 memory, measured = _memory(), time.monotonic()
-            pipe.send(("report", {**report(), "memory": memory}))
+            pipe.send(("report", {**report_of(session), "memory": memory}))
             if pipe.poll(STATUS_PERIOD_S):
-                _take(pipe, served, done)
+                _take(pipe, session, done)
         # A request that stops it is noted after it was carried out.
         while pipe.poll(0.1):
-            _take(pipe, served, done)
-    except NisusError as error:
-        with suppress(OSError):
-            pipe.send(("failed", str(error).splitlines()[0]))
-        sys.exit(2)
+            _take(pipe, session, done)
     except (EOFError, OSError):  # the service has ended
         pass
     finally:
-        served.stop()
+        session.stop()
 
 
-def _take(pipe: Connection, served: Any, done: threading.Event) -> None:
+def _take(pipe: Connection, session: Session, done: threading.Event) -> None:
     """Carry out a message of the service: (kind, content)."""
     kind, content = pipe.recv()
     if kind == "stop":
         done.set()
-    elif kind == "audit" and served.running is not None:
-        served.engine.audit.add(*content)
+    elif kind == "audit" and session.running is not None:
+        session.engine.audit.add(*content)
 
 
-def _opened(options: TwinPlaces, name: str, path: str) -> Opened:
+def _opened(options: TwinPlaces, name: str, path: str) -> tuple[Session, Mapping[str, Any]]:
     from dataclasses import asdict
 
     from ..web.gallery.cards import card_of
@@ -230,7 +204,7 @@ def _opened(options: TwinPlaces, name: str, path: str) -> Opened:
         opening, StartRequest(path), opener, page=page,
         recordings=options.recordings / name, printed=True,
     )  # fmt: skip
-    return Opened(session, asdict(card_of(path, opening.twin)), partial(report_of, session))
+    return session, asdict(card_of(path, opening.twin))
 
 
 def report_of(session: Session) -> dict[str, Any]:

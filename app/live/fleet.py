@@ -19,7 +19,7 @@ from estimators.errors import NisusError, SourceError, is_blank, quoted
 from estimators.fleet.table import FleetTable
 from estimators.log import BEFORE
 from estimators.track import STALE
-from sources.source import NO_ASSET, WHOLE, Acknowledging, AssetEvents, Marked, Partition, Report, ignore
+from sources.source import NO_ASSET, Acknowledging, AssetEvents, Marked, Report
 
 from ..twin.fleet import FleetPlan
 from ..twin.twin import Twin
@@ -51,14 +51,11 @@ TICKS_PER_DELAY = 4
 MAX_UNACKNOWLEDGED = 0.5
 """Share of the messages that a broker sends without acknowledgement after which the store is written at once."""
 
-CHANGED = {"version": "another version of Nisus", "partition": "another number of processes"}
-"""Reason for which a store is refused, by the part of its identity."""
-
 STORE, STOPPED = "store", "failed"
 """Keys of reports that the store cannot be written, or is again, and that nothing is folded any more."""
 
-UNKNOWN, FOREIGN = -1, -2
-"""In place of the position of an asset: it is refused, or another process has it."""
+UNKNOWN = -1
+"""In place of the position of an asset: it is refused."""
 
 
 class EventSink(Protocol):
@@ -87,7 +84,6 @@ class RunningFleet:
         *,
         threads: int | None = None,
         store: Path | None = None,
-        partition: Partition = WHOLE,
     ) -> None:
         """Compile the filter, open the source, and continue from the store.
 
@@ -96,15 +92,13 @@ class RunningFleet:
             report: Called as report(key, text) for what cannot be used; counted in `counts`.
             threads: Threads that fold; None for all.
             store: File in which the state of the fleet is kept with the position in its source; None for none.
-            partition: The assets that are folded; other processes have the others.
 
         Raises:
             NisusError: If the estimator is not for fleets, the source cannot be opened, or the store is of another
                 fleet.
         """
         given = plan.config.assets
-        plan = replace(plan, values=plan.values.only(partition.has))
-        self.plan, self.partition, self._report = plan, partition, report
+        self.plan, self._report = plan, report
         self.counts: Counter[str] = Counter()
         """Reports by key."""
         self._given = frozenset(given) if isinstance(given, tuple) else None
@@ -139,9 +133,7 @@ class RunningFleet:
         """Numbers of the archive that the store has; None without a store, or without an archive in it."""
         self._store = None if store is None else Store(store)
         try:
-            # Each process reads all rows of tables; one reports those that cannot be used.
-            reads_all = plan.reads_files and partition.number > 0
-            self.source = plan.open(ignore if reads_all else self.note, partition, stored=store is not None)
+            self.source = plan.open(self.note, stored=store is not None)
             if self._store is not None:
                 self._continue(self._store)
         except BaseException:
@@ -227,17 +219,17 @@ class RunningFleet:
         return True
 
     def _add(self, batch: AssetEvents) -> None:
-        """Add the events of its own assets, and count those of all: all processes fold at the same rows of a table."""
+        """Add the events of the assets that are known or new."""
         used = np.unique(batch.code)
         places = np.full(len(batch.names), UNKNOWN)
         for code in used.tolist():
             places[code] = self._place(batch.names[code])
         at, events = places[batch.code], batch.events
-        self._newest = max(self._newest, int(events.t[at != UNKNOWN].max(initial=BEFORE)))
-        self._pending += int(np.count_nonzero(at != UNKNOWN))
-        own = at >= 0
-        if not own.all():
-            at, events = at[own], events.select(own)
+        known = at != UNKNOWN
+        if not known.all():
+            at, events = at[known], events.select(known)
+        self._newest = max(self._newest, int(events.t.max(initial=BEFORE)))
+        self._pending += at.size
         with self._lock:
             self._silent.put_back(np.unique(at))
             self.fleet.add_events(at, events)
@@ -247,15 +239,13 @@ class RunningFleet:
         np.maximum.at(self._last, at, events.t)
 
     def _place(self, name: str) -> int:
-        """Return the position of an asset, a new one for a new name; UNKNOWN if it is refused, or FOREIGN."""
+        """Return the position of an asset, a new one for a new name; UNKNOWN if it is refused."""
         place = self._places.get(name)
         if place is not None:
             return place
         if is_blank(name):
             self.note(NO_ASSET, f"{self.plan.path.name}: asset {quoted(name)} is blank; name it in the source")
             return UNKNOWN
-        if not self.partition.has(name):
-            return FOREIGN if self._given is None or name in self._given else UNKNOWN
         if self._most is not None and len(self.names) >= self._most:
             rule = f"is beyond {self._most}" if self._given is None else "is not among assets"
             self.note(NO_ASSET, f"{self.plan.path.name}: asset {quoted(name)} {rule}; add it to assets")
@@ -284,7 +274,7 @@ class RunningFleet:
         plan, model, given = self.plan, self.plan.twin.model, self.plan.config.assets
         names = [model.name, *model.state_names, *model.row_names, *(given if isinstance(given, tuple) else ())]
         tuning = tuning_to_json(plan.twin.tuning, plan.twin.estimator)
-        known = {"version": version("nisus"), "partition": [*self.partition], "tuning": tuning}
+        known = {"version": version("nisus"), "tuning": tuning}
         own = {"late": plan.config.late, "values": {k: repr(v.tolist()) for k, v in plan.values.columns.items()}}
         return known | {"policy": [*plan.twin.policy], "names of": names} | own
 
@@ -344,7 +334,7 @@ class RunningFleet:
         if state:
             for key, value in self._identity().items():
                 if state.get(key) != value:
-                    what = CHANGED.get(key, "another model, tuning or assets")
+                    what = "another " + ("version of Nisus" if key == "version" else "model, tuning or assets")
                     raise SourceError(f"store {store.path}: was written with {what}; remove it, or choose another path")
             for name in state["names"]:
                 self._place(name)

@@ -135,13 +135,8 @@ class Publisher:
         mqtt = None
         if section.mqtt is not None:
             from .mqtt import JsonTopics, MqttOutput
-            from .sparkplug import SparkplugNode
 
-            form = (
-                JsonTopics(section.mqtt.prefix, twin.name, lambda: self._engine.model)
-                if section.mqtt.sparkplug is None
-                else SparkplugNode(section.mqtt.sparkplug, self._engine)
-            )
+            form = JsonTopics(section.mqtt.prefix, twin.name, lambda: self._engine.model)
             mqtt = MqttOutput(section.mqtt, twin.name, form, notices, secrets)
         outputs: list[Output] = [] if mqtt is None else [mqtt]
         if section.opcua is not None:

@@ -6,7 +6,7 @@ import threading
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 from config.fleet_schema import FleetAlertSection
 from estimators.fleet.table import FleetTable
@@ -22,7 +22,7 @@ from .fleet_alerts import FleetRules
 from .receivers import Deliveries
 
 if TYPE_CHECKING:
-    from ..twin.fleet import FleetPlan
+    from ..live.fleet import RunningFleet
     from .mqtt import MqttOutput
 
 HEALTH_RULE = FleetAlertSection(health="degraded")
@@ -32,23 +32,10 @@ DELIVERY_PERIOD_S, POLL_S = 0.2, 0.002
 """Between two looks at the queues of receivers, and at a connection that takes no state."""
 
 
-class TabledFleet(Protocol):
-    """A running fleet, in one process or several."""
-
-    plan: FleetPlan
-
-    @property
-    def failure(self) -> str:
-        """Why it stands still, or a part of it; empty if it does not."""
-
-    def table(self) -> tuple[int, list[str], FleetTable]:
-        """Return the version, the names, and the table of all assets."""
-
-
 class FleetPublisher:
     """Outputs and alerts of a running fleet, as its YAML asks for them."""
 
-    def __init__(self, fleet: TabledFleet, *, page: str | None = None, store: Path | None = None) -> None:
+    def __init__(self, fleet: RunningFleet, *, page: str | None = None, store: Path | None = None) -> None:
         """Prepare; nothing is connected yet.
 
         Args:

@@ -210,35 +210,33 @@ def rows_of(model: StateSpaceModel, names: Sequence[str], at: np.ndarray, events
 class AssetHistory:
     """Archived rows of one asset, each of which is read once."""
 
-    def __init__(self, folders: Sequence[Path], asset: str) -> None:
-        """`folders`: those of the fleet, one for each process."""
-        self._folders, self._asset = folders, asset
-        self._read: dict[Path, tuple[int, int]] = {}
-        """Number of the last file of a folder, and how many rows of it were read."""
+    def __init__(self, folder: Path, asset: str) -> None:
+        """`folder`: that of the fleet."""
+        self._folder, self._asset = folder, asset
+        self._read = 0, 0
+        """Number of the last file, and how many rows of it were read."""
 
     def read(self, most: int) -> Any:
         """Return the rows since the last call in the order of time as a pyarrow.Table; None if there are none.
 
         Args:
-            most: Rows of a folder after which older files are not read.
+            most: Rows after which older files are not read.
 
         Raises:
             SourceError: If a file is damaged.
         """
         import pyarrow as pa
 
-        found = []
-        for folder in self._folders:
-            left, (last, seen) = most, self._read.get(folder, (0, 0))
-            for number, rows in _pieces(folder, self._asset, last):
-                # A journal that was completed has the rows of an asset in the same order.
-                fresh = rows.slice(seen) if number == last else rows
-                if number >= self._read.get(folder, (0, 0))[0]:
-                    self._read[folder] = number, rows.num_rows
-                found.append(fresh)
-                left -= fresh.num_rows
-                if left <= 0:
-                    break
+        found, (last, seen) = [], self._read
+        for number, rows in _pieces(self._folder, self._asset, last):
+            # A journal that was completed has the rows of an asset in the same order.
+            fresh = rows.slice(seen) if number == last else rows
+            if number >= self._read[0]:
+                self._read = number, rows.num_rows
+            found.append(fresh)
+            most -= fresh.num_rows
+            if most <= 0:
+                break
         table = pa.concat_tables(found[::-1]) if found else None
         return None if table is None or not table.num_rows else table.sort_by("t_ns")
 

@@ -1,11 +1,11 @@
-"""MQTT: states, birth, last will and alerts at a broker, as JSON under PREFIX/TWIN or as Sparkplug B."""
+"""MQTT: states, birth, last will and alerts at a broker, as JSON under PREFIX/TWIN."""
 
 from __future__ import annotations
 
 import json
 import threading
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from estimators.errors import printable
 
@@ -14,7 +14,6 @@ from ..present.state_message import StateMessage, iso_now, state_schema
 from ..twin.secrets import Secrets
 from .alerts import AlertMessage
 from .receivers import TIMEOUT_S
-from .sparkplug import Packet, SparkplugNode
 
 if TYPE_CHECKING:
     from config.output_schema import MqttSection
@@ -32,11 +31,17 @@ STATUS, BIRTH, STATE, ALERT = "status", "birth", "state", "alert"
 """Last parts of the topics."""
 
 
+class Packet(NamedTuple):
+    """A message to the broker."""
+
+    topic: str
+    payload: str
+    qos: int = 0
+    retain: bool = False
+
+
 class JsonTopics:
     """Messages of one twin as JSON, under PREFIX/TWIN; or of the assets of a fleet, under PREFIX/FLEET/ASSET."""
-
-    commands: str | None = None
-    """Topic of commands to the twin; none."""
 
     def __init__(
         self, prefix: str, name: str, model: Callable[[], StateSpaceModel], *, of_assets: bool = False
@@ -52,29 +57,18 @@ class JsonTopics:
         self._name, self._model, self._of_assets = name, model, of_assets
         self.place = f"{prefix}/{name}"
 
-    def will(self) -> Packet:
-        """Return the message that the broker publishes when it loses the next connection."""
-        return self.death()
-
     def death(self) -> Packet:
-        """Return the message that ends the connection."""
+        """Return the message that ends a connection; as last will, the broker publishes it when it loses one."""
         return self._status(online=False)
 
     def births(self) -> list[Packet]:
         """Return the messages that begin a connection."""
         return [Packet(f"{self.place}/{BIRTH}", self._birth(), qos=1, retain=True), self._status(online=True)]
 
-    def states(self, message: StateMessage) -> list[Packet]:
-        """Return the messages of a state."""
+    def state(self, message: StateMessage) -> Packet:
+        """Return the message of a state."""
         place = f"{self.place}/{message.twin.translate(ESCAPES)}" if self._of_assets else self.place
-        return [Packet(f"{place}/{STATE}", message.model_dump_json(), retain=self._of_assets)]
-
-    def lost(self) -> None:
-        """Note the end of a connection."""
-
-    def wants_birth(self, payload: bytes) -> bool:
-        """Return whether a command requests the births again; there are no commands."""
-        return False
+        return Packet(f"{place}/{STATE}", message.model_dump_json(), retain=self._of_assets)
 
     def _status(self, *, online: bool) -> Packet:
         body = json.dumps({"online": online, "since": iso_now()})
@@ -94,9 +88,7 @@ class MqttOutput:
 
     name = "mqtt"
 
-    def __init__(
-        self, section: MqttSection, name: str, form: JsonTopics | SparkplugNode, notices: Notices, secrets: Secrets
-    ) -> None:
+    def __init__(self, section: MqttSection, name: str, form: JsonTopics, notices: Notices, secrets: Secrets) -> None:
         """Prepare; nothing is connected yet.
 
         Args:
@@ -113,12 +105,9 @@ class MqttOutput:
 
         self._section, self._form, self._notices = section, form, notices
         self._alerts = f"{section.prefix}/{name}/{ALERT}"
-        self._ordered = threading.Lock()
-        """Held from making a message to handing it to the client, as Sparkplug numbers them."""
         password = None if section.password_env is None else secrets[section.password_env]
         self.client: Any = mqtt_client(section, password, client_id=f"nisus-{name}")
         self.client.on_pre_connect = self._connecting
-        self.client.on_message = self._command
         self.client.on_connect, self.client.on_disconnect = self._connected, self._disconnected
         self.client.on_connect_fail = lambda *_: self._lost("the broker does not answer")
         self.client.on_publish = self._taken
@@ -148,8 +137,7 @@ class MqttOutput:
             self._dropped += full
             first = full and self._dropped == 1
         if not full:
-            with self._ordered:
-                self._hand_over(self._form.states(message))
+            self._hand_over([self._form.state(message)])
         elif first:
             text = f"output mqtt: the broker at {self._place} takes states too slowly; some are dropped"
             self._notices.count("output mqtt")
@@ -176,8 +164,7 @@ class MqttOutput:
     def stop(self) -> None:
         """Publish the death, and disconnect."""
         if self.client.is_connected():
-            with self._ordered:
-                sent = self.client.publish(*self._form.death())
+            sent = self.client.publish(*self._form.death())
             try:
                 sent.wait_for_publish(1.0)
             except (RuntimeError, ValueError):
@@ -204,8 +191,7 @@ class MqttOutput:
     # On the thread of the client
 
     def _connecting(self, client: Any, _data: Any) -> None:
-        with self._ordered:
-            client.will_set(*self._form.will())
+        client.will_set(*self._form.death())
 
     def _connected(self, client: Any, _data: Any, _flags: Any, reason: Any, _properties: Any) -> None:
         if reason.is_failure:
@@ -214,29 +200,13 @@ class MqttOutput:
         with self._counting:
             self._unsent, self._dropped = 0, 0
         self.connections += 1
-        if self._form.commands is not None:
-            client.subscribe(self._form.commands, qos=1)
-        with self._ordered:
-            self._hand_over(self._form.births())
+        self._hand_over(self._form.births())
         if self._reported:
             self._reported = False
             self._notices.say(f"output mqtt: connected again to {self._place}")
 
     def _disconnected(self, _client: Any, _data: Any, _flags: Any, reason: Any, _properties: Any) -> None:
-        with self._ordered:
-            self._form.lost()
         self._lost(f"the connection ended: {reason}")
-
-    def _command(self, _client: Any, _data: Any, message: Any) -> None:
-        try:
-            wanted = self._form.wants_birth(message.payload)
-        except ValueError as error:
-            text = f"output mqtt: a command at {message.topic} is ignored: {error}"
-            self._notices.report("output mqtt command", text)
-            return
-        if wanted:
-            with self._ordered:
-                self._hand_over(self._form.births())
 
     def _lost(self, text: str) -> None:
         self._problem = printable(text)

@@ -69,7 +69,7 @@ def ordered(model: StateSpaceModel, table: FleetTable, sort: str = "health", dow
 
 
 def in_name_order(table: FleetTable) -> FleetTable:
-    """Return a table with its assets in the order of their names, which is the same for any number of processes."""
+    """Return a table with its assets in the order of their names."""
     order = np.argsort(np.array(table.assets, object), kind="stable")
     return FleetTable([table.assets[k] for k in order.tolist()], *(column[order] for column in table[1:]))
 

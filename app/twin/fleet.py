@@ -11,13 +11,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from config.fleet_schema import MAX_PROCESSES, FleetSection, FleetTableSection
+from config.fleet_schema import FleetSection, FleetTableSection
 from config.loader import shipped
 from config.problems import check_section
 from config.yaml_files import as_flow, read_text
 from estimators.errors import ConfigError, EstimatorError
 from estimators.fleet.fleet import Fleet
-from sources.source import WHOLE, Partition
 from sources.tables.one_asset import rows_of_asset
 from sources.tables.text import column_of
 
@@ -62,7 +61,7 @@ class FleetPlan:
 
     @property
     def reads_files(self) -> bool:
-        """Whether its source is tables, of which each process reads all rows."""
+        """Whether its source is tables."""
         return isinstance(self.config.source, FleetTableSection)
 
     def fleet(self, assets: int, threads: int | None = None) -> Fleet:
@@ -81,19 +80,18 @@ class FleetPlan:
         except EstimatorError as error:
             raise ConfigError(f"{self.source.loaded.places.at(('twin',))}: twin {twin.name}: {error}") from None
 
-    def open(self, report: Report, partition: Partition = WHOLE, *, stored: bool = False) -> Source:
+    def open(self, report: Report, *, stored: bool = False) -> Source:
         """Open the source, whose `read` returns `AssetEvents`.
 
         Args:
             report: Called for what cannot be used.
-            partition: Assets whose messages are read; of tables all rows are.
             stored: Whether the state of the fleet is kept; the source is then to be given its own with `restore`.
 
         Raises:
             SourceError: If it cannot be opened, with the remedy.
         """
         opening = self._opening(report)
-        return SOURCES[self.config.source.type].open(replace(opening, partition=partition, stored=stored))
+        return SOURCES[self.config.source.type].open(replace(opening, stored=stored))
 
     def check_files(self) -> None:
         """Open the files of the source, and close them; raises as `open`."""
@@ -164,15 +162,12 @@ class FleetPlan:
         }
 
 
-def load_fleet(
-    path: str | os.PathLike[str], overrides: Mapping[str, str] | None = None, processes: int | None = None
-) -> FleetPlan:
+def load_fleet(path: str | os.PathLike[str], overrides: Mapping[str, str] | None = None) -> FleetPlan:
     """Read and check a fleet's YAML, and put its twin together.
 
     Args:
         path: The YAML file.
         overrides: The command line's `--set KEY=VALUE` for the twin.
-        processes: In place of the YAML's.
 
     Raises:
         ConfigError: If the YAML, the twin or an override breaks a rule.
@@ -181,13 +176,6 @@ def load_fleet(
     path = Path(path).expanduser()
     text = read_text(path, "nisus fleet --help")
     section, _, places = check_section(FleetSection, text, path, "a fleet is a mapping with twin and source")
-    if processes is not None:
-        if not 1 <= processes <= MAX_PROCESSES:
-            raise ConfigError(f"--processes {processes}: must be from 1 to {MAX_PROCESSES}")
-        if processes > 1 and isinstance(section.assets, int):
-            rule = f"is {section.assets}; name the assets, or leave it out, for --processes {processes}"
-            raise ConfigError(f"{places.at(('assets',))}: assets {rule}")
-        section = section.model_copy(update={"processes": processes})
     named = section.twin
     if named not in shipped():
         named = str(path.parent / Path(named).expanduser())

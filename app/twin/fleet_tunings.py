@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -33,13 +33,6 @@ class AssetValues(NamedTuple):
             return {}
         values = {key: float(column[self.names.index(asset)]) for key, column in self.columns.items()}
         return {key: value for key, value in values.items() if not np.isnan(value)}
-
-    def only(self, has: Callable[[str], bool]) -> AssetValues:
-        """Return those of the assets whose names `has` accepts."""
-        kept = [k for k, name in enumerate(self.names) if has(name)]
-        return AssetValues(
-            tuple(self.names[k] for k in kept), {key: column[kept] for key, column in self.columns.items()}
-        )
 
     def padded(self, count: int) -> dict[str, np.ndarray]:
         """Return the values of these assets, and the twin's for others, (count,) each."""

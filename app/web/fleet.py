@@ -21,7 +21,6 @@ from ..present.fleet_table import counts_of, histogram, matching, ordered, sibli
 from . import readings
 from .http import get, page_file
 from .metrics import exposed
-from .partitions import PartitionedFleet
 
 if TYPE_CHECKING:
     from prometheus_client.core import Metric
@@ -51,7 +50,7 @@ class _Order(NamedTuple):
 class FleetApi:
     """Answers with parts of the table of a running fleet."""
 
-    def __init__(self, running: RunningFleet | PartitionedFleet) -> None:
+    def __init__(self, running: RunningFleet) -> None:
         self._running = running
         self._orders: OrderedDict[_Order, np.ndarray] = OrderedDict()
         self._siblings: tuple[tuple[int, str], Siblings | None] = ((-1, ""), None)
@@ -60,8 +59,7 @@ class FleetApi:
 
     def routes(self) -> list[BaseRoute]:
         """Return the routes."""
-        take = self._running.take if isinstance(self._running, PartitionedFleet) else None
-        return [get("/api/fleet", self.rows), get("/metrics", self.metrics), *readings.routes(self._running, take)]
+        return [get("/api/fleet", self.rows), get("/metrics", self.metrics), *readings.routes(self._running)]
 
     def page(self, boot: str) -> Response:
         """Answer with the overview."""
@@ -154,9 +152,8 @@ class FleetApi:
     def unready(self) -> str:
         """Return why the assets are not followed, not yet or not any more; empty if they are."""
         running = self._running
-        reason = running.failure or (running.starting if isinstance(running, PartitionedFleet) else "")
         self._arrived = self._arrived or bool(running.table()[2].events.any())
-        return reason or ("" if self._arrived else "no measurement has arrived")
+        return running.failure or ("" if self._arrived else "no measurement has arrived")
 
     def metrics(self) -> Response:
         """Answer with the counts of assets by health in the text format of Prometheus."""
@@ -182,7 +179,7 @@ def _short(value: float) -> float | None:
 class _Collector:
     """Metrics of a fleet, made anew for each scrape: a series for each grade of health, none for an asset."""
 
-    def __init__(self, running: RunningFleet | PartitionedFleet) -> None:
+    def __init__(self, running: RunningFleet) -> None:
         self._running = running
 
     def collect(self) -> Iterator[Metric]:

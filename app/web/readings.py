@@ -6,7 +6,7 @@ import asyncio
 import json
 import struct
 import time
-from collections.abc import Awaitable, Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Protocol
 
 from starlette.requests import Request
@@ -50,12 +50,8 @@ class Receiver(Protocol):
         """The twin."""
 
 
-Take = Callable[[Sequence[Any]], Awaitable[dict[str, Any]]]
-"""Takes messages, and answers what became of them."""
-
-
-def routes(engine: Receiver, take: Take | None = None) -> list[BaseRoute]:
-    """Return the routes of a running twin or fleet; `take` takes messages in place of its source."""
+def routes(engine: Receiver) -> list[BaseRoute]:
+    """Return the routes of a running twin or fleet."""
 
     def names() -> dict[str, Any]:
         """Return names and units of the values that the twin reads."""
@@ -75,7 +71,7 @@ def routes(engine: Receiver, take: Take | None = None) -> list[BaseRoute]:
             body = await bounded_body(request, MAX_BYTES)
             messages = await in_thread(lambda: READERS[kind](body, source.fields))
             _check_count(len(messages))
-            return Json(await (take(messages) if take else send_to(engine, messages)))
+            return Json(await send_to(engine, messages))
         except TooLarge:
             bounds = f"{MAX_BYTES // 2**20} MB and {MAX_MESSAGES:,} messages"
             return PlainTextResponse(f"Nisus: a body may have {bounds}; send fewer messages at once.\n", 413)

@@ -47,9 +47,8 @@ FOLDER_PERIOD_S = 2.0
 class ServedTwin:
     """A twin of the service, and its process.
 
-    `text` is the reason of a failure, `failure` that of the last one, and `refused` whether the process told it. `card`
-    describes the twin, once it has been read, and `report` its estimate. `noted` are requests for its audit log, which
-    wait until it runs.
+    `text` is the reason of a failure, and `failure` that of the last one. `card` describes the twin, once it has been
+    read, and `report` its estimate. `noted` are requests for its audit log, which wait until it runs.
     """
 
     name: str
@@ -57,7 +56,6 @@ class ServedTwin:
     state: str = STARTING
     text: str = ""
     failure: str = ""
-    refused: bool = False
     wanted: bool = True
     process: multiprocessing.process.BaseProcess | None = None
     pipe: Connection | None = None
@@ -126,7 +124,7 @@ def forget_safe_path() -> None:
 
 
 class Supervisor:
-    """Starts the processes of twins, or of parts of a fleet, and watches them."""
+    """Starts the processes of twins, and watches them."""
 
     def __init__(
         self,
@@ -227,7 +225,7 @@ class Supervisor:
         elif kind == "report":
             twin.report = content
         elif kind == "failed":
-            twin.text, twin.refused = content, True
+            twin.text = content
 
     def _look(self) -> None:
         """Start processes that are due, and note those that have ended."""
@@ -264,7 +262,7 @@ class Supervisor:
         """Start the process of a twin that has none; `changing` is held."""
         ours, its = self._context.Pipe()
         process = self._context.Process(target=self._child, args=(twin.name, twin.path, its), name=twin.name)
-        twin.pipe, twin.state, twin.refused = ours, STARTING, False
+        twin.pipe, twin.state = ours, STARTING
         twin.began = twin.heard = time.monotonic()
         twin.starts += 1
         with _safe_path():

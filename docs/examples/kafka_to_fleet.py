@@ -1,24 +1,26 @@
-"""Pass messages of a Kafka topic on to a fleet of type push with a store, so that each counts once.
+"""Pass messages of a Kafka topic on to fleets of type push with a store, so that each counts once.
 
 The key of a message is the name of its asset, the value is JSON such as {"time": ..., "values": {"winding": 41.5}}.
-Offsets are committed once the fleet has stored the messages.
+Offsets are committed once the fleet has stored the messages. The partition decides which of several fleets gets them.
 
-Run: NISUS_TOKEN=... python docs/examples/kafka_to_fleet.py
+Run: NISUS_TOKEN=... python docs/examples/kafka_to_fleet.py http://127.0.0.1:9901 http://127.0.0.1:9902
 """
 
 import json
 import os
+import sys
 import time
 import urllib.request
 
 from quixstreams import Application
 from quixstreams.sinks import BatchingSink, SinkBatch
 
+FLEETS = sys.argv[1:] or ["http://127.0.0.1:9900"]
 RETRY_S = 1.0
 
 
 class FleetSink(BatchingSink):
-    """Sends batches to POST /api/readings, again and again until they are stored."""
+    """Sends batches to POST /api/readings of fleets, again and again until they are stored."""
 
     def write(self, batch: SinkBatch) -> None:
         """Send a batch; a message is known by its partition and offset."""
@@ -26,15 +28,14 @@ class FleetSink(BatchingSink):
         messages = [
             {**item.value, "asset": item.key.decode(), "source": source, "sequence": item.offset} for item in batch
         ]
-        while not self.is_stored(messages):
+        fleet = FLEETS[batch.partition % len(FLEETS)]
+        while not self.is_stored(fleet, messages):
             time.sleep(RETRY_S)
 
-    def is_stored(self, messages: list) -> bool:
+    def is_stored(self, fleet: str, messages: list) -> bool:
         """Send messages; return whether the fleet has stored them."""
         headers = {"Authorization": f"Bearer {os.environ['NISUS_TOKEN']}", "Content-Type": "application/json"}
-        request = urllib.request.Request(
-            "http://127.0.0.1:9900/api/readings", json.dumps(messages).encode(), headers, method="POST"
-        )
+        request = urllib.request.Request(f"{fleet}/api/readings", json.dumps(messages).encode(), headers, method="POST")
         try:
             with urllib.request.urlopen(request) as answer:
                 return json.load(answer)["stored"]

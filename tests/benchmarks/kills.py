@@ -5,8 +5,8 @@ random moments (SIGKILL), and another one continues. After each kill the store i
 every measurement that was sent a second before the kill. At the end the events of all processes are folded in one go:
 each stored state of the filter must be that of the undisturbed fold, bit for bit. It exits with 1 if anything is wrong.
 
-With `--fleet` the processes of a fleet and their parent are killed while messages are published to a broker, some of
-them twice: at the end the table of all assets must be that of one process without kills.
+With `--fleet` the process of a fleet is killed while messages are published to a broker, some of them twice: at the end
+the table of all assets must be that of a process without kills.
 """
 
 from __future__ import annotations
@@ -15,7 +15,6 @@ import argparse
 import json
 import os
 import select
-import signal
 import struct
 import subprocess
 import sys
@@ -23,31 +22,25 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable
-from contextlib import suppress
-from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 import pyarrow.parquet
 
-from app.cli.fleet import FLEET_PRELOADED, open_partition
-from app.cli.serve import run_child
 from app.live.fleet import RunningFleet
 from app.live.store import Store, read_store
 from app.present.fleet_table import arrow_table, in_name_order
 from app.terminal import EndRequest, when_asked_to_end
 from app.twin.fleet import load_fleet
 from app.twin.twin import Twin, load_twin
-from app.web import supervisor
-from app.web.partitions import PartitionedFleet
 from app.web.readings import messages_of
 from app.web.running import OpenedTwin, RunningTwin
 from estimators.fold import Fold
 from estimators.log import READING, Events, Log
 from estimators.snapshots import Base
-from sources.brokers import TopicMap, mqtt_client
+from sources.brokers import MqttSource, TopicMap, mqtt_client
 from sources.messages import ACCEPTED
 from tests import ROOT
 from tests.app.outputs.broker import Broker
@@ -200,15 +193,12 @@ def survive(
 
 
 class FleetRun(NamedTuple):
-    """A fleet of MQTT messages that are published while its processes are killed."""
+    """A fleet of MQTT messages that are published while its process is killed."""
 
     assets: int = 40
     rounds: int = 600
     """Measurements of each asset, one a round."""
     seconds: float = 600.0
-    processes: int = 2
-    parents: int = 10
-    """Each of so many kills is that of the parent."""
 
     def messages(self, k: int) -> list[tuple[str, str]]:
         """Return topics and payloads of a round; each 20th is published twice."""
@@ -224,26 +214,23 @@ FLEET_BEGIN = 1_767_225_600 * 10**9
 LONG_S = "1e6"
 """Longer than the run: no asset is silent, so the table does not depend on the clock."""
 
+SUBSCRIBED = "subscribed"
+"""Line that the process of a fleet prints once the broker keeps its messages."""
+
 FLEET_TOPIC: dict[str, Any] = {"values": {"winding": "v"}, "time": "t", "sequence": "n"}
 
 
 def run_fleet_part(folder: Path, expected: int) -> None:
-    """Run the processes of a fleet until this one is killed; write the table once it has all events."""
-    supervisor.FIRST_RETRY_S = supervisor.MAX_RETRY_S = 0.1
+    """Run a fleet until its process is killed; write the table once it has all events."""
     overrides = {"time.degraded_after": LONG_S, "time.stale_after": LONG_S}
     plan = load_fleet(folder / "pumps.yaml", overrides)
-    processes = plan.config.processes
-    opened = partial(open_partition, folder / "pumps.yaml", overrides, processes, folder / "fleet.store", None)
-    fleet = PartitionedFleet(plan, lambda *_: None, partial(run_child, opened, False), preload=FLEET_PRELOADED)
+    fleet = RunningFleet(plan, lambda *_: None, threads=1, store=folder / "fleet.store")
     fleet.start()
+    cast(MqttSource, fleet.source).connected.wait()
+    print(SUBSCRIBED, flush=True)
     done = EndRequest()
     when_asked_to_end(done.set)
-    told: list[int | None] = []
     while not done.wait(0.1):
-        pids = [part.twin.process.pid for part in fleet._parts if part.twin.process is not None and part.twin.port]
-        if pids != told:
-            told = pids
-            print("pids", *pids, flush=True)
         table = in_name_order(fleet.table()[2])
         if int(table.events.sum()) >= expected:
             pyarrow.parquet.write_table(arrow_table(plan.twin.model, table), folder / "table.part")
@@ -252,7 +239,7 @@ def run_fleet_part(folder: Path, expected: int) -> None:
 
 
 def undisturbed(folder: Path, run: FleetRun) -> bytes:
-    """Return the table of one process that gets each message once, as bytes of Parquet."""
+    """Return the table of a process that gets each message once, as bytes of Parquet."""
     path = folder / "one.yaml"
     path.write_text(json.dumps({"twin": "motor_winding", "source": {"type": "push"}}))
     overrides = {"time.degraded_after": LONG_S, "time.stale_after": LONG_S}
@@ -268,24 +255,24 @@ def undisturbed(folder: Path, run: FleetRun) -> bytes:
     return (folder / "one.parquet").read_bytes()
 
 
-class FleetParent:
-    """The process that starts those of a fleet; it says which run."""
+class FleetProcess:
+    """The process of a fleet."""
 
     def __init__(self, folder: Path, expected: int) -> None:
         command = [sys.executable, "-m", "tests.benchmarks.kills", "--fed", str(folder), "--fleet"]
         command += ["--kills", str(expected)]
         self.process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True)
-        self.pids: list[int] = []
+        self.subscribed = threading.Event()
         threading.Thread(target=self._listen, daemon=True).start()
 
     def _listen(self) -> None:
         assert self.process.stdout is not None
         for line in self.process.stdout:
-            if line.startswith("pids"):
-                self.pids = [*map(int, line.split()[1:])]
+            if line.strip() == SUBSCRIBED:
+                self.subscribed.set()
 
     def kill(self) -> None:
-        """Kill it alone; its processes notice that."""
+        """Kill it."""
         self.process.kill()
         self.process.wait()
 
@@ -293,7 +280,7 @@ class FleetParent:
 def survive_fleet(
     kills: int, folder: Path, run: FleetRun, seed: int = 1, report: Callable[[str], None] = lambda line: None
 ) -> str:
-    """Publish the messages of a fleet while its processes are killed; return a line of results.
+    """Publish the messages of a fleet while its process is killed; return a line of results.
 
     Raises:
         AssertionError: If the table is not that of the undisturbed process, to the last bit.
@@ -302,16 +289,15 @@ def survive_fleet(
     broker = Broker(folder, "max_queued_messages 0\nmax_inflight_messages 0\n")
     source = {"type": "mqtt", "host": "127.0.0.1", "port": broker.port, "client_id": "kills",
               "topics": {"plant/{asset}": FLEET_TOPIC}}  # fmt: skip
-    fleet = {"twin": "motor_winding", "processes": run.processes, "source": source}
+    fleet = {"twin": "motor_winding", "source": source}
     (folder / "pumps.yaml").write_text(json.dumps(fleet))
-    parent, rng = FleetParent(folder, expected), np.random.default_rng(seed)
+    process, rng = FleetProcess(folder, expected), np.random.default_rng(seed)
     publisher = mqtt_client(SimpleNamespace(user=None, ca_file=None), None, client_id="")
     publisher.max_queued_messages_set(0)
     publisher.connect("127.0.0.1", broker.port)
     publisher.loop_start()
-    while len(parent.pids) < run.processes:  # subscribed from now on, also while they are dead
-        time.sleep(0.05)
-    killed, parents, published, begun = 0, 0, 0, time.monotonic()
+    process.subscribed.wait()  # from now on, also while it is dead
+    killed, published, begun = 0, 0, time.monotonic()
     due = np.sort(rng.uniform(0.0, run.seconds, kills))
     while published < run.rounds or killed < kills:
         now = time.monotonic() - begun
@@ -319,29 +305,22 @@ def survive_fleet(
             for name, text in run.messages(published):
                 publisher.publish(name, text, qos=1)
             published += 1
-        if killed < kills and now > due[killed] and parent.pids:
-            if killed % run.parents == run.parents - 1:
-                parent.kill()
-                parent, parents = FleetParent(folder, expected), parents + 1
-            else:
-                with suppress(ProcessLookupError):
-                    os.kill(parent.pids[int(rng.integers(len(parent.pids)))], signal.SIGKILL)
-                parent.pids = []
-            killed += 1
+        if killed < kills and now > due[killed] and process.subscribed.is_set():
+            process.kill()
+            process, killed = FleetProcess(folder, expected), killed + 1
             report(f"kill {killed} at {now:.1f} s, after {published} rounds")
         time.sleep(0.01)
     while not (folder / "table.parquet").exists():
         time.sleep(0.05)
     found = (folder / "table.parquet").read_bytes()
-    parent.process.terminate()
-    parent.process.wait()
+    process.process.terminate()
+    process.process.wait()
     publisher.disconnect()
     publisher.loop_stop()
     broker.stop()
-    line = f"{expected} messages of {run.assets} assets in {run.processes} processes, {killed} kills"
-    line += f", {parents} of them of the parent: the table is"
-    assert found == wanted, f"{line} another than that of one process without kills"
-    return f"{line} that of one process without kills, bit for bit"
+    line = f"{expected} messages of {run.assets} assets, {killed} kills: the table is"
+    assert found == wanted, f"{line} another than that of a process without kills"
+    return f"{line} that of a process without kills, bit for bit"
 
 
 def main() -> int:
@@ -350,7 +329,7 @@ def main() -> int:
     parser.add_argument("--kills", type=int, default=200)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--fed", type=Path, help=argparse.SUPPRESS)
-    parser.add_argument("--fleet", action="store_true", help="kill the processes of a fleet, and their parent")
+    parser.add_argument("--fleet", action="store_true", help="kill the process of a fleet")
     parser.add_argument("--seconds", type=float, default=600.0, help="length of the stream of a fleet")
     given = parser.parse_args()
     if given.fed is not None and given.fleet:

@@ -15,7 +15,6 @@ from config.yaml_files import Key, dotted
 from estimators.errors import SourceError
 from estimators.model.state_space import StateSpaceModel
 from sources.formats import BAG_FILE, TABLES, check_once, files_of, suffix_of
-from sources.source import WHOLE, Partition
 
 from ..channels import channels
 
@@ -29,8 +28,8 @@ T = TypeVar("T")
 class Opening:
     """A section that is to be opened: its twin, its place in the YAML, and for what.
 
-    `live` False takes a recording in place of a bus; `log_files` are recordings in place of its own. Of a fleet only
-    the assets of a `partition` are read, which are among `assets` if there are any; with `stored` its state is kept.
+    `live` False takes a recording in place of a bus; `log_files` are recordings in place of its own. `assets` are those
+    of a fleet, if they are named; with `stored` its state is kept.
     """
 
     loaded: Loaded
@@ -40,7 +39,6 @@ class Opening:
     report: Report
     live: bool = True
     log_files: Sequence[Path] | None = None
-    partition: Partition = WHOLE
     assets: tuple[str, ...] = ()
     stored: bool = False
 

@@ -44,22 +44,18 @@ def _messages(opening: Opening) -> Messages:
 
 
 def _open_mqtt(opening: Opening) -> Source:
-    from sources.brokers import MqttSource, TopicMap
+    from sources.brokers import SHARED, MqttSource, TopicMap
 
     section: MqttSourceSection = opening.section
     messages = _messages(opening)
     _check_names(opening, messages, {name for topic in section.topics.values() for name in topic.values}, "topics")
     topics: dict[str, TopicMap] = {}
     subscribed: list[str] = []
-    part = opening.partition
     by_hand = opening.stored and section.client_id is not None and section.qos > 0
     if by_hand and section.qos == 2:
         rule = "is 2; set it to 1: a fleet with --store takes each of its messages once"
         raise failure(opening.loaded, (*opening.key, "qos"), rule)
     password = _password(opening)
-    client_id = section.client_id
-    if client_id is not None and part.processes > 1:
-        client_id = f"{client_id}-{part.number}"
     for name, topic in section.topics.items():
         levels = name.split("/")
         asset = levels.index(ASSET_LEVEL) if isinstance(section, FleetMqttSection) else None
@@ -69,11 +65,12 @@ def _open_mqtt(opening: Opening) -> Source:
             raise failure(opening.loaded, (*opening.key, "topics"), f"names {shown_name(name)}; {rule}")
         if name in topics:
             raise failure(opening.loaded, (*opening.key, "topics"), f"has {name} twice; name each topic once")
-        topics[name] = TopicMap(**topic.model_dump(), asset=asset)
+        group = 2 if SHARED.match(name) else 0
+        topics[name] = TopicMap(**topic.model_dump(), asset=None if asset is None else asset - group)
         if asset is None or not opening.assets:
             subscribed.append(name)
         else:
-            own = [item for item in opening.assets if part.has(item) and not set(item) & set("+#/")]
+            own = [item for item in opening.assets if not set(item) & set("+#/")]
             subscribed += ["/".join([*levels[:asset], item, *levels[asset + 1 :]]) for item in own]
     return MqttSource(
         messages,
@@ -81,9 +78,8 @@ def _open_mqtt(opening: Opening) -> Source:
         topics,
         qos=section.qos,
         password=password,
-        client_id=client_id,
+        client_id=section.client_id,
         report=opening.report,
-        wanted=part.has,
         subscribed=subscribed,
         by_hand=by_hand,
     )
@@ -95,7 +91,7 @@ def _password(opening: Opening) -> str | None:
 
 
 def _check_secrets(opening: Opening) -> None:
-    """Miss the password of a fleet once, not in each of its processes; commands on recordings of a twin need none."""
+    """Report a missing password of a fleet before anything is compiled; commands on recordings of a twin need none."""
     if isinstance(opening.section, FleetMqttSection):
         _password(opening)
 

@@ -148,8 +148,6 @@ def test_rows_of_a_blank_name_are_of_no_asset(tmp_path, monkeypatch):
          "outputs.mqtt.host is 'a b'; give a host name or an IP address"),
         ({"twin: motor_winding": "twin: motor_winding\noutputs: {receivers: {a: {type: webhook, url: 'ftp://x'}}}"},
          "outputs.receivers.a.url is 'ftp://x'; give an address such as https://HOST/PATH"),
-        ({"twin: motor_winding": "twin: motor_winding\nprocesses: 2\nassets: 3"}, "assets is 3 for 2 processes; name"),
-        ({"twin: motor_winding": "twin: motor_winding\nprocesses: 0"}, "pumps.yaml:2: processes"),
         ({"  asset: pump\n": ""}, "source.asset is missing"),
         ({"asset: pump": "asset: pum"}, "there is no column 'pum'; did you mean pump?"),
         ({"winding:": "windng:"}, "pumps.yaml:8: source.sensors"),

@@ -11,10 +11,8 @@ from pathlib import Path
 import pytest
 
 from app.cli.arguments import COMMANDS, NAMES
-from app.cli.completion import SCRIPTS, candidates
 from app.cli.main import described, main, parse
 from config.loader import shipped
-from estimators.registry import ESTIMATORS
 
 FULL = Path("/dev/full")
 needs_full = pytest.mark.skipif(not FULL.exists(), reason="there is no /dev/full")
@@ -72,7 +70,9 @@ def test_examples_in_the_help_are_commands_of_bundled_twins(name, capsys):
     assert left.value.code == 0 and f"nisus {name}" in shown and all(line in shown for line in lines)
 
 
-TO_FULL_PIPES = ["--help", "twins", "fold --help", "filters", "schema", "completion bash", "log nothing.csv", "fld"]
+TO_FULL_PIPES = [
+    "--help", "twins", "fold --help", "filters", "schema", "--tyro-print-completion bash", "log nothing.csv", "fld",
+]  # fmt: skip
 
 
 @pytest.mark.parametrize("words", TO_FULL_PIPES)
@@ -98,38 +98,36 @@ sys.stdout.flush()
 
 
 COMPLETED = {
-    "": [*NAMES, "--help", "--version"],
-    "comp": ["compare", "completion"],
-    "fold uwb": ["uwb_rover_labyrinth", "uwb_rover_plaza"],
-    "fold motor_can --es": ["--estimator"],
-    "fold motor_can --estimator uk": ["ukf"],
-    "fold motor_can --estimator=uk": ["--estimator=ukf"],
-    "fold motor_can --estimator = uk": ["ukf"],
-    "fold motor_can --estimator =": list(ESTIMATORS),
-    "compare motor_can --estimators ekf uk": ["ukf"],
-    "tune motor_can --aim l": ["likelihood"],
-    "fold motor_winding --set R.": ["R.winding="],
-    "filters --twin lor": ["lorenz63", "lorenz96"],
-    "tunings motor_winding o": ["own"],
-    "completion ": ["bash", "zsh", "fish"],
-    "log ": [],
-    "fold motor_can --out ": [],
-    "no_command ": [],
+    "": {*NAMES},
+    "comp": {"compare"},
+    "fold motor_can --es": {"--estimator"},
+    "fleet --archive-": {"--archive-split", "--archive-keep"},
+    "tune motor_can --aim l": {"likelihood"},
+    "serve --log-format ": {"text", "json"},
+    "fold --out dri": {"drive.csv"},
+    "fold dri": set(),  # the shell completes names of files
 }
 
 
-@pytest.mark.parametrize("words", COMPLETED)
-def test_words_are_completed(words):
-    assert candidates(words.split(" ")) == COMPLETED[words]
-
-
-def test_the_script_for_bash_completes_words(tmp_path):
+def test_the_lines_of_the_guide_complete_words_in_bash(tmp_path):
     program = tmp_path / "nisus"
     program.write_text(f'#!/bin/sh\nexec {sys.executable} -m app.cli.main "$@"\n')
     program.chmod(0o755)
-    asked = "COMP_WORDS=(nisus fold lor); COMP_CWORD=2; _nisus; echo ${COMPREPLY[@]}"
-    script = f"PATH={tmp_path}:$PATH\n{SCRIPTS['bash']}\n{asked}"
-    assert subprocess.check_output(["bash", "-c", script], text=True) == "lorenz63 lorenz96\n"
+    (tmp_path / "drive.csv").touch()
+    guide = Path("docs/reference.md").read_text(encoding="utf-8")
+    (lines,) = re.findall(r"```sh\n(source .*?)```", guide, re.DOTALL)
+    typed = [" ".join(map(shlex.quote, ["nisus", *words.split(" ")])) for words in COMPLETED]
+    ask = "COMP_CWORD=$((${#COMP_WORDS[@]} - 1)); _nisus; echo ${COMPREPLY[@]}"
+    asked = [f"COMP_WORDS=({words}); {ask}" for words in typed]
+    script = "\n".join([f"PATH={tmp_path}:$PATH", lines, f"cd {tmp_path}", *asked])
+    said = subprocess.check_output(["bash", "-c", script], text=True).splitlines()
+    found = [{word for word in line.split() if not word.startswith("-h") and word != "--help"} for line in said]
+    assert dict(zip(COMPLETED, found, strict=True)) == COMPLETED
+
+
+def test_a_shell_without_a_script_is_one_line(nisus):
+    line = "--tyro-print-completion: give one of bash, zsh"
+    assert line in nisus.refuses("--tyro-print-completion", "csh") and line in nisus.refuses("--tyro-print-completion")
 
 
 def documented():
@@ -168,7 +166,7 @@ RUNS = {
 def test_every_command_with_a_result_prints_json_that_the_guide_describes():
     assert set(WITH_JSON) == set(documented()) >= {words.split()[0] for words in RUNS.values()}
     without = set(NAMES) - set(WITH_JSON)
-    assert without == {"review", "serve", "schema", "completion"}  # pages, a JSON Schema, a script
+    assert without == {"review", "serve", "schema"}  # pages, a JSON Schema
 
 
 @pytest.mark.parametrize("case", RUNS)

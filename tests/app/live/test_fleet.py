@@ -8,7 +8,6 @@ import signal
 import subprocess
 import sys
 import time
-import zlib
 from contextlib import nullcontext
 from types import SimpleNamespace
 
@@ -18,20 +17,16 @@ import pytest
 
 import app.live.fleet as live
 from app.live.fleet import RunningFleet
-from app.present.fleet_table import in_name_order
 from app.twin.fleet import load_fleet
 from app.twin.twin import load_twin
 from app.web.fleet import FleetApi
-from app.web.partitions import PartitionedFleet, PartitionServer
 from app.web.readings import READERS, messages_of, send_to, summary
-from app.web.supervisor import RUNNING, STARTING
 from estimators import Log
 from estimators.errors import NisusError, SourceError
 from estimators.fold import Fold
 from estimators.log import Events
 from estimators.track import HEALTH_NAMES, STALE, USABLE
 from sources.brokers import TopicMap
-from sources.source import Partition
 from tests import ROOT
 from tests.app.cli.test_fleet import FLEET, write
 from tests.app.outputs.broker import Broker, Listener
@@ -120,9 +115,13 @@ def test_an_asset_that_is_silent_becomes_stale_by_the_clock_of_the_others(tmp_pa
     fleet.stop()
 
 
-def test_the_asset_is_a_level_of_the_topic(tmp_path):
+@pytest.mark.parametrize("group", ["", "$share/fleets/"])
+def test_the_asset_is_a_level_of_the_topic(tmp_path, group):
     broker = Broker(tmp_path)
-    topics = {"plant/{asset}/temperature": "winding", "line/{asset}": {"values": {"winding": "v"}, "time": "t"}}
+    topics = {
+        f"{group}plant/{{asset}}/temperature": "winding",
+        "line/{asset}": {"values": {"winding": "v"}, "time": "t"},
+    }
     fleet, said = running(tmp_path, {"type": "mqtt", "host": "127.0.0.1", "port": broker.port, "topics": topics})
     assert fleet.source.connected.wait(60.0)
     listener = Listener(broker)
@@ -161,8 +160,8 @@ def test_a_password_that_is_not_set_is_one_line_with_its_place(tmp_path, monkeyp
         running(tmp_path, {"type": "mqtt", "host": "a", "topics": {"{asset}/t": "winding"}, **more})
     rule = "is NISUS_NO_SECRET, an environment variable that is not set; set it before the start"
     assert str(caught.value) == f"{tmp_path / 'pumps.yaml'}:1: source.password_env {rule}"
-    with pytest.raises(NisusError, match="NISUS_NO_SECRET"):  # before any process is started
-        load_fleet(tmp_path / "pumps.yaml", processes=2).check_files()
+    with pytest.raises(NisusError, match="NISUS_NO_SECRET"):  # before anything is compiled
+        load_fleet(tmp_path / "pumps.yaml").check_files()
 
 
 KILLED = """
@@ -292,8 +291,8 @@ def same(mine, its):
     return mine.assets == its.assets and all(a.astype(b.dtype).tobytes() == b.tobytes() for a, b in pairs)
 
 
-def test_partitions_of_tables_have_the_bits_of_one_process(tmp_path, monkeypatch):
-    """Also late rows, which are dropped at the same folds, and silent assets, by the newest time of all."""
+def test_silent_assets_of_a_table_are_dated_by_their_silence_and_late_rows_dropped(tmp_path, monkeypatch):
+    """By the newest time of all, whenever that was looked at."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(live, "MAX_PENDING", 500)
     monkeypatch.setattr("sources.tables.follow.PIECE_BYTES", 2**13)
@@ -306,20 +305,12 @@ def test_partitions_of_tables_have_the_bits_of_one_process(tmp_path, monkeypatch
     ]
     write(tmp_path / "a.csv", rows)
     (tmp_path / "pumps.yaml").write_text(FLEET.format(files="a.csv"))
-    plan, tables = load_fleet("pumps.yaml"), []
-    for partition in (Partition(), *(Partition(k, 3) for k in range(3))):
-        fleet = RunningFleet(plan, lambda *_: None, threads=1, partition=partition)
-        fleet.run()
-        assert all(zlib.crc32(name.encode()) % partition.processes == partition.number for name in fleet.names)
-        tables.append(fleet.table()[2])
-        fleet.stop()
-    whole, *parts = tables
-    names = [name for part in parts for name in part.assets]
-    merged = type(whole)(names, *map(np.concatenate, zip(*(part[1:] for part in parts), strict=True)))
-    assert len(names) == 30 and whole.stale.sum() == 1 and "stale" in {HEALTH_NAMES[k] for k in whole.health}
-    assert same(in_name_order(merged), in_name_order(whole))
-    # Whenever that was looked at.
-    assert set(whole.since[whole.health == STALE]) == {40.0 + plan.twin.policy.stale_after}
+    fleet = RunningFleet(load_fleet("pumps.yaml"), lambda *_: None, threads=1)
+    fleet.run()
+    _, names, table = fleet.table()
+    assert len(names) == 30 and table.stale.sum() == 1 and "stale" in {HEALTH_NAMES[k] for k in table.health}
+    assert set(table.since[table.health == STALE]) == {40.0 + fleet.plan.twin.policy.stale_after}
+    fleet.stop()
 
 
 def mqtt(port, **more):
@@ -375,16 +366,15 @@ def test_a_broker_keeps_what_was_not_stored(tmp_path, monkeypatch):
     broker = Broker(tmp_path)
     listener = Listener(broker)
     named = ["pump 3", "pump 4", "pump 5"]
-    before, _ = running(tmp_path, mqtt(broker.port), assets=named)
+    before, said = running(tmp_path, mqtt(broker.port), assets=named)
     before.stop()
-    plan, store, part = before.plan, tmp_path / "fleet.store", Partition(0, 2)
-    fleet = RunningFleet(plan, lambda *_: None, threads=1, store=store, partition=part)
-    own = [name for name in named if zlib.crc32(name.encode()) % 2 == 0]
-    assert fleet.names == own and 0 < len(own) < 3 and fleet.source.connected.wait(60.0)
+    plan, store = before.plan, tmp_path / "fleet.store"
+    fleet = RunningFleet(plan, lambda key, text: said.append(text), threads=1, store=store)
+    assert fleet.names == named and fleet.source.connected.wait(60.0)
 
     def publish(first, last):
         for k in range(first, last):
-            for name in named:
+            for name in [*named, "pump 6"]:  # another process has the last one
                 listener.publish(f"plant/{name}", {"v": 40.0 + k, "t": BEGIN + k * SECOND})
 
     def step_until(fleet, count):
@@ -398,15 +388,13 @@ def test_a_broker_keeps_what_was_not_stored(tmp_path, monkeypatch):
     step_until(fleet, 60)
     fleet.stop()  # as with a kill: nothing was stored or acknowledged since
     publish(60, 70)
-    again = RunningFleet(plan, lambda *_: None, threads=1, store=store, partition=part)
-    assert again.table()[2].events.tolist() == [30] * len(own)
+    again = RunningFleet(plan, lambda *_: None, threads=1, store=store)
+    assert again.table()[2].events.tolist() == [30] * 3
     step_until(again, 70)
-    assert again.table()[2].events.tolist() == [70] * len(own)
+    assert again.table()[2].events.tolist() == [70] * 3 and not said
     last = folded([40.0 + k for k in range(70)])
-    assert again.table()[2].mean.tobytes() == np.tile(last.mean, (len(own), 1)).tobytes()
+    assert again.table()[2].mean.tobytes() == np.tile(last.mean, (3, 1)).tobytes()
     again.stop()
-    with pytest.raises(NisusError, match=r"was written with another number of processes; remove it"):
-        RunningFleet(plan, lambda *_: None, threads=1, store=store)
     with pytest.raises(NisusError, match=r"source.qos is 2; set it to 1"):
         path = tmp_path / "pumps.yaml"
         path.write_text(json.dumps({"twin": "motor_winding", "source": mqtt(broker.port, qos=2)}))
@@ -415,42 +403,6 @@ def test_a_broker_keeps_what_was_not_stored(tmp_path, monkeypatch):
     broker.stop()
 
 
-def test_messages_go_to_the_process_of_their_asset_and_the_table_is_that_of_all(tmp_path):
-    whole, _ = running(tmp_path, {"type": "push"}, processes=2)
-    sent = [message(k, f"pump {j}", 40.0 + k + j) for k in range(6) for j in range(9)]
-    messages_of(whole).send(sent)
-    whole.step()
-    fleet = PartitionedFleet(whole.plan, lambda *_: None, lambda *_: None)
-    servers = []
-    for k, part in enumerate(fleet._parts):
-        own = RunningFleet(whole.plan, lambda *_: None, threads=1, partition=Partition(k, 2), store=tmp_path / f"{k}")
-        servers.append(PartitionServer(own))
-        servers[-1].start()
-        part.twin.port, part.twin.token = servers[-1].door.port, servers[-1].door.token
-    numbered = [{**item, "source": "plc", "sequence": k} for k, item in enumerate(sent)]
-    found = asyncio.run(fleet.take([*numbered, {"values": {"winding": 1.0}}]))
-    assert (found["accepted"], found["refused"], found["stored"]) == (54, 1, True)
-    assert [item["index"] for item in found["items"] if item["status"] == "refused"] == [54]
-    assert asyncio.run(fleet.take(numbered))["duplicate"] == 54
-    while fleet.table()[2].events.sum() < 54:
-        pass
-    assert same(in_name_order(fleet.table()[2]), in_name_order(whole.table()[2]))
-    assert fleet.find("pump 3") and not fleet.ended
-    fleet._parts[0].twin.state = RUNNING
-    assert FleetApi(fleet).unready() == "starting: pumps 2 of 2"
-    fleet._parts[1].twin.state = RUNNING
-    assert FleetApi(fleet).unready() == ""
-    servers[1].stop()
-    fleet._parts[1].twin.state, fleet._parts[1].twin.port = STARTING, 0
-    found = asyncio.run(fleet.take([message(9, f"pump {j}", 40.0) for j in range(9)]))
-    here = [zlib.crc32(f"pump {j}".encode()) % 2 == 0 for j in range(9)]
-    assert [item["status"] == "accepted" for item in found["items"]] == here and not found["stored"]
-    assert "is starting; send it again" in found["items"][here.index(False)]["reason"]
-    servers[0].stop()
-    fleet.stop()
-    whole.stop()
-
-
 def test_killed_processes_leave_the_table_of_one_that_was_not(tmp_path):
     program("mosquitto")
-    survive_fleet(2, tmp_path, FleetRun(assets=8, rounds=60, seconds=2.0, parents=2))
+    survive_fleet(2, tmp_path, FleetRun(assets=8, rounds=60, seconds=2.0))

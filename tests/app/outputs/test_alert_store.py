@@ -365,13 +365,12 @@ def test_a_killed_process_is_followed_by_one_that_resolves_its_alert(tmp_path):
     assert told[0]["id"] == told[1]["id"] and told[0]["since"] == told[1]["since"]
 
 
-def test_a_fleet_whose_assets_are_folded_elsewhere_resolves_after_a_restart(tmp_path, monkeypatch):
-    """As the process of a fleet in several, which has the table alone, and the file of alerts."""
+def test_a_fleet_resolves_after_a_restart_with_its_assets_in_another_order(tmp_path, monkeypatch):
     monkeypatch.setattr("app.outputs.fleet_alerts.SETTLE_S", 0.0)
     program = "import sys; open(sys.argv[1], 'a').write(sys.stdin.read() + '\\n')"
     command = [sys.executable, "-c", program, str(tmp_path / "alerts")]
     outputs = {"every": 0.02, "receivers": {"log": {"type": "command", "command": command}}}
-    given = {"twin": "motor_winding", "source": {"type": "push"}, "outputs": outputs, "processes": 2}
+    given = {"twin": "motor_winding", "source": {"type": "push"}, "outputs": outputs}
     given["alerts"] = [{"health": "degraded", "after": 0, "clear": 0, "group": 0}]
     (tmp_path / "pumps.yaml").write_text(json.dumps(given))
     plan = load_fleet(tmp_path / "pumps.yaml")

@@ -25,7 +25,7 @@ def test_a_journal_of_a_killed_process_is_completed_up_to_its_last_whole_batch(t
     (part,) = parts_of(again.folder)
     journal.write_bytes(content)  # killed after the file was complete, and before its journal was removed
     again.archive._journal.close()
-    assert AssetHistory([again.folder], "pump 3").read(100)["value_0"].to_pylist() == [3.0, 8.0, 13.0, 18.0, 33.0, 38.0]
+    assert AssetHistory(again.folder, "pump 3").read(100)["value_0"].to_pylist() == [3.0, 8.0, 13.0, 18.0, 33.0, 38.0]
     archive_journal.complete_journals(again.folder)
     assert len(parts_of(again.folder)) == 2 and part.exists() and len(again.values()) == 30
 

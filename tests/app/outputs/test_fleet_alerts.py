@@ -198,7 +198,6 @@ def test_a_fleet_that_stands_still_does_not_tell_that_it_runs(tmp_path):
         ({"receivers": {"ops": {"type": "mqtt"}}}, [], "is of type mqtt; give the broker under outputs.mqtt"),
         ({"receivers": {"ops": {"type": "command", "command": ["x"]}}}, [{"health": "stale", "to": ["op"]}],
          "names 'op', no receiver under outputs.receivers; did you mean ops"),
-        ({"mqtt": {"host": "x", "sparkplug": "plant"}}, [], "sparkplug, which is for single twins; leave it out"),
         ({}, [{"nis": 3}], "alerts[0].nis is not known"),
     ],
 )  # fmt: skip

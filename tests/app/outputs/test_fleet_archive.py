@@ -7,7 +7,6 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from app.cli.fleet import folders_of
 from app.live import fleet as live
 from app.live.fleet import RunningFleet
 from app.outputs import fleet_archive as archives
@@ -19,20 +18,19 @@ from app.views.recording.rrd_file import Split, parse_split
 from app.web.readings import messages_of
 from estimators.fold import Fold
 from estimators.log import Log
-from sources.source import WHOLE, Partition
 from tests.app.outputs.written_archive import BEGIN, SECOND, SPLIT, Written
 
 DAY_S = 86_400
 MODEL = load_twin("motor_can").model
 
 
-def started(folder, *, store=None, partition=WHOLE, split=SPLIT):
+def started(folder, *, store=None, split=SPLIT):
     """A fleet of pushed messages whose archive is written by the test."""
     folder.mkdir(exist_ok=True)
     path = folder / "drives.yaml"
     path.write_text(json.dumps({"twin": "motor_can", "source": {"type": "push"}}))
     plan = ArchivePlan(folder / "archive" / "drives", split)
-    fleet = RunningFleet(load_fleet(path), lambda *_: None, threads=1, store=store, partition=partition)
+    fleet = RunningFleet(load_fleet(path), lambda *_: None, threads=1, store=store)
     fleet.archive = FleetArchive(plan, fleet.twin.model, fleet.names, fleet.note, fleet.archived)
     return fleet, messages_of(fleet)
 
@@ -55,10 +53,10 @@ def messages(seed=1, assets=7, count=60):
     return found
 
 
-def folded(fleet, asset, folders, tmp_path):
+def folded(fleet, asset, archive, tmp_path):
     """The last row of the fold over the archived rows of an asset, read as its page does."""
     (folder := tmp_path / asset).mkdir()
-    rows = AssetHistory(folders, asset).read(10**6)
+    rows = AssetHistory(archive, asset).read(10**6)
     pq.write_table(rows, folder / "0.parquet")
     twin = load_twin("motor_can", overrides=fleet.plan.archived(asset, folder))
     source, log = twin.open_source(lambda *_: None), Log.of(twin.model)
@@ -80,32 +78,14 @@ def test_the_fold_of_archived_rows_has_the_bits_of_the_fleet(closing, tmp_path):
         fleet.archive.look()
     _, names, table = fleet.table()
     fleet.archive.look(closing=closing)
-    folders = [tmp_path / "archive" / "drives"]
-    assert bool(parts_of(folders[0])) == closing and table.stale.sum() == 0
+    archive = tmp_path / "archive" / "drives"
+    assert bool(parts_of(archive)) == closing and table.stale.sum() == 0
     for k, asset in enumerate(names):
-        last = folded(fleet, asset, folders, tmp_path)
+        last = folded(fleet, asset, archive, tmp_path)
         assert last.mean.tobytes() == table.mean[k].tobytes() and last.std.tobytes() == table.std[k].tobytes()
         assert (last.health, last.verdict) == (table.health[k], table.verdict[k])
         assert last.nis_mean.tobytes() == table.nis_mean[k].tobytes()
     fleet.stop()
-
-
-def test_each_process_has_a_folder_of_its_own_and_all_are_read(tmp_path):
-    sent, plan = messages(count=3), ArchivePlan(tmp_path / "archive" / "drives", SPLIT)
-    folders = folders_of(plan, 2)
-    for number, folder in enumerate(folders):
-        fleet, source = started(tmp_path, partition=Partition(number, 2))
-        fleet.archive._folder = folder
-        source.send(sent)
-        fleet.step()
-        fleet.archive.look(closing=True)
-        fleet.stop()
-    assert [folder.name for folder in folders] == ["drives", "drives.1"]
-    assert folders_of(plan, 1) == folders  # of an earlier run with two
-    counts = [AssetHistory(folders, f"drive {a}").read(10**6).num_rows for a in range(7)]
-    tables = [pq.read_table(parts_of(folder)[0]) for folder in folders]
-    assert sum(counts) == sum(table.num_rows for table in tables) and min(counts) > 0
-    assert not set(tables[0]["asset"].to_pylist()) & set(tables[1]["asset"].to_pylist())
 
 
 @pytest.mark.parametrize("killed", ["before the transaction", "after", "and completed", "and a journal of none"])
@@ -154,7 +134,7 @@ def test_rows_of_a_store_are_archived_once_whenever_it_is_killed(killed, tmp_pat
     whole, source = started(tmp_path / "whole")
     steps(whole, source, parts)
     assert found.num_rows == whole.table()[2].events.sum()
-    assert sum(AssetHistory([folder], f"drive {a}").read(10**6).num_rows for a in range(7)) == found.num_rows
+    assert sum(AssetHistory(folder, f"drive {a}").read(10**6).num_rows for a in range(7)) == found.num_rows
     for each in (last, whole):
         each.stop()
 
@@ -203,17 +183,17 @@ def test_the_rows_of_an_asset_are_in_one_or_two_groups_of_a_file_and_old_files_a
     read = []
     groups = pq.ParquetFile.read_row_groups
     monkeypatch.setattr(pq.ParquetFile, "read_row_groups", lambda file, k: read.append(len(k)) or groups(file, k))
-    found = AssetHistory([written.folder], "pump 2").read(10**6)["value_0"].to_pylist()
+    found = AssetHistory(written.folder, "pump 2").read(10**6)["value_0"].to_pylist()
     assert found == [*map(float, range(2, 3000, 5))]
     assert len(read) == len(parts) and sum(read) < sum(pq.ParquetFile(path).num_row_groups for path in parts) / 2
-    last = AssetHistory([written.folder], "pump 2").read(1)["value_0"].to_pylist()
+    last = AssetHistory(written.folder, "pump 2").read(1)["value_0"].to_pylist()
     assert last == found[-len(last) :] and len(last) < len(found)
-    assert AssetHistory([written.folder], "pump 9").read(10**6) is None
+    assert AssetHistory(written.folder, "pump 9").read(10**6) is None
 
 
 def test_each_row_of_an_asset_is_read_once_while_files_are_completed(tmp_path):
     rng, written = np.random.default_rng(5), Written(tmp_path, Split())
-    history, found, files = AssetHistory([written.folder], "pump 2"), [], set()
+    history, found, files = AssetHistory(written.folder, "pump 2"), [], set()
     for k in range(0, 600, 10):
         written.put(k)
         if rng.random() < 0.2:
