@@ -13,4 +13,3 @@ autosummary_generate = True
 autodoc_typehints = "none"
 autodoc_default_options = {"members": True}
 napoleon_google_docstring = True
-nitpicky = False

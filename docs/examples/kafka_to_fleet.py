@@ -15,8 +15,7 @@ import urllib.request
 from quixstreams import Application
 from quixstreams.sinks import BatchingSink, SinkBatch
 
-FLEETS = sys.argv[1:] or ["http://127.0.0.1:9900"]
-RETRY_S = 1.0
+FLEETS = sys.argv[1:]
 
 
 class FleetSink(BatchingSink):
@@ -28,14 +27,14 @@ class FleetSink(BatchingSink):
         messages = [
             {**item.value, "asset": item.key.decode(), "source": source, "sequence": item.offset} for item in batch
         ]
-        fleet = FLEETS[batch.partition % len(FLEETS)]
-        while not self.is_stored(fleet, messages):
-            time.sleep(RETRY_S)
+        url = f"{FLEETS[batch.partition % len(FLEETS)]}/api/readings"
+        while not self.is_stored(url, messages):
+            time.sleep(1.0)
 
-    def is_stored(self, fleet: str, messages: list) -> bool:
+    def is_stored(self, url: str, messages: list) -> bool:
         """Send messages; return whether the fleet has stored them."""
         headers = {"Authorization": f"Bearer {os.environ['NISUS_TOKEN']}", "Content-Type": "application/json"}
-        request = urllib.request.Request(f"{fleet}/api/readings", json.dumps(messages).encode(), headers, method="POST")
+        request = urllib.request.Request(url, json.dumps(messages).encode(), headers)
         try:
             with urllib.request.urlopen(request) as answer:
                 return json.load(answer)["stored"]
@@ -43,7 +42,6 @@ class FleetSink(BatchingSink):
             return False
 
 
-if __name__ == "__main__":
-    app = Application("localhost:9092", consumer_group="nisus", commit_interval=1.0)
-    app.dataframe(app.topic("measurements", value_deserializer="json")).sink(FleetSink())
-    app.run()
+app = Application("localhost:9092", consumer_group="nisus", commit_interval=1.0)
+app.dataframe(app.topic("measurements", value_deserializer="json")).sink(FleetSink())
+app.run()
