@@ -1,7 +1,6 @@
 """Sphinx configuration of the guides: Markdown by MyST, the Python API from its docstrings."""
 
 project = "Nisus"
-author = "the Nisus developers"
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.autosummary", "sphinx.ext.napoleon"]
 exclude_patterns = ["examples"]
 html_theme = "furo"

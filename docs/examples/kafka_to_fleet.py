@@ -31,7 +31,7 @@ class FleetSink(BatchingSink):
         while not self.is_stored(url, messages):
             time.sleep(1.0)
 
-    def is_stored(self, url: str, messages: list) -> bool:
+    def is_stored(self, url: str, messages: list):
         """Send messages; return whether the fleet has stored them."""
         headers = {"Authorization": f"Bearer {os.environ['NISUS_TOKEN']}", "Content-Type": "application/json"}
         request = urllib.request.Request(url, json.dumps(messages).encode(), headers)
