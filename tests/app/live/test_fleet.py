@@ -37,6 +37,7 @@ from tests.app.cli.test_fleet import FLEET, write
 from tests.app.outputs.broker import Broker, Listener
 from tests.benchmarks.kills import FleetRun, survive_fleet
 from tests.skips import program
+from tests.waiting import LIMIT_S, wait_for
 
 BEGIN, SECOND = 1_767_225_600 * 10**9, 10**9
 
@@ -124,13 +125,12 @@ def test_the_asset_is_a_level_of_the_topic(tmp_path):
     broker = Broker(tmp_path)
     topics = {"plant/{asset}/temperature": "winding", "line/{asset}": {"values": {"winding": "v"}, "time": "t"}}
     fleet, said = running(tmp_path, {"type": "mqtt", "host": "127.0.0.1", "port": broker.port, "topics": topics})
-    assert fleet.source.connected.wait(60.0)
+    assert fleet.source.connected.wait(LIMIT_S)
     listener = Listener(broker)
     listener.publish("plant/pump 3/temperature", "41.5")
     listener.publish("line/pump 4", {"v": 42.5, "t": time.time_ns()})
     listener.publish("plant//temperature", "41.5")
-    while not said or len(fleet.table()[1]) < 2:
-        fleet.step()
+    wait_for(lambda: fleet.step() and said and len(fleet.table()[1]) == 2)
     _, names, table = fleet.table()
     assert names == ["pump 3", "pump 4"] and table.events.tolist() == [1, 1]
     assert said[0].startswith("plant//temperature: asset is ''; it must be a text")
@@ -209,7 +209,7 @@ def test_a_fleet_that_was_killed_continues_to_the_same_bits(ending, tmp_path, mo
     whole.run()
     killed = subprocess.run(
         [sys.executable, "-c", KILLED],
-        cwd=tmp_path, env=os.environ | {"PYTHONPATH": str(ROOT)}, text=True, capture_output=True, timeout=120,
+        cwd=tmp_path, env=os.environ | {"PYTHONPATH": str(ROOT)}, text=True, capture_output=True, timeout=LIMIT_S,
     )  # fmt: skip
     assert killed.returncode == -signal.SIGKILL, killed.stderr
     events = int(killed.stdout.split()[-1])
@@ -380,7 +380,7 @@ def test_a_broker_keeps_what_was_not_stored(tmp_path, monkeypatch):
     plan, store, part = before.plan, tmp_path / "fleet.store", Partition(0, 2)
     fleet = RunningFleet(plan, lambda *_: None, threads=1, store=store, partition=part)
     own = [name for name in named if zlib.crc32(name.encode()) % 2 == 0]
-    assert fleet.names == own and 0 < len(own) < 3 and fleet.source.connected.wait(60.0)
+    assert fleet.names == own and 0 < len(own) < 3 and fleet.source.connected.wait(LIMIT_S)
 
     def publish(first, last):
         for k in range(first, last):
@@ -388,8 +388,7 @@ def test_a_broker_keeps_what_was_not_stored(tmp_path, monkeypatch):
                 listener.publish(f"plant/{name}", {"v": 40.0 + k, "t": BEGIN + k * SECOND})
 
     def step_until(fleet, count):
-        while fleet.table()[2].events.min(initial=10**9) < count:
-            fleet.step()
+        wait_for(lambda: fleet.step() and fleet.table()[2].events.min(initial=10**9) >= count)
 
     publish(0, 30)
     step_until(fleet, 30)
@@ -432,8 +431,7 @@ def test_messages_go_to_the_process_of_their_asset_and_the_table_is_that_of_all(
     assert (found["accepted"], found["refused"], found["stored"]) == (54, 1, True)
     assert [item["index"] for item in found["items"] if item["status"] == "refused"] == [54]
     assert asyncio.run(fleet.take(numbered))["duplicate"] == 54
-    while fleet.table()[2].events.sum() < 54:
-        pass
+    wait_for(lambda: fleet.table()[2].events.sum() == 54)
     assert same(in_name_order(fleet.table()[2]), in_name_order(whole.table()[2]))
     assert fleet.find("pump 3") and not fleet.ended
     fleet._parts[0].twin.state = RUNNING
