@@ -33,12 +33,14 @@ def within(budget: float, names: list[str], took: dict[str, float]) -> set[str]:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    budget, cache = config.getoption("--quickest"), getattr(config, "cache", None)
-    if budget is None or cache is None:
-        return
-    chosen = within(budget, [item.nodeid for item in items], cache.get(DURATIONS, {}))
-    config.hook.pytest_deselected(items=[item for item in items if item.nodeid not in chosen])
-    items[:] = [item for item in items if item.nodeid in chosen]
+    kept, budget, cache = list(items), config.getoption("--quickest"), getattr(config, "cache", None)
+    if "release" not in config.getoption("-m"):
+        kept = [item for item in kept if item.get_closest_marker("release") is None]
+    if budget is not None and cache is not None:
+        chosen = within(budget, [item.nodeid for item in kept], cache.get(DURATIONS, {}))
+        kept = [item for item in kept if item.nodeid in chosen]
+    config.hook.pytest_deselected(items=list(set(items) - set(kept)))
+    items[:] = kept
 
 
 class Durations:

@@ -1,8 +1,10 @@
-"""The guides: Python blocks and console commands run as printed, other commands exist, links lead somewhere."""
+"""The guides: Python blocks run as printed, commands exist, links lead somewhere; console commands run for releases."""
 
+import itertools
 import os
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -10,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from app.cli.main import main, parse
+from config.loader import find
 from tests import ROOT
 
 GUIDES = sorted([ROOT / "README.md", *(ROOT / "docs").glob("*.md")])
@@ -36,15 +39,53 @@ def test_python_blocks_run(path, tmp_path, monkeypatch):
         exec(compile(block, str(file), "exec"), names)
 
 
-@pytest.mark.parametrize("path", [path for path in GUIDES if blocks(path, "console")], ids=name)
-def test_console_commands_succeed(path, tmp_path, monkeypatch, capsys):
-    """`nisus` runs in this process, which has it loaded, except `nisus run`, which ends with its process."""
+WRITES = (">", "--out", "--html", "--record", "--archive")
+"""What stands before the file that a command writes."""
+
+
+def commands(path: Path) -> list[str]:
+    """Return the console commands of a page."""
+    lines = "".join(blocks(path, "console")).splitlines()
+    return [line.removeprefix("$ ") for line in lines if line.startswith("$ ")]
+
+
+in_each_page = pytest.mark.parametrize("path", [path for path in GUIDES if commands(path)], ids=name)
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """Where a reader enters the commands."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "config").symlink_to(ROOT / "config")
-    lines = "".join(blocks(path, "console")).splitlines()
-    commands = [line.removeprefix("$ ") for line in lines if line.startswith("$ ")]
-    assert commands
-    for command in commands:
+    return tmp_path
+
+
+@in_each_page
+def test_console_commands_and_what_they_read_exist(path, folder):
+    """They are parsed; a file that they name is here, or an earlier command of the page wrote it."""
+    for command in commands(path):
+        words = shlex.split(command)
+        assert shutil.which(words[0], path=PATH_OF_NISUS)
+        writes = {word for before, word in itertools.pairwise(words) if before in WRITES}
+        reads = {word for word in words if re.fullmatch(r"[\w/]+\.[a-z]\w*", word)} - writes
+        if words[0] == "nisus":
+            asked = parse(words[1:])
+            if words[1] == "new":
+                writes.add(f"{asked.name}.yaml")
+            elif words[1] == "query":
+                reads.add(str(asked.folder))
+            elif getattr(asked, "twin", None):
+                reads.add(str(find(asked.twin)))
+        assert [word for word in reads if not (folder / word).exists()] == [], command
+        for word in writes:
+            (folder / word).touch()
+
+
+@pytest.mark.release
+@in_each_page
+def test_console_commands_succeed(path, folder, capsys):
+    """`nisus` runs in this process, which has it loaded, except `nisus run`, which ends with its process."""
+    for command in commands(path):
         words = shlex.split(command)
         if words[0] == "nisus" and words[1] != "run":
             status, said = main(words[1:]), capsys.readouterr().err

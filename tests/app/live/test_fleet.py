@@ -32,6 +32,7 @@ from tests.app.cli.test_fleet import FLEET, write
 from tests.app.outputs.broker import Broker, Listener
 from tests.benchmarks.kills import FleetRun, survive_fleet
 from tests.skips import program
+from tests.waiting import LIMIT_S, wait_for
 
 BEGIN, SECOND = 1_767_225_600 * 10**9, 10**9
 
@@ -123,13 +124,12 @@ def test_the_asset_is_a_level_of_the_topic(tmp_path, group):
         "line/{asset}": {"values": {"winding": "v"}, "time": "t"},
     }
     fleet, said = running(tmp_path, {"type": "mqtt", "host": "127.0.0.1", "port": broker.port, "topics": topics})
-    assert fleet.source.connected.wait(60.0)
+    assert fleet.source.connected.wait(LIMIT_S)
     listener = Listener(broker)
     listener.publish("plant/pump 3/temperature", "41.5")
     listener.publish("line/pump 4", {"v": 42.5, "t": time.time_ns()})
     listener.publish("plant//temperature", "41.5")
-    while not said or len(fleet.table()[1]) < 2:
-        fleet.step()
+    wait_for(lambda: fleet.step() and said and len(fleet.table()[1]) == 2)
     _, names, table = fleet.table()
     assert names == ["pump 3", "pump 4"] and table.events.tolist() == [1, 1]
     assert said[0].startswith("plant//temperature: asset is ''; it must be a text")
@@ -208,7 +208,7 @@ def test_a_fleet_that_was_killed_continues_to_the_same_bits(ending, tmp_path, mo
     whole.run()
     killed = subprocess.run(
         [sys.executable, "-c", KILLED],
-        cwd=tmp_path, env=os.environ | {"PYTHONPATH": str(ROOT)}, text=True, capture_output=True, timeout=120,
+        cwd=tmp_path, env=os.environ | {"PYTHONPATH": str(ROOT)}, text=True, capture_output=True, timeout=LIMIT_S,
     )  # fmt: skip
     assert killed.returncode == -signal.SIGKILL, killed.stderr
     events = int(killed.stdout.split()[-1])
@@ -370,7 +370,7 @@ def test_a_broker_keeps_what_was_not_stored(tmp_path, monkeypatch):
     before.stop()
     plan, store = before.plan, tmp_path / "fleet.store"
     fleet = RunningFleet(plan, lambda key, text: said.append(text), threads=1, store=store)
-    assert fleet.names == named and fleet.source.connected.wait(60.0)
+    assert fleet.names == named and fleet.source.connected.wait(LIMIT_S)
 
     def publish(first, last):
         for k in range(first, last):
@@ -378,8 +378,7 @@ def test_a_broker_keeps_what_was_not_stored(tmp_path, monkeypatch):
                 listener.publish(f"plant/{name}", {"v": 40.0 + k, "t": BEGIN + k * SECOND})
 
     def step_until(fleet, count):
-        while fleet.table()[2].events.min(initial=10**9) < count:
-            fleet.step()
+        wait_for(lambda: fleet.step() and fleet.table()[2].events.min(initial=10**9) >= count)
 
     publish(0, 30)
     step_until(fleet, 30)

@@ -65,9 +65,9 @@ def f_of_one(x, u, p, dt, out):
 ONE = replace(RAIL, name="rail_of_one", f=f_of_one)
 
 
-@pytest.fixture(params=[RAIL, ONE], ids=["all states", "one state"], autouse=True)
-def rail(request, monkeypatch):
-    monkeypatch.setitem(globals(), "RAIL", request.param)
+@pytest.fixture(params=[RAIL, ONE], ids=["all states", "one state"])
+def rail(request):
+    return request.param
 
 
 def fixes(first, last):
@@ -79,10 +79,10 @@ def reset(at=RESET_AT):
     return events(RAIL, RESET, 0, [at], [np.nan])
 
 
-def by_hand(estimator, *batches):
+def by_hand(model, estimator, *batches):
     """An engine without threads that has these measurements."""
     made = twin()
-    made.model, made.tuning, made.estimator = RAIL, Tuning.of(RAIL).with_options({}), estimator
+    made.model, made.tuning, made.estimator = model, Tuning.of(model).with_options({}), estimator
     made.config.view = SimpleNamespace(window=60.0)
     stepped = Stepped(of=made)
     stepped.put(*batches)
@@ -99,9 +99,9 @@ def lost_rows(track):
 
 
 @pytest.fixture(params=["belief", "vehicle"])
-def view(request):
+def view(request, rail):
     scene = SceneSection(kind="vehicle", position=("east", "north")) if request.param == "vehicle" else SceneSection()
-    engine = viewed(RAIL, "pf", ViewSection(window=60.0, scene=scene))
+    engine = viewed(rail, "pf", ViewSection(window=60.0, scene=scene))
     engine.put(fixes(1, RESET_AT - 1))
     view = ViserView(engine, secret="x")
     view.frame()
@@ -130,8 +130,8 @@ def test_the_scene_drops_the_filter_before_and_shows_what_is_there_again(view):
     assert shown(view.stage.scene) == (True, True, False)
 
 
-def test_the_other_charts_end_their_lines_and_pictures_and_begin_them_anew(tmp_path):
-    engine = by_hand("ekf", fixes(1, RESET_AT - 1), reset(), fixes(RESET_AT + 1, END))
+def test_the_other_charts_end_their_lines_and_pictures_and_begin_them_anew(rail, tmp_path):
+    engine = by_hand(rail, "ekf", fixes(1, RESET_AT - 1), reset(), fixes(RESET_AT + 1, END))
     feed = RerunFeed(engine)
     data = [message for message in feed.next() if isinstance(message, bytes)]
     feed.close()
@@ -145,7 +145,7 @@ def test_the_other_charts_end_their_lines_and_pictures_and_begin_them_anew(tmp_p
             into.setdefault(chunk.entity_path, set()).update((t // SECOND).tolist())
     track, t = engine._fold.track, engine._log.events.t // SECOND
     first = int(t[lost_rows(track)[0]])
-    pair = f"/pair/{pair_name(RAIL, engine.pairs[0])}/up"
+    pair = f"/pair/{pair_name(rail, engine.pairs[0])}/up"
     paths = ["/state/east", "/state/height", *(f"{pair}/{name}" for name in ("ellipse", "mean", "way", "numbers"))]
     for path in paths:
         assert cleared[path] == {first}
@@ -156,8 +156,8 @@ def test_the_other_charts_end_their_lines_and_pictures_and_begin_them_anew(tmp_p
     assert "/truth/east" not in cleared and "/reading/gnss.east" not in cleared
 
 
-def test_it_is_said_since_when_and_what_mends_it():
-    engine = by_hand("ekf", fixes(1, 3))
+def test_it_is_said_since_when_and_what_mends_it(rail):
+    engine = by_hand(rail, "ekf", fixes(1, 3))
     assert fresh_status(engine).lost is None and status_json(engine)["lost"] is None
     engine._accept([fixes(4, RESET_AT - 1)])
     first = int(engine._log.t[lost_rows(engine._fold.track)[0]])
@@ -178,8 +178,8 @@ def test_it_is_said_since_when_and_what_mends_it():
     assert fresh_status(engine).lost == 21.5 * SECOND
 
 
-def test_it_is_said_of_the_filter_that_is_shown():
-    engine = by_hand("pf", fixes(1, RESET_AT - 1))
+def test_it_is_said_of_the_filter_that_is_shown(rail):
+    engine = by_hand(rail, "pf", fixes(1, RESET_AT - 1))
     assert fresh_status(engine).lost is None
     swap(engine, "ekf")
     assert fresh_status(engine).lost == int(engine._log.t[lost_rows(engine._fold.track)[0]])
@@ -187,8 +187,8 @@ def test_it_is_said_of_the_filter_that_is_shown():
     assert fresh_status(engine).lost is None
 
 
-def test_counts_are_those_of_the_revision_that_is_shown():
-    engine = by_hand("pf", fixes(1, RESET_AT - 1))
+def test_counts_are_those_of_the_revision_that_is_shown(rail):
+    engine = by_hand(rail, "pf", fixes(1, RESET_AT - 1))
     assert fresh_status(engine).counts["recovered"] == engine._fold.recoveries() > 0
     swap(engine, "ekf")
     counts = fresh_status(engine).counts
