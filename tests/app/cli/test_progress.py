@@ -39,7 +39,7 @@ def test_lines_come_while_nothing_is_done_and_count_what_is(monkeypatch):
     assert not any(thread.name == "progress" for thread in threading.enumerate())
 
 
-def test_the_first_interrupt_ends_attended_work_with_its_best_result(monkeypatch):
+def test_the_first_interrupt_ends_attended_work_with_its_best_result(monkeypatch, interruptible):
     heard, stopped = Heard(), threading.Event()
     monkeypatch.setattr(sys, "stderr", heard)
     monkeypatch.setattr(app.cli.prepare, "LINE_PERIOD_S", 1e-3)
@@ -51,11 +51,7 @@ def test_the_first_interrupt_ends_attended_work_with_its_best_result(monkeypatch
         signal.pthread_kill(threading.main_thread().ident, signal.SIGINT)
         return "best so far" if stopped.wait(60.0) else "not interrupted"
 
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # servers of other tests set their own
-    try:
-        assert attend(MODEL, work, "fitting", text=lambda: "half done", stop=stopped.set) == "best so far"
-    finally:
-        signal.signal(signal.SIGINT, before)
+    assert attend(MODEL, work, "fitting", text=lambda: "half done", stop=stopped.set) == "best so far"
     assert "fitting: 0 s, half done\n" in heard.getvalue() and "interrupted; " in heard.getvalue()
 
 

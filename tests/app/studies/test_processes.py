@@ -6,6 +6,7 @@ import signal
 import sys
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
@@ -17,8 +18,8 @@ from app.studies.processes import jobs_of, results
 from app.studies.stress.trials import Trials, all_trials
 from app.twin.twin import load_twin
 from estimators.errors import ConfigError
-from tests.app.scripted import wait_for
 from tests.app.studies.conftest import started
+from tests.waiting import wait_for
 
 _begun: list[int] = []
 
@@ -34,6 +35,15 @@ def double(number: int) -> tuple[int, int, list[int]]:
 
 def sleep(marker: str) -> None:
     open(marker, "w").close()
+    time.sleep(600)
+
+
+def interrupt(marker: str) -> None:
+    """Send Ctrl-C to the parent in the first call, which leaves its process id; take ten minutes in each."""
+    with suppress(FileExistsError):
+        with open(marker, "x") as file:
+            file.write(str(os.getpid()))
+        os.kill(os.getppid(), signal.SIGINT)
     time.sleep(600)
 
 
@@ -56,19 +66,17 @@ def test_every_call_is_answered_once(jobs: int) -> None:
     assert numba.get_num_threads() == before
 
 
-def test_what_is_given_up_ends(tmp_path) -> None:
+def test_what_is_given_up_ends(tmp_path, interruptible) -> None:
     """Without a wait for work that has begun: the ten minutes would be over before the test."""
-    running = results(sleep, [(str(tmp_path / str(k)),) for k in range(3)], jobs=2)
+    marker = tmp_path / "begun"
+    running = results(interrupt, [(str(marker),)] * 3, jobs=2)
     with pytest.raises(KeyboardInterrupt):
-        main = os.getpid()
-        signal.signal(signal.SIGALRM, lambda *_: os.kill(main, signal.SIGINT) if any(tmp_path.iterdir()) else None)
-        signal.setitimer(signal.ITIMER_REAL, 0.05, 0.05)
         try:
             next(running)
         finally:
-            signal.setitimer(signal.ITIMER_REAL, 0.0)
-            children = multiprocessing.active_children()
-    wait_for(lambda: all(_gone(child.pid) for child in children), 120.0)
+            pids = {child.pid for child in multiprocessing.active_children()}
+    pids.add(int(marker.read_text()))
+    wait_for(lambda: all(map(_gone, pids)))
 
 
 def _gone(pid: int) -> bool:
