@@ -2,35 +2,37 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
+VERSIONS := tests/constraints.txt
 
-# A file's tests stay on one worker, which keeps what they share (servers, recordings, folded logs).
-PYTEST := $(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile
+# Workers get stretches of tests that follow each other, and share what a file's tests share (servers, folded logs).
+PYTEST := $(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist worksteal
 
 # Tests of what is written in vector instructions, which LLVM splits where a processor's vectors are shorter.
 VECTORS := simd simd_rows linalg inverse_root symmetric
 
-.PHONY: run test types warm fast generic versions lowest newest bench shots docs size clean
+.PHONY: run test lint fast release generic versions lowest newest bench shots docs size upgrade clean
 
 run: $(VENV)/.installed
 	$(BIN)/nisus run motor_can
 
+# Compiles first what tests share: two workers that need the same filter at once would both compile it.
 test: $(VENV)/.installed-dev
-	$(BIN)/ruff check .
-	$(BIN)/ruff format --check .
-	$(MAKE) --jobs types docs warm
-	$(BIN)/nisus guard --junit guard.xml
+	$(BIN)/python -m tests.warm
 	$(PYTEST)
 
-types: $(VENV)/.installed-dev
+lint: $(VENV)/.installed-dev
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-
-# Compiles what tests share; types and guides are checked beside it, each on one processor.
-warm: $(VENV)/.installed-dev
-	$(BIN)/python -m tests.warm
 
 # The quickest tests, so many that they take 100 s of a processor by the runs before; all, if there was none.
 fast: $(VENV)/.installed-dev
 	$(PYTEST) -m "not browser" --quickest 100 -x -q
+
+# What takes long and seldom fails, before a release: guides as a site and their commands, figures of all recordings,
+# other processors, and other versions of Python and of all packages.
+release: lint test docs generic versions
+	$(BIN)/nisus guard --junit guard.xml
 
 # On a processor without AVX or FMA; Numba's cache keeps its machine code apart.
 generic: $(VENV)/.installed-dev
@@ -42,8 +44,9 @@ versions: lowest newest
 lowest newest: $(VENV)/.installed-dev
 	$(BIN)/python -m tests.versions $@
 
-bench: $(VENV)/.installed-dev
-	$(BIN)/python -m tests.benchmarks
+# In an environment of its own: a peer installs a package `tests`.
+bench: $(VENV)-bench/.installed
+	$(VENV)-bench/bin/python -m tests.benchmarks
 
 # The README's pictures, from the running page.
 shots: $(VENV)/.installed-dev
@@ -57,18 +60,28 @@ docs: $(VENV)/.installed-dev
 size: $(VENV)/.installed-dev
 	$(BIN)/python -m tests.size
 
-$(VENV)/bin/python:
-	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Nisus needs Python 3.11 or later; try: make PYTHON=python3.11")'
-	$(PYTHON) -m venv $(VENV)
+# The newest versions of all packages from now on; run `make release` then.
+upgrade: $(VENV)/.installed-dev
+	$(BIN)/python -m uv pip compile --quiet --upgrade --universal --python-version 3.11 --all-extras \
+	    --no-annotate --custom-compile-command 'make upgrade' --output-file $(VERSIONS) pyproject.toml
 
-$(VENV)/.installed: pyproject.toml | $(VENV)/bin/python
-	$(BIN)/python -m pip install --quiet --upgrade pip
-	$(BIN)/python -m pip install --quiet -e .
+%/bin/python:
+	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Nisus needs Python 3.11 or later; try: make PYTHON=python3.11")'
+	$(PYTHON) -m venv $*
+
+INSTALL = -m pip install --quiet --disable-pip-version-check --constraint $(VERSIONS) --editable
+
+$(VENV)/.installed: pyproject.toml $(VERSIONS) | $(VENV)/bin/python
+	$(BIN)/python $(INSTALL) .
 	touch $@
 
 $(VENV)/.installed-dev: $(VENV)/.installed
-	$(BIN)/python -m pip install --quiet -e '.[dev]'
+	$(BIN)/python $(INSTALL) '.[dev]'
+	touch $@
+
+$(VENV)-bench/.installed: pyproject.toml $(VERSIONS) | $(VENV)-bench/bin/python
+	$(VENV)-bench/bin/python $(INSTALL) '.[dev,bench]'
 	touch $@
 
 clean:
-	rm -rf $(VENV) *.egg-info build dist
+	rm -rf $(VENV) $(VENV)-bench *.egg-info build dist

@@ -193,17 +193,6 @@ def viewed(model, estimator="kf", view=None):
     return engine
 
 
-def wait_for(condition, seconds=120.0):
-    """Poll until a condition holds; what another thread does has no event to wait on."""
-    import time
-
-    end = time.monotonic() + seconds
-    while not condition():
-        if time.monotonic() > end:
-            raise AssertionError("waited in vain")
-        time.sleep(0.002)
-
-
 def pull_all(engine):
     """All rows of a running twin, as a consumer that has just come gets them."""
     cursor = engine.cursor()

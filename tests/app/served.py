@@ -17,11 +17,11 @@ from app.live.engine import Engine
 from app.views.viser.guarded_server import HEADER
 from app.views.viser.stage import Choice, Choices
 from app.web.server import PageServer
-from tests.app.scripted import Scripted, wait_for
+from tests.app.scripted import Scripted
 from tests.app.scripted import twin as scripted_twin
+from tests.waiting import LIMIT_S, wait_for
 
 SECRET = "the secret between the servers"
-PATIENCE = 60.0
 
 
 class FakeViser:
@@ -104,7 +104,7 @@ class Client:
             lines += ["Connection: close"]
         if body:
             lines += [f"Content-Length: {len(body)}"]
-        with socket.create_connection(("127.0.0.1", self.port), timeout=PATIENCE) as sock:
+        with socket.create_connection(("127.0.0.1", self.port), timeout=LIMIT_S) as sock:
             sock.sendall(("\r\n".join(lines) + "\r\n\r\n").encode("latin-1") + body)
             data = b""
             while piece := sock.recv(65536):
@@ -146,7 +146,7 @@ class ServedEngine:
         headers = {"Cookie": self.client.cookie}
         return connect(
             f"ws://{self.client.host}{path}", origin=self.client.origin, additional_headers=headers,
-            compression=None, max_size=None, proxy=None, open_timeout=PATIENCE, close_timeout=0.5,
+            compression=None, max_size=None, proxy=None, open_timeout=LIMIT_S, close_timeout=0.5,
             ping_interval=None, **options,
         )  # fmt: skip
 

@@ -10,9 +10,9 @@ from app.live.engine import Engine
 from app.twin.twin import load_twin
 from app.views.viser.guarded_server import HEADER
 from app.views.viser.view import ViserView
-from tests.app.scripted import Scripted, wait_for
+from tests.app.scripted import Scripted
 from tests.app.test_field_views import PLATE, SHAPE
-from tests.app.web.page.browsed import PATIENCE
+from tests.waiting import LIMIT_S, wait_for
 
 pytestmark = pytest.mark.browser
 
@@ -41,7 +41,7 @@ def page(browser, engine):
     view.start()
     context = browser.new_context(viewport={"width": 900, "height": 1300}, extra_http_headers={HEADER: "s3cret"})
     page = context.new_page()
-    page.set_default_timeout(PATIENCE * 1000)
+    page.set_default_timeout(LIMIT_S * 1000)
     errors = []
     page.on("pageerror", lambda error: errors.append(str(error)))
     page.goto(f"http://127.0.0.1:{view.port}/")
@@ -95,9 +95,9 @@ def likeness(page, engine):
 
 
 def test_the_map_is_drawn_and_still_is_with_another_filter(page, engine):
-    wait_for(lambda: likeness(page, engine) > 0.95, PATIENCE)
+    wait_for(lambda: likeness(page, engine) > 0.95)
     before = cells(page), estimate(engine)
     engine.submit(SetEstimator("etkf"))
-    wait_for(lambda: engine.status().estimator == "etkf" and not engine.status().refolding, PATIENCE)
-    wait_for(lambda: not np.array_equal(estimate(engine), before[1]), PATIENCE)
-    wait_for(lambda: likeness(page, engine) > 0.95 and not np.array_equal(cells(page), before[0]), PATIENCE)
+    wait_for(lambda: engine.status().estimator == "etkf" and not engine.status().refolding)
+    wait_for(lambda: not np.array_equal(estimate(engine), before[1]))
+    wait_for(lambda: likeness(page, engine) > 0.95 and not np.array_equal(cells(page), before[0]))

@@ -31,7 +31,8 @@ from estimators.errors import ConfigError
 from estimators.fold import Fold
 from estimators.log import READING, Log
 from estimators.model.parts import Field
-from tests.app.scripted import Scripted, wait_for
+from tests.app.scripted import Scripted
+from tests.waiting import wait_for
 
 PLATE = """
 title: A small plate

@@ -14,17 +14,16 @@ from app.twin.twin import load_twin
 from app.views.recording.reader import finished, read_recording
 from app.views.recording.writer import RecordingPart
 from app.web.running import OpenedTwin, RunningTwin
-from tests.app.scripted import row_count, wait_for
-from tests.conftest import ROOT
-
-PATIENCE = 120.0
+from tests import ROOT
+from tests.app.scripted import row_count
+from tests.waiting import LIMIT_S, wait_for
 
 
 def test_works_are_done_side_by_side_and_all_before_it_returns():
     meeting, done = threading.Barrier(3), []
 
     def work():
-        meeting.wait(PATIENCE)
+        meeting.wait(LIMIT_S)
         done.append(threading.current_thread())
 
     run_all(work, work, work)
@@ -53,7 +52,7 @@ print(len(calls) > 2 and done.wait(0.0))
 @pytest.mark.skipif(sys.platform == "win32", reason="os.kill ends a process there")
 def test_a_signal_at_any_moment_of_the_wait_ends_it():
     told = subprocess.run(
-        [sys.executable, "-c", SIGNALS_IN_WAIT], cwd=ROOT, capture_output=True, text=True, check=True, timeout=PATIENCE
+        [sys.executable, "-c", SIGNALS_IN_WAIT], cwd=ROOT, capture_output=True, text=True, check=True, timeout=LIMIT_S
     )
     assert told.stdout == "True\n"
 
@@ -66,7 +65,7 @@ def test_what_fails_is_raised_once_all_are_done():
         raise OSError("it cannot be closed")
 
     def work():
-        failing.wait(PATIENCE)
+        failing.wait(LIMIT_S)
         done.append(True)
 
     with pytest.raises(OSError, match="it cannot be closed"):
@@ -92,7 +91,7 @@ def test_the_recording_is_closed_after_the_last_row_and_has_it(tmp_path, monkeyp
     monkeypatch.setattr(RecordingPart, "end", end)
     running.start()
     running.recorder.record(path)
-    wait_for(lambda: path.exists() and row_count(running.engine) > 100, PATIENCE)
+    wait_for(lambda: path.exists() and row_count(running.engine) > 100)
     running.stop()
     assert order == [row_count(running.engine), "closed"]
     assert read_recording(path).rows == order[0] and not running.recorder._thread.is_alive()
@@ -108,9 +107,9 @@ def test_a_page_that_is_asked_to_end_ends_well_and_its_recording_is_whole(tmp_pa
     try:
         assert process.stdout is not None
         assert any("http://" in line for line in process.stdout)
-        wait_for(lambda: path.exists() and path.stat().st_size > 20_000, PATIENCE)
+        wait_for(lambda: path.exists() and path.stat().st_size > 20_000)
         process.send_signal(signal.SIGTERM)
-        assert process.wait(PATIENCE) == 0
+        assert process.wait(LIMIT_S) == 0
     finally:
         process.kill()
     recorded = read_recording(path)

@@ -47,7 +47,7 @@ from estimators.log import Log
 from estimators.model.parts import Field
 from estimators.track import Track
 
-from ..conftest import data_folder
+from ..skips import data_folder
 from .recordings import CASES, GOOD, Case, halves
 
 OTHERS = (Case("motor_bench_hybrid"), Case("field_era5"))

@@ -35,9 +35,9 @@ from sources.can.mf4 import read_mf4
 from sources.can.readers import Raw, read_messages
 from sources.source import Channel
 
-from ..conftest import data_folder
 from ..estimators.smoothing.test_textbook import CAR
 from ..models import write_plant
+from ..skips import data_folder
 from ..support import SECOND
 from .filters import STEPS, noisy_log
 from .timing import BenchmarkRow, Bound, both, medians, seconds

@@ -49,8 +49,8 @@ from estimators.log import READING, Events, Log
 from estimators.snapshots import Base
 from sources.brokers import TopicMap, mqtt_client
 from sources.messages import ACCEPTED
+from tests import ROOT
 from tests.app.outputs.broker import Broker
-from tests.conftest import ROOT
 
 PERIOD_S = 0.001
 LATE_EVERY, LATE_S = 50, 0.02

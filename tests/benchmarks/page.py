@@ -375,11 +375,12 @@ def published(seconds: float = 15.0, rate: float = 1000.0) -> Iterator[Benchmark
     """
     from sources.brokers import mqtt_client
 
-    from ..app.outputs.broker import MOSQUITTO, Broker
+    from ..app.outputs.broker import Broker
     from ..app.outputs.test_one_state import Plant
+    from ..skips import find_program
     from ..support import free_port
 
-    if MOSQUITTO is None:
+    if find_program("mosquitto") is None:
         raise SourceError("no mosquitto was found")
     for kind in ("mqtt", "push", "can", "opcua"):
         with tempfile.TemporaryDirectory() as name:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import os
 from collections import defaultdict
 from collections.abc import Iterator
 from datetime import datetime
@@ -15,12 +14,12 @@ from estimators import Fleet
 from estimators.fleet.siblings import siblings
 from estimators.fleet.table import FleetTable
 from tests.models import level_model
+from tests.skips import data_folder
 
 from .timing import BenchmarkRow
 
 COUNT, PLANTED, MEASUREMENTS = 10_000, 50, 30
 PLANT = ("industrial_nab_temperature", "ambient_temperature_system_failure.csv")
-DATA = Path(os.environ.get("NISUS_DATA") or Path(__file__).resolve().parents[3] / "shared" / "data")
 HOURS = 20
 """Measurements from which on a day is compared."""
 
@@ -29,7 +28,7 @@ def found_siblings() -> Iterator[BenchmarkRow]:
     """Assets that differ from their siblings, at a false discovery rate of 5 %."""
     for shift in (2.5, 3.5):
         yield _simulated(shift)
-    if (path := DATA.joinpath(*PLANT)).is_file():
+    if (path := data_folder().joinpath(*PLANT)).is_file():
         yield _days(path)
 
 

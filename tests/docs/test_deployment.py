@@ -9,7 +9,6 @@ import shutil
 import ssl
 import subprocess
 import sys
-import time
 from urllib.error import URLError
 from urllib.request import HTTPSHandler, ProxyHandler, Request, build_opener, urlopen
 
@@ -19,9 +18,11 @@ from websockets.sync.client import connect
 from app.cli.arguments import ServeCommand
 from app.cli.main import parse
 from app.cli.options import environment_options
-from tests.app.web.test_service import PATIENCE_S, Served, all_run
-from tests.conftest import ROOT
+from tests import ROOT
+from tests.app.web.test_service import Served, all_run
+from tests.skips import program
 from tests.support import free_port
+from tests.waiting import LIMIT_S, wait_for
 
 TWIN = ROOT / "config" / "twins" / "motor_winding.yaml"
 TOKEN = "b" * 24
@@ -37,9 +38,8 @@ def folder(tmp_path):
     return tmp_path
 
 
-@pytest.mark.skipif(shutil.which("nginx") is None and not os.environ.get("CI"), reason="needs nginx")
 def test_nginx_adds_tls_and_the_audit_log_has_the_address_of_the_client(folder):
-    port, public = free_port(), free_port()
+    nginx, port, public = program("nginx"), free_port(), free_port()
     key, certificate = folder / "key.pem", folder / "certificate.pem"
     subprocess.run(
         ["openssl", "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-keyout", key, "-out", certificate, "-days", "2",
@@ -62,7 +62,7 @@ def test_nginx_adds_tls_and_the_audit_log_has_the_address_of_the_client(folder):
     (folder / "nginx.conf").write_text(f"{head}http {{\naccess_log off;\n{places}{text}}}\n")
     site = f"https://localhost:{public}"
     trusted = ssl.create_default_context(cafile=certificate)
-    nginx = subprocess.Popen(["nginx", "-c", folder / "nginx.conf", "-p", folder], stderr=subprocess.PIPE)
+    nginx = subprocess.Popen([nginx, "-c", folder / "nginx.conf", "-p", folder], stderr=subprocess.PIPE)
     service = Served(folder, "twins", "--tokens", "tokens", "--public", site, "--port", str(port))
     try:
         service.wait(all_run)
@@ -72,7 +72,7 @@ def test_nginx_adds_tls_and_the_audit_log_has_the_address_of_the_client(folder):
         def ask(path, body=None, **headers):
             data = None if body is None else json.dumps(body).encode()
             headers = bearer | {"Content-Type": "application/json"} | headers
-            with opener.open(Request(site + path, data, headers), timeout=PATIENCE_S) as answer:
+            with opener.open(Request(site + path, data, headers), timeout=LIMIT_S) as answer:
                 return answer.headers, answer.read().decode()
 
         headers, page = ask("/twins/pump/")
@@ -84,9 +84,9 @@ def test_nginx_adds_tls_and_the_audit_log_has_the_address_of_the_client(folder):
             ask("/twins/pump/api/command", {"command": "Undo"}, Origin="https://elsewhere.example")
         stream = f"wss://localhost:{public}/twins/pump/api/stream"
         with connect(
-            stream, origin=site, additional_headers=bearer, ssl=trusted, proxy=None, open_timeout=PATIENCE_S
+            stream, origin=site, additional_headers=bearer, ssl=trusted, proxy=None, open_timeout=LIMIT_S
         ) as socket:
-            assert json.loads(socket.recv(timeout=PATIENCE_S))["boot"]
+            assert json.loads(socket.recv(timeout=LIMIT_S))["boot"]
         # The cookie of a browser is sent through TLS only.
         stays = subprocess.run(
             ["curl", "-s", "-o", os.devnull, "-D", "-", "--noproxy", "*", "--cacert", certificate,
@@ -97,7 +97,7 @@ def test_nginx_adds_tls_and_the_audit_log_has_the_address_of_the_client(folder):
     finally:
         service.stop()
         nginx.terminate()
-        nginx.wait(PATIENCE_S)
+        nginx.wait(LIMIT_S)
 
 
 def test_the_unit_runs_a_command_that_exists_with_options_that_exist():
@@ -157,16 +157,14 @@ def test_the_steps_of_the_container_serve_in_a_clean_folder(folder):
             cwd=folder / "lib", env=environment, stdout=subprocess.DEVNULL, stderr=errors,
         )  # fmt: skip
     try:
-        end = time.monotonic() + PATIENCE_S
         command = [sys.executable, "-c", check[2].replace("9900", str(port))]
-        while subprocess.run(command, capture_output=True).returncode:
-            assert process.poll() is None and time.monotonic() < end, (folder / "lines").read_text()
-            time.sleep(0.5)
+        wait_for(lambda: process.poll() is not None or not subprocess.run(command, capture_output=True).returncode)
+        assert process.poll() is None, (folder / "lines").read_text()
         request = Request(f"http://127.0.0.1:{port}/twins/pump/api/state", headers={"Authorization": f"Bearer {TOKEN}"})
-        assert json.load(urlopen(request, timeout=PATIENCE_S))["twin"] == "pump"
+        assert json.load(urlopen(request, timeout=LIMIT_S))["twin"] == "pump"
     finally:
         process.terminate()
-        assert process.wait(PATIENCE_S) == 0
+        assert process.wait(LIMIT_S) == 0
     assert sorted(path.name for path in folder.iterdir()) == ["cache", "lib", "lines", "tokens", "twins"]
     assert [path.name for path in (folder / "lib" / "stores").iterdir()] == ["pump.store"]
     assert all(json.loads(line)["twin"] == "pump" for line in (folder / "lines").read_text().splitlines())

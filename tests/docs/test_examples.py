@@ -10,7 +10,7 @@ from scipy import stats
 
 from estimators import fold
 from estimators.log import READING, TRUTH
-from tests.conftest import ROOT
+from tests import ROOT
 
 EXAMPLES = ROOT / "docs" / "examples"
 

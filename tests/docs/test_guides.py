@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from app.cli.main import main, parse
-from tests.conftest import ROOT
+from tests import ROOT
 
 GUIDES = sorted([ROOT / "README.md", *(ROOT / "docs").glob("*.md")])
 PATH_OF_NISUS = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")])

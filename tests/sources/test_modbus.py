@@ -10,7 +10,7 @@ from sources.messages import Messages
 from sources.modbus import ModbusSource, Register, blocks_of
 from sources.source import Channel
 from tests.app.outputs.modbus_device import Device
-from tests.app.scripted import wait_for
+from tests.waiting import wait_for
 
 FORMATS = dict(int16="h", uint16="H", int32="i", uint32="I", int64="q", uint64="Q", float32="f", float64="d")
 

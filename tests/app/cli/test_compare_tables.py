@@ -15,7 +15,7 @@ from app.twin.twin import Twin, load_twin
 from config.loader import shipped
 from estimators.log import Events
 from estimators.registry import ESTIMATORS, unfit
-from tests.conftest import recorded
+from tests.skips import recorded
 
 SEED = 1234
 """Not among the table's 0 to 7."""

@@ -17,9 +17,9 @@ from config.loader import load
 from estimators.diagnostics.episodes import episodes
 from estimators.errors import ConfigError, SourceError
 from sources.source import LOST_FRAMES, controls_of
-from tests.app.scripted import wait_for
-from tests.conftest import ROOT
+from tests import ROOT
 from tests.support import SECOND, assert_same, folded
+from tests.waiting import wait_for
 
 TWIN = (
     "title: tank\nmodel: motor_winding\nestimator: kf\nsource:\n  type: simulator\n  seed: 1\n  step: 1\n"

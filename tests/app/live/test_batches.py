@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import pytest
 
 from app.live.batches import BATCH_PERIOD_S, MAX_BATCH_EVENTS, BatchSizer, FairLock
-from tests.app.scripted import wait_for
+from tests.waiting import wait_for
 
 
 @pytest.mark.parametrize("cost", [0.0, 1e-6, 1e-3, 3.0])

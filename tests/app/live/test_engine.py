@@ -21,8 +21,9 @@ from estimators.fold import Fold, fold
 from estimators.log import READING, Events, Log
 from estimators.track import DIVERGED, FAILED, USED
 from estimators.tuning import Tuning
-from tests.app.scripted import MODEL, Replayed, Scripted, Stepped, pull_all, readings, row_count, twin, wait_for
+from tests.app.scripted import MODEL, Replayed, Scripted, Stepped, pull_all, readings, row_count, twin
 from tests.support import SECOND, assert_same
+from tests.waiting import wait_for
 
 FIRST = Tuning.of(MODEL)
 

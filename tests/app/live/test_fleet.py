@@ -32,10 +32,11 @@ from estimators.log import Events
 from estimators.track import HEALTH_NAMES, STALE, USABLE
 from sources.brokers import TopicMap
 from sources.source import Partition
+from tests import ROOT
 from tests.app.cli.test_fleet import FLEET, write
-from tests.app.outputs.broker import Broker, Listener, needs_mosquitto
+from tests.app.outputs.broker import Broker, Listener
 from tests.benchmarks.kills import FleetRun, survive_fleet
-from tests.conftest import ROOT
+from tests.skips import program
 
 BEGIN, SECOND = 1_767_225_600 * 10**9, 10**9
 
@@ -120,7 +121,6 @@ def test_an_asset_that_is_silent_becomes_stale_by_the_clock_of_the_others(tmp_pa
 
 
 def test_the_asset_is_a_level_of_the_topic(tmp_path):
-    needs_mosquitto()
     broker = Broker(tmp_path)
     topics = {"plant/{asset}/temperature": "winding", "line/{asset}": {"values": {"winding": "v"}, "time": "t"}}
     fleet, said = running(tmp_path, {"type": "mqtt", "host": "127.0.0.1", "port": broker.port, "topics": topics})
@@ -371,7 +371,6 @@ def test_packets_that_are_sent_again_count_once(tmp_path, monkeypatch):
 
 
 def test_a_broker_keeps_what_was_not_stored(tmp_path, monkeypatch):
-    needs_mosquitto()
     monkeypatch.setattr(live, "STORE_PERIOD_S", 1e9)
     broker = Broker(tmp_path)
     listener = Listener(broker)
@@ -453,5 +452,5 @@ def test_messages_go_to_the_process_of_their_asset_and_the_table_is_that_of_all(
 
 
 def test_killed_processes_leave_the_table_of_one_that_was_not(tmp_path):
-    needs_mosquitto()
+    program("mosquitto")
     survive_fleet(2, tmp_path, FleetRun(assets=8, rounds=60, seconds=2.0, parents=2))

@@ -21,7 +21,7 @@ from app.live.jobs import (
 )
 from app.live.notices import Notices
 from estimators.errors import ConfigError
-from tests.app.scripted import wait_for
+from tests.waiting import wait_for
 
 
 class Clock:

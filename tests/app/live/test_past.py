@@ -6,9 +6,10 @@ import pytest
 from app.cli.open_twin import live_source
 from app.live.commands import SetTuning
 from app.live.engine import Engine
-from app.twin.twin import load_twin
-from tests.app.scripted import Stepped, pull_all, random_walk, readings, wait_for
+from tests.app.scripted import Stepped, pull_all, random_walk, readings
+from tests.skips import with_recording
 from tests.support import SECOND
+from tests.waiting import wait_for
 
 N = 5000  # events: several permanent snapshots, and recent ones between them
 
@@ -55,7 +56,7 @@ def test_the_status_of_a_moment_is_that_of_the_events_until_then(at):
 
 def test_the_status_of_a_moment_of_a_large_field_is_that_of_its_rows(monkeypatch):
     """Without a fold of 1,617 cells it is the same as with one, folded from the snapshot before."""
-    twin = load_twin("field_era5")
+    twin = with_recording("field_era5")
     engine = Engine(twin, live_source(twin, np.inf))
     engine.start()
     try:

@@ -18,10 +18,11 @@ from app.twin.twin import load_twin
 from app.web.readings import stored
 from app.web.running import OpenedTwin, RunningTwin
 from sources.source import ignore
-from tests.app.scripted import Replayed, Scripted, pull_all, random_walk, readings, wait_for
+from tests import ROOT
+from tests.app.scripted import Replayed, Scripted, pull_all, random_walk, readings
 from tests.benchmarks.kills import survive
-from tests.conftest import ROOT
 from tests.support import SECOND, assert_same
+from tests.waiting import wait_for
 
 T0 = 1_700_000_000.0  # s; a live source has dates
 HEADER = 100  # bytes of an SQLite file, among them a count of its openings

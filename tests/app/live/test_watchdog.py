@@ -13,8 +13,9 @@ import app.live.watchdog
 from app.live.commands import SetTuning
 from app.live.watchdog import CHECK_AFTER_S, STALLED_AFTER_S, Watchdog, unanswered
 from app.views.recording.reader import finished, read_recording
-from tests.app.scripted import Stepped, fresh_status, wait_for
-from tests.conftest import ROOT
+from tests import ROOT
+from tests.app.scripted import Stepped, fresh_status
+from tests.waiting import wait_for
 
 MODEL = """
 from estimators.model import Noise, Row, Sensor, State, StateSpaceModel
@@ -98,7 +99,7 @@ def test_a_run_whose_f_loops_says_so_and_ends_when_asked(name, estimator, loopin
     path = tmp_path / "run.rrd"
     child = Child("run", looping(estimator), "--headless", "--record", path, "--duration", "600")
     try:
-        wait_for(lambda: child.said("has not returned") or child.process.poll() is not None, 180.0)
+        wait_for(lambda: child.said("has not returned") or child.process.poll() is not None)
         (line,) = child.said("has not returned")
         where = MODEL.splitlines().index("def f(x, u, p, dt, out):") + 1
         assert f"looping.py:{where}: model looping: f(x, u, dt) at x = [" in line and "the estimate stays" in line
@@ -114,7 +115,7 @@ def test_a_run_whose_f_loops_says_so_and_ends_when_asked(name, estimator, loopin
 def test_a_fold_whose_f_loops_says_so_and_ends_when_asked(looping):
     child = Child("fold", looping())
     try:
-        wait_for(lambda: child.said("has not returned") or child.process.poll() is not None, 180.0)
+        wait_for(lambda: child.said("has not returned") or child.process.poll() is not None)
         assert "f(x, u, dt) at x = [" in child.said("has not returned")[0]
         os.kill(child.process.pid, signal.SIGINT)
         assert child.process.wait(60.0) == 130

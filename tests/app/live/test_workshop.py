@@ -30,8 +30,9 @@ from estimators.pieces import LOOP, Piece, is_made, pieces_of
 from estimators.registry import ESTIMATORS
 from estimators.tuning import Tuning
 from sources.pieces import FRAMES
-from tests.app.scripted import MODEL, Scripted, fresh_status, pull_all, readings, row_count, twin, wait_for
+from tests.app.scripted import MODEL, Scripted, fresh_status, pull_all, readings, row_count, twin
 from tests.support import assert_same
+from tests.waiting import wait_for
 
 
 def paper(folder: Path, what: str, piece: Piece) -> Path:

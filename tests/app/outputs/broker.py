@@ -1,36 +1,24 @@
 """A Mosquitto of a test's own on loopback, and a client that keeps what it hears."""
 
 import json
-import os
-import shutil
 import socket
 import subprocess
 import threading
-import time
 from pathlib import Path
 from typing import Any
 
 import paho.mqtt.client as paho
-import pytest
 
+from tests.skips import program
 from tests.support import free_port
-
-MOSQUITTO = shutil.which("mosquitto", path=f"{os.environ.get('PATH', '')}:/usr/sbin")
-
-
-def needs_mosquitto() -> None:
-    """Skip the test, or in CI fail it, without Mosquitto."""
-    if MOSQUITTO is None:
-        if os.environ.get("CI"):
-            pytest.fail("mosquitto is not installed; .ci/run installs it")
-        pytest.skip("mosquitto is not installed (Debian: apt install mosquitto)")
+from tests.waiting import LIMIT_S, wait_for
 
 
 class Broker:
-    """A Mosquitto that may be stopped and started again at its port."""
+    """A Mosquitto that may be stopped and started again at its port; the test skips where it is not installed."""
 
     def __init__(self, folder: Path, more: str = "") -> None:
-        self.port = free_port()
+        self.program, self.port = program("mosquitto"), free_port()
         self.settings = folder / "mosquitto.conf"
         self.settings.write_text(
             f"listener {self.port} 127.0.0.1\nallow_anonymous true\npersistence false\nset_tcp_nodelay true\n{more}"
@@ -38,12 +26,10 @@ class Broker:
         self.start()
 
     def start(self) -> None:
-        command = [str(MOSQUITTO), "-c", str(self.settings)]
+        command = [self.program, "-c", str(self.settings)]
         self.process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-        end = time.monotonic() + 60.0
-        while not self.answers():
-            assert time.monotonic() < end and self.process.poll() is None, "mosquitto does not start"
-            time.sleep(0.01)
+        wait_for(lambda: self.answers() or self.process.poll() is not None)
+        assert self.process.poll() is None, "mosquitto does not start"
 
     def answers(self) -> bool:
         try:
@@ -54,7 +40,7 @@ class Broker:
 
     def stop(self) -> None:
         self.process.terminate()
-        self.process.wait(10)
+        self.process.wait(LIMIT_S)
 
 
 class Listener:

@@ -25,10 +25,10 @@ from app.twin.secrets import NO_SECRETS
 from config.output_schema import WebhookSection
 from estimators.errors import SourceError
 from sources.source import ignore
+from tests import ROOT
 from tests.app.outputs import test_fleet_alerts as of_fleets
 from tests.app.outputs.test_alerts import Looked, episode, send, started, state
-from tests.app.scripted import wait_for
-from tests.conftest import ROOT
+from tests.waiting import wait_for
 
 BAD = {"health": "degraded", "cause": "yoke is silent"}
 

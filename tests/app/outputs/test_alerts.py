@@ -25,8 +25,8 @@ from config.output_schema import AlertSection, CommandSection, EmailSection, Web
 from estimators.diagnostics.episodes import Episode
 from estimators.errors import ConfigError
 from sources.source import ignore
-from tests.app.scripted import wait_for
 from tests.support import SECOND
+from tests.waiting import wait_for
 
 BEGIN = 1_767_225_600 * SECOND
 

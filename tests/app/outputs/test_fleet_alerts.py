@@ -20,7 +20,7 @@ from estimators.fleet.fleet import Fleet
 from estimators.models import MODELS
 from estimators.track import HEALTH_NAMES
 from tests.app.outputs.test_alerts import state
-from tests.app.scripted import wait_for
+from tests.waiting import wait_for
 
 BEGIN, SECOND = 1_767_225_600 * 10**9, 10**9
 EMPTY = Fleet("kf", MODELS["motor_winding"], assets=1).table()

@@ -16,9 +16,9 @@ from app.twin.twin import load_twin
 from app.web.readings import messages_of
 from estimators.track import HEALTH_NAMES
 from tests.app.live.test_fleet import folded
-from tests.app.outputs.broker import Broker, Listener, needs_mosquitto
+from tests.app.outputs.broker import Broker, Listener
 from tests.app.outputs.test_fleet_alerts import table
-from tests.app.scripted import wait_for
+from tests.waiting import wait_for
 
 BEGIN, SECOND = 1_767_225_600 * 10**9, 10**9
 ASSETS = ("pump 1", "hall/pump+2", "50 %")
@@ -27,7 +27,6 @@ LEVELS = ("pump 1", "hall%2Fpump%2B2", "50 %25")
 
 @pytest.fixture
 def broker(tmp_path):
-    needs_mosquitto()
     found = Broker(tmp_path)
     yield found
     if found.process.poll() is None:

@@ -15,9 +15,9 @@ from estimators.errors import ConfigError, NisusError
 from sources.brokers import MqttSource, TopicMap
 from sources.messages import Messages
 from sources.source import Channel, ignore
-from tests.app.outputs.broker import Broker, Listener, needs_mosquitto
-from tests.app.scripted import wait_for
+from tests.app.outputs.broker import Broker, Listener
 from tests.support import SECOND, free_port
+from tests.waiting import wait_for
 
 BEGIN = 1_767_225_600 * SECOND
 ROOT = "nisus/motor_winding"
@@ -25,7 +25,6 @@ ROOT = "nisus/motor_winding"
 
 @pytest.fixture
 def broker(tmp_path):
-    needs_mosquitto()
     made = Broker(tmp_path)
     yield made
     made.stop()

@@ -23,12 +23,13 @@ from estimators.errors import ConfigError
 from estimators.log import Log
 from estimators.track import HEALTH_NAMES
 from sources.source import ignore
-from tests.app.outputs.broker import Broker, Listener, needs_mosquitto
+from tests import ROOT
+from tests.app.outputs.broker import Broker, Listener
 from tests.app.outputs.modbus_device import Device
 from tests.app.outputs.test_alerts import state
-from tests.app.scripted import pull_all, wait_for
-from tests.conftest import ROOT
+from tests.app.scripted import pull_all
 from tests.support import SECOND, free_port
+from tests.waiting import wait_for
 
 BEGIN = 1_767_225_600 * SECOND
 VALUES = (40.25, 41.5, 42.125, 41.75)
@@ -151,7 +152,6 @@ class Subscriber:
 
 @pytest.mark.parametrize("kind", ["push", "mqtt", "opcua", "modbus", "can"])
 def test_the_same_state_from_every_output_whatever_the_source(serve, tmp_path, kind):
-    needs_mosquitto()
     broker = Broker(tmp_path)
     plant, port, dbc = Plant(tmp_path, broker), free_port(), tmp_path / "estimate.dbc"
     bus = {"interface": "virtual", "channel": plant.channel, "id": 1536, "dbc": str(dbc)}

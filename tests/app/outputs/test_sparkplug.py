@@ -11,8 +11,9 @@ from estimators.track import HEALTH_NAMES
 from tests.app.outputs.broker import Listener
 from tests.app.outputs.test_alerts import state
 from tests.app.outputs.test_mqtt import BEGIN, broker, published, push  # noqa: F401  a fixture
-from tests.app.scripted import pull_all, wait_for
+from tests.app.scripted import pull_all
 from tests.support import SECOND
+from tests.waiting import wait_for
 
 PROTO = """
 PropertyValue: uint32 type 1, bool is_null 2, uint32 int_value 3, uint64 long_value 4, float float_value 5,

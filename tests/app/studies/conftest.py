@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.app.scripted import wait_for
+from tests.waiting import wait_for
 
 
 @contextmanager

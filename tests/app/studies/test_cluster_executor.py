@@ -27,8 +27,8 @@ from estimators.fit.objective import Cancelled
 from estimators.fit.recording import Recording
 from estimators.log import Log
 from estimators.tuning import Tuning
+from tests import ROOT
 from tests.app.studies.test_processes import die_once
-from tests.conftest import ROOT
 from tests.estimators.fit.test_fit import MODEL, log_of, simulated
 
 NAME, OVERRIDES = "motor_winding", {"R.winding": "0.2"}

@@ -1,10 +1,11 @@
 """FMUs of FMI 2 and 3 for the tests, compiled from one C source of 60 lines."""
 
 import re
-import shutil
 import subprocess
 import zipfile
 from pathlib import Path
+
+from tests.skips import program
 
 # Value references: 0 x0, 1 x1, 2 and 3 their derivatives, 4 mu, 5 push, 6 both. A FLAW makes the model one that no
 # filter can use: its derivatives depend on TIME or on MEMORY of the past, setting states is IGNORED, values OVERFLOW
@@ -142,7 +143,7 @@ def build(
     c, library = file.with_suffix(".c"), file.with_suffix(".so")
     c.write_text(source)
     flags = [f"-DFMI{version}", f"-DB={flag}", f"-D{model}", *([f"-D{flaw}"] if flaw else [])]
-    compiler = shutil.which("gcc") or shutil.which("cc") or "gcc"
+    compiler = program("compiler")
     subprocess.run([compiler, "-shared", "-fPIC", "-O1", "-ffp-contract=off", *flags, "-o", library, c], check=True)
     place = f"binaries/{fmpy.platform if version == 2 else fmpy.platform_tuple}/m.so"
     interface = '<ModelExchange modelIdentifier="m"/>' if kind is None else kind

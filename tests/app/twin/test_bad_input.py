@@ -19,8 +19,8 @@ from estimators.models import MODELS
 from estimators.registry import ESTIMATORS, unfit
 from estimators.track import FAILED, GATED, USED
 from estimators.tuning import Tuning
+from tests import ROOT
 from tests.app.scripted import Replayed, Stepped, pull_all
-from tests.conftest import ROOT
 from tests.support import SECOND
 
 BAD = {

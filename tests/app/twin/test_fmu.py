@@ -1,7 +1,6 @@
 """Twins whose model is an FMU: integrated as by SciPy, filtered as the same black box in Python, checked on load."""
 
 import gc
-import shutil
 import sys
 import zipfile
 from pathlib import Path
@@ -16,8 +15,6 @@ from estimators.fold import fold
 from estimators.log import INPUT, READING, Events, Log
 
 from .fmus import build
-
-pytestmark = pytest.mark.skipif(shutil.which("gcc") is None, reason="compiles FMUs with gcc")
 
 PYTHON = """\
 import numpy as np

@@ -9,7 +9,7 @@ from estimators.diagnostics.episodes import episodes
 from estimators.fold import Fold, fold
 from estimators.log import READING, Events, truth_of
 from estimators.track import GATED, USED, Track
-from tests.conftest import recorded
+from tests.skips import recorded
 from tests.support import SECOND, as_log, read_all
 
 

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from estimators.fit.objective import Objective
-from tests.app.scripted import readings, wait_for
+from tests.app.scripted import readings
 from tests.app.served import ServedEngine
+from tests.waiting import wait_for
 
 
 @contextmanager

@@ -15,9 +15,10 @@ import app.live.watchdog
 from app.live.commands import SetTuning
 from app.live.engine import Engine
 from app.web.server import PageServer
-from tests.app.scripted import MODEL, Scripted, readings, row_count, twin, wait_for
-from tests.app.served import PATIENCE, SECRET, Client
+from tests.app.scripted import MODEL, Scripted, readings, row_count, twin
+from tests.app.served import SECRET, Client
 from tests.support import SECOND
+from tests.waiting import LIMIT_S, wait_for
 
 READINGS = 40
 
@@ -67,7 +68,7 @@ def running(monkeypatch, tmp_path):
     solver.hold("engine")
     times = np.arange(1, READINGS + 1) * 0.5
     source.put(readings(times, 40.0 + times))
-    assert solver.at_work.wait(PATIENCE)
+    assert solver.at_work.wait(LIMIT_S)
     yield engine, server, solver
     solver.let_go()
     server.stop()
@@ -89,7 +90,7 @@ def test_the_page_and_what_it_asks_are_answered_while_the_fold_is_at_work(runnin
     assert told["twin"] == "scripted" and told["tuning"]["Q.rate"] == engine.twin.tuning.get("Q.rate")
     # The engine takes the command once the fold returns.
     solver.let_go()
-    waiting.join(PATIENCE)
+    waiting.join(LIMIT_S)
     assert not waiting.is_alive()
     wait_for(lambda: engine.status().revision == 1 and not engine.status().refolding)
     assert row_count(engine) == READINGS
@@ -101,18 +102,18 @@ def test_a_page_that_looks_at_charts_is_told_of_the_twin_while_the_fold_is_at_wo
     with connect(
         f"ws://{client.host}/api/stream", origin=client.origin, additional_headers={"Cookie": client.cookie}
     ) as stream:
-        assert "boot" in json.loads(stream.recv(PATIENCE))
+        assert "boot" in json.loads(stream.recv(LIMIT_S))
         query = {"columns": ["mean:winding"], "points": 100}
         stream.send(json.dumps({"streams": {"charts": query}, "pair": ["winding", "rate"]}))
         said = ""
         # Every word on the twin, though its rows are asked for and do not come.
         while "the measurements so far are being folded (" not in said:
-            said = stream.recv(PATIENCE)
+            said = stream.recv(LIMIT_S)
         stream.send(json.dumps({"streams": {"charts": None}}))
     with connect(
         f"ws://{client.host}/api/stream", origin=client.origin, additional_headers={"Cookie": client.cookie}
     ) as stream:
-        said = [json.loads(stream.recv(PATIENCE)) for _ in range(2)]
+        said = [json.loads(stream.recv(LIMIT_S)) for _ in range(2)]
     assert any("status" in message for message in said)
 
 
@@ -135,13 +136,13 @@ def test_a_refold_catches_up_beside_the_fold_that_is_shown(running):
     solver.left = threading.Semaphore(0)
     solver.hold("refold 0")
     engine.submit(SetTuning("Q.rate", 0.5))
-    assert solver.at_work.wait(PATIENCE)
+    assert solver.at_work.wait(LIMIT_S)
     engine.source.put(readings([20.5, 21.0], [60.0, 61.0]))
     wait_for(lambda: row_count(engine) == READINGS + 2)
     # Now the engine stands still in what the refold has not seen, and the rows of before can be read all the same.
     solver.hold("engine")
     solver.left.release()
-    assert solver.at_work.wait(PATIENCE)
+    assert solver.at_work.wait(LIMIT_S)
     assert row_count(engine) == READINGS + 2 and engine.status().refolding and engine.status().revision == 0
     solver.let_go()
     wait_for(lambda: engine.status().revision == 1 and not engine.status().refolding)

@@ -15,15 +15,15 @@ from app.views.viser import guarded_server as private_viser
 from app.web import door
 from app.web.door import MAX_CONNECTIONS as CONNECTIONS
 from app.web.http import MAX_BODY_BYTES as BODY
-from tests.app.scripted import Replayed, readings, wait_for
-from tests.app.served import PATIENCE
+from tests.app.scripted import Replayed, readings
 from tests.app.web.test_door import STREAM
+from tests.waiting import LIMIT_S, wait_for
 
 HALF = b"GET /api/status HTTP/1.1\r\nHost: 127.0.0.1"
 
 
 def half_open(port, sent=HALF):
-    sock = socket.create_connection(("127.0.0.1", port), timeout=PATIENCE)
+    sock = socket.create_connection(("127.0.0.1", port), timeout=LIMIT_S)
     sock.sendall(sent)
     return sock
 
@@ -48,7 +48,7 @@ def test_many_half_open_connections_leave_room_for_an_honest_one(page):
             for _ in range(3):
                 assert page.client.get("/api/status").status == 200
             # Who has been let in already stays.
-            assert json.loads(stream.recv(timeout=PATIENCE))
+            assert json.loads(stream.recv(timeout=LIMIT_S))
             wait_for(lambda: sum(map(is_open, crowd)) <= CONNECTIONS)
         finally:
             for sock in crowd:
@@ -141,7 +141,7 @@ def test_what_a_browser_says_on_the_stream_is_a_word(page):
         with page.connect(STREAM) as stream, pytest.raises(ConnectionClosed):
             stream.send(message)
             while True:
-                stream.recv(timeout=PATIENCE)
+                stream.recv(timeout=LIMIT_S)
     # What is left is the engine's own, of its episode log.
     wait_for(lambda: len(page.engine._cursors) == 1)
 
@@ -153,7 +153,7 @@ def test_large_things_still_pass(page):
     with page.connect("/viser/", subprotocols=["viser-test"]) as viser:
         upload = bytes(2**23)
         viser.send(upload)
-        assert viser.recv(timeout=PATIENCE) == upload
+        assert viser.recv(timeout=LIMIT_S) == upload
 
 
 # Nonsense

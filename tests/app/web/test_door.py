@@ -3,7 +3,6 @@
 import asyncio
 import json
 import socket
-import time
 from urllib.parse import quote
 
 import numpy as np
@@ -14,9 +13,10 @@ from websockets.sync.client import connect
 from app.web.door import Door, listen
 from app.web.server import PageServer
 from estimators.errors import ConfigError
-from tests.app.scripted import pull_all, readings, wait_for
-from tests.app.served import PATIENCE, SECRET
+from tests.app.scripted import pull_all, readings
+from tests.app.served import SECRET
 from tests.app.web.conftest import reviewing, serving
+from tests.waiting import LIMIT_S, wait_for
 
 STREAM = "/rerun/stream"
 
@@ -174,7 +174,7 @@ def test_a_pass_opens_the_stage_without_a_cookie(page):
         f"ws://{here}/viser/?pass={given}&theme=light", origin=f"http://{here}", subprotocols=["viser-test"], proxy=None
     ) as viser:
         viser.send("text")
-        assert viser.recv(timeout=PATIENCE) == "text"
+        assert viser.recv(timeout=LIMIT_S) == "text"
     assert page.viser.requests and not any(given in str(request) for request in page.viser.requests)
 
 
@@ -272,7 +272,7 @@ def test_each_view_has_a_page_of_its_own(page):
     assert 'id="rerun"' in alone and 'id="tune"' not in alone and "{{settings}}" not in alone
     with page.connect("/viser/?theme=dark", subprotocols=["viser-test"]) as socket:
         socket.send("hello")
-        assert socket.recv(timeout=PATIENCE) == "hello"
+        assert socket.recv(timeout=LIMIT_S) == "hello"
     assert page.viser.requests[-1] == ("/?theme=dark", [SECRET])
 
 
@@ -293,7 +293,7 @@ def test_viser_messages_pass_both_ways(page):
         assert viser.subprotocol == "viser-test"
         for message in ("text", b"bytes"):
             viser.send(message)
-            assert viser.recv(timeout=PATIENCE) == message
+            assert viser.recv(timeout=LIMIT_S) == message
     assert page.viser.requests[-1] == ("/?a=b", [SECRET])
 
 
@@ -304,7 +304,7 @@ def test_a_page_gets_the_next_frames_once_it_has_drawn_the_last_ones(fresh):
     def message(key):
         """The next message that has a key."""
         while True:
-            text = stream.recv(timeout=PATIENCE)
+            text = stream.recv(timeout=LIMIT_S)
             if isinstance(text, str) and key in (found := json.loads(text)):
                 return found[key]
             assert isinstance(text, bytes) or "error" not in text
@@ -334,7 +334,7 @@ class Viewer:
         """By path, ns."""
 
     def take(self):
-        message = self.connection.recv(timeout=PATIENCE)
+        message = self.connection.recv(timeout=LIMIT_S)
         if isinstance(message, bytes):
             self.file.write_bytes(message)
             for chunk in RrdReader(str(self.file)).stream():
@@ -344,10 +344,7 @@ class Viewer:
             self.connection.send("drawn")
 
     def until(self, condition):
-        end = time.monotonic() + 3 * PATIENCE
-        while not condition():
-            assert time.monotonic() < end, "waited in vain"
-            self.take()
+        wait_for(lambda: condition() or self.take())
 
 
 def test_a_viewer_that_stops_reading_costs_nobody_anything(fresh, tmp_path):

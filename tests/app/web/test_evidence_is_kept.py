@@ -14,8 +14,8 @@ from app.web.running import OpenedTwin
 from app.web.session import Page, Session
 from estimators.log import READING
 from tests.app.cli.test_check import ParsedHtml
-from tests.app.scripted import wait_for
 from tests.app.served import Client
+from tests.waiting import wait_for
 
 FAULT = "[{kind: bias, sensor: yoke, size: 6, start: 100}]"
 

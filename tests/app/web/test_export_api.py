@@ -17,8 +17,9 @@ from app.twin.twin import load_twin
 from app.web.running import OpenedTwin
 from app.web.session import Page, Session
 from tests.app.cli.test_check import ParsedHtml
-from tests.app.scripted import pull_all, wait_for
+from tests.app.scripted import pull_all
 from tests.app.served import Client
+from tests.waiting import wait_for
 
 TWIN = "motor_joint"
 SECONDS = 200.0

@@ -9,9 +9,10 @@ from estimators.errors import NisusError
 from estimators.log import MARK, READING
 from sources.faults.kinds import KINDS
 from sources.faults.layer import Faults, FaultySource
-from tests.app.scripted import MODEL, pull_all, readings, wait_for
+from tests.app.scripted import MODEL, pull_all, readings
 from tests.app.web.test_bounds import NASTY
 from tests.support import SECOND
+from tests.waiting import wait_for
 
 
 @pytest.fixture

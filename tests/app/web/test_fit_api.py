@@ -12,7 +12,7 @@ from app.twin.twin import load_twin
 from app.web.commands_json import command_from_json
 from config.loader import TWINS
 from estimators.errors import NisusError
-from tests.app.scripted import wait_for
+from tests.waiting import wait_for
 
 DONE = ("done", "failed", "cancelled")
 

@@ -22,10 +22,9 @@ from app.web.fleet import FleetApi, id_of
 from estimators.errors import ConfigError
 from estimators.fleet.siblings import siblings
 from estimators.track import HEALTH_NAMES
+from tests import ROOT
 from tests.app.cli.test_fleet import FLEET, pump_rows, write
-from tests.conftest import ROOT
-
-PATIENCE_S = 120.0
+from tests.waiting import LIMIT_S
 
 
 @pytest.fixture(scope="module")
@@ -139,13 +138,13 @@ def served(folder, *options):
         def ask(path, messages=None):
             body = None if messages is None else json.dumps(messages).encode()
             request = Request(f"{site}{path}", body, headers | {"Content-Type": "application/json"})
-            with opener.open(request, timeout=PATIENCE_S) as answer:
+            with opener.open(request, timeout=LIMIT_S) as answer:
                 return json.loads(answer.read())
 
         yield url, ask
     finally:
         run.terminate()
-        run.wait(PATIENCE_S)
+        run.wait(LIMIT_S)
         run.stdout.close()
 
 
@@ -161,16 +160,16 @@ def test_the_page_lists_the_worst_first_and_a_click_opens_the_history_of_an_asse
         page = browser.new_context(viewport={"width": 1440, "height": 900}).new_page()
         errors: list[str] = []
         page.on("pageerror", lambda error: errors.append(str(error)))
-        page.set_default_timeout(PATIENCE_S * 1e3)
+        page.set_default_timeout(LIMIT_S * 1e3)
         page.goto(url)
-        expect(page.locator("#rows a").first).to_be_visible(timeout=PATIENCE_S * 1e3)
-        expect(page.locator("#state")).to_contain_text("source has ended", timeout=PATIENCE_S * 1e3)
+        expect(page.locator("#rows a").first).to_be_visible(timeout=LIMIT_S * 1e3)
+        expect(page.locator("#state")).to_contain_text("source has ended", timeout=LIMIT_S * 1e3)
         assert page.locator("#rows a").count() < 60  # those in view
         page.fill("#find", "pump 31")
         expect(page.locator("#rows a")).to_have_count(1)
         page.locator("#rows a").click()
         page.wait_for_url("**/twins/pump%2031/")
-        expect(page.locator("#trust")).to_contain_text("pump_31", timeout=PATIENCE_S * 1e3)
+        expect(page.locator("#trust")).to_contain_text("pump_31", timeout=LIMIT_S * 1e3)
         assert ask("/twins/pump%2031/api/state")["twin"] == "pump_31"
         # The scripts are those of the overview: a browser fetches them once, not for each asset.
         loaded = page.evaluate("performance.getEntriesByType('resource').map((one) => new URL(one.name).pathname)")
@@ -183,7 +182,7 @@ def test_the_page_lists_the_worst_first_and_a_click_opens_the_history_of_an_asse
 @pytest.mark.parametrize("width", [1440, 1000, 700])
 def test_the_overview_is_within_its_bounds_at_any_width(width, fleet, browser, overview):
     page = browser.new_context(viewport={"width": width, "height": 800}).new_page()
-    page.set_default_timeout(PATIENCE_S * 1e3)
+    page.set_default_timeout(LIMIT_S * 1e3)
     page.goto(overview)
     expect(page.locator("#rows a").first).to_be_visible()
 
@@ -225,11 +224,11 @@ def test_a_click_opens_an_asset_of_messages_from_the_archive(tmp_path, browser):
         while (found := AssetHistory(folders, "pump 3").read(1000)) is None or found.num_rows < 60:
             pass
         page = browser.new_context(viewport={"width": 1440, "height": 900}).new_page()
-        page.set_default_timeout(PATIENCE_S * 1e3)
+        page.set_default_timeout(LIMIT_S * 1e3)
         page.goto(url)
         page.get_by_role("row", name="pump 3").click()
         page.wait_for_url("**/twins/pump%203/")
-        expect(page.locator("#trust")).to_contain_text("pump_3", timeout=PATIENCE_S * 1e3)
+        expect(page.locator("#trust")).to_contain_text("pump_3", timeout=LIMIT_S * 1e3)
         while (state := ask("/twins/pump%203/api/state"))["sensors"][0]["accepted"] < 60:
             pass
         last = max(item["time"] for item in sent)

@@ -14,9 +14,9 @@ from estimators.log import Log
 from sources.messages import Messages, SentNumbers
 from sources.source import Channel, Condition, ignore
 from sources.tables.text import TextMatch
-from tests.app.scripted import wait_for
 from tests.app.served import ServedEngine
 from tests.support import SECOND
+from tests.waiting import wait_for
 
 BEGIN = 1_767_225_600 * SECOND  # 2026-01-01T00:00:00Z
 JSON, LINES, ARROW = "application/json", "application/x-ndjson", "application/vnd.apache.arrow.stream"

@@ -6,7 +6,7 @@ import threading
 import pytest
 
 from app.web.request_threads import RequestThreads
-from tests.app.served import PATIENCE
+from tests.waiting import LIMIT_S
 
 
 def started_by(act):
@@ -19,20 +19,20 @@ def test_all_threads_start_with_the_first_request_and_none_with_more():
     threads, go_on = RequestThreads("test", 4), threading.Event()
     try:
         first, started = started_by(lambda: threads.submit(lambda: 7))
-        assert first.result(PATIENCE) == 7 and len(started) == 4
+        assert first.result(LIMIT_S) == 7 and len(started) == 4
         busy = threading.Barrier(5)
 
         def wait():
-            busy.wait(PATIENCE)
-            go_on.wait(PATIENCE)
+            busy.wait(LIMIT_S)
+            go_on.wait(LIMIT_S)
             return threading.current_thread()
 
         outcomes, more = started_by(lambda: [threads.submit(wait) for _ in range(4)])
-        busy.wait(PATIENCE)  # all four are at work
+        busy.wait(LIMIT_S)  # all four are at work
         queued, further = started_by(lambda: [threads.submit(threading.current_thread) for _ in range(20)])
         assert not more and not further and not any(item.done() for item in queued)
         go_on.set()
-        assert {item.result(PATIENCE) for item in outcomes + queued} == started
+        assert {item.result(LIMIT_S) for item in outcomes + queued} == started
     finally:
         go_on.set()
 
@@ -41,8 +41,8 @@ def test_an_error_is_the_request_s_and_the_thread_goes_on():
     threads = RequestThreads("test", 1)
     failed = threads.submit(lambda: 1 / 0)
     with pytest.raises(ZeroDivisionError):
-        failed.result(PATIENCE)
-    assert threads.submit(lambda: 3).result(PATIENCE) == 3
+        failed.result(LIMIT_S)
+    assert threads.submit(lambda: 3).result(LIMIT_S) == 3
 
 
 def test_a_cancelled_request_ends_after_its_work():
@@ -51,7 +51,7 @@ def test_a_cancelled_request_ends_after_its_work():
 
         def work(word, *, more):
             begun.set()
-            go_on.wait(PATIENCE)
+            go_on.wait(LIMIT_S)
             done.append(word + more)
 
         task = asyncio.ensure_future(RequestThreads("test", 2).run(work, "a", more="b"))

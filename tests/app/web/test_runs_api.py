@@ -13,7 +13,8 @@ from app.twin.twin import load_twin
 from config.loader import TWINS
 from estimators.fold import Fold
 from estimators.tuning import Tuning
-from tests.app.scripted import MODEL, wait_for
+from tests.app.scripted import MODEL
+from tests.waiting import wait_for
 
 FIRST = Tuning.of(MODEL)
 UNIT = next(item.unit for item in FIRST.items() if item.key == "Q.rate")

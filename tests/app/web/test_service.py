@@ -8,7 +8,6 @@ import re
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 from urllib.error import HTTPError
 from urllib.parse import unquote, urljoin
@@ -18,9 +17,9 @@ import pytest
 from websockets.sync.client import connect
 
 from app.cli.main import main
-from tests.conftest import ROOT
+from tests import ROOT
+from tests.waiting import LIMIT_S, wait_for
 
-PATIENCE_S = 120.0
 TOKENS = {"ann": ("view", "a" * 20), "bob": ("tune", "b" * 20), "plc": ("feed", "c" * 20), "eve": ("admin", "e" * 20)}
 
 OPENER = build_opener(ProxyHandler({}))
@@ -50,7 +49,7 @@ class Served:
         data = None if body is None else json.dumps(body).encode()
         headers = {"Authorization": f"Bearer {token or self.token}", "Content-Type": "application/json"} | headers
         try:
-            with OPENER.open(Request(self.url + path, data, headers), timeout=PATIENCE_S) as answer:
+            with OPENER.open(Request(self.url + path, data, headers), timeout=LIMIT_S) as answer:
                 text, status = answer.read().decode(), answer.status
         except HTTPError as error:
             text, status = error.read().decode(), error.code
@@ -59,20 +58,20 @@ class Served:
     def twins(self):
         return {twin["name"]: twin for twin in self.ask("/api/session")[1]["twins"]}
 
-    def wait(self, condition, patience_s=PATIENCE_S):
+    def wait(self, condition):
         """Wait until the twins fulfil a condition; return them."""
-        end = time.monotonic() + patience_s
-        while not condition(found := self.twins()):
-            assert time.monotonic() < end, f"waited in vain: {found}; {self.lines()[-5000:]}"
-            time.sleep(0.2)
-        return found
+        try:
+            return wait_for(lambda: condition(found := self.twins()) and found, every_s=0.2)
+        except AssertionError as error:
+            error.add_note(f"{self.twins()}\n{self.lines()[-5000:]}")
+            raise
 
     def lines(self):
         return (self.folder / "lines").read_text()
 
     def stop(self):
         self.process.terminate()
-        self.process.wait(PATIENCE_S)
+        self.process.wait(LIMIT_S)
         self.process.stdout.close()
 
 
@@ -114,8 +113,8 @@ def test_each_twin_has_its_page_behind_one_port(served):
     assert served.ask("/twins/east/api/state") == (404, "Nisus: east is no twin of this service.\n")
     headers = {"Authorization": f"Bearer {served.token}"}
     address = f"{served.url.replace('http', 'ws')}/twins/north/api/stream"
-    with connect(address, origin=served.url, additional_headers=headers, proxy=None, open_timeout=PATIENCE_S) as page:
-        assert json.loads(page.recv(timeout=PATIENCE_S))["boot"]
+    with connect(address, origin=served.url, additional_headers=headers, proxy=None, open_timeout=LIMIT_S) as page:
+        assert json.loads(page.recv(timeout=LIMIT_S))["boot"]
     cards = {card["name"]: card for card in served.ask("/api/gallery")[1]}
     assert cards["north"]["states"] == 2 and cards["south"]["source"] == "messages"
     assert served.ask("/readyz") == (200, "ok\n")
@@ -144,7 +143,7 @@ def test_roles_hold_for_every_twin_and_commands_are_noted_with_their_user(served
     assert (entry["user"], entry["role"], entry["address"]) == ("bob", "tune", "127.0.0.1")
     assert entry["path"] == "/api/command" and entry["body"] == edit
     # A browser exchanges the token of its user for a cookie, with the same role.
-    connection = http.client.HTTPConnection(served.url.removeprefix("http://"), timeout=PATIENCE_S)
+    connection = http.client.HTTPConnection(served.url.removeprefix("http://"), timeout=LIMIT_S)
     connection.request("GET", f"/?token={token['ann']}")
     answer = connection.getresponse()
     cookie = answer.getheader("set-cookie").partition(";")[0]
@@ -163,7 +162,7 @@ def test_roles_hold_for_every_twin_and_commands_are_noted_with_their_user(served
 
 
 def test_a_body_without_a_length_and_an_odd_name_reach_the_twin_and_no_other_site(served):
-    connection = http.client.HTTPConnection(served.url.removeprefix("http://"), timeout=PATIENCE_S)
+    connection = http.client.HTTPConnection(served.url.removeprefix("http://"), timeout=LIMIT_S)
     headers = {"Authorization": f"Bearer {served.token}", "Content-Type": "application/x-ndjson"}
     lines = [b'{"values": {"winding": 40.0}, "sour', b'ce": "pipe", "sequence": 1}\n', b"{broken\n"]
     connection.request("POST", "/twins/south/api/readings", iter(lines), headers, encode_chunked=True)
@@ -204,9 +203,11 @@ def test_one_twin_is_stopped_and_started_alone(served):
     served.wait(all_run)
     # Its edit and its audit log are continued.
     assert served.ask("/twins/north/api/status")[1]["tuning"]["Q.temperature"] == 0.5
-    end = time.monotonic() + PATIENCE_S
-    while len(entries := served.ask("/twins/north/api/audit")[1]) < 3 and time.monotonic() < end:
-        time.sleep(0.1)
+
+    def three():
+        return len(found := served.ask("/twins/north/api/audit")[1]) >= 3 and found
+
+    entries = wait_for(three, every_s=0.1)
     assert [(entry["user"], entry["path"]) for entry in entries] == [
         ("bob", "/api/command"), ("session", "/api/gallery/stop"), ("session", "/api/gallery/start"),
     ]  # fmt: skip

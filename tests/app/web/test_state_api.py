@@ -18,8 +18,9 @@ from starlette.routing import Route
 from app.present.state_message import PublishedState, StateMessage, state_message, state_schema
 from estimators import fuse
 from estimators.track import DEGRADED, DIVERGED, STALE, SUSPECT, WAITING
-from tests.app.scripted import pull_all, readings, wait_for
+from tests.app.scripted import pull_all, readings
 from tests.support import SECOND
+from tests.waiting import wait_for
 
 
 @pytest.fixture

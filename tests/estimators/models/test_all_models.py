@@ -15,8 +15,8 @@ from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceMo
 from estimators.models import MODELS
 from estimators.models.motor_drive import COPPER, MOTOR_DRIVE
 from estimators.models.road_car import ROAD_CAR
-from tests.conftest import recorded
 from tests.models import first_state
+from tests.skips import recorded
 
 P = {item.name: k for k, item in enumerate(MOTOR_DRIVE.parameters)}
 

@@ -11,7 +11,7 @@ from estimators.log import truth_of
 from estimators.models.uwb_rover import UWB_ROVER, uwb_rover
 from estimators.tuning import Tuning
 from sources.simulator import Simulator, constant_input, sine_input
-from tests.conftest import recorded
+from tests.skips import recorded
 from tests.support import as_log, read_all
 
 

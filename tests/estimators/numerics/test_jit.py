@@ -13,7 +13,7 @@ from numba.extending import intrinsic
 
 from estimators.numerics.cache_entries import EntryFiles
 from estimators.numerics.jit import by_address, embedded, jit, linkable, linkable_embedded, part
-from tests.conftest import ROOT
+from tests import ROOT
 
 LOADED = """
 from llvmlite.binding import address_of_symbol

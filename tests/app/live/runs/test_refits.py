@@ -18,7 +18,8 @@ from app.web.session import Session
 from config.loader import TWINS
 from config.tunings import load_version, version_files
 from estimators.errors import ConfigError
-from tests.app.scripted import Replayed, Stepped, readings, row_count, wait_for
+from tests.app.scripted import Replayed, Stepped, readings, row_count
+from tests.waiting import wait_for
 
 WINDOW, EVERY, RATE = 60, 30, 10
 SECTION = f"{{entries: [R.winding], every: {EVERY} s, window: {WINDOW} s, adopt: %s}}"

@@ -18,8 +18,9 @@ from estimators.events.maintenance import maintained
 from estimators.fold import Fold
 from estimators.log import TRUTH, Events, Log
 from estimators.tuning import Tuning
-from tests.app.scripted import MODEL, Replayed, Stepped, decoded, random_walk, readings, wait_for
+from tests.app.scripted import MODEL, Replayed, Stepped, decoded, random_walk, readings
 from tests.support import SECOND
+from tests.waiting import wait_for
 
 ROW = MODEL.row_names[0]
 MEAN, UPPER, READING = f"mean:{MODEL.states[0].name}", f"upper:{MODEL.states[0].name}", f"reading:{ROW}"

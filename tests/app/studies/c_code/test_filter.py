@@ -1,7 +1,6 @@
 """Exported C against the fold, compiled by the C compiler; single precision against a bound on its rounding errors."""
 
 import re
-import shutil
 import subprocess
 
 import numpy as np
@@ -12,7 +11,7 @@ from app.studies.c_code.filter import export_c
 from app.twin.log_reader import read_log
 from app.twin.twin import load_twin
 from estimators.errors import ConfigError
-from tests.conftest import absent
+from tests.skips import program, with_recording
 
 WARNINGS = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-O2")
 
@@ -22,11 +21,11 @@ SINGLE = 2.0**-24  # unit roundoff
 @pytest.fixture(scope="module")
 def compiler():
     """The C compiler."""
-    return shutil.which("cc") or absent("no C compiler: install gcc and libc6-dev")
+    return program("compiler")
 
 
 def exported(name, duration=None, events=2000, **overrides):
-    twin = load_twin(name, overrides=overrides)
+    twin = with_recording(name, overrides=overrides)
     log, _ = read_log(twin, duration)
     return twin, log, export_c(twin.name, twin.estimator, twin.model, twin.tuning, log, events)
 

@@ -31,9 +31,10 @@ from estimators.model.assemble import JointParameter, joint
 from estimators.model.instruments import Instrument, with_instruments
 from estimators.tuning import Tuning
 from sources.merged import MemorySource
-from tests.app.scripted import MODEL, Scripted, Stepped, pull_all, readings, twin, wait_for
-from tests.conftest import ROOT
+from tests import ROOT
+from tests.app.scripted import MODEL, Scripted, Stepped, pull_all, readings, twin
 from tests.support import assert_same
+from tests.waiting import wait_for
 
 COUNT = 6000
 TIMES = np.arange(1, COUNT + 1) * 0.01
@@ -476,7 +477,7 @@ def test_a_terminal_that_closes_leaves_a_whole_recording(name, tmp_path):
     words = ["run", "motor_winding", "--headless", "--record", str(path)]
     child = subprocess.Popen([sys.executable, "-m", "app.cli.main", *words], cwd=ROOT)
     try:
-        wait_for(lambda: path.exists() and path.stat().st_size > 2000, 120.0)
+        wait_for(lambda: path.exists() and path.stat().st_size > 2000)
         os.kill(child.pid, getattr(signal, name))
         assert child.wait(180.0) == 0
     finally:

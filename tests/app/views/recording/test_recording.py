@@ -25,10 +25,11 @@ from estimators.fold import fold
 from estimators.log import TRUTH, Events, Log
 from estimators.track import Track
 from estimators.tuning import Tuning
-from tests.app.scripted import MODEL, Scripted, pull_all, readings, twin, wait_for
+from tests import ROOT
+from tests.app.scripted import MODEL, Scripted, pull_all, readings, twin
 from tests.app.views.recording.test_parts import refold
-from tests.conftest import ROOT
 from tests.support import SECOND, assert_same
+from tests.waiting import wait_for
 
 
 def drawn(stream):
@@ -167,7 +168,7 @@ import sys
 sys.path.insert(0, {root!r})
 import numpy as np
 from pathlib import Path
-from tests.app.scripted import Scripted, readings, twin, wait_for
+from tests.app.scripted import Scripted, readings, twin
 from app.live import commands
 from app.live.engine import Engine
 from app.views.recording.writer import Recorder

@@ -25,8 +25,9 @@ from estimators.diagnostics.detectors import ADVISORY_ALARM
 from estimators.diagnostics.references import HALF_WIDTH
 from estimators.log import READING, TRUTH, Events
 from estimators.track import HEALTH_NAMES
-from tests.app.scripted import MODEL, Replayed, pull_all, readings, twin, wait_for
+from tests.app.scripted import MODEL, Replayed, pull_all, readings, twin
 from tests.support import SECOND
+from tests.waiting import wait_for
 
 WINDOW = 10.0
 

@@ -9,9 +9,10 @@ import pytest
 from app.live import commands
 from app.live.engine import Engine
 from app.web.server import PageServer
-from tests.app.scripted import Scripted, readings, twin, wait_for
+from tests.app.scripted import Scripted, readings, twin
 from tests.app.served import SECRET
-from tests.app.web.page.browsed import PATIENCE, until
+from tests.app.web.page.browsed import until
+from tests.waiting import LIMIT_S, wait_for
 
 pytestmark = pytest.mark.browser
 
@@ -43,10 +44,10 @@ def at_rest(page):
     box, looks = page.evaluate(PIXELS), []
 
     def alike():
-        looks.append(page.screenshot(clip=box, timeout=PATIENCE * 1000))
+        looks.append(page.screenshot(clip=box, timeout=LIMIT_S * 1000))
         return len(looks) > 1 and looks[-1] == looks[-2]
 
-    wait_for(alike, PATIENCE)
+    wait_for(alike)
     return colours(looks[-1])
 
 
@@ -60,13 +61,13 @@ def test_the_viewer_is_covered_until_it_has_drawn_the_next(browser):
     try:
         t = np.arange(1.0, 101.0)
         source.put(readings(t, 40 + np.sin(t)))
-        page.goto(server.url, timeout=PATIENCE * 1000)
+        page.goto(server.url, timeout=LIMIT_S * 1000)
         page.get_by_role("tab", name="Explore").click()
         until(page, "window.nisus?.explored > 0")
         page.evaluate(NOTE)
         before = at_rest(page)
         engine.submit(commands.SetTuning("Q.temperature", 0.5))
-        wait_for(lambda: engine.status().revision == 1, PATIENCE)
+        wait_for(lambda: engine.status().revision == 1)
         until(page, "window.nisus.panes.explore.revisions.drawn === 1 && !window.nisus.viewer.announced")
         until(page, "window.covered.length > 1")
         covered = page.evaluate("window.covered")

@@ -8,7 +8,8 @@ from app.views.viser.scene import place
 from app.views.viser.view import ViserView
 from estimators.log import READING, TRUTH, Events
 from estimators.models import MODELS
-from tests.app.scripted import events, viewed, wait_for
+from tests.app.scripted import events, viewed
+from tests.waiting import wait_for
 
 pytestmark = pytest.mark.browser
 

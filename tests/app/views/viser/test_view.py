@@ -24,7 +24,8 @@ from config.schema import SceneSection, ViewSection
 from estimators.log import READING, TRUTH, Events
 from estimators.models import MODELS
 from estimators.numerics.peaks import Peak
-from tests.app.scripted import events, viewed, wait_for
+from tests.app.scripted import events, viewed
+from tests.waiting import wait_for
 
 WINDING = MODELS["motor_winding"]
 

@@ -6,10 +6,8 @@ from contextlib import contextmanager
 from app.cli.open_twin import FileOpener, open_session, opened_twin
 from app.web.gallery.gallery import StartRequest
 from app.web.session import Page
-from tests.app.scripted import wait_for
 from tests.app.served import Client
-
-PATIENCE = 60.0
+from tests.waiting import wait_for
 
 
 class Opened:
@@ -34,7 +32,7 @@ class Opened:
         return self.get("/api/session")
 
     def settled(self):
-        wait_for(lambda: self.state()["starting"] is None, PATIENCE)
+        wait_for(lambda: self.state()["starting"] is None)
         return self.state()
 
     def start(self, name):

@@ -13,8 +13,8 @@ import app.web.gallery.api
 from app.cli.open_twin import FileOpener
 from config.loader import shipped
 from estimators.errors import ConfigError
-from tests.app.scripted import wait_for
-from tests.app.web.gallery.opened import PATIENCE, opened
+from tests.app.web.gallery.opened import opened
+from tests.waiting import LIMIT_S, wait_for
 
 RECORDED = {
     "battery_dmegc", "battery_panasonic", "field_era5", "motor_bench", "motor_bench_hybrid", "motor_bench_joint",
@@ -34,14 +34,14 @@ def stream(session):
     client = session.client
     return connect(
         f"ws://{client.host}/api/stream", origin=client.origin, additional_headers={"Cookie": client.cookie},
-        proxy=None, open_timeout=PATIENCE, compression=None,
+        proxy=None, open_timeout=LIMIT_S, compression=None,
     )  # fmt: skip
 
 
 def told(session):
     """The first word of a page's stream."""
     with stream(session) as socket_:
-        return json.loads(socket_.recv(PATIENCE))
+        return json.loads(socket_.recv(LIMIT_S))
 
 
 def test_every_twin_that_ships_has_its_card(empty):
@@ -100,18 +100,18 @@ def test_a_twin_that_is_started_says_that_its_model_is_compiled(tmp_path, monkey
 
     def made_ready(self, opening):
         begun.set()
-        go.wait(PATIENCE)
+        go.wait(LIMIT_S)
         raise ConfigError("enough")
 
     monkeypatch.setattr(FileOpener, "made_ready", made_ready)
     with opened(tmp_path) as session:
         monkeypatch.setattr(app.web.gallery.api, "COMPILING_SHOWN_AFTER_S", 0.0)
         assert session.post("/api/gallery/start", {"twin": "motor_winding"})[0] == 202
-        begun.wait(PATIENCE)
+        begun.wait(LIMIT_S)
         starting = session.state()["starting"]
         assert starting["name"] == "motor_winding" and starting["doing"] == "compiling"
         monkeypatch.setattr(
-            app.web.gallery.api, "COMPILING_SHOWN_AFTER_S", PATIENCE
+            app.web.gallery.api, "COMPILING_SHOWN_AFTER_S", LIMIT_S
         )  # what takes no longer is loaded from the cache
         assert session.state()["starting"]["doing"] == ""
         go.set()
@@ -132,17 +132,17 @@ def test_one_twin_after_another_behind_one_port(tmp_path):
             assert state["failed"] is None and state["running"]["name"] == name
             boots.append(state["boot"])
             assert session.get("/api/status")["twin"] == name and session.get("/api/model")["twin"] == name
-            wait_for(lambda: session.engine.status().counts.get("readings", 0) > 3, PATIENCE)
+            wait_for(lambda: session.engine.status().counts.get("readings", 0) > 3)
             if page is not None and before is not None:
                 # The page of the twin before is let go of, and finds another one.
                 with pytest.raises(Exception, match=r"1012|1000|1005"):
-                    while page.recv(PATIENCE):
+                    while page.recv(LIMIT_S):
                         pass
                 assert told(session)["boot"] == state["boot"]
                 with pytest.raises(OSError):
                     socket.create_connection(("127.0.0.1", before[1]), timeout=1.0)
                 gone = before[0]
-                wait_for(lambda gone=gone: gc.collect() >= 0 and gone() is None, PATIENCE)
+                wait_for(lambda gone=gone: gc.collect() >= 0 and gone() is None)
         assert len(set(boots)) == len(boots) and session.session.url == url
         session.post("/api/gallery/stop", {})
         assert session.state()["running"] is None and b"Gallery" in session.client.get("/").body
@@ -151,7 +151,7 @@ def test_one_twin_after_another_behind_one_port(tmp_path):
             names = {thread.name for thread in threading.enumerate() if thread.name != "MainThread"}
             return {name for name in names - threads if not name.startswith(("AnyIO", "asyncio"))}
 
-        wait_for(lambda: not left(), PATIENCE)
+        wait_for(lambda: not left())
 
 
 def test_a_bus_is_left_before_another_twin_listens_to_it(tmp_path):
@@ -183,7 +183,7 @@ def test_what_ran_goes_on_when_another_one_fails(tmp_path):
         assert state["failed"]["title"] == "bad" and "bad.yaml:2: " in state["failed"]["text"]
         assert state["running"]["name"] == "motor_winding" and session.engine is engine
         before = engine.status().counts["readings"]
-        wait_for(lambda: engine.status().counts["readings"] > before, PATIENCE)
+        wait_for(lambda: engine.status().counts["readings"] > before)
         bad.write_text(good)
         state = session.start(str(bad))
         assert state["failed"] is None and state["running"]["name"] == str(bad)

@@ -13,8 +13,9 @@ from app.views.recording.reader import facts_of, read_recording
 from app.web.gallery.recordings import Recordings
 from estimators.errors import ConfigError, SourceError
 from estimators.track import USED
-from tests.app.scripted import pull_all, wait_for
-from tests.app.web.gallery.opened import PATIENCE, opened
+from tests.app.scripted import pull_all
+from tests.app.web.gallery.opened import opened
+from tests.waiting import wait_for
 
 OUTSIDE = [
     "../private.rrd", "..", ".", "", "/etc/passwd", "a/b.rrd", "a\\b.rrd", ".hidden.rrd", "..\\private.rrd",
@@ -65,7 +66,7 @@ def test_what_cannot_be_read_says_so(folder):
         return next(entry["error"] for entry in recordings.entries() if entry["name"] == "here.rrd")
 
     assert error() is None
-    wait_for(lambda: error() is not None, PATIENCE)
+    wait_for(lambda: error() is not None)
     assert error() == "it cannot be read; is it an .rrd file?"
     with pytest.raises(SourceError, match="is it an .rrd file"):
         facts_of(folder / "here.rrd")
@@ -111,15 +112,15 @@ def recorded(tmp_path_factory):
     folder = tmp_path_factory.mktemp("recordings")
     with opened(folder, "motor_winding", speed=1e6) as session:
         engine = session.engine
-        wait_for(lambda: engine.status().finished, PATIENCE)
+        wait_for(lambda: engine.status().finished)
         assert session.post("/api/command", {"command": "Record", "path": "run.rrd"})[0] == 202
-        wait_for(lambda: engine.status().recording is not None, PATIENCE)
+        wait_for(lambda: engine.status().recording is not None)
         busy = {item["name"]: item for item in session.get("/api/gallery/recordings")["files"]}
         assert busy["run.rrd"]["error"] == "is being recorded"
         assert session.post("/api/gallery/recordings/delete", {"name": "run.rrd"})[0] == 400
         assert session.post("/api/gallery/recordings/open", {"name": "run.rrd"})[0] == 400
         engine.submit(Record(None))
-        wait_for(lambda: session.session.recorder.finished, PATIENCE)
+        wait_for(lambda: session.session.recorder.finished)
         yield session, folder, pull_all(engine)
 
 
@@ -129,7 +130,7 @@ def test_a_recording_is_listed_with_what_it_was_worth(recorded):
     def entry():
         return next(item for item in session.get("/api/gallery/recordings")["files"] if item["name"] == "run.rrd")
 
-    wait_for(lambda: not entry()["looking"], PATIENCE)
+    wait_for(lambda: not entry()["looking"])
     found = entry()
     assert (found["twin"], found["estimator"]) == ("motor_winding", "kf")
     assert found["bytes"] == (folder / "run.rrd").stat().st_size
@@ -165,7 +166,7 @@ def test_open_review_and_back_and_delete(recorded):
     assert status == 202 and answer == {"opening": "run.rrd"}
     state = session.settled()
     assert state["failed"] is None and state["running"]["review"] and state["running"]["title"] == "run.rrd"
-    wait_for(lambda: session.engine.status().finished, PATIENCE)
+    wait_for(lambda: session.engine.status().finished)
     # The same bits as live, by the same engine and page.
     np.testing.assert_array_equal(pull_all(session.engine).track.mean, rows.track.mean)
     assert session.get("/api/status")["began_as"] == "recorded"
@@ -199,7 +200,7 @@ def test_a_log_that_is_dropped_is_read_by_a_twin(tmp_path):
         assert session.post("/api/gallery/recordings/open", {"name": "drive.csv", "twin": str(yaml)})[0] == 202
         state = session.settled()
         assert state["failed"] is None and state["running"]["title"] == "winding on drive.csv"
-        wait_for(lambda: session.engine.status().finished, PATIENCE)
+        wait_for(lambda: session.engine.status().finished)
         read = pull_all(session.engine).events.value[:, 0]
         np.testing.assert_array_equal(read[np.isfinite(read)], values)
         # Of a twin that cannot read it one learns why, and what runs goes on.
@@ -220,17 +221,17 @@ def test_what_the_session_recorded_elsewhere_is_listed_as_well_and_nothing_else_
         return {item["name"]: item for item in session.get("/api/gallery/recordings")["files"]}
 
     with opened(folder, "motor_winding", speed=1e6) as session:
-        wait_for(lambda: session.engine.status().finished, PATIENCE)
+        wait_for(lambda: session.engine.status().finished)
         assert files() == {}
         for name in ("run.rrd", "run2.rrd"):
             session.engine.submit(Record(elsewhere / name))
-            wait_for(lambda n=name: n in files(), PATIENCE)
+            wait_for(lambda n=name: n in files())
             assert files()[name]["error"] == "is being recorded" and files()[name]["folder"] == str(elsewhere)
         # The first is finished, whatever the second is called.
-        wait_for(lambda: files()["run.rrd"]["error"] is None, PATIENCE)
-        wait_for(lambda: session.get("/api/status")["recording_folder"] == str(elsewhere), PATIENCE)
+        wait_for(lambda: files()["run.rrd"]["error"] is None)
+        wait_for(lambda: session.get("/api/status")["recording_folder"] == str(elsewhere))
         session.engine.submit(Record(None))
-        wait_for(lambda: files()["run2.rrd"]["error"] is None, PATIENCE)
+        wait_for(lambda: files()["run2.rrd"]["error"] is None)
         assert session.start("lorenz63")["failed"] is None
         assert set(files()) == {"run.rrd", "run2.rrd"}
         assert session.client.get("/recordings/run.rrd").body == (elsewhere / "run.rrd").read_bytes()

@@ -15,8 +15,9 @@ from app.web.running import stamp_of
 from estimators.fold import Fold
 from estimators.log import Log
 from estimators.model.user_file import imported_beside
-from tests.app.scripted import pull_all, wait_for
-from tests.app.web.gallery.opened import PATIENCE, opened
+from tests.app.scripted import pull_all
+from tests.app.web.gallery.opened import opened
+from tests.waiting import wait_for
 
 YAML = """\
 model: motor_winding
@@ -48,7 +49,7 @@ def save(path, text):
 
 
 def folded(session):
-    wait_for(lambda: not session.engine.status().refolding, PATIENCE)
+    wait_for(lambda: not session.engine.status().refolding)
 
 
 def told(session):
@@ -72,13 +73,13 @@ def mean(path, events):
 def test_a_saved_tuning_is_a_revision_over_the_same_readings(pump):
     with opened(pump.parent / "r", pump, speed=1e6) as session:
         engine = session.engine
-        wait_for(lambda: engine.status().finished, PATIENCE)
+        wait_for(lambda: engine.status().finished)
         # What is turned on the page stays, unless the file says otherwise.
         engine.submit(SetTuning("R.winding", 9.0))
-        wait_for(lambda: engine.status().revision == 1, PATIENCE)
+        wait_for(lambda: engine.status().revision == 1)
         before = pull_all(engine)
         save(pump, YAML.replace("0.01", "0.5"))
-        wait_for(lambda: engine.status().revision == 2, PATIENCE)
+        wait_for(lambda: engine.status().revision == 2)
         folded(session)
         after = pull_all(engine)
         np.testing.assert_array_equal(after.events.value, before.events.value)
@@ -95,14 +96,14 @@ def test_a_mistake_is_said_with_its_line_and_what_runs_goes_on(pump):
     with opened(pump.parent / "r", pump) as session:
         engine = session.engine
         save(pump, YAML.replace("variance: 4", "variance: -4"))
-        wait_for(lambda: told(session)["unread"] is not None, PATIENCE)
+        wait_for(lambda: told(session)["unread"] is not None)
         assert told(session)["unread"].startswith("pump.yaml:5: ") and "-4" in told(session)["unread"]
         assert ("error", f"not read again: {told(session)['unread']}") in lines(session)
         before = engine.status().counts.get("readings", 0)
-        wait_for(lambda: engine.status().counts.get("readings", 0) > before + 2, PATIENCE)
+        wait_for(lambda: engine.status().counts.get("readings", 0) > before + 2)
         assert engine.status().revision == 0 and told(session)["tuning"]["R.winding"] == 4.0
         save(pump, YAML.replace("variance: 4", "variance: 16"))
-        wait_for(lambda: engine.status().revision == 1, PATIENCE)
+        wait_for(lambda: engine.status().revision == 1)
         assert told(session)["unread"] is None and told(session)["tuning"]["R.winding"] == 16.0
 
 
@@ -110,7 +111,7 @@ def test_another_shape_is_started_anew_and_says_so(pump):
     with opened(pump.parent / "r", pump) as session:
         boot = session.state()["boot"]
         save(pump, YAML.replace("seed: 2", "seed: 3"))
-        wait_for(lambda: session.state()["boot"] != boot, PATIENCE)
+        wait_for(lambda: session.state()["boot"] != boot)
         assert ("warn", "pump.yaml was saved and its `source` changed: the twin was started anew") in lines(session)
         assert session.state()["running"]["name"] == str(pump) and session.engine.status().revision == 0
 
@@ -131,13 +132,13 @@ def test_a_saved_model_is_folded_and_its_mistake_has_a_line(pump):
     save(pump, YAML.replace("motor_winding", "./pump.py:Pump"))
     with opened(pump.parent / "r", pump, speed=1e6) as session:
         engine = session.engine
-        wait_for(lambda: engine.status().finished, PATIENCE)
+        wait_for(lambda: engine.status().finished)
         began = pull_all(engine)
         save(model, MODEL.replace("1.0", "1.0 / 0"))
-        wait_for(lambda: told(session)["unread"] is not None, PATIENCE)
+        wait_for(lambda: told(session)["unread"] is not None)
         assert told(session)["unread"].startswith("pump.py:4: ZeroDivisionError")
         save(model, MODEL.replace("1.0", "2.0"))
-        wait_for(lambda: engine.status().revision == 1, PATIENCE)
+        wait_for(lambda: engine.status().revision == 1)
         folded(session)
         after = pull_all(engine)
         # The prior's mean is twice as high, which the first reading has not made up for.
@@ -145,7 +146,7 @@ def test_a_saved_model_is_folded_and_its_mistake_has_a_line(pump):
         np.testing.assert_array_equal(after.track.mean, mean(pump, after.events))
         # A revision of before has the tuning of before, and the model of now.
         engine.submit(SetEstimator("ekf"))
-        wait_for(lambda: engine.status().revision == 2, PATIENCE)
+        wait_for(lambda: engine.status().revision == 2)
         assert engine.folded_with()[0].model is engine.model
 
 
@@ -168,13 +169,13 @@ Pump = replace(Pump, f=f, F=None, linear=False)
     save(pump, YAML.replace("motor_winding", "./pump.py:Pump").replace("kf", "ekf"))
     with opened(pump.parent / "r", pump, speed=1e6) as session:
         engine = session.engine
-        wait_for(lambda: engine.status().finished, PATIENCE)
+        wait_for(lambda: engine.status().finished)
         began = pull_all(engine)
         save(helper, "FACTOR = 1.0\nDAMPING = 1.0 +\n")
-        wait_for(lambda: told(session)["unread"] is not None, PATIENCE)
+        wait_for(lambda: told(session)["unread"] is not None)
         assert told(session)["unread"].startswith("lib/numbers.py:2: ")
         save(helper, "FACTOR = 1.0\nDAMPING = 0.0\n")
-        wait_for(lambda: engine.status().revision == 1, PATIENCE)
+        wait_for(lambda: engine.status().revision == 1)
         folded(session)
         after = pull_all(engine)
         assert told(session)["unread"] is None
@@ -212,13 +213,13 @@ def test_a_recording_has_the_twin_as_it_was_saved_last(pump):
     recordings = pump.parent / "r"
     with opened(recordings, pump, speed=1e6) as session:
         engine = session.engine
-        wait_for(lambda: engine.status().finished, PATIENCE)
+        wait_for(lambda: engine.status().finished)
         session.post("/api/command", {"command": "Record", "path": "run.rrd"})
-        wait_for(lambda: engine.status().recording is not None, PATIENCE)
+        wait_for(lambda: engine.status().recording is not None)
         save(pump, YAML.replace("0.01", "0.5"))
-        wait_for(lambda: engine.status().revision == 1, PATIENCE)
+        wait_for(lambda: engine.status().revision == 1)
         session.post("/api/command", {"command": "Record", "path": None})
-        wait_for(lambda: session.session.recorder.finished, PATIENCE)
+        wait_for(lambda: session.session.recorder.finished)
     recorded = read_recording(recordings / "run.rrd")
     assert recorded.text == pump.read_text() and recorded.tunings == 2
 

@@ -11,13 +11,10 @@ from typing import Any
 import numpy as np
 
 from app.cli.open_twin import live_source
-from app.twin.twin import load_twin
 from app.web.running import OpenedTwin
 from app.web.session import Page, Session
-from tests.app.scripted import wait_for
-
-PATIENCE = 120.0
-"""Seconds for a step on a busy machine without a graphics card; a test that works takes a fraction."""
+from tests.skips import with_recording
+from tests.waiting import LIMIT_S, wait_for
 
 DRAWN = "window.nisus?.drawn > 0"
 
@@ -31,7 +28,7 @@ def until(page: Any, expression: str) -> None:
         except Exception:  # noqa: BLE001  a page that is being left: there is nobody to answer
             return False
 
-    wait_for(holds, PATIENCE)
+    wait_for(holds)
 
 
 @contextmanager
@@ -39,12 +36,12 @@ def running(
     name: str, speed: float | None = float("inf"), *, log: Path | None = None, **overrides: str
 ) -> Iterator[Session]:
     """A session of a twin with its page, of a log in place of its source; played as fast as possible, it has ended."""
-    twin = load_twin(name, log_files=None if log is None else [log], overrides=overrides)
+    twin = with_recording(name, log_files=None if log is None else [log], overrides=overrides)
     session = Session(OpenedTwin(twin, live_source(twin, speed)), page=Page(0, open_browser=False))
     session.start()
     try:
         if speed == float("inf"):
-            wait_for(lambda: session.engine.status().finished, PATIENCE)
+            wait_for(lambda: session.engine.status().finished)
         yield session
     finally:
         session.stop()
@@ -52,7 +49,7 @@ def running(
 
 def settled(engine: Any, revision: int = 0) -> None:
     """Wait until a revision runs, and no refold is under way."""
-    wait_for(lambda: engine.revisions.runs[-1].number >= revision and not engine.status().refolding, PATIENCE)
+    wait_for(lambda: engine.revisions.runs[-1].number >= revision and not engine.status().refolding)
 
 
 def pixels(page: Any, selector: str, lower: float = 1.0) -> np.ndarray:
@@ -61,7 +58,7 @@ def pixels(page: Any, selector: str, lower: float = 1.0) -> np.ndarray:
 
     box = page.locator(selector).first.bounding_box()
     clip = box | {"y": box["y"] + (1 - lower) * box["height"], "height": lower * box["height"]}
-    picture = page.screenshot(clip=clip, timeout=PATIENCE * 1000)
+    picture = page.screenshot(clip=clip, timeout=LIMIT_S * 1000)
     return np.asarray(Image.open(io.BytesIO(picture)).convert("RGB")).astype(int)
 
 

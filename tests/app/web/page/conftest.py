@@ -4,7 +4,8 @@ from urllib.parse import urlsplit
 
 import pytest
 
-from tests.app.web.page.browsed import DRAWN, PATIENCE, until
+from tests.app.web.page.browsed import DRAWN, until
+from tests.waiting import LIMIT_S
 
 
 @pytest.fixture
@@ -23,7 +24,7 @@ def visit(browser):
             if not scene:
                 contexts[-1].add_init_script("if (location.pathname.endsWith('/viser/')) window.stop()")
         page = (contexts[-1] if beside is None else beside.context).new_page()
-        page.set_default_timeout(PATIENCE * 1000)
+        page.set_default_timeout(LIMIT_S * 1000)
         own = tuple(f"http://{name}:{urlsplit(url).port}/" for name in ("127.0.0.1", "localhost"))
         page.asked = []
 

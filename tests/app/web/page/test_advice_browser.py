@@ -2,8 +2,8 @@
 
 import pytest
 
-from tests.app.scripted import wait_for
-from tests.app.web.page.browsed import PATIENCE, running, settled
+from tests.app.web.page.browsed import running, settled
+from tests.waiting import wait_for
 
 pytestmark = pytest.mark.browser
 
@@ -21,7 +21,7 @@ def test_a_linear_model_is_told_its_filter_which_applies_itself(page, session):
     page.locator("#advice-panel").get_by_text("nothing measured yet").wait_for()
     page.locator("#advice-begin").click()
     apply = page.locator("#advice-apply")
-    wait_for(lambda: apply.count() == 1, PATIENCE)
+    wait_for(lambda: apply.count() == 1)
     card = page.locator("#advice-panel article.first")
     assert card.locator("h3").inner_text().startswith("Kalman filter")
     assert "The model is linear; a Kalman filter is exact." in card.inner_text()
@@ -39,7 +39,7 @@ def test_a_linear_model_is_told_its_filter_which_applies_itself(page, session):
     apply.click()
     settled(engine, 1)
     assert engine.estimator == "kf" and engine.revisions.runs[-1].number == 1
-    wait_for(lambda: "another runs now" in page.locator("#advice-panel").inner_text(), PATIENCE)
+    wait_for(lambda: "another runs now" in page.locator("#advice-panel").inner_text())
     # Wherever the focus went while it was measured.
     page.evaluate("document.activeElement.blur()")
     page.keyboard.press("Escape")

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from estimators.log import INPUT
-from tests.app.scripted import pull_all, row_count, wait_for
-from tests.app.web.page.browsed import PATIENCE, running, until
+from tests.app.scripted import pull_all, row_count
+from tests.app.web.page.browsed import running, until
+from tests.waiting import wait_for
 
 pytestmark = pytest.mark.browser
 
@@ -13,7 +14,7 @@ pytestmark = pytest.mark.browser
 @pytest.fixture(scope="module")
 def session():
     with running("motor_can", 1.0) as made:
-        wait_for(lambda: row_count(made.engine) > 600, PATIENCE)
+        wait_for(lambda: row_count(made.engine) > 600)
         yield made
 
 
@@ -35,14 +36,14 @@ def test_what_if_draws_a_fan_and_says_when_a_limit_is_reached(page, session):
         for (let k = 0; k < data.length; k += 4) if (data[k + 3] > 100 && data[k + 2] > data[k] + 60) blue++;
         return blue;
     })"""
-    wait_for(lambda: min(page.evaluate(right)) > 50, PATIENCE)
+    wait_for(lambda: min(page.evaluate(right)) > 50)
     # A current ten times as strong heats the winding beyond any doubt.
     page.get_by_label("i q [A] from now on, as a number").fill("600")
     page.get_by_label("i q [A] from now on, as a number").press("Enter")
     page.get_by_label("Limit of winding °C", exact=True).fill("90")
     page.get_by_label("Limit of winding °C", exact=True).press("Enter")
     said = page.get_by_label("When winding reaches its limit")
-    wait_for(lambda: said.inner_text().startswith("reaches 90 °C in "), PATIENCE)
+    wait_for(lambda: said.inner_text().startswith("reaches 90 °C in "))
     assert "over 99 % within 6 min" in said.inner_text()
     # And as it is now again: less hot.
     hot = page.evaluate("window.nisus.panes.whatif.found.states.winding.mean.at(-1)")
@@ -97,7 +98,7 @@ def test_an_input_steps_ramps_or_repeats_what_was_recorded(page, session):
 
     page.get_by_label("i q as it is now").click()
     until(page, "!window.nisus.panes.whatif.found.chosen.i_q")
-    wait_for(lambda: charts.count() == 4, PATIENCE)
+    wait_for(lambda: charts.count() == 4)
 
 
 def test_how_likely_a_limit_is_passed_stands_at_the_foot_of_its_chart(page):
@@ -122,7 +123,7 @@ def test_how_likely_a_limit_is_passed_stands_at_the_foot_of_its_chart(page):
         }
         return 0;
     }"""
-    wait_for(lambda: abs(page.evaluate(height) - 0.25) < 0.03, PATIENCE)
+    wait_for(lambda: abs(page.evaluate(height) - 0.25) < 0.03)
     page.get_by_label("i q as it is now").click()
     until(page, "!window.nisus.panes.whatif.found.chosen.i_q")
 
@@ -138,15 +139,15 @@ def test_diagnose_draws_what_the_rows_say(page, tmp_path):
         # Correlations at 50 lags; coverage of ten parts of the time, each with its interval once it has 8 readings.
         assert row.locator("svg[aria-label^=Autocorrelation] line.stem").count() == 50
         over = row.locator("svg[aria-label^=Coverage]")
-        wait_for(lambda over=over: over.locator("line.stem").count() == 10, PATIENCE)
+        wait_for(lambda over=over: over.locator("line.stem").count() == 10)
         assert over.locator("circle").count() == 10
         assert "adaptive 95 % interval" in row.inner_text()
     page.locator("#diagnose").screenshot(path=tmp_path / "diagnose.png")
     assert page.locator("#diagnose svg.map rect").count() == 16
     # What takes many folds comes later.
-    wait_for(lambda: page.get_by_label("Smallest visible faults", exact=True).count() == 1, PATIENCE)
-    wait_for(lambda: page.locator("#diagnose .shares tr").count() == 4, PATIENCE)
-    wait_for(lambda: "µs" in page.locator("#diagnose .summary").inner_text(), PATIENCE)
+    wait_for(lambda: page.get_by_label("Smallest visible faults", exact=True).count() == 1)
+    wait_for(lambda: page.locator("#diagnose .shares tr").count() == 4)
+    wait_for(lambda: "µs" in page.locator("#diagnose .summary").inner_text())
 
 
 @pytest.mark.parametrize("place", ["inside", "above"])

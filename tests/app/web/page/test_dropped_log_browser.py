@@ -16,16 +16,15 @@ import pytest
 
 from estimators.log import READING
 from estimators.track import HELD_OUT
-from tests.app.scripted import pull_all, wait_for
+from tests.app.scripted import pull_all
 from tests.app.web.gallery.opened import opened
-from tests.app.web.page.browsed import PATIENCE, until
+from tests.app.web.page.browsed import until
 from tests.app.web.page.test_gallery_browser import drop
 from tests.sources.can.can_tools import dbc
+from tests.waiting import wait_for
 
 pytestmark = pytest.mark.browser
 
-DRAFT_PATIENCE = 600.0
-"""Seconds for a draft: hundreds of folds, where a page takes one."""
 
 BY_ASAMMDF = """
 import json, sys, asammdf, numpy
@@ -100,10 +99,10 @@ def drafted(page, session, name):
     page.get_by_role("button", name="Draft and run").click()
     page.locator(".draft .row").get_by_text("…").first.wait_for()
     progress = "/api/gallery/log/draft"
-    wait_for(lambda: session.get(progress)["state"] != "running", DRAFT_PATIENCE)
+    wait_for(lambda: session.get(progress)["state"] != "running")
     assert session.get(progress)["error"] is None and "95 % bounds" in session.get(progress)["summary"]
     until(page, f"window.nisus?.model?.twin === '{name}' && window.nisus.drawn > 0")
-    wait_for(lambda: session.engine.status().finished, PATIENCE)
+    wait_for(lambda: session.engine.status().finished)
     return pull_all(session.engine)
 
 
@@ -275,7 +274,7 @@ def test_no_error_is_a_dead_end(visit, tmp_path):
         page.locator(".card").first.wait_for()
         # A twin that cannot read a file says so without a path, and what was dropped stays.
         drop(page, "plain.csv", b"a,b\n0,1\n", "[data-name=motor_bench] h2")
-        wait_for(lambda: "there is no column 't_s'" in page.locator("#failed").inner_text(), PATIENCE)
+        wait_for(lambda: "there is no column 't_s'" in page.locator("#failed").inner_text())
         assert str(tmp_path) not in page.locator("#failed").inner_text()
 
 

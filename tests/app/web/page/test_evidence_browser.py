@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from app.live.commands import SetTuning
-from tests.app.scripted import pull_all, wait_for
-from tests.app.web.page.browsed import PATIENCE, running, until
+from tests.app.scripted import pull_all
+from tests.app.web.page.browsed import running, until
 from tests.app.web.page.test_quiet_browser import streams
+from tests.waiting import wait_for
 
 pytestmark = pytest.mark.browser
 
@@ -68,7 +69,7 @@ def test_where_the_innovations_are_correlated_no_value_of_r_is_offered_and_it_sa
     mark.click(force=True)
     # Another one, of which nothing speaks against it, is taken: then the first would have been, too.
     other.click(force=True)
-    wait_for(lambda: session.engine.revisions.runs[-1].number > before, PATIENCE)
+    wait_for(lambda: session.engine.revisions.runs[-1].number > before)
     assert session.engine.tuning.get("R.tooth") == 0.5 and session.engine.tuning.get("R.yoke") != 0.5
     assert page.locator("#scale-Q").is_disabled() and doubt in page.locator("#scale-Q").get_attribute("title")
     page.locator('[data-key="R.yoke"] label').click()
@@ -127,7 +128,7 @@ def test_many_states_of_a_kind_are_one_chart_in_which_the_odd_one_stands_out(sho
     # Each of them can be had.
     page.get_by_text("Shown", exact=True).click()
     page.locator("#layout li").filter(has_text="state of charge 5").first.get_by_role("checkbox").check()
-    wait_for(lambda: "upper:soc_5" in streams(session)["charts"], PATIENCE)
+    wait_for(lambda: "upper:soc_5" in streams(session)["charts"])
 
 
 def test_a_dozen_states_and_more_are_a_picture_of_space_and_time(shown):

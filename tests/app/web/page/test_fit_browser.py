@@ -9,8 +9,8 @@ from app.live.tunings.versions import listing
 from app.studies.baseline import ComparedFigure
 from app.studies.guard import GuardVerdict, keep_last
 from app.twin.twin import with_version
-from tests.app.scripted import wait_for
-from tests.app.web.page.browsed import PATIENCE, running, settled
+from tests.app.web.page.browsed import running, settled
+from tests.waiting import LIMIT_S, wait_for
 
 pytestmark = pytest.mark.browser
 
@@ -32,8 +32,8 @@ def fitted(page):
     """The fit's answer, once it is there."""
     before = page.evaluate("window.nisus.tune.fit.told?.number ?? 0")
     page.locator("#fit-begin").click()
-    wait_for(lambda: page.evaluate("window.nisus.tune.fit.told?.number ?? 0") == before + 1, PATIENCE)
-    wait_for(lambda: page.locator("#fit-panel .progress").is_hidden(), PATIENCE)
+    wait_for(lambda: page.evaluate("window.nisus.tune.fit.told?.number ?? 0") == before + 1)
+    wait_for(lambda: page.locator("#fit-panel .progress").is_hidden())
     assert verdict(page) is not None
     return json.loads(page.evaluate("JSON.stringify(window.nisus.tune.fit.told)"))
 
@@ -48,7 +48,7 @@ def test_what_is_wrong_is_found_put_in_and_taken_back(page, session):
     assert engine.tuning.get("R.winding") == WRONG
     page.locator("#fit").click()
     # Opened by the keyboard or the mouse, the first thing that can be chosen has the focus.
-    wait_for(lambda: page.evaluate("document.activeElement?.closest('#fit-panel') !== null"), PATIENCE)
+    wait_for(lambda: page.evaluate("document.activeElement?.closest('#fit-panel') !== null"))
     told = fitted(page)
     assert told["result"]["proposed"], told["result"]["verdict"]
     assert verdict(page).startswith("Better on the blocks held out: +")
@@ -62,7 +62,7 @@ def test_what_is_wrong_is_found_put_in_and_taken_back(page, session):
     # Kept as a version, with what it was worth on the blocks held out.
     page.locator("#fit-name").fill("found")
     page.locator("#fit-keep").click()
-    wait_for(lambda: len(listing(engine.twin)) == 2, PATIENCE)
+    wait_for(lambda: len(listing(engine.twin)) == 2)
     kept = listing(engine.twin)[1]
     assert kept["name"] == "found" and kept["note"] == "fitted: Q, R"
     held_out = told["result"]["after"]["held_out"]
@@ -77,7 +77,7 @@ def test_what_is_wrong_is_found_put_in_and_taken_back(page, session):
     run = engine.revisions.runs[-1]
     assert run.number == 1
     assert {key: engine.tuning.get(key) for key in told["values"]} == told["values"]
-    wait_for(lambda: page.locator("#fit-use").is_disabled(), PATIENCE)
+    wait_for(lambda: page.locator("#fit-use").is_disabled())
 
     # What was found leaves nothing to be found.
     again = fitted(page)
@@ -85,7 +85,7 @@ def test_what_is_wrong_is_found_put_in_and_taken_back(page, session):
     assert page.locator("#fit-use.first").count() == 0
 
     page.keyboard.press("Escape")
-    wait_for(lambda: page.evaluate("document.activeElement?.id") == "fit", PATIENCE)
+    wait_for(lambda: page.evaluate("document.activeElement?.id") == "fit")
     assert page.locator("#fit-panel").is_hidden()
     page.locator("body").press("u")
     settled(engine, 2)
@@ -95,9 +95,9 @@ def test_what_is_wrong_is_found_put_in_and_taken_back(page, session):
 def test_a_fit_shows_its_progress_while_the_page_is_used_and_stops_with_its_best_values(page, session, halted):
     page.locator("#fit").click()
     page.locator("#fit-begin").click()
-    assert halted.reached.wait(PATIENCE)
+    assert halted.reached.wait(LIMIT_S)
     progress = page.locator("#fit-panel .progress")
-    wait_for(lambda: "Best so far: +" in progress.inner_text(), PATIENCE)
+    wait_for(lambda: "Best so far: +" in progress.inner_text())
     assert re.fullmatch(r"about .+ left, .+ so far", progress.locator("output").inner_text())
     assert re.search(r"Best so far: \+[\d.]+ on the fitted blocks \([QR]\.\w+ \S+ -> \S+, ", progress.inner_text())
     assert 0.0 < page.evaluate("document.querySelector('#fit-panel progress').value") < 1.0
@@ -108,7 +108,7 @@ def test_a_fit_shows_its_progress_while_the_page_is_used_and_stops_with_its_best
 
     page.locator("#fit-cancel").click()
     halted.released.set()
-    wait_for(lambda: progress.is_hidden() and verdict(page) is not None, PATIENCE)
+    wait_for(lambda: progress.is_hidden() and verdict(page) is not None)
     result = page.locator("#fit-panel .result").inner_text()
     assert "Ended early: these are the best values so far" in result and "R.winding" in result
 
@@ -120,7 +120,7 @@ def test_single_entries_are_fitted_alone(page, session):
     assert told["wanted"] == ["R"] and [line["key"] for line in told["result"]["entries"]] == ["R.winding"]
     page.locator("#fit-panel .groups label", has_text="R").locator("input").uncheck()
     page.locator("#fit-begin").click()
-    wait_for(lambda: "wanted is empty" in page.locator("#fit-panel .error").inner_text(), PATIENCE)
+    wait_for(lambda: "wanted is empty" in page.locator("#fit-panel .error").inner_text())
     page.locator("#fit-panel details.entries summary").click()
     page.locator("#fit-panel .entry-list input").first.check()
     told = fitted(page)
@@ -134,26 +134,26 @@ def test_what_runs_is_kept_compared_and_loaded_again(page, session):
     )
     page.get_by_role("tab", name="Runs").click()
     guarded = page.locator('.versions [data-guarded="winding"]')
-    wait_for(lambda: "1 of 1 figures worse: rmse.temperature was 0.5 and is 0.6" in guarded.inner_text(), PATIENCE)
+    wait_for(lambda: "1 of 1 figures worse: rmse.temperature was 0.5 and is 0.6" in guarded.inner_text())
     page.get_by_role("textbox", name="Name of the version").fill("as it was")
     page.get_by_role("textbox", name="Note on the version").fill("too much noise")
     page.locator(".versions form button").click()
     row = page.locator('.versions tbody[data-version="as_it_was"]')
-    wait_for(lambda: row.count() == 1, PATIENCE)
+    wait_for(lambda: row.count() == 1)
     assert "too much noise" in row.inner_text()
     assert page.evaluate("window.nisus.link.ask('SetTuning', {key: 'R.winding', value: 9})") is None
     settled(engine, 1)
 
     row.get_by_role("button", name="Compare with the running tuning").click()
-    wait_for(lambda: "R.winding" in row.inner_text(), PATIENCE)
+    wait_for(lambda: "R.winding" in row.inner_text())
     assert row.locator("table tbody tr").all_inner_texts() == ["R.winding\t100\t9"]
 
     row.get_by_role("button", name="Load").click()
     settled(engine, 2)
-    wait_for(lambda: engine.tuning.get("R.winding") == WRONG, PATIENCE)
+    wait_for(lambda: engine.tuning.get("R.winding") == WRONG)
     assert engine.tuning.name == "as_it_was" and engine.revisions.runs[-1].number == 2
-    wait_for(lambda: row.get_attribute("data-running") == "true", PATIENCE)
+    wait_for(lambda: row.get_attribute("data-running") == "true")
     # A name that is taken is refused, and it says why.
     page.get_by_role("textbox", name="Name of the version").fill("as it was")
     page.locator(".versions form button").click()
-    wait_for(lambda: "there is a version of that name" in page.locator(".versions .error").last.inner_text(), PATIENCE)
+    wait_for(lambda: "there is a version of that name" in page.locator(".versions .error").last.inner_text())

@@ -2,8 +2,8 @@
 
 import pytest
 
-from tests.app.scripted import wait_for
-from tests.app.web.page.browsed import PATIENCE, running, until
+from tests.app.web.page.browsed import running, until
+from tests.waiting import wait_for
 
 pytestmark = pytest.mark.browser
 
@@ -53,7 +53,7 @@ def test_nothing_is_wider_than_its_column(name, visit):
         page = visit(session.url, ready="window.nisus?.drawn > 3")
         # Rows with all their buttons: a run before the one that runs, and both have a name.
         page.evaluate("window.nisus.link.ask('UseSensor', {name: window.nisus.model.sensors[0], used: false})")
-        wait_for(lambda: session.engine.status().revision > 0, PATIENCE)
+        wait_for(lambda: session.engine.status().revision > 0)
         page.evaluate("window.nisus.link.ask('Note', {number: 0, name: 'a name of some length', note: ''})")
         # A value as long as they come.
         key = page.evaluate("document.querySelector('.knob[data-key^=\"Q.\"]').dataset.key")
@@ -64,9 +64,7 @@ def test_nothing_is_wider_than_its_column(name, visit):
             for tab in TABS:
                 page.get_by_role("tab", name=tab, exact=True).click()
                 if tab == "Runs":
-                    wait_for(
-                        lambda: page.locator(".runs .scores").count() == len(session.engine.revisions.runs), PATIENCE
-                    )
+                    wait_for(lambda: page.locator(".runs .scores").count() == len(session.engine.revisions.runs))
                 if tab in FILLED:
                     until(page, FILLED[tab])
                 # Laid out, and drawn in that layout.
@@ -189,7 +187,7 @@ def test_the_legend_has_every_mark_of_the_charts_and_no_other(visit, width):
             extra = set(seen) - {"episode-strip", "outside"}
             return marks <= set(drawn) and set(drawn) == extra and explained
 
-        wait_for(complete, PATIENCE)
+        wait_for(complete)
 
 
 def test_a_picture_has_a_colour_bar_with_its_ends(visit):

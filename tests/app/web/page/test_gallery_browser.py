@@ -11,11 +11,12 @@ from app.cli.commission import commission_twin
 from app.live.commands import Load, Record, SetTuning
 from app.views.recording.reader import read_recording
 from estimators.track import TRACKING
-from tests.app.scripted import pull_all, wait_for
+from tests import ROOT
+from tests.app.scripted import pull_all
 from tests.app.web.gallery.opened import opened
-from tests.app.web.page.browsed import PATIENCE, drawn, until
+from tests.app.web.page.browsed import drawn, until
 from tests.app.web.test_service import Served
-from tests.conftest import ROOT
+from tests.waiting import wait_for
 
 pytestmark = pytest.mark.browser
 
@@ -47,14 +48,14 @@ def test_two_browsers_start_switch_and_come_back(visit, tmp_path):
         for page in (first, second):
             shows(page, "motor_winding")
             assert page.url == address
-        wait_for(lambda: drawn(first, "#charts")["estimate"] > 200, PATIENCE)
+        wait_for(lambda: drawn(first, "#charts")["estimate"] > 200)
 
         # Back to the gallery while it goes on; the other browser stays where it is.
         first.keyboard.press("g")
         first.get_by_text("motor_winding runs").wait_for()
         assert first.url.endswith("/gallery") and second.url == address
         before = session.engine.status().counts["readings"]
-        wait_for(lambda: session.engine.status().counts["readings"] > before, PATIENCE)
+        wait_for(lambda: session.engine.status().counts["readings"] > before)
         card(first, "motor_winding").get_by_role("button", name="Back to").click()
         shows(first, "motor_winding")
 
@@ -69,7 +70,7 @@ def test_two_browsers_start_switch_and_come_back(visit, tmp_path):
             shows(page, "motor_can")
             assert page.url == address
         rows = left.status().counts["readings"]
-        wait_for(lambda: drawn(second, "#charts")["reading"] > 30, PATIENCE)
+        wait_for(lambda: drawn(second, "#charts")["reading"] > 30)
         assert left.status().counts["readings"] == rows
         second.frame_locator("#stage").locator("canvas").first.wait_for()
 
@@ -81,7 +82,7 @@ def test_two_browsers_start_switch_and_come_back(visit, tmp_path):
         first.get_by_role("button", name="Stop").click()
         for page in (first, second):
             page.get_by_text("How do I know that my filter works?").wait_for()
-            wait_for(lambda page=page: page.locator("#now").inner_text() == "", PATIENCE)
+            wait_for(lambda page=page: page.locator("#now").inner_text() == "")
         assert session.state()["running"] is None
 
 
@@ -114,13 +115,13 @@ def test_a_mistake_in_a_file_is_on_the_page_until_it_is_mended(visit, tmp_path, 
         page.locator("#unread").wait_for(state="hidden")
         until(page, "window.nisus.revision === 1")
         field = page.get_by_label("winding, value")
-        wait_for(lambda: field.input_value() == "400", PATIENCE)
+        wait_for(lambda: field.input_value() == "400")
         # That is what is configured now: nothing is turned.
-        wait_for(lambda: page.locator("[data-key='R.winding'][data-turned]").count() == 0, PATIENCE)
+        wait_for(lambda: page.locator("[data-key='R.winding'][data-turned]").count() == 0)
         # Saved with another shape, it is started anew, which the page says.
         yaml.write_text(good.replace("step: 0.1", "step: 0.05"))
         page.get_by_role("tab", name="Episodes").click()
-        wait_for(lambda: "started anew" in page.locator("body").inner_text(), PATIENCE)
+        wait_for(lambda: "started anew" in page.locator("body").inner_text())
 
 
 DROP = """([name, data, target]) => {
@@ -142,11 +143,11 @@ def test_record_review_drop_and_delete(visit, tmp_path):
     with opened(folder, "motor_winding", speed=1e6) as session:
         page = visit(session.session.url, ready=None)
         shows(page, "motor_winding")
-        wait_for(lambda: session.engine.status().finished, PATIENCE)
+        wait_for(lambda: session.engine.status().finished)
         page.keyboard.press("r")
         until(page, "window.nisus.link.status.recording !== null")
         page.keyboard.press("r")
-        wait_for(lambda: session.session.recorder.finished, PATIENCE)
+        wait_for(lambda: session.session.recorder.finished)
         (path,) = folder.glob("motor_winding-*.rrd")
         live = pull_all(session.engine)
         page.keyboard.press("g")
@@ -160,14 +161,14 @@ def test_record_review_drop_and_delete(visit, tmp_path):
         # Open is review: the same page, the same bits.
         row.locator(".name").click()
         until(page, "window.nisus?.link?.status.began_as === 'recorded'")
-        wait_for(lambda: session.engine.status().finished, PATIENCE)
+        wait_for(lambda: session.engine.status().finished)
         np.testing.assert_array_equal(pull_all(session.engine).track.mean, live.track.mean)
-        wait_for(lambda: drawn(page, "#charts")["estimate"] > 200, PATIENCE)
+        wait_for(lambda: drawn(page, "#charts")["estimate"] > 200)
 
         # Dropped on a twin's page it is kept under a name of its own, and opens.
         drop(page, path.name, path.read_bytes())
         kept = folder / path.name.replace(".rrd", "-2.rrd")
-        wait_for(lambda: session.state()["running"]["title"] == kept.name, PATIENCE)
+        wait_for(lambda: session.state()["running"]["title"] == kept.name)
         assert kept.read_bytes() == path.read_bytes() and read_recording(kept).name == "motor_winding"
         until(page, f"window.nisus?.link?.boot === '{session.settled()['boot']}' && window.nisus.drawn > 0")
         drop(page, "broken.rrd", b"RRF2 and no more")
@@ -184,7 +185,7 @@ def test_record_review_drop_and_delete(visit, tmp_path):
         card(page, "motor_bench").wait_for()
         drop(page, "other.csv", b"t,T\n0,1\n", "[data-name=motor_bench] h2")
         page.locator("#failed").wait_for()
-        wait_for(lambda: "other.csv" in page.locator("#failed").inner_text(), PATIENCE)
+        wait_for(lambda: "other.csv" in page.locator("#failed").inner_text())
 
         # Delete asks first.
         row = page.locator(".file[data-name='drive.csv']")
@@ -250,26 +251,26 @@ def test_a_twin_of_ones_own_stores_its_baseline(visit, tmp_path, capsys):
     with opened(tmp_path / "recordings", path, speed=float("inf")) as session:
         page = visit(session.session.url, ready=None)
         shows(page, "drive")
-        wait_for(lambda: session.engine.status().finished, PATIENCE)
+        wait_for(lambda: session.engine.status().finished)
         # An edit is not in the file, so its baseline would be another tuning's.
         session.engine.submit(SetTuning("Q.rate", 0.02))
-        wait_for(lambda: session.engine.folded_with()[0].get("Q.rate") == 0.02, PATIENCE)
+        wait_for(lambda: session.engine.folded_with()[0].get("Q.rate") == 0.02)
         page.get_by_role("tab", name="Episodes").click()
         section = page.get_by_role("region", name="Baseline")
         section.get_by_role("button", name="Store baseline").click()
         section.get_by_text("has been edited; save it first").wait_for()
         assert "commissioned" not in path.read_text()
         session.engine.submit(Load(0))
-        wait_for(lambda: session.engine.folded_with()[0].get("Q.rate") != 0.02, PATIENCE)
+        wait_for(lambda: session.engine.folded_with()[0].get("Q.rate") != 0.02)
         section.get_by_role("button", name="Store baseline").click()
-        wait_for(lambda: session.engine.folded_with()[0].baseline is not None, PATIENCE)
+        wait_for(lambda: session.engine.folded_with()[0].baseline is not None)
         # What `nisus commission` prints for the file.
         stored = path.read_text().partition("commissioned:")[2]
         assert commission_twin(CommissionCommand(str(path))) == 0
         assert capsys.readouterr().out.partition("commissioned:")[2] == stored and "scale: 1.275" in stored
         section.get_by_text("Stored in drive.yaml").wait_for()
         assert section.get_by_role("button").count() == 0
-        wait_for(lambda: session.engine.status().health == TRACKING, PATIENCE)
+        wait_for(lambda: session.engine.status().health == TRACKING)
 
 
 def test_a_bundled_twin_has_no_baseline_to_store(visit, tmp_path):

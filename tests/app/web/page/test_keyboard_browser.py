@@ -5,9 +5,9 @@ import re
 import numpy as np
 import pytest
 
-from tests.app.scripted import wait_for
-from tests.app.web.page.browsed import PATIENCE, running, until
+from tests.app.web.page.browsed import running, until
 from tests.app.web.page.test_colours import TEXT, contrast, over
+from tests.waiting import wait_for
 
 pytestmark = pytest.mark.browser
 
@@ -88,7 +88,7 @@ def test_every_control_is_reached_by_tab_and_has_a_name(visit, session, show):
     # Paused, nothing comes or goes on the way; and the scene is Viser's, with focus of its own.
     page.get_by_role("tab", name="XY").click()
     page.get_by_label("Pause or continue").click()
-    wait_for(lambda: session.engine.status().paused, PATIENCE)
+    wait_for(lambda: session.engine.status().paused)
     try:
         for tab in show:
             page.get_by_role("tab", name=tab, exact=True).click()
@@ -111,7 +111,7 @@ def test_every_control_is_reached_by_tab_and_has_a_name(visit, session, show):
         assert page.evaluate("document.activeElement.getAttribute('aria-selected')") == "true"
     finally:
         page.get_by_label("Pause or continue").click()
-        wait_for(lambda: not session.engine.status().paused, PATIENCE)
+        wait_for(lambda: not session.engine.status().paused)
 
 
 OUTLINE = """() => {
@@ -137,10 +137,7 @@ def test_headings_form_an_outline_and_sliders_have_values(visit, session, tabs, 
     page.locator("#faults details").first.wait_for(state="attached")
     for tab in tabs:
         page.get_by_role("tab", name=tab, exact=True).click()
-    wait_for(
-        lambda: page.locator("#diagnose h2, #diagnose article, #whatif article, #xy canvas, #charts").count() > 0,
-        PATIENCE,
-    )
+    wait_for(lambda: page.locator("#diagnose h2, #diagnose article, #whatif article, #xy canvas, #charts").count() > 0)
     found = page.evaluate(OUTLINE)
     levels = found["levels"]
     assert levels[0] == 1 and levels.count(1) == 1
@@ -174,8 +171,8 @@ def test_all_text_can_be_read(visit, session, scheme, tabs):
     page = opened(visit, session, scheme)
     for tab in tabs:
         page.get_by_role("tab", name=tab, exact=True).click()
-    wait_for(lambda: page.evaluate("document.getElementById('health').textContent.length > 3"), PATIENCE)
-    wait_for(lambda: len(page.evaluate(TEXTS)) > 60, PATIENCE)
+    wait_for(lambda: page.evaluate("document.getElementById('health').textContent.length > 3"))
+    wait_for(lambda: len(page.evaluate(TEXTS)) > 60)
     texts = page.evaluate(TEXTS)
     faint = []
     for text, ink, layers in texts:

@@ -5,8 +5,8 @@ import re
 import numpy as np
 import pytest
 
-from tests.app.scripted import wait_for
-from tests.app.web.page.browsed import PATIENCE, pixels, running, until
+from tests.app.web.page.browsed import pixels, running, until
+from tests.waiting import wait_for
 
 pytestmark = pytest.mark.browser
 
@@ -59,16 +59,16 @@ def test_a_note_is_written_at_a_moment_and_every_browser_has_it(visit, session):
     field = page.get_by_role("textbox", name="Note")
     field.fill("fan off")
     field.press("Enter")
-    wait_for(lambda: engine.annotations.notes, PATIENCE)
+    wait_for(lambda: engine.annotations.notes)
     (note,) = engine.annotations.notes
     low, high = page.evaluate("window.nisus.charts.range")
     pixel = (high - low) / page.locator("#charts .u-over").nth(1).bounding_box()["width"]
     assert (note.t - engine.span()[0]) * 1e-9 == pytest.approx(time, abs=pixel) and note.text == "fan off"
     # Drawn through the charts, its text in the first one; listed in both browsers.
-    wait_for(lambda: texts(page) == texts(other) == ["fan off"], PATIENCE)
+    wait_for(lambda: texts(page) == texts(other) == ["fan off"])
     until(page, "window.nisus.charts.charts[0].written.includes('fan off')")
     page.mouse.move(left + 200, top)
-    wait_for(lambda: dotted(page, left) > before + 0.1, PATIENCE)
+    wait_for(lambda: dotted(page, left) > before + 0.1)
     assert field.is_hidden()
 
     # N writes one where the pointer is; without a text it says why not.
@@ -78,10 +78,10 @@ def test_a_note_is_written_at_a_moment_and_every_browser_has_it(visit, session):
     other.keyboard.press("n")
     field = other.get_by_role("textbox", name="Note")
     field.press("Enter")
-    wait_for(lambda: "write 1 to 500" in other.locator("#note .error").inner_text(), PATIENCE)
+    wait_for(lambda: "write 1 to 500" in other.locator("#note .error").inner_text())
     field.fill("torque step")
     field.press("Enter")
-    wait_for(lambda: texts(page) == ["fan off", "torque step"], PATIENCE)
+    wait_for(lambda: texts(page) == ["fan off", "torque step"])
     assert (engine.annotations.find(2).t - engine.span()[0]) * 1e-9 == pytest.approx(time, abs=pixel)
 
     # Its entry leads there; the text can be changed, and each can be deleted.
@@ -92,12 +92,12 @@ def test_a_note_is_written_at_a_moment_and_every_browser_has_it(visit, session):
     assert field.input_value() == "torque step"
     field.fill("torque step to 120 Nm")
     field.press("Enter")
-    wait_for(lambda: texts(other) == ["fan off", "torque step to 120 Nm"], PATIENCE)
+    wait_for(lambda: texts(other) == ["fan off", "torque step to 120 Nm"])
     page.get_by_role("button", name=re.compile("^Edit the note")).first.click()
     page.get_by_role("textbox", name="Note").fill("not this")
     page.get_by_role("textbox", name="Note").press("Escape")
     other.get_by_role("button", name=re.compile("^Delete the note")).first.click()
-    wait_for(lambda: texts(page) == ["torque step to 120 Nm"], PATIENCE)
+    wait_for(lambda: texts(page) == ["torque step to 120 Nm"])
     assert [note.text for note in engine.annotations.notes] == ["torque step to 120 Nm"]
 
 
@@ -109,7 +109,7 @@ def test_a_link_to_the_moment_of_a_note_and_the_report_show_it(visit, session, t
     for second, text in ((50.0, "a first note, of some length, before the other one"), (52.0, "fan off")):
         engine.submit(Annotate(text, first + second))
     page.get_by_role("tab", name="Episodes").click()
-    wait_for(lambda: len(texts(page)) == 2, PATIENCE)
+    wait_for(lambda: len(texts(page)) == 2)
     # The first has no room before the second, unless it is looked at.
     until(page, "window.nisus.charts.charts[0].written.join() === 'fan off'")
     page.get_by_role("button", name=re.compile("a first note")).click()
@@ -128,5 +128,5 @@ def test_a_link_to_the_moment_of_a_note_and_the_report_show_it(visit, session, t
     report.get_by_role("heading", name="Notes").wait_for()
     assert report.get_by_role("row", name="0:52 fan off").is_visible()
     drawings = report.locator("img.paper")
-    wait_for(lambda: drawings.count() > 2, PATIENCE)
+    wait_for(lambda: drawings.count() > 2)
     assert all("fan%20off" in drawing.get_attribute("src") for drawing in drawings.all())

@@ -5,8 +5,9 @@ import pytest
 
 from config.loader import TWINS
 from estimators.track import HEALTH_NAMES
-from tests.app.scripted import pull_all, wait_for
-from tests.app.web.page.browsed import PATIENCE, running, until
+from tests.app.scripted import pull_all
+from tests.app.web.page.browsed import running, until
+from tests.waiting import wait_for
 
 pytestmark = pytest.mark.browser
 
@@ -30,7 +31,7 @@ def cursor_is(page, seconds, play):
         time, state = page.evaluate(CURSOR)
         return state == play and time == pytest.approx(seconds, abs=1e-6)
 
-    wait_for(there, PATIENCE)
+    wait_for(there)
 
 
 @pytest.fixture(scope="module")
@@ -112,7 +113,7 @@ def test_a_recording_opens_folded_and_is_replayed_from_the_cursor(visit):
         until(page, "window.nisus.link.status.moment?.t < window.nisus.link.status.t")
 
         page.locator("#pause").click()
-        wait_for(lambda: engine.status().speed == 1.0 and not engine.status().finished, PATIENCE)
+        wait_for(lambda: engine.status().speed == 1.0 and not engine.status().finished)
         until(page, "window.nisus.view.following && window.nisus.charts.newest < 100")
         # The replay shows a window, and so does a part that is zoomed: the list of widths says so.
         until(page, "document.getElementById('window').value === String(window.nisus.model.window)")
@@ -125,7 +126,7 @@ def test_a_recording_opens_folded_and_is_replayed_from_the_cursor(visit):
         assert np.array_equal(replayed.track.mean, track.track.mean[:n])
 
         page.locator("#speed").select_option("inf")
-        wait_for(lambda: engine.status().finished, PATIENCE)
+        wait_for(lambda: engine.status().finished)
         assert np.array_equal(pull_all(engine).track.mean, track.track.mean)
 
 
@@ -153,7 +154,7 @@ def test_a_month_is_replayed_in_minutes_and_its_axis_counts_days(tmp_path, visit
         assert "8.33 d" in page.locator("#window").inner_text()
         # 30 days at real time would show a row an hour: 10,000 times faster they take 4 minutes.
         page.locator("#pause").click()
-        wait_for(lambda: session.engine.status().speed == 1e4 and not session.engine.status().finished, PATIENCE)
+        wait_for(lambda: session.engine.status().speed == 1e4 and not session.engine.status().finished)
         until(page, "window.nisus.charts.newest > 20 * 3600")
         page.screenshot(path=tmp_path / "replay.png")
 
@@ -178,7 +179,7 @@ def shows(page, status, caption):
             and time == caption
         )
 
-    wait_for(there, PATIENCE)
+    wait_for(there)
 
 
 def test_strip_and_scene_show_the_moment_of_the_cursor(visit, session):
@@ -188,7 +189,7 @@ def test_strip_and_scene_show_the_moment_of_the_cursor(visit, session):
     end = float(pull_all(engine).events.t[-1]) * 1e-9
     origin = engine.span()[0]
     page.evaluate("window.nisus.view.follow()")
-    wait_for(lambda: view.history.n > 0 and view.history.column("t")[-1] == engine.span()[1], PATIENCE)
+    wait_for(lambda: view.history.n > 0 and view.history.column("t")[-1] == engine.span()[1])
     shows(page, engine.status(), "")
 
     page.evaluate("window.nisus.view.show(20, 60, 41.03)")
@@ -196,7 +197,7 @@ def test_strip_and_scene_show_the_moment_of_the_cursor(visit, session):
     then = engine.status_at(at)
     assert strip_of(then) != strip_of(engine.status()), "the test needs another NIS than at the end"
     shows(page, then, "at 0:41.0")
-    wait_for(lambda: view.history.n and view.history.column("t")[-1] == then.t, PATIENCE)
+    wait_for(lambda: view.history.n and view.history.column("t")[-1] == then.t)
     # The charts' window before that moment, and nothing after it.
     assert view.history.column("t")[0] <= max(origin, then.t - view.history.span) + 10**9
 
@@ -206,7 +207,7 @@ def test_strip_and_scene_show_the_moment_of_the_cursor(visit, session):
     shows(other, engine.status_at(origin + 11 * 10**9), "at 0:11.0")
     shows(page, then, "at 0:11.0, 30 s earlier than the charts")
     other.close()
-    wait_for(lambda: view.stage.choices.at is None, PATIENCE)
+    wait_for(lambda: view.stage.choices.at is None)
     shows(page, then, f"at {int(end // 60)}:{end % 60:04.1f}, {round(end - 41.03)} s later than the charts")
 
     # Back at the newest row; a folded recording offers the whole of it, and no newest row.
@@ -238,7 +239,7 @@ def test_charts_show_the_values_of_the_row_at_the_moment(visit, width):
                 decimals = max(0, 1 - int(np.floor(np.log10(half))))
                 wanted = f"{mean:.{decimals}f} ± {half:.{decimals}f}"
                 reading = page.locator(f"[aria-label='Chart of {label}'] .reading")
-                wait_for(lambda reading=reading, wanted=wanted: reading.inner_text().startswith(wanted), PATIENCE)
+                wait_for(lambda reading=reading, wanted=wanted: reading.inner_text().startswith(wanted))
 
         for moment in (700.25, 1400.25, 3200.25):
             page.evaluate("(at) => window.nisus.view.show(0, window.nisus.charts.newest, at)", moment)

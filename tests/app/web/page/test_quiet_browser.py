@@ -7,9 +7,10 @@ from app.live.commands import Pin, SetTuning, UseSensor
 from estimators.attribution import attribution
 from estimators.fold import Fold
 from estimators.log import READING, Log
-from tests.app.scripted import pull_all, wait_for
-from tests.app.web.page.browsed import PATIENCE, running, settled, until
+from tests.app.scripted import pull_all
+from tests.app.web.page.browsed import running, settled, until
 from tests.support import SECOND
+from tests.waiting import wait_for
 
 pytestmark = pytest.mark.browser
 
@@ -34,7 +35,7 @@ def test_the_charts_go_to_another_moment_of_the_stretch_that_they_show(page, ses
     said = page.locator("#charts article .reading").first
     before = said.inner_text()
     page.evaluate("window.nisus.view.goTo(140, window.nisus.charts.range)")
-    wait_for(lambda: said.inner_text() != before, PATIENCE)
+    wait_for(lambda: said.inner_text() != before)
     rows = pull_all(session.engine)
     at = int(np.searchsorted(rows.events.t, rows.events.t[0] + 140 * SECOND, side="right")) - 1
     name = page.evaluate("window.nisus.charts.charts[0].what.key").removeprefix("state:")
@@ -100,9 +101,9 @@ def test_hidden_charts_ask_for_nothing(page, session):
     engine.submit(SetTuning("Q.winding", 0.5))
     asked = {"overview", "charts", "previous", "run 0", "less 0"}
     # Of all 300 s the charts draw groups of rows, so the values at the cursor are a stream of their own.
-    wait_for(lambda: streams(session).keys() == asked | {"moment"}, PATIENCE)
+    wait_for(lambda: streams(session).keys() == asked | {"moment"})
     page.get_by_role("tab", name="Diagnose").click()
-    wait_for(lambda: streams(session).keys() == {"overview"}, PATIENCE)
+    wait_for(lambda: streams(session).keys() == {"overview"})
     # The bar of time goes on, and knows what the charts would show.
     page.evaluate("window.nisus.view.show(10, 20)")
     assert page.evaluate("window.nisus.charts.range") == [10, 20]
@@ -110,16 +111,16 @@ def test_hidden_charts_ask_for_nothing(page, session):
     assert page.evaluate("window.nisus.charts.range[1]") == pytest.approx(300, rel=0.01)
     drawn = page.evaluate("window.nisus.drawn")
     page.get_by_role("tab", name="Charts").click()
-    wait_for(lambda: streams(session).keys() == asked | {"moment"}, PATIENCE)
+    wait_for(lambda: streams(session).keys() == asked | {"moment"})
     until(page, f"window.nisus.drawn > {drawn} && window.nisus.revision === 1")
 
 
 def test_a_chart_that_is_not_chosen_is_not_sent(page, session):
-    wait_for(lambda: "innovation:yoke" in streams(session).get("charts", ()), PATIENCE)
+    wait_for(lambda: "innovation:yoke" in streams(session).get("charts", ()))
     page.get_by_text("Shown", exact=True).click()
     for name in ("yoke", "magnet"):
         page.locator("#layout li", has_text=name).last.get_by_role("checkbox").uncheck()
-    wait_for(lambda: not {"innovation:yoke", "mean:magnet"} & set(streams(session)["charts"]), PATIENCE)
+    wait_for(lambda: not {"innovation:yoke", "mean:magnet"} & set(streams(session)["charts"]))
     assert "mean:yoke" in streams(session)["charts"]
 
 
@@ -127,25 +128,25 @@ def test_all_of_q_is_one_command_one_revision_and_one_undo(page, session):
     engine = session.engine
     before, first = engine.status().tuning, engine.revisions.runs[-1].number
     page.get_by_role("button", name="×10", exact=True).first.click()
-    wait_for(lambda: engine.revisions.runs[-1].number == first + 1 and not engine.status().refolding, PATIENCE)
+    wait_for(lambda: engine.revisions.runs[-1].number == first + 1 and not engine.status().refolding)
     assert engine.tuning.q.tolist() == [pytest.approx(10 * value, rel=1e-5) for value in before.q]
     assert {change.key for change in engine.revisions.runs[-1].changes} == {f"Q.{n.name}" for n in engine.model.noises}
     page.locator("#undo").click()
-    wait_for(lambda: engine.revisions.runs[-1].number == first + 2 and not engine.status().refolding, PATIENCE)
+    wait_for(lambda: engine.revisions.runs[-1].number == first + 2 and not engine.status().refolding)
     assert engine.tuning.q.tolist() == before.q.tolist()
     page.locator("#redo").click()
-    wait_for(lambda: engine.revisions.runs[-1].number == first + 3 and not engine.status().refolding, PATIENCE)
+    wait_for(lambda: engine.revisions.runs[-1].number == first + 3 and not engine.status().refolding)
     assert engine.tuning.q[0] == pytest.approx(10 * before.q[0], rel=1e-5)
     # What can be undone comes with the status.
-    wait_for(lambda: page.locator("#undo").is_enabled() and page.locator("#redo").is_disabled(), PATIENCE)
+    wait_for(lambda: page.locator("#undo").is_enabled() and page.locator("#redo").is_disabled())
 
 
 def test_what_became_of_the_readings_is_told(page, session):
     session.engine.submit(UseSensor("yoke", False))
-    wait_for(lambda: session.engine.status().counts.get("held out"), PATIENCE)
+    wait_for(lambda: session.engine.status().counts.get("held out"))
     page.get_by_role("tab", name="Episodes").click()
     told = page.locator(".counts")
-    wait_for(lambda: "held out" in told.inner_text(), PATIENCE)
+    wait_for(lambda: "held out" in told.inner_text())
     counts = session.engine.status().counts
     words = told.inner_text().split("\n")
     assert words[:4] == ["measurements", f"{counts['readings']:,}", "used", f"{counts['used']:,}"]
@@ -180,7 +181,7 @@ def test_an_episode_that_is_told_at_rest_is_drawn(page, session):
     assert after != before and after[0] > after[2]
     # Over again right after it was drawn: that is drawn too, a moment later.
     page.evaluate("window.nisus.charts.draw(); window.nisus.link.tell('episodes', (window.nisus.link.episodes = []))")
-    wait_for(lambda: page.evaluate(strip) == before, PATIENCE)
+    wait_for(lambda: page.evaluate(strip) == before)
 
 
 def test_what_moved_the_estimate_in_the_charts_is_explained(page, session):

@@ -8,8 +8,9 @@ import pytest
 from estimators.fold import fold
 from estimators.log import Log
 from estimators.track import GATED, USED
-from tests.app.scripted import pull_all, wait_for
-from tests.app.web.page.browsed import PATIENCE, pixels, running, settled, until
+from tests.app.scripted import pull_all
+from tests.app.web.page.browsed import pixels, running, settled, until
+from tests.waiting import wait_for
 
 pytestmark = pytest.mark.browser
 
@@ -33,33 +34,33 @@ def test_pin_overlay_and_unpin(page, session):
     page.get_by_role("tab", name="Runs").click()
     first = engine.revisions.runs[-1].number
     page.get_by_role("button", name=f"Pin run {first}", exact=True).click()
-    wait_for(lambda: engine.revisions.find(first).pinned, PATIENCE)
-    wait_for(lambda: coloured(page, "#charts") == 0, PATIENCE)
+    wait_for(lambda: engine.revisions.find(first).pinned)
+    wait_for(lambda: coloured(page, "#charts") == 0)
 
     page.get_by_role("button", name=f"Menu of run {first}", exact=True).click()
     page.get_by_role("menuitem", name="Name and note").click()
     name = page.get_by_role("textbox", name=f"Name of run {first}")
     name.fill("as it was")
     name.press("Enter")
-    wait_for(lambda: engine.revisions.find(first).name == "as it was", PATIENCE)
+    wait_for(lambda: engine.revisions.find(first).name == "as it was")
 
     # Another filter tuning: the pinned run stays where it was, beside the new estimate.
     knob = page.locator('[data-key^="Q."] input[type=text]').first
     knob.fill("100")
     knob.press("Enter")
     settled(engine, first + 1)
-    wait_for(lambda: coloured(page, "#charts article") > 100, PATIENCE)
-    wait_for(lambda: coloured(page, ".chart.difference .plot") > 100, PATIENCE)
-    wait_for(lambda: "as it was" in page.locator(".pins").inner_text(), PATIENCE)
+    wait_for(lambda: coloured(page, "#charts article") > 100)
+    wait_for(lambda: coloured(page, ".chart.difference .plot") > 100)
+    wait_for(lambda: "as it was" in page.locator(".pins").inner_text())
     # Of the rate, which nobody measures.
     kept, now = engine.revisions.find(first).track.track.mean[-1, 1], pull_all(engine).track.mean[-1, 1]
     difference = page.locator(".pins output")
     difference.filter(has_text=re.compile(r"\d")).wait_for()
-    wait_for(lambda: float(difference.inner_text()) == pytest.approx(kept - now, rel=0.05), PATIENCE)
+    wait_for(lambda: float(difference.inner_text()) == pytest.approx(kept - now, rel=0.05))
 
     # The table has a score for both, and marks the better one; the change has its values and their unit.
     row = page.locator(f'tbody[data-number="{first}"]')
-    wait_for(lambda: row.locator(".scores td").count() == 6, PATIENCE)
+    wait_for(lambda: row.locator(".scores td").count() == 6)
     page.locator(".runs .best").first.wait_for()
     changed = page.locator(f'tbody[data-number="{first + 1}"] .what').inner_text()
     unit = next(item.unit for item in engine.tuning.items() if item.key == "Q.temperature")
@@ -70,15 +71,15 @@ def test_pin_overlay_and_unpin(page, session):
     page.locator("body").press("b")
     settled(engine, first + 2)
     assert engine.status().tuning is engine.revisions.find(first).tuning
-    wait_for(lambda: page.evaluate("window.nisus.link.status.runs.last") == first + 1, PATIENCE)
+    wait_for(lambda: page.evaluate("window.nisus.link.status.runs.last") == first + 1)
     page.locator("body").press("b")
     settled(engine, first + 3)
     assert engine.status().tuning.q[0] == 100.0
 
     page.locator(".pins").get_by_role("button", name=f"Unpin run {first}").click()
-    wait_for(lambda: not any(run.pinned for run in engine.revisions.runs), PATIENCE)
-    wait_for(lambda: page.locator(".chart.difference").is_hidden(), PATIENCE)
-    wait_for(lambda: coloured(page, "#charts") == 0, PATIENCE)
+    wait_for(lambda: not any(run.pinned for run in engine.revisions.runs))
+    wait_for(lambda: page.locator(".chart.difference").is_hidden())
+    wait_for(lambda: coloured(page, "#charts") == 0)
     until(page, "Object.keys(window.nisus.link.streams).every(name => !/^(run|less) /.test(name))")
 
 
@@ -95,7 +96,7 @@ def test_a_drag_is_one_run_and_its_undo_is_every_browsers(visit, session):
         # Each value is folded before the next: without a gesture they were 16 runs.
         before = engine.status().revision
         across(0.5 + 0.02 * step)
-        wait_for(lambda before=before: engine.status().revision > before, PATIENCE)
+        wait_for(lambda before=before: engine.status().revision > before)
     page.mouse.up()
     until(page, "document.getElementById('undo').title.startsWith('Undo Q.')")
     settled(engine)
@@ -115,12 +116,12 @@ def test_a_drag_is_one_run_and_its_undo_is_every_browsers(visit, session):
     # The other browser takes both back, and this one makes the first again.
     until(other, "!document.getElementById('undo').disabled")
     other.locator("body").press("u")
-    wait_for(lambda: engine.tuning.q[0] == last, PATIENCE)
+    wait_for(lambda: engine.tuning.q[0] == last)
     other.locator("body").press("u")
-    wait_for(lambda: engine.tuning.q[0] == began, PATIENCE)
+    wait_for(lambda: engine.tuning.q[0] == began)
     until(page, "document.getElementById('undo').disabled && !document.getElementById('redo').disabled")
     page.locator("body").press("U")
-    wait_for(lambda: engine.tuning.q[0] == last, PATIENCE)
+    wait_for(lambda: engine.tuning.q[0] == last)
 
 
 def likelihood(track):
@@ -136,7 +137,7 @@ def test_the_curve_around_a_knob_shows_the_likeliest_value(page, session):
     label.focus()
     label.press("Enter")
     curve = page.locator(f'[data-key="{key}"] .around')
-    wait_for(lambda: curve.get_attribute("data-done") == "true", PATIENCE)
+    wait_for(lambda: curve.get_attribute("data-done") == "true")
     assert curve.locator("circle").count() == 7
 
     status, model, log = engine.status(), engine.model, Log.of(engine.model)
@@ -153,7 +154,7 @@ def test_the_curve_around_a_knob_shows_the_likeliest_value(page, session):
     take = curve.locator(".takes button:not([hidden])").last
     wanted = float(take.inner_text().split()[-1])
     take.click()
-    wait_for(lambda: engine.status().tuning.get(key) == pytest.approx(wanted, rel=0.01), PATIENCE)
+    wait_for(lambda: engine.status().tuning.get(key) == pytest.approx(wanted, rel=0.01))
 
 
 def test_the_smoothed_estimate_is_drawn_while_it_is_on(page):
@@ -162,6 +163,6 @@ def test_the_smoothed_estimate_is_drawn_while_it_is_on(page):
     button = page.locator("#smoothed")
     button.click()
     assert button.get_attribute("aria-pressed") == "true"
-    wait_for(lambda: coloured(page, chart, colour) > before + 100, PATIENCE)
+    wait_for(lambda: coloured(page, chart, colour) > before + 100)
     button.click()
-    wait_for(lambda: coloured(page, chart, colour) <= before + 20, PATIENCE)
+    wait_for(lambda: coloured(page, chart, colour) <= before + 20)

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from app.live.commands import SetTuning
-from tests.app.scripted import pull_all, wait_for
-from tests.app.web.page.browsed import PATIENCE, running, until
+from tests.app.scripted import pull_all
+from tests.app.web.page.browsed import running, until
+from tests.waiting import wait_for
 
 pytestmark = pytest.mark.browser
 
@@ -100,10 +101,10 @@ def test_a_picture_is_as_large_as_it_says_and_light(page, tmp_path):
 def test_two_states_against_each_other(page, session, tmp_path):
     """The end of the drawn curve is where the mean of the last rows is, by the labels of both axes."""
     page.get_by_role("tab", name="XY").click()
-    wait_for(lambda: page.evaluate("document.querySelector('#xy canvas').width > 300"), PATIENCE)
+    wait_for(lambda: page.evaluate("document.querySelector('#xy canvas').width > 300"))
     page.evaluate("window.told = 0; window.nisus.link.addEventListener('belief', () => (window.told += 1))")
     page.evaluate("window.nisus.view.follow(null)")
-    wait_for(lambda: page.evaluate("window.told > 0"), PATIENCE)
+    wait_for(lambda: page.evaluate("window.told > 0"))
     roots = []
 
     def outlined():
@@ -114,7 +115,7 @@ def test_two_states_against_each_other(page, session, tmp_path):
         roots.append(ElementTree.fromstring(path.read_text(encoding="utf-8")))
         return len(curves_of(roots[-1])) == 3
 
-    wait_for(outlined, PATIENCE)
+    wait_for(outlined)
     root = roots[-1]
     curve = curves_of(root)[0]
     x, y = (float(v) for v in re.findall(r"[ML]([-\d.]+) ([-\d.]+)", curve.get("d"))[-1])
@@ -168,7 +169,7 @@ def test_a_link_goes_to_the_moment_and_holds_it(visit, page, session):
 
     page.evaluate("localStorage.clear()")
     other = opened(visit, address, page)
-    wait_for(lambda: not other.evaluate("window.nisus.view.following"), PATIENCE)
+    wait_for(lambda: not other.evaluate("window.nisus.view.following"))
     first, last = other.evaluate("window.nisus.charts.range")
     assert (first, last) == (pytest.approx(12.3456789, abs=1e-9), pytest.approx(22.5, abs=1e-8))
     assert hidden not in other.evaluate("window.nisus.charts.layout.shown().map(([key]) => key)")
@@ -187,7 +188,7 @@ def test_a_link_goes_to_the_moment_and_holds_it(visit, page, session):
 def test_a_plot_of_diagnose_as_a_drawing_of_its_own(page, session, tmp_path):
     """The stems of the file are the autocorrelation that the server gives, on the scale of its own labels."""
     page.get_by_role("tab", name="Diagnose").click()
-    wait_for(lambda: page.evaluate("window.nisus.diagnosed > 0"), PATIENCE)
+    wait_for(lambda: page.evaluate("window.nisus.diagnosed > 0"))
     row = page.evaluate("fetch('/api/diagnose').then((answer) => answer.json())")["rows"][0]
     label = f"Autocorrelation of the innovations of {row['name']}"
     path = saved(page, f"Save the plot: {label}", "SVG", tmp_path)
@@ -215,7 +216,7 @@ def test_of_a_run_whose_track_is_gone_nothing_is_offered_and_it_says_why(page, s
     # More than the two seconds apart within which edits of one entry are one.
     for revision, entry in enumerate((key, f"R.{engine.model.row_names[0]}"), start=first + 1):
         engine.submit(SetTuning(entry, 1.5 * engine.tuning.get(entry)))
-        wait_for(lambda n=revision: engine.status().revision == n and not engine.status().refolding, PATIENCE)
+        wait_for(lambda n=revision: engine.status().revision == n and not engine.status().refolding)
     reason = f"the track of run {first} is gone: load it, and it is folded again"
     page.get_by_role("tab", name="Runs").click()
     page.locator(f'tbody[data-number="{first + 2}"]').wait_for()

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from app.web.http import PAGE
-from tests.app.scripted import wait_for
-from tests.app.web.page.browsed import PATIENCE, pixels, running, until
+from tests.app.web.page.browsed import pixels, running, until
+from tests.waiting import wait_for
 
 pytestmark = pytest.mark.browser
 
@@ -35,7 +35,7 @@ def test_a_scene_whose_document_comes_late_is_announced(page):
     held = []
     page.route("**/viser/?*", lambda route: held.append(route))
     page.reload()
-    wait_for(lambda: held or page.evaluate("1") is None, PATIENCE)
+    wait_for(lambda: held or page.evaluate("1") is None)
     assert "Loading the scene" in page.evaluate(AFTER)
     held[0].continue_()
     until(page, f"{AFTER} === 'none'")
@@ -44,14 +44,14 @@ def test_a_scene_whose_document_comes_late_is_announced(page):
 def test_the_scene_is_chosen_enlarged_and_opened_alone(visit, session):
     assert asked(session) == [] and session.running.view.history.n == 0
     page = visit(session.url, scene=True)
-    wait_for(lambda: asked(session) == ["theme=light"], PATIENCE)
-    wait_for(lambda: session.running.view.history.n > 0, PATIENCE)
+    wait_for(lambda: asked(session) == ["theme=light"])
+    wait_for(lambda: session.running.view.history.n > 0)
 
     select = page.get_by_label("Scene: Show")
     select.select_option("belief")
-    wait_for(lambda: session.running.view.stage.choices.values()["show"] == "belief", PATIENCE)
+    wait_for(lambda: session.running.view.stage.choices.values()["show"] == "belief")
     page.get_by_label("Scene: x", exact=True).select_option("rate")
-    wait_for(lambda: session.running.view.stage.choices.values()["y"] == "temperature", PATIENCE)
+    wait_for(lambda: session.running.view.stage.choices.values()["y"] == "temperature")
     until(page, "document.querySelector('[aria-label=\"Scene: y\"]').value === 'temperature'")
 
     # Once more S: the scene is larger than the charts, and stays so over a reload.
@@ -63,13 +63,13 @@ def test_the_scene_is_chosen_enlarged_and_opened_alone(visit, session):
 
     # Hidden, nothing is sent for it.
     page.get_by_role("tab", name="Runs").click()
-    wait_for(lambda: asked(session) == [], PATIENCE)
+    wait_for(lambda: asked(session) == [])
     page.get_by_role("tab", name="Scene").click()
 
     with page.context.expect_page() as opened:
         page.get_by_label("Scene in a window of its own").click()
     alone = opened.value
-    wait_for(lambda: asked(session) == ["theme=light", "theme=light"], PATIENCE)
+    wait_for(lambda: asked(session) == ["theme=light", "theme=light"])
     until(alone, "getComputedStyle(document.body).opacity === '1'")
     alone.wait_for_selector("canvas")
     # Viser's own panel is hidden; a link leads to the page.
@@ -88,14 +88,14 @@ def test_rerun_has_a_window_of_its_own(page, session):
 def test_in_the_dark_the_scene_has_light_labels_on_dark(visit, session):
     """Viser draws black on white: boxes of some thousand pixels. Letters alone are a few hundred."""
     page = visit(session.url, scheme="dark", scene=True)
-    wait_for(lambda: session.running.view.history.n > 0, PATIENCE)
+    wait_for(lambda: session.running.view.history.n > 0)
 
     def share(least):
         """Of the lower half, with a scale's numbers and the temperature in words: pixels as grey and as light."""
         found = pixels(page, "#stage", 0.5)
         return np.mean((found.min(axis=2) > least) & (np.ptp(found, axis=2) < 40))
 
-    wait_for(lambda: share(110) > 2e-4, PATIENCE)
+    wait_for(lambda: share(110) > 2e-4)
     page.wait_for_timeout(2000)
     assert share(190) < 2e-3
 
@@ -148,7 +148,7 @@ def test_the_scene_is_hidden_until_it_is_drawn(browser, scene):
 
 
 def test_the_scene_is_seen_on_the_page(page, session):
-    wait_for(lambda: asked(session) != [], PATIENCE)
+    wait_for(lambda: asked(session) != [])
     frame = page.locator("#stage").element_handle().content_frame()
     frame.wait_for_function("document.body && getComputedStyle(document.body).opacity === '1'")
     frame.wait_for_selector("canvas")

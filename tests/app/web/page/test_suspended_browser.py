@@ -10,8 +10,8 @@ import pytest
 from app.live.commands import Record
 from app.views.recording.reader import read_recording
 from estimators.log import READING
-from tests.app.scripted import wait_for
-from tests.app.web.page.browsed import PATIENCE, running
+from tests.app.web.page.browsed import running
+from tests.waiting import LIMIT_S, wait_for
 
 pytestmark = pytest.mark.browser
 
@@ -34,7 +34,7 @@ def suspendable(chromium, tmp_path):
         stderr=subprocess.DEVNULL,
     )
     port = profile / "DevToolsActivePort"
-    wait_for(lambda: port.is_file() and port.read_text().count("\n") > 0, PATIENCE)
+    wait_for(lambda: port.is_file() and port.read_text().count("\n") > 0)
     yield process, int(port.read_text().split()[0])
     os.killpg(process.pid, signal.SIGKILL)
     process.wait()
@@ -49,18 +49,18 @@ def test_a_suspended_browser_costs_nothing(suspendable, tmp_path):
         session.engine.submit(Record(path))
         with sync_api.sync_playwright() as playwright:
             page = playwright.chromium.connect_over_cdp(f"http://127.0.0.1:{port}").contexts[0].new_page()
-            page.goto(session.url, timeout=PATIENCE * 1000)
-            wait_for(lambda: page.evaluate("window.nisus?.drawn > 0"), PATIENCE)
+            page.goto(session.url, timeout=LIMIT_S * 1000)
+            wait_for(lambda: page.evaluate("window.nisus?.drawn > 0"))
             before = session.engine.status().counts["readings"]
             os.killpg(process.pid, signal.SIGSTOP)
-            wait_for(lambda: session.engine.status().counts["readings"] > before + LIVED, PATIENCE)
+            wait_for(lambda: session.engine.status().counts["readings"] > before + LIVED)
             during = session.engine.status().counts["readings"]
             os.killpg(process.pid, signal.SIGCONT)
             drawn = page.evaluate("window.nisus.drawn")
             # It goes on where it is now, without anybody's help.
-            wait_for(lambda: page.evaluate("window.nisus.drawn") > drawn, PATIENCE)
+            wait_for(lambda: page.evaluate("window.nisus.drawn") > drawn)
         session.engine.submit(Record(None))
-        wait_for(lambda: session.recorder.finished, PATIENCE)
+        wait_for(lambda: session.recorder.finished)
     recorded = read_recording(path)
     rows = recorded.events.t[recorded.events.kind == READING]
     assert rows.size > during

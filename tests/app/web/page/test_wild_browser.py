@@ -6,8 +6,9 @@ import pytest
 from app.studies.analysis.forecast import Forecasts, question_from_json
 from app.web.streams import belief_json
 from estimators.log import READING
-from tests.app.scripted import pull_all, wait_for
-from tests.app.web.page.browsed import PATIENCE, running, until
+from tests.app.scripted import pull_all
+from tests.app.web.page.browsed import running, until
+from tests.waiting import wait_for
 
 pytestmark = pytest.mark.browser
 
@@ -39,12 +40,12 @@ def test_a_wild_reading_is_marked_at_the_edge_and_the_others_rule_the_axis(page,
     ordinary = np.abs(innovation[np.abs(innovation) < 30.0]).max()
     assert np.abs(innovation).max() > 20 * ordinary
     page.evaluate("window.nisus.view.follow(null)")
-    wait_for(lambda: page.evaluate("window.nisus.charts.live.x[0]") < 1.0, PATIENCE)
+    wait_for(lambda: page.evaluate("window.nisus.charts.live.x[0]") < 1.0)
 
     def drawn(key):
         """The chart, once the picture is that of all of it."""
         found = {}
-        wait_for(lambda: found.update(chart(page, key)) or found["since"] < 1.0 and found["until"] > 590.0, PATIENCE)
+        wait_for(lambda: found.update(chart(page, key)) or found["since"] < 1.0 and found["until"] > 590.0)
         return found
 
     shown = drawn("innovation:winding")
