@@ -163,7 +163,7 @@ def lost(address: str, marker: Path) -> Iterator[None]:
     """Yield when a call of ten minutes has begun, and wait for it then."""
     with processes.dask(address, handled, ()) as cluster:
         future = cluster.submit(sleep, str(marker))
-        wait_for(marker.exists)
+        wait_for(lambda: marker.exists() or future.done())
         yield
         future.result()
 
