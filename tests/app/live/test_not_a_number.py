@@ -65,7 +65,7 @@ def f_of_one(x, u, p, dt, out):
 ONE = replace(RAIL, name="rail_of_one", f=f_of_one)
 
 
-@pytest.fixture(params=[RAIL, ONE], ids=["all states", "one state"], autouse=True)
+@pytest.fixture(params=[RAIL, ONE], ids=["all states", "one state"])
 def rail(request, monkeypatch):
     monkeypatch.setitem(globals(), "RAIL", request.param)
 
@@ -99,7 +99,7 @@ def lost_rows(track):
 
 
 @pytest.fixture(params=["belief", "vehicle"])
-def view(request):
+def view(request, rail):
     scene = SceneSection(kind="vehicle", position=("east", "north")) if request.param == "vehicle" else SceneSection()
     engine = viewed(RAIL, "pf", ViewSection(window=60.0, scene=scene))
     engine.put(fixes(1, RESET_AT - 1))
@@ -130,7 +130,7 @@ def test_the_scene_drops_the_filter_before_and_shows_what_is_there_again(view):
     assert shown(view.stage.scene) == (True, True, False)
 
 
-def test_the_other_charts_end_their_lines_and_pictures_and_begin_them_anew(tmp_path):
+def test_the_other_charts_end_their_lines_and_pictures_and_begin_them_anew(rail, tmp_path):
     engine = by_hand("ekf", fixes(1, RESET_AT - 1), reset(), fixes(RESET_AT + 1, END))
     feed = RerunFeed(engine)
     data = [message for message in feed.next() if isinstance(message, bytes)]
@@ -156,7 +156,7 @@ def test_the_other_charts_end_their_lines_and_pictures_and_begin_them_anew(tmp_p
     assert "/truth/east" not in cleared and "/reading/gnss.east" not in cleared
 
 
-def test_it_is_said_since_when_and_what_mends_it():
+def test_it_is_said_since_when_and_what_mends_it(rail):
     engine = by_hand("ekf", fixes(1, 3))
     assert fresh_status(engine).lost is None and status_json(engine)["lost"] is None
     engine._accept([fixes(4, RESET_AT - 1)])
@@ -178,7 +178,7 @@ def test_it_is_said_since_when_and_what_mends_it():
     assert fresh_status(engine).lost == 21.5 * SECOND
 
 
-def test_it_is_said_of_the_filter_that_is_shown():
+def test_it_is_said_of_the_filter_that_is_shown(rail):
     engine = by_hand("pf", fixes(1, RESET_AT - 1))
     assert fresh_status(engine).lost is None
     swap(engine, "ekf")
@@ -187,7 +187,7 @@ def test_it_is_said_of_the_filter_that_is_shown():
     assert fresh_status(engine).lost is None
 
 
-def test_counts_are_those_of_the_revision_that_is_shown():
+def test_counts_are_those_of_the_revision_that_is_shown(rail):
     engine = by_hand("pf", fixes(1, RESET_AT - 1))
     assert fresh_status(engine).counts["recovered"] == engine._fold.recoveries() > 0
     swap(engine, "ekf")
