@@ -36,6 +36,7 @@ fast: $(VENV)/.installed-dev
 # What takes long and seldom fails, before a release: guides as a site and their commands, figures of all recordings,
 # other processors, and other versions of Python and of all packages.
 release: lint test docs generic versions
+	$(PYTEST) -m release
 	$(BIN)/nisus guard --junit guard.xml
 
 # On a processor without AVX or FMA; Numba's cache keeps its machine code apart.

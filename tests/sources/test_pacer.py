@@ -9,6 +9,7 @@ from estimators.log import Events
 from sources.merged import MemorySource
 from sources.pacer import MAX_BATCH_EVENTS, Pacer
 from tests.support import SECOND, read_all
+from tests.waiting import LIMIT_S
 
 
 class Clock:
@@ -204,10 +205,10 @@ def test_a_reader_that_waits_is_woken_by_a_seek():
     pacer, _ = player(times=(0, 3600))
     due(pacer)
     got = []
-    thread = threading.Thread(target=lambda: got.append(pacer.read(600.0)))
+    thread = threading.Thread(target=lambda: got.append(pacer.read(10.0 * LIMIT_S)))
     thread.start()
     pacer.seek(3700 * SECOND)
-    thread.join(60.0)
+    thread.join(LIMIT_S)
     assert not thread.is_alive()
     numbers = [int(v) for batch in got for v in batch.value[:, 0]] + due(pacer)
     assert numbers == [1]

@@ -6,14 +6,13 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
 
 from estimators.errors import SourceError
 from sources import worker_process as module
-from sources.worker_process import IsolatedReader, ReaderError, read_isolated
+from sources.worker_process import ITEM, IsolatedReader, ReaderError, read_isolated
 from tests.sources.readers_that_fail import (
     abort,
     allocate,
@@ -26,6 +25,7 @@ from tests.sources.readers_that_fail import (
     pid_then,
     shout,
 )
+from tests.waiting import wait_for
 
 PATH = Path("recording")  # the functions do not read it
 
@@ -38,41 +38,72 @@ def item_of(reader):
 
 
 def gone(pid):
-    """Wait until a process has ended; a zombie has."""
-    deadline = time.monotonic() + 60.0
-    while time.monotonic() < deadline:
-        try:
-            with open(f"/proc/{pid}/stat") as file:
-                if file.read().rpartition(")")[2].split()[0] == "Z":
-                    return True
-        except OSError:
-            return True
-        time.sleep(0.01)
-    return False
-
-
-@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="processes cannot be kept on one processor here")
-@pytest.mark.parametrize(("seconds", "ends"), [(0.8, True), (60.0, False)])
-def test_time_in_which_others_have_the_processor_does_not_count(seconds, ends):
-    """Four others on its processor: 0.8 s of its own take 4 s, far longer than the 1.5 s that it may take."""
-    processor = min(os.sched_getaffinity(0))
-    spin = f"import os\nos.sched_setaffinity(0, {{{processor}}})\nwhile True: pass"
-    others = [subprocess.Popen([sys.executable, "-c", spin]) for _ in range(4)]
+    """Whether a process has ended; a zombie has."""
     try:
-        reader = IsolatedReader(computing, PATH, processor, seconds, timeout=1.5)
-        if ends:
-            while (item := reader.take(0.1)) is None:
-                assert not reader.ended
-            assert item == "read"
-            reader.close()
-        else:
-            with pytest.raises(ReaderError, match="gave nothing for 2 s and was ended"):
-                while not reader.ended:
-                    reader.take(0.1)
-    finally:
-        for other in others:
-            other.kill()
-            other.wait()
+        with open(f"/proc/{pid}/stat") as file:
+            return file.read().rpartition(")")[2].split()[0] == "Z"
+    except OSError:
+        return True
+
+
+def wait_until_gone(*pids):
+    wait_for(lambda: all(map(gone, pids)))
+
+
+class Starved:
+    """A worker that computes with a fifth of a processor, on a clock of its own; its item takes it so many seconds."""
+
+    def __init__(self, seconds):
+        self.seconds, self.now, self.used = seconds, 0.0, 0.0
+
+    def monotonic(self):
+        return self.now
+
+    def ask(self, *_):
+        pass
+
+    def answer(self, timeout):
+        self.now, self.used = self.now + timeout, self.used + timeout / 5.0
+        return (ITEM, "read") if self.used > self.seconds else None
+
+    def processor_time(self):
+        return self.used
+
+    def end(self, grace=0.0):
+        return "was ended"
+
+
+@pytest.mark.parametrize("seconds", [0.8, 60.0])
+def test_time_in_which_others_have_the_processor_does_not_count(seconds, monkeypatch):
+    """0.8 s of its own take 4 s, far longer than the 1.5 s that it may take."""
+    worker = Starved(seconds)
+    monkeypatch.setattr(module, "_hire", lambda: worker)
+    monkeypatch.setattr(module, "time", worker)
+    reader = IsolatedReader(counting, PATH, 1, timeout=1.5)
+    if seconds < 1.5:
+        while (item := reader.take(0.1)) is None:
+            assert not reader.ended
+        assert item == "read" and worker.now > 3.9
+    else:
+        with pytest.raises(ReaderError, match="gave nothing for 2 s and was ended"):
+            while not reader.ended:
+                reader.take(0.1)
+        # The first wait counts in full, as no processor time was known before it: 0.1 + 70 × 0.02 = 1.5.
+        assert worker.used == pytest.approx(71 * 0.02)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_the_processor_time_of_a_worker_is_known_while_it_computes():
+    reader = IsolatedReader(computing, PATH)
+    own = item_of(reader)
+    begun = wait_for(reader._worker.processor_time)
+    assert begun > own - 0.03  # user and system time, each rounded down to ticks of 10 ms
+    wait_for(lambda: (reader._worker.processor_time() or 0.0) > begun + 0.1)
+    reader.close()
+    reader = IsolatedReader(pid_then, PATH, hang)
+    item_of(reader)
+    wait_for(lambda: reader._worker.processor_time() is None)
+    reader.close()
 
 
 def test_items_come_in_order_and_the_end_is_known():
@@ -109,7 +140,7 @@ def test_a_reader_that_hangs_is_ended():
     with pytest.raises(ReaderError, match=r"gave nothing for 0 s and was ended"):
         while True:
             assert reader.take(0.01) is None
-    assert gone(pid)
+    wait_until_gone(pid)
 
 
 def test_time_in_which_nobody_waits_does_not_count(monkeypatch):
@@ -144,7 +175,8 @@ def test_a_reader_is_used_again_and_one_that_is_left_is_not_waited_for():
     reader = IsolatedReader(pid_then, PATH, hang)
     pid = item_of(reader)
     reader.close()
-    assert gone(pid) and reader.ended
+    assert reader.ended
+    wait_until_gone(pid)
     endless = IsolatedReader(counting, PATH, 10**12)
     item_of(endless)
     endless.close()
@@ -175,13 +207,14 @@ def test_a_reader_that_is_left_with_its_source_is_ended():
 
     pids = [Source().pid for _ in range(3)]
     gc.collect()
-    assert all(map(gone, pids)) and read_isolated(counting, PATH, 2) == [0, 1]
+    wait_until_gone(*pids)
+    assert read_isolated(counting, PATH, 2) == [0, 1]
 
 
 def test_a_spare_reader_that_died_is_replaced():
     pid = read_isolated(pid_then, PATH, print)[0]
     os.kill(pid, signal.SIGKILL)
-    assert gone(pid)
+    wait_until_gone(pid)
     assert read_isolated(counting, PATH, 2) == [0, 1]
 
 
@@ -227,4 +260,4 @@ def test_a_reader_that_hangs_ends_with_its_parent():
         assert os.path.exists(f"/proc/{pid}")
         parent.kill()
         parent.wait()
-    assert gone(pid)
+    wait_until_gone(pid)

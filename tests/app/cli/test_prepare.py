@@ -3,7 +3,6 @@
 import io
 import sys
 import threading
-import time
 
 import pytest
 
@@ -11,6 +10,7 @@ import app.cli.prepare
 from app.cli.prepare import attend
 from app.live.watchdog import CALL_TIMEOUT_S, CallWatch
 from tests.models import level_model
+from tests.waiting import wait_for
 
 ENTERED, LEAVE = threading.Event(), threading.Event()
 
@@ -88,10 +88,7 @@ def test_where_output_is_redirected_it_says_what_it_does_before_it_is_done(monke
     monkeypatch.setattr(app.cli.prepare, "STATUS_DELAY_S", 0.0)
 
     def work():
-        end = time.monotonic() + 60.0
-        while not pipe.read and time.monotonic() < end:
-            time.sleep(0.001)
-        return pipe.read
+        return wait_for(lambda: pipe.read)
 
     assert attend(MODEL, work, "compiling filters, once", "compiled filters, once") == "compiling filters, once ...\n"
     before, after = pipe.read.splitlines()

@@ -10,7 +10,16 @@ from pathlib import Path
 
 import pytest
 
-from tests.waiting import wait_for
+from app.studies import processes
+from tests import ROOT
+from tests.waiting import LIMIT_S, wait_for
+
+
+@pytest.fixture(autouse=True)
+def patience(monkeypatch):
+    """A busy machine may take minutes to start a worker."""
+    monkeypatch.setattr(processes, "WAIT_S", LIMIT_S)
+    monkeypatch.setattr(processes, "CONNECT_S", LIMIT_S)
 
 
 @contextmanager
@@ -18,6 +27,8 @@ def started(path: Path, workers: int, **environment: str) -> Iterator[tuple[str,
     """A Dask scheduler and workers in a folder: its address, and the processes, that of the scheduler first."""
     at = path / "scheduler.json"
     start = [sys.executable, "-m", "distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", "0"]
+    # Found before a package `tests` that another project installs.
+    environment["PYTHONPATH"] = str(ROOT)
     run = {"stderr": subprocess.DEVNULL, "cwd": path, "env": os.environ | environment}
     begun = [subprocess.Popen([*start, "--no-dashboard", "--scheduler-file", str(at)], **run)]
     wait_for(at.is_file)

@@ -30,6 +30,7 @@ from estimators.tuning import Tuning
 from tests import ROOT
 from tests.app.studies.test_processes import die_once
 from tests.estimators.fit.test_fit import MODEL, log_of, simulated
+from tests.waiting import LIMIT_S
 
 NAME, OVERRIDES = "motor_winding", {"R.winding": "0.2"}
 
@@ -225,17 +226,17 @@ def test_without_a_cluster_the_folds_run_in_threads(twin):
 
 @pytest.mark.parametrize("command", ["check", "tune"])
 def test_the_commands_take_a_cluster(nisus, command):
-    done = nisus.run(command, NAME, "--duration", 60, "--cluster", "nowhere")
-    assert done.status == 2 and "--cluster nowhere: " in done.err and done.err.count("\n") == 1
+    assert "--cluster nowhere: " in nisus.refuses(command, NAME, "--duration", 60, "--cluster", "nowhere")
 
 
 def test_a_wrong_address_ends_the_command():
     """A Client of Dask that does not connect waits two minutes for its own end."""
     command = [sys.executable, "-m", "app.cli.main", "check", "motor_winding", "--cluster", "http://x"]
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    done = subprocess.run(command, env=environment, text=True, capture_output=True, timeout=90)
-    assert done.returncode == 2 and done.stderr.startswith("nisus: --cluster http://x: unknown address scheme")
-    assert done.stderr.count("\n") == 1
+    done = subprocess.run(command, env=environment, text=True, capture_output=True, timeout=LIMIT_S)
+    # Before it stands that filters are compiled, if that takes long.
+    (line,) = (line for line in done.stderr.splitlines() if not line.startswith("compil"))
+    assert done.returncode == 2 and line.startswith("nisus: --cluster http://x: unknown address scheme")
 
 
 def test_a_server_of_another_kind_is_told(twin, monkeypatch):

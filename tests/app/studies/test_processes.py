@@ -6,6 +6,7 @@ import signal
 import sys
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
@@ -37,6 +38,15 @@ def sleep(marker: str) -> None:
     time.sleep(600)
 
 
+def interrupt(marker: str) -> None:
+    """Send Ctrl-C to the parent in the first call, which leaves its process id; take ten minutes in each."""
+    with suppress(FileExistsError):
+        with open(marker, "x") as file:
+            file.write(str(os.getpid()))
+        os.kill(os.getppid(), signal.SIGINT)
+    time.sleep(600)
+
+
 def handled() -> bool:
     return signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, ())
 
@@ -56,19 +66,17 @@ def test_every_call_is_answered_once(jobs: int) -> None:
     assert numba.get_num_threads() == before
 
 
-def test_what_is_given_up_ends(tmp_path) -> None:
+def test_what_is_given_up_ends(tmp_path, interruptible) -> None:
     """Without a wait for work that has begun: the ten minutes would be over before the test."""
-    running = results(sleep, [(str(tmp_path / str(k)),) for k in range(3)], jobs=2)
+    marker = tmp_path / "begun"
+    running = results(interrupt, [(str(marker),)] * 3, jobs=2)
     with pytest.raises(KeyboardInterrupt):
-        main = os.getpid()
-        signal.signal(signal.SIGALRM, lambda *_: os.kill(main, signal.SIGINT) if any(tmp_path.iterdir()) else None)
-        signal.setitimer(signal.ITIMER_REAL, 0.05, 0.05)
         try:
             next(running)
         finally:
-            signal.setitimer(signal.ITIMER_REAL, 0.0)
-            children = multiprocessing.active_children()
-    wait_for(lambda: all(_gone(child.pid) for child in children))
+            pids = {child.pid for child in multiprocessing.active_children()}
+    pids.add(int(marker.read_text()))
+    wait_for(lambda: all(map(_gone, pids)))
 
 
 def _gone(pid: int) -> bool:
@@ -155,7 +163,7 @@ def lost(address: str, marker: Path) -> Iterator[None]:
     """Yield when a call of ten minutes has begun, and wait for it then."""
     with processes.dask(address, handled, ()) as cluster:
         future = cluster.submit(sleep, str(marker))
-        wait_for(marker.exists)
+        wait_for(lambda: marker.exists() or future.done())
         yield
         future.result()
 

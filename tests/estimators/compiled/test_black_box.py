@@ -6,7 +6,6 @@ import re
 import signal
 import subprocess
 import sys
-import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
@@ -29,6 +28,7 @@ from estimators.track import DIVERGED, FAILED, NONE
 from estimators.tuning import Tuning
 from tests.estimators.ensemble.blocks import BOX, ONE, both_block, f_block
 from tests.support import assert_same, log_of
+from tests.waiting import wait_for
 
 COMPILED = [name for name, entry in ESTIMATORS.items() if entry.blocks is not None]
 
@@ -406,10 +406,7 @@ def test_workers_that_were_killed_between_two_calls_are_replaced():
     pool = _pool("processes")
     for worker in list(pool._processes.values()):
         worker.kill()
-    deadline = time.monotonic() + 60.0
-    while not pool._broken:
-        assert time.monotonic() < deadline, "the pool does not notice"
-        time.sleep(0.01)
+    wait_for(lambda: pool._broken)
     np.testing.assert_array_equal(box.f_block(X, u, p, 0.1), expected)
     assert _pool("processes") is not pool
 
@@ -422,7 +419,4 @@ def test_workers_end_with_a_parent_that_is_killed(tmp_path):
         workers = [int(pid) for pid in parent.stdout.readline().split()]
         assert workers and all(map(alive, workers))
         parent.send_signal(signal.SIGKILL)
-    deadline = time.monotonic() + 60.0
-    while any(map(alive, workers)):
-        assert time.monotonic() < deadline, f"of {workers} some still run"
-        time.sleep(0.05)
+    wait_for(lambda: not any(map(alive, workers)))

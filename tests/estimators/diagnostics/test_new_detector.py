@@ -44,7 +44,7 @@ g = rng.gamma(16.0 / 9.0, size=3000)
 z[3000:] = (g - 16.0 / 9.0) / (4.0 / 3.0)
 log = Log.of(model)
 log.add("gauge", 1.0 + np.arange(z.size), z)
-fold = folded("kf", model, log)
+fold = folded("filterpy-kf", model, log)  # in Python: of a changed bank, only the detectors are compiled
 found = episodes(fold)
 judged = judged_rows(fold)
 tracker = EpisodeTracker(model, fold.tuning, fold.marginal, max_rows=1000)
@@ -78,10 +78,8 @@ def told(tmp_path_factory):
     assert text.count(')\n"""Order:') == 1
     table.write_text(text.replace(')\n"""Order:', ROW.lstrip("\n")))
     (root / "newcomer.py").write_text(SCRIPT)
-    run = subprocess.run(
-        [sys.executable, "newcomer.py"], cwd=root, capture_output=True, text=True, timeout=600,
-        env={**os.environ, "PYTHONPATH": str(root)},
-    )  # fmt: skip
+    environment = {**os.environ, "PYTHONPATH": str(root)}
+    run = subprocess.run([sys.executable, "newcomer.py"], cwd=root, capture_output=True, text=True, env=environment)
     assert run.returncode == 0, run.stderr
     return json.loads(run.stdout)
 

@@ -15,6 +15,7 @@ from sources.can.bus import LOSS_PERIOD_S, RECONNECT_WAITS_S, CanBus, open_bus
 from sources.can.decoder import Decoder
 from tests.sources.can.can_tools import DBC, Reports, dbc, frame, sensor
 from tests.support import free_port
+from tests.waiting import wait_for
 
 DATA = bytes.fromhex("f4010fa000000080")
 GROUP = "239.74.163.2"
@@ -53,11 +54,14 @@ def decoder(tmp_path):
 
 
 def listen(bus, count):
-    """Read until `count` events came; a bus that gives too few for a minute has lost them."""
-    batches, deadline = [], time.monotonic() + 60.0
-    while sum(map(len, batches)) < count:
-        assert time.monotonic() < deadline
+    """Read until `count` events came."""
+    batches = []
+
+    def heard():
         batches.append(bus.read(0.1))
+        return sum(map(len, batches)) >= count
+
+    wait_for(heard)
     return Events.concat(batches, 1)
 
 

@@ -18,6 +18,7 @@ from sources.source import Channel, Condition
 from sources.units import to_ns
 from tests.sources.can.can_tools import Reports, dbc, frame, same, sensor
 from tests.support import read_all
+from tests.waiting import LIMIT_S
 
 FORMATS = [".asc", ".blf", ".csv", ".db", ".log", ".mf4", ".trc"]
 START = 1_700_000_000
@@ -175,7 +176,7 @@ def test_a_log_read_in_one_thread_is_closed_in_another(tmp_path, messages, suffi
     path = tmp_path / f"a{suffix}"
     write(path, messages)
     log = CanLog([path], decoder_of(tmp_path))
-    thread = threading.Thread(target=log.read, args=(60.0,))
+    thread = threading.Thread(target=log.read, args=(LIMIT_S,))
     thread.start()
     thread.join()
     log.close()

@@ -17,6 +17,7 @@ from sources.source import Channel
 from tests.models import first_state
 from tests.sources.can.can_tools import Reports, dbc
 from tests.support import read_all
+from tests.waiting import wait_for
 
 ASSET = """VERSION ""
 NS_ :
@@ -181,14 +182,16 @@ def test_a_thread_beside_the_listener(tmp_path):
     fast = Simulator(MODEL, seed=1, step=0.001, duration=0.05)
     player = Player(fast, [(path, None)], CHANNELS, interface="virtual", channel=name)
     player.start()
-    got = 0
-    for _ in range(200):
-        got += int((source.read(0.05).kind == READING).sum())
-        if got == 100:
-            break
+    batches = []
+
+    def heard():
+        batches.append(source.read(0.05))
+        return sum((batch.kind == READING).sum() for batch in batches) >= 100
+
+    wait_for(heard)
     player.close()
     source.close()
-    assert got == 100 and not player._thread.is_alive()
+    assert sum((batch.kind == READING).sum() for batch in batches) == 100 and not player._thread.is_alive()
 
 
 def test_an_old_reading_is_not_sent_again_with_an_input(tmp_path):
