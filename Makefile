@@ -29,9 +29,9 @@ lint: $(VENV)/.installed-dev
 	$(BIN)/mypy
 	$(BIN)/python -m tests.size --check
 
-# The quickest tests, so many that they take 100 s of a processor by the runs before; all, if there was none.
+# A minute of the tests nearest to what differs from main, by imports.
 fast: $(VENV)/.installed-dev
-	$(PYTEST) -m "not browser" --quickest 100 -x -q
+	arguments=$$($(BIN)/python -m tests.affected) && $(PYTEST) -m "not browser" -x -q $$arguments
 
 # What takes long and seldom fails, before a release: guides as a site and their commands, figures of all recordings,
 # other processors, and other versions of Python and of all packages.

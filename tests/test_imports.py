@@ -1,10 +1,8 @@
 """Imports run one way: app → sources → estimators; config describes and may know only the errors."""
 
-import ast
-from pathlib import Path
+from tests import ROOT
+from tests.imports import PACKAGES, edges, imported, modules
 
-ROOT = Path(__file__).resolve().parent.parent
-PACKAGES = ("app", "sources", "estimators", "config")
 MAY_IMPORT = {
     "estimators": ("estimators",),
     "sources": ("sources", "estimators"),
@@ -22,31 +20,13 @@ IMPURE_HERE = {
 }
 
 
-def imported(source: str, package: str) -> list[str]:
-    """Every module that a source imports, anywhere in it, with relative names made absolute."""
-    found = []
-    for node in ast.walk(ast.parse(source)):
-        if isinstance(node, ast.Import):
-            found += [alias.name for alias in node.names]
-        elif isinstance(node, ast.ImportFrom):
-            parts = package.split(".")[: len(package.split(".")) - node.level + 1] if node.level else []
-            base = ".".join([*parts, *([node.module] if node.module else [])])
-            # `from package import name` may import a module of that name, so the name counts too.
-            found += [f"{base}.{alias.name}" for alias in node.names]
-    return found
-
-
-def modules() -> list[Path]:
-    return sorted(path for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
-
-
 def within(name: str, allowed: str) -> bool:
     return name == allowed or name.startswith(allowed + ".")
 
 
 def test_direction():
     wrong = {}
-    for path in modules():
+    for path in modules().values():
         parts = path.relative_to(ROOT).parts
         names = imported(path.read_text(), ".".join(parts[:-1]))
         inner = [name for name in names if name.split(".")[0] in PACKAGES]
@@ -63,22 +43,6 @@ def test_estimators_are_pure():
         if found:
             touched[str(path.relative_to(ROOT / "estimators"))] = found
     assert touched == IMPURE_HERE
-
-
-def edges() -> dict[str, set[str]]:
-    """Every module, and the modules that it imports: at the top, in a function, or for its types only."""
-    names = {}
-    for path in modules():
-        parts = path.relative_to(ROOT).with_suffix("").parts
-        names[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path
-    found: dict[str, set[str]] = {}
-    for name, path in names.items():
-        package = ".".join(path.relative_to(ROOT).parent.parts)
-        found[name] = set()
-        for item in imported(path.read_text(), package):
-            whole = [item, item.rpartition(".")[0]]
-            found[name] |= {next((known for known in whole if known in names), name)} - {name}
-    return found
 
 
 def room(name: str) -> str:
