@@ -29,7 +29,7 @@ from tests import ROOT
 from tests.app.scripted import MODEL, Scripted, pull_all, readings, twin
 from tests.app.views.recording.test_parts import refold
 from tests.support import SECOND, assert_same
-from tests.waiting import wait_for
+from tests.waiting import LIMIT_S, wait_for
 
 
 def drawn(stream):
@@ -97,7 +97,7 @@ def test_a_recording_is_listed_from_when_it_is_asked_for_until_it_is_finished(tm
     """It is ended while its file is only being begun, and the next is asked for already."""
     going_on, source = threading.Event(), Scripted()
     engine = Engine(twin(), lambda report: source)
-    recorder = engine.recorder = Recorder(engine, lambda stream: going_on.wait(60.0) and drawn(stream))
+    recorder = engine.recorder = Recorder(engine, lambda stream: going_on.wait(LIMIT_S) and drawn(stream))
     recorder.start()
     engine.start()
     first, second = tmp_path / "first.rrd", tmp_path / "second.rrd"
@@ -336,7 +336,7 @@ def test_a_file_that_takes_no_more_is_one_line_and_keeps_what_it_has(tmp_path):
     code = limited.replace("while True", "while not engine.notices.counts().get('recording failed')")
     code += "print('LINE', [line.text for line in engine.notices.since(0) if line.level == 'error'])\n"
     code = code.format(root=str(ROOT), path=str(path))
-    child = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=180)
+    child = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=LIMIT_S)
     (said,) = [line for line in child.stdout.splitlines() if line.startswith("LINE")]
     assert f"recording failed: {path}: it can no longer be written" in said and said.count("recording failed") == 1
     recorded = read_recording(path)
