@@ -1,5 +1,6 @@
 """A browser, the command line, and a twin file for the tests of `app`."""
 
+import asyncio
 import json
 import shutil
 import signal
@@ -12,6 +13,7 @@ import pytest
 from app.cli.main import main
 from config.loader import TWINS
 from tests.chromium import launched
+from tests.waiting import LIMIT_S
 
 LATE = """(() => {
     const { send } = WebSocket.prototype;
@@ -33,21 +35,43 @@ LATE = """(() => {
 })()"""
 
 
-@pytest.fixture(scope="module")
-def browser(chromium: str, pytestconfig: pytest.Config) -> Iterator[Any]:
-    """Chromium, as Playwright drives it; each test opens a page of its own in it. `--lag` makes its pages late."""
-    lag = 1e3 * pytestconfig.getoption("--lag")
-    with launched(chromium) as started:
-        punctual = started.new_context
+@pytest.fixture(scope="session")
+def shared_chromium(chromium: str, pytestconfig: pytest.Config) -> Iterator[Any]:
+    """Chromium, as Playwright drives it, one for each worker; its event loop is marked as running in this thread."""
+    from playwright.sync_api import expect
 
-        def late(**options: Any) -> Any:
-            context = punctual(**options)
-            context.add_init_script(LATE.replace("LAG", f"{lag:g}"))
+    expect.set_options(timeout=1e3 * LIMIT_S)
+    lag = 1e3 * pytestconfig.getoption("--lag")
+    with launched(chromium) as browser:
+        loop, new_context = asyncio.get_running_loop(), browser.new_context
+
+        def patient(**options: Any) -> Any:
+            context = new_context(**options)
+            context.set_default_timeout(1e3 * LIMIT_S)
+            if lag:
+                context.add_init_script(LATE.replace("LAG", f"{lag:g}"))
             return context
 
-        if lag:
-            started.new_context = late
-        yield started
+        browser.new_context = patient
+        asyncio._set_running_loop(None)
+        yield browser, loop
+        asyncio._set_running_loop(loop)
+
+
+@pytest.fixture
+def browser(shared_chromium: tuple[Any, asyncio.AbstractEventLoop]) -> Iterator[Any]:
+    """Chromium, for contexts of a test's own. `--lag` makes its pages late.
+
+    Between tests with a browser the mark of Playwright's loop is taken away: others call `asyncio.run`.
+    """
+    browser, loop = shared_chromium
+    asyncio._set_running_loop(loop)
+    try:
+        yield browser
+        for context in browser.contexts:
+            context.close()
+    finally:
+        asyncio._set_running_loop(None)
 
 
 class Finished(NamedTuple):

@@ -12,7 +12,7 @@ from app.views.viser.guarded_server import HEADER
 from app.views.viser.view import ViserView
 from tests.app.scripted import Scripted
 from tests.app.test_field_views import PLATE, SHAPE
-from tests.waiting import LIMIT_S, wait_for
+from tests.waiting import wait_for
 
 pytestmark = pytest.mark.browser
 
@@ -41,12 +41,10 @@ def page(browser, engine):
     view.start()
     context = browser.new_context(viewport={"width": 900, "height": 1300}, extra_http_headers={HEADER: "s3cret"})
     page = context.new_page()
-    page.set_default_timeout(LIMIT_S * 1000)
     errors = []
     page.on("pageerror", lambda error: errors.append(str(error)))
     page.goto(f"http://127.0.0.1:{view.port}/")
     yield page
-    page.close()
     view.stop()
     assert errors == []
 

@@ -10,7 +10,7 @@ import pytest
 from estimators.fit.objective import Objective
 from tests.app.scripted import readings
 from tests.app.served import ServedEngine
-from tests.waiting import wait_for
+from tests.waiting import LIMIT_S, wait_for
 
 
 @contextmanager
@@ -63,7 +63,7 @@ def halted(monkeypatch):
     def waiting(self, points):
         if self.progress.gain > 0.0:
             reached.set()
-            assert released.wait(300.0)
+            assert released.wait(LIMIT_S)
         return terms(self, points)
 
     monkeypatch.setattr(Objective, "all_terms", waiting)

@@ -105,10 +105,8 @@ def test_a_page_that_looks_at_charts_is_told_of_the_twin_while_the_fold_is_at_wo
         assert "boot" in json.loads(stream.recv(LIMIT_S))
         query = {"columns": ["mean:winding"], "points": 100}
         stream.send(json.dumps({"streams": {"charts": query}, "pair": ["winding", "rate"]}))
-        said = ""
         # Every word on the twin, though its rows are asked for and do not come.
-        while "the measurements so far are being folded (" not in said:
-            said = stream.recv(LIMIT_S)
+        wait_for(lambda: "the measurements so far are being folded (" in stream.recv(LIMIT_S))
         stream.send(json.dumps({"streams": {"charts": None}}))
     with connect(
         f"ws://{client.host}/api/stream", origin=client.origin, additional_headers={"Cookie": client.cookie}
@@ -122,9 +120,14 @@ def test_rows_can_be_read_between_the_pieces_of_a_fold(running):
     found: list[int] = []
     reader = threading.Thread(target=lambda: found.append(row_count(engine)), daemon=True)
     reader.start()
-    while reader.is_alive():
-        solver.left.release()
-        reader.join(0.01)
+
+    def read():
+        """Let the solver on, an answer at a time, while the reader waits for its turn."""
+        if engine._lock._outer.locked() and not solver.left._value:
+            solver.left.release()
+        return not reader.is_alive()
+
+    wait_for(read)
     # The first reading is a piece, as nothing is known of the fold; four times as many are the next at most.
     assert 2 <= found[0] <= 5 and engine.span()[1] == READINGS * SECOND // 2
 

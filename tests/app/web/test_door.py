@@ -303,11 +303,15 @@ def test_viser_messages_pass_both_ways(page):
 def test_a_page_gets_the_next_frames_once_it_has_drawn_the_last_ones(fresh):
     def message(key):
         """The next message that has a key."""
-        while True:
+
+        def received():
             text = stream.recv(timeout=LIMIT_S)
             if isinstance(text, str) and key in (found := json.loads(text)):
-                return found[key]
+                return found
             assert isinstance(text, bytes) or "error" not in text
+            return None
+
+        return wait_for(received)[key]
 
     fresh.source.put(readings([1.0, 2.0], [40.0, 41.0]))
     wait_for(lambda: fresh.rows() == 2)

@@ -10,7 +10,7 @@ import pytest
 from app.live.engine import Engine
 from app.web.twin_json import episodes_json, status_json
 from tests.app.scripted import Scripted, readings, twin
-from tests.waiting import LIMIT_S
+from tests.waiting import LIMIT_S, wait_for
 
 ROOT = Path(__file__).parents[3]
 
@@ -51,9 +51,9 @@ def test_every_browser_gets_the_notes_of_users(serve):
 
     def told(browser):
         """The next list of notes that a browser gets."""
-        while "annotations" not in (message := json.loads(browser.recv(timeout=LIMIT_S))):
-            pass
-        return message["annotations"]
+        return wait_for(lambda: "annotations" in (message := json.loads(browser.recv(timeout=LIMIT_S))) and message)[
+            "annotations"
+        ]
 
     with page.connect("/api/stream") as one, page.connect("/api/stream") as other:
         assert told(one) == told(other) == []

@@ -12,7 +12,7 @@ from app.twin.twin import load_twin
 from app.web.commands_json import command_from_json
 from config.loader import TWINS
 from estimators.errors import NisusError
-from tests.waiting import wait_for
+from tests.waiting import LIMIT_S, wait_for
 
 DONE = ("done", "failed", "cancelled")
 
@@ -43,7 +43,7 @@ def test_a_fit_is_begun_told_and_put_in_at_once(page):
 
 def test_a_stopped_fit_keeps_its_best_values(page, halted):
     page.client.post("/api/fit", {"wanted": ["Q", "R"]})
-    assert halted.reached.wait(60.0)
+    assert halted.reached.wait(LIMIT_S)
     told = look(page)
     assert told["state"] == "running" and 0 < told["folds"] <= told["expected"]
     assert told["left"] == pytest.approx(told["elapsed"] * (told["expected"] / told["folds"] - 1.0), rel=0.5)

@@ -24,7 +24,7 @@ from estimators.fleet.siblings import siblings
 from estimators.track import HEALTH_NAMES
 from tests import ROOT
 from tests.app.cli.test_fleet import FLEET, pump_rows, write
-from tests.waiting import LIMIT_S
+from tests.waiting import LIMIT_S, wait_for
 
 
 @pytest.fixture(scope="module")
@@ -160,29 +160,26 @@ def test_the_page_lists_the_worst_first_and_a_click_opens_the_history_of_an_asse
         page = browser.new_context(viewport={"width": 1440, "height": 900}).new_page()
         errors: list[str] = []
         page.on("pageerror", lambda error: errors.append(str(error)))
-        page.set_default_timeout(LIMIT_S * 1e3)
         page.goto(url)
         expect(page.locator("#rows a").first).to_be_visible(timeout=LIMIT_S * 1e3)
-        expect(page.locator("#state")).to_contain_text("source has ended", timeout=LIMIT_S * 1e3)
+        expect(page.locator("#state")).to_contain_text("source has ended")
         assert page.locator("#rows a").count() < 60  # those in view
         page.fill("#find", "pump 31")
         expect(page.locator("#rows a")).to_have_count(1)
         page.locator("#rows a").click()
         page.wait_for_url("**/twins/pump%2031/")
-        expect(page.locator("#trust")).to_contain_text("pump_31", timeout=LIMIT_S * 1e3)
+        expect(page.locator("#trust")).to_contain_text("pump_31")
         assert ask("/twins/pump%2031/api/state")["twin"] == "pump_31"
         # The scripts are those of the overview: a browser fetches them once, not for each asset.
         loaded = page.evaluate("performance.getEntriesByType('resource').map((one) => new URL(one.name).pathname)")
         scripts = [path for path in loaded if path.endswith((".js", ".css"))]
         assert "/page/page.js" in scripts and all(path.startswith("/page/") for path in scripts)
         assert errors == []
-        page.close()
 
 
 @pytest.mark.parametrize("width", [1440, 1000, 700])
 def test_the_overview_is_within_its_bounds_at_any_width(width, fleet, browser, overview):
     page = browser.new_context(viewport={"width": width, "height": 800}).new_page()
-    page.set_default_timeout(LIMIT_S * 1e3)
     page.goto(overview)
     expect(page.locator("#rows a").first).to_be_visible()
 
@@ -208,7 +205,6 @@ def test_the_overview_is_within_its_bounds_at_any_width(width, fleet, browser, o
     ends = [heads[k] for k in shown]
     assert all(one[1] <= next_one[0] for one, next_one in itertools.pairwise(ends)) and ends[-1][1] <= width
     assert page.locator("aside").evaluate("node => node.scrollHeight <= node.clientHeight")
-    page.close()
 
 
 def test_a_click_opens_an_asset_of_messages_from_the_archive(tmp_path, browser):
@@ -218,22 +214,21 @@ def test_a_click_opens_an_asset_of_messages_from_the_archive(tmp_path, browser):
         sent = [{"time": begin + round(t * 1e9), "asset": name, "values": {"winding": y}} for t, name, y in rows]
         assert ask("/api/readings", sent)["accepted"] == len(sent)
         archive = tmp_path / "archive" / "pumps"
-        while (found := AssetHistory(archive, "pump 3").read(1000)) is None or found.num_rows < 60:
-            pass
+        wait_for(lambda: (found := AssetHistory(archive, "pump 3").read(1000)) is not None and found.num_rows >= 60)
         page = browser.new_context(viewport={"width": 1440, "height": 900}).new_page()
-        page.set_default_timeout(LIMIT_S * 1e3)
         page.goto(url)
         page.get_by_role("row", name="pump 3").click()
         page.wait_for_url("**/twins/pump%203/")
-        expect(page.locator("#trust")).to_contain_text("pump_3", timeout=LIMIT_S * 1e3)
-        while (state := ask("/twins/pump%203/api/state"))["sensors"][0]["accepted"] < 60:
-            pass
+        expect(page.locator("#trust")).to_contain_text("pump_3")
+
+        def accepted(count):
+            return (state := ask("/twins/pump%203/api/state"))["sensors"][0]["accepted"] >= count and state
+
+        state = wait_for(lambda: accepted(60))
         last = max(item["time"] for item in sent)
         assert state["time_ns"] >= max(item["time"] for item in sent if item["asset"] == "pump 3")
         more = [{"time": last + 10**9, "asset": "pump 3", "values": {"winding": 40.0}}]
         assert ask("/api/readings", more)["accepted"]
-        while (state := ask("/twins/pump%203/api/state"))["sensors"][0]["accepted"] < 61:
-            pass  # the open page follows
+        state = wait_for(lambda: accepted(61))  # the open page follows
         assert state["time_ns"] >= last + 10**9
-        page.close()
     assert parts_of(archive) and not [*(tmp_path / "archive").glob("*/*.arrows")]

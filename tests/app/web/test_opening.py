@@ -25,7 +25,7 @@ from estimators.errors import ConfigError
 from tests.app.scripted import Scripted, twin
 from tests.app.served import SECRET
 from tests.app.web.page.browsed import DRAWN, until
-from tests.waiting import LIMIT_S, wait_for
+from tests.waiting import wait_for
 
 posix = pytest.mark.skipif(os.name != "posix", reason="permissions and command lines as on POSIX")
 URL = 'http://127.0.0.1:9900/?token=a"b&c'
@@ -162,7 +162,6 @@ def test_the_file_opens_the_page_and_the_next_session_asks_for_its_own_address(b
     server.start()
     opening = BrowserPage(server.url)
     page = browser.new_context().new_page()
-    page.set_default_timeout(LIMIT_S * 1000)
     try:
         page.goto(opening.path.as_uri())
         page.locator("#connection[data-state=live]").wait_for(state="attached")
@@ -176,7 +175,6 @@ def test_the_file_opens_the_page_and_the_next_session_asks_for_its_own_address(b
         server.start()
         page.get_by_text("This session has ended").wait_for()
     finally:
-        page.context.close()
         opening.close()
         server.stop()
 
@@ -193,7 +191,6 @@ def test_an_open_page_returns_to_a_session_that_is_killed_and_started_again(brow
         return run, next(found[0] for line in run.stdout if (found := re.search(r"http://127\.0\.0\.1:\d+/\S+", line)))
 
     page = browser.new_context().new_page()
-    page.set_default_timeout(LIMIT_S * 1000)
     run, address = begun()
     try:
         page.goto(address)
@@ -213,6 +210,5 @@ def test_an_open_page_returns_to_a_session_that_is_killed_and_started_again(brow
         kept.chmod(0o666)
         assert not FormerSessions(port).digests()
     finally:
-        page.context.close()
         run.kill()
         run.wait()

@@ -55,8 +55,7 @@ def test_a_cancelled_request_ends_after_its_work():
             done.append(word + more)
 
         task = asyncio.ensure_future(RequestThreads("test", 2).run(work, "a", more="b"))
-        while not begun.is_set():
-            await asyncio.sleep(0)
+        assert await asyncio.to_thread(begun.wait, LIMIT_S)
         task.cancel()
         asyncio.get_running_loop().call_later(0.05, go_on.set)
         with pytest.raises(asyncio.CancelledError):

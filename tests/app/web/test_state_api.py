@@ -20,7 +20,7 @@ from estimators import fuse
 from estimators.track import DEGRADED, DIVERGED, STALE, SUSPECT, WAITING
 from tests.app.scripted import pull_all, readings
 from tests.support import SECOND
-from tests.waiting import wait_for
+from tests.waiting import LIMIT_S, wait_for
 
 
 @pytest.fixture
@@ -143,18 +143,19 @@ def test_no_message_can_hold_a_value_without_validity(fields):
 
 def test_the_stream_sends_each_change(page):
     t = int(last_row(page)[0])
-    connection = http.client.HTTPConnection("127.0.0.1", page.client.port, timeout=60)
+    connection = http.client.HTTPConnection("127.0.0.1", page.client.port, timeout=LIMIT_S)
     connection.request("GET", "/api/state/stream", headers={"Cookie": page.client.cookie})
     answer = connection.getresponse()
     assert (answer.status, answer.headers["content-type"]) == (200, "text/event-stream; charset=utf-8")
 
     def until(time_ns):
-        while True:
+        def sent():
             line = answer.readline().decode()
-            if line.startswith("data: "):
-                message = StateMessage.model_validate_json(line.removeprefix("data: "))
-                if message.time_ns == time_ns:
-                    return message
+            assert line, "the stream has ended"
+            message = line.startswith("data: ") and StateMessage.model_validate_json(line.removeprefix("data: "))
+            return message and message.time_ns == time_ns and message
+
+        return wait_for(sent)
 
     first = until(t)
     page.source.put(readings([6.0], [41.0]))

@@ -12,7 +12,7 @@ from app.web.server import PageServer
 from tests.app.scripted import Scripted, readings, twin
 from tests.app.served import SECRET
 from tests.app.web.page.browsed import until
-from tests.waiting import LIMIT_S, wait_for
+from tests.waiting import wait_for
 
 pytestmark = pytest.mark.browser
 
@@ -44,7 +44,7 @@ def at_rest(page):
     box, looks = page.evaluate(PIXELS), []
 
     def alike():
-        looks.append(page.screenshot(clip=box, timeout=LIMIT_S * 1000))
+        looks.append(page.screenshot(clip=box))
         return len(looks) > 1 and looks[-1] == looks[-2]
 
     wait_for(alike)
@@ -61,7 +61,7 @@ def test_the_viewer_is_covered_until_it_has_drawn_the_next(browser):
     try:
         t = np.arange(1.0, 101.0)
         source.put(readings(t, 40 + np.sin(t)))
-        page.goto(server.url, timeout=LIMIT_S * 1000)
+        page.goto(server.url)
         page.get_by_role("tab", name="Explore").click()
         until(page, "window.nisus?.explored > 0")
         page.evaluate(NOTE)
@@ -77,6 +77,5 @@ def test_the_viewer_is_covered_until_it_has_drawn_the_next(browser):
         assert held.shape == before.shape and before.std() > 5
         assert np.mean(np.abs(held - before).max(axis=-1) > 32) < 0.01
     finally:
-        page.context.close()
         engine.stop()
         server.stop()

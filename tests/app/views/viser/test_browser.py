@@ -40,14 +40,12 @@ def view(engine):
 def page(browser, view):
     context = browser.new_context(viewport={"width": 900, "height": 1000}, extra_http_headers={HEADER: "s3cret"})
     page = context.new_page()
-    page.set_default_timeout(60_000)
     errors = []
     page.on("pageerror", lambda error: errors.append(str(error)))
     page.goto(f"http://127.0.0.1:{view.port}/")
     page.wait_for_selector("canvas")
     wait_for(lambda: len(view.server.get_clients()) == 1)
     yield page
-    context.close()
     assert errors == []
 
 

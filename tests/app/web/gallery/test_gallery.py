@@ -136,11 +136,10 @@ def test_one_twin_after_another_behind_one_port(tmp_path):
             if page is not None and before is not None:
                 # The page of the twin before is let go of, and finds another one.
                 with pytest.raises(Exception, match=r"1012|1000|1005"):
-                    while page.recv(LIMIT_S):
-                        pass
+                    wait_for(lambda page=page: not page.recv(LIMIT_S))
                 assert told(session)["boot"] == state["boot"]
                 with pytest.raises(OSError):
-                    socket.create_connection(("127.0.0.1", before[1]), timeout=1.0)
+                    socket.create_connection(("127.0.0.1", before[1]), timeout=LIMIT_S)
                 gone = before[0]
                 wait_for(lambda gone=gone: gc.collect() >= 0 and gone() is None)
         assert len(set(boots)) == len(boots) and session.session.url == url

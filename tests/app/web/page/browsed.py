@@ -14,7 +14,7 @@ from app.cli.open_twin import live_source
 from app.web.running import OpenedTwin
 from app.web.session import Page, Session
 from tests.skips import with_recording
-from tests.waiting import LIMIT_S, wait_for
+from tests.waiting import wait_for
 
 DRAWN = "window.nisus?.drawn > 0"
 
@@ -58,7 +58,7 @@ def pixels(page: Any, selector: str, lower: float = 1.0) -> np.ndarray:
 
     box = page.locator(selector).first.bounding_box()
     clip = box | {"y": box["y"] + (1 - lower) * box["height"], "height": lower * box["height"]}
-    picture = page.screenshot(clip=clip, timeout=LIMIT_S * 1000)
+    picture = page.screenshot(clip=clip)
     return np.asarray(Image.open(io.BytesIO(picture)).convert("RGB")).astype(int)
 
 

@@ -5,7 +5,6 @@ from urllib.parse import urlsplit
 import pytest
 
 from tests.app.web.page.browsed import DRAWN, until
-from tests.waiting import LIMIT_S
 
 
 @pytest.fixture
@@ -15,16 +14,15 @@ def visit(browser):
     `beside` is a page whose window (cookies and storage) it shares; `asked` has the addresses that it requested. The
     scene is drawn only with `scene`: without a graphics card that takes more of the processor than all else.
     """
-    contexts, wrong = [], []
+    wrong = []
 
     def visit(url, *, beside=None, ready=DRAWN, size=(1440, 900), scheme="light", scene=False):
         if beside is None:
             viewport = {"width": size[0], "height": size[1]}
-            contexts.append(browser.new_context(viewport=viewport, color_scheme=scheme))
+            context = browser.new_context(viewport=viewport, color_scheme=scheme)
             if not scene:
-                contexts[-1].add_init_script("if (location.pathname.endsWith('/viser/')) window.stop()")
-        page = (contexts[-1] if beside is None else beside.context).new_page()
-        page.set_default_timeout(LIMIT_S * 1000)
+                context.add_init_script("if (location.pathname.endsWith('/viser/')) window.stop()")
+        page = (context if beside is None else beside.context).new_page()
         own = tuple(f"http://{name}:{urlsplit(url).port}/" for name in ("127.0.0.1", "localhost"))
         page.asked = []
 
@@ -41,8 +39,6 @@ def visit(browser):
         return page
 
     yield visit
-    for context in contexts:
-        context.close()
     assert wrong == []
 
 

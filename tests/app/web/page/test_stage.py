@@ -144,7 +144,6 @@ def test_the_scene_is_hidden_until_it_is_drawn(browser, scene):
         assert opacity(page) == "0"
     page.clock.run_for(200)
     assert opacity(page) == "1" and not counted(page)
-    page.close()
 
 
 def test_the_scene_is_seen_on_the_page(page, session):

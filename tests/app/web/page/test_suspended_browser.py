@@ -11,14 +11,11 @@ from app.live.commands import Record
 from app.views.recording.reader import read_recording
 from estimators.log import READING
 from tests.app.web.page.browsed import running
+from tests.chromium import FLAGS
 from tests.waiting import LIMIT_S, wait_for
 
 pytestmark = pytest.mark.browser
 
-FLAGS = (
-    "--headless=new --no-sandbox --disable-gpu --enable-unsafe-swiftshader --disable-background-networking "
-    "--disable-component-update --disable-sync --no-first-run --disable-quic --remote-debugging-port=0"
-).split()
 LIVED = 300
 """Events, one a second of the twin, that come while the browser is suspended."""
 
@@ -28,7 +25,7 @@ def suspendable(chromium, tmp_path):
     """A Chromium in a process group of its own, and the port that controls it."""
     profile = tmp_path / "profile"
     process = subprocess.Popen(
-        [chromium, *FLAGS, f"--user-data-dir={profile}", "about:blank"],
+        [chromium, *FLAGS, "--remote-debugging-port=0", f"--user-data-dir={profile}", "about:blank"],
         start_new_session=True,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
