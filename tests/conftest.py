@@ -81,7 +81,8 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         distance = distances_of(near) if near else lambda name: 0
         chosen = within(seconds, [item.nodeid for item in kept], cache.get(DURATIONS, {}), workers, distance)
         kept = [item for item in kept if item.nodeid in chosen]
-    config.hook.pytest_deselected(items=list(set(items) - set(kept)))
+    left = {item.nodeid for item in kept}
+    config.hook.pytest_deselected(items=[item for item in items if item.nodeid not in left])
     items[:] = kept
 
 

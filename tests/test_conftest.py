@@ -57,7 +57,7 @@ def test_pytest_runs_only_the_chosen_in_its_own_order(near, workers, left):
     took = {"y::a": 1.0, "x::b": 0.5, "x::c": 0.25}
     gone = []
     hook = SimpleNamespace(pytest_deselected=lambda items: gone.extend(item.nodeid for item in items))
-    options = {"--quickest": 1.0, "--near": near}
+    options = {"--quickest": 1.0, "--near": near, "-m": "release"}
     config = SimpleNamespace(
         getoption=options.get,
         hook=hook,
