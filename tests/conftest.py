@@ -107,7 +107,8 @@ def pytest_configure(config: pytest.Config) -> None:
     if config.getoption("timeout", None) is None:
         config.option.timeout = TEST_LIMIT_S
     # Workers of xdist send their reports to the process that started them, which alone keeps them.
-    if getattr(config, "cache", None) is not None and not hasattr(config, "workerinput"):
+    # The cache itself is made after this.
+    if config.pluginmanager.hasplugin("cacheprovider") and not hasattr(config, "workerinput"):
         config.pluginmanager.register(Durations(config), "durations")
 
 

@@ -1,11 +1,14 @@
 """The choice of `--quickest`."""
 
+import json
+import subprocess
+import sys
 from types import SimpleNamespace
 
 import pytest
 
-from tests import conftest
-from tests.conftest import distances_of, within
+from tests import ROOT, conftest
+from tests.conftest import DURATIONS, distances_of, within
 
 TOOK = {"a": 3.0, "b": 0.5, "c": 1.0, "d": 0.25}
 
@@ -68,3 +71,10 @@ def test_pytest_runs_only_the_chosen_in_its_own_order(near, workers, left):
     conftest.pytest_collection_modifyitems(config, items)
     assert [item.nodeid for item in items] == left
     assert sorted(gone) == sorted(took.keys() - set(left))
+
+
+def test_a_run_keeps_the_duration_of_each_of_its_tests(tmp_path):
+    name = "tests/test_conftest.py::test_a_test_that_is_not_asked_for_takes_no_time_from_the_others"
+    command = [sys.executable, "-m", "pytest", "-q", "-o", f"cache_dir={tmp_path}", name]
+    subprocess.run(command, cwd=ROOT, check=True, capture_output=True)
+    assert json.loads((tmp_path / "v" / DURATIONS).read_text()).keys() == {name}

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from functools import lru_cache
 
 import numpy as np
 import pytest
@@ -441,13 +442,19 @@ def setting(rng, seed):
     return replace(tuning, baseline=baseline), np.array([1, 0, 1])
 
 
-@pytest.mark.parametrize("seed", range(8))
-def test_the_bank_is_its_definition(seed):
+@lru_cache
+def of_seed(seed):
+    """A stream, its tuning and the sensors that must speak, and its fold."""
     rng = np.random.default_rng(seed)
     events = as_log(stream(rng, 4000)).events
     tuning, expected = setting(rng, seed)
-    track = folded("kf", MODEL, as_log(events), tuning, policy=POLICY, expected=expected)
-    found = track.track
+    track = folded("kf", MODEL, as_log(events), tuning, policy=POLICY, expected=expected).track
+    return events, tuning, expected, track
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_the_bank_is_its_definition(seed):
+    events, tuning, expected, found = of_seed(seed)
     said = by_definition(events, found, tuning.gate, tuning.baseline, expected)
     alarms, flags, health = (np.array(column) for column in zip(*said, strict=True))
     np.testing.assert_array_equal(found.flags, flags)
@@ -460,14 +467,11 @@ def test_all_that_can_be_said_is_said_in_those_streams():
     """Else the test above would say nothing of it."""
     bits, flags, healths, verdicts = 0, 0, set(), set()
     for seed in range(8):
-        rng = np.random.default_rng(seed)
-        events = stream(rng, 4000)
-        tuning, expected = setting(rng, seed)
-        growing = folded("kf", MODEL, as_log(events), tuning, policy=POLICY, expected=expected)
-        bits |= int(np.bitwise_or.reduce(growing.track.alarms, axis=None))
-        flags |= int(np.bitwise_or.reduce(growing.track.flags))
-        healths |= set(growing.track.health)
-        verdicts |= set(growing.track.verdict)
+        *_, track = of_seed(seed)
+        bits |= int(np.bitwise_or.reduce(track.alarms, axis=None))
+        flags |= int(np.bitwise_or.reduce(track.flags))
+        healths |= set(track.health)
+        verdicts |= set(track.verdict)
     assert bits == (1 << len(ALARM_NAMES)) - 1 | ADVISORY_ALARM
     assert flags == OUTSIDE | OUTSIDE_WIDENED | 0b111
     assert healths == {WAITING, TRACKING, ADVISORY, SUSPECT, DEGRADED, DIVERGED, STALE}
