@@ -24,7 +24,7 @@ SECONDS = 1800
 
 FOLDERS = ("config", "sources")
 MODULES = (
-    "test_imports.py", "test_readme.py", "test_conftest.py", "estimators/numerics/test_jit.py",
+    "test_imports.py", "test_readme.py", "test_affected.py", "estimators/numerics/test_jit.py",
     "estimators/numerics/test_simd_rows.py", "estimators/numerics/test_simd.py", "estimators/test_log.py",
     "app/web/test_server.py", "app/web/test_door.py", "app/views/rerun/test_feed.py",
     "app/views/viser/test_view.py", "app/views/viser/test_numbers.py", "app/cli/test_new.py",
