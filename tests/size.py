@@ -14,7 +14,7 @@ from concurrent.futures import ProcessPoolExecutor
 from itertools import repeat
 from pathlib import Path, PurePosixPath
 
-COLUMNS = ("files", "lines", "tokens", "code", "imports", "docstrings", "comments", "blank")
+COLUMNS = ("files", "lines", "code", "tokens")
 CAPPED = ("lines", "tokens")
 LAYOUT = (tokenize.NEWLINE, tokenize.NL, tokenize.INDENT, tokenize.DEDENT, tokenize.ENDMARKER)
 # Python 3.12 and later split an f-string into tokens.
@@ -23,51 +23,34 @@ JAVASCRIPT = re.compile(r"""(//.*|/\*[\s\S]*?\*/)|"(?:\\.|[^"\\\n])*"|'(?:\\.|[^
 
 
 def count_python(source: str) -> Counter[str]:
-    """Count the tokens of a Python file, and its lines by kind.
+    """Count the lines of a Python file, and its tokens and the lines that have any.
 
     Tokens are those of `tokenize` without comments, docstrings and layout; an f-string is one token, as in Python 3.11.
-    A line of several kinds counts once, as the first of import, docstring, code and comment.
     """
-    kinds: dict[str, set[int]] = {kind: set() for kind in ("imports", "docstrings", "code", "comments")}
-    statement: list[tokenize.TokenInfo] = []
-    tokens, in_fstring = 0, 0
+    code, statement, tokens, in_fstring = set[int](), list[tokenize.TokenInfo](), 0, 0
     for token in tokenize.generate_tokens(io.StringIO(source).readline):
-        if token.type == tokenize.COMMENT:
-            kinds["comments"].add(token.start[0])
-        elif token.type not in LAYOUT:
-            statement.append(token)
-            tokens += not in_fstring
-            in_fstring += (token.type == FSTRING_START) - (token.type == FSTRING_END)
-        elif token.type == tokenize.NEWLINE and statement:
-            rows = range(statement[0].start[0], statement[-1].end[0] + 1)
-            if statement[0].string in ("import", "from"):
-                kinds["imports"].update(rows)
-            elif all(part.type == tokenize.STRING and part.string[0] in "\"'r" for part in statement):
-                kinds["docstrings"].update(rows)
-                tokens -= len(statement)
-            elif len(rows) == 1:
-                kinds["code"].update(rows)
-            else:
-                kinds["code"].update(*(range(part.start[0], part.end[0] + 1) for part in statement))
+        if token.type == tokenize.NEWLINE:
+            if not all(part.type == tokenize.STRING and part.string[0] in "\"'r" for part in statement):
+                code.update(*(range(part.start[0], part.end[0] + 1) for part in statement))
+                for part in statement:
+                    in_fstring -= part.type == FSTRING_END
+                    tokens += not in_fstring and part.type != FSTRING_END
+                    in_fstring += part.type == FSTRING_START
             statement = []
-    found, seen = Counter(files=1, lines=len(source.splitlines()), tokens=tokens), set[int]()
-    for kind, numbers in kinds.items():
-        found[kind] = len(numbers - seen)
-        seen |= numbers
-    found["blank"] = found["lines"] - len(seen)
-    return found
+        elif token.type not in (tokenize.COMMENT, *LAYOUT):
+            statement.append(token)
+    return Counter(files=1, lines=len(source.splitlines()), code=len(code), tokens=tokens)
 
 
 def count_javascript(source: str) -> Counter[str]:
-    """Count the tokens of a JavaScript file, and its lines by kind.
+    """Count the lines of a JavaScript file, and its tokens and the lines that have any.
 
     Tokens are, outside comments, strings in single or double quotes, numbers, words, and every other character except
     white space. Template strings and regular expressions are not recognised: their words and characters count.
     """
     code = JAVASCRIPT.sub(lambda part: re.sub(".", " ", part[1]) if part[1] else part[0], source)
-    lines, written, n_code = len(source.splitlines()), *(len(re.findall(r"(?m)^.*\S", text)) for text in (source, code))
-    tokens = len(JAVASCRIPT.findall(code))
-    return Counter(files=1, lines=lines, tokens=tokens, code=n_code, comments=written - n_code, blank=lines - written)
+    written, tokens = len(re.findall(r"(?m)^.*\S", code)), len(JAVASCRIPT.findall(code))
+    return Counter(files=1, lines=len(source.splitlines()), code=written, tokens=tokens)
 
 
 COUNT = {".py": count_python, ".js": count_javascript}
@@ -84,7 +67,7 @@ def read(path: str, revision: str | None) -> str:
 
 
 def count_file(path: PurePosixPath, revision: str | None) -> Counter[str]:
-    """Count the tokens of a file, and its lines by kind."""
+    """Count the lines and tokens of a file."""
     return COUNT[path.suffix](read(str(path), revision))
 
 
@@ -118,21 +101,11 @@ def print_budgets(sizes: dict[str, Counter[str]], budgets: dict[str, dict[str, i
         print(f"{name:<28}" + "".join(f"{figure:>12,}" for row in rows for figure in row))
 
 
-def lower(name: str, budget: dict[str, int], size: Counter[str]) -> None:
-    """Lower a budget in pyproject.toml to the present figures, where these are lower."""
-    path = Path("pyproject.toml")
-    figures = ", ".join(f"{column} = {min(budget[column], size[column])}" for column in CAPPED)
-    pattern = rf'(?m)^("{re.escape(name)}" *= *){{.*?}}'
-    path.write_text(re.sub(pattern, rf"\1{{ {figures} }}", path.read_text(encoding="utf-8")), encoding="utf-8")
-
-
 def main(*words: str) -> None:
-    """Print packages and budgets, check budgets, or lower them; `words` are the command line."""
+    """Print packages and budgets, or check the budgets; `words` are the command line."""
     parser = argparse.ArgumentParser(prog="python -m tests.size", description=__doc__)
-    choice = parser.add_mutually_exclusive_group()
-    choice.add_argument("revision", nargs="?", help="git revision to count instead of the working tree")
-    choice.add_argument("--check", action="store_true", help="print only the budgets; fail if one is exceeded")
-    choice.add_argument("--lower", nargs="*", metavar="NAME", help="lower these budgets, or all, to present figures")
+    parser.add_argument("revision", nargs="?", help="git revision to count instead of the working tree")
+    parser.add_argument("--check", action="store_true", help="print only the budgets; fail if one is exceeded")
     args = parser.parse_args(words)
     counted, text = count_all(args.revision), read("pyproject.toml", args.revision)
     budgets = tomllib.loads(text).get("tool", {}).get("nisus", {}).get("size", {})
@@ -149,10 +122,6 @@ def main(*words: str) -> None:
         for column, most in budget.items()
         if sizes[name][column] > most
     ]
-    if args.lower is not None:
-        for name in args.lower or budgets:
-            lower(name, budgets[name], sizes[name])
-        return
     if not args.check:
         print_packages(counted)
         print()
