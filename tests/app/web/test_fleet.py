@@ -24,7 +24,7 @@ from estimators.fleet.siblings import siblings
 from estimators.track import HEALTH_NAMES
 from tests import ROOT
 from tests.app.cli.test_fleet import FLEET, pump_rows, write
-from tests.waiting import LIMIT_S
+from tests.waiting import LIMIT_S, wait_for
 
 
 @pytest.fixture(scope="module")
@@ -212,25 +212,24 @@ def test_a_click_opens_an_asset_of_messages_from_the_archive(tmp_path, browser):
     begin, rows = 1_767_225_600 * 10**9, pump_rows(count=60)
     with served(tmp_path, "--archive", "archive") as (url, ask):
         sent = [{"time": begin + round(t * 1e9), "asset": name, "values": {"winding": y}} for t, name, y in rows]
-        while ask("/api/readings", sent[:1])["refused"]:  # a process starts
-            pass
-        while ask("/api/readings", sent[1:])["refused"]:
-            pass
+        for part in (sent[:1], sent[1:]):  # refused while a process starts
+            wait_for(lambda part=part: not ask("/api/readings", part)["refused"])
         folders = [tmp_path / "archive" / name for name in ("pumps", "pumps.1")]
-        while (found := AssetHistory(folders, "pump 3").read(1000)) is None or found.num_rows < 60:
-            pass
+        wait_for(lambda: (found := AssetHistory(folders, "pump 3").read(1000)) is not None and found.num_rows >= 60)
         page = browser.new_context(viewport={"width": 1440, "height": 900}).new_page()
         page.goto(url)
         page.get_by_role("row", name="pump 3").click()
         page.wait_for_url("**/twins/pump%203/")
         expect(page.locator("#trust")).to_contain_text("pump_3")
-        while (state := ask("/twins/pump%203/api/state"))["sensors"][0]["accepted"] < 60:
-            pass
+
+        def state(accepted):
+            found = ask("/twins/pump%203/api/state")
+            return found["sensors"][0]["accepted"] >= accepted and found
+
+        at_60 = wait_for(lambda: state(60))
         last = max(item["time"] for item in sent)
-        assert state["time_ns"] >= max(item["time"] for item in sent if item["asset"] == "pump 3")
+        assert at_60["time_ns"] >= max(item["time"] for item in sent if item["asset"] == "pump 3")
         more = [{"time": last + 10**9, "asset": "pump 3", "values": {"winding": 40.0}}]
         assert ask("/api/readings", more)["accepted"]
-        while (state := ask("/twins/pump%203/api/state"))["sensors"][0]["accepted"] < 61:
-            pass  # the open page follows
-        assert state["time_ns"] >= last + 10**9
+        assert wait_for(lambda: state(61))["time_ns"] >= last + 10**9  # the open page follows
     assert all(map(parts_of, folders)) and not [*(tmp_path / "archive").glob("*/*.arrows")]
