@@ -1,7 +1,9 @@
 """What the tests of several rooms share: a second, logs from a few rows, all that a source gives, the same bits."""
 
 import socket
-from collections.abc import Iterable
+import sys
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -20,6 +22,22 @@ def free_port(kind: socket.SocketKind = socket.SOCK_STREAM) -> int:
     with socket.socket(type=kind) as sock:
         sock.bind(("127.0.0.1", 0))
         return int(sock.getsockname()[1])
+
+
+@contextmanager
+def reserved_port() -> Iterator[int]:
+    """A TCP port of loopback that the system gives to no other process, for a server of the test's own to listen on.
+
+    Linux: a bound socket that does not listen keeps the port from everyone but those who allow a shared address, as
+    servers do. Elsewhere it can be taken before the server begins.
+    """
+    with socket.socket() as sock:
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        sock.bind(("127.0.0.1", 0))
+        port = int(sock.getsockname()[1])
+        if sys.platform != "linux":
+            sock.close()
+        yield port
 
 
 def as_log(events: Events) -> Log:

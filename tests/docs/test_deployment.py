@@ -21,7 +21,7 @@ from app.cli.options import environment_options
 from tests import ROOT
 from tests.app.web.test_service import Served, all_run
 from tests.skips import program
-from tests.support import free_port
+from tests.support import reserved_port
 from tests.waiting import LIMIT_S, wait_for
 
 TWIN = ROOT / "config" / "twins" / "motor_winding.yaml"
@@ -38,8 +38,14 @@ def folder(tmp_path):
     return tmp_path
 
 
-def test_nginx_adds_tls_and_the_audit_log_has_the_address_of_the_client(folder):
-    nginx, port, public = program("nginx"), free_port(), free_port()
+@pytest.fixture
+def ports():
+    with reserved_port() as one, reserved_port() as other:
+        yield one, other
+
+
+def test_nginx_adds_tls_and_the_audit_log_has_the_address_of_the_client(folder, ports):
+    nginx, (port, public) = program("nginx"), ports
     key, certificate = folder / "key.pem", folder / "certificate.pem"
     subprocess.run(
         ["openssl", "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-keyout", key, "-out", certificate, "-days", "2",
@@ -125,7 +131,7 @@ def test_the_unit_runs_a_command_that_exists_with_options_that_exist():
         ] == []
 
 
-def test_the_steps_of_the_container_serve_in_a_clean_folder(folder):
+def test_the_steps_of_the_container_serve_in_a_clean_folder(folder, ports):
     """With its entry point, environment and health check, as another user who can write to two folders only."""
     lines = re.sub(r"\\\n\s*", "", (ROOT / "docs" / "Dockerfile").read_text()).splitlines()
     steps = [line.partition(" ")[::2] for line in lines if line and not line.startswith("#")]
@@ -133,7 +139,7 @@ def test_the_steps_of_the_container_serve_in_a_clean_folder(folder):
     (entry,) = [json.loads(text) for kind, text in steps if kind == "ENTRYPOINT"]
     (check,) = [json.loads(text.partition("CMD ")[2]) for kind, text in steps if kind == "HEALTHCHECK"]
     assert [text for kind, text in steps if kind == "USER"] == ["nisus"] and entry[:2] == ["nisus", "serve"]
-    port = free_port()
+    port = ports[0]
     inside = {
         "/etc/nisus": str(folder),
         "/var/lib/nisus": str(folder / "lib"),

@@ -5,7 +5,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import pytest
@@ -31,12 +31,17 @@ def started(path: Path, workers: int, **environment: str) -> Iterator[tuple[str,
     environment["PYTHONPATH"] = str(ROOT)
     run = {"stderr": subprocess.DEVNULL, "cwd": path, "env": os.environ | environment}
     begun = [subprocess.Popen([*start, "--no-dashboard", "--scheduler-file", str(at)], **run)]
-    wait_for(at.is_file)
+
+    def written():
+        with suppress(OSError, ValueError):  # not there, or half
+            return json.loads(at.read_text())["address"]
+
+    address = wait_for(written)
     worker = [sys.executable, "-m", "distributed.cli.dask_worker", "--scheduler-file", str(at), "--host", "127.0.0.1"]
     options = ["--nthreads", "2", "--no-dashboard", "--no-nanny"]
     begun += [subprocess.Popen([*worker, *options], **run) for _ in range(workers)]
     try:
-        yield json.loads(at.read_text())["address"], begun
+        yield address, begun
     finally:
         for process in begun:
             process.kill()

@@ -221,14 +221,14 @@ def test_a_click_opens_an_asset_of_messages_from_the_archive(tmp_path, browser):
         page.wait_for_url("**/twins/pump%203/")
         expect(page.locator("#trust")).to_contain_text("pump_3")
 
-        def accepted(count):
-            return (state := ask("/twins/pump%203/api/state"))["sensors"][0]["accepted"] >= count and state
+        def state(accepted):
+            found = ask("/twins/pump%203/api/state")
+            return found["sensors"][0]["accepted"] >= accepted and found
 
-        state = wait_for(lambda: accepted(60))
+        at_60 = wait_for(lambda: state(60))
         last = max(item["time"] for item in sent)
-        assert state["time_ns"] >= max(item["time"] for item in sent if item["asset"] == "pump 3")
+        assert at_60["time_ns"] >= max(item["time"] for item in sent if item["asset"] == "pump 3")
         more = [{"time": last + 10**9, "asset": "pump 3", "values": {"winding": 40.0}}]
         assert ask("/api/readings", more)["accepted"]
-        state = wait_for(lambda: accepted(61))  # the open page follows
-        assert state["time_ns"] >= last + 10**9
+        assert wait_for(lambda: state(61))["time_ns"] >= last + 10**9  # the open page follows
     assert parts_of(archive) and not [*(tmp_path / "archive").glob("*/*.arrows")]

@@ -25,10 +25,17 @@ from estimators.errors import ConfigError
 from tests.app.scripted import Scripted, twin
 from tests.app.served import SECRET
 from tests.app.web.page.browsed import DRAWN, until
+from tests.support import reserved_port
 from tests.waiting import wait_for
 
 posix = pytest.mark.skipif(os.name != "posix", reason="permissions and command lines as on POSIX")
 URL = 'http://127.0.0.1:9900/?token=a"b&c'
+
+
+@pytest.fixture
+def port():
+    with reserved_port() as port:
+        yield port
 
 
 @pytest.fixture
@@ -55,12 +62,9 @@ def test_without_a_page_the_port_does_not_matter(taken, monkeypatch):
     assert len(reached) == 1
 
 
-def test_a_port_that_was_checked_is_free_again():
-    with socket.socket() as other:
-        other.bind(("127.0.0.1", 0))
-        free = other.getsockname()[1]
-    for port in (free, free, 0):
-        check_port(port)
+def test_a_port_that_was_checked_is_free_again(port):
+    for wanted in (port, port, 0):
+        check_port(wanted)
     for wrong in (-1, 70000):
         with pytest.raises(ConfigError, match=f"port {wrong}: is not a port; choose another with --port"):
             check_port(wrong)
@@ -113,6 +117,10 @@ def program(*words):
     return [sys.executable, "-c", f"import sys; from app.cli.main import main; sys.exit(main({list(words)!r}))"]
 
 
+def printed_address(run):
+    return next(found[0] for line in run.stdout if (found := re.search(r"http://127\.0\.0\.1:\d+/\S+", line)))
+
+
 @posix
 @pytest.mark.skipif(not Path("/proc/self/cmdline").exists(), reason="reads command lines from /proc")
 def test_two_runs_have_two_tokens_and_show_neither(tmp_path, runtime):
@@ -127,9 +135,7 @@ def test_two_runs_have_two_tokens_and_show_neither(tmp_path, runtime):
             program("run", "motor_winding", "--port", "0"), env=settings, stdout=subprocess.PIPE, text=True
         )
         try:
-            printed = next(
-                found[0] for line in run.stdout if (found := re.search(r"http://127\.0\.0\.1:\d+/\S+", line))
-            )
+            printed = printed_address(run)
             wait_for(seen.exists)
             address = urlsplit(printed)
             token, said = address.query.removeprefix("token="), seen.read_text().splitlines()
@@ -180,15 +186,12 @@ def test_the_file_opens_the_page_and_the_next_session_asks_for_its_own_address(b
 
 
 @pytest.mark.browser
-def test_an_open_page_returns_to_a_session_that_is_killed_and_started_again(browser, runtime):
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
+def test_an_open_page_returns_to_a_session_that_is_killed_and_started_again(browser, runtime, port):
     words = program("run", "motor_winding", "--port", str(port), "--no-browser")
 
     def begun():
         run = subprocess.Popen(words, stdout=subprocess.PIPE, text=True)
-        return run, next(found[0] for line in run.stdout if (found := re.search(r"http://127\.0\.0\.1:\d+/\S+", line)))
+        return run, printed_address(run)
 
     page = browser.new_context().new_page()
     run, address = begun()

@@ -6,10 +6,12 @@ import pytest
 
 from tests.app.web.page.browsed import DRAWN, until
 
+OWN_NAMES = ("127.0.0.1", "localhost")
+
 
 @pytest.fixture
 def visit(browser):
-    """visit(url): a page, once it has drawn. None may ask a stranger for anything or raise an exception.
+    """visit(url): a page, once it has drawn. It may raise no exception, and ask no other host for anything.
 
     `beside` is a page whose window (cookies and storage) it shares; `asked` has the addresses that it requested. The
     scene is drawn only with `scene`: without a graphics card that takes more of the processor than all else.
@@ -23,15 +25,17 @@ def visit(browser):
             if not scene:
                 context.add_init_script("if (location.pathname.endsWith('/viser/')) window.stop()")
         page = (context if beside is None else beside.context).new_page()
-        own = tuple(f"http://{name}:{urlsplit(url).port}/" for name in ("127.0.0.1", "localhost"))
+        own = tuple(f"{scheme}://{name}:{urlsplit(url).port}/" for scheme in ("http", "ws") for name in OWN_NAMES)
         page.asked = []
 
         def note(request):
             page.asked.append(request.url)
-            if not request.url.startswith((*own, "blob:", "data:", "https://tel.rerun.io/")):
+            # What the policy of the page blocks is no request: Rerun's viewer calls home at its start, in vain.
+            if not request.url.startswith((*own, "blob:", "data:")):
                 wrong.append(request.url)
 
         page.on("request", note)
+        page.on("websocket", lambda socket: socket.url.startswith(own) or wrong.append(socket.url))
         page.on("pageerror", lambda error: wrong.append(f"{error} {error.stack}"))
         page.goto(url)
         if ready is not None:

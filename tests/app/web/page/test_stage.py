@@ -28,6 +28,13 @@ def asked(session):
     return sorted(addresses(session.running.view.server))
 
 
+def scene_is_drawn(page):
+    """Wait for it, and return its frame."""
+    frame = page.locator("#stage").element_handle().content_frame()
+    frame.wait_for_function("document.body && getComputedStyle(document.body).opacity === '1'")
+    return frame
+
+
 AFTER = "getComputedStyle(document.getElementById('scene'), '::after').content"
 
 
@@ -78,26 +85,20 @@ def test_the_scene_is_chosen_enlarged_and_opened_alone(visit, session):
     alone.wait_for_selector("#charts .chart canvas")
 
 
-def test_rerun_has_a_window_of_its_own(page, session):
-    page.goto(f"{session.url.partition('?')[0]}explore")
-    until(page, "window.nisus?.explored > 0")
-    assert page.evaluate("document.getElementById('notice').hidden")
-    assert page.evaluate("document.getElementById('rerun').clientHeight") > 700
-
-
 def test_in_the_dark_the_scene_has_light_labels_on_dark(visit, session):
     """Viser draws black on white: boxes of some thousand pixels. Letters alone are a few hundred."""
     page = visit(session.url, scheme="dark", scene=True)
     wait_for(lambda: session.running.view.history.n > 0)
 
-    def share(least):
-        """Of the lower half, with a scale's numbers and the temperature in words: pixels as grey and as light."""
-        found = pixels(page, "#stage", 0.5)
-        return np.mean((found.min(axis=2) > least) & (np.ptp(found, axis=2) < 40))
+    scene_is_drawn(page)
 
-    wait_for(lambda: share(110) > 2e-4)
-    page.wait_for_timeout(2000)
-    assert share(190) < 2e-3
+    def light_labels():
+        """By the pixels of the lower half, with a scale's numbers and the temperature in words: as grey, as light."""
+        found = pixels(page, "#stage", 0.5)
+        grey, least = np.ptp(found, axis=2) < 40, found.min(axis=2)
+        return np.mean(grey & (least > 110)) > 2e-4 and np.mean(grey & (least > 190)) < 2e-3
+
+    wait_for(light_labels)
 
 
 def opacity(page):
@@ -148,7 +149,6 @@ def test_the_scene_is_hidden_until_it_is_drawn(browser, scene):
 
 def test_the_scene_is_seen_on_the_page(page, session):
     wait_for(lambda: asked(session) != [])
-    frame = page.locator("#stage").element_handle().content_frame()
-    frame.wait_for_function("document.body && getComputedStyle(document.body).opacity === '1'")
+    frame = scene_is_drawn(page)
     frame.wait_for_selector("canvas")
     assert not counted(frame)

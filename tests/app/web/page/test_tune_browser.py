@@ -45,11 +45,18 @@ def session():
         yield session
 
 
+@pytest.fixture(scope="module")
+def models():
+    """What the page gets of each bundled twin, by its name."""
+    twins = {path.stem: load_twin(path) for path in sorted(TWINS.glob("*.yaml"))}
+    return {
+        name: model_json(SimpleNamespace(model=twin.model, twin=twin, pairs=twin.pairs)) for name, twin in twins.items()
+    }
+
+
 @pytest.mark.parametrize("width", [1440, 1920])
-def test_units_are_whole_and_sliders_span_the_panel(visit, session, width):
+def test_units_are_whole_and_sliders_span_the_panel(visit, session, models, width):
     page = visit(session.url, size=(width, 900))
-    for path in sorted(TWINS.glob("*.yaml")):
-        twin = load_twin(path)
-        model = model_json(SimpleNamespace(model=twin.model, twin=twin, pairs=twin.pairs))
+    for name, model in models.items():
         wrong, knobs = page.evaluate(BUILD, model)
-        assert wrong == [] and knobs > 0, path.stem
+        assert wrong == [] and knobs > 0, name
