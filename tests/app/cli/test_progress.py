@@ -8,6 +8,7 @@ import threading
 import app.cli.prepare
 from app.cli.prepare import attend, progress, progress_text
 from tests.app.cli.test_prepare import MODEL
+from tests.waiting import LIMIT_S
 
 
 class Heard(io.StringIO):
@@ -27,14 +28,14 @@ def test_lines_come_while_nothing_is_done_and_count_what_is(monkeypatch):
     monkeypatch.setattr(sys, "stderr", heard)
     monkeypatch.setattr(app.cli.prepare, "LINE_PERIOD_S", 1e-3)
     with progress("pump", 12, "filters", clock=lambda: now) as advance:
-        assert heard.written.wait(60.0)
+        assert heard.written.wait(LIMIT_S)
         assert heard.getvalue().startswith("pump: 0 of 12 filters after 0 s\n")
         now = 130.0
         for _ in range(3):
             advance("best so far ekf")
         for _ in range(2):  # the first may have begun before they were done
             heard.written.clear()
-            assert heard.written.wait(60.0)
+            assert heard.written.wait(LIMIT_S)
     assert heard.getvalue().endswith("pump: 3 of 12 filters after 30 s, about 90 s left; best so far ekf\n")
     assert not any(thread.name == "progress" for thread in threading.enumerate())
 
@@ -47,9 +48,9 @@ def test_the_first_interrupt_ends_attended_work_with_its_best_result(monkeypatch
 
     def work():
         while "half done" not in heard.getvalue():
-            heard.written.wait(60.0)
+            heard.written.wait(LIMIT_S)
         signal.pthread_kill(threading.main_thread().ident, signal.SIGINT)
-        return "best so far" if stopped.wait(60.0) else "not interrupted"
+        return "best so far" if stopped.wait(LIMIT_S) else "not interrupted"
 
     before = signal.signal(signal.SIGINT, signal.default_int_handler)  # servers of other tests set their own
     try:

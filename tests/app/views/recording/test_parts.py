@@ -34,7 +34,7 @@ from sources.merged import MemorySource
 from tests import ROOT
 from tests.app.scripted import MODEL, Scripted, Stepped, pull_all, readings, twin
 from tests.support import assert_same
-from tests.waiting import wait_for
+from tests.waiting import LIMIT_S, wait_for
 
 COUNT = 6000
 TIMES = np.arange(1, COUNT + 1) * 0.01
@@ -479,7 +479,7 @@ def test_a_terminal_that_closes_leaves_a_whole_recording(name, tmp_path):
     try:
         wait_for(lambda: path.exists() and path.stat().st_size > 2000)
         os.kill(child.pid, getattr(signal, name))
-        assert child.wait(180.0) == 0
+        assert child.wait(LIMIT_S) == 0
     finally:
         child.kill()
     assert finished(path) and read_recording(path).rows > 0

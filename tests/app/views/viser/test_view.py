@@ -25,7 +25,7 @@ from estimators.log import READING, TRUTH, Events
 from estimators.models import MODELS
 from estimators.numerics.peaks import Peak
 from tests.app.scripted import events, viewed
-from tests.waiting import wait_for
+from tests.waiting import LIMIT_S, wait_for
 
 WINDING = MODELS["motor_winding"]
 
@@ -68,7 +68,7 @@ def guarded():
 
 
 def get(port, path="/", **headers):
-    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=60)
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=LIMIT_S)
     connection.request("GET", path, headers=headers)
     response = connection.getresponse()
     body = response.read()
@@ -88,7 +88,7 @@ def test_upgrade_without_the_secret_is_refused_on_the_wire(guarded):
     """A raw socket: neither a missing header nor a header given twice opens a WebSocket."""
     key = base64.b64encode(os.urandom(16)).decode()
     for extra in ("", f"{HEADER}: wrong\r\n", f"{HEADER}: s3cret\r\n{HEADER}: wrong\r\n"):
-        with socket.create_connection(("127.0.0.1", guarded.get_port()), timeout=60) as raw:
+        with socket.create_connection(("127.0.0.1", guarded.get_port()), timeout=LIMIT_S) as raw:
             raw.sendall(
                 f"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n{extra}"
                 f"Sec-WebSocket-Key: {key}\r\nSec-WebSocket-Version: 13\r\n"
@@ -150,12 +150,12 @@ def test_nobody_there_nothing_pulled(engine, monkeypatch):
         assert addresses(view.server) == [] and pulled == [] and view.history.n == 0
         browser = threading.Thread(target=lambda: asyncio.run(browse()))
         browser.start()
-        assert connected.wait(60)
+        assert connected.wait(LIMIT_S)
         wait_for(lambda: view.history.n == engine._log.n)
         assert addresses(view.server) == ["theme=dark"] and pulled
         leave.set()
-        assert gone.wait(60)
-        browser.join()
+        assert gone.wait(LIMIT_S)
+        browser.join(LIMIT_S)
         wait_for(lambda: view._cursor is None)
         count = len(pulled)
         engine.put(events(WINDING, READING, 0, [100.0], [45.0]))
