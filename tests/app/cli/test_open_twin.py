@@ -113,7 +113,7 @@ def test_the_terminal_states_lost_frames_once(capsys):
 
 
 RECORDED = """
-import sys, time
+import sys
 sys.path.insert(0, {root!r})
 from pathlib import Path
 from app.cli.open_twin import live_source
@@ -121,23 +121,22 @@ from app.live.commands import Annotate, DeleteAnnotation, Record
 from app.twin.twin import load_twin
 from app.web.running import OpenedTwin
 from app.web.session import Session
+from tests.waiting import wait_for
 twin = load_twin({twin!r})
 session = Session(OpenedTwin(twin, live_source(twin, float("inf"))), page=None)
 session.engine.submit(Record(Path({path!r})))
 session.start()
-while not session.engine.status().finished:
-    time.sleep(0.01)
+wait_for(lambda: session.engine.status().finished)
 first = session.engine.span()[0] * 1e-9
 for text in ("pump off", "a slip", "door open"):
     session.engine.submit(Annotate(text, first + 12.5))
-while len(session.engine.annotations.notes) < 3:
-    time.sleep(0.01)
+wait_for(lambda: len(session.engine.annotations.notes) == 3)
 print("noted", flush=True)
 sys.stdin.readline()
 session.engine.submit(Annotate("door shut", number=3))
 session.engine.submit(DeleteAnnotation(2))
 print("corrected", flush=True)
-time.sleep(600)
+sys.stdin.read()
 """
 
 

@@ -5,6 +5,7 @@ import subprocess
 import sys
 
 from tests import ROOT
+from tests.waiting import LIMIT_S
 
 PROGRAM = """
 import json, sys
@@ -27,7 +28,7 @@ session.stop()
 
 def test_a_twin_opens_without_further_libraries(tmp_path):
     run = subprocess.run(
-        [sys.executable, "-c", PROGRAM, str(tmp_path)], cwd=ROOT, capture_output=True, text=True, timeout=300
+        [sys.executable, "-c", PROGRAM, str(tmp_path)], cwd=ROOT, capture_output=True, text=True, timeout=LIMIT_S
     )
     complete, loaded = json.loads(run.stdout.splitlines()[-1])
     assert complete

@@ -10,14 +10,13 @@ import app.cli.prepare
 from app.cli.prepare import attend
 from app.live.watchdog import CALL_TIMEOUT_S, CallWatch
 from tests.models import level_model
-from tests.waiting import wait_for
+from tests.waiting import LIMIT_S, wait_for
 
 ENTERED, LEAVE = threading.Event(), threading.Event()
 
 
 def waits(x, u, p, dt, out):
-    ENTERED.set()
-    LEAVE.wait()
+    LEAVE.wait(ENTERED.set())  # seen in this line from the moment that it is entered
 
 
 MODEL = level_model({"s": {"r": 1.0}}, 1.0, state="x", name="slow", f=waits)
@@ -29,7 +28,7 @@ def call():
     LEAVE.clear()
     thread = threading.Thread(target=waits, args=(None,) * 5, daemon=True)
     thread.start()
-    ENTERED.wait()
+    assert ENTERED.wait(LIMIT_S)
     return thread
 
 
@@ -45,13 +44,13 @@ def test_a_call_that_does_not_return_is_named_once():
         line = watch.look()
         assert line is not None and "\n" not in line
         place, rest = line.split(": ", 1)
-        assert place.endswith(f"test_prepare.py:{waits.__code__.co_firstlineno + 2}")  # where it waits
+        assert place.endswith(f"test_prepare.py:{waits.__code__.co_firstlineno + 1}")  # where it waits
         assert rest.startswith("f of the model slow has not returned for 10 s; ") and "Ctrl-C" in rest
         now = 100.0
         assert watch.look() is None
     finally:
         LEAVE.set()
-        thread.join()
+        thread.join(LIMIT_S)
 
 
 def test_calls_that_return_are_not():
@@ -63,7 +62,7 @@ def test_calls_that_return_are_not():
         now += 0.6 * CALL_TIMEOUT_S
         assert watch.look() is None
         LEAVE.set()
-        thread.join()
+        thread.join(LIMIT_S)
     assert watch.look() is None
 
 

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import pytest
 
 from app.live.batches import BATCH_PERIOD_S, MAX_BATCH_EVENTS, BatchSizer, FairLock
-from tests.waiting import wait_for
+from tests.waiting import LIMIT_S, wait_for
 
 
 @pytest.mark.parametrize("cost", [0.0, 1e-6, 1e-3, 3.0])
@@ -59,7 +59,7 @@ def test_who_waits_comes_before_who_has_just_been_there():
     turns.release()
     with turns:
         order.append("again")
-    waiting.join()
+    waiting.join(LIMIT_S)
     assert order == ["waited", "again"]
 
 
@@ -68,4 +68,4 @@ def test_whoever_waits_in_vain_leaves_the_outer_to_others():
     turns.acquire()
     assert not turns.acquire(timeout=0.001)
     turns.release()
-    assert turns.acquire(timeout=0.001)
+    assert turns.acquire(timeout=LIMIT_S)

@@ -21,7 +21,7 @@ from app.live.jobs import (
 )
 from app.live.notices import Notices
 from estimators.errors import ConfigError
-from tests.waiting import wait_for
+from tests.waiting import LIMIT_S, wait_for
 
 
 class Clock:
@@ -137,7 +137,7 @@ def test_a_job_that_ends_while_it_is_cancelled_keeps_its_final_state():
     job = Racing("racing", lambda job: 1)
     ending = threading.Thread(target=job.run)
     job.cancel()
-    ending.join(60.0)
+    ending.join(LIMIT_S)
     assert job.state in (CANCELLED, DONE)
     job.cancel()
     assert job.state in (CANCELLED, DONE)
@@ -146,10 +146,10 @@ def test_a_job_that_ends_while_it_is_cancelled_keeps_its_final_state():
 def test_jobs_that_do_not_return_are_left_behind(notices):
     jobs = Jobs(notices, "refold", threads=1, niceness=0)
     leave, begun = threading.Event(), threading.Event()
-    stuck = jobs.run("stuck", lambda job: (begun.set(), leave.wait(60.0)))
+    stuck = jobs.run("stuck", lambda job: (begun.set(), leave.wait(LIMIT_S)))
     after = jobs.run("after", lambda job: threading.current_thread().name)
     jobs.start()
-    assert begun.wait(60.0) and not after.over
+    assert begun.wait(LIMIT_S) and not after.over
     jobs.abandon()
     wait_for(lambda: after.over)
     assert after.result == "refold 0" and not stuck.over
@@ -169,23 +169,24 @@ def test_a_paced_executor_maps_in_order_and_ends_with_its_job():
 
 def test_threads_are_few_of_low_priority_and_end(notices):
     jobs = Jobs(notices)
-    go_on, niceness, before = threading.Event(), [], threading.active_count()
+    go_on, niceness = threading.Event(), []
 
     def work(job):
-        if sys.platform == "linux":
-            niceness.append(os.getpriority(os.PRIO_PROCESS, threading.get_native_id()))
-        go_on.wait(60.0)
+        linux = sys.platform == "linux"
+        niceness.append(os.getpriority(os.PRIO_PROCESS, threading.get_native_id()) if linux else LOWEST_PRIORITY)
+        go_on.wait(LIMIT_S)
         return job.name
 
     made = [jobs.run(str(k), work) for k in range(MAX_JOBS + 3)]
     jobs.start()
-    wait_for(lambda: threading.active_count() == before + MAX_JOBS)
+    wait_for(lambda: len(niceness) >= MAX_JOBS)
+    threads = [*jobs._threads]
     go_on.set()
     wait_for(lambda: all(job.over for job in made))
     assert [job.result for job in made] == [str(k) for k in range(MAX_JOBS + 3)]
-    assert threading.active_count() <= before + MAX_JOBS and set(niceness) <= {LOWEST_PRIORITY}
+    assert len(threads) == MAX_JOBS and jobs._threads == threads and set(niceness) == {LOWEST_PRIORITY}
     begun = threading.Event()
     waits = jobs.run("waits", lambda job: (begun.set(), job.rest(60.0)))
-    assert begun.wait(60.0)
+    assert begun.wait(LIMIT_S)
     jobs.stop()
-    assert waits.state == CANCELLED and threading.active_count() == before
+    assert waits.state == CANCELLED and not any(thread.is_alive() for thread in threads)

@@ -15,7 +15,7 @@ from app.live.watchdog import CHECK_AFTER_S, STALLED_AFTER_S, Watchdog, unanswer
 from app.views.recording.reader import finished, read_recording
 from tests import ROOT
 from tests.app.scripted import Stepped, fresh_status
-from tests.waiting import wait_for
+from tests.waiting import LIMIT_S, wait_for
 
 MODEL = """
 from estimators.model import Noise, Row, Sensor, State, StateSpaceModel
@@ -103,8 +103,10 @@ def test_a_run_whose_f_loops_says_so_and_ends_when_asked(name, estimator, loopin
         (line,) = child.said("has not returned")
         where = MODEL.splitlines().index("def f(x, u, p, dt, out):") + 1
         assert f"looping.py:{where}: model looping: f(x, u, dt) at x = [" in line and "the estimate stays" in line
+        # Whoever ends a run waits some seconds for a recording, of which opening the file may take more.
+        wait_for(lambda: path.exists() and path.stat().st_size > 2000)
         os.kill(child.process.pid, getattr(signal, name))
-        assert child.process.wait(60.0) == 0
+        assert child.process.wait(LIMIT_S) == 0
     finally:
         child.process.kill()
     recorded = read_recording(path)
@@ -118,7 +120,7 @@ def test_a_fold_whose_f_loops_says_so_and_ends_when_asked(looping):
         wait_for(lambda: child.said("has not returned") or child.process.poll() is not None)
         assert "f(x, u, dt) at x = [" in child.said("has not returned")[0]
         os.kill(child.process.pid, signal.SIGINT)
-        assert child.process.wait(60.0) == 130
+        assert child.process.wait(LIMIT_S) == 130
     finally:
         child.process.kill()
 
@@ -138,10 +140,11 @@ def asked_of_work(monkeypatch):
     monkeypatch.setattr(app.live.watchdog, "questions_of", lambda work: iter(getattr(work, "questions", ())))
 
 
-def test_work_that_takes_long_is_named_only_if_a_question_is_not_answered(asked_of_work):
+def test_work_that_takes_long_is_named_only_if_a_question_is_not_answered(monkeypatch, asked_of_work):
     now, said, leave = 0.0, [], threading.Event()
     watchdog = Watchdog(lambda text, level: said.append((level, text)), clock=lambda: now)
-    with watchdog.watched(Work(("f", lambda: None), ("h", lambda: None))):
+    with monkeypatch.context() as patch, watchdog.watched(Work(("f", lambda: None), ("h", lambda: None))):
+        patch.setattr(app.live.watchdog, "ANSWER_TIMEOUT_S", LIMIT_S)
         now = CHECK_AFTER_S + 1.0
         watchdog.look()
         assert watchdog.text is None
@@ -163,8 +166,8 @@ def test_work_that_takes_long_is_named_only_if_a_question_is_not_answered(asked_
 def test_questions_are_asked_until_one_is_not_answered():
     asked, leave = [], threading.Event()
     questions = [(str(k), lambda k=k: asked.append(k)) for k in range(5)]
-    assert unanswered(questions, 30.0) is None and asked == [0, 1, 2, 3, 4]
-    assert unanswered([*questions, ("loop", leave.wait), ("after", lambda: asked.append("after"))], 0.2) == "loop"
+    assert unanswered(questions, LIMIT_S) is None and asked == [0, 1, 2, 3, 4]
+    assert unanswered([*questions, ("loop", leave.wait), ("after", lambda: asked.append("after"))], 1.0) == "loop"
     leave.set()
     assert np.all(np.array(asked[:10]) == [*range(5)] * 2)
 

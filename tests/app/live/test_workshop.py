@@ -32,7 +32,7 @@ from estimators.tuning import Tuning
 from sources.pieces import FRAMES
 from tests.app.scripted import MODEL, Scripted, fresh_status, pull_all, readings, row_count, twin
 from tests.support import assert_same
-from tests.waiting import wait_for
+from tests.waiting import LIMIT_S, wait_for
 
 
 def paper(folder: Path, what: str, piece: Piece) -> Path:
@@ -44,8 +44,7 @@ def slow_work(folder: Path, piece: Piece) -> None:
     begun = paper(folder, "begun", piece)
     begun.with_suffix(".new").write_text(f"{os.getpid()} {os.nice(0)} {time.monotonic_ns()}")
     begun.with_suffix(".new").rename(begun)
-    while not (paper(folder, "go", piece).exists() or (folder / "go").exists()):
-        time.sleep(0.005)
+    wait_for(lambda: paper(folder, "go", piece).exists() or (folder / "go").exists(), every_s=0.005)
     if paper(folder, "fail", piece).exists():
         raise RuntimeError("as asked")
     paper(folder, "done", piece).touch()
@@ -326,7 +325,7 @@ def test_what_a_source_needs_comes_first_and_is_waited_for_alone(shop, tmp_path)
     waiting = threading.Thread(target=workshop.wait, args=("ukf",), daemon=True)
     waiting.start()
     workshop.stop()
-    waiting.join(60.0)
+    waiting.join(LIMIT_S)
     assert not waiting.is_alive()
 
 

@@ -57,14 +57,14 @@ class Listener:
         ))  # fmt: skip
         self.client.connect("127.0.0.1", broker.port)
         self.client.loop_start()
-        assert self.ready.wait(60.0)
+        assert self.ready.wait(LIMIT_S)
 
     def of(self, topic: str) -> list[Any]:
         return [body for name, body, _ in self.heard.copy() if name == topic]
 
     def publish(self, topic: str, body: Any, **options: Any) -> None:
         text = body if isinstance(body, str | bytes) else json.dumps(body)
-        self.client.publish(topic, text, qos=1, **options).wait_for_publish(60.0)
+        self.client.publish(topic, text, qos=1, **options).wait_for_publish(LIMIT_S)
 
     def stop(self) -> None:
         self.client.disconnect()

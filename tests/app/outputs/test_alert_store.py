@@ -28,7 +28,7 @@ from sources.source import ignore
 from tests import ROOT
 from tests.app.outputs import test_fleet_alerts as of_fleets
 from tests.app.outputs.test_alerts import Looked, episode, send, started, state
-from tests.waiting import wait_for
+from tests.waiting import LIMIT_S, wait_for
 
 BAD = {"health": "degraded", "cause": "yoke is silent"}
 
@@ -294,11 +294,12 @@ def test_alerts_are_sent_while_the_disk_is_full(tmp_path, monkeypatch):
 
 
 RUN = """
-import os, signal, sys, json, time
+import os, signal, sys, json
 from pathlib import Path
 from app.twin.twin import load_twin
 from app.web.running import OpenedTwin, RunningTwin
 from sources.source import ignore
+from tests.waiting import wait_for
 
 folder, first, value, count = Path(sys.argv[1]), int(sys.argv[2]), float(sys.argv[3]), int(sys.argv[4])
 program = "import sys; open(sys.argv[1], 'a').write(sys.stdin.read() + chr(10))"
@@ -313,14 +314,13 @@ running.start()
 source = running.engine.innermost
 for k in range(first, first + 60):
     source.send([{"time": (1767225600 + k) * 10**9, "values": {"winding": value}}])
-while True:
-    time.sleep(0.05)
-    file = folder / "alerts"
-    told = file.read_text().count("\\n") if file.exists() else 0
-    taken = sum(queue.delivered for queue in running.publisher._parts.deliveries.queues.values())
-    if told >= count and source.accepted and running.store.has(source.accepted) and (taken or not first):
-        time.sleep(1.0)  # the queue without it is stored after the next look
-        os.kill(os.getpid(), signal.SIGKILL)
+publisher = running.publisher
+def stored():
+    counts = publisher._parts.deliveries.counts()  # taken, which is stored after the next look
+    return source.accepted and running.store.has(source.accepted) and counts == publisher._store._written == [(1, 0)]
+wait_for(stored)
+assert (folder / "alerts").read_text().count("\\n") == count
+os.kill(os.getpid(), signal.SIGKILL)
 """
 
 
@@ -357,7 +357,7 @@ def test_a_killed_process_is_followed_by_one_that_resolves_its_alert(tmp_path):
     for arguments in (("0", "50.0", "1"), ("60", "40.0", "2")):
         ended = subprocess.run(
             [sys.executable, "-c", RUN, str(tmp_path), *arguments],
-            cwd=ROOT, text=True, capture_output=True, timeout=300,
+            cwd=ROOT, text=True, capture_output=True, timeout=LIMIT_S,
         )  # fmt: skip
         assert ended.returncode == -signal.SIGKILL, ended.stderr
     told = [json.loads(line) for line in (tmp_path / "alerts").read_text().splitlines()]

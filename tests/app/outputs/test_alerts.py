@@ -26,7 +26,7 @@ from estimators.diagnostics.episodes import Episode
 from estimators.errors import ConfigError
 from sources.source import ignore
 from tests.support import SECOND
-from tests.waiting import wait_for
+from tests.waiting import LIMIT_S, wait_for
 
 BEGIN = 1_767_225_600 * SECOND
 
@@ -314,7 +314,7 @@ def test_a_receiver_that_answers_nonsense_fails_as_any_other(tmp_path):
     child = "import subprocess, sys; subprocess.Popen([sys.executable, '-c', {!r}, sys.argv[1]])"
     child = child.format("import sys; open(sys.argv[1])")
     words = [sys.executable, "-c", child, str(tmp_path / "end")]
-    leaves = CommandReceiver(CommandSection(type="command", command=words, timeout=60), tmp_path)
+    leaves = CommandReceiver(CommandSection(type="command", command=words, timeout=LIMIT_S), tmp_path)
     for receiver in (command[1], leaves):
         delivery = Delivery("ops", receiver, notices)
         delivery.put(heartbeat("motor", "tracking"))

@@ -1,21 +1,27 @@
 """Every twin that ships opens, folds, and does what its opening text promises."""
 
+from functools import lru_cache
+
 import numpy as np
 import pytest
 
 from app.twin.twin import load_twin
 from config.loader import TWINS, shipped
-from estimators.diagnostics.episodes import episodes
+from estimators.diagnostics.episodes import episodes_of, judged_rows
 from estimators.fold import Fold, fold
-from estimators.log import READING, Events, truth_of
-from estimators.track import GATED, USED, Track
+from estimators.log import READING, truth_of
+from estimators.track import GATED, USED
 from tests.skips import recorded
 from tests.support import SECOND, as_log, read_all
 
 
-def folded(name: str) -> tuple[Events, Track]:
+@lru_cache(maxsize=1)
+def folded(name: str) -> Fold:
+    """Return the fold of a twin's own log, as the twin runs."""
     twin, log = recorded(name)
-    return log.events, fold(twin.estimator, twin.model, twin.tuning, log)
+    fold = Fold(twin.estimator, twin.model, twin.tuning, log, policy=twin.policy, expected=twin.expected)
+    fold.advance()
+    return fold
 
 
 HUGE = ("thermal_field_large",)
@@ -33,32 +39,35 @@ def test_a_million_cells_fold() -> None:
         assert np.isfinite(track.mean).all() and (track.std > 0).all()
 
 
-@pytest.mark.parametrize("name", [name for name in shipped() if name not in HUGE])
-def test_it_opens_and_folds(name: str) -> None:
-    events, track = folded(name)
+@pytest.fixture(scope="module", params=[name for name in shipped() if name not in HUGE])
+def run(request: pytest.FixtureRequest) -> Fold:
+    """The tests of a twin follow each other, and share its fold."""
+    return folded(request.param)
+
+
+def test_it_opens_and_folds(run: Fold) -> None:
+    events, track = run.log.events, run.track
     readings = events.kind == READING
     assert readings.sum() > 100
     used, gated = (np.sum(track.verdict[readings] == verdict) for verdict in (USED, GATED))
     assert used > 100 and gated < 0.1 * used, f"{used} readings were used and {gated} gated"
     # Of a mode one may be certain.
-    uncertain = np.delete(track.std, model.mode, axis=1) if (model := load_twin(name).model).jump else track.std
+    uncertain = np.delete(track.std, run.model.mode, axis=1) if run.model.jump else track.std
     assert np.isfinite(track.mean).all() and (uncertain > 0).all() and (track.std >= 0).all()
 
 
-@pytest.mark.parametrize("name", [name for name in shipped() if name not in HUGE])
-def test_no_sensor_drops_out_in_the_first_minute(name: str) -> None:
-    twin, log = recorded(name)
-    events = log.events
-    log = as_log(events.select(events.t <= events.t[0] + 60 * SECOND))
-    judged = Fold(twin.estimator, twin.model, twin.tuning, log, policy=twin.policy, expected=twin.expected)
-    judged.advance()
+def test_no_sensor_drops_out_in_the_first_minute(run: Fold, request: pytest.FixtureRequest) -> None:
+    twin = load_twin(request.node.callspec.params["run"])
     injected = {fault.sensor for fault in twin.plan.scheduled}
-    causes = {item.cause for item in episodes(judged) if item.subject not in injected}
+    judged = judged_rows(run)
+    minute = judged.events.t <= judged.events.t[0] + 60 * SECOND
+    judged = judged._replace(events=judged.events.select(minute), track=judged.track.select(minute))
+    causes = {item.cause for item in episodes_of(judged) if item.subject not in injected}
     assert not causes & {"silent", "never heard", "stale", "diverged"}
 
 
 def test_the_motor_on_the_bus_finds_its_magnet() -> None:
-    events, track = folded("motor_can")
+    events, track = (fold := folded("motor_can")).log.events, fold.track
     assert (TWINS.parent / "logs" / "motor_can.blf").stat().st_size < 1_000_000
     seconds = (events.t - events.t[0]) * 1e-9
     for state, bound in ((0, 0.5), (1, 0.5), (2, 0.5)):
@@ -72,7 +81,7 @@ def test_the_motor_on_the_bus_finds_its_magnet() -> None:
 
 def test_what_was_learned_of_the_magnet_holds_where_it_was_not_learned() -> None:
     def last(name: str) -> float:
-        events, track = folded(name)
+        events, track = (fold := folded(name)).log.events, fold.track
         rows, values = truth_of(events, 3)
         rows, values = rows[(late := events.t[rows] >= events.t[0] + 1_200_000_000_000)], values[late]
         return float(np.sqrt(np.mean((track.mean[rows, 3] - values) ** 2)))

@@ -155,7 +155,7 @@ def test_nobody_there_nothing_pulled(engine, monkeypatch):
         assert addresses(view.server) == ["theme=dark"] and pulled
         leave.set()
         assert gone.wait(LIMIT_S)
-        browser.join()
+        browser.join(LIMIT_S)
         wait_for(lambda: view._cursor is None)
         count = len(pulled)
         engine.put(events(WINDING, READING, 0, [100.0], [45.0]))
