@@ -10,6 +10,8 @@ pytestmark = pytest.mark.browser
 SIZES = ((1024, 700), (1440, 900), (2560, 1440))
 FILLED = {"What if": "window.nisus.forecasts > 0", "Diagnose": "window.nisus.diagnosed > 0"}
 """By tab, whether there is something in it."""
+ROWS_DRAWN = "window.nisus?.drawn > 0 && window.nisus.charts.live.x.length > 20"
+"""Of a source that may have ended meanwhile, which is drawn once."""
 TABS = ("Charts", "What if", "Diagnose", "Scene", "XY", "Runs", "Episodes")
 
 WIDER = """() => {
@@ -47,10 +49,21 @@ def session():
         yield session
 
 
+@pytest.fixture(scope="module")
+def picture():
+    with running("lorenz96", 4.0) as session:
+        yield session
+
+
+def laid_out(page):
+    """Wait until the page is laid out, and drawn in that layout."""
+    page.evaluate("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
+
+
 @pytest.mark.parametrize("name", ["motor_can", "agv_corridor", "battery_pack", "lorenz96"])
 def test_nothing_is_wider_than_its_column(name, visit):
     with running(name, 4.0) as session:
-        page = visit(session.url, ready="window.nisus?.drawn > 3")
+        page = visit(session.url, ready=ROWS_DRAWN)
         # Rows with all their buttons: a run before the one that runs, and both have a name.
         page.evaluate("window.nisus.link.ask('UseSensor', {name: window.nisus.model.sensors[0], used: false})")
         wait_for(lambda: session.engine.status().revision > 0)
@@ -67,8 +80,7 @@ def test_nothing_is_wider_than_its_column(name, visit):
                     wait_for(lambda: page.locator(".runs .scores").count() == len(session.engine.revisions.runs))
                 if tab in FILLED:
                     until(page, FILLED[tab])
-                # Laid out, and drawn in that layout.
-                page.evaluate("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
+                laid_out(page)
                 assert page.evaluate(WIDER) == [], (width, tab)
             if width < 1100:
                 page.get_by_role("button", name="Tune").first.click()
@@ -78,7 +90,7 @@ def test_nothing_is_wider_than_its_column(name, visit):
 
 def test_the_nis_is_seen_on_a_low_window_and_the_choice_of_the_error_is_whole(visit):
     with running("battery_pack", 60.0) as session:
-        page = visit(session.url, ready="window.nisus?.drawn > 3", size=(1440, 480))
+        page = visit(session.url, ready=ROWS_DRAWN, size=(1440, 480))
         charts = page.locator("#charts .chart:not([data-kind=nis]):visible")
         above = sum(charts.nth(k).bounding_box()["height"] for k in range(3))
         assert above > page.locator("#charts").evaluate("(node) => node.clientHeight") - 60
@@ -91,16 +103,15 @@ def test_the_nis_is_seen_on_a_low_window_and_the_choice_of_the_error_is_whole(vi
         assert select.evaluate("(node) => node.scrollWidth <= node.clientWidth && node.clientWidth > 100")
 
 
-def test_a_narrow_scale_has_two_ends(visit):
-    with running("lorenz96", 4.0) as session:
-        page = visit(session.url, ready="window.nisus?.drawn > 5")
-        ends = page.evaluate("""(() => {
-          const chart = window.nisus.charts.charts.find((chart) => chart.what.ramp);
-          chart.what.ramp = () => ({ colors: [], low: 25.1034, high: 25.1287 });
-          chart.scale();
-          return [...chart.ramp.children].map((node) => node.textContent);
-        })()""")
-        assert ends[0] == "25.103" and ends[2].startswith("25.129")
+def test_a_narrow_scale_has_two_ends(visit, picture):
+    page = visit(picture.url, ready=ROWS_DRAWN)
+    ends = page.evaluate("""(() => {
+      const chart = window.nisus.charts.charts.find((chart) => chart.what.ramp);
+      chart.what.ramp = () => ({ colors: [], low: 25.1034, high: 25.1287 });
+      chart.scale();
+      return [...chart.ramp.children].map((node) => node.textContent);
+    })()""")
+    assert ends[0] == "25.103" and ends[2].startswith("25.129")
 
 
 SIDE = {"Scene": "scene", "XY": "xy", "Runs": "runs", "Episodes": "episodes"}
@@ -137,12 +148,12 @@ def test_below_1100_px_the_right_column_becomes_tabs(visit, session):
 def test_a_phone_shows_health_cause_and_charts_without_controls(name, visit):
     """At 390 px nothing leaves the screen, and no control changes the session."""
     with running(name, 4.0) as session:
-        page = visit(session.url, size=(390, 844), ready="window.nisus?.drawn > 3")
+        page = visit(session.url, size=(390, 844), ready=ROWS_DRAWN)
         for tab in ("Charts", "Diagnose", "Scene", "XY", "Episodes"):
             page.get_by_role("tab", name=tab, exact=True).click()
             if tab in FILLED:
                 until(page, FILLED[tab])
-            page.evaluate("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
+            laid_out(page)
             assert page.evaluate(WIDER) == [], tab
         page.get_by_role("tab", name="Charts").click()
         assert page.locator("#health").is_visible() and page.locator("#lights").is_visible()
@@ -175,10 +186,9 @@ LEGEND = """() => {
 }"""
 
 
-@pytest.mark.parametrize("width", [1000, 1440, 1920])
-def test_the_legend_has_every_mark_of_the_charts_and_no_other(visit, width):
+def test_the_legend_has_every_mark_of_the_charts_and_no_other(visit):
     with running("motor_can", 4.0, **{"gate.probability": "0.9"}) as session:
-        page = visit(session.url, size=(width, 900), ready="window.nisus?.drawn > 3")
+        page = visit(session.url, ready=ROWS_DRAWN)
         page.evaluate("window.nisus.link.ask('UseSensor', {name: 'yoke', used: false})")
         marks = {"estimate", "band", "truth", "reading", "reading ring", "refused", "previous", "quiet", "bounds"}
 
@@ -187,19 +197,21 @@ def test_the_legend_has_every_mark_of_the_charts_and_no_other(visit, width):
             extra = set(seen) - {"episode-strip", "outside"}
             return marks <= set(drawn) and set(drawn) == extra and explained
 
-        wait_for(complete)
+        for width in (1000, 1440, 1920):
+            page.set_viewport_size({"width": width, "height": 900})
+            laid_out(page)
+            wait_for(complete)
 
 
-def test_a_picture_has_a_colour_bar_with_its_ends(visit):
+def test_a_picture_has_a_colour_bar_with_its_ends(visit, picture):
     """The bar's ends enclose all that is drawn, and are not far beyond it; a file has the bar too."""
-    with running("lorenz96", 4.0) as session:
-        page = visit(session.url, ready="window.nisus?.drawn > 5")
-        picture = "window.nisus.charts.charts.find((chart) => chart.what.ramp)"
-        low, high, least, most, legend = page.evaluate(f"""(() => {{
-          const chart = {picture}, values = chart.names.flatMap((name) => chart.data[name]).filter((v) => typeof v === "number");
-          const [low, , high] = [...chart.ramp.children].map((node) => parseFloat(node.textContent));
-          return [low, high, Math.min(...values), Math.max(...values), chart.legend.map(([text]) => text)];
-        }})()""")  # noqa: E501
-        assert low <= least < most <= high and high - low < 2 * (most - least)
-        assert page.locator(".ramp i").first.bounding_box()["width"] > 80
-        assert len(legend) == 1 and [float(part) for part in legend[0].split(" to ")] == [low, high]
+    page = visit(picture.url, ready=ROWS_DRAWN)
+    chart = "window.nisus.charts.charts.find((chart) => chart.what.ramp)"
+    low, high, least, most, legend = page.evaluate(f"""(() => {{
+      const chart = {chart}, values = chart.names.flatMap((name) => chart.data[name]).filter((v) => typeof v === "number");
+      const [low, , high] = [...chart.ramp.children].map((node) => parseFloat(node.textContent));
+      return [low, high, Math.min(...values), Math.max(...values), chart.legend.map(([text]) => text)];
+    }})()""")  # noqa: E501
+    assert low <= least < most <= high and high - low < 2 * (most - least)
+    assert page.locator(".ramp i").first.bounding_box()["width"] > 80
+    assert len(legend) == 1 and [float(part) for part in legend[0].split(" to ")] == [low, high]
