@@ -82,12 +82,15 @@ def drawn_range(page, signal, begins=0.0):
 def assign(page, **roles):
     """Give these signals their roles, and none to all others that the draft proposes."""
     page.locator(".signal-link").first.wait_for()
-    while True:
+
+    def others_without_role():
         names = [name for name in page.locator(".signal-link").all_inner_texts() if name not in roles]
-        if not names:
-            break
-        page.get_by_role("searchbox", name="Find a signal").fill(names[0])
-        page.get_by_label(f"Role of {names[0]}", exact=True).select_option("")
+        for name in names[:1]:
+            page.get_by_role("searchbox", name="Find a signal").fill(name)
+            page.get_by_label(f"Role of {name}", exact=True).select_option("")
+        return not names
+
+    wait_for(others_without_role)
     for name, role in roles.items():
         page.get_by_role("searchbox", name="Find a signal").fill(name)
         page.get_by_label(f"Role of {name}", exact=True).select_option(role)
@@ -97,9 +100,8 @@ def drafted(page, session, name):
     """Draft a twin, follow it to its page, and return all rows of its run."""
     page.get_by_label("Name of the twin").fill(name)
     page.get_by_role("button", name="Draft and run").click()
-    page.locator(".draft .row").get_by_text("…").first.wait_for()
     progress = "/api/gallery/log/draft"
-    wait_for(lambda: session.get(progress)["state"] != "running")
+    wait_for(lambda: session.get(progress)["state"] not in ("none", "running"))
     assert session.get(progress)["error"] is None and "95 % bounds" in session.get(progress)["summary"]
     until(page, f"window.nisus?.model?.twin === '{name}' && window.nisus.drawn > 0")
     wait_for(lambda: session.engine.status().finished)
@@ -241,6 +243,23 @@ def test_every_format_is_drawn_with_the_values_of_the_file(visit, tmp_path, endi
         box = row(page, "level").locator("svg").bounding_box()
         page.mouse.move(box["x"] + 0.6 * box["width"], box["y"] + 5)
         assert row(page, "level").locator(".readout").inner_text().split()[:2] == ["0:11.0", "27"]
+
+
+def test_the_progress_of_a_draft_is_shown_until_it_is_stopped(visit, tmp_path):
+    path, _ = written(tmp_path, "tank.csv")
+    with opened(tmp_path / "recordings") as session:
+        page = visit_log(visit, session, path)
+        page.locator(".signal-link").first.wait_for()
+        told = {"state": "running", "twin": "tank", "seconds": 3.7, "error": None, "doing": "fitting", "summary": ""}
+        page.route("**/api/gallery/log/draft", lambda route: route.fulfill(json=told))
+        page.get_by_role("button", name="Draft and run").click()
+        page.locator(".draft .row").get_by_text("fitting … 3 s").wait_for()
+        assert page.get_by_role("button", name="Draft and run").is_disabled()
+        assert page.locator(".draft").get_by_role("button", name="Stop").is_visible()
+        told["state"] = "stopped"
+        page.locator(".draft .row").get_by_text("stopped").wait_for()
+        assert page.locator(".draft").get_by_role("button", name="Stop").is_hidden()
+        assert page.get_by_role("button", name="Draft and run").is_enabled()
 
 
 def test_no_error_is_a_dead_end(visit, tmp_path):

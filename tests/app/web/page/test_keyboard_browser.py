@@ -4,6 +4,7 @@ import re
 
 import numpy as np
 import pytest
+from playwright.sync_api import Error
 
 from tests.app.web.page.browsed import running, until
 from tests.app.web.page.test_colours import TEXT, contrast, over
@@ -45,7 +46,8 @@ TEXTS = """(() => {
 
 @pytest.fixture(scope="module")
 def session():
-    with running("motor_winding", 4.0) as session:
+    # It goes on through all tests: what has ended cannot be paused.
+    with running("motor_winding", 4.0, **{"source.duration": "1000000"}) as session:
         yield session
 
 
@@ -93,10 +95,19 @@ def test_every_control_is_reached_by_tab_and_has_a_name(visit, session, show):
         for tab in show:
             page.get_by_role("tab", name=tab, exact=True).click()
         page.evaluate("for (const item of document.querySelectorAll('#left details')) item.open = true")
-        page.wait_for_timeout(500)
-        controls = page.evaluate(CONTROLS)
+
+        def undisturbed_walk():
+            """Controls, their names and those that were reached, once none came or went on the way."""
+            controls = page.evaluate(CONTROLS)
+            try:
+                names, reached = names_of(page), walked(page)
+            except Error:  # the document has lost one of them
+                return False
+            same = [number for number, *_ in controls] == [number for number, *_ in page.evaluate(CONTROLS)]
+            return same and (controls, names, reached)
+
+        controls, names, reached = wait_for(undisturbed_walk)
         assert len(controls) > 40
-        names, reached = names_of(page), walked(page)
         nameless = [html for number, _, html in controls if not names.get(number, "").strip()]
         assert nameless == []
         # One tab of a list has its turn, and arrows go on from it.

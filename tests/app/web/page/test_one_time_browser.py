@@ -78,6 +78,8 @@ def test_page_and_rerun_show_one_time(page, session):
 def test_rerun_in_a_window_of_its_own_shares_the_time_of_the_page(visit, page, session):
     page.evaluate("window.nisus.view.show(20, 50)")
     alone = visit(session.url.partition("?")[0] + "explore", beside=page, ready="window.nisus?.explored > 0")
+    assert alone.locator("#notice").is_hidden()
+    assert alone.locator("#rerun").evaluate("(node) => node.clientHeight") > 700
     assert alone.locator("#shared").inner_text() == "one time with the page"
     cursor_is(alone, 50.0, PAUSED)
     # What is gone to on the page moves it, and what is scrubbed in it moves the page.
@@ -220,35 +222,40 @@ def test_strip_and_scene_show_the_moment_of_the_cursor(visit, session):
     shows(page, engine.status(), "")
 
 
-@pytest.mark.parametrize("width", [390, 1440])
-def test_charts_show_the_values_of_the_row_at_the_moment(visit, width):
-    """Drawn are the extremes of groups of rows; the text beside a chart is of the last row then, or at the pointer."""
+@pytest.fixture(scope="module")
+def battery():
     with running("battery_dmegc") as session:
-        page = visit(session.url, size=(width, 900))
-        pull = pull_all(session.engine)
-        seconds = (pull.events.t - pull.events.t[0]) * 1e-9
-        assert len(seconds) > 1000  # more than are drawn
-        names = [state.name for state in session.engine.model.shown_states]
-        labels = {"v1": "polarisation voltage", "r0": "series resistance"}
+        yield session
 
-        def shown(moment):
-            row = int(np.flatnonzero(seconds <= moment)[-1])
-            for name, label in labels.items():
-                k = names.index(name)
-                mean, half = pull.track.mean[row, k], 2.0 * pull.track.std[row, k]
-                decimals = max(0, 1 - int(np.floor(np.log10(half))))
-                wanted = f"{mean:.{decimals}f} ± {half:.{decimals}f}"
-                reading = page.locator(f"[aria-label='Chart of {label}'] .reading")
-                wait_for(lambda reading=reading, wanted=wanted: reading.inner_text().startswith(wanted))
 
-        for moment in (700.25, 1400.25, 3200.25):
-            page.evaluate("(at) => window.nisus.view.show(0, window.nisus.charts.newest, at)", moment)
-            shown(moment)
-        assert page.evaluate("window.nisus.charts.live.size") > 1
-        box = page.locator("[aria-label='Chart of polarisation voltage'] .u-over").bounding_box()
-        for share in (0.31, 0.62):
-            page.mouse.move(box["x"] + share * box["width"], box["y"] + box["height"] / 2)
-            until(page, "window.nisus.charts.hovered !== null")
-            shown(page.evaluate("window.nisus.charts.hovered"))
-        page.mouse.move(5, 5)
-        shown(3200.25)
+@pytest.mark.parametrize("width", [390, 1440])
+def test_charts_show_the_values_of_the_row_at_the_moment(visit, battery, width):
+    """Drawn are the extremes of groups of rows; the text beside a chart is of the last row then, or at the pointer."""
+    page = visit(battery.url, size=(width, 900))
+    pull = pull_all(battery.engine)
+    seconds = (pull.events.t - pull.events.t[0]) * 1e-9
+    assert len(seconds) > 1000  # more than are drawn
+    names = [state.name for state in battery.engine.model.shown_states]
+    labels = {"v1": "polarisation voltage", "r0": "series resistance"}
+
+    def shown(moment):
+        row = int(np.flatnonzero(seconds <= moment)[-1])
+        for name, label in labels.items():
+            k = names.index(name)
+            mean, half = pull.track.mean[row, k], 2.0 * pull.track.std[row, k]
+            decimals = max(0, 1 - int(np.floor(np.log10(half))))
+            wanted = f"{mean:.{decimals}f} ± {half:.{decimals}f}"
+            reading = page.locator(f"[aria-label='Chart of {label}'] .reading")
+            wait_for(lambda reading=reading, wanted=wanted: reading.inner_text().startswith(wanted))
+
+    for moment in (700.25, 1400.25, 3200.25):
+        page.evaluate("(at) => window.nisus.view.show(0, window.nisus.charts.newest, at)", moment)
+        shown(moment)
+    assert page.evaluate("window.nisus.charts.live.size") > 1
+    box = page.locator("[aria-label='Chart of polarisation voltage'] .u-over").bounding_box()
+    for share in (0.31, 0.62):
+        page.mouse.move(box["x"] + share * box["width"], box["y"] + box["height"] / 2)
+        until(page, f"Math.abs(window.nisus.charts.hovered / window.nisus.charts.newest - {share}) < 0.02")
+        shown(page.evaluate("window.nisus.charts.hovered"))
+    page.mouse.move(5, 5)
+    shown(3200.25)

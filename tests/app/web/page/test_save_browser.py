@@ -41,8 +41,7 @@ def saved(page, button, item, folder):
     page.get_by_role("button", name=button, exact=True).focus()
     page.keyboard.press("Enter")
     wanted = page.get_by_role("menuitem", name=item, exact=True)
-    while not wanted.evaluate("node => node === document.activeElement"):
-        page.keyboard.press("ArrowDown")
+    wait_for(lambda: wanted.evaluate("node => node === document.activeElement") or page.keyboard.press("ArrowDown"))
     with page.expect_download() as download:
         page.keyboard.press("Enter")
     path = folder / download.value.suggested_filename
