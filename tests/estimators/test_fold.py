@@ -366,10 +366,7 @@ def test_an_unused_sensor_is_held_out_and_a_gated_one_stays_held_out(estimator):
 
 
 def test_inputs_that_are_nan_stay(estimator):
-    events = [
-        Events.one(0, 0, INPUT, 0, [5.0, np.nan], MODEL.width),
-        Events.one(SECOND, 0, TICK, 0, (), MODEL.width),
-    ]
+    events = [Events.one(0, 0, INPUT, 0, [5.0, np.nan], MODEL.width), Events.one(SECOND, 0, TICK, 0, (), MODEL.width)]
     growing = folded(estimator, MODEL, as_log(Events.concat(events, MODEL.width)))
     u = np.array([5.0, MATRICES.u[1]])
     np.testing.assert_array_equal(growing.u, u)

@@ -86,10 +86,7 @@ def model(**more):
     return StateSpaceModel(**given)
 
 
-QUIET = {
-    "both": SensorPlan(variances=(1e-30, 1e-30)),
-    "one": SensorPlan(every=3, variances=(1e-30,), drop_every=2),
-}
+QUIET = {"both": SensorPlan(variances=(1e-30, 1e-30)), "one": SensorPlan(every=3, variances=(1e-30,), drop_every=2)}
 
 
 def test_inputs_parameters_rates_and_losses():

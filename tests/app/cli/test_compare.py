@@ -12,16 +12,7 @@ from pyarrow import csv as pa_csv
 import app.cli.compare
 import app.studies.compare
 from app.studies.compare import fold_row, tidy, within
-from app.studies.scores import (
-    SCORES,
-    FilterScore,
-    Spread,
-    cells,
-    printed,
-    read_scores,
-    scores_file,
-    write_scores,
-)
+from app.studies.scores import SCORES, FilterScore, Spread, cells, printed, read_scores, scores_file, write_scores
 from app.twin.log_reader import read_log
 from app.twin.twin import load_twin
 from config.loader import load, shipped

@@ -180,11 +180,7 @@ def test_tables_of_other_columns_are_listed_one_after_the_other(tmp_path, nisus)
         ("t,a\n1,5\n", ["--dbc", "no.dbc"], "--dbc no.dbc: there is no such file; check the path"),
         ("t,a\n1,5\n", ["--dbc", "car.dbc"], "--dbc car.dbc: describes CAN logs, and {0} is a table; leave it out"),
         ("t,a\n1,5\n", ["{0}"], "{0}: is given twice; name each recording once"),
-        (
-            "t,a\n1,5\n",
-            ["drive.blf"],
-            "drive.blf: no message of it is in a DBC; give one that describes it with",
-        ),
+        ("t,a\n1,5\n", ["drive.blf"], "drive.blf: no message of it is in a DBC; give one that describes it with"),
     ],
 )
 def test_a_file_of_which_no_twin_can_be_drafted_is_refused_with_the_remedy(

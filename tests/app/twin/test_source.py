@@ -160,10 +160,7 @@ def test_what_the_dbc_lacks_is_one_line_at_the_mapping(old: str, new: str, place
 
 @pytest.mark.parametrize(
     ("old", "new", "words"),
-    [
-        ("columns: temp_f", "columns: temp_c", ["temp_c", "temp_f"]),
-        ("units: degF", "units: m/s", ["m/s", "°C"]),
-    ],
+    [("columns: temp_f", "columns: temp_c", ["temp_c", "temp_f"]), ("units: degF", "units: m/s", ["m/s", "°C"])],
 )
 def test_what_a_table_lacks_is_one_line_at_the_mapping(old: str, new: str, words: list[str]) -> None:
     Path("a1.csv").write_text(CSV)

@@ -20,18 +20,7 @@ from estimators.log import READING, RESET, TICK, TRUTH, Events, Log
 from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
 from estimators.models import MODELS
 from estimators.registry import ESTIMATORS
-from estimators.track import (
-    DIVERGED,
-    FAILED,
-    GATED,
-    HELD_OUT,
-    MISSING,
-    NONE,
-    SUSPECT,
-    TRACKING,
-    USED,
-    Track,
-)
+from estimators.track import DIVERGED, FAILED, GATED, HELD_OUT, MISSING, NONE, SUSPECT, TRACKING, USED, Track
 from estimators.tuning import Tuning
 from tests.models import first_state, level_model, unchanged
 from tests.support import SECOND

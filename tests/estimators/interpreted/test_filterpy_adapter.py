@@ -55,8 +55,7 @@ def test_a_linear_model_with_gate_inputs_and_held_out_sensor(name):
 
 
 @pytest.mark.parametrize(
-    ("name", "values"),
-    [("ekf", {}), ("ukf", {}), ("ukf", {"alpha": 0.5, "beta": 1.0, "kappa": 1.0})],
+    ("name", "values"), [("ekf", {}), ("ukf", {}), ("ukf", {"alpha": 0.5, "beta": 1.0, "kappa": 1.0})]
 )
 def test_a_curved_model(name, values, log):  # noqa: F811
     tuning = Tuning.of(PENDULUM).with_options(values)

@@ -119,11 +119,7 @@ def test_slopes_match_complex_step_from_below_empty_to_above_full(model, soc: fl
     checks = [(lambda z, out: compiled.f(z, u, p, 1.5, out), lambda J: model.F(x, u, p, 1.5, J), n)]
     for k, sensor in enumerate(model.sensors):
         checks.append(
-            (
-                lambda z, out, k=k: compiled.h[k](z, u, p, out),
-                lambda J, s=sensor: s.H(x, u, p, J),
-                len(sensor.rows),
-            )
+            (lambda z, out, k=k: compiled.h[k](z, u, p, out), lambda J, s=sensor: s.H(x, u, p, J), len(sensor.rows))
         )
     for function, slope, rows in checks:
         exact, own = np.empty((rows, n)), np.full((rows, n), np.nan)

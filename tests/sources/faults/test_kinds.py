@@ -183,11 +183,7 @@ def test_begin_and_end_are_stamped_where_they_hold():
     code, stuck = KINDS["bias"].code, KINDS["stuck"].code
     assert [
         (t / 1e9 - START, channel, value) for t, channel, value in zip(marks.t, marks.channel, marks.value[:, 0])
-    ] == [
-        (20.0, 1, code),
-        (30.0, whole, stuck),
-        (40.0, 1, -code),
-    ]
+    ] == [(20.0, 1, code), (30.0, whole, stuck), (40.0, 1, -code)]
     sent = out.select(out.kind != MARK)
     assert len(sent) == len(stream())
 

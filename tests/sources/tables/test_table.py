@@ -126,9 +126,7 @@ def test_a_header_without_rows_is_named(tmp_path, rest):
 
 
 @pytest.mark.parametrize(
-    "content",
-    [b"\x89PNG\r\n\x1a\n" + bytes(range(256)) * 40, b"t,\x1b[31mx\n0,1\n"],
-    ids=["picture", "colours"],
+    "content", [b"\x89PNG\r\n\x1a\n" + bytes(range(256)) * 40, b"t,\x1b[31mx\n0,1\n"], ids=["picture", "colours"]
 )
 def test_a_file_that_is_no_text_is_told_in_letters_and_briefly(tmp_path, content):
     path = tmp_path / "drive.csv"

@@ -317,17 +317,11 @@ def test_the_name_is_in_every_row_and_recording(own, tmp_path):
     [
         (("rate: {variance", "ratee: {variance"), r"tried\.yaml:11: noise\.ratee is no noise .* did you mean rate\?"),
         (("variance: 0.001", "varianc: 0.001"), r"tried\.yaml:11: noise\.rate\.varianc is not known; did you mean v"),
-        (
-            ("variance: 4,", "variance: -4,"),
-            r"tried\.yaml:13: sensors\.winding\.variance.* is -4; it must be zero",
-        ),
+        (("variance: 4,", "variance: -4,"), r"tried\.yaml:13: sensors\.winding\.variance.* is -4; it must be zero"),
         (("winding: {variance", "yoke: {variance"), r"tried\.yaml:13: sensors\.yoke is no sensor"),
         (("estimator: kf", "estimator: kff"), r"tried\.yaml:8: .*kff.*did you mean kf"),
         (("gate: null", "gate: 2"), r"tried\.yaml:14: gate.* is 2; it must be below 1"),
-        (
-            ("model: motor_winding", "model: motor_drive"),
-            r"tried\.yaml:4: version\.model is 'motor_drive'; the model",
-        ),
+        (("model: motor_winding", "model: motor_drive"), r"tried\.yaml:4: version\.model is 'motor_drive'; the model"),
         (("  saved:", "  save:"), r"tried\.yaml:5: version\.save is not known; did you mean saved"),
         (("version:", "versio:"), r"tried\.yaml:2: versio is not known; did you mean version"),
     ],

@@ -130,9 +130,7 @@ FIELD = StateSpaceModel(
     noises=(Noise("warmth", "K²/s", 0.05),),
     sensors=(
         Sensor(
-            "probes",
-            tuple(Row(f"p{k}", "K", 0.04, position=(float(k),)) for k in range(0, CELLS, EVERY)),
-            h=probes,
+            "probes", tuple(Row(f"p{k}", "K", 0.04, position=(float(k),)) for k in range(0, CELLS, EVERY)), h=probes
         ),
     ),
     f=spreading,

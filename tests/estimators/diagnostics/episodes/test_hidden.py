@@ -13,10 +13,7 @@ from tests.support import folded
 
 from .test_find import MODEL, POLICY
 
-LIMITED = replace(
-    MODEL,
-    sensors=(replace(MODEL.sensors[0], limits=Limits(range=((-100.0, 100.0),))), MODEL.sensors[1]),
-)
+LIMITED = replace(MODEL, sensors=(replace(MODEL.sensors[0], limits=Limits(range=((-100.0, 100.0),))), MODEL.sensors[1]))
 N, BEGIN, END = 1500, 700, 1000
 """Readings of the gauge, one a second, and those that are changed."""
 
