@@ -111,7 +111,7 @@ COMPLETED = {
 
 def test_the_lines_of_the_guide_complete_words_in_bash(tmp_path):
     program = tmp_path / "nisus"
-    program.write_text(f'#!/bin/sh\nexec {sys.executable} -m app.cli.main "$@"\n')
+    program.write_text(f'#!/bin/sh\nexec {shlex.quote(sys.executable)} -m app.cli.main "$@"\n')
     program.chmod(0o755)
     (tmp_path / "drive.csv").touch()
     guide = Path("docs/reference.md").read_text(encoding="utf-8")
