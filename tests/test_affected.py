@@ -2,10 +2,13 @@
 
 import json
 import subprocess
+import sys
 
 import pytest
 
+from tests import ROOT
 from tests.affected import UNKNOWN_S, changed, durations, fitting, nearest
+from tests.conftest import DURATIONS
 
 CHECKOUT = {
     "app/a.py": "",
@@ -74,3 +77,10 @@ def test_durations_are_those_of_earlier_runs(checkout):
     kept.parent.mkdir(parents=True)
     kept.write_text(json.dumps({"tests/test_b.py::test_one": 1.0, "tests/test_b.py::test_two[x]": 0.5}))
     assert durations(names, checkout)["tests/test_b.py"] == 1.5
+
+
+def test_a_run_keeps_the_duration_of_each_of_its_tests(tmp_path):
+    name = "tests/test_affected.py::test_near_files_come_first_and_what_does_not_fit_makes_room"
+    run = [sys.executable, "-m", "pytest", "-q", "-o", f"cache_dir={tmp_path}", name]
+    subprocess.run(run, cwd=ROOT, check=True, capture_output=True)
+    assert [*json.loads((tmp_path / "v" / DURATIONS).read_text())] == [name]
