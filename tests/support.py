@@ -2,8 +2,7 @@
 
 import socket
 import sys
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -17,27 +16,23 @@ SECOND = 1_000_000_000
 """Nanoseconds."""
 
 
+_RESERVED: list[socket.socket] = []
+
+
 def free_port(kind: socket.SocketKind = socket.SOCK_STREAM) -> int:
-    """A port of loopback that nobody uses, of TCP or UDP."""
-    with socket.socket(type=kind) as sock:
-        sock.bind(("127.0.0.1", 0))
-        return int(sock.getsockname()[1])
+    """A port of loopback, of TCP or UDP; on Linux the system gives one of TCP to no other process while this one runs.
 
-
-@contextmanager
-def reserved_port() -> Iterator[int]:
-    """A TCP port of loopback that the system gives to no other process, for a server of the test's own to listen on.
-
-    Linux: a bound socket that does not listen keeps the port from everyone but those who allow a shared address, as
-    servers do. Elsewhere it can be taken before the server begins.
+    There a bound socket that does not listen keeps the port from all but those who share addresses, as servers do.
     """
-    with socket.socket() as sock:
+    sock = socket.socket(type=kind)
+    if reserves := kind == socket.SOCK_STREAM and sys.platform == "linux":
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        sock.bind(("127.0.0.1", 0))
-        port = int(sock.getsockname()[1])
-        if sys.platform != "linux":
-            sock.close()
-        yield port
+        _RESERVED.append(sock)
+    sock.bind(("127.0.0.1", 0))
+    port = int(sock.getsockname()[1])
+    if not reserves:
+        sock.close()
+    return port
 
 
 def as_log(events: Events) -> Log:

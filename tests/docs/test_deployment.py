@@ -21,7 +21,7 @@ from app.cli.options import environment_options
 from tests import ROOT
 from tests.app.web.test_service import Served, all_run
 from tests.skips import program
-from tests.support import reserved_port
+from tests.support import free_port
 from tests.waiting import LIMIT_S, wait_for
 
 TWIN = ROOT / "config" / "twins" / "motor_winding.yaml"
@@ -40,8 +40,7 @@ def folder(tmp_path):
 
 @pytest.fixture
 def ports():
-    with reserved_port() as one, reserved_port() as other:
-        yield one, other
+    return free_port(), free_port()
 
 
 def test_nginx_adds_tls_and_the_audit_log_has_the_address_of_the_client(folder, ports):

@@ -25,7 +25,7 @@ from estimators.errors import ConfigError
 from tests.app.scripted import Scripted, twin
 from tests.app.served import SECRET
 from tests.app.web.page.browsed import DRAWN, until
-from tests.support import reserved_port
+from tests.support import free_port
 from tests.waiting import wait_for
 
 posix = pytest.mark.skipif(os.name != "posix", reason="permissions and command lines as on POSIX")
@@ -34,8 +34,7 @@ URL = 'http://127.0.0.1:9900/?token=a"b&c'
 
 @pytest.fixture
 def port():
-    with reserved_port() as port:
-        yield port
+    return free_port()
 
 
 @pytest.fixture
