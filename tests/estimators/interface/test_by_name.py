@@ -12,7 +12,7 @@ from estimators import MODELS, Log, fold, fold_many, mean_nees
 from estimators.diagnostics.consistency import Nees
 from estimators.errors import EstimatorError, EventError, NisusError
 from estimators.fold import fold as fold_track
-from estimators.log import INPUT, READING, TICK, TRUTH, Events
+from estimators.log import INPUT, READING, TRUTH, Events
 from estimators.models.uwb_rover import HEADING, YAW_RATE_BIAS
 from estimators.track import HELD_OUT, USED
 from estimators.tuning import Tuning
@@ -385,10 +385,3 @@ except AttributeError as error:
     assert "nothing" in str(error)
 """
     subprocess.run([sys.executable, "-c", code], check=True)
-
-
-def test_ticks_are_asked_by_seconds():
-    log = Log.of(MOTOR, start=0.0)
-    log.add_ticks(np.arange(3.0))
-    track = fold("kf", MOTOR, log)
-    assert log.events.kind.tolist() == [TICK] * 3 and np.all(np.diff(track.std[:, 0]) > 0)

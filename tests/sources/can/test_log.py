@@ -49,6 +49,12 @@ def decoder_of(tmp_path, report=lambda key, text: None):
     return Decoder([(dbc(tmp_path), None)], [sensor(0, "ENGINE", "Temp", "Rpm", "Torque")], width=3, report=report)
 
 
+def read(path, decoder):
+    reports = Reports()
+    got = read_all(CanLog([path], decoder, report=reports))
+    return got, reports
+
+
 @pytest.mark.parametrize("suffix", FORMATS)
 def test_written_and_read_equal(tmp_path, messages, suffix):
     path = tmp_path / f"drive{suffix}"
@@ -119,9 +125,8 @@ def test_a_cut_database_and_archive_say_so(tmp_path, messages):
     for source, cut in (("b.log.gz", "c.log.gz"), ("a.db", "c.db")):
         content = (tmp_path / source).read_bytes()
         (tmp_path / cut).write_bytes(content[: int(len(content) * 0.7)])
-        reports = Reports()
         try:
-            read_all(CanLog([tmp_path / cut], decoder_of(tmp_path), report=reports))
+            _, reports = read(tmp_path / cut, decoder_of(tmp_path))
             assert reports.counts["truncated file"] == 1
         except SourceError as error:
             assert str(tmp_path / cut) in str(error) and "\n" not in str(error)
@@ -131,8 +136,7 @@ def test_a_database_whose_last_page_is_cut_says_so(tmp_path, messages):
     """SQLite itself reads on: what is missing of a page counts as zeros."""
     write(tmp_path / "a.db", messages[:40])
     whole = (tmp_path / "a.db").read_bytes()
-    reports = Reports()
-    read_all(CanLog([tmp_path / "a.db"], decoder_of(tmp_path), report=reports))
+    _, reports = read(tmp_path / "a.db", decoder_of(tmp_path))
     assert reports.counts["truncated file"] == 0
     texts = []
     for size in range(4500, len(whole), 300):
@@ -185,10 +189,10 @@ def test_a_log_read_in_one_thread_is_closed_in_another(tmp_path, messages, suffi
 
 
 def test_error_frames_are_counted(tmp_path, messages):
-    path, reports = tmp_path / "a.blf", Reports()
+    path = tmp_path / "a.blf"
     messages[500] = can.Message(timestamp=messages[500].timestamp, is_error_frame=True, channel=0)
     write(path, messages)
-    read_all(CanLog([path], decoder_of(tmp_path), report=reports))
+    _, reports = read(path, decoder_of(tmp_path))
     assert reports.counts == {"error frame": 1} and reports.texts["error frame"] == "a.blf: error frame"
 
 

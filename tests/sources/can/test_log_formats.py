@@ -8,10 +8,8 @@ import pytest
 
 from estimators.errors import SourceError
 from sources.can.decoder import Decoder
-from sources.can.log import CanLog
 from tests.sources.can.can_tools import Reports, dbc, frame, sensor
-from tests.sources.can.test_log import START, decoder_of, messages, write  # noqa: F401  a fixture
-from tests.support import read_all
+from tests.sources.can.test_log import START, decoder_of, messages, read, write  # noqa: F401  a fixture
 
 FD = """VERSION ""
 
@@ -63,12 +61,6 @@ def fd_101(k, stored=64, ext=b""):
     end = 32 + 40 + stored if ext else 0
     head = struct.pack("<BBBBLLLLLLLHBBL", 1, 15, 64, 0, 512, 0, 0x3000, 0, 0, 0, 0, 0, 0, end, 0)
     return head + long_payload(k)[:stored] + ext
-
-
-def read(path, decoder):
-    reports = Reports()
-    got = read_all(CanLog([path], decoder, report=reports))
-    return got, reports
 
 
 def fd_decoder(tmp_path, reports=lambda key, text: None):
@@ -134,9 +126,8 @@ def test_a_blf_whose_header_was_never_completed_says_that_it_is_cut(tmp_path, lo
 
 
 def long_frames():
-    out = [can.Message(timestamp=START + k, arbitration_id=512, is_extended_id=False, is_fd=True, bitrate_switch=True,
+    return [can.Message(timestamp=START + k, arbitration_id=512, is_extended_id=False, is_fd=True, bitrate_switch=True,
                        data=long_payload(k), dlc=64, channel=0, is_rx=True) for k in range(3)]  # fmt: skip
-    return out
 
 
 @pytest.mark.parametrize("suffix", [".asc", ".log", ".blf", ".trc", ".mf4"])

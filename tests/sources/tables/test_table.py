@@ -36,6 +36,14 @@ def table(path, *, unit="s", channels=CHANNELS, report=lambda key, text: None):
     return Table(files, time_column="t", time_unit=unit, channels=channels, width=2, report=report)
 
 
+X = (Channel(READING, 0, "x", ("x",)),)
+
+
+def read_reports(path, channels=CHANNELS, **more):
+    reports = Reports()
+    return read_all(table(path, channels=channels, report=reports, **more)), reports
+
+
 def events(batch):
     return [
         (t, kind, channel, *value)
@@ -46,9 +54,7 @@ def events(batch):
 
 
 def test_a_row_is_inputs_then_readings_then_truths(tmp_path):
-    path = write(tmp_path, HEADER + "0.1,20,1,2,1,3,7\n0.2,21,3,4,0,,8\n")
-    reports = Reports()
-    got = events(read_all(table(path, report=reports)))
+    got, reports = read_reports(write(tmp_path, HEADER + "0.1,20,1,2,1,3,7\n0.2,21,3,4,0,,8\n"))
     expected = [
         (100_000_000, INPUT, 0, NAN, 3000.0),
         (100_000_000, READING, 0, 293.15, NAN),
@@ -58,7 +64,7 @@ def test_a_row_is_inputs_then_readings_then_truths(tmp_path):
         (200_000_000, READING, 1, NAN, NAN),
         (200_000_000, TRUTH, 2, 8.0, NAN),
     ]
-    np.testing.assert_array_equal(np.array(got), np.array(expected))
+    np.testing.assert_array_equal(np.array(events(got)), np.array(expected))
     assert reports.counts == {"condition pair": 1}
 
 
@@ -85,9 +91,8 @@ def test_true_states_of_a_row_are_blocks(tmp_path):
 
 
 def test_blank_says_nothing_and_what_is_no_number_is_missing_with_its_line(tmp_path):
-    reports = Reports()
     path = write(tmp_path, HEADER + "0,,1,2,1,,\n\n1,hot,3,,1,nan,oops\n2,NaN,inf,1,1,n/a,\n")
-    got = events(read_all(table(path, report=reports)))
+    got, reports = read_reports(path)
     expected = [
         (0, READING, 1, 1.0, 2.0),
         (10**9, INPUT, 0, NAN, NAN),
@@ -97,15 +102,13 @@ def test_blank_says_nothing_and_what_is_no_number_is_missing_with_its_line(tmp_p
         (2 * 10**9, READING, 0, NAN, NAN),
         (2 * 10**9, READING, 1, NAN, 1.0),
     ]
-    np.testing.assert_array_equal(np.array(got), np.array(expected))
+    np.testing.assert_array_equal(np.array(events(got)), np.array(expected))
     assert reports.counts == {"unreadable value": 2, "never seen": 3}  # temp, power and x have no number
     assert reports.texts["unreadable value"] == "drive.csv:4: x is 'oops', which is not a number; the value is missing"
 
 
 def test_rows_without_a_time_or_with_missing_cells_are_left_out_and_counted(tmp_path):
-    reports = Reports()
-    path = write(tmp_path, HEADER + "soon,1,1,2,1,1,1\n1,2,3\n2,20,1,2,1,3,7\n3,20,1")
-    got = read_all(table(path, report=reports))
+    got, reports = read_reports(write(tmp_path, HEADER + "soon,1,1,2,1,1,1\n1,2,3\n2,20,1,2,1,3,7\n3,20,1"))
     assert set(got.t.tolist()) == {2 * 10**9}
     assert reports.counts == {"undated row": 1, "unreadable value": 1, "truncated file": 1}
     assert (
@@ -144,13 +147,9 @@ def test_what_is_quoted_from_a_file_is_escaped_and_cut(tmp_path):
     with pytest.raises(SourceError, match="there is no column 'temp'; choose from t, 'nnn.*[.]{3}', a, b") as caught:
         table(path)
     assert str(caught.value).isprintable() and len(str(caught.value)) < len(str(path)) + 200
-    reports = Reports()
-    read_all(table(write(tmp_path, HEADER + f"0,\x9b31m{'9' * 500}x,1,2,1,3,7\n"), report=reports))
+    _, reports = read_reports(write(tmp_path, HEADER + f"0,\x9b31m{'9' * 500}x,1,2,1,3,7\n"))
     text = reports.texts["unreadable value"]
     assert text.startswith("drive.csv:2: temp is '\\x9b31m999") and text.isprintable() and len(text) < 150
-
-
-X = (Channel(READING, 0, "x", ("x",)),)
 
 
 @pytest.mark.parametrize(
@@ -183,9 +182,8 @@ def test_times_are_exact(tmp_path, cells, unit, expected):
     ],
 )
 def test_parquet_times(tmp_path, column, unit, expected):
-    reports = Reports()
     pq.write_table(pa.table({"t": column, "x": [1.0, 2.0, 3.0]}), tmp_path / "a.parquet")
-    got = read_all(table(tmp_path / "a.parquet", unit=unit, channels=X, report=reports))
+    got, reports = read_reports(tmp_path / "a.parquet", X, unit=unit)
     assert got.t.tolist() == expected and got.value[:, 0].tolist() == [1.0, 3.0]
     rule = "is 'soon', which is neither a time in s nor a date" if column[1].as_py() == "soon" else "is empty"
     assert reports.texts["undated row"].startswith(f"a.parquet:2: t {rule}; the row is left out")
@@ -238,21 +236,19 @@ def test_what_a_table_lacks_is_one_line(tmp_path, name, content, expected):
 
 def test_only_picks_the_rows_that_speak_of_a_sensor(tmp_path):
     """Ranges to one anchor or the other in one column; a row of neither, or whose anchor is blank, says nothing."""
-    path = tmp_path / "ranges.csv"
-    path.write_text("t,range,anchor,ok\n0,1,7,1\n1,2,8,1\n2,3,7,0\n3,4,9,1\n4,5,,1\n5,nan,8,1\n", encoding="utf-8")
+    path = write(tmp_path, "t,range,anchor,ok\n0,1,7,1\n1,2,8,1\n2,3,7,0\n3,4,9,1\n4,5,,1\n5,nan,8,1\n", "ranges.csv")
     channels = [
         Channel(READING, k, f"r{k}", ("range",), only=(Condition("anchor", a, a),), where=(Condition("ok", 1, 1),))
         for k, a in enumerate((7, 8))
     ]
-    reports = Reports()
-    got = events(read_all(table(path, channels=channels, report=reports)))
+    got, reports = read_reports(path, channels)
     expected = [
         (0, READING, 0, 1.0, NAN),
         (10**9, READING, 1, 2.0, NAN),
         (2 * 10**9, READING, 0, NAN, NAN),
         (5 * 10**9, READING, 1, NAN, NAN),
     ]
-    np.testing.assert_array_equal(np.array(got), np.array(expected))
+    np.testing.assert_array_equal(np.array(events(got)), np.array(expected))
     assert reports.counts == {"condition r0": 1, "row of no sensor": 1}
     assert reports.texts["row of no sensor"] == (
         "ranges.csv:6: anchor has no value, so the row is of no sensor and is left out; give it its anchor"
@@ -276,14 +272,6 @@ def test_times_beyond_any_clock_are_left_out():
     np.testing.assert_array_equal(time[known], [0, 2_000_000_000])
 
 
-def read_reports(path, channels):
-    reports = Reports()
-    return read_all(table(path, channels=channels, report=reports)), reports
-
-
-ONE = (Channel(READING, 0, "x", ("x",)),)
-
-
 @pytest.mark.parametrize("ending", [".csv", ".parquet"])
 def test_a_column_that_is_there_twice_is_refused_if_it_is_needed(tmp_path, ending):
     names, rows = ["t", "x", "y", "x", "y"], [[0, 1, 2, 3, 4], [1, 5, 6, 7, 8]]
@@ -293,17 +281,17 @@ def test_a_column_that_is_there_twice_is_refused_if_it_is_needed(tmp_path, endin
     else:
         pq.write_table(pa.Table.from_arrays([pa.array(column) for column in zip(*rows, strict=True)], names), path)
     with pytest.raises(SourceError) as caught:
-        table(path, channels=ONE)
+        table(path, channels=X)
     assert str(caught.value) == f"{path}: there are 2 columns 'x', the 2nd and the 4th; give each its own name"
     path.write_text("t,x,y,y\n0,1,2,3\n") if ending == ".csv" else None
     if ending == ".csv":
-        assert len(read_all(table(path, channels=ONE))) == 1
+        assert len(read_all(table(path, channels=X))) == 1
 
 
 def test_a_quote_that_is_not_closed_is_named_with_its_line_and_what_it_takes(tmp_path):
     lines = [f"{k},{k}.5,note" for k in range(20)]
     lines[6] = '6,6.5,"note'
-    got, reports = read_reports(write(tmp_path, "t,x,words\n" + "\n".join(lines) + "\n"), ONE)
+    got, reports = read_reports(write(tmp_path, "t,x,words\n" + "\n".join(lines) + "\n"), X)
     assert got.value[:, 0].tolist() == [k + 0.5 for k in range(6)]
     assert reports.counts == {"truncated file": 1}
     assert reports.texts["truncated file"] == (
@@ -312,18 +300,18 @@ def test_a_quote_that_is_not_closed_is_named_with_its_line_and_what_it_takes(tmp
 
 
 def test_a_quote_that_is_closed_may_hold_lines(tmp_path):
-    got, reports = read_reports(write(tmp_path, 't,x,words\n0,1,"two\nlines"\n1,2,one\n'), ONE)
+    got, reports = read_reports(write(tmp_path, 't,x,words\n0,1,"two\nlines"\n1,2,one\n'), X)
     assert got.value[:, 0].tolist() == [1, 2] and not reports.counts
 
 
 def test_a_decimal_comma_is_read_if_the_table_uses_it(tmp_path):
     path = write(tmp_path, "t;x\n0;1\n0,5;2,25\n1;1.234,5\n2;3.5\n")
-    got, reports = read_reports(path, ONE)
+    got, reports = read_reports(path, X)
     assert got.t.tolist() == [0, 500_000_000, 10**9, 2 * 10**9]
     np.testing.assert_array_equal(got.value[:, 0], [1.0, 2.25, 1234.5, NAN])
     assert f"{path.name}:5: x is '3.5', with a point in a table of decimal commas" in reports.texts["unreadable value"]
     path = write(tmp_path, "t;x\n" + "".join(f"{k};{k}.5\n" for k in range(20_000)) + "20000;2,5\n")
-    _, reports = read_reports(path, ONE)
+    _, reports = read_reports(path, X)
     assert reports.counts == {"unreadable value": 1}
     assert "x is '2,5', with a decimal comma; write 2.5; the value is missing" in reports.texts["unreadable value"]
 
@@ -331,7 +319,7 @@ def test_a_decimal_comma_is_read_if_the_table_uses_it(tmp_path):
 def test_a_table_in_utf_16(tmp_path):
     path = tmp_path / "drive.csv"
     path.write_bytes("t;x\n0;1,5\n".encode("utf-16"))
-    assert read_reports(path, ONE)[0].value[:, 0].tolist() == [1.5]
+    assert read_reports(path, X)[0].value[:, 0].tolist() == [1.5]
 
 
 def test_text_of_another_encoding_and_units_in_headings(tmp_path):
@@ -371,9 +359,8 @@ def test_tags_select_rows_and_quality_judges_them(tmp_path, ending):
 
 def test_a_tag_that_never_comes_is_reported(tmp_path):
     channels = (Channel(READING, 0, "flow", ("x",), only=(Condition(TextMatch("tag", ("FT9",)), 1, 1),)),)
-    reports = Reports()
-    source = table(write(tmp_path, TAGS), channels=channels, report=reports)
-    assert not len(read_all(source))
+    got, reports = read_reports(write(tmp_path, TAGS), channels)
+    assert not len(got)
     assert "column 'tag' is never 'FT9' in 5 rows, so flow has no values" in str(reports.texts)
 
 
@@ -421,7 +408,7 @@ def test_local_times_go_on_when_the_clock_is_set_back(kind):
 
 def test_what_only_python_takes_for_a_number_is_none(tmp_path):
     """1_5 is fifteen in a program's text; in a table it is nobody knows what."""
-    got, reports = read_reports(write(tmp_path, "t,x\n0,1_5\n1_0,2\n2,3\n"), ONE)
+    got, reports = read_reports(write(tmp_path, "t,x\n0,1_5\n1_0,2\n2,3\n"), X)
     assert reports.counts == {"unreadable value": 1, "undated row": 1}
     np.testing.assert_array_equal(got.value[:, 0], [NAN, 3.0])
     assert got.t.tolist() == [0, 2 * 10**9]
