@@ -326,15 +326,12 @@ def test_only_charted_cells_are_looked_for_among_what_sensors_read(twin):
 @pytest.mark.parametrize(
     ("old", "new", "error"),
     [
-        (
-            'cells: ["temperature[2,3]"',
-            'cells: ["temperature[8,3]"',
-            r"plate.yaml:16: view.cells names 'temperature\[8,3\]'",
-        ),
+        ('cells: ["temperature[2,3]"', 'cells: ["temperature[8,3]"',
+            r"plate.yaml:16: view.cells names 'temperature\[8,3\]'"),
         ("window: 12", 'pairs: [["temperature[2,3]", "temperature[1,1]"]]', "which is not among view.cells; add it"),
         ("every: 5", "every: 0", "truth.every is 0"),
     ],
-)
+)  # fmt: skip
 def test_a_view_that_cannot_be_is_refused(folder, old, new, error):
     path = folder / "plate.yaml"
     path.write_text(PLATE.replace(old, new))

@@ -63,16 +63,10 @@ def test_values_are_read_and_defaults_filled_in() -> None:
         ("    std: 2", "    std: [1, -1]", "motor.yaml:6: sensors.winding.std[1] is -1; it must be zero or positive"),
         ("    std: 2", "    std: .nan", "motor.yaml:6: sensors.winding.std is nan; it must be a finite number"),
         ("    std: 2", "    std: []", "motor.yaml:6: sensors.winding.std is []; it needs 1 or more entries"),
-        (
-            "    std: 2",
-            "    std: 2\n    variance: 4",
-            "motor.yaml:6: sensors.winding gives both variance and std; keep one",
-        ),
-        (
-            "{variance: 1e-3}",
-            "{variance: -1e-3}",
-            "motor.yaml:3: noise.temperature.variance is -0.001; it must be zero or positive",
-        ),
+        ("    std: 2", "    std: 2\n    variance: 4",
+            "motor.yaml:6: sensors.winding gives both variance and std; keep one"),
+        ("{variance: 1e-3}", "{variance: -1e-3}",
+            "motor.yaml:3: noise.temperature.variance is -0.001; it must be zero or positive"),
         ("{variance: 1e-3}", "{}", "motor.yaml:3: noise.temperature gives neither variance nor std; add it"),
         ("gate: 0.9973", "gate: 99.73", "motor.yaml:8: gate is 99.73; it must be below 1"),
         ("gate: 0.9973", "gates: 0.9973", "motor.yaml:8: gates is not known; did you mean gate?"),
@@ -84,13 +78,10 @@ def test_values_are_read_and_defaults_filled_in() -> None:
         ("motor_winding", "5", "motor.yaml:1: model is 5; it must be text; put it in quotes if it looks like a number"),
         ("[5, 2]", "[0, 2]", "motor.yaml:13: source.inputs.torque[1].steps must have rising times; put them in order"),
         ("[5, 2]", "[5]", "motor.yaml:13: source.inputs.torque[1].steps[1] is [5]; it needs 2 or more entries"),
-        (
-            "estimator: kf",
-            "estimator: {name: kf, options: {a: [b]}}",
-            "motor.yaml:7: estimator.options.a is ['b']; it must be a number",
-        ),
+        ("estimator: kf", "estimator: {name: kf, options: {a: [b]}}",
+            "motor.yaml:7: estimator.options.a is ['b']; it must be a number"),
     ],
-)
+)  # fmt: skip
 def test_a_value_that_breaks_a_rule_is_one_line(old: str, new: str, expected: str) -> None:
     assert old in MOTOR
     assert message(MOTOR.replace(old, new, 1)) == expected
@@ -111,31 +102,22 @@ def test_a_missing_type_is_told_those_of_the_schema(monkeypatch: pytest.MonkeyPa
         ("# only a comment\n", "motor.yaml:1: the file is empty; a twin needs at least model and source"),
         ("- a\n", "motor.yaml:1: the file is ['a']; it must be a mapping of keys and values"),
         ("just text\n", "motor.yaml:1: the file is 'just text'; it must be a mapping of keys and values"),
-        (
-            "model: a\nsource: b: c\n",
-            "motor.yaml:2: not valid YAML: mapping values are not allowed here; check indentation, quotes and brackets",
-        ),
-        (
-            "model: [a\n",
-            "motor.yaml:2: not valid YAML: expected ',' or ']', but got '<stream end>'; "
-            "check indentation, quotes and brackets",
-        ),
+        ("model: a\nsource: b: c\n", "motor.yaml:2: not valid YAML: mapping values are not allowed here; check "
+            "indentation, quotes and brackets"),
+        ("model: [a\n", "motor.yaml:2: not valid YAML: expected ',' or ']', but got '<stream end>'; check indentation, "
+            "quotes and brackets"),
         ("model: a\ngate: 0.9\nmodel: b\n", "motor.yaml:3: model is given twice, first in line 1; remove one"),
         ("model: &a [*a]\n", "motor.yaml:1: it contains itself through an alias (*name); write the value out"),
         ("[" * 5000, "motor.yaml:1: it is nested too deeply; a twin needs six levels"),
         ("model: a\n? [1]\n: 2\n", "motor.yaml:2: a key must be one word, not a list or mapping; put braces in quotes"),
         ("model: !car x\n", "motor.yaml:1: the tag !car has no meaning here; remove it"),
-        (
-            "model: !!python/name:os.system ''\n",
-            "motor.yaml:1: the tag tag:yaml.org,2002:python/name:os.system has no meaning here; remove it",
-        ),
+        ("model: !!python/name:os.system ''\n",
+            "motor.yaml:1: the tag tag:yaml.org,2002:python/name:os.system has no meaning here; remove it"),
         ("model: a\ntitle: '\x01'\n", "motor.yaml:2: the character '\\x01' is not text; remove it"),
-        (
-            "model: a\n---\nmodel: b\n",
-            "motor.yaml:2: not valid YAML: a second document begins here (---); check indentation, quotes and brackets",
-        ),
+        ("model: a\n---\nmodel: b\n", "motor.yaml:2: not valid YAML: a second document begins here (---); check "
+            "indentation, quotes and brackets"),
     ],
-)
+)  # fmt: skip
 def test_what_is_not_a_twin_at_all_is_one_line(text: str, expected: str) -> None:
     assert message(text) == expected
 
@@ -143,20 +125,16 @@ def test_what_is_not_a_twin_at_all_is_one_line(text: str, expected: str) -> None
 @pytest.mark.parametrize(
     ("more", "expected"),
     [
-        (
-            "time: {degraded_after: 20}",
-            "motor.yaml:14: time.stale_after is 15.0 s; it must not be below degraded_after (20.0 s)",
-        ),
+        ("time: {degraded_after: 20}",
+            "motor.yaml:14: time.stale_after is 15.0 s; it must not be below degraded_after (20.0 s)"),
         ("view: {scene: {kind: vehicle}}", "motor.yaml:14: view.scene is a vehicle and has no position; add it"),
         ("view: {pairs: [[a]]}", "motor.yaml:14: view.pairs[0] is ['a']; it needs 2 or more entries"),
-        (
-            "name: my motor",
-            "motor.yaml:14: name is 'my motor'; use letters, digits, _ and -, and begin with a letter or digit",
-        ),
+        ("name: my motor",
+            "motor.yaml:14: name is 'my motor'; use letters, digits, _ and -, and begin with a letter or digit"),
         ("history: 2.5", "motor.yaml:14: history is 2.5; it must be a whole number"),
         ("prior: {a: {std: -1}}", "motor.yaml:14: prior.a.std is -1; it must be zero or positive"),
     ],
-)
+)  # fmt: skip
 def test_settings_that_contradict_each_other_are_one_line(more: str, expected: str) -> None:
     assert message(MOTOR + more) == expected
 

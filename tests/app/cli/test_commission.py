@@ -115,18 +115,14 @@ def test_a_file_that_cannot_be_written_is_one_line(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("section", "said"),
     [
-        (
-            "  tooth: {bias: 0, scale: 1, correlation: 0}\n",
-            "drive.yaml:10: commissioned.tooth is no sensor row of motor_winding; it has winding",
-        ),
-        (
-            "  winding:\n    reached:\n      broken: 2\n",
-            "drive.yaml:12: commissioned.winding.reached.broken is no cause; choose from " + ", ".join(ALARM_NAMES),
-        ),
+        ("  tooth: {bias: 0, scale: 1, correlation: 0}\n",
+            "drive.yaml:10: commissioned.tooth is no sensor row of motor_winding; it has winding"),
+        ("  winding:\n    reached:\n      broken: 2\n",
+            "drive.yaml:12: commissioned.winding.reached.broken is no cause; choose from " + ", ".join(ALARM_NAMES)),
         ("  winding: {scale: 0}\n", "drive.yaml:10: commissioned.winding.scale"),
         ("  winding: {correlation: 1}\n", "drive.yaml:10: commissioned.winding.correlation"),
     ],
-)
+)  # fmt: skip
 def test_a_wrong_section_is_one_line(tmp_path: Path, section: str, said: str) -> None:
     path = drive(tmp_path, TWIN + "commissioned:\n" + section)
     with pytest.raises(ConfigError) as problem:

@@ -208,35 +208,23 @@ def test_a_source_whose_broker_comes_back_goes_on(serve, broker):
     ("source", "text"),
     [
         ({"type": "mqtt", "host": "x", "topics": {}}, "topics"),
-        (
-            {"type": "mqtt", "host": "x", "topics": {"a": "windng"}},
-            "names 'windng', no value of this twin; did you mean",
-        ),
-        (
-            {"type": "mqtt", "host": "x", "topics": {"a": "winding"}, "password_env": "NISUS_NO"},
-            "source.password_env is NISUS_NO, an environment variable that is not set",
-        ),
+        ({"type": "mqtt", "host": "x", "topics": {"a": "windng"}},
+            "names 'windng', no value of this twin; did you mean"),
+        ({"type": "mqtt", "host": "x", "topics": {"a": "winding"}, "password_env": "NISUS_NO"},
+            "source.password_env is NISUS_NO, an environment variable that is not set"),
         ({"type": "mqtt", "host": "x", "topics": {"a": {"tme": "t"}}}, "tme"),
         ({"type": "mqtt", "host": "x", "topics": {"a/#/b": "winding"}}, "topics names a/#/b; + and # must stand"),
         ({"type": "mqtt", "host": "x", "topics": {"a+/b": "winding"}}, "topics names a+/b; + and # must stand"),
-        (
-            {"type": "opcua", "url": "opc.tcp://x:1", "nodes": {"winding": "Tank.Level"}},
-            "node 'Tank.Level' of winding is no node id; it must be like ns=2;s=Tank.Level",
-        ),
-        (
-            {"type": "modbus", "host": "x", "registers": {"windng": 1}},
-            "registers names 'windng', no value of this twin",
-        ),
-        (
-            {"type": "modbus", "host": "x", "registers": {"winding": {"address": 65535, "type": "float32"}}},
-            "registers.winding.address is 65535; a float32 has 2 registers, so it is at most 65534",
-        ),
-        (
-            {"type": "modbus", "host": "x", "registers": {"winding": {"address": 4, "table": "coil", "words": "big"}}},
-            "source.registers.winding.table is coil, a bit; leave type and words out, or read a register",
-        ),
+        ({"type": "opcua", "url": "opc.tcp://x:1", "nodes": {"winding": "Tank.Level"}},
+            "node 'Tank.Level' of winding is no node id; it must be like ns=2;s=Tank.Level"),
+        ({"type": "modbus", "host": "x", "registers": {"windng": 1}},
+            "registers names 'windng', no value of this twin"),
+        ({"type": "modbus", "host": "x", "registers": {"winding": {"address": 65535, "type": "float32"}}},
+            "registers.winding.address is 65535; a float32 has 2 registers, so it is at most 65534"),
+        ({"type": "modbus", "host": "x", "registers": {"winding": {"address": 4, "table": "coil", "words": "big"}}},
+            "source.registers.winding.table is coil, a bit; leave type and words out, or read a register"),
     ],
-)
+)  # fmt: skip
 def test_a_source_that_cannot_be_is_refused_in_one_line(source, text, monkeypatch):
     monkeypatch.delenv("NISUS_NO", raising=False)
     with pytest.raises(NisusError) as error:

@@ -180,18 +180,14 @@ CO_SIMULATION = '<CoSimulation modelIdentifier="m" {}/>'
         ({"flaw": "MEMORY"}, "steps from one state differ and lacks canGetAndSetFMUstate"),
         ({"flaw": "IGNORED"}, "setContinuousStates has no effect"),
         ({"flaw": "OVERFLOW"}, "its derivatives at the start values are not finite"),
-        (
-            {"kind": CO_SIMULATION.format("")},
-            "co-simulation only, without canGetAndSetFMUstate; export it for model ex",
-        ),
-        (
-            {"kind": CO_SIMULATION.format('canGetAndSetFMUstate="true"')},
-            "co-simulation only, whose canGetAndSetFMUstate restores a state but cannot set",
-        ),
+        ({"kind": CO_SIMULATION.format("")},
+            "co-simulation only, without canGetAndSetFMUstate; export it for model ex"),
+        ({"kind": CO_SIMULATION.format('canGetAndSetFMUstate="true"')},
+            "co-simulation only, whose canGetAndSetFMUstate restores a state but cannot set"),
         ({"kind": '<ModelExchange modelIdentifier="m" needsExecutionTool="true"/>'}, "needsExecutionTool"),
         ({"kind": '<ModelExchange modelIdentifier="other"/>'}, "it cannot be loaded: Cannot find shared library"),
     ],
-)
+)  # fmt: skip
 def test_what_a_filter_needs_is_checked_on_load(tmp_path, given, says):
     said = refused(tmp_path, build(tmp_path, **given))
     assert says in said and ".fmu: " in said
@@ -200,11 +196,8 @@ def test_what_a_filter_needs_is_checked_on_load(tmp_path, given, says):
 @pytest.mark.parametrize(
     ("old", "new", "says"),
     [
-        (
-            "car.v[1]",
-            "car.v[2]",
-            "box.yaml:4: model.states.speed is 'car.v[2]', no continuous state of the FMU; did you",
-        ),
+        ("car.v[1]", "car.v[2]",
+            "box.yaml:4: model.states.speed is 'car.v[2]', no continuous state of the FMU; did you"),
         ("[mu]", "[nu]", "box.yaml:5: model.parameters.nu names 'nu', no real variable of the FMU"),
         ("both: both}}", "both: bath}}", "box.yaml:6: model.sensors.pair names 'bath', no real variable of the FMU"),
         ("  step: 0.02\n", "", "box.yaml:1: model.step is missing"),
@@ -212,7 +205,7 @@ def test_what_a_filter_needs_is_checked_on_load(tmp_path, given, says):
         ("{both: m}", "{bath: m}", "model.units names 'bath', no real variable"),
         ("{speed:", "{x0:", "model.states gives two states one name"),
     ],
-)
+)  # fmt: skip
 def test_what_the_yaml_may_not_name(tmp_path, old, new, says):
     assert says in refused(tmp_path, build(tmp_path), FMU.replace(old, new))
 

@@ -301,14 +301,10 @@ source:
     ("step", "duration", "expected"),
     [
         # motor_drive has three sensors.
-        ("1e-6", "600", "motor.yaml:4: source.step is 1e-06 s; the simulator would make 1.8e+09 events in 600 s, and may "
-            "make 1e+08; lengthen it, or shorten source.duration"),
-        ("0.5", "1e9", "motor.yaml:5: source.duration is 1e+09 s; the simulator would make 6e+09 events in 1e+09 s, and "
-            "may make 1e+08; shorten it, or lengthen source.step"),
-        ("1e-6", "null", "motor.yaml:4: source.step is 1e-06 s; the simulator would make 3e+08 events in 100 s, and may "
-            "make 1e+08; lengthen it"),
-        ("1e9", "null", "motor.yaml:4: source.step is 1e+09 s; the simulator would make RUNS steps of f in 1e+09 s, and "
-            "may make 1e+08; shorten it"),
+        ("1e-6", "600", "motor.yaml:4: source.step is 1e-06 s; the simulator would make 1.8e+09 events in 600 s, and may make 1e+08; lengthen it, or shorten source.duration"),
+        ("0.5", "1e9", "motor.yaml:5: source.duration is 1e+09 s; the simulator would make 6e+09 events in 1e+09 s, and may make 1e+08; shorten it, or lengthen source.step"),
+        ("1e-6", "null", "motor.yaml:4: source.step is 1e-06 s; the simulator would make 3e+08 events in 100 s, and may make 1e+08; lengthen it"),
+        ("1e9", "null", "motor.yaml:4: source.step is 1e+09 s; the simulator would make RUNS steps of f in 1e+09 s, and may make 1e+08; shorten it"),
     ],
 )  # fmt: skip
 def test_a_simulation_that_would_never_end_is_one_line(step: str, duration: str, expected: str) -> None:

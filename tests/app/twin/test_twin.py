@@ -108,89 +108,24 @@ def test_an_unknown_override_names_what_is_near() -> None:
 @pytest.mark.parametrize(
     ("old", "new", "expected"),
     [
-        (
-            "model: motor_winding",
-            "model: motor_windin",
-            "motor.yaml:1: model is 'motor_windin'; no model of that name ships; did you mean motor_winding ",
-        ),
-        (
-            "  temperature: {mean",
-            "  temprature: {mean",
-            "motor.yaml:3: prior.temprature is no state of motor_winding; did you mean temperature?",
-        ),
-        (
-            "  rate: {std",
-            "  heat: {std",
-            "motor.yaml:5: noise.heat is no noise of motor_winding; choose from temperature, rate",
-        ),
-        (
-            "  winding: {std: 3}",
-            "  windin: {std: 3}",
-            "motor.yaml:7: sensors.windin is no sensor of motor_winding; did you mean winding?",
-        ),
-        (
-            "  winding: {std: 3}",
-            "  winding: {std: [3, 4]}",
-            "motor.yaml:7: sensors.winding.std has 2 entries; give one, or 1: winding",
-        ),
-        (
-            "estimator: kf",
-            "estimator: kff",
-            "motor.yaml:8: estimator 'kff' does not exist; did you mean kf, ukf or ekf?",
-        ),
-        (
-            "estimator: kf",
-            "estimator: {name: ukf, options: {alfa: 1}}",
-            "motor.yaml:8: estimator ukf has no option 'alfa'; did you mean alpha?",
-        ),
-        (
-            "pairs: [[rate, temperature]]",
-            "pairs: [[rate, temp]]",
-            "motor.yaml:11: view.pairs[0] names 'temp', no state of motor_winding; did you mean temperature?",
-        ),
-        (
-            "pairs: [[rate, temperature]]",
-            "pairs: [[rate, rate]]",
-            "motor.yaml:11: view.pairs[0] names rate twice; an ellipse needs two states",
-        ),
-        (
-            "pairs: [[rate, temperature]]",
-            "scene: {axes: [speed]}",
-            "motor.yaml:11: view.scene.axes names 'speed', no state of motor_winding; choose from temperature, rate",
-        ),
-        (
-            "pairs: [[rate, temperature]]",
-            "scene: {beams: {scan: [0]}}",
-            "motor.yaml:11: view.scene.beams names 'scan', no sensor of motor_winding; choose from winding",
-        ),
-        (
-            "pairs: [[rate, temperature]]",
-            "scene: {beams: {winding: [0, 1.57]}}",
-            "motor.yaml:11: view.scene.beams.winding has 2 angles; winding has 1 rows, give one for each",
-        ),
-        (
-            "pairs: [[rate, temperature]]",
-            "scene: {beacons: {winding: [rate, mast]}}",
-            "motor.yaml:11: view.scene.beacons.winding names 'mast', no state or parameter of motor_winding; choose from "
-            "temperature, rate",
-        ),
-        (
-            "initial: {rate: 0.2}",
-            "initial: {speed: 1}",
-            "motor.yaml:15: source.initial.speed is no state of motor_winding; choose from temperature, rate",
-        ),
-        (
-            "initial: {rate: 0.2}",
-            "inputs: {load: 1}",
-            "motor.yaml:15: source.inputs.load is no input of motor_winding; there are none to choose from",
-        ),
-        (
-            "model: motor_winding",
-            "model: motor_winding\nparameters: {r: 1}",
-            "motor.yaml:2: parameters.r is no parameter of motor_winding; there are none to choose from",
-        ),
+        ("model: motor_winding", "model: motor_windin", "motor.yaml:1: model is 'motor_windin'; no model of that name ships; did you mean motor_winding "),
+        ("  temperature: {mean", "  temprature: {mean", "motor.yaml:3: prior.temprature is no state of motor_winding; did you mean temperature?"),
+        ("  rate: {std", "  heat: {std", "motor.yaml:5: noise.heat is no noise of motor_winding; choose from temperature, rate"),
+        ("  winding: {std: 3}", "  windin: {std: 3}", "motor.yaml:7: sensors.windin is no sensor of motor_winding; did you mean winding?"),
+        ("  winding: {std: 3}", "  winding: {std: [3, 4]}", "motor.yaml:7: sensors.winding.std has 2 entries; give one, or 1: winding"),
+        ("estimator: kf", "estimator: kff", "motor.yaml:8: estimator 'kff' does not exist; did you mean kf, ukf or ekf?"),
+        ("estimator: kf", "estimator: {name: ukf, options: {alfa: 1}}", "motor.yaml:8: estimator ukf has no option 'alfa'; did you mean alpha?"),
+        ("pairs: [[rate, temperature]]", "pairs: [[rate, temp]]", "motor.yaml:11: view.pairs[0] names 'temp', no state of motor_winding; did you mean temperature?"),
+        ("pairs: [[rate, temperature]]", "pairs: [[rate, rate]]", "motor.yaml:11: view.pairs[0] names rate twice; an ellipse needs two states"),
+        ("pairs: [[rate, temperature]]", "scene: {axes: [speed]}", "motor.yaml:11: view.scene.axes names 'speed', no state of motor_winding; choose from temperature, rate"),
+        ("pairs: [[rate, temperature]]", "scene: {beams: {scan: [0]}}", "motor.yaml:11: view.scene.beams names 'scan', no sensor of motor_winding; choose from winding"),
+        ("pairs: [[rate, temperature]]", "scene: {beams: {winding: [0, 1.57]}}", "motor.yaml:11: view.scene.beams.winding has 2 angles; winding has 1 rows, give one for each"),
+        ("pairs: [[rate, temperature]]", "scene: {beacons: {winding: [rate, mast]}}", "motor.yaml:11: view.scene.beacons.winding names 'mast', no state or parameter of motor_winding; choose from temperature, rate"),
+        ("initial: {rate: 0.2}", "initial: {speed: 1}", "motor.yaml:15: source.initial.speed is no state of motor_winding; choose from temperature, rate"),
+        ("initial: {rate: 0.2}", "inputs: {load: 1}", "motor.yaml:15: source.inputs.load is no input of motor_winding; there are none to choose from"),
+        ("model: motor_winding", "model: motor_winding\nparameters: {r: 1}", "motor.yaml:2: parameters.r is no parameter of motor_winding; there are none to choose from"),
     ],
-)
+)  # fmt: skip
 def test_what_the_model_lacks_is_one_line_with_what_is_near(old: str, new: str, expected: str) -> None:
     assert old in MOTOR
     text = refusal(MOTOR.replace(old, new, 1))
@@ -226,72 +161,20 @@ def test_a_model_from_a_file_beside_the_yaml(monkeypatch: pytest.MonkeyPatch) ->
 @pytest.mark.parametrize(
     ("python", "reference", "kind", "expected"),
     [
-        (
-            PUMP,
-            "./pum.py:Pump",
-            ConfigError,
-            "motor.yaml:1: model is './pum.py:Pump'; there is no file pum.py; it is sought beside the YAML",
-        ),
-        (
-            PUMP,
-            "./pump.py:Pumpe",
-            ConfigError,
-            "motor.yaml:1: model is './pump.py:Pumpe'; pump.py has no Pumpe; did you mean Pump?",
-        ),
-        (
-            PUMP,
-            "./pump.py",
-            ConfigError,
-            "motor.yaml:1: model is './pump.py'; name what to take from the file, as in ./pump.py:Pump",
-        ),
-        (
-            PUMP + "X = 3\n",
-            "./pump.py:X",
-            ConfigError,
-            "motor.yaml:1: model names X, which is of type int; it must be a StateSpaceModel, or return one",
-        ),
-        (
-            PUMP + "def X(a): pass\n",
-            "./pump.py:X",
-            ModelError,
-            "pump.py: TypeError: X() missing 1 required positional argument: 'a'; correct the model's file",
-        ),
+        (PUMP, "./pum.py:Pump", ConfigError, "motor.yaml:1: model is './pum.py:Pump'; there is no file pum.py; it is sought beside the YAML"),
+        (PUMP, "./pump.py:Pumpe", ConfigError, "motor.yaml:1: model is './pump.py:Pumpe'; pump.py has no Pumpe; did you mean Pump?"),
+        (PUMP, "./pump.py", ConfigError, "motor.yaml:1: model is './pump.py'; name what to take from the file, as in ./pump.py:Pump"),
+        (PUMP + "X = 3\n", "./pump.py:X", ConfigError, "motor.yaml:1: model names X, which is of type int; it must be a StateSpaceModel, or return one"),
+        (PUMP + "def X(a): pass\n", "./pump.py:X", ModelError, "pump.py: TypeError: X() missing 1 required positional argument: 'a'; correct the model's file"),
         ("import math\nx = 1 +\n", "./pump.py:Pump", ModelError, "pump.py:2: invalid syntax; correct the Python"),
-        (
-            "\nimport absent_module\n",
-            "./pump.py:Pump",
-            ModelError,
-            "pump.py:2: ModuleNotFoundError: No module named 'absent_module'; correct the model's file",
-        ),
-        (
-            "def g():\n    return 1 / 0\n\n\ng()\n",
-            "./pump.py:Pump",
-            ModelError,
-            "pump.py:2: ZeroDivisionError: division by zero; correct the model's file",
-        ),
-        (
-            "import sys\nsys.exit(3)\n",
-            "./pump.py:Pump",
-            ModelError,
-            "pump.py:2: SystemExit: 3; correct the model's file",
-        ),
-        (
-            "from os import _exit\n_exit(3)\n",
-            "./pump.py:Pump",
-            ModelError,
-            "pump.py:2: RuntimeError: os._exit(3) would end the program; a model reports an error by raising an "
-            "exception; correct the model's file",
-        ),
+        ("\nimport absent_module\n", "./pump.py:Pump", ModelError, "pump.py:2: ModuleNotFoundError: No module named 'absent_module'; correct the model's file"),
+        ("def g():\n    return 1 / 0\n\n\ng()\n", "./pump.py:Pump", ModelError, "pump.py:2: ZeroDivisionError: division by zero; correct the model's file"),
+        ("import sys\nsys.exit(3)\n", "./pump.py:Pump", ModelError, "pump.py:2: SystemExit: 3; correct the model's file"),
+        ("from os import _exit\n_exit(3)\n", "./pump.py:Pump", ModelError, "pump.py:2: RuntimeError: os._exit(3) would end the program; a model reports an error by raising an exception; correct the model's file"),
         ("x = 1\x00", "./pump.py:Pump", ModelError, "pump.py: "),
-        (
-            PUMP.replace("0.01", "-1.0"),
-            "./pump.py:Pump",
-            ModelError,
-            "pump.py:13: model pump: sensor level.level has variance -1.0; it must be positive, or zero of a row without "
-            "noise",
-        ),
+        (PUMP.replace("0.01", "-1.0"), "./pump.py:Pump", ModelError, "pump.py:13: model pump: sensor level.level has variance -1.0; it must be positive, or zero of a row without noise"),
     ],
-)
+)  # fmt: skip
 def test_a_model_file_that_fails_is_one_line_in_the_users_code(
     python: str, reference: str, kind: type[NisusError], expected: str
 ) -> None:
@@ -372,20 +255,10 @@ def test_the_prior_of_what_is_considered_is_that_of_the_parameter() -> None:
 @pytest.mark.parametrize(
     ("parameters", "said"),
     [
-        (
-            "{yoke_coolant: {value: 0.2, use: considered}}",
-            "is considered and needs a standard deviation, as in std: 10 %",
-        ),
+        ("{yoke_coolant: {value: 0.2, use: considered}}", "is considered and needs a standard deviation, as in std: 10 %"),
         ("{yoke_coolant: {std: 1 %, correlation: {yoke_coolant: 0.5}}}", "is with itself; give each pair once"),
-        (
-            "{yoke_coolant: {std: 1 %, correlation: {iron_magnet: 0.5}},"
-            " iron_magnet: {std: 1 %, correlation: {yoke_coolant: -0.5}}}",
-            "is 0.5 here and -0.5 under iron_magnet; give each pair once",
-        ),
-        (
-            "{yoke_coolant: {std: 1 %, correlation: {iron_magnt: 0.5}}}",
-            "correlation.iron_magnt is no parameter of motor_drive; did you mean iron_magnet",
-        ),
+        ("{yoke_coolant: {std: 1 %, correlation: {iron_magnet: 0.5}}, iron_magnet: {std: 1 %, correlation: {yoke_coolant: -0.5}}}", "is 0.5 here and -0.5 under iron_magnet; give each pair once"),
+        ("{yoke_coolant: {std: 1 %, correlation: {iron_magnt: 0.5}}}", "correlation.iron_magnt is no parameter of motor_drive; did you mean iron_magnet"),
         *(
             (
                 f"{{yoke_coolant: {{std: {width}}}}}",
@@ -395,7 +268,7 @@ def test_the_prior_of_what_is_considered_is_that_of_the_parameter() -> None:
             for width in ("-10 %", "10 %%", "5 cm²", "0 %")
         ),
     ],
-)
+)  # fmt: skip
 def test_a_width_is_given_once_and_as_a_number_or_share(parameters: str, said: str) -> None:
     assert said in refusal(f"model: motor_drive\nparameters: {parameters}\nsource: {{type: simulator}}\n")
 

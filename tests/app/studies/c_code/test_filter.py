@@ -146,15 +146,12 @@ def test_single_precision_stays_within_the_bound_on_its_rounding_errors(compiler
     ("name", "overrides", "message"),
     [
         ("motor_winding", {"estimator": "ukf"}, "ukf cannot be written as C; choose one of kf, kf-steady, ekf"),
-        (
-            "motor_winding",
-            {"gate": "{probability: 0.99, kind: soft}"},
-            "a soft gate cannot be written as C; use --set gate",
-        ),
+        ("motor_winding", {"gate": "{probability: 0.99, kind: soft}"},
+            "a soft gate cannot be written as C; use --set gate"),
         ("gripper_contact", {"estimator": "ekf"}, "a black box and a model with a mode have no formulas"),
         ("motor_can", {"estimator": "ekf", "filters.ekf.robust": "huber"}, "the option robust cannot be written as C"),
     ],
-)
+)  # fmt: skip
 def test_what_cannot_be_written_says_why(name, overrides, message):
     twin = load_twin(name, overrides=overrides)
     with pytest.raises(ConfigError) as error:
