@@ -6,12 +6,13 @@ Parameters p: nx, nu, then A, B, W, then for each of three sensors H_k, D_k. A s
 """
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 
 from estimators.log import INPUT, READING, Events, Log
 from estimators.model.state_space import Input, Noise, Parameter, Row, Sensor, State, StateSpaceModel
-from tests.support import SECOND
+from tests.support import SECOND, as_log
 
 ROWS = (1, 2, 3)
 """Rows of the three sensors."""
@@ -157,9 +158,7 @@ def random_log(rng: np.random.Generator, matrices: Matrices, events: int, *, mis
         y = rng.normal(0, 2, ROWS[sensor])
         y[rng.random(y.size) < missing] = np.nan
         batch.append(Events.one(t, t, READING, sensor, y, width))
-    log = Log(width)
-    log.extend(Events.concat(batch, width))
-    return log
+    return as_log(Events.concat(batch, width))
 
 
 class JointGaussian:
@@ -257,3 +256,23 @@ class JointGaussian:
         nu = self.y[mask] - self.offset[mask] - H @ self.mean
         _, log_det = np.linalg.slogdet(S)
         return float(-0.5 * (nu @ np.linalg.solve(S, nu) + log_det + nu.size * np.log(2 * np.pi)))
+
+
+CORRELATED = 2
+"""The seed of a case whose sensors' rows are correlated."""
+
+
+@cache
+def case(nx: int, nu: int, seed: int) -> tuple[Matrices, Log, JointGaussian]:
+    """A random linear model, a log of it, and both as one Gaussian."""
+    rng = np.random.default_rng([nx, nu, seed])
+    matrices = random_linear(rng, nx, nu, correlated=seed == CORRELATED)
+    log = random_log(rng, matrices, events=40)
+    return matrices, log, JointGaussian(matrices, log)
+
+
+def close(actual: np.ndarray, expected: np.ndarray, what: str, tolerance: float = 1e-9) -> None:
+    """Equal but for a share of the largest entry."""
+    scale = max(1e-3, float(np.max(np.abs(expected))))
+    error = float(np.max(np.abs(np.asarray(actual) - expected))) / scale
+    assert error < tolerance, f"{what}: off by {error:.1e} of {scale:.3g}"

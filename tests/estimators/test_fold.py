@@ -15,7 +15,7 @@ from estimators.snapshots import RECENT_EVENTS, Snapshot
 from estimators.track import FAILED, GATED, HELD_OUT, MISSING, NONE, USED
 from estimators.tuning import Tuning
 from tests.estimators.linear_models import ROWS, random_linear, random_log
-from tests.support import SECOND, as_log, assert_same, folded
+from tests.support import SECOND, as_log, assert_same, folded, log_of
 
 MATRICES = random_linear(np.random.default_rng(1), 3, 2)
 MODEL = MATRICES.model
@@ -297,22 +297,16 @@ def test_reset_is_a_fresh_start(estimator):
 
 def test_reset_keeps_the_inputs(estimator):
     """Inputs are facts about the asset, not beliefs: a reset does not forget them."""
-    events = [
-        Events.one(0, 0, INPUT, 0, [5.0, -3.0], MODEL.width),
-        Events.one(SECOND, 0, RESET, 0, (), MODEL.width),
-        Events.one(2 * SECOND, 0, TICK, 0, (), MODEL.width),
-    ]
-    track = fold(estimator, MODEL, Tuning.of(MODEL), as_log(Events.concat(events, MODEL.width)))
+    log = log_of(MODEL.width, (0, INPUT, [5.0, -3.0]), (1, RESET, ()), (2, TICK, ()))
+    track = fold(estimator, MODEL, Tuning.of(MODEL), log)
     expected = MATRICES.mean + MATRICES.A @ MATRICES.mean + MATRICES.B @ [5.0, -3.0]
     # One step of a linear map: a few roundings of numbers of order 10.
     np.testing.assert_allclose(track.mean[2], expected, rtol=1e-13, atol=1e-13)
 
 
 def test_dt_of_zero_predicts_nothing(estimator):
-    tuning = Tuning.of(MODEL)
-    t = 3 * SECOND
-    log = as_log(Events.concat([reading(t, 0, [1.0]), reading(t, 1, [np.nan] * 2), reading(t, 0, [np.nan])], 3))
-    track = fold(estimator, MODEL, tuning, log)
+    log = log_of(3, (3, READING, 1.0), (3, READING, [np.nan] * 2, 1), (3, READING, np.nan))
+    track = fold(estimator, MODEL, Tuning.of(MODEL), log)
     np.testing.assert_array_equal(track.mean[1], track.mean[0])
     np.testing.assert_array_equal(track.std[2], track.std[0])
     # The first reading meets the prior as it is: nothing was predicted before the first event.
@@ -323,7 +317,7 @@ def test_dt_of_zero_predicts_nothing(estimator):
 
 def test_an_enormous_reading_does_not_raise(estimator):
     """1e300 overflows the NIS: the reading fails or is gated; nothing raises, and the estimate stays a number."""
-    log = as_log(Events.concat([reading(SECOND, 0, [1.0]), reading(2 * SECOND, 0, [1e300])], 3))
+    log = log_of(3, (1, READING, 1.0), (2, READING, 1e300))
     assert fold(estimator, MODEL, Tuning.of(MODEL).set("gate", 0.999), log).verdict[1] == GATED
     track = fold(estimator, MODEL, Tuning.of(MODEL), log)
     assert track.nis[1] == np.inf
@@ -332,10 +326,10 @@ def test_an_enormous_reading_does_not_raise(estimator):
 
 
 def test_gate_refuses_and_leaves_the_prediction(estimator):
-    t = [SECOND, 2 * SECOND, 3 * SECOND]
     tuning = Tuning.of(MODEL).set("gate", 0.99)
-    both = as_log(Events.concat([reading(t[0], 1, [0.1, 0.2]), reading(t[1], 1, [80.0, -90.0])], 3))
-    missed = as_log(Events.concat([reading(t[0], 1, [0.1, 0.2]), reading(t[1], 1, [np.nan, np.nan])], 3))
+    both, missed = (
+        log_of(3, (1, READING, [0.1, 0.2], 1), (2, READING, y, 1)) for y in ([80.0, -90.0], [np.nan, np.nan])
+    )
     gated, missing = (fold(estimator, MODEL, tuning, log) for log in (both, missed))
     assert gated.verdict[1] == GATED
     np.testing.assert_array_equal(gated.mean[1], missing.mean[1])
@@ -366,8 +360,7 @@ def test_an_unused_sensor_is_held_out_and_a_gated_one_stays_held_out(estimator):
 
 
 def test_inputs_that_are_nan_stay(estimator):
-    events = [Events.one(0, 0, INPUT, 0, [5.0, np.nan], MODEL.width), Events.one(SECOND, 0, TICK, 0, (), MODEL.width)]
-    growing = folded(estimator, MODEL, as_log(Events.concat(events, MODEL.width)))
+    growing = folded(estimator, MODEL, log_of(MODEL.width, (0, INPUT, [5.0, np.nan]), (1, TICK, ())))
     u = np.array([5.0, MATRICES.u[1]])
     np.testing.assert_array_equal(growing.u, u)
     expected = MATRICES.mean + MATRICES.A @ MATRICES.mean + MATRICES.B @ u
@@ -381,10 +374,7 @@ def test_covariance_stays_symmetric_and_positive(estimator):
     tuning = Tuning.of(MODEL)
     for key in [item.key for item in tuning.items() if item.key.startswith("R.")]:
         tuning = tuning.set(key, 1e-6)
-    log = Log(MODEL.width)
-    for k in range(2000):
-        sensor = k % 3
-        log.extend(reading(k * SECOND // 100, sensor, rng.normal(0, 1, ROWS[sensor])))
+    log = log_of(MODEL.width, *((k / 100, READING, rng.normal(0, 1, ROWS[k % 3]), k % 3) for k in range(2000)))
     growing = Fold(estimator, MODEL, tuning, log)
     while growing.advance(97):
         _, P = growing.moments()

@@ -6,10 +6,10 @@ from scipy.stats import norm
 
 from estimators.errors import EstimatorError
 from estimators.forecast import SIGMAS, first_time, forecast
-from estimators.log import INPUT, READING, Events, Log
+from estimators.log import INPUT, READING, Events
 from tests.estimators.linear_models import random_linear, random_log
 from tests.models import level_model
-from tests.support import SECOND, assert_same, folded, log_of
+from tests.support import SECOND, as_log, assert_same, folded, log_of
 
 SURE = 4.5
 """Standard errors that a test by chance may be off: once in 150,000 looks."""
@@ -102,8 +102,7 @@ def test_the_fold_that_runs_is_not_disturbed():
     rng = np.random.default_rng(3)
     matrices = random_linear(rng, 2, 1)
     log = random_log(rng, matrices, 60)
-    half = Log(log.width)
-    half.extend(log.events.select(slice(0, 30)))
+    half = as_log(log.events.select(slice(0, 30)))
     made = folded("pf", matrices.model, half, options={"particles": 200})
     ahead(made, 3.0, 0.1, limits={"x0": 100.0})
     half.extend(log.events.select(slice(30, None)))

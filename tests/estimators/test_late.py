@@ -8,7 +8,8 @@ from estimators.late import inflated, moved_variance, rewind_seconds
 from estimators.log import READING, TICK, Events, Log
 from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
 from estimators.tuning import Tuning
-from tests.support import SECOND, assert_same
+from tests.support import SECOND, as_log, assert_same
+from tests.support import folded as advanced
 
 
 def moving(x, u, p, dt, out):
@@ -46,11 +47,8 @@ def reading(seconds, value, sensor=0, own=()):
 
 
 def folded(*events):
-    log = Log.of(MODEL)
-    log.extend(Events.concat(list(events), MODEL.width))
-    made = Fold("ekf", MODEL, Tuning.of(MODEL), log)
-    made.advance()
-    return log, made
+    log = as_log(Events.concat(list(events), MODEL.width))
+    return log, advanced("ekf", MODEL, log)
 
 
 @pytest.mark.parametrize("delay", [0.1, 1.0, 4.0])

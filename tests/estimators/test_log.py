@@ -14,7 +14,7 @@ from estimators.registry import ESTIMATORS
 from estimators.track import Track
 from estimators.tuning import Tuning
 from tests.estimators.linear_models import ROWS, random_linear
-from tests.support import SECOND, arrive, assert_same, folded
+from tests.support import SECOND, arrive, as_log, assert_same, folded
 
 
 def any_seed(test):
@@ -263,8 +263,7 @@ def test_any_order_of_arrival_gives_the_same_bits(name):
     tuning = Tuning.of(MODEL).with_options(FILTERS[name])
     for _ in range(6):
         events = crowded(rng)
-        whole = Log.of(MODEL)
-        whole.extend(events)
+        whole = as_log(events)
         expected = fold(name, MODEL, tuning, whole)
         log = Log.of(MODEL, capacity=1)
         growing = Fold(name, MODEL, tuning, log)
@@ -280,15 +279,13 @@ def test_inputs_hold_for_the_readings_of_their_time_and_a_reset_comes_last():
         Events.one(SECOND, 0, READING, 1, [5.0, 5.0], WIDTH),
         Events.one(SECOND, 0, INPUT, 0, [3.0, 4.0], WIDTH),
     ]
-    log = Log.of(MODEL)
-    log.extend(Events.concat(events, WIDTH))
+    log = as_log(Events.concat(events, WIDTH))
     track = fold("ekf", MODEL, Tuning.of(MODEL), log)
     assert log.events.kind.tolist() == [INPUT, READING, TICK, RESET]
     np.testing.assert_array_equal(track.mean[2], track.mean[1])
     np.testing.assert_array_equal(track.mean[3], MODEL.prior_mean)
     # The innovation is y - H m - D u, with the input of that very time.
-    without = Log.of(MODEL)
-    without.extend(Events.concat(events[2:3], WIDTH))
+    without = as_log(Events.concat(events[2:3], WIDTH))
     u = np.array([item.default for item in MODEL.inputs])
     D = random_linear(np.random.default_rng(1), 3, 2).D[1]
     plain = fold("ekf", MODEL, Tuning.of(MODEL), without)
@@ -317,8 +314,7 @@ def test_appending_in_order_changes_nothing_before():
 @pytest.mark.parametrize("horizon", [None, 10_000 * SECOND])
 def test_what_is_older_than_all_that_is_kept_is_stale(horizon):
     """It was folded on the base, with the clock set back to its own time."""
-    log = Log.of(MODEL)
-    log.extend(Events.concat([Events.one(k * SECOND, 0, READING, 0, 0.1, WIDTH) for k in range(2000)], WIDTH))
+    log = as_log(Events.concat([Events.one(k * SECOND, 0, READING, 0, 0.1, WIDTH) for k in range(2000)], WIDTH))
     growing = folded("kf", MODEL, log)
     at, base = growing.base_at(1500)
     growing.drop_front(at)

@@ -9,7 +9,7 @@ from estimators.fold import fold
 from estimators.log import INPUT, MAINTENANCE, READING, TICK, Events, Log, model_version_at
 from estimators.models import MODELS
 from estimators.tuning import Tuning
-from tests.support import SECOND, folded
+from tests.support import SECOND, as_log, folded
 
 MODEL = MODELS["motor_winding"]
 PAIR = np.array([[0, 1]])
@@ -26,9 +26,7 @@ def stream(n=300, at=(100, 200), states=(1,), seed=0):
 
 
 def log_of(events):
-    log = Log.of(MODEL)
-    log.extend(events)
-    return log
+    return as_log(events)
 
 
 def test_the_kalman_filter_is_the_textbooks_with_the_covariance_edited():

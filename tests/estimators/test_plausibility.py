@@ -19,7 +19,7 @@ from estimators.models import MODELS
 from estimators.track import DUPLICATE, MISSING, RANGE, RATE, REPEATED, SATURATED, SCREENED, SUSPECT, USED
 from estimators.tuning import Tuning
 from tests.models import first_state, unchanged
-from tests.support import SECOND, folded
+from tests.support import SECOND, as_log, folded
 
 BEAT = SECOND // 4
 """Times are multiples of a quarter of a second and values of a quarter of a unit: sums of these are exact."""
@@ -139,8 +139,7 @@ reading = st.one_of(
 )
 def test_the_kernel_finds_what_the_rules_say_however_it_is_cut(a, b, rows, data) -> None:
     walk = model(a, b)
-    log = Log.of(walk)
-    log.extend(events(rows, walk.width))
+    log = as_log(events(rows, walk.width))
     ordered = [(int(t) // BEAT, int(s), tuple(y[: s + 1])) for t, s, y in zip(log.t, log.channel, log.value[: log.n])]
     growing = Fold("kf", walk, Tuning.of(walk), log)
     cuts = sorted(data.draw(st.lists(st.integers(0, log.n), max_size=3)))
@@ -181,8 +180,7 @@ FILTERS = ["kf", "ukf", "pf", "enkf", "filterpy-kf"]
 @pytest.mark.parametrize("name", FILTERS)
 def test_a_screened_row_is_to_the_filter_a_row_that_is_missing(name) -> None:
     strict, free = model(STRICT, STRICT), model()
-    log = Log.of(strict)
-    log.extend(stream(np.random.default_rng(3), strict, 300))
+    log = as_log(stream(np.random.default_rng(3), strict, 300))
     found = fold(name, strict, Tuning.of(strict), log)
     assert {RANGE, RATE, REPEATED, SATURATED, DUPLICATE} <= {
         1 << k for k in range(5) if np.any(found.screened & (1 << k))
@@ -201,8 +199,7 @@ def test_a_screened_row_is_to_the_filter_a_row_that_is_missing(name) -> None:
 
 def test_a_fold_from_a_base_knows_what_came_before_it() -> None:
     walk = model(STRICT, STRICT)
-    log = Log.of(walk)
-    log.extend(stream(np.random.default_rng(5), walk, 3000))
+    log = as_log(stream(np.random.default_rng(5), walk, 3000))
     whole = folded("kf", walk, log)
     at, base = whole.base_at(2500)
     rest = Log.of(walk)
@@ -229,8 +226,7 @@ def test_a_gateway_that_repeats_everything_makes_the_band_no_narrower(seconds, l
     walk = model(limit)
     ends = {}
     for times in (1, 5):
-        log = Log.of(walk)
-        log.extend(repeated(times, seconds))
+        log = as_log(repeated(times, seconds))
         track = fold("kf", walk, Tuning.of(walk), log)
         ends[times] = track
         assert np.sum(track.screened & DUPLICATE != 0) == 400 * (times - 1)
@@ -242,8 +238,7 @@ def test_a_gateway_that_repeats_everything_makes_the_band_no_narrower(seconds, l
     np.testing.assert_array_equal(ends[5].alarms[first], ends[1].alarms)
     if seconds:
         free = model()
-        log = Log.of(free)
-        log.extend(repeated(5, seconds))
+        log = as_log(repeated(5, seconds))
         believed = fold("kf", free, Tuning.of(free), log).std[-1, 0] / ends[1].std[-1, 0]
         # A walk's steady P = (√(q² + 4qR) - q) / 2, here with R/5; the copies' 0.04 s add 6 % to P.
         q, r = 0.01, 1 / 16
@@ -286,8 +281,7 @@ def test_a_sensor_that_is_always_refused_is_lost_and_said_to_be() -> None:
 
 def test_copies_are_no_stuck_sensor() -> None:
     walk = model(Limits(duplicates=0.05))
-    log = Log.of(walk)
-    log.extend(repeated(5, 0.05))
+    log = as_log(repeated(5, 0.05))
     assert not np.any(fold("kf", walk, Tuning.of(walk), log).alarms & STUCK)
 
 

@@ -10,7 +10,7 @@ from estimators.models import MODELS
 from estimators.registry import ESTIMATORS, unfit
 from estimators.tuning import Tuning
 from tests.estimators.linear_models import random_linear
-from tests.support import SECOND
+from tests.support import SECOND, log_of
 
 MATRICES = random_linear(np.random.default_rng(6), 3, 2)
 MODEL = MATRICES.model
@@ -41,9 +41,7 @@ def posterior(P, y, sensor):
 
 
 def one_reading(y, sensor):
-    log = Log.of(MODEL)
-    log.extend(Events.one(SECOND, 0, READING, sensor, y, MODEL.width))
-    return log
+    return log_of(MODEL.width, (1, READING, y, sensor))
 
 
 @pytest.mark.parametrize("kind", PRIORS)

@@ -7,13 +7,13 @@ import pytest
 
 from estimators.errors import EstimatorError
 from estimators.fold import Fold, fold
-from estimators.log import READING, Events, Log
+from estimators.log import READING, Log
 from estimators.models import MODELS
 from estimators.registry import ESTIMATORS, checked, find_estimator
 from estimators.tuning import Tuning
 from tests.estimators.interpreted.test_filterpy import PENDULUM
 from tests.estimators.linear_models import random_linear, random_log
-from tests.support import folded
+from tests.support import folded, log_of
 
 WINDING = MODELS["motor_winding"]
 ANYBODYS = replace(WINDING, conditionally_linear=WINDING.state_names)
@@ -128,8 +128,7 @@ def test_an_unknown_name_is_told_the_near_ones():
 
 def test_ukf_points_have_the_moments_of_the_state():
     model = WINDING
-    log = Log(1)
-    log.extend(Events.one(0, 0, READING, 0, 36.0, 1))
+    log = log_of(1, (0, READING, 36.0))
     fold = folded("ukf", model, log, options={"alpha": 0.7, "kappa": 1.0})
     points = fold.points()
     mean, cov = fold.moments()

@@ -27,7 +27,7 @@ from estimators.registry import ESTIMATORS, find_estimator, unfit
 from estimators.track import DIVERGED, FAILED, NONE
 from estimators.tuning import Tuning
 from tests.estimators.ensemble.blocks import BOX, ONE, both_block, f_block
-from tests.support import assert_same, log_of
+from tests.support import as_log, assert_same, log_of
 from tests.waiting import wait_for
 
 COMPILED = [name for name, entry in ESTIMATORS.items() if entry.blocks is not None]
@@ -309,9 +309,7 @@ def test_a_reading_that_f_does_not_reach_is_as_if_it_had_not_come(name):
     assert len(alone) == 3 and tick
     growing = folded(name, Switch(), log, dict.fromkeys(alone + tick, "f"))
     kept = np.setdiff1d(np.arange(log.n), alone + tick)
-    shorter = Log(ONE.width)
-    shorter.extend(log.events.select(kept))
-    expected, track = fold(name, BOX, few(name), shorter), growing.track
+    expected, track = fold(name, BOX, few(name), as_log(log.events.select(kept))), growing.track
     assert np.all(track.verdict[alone] == FAILED) and np.all(track.verdict[tick] == NONE)
     assert np.all(np.isnan(track.mean[alone + tick])) and np.all(np.isnan(track.std[alone + tick]))
     assert np.all(track.health[alone + tick] == DIVERGED)

@@ -5,13 +5,14 @@ import pytest
 
 from estimators.compiled.jacobians import ANALYTIC, CENTRAL, COMPLEX_STEP, complex_step_f, complex_step_h, scratch_size
 from estimators.compiled.model import compile_model
-from estimators.fold import Fold, fold
-from estimators.log import READING, Events, Log
+from estimators.fold import fold
+from estimators.log import READING, Log
 from estimators.model.state_space import Input, Noise, Parameter, Row, Sensor, State, StateSpaceModel
 from estimators.models import MODELS
 from estimators.numerics.jit import jit
 from estimators.track import FAILED
 from estimators.tuning import Tuning
+from tests.support import folded, log_of
 
 
 def f(x, u, p, dt, out):
@@ -104,13 +105,9 @@ def test_complex_step_is_exact(seed):
 
 
 def track(model):
-    log = Log(2)
     rng = np.random.default_rng(0)
-    for k in range(40):
-        log.extend(Events.one(k * 20_000_000, 0, READING, 0, rng.normal((0.18, -0.66), 0.1), 2))
-    folded = Fold("ekf", model, Tuning.of(model), log)
-    folded.advance()
-    return folded.track
+    rows = [(0.02 * k, READING, rng.normal((0.18, -0.66), 0.1)) for k in range(40)]
+    return folded("ekf", model, log_of(2, *rows)).track
 
 
 def test_the_filter_says_the_same_with_the_models_own_jacobians():
@@ -176,14 +173,11 @@ def test_h_of_a_linear_model_is_that_of_the_parameters_in_use(estimator):
         parameters=(Parameter("gain", "1", 2.0),),
         linear=True,
     )
-    log = Log.of(model)
-    log.extend(Events.one(0, 0, READING, 0, 3.0, 1))
     for gain in (2.0, 5.0):
-        fold = Fold(estimator, model, Tuning.of(model).set("p.gain", gain), log)
-        fold.advance()
+        track = fold(estimator, model, Tuning.of(model).set("p.gain", gain), log_of(1, (0, READING, 3.0)))
         S = 4.0 * gain**2 + 0.25
-        assert fold.track.innovation_std[0, 0] == pytest.approx(np.sqrt(S), rel=1e-12)
-        assert fold.track.mean[0, 0] == pytest.approx(1.0 + 4.0 * gain / S * (3.0 - gain), rel=1e-12)
+        assert track.innovation_std[0, 0] == pytest.approx(np.sqrt(S), rel=1e-12)
+        assert track.mean[0, 0] == pytest.approx(1.0 + 4.0 * gain / S * (3.0 - gain), rel=1e-12)
 
 
 def stopped(x, u, p, dt, out):

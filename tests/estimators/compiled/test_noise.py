@@ -19,7 +19,7 @@ from sources.simulator import Simulator
 from tests.estimators.linear_models import random_linear
 from tests.estimators.test_fold import in_python
 from tests.models import first_state, level_model, unchanged
-from tests.support import SECOND, as_log, read_all
+from tests.support import SECOND, as_log, log_of, read_all
 
 
 def root(A):
@@ -197,10 +197,7 @@ def relative(x, u, p, q, dt, out):
 def test_noise_is_that_of_the_state_before_the_step(estimator):
     """x = 3 ± 0.5 doubles in 1 s with Q = 0.1 x²: P = 4·0.25 + 0.1·9, not 0.1·36."""
     model = level_model({"y": 1.0}, 0.1, state="x", mean=3.0, std=0.5, f=double, Q=relative)
-    log = Log(1)
-    for t in (0, 1_000_000_000):
-        log.extend(Events.one(t, 0, TICK, 0, [], 1))
-    track = fold(estimator, model, Tuning.of(model), log)
+    track = fold(estimator, model, Tuning.of(model), log_of(1, (0, TICK, []), (1, TICK, [])))
     np.testing.assert_allclose(track.mean[1, 0], 6.0, rtol=1e-14)
     np.testing.assert_allclose(track.std[1, 0] ** 2, 1.9, rtol=1e-13)
 

@@ -8,13 +8,13 @@ import pytest
 
 from estimators.diagnostics.failure_cause import failures
 from estimators.fold_failures import cause_of
-from estimators.log import INPUT, READING, TICK, Events, Log
+from estimators.log import INPUT, READING, TICK
 from estimators.model.assemble import JointParameter, joint
 from estimators.model.state_space import Input, Noise, Parameter, Row, Sensor, State, StateSpaceModel
 from estimators.track import FAILED
 from estimators.tuning import Tuning
 from tests.estimators.ensemble.blocks import BOX, both_block, f_block
-from tests.support import SECOND, folded
+from tests.support import folded, log_of
 
 
 def drift(x, u, p, dt, out):
@@ -52,13 +52,8 @@ def walk(**changes):
 
 def driven(model, name="ekf"):
     """At 0 m until 2 s, then 1 m/s: past 1 m at 3 s, past 2 m at 4 s; the readings say so."""
-    log = Log(model.width)
-    for k in range(9):
-        t = k * SECOND // 2
-        if k == 4:
-            log.extend(Events.one(t, 0, INPUT, 0, [1.0], model.width))
-        log.extend(Events.one(t, 0, READING, 0, [max(0.0, 0.5 * (k - 4))], model.width))
-    return folded(name, model, log)
+    rows = [(0.5 * k, READING, max(0.0, 0.5 * (k - 4))) for k in range(9)]
+    return folded(name, model, log_of(model.width, *rows, (2, INPUT, 1.0)))
 
 
 @pytest.mark.parametrize("name", ["ekf", "ukf", "pf", "filterpy-ukf"])
@@ -125,10 +120,8 @@ def test_failures_are_failed_readings_and_estimates_that_are_no_numbers():
 def test_the_inputs_that_held_are_taken():
     """u is 1 from 2 s on; without it the path stays at 0 m, where nothing fails."""
     model = walk(f=root_step, states=(State("s", "m", 0.0, 1e-6),), noises=(Noise("s", "m²/s", 0.0),))
-    log = Log(model.width)
-    for t, kind, value in ((0, READING, 0.0), (1, INPUT, 1.0), (2, TICK, np.nan), (4, READING, 3.0), (5, READING, 4.0)):
-        log.extend(Events.one(t * SECOND, 0, kind, 0, [value], 1))
-    growing = folded("ekf", model, log)
+    rows = (0, READING, 0.0), (1, INPUT, 1.0), (2, TICK, np.nan), (4, READING, 3.0), (5, READING, 4.0)
+    growing = folded("ekf", model, log_of(1, *rows))
     rows = failures(growing.track)
     assert rows[0] == 4
     assert "x = [3], u = [1], dt = 1 s" in cause_of(growing, 4)
@@ -145,10 +138,7 @@ def test_the_models_own_function_is_named_where_a_parameter_is_estimated(changes
 def test_the_path_is_walked_in_the_models_own_steps():
     """Four steps of 1 s from 0 m at 1 m/s: f is asked at 0, 1 and 2 m, and has no answer there."""
     model = walk(f=root_step, states=(State("s", "m", 0.0, 1e-6),), noises=(Noise("s", "m²/s", 0.0),), max_step=1.0)
-    log = Log(model.width)
-    for t, kind, value in ((0, READING, 0.0), (0, INPUT, 1.0), (4, READING, 4.0)):
-        log.extend(Events.one(t * SECOND, 0, kind, 0, [value], 1))
-    growing = folded("ekf", model, log)
+    growing = folded("ekf", model, log_of(1, (0, READING, 0.0), (0, INPUT, 1.0), (4, READING, 4.0)))
     assert list(failures(growing.track)) == [2]
     assert "f(x, u, dt) is [nan] at x = [2], u = [1], dt = 1 s" in cause_of(growing, 2)
 
@@ -163,10 +153,8 @@ def test_a_block_that_returns_no_number_is_named_too():
         return np.where(u[0] < 1.0, f_block(X, u, p, dt), np.nan)
 
     model = replace(BOX, f=f, sensors=(replace(BOX.sensors[0], h=both), BOX.sensors[1]))
-    log = Log(model.width)
-    for t, kind, values in ((0.0, READING, [0.2, 0.1]), (0.1, INPUT, [2.0]), (0.2, READING, [0.2, 0.1])):
-        log.extend(Events.one(round(t * SECOND), 0, kind, 0, values, model.width))
-    growing = folded("enkf", model, log)
+    rows = (0.0, READING, [0.2, 0.1]), (0.1, INPUT, [2.0]), (0.2, READING, [0.2, 0.1])
+    growing = folded("enkf", model, log_of(model.width, *rows))
     assert list(failures(growing.track)) == [2]
     assert re.search(r"test_failure_cause.py:\d+: model duffing: f\(x, u, dt\) is \[nan, nan\]", cause_of(growing, 2))
 
@@ -177,8 +165,6 @@ def test_a_reading_that_the_model_cannot_expect_has_failed_and_is_not_gated(esti
     """Of a NIS that is no number the model is the reason, not the reading."""
     model = walk(sensors=(Sensor("gauge", (Row("s", "m", 0.01),), h=root),))
     tuning = Tuning.of(model) if gate is None else Tuning.of(model).set("gate", gate)
-    log = Log(model.width)
-    for t, kind, value in ((1, READING, 0.0), (2, INPUT, 50.0), (3, READING, 0.0)):
-        log.extend(Events.one(t * SECOND, t * SECOND, kind, 0, value, model.width))
+    log = log_of(model.width, (1, READING, 0.0), (2, INPUT, 50.0), (3, READING, 0.0))
     growing = folded(estimator, model, log, tuning)
     assert growing.track.verdict[2] == FAILED

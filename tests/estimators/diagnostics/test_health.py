@@ -16,14 +16,14 @@ from estimators.diagnostics.health import (
 )
 from estimators.diagnostics.score import score
 from estimators.fold import fold
-from estimators.log import READING, RESET, TICK, TRUTH, Events, Log
+from estimators.log import READING, RESET, TICK, TRUTH, Events
 from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
 from estimators.models import MODELS
 from estimators.registry import ESTIMATORS
 from estimators.track import DIVERGED, FAILED, GATED, HELD_OUT, MISSING, NONE, SUSPECT, TRACKING, USED, Track
 from estimators.tuning import Tuning
 from tests.models import first_state, level_model, unchanged
-from tests.support import SECOND
+from tests.support import SECOND, as_log, log_of
 from tests.support import folded as advanced
 
 MOTOR = MODELS["motor_winding"]
@@ -41,9 +41,7 @@ def simulated(seed, bias=0.0):
         x = F @ x + rng.normal(0, np.sqrt(np.diag(Q)))
         batch.append(Events.one(k * SECOND, 0, READING, 0, x[0] + bias + rng.normal(0, 2.0), 1))
         batch += [Events.one(k * SECOND, 0, TRUTH, j, x[j], 1) for j in range(2)]
-    log = Log(1)
-    log.extend(Events.concat(batch, 1))
-    return log
+    return as_log(Events.concat(batch, 1))
 
 
 def averages(estimator, tuning, bias=0.0):
@@ -120,8 +118,7 @@ def test_true_states_come_in_blocks():
         Events.one(SECOND, 0, TRUTH, 5, 0.5 - 2.0, 32),  # error 2, outside the band as the -1 before it
         Events.one(SECOND, 0, TRUTH, 0, nan, 32),
     ]
-    log = Log(many.width)
-    log.extend(Events.concat(batch, many.width))
+    log = as_log(Events.concat(batch, many.width))
     fits = score(fold("kf", many, Tuning.of(many), log), log.events, many).states
     expected = {
         "s0": (0.3, 1.0),
@@ -152,10 +149,7 @@ COMPASS = StateSpaceModel(
 
 def history(values, kind=READING, step=1.0):
     """Events `step` seconds apart, one a value."""
-    log = Log(1)
-    for k, value in enumerate(values):
-        log.extend(Events.one(round(k * step * SECOND), 0, kind, 0, value, 1))
-    return log
+    return log_of(1, *((k * step, kind, value) for k, value in enumerate(values)))
 
 
 def healths(log, policy=None, gate=None):

@@ -5,12 +5,12 @@ import pytest
 
 from estimators.diagnostics.innovations import mean_nis, sensor_noise
 from estimators.fold import fold
-from estimators.log import READING, Events, Log
+from estimators.log import READING, Events
 from estimators.models import MODELS
 from estimators.numerics.quantiles import chi_square_quantile
 from estimators.track import GATED, USED, Track
 from estimators.tuning import Tuning
-from tests.support import SECOND
+from tests.support import SECOND, as_log
 
 MODEL = MODELS["motor_winding"]
 
@@ -55,8 +55,7 @@ def walked(n, r, seed):
 
 @pytest.mark.parametrize("start, r", [(1.0, 1.0), (0.2, 1.0), (5.0, 1.0)])
 def test_taken_again_and_again_it_comes_to_the_true_noise(start, r):
-    log = Log(MODEL.width)
-    log.extend(walked(8000, r, seed=11))
+    log = as_log(walked(8000, r, seed=11))
     tuning = Tuning.of(MODEL).set("R.winding", start)
     for _ in range(8):
         found = sensor_noise(fold("kf", MODEL, tuning, log), log.events, tuning)["winding"]
@@ -88,8 +87,7 @@ def test_by_hand_on_a_scalar_filter():
 
 
 def test_few_readings_say_nothing():
-    log = Log(MODEL.width)
-    log.extend(walked(40, 1.0, seed=1))
+    log = as_log(walked(40, 1.0, seed=1))
     tuning = Tuning.of(MODEL)
     assert sensor_noise(fold("kf", MODEL, tuning, log), log.events, tuning) == {}
 
@@ -98,8 +96,7 @@ def test_innovations_of_a_right_filter_are_as_white_as_chance_has_it_and_of_a_wr
     """Of ten right filters the chances are spread over 0 to 1; with Q a hundred times too small none has any."""
     right, wrong = [], []
     for seed in range(10):
-        log = Log(MODEL.width)
-        log.extend(walked(2000, 1.0, seed=100 + seed))
+        log = as_log(walked(2000, 1.0, seed=100 + seed))
         for tuning, chances in (
             (Tuning.of(MODEL).set("R.winding", 1.0), right),
             (Tuning.of(MODEL).set("R.winding", 1.0).set("Q.temperature", 5e-5).set("Q.rate", 5e-6), wrong),

@@ -389,9 +389,7 @@ def test_gaspari_cohn_is_their_function():
 @pytest.mark.parametrize("name", NAMES)
 def test_bits_are_the_same_on_any_number_of_threads(name, monkeypatch):
     rng = np.random.default_rng(2)
-    log = Log(40)
-    for k in range(6):
-        log.extend(Events.one(k * 50_000_000, 0, READING, 0, rng.normal(2, 4, 40), 40))
+    log = log_of(40, *((0.05 * k, READING, rng.normal(2, 4, 40)) for k in range(6)))
     options = {"members": 11, "inflation": 1.02, "additive": 0.01} | ({} if name == "etkf" else {"radius": 8.0})
     states = []
     for crews in (1, 2, 5):

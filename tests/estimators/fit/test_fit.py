@@ -25,6 +25,7 @@ from estimators.model.state_space import Noise, Parameter, Row, Sensor, State, S
 from estimators.track import Track
 from estimators.tuning import Tuning
 from tests.benchmarks.recovery import CASES, recover
+from tests.support import folded
 
 DECADES = 2.0 * np.log(10.0)
 """Deviation of the weak belief in a variance."""
@@ -236,8 +237,7 @@ def test_a_step_does_not_fold_the_point_again_that_it_has_tried(ys):
 @pytest.mark.parametrize("estimator", ["kf", "filterpy-kf"])
 def test_a_fold_that_judges_no_rows_is_the_same_bits_in_all_other_columns(ys, estimator):
     log, setting = log_of(ys), Setting(Tuning.of(MODEL).set("gate", 0.9), None)
-    fold = Fold(estimator, MODEL, setting.tuning, log)
-    fold.advance()
+    fold = folded(estimator, MODEL, log, setting.tuning)
     found = track_of(estimator, setting, Recording(log))
     judged = {"age", "nis_mean", "nis_low", "nis_high", "consistency", "health", "alarms", "flags"}
     for name, here, there in zip(Track._fields, found, fold.track, strict=True):

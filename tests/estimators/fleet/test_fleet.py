@@ -14,6 +14,7 @@ from estimators.log import READING, TRUTH, Events
 from estimators.model.state_space import Parameter
 from estimators.track import GATED, HEALTH_NAMES
 from tests.models import level_model
+from tests.support import folded
 
 POLICY = HealthPolicy(window=12, degraded_after=40.0, stale_after=90.0)
 """A window short enough that it is full, and slides, in the logs of these tests."""
@@ -113,8 +114,7 @@ def test_fleet_of_random_assets_has_the_bits_of_single_folds(estimator, name, ga
         if rng.random() < 0.2 or not any(arriving):
             for a, log in enumerate(logs):
                 if log.n:
-                    fold = Fold(estimator, model, tunings[a], log, policy=POLICY)
-                    fold.advance()
+                    fold = folded(estimator, model, log, tunings[a], policy=POLICY)
                     assert_same(fleet, a, fold)
                     verdicts |= set(fold.track.verdict.tolist())
     assert fleet.table().stale.sum() == 0
@@ -164,8 +164,7 @@ def test_decisions_on_rejected_sensors_are_those_of_single_folds(estimator, name
             for part in (slice(0, 3), slice(3, count)):
                 fleet.restore(part.start, former.state(part))
     for a, log in enumerate(logs):
-        fold = Fold(estimator, model, tunings[a], log, policy=POLICY)
-        fold.advance()
+        fold = folded(estimator, model, log, tunings[a], policy=POLICY)
         assert_same(fleet, a, fold)
         # The state of a fleet has what the next decisions need, not those that were taken.
         assert threads > 1 or str(fleet.decisions(a)) == str(fold.decisions[-64:])
@@ -206,8 +205,7 @@ def test_assets_of_other_parameters_share_nothing():
     for a, tuning in enumerate(tunings):
         log = Log.of(model)
         log.add("gauge", t, y)
-        fold = Fold("kf", model, tuning, log)
-        fold.advance()
+        fold = folded("kf", model, log, tuning)
         assert_same(fleet, a, fold)
 
 
@@ -240,8 +238,7 @@ def test_values_of_each_asset_are_those_of_a_tuning_of_its_own(estimator, name, 
             add(log, event)
         fleet.advance()
     for a, log in enumerate(logs):
-        fold = Fold(estimator, model, tunings[a], log, policy=POLICY)
-        fold.advance()
+        fold = folded(estimator, model, log, tunings[a], policy=POLICY)
         assert_same(fleet, a, fold)
         assert bool(fleet.decisions(a)) == bool(fold.decisions)
 
@@ -278,8 +275,7 @@ def test_a_new_asset_begins_from_the_spread_of_its_siblings():
         target.add("winding", *asset, [1.0, 2.0, 3.0], [38.0, 39.0, 38.5])
     fleet.add("winding", 40, 1.0, 38.0)
     fleet.advance()
-    fold = Fold("kf", model, Tuning.of(model), log, prior=(mean, cov))
-    fold.advance()
+    fold = folded("kf", model, log, prior=(mean, cov))
     assert_same(fleet, 41, fold)
     alone = Fold("kf", model, Tuning.of(model), Log.of(model))
     assert fold.track.mean[0].tobytes() != alone.prior[0].tobytes() and fleet.table().events[40] == 1
@@ -294,8 +290,7 @@ def test_measurements_too_old_to_count_leave_the_window():
             target.add("winding", *asset, seconds, 40.0 + np.sin(seconds))
             target.add_ticks(np.linspace(seconds[-1] + 0.1, seconds[-1] + 1.0, 39))
         fleet.advance()
-        fold = Fold("kf", model, Tuning.of(model), log, policy=policy)
-        fold.advance()
+        fold = folded("kf", model, log, policy=policy)
         assert_same(fleet, 0, fold)
     assert fold.track.nis_mean[-1] == fold.track.nis[-40]
 

@@ -30,8 +30,7 @@ class Drive:
         self.place = self.fold(self.events).track.mean[:, :2].copy()
 
     def fold(self, events, tuning=None, prior=None):
-        growing = folded("ekf", self.twin.model, as_log(events), tuning or self.twin.tuning, prior=prior)
-        return growing
+        return folded("ekf", self.twin.model, as_log(events), tuning or self.twin.tuning, prior=prior)
 
     def changed(self, sensor, change, first=0.0, last=np.inf):
         """The events, the first row of one sensor's readings between two times changed."""

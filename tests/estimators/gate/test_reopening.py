@@ -14,6 +14,7 @@ from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceMo
 from estimators.track import GATED, USED
 from estimators.tuning import Tuning
 from tests.support import SECOND, arrive, as_log, assert_same
+from tests.support import folded as advanced
 
 from .two_sensors import JUMP, MODEL, TUNING, series
 
@@ -21,9 +22,7 @@ FILTERS = ["kf", "sr-kf", "pf", "enkf", "filterpy-kf"]
 
 
 def folded(name, events, tuning=TUNING, **rest):
-    growing = Fold(name, MODEL, tuning, as_log(events), **rest)
-    growing.advance()
-    return growing
+    return advanced(name, MODEL, as_log(events), tuning, **rest)
 
 
 def outcomes(growing):
@@ -78,8 +77,7 @@ def test_a_jump_after_maintenance_is_the_twins():
     assert outcomes(growing)[-1] == "believed" and growing.decisions[-1].time < JUMP + 1.0
     said = "maintenance has changed the asset, so the twin is wrong rather than the sensor"
     assert growing.decisions[-1].text.endswith(said)
-    track = Fold("kf", MODEL, TUNING.set("gate.reopen", None), growing.log)
-    track.advance()
+    track = advanced("kf", MODEL, growing.log, TUNING.set("gate.reopen", None))
     assert any(episode.cause == "refused" and episode.text.endswith(said) for episode in episodes(track))
 
 
@@ -150,8 +148,7 @@ def test_a_fold_from_a_base_decides_as_the_whole_one():
     assert at == 192
     tail = as_log(events.select(slice(at, None)))
     tail.first = at
-    rest = Fold("kf", MODEL, TUNING, tail, base=base)
-    rest.advance()
+    rest = advanced("kf", MODEL, tail, TUNING, base=base)
     assert np.array_equal(rest.track.mean, whole.track.mean[at:])
     assert [d.outcome for d in rest.decisions] == ["doubted", "believed"]
 
@@ -243,9 +240,7 @@ def ranges(exchanged=False, jump=0.0):
     log.add("west", t, np.where(after, east, west))
     log.add("east", t + 0.1, np.where(after, west, east))
     log.add("fix", t + 0.2, x + 0.1 * rng.standard_normal(t.size))
-    growing = Fold("kf", LANDMARKS, Tuning.of(LANDMARKS).set("gate", 0.9999), log)
-    growing.advance()
-    return growing
+    return advanced("kf", LANDMARKS, log, Tuning.of(LANDMARKS).set("gate", 0.9999))
 
 
 def test_swapped_landmarks_are_named_and_never_accepted():

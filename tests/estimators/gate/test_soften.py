@@ -5,11 +5,11 @@ import pytest
 
 from estimators.errors import EstimatorError
 from estimators.fold import Fold
-from estimators.log import Log
+from estimators.log import READING, Log
 from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
 from estimators.track import GATED, USED
 from estimators.tuning import Tuning
-from tests.support import assert_same, folded
+from tests.support import assert_same, folded, log_of
 
 from .two_sensors import MODEL, TUNING
 
@@ -18,10 +18,7 @@ SOFT = TUNING.set("gate.kind", "soft")
 
 
 def one_reading(name, tuning, y=Y):
-    log = Log.of(MODEL)
-    log.add("a", [0.0], [y])
-    growing = folded(name, MODEL, log, tuning)
-    return growing
+    return folded(name, MODEL, log_of(MODEL.width, (0, READING, y)), tuning)
 
 
 @pytest.mark.parametrize("name", ["kf", "sr-kf", "filterpy-kf"])

@@ -5,13 +5,13 @@ import pytest
 
 from estimators.errors import ConfigError, EstimatorError
 from estimators.fold import Fold
-from estimators.log import READING, Events, Log
+from estimators.log import READING, Events
 from estimators.registry import ESTIMATORS, find_estimator
 from estimators.track import FAILED, USED
 from estimators.tuning import Tuning
 from tests.estimators.linear_models import JointGaussian, random_linear, random_log
 from tests.models import level_model
-from tests.support import SECOND, folded
+from tests.support import as_log, folded, log_of
 
 SINGULAR = [name for name, entry in ESTIMATORS.items() if entry.singular]
 
@@ -20,9 +20,7 @@ def apart(log):
     """The same events, each 10 ms after the one before at least: two exact readings at one time have no S."""
     events = log.events
     t, *columns = events.select(slice(0, None))
-    other = Log(log.width)
-    other.extend(Events(t + 10**7 * np.arange(len(events)), *columns))
-    return other
+    return as_log(Events(t + 10**7 * np.arange(len(events)), *columns))
 
 
 @pytest.mark.parametrize("estimator", SINGULAR)
@@ -52,11 +50,7 @@ def model(*, std=1.0, variance=0.0):
 
 @pytest.mark.parametrize("estimator", SINGULAR)
 def test_an_exact_reading_is_believed_and_a_second_one_at_that_time_fails(estimator):
-    log = Log(1)
-    log.extend(
-        Events.concat([Events.one(t * SECOND, 0, READING, 0, [y], 1) for t, y in ((0, 2.0), (0, 3.0), (2, 4.0))], 1)
-    )
-    fold = folded(estimator, model(), log)
+    fold = folded(estimator, model(), log_of(1, (0, READING, 2.0), (0, READING, 3.0), (2, READING, 4.0)))
     np.testing.assert_array_equal(fold.track.verdict, [USED, FAILED, USED])
     np.testing.assert_allclose(fold.track.mean[:, 0], [2.0, 2.0, 4.0], rtol=1e-14)
     np.testing.assert_allclose(fold.track.std[:, 0], 0.0, atol=1e-15)

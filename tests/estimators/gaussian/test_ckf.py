@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 
-from estimators.fold import Fold
-from estimators.log import INPUT, READING, TICK, Events, Log
-from estimators.tuning import Tuning
+from estimators.log import INPUT, READING, TICK
 from tests.estimators.interpreted.test_filterpy import P0, PENDULUM, X0, Q, R, hx
+from tests.support import folded, log_of
 
 DT = 0.4
 
@@ -25,14 +24,8 @@ def moved(x, u):
 
 @pytest.mark.parametrize(("sensor", "y"), [(0, [1.2]), (1, [-1.0, 2.9]), (1, [np.nan, 2.0])])
 def test_a_step_and_a_reading_are_the_published_sums(sensor, y):
-    log = Log(2)
-    log.extend(Events.one(0, 0, INPUT, 0, [0.7], 2))
-    asked = log.copy()
-    asked.extend(Events.one(round(DT * 1e9), 0, TICK, 0, [], 2))
-    log.extend(Events.one(round(DT * 1e9), 0, READING, sensor, y, 2))
-    before, fold = (Fold("ckf", PENDULUM, Tuning.of(PENDULUM), one) for one in (asked, log))
-    before.advance()
-    fold.advance()
+    rows = (DT, TICK, []), (DT, READING, y, sensor)
+    before, fold = (folded("ckf", PENDULUM, log_of(2, (0, INPUT, 0.7), row)) for row in rows)
 
     X = np.array([moved(x, 0.7) for x in on_the_sphere(X0, np.diag(P0))])
     x = X.mean(0)

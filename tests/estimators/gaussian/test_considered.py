@@ -15,7 +15,8 @@ from estimators.model.state_space import Input, Noise, Parameter, Row, Sensor, S
 from estimators.registry import ESTIMATORS, find_estimator
 from estimators.smoothing.smooth import check_smooth
 from estimators.tuning import Tuning
-from tests.support import SECOND
+from tests.models import complex_step
+from tests.support import SECOND, folded
 
 CONSIDERING = [name for name, entry in ESTIMATORS.items() if entry.considers and entry.family == "Gaussian"]
 CONSIDERED = {"offset": JointParameter(0.3, considered=True), "loss": JointParameter(0.02, considered=True)}
@@ -91,21 +92,13 @@ def schmidt(model, log, u, inflation=1.0):
     for noise in model.noises:
         q[model.state_names.index(noise.name)] += noise.variance
 
-    def jacobian(function, rows):
-        J = np.empty((rows, model.nx))
-        for j in range(model.nx):
-            out = np.zeros(rows, complex)
-            function(z + 1e-30j * np.eye(model.nx)[j], out)
-            J[:, j] = out.imag / 1e-30
-        return J
-
     for k in range(log.n):
         if k > 0:
 
             def step(x, out):
                 model.f(x, u, p, STEP, out)
 
-            F = jacobian(step, model.nx)
+            F = complex_step(step, z, model.nx)
             A, B = F[:n, :n], F[:n, n:]
             forward = np.empty(model.nx)
             step(z, forward)
@@ -115,7 +108,7 @@ def schmidt(model, log, u, inflation=1.0):
             Pxc = inflation ** (0.5 * STEP) * (A @ Pxc + B @ C)
         sensor = model.sensors[log.events.channel[k]]
         rows = len(sensor.rows)
-        H = jacobian(lambda x, out, h=sensor.h: h(x, u, p, out), rows)
+        H = complex_step(lambda x, out, h=sensor.h: h(x, u, p, out), z, rows)
         expected = np.empty(rows)
         sensor.h(z, u, p, expected)
         nu = log.events.value[k, :rows] - expected
@@ -167,10 +160,11 @@ def test_offsets_and_scales_equal_the_equations_in_blocks(estimator, f, instrume
     equal_to_the_equations(estimator, model, {})
 
 
-def equal_to_the_equations(estimator, model, options):
+def equal_to_the_equations(estimator, model, options, written=None):
     log = log_of()
     fold = Fold(estimator, model, Tuning.of(model).with_options(options), log)
-    for mean, cov, nis in schmidt(model, log, model.default_inputs, **options if "inflation" in options else {}):
+    inflation = options.get("inflation", 1.0)
+    for mean, cov, nis in schmidt(written or model, log, model.default_inputs, inflation):
         fold.advance(1)
         actual, P = fold.moments()
         np.testing.assert_allclose(actual, mean, rtol=0, atol=1e-9 * np.max(np.abs(mean)))
@@ -216,13 +210,7 @@ def test_correlated_and_widened_parameters_equal_the_equations_in_blocks(estimat
     model = joint(ranged(), FITTED, {("loss", "offset"): -0.8})
     assert model.state_names[2:] == ("offset_deviation", "loss_deviation", "loss_outside", "heat_outside")
     assert model.prior_cov[2, 3] == pytest.approx(-0.8 * 0.3 * 0.02)
-    log = log_of()
-    fold = Fold(estimator, model, Tuning.of(model), log)
-    for mean, cov, _ in schmidt(by_hand(model), log, model.default_inputs):
-        fold.advance(1)
-        actual, P = fold.moments()
-        np.testing.assert_allclose(actual, mean, rtol=0, atol=1e-9 * np.max(np.abs(mean)))
-        np.testing.assert_allclose(P, cov, rtol=0, atol=1e-9 * np.max(np.abs(cov)))
+    equal_to_the_equations(estimator, model, {}, by_hand(model))
 
 
 @pytest.mark.parametrize(
@@ -245,8 +233,7 @@ def test_impossible_widths_are_refused(estimated, correlations, rule):
 @pytest.mark.parametrize("options", [{"adapt": "Q"}, {"adapt": "R"}, {"robust": "huber"}, {"inflation": 2.0}])
 def test_options_leave_what_is_considered(estimator, options):
     model = joint(physics(bilinear), CONSIDERED)
-    fold = Fold(estimator, model, Tuning.of(model).with_options(options), log_of())
-    fold.advance()
+    fold = folded(estimator, model, log_of(), options=options)
     mean, P = fold.moments()
     np.testing.assert_allclose(mean[2:], 0.0, atol=1e-13)  # sigma points leave rounding errors
     np.testing.assert_allclose(P[2:, 2:], np.diag([0.3**2, 0.02**2]), rtol=1e-9, atol=1e-12)
@@ -323,8 +310,7 @@ def test_shares_of_the_variance_are_those_of_refolds(estimator):
         p = own.default_parameters + np.array([moved.get(k, 0.0) for k in range(3)])
         log, truth = simulated(own, p)
         pairs = np.concatenate(([[0, 1]], considered_pairs(model)))
-        fold = Fold(estimator, model, Tuning.of(model), log, pairs=pairs)
-        fold.advance()
+        fold = folded(estimator, model, log, pairs=pairs)
         mean, P = fold.moments()
         errors.append(truth - mean[:2])
     shares = variance_shares(model, P)
@@ -336,8 +322,7 @@ def test_shares_of_the_variance_are_those_of_refolds(estimator):
         assert noise[-1] == pytest.approx(np.sqrt(P[i, i] * (1.0 - offset - loss)), rel=1e-7)
         assert np.isnan(noise_std(model, i, fold.track.std, fold.track.cross[:, :1])).all()
     correlated = joint(own, CONSIDERED, {("offset", "loss"): 0.9})
-    fold = Fold(estimator, correlated, Tuning.of(correlated), log)
-    fold.advance()
+    fold = folded(estimator, correlated, log)
     P = fold.moments()[1]
     assert sum(variance_shares(correlated, P)["a"].values()) == pytest.approx(1.0)
     known = known_stds(correlated, P)

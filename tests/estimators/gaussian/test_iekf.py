@@ -4,13 +4,14 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from estimators.fold import Fold, fold
-from estimators.log import READING, Events, Log
+from estimators.fold import fold
+from estimators.log import READING
 from estimators.track import FAILED
 from estimators.tuning import Tuning
 from tests.estimators.gaussian.test_square_root import EVERYTHING
 from tests.estimators.interpreted.test_filterpy import P0, PENDULUM, X0, H_of, R, hx, log  # noqa: F401  the fixture
 from tests.models import level_model
+from tests.support import assert_same, folded, log_of
 
 
 @pytest.mark.parametrize("joseph", [0, 1])
@@ -19,17 +20,13 @@ def test_one_iteration_is_the_ekf_to_the_bit(log, options, joseph):  # noqa: F81
     options = {**options, "joseph": joseph}
     once = fold("iekf", PENDULUM, Tuning.of(PENDULUM).with_options({**options, "iterations": 1}), log)
     ekf = fold("ekf", PENDULUM, Tuning.of(PENDULUM).with_options(options), log)
-    for name, left, right in zip(ekf._fields, once, ekf, strict=True):
-        np.testing.assert_array_equal(left, right, err_msg=name)
+    assert_same(once, ekf)
 
 
 @pytest.mark.parametrize(("sensor", "y"), [(0, [1.0]), (1, [-1.0, 2.9]), (1, [np.nan, 3.0])])
 def test_many_iterations_find_the_mode_and_count_the_reading_once(sensor, y):
     """The minimum of ½ |x - x̂|²_P⁻¹ + ½ |y - h(x)|²_R⁻¹ by scipy, and P = (P⁻¹ + Hᵀ R⁻¹ H)⁻¹ there."""
-    readings = Log(2)
-    readings.extend(Events.one(0, 0, READING, sensor, y, 2))
-    folded = Fold("iekf", PENDULUM, Tuning.of(PENDULUM).with_options({"iterations": 20}), readings)
-    folded.advance()
+    readings = log_of(2, (0, READING, y, sensor))
     finite = np.isfinite(y)
     y, r = np.array(y)[finite], R[sensor][finite]
 
@@ -38,7 +35,7 @@ def test_many_iterations_find_the_mode_and_count_the_reading_once(sensor, y):
 
     best = least_squares(residuals, X0, xtol=1e-15, ftol=1e-15, gtol=1e-15).x
     H = H_of(sensor, best)[finite]
-    mean, cov = folded.moments()
+    mean, cov = folded("iekf", PENDULUM, readings, options={"iterations": 20}).moments()
     assert np.max(np.abs(best - fold("ekf", PENDULUM, Tuning.of(PENDULUM), readings).mean[0])) > 1e-2
     # scipy stops when its gradient is 1e-15 of its size at the start: the mode is good to about 1e-8.
     np.testing.assert_allclose(mean, best, rtol=0, atol=1e-7)
@@ -52,8 +49,6 @@ def cliff(x, u, p, out):
 def test_an_iteration_that_leaves_the_model_fails_visibly():
     """y = log x from 1 ± 10, reading -3: the first step leads to -1.9, where there is no logarithm."""
     model = level_model({"y": 1.0}, 1.0, state="x", mean=1.0, std=10.0, h=cliff)
-    readings = Log(1)
-    readings.extend(Events.one(0, 0, READING, 0, -3.0, 1))
-    track = fold("iekf", model, Tuning.of(model), readings)
+    track = fold("iekf", model, Tuning.of(model), log_of(1, (0, READING, -3.0)))
     assert track.verdict[0] == FAILED
     assert (track.mean[0, 0], track.std[0, 0]) == (1.0, 10.0)

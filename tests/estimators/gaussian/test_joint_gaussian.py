@@ -6,8 +6,6 @@ Tolerance 1e-9, relative to the size of the quantity: some hundred roundings of 
 oracle's own dense solve, which is 1e3 to 1e5 for these models.
 """
 
-from functools import cache
-
 import numpy as np
 import pytest
 
@@ -15,28 +13,12 @@ from estimators.log import READING, Events
 from estimators.registry import ESTIMATORS
 from estimators.track import HELD_OUT, MISSING, USED
 from estimators.tuning import Tuning
-from tests.estimators.linear_models import JointGaussian, random_linear, random_log
+from tests.estimators.linear_models import CORRELATED, case, close
 from tests.support import folded
 
 GAUSSIAN = [name for name, entry in ESTIMATORS.items() if entry.family == "Gaussian" and name != "kf-steady"]
 CASES = [(nx, nu, 0) for nx, nu in ((1, 0), (1, 1), (2, 0), (3, 2), (4, 0), (5, 1))]
-CORRELATED = 2
-"""The seed of a case whose sensors' rows are correlated."""
 CASES += [(nx, nu, CORRELATED) for nx, nu in ((1, 0), (3, 2), (5, 1))]
-
-
-def close(actual, expected, what):
-    scale = max(1e-3, float(np.max(np.abs(expected))))
-    error = float(np.max(np.abs(np.asarray(actual) - expected))) / scale
-    assert error < 1e-9, f"{what}: off by {error:.1e} of {scale:.3g}"
-
-
-@cache
-def case(nx, nu, seed):
-    rng = np.random.default_rng([nx, nu, seed])
-    matrices = random_linear(rng, nx, nu, correlated=seed == CORRELATED)
-    log = random_log(rng, matrices, events=40)
-    return matrices, log, JointGaussian(matrices, log)
 
 
 @pytest.mark.parametrize("estimator", GAUSSIAN)

@@ -15,7 +15,8 @@ from estimators.tuning import Tuning
 from tests.estimators.interpreted.test_filterpy import PENDULUM
 from tests.estimators.linear_models import random_linear
 from tests.models import first_state
-from tests.support import SECOND
+from tests.support import SECOND, log_of
+from tests.support import folded as advanced
 
 MOTOR = MODELS["motor_winding"]
 F, H, R = np.array([[1.0, 1.0], [0.0, 1.0]]), np.array([[1.0, 0.0]]), 4.0
@@ -23,17 +24,12 @@ Q = np.diag([0.01, 0.001])
 
 
 def readings(values, times=None):
-    log = Log(1)
-    for k, value in enumerate(values):
-        t = k if times is None else times[k]
-        log.extend(Events.one(round(t * SECOND), 0, READING, 0, value, 1))
-    return log
+    times = range(len(values)) if times is None else times
+    return log_of(np.size(values[0]), *((t, READING, value) for t, value in zip(times, values, strict=True)))
 
 
 def folded(estimator, log, tuning=None, model=MOTOR):
-    fold = Fold(estimator, model, tuning or Tuning.of(model), log)
-    fold.advance()
-    return fold
+    return advanced(estimator, model, log, tuning)
 
 
 def steady_gain():
@@ -122,11 +118,9 @@ TWO_ROWS = StateSpaceModel(
 def test_two_rows_an_input_split_steps_and_a_row_that_is_missing():
     """The Kalman filter's estimate after 300 readings 0.25 s apart, which the model crosses in three steps."""
     rng = np.random.default_rng(3)
-    log = Log(2)
     values = rng.normal(0, 1, (300, 2))
     values[150, 1] = values[170, 0] = np.nan
-    for k, value in enumerate(values):
-        log.extend(Events.one(k * SECOND // 4, 0, READING, 0, value, 2))
+    log = readings(values, 0.25 * np.arange(300))
     steady = folded("kf-steady", log, Tuning.of(TWO_ROWS).with_options({"period": 0.25}), TWO_ROWS)
     kalman = folded("kf", log, model=TWO_ROWS)
     assert np.all(steady.track.verdict == USED)
@@ -210,11 +204,7 @@ def test_the_steady_gain_of_correlated_rows():
         linear=True,
     )
     y = np.random.default_rng(5).normal(0, 1.0, (1500, 2)) + [36.0, 0.0]
-    log = Log(declared.width)
-    log.extend(
-        Events.concat([Events.one(k * SECOND, 0, READING, 0, row, 2) for k, row in enumerate(y)], declared.width)
-    )
-    steady, kalman = (folded(name, log, model=declared) for name in ("kf-steady", "kf"))
+    steady, kalman = (folded(name, readings(y), model=declared) for name in ("kf-steady", "kf"))
     for a, b in zip(steady.moments(), kalman.moments(), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-9)
     assert steady._now.state[-1] == AFTER

@@ -5,14 +5,14 @@ import pytest
 
 from estimators.fold import Fold, fold
 from estimators.interpreted.fold_loop import MAX_PREDICT_STEPS
-from estimators.log import INPUT, READING, RESET, TICK, TRUTH, Events, Log
+from estimators.log import INPUT, READING, RESET, TICK, TRUTH, Events
 from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
 from estimators.models import MODELS
 from estimators.registry import ESTIMATORS
 from estimators.track import MISSING, USED
 from estimators.tuning import Tuning
 from tests.models import first_state, unchanged
-from tests.support import SECOND, log_of
+from tests.support import SECOND, folded, log_of
 
 # The gain of the first readings of kf-steady is another.
 NAMES = [name for name, entry in ESTIMATORS.items() if entry.family == "Gaussian" and name != "kf-steady"]
@@ -54,34 +54,32 @@ def model(f, h=first_state, *, states=1, std=0.5, mean=0.0, q=0.02, r=0.0025, ci
 
 
 def run(estimator, model, *events):
-    folded = Fold(estimator, model, Tuning.of(model), log_of(1, *events))
-    folded.advance()
-    return folded
+    return folded(estimator, model, log_of(1, *events))
 
 
 @pytest.mark.parametrize("estimator", NAMES)
 def test_covariance_grows_without_readings_as_the_sum_says(estimator):
     """P(k) = Fᵏ P₀ Fᵏᵀ + Σ Fⁱ Q Fⁱᵀ for F = [[1, 1], [0, 1]]: polynomials of k."""
     events = [(0, TICK, 0.0)] + [(k, READING, np.nan) for k in range(1, 41)]
-    folded = run(estimator, MODELS["motor_winding"], *events)
+    found = run(estimator, MODELS["motor_winding"], *events)
     k, (p1, p2), (q1, q2) = 40, (25.0, 1.0), (0.01, 0.001)
     expected = [
         [p1 + k**2 * p2 + k * q1 + q2 * (k - 1) * k * (2 * k - 1) / 6, k * p2 + q2 * k * (k - 1) / 2],
         [k * p2 + q2 * k * (k - 1) / 2, p2 + k * q2],
     ]
     # Forty steps, a few roundings each; the UKF takes P apart and puts it together again at every one.
-    np.testing.assert_allclose(folded.moments()[1], expected, rtol=1e-12)
-    assert np.all(folded.track.verdict[1:] == MISSING)
-    assert np.all(np.diff(folded.track.std, axis=0) > 0)
+    np.testing.assert_allclose(found.moments()[1], expected, rtol=1e-12)
+    assert np.all(found.track.verdict[1:] == MISSING)
+    assert np.all(np.diff(found.track.std, axis=0) > 0)
 
 
 @pytest.mark.parametrize("estimator", NAMES)
 @pytest.mark.parametrize(("dt", "steps"), [(0.5, 1), (2.0, 4), (1.1, 3), (0.2, 1)])
 def test_long_steps_are_split(estimator, dt, steps):
     """x ← (1 + dt/k) x, k times, where a step may last 0.5 s; the noise adds up on the way."""
-    folded = run(estimator, model(growth, mean=2.0, max_step=0.5), (0, TICK, 0.0), (dt, READING, np.nan))
+    found = run(estimator, model(growth, mean=2.0, max_step=0.5), (0, TICK, 0.0), (dt, READING, np.nan))
     a = 1.0 + dt / steps
-    mean, cov = folded.moments()
+    mean, cov = found.moments()
     np.testing.assert_allclose(mean[0], 2.0 * a**steps, rtol=1e-14)
     variance = 0.25
     for _ in range(steps):
@@ -93,13 +91,13 @@ def test_long_steps_are_split(estimator, dt, steps):
 def test_heading_takes_the_short_way_over_pi(estimator):
     """Prior 3.1 ± 0.1, reading -3.1 with R = 0.0025: gain 0.8, innovation 2π - 6.2, not -6.2."""
     compass = model(unchanged, mean=3.1, std=0.1, circular=("x0", "y"))
-    folded = run(estimator, compass, (0, READING, -3.1))
+    found = run(estimator, compass, (0, READING, -3.1))
     innovation = 2 * np.pi - 6.2
-    np.testing.assert_allclose(folded.track.innovation[0, 0], innovation, rtol=1e-13)
+    np.testing.assert_allclose(found.track.innovation[0, 0], innovation, rtol=1e-13)
     # 3.1 + 0.8 · 0.0832 = 3.1665 is beyond π, so it is told as 2π less.
-    np.testing.assert_allclose(folded.track.mean[0, 0], 3.1 + 0.8 * innovation - 2 * np.pi, rtol=1e-14)
-    np.testing.assert_allclose(folded.track.std[0, 0] ** 2, 0.2 * 0.01, rtol=1e-13)
-    np.testing.assert_allclose(folded.track.nis[0], innovation**2 / 0.0125, rtol=1e-12)
+    np.testing.assert_allclose(found.track.mean[0, 0], 3.1 + 0.8 * innovation - 2 * np.pi, rtol=1e-14)
+    np.testing.assert_allclose(found.track.std[0, 0] ** 2, 0.2 * 0.01, rtol=1e-13)
+    np.testing.assert_allclose(found.track.nis[0], innovation**2 / 0.0125, rtol=1e-12)
 
 
 @pytest.mark.parametrize("estimator", NAMES)
@@ -107,19 +105,19 @@ def test_turning_for_many_rounds(estimator):
     """A heading that turns 1 rad/s for a minute: wrapped all the way, the rate found, the error never a round."""
     turning = model(drift, states=2, mean=0.0, std=1.0, q=1e-6, r=1e-4, circular=("x0", "y"))
     wrapped = lambda a: (a + np.pi) % (2 * np.pi) - np.pi  # noqa: E731
-    folded = run(estimator, turning, *[(0.2 * k, READING, wrapped(0.2 * k)) for k in range(300)])
-    heading, rate = folded.track.mean.T
+    found = run(estimator, turning, *[(0.2 * k, READING, wrapped(0.2 * k)) for k in range(300)])
+    heading, rate = found.track.mean.T
     assert np.all((heading >= -np.pi) & (heading < np.pi))
     # The readings are exact and the prior is off by one sigma at most: within a few of the filter's own.
     error = np.abs(wrapped(heading - 0.2 * np.arange(300)))
-    assert np.all(error[5:] < 3 * folded.track.std[5:, 0])
-    assert abs(rate[-1] - 1.0) < 3 * folded.track.std[-1, 1]
+    assert np.all(error[5:] < 3 * found.track.std[5:, 0])
+    assert abs(rate[-1] - 1.0) < 3 * found.track.std[-1, 1]
 
 
 @pytest.mark.parametrize("estimator", NAMES)
 def test_a_state_that_is_not_circular_does_not_wrap(estimator):
-    folded = run(estimator, model(unchanged, mean=3.1, std=0.1), (0, READING, 3.3))
-    np.testing.assert_allclose(folded.track.mean[0, 0], 3.26, rtol=1e-14)
+    found = run(estimator, model(unchanged, mean=3.1, std=0.1), (0, READING, 3.3))
+    np.testing.assert_allclose(found.track.mean[0, 0], 3.26, rtol=1e-14)
 
 
 @pytest.mark.parametrize("estimator", ["ekf", "ukf"])
@@ -130,14 +128,14 @@ def test_bearing_where_atan2_jumps(estimator, side):
     At (-2, 0) the bearing's Jacobian is (0, -1/2): the reading -π + 0.1 has the innovation 0.1.
     """
     west = model(unchanged, bearing, states=2, mean=(-2.0, side), std=0.01, r=1e-6, circular=("y",), linear=False)
-    folded = run(estimator, west, (0, READING, -np.pi + 0.001))
+    found = run(estimator, west, (0, READING, -np.pi + 0.001))
     S = 0.25e-4 + 1e-6
     gain = -0.5e-4 / S
     # The UKF sees the curvature too: h'' σ² is 1e-4 of h' σ here. Central differences are good to 1e-9.
     tolerance = 1e-7 if estimator == "ekf" else 1e-3
-    np.testing.assert_allclose(folded.track.innovation_std[0, 0], np.sqrt(S), rtol=tolerance)
-    np.testing.assert_allclose(folded.track.mean[0, 1] - side, gain * (0.001 + side / 2), rtol=tolerance)
-    assert folded.track.verdict[0] == USED
+    np.testing.assert_allclose(found.track.innovation_std[0, 0], np.sqrt(S), rtol=tolerance)
+    np.testing.assert_allclose(found.track.mean[0, 1] - side, gain * (0.001 + side / 2), rtol=tolerance)
+    assert found.track.verdict[0] == USED
 
 
 @pytest.mark.parametrize("estimator", NAMES)
@@ -151,8 +149,7 @@ def test_purity_where_jacobians_are_differences(estimator):
     whole = fold(estimator, guarded_model, tuning, log_of(1, *events))
     late = 300
     log = log_of(1, *events[:late], *events[late + 1 :])
-    growing = Fold(estimator, guarded_model, tuning, log)
-    growing.advance()
+    growing = folded(estimator, guarded_model, log, tuning)
     t, kind, value = events[late]
     changed, _ = log.extend(Events.one(round(t * SECOND), 0, kind, 0, value, 1))
     growing.rewind(changed)
@@ -174,12 +171,9 @@ def test_a_reset_recovers_from_an_estimate_that_was_lost(estimator):
 
 def test_after_a_clock_jump_the_estimate_is_the_prior():
     model = MODELS["motor_drive"]
-    log = Log(model.width)
-    log.extend(Events.one(0, 0, READING, 0, 90.0, model.width))
-    just, beyond = int(model.max_step * MAX_PREDICT_STEPS * 1e9), int(model.max_step * MAX_PREDICT_STEPS * 1e9) + 10**9
-    log.extend(Events.one(just, 0, TICK, 0, [], model.width))
-    log.extend(Events.one(beyond, 0, TICK, 0, [], model.width))
-    log.extend(Events.one(1_700_000_000 * 10**9, 0, INPUT, 0, [0, 0, 0, 40, 25], model.width))
+    just = model.max_step * MAX_PREDICT_STEPS
+    later = [(just, TICK, []), (just + 1, TICK, []), (1_700_000_000, INPUT, [0, 0, 0, 40, 25])]
+    log = log_of(model.width, (0, READING, 90.0), *later)
     track = fold("ekf", model, Tuning.of(model), log)
     prior = np.array([state.mean for state in model.states])
     assert np.all(np.abs(track.mean[1] - prior) > 1e-3)  # still predicted, towards its surroundings
@@ -189,10 +183,8 @@ def test_after_a_clock_jump_the_estimate_is_the_prior():
 
 def test_several_truths_at_one_time_are_one_query():
     model = MODELS["motor_drive"]
-    log = Log(model.width)
-    log.extend(Events.one(0, 0, READING, 0, 90.0, model.width))
-    for kind, t in ((TRUTH, 5), (TRUTH, 5), (TICK, 5), (TRUTH, 9), (INPUT, 12), (TRUTH, 12), (TRUTH, 12)):
-        log.extend(Events.one(t * 10**8, 0, kind, 0, 50.0, model.width))
+    later = ((TRUTH, 5), (TRUTH, 5), (TICK, 5), (TRUTH, 9), (INPUT, 12), (TRUTH, 12), (TRUTH, 12))
+    log = log_of(model.width, (0, READING, 90.0), *((0.1 * t, kind, 50.0) for kind, t in later))
     whole = fold("ekf", model, Tuning.of(model), log)
     alone = Fold("ekf", model, Tuning.of(model), log)
     while alone.advance(1):

@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 
 from estimators.errors import EstimatorError
-from estimators.fold import Fold
-from estimators.log import READING, Events, Log
+from estimators.log import READING
 from estimators.model.state_space import Noise, Parameter, Row, Sensor, State, StateSpaceModel
 from estimators.track import FAILED, USED
 from estimators.tuning import Tuning
 from tests.estimators.interpreted.test_filterpy import PENDULUM, log  # noqa: F401  the fixture
 from tests.models import level_model, unchanged
-from tests.support import SECOND
+from tests.support import folded as advanced
+from tests.support import log_of
 
 FILTERPY = ["filterpy-kf", "filterpy-ekf", "filterpy-ukf"]
 EVERYTHING = [
@@ -33,9 +33,7 @@ def folded(estimator, model, log, options=None, **tuned):  # noqa: F811
     tuning = Tuning.of(model).with_options(options or {})
     for key, value in tuned.items():
         tuning = tuning.set(key, value)
-    fold = Fold(estimator, model, tuning, log, pairs=np.array([[0, 1], [2, 1]]))
-    fold.advance()
-    return fold
+    return advanced(estimator, model, log, tuning, pairs=np.array([[0, 1], [2, 1]]))
 
 
 def same(a, b, tolerance):
@@ -91,18 +89,11 @@ def test_a_negative_weight_that_outweighs_the_others_fails_visibly(estimator):
     """
     values = {"alpha": 1.0, "beta": 0.0, "kappa": -0.9}
     model = one(unchanged, squared, 1e-9)
-    readings = Log(1)
-    readings.extend(Events.one(0, 0, READING, 0, 0.3, 1))
-    fold = Fold(estimator, model, Tuning.of(model).with_options(values), readings)
-    fold.advance()
+    fold = advanced(estimator, model, log_of(1, (0, READING, 0.3)), options=values)
     assert fold.track.verdict[0] == FAILED
     np.testing.assert_array_equal(fold.track.mean[0], 0.0)
     model = one(square, squared, 1e-9)
-    readings = Log(1)
-    readings.extend(Events.one(0, 0, READING, 0, np.nan, 1))
-    readings.extend(Events.one(SECOND, 0, READING, 0, 0.3, 1))
-    fold = Fold(estimator, model, Tuning.of(model).with_options(values), readings)
-    fold.advance()
+    fold = advanced(estimator, model, log_of(1, (0, READING, np.nan), (1, READING, 0.3)), options=values)
     assert fold.track.verdict[1] == FAILED
     assert np.isnan(fold.track.std[1, 0])  # the health of such a row is `diverged`
 
@@ -153,24 +144,15 @@ def exact():
     return np.array(mean, float), np.array(cov, float)
 
 
-def at_once():
-    together = Log(2)
-    together.extend(Events.one(0, 0, READING, 0, Y, 2))
-    return together
+AT_ONCE = [(0, READING, Y, 0)]
+ONE_BY_ONE = [(0, READING, Y[:1], 1), (0, READING, Y[1:], 2)]
 
 
-def one_by_one():
-    apart = Log(2)
-    apart.extend(Events.one(0, 0, READING, 1, Y[:1], 2))
-    apart.extend(Events.one(0, 0, READING, 2, Y[1:], 2))
-    return apart
-
-
-@pytest.mark.parametrize("readings", [at_once, one_by_one])
+@pytest.mark.parametrize("readings", [AT_ONCE, ONE_BY_ONE])
 @pytest.mark.parametrize("estimator", ["sr-kf", "sr-ekf", "sr-ukf"])
 def test_a_reading_beyond_the_digits_of_the_plain_forms(estimator, readings):
     """S = H Hᵀ + R has a condition of 1e18; its factor one of 1e9, which leaves 1e-7 of a double."""
-    fold = folded(estimator, TWINS, readings())
+    fold = folded(estimator, TWINS, log_of(2, *readings))
     mean, cov = exact()
     assert np.all(fold.track.verdict == USED)
     np.testing.assert_allclose(fold.moments()[0], mean, rtol=0, atol=1e-6)
@@ -182,7 +164,7 @@ def test_a_reading_beyond_the_digits_of_the_plain_forms(estimator, readings):
 @pytest.mark.parametrize("estimator", ["kf", "ekf", "iekf", "ukf", "ckf", *FILTERPY])
 def test_the_plain_forms_refuse_it_and_say_so(estimator, options):
     try:
-        fold = folded(estimator, TWINS, at_once(), options)
+        fold = folded(estimator, TWINS, log_of(2, *AT_ONCE), options)
     except EstimatorError:
         assert "joseph" in options and estimator in ("ukf", "ckf", *FILTERPY)
         return
@@ -210,7 +192,7 @@ def test_a_pivot_that_rounding_could_have_made_is_refused(estimator, apart, verd
         f=unchanged,
         linear=True,
     )
-    fold = folded(estimator, model, at_once())
+    fold = folded(estimator, model, log_of(2, *AT_ONCE))
     assert fold.track.verdict[0] == verdict
 
 
@@ -228,7 +210,7 @@ def test_square_roots_refuse_what_their_own_digits_cannot_tell(estimator):
         f=unchanged,
         linear=True,
     )
-    fold = folded(estimator, model, at_once())
+    fold = folded(estimator, model, log_of(2, *AT_ONCE))
     assert fold.track.verdict[0] == FAILED
     np.testing.assert_array_equal(fold.track.mean[0], 0.0)
 
@@ -236,6 +218,6 @@ def test_square_roots_refuse_what_their_own_digits_cannot_tell(estimator):
 @pytest.mark.parametrize("estimator", ["kf", "ekf", "iekf", "ukf", "ckf", *FILTERPY])
 def test_one_by_one_the_plain_forms_refuse_the_second(estimator):
     """H₂ P H₂ᵀ is nothing but rounding after the first: what R is beside that, no gain can know."""
-    fold = folded(estimator, TWINS, one_by_one())
+    fold = folded(estimator, TWINS, log_of(2, *ONE_BY_ONE))
     assert list(fold.track.verdict) == [USED, FAILED]
     np.testing.assert_array_equal(fold.track.mean[1], fold.track.mean[0])

@@ -12,11 +12,11 @@ from estimators import MODELS, Log, fold, fold_many, mean_nees
 from estimators.diagnostics.consistency import Nees
 from estimators.errors import EstimatorError, EventError, NisusError
 from estimators.fold import fold as fold_track
-from estimators.log import INPUT, READING, TRUTH, Events
+from estimators.log import INPUT, READING, TRUTH
 from estimators.models.uwb_rover import HEADING, YAW_RATE_BIAS
 from estimators.track import HELD_OUT, USED
 from estimators.tuning import Tuning
-from tests.support import SECOND, assert_same, folded
+from tests.support import SECOND, assert_same, folded, log_of
 
 MOTOR = MODELS["motor_winding"]
 DRIVE = MODELS["motor_drive"]
@@ -31,9 +31,7 @@ def motor_log(**given):
 
 
 def test_it_is_the_fold_of_events_and_a_tuning():
-    log = Log(MOTOR.width)
-    for second, celsius in enumerate(CELSIUS, start=1):
-        log.extend(Events.one(second * SECOND, second * SECOND, READING, 0, celsius, MOTOR.width))
+    log = log_of(MOTOR.width, *((second, READING, celsius) for second, celsius in enumerate(CELSIUS, start=1)))
     tuning = Tuning.of(MOTOR).set("R.winding", 9.0).set("gate", 0.99).with_options({"alpha": 0.5})
     expected = fold_track("ukf", MOTOR, tuning, log)
     got = fold("ukf", MOTOR, motor_log(), R={"winding": 9.0}, gate=0.99, alpha=0.5)
@@ -46,8 +44,7 @@ def test_any_order_and_any_pieces_give_the_same_log():
     whole, pieces = motor_log(), Log.of(MOTOR)
     for k in (3, 0, 4, 2, 1):
         pieces.add("winding", k + 1.0, CELSIUS[k])
-    for a, b in zip(whole.events, pieces.events, strict=True):
-        np.testing.assert_array_equal(a, b)
+    assert_same(whole.events, pieces.events)
 
 
 def test_the_prior_holds_at_the_start():

@@ -17,11 +17,11 @@ import numpy as np
 import pytest
 from filterpy.kalman import ExtendedKalmanFilter, MerweScaledSigmaPoints, UnscentedKalmanFilter
 
-from estimators.fold import Fold
-from estimators.log import READING, TICK, Events, Log
+from estimators.log import READING, TICK, Events
 from estimators.model.state_space import Input, Noise, Parameter, Row, Sensor, State, StateSpaceModel
 from estimators.tuning import Tuning
-from tests.support import SECOND
+from tests.estimators.linear_models import close
+from tests.support import SECOND, as_log, folded
 
 Q = np.array([0.02, 0.05, 0.01])
 R = (np.array([0.04]), np.array([0.09, 0.25]))
@@ -108,9 +108,7 @@ def log():
         y = hx(sensor, x) + rng.normal(0, np.sqrt(R[sensor]))
         y[rng.random(y.size) < 0.15] = np.nan
         batch.append(Events.one(t, t, READING, sensor, y, 2))
-    log = Log(2)
-    log.extend(Events.concat(batch, 2))
-    return log
+    return as_log(Events.concat(batch, 2))
 
 
 def steps(log):
@@ -124,22 +122,15 @@ def steps(log):
 
 
 def check(track, k, x, P, log_likelihood):
-    def close(actual, expected, what):
-        scale = max(1e-3, float(np.max(np.abs(expected))))
-        error = float(np.max(np.abs(actual - expected))) / scale
-        assert error < 1e-8, f"{what} after event {k}: off by {error:.1e}"
-
-    close(track.mean[k], x, "mean")
-    close(track.std[k] ** 2, np.diag(P), "variances")
-    close(track.cross[k], P[[0, 0, 1], [1, 2, 2]], "covariances")
+    close(track.mean[k], x, f"mean after event {k}", 1e-8)
+    close(track.std[k] ** 2, np.diag(P), f"variances after event {k}", 1e-8)
+    close(track.cross[k], P[[0, 0, 1], [1, 2, 2]], f"covariances after event {k}", 1e-8)
     if log_likelihood is not None:
-        close(track.log_likelihood[k], log_likelihood, "log-likelihood")
+        close(track.log_likelihood[k], log_likelihood, f"log-likelihood after event {k}", 1e-8)
 
 
-def folded(estimator, model, log, tuning=None):
-    fold = Fold(estimator, model, tuning or Tuning.of(model), log, pairs=np.array([[0, 1], [0, 2], [1, 2]]))
-    fold.advance()
-    return fold.track
+def track_of(estimator, model, log, tuning=None):
+    return folded(estimator, model, log, tuning, pairs=np.array([[0, 1], [0, 2], [1, 2]])).track
 
 
 def test_ekf(log):
@@ -151,7 +142,7 @@ def test_ekf(log):
 
     ekf = Theirs(dim_x=3, dim_z=2)
     ekf.x, ekf.P = X0.copy(), np.diag(P0)
-    track = folded("ekf", PENDULUM, log)
+    track = track_of("ekf", PENDULUM, log)
     for k, dt, sensor, rows, y, r in steps(log):
         if dt:
             ekf.dt, ekf.F, ekf.Q = dt, F_of(ekf.x, dt), np.diag(Q * dt)
@@ -179,7 +170,7 @@ def unscented(values):
 )
 def test_ukf(log, values):
     points, ukf = unscented(values)
-    track = folded("ukf", PENDULUM, log, Tuning.of(PENDULUM).with_options(values))
+    track = track_of("ukf", PENDULUM, log, Tuning.of(PENDULUM).with_options(values))
     for k, dt, sensor, rows, y, r in steps(log):
         if dt:
             ukf.Q = np.diag(Q * dt)

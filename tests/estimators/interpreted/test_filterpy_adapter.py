@@ -12,7 +12,7 @@ from estimators.track import FAILED, GATED, HELD_OUT, MISSING, USED
 from estimators.tuning import Tuning
 from tests.estimators.interpreted.test_filterpy import PENDULUM, log  # noqa: F401  log is a fixture
 from tests.estimators.test_fold import MODEL, everything
-from tests.support import SECOND, as_log, assert_same, folded
+from tests.support import SECOND, as_log, assert_same, folded, log_of
 
 PAIRS = np.array([[0, 1], [0, 2], [1, 2]])
 
@@ -85,14 +85,8 @@ def test_angles_turn_past_pi(name):
 
 
 def one_reading(members):
-    tuning = Tuning.of(MODEL).with_options({"members": members})
-    fold_ = folded(
-        "filterpy-enkf",
-        MODEL,
-        as_log(Events.concat([Events.one(0, 0, TICK, 0, (), 3), Events.one(SECOND, 0, READING, 1, [0.4, -0.7], 3)], 3)),
-        tuning,
-    )
-    return fold_
+    events = log_of(3, (0, TICK, ()), (1, READING, [0.4, -0.7], 1))
+    return folded("filterpy-enkf", MODEL, events, options={"members": members})
 
 
 def test_enkf_is_within_monte_carlo_error_of_the_exact_answer():
@@ -133,10 +127,7 @@ def test_enkf_draws_by_seed_and_leaves_the_global_generator_alone():
 
 
 def test_a_covariance_without_a_factor_fails_and_is_no_exception():
-    events = Log(2)
-    events.extend(Events.one(0, 0, TICK, 0, (), 2))
-    events.extend(Events.one(SECOND, 0, READING, 0, [0.5], 2))
-    fold_ = folded("filterpy-ukf", PENDULUM, events, stop=1)
+    fold_ = folded("filterpy-ukf", PENDULUM, log_of(2, (0, TICK, ()), (1, READING, 0.5)), stop=1)
     fold_._now.state[3:] = -np.eye(3).ravel()
     fold_.advance()
     assert np.all(np.isnan(fold_.track.mean[1]))

@@ -11,7 +11,7 @@ from scipy.stats import multivariate_normal
 from estimators.compiled.model import compile_model
 from estimators.errors import ModelError
 from estimators.fold import fold
-from estimators.log import READING, Events, Log
+from estimators.log import READING
 from estimators.model.assemble import JointParameter, joint
 from estimators.model.coloured import ColouredError, channels, coloured
 from estimators.model.state_space import Noise, Parameter, Row, Sensor, State, StateSpaceModel
@@ -19,6 +19,7 @@ from estimators.models import MODELS
 from estimators.registry import find_estimator
 from estimators.tuning import Tuning
 from tests.models import level_model
+from tests.support import log_of as log_of_rows
 
 TAU, Q, R, STD, ERROR, ERROR_TIME = 7.0, 0.3, 0.04, 2.0, 0.6, 20.0
 
@@ -63,10 +64,7 @@ def lasted(times, tau=ERROR_TIME):
 
 
 def log_of(times, y):
-    log = Log(1)
-    for t, value in zip(times, y, strict=True):
-        log.extend(Events.one(round(t * 1e9), 0, READING, 0, value, 1))
-    return log
+    return log_of_rows(1, *((t, READING, value) for t, value in zip(times, y, strict=True)))
 
 
 def regression(level, readings):

@@ -7,13 +7,13 @@ from estimators.compiled.model import compile_model
 from estimators.diagnostics.score import score
 from estimators.errors import EstimatorError, ModelError
 from estimators.fold import Fold
-from estimators.log import READING, TRUTH, Events, Log
+from estimators.log import READING, TRUTH
 from estimators.model.state_space import LARGE, Field, Noise, Row, Sensor, StateSpaceModel
 from estimators.models.thermal_field import thermal_field
 from estimators.numerics.smoothed_noise import smooth
 from estimators.tuning import Tuning
 from sources.simulator import Simulator
-from tests.support import as_log, folded, read_all
+from tests.support import as_log, folded, log_of, read_all
 
 
 def test_cells_have_names_places_and_a_prior():
@@ -104,9 +104,7 @@ def test_a_field_is_folded_and_scored_by_its_shown_cells():
 def test_forecast_noise_has_the_models_shape():
     """10 000 members of a plate at rest after one second: covariance q dt L Lᵀ + prior, within five sigma."""
     model = thermal_field(4, 5, 1)
-    log = Log(model.width)
-    for k in (0, 1):
-        log.extend(Events.one(k * 10**9, 0, READING, 0, [np.nan], model.width))
+    log = log_of(model.width, (0, READING, np.nan), (1, READING, np.nan))
     tuning = Tuning.of(model).set("p.diffusivity", 0.0).set("p.relaxation", 1e6).set("p.heating", 0.0)
     fold = folded("etkf", model, log, tuning.set("Q.temperature", 3.0).with_options({"members": 10_000}))
     i, j = np.divmod(np.arange(20), 5)

@@ -15,7 +15,7 @@ from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceMo
 from estimators.models import MODELS
 from estimators.models.motor_drive import COPPER, MOTOR_DRIVE
 from estimators.models.road_car import ROAD_CAR
-from tests.models import first_state
+from tests.models import complex_step, first_state
 from tests.skips import recorded
 
 P = {item.name: k for k, item in enumerate(MOTOR_DRIVE.parameters)}
@@ -70,18 +70,15 @@ def test_jacobians_match_central_differences_at_random_states(name: str) -> None
         x = mean + std * rng.standard_normal(model.nx)
         u = np.array([item.default for item in model.inputs]) + rng.normal(0.0, 20.0, model.nu)
         for function, rows in calls:
-            exact, near = np.empty((rows, model.nx)), np.empty((rows, model.nx))
+            near = np.empty((rows, model.nx))
             for j in range(model.nx):
-                z, out = x.astype(complex), np.empty(rows, complex)
-                z[j] += 1e-20j
-                function(z, u, out)
-                exact[:, j] = out.imag / 1e-20
                 step = 1e-4 * std[j]
                 high, low = np.empty(rows), np.empty(rows)
                 function(x + step * (np.arange(model.nx) == j), u, high)
                 function(x - step * (np.arange(model.nx) == j), u, low)
                 near[:, j] = (high - low) / (2.0 * step)
             # Rounding: 1e-16 of values up to 1e3 over a step of at least 1e-6; truncation: step² of third derivatives.
+            exact = complex_step(lambda z, out, of=function, u=u: of(z, u, out), x, rows)
             np.testing.assert_allclose(exact, near, rtol=1e-6, atol=1e-6)
 
 
@@ -290,13 +287,9 @@ def test_drive_s_own_jacobian_is_the_complex_step_of_its_step() -> None:
     for _ in range(100):
         x, dt = rng.uniform(0.0, 150.0, 4), rng.uniform(0.01, 1.0)
         u = drive(*(rng.uniform(-1.0, 1.0, 3) * [100.0, 250.0, 500.0]))
-        own, exact, out = np.empty((4, 4)), np.empty((4, 4)), np.empty(4, complex)
+        own = np.empty((4, 4))
         model.F(x, u, p, dt, own)
-        for j in range(4):
-            z = x.astype(complex)
-            z[j] += 1e-20j
-            model.f(z, u, p, dt, out)
-            exact[:, j] = out.imag / 1e-20
+        exact = complex_step(lambda z, out, u=u, dt=dt: model.f(z, u, p, dt, out), x, 4)
         # Both are exact but for rounding of a few dozen operations on numbers of about one.
         np.testing.assert_allclose(own, exact, rtol=0, atol=1e-14)
 

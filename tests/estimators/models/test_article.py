@@ -9,11 +9,11 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from estimators.diagnostics.score import score
-from estimators.log import READING, TICK, TRUTH, Events, Log
+from estimators.log import READING, TICK, TRUTH, Events
 from estimators.models import MODELS
 from estimators.models.lorenz import LORENZ63, LORENZ96
 from estimators.track import MISSING, USED
-from tests.support import SECOND
+from tests.support import SECOND, as_log
 from tests.support import folded as advanced
 
 
@@ -54,9 +54,7 @@ def example_log(rows):
         t = (k + 1) * SECOND
         batch.append(Events.one(t, t, READING, 0, np.nan if lost else y, 2))
         batch.append(Events.one(t, t, TRUTH, 0, truth, 2))
-    log = Log(2)
-    log.extend(Events.concat(batch, 2))
-    return log
+    return as_log(Events.concat(batch, 2))
 
 
 @pytest.fixture(scope="module")

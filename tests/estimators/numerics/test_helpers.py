@@ -11,12 +11,13 @@ import pytest
 from estimators.compiled.model import compile_model
 from estimators.errors import ModelError
 from estimators.fold import fold
-from estimators.log import READING, Events, Log
+from estimators.log import READING
 from estimators.model.assemble import JointParameter, joint
 from estimators.model.state_space import Noise, Parameter, Row, Sensor, State, StateSpaceModel
 from estimators.numerics.helpers import with_helpers
 from estimators.numerics.jit import jit
 from estimators.tuning import Tuning
+from tests.support import log_of
 
 LIMIT = 41.0
 
@@ -54,10 +55,7 @@ def tank(f=f, h=h):
 
 
 def log():
-    given = Log(2)
-    for k, value in enumerate((40.0, 38.0, 35.0, 31.0)):
-        given.extend(Events.one(k * 10**9, 0, READING, 0, value, 2))
-    return given
+    return log_of(2, *((k, READING, value) for k, value in enumerate((40.0, 38.0, 35.0, 31.0))))
 
 
 @pytest.mark.parametrize("name", ("ekf", "ukf", "pf"))

@@ -188,9 +188,7 @@ def test_ancestors_are_those_that_a_constant_tells(name):
     model = walk_and_constant()
     rng = np.random.default_rng(3)
     log = log_of(1, *((0.2 * k, READING, rng.normal()) for k in range(25)))
-    growing = Fold(name, model, Tuning.of(model).with_options({"particles": 300}), log)
-    # The auxiliary filter resamples before it counts, the others after.
-    growing.advance(20 if name == "apf" else 19)
+    growing = folded(name, model, log, options={"particles": 300}, stop=20 if name == "apf" else 19)
     constants = len(np.unique(weights_of(growing.options, growing._now.state, 2)[1][:, 1]))
     growing.advance()
     assert 1 < constants < 300
@@ -202,11 +200,9 @@ def test_effective_sample_size_before_resampling():
     """1 / Σ w² of w p(y | x), the particles from before the second of two readings at one time."""
     pair = tuple(Sensor(name, (Row("y", "m", 0.04),), h=first_state) for name in ("y", "z"))
     model = scalar(sensors=pair)
-    growing = Fold(
-        "pf", model, Tuning.of(model).with_options({"particles": 300}),
-        log_of(1, (0.0, READING, 2.2, 0), (0.0, READING, 2.4, 1)),
-    )  # fmt: skip
-    growing.advance(1)
+    growing = folded(
+        "pf", model, log_of(1, (0.0, READING, 2.2, 0), (0.0, READING, 2.4, 1)), options={"particles": 300}, stop=1
+    )
     w, records = weights_of(growing.options, growing._now.state.copy(), 1)
     growing.advance()
     w = w * np.exp(-0.5 * (growing.log.value[1, 0] - records[:, 0]) ** 2 / 0.04)

@@ -3,8 +3,6 @@
 Tolerance 1e-9, relative to the size of the quantity, as for the filters (gaussian/test_joint_gaussian.py).
 """
 
-from functools import cache
-
 import numpy as np
 import pytest
 from scipy.linalg import block_diag
@@ -12,27 +10,19 @@ from scipy.linalg import block_diag
 from estimators.errors import EstimatorError
 from estimators.events.maintenance import maintained
 from estimators.fold import Fold
-from estimators.log import READING, RESET, TICK, Events, Log
+from estimators.log import READING, RESET, TICK, Events
 from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
 from estimators.registry import ESTIMATORS
 from estimators.smoothing import moments_back, walk
 from estimators.smoothing.smooth import KINDS, smooth
 from estimators.track import GATED
 from estimators.tuning import Tuning
-from tests.estimators.linear_models import JointGaussian, random_linear, random_log
+from tests.estimators.linear_models import CORRELATED, JointGaussian, case, close, random_linear, random_log
 from tests.models import first_state
-from tests.support import SECOND, folded
+from tests.support import SECOND, as_log, assert_same, folded
 
 GAUSSIAN = [name for name in KINDS if ESTIMATORS[name].family == "Gaussian" and name != "kf-steady"]
-CASES = [(nx, nu, seed) for nx, nu in ((1, 0), (3, 2), (5, 1)) for seed in (0, 2)]
-CORRELATED = 2
-"""The seed of a case whose sensors' rows are correlated."""
-
-
-def close(actual, expected, what):
-    scale = max(1e-3, float(np.max(np.abs(expected))))
-    error = float(np.max(np.abs(np.asarray(actual) - expected))) / scale
-    assert error < 1e-9, f"{what}: off by {error:.1e} of {scale:.3g}"
+CASES = [(nx, nu, seed) for nx, nu in ((1, 0), (3, 2), (5, 1)) for seed in (0, CORRELATED)]
 
 
 def pairs_of(nx):
@@ -51,14 +41,6 @@ def moments(smoothed, nx):
 def smoothed_by(estimator, model, tuning, log):
     fold = folded(estimator, model, log, tuning, pairs=pairs_of(model.nx))
     return moments(smooth(fold), model.nx)
-
-
-@cache
-def case(nx, nu, seed):
-    rng = np.random.default_rng([nx, nu, seed])
-    matrices = random_linear(rng, nx, nu, correlated=seed == CORRELATED)
-    log = random_log(rng, matrices, events=40)
-    return matrices, log, JointGaussian(matrices, log)
 
 
 @pytest.mark.parametrize("estimator", GAUSSIAN)
@@ -156,9 +138,7 @@ class Chain:
 
 
 def body_log(events):
-    log = Log.of(BODY)
-    log.extend(Events.concat(events, 1))
-    return log
+    return as_log(Events.concat(events, 1))
 
 
 def reading(t, y):
@@ -229,13 +209,11 @@ def long_log(n=3000, seed=3, jump=0.0):
     rng = np.random.default_rng(seed)
     t = np.cumsum(rng.integers(1, 40, n)) * (SECOND // 100)
     y = np.cumsum(rng.normal(0, 0.3, n)) + np.where(np.arange(n) < n // 2, 0.0, jump)
-    log = Log.of(BODY)
     readings = Events(t, t, np.full(n, READING, np.int8), np.zeros(n, np.int32), y.reshape(n, 1))
     asked = readings.select(np.arange(0, n, 3))
     between = asked._replace(t=asked.t + SECOND // 300, kind=np.full(asked.t.size, TICK, np.int8))
     at = asked._replace(kind=np.full(asked.t.size, TICK, np.int8))
-    log.extend(Events.concat([readings, between, at], 1))
-    return log
+    return as_log(Events.concat([readings, between, at], 1))
 
 
 @pytest.mark.parametrize("notes", [10_000, 1])
@@ -252,19 +230,16 @@ def test_the_memory_is_bounded_and_the_bits_are_the_same(estimator, notes, monke
 
     monkeypatch.setattr(moments_back, "StepRecorder", noting)
     monkeypatch.setattr(walk, "BATCH_BYTES", notes)
-    for one, other in zip(whole, smooth_with_pairs(estimator, log), strict=True):
-        np.testing.assert_array_equal(one, other)
+    assert_same(whole, smooth_with_pairs(estimator, log))
     assert rooms[0] < 100
 
 
 def test_the_fold_stays_as_it_is():
     log = long_log(500)
-    fold = Fold("ukf", BODY, Tuning.of(BODY), log)
-    fold.advance(300)
+    fold = folded("ukf", BODY, log, stop=300)
     before, state = fold.track.copy(), fold.moments()
     smooth(fold)
-    for one, other in zip(before, fold.track, strict=True):
-        np.testing.assert_array_equal(one, other)
+    assert_same(before, fold.track)
     for one, other in zip(state, fold.moments(), strict=True):
         np.testing.assert_array_equal(one, other)
     fold.advance()
