@@ -27,7 +27,7 @@ from estimators.errors import SourceError
 from sources.source import ignore
 from tests import ROOT
 from tests.app.outputs import test_fleet_alerts as of_fleets
-from tests.app.outputs.test_alerts import Looked, episode, send, started, state
+from tests.app.outputs.test_alerts import Looked, episode, kept_in, send, started, state
 from tests.waiting import LIMIT_S, wait_for
 
 BAD = {"health": "degraded", "cause": "yoke is silent"}
@@ -294,21 +294,16 @@ def test_alerts_are_sent_while_the_disk_is_full(tmp_path, monkeypatch):
 
 
 RUN = """
-import os, signal, sys, json
+import os, signal, sys
 from pathlib import Path
-from app.twin.twin import load_twin
 from app.web.running import OpenedTwin, RunningTwin
 from sources.source import ignore
+from tests.app.outputs.test_alerts import kept_in, started
 from tests.waiting import wait_for
 
 folder, first, value, count = Path(sys.argv[1]), int(sys.argv[2]), float(sys.argv[3]), int(sys.argv[4])
-program = "import sys; open(sys.argv[1], 'a').write(sys.stdin.read() + chr(10))"
-command = [sys.executable, "-c", program, str(folder / "alerts")]
-twin = load_twin("motor_winding", overrides={
-    "source": "{type: push}", "time.tick": "1000",
-    "outputs": json.dumps({"receivers": {"log": {"type": "command", "command": command}}}),
-    "alerts": "[{state: temperature, above: 45, after: 0, clear: 0}]",
-})
+receiver, told = kept_in(folder / "alerts")
+twin = started({"log": receiver})
 running = RunningTwin(OpenedTwin(twin, lambda report: twin.open_source(ignore), store=folder / "a.store"), door=None)
 running.start()
 source = running.engine.innermost
@@ -319,30 +314,25 @@ def stored():
     counts = publisher._parts.deliveries.counts()  # taken, which is stored after the next look
     return source.accepted and running.store.has(source.accepted) and counts == publisher._store._written == [(1, 0)]
 wait_for(stored)
-assert (folder / "alerts").read_text().count("\\n") == count
+assert len(told()) == count
 os.kill(os.getpid(), signal.SIGKILL)
 """
 
 
 def test_a_yaml_that_is_saved_while_an_alert_is_open_does_not_begin_it_again(serve, tmp_path, monkeypatch):
     monkeypatch.setattr("app.outputs.alerts.SETTLE_S", 0.0)
-    program = "import sys; open(sys.argv[1], 'a').write(sys.stdin.read() + chr(10))"
-    receivers = {"log": {"type": "command", "command": [sys.executable, "-c", program, str(tmp_path / "alerts")]}}
+    receiver, told = kept_in(tmp_path / "alerts")
     rule = "{state: temperature, above: 45, after: 0, clear: 0}"
-    twin = started(receivers, f"[{rule}]")
+    twin = started({"log": receiver}, f"[{rule}]")
     page = serve(twin=twin, behind=lambda _: twin.open_source(ignore))
     publisher = page.engine.published = Publisher(page.engine)
-
-    def told():
-        file = tmp_path / "alerts"
-        return [json.loads(line) for line in file.read_text().splitlines()] if file.exists() else []
 
     publisher.start()
     try:
         for k in range(30):
             send(page, k, 50.0)
         wait_for(lambda: len(told()) == 1)
-        first, page.engine.twin = publisher._parts, started(receivers, f"[{{health: stale}}, {rule}]")
+        first, page.engine.twin = publisher._parts, started({"log": receiver}, f"[{{health: stale}}, {rule}]")
         wait_for(lambda: publisher._parts is not first)
         for k in range(30, 80):
             send(page, k, 40.0)
@@ -360,24 +350,19 @@ def test_a_killed_process_is_followed_by_one_that_resolves_its_alert(tmp_path):
             cwd=ROOT, text=True, capture_output=True, timeout=LIMIT_S,
         )  # fmt: skip
         assert ended.returncode == -signal.SIGKILL, ended.stderr
-    told = [json.loads(line) for line in (tmp_path / "alerts").read_text().splitlines()]
+    told = kept_in(tmp_path / "alerts")[1]()
     assert [alert["status"] for alert in told] == ["firing", "resolved"]
     assert told[0]["id"] == told[1]["id"] and told[0]["since"] == told[1]["since"]
 
 
 def test_a_fleet_resolves_after_a_restart_with_its_assets_in_another_order(tmp_path, monkeypatch):
     monkeypatch.setattr("app.outputs.fleet_alerts.SETTLE_S", 0.0)
-    program = "import sys; open(sys.argv[1], 'a').write(sys.stdin.read() + '\\n')"
-    command = [sys.executable, "-c", program, str(tmp_path / "alerts")]
-    outputs = {"every": 0.02, "receivers": {"log": {"type": "command", "command": command}}}
+    receiver, told = kept_in(tmp_path / "alerts")
+    outputs = {"every": 0.02, "receivers": {"log": receiver}}
     given = {"twin": "motor_winding", "source": {"type": "push"}, "outputs": outputs}
     given["alerts"] = [{"health": "degraded", "after": 0, "clear": 0, "group": 0}]
     (tmp_path / "pumps.yaml").write_text(json.dumps(given))
     plan = load_fleet(tmp_path / "pumps.yaml")
-
-    def told():
-        file = tmp_path / "alerts"
-        return [json.loads(line) for line in file.read_text().splitlines()] if file.exists() else []
 
     def run(names, health, count):
         table = of_fleets.table(health)._replace(assets=names)

@@ -180,6 +180,13 @@ class MailServer(socketserver.StreamRequestHandler):
             self.wfile.write(b"221 bye\r\n" if word == b"QUIT" else b"250 ok\r\n")
 
 
+def kept_in(file):
+    """A receiver that appends each alert to a file, and a function that reads all of them."""
+    program = "import sys; open(sys.argv[1], 'a').write(sys.stdin.read() + chr(10))"
+    receiver = {"type": "command", "command": [sys.executable, "-c", program, str(file)]}
+    return receiver, lambda: [json.loads(line) for line in file.read_text().splitlines()] if file.exists() else []
+
+
 def started(receivers, alerts="[{state: temperature, above: 45, after: 0, clear: 0}]"):
     """A twin whose measurements come by `send`, with its publisher."""
     overrides = {"source": "{type: push}", "outputs": json.dumps({"receivers": receivers}), "alerts": alerts}
@@ -197,13 +204,13 @@ def test_every_receiver_gets_the_alert_although_one_is_dead(serve, hook, tmp_pat
     mail.mails = []
     threading.Thread(target=mail.serve_forever, daemon=True).start()
     monkeypatch.setenv("NISUS_TEST_SECRET", "a key")
-    program = "import sys; open(sys.argv[1], 'a').write(sys.stdin.read() + chr(10))"
+    log, told = kept_in(tmp_path / "alerts")
     twin = started({
         "dead": {"type": "webhook", "url": "http://127.0.0.1:9/"},
         "ops": {"type": "webhook", "url": hook.url, "secret_env": "NISUS_TEST_SECRET", "heartbeat": 3600},
         "mail": {"type": "email", "to": "ops@plant", "sender": "nisus@plant", "server": "127.0.0.1",
                  "port": mail.server_address[1]},
-        "log": {"type": "command", "command": [sys.executable, "-c", program, str(tmp_path / "alerts")]},
+        "log": log,
     })  # fmt: skip
     page = serve(twin=twin, behind=lambda _: twin.open_source(ignore))
     publisher = page.engine.published = Publisher(page.engine, page="http://127.0.0.1:9900")
@@ -211,7 +218,7 @@ def test_every_receiver_gets_the_alert_although_one_is_dead(serve, hook, tmp_pat
     try:
         for k in range(30):
             send(page, k, 50.0)
-        wait_for(lambda: len(hook.received) == 2 and mail.mails and (tmp_path / "alerts").exists())
+        wait_for(lambda: len(hook.received) == 2 and mail.mails and told())
         first, alert = sorted(hook.alerts, key=lambda item: item["status"] == "firing")
         assert first["status"] == "heartbeat"
         probability = norm.sf(45.0, alert["value"], alert["std"])
@@ -221,7 +228,7 @@ def test_every_receiver_gets_the_alert_although_one_is_dead(serve, hook, tmp_pat
         signed = headers["X-Nisus-Timestamp"].encode() + b"." + body
         assert headers["X-Nisus-Signature"] == "sha256=" + hmac.new(b"a key", signed, hashlib.sha256).hexdigest()
         assert "Subject: [motor_winding] firing: temperature-above" in mail.mails[0]
-        assert json.loads((tmp_path / "alerts").read_text())["id"] == alert["id"]
+        assert [item["id"] for item in told()] == [alert["id"]]
         wait_for(lambda: page.get("/api/alerts")["receivers"][0]["failing"])
         # The program of the command may not have ended yet.
         wait_for(lambda: [item["waiting"] for item in page.get("/api/alerts")["receivers"]] == [1, 0, 0, 0])

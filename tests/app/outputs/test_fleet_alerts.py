@@ -1,7 +1,6 @@
 """Alerts of fleets: each asset is in alarm as a twin of its own would be, and those of a moment are one message."""
 
 import json
-import sys
 from types import SimpleNamespace
 
 import numpy as np
@@ -19,7 +18,7 @@ from estimators.errors import ConfigError
 from estimators.fleet.fleet import Fleet
 from estimators.models import MODELS
 from estimators.track import HEALTH_NAMES
-from tests.app.outputs.test_alerts import state
+from tests.app.outputs.test_alerts import kept_in, state
 from tests.waiting import wait_for
 
 BEGIN, SECOND = 1_767_225_600 * 10**9, 10**9
@@ -131,10 +130,9 @@ def started(folder, outputs, alerts=()):
 
 
 def test_silent_assets_are_one_alert_of_a_receiver_which_is_resolved(tmp_path, capsys):
-    program = "import sys; open(sys.argv[1], 'a').write(sys.stdin.read() + '\\n')"
-    command = [sys.executable, "-c", program, str(tmp_path / "alerts")]
+    log, received = kept_in(tmp_path / "alerts")
     rule = {"health": "degraded", "after": 0, "clear": 0, "group": 0}
-    fleet = started(tmp_path, {"every": 0.05, "receivers": {"log": {"type": "command", "command": command}}}, [rule])
+    fleet = started(tmp_path, {"every": 0.05, "receivers": {"log": log}}, [rule])
     publisher, source = FleetPublisher(fleet, page="http://127.0.0.1:1"), messages_of(fleet)
 
     def send(first, last, assets):
@@ -143,10 +141,6 @@ def test_silent_assets_are_one_alert_of_a_receiver_which_is_resolved(tmp_path, c
             for k in range(first, last) for a in assets
         ])  # fmt: skip
         fleet.step()
-
-    def received():
-        file = tmp_path / "alerts"
-        return [json.loads(line) for line in file.read_text().splitlines()] if file.exists() else []
 
     send(0, 30, range(5))
     publisher.start()
