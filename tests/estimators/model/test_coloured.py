@@ -1,4 +1,4 @@
-"""Noise that lasts: what filters make of it, beside joint Gaussians in closed form, and simulations."""
+"""Noise that lasts: what filters make of it, beside joint Gaussians in closed form, statsmodels, and simulations."""
 
 import math
 from dataclasses import replace
@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 from scipy.stats import multivariate_normal
+from statsmodels.tsa.statespace.mlemodel import MLEModel
 
 from estimators.compiled.model import compile_model
 from estimators.errors import ModelError
@@ -171,6 +172,20 @@ def test_a_step_is_as_many_shorter_ones(parts, dt):
     np.testing.assert_allclose(together, F, rtol=1e-11, atol=1e-14)
     np.testing.assert_allclose(spread, noise, rtol=1e-10, atol=1e-14)
     np.testing.assert_array_equal(discrete(BOTH, 0.0)[1], 0.0)
+
+
+def test_statsmodels_finds_the_same_likelihood():
+    error = {"gauge": ColouredError((ERROR**2,), ERROR_TIME)}
+    model = coloured(WALK, errors=error)
+    y = 1.0 + np.cumsum(np.random.default_rng(1).normal(0.0, 0.7, 200))
+    kept = np.exp(-1.0 / ERROR_TIME)
+    other = MLEModel(y, k_states=2, k_posdef=2)
+    other["design"], other["obs_cov"] = np.array([[1.0, 1.0]]), np.array([[R]])
+    other["transition"], other["selection"] = np.diag([1.0, kept]), np.eye(2)
+    other["state_cov"] = np.diag([Q, ERROR**2 * (1.0 - kept**2)])
+    other.ssm.initialize_known(np.array([1.0, 0.0]), np.diag([STD**2, ERROR**2]))
+    track = fold("kf", model, Tuning.of(model), log_of(np.arange(200.0), y))
+    np.testing.assert_allclose(track.log_likelihood, other.ssm.filter().llf_obs, rtol=0, atol=1e-9)
 
 
 def test_a_steady_gain_is_that_of_the_kalman_filter_in_the_end():
