@@ -31,7 +31,7 @@ from estimators.errors import ConfigError
 from estimators.fold import Fold
 from estimators.log import READING, Log
 from estimators.model.parts import Field
-from tests.app.scripted import Scripted
+from tests.app.scripted import Scripted, pull_all
 from tests.waiting import wait_for
 
 PLATE = """
@@ -106,10 +106,7 @@ class Running:
         wait_for(lambda: self.engine.status().finished)
 
     def pull(self):
-        cursor = self.engine.cursor()
-        pull = self.engine.pull(cursor)
-        self.engine.release(cursor)
-        return pull
+        return pull_all(self.engine)
 
     def submit(self, command):
         revision = self.engine.status().revision

@@ -22,7 +22,7 @@ from estimators.log import READING, Events, Log
 from estimators.track import DIVERGED, FAILED, USED
 from estimators.tuning import Tuning
 from tests.app.scripted import MODEL, Replayed, Scripted, Stepped, pull_all, readings, row_count, twin
-from tests.support import SECOND, assert_same
+from tests.support import SECOND, as_log, assert_same
 from tests.waiting import wait_for
 
 FIRST = Tuning.of(MODEL)
@@ -51,9 +51,7 @@ def series(n, seed=1):
 
 
 def reference(times, values, estimator="kf", tuning=FIRST):
-    log = Log(1)
-    log.extend(readings(times, values))
-    return fold(estimator, MODEL, tuning, log, pairs=np.array([[0, 1]]))
+    return fold(estimator, MODEL, tuning, as_log(readings(times, values)), pairs=np.array([[0, 1]]))
 
 
 def errors(stepped):
@@ -86,22 +84,25 @@ def test_any_order_and_batches_with_refolds_in_between_equal_one_fold(seed, shar
     engine = stepped.engine
     cursor, rows = engine.cursor(), {}
     left, parts = list(edits), batches(rng, late_order(rng, times, share))
+
+    def take():
+        pull = engine.pull(cursor)
+        if pull.fresh:
+            rows.clear()
+        rows.update(zip(range(pull.first, pull.first + len(pull.events)), pull.track.mean[:, 0], strict=True))
+
     for batch in parts:
         stepped.put(readings(times[batch], values[batch]))
         if left and rng.random() < 0.5:
             engine.submit(left.pop())
             # What arrives before the refold is adopted is in it.
             engine._round(0.0)
-        pull = engine.pull(cursor)
-        rows = {} if pull.fresh else rows
-        rows.update(zip(range(pull.first, pull.first + len(pull.events)), pull.track.mean[:, 0], strict=True))
+        take()
     stepped.submit(*left)
     tuning, estimator = engine.folded_with()
     expected = reference(times, values, estimator, tuning)
     assert_same(pull_all(engine).track, expected)
-    pull = engine.pull(cursor)
-    rows = {} if pull.fresh else rows
-    rows.update(zip(range(pull.first, pull.first + len(pull.events)), pull.track.mean[:, 0], strict=True))
+    take()
     np.testing.assert_array_equal([rows[k] for k in range(400)], expected.mean[:, 0])
 
 

@@ -5,7 +5,6 @@ import pytest
 
 from app.live import commands
 from app.live.counts import last_run
-from app.live.fold_json import tuning_from_json
 from app.twin.twin import load_twin
 from app.views.recording.reader import read_recording
 from app.views.recording.writer import RecordingPart
@@ -13,11 +12,11 @@ from app.web.commands_json import command_from_json
 from app.web.twin_json import status_json
 from estimators.errors import NisusError
 from estimators.events.maintenance import model_versions
-from estimators.fold import fold
-from estimators.log import RESET, Log
+from estimators.log import RESET
 from estimators.registry import ESTIMATORS
 from estimators.track import DIVERGED, GATED, TRACKING, USED
 from tests.app.scripted import MODEL, Stepped, pull_all, readings, row_count, twin
+from tests.app.views.recording.test_parts import refold
 from tests.support import SECOND, assert_same
 
 JUMP = 60
@@ -87,10 +86,7 @@ def test_reset_and_maintenance_are_in_the_recording(name, tmp_path):
     # Of one time, an event of the asset comes before one of the estimate.
     assert np.flatnonzero(recorded.events.kind == RESET).tolist() == [RESET_AT + 1]
     np.testing.assert_array_equal(model_versions(recorded.events), model_versions(pull.events))
-    tuning, estimator = tuning_from_json(recorded.tuning, MODEL)
-    log = Log(MODEL.width)
-    log.extend(recorded.events)
-    assert_same(fold(estimator, MODEL, tuning, log, pairs=np.array([[0, 1]])), pull.track)
+    assert_same(refold(recorded), pull.track)
 
 
 def test_a_reset_stays_where_it_was_when_the_history_is_folded_again():

@@ -18,11 +18,10 @@ import pytest
 from app.live.commands import Record, SetEstimator, SetTuning
 from app.live.compilers import MAX_COMPILERS, Compiler, first_compilers
 from app.live.engine import Engine
-from app.live.fold_json import tuning_from_json
 from app.live.workshop import Workshop
 from app.views.recording.reader import read_recording
 from app.views.recording.writer import Recorder
-from estimators.fold import Fold, fold
+from estimators.fold import Fold
 from estimators.log import Log
 from estimators.numerics.cache import cache_folder
 from estimators.numerics.jit import threaded
@@ -30,7 +29,10 @@ from estimators.pieces import LOOP, Piece, is_made, pieces_of
 from estimators.registry import ESTIMATORS
 from estimators.tuning import Tuning
 from sources.pieces import FRAMES
+from tests.app.live.test_engine import reference as cold
+from tests.app.live.test_engine import series
 from tests.app.scripted import MODEL, Scripted, fresh_status, pull_all, readings, row_count, twin
+from tests.app.views.recording.test_parts import refold
 from tests.support import assert_same
 from tests.waiting import LIMIT_S, wait_for
 
@@ -89,17 +91,6 @@ def started(shop):
     yield start
     for engine in engines:
         engine.stop()
-
-
-def series(n, seed=1):
-    rng = np.random.default_rng(seed)
-    return np.arange(1, n + 1) * 0.01, 40 + np.cumsum(rng.normal(size=n)) * 0.1 + rng.normal(size=n)
-
-
-def cold(times, values, estimator, tuning=None):
-    log = Log(1)
-    log.extend(readings(times, values))
-    return fold(estimator, MODEL, tuning or Tuning.of(MODEL), log, pairs=np.array([[0, 1]]))
 
 
 def begun(tmp_path, piece):
@@ -199,10 +190,7 @@ def test_a_recording_that_begins_before_the_first_filter_holds_all_of_it(started
     recorder.stop()
     recorded = read_recording(tmp_path / "run.rrd")
     np.testing.assert_array_equal(recorded.events.value[:, 0], values)
-    tuning, estimator = tuning_from_json(recorded.tuning, MODEL)
-    log = Log(1)
-    log.extend(recorded.events)
-    assert_same(fold(estimator, MODEL, tuning, log, pairs=np.array([[0, 1]])), cold(times, values, "kf"))
+    assert_same(refold(recorded), cold(times, values, "kf"))
     assert recorded.base is None
 
 

@@ -1,6 +1,5 @@
 """Tuning versions: kept, listed, applied, accepted, named in what comes out; and what is wrong with one is said."""
 
-import json
 import shutil
 import tempfile
 from dataclasses import replace
@@ -11,11 +10,9 @@ import pyarrow.parquet
 import pytest
 import yaml
 
-from app.cli.arguments import FoldCommand, TuningsCommand
+from app.cli.arguments import FoldCommand
 from app.cli.fold import fold_twin
-from app.cli.main import main
 from app.cli.open_twin import recorded_twin
-from app.cli.tunings import tunings_of
 from app.live.tunings.tuning_yaml import tuning_yaml, with_tuning
 from app.live.tunings.versions import Settings, accept, keep, load_into, version_text
 from app.twin.log_reader import read_log
@@ -27,14 +24,6 @@ from estimators.errors import ConfigError
 from estimators.fit.uncertainty import ParameterWidths
 from estimators.registry import ESTIMATORS
 from tests.app.web.page.browsed import running, settled
-
-
-@pytest.fixture
-def own(tmp_path):
-    """A twin of one's own: a copy of one that ships, which is linear and small."""
-    path = tmp_path / "winding.yaml"
-    shutil.copy(TWINS / "motor_winding.yaml", path)
-    return path
 
 
 def same(a, b):
@@ -64,6 +53,12 @@ def applied(twin, estimator, tuning, **more):
         path = Path(folder) / "tried.yaml"
         path.write_text(version_text(twin, Settings(estimator, tuning, **more)), encoding="utf-8")
         return load_twin(twin.path, overrides={"tuning": str(path)})
+
+
+def kept(twin, name="quiet", tuning=None):
+    """Keep a version, by default one that believes its sensor more."""
+    tuning = tuning or twin.tuning.set("R.winding", 0.5)
+    return keep(twin, name, version_text(twin, Settings("kf", tuning)))
 
 
 either = pytest.mark.parametrize("back_of", [pasted, applied])
@@ -205,21 +200,21 @@ def test_how_long_errors_last_stands_beside_their_size():
     assert "over: 120}" in tuning_yaml(twin.config, "ekf", twin.tuning)
 
 
-def test_what_a_version_does_not_say_stays_the_twins(own):
+def test_what_a_version_does_not_say_stays_the_twins(winding):
     """A limit that was added after the version was kept holds with it."""
-    twin = load_twin(own)
-    path = keep(twin, "quiet", version_text(twin, Settings("kf", twin.tuning.set("R.winding", 0.5))))
-    own.write_text(own.read_text().replace("winding: {variance: 4}", "winding: {variance: 4, range: [0, 200]}"))
-    back = load_twin(own, overrides={"tuning": "quiet"})
-    assert path == own.with_name("winding.tunings") / "quiet.yaml"
+    twin = load_twin(winding)
+    path = kept(twin)
+    winding.write_text(winding.read_text().replace("winding: {variance: 4}", "winding: {variance: 4, range: [0, 200]}"))
+    back = load_twin(winding, overrides={"tuning": "quiet"})
+    assert path == winding.with_name("winding.tunings") / "quiet.yaml"
     assert back.tuning.get("R.winding") == 0.5 and back.config.sensors["winding"].range == ((0.0, 200.0),)
 
 
-def test_the_asset_stays_as_it_is(own):
+def test_the_asset_stays_as_it_is(winding):
     """A simulator draws from the noise that the twin's file believes; what a version assumes is no other asset."""
-    twin = load_twin(own)
-    keep(twin, "quiet", version_text(twin, Settings("kf", twin.tuning.set("R.winding", 0.5).set("Q.rate", 1.0))))
-    said = [read_log(load_twin(own, overrides={"tuning": name}), None)[0] for name in ("own", "quiet")]
+    twin = load_twin(winding)
+    kept(twin, tuning=twin.tuning.set("R.winding", 0.5).set("Q.rate", 1.0))
+    said = [read_log(load_twin(winding, overrides={"tuning": name}), None)[0] for name in ("own", "quiet")]
     for a, b in zip(*(log.events for log in said), strict=True):
         np.testing.assert_array_equal(a, b)
 
@@ -234,29 +229,25 @@ def test_another_filter_and_no_options():
     assert dict(bare.tuning.options) == {}
 
 
-def test_the_command_line_has_the_last_word(own):
-    twin = load_twin(own)
-    keep(twin, "quiet", version_text(twin, Settings("kf", twin.tuning.set("R.winding", 0.5))))
+def test_the_command_line_has_the_last_word(winding):
+    kept(load_twin(winding))
     for key, value in (("R.winding", 3.0), ("sensors.winding.variance", 3.0)):
-        back = load_twin(own, overrides={"tuning": "quiet", key: str(value)})
+        back = load_twin(winding, overrides={"tuning": "quiet", key: str(value)})
         assert back.tuning.get("R.winding") == value and back.tuning.name == "quiet*"
-    assert load_twin(own, overrides={"tuning": "own"}).tuning.name == "own"
-    assert load_twin(own).tuning.set("R.winding", 3.0).set("R.winding", 4.0).name == "own*"
+    assert load_twin(winding, overrides={"tuning": "own"}).tuning.name == "own"
+    assert load_twin(winding).tuning.set("R.winding", 3.0).set("R.winding", 4.0).name == "own*"
 
 
-def test_kept_listed_compared_accepted(own, capsys):
-    assert main(["tunings", str(own), "--save", "quiet", "--set", "R.winding=0.5", "--note", "a ‘quieter’ sensor"]) == 0
-    with pytest.raises(ConfigError, match=r"quiet\.yaml: there is a version of that name; choose another name"):
-        tunings_of(TuningsCommand(str(own), save="quiet"))
-    tunings_of(TuningsCommand(str(own), save="loud", set=("R.winding=9",)))
-    capsys.readouterr()
-    tunings_of(TuningsCommand(str(own), json=True))
-    listed = {item["name"]: item for item in json.loads(capsys.readouterr().out)}
+def test_kept_listed_compared_accepted(winding, nisus):
+    nisus("tunings", winding, "--save", "quiet", "--set", "R.winding=0.5", "--note", "a ‘quieter’ sensor")
+    refused = nisus.refuses("tunings", winding, "--save", "quiet")
+    assert "quiet.yaml: there is a version of that name; choose another name" in refused
+    nisus("tunings", winding, "--save", "loud", "--set", "R.winding=9")
+    listed = {item["name"]: item for item in nisus("tunings", winding, "--json").json}
     assert set(listed) == {"own", "quiet", "loud"}
     assert listed["own"]["holds"] and listed["quiet"]["note"] == "a ‘quieter’ sensor"
     # What the fold says of itself.
-    fold_twin(FoldCommand(str(own), tuning="quiet", json=True))
-    told = json.loads(capsys.readouterr().out)
+    told = nisus("fold", winding, "--tuning", "quiet", "--json").json
     assert told["tuning"] == "quiet"
     scores = listed["quiet"]["scores"]
     assert scores["nis"] == pytest.approx(told["nis"]["mean"] / told["nis"]["dof"], rel=1e-7)
@@ -264,48 +255,46 @@ def test_kept_listed_compared_accepted(own, capsys):
     assert scores["coverage.rate"] == pytest.approx(told["coverage"]["rate"], rel=1e-7)
     assert scores["log_likelihood"] * told["nis"]["n"] == pytest.approx(told["log_likelihood"], rel=1e-7)
 
-    tunings_of(TuningsCommand(str(own), ("quiet", "loud"), json=True))
-    compared = json.loads(capsys.readouterr().out)
+    compared = nisus("tunings", winding, "quiet", "loud", "--json").json
     assert compared["entries"] == [{"key": "R.winding", "values": [0.5, 9.0]}]
-    assert accepted_version(own) is None
-    before = find_version(own, "quiet")
-    tunings_of(TuningsCommand(str(own), accept="quiet", note="it is"))
-    version = accepted_version(own)
+    assert accepted_version(winding) is None
+    before = find_version(winding, "quiet")
+    nisus("tunings", winding, "--accept", "quiet", "--note", "it is")
+    version = accepted_version(winding)
     assert version.name == "quiet" and version.head.accepted.note == "it is"
     assert version.head.model_copy(update={"accepted": None}) == before.head
     assert {**version.data, "version": 0} == {**before.data, "version": 0}
-    tunings_of(TuningsCommand(str(own)))
-    assert "quiet *" in capsys.readouterr().out
+    assert "quiet *" in nisus("tunings", winding).out
 
 
-def test_the_last_that_was_accepted_holds(own, monkeypatch):
-    twin = load_twin(own)
+def test_the_last_that_was_accepted_holds(winding, monkeypatch):
+    twin = load_twin(winding)
     for k, name in enumerate(("b", "a")):
-        path = keep(twin, name, version_text(twin, Settings("kf", twin.tuning)))
+        path = kept(twin, name)
         monkeypatch.setattr("app.live.tunings.versions.now", lambda k=k: f"2026-11-2{k}T00:00:00Z")
         accept(load_version(path), "")
-    assert accepted_version(own).name == "a"
+    assert accepted_version(winding).name == "a"
 
 
 def test_versions_of_a_twin_that_ships_go_to_the_users_folder(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
     twin = load_twin("motor_winding")
-    path = keep(twin, "quiet", version_text(twin, Settings("kf", twin.tuning)))
+    path = kept(twin)
     assert path == tmp_path / "nisus" / "tunings" / "motor_winding" / "quiet.yaml"
     assert version_files(twin.path)["quiet"] == path and folders(twin.path)[1].parent.name == "tunings"
 
 
-def test_the_name_is_in_every_row_and_recording(own, tmp_path):
-    text = own.read_text()
-    twin = load_twin(own)
+def test_the_name_is_in_every_row_and_recording(winding, tmp_path):
+    text = winding.read_text()
+    twin = load_twin(winding)
     tuning = replace(twin.tuning.set("Q.rate", 1e-4))
     normal = "commissioned:\n  winding: {bias: 0.25}\n"
     keep(twin, "tried", version_text(twin, Settings("kf", tuning, prior={"rate": {"std": 0.7}})) + normal)
-    fold_twin(FoldCommand(str(own), tuning="tried", out=tmp_path / "a.parquet"))
+    fold_twin(FoldCommand(str(winding), tuning="tried", out=tmp_path / "a.parquet"))
     assert set(pyarrow.parquet.read_table(tmp_path / "a.parquet").column("tuning").to_pylist()) == {"tried"}
-    fold_twin(FoldCommand(str(own), tuning="tried", out=tmp_path / "a.rrd"))
+    fold_twin(FoldCommand(str(winding), tuning="tried", out=tmp_path / "a.rrd"))
     # The recording holds the version whole: it is reviewed when that is gone.
-    shutil.rmtree(folders(own)[0])
+    shutil.rmtree(folders(winding)[0])
     back = recorded_twin(read_recording(tmp_path / "a.rrd"))
     assert back.tuning.name == "tried" and back.text == text
     assert back.model.prior_std[back.model.state_names.index("rate")] == 0.7
@@ -326,16 +315,16 @@ def test_the_name_is_in_every_row_and_recording(own, tmp_path):
         (("version:", "versio:"), r"tried\.yaml:2: versio is not known; did you mean version"),
     ],
 )
-def test_what_is_wrong_is_said_with_its_line(own, change, said):
-    twin = load_twin(own)
+def test_what_is_wrong_is_said_with_its_line(winding, change, said):
+    twin = load_twin(winding)
     given = Settings("kf", twin.tuning, note="tried", scores={"nis": 1.0})
     text = version_text(twin, given)
     assert change[0] in text
-    folder = folders(own)[0]
+    folder = folders(winding)[0]
     folder.mkdir()
     (folder / "tried.yaml").write_text(text.replace(change[0], change[1], 1), encoding="utf-8")
     with pytest.raises(ConfigError, match=said):
-        load_twin(own, overrides={"tuning": "tried"})
+        load_twin(winding, overrides={"tuning": "tried"})
 
 
 @pytest.mark.parametrize(
@@ -348,28 +337,24 @@ def test_what_is_no_version_is_said(tmp_path, text, said):
         load_version(path)
 
 
-def test_a_version_that_is_not_there(own, tmp_path):
-    twin = load_twin(own)
-    keep(twin, "quiet", version_text(twin, Settings("kf", twin.tuning)))
+def test_a_version_that_is_not_there(winding, tmp_path):
+    kept(load_twin(winding))
     with pytest.raises(ConfigError, match=r"--tuning quite: winding has no such version; did you mean quiet; see"):
-        load_twin(own, overrides={"tuning": "quite"})
+        load_twin(winding, overrides={"tuning": "quite"})
     with pytest.raises(ConfigError, match=r"no\.yaml: there is no such file; check the path, or see `nisus tunings"):
-        load_twin(own, overrides={"tuning": str(tmp_path / "no.yaml")})
+        load_twin(winding, overrides={"tuning": str(tmp_path / "no.yaml")})
 
 
 @pytest.mark.parametrize("name", ["own", "", "a/b", ".a", "a b", "x" * 61, "a.yaml"])
-def test_a_name_that_is_none(own, name):
-    twin = load_twin(own)
+def test_a_name_that_is_none(winding, name):
     with pytest.raises(ConfigError, match="the version's name is"):
-        keep(twin, name, version_text(twin, Settings("kf", twin.tuning)))
+        kept(load_twin(winding), name)
 
 
-def test_one_that_cannot_be_read_is_listed_beneath_the_others(own, capsys):
-    assert main(["tunings", str(own), "--save", "good"]) == 0
-    (folders(own)[0] / "bad.yaml").write_text("- 1\n")
-    capsys.readouterr()
-    tunings_of(TuningsCommand(str(own)))
-    table, beneath = capsys.readouterr().out.split("Cannot be read")
+def test_one_that_cannot_be_read_is_listed_beneath_the_others(winding, nisus):
+    nisus("tunings", winding, "--save", "good")
+    (folders(winding)[0] / "bad.yaml").write_text("- 1\n")
+    table, beneath = nisus("tunings", winding).out.split("Cannot be read")
     assert [line.split()[0] for line in table.splitlines()[-3:-1]] == ["own", "good"]
     assert "bad.yaml:1: the file is [1]; a tuning version is a mapping" in " ".join(beneath.split())
 

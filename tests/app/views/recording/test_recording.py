@@ -48,11 +48,11 @@ def running():
     recorder.stop()
 
 
-def steady(count):
-    """What a fold gives of `count` readings as the child process below sends them."""
+def steady(count, every=0.005):
+    """Log and track of `count` equal readings, as the child process below sends them."""
     log = Log(MODEL.width)
-    log.extend(readings(np.arange(1, count + 1) * 0.005, np.full(count, 40.0)))
-    return fold("kf", MODEL, Tuning.of(MODEL), log, pairs=np.array([[0, 1]]))
+    log.extend(readings(np.arange(1, count + 1) * every, np.full(count, 40.0)))
+    return log, fold("kf", MODEL, Tuning.of(MODEL), log, pairs=np.array([[0, 1]]))
 
 
 def test_recording_holds_history_late_readings_and_retunes(running, tmp_path):
@@ -208,15 +208,12 @@ def test_killed_process_keeps_what_was_folded_before_its_last_write(tmp_path):
     recorded = read_recording(path)
     assert recorded.rows >= kept[-1] and not recorded.closed
     assert len(kept) > 1 and writer.LOG_PERIOD_S < 1.0
-    assert_same(refold(recorded), steady(recorded.rows))
+    assert_same(refold(recorded), steady(recorded.rows)[1])
 
 
 def test_truncated_recording_keeps_what_is_whole(tmp_path):
     """Cut in the middle of a message, as by a full disk: what was whole before it is there."""
-    times = np.arange(1, 1001) * 0.01
-    log = Log(MODEL.width)
-    log.extend(readings(times, np.full(1000, 40.0)))
-    track = fold("kf", MODEL, Tuning.of(MODEL), log, pairs=np.array([[0, 1]]))
+    log, track = steady(1000, 0.01)
     path = tmp_path / "run.rrd"
     file = RecordingFile(path, twin(), None)
     file.tuning(Tuning.of(MODEL), "kf", 0, 0)
@@ -344,4 +341,4 @@ def test_a_file_that_takes_no_more_is_one_line_and_keeps_what_it_has(tmp_path):
     assert f"recording failed: {path}: it can no longer be written" in said and said.count("recording failed") == 1
     recorded = read_recording(path)
     assert recorded.rows > 10
-    assert_same(refold(recorded), steady(recorded.rows))
+    assert_same(refold(recorded), steady(recorded.rows)[1])

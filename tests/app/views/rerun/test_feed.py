@@ -53,10 +53,7 @@ class Fed:
         return len(self.track().events)
 
     def track(self):
-        cursor = self.engine.cursor()
-        pull = self.engine.pull(cursor)
-        self.engine.release(cursor)
-        return pull
+        return pull_all(self.engine)
 
     def submit(self, command):
         self.engine.submit(command)
@@ -317,14 +314,6 @@ def test_dates_are_dates_and_seconds_are_durations(fed):
     }
     assert kinds and all(pa.types.is_timestamp(kind) for kind in kinds)
     np.testing.assert_array_equal(fed.column("/state/temperature")[0], batch.t)
-
-
-def test_a_history_pulled_in_pieces_is_whole(fed, monkeypatch):
-    monkeypatch.setattr(feed, "MAX_PULL_ROWS", 7)
-    t = np.arange(1, 51) * 0.1
-    fed.put(readings(t, 40 + t))
-    fed.next()
-    np.testing.assert_array_equal(fed.column("/state/temperature")[0], fed.track().events.t)
 
 
 def test_rows_rewritten_between_two_pieces_count_once(fed, monkeypatch):
