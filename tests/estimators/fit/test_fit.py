@@ -4,6 +4,7 @@ The walk x_k = a x_k-1 + w, y_k = x_k + v has y ~ N(H m, H P Hᵀ + R) as a whol
 """
 
 import warnings
+from functools import lru_cache
 
 import numpy as np
 import pytest
@@ -70,15 +71,24 @@ def log_of(ys: np.ndarray) -> Log:
     return log
 
 
+@lru_cache
+def covariances(n: int, rate: float) -> tuple[np.ndarray, np.ndarray]:
+    """Covariance of the states, from the prior and from process noise of variance 1, each (n, n)."""
+    a = 1.0 - rate
+    variance = np.zeros((2, n))
+    variance[0, 0] = 4.0
+    for k in range(1, n):
+        variance[:, k] = a * a * variance[:, k - 1] + (0.0, 1.0)
+    i, j = np.indices((n, n))
+    prior, noise = a ** np.abs(i - j) * variance[:, np.minimum(i, j)]
+    return prior, noise
+
+
 def dense(ys: np.ndarray, q: float, r: float, rate: float = 0.1) -> float:
     """Log density of all readings at once."""
-    n, a = ys.size, 1.0 - rate
-    variance = np.empty(n)
-    variance[0] = 4.0
-    for k in range(1, n):
-        variance[k] = a * a * variance[k - 1] + q
-    i, j = np.indices((n, n))
-    factor = np.linalg.cholesky(a ** np.abs(i - j) * variance[np.minimum(i, j)] + r * np.eye(n))
+    n = ys.size
+    prior, noise = covariances(n, rate)
+    factor = np.linalg.cholesky(prior + q * noise + r * np.eye(n))
     z = solve_triangular(factor, ys, lower=True)
     return float(-0.5 * z @ z - np.log(np.diag(factor)).sum() - 0.5 * n * np.log(2.0 * np.pi))
 
