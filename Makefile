@@ -8,7 +8,8 @@ VERSIONS := tests/constraints.txt
 unexport PYTHONDONTWRITEBYTECODE
 
 # Workers get stretches of tests that follow each other, and share what a file's tests share (servers, folded logs).
-PYTEST := $(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist worksteal
+# Threads of OpenBLAS wait for each other by spinning, on processors that other tests need.
+PYTEST := OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist worksteal
 
 # Tests of what is written in vector instructions, which LLVM splits where a processor's vectors are shorter.
 VECTORS := simd simd_rows linalg inverse_root symmetric
