@@ -5,10 +5,15 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from hypothesis import HealthCheck, settings
 
 from tests.chromium import find_chromium
 from tests.skips import recording, skip_without, summary
 from tests.waiting import TEST_LIMIT_S
+
+# On a busy machine an example takes longer than Hypothesis allows.
+settings.register_profile("patient", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("patient")
 
 DURATIONS = "nisus/durations"
 """In pytest's cache: seconds of each test, the least of all runs, so that neither compiling nor other work counts."""
