@@ -13,7 +13,7 @@ from tests import ROOT
 
 MISSING = {
     "recordings": "recordings are not here (see docs/recordings.md)",
-    "Chromium": "Chromium is not here (Debian: apt install chromium; or NISUS_CHROMIUM=path)",
+    "Chromium": "Chromium is not here (Debian: apt install chromium-headless-shell; or NISUS_CHROMIUM=path)",
     "mosquitto": "mosquitto is not here (Debian: apt install mosquitto)",
     "nginx": "nginx is not here (Debian: apt install nginx-light)",
     "compiler": "a C compiler is not here (Debian: apt install gcc libc6-dev)",
