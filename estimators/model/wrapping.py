@@ -7,19 +7,16 @@ where that is a poor approximation.
 
 from __future__ import annotations
 
-import hashlib
-import inspect
-import uuid
 from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache
-from pathlib import Path
 from typing import Any
+from uuid import UUID
 
 import numpy as np
 
-from ..numerics.helpers import with_helpers
-from ..numerics.jit import jit, plain
+from ..numerics.helpers import source_digest, with_helpers
+from ..numerics.jit import jit, named, plain
 from .state_space import StateSpaceModel
 
 
@@ -28,14 +25,12 @@ def as_inner(function: Callable) -> Any:
     """Compile a model's function for a wrapper to call, under a name by which Numba's cache finds it again.
 
     The cache distinguishes closures by their enclosed values, and compiled functions by an identifier that is random in
-    every process. An identifier made from the source finds the code that another process compiled from that source.
+    every process. An identifier made from the source and from what it encloses finds the code that another process
+    compiled.
     """
     python = with_helpers(plain(function))
     inner = jit(python)
-    file = inspect.getsourcefile(python)
-    source = Path(file).read_bytes() if file and Path(file).is_file() else uuid.uuid4().bytes
-    key = hashlib.sha256(source + f"{python.__module__}.{python.__qualname__}".encode()).hexdigest()
-    inner._set_uuid(str(uuid.UUID(key[:32])))
+    inner._set_uuid(str(UUID(source_digest([python])[:32])))
     return inner
 
 
@@ -96,6 +91,7 @@ def _indicator(model: StateSpaceModel) -> StateSpaceModel:
     )
 
 
+@named
 @jit
 def _between(m, count):
     """Return the lower of the two modes next to m, and the fraction of the way to the upper one."""
@@ -109,6 +105,7 @@ def _between(m, count):
     return low, m - low
 
 
+@named
 @jit
 def _moments(c, part):
     """Return mean and variance of the next mode, from the chances c (2, modes) of two modes and the second's weight."""

@@ -1,5 +1,8 @@
 """One function appends everything to a model, in one order, and names the part that it cannot append."""
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 
@@ -8,6 +11,7 @@ from estimators.model.coloured import ColouredError
 from estimators.model.correction import Ridge
 from estimators.model.hybrid import LearnedCorrection
 from estimators.models import MODELS
+from tests import ROOT
 
 MODEL = MODELS["motor_winding"]
 RIDGE = Ridge(np.array([[20.0], [30.0], [40.0]]), np.array([[0.1], [0.2], [0.1]]), 1.0)
@@ -53,3 +57,26 @@ def test_what_cannot_be_appended_is_named(given, part, words):
     with pytest.raises(AppendError, match=words) as caught:
         assemble(MODEL, **given)
     assert caught.value.part == part
+
+
+ENCLOSED = """
+import hashlib
+from estimators.model.assemble import JointParameter, assemble
+from estimators.model.instruments import Instrument
+from estimators.models import MODELS
+from numba.core.serialize import dumps
+model = MODELS["motor_drive"]
+instruments = {item.name: Instrument((0.1,)) for item in (model.sensors[0], model.inputs[0])}
+made = assemble(model, instruments=instruments, estimated={model.parameters[0].name: JointParameter(0.1)})
+for function in (made.f, made.F, made.sensors[0].h, made.sensors[0].H):
+    print(hashlib.sha256(dumps([cell.cell_contents for cell in function.__closure__])).hexdigest())
+"""
+
+
+def test_code_of_a_wrapped_model_is_found_by_another_process():
+    """Numba finds the code of a closure by what it encloses: a wrapper around a wrapper was compiled in each process."""
+    one, two = (
+        subprocess.run([sys.executable, "-c", ENCLOSED], cwd=ROOT, capture_output=True, text=True, check=True).stdout
+        for _ in range(2)
+    )
+    assert one == two and len(set(one.split())) == 4

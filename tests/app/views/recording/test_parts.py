@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from collections import namedtuple
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -475,7 +476,9 @@ def test_memory_does_not_grow_with_what_was_written(tmp_path):
 def test_a_terminal_that_closes_leaves_a_whole_recording(name, tmp_path):
     path = tmp_path / "run.rrd"
     words = ["run", "motor_winding", "--headless", "--record", str(path)]
-    child = subprocess.Popen([sys.executable, "-m", "app.cli.main", *words], cwd=ROOT)
+    # Under `nohup` a process and its children ignore SIGHUP.
+    reset = partial(signal.signal, getattr(signal, name), signal.SIG_DFL)
+    child = subprocess.Popen([sys.executable, "-m", "app.cli.main", *words], cwd=ROOT, preexec_fn=reset)
     try:
         wait_for(lambda: path.exists() and path.stat().st_size > 2000)
         os.kill(child.pid, getattr(signal, name))
