@@ -134,7 +134,7 @@ def named(made: Any) -> Any:
 
 
 def inlined(function: Callable[..., Any]) -> Any:
-    """`jit` for helpers that stand inside a filter's step: a call that hands over context and arrays costs 50 to 100 ns."""
+    """`jit` for helpers inside a filter's step, where a call that hands over context and arrays costs 50 to 100 ns."""
     return named(jit(function, inline="always"))
 
 

@@ -74,7 +74,7 @@ for function in (made.f, made.F, made.sensors[0].h, made.sensors[0].H):
 
 
 def test_code_of_a_wrapped_model_is_found_by_another_process():
-    """Numba finds the code of a closure by what it encloses: a wrapper around a wrapper was compiled in each process."""
+    """Numba finds the code of a closure by what it encloses, also that of a wrapper around a wrapper."""
     one, two = (
         subprocess.run([sys.executable, "-c", ENCLOSED], cwd=ROOT, capture_output=True, text=True, check=True).stdout
         for _ in range(2)
