@@ -85,7 +85,8 @@ class ReaderJob(Job):
         """
         super().__init__(path.name, lambda job: self._read(function, path, args))
         self.item: Any = None
-        self.answer: dict[str, Any] | None = None
+        self.answer: tuple[Any, dict[str, Any]] = (None, {})
+        """The answer of an item, and that item."""
         self._then = then
         threading.Thread(target=self.run, name="log", daemon=True).start()
 
@@ -155,12 +156,13 @@ class DroppedLogs:
         running = not job.over  # asked before its item, which is the last one once it has ended
         if running and job.item is None:
             return {"name": path.name, "state": "reading", "seconds": job.seconds}
-        if job.item is None:
+        item = job.item
+        if item is None:
             return {"name": path.name, "state": "failed", "error": self._words(job.error or "")}
-        if job.answer is None or job.answer["roles"] is None:
-            job.answer = self._answer(path, job.item)
+        if job.answer[0] is not item:
+            job.answer = item, self._answer(path, item)
         unproposed = None if job.error is None else self._words(job.error)
-        return {**job.answer, "proposing": running, "unproposed": unproposed}
+        return {**job.answer[1], "proposing": running, "unproposed": unproposed}
 
     def _answer(self, path: Path, found: LogOverview) -> dict[str, Any]:
         answer = found.as_json()

@@ -88,10 +88,10 @@ def test_a_drag_is_one_run_and_its_undo_is_every_browsers(visit, session):
     other = visit(session.url)
     first, began = engine.revisions.runs[-1].number, engine.tuning.q[0]
     slider = page.locator('[data-key^="Q."] input[type=range]').first
+    slider.hover()  # Waits until its place is final.
+    page.mouse.down()
     box = slider.bounding_box()
     across = lambda share: page.mouse.move(box["x"] + share * box["width"], box["y"] + box["height"] / 2)  # noqa: E731
-    across(0.5)
-    page.mouse.down()
     for step in range(1, 17):
         # Each value is folded before the next: without a gesture they were 16 runs.
         before = engine.status().revision
