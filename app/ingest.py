@@ -19,7 +19,6 @@ MAINTENANCE = "maintenance"  # key of maintenance
 PAUSED = "paused"  # key of pauses of a source, over which inputs are unknown
 PAUSE_PERIODS = 3.0  # median periods of a source beyond which a gap may be a pause: some log once a minute
 PERIODS = 20  # latest periods of which the median is taken
-MIN_STEP_BACK_NS = 10**9  # by which arrivals go back if this machine's clock was set; those of a moment are unordered
 
 
 class Planned(NamedTuple):
@@ -57,6 +56,7 @@ class Ingest:
         report: Report,
         planned: Sequence[Planned] = (),
         unknown: UnknownInputs | None = None,
+        utc: bool = False,
     ) -> None:
         """Prepare for a source of this model.
 
@@ -66,17 +66,14 @@ class Ingest:
             report: Receives rejections, corrections and maintenance.
             planned: Maintenance by the YAML; a recording's log contains it already.
             unknown: Pauses over which the inputs are unknown, by the YAML; a recording's log contains them already.
+            utc: See `ClockGuard`.
         """
         self._model, self._report = model, report
-        self._guard = None if horizon is None else ClockGuard(len(model.sensors), horizon)
+        self._guard = None if horizon is None else ClockGuard(len(model.sensors), horizon, utc)
         self._planned = [] if horizon is None else sorted(planned, key=lambda item: item.at)
         self._unknown = None if horizon is None else unknown
         self._newest = BEFORE
         self._periods = deque[int](maxlen=PERIODS)
-        self._step_back = max(MIN_STEP_BACK_NS, horizon or 0)
-        self._arrived = BEFORE
-        self._set_back = 0
-        """Time by which this machine's clock was set back since the first event, ns."""
 
     @property
     def held(self) -> int:
@@ -85,9 +82,8 @@ class Ingest:
 
     def state(self) -> dict[str, Any]:
         """Return a copy of the state for `restore`, of arrays, lists and numbers."""
-        own = {"newest": self._newest, "arrived": self._arrived, "set_back": self._set_back}
         guard = None if self._guard is None else self._guard.state()
-        return own | {"periods": [*self._periods], "guard": guard}
+        return {"newest": self._newest, "periods": [*self._periods], "guard": guard}
 
     def restore(self, state: Mapping[str, Any], newest: int) -> None:
         """Continue from the `state` of another; `newest` is the time of the log's newest event, ns.
@@ -95,8 +91,7 @@ class Ingest:
         Raises:
             ValueError: If it is of another model.
         """
-        self._newest, self._arrived = int(state["newest"]), int(state["arrived"])
-        self._set_back = int(state["set_back"])
+        self._newest = int(state["newest"])
         self._periods.extend(state["periods"])
         self._planned = [item for item in self._planned if item.at > newest]
         if self._guard is not None and state["guard"] is not None:
@@ -106,31 +101,7 @@ class Ingest:
         """Return those of the next events, in order of arrival, that enter the log."""
         if self._guard is None:
             return Passed(batch, np.zeros(len(batch), np.bool_), [], [])
-        return self._reported(self._guard.take(self._arrivals_in_order(batch)))
-
-    def _arrivals_in_order(self, batch: Events) -> Events:
-        """Return the events with arrivals as if this machine's clock had not been set back.
-
-        `ClockGuard` finds a step of the source's clock in t - arrival, where a step of both does not show.
-        """
-        live = np.flatnonzero(batch.arrival != batch.t)
-        if not live.size:
-            return batch
-        arrival = batch.arrival[live] + self._set_back
-        while True:
-            before = np.maximum.accumulate(np.concatenate(([self._arrived], arrival)))[:-1]
-            back = np.flatnonzero(arrival < before - self._step_back)
-            if not back.size:
-                break
-            step = int(before[back[0]] - arrival[back[0]])
-            arrival[back[0] :] += step
-            self._set_back += step
-        self._arrived = int(max(self._arrived, arrival.max()))
-        if not self._set_back:
-            return batch
-        arrivals = batch.arrival.copy()
-        arrivals[live] = arrival
-        return batch._replace(arrival=arrivals)
+        return self._reported(self._guard.take(batch))
 
     def finish(self) -> Passed:
         """Return the events that are held at the end of the source."""
@@ -140,9 +111,10 @@ class Ingest:
 
     def _reported(self, passed: Passed) -> Passed:
         for refused in passed.refused:
-            self._report(WRONG_TIME, self._refusal(refused))
+            self._report(WRONG_TIME, refusal(self._named(refused.kind, refused.channel), refused))
         for by in dict.fromkeys(moved.by for moved in passed.moved):
-            self._report(CLOCK_MOVED, self._move([moved for moved in passed.moved if moved.by == by]))
+            moved = [item for item in passed.moved if item.by == by]
+            self._report(CLOCK_MOVED, clock_moved([self._named(item.kind, item.channel) for item in moved], moved))
         while self._planned and len(passed.events) and self._planned[0].at <= passed.events.t.max():
             item = self._planned.pop(0)
             self._report(MAINTENANCE, maintenance_text(item.what, item.states, self._model))
@@ -186,20 +158,22 @@ class Ingest:
             return self._model.sensors[channel].name
         return "the inputs" if kind == INPUT else "the true states"
 
-    def _refusal(self, refused: Refused) -> str:
-        ahead = (refused.t - refused.expected) * 1e-9
-        return (
-            f"{self._named(refused.kind, refused.channel)}: its time, {refused.t * 1e-9:.9g} s, is {ahead:.6g} s after "
-            "the newest, and the next events do not confirm it; rejected"
-        )
 
-    def _move(self, moved: Sequence[Moved]) -> str:
-        """Return the line for channels whose clock made one step; all of one source share its clock."""
-        by, begun = moved[0].by * 1e-9, min(item.t for item in moved) * 1e-9
-        names = [self._named(item.kind, item.channel) for item in moved]
-        named = ", ".join(names[:6]) + (f" and {len(names) - 6} more" if len(names) > 6 else "")
-        whose, where = "its" if len(names) == 1 else "their", "ahead" if by > 0 else "back"
-        return (
-            f"{named}: {whose} clock was set {abs(by):.6g} s {where} at {begun:.9g} s; times from there on are "
-            "corrected by it (if the rows are out of order, sort them by time)"
-        )
+def refusal(name: str, refused: Refused) -> str:
+    """Return the line for a rejected event of a channel."""
+    ahead = (refused.t - refused.expected) * 1e-9
+    return (
+        f"{name}: its time, {refused.t * 1e-9:.9g} s, is {ahead:.6g} s after the newest, and the next events do not "
+        "confirm it; rejected"
+    )
+
+
+def clock_moved(names: Sequence[str], moved: Sequence[Moved]) -> str:
+    """Return the line for channels whose clock made one step; all of one source share its clock."""
+    by, begun = moved[0].by * 1e-9, min(item.t for item in moved) * 1e-9
+    named = ", ".join(names[:6]) + (f" and {len(names) - 6} more" if len(names) > 6 else "")
+    whose, where = "its" if len(names) == 1 else "their", "ahead" if by > 0 else "back"
+    return (
+        f"{named}: {whose} clock was set {abs(by):.6g} s {where} at {begun:.9g} s; times from there on are corrected "
+        "by it (if the rows are out of order, sort them by time)"
+    )

@@ -198,7 +198,7 @@ class TakenPackets:
 class MqttSource:
     """Live source of the topics of an MQTT broker; payloads are decoded in the thread that reads."""
 
-    live = True
+    live = utc = True
 
     def __init__(
         self,
@@ -378,7 +378,7 @@ class MqttSource:
 class OpcUaSource:
     """Live source of the nodes of an OPC UA server, by subscription. A value of bad status is missing."""
 
-    live = True
+    live = utc = True
 
     def __init__(
         self, messages: Messages, url: str, nodes: Mapping[str, str], *, period: float, report: Report

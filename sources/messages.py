@@ -60,9 +60,10 @@ CLOSED = Answer(REFUSED, "nothing is folded any more; send it again after a rest
 
 
 class Rows(NamedTuple):
-    """Messages as rows: times (n,) in ns; values and their state (n, columns), see `ChannelMapping`; assets (n,)."""
+    """Messages as rows: times and arrivals (n,), ns; values and their state (n, columns), see `ChannelMapping`."""
 
     t: np.ndarray
+    arrival: np.ndarray
     values: np.ndarray
     state: np.ndarray
     asset: np.ndarray
@@ -118,7 +119,7 @@ class Messages:
         SourceError: If a unit does not convert to the model's.
     """
 
-    live = True
+    live = utc = True
 
     def __init__(
         self, channels: Iterable[Channel], *, width: int, report: Report = ignore, assets: bool = False
@@ -153,7 +154,6 @@ class Messages:
         self.closed = False
         """Whether it takes no messages any more."""
         self._sending = threading.Lock()
-        self._newest: tuple[int, int] | None = None
 
     def send(self, messages: Sequence[Any]) -> list[Answer]:
         """Take messages in their order; return for each what became of it. Wrong ones do not hold up the others."""
@@ -172,7 +172,9 @@ class Messages:
             taken = np.array([answer.status == ACCEPTED for answer in answers], np.bool_)
             if taken.any():
                 names = [item[ASSET] if self._assets and ok else "" for item, ok in zip(messages, taken, strict=True)]
-                rows = Rows(t[taken], values[taken], state[taken], np.array(names, object)[taken])
+                rows = Rows(
+                    t[taken], np.full(taken.sum(), arrival), values[taken], state[taken], np.array(names, object)[taken]
+                )
                 self._room -= rows.t.size
                 self._waiting.put(rows)
         return answers
@@ -261,25 +263,20 @@ class Messages:
         while not self._waiting.empty():
             found.append(self._waiting.get())
         rows = Rows(*map(np.concatenate, zip(*found, strict=True)))
-        latest = int(rows.t.max())
         with self._sending:
             self._room += rows.t.size
             self.mark += rows.t.size
-            if self._newest is None or latest > self._newest[0]:
-                self._newest = latest, time.monotonic_ns()
         plan, skip = np.zeros(rows.t.size, np.int64), np.zeros(rows.t.size, np.int8)
-        # What was buffered on its way, or is history, arrives at once: its arrival would tell nothing of its clock.
-        events, row = self._mapping.events(plan, rows.t, rows.t, rows.values, rows.state, skip)
+        events, row = self._mapping.events(plan, rows.t, rows.arrival, rows.values, rows.state, skip)
         if not self._assets:
             return events
         codes: dict[str, int] = {}
         code = np.array([codes.setdefault(name, len(codes)) for name in rows.asset.tolist()], np.int64)
         return AssetEvents(events, code[row], tuple(codes))
 
-    def now(self) -> int | None:
-        """Return the present time by the clock of the senders, ns: that of the newest message and its age."""
-        newest = self._newest
-        return None if newest is None else newest[0] + time.monotonic_ns() - newest[1]
+    def now(self) -> int:
+        """Return this machine's time, ns, which is that of arrivals."""
+        return time.time_ns()
 
     def close(self) -> None:
         """Refuse all further messages, which nobody would read."""

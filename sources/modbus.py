@@ -65,7 +65,7 @@ def blocks_of(registers: Mapping[str, Register]) -> list[Block]:
 class ModbusSource:
     """Live source of the registers of a device. What the device does not give is missing."""
 
-    live = True
+    live = utc = True
 
     def __init__(
         self,

@@ -104,6 +104,11 @@ def span_of(source: Source) -> tuple[int, int] | None:
     return getattr(source, "span", None)
 
 
+def is_utc(source: Source) -> bool:
+    """Return whether all times of a source, also of one behind faults, are of clocks that are set to UTC."""
+    return getattr(getattr(source, "inner", source), "utc", False)
+
+
 def is_endless(source: Source) -> bool:
     """Return whether a source has no end."""
     return getattr(source, "endless", False)

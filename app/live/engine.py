@@ -20,10 +20,10 @@ import numpy as np
 from estimators.diagnostics.references import withheld_reasons
 from estimators.errors import NisusError
 from estimators.late import inflated
-from estimators.log import TICK, Events
+from estimators.log import INPUT, READING, TICK, Events
 from estimators.registry import find_estimator
 from estimators.snapshots import PERMANENT_SPACING, Base
-from sources.source import controls_of, span_of
+from sources.source import controls_of, is_utc, span_of
 
 from ..ingest import Ingest
 from ..terminal import complain
@@ -102,7 +102,6 @@ class Engine(Running):
         self._workshop.report = lambda text: self.notices.say(text, level="warn")
         if self.twin.forced_baseline:
             self.notices.say(f"the baseline was accepted with --force: {self.twin.forced_baseline}", level="warn")
-        self._begin_intake()
         self._feeder = Feeder(
             lambda: open_source(self.notices.report),
             self._inbox,
@@ -110,6 +109,7 @@ class Engine(Running):
             restarted=self._restart,
             finished=self._finish,
         )
+        self._begin_intake()
         # One at a time, at the priority of the engine; of the requests that arrive meanwhile only the latest counts.
         self._refolds = Jobs(self.notices, "refold", threads=1, niceness=0)
         # A long history may take minutes: only a function that does not return ends a refold.
@@ -133,8 +133,14 @@ class Engine(Running):
         """Begin a log, of which no event has been judged."""
         self._late = self._taken = self._skipped = 0
         self._intake_state = {}
+        twin = self.twin
         self._intake = Ingest(
-            self.model, self._horizon, self.notices.report, self.twin.maintenance, self.twin.unknown_inputs
+            self.model,
+            self._horizon,
+            self.notices.report,
+            twin.maintenance,
+            twin.unknown_inputs,
+            is_utc(self._feeder.source),
         )
 
     def _go_on_from(self, tail: LogTail) -> None:
@@ -350,7 +356,7 @@ class Engine(Running):
                 events, late = inflated(events, self._fold, self._log.newest, self._horizon)
                 self._late += late
             stale = self._take(events, self._horizon, passed.settled)
-            if taken or mark is None:
+            if np.count_nonzero((events.kind == READING) | (events.kind == INPUT)) > stale:
                 self._idle_ticks.broken(self._log.newest)
             if self._log.n:
                 self._watchers.silence.broken()

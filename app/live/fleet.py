@@ -16,11 +16,13 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from estimators.errors import NisusError, SourceError, is_blank, quoted
+from estimators.events.clocks import ClockGuard
 from estimators.fleet.table import FleetTable
-from estimators.log import BEFORE
+from estimators.log import BEFORE, READING, Events
 from estimators.track import STALE
-from sources.source import NO_ASSET, Acknowledging, AssetEvents, Marked, Report
+from sources.source import NO_ASSET, WRONG_TIME, Acknowledging, AssetEvents, Marked, Report, is_utc
 
+from ..ingest import CLOCK_MOVED, clock_moved, refusal
 from ..twin.fleet import FleetPlan
 from ..twin.twin import Twin
 from .fold_json import tuning_to_json
@@ -28,7 +30,7 @@ from .silent_assets import SilentAssets
 from .store import RETRY_PERIOD_S, Store
 
 if TYPE_CHECKING:
-    from estimators.log import Events
+    from estimators.events.clocks import Passed
 
 FIRST_ROOM = 256
 """Assets for which there is room at the start, unless their number is given; it is doubled as they come."""
@@ -109,6 +111,11 @@ class RunningFleet:
         self.fleet = plan.fleet(self._most or max(FIRST_ROOM, len(self.names)), threads)
         self._silent = SilentAssets(self.fleet)
         self._last = np.full(len(self.fleet.assets), BEFORE, np.int64)
+        self._heard = self._last.copy()
+        """Arrival of the last event of each asset, ns."""
+        begun = time.time_ns() - time.monotonic_ns()
+        self.clock: Callable[[], int] = lambda: begun + time.monotonic_ns()
+        """This machine's time, ns, without the steps of its clock since the start."""
         self._newest = self._looked = BEFORE
         self._silence = round(plan.twin.policy.degraded_after * 1e9)
         self._pending = 0
@@ -134,6 +141,8 @@ class RunningFleet:
         self._store = None if store is None else Store(store)
         try:
             self.source = plan.open(self.note, stored=store is not None)
+            horizon = round(plan.twin.config.time.horizon * 1e9)
+            self._guard = ClockGuard(self._last.size, horizon, True) if is_utc(self.source) else None
             if self._store is not None:
                 self._continue(self._store)
         except BaseException:
@@ -176,6 +185,8 @@ class RunningFleet:
             self.archive.start()
         while go_on() and self.step():
             pass
+        if self._guard is not None:
+            self._enter(self._guard.finish())
         self._fold()
         self._keep()
 
@@ -203,7 +214,7 @@ class RunningFleet:
         batch: Any = self.source.read(READ_S)
         if batch is None:
             self._fold()
-            self._query(self._newest, 0)
+            self._query(0)
             self.ended = True
             self.version += 1
             self._keep(at_once=True)
@@ -213,8 +224,7 @@ class RunningFleet:
         if self._pending and (self.source.live or self._pending >= MAX_PENDING):
             self._fold()
         if not self._pending:
-            now = self.source.now()
-            self._query(self._newest if now is None else now, self._silence // TICKS_PER_DELAY)
+            self._query(self._silence // TICKS_PER_DELAY)
             self._keep()
         return True
 
@@ -228,6 +238,27 @@ class RunningFleet:
         known = at != UNKNOWN
         if not known.all():
             at, events = at[known], events.select(known)
+        if self._guard is None:
+            self._take(at, events)
+        else:
+            # To the guard an asset is a sensor: its measurements and inputs are of one clock.
+            own = np.column_stack((events.value, events.kind, events.channel))
+            kinds = np.full(at.size, READING, np.int8)
+            self._enter(self._guard.take(Events(events.t, events.arrival, kinds, at.astype(np.int32), own)))
+
+    def _enter(self, passed: Passed) -> None:
+        """Take what the guard lets pass, and report what it does not."""
+        for refused in passed.refused:
+            self.note(WRONG_TIME, refusal(f"asset {quoted(self.names[refused.channel])}", refused))
+        for by in dict.fromkeys(moved.by for moved in passed.moved):
+            moved = [item for item in passed.moved if item.by == by]
+            self.note(CLOCK_MOVED, clock_moved([f"asset {quoted(self.names[item.channel])}" for item in moved], moved))
+        t, arrival, _, at, own = passed.events
+        if at.size:
+            kind, channel = own[:, -2].astype(np.int8), own[:, -1].astype(np.int32)
+            self._take(at.astype(np.int64), Events(t, arrival, kind, channel, np.ascontiguousarray(own[:, :-2])))
+
+    def _take(self, at: np.ndarray, events: Events) -> None:
         self._newest = max(self._newest, int(events.t.max(initial=BEFORE)))
         self._pending += at.size
         with self._lock:
@@ -237,6 +268,7 @@ class RunningFleet:
             self._unarchived.append((at, events))
         self._changed.update(np.unique(at // BLOCK).tolist())
         np.maximum.at(self._last, at, events.t)
+        self._heard[at] = self.clock()
 
     def _place(self, name: str) -> int:
         """Return the position of an asset, a new one for a new name; UNKNOWN if it is refused."""
@@ -253,20 +285,32 @@ class RunningFleet:
         if len(self.names) == len(self.fleet.assets):
             with self._lock:
                 self.fleet.extend(len(self.names))
-            self._last = np.concatenate([self._last, np.full(self._last.size, BEFORE)])
+            self._last, self._heard = (
+                np.concatenate([column, np.full(column.size, BEFORE)]) for column in (self._last, self._heard)
+            )
+            if self._guard is not None:
+                self._guard.extend(self._last.size)
         place = self._places[name] = len(self.names)
         self.names.append(name)
         return place
 
-    def _query(self, now: int, period: int) -> None:
-        """Show the assets that have been silent for long as of now, if the last look is `period` ns ago."""
+    def _query(self, period: int) -> None:
+        """Show the assets that have been silent for long as of now, if the last look is `period` ns ago.
+
+        Now is of a live source the last time of each asset, and what has gone by since it arrived: its clock need not
+        be that of others.
+        """
+        live = self.source.live
+        now = self.clock() if live else self.source.now()
+        now = self._newest if now is None else now
         if now == BEFORE or now - self._looked < period:
             return
         self._looked = now
-        silent = np.flatnonzero((self._last > BEFORE) & (self._last < now - self._silence))
+        present = self._last + (now - self._heard) if live else np.full(self._last.size, now)
+        silent = np.flatnonzero((self._last > BEFORE) & (present - self._last > self._silence))
         if silent.size:
             with self._lock:
-                self._silent.query(silent, now)
+                self._silent.query(silent, present[silent])
                 self.version += 1
 
     def _identity(self) -> dict[str, Any]:
@@ -299,7 +343,7 @@ class RunningFleet:
         for number in sorted(self._changed):
             part = slice(number * BLOCK, min(len(self.names), (number + 1) * BLOCK))
             blocks["assets", number] = self._silent.state(part)
-            blocks["last", number] = self._last[part].tobytes()
+            blocks["last", number] = np.concatenate((self._last[part], self._heard[part])).tobytes()
         rows, self._unarchived = self._unarchived, []
         try:
             # Before: a kill loses no row that the store has. Messages that it has not come again.
@@ -342,8 +386,12 @@ class RunningFleet:
                 if kind == "assets":
                     self._silent.restore(number * BLOCK, data)
                 elif kind == "last":
-                    times = np.frombuffer(data, np.int64)
-                    self._last[number * BLOCK : number * BLOCK + times.size] = times
+                    last, heard = np.frombuffer(data, np.int64).reshape(2, -1)
+                    part = slice(number * BLOCK, number * BLOCK + last.size)
+                    self._last[part], self._heard[part] = last, heard
+            if self._guard is not None:
+                at = np.flatnonzero(self._last > BEFORE)
+                self._guard.continue_from(at, self._last[at], self._heard[at])
             self._newest, self.archived = state["newest"], state.get("archive")
             self.counts.update(state["counts"])
         if isinstance(self.source, Marked):

@@ -29,15 +29,15 @@ class SilentAssets:
         """Positions of the assets that are silent."""
         return np.fromiter(self._states, np.int64, len(self._states))
 
-    def query(self, places: np.ndarray, t: int) -> None:
-        """Show the estimate and health of assets (rising positions) at a time, ns. All events must be folded."""
+    def query(self, places: np.ndarray, times: np.ndarray) -> None:
+        """Show the estimate and health of assets (rising positions) at their times, ns. All events must be folded."""
         for place in places.tolist():
             known = self._states.get(place)
             if known is None:
                 self._states[place] = self._fleet.state(slice(place, place + 1))
             else:
                 self._fleet.restore(place, known)
-        times, none = np.full(places.size, t), np.zeros(places.size, np.int32)
+        none = np.zeros(places.size, np.int32)
         missing = np.full((places.size, self._fleet.model.width), np.nan)
         self._fleet.add_events(places, Events(times, times, np.full(places.size, TICK, np.int8), none, missing))
         self._fleet.advance()

@@ -82,7 +82,7 @@ class IdleTicks:
         """`tick`: seconds without events before the first prediction."""
         self._tick = tick
         self.since = time.monotonic()
-        """Monotonic time of the last arrival, s."""
+        """Monotonic time of the last arrival of what was used, s."""
         self._newest: int | None = None
 
     def broken(self, newest: int, ago: float = 0.0) -> None:
@@ -96,9 +96,8 @@ class IdleTicks:
         if silent < self._tick:
             return None
         if source.live:
-            assert self._newest is not None
             # Counted from the newest reading: a driver's clock need not be this machine's.
-            now: int | None = self._newest + int(silent * 1e9)
+            now: int | None = (last if self._newest is None else self._newest) + int(silent * 1e9)
         elif (paced := controls_of(source)) is not None and (paced.paused or paced.speed == np.inf):
             # As fast as possible, the playhead is ahead of what has been read.
             now = None

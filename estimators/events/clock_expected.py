@@ -7,8 +7,7 @@ from typing import Any
 
 from numba import types
 
-from ..numerics.jit import B1, I1, I2, i64, inlined, jit_brief
-from .batch import INPUT, READING, TRUTH
+from ..numerics.jit import I1, I2, i64, inlined, jit_brief
 
 SECOND_NS = 10**9
 
@@ -47,11 +46,15 @@ def _reach(state, row, horizon, live):
 
 
 @inlined
-def _judge(state, row, t, arrival, live, horizon):
+def _judge(state, row, t, arrival, live, horizon, utc):
     """Return whether a time fits its channel's clock, or is far ahead or back."""
     everything = state.shape[0] - 1
     if state[row, SEEN] and t < state[row, LAST] - horizon:
         return BACK
+    if utc:
+        # What was buffered, or is history, comes late by any time, but a clock that is right is never ahead.
+        offset = max(0, state[row, OFFSET]) if state[row, SEEN] else 0
+        return FITS if t - arrival <= offset + max(horizon // 2, MIN_OFFSET_TOLERANCE_NS) else AHEAD
     if not state[everything, SEEN]:
         return FITS
     live = live or state[row, LIVE] > 0
@@ -73,6 +76,9 @@ def _note(state, row, t, arrival, live, horizon):
     """Update the expectation of a channel, and of all together, with an accepted time."""
     everything = state.shape[0] - 1
     for k in (row, everything):
+        if live and not state[k, LIVE]:
+            # Of what came before, such as the history in a file, no arrival is known.
+            state[k, OFFSET], state[k, ARRIVED] = t - arrival, arrival
         if not state[k, SEEN]:
             state[k, SEEN], state[k, FIRST], state[k, LAST] = 1, t, t
             state[k, OFFSET], state[k, ARRIVED] = t - arrival, arrival
@@ -92,23 +98,14 @@ def _note(state, row, t, arrival, live, horizon):
             state[k, LIVE] = 1
 
 
-@inlined
-def row_of(kind, channel, sensors):
-    """Return the row of the state for an event; -1 for events that always pass, or that the log rejects."""
-    if kind == READING and 0 <= channel < sensors:
-        return channel
-    return sensors if kind == INPUT else sensors + 1 if kind == TRUTH else -1
-
-
 @jit_brief
-def _scan(state, t, raw, arrival, kind, channel, start, horizon):
+def _scan(state, t, raw, arrival, rows, start, horizon, utc):
     """Accept events from `start` on; return the first that does not fit or whose channel has held events."""
-    sensors = state.shape[0] - 3
     for i in range(start, t.size):
-        row = row_of(kind[i], channel[i], sensors)
+        row = rows[i]
         if row >= 0:
-            live = raw[i] != arrival[i]
-            if state[row, HOLDING] or _judge(state, row, t[i], arrival[i], live, horizon) != FITS:
+            live = utc or raw[i] != arrival[i]
+            if state[row, HOLDING] or _judge(state, row, t[i], arrival[i], live, horizon, utc) != FITS:
                 return i
             _note(state, row, t[i], arrival[i], live, horizon)
     return t.size
@@ -119,7 +116,7 @@ def compiled() -> tuple[Any, Any, Any, Any]:
     """Return the functions, compiled for their only signatures."""
     one = (I2, i64, i64, i64, types.boolean, i64)
     _reach.compile((I2, i64, i64, types.boolean))
-    _judge.compile(one)
+    _judge.compile((*one, types.boolean))
     _note.compile(one)
-    _scan.compile((I2, I1, I1, I1, B1, types.int32[::1], i64, i64))
+    _scan.compile((I2, I1, I1, I1, I1, i64, i64, types.boolean))
     return _reach, _judge, _note, _scan

@@ -34,9 +34,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .batch import INPUT, READING, TRUTH, Events
+from .batch import BEFORE, INPUT, READING, TRUTH, Events
 from .clock_expected import (
     AHEAD,
+    ARRIVED,
     BACK,
     FIRST,
     FITS,
@@ -55,6 +56,7 @@ from .clock_expected import (
     compiled,
 )
 
+MIN_STEP_BACK_NS = SECOND_NS  # By which arrivals go back if this machine's clock was set; a moment's are unordered
 SETTLING_TIME_NS = 2 * SECOND_NS  # Time, by the source's clock, over which held events must agree before they pass
 ZONE_STEP_NS = 900 * SECOND_NS  # Time zones, and daylight saving time, differ by a multiple of 15 minutes
 MAX_HELD, MAX_HELD_LIVE = 1 << 17, 4096  # Largest number of held events of a channel, without and with known arrivals
@@ -63,9 +65,13 @@ MAX_HELD, MAX_HELD_LIVE = 1 << 17, 4096  # Largest number of held events of a ch
 class ClockGuard:
     """Filter between a source and a log: `take` each batch, and `finish` at the end."""
 
-    def __init__(self, sensors: int, horizon: int) -> None:
-        """Guard the events of a model with `sensors` sensors; `horizon` is the log's, ns."""
-        self._sensors, self._horizon = sensors, horizon
+    def __init__(self, sensors: int, horizon: int, utc: bool = False) -> None:
+        """Guard the events of a model with `sensors` sensors.
+
+        `horizon` is the log's, ns. `utc`: the arrivals of all events are known, and their times are those of clocks
+        that are set to UTC, as this machine's.
+        """
+        self._sensors, self._horizon, self._utc = sensors, horizon, utc
         self._agree = min(max(SECOND_NS // 2, horizon // 2), SETTLING_TIME_NS)
         self._settled = max(SETTLING_TIME_NS, 2 * self._agree)
         self._spread = horizon + self._agree
@@ -73,6 +79,7 @@ class ClockGuard:
         self._state = np.zeros((sensors + 3, 11), np.int64)
         self._shift = np.zeros(sensors + 2, np.int64)
         self._steps: list[int] = []
+        self._arrived, self._set_back = BEFORE, 0  # newest arrival; ns by which this machine's clock was set back
         self._runs: dict[int, HeldRun] = {}
         self._held = Events.empty(0)
         self._raw = np.zeros(0, np.int64)
@@ -89,6 +96,8 @@ class ClockGuard:
             "clocks": self._state.copy(),
             "shift": self._shift.copy(),
             "steps": self._steps.copy(),
+            "arrived": self._arrived,
+            "set_back": self._set_back,
             "runs": {row: vars(deepcopy(run)) for row, run in self._runs.items()},
             "held": tuple(self._held),
             "raw": self._raw,
@@ -104,18 +113,34 @@ class ClockGuard:
         if clocks.shape != self._state.shape or shift.shape != self._shift.shape:
             raise ValueError("it is of other sensors")
         self._state, self._shift, self._steps = clocks, shift, list(state["steps"])
+        self._arrived, self._set_back = int(state["arrived"]), int(state["set_back"])
         self._raw = np.array(state["raw"], np.int64)
         held = Events(*map(np.array, state["held"])) if self._raw.size else Events.empty(0)
         self._held = plain_events(held)
         self._runs = {int(row): HeldRun.restored(run) for row, run in state["runs"].items()}
 
+    def extend(self, sensors: int) -> None:
+        """Make room for more sensors, while no inputs or true states are held."""
+        more = sensors - self._sensors
+        self._state = np.insert(self._state, [self._sensors] * more, 0, axis=0)
+        self._shift = np.insert(self._shift, [self._sensors] * more, 0)
+        self._sensors, self._everything = sensors, sensors + 2
+
+    def continue_from(self, sensors: np.ndarray, t: np.ndarray, arrival: np.ndarray) -> None:
+        """Take the last event of each of some sensors as before a restart, at times and arrivals of that shape, ns."""
+        self._state[sensors, SEEN] = self._state[sensors, LIVE] = 1
+        self._state[sensors, LAST] = self._state[sensors, FIRST] = t
+        self._state[sensors, OFFSET], self._state[sensors, ARRIVED] = t - arrival, arrival
+
     def take(self, batch: Events) -> Passed:
         """Take the next events, in order of arrival, and return those that may enter the log now."""
         if not len(batch):
             return Passed(batch, np.zeros(0, np.bool_), [], [])
+        batch = self._arrivals_in_order(batch)
         if not self._runs and not self._shift.any():
             batch = plain_events(batch)
-            at = self._scan(self._state, batch.t, batch.t, *batch[1:4], 0, self._horizon)
+            rows = self._rows_of(batch)
+            at = self._scan(self._state, batch.t, batch.t, batch.arrival, rows, 0, self._horizon, self._utc)
             if at == len(batch):
                 return Passed(batch, np.zeros(len(batch), np.bool_), [], [])
             work = self._work(batch)
@@ -124,13 +149,37 @@ class ClockGuard:
             work = self._work(batch)
             at = work.begin
         while at < len(work.t):
-            columns = work.t, work.raw, work.arrival, work.kind, work.channel
-            stop = int(self._scan(self._state, *columns, at, self._horizon))
+            columns = work.t, work.raw, work.arrival, work.rows
+            stop = int(self._scan(self._state, *columns, at, self._horizon, self._utc))
             work.emit(range(at, stop))
             if stop < len(work.t):
                 self._suspect(work, stop)
             at = stop + 1
         return self._leave(work)
+
+    def _arrivals_in_order(self, batch: Events) -> Events:
+        """Return the events with arrivals as if this machine's clock had not been set back.
+
+        A step of the source's clock shows in t - arrival, where a step of both does not.
+        """
+        live = np.flatnonzero(np.logical_or(self._utc, batch.arrival != batch.t))
+        if not live.size:
+            return batch
+        arrival = batch.arrival[live] + self._set_back
+        while True:
+            before = np.maximum.accumulate(np.concatenate(([self._arrived], arrival)))[:-1]
+            back = np.flatnonzero(arrival < before - max(MIN_STEP_BACK_NS, self._horizon))
+            if not back.size:
+                break
+            step = int(before[back[0]] - arrival[back[0]])
+            arrival[back[0] :] += step
+            self._set_back += step
+        self._arrived = int(max(self._arrived, arrival.max()))
+        if not self._set_back:
+            return batch
+        arrivals = batch.arrival.copy()
+        arrivals[live] = arrival
+        return batch._replace(arrival=arrivals)
 
     def finish(self) -> Passed:
         """Decide on the held events at the end of the source.
@@ -156,16 +205,17 @@ class ClockGuard:
         moved = batch._replace(t=batch.t + np.where(rows >= 0, self._shift[rows], 0))
         events = Events.concat([self._held, moved], batch.value.shape[1]) if self._runs else moved
         rows = np.concatenate((self._rows_of(self._held), rows))
-        return Work(events, rows, np.concatenate((self._raw, batch.t)), len(self._held))
+        return Work(events, rows, np.concatenate((self._raw, batch.t)), len(self._held), self._utc)
 
     def _rows_of(self, batch: Events) -> np.ndarray:
-        """Return the row of the state for each event, as `row_of` does."""
+        """Return the row of the state for each event; -1 for events that always pass, or that the log rejects."""
         reading = (batch.kind == READING) & (batch.channel >= 0) & (batch.channel < self._sensors)
         cases = [reading, batch.kind == INPUT, batch.kind == TRUTH]
         return np.select(cases, [batch.channel, self._sensors, self._sensors + 1], -1).astype(np.int64)
 
     def _verdict(self, work: Work, i: int) -> int:
-        return int(self._judge(self._state, work.rows[i], work.t[i], work.arrival[i], work.live[i], self._horizon))
+        given = work.rows[i], work.t[i], work.arrival[i], work.live[i]
+        return int(self._judge(self._state, *given, self._horizon, self._utc))
 
     def _let_in(self, work: Work, i: int) -> None:
         self._note(self._state, work.rows[i], work.t[i], work.arrival[i], work.live[i], self._horizon)
@@ -198,7 +248,7 @@ class ClockGuard:
             return
         if run is None:
             live = work.live[i] or self._state[row, LIVE] > 0
-            begin = int(self._state[self._everything, LAST])
+            begin = int(self._state[row if self._utc and self._state[row, SEEN] else self._everything, LAST])
             run = self._runs[row] = HeldRun(
                 verdict == AHEAD, live, begin, self._agree, MAX_HELD_LIVE if live else MAX_HELD
             )
@@ -453,12 +503,12 @@ class HeldRun:
 class Work:
     """Held events followed by a batch, and the decisions on them."""
 
-    def __init__(self, events: Events, rows: np.ndarray, raw: np.ndarray, begin: int) -> None:
-        """`rows` (n,) of the state, timestamps `raw` (n,), and the number `begin` of held events."""
+    def __init__(self, events: Events, rows: np.ndarray, raw: np.ndarray, begin: int, utc: bool) -> None:
+        """`rows` (n,) of the state, timestamps `raw` (n,), the number `begin` of held events; `utc` of the guard."""
         self._events = events
         self.t, self.arrival, self.kind, self.channel = events[:4]
         self.rows, self.raw, self.begin = rows, raw, begin
-        self.live = self.raw != self.arrival
+        self.live = np.logical_or(utc, self.raw != self.arrival)
         self.order: list[int] = []
         self.settled: list[bool] = []
         self.refused: list[Refused] = []

@@ -9,7 +9,7 @@ import subprocess
 import sys
 import time
 from contextlib import nullcontext
-from types import SimpleNamespace
+from types import MappingProxyType, SimpleNamespace
 
 import numpy as np
 import pyarrow as pa
@@ -37,11 +37,15 @@ from tests.waiting import LIMIT_S, wait_for
 BEGIN, SECOND = 1_767_225_600 * 10**9, 10**9
 
 
-def running(folder, source, **more):
+def fleet_of(folder, source=MappingProxyType({"type": "push"}), **more):
     path = folder / "pumps.yaml"
-    path.write_text(json.dumps({"twin": "motor_winding", "source": source, **more}))
+    path.write_text(json.dumps({"twin": "motor_winding", "source": {**source}, **more}))
+    return load_fleet(path)
+
+
+def running(folder, source, **more):
     said: list[str] = []
-    found = RunningFleet(load_fleet(path), lambda key, text: said.append(text), threads=1)
+    found = RunningFleet(fleet_of(folder, source, **more), lambda key, text: said.append(text), threads=1)
     return found, said
 
 
@@ -102,17 +106,63 @@ def test_messages_without_the_name_of_an_asset_are_refused(tmp_path):
     fleet.stop()
 
 
-def test_an_asset_that_is_silent_becomes_stale_by_the_clock_of_the_others(tmp_path):
+class Watch:
+    """This machine's time as a test sets it, ns, for the arrival of messages and for the age of assets."""
+
+    def __init__(self, fleet, monkeypatch):
+        self.ns = BEGIN
+        fleet.clock = self
+        monkeypatch.setattr("sources.messages.time", SimpleNamespace(time_ns=self))
+
+    def __call__(self):
+        return self.ns
+
+
+def test_an_asset_that_is_silent_becomes_stale_by_the_clock_of_the_receiver(tmp_path, monkeypatch):
     fleet, _ = running(tmp_path, {"type": "push"})
-    source = messages_of(fleet)
-    source.send([message(k, asset, 40.0) for k in range(5) for asset in ("a", "b")])
-    fleet.step()
-    for k in range(6, 60, 3):
-        source.send([message(k, "b", 40.0)])
+    source, watch, rng = messages_of(fleet), Watch(fleet, monkeypatch), np.random.default_rng(2)
+    for k in range(60):
+        watch.ns = BEGIN + k * SECOND
+        value = rng.normal(40.0, 2.0)
+        source.send([message(k, asset, value) for asset in ("a", "b") if asset == "b" or k < 5])
         fleet.step()
     _, _, table = fleet.table()
     assert HEALTH_NAMES[table.health[0]] == "stale" and table.health[1] in USABLE and table.age[1] == 0.0
-    assert table.age[0] > fleet.plan.twin.policy.stale_after
+    assert table.age[0] == pytest.approx(55.0, abs=3.0)
+    fleet.stop()
+
+
+STEPS_S = (1.0, 60.0, 3600.0, 86_400.0, 315_576_000.0)
+
+
+@pytest.mark.parametrize("stored", [False, True])
+@pytest.mark.parametrize("step", [*STEPS_S, *(-step for step in STEPS_S)])
+def test_a_clock_that_was_wrong_for_a_while_costs_its_asset_seconds_and_no_other(step, stored, tmp_path, monkeypatch):
+    """Wrong from 10 to 15 s and again from 30 to 45 s, in between a restart; what is sent rises."""
+    store = tmp_path / "fleet.db" if stored else None
+    fleet = RunningFleet(fleet_of(tmp_path), lambda *_: None, threads=1, store=store)
+    source, watch, rng = messages_of(fleet), Watch(fleet, monkeypatch), np.random.default_rng(1)
+    for k in range(600):
+        if stored and k == 200:
+            fleet.step()
+            fleet._keep(at_once=True)
+            fleet.stop()
+            fleet = RunningFleet(fleet_of(tmp_path), lambda *_: None, threads=1, store=store)
+            source, fleet.clock = messages_of(fleet), watch
+        at = 0.1 * k
+        watch.ns = BEGIN + k * SECOND // 10
+        wrong = 10.0 <= at < 15.0 or 30.0 <= at < 45.0
+        value = rng.normal(40.0 + 0.1 * at, 2.0)
+        for name in ("a", "b", "c"):
+            off = round(step * SECOND) if wrong and name == "a" else 0
+            source.send([{"asset": name, "values": {"winding": value}, "time": watch.ns + off}])
+        fleet.step()
+        _, _, table = fleet.table()
+        states = [HEALTH_NAMES[health] for health in table.health[:3]]
+        assert not {"stale", "degraded", "lost", "diverged"} & {*states[1:]}, (at, states)
+        if at > 4.0 and not 10.0 <= at < 19.0 and not 30.0 <= at < 34.0 and not 45.0 <= at < 49.0:
+            assert states[0] not in ("stale", "degraded", "lost", "diverged"), (at, states)
+            np.testing.assert_allclose(table.mean[0, 0], table.mean[1, 0], atol=0.5)
     fleet.stop()
 
 

@@ -140,6 +140,7 @@ def test_silent_assets_are_one_alert_of_a_receiver_which_is_resolved(tmp_path, c
             {"time": BEGIN + k * SECOND, "asset": f"pump {a}", "values": {"winding": 40.0 + 2.0 * (-1) ** k}}
             for k in range(first, last) for a in assets
         ])  # fmt: skip
+        fleet.clock = lambda: BEGIN + last * SECOND
         fleet.step()
 
     send(0, 30, range(5))

@@ -47,6 +47,7 @@ def send(fleet, first, last, assets):
         for k in range(first, last) for j, asset in enumerate(assets)
     ]  # fmt: skip
     assert {item.status for item in messages_of(fleet).send(sent)} == {"accepted"}
+    fleet.clock = lambda: BEGIN + last * SECOND
     fleet.step()
 
 

@@ -28,8 +28,8 @@ def events(t, arrival=None, kind=READING, channel=0):
 class Outcome:
     """A stream through guard and log, cut before the events at `cuts`."""
 
-    def __init__(self, stream, cuts=(), horizon=HORIZON, sensors=2):
-        guard, self.log = ClockGuard(sensors, horizon), Log(1)
+    def __init__(self, stream, cuts=(), horizon=HORIZON, sensors=2, utc=False):
+        guard, self.log = ClockGuard(sensors, horizon, utc), Log(1)
         self.stale, self.refused, self.moved = 0, [], []
         edges = [0, *sorted(cuts), len(stream)]
         passed = [guard.take(stream.select(slice(a, b))) for a, b in zip(edges, edges[1:], strict=False)]
@@ -280,6 +280,40 @@ def spoiled(seed):
 
 
 SEEDS = st.integers(0, 2**32 - 1)
+
+
+STEPS = [sign * step for step in (60.0, HOUR, 24 * HOUR, 87_660 * HOUR) for sign in (1, -1)]
+SENT = np.arange(0.0, 60.0, 0.1)
+
+
+@pytest.mark.parametrize("step", STEPS)
+@pytest.mark.parametrize("spans", [[(10, 15)], [(10, 15), (30, 45)], [(0, 5)], [(40, 60)]])
+def test_senders_of_utc_that_are_wrong_for_a_while_lose_nothing(step, spans):
+    """Also where they are wrong from the start, as after a restart of the twin."""
+    wrong = np.any([(first <= SENT) & (last > SENT) for first, last in spans], axis=0)
+    found = Outcome(events(SENT + step * wrong, SENT + DELAY), cuts=range(0, 600, 7), utc=True)
+    assert (found.stale, found.refused) == (0, [])
+    # History may begin at any time: what is back from the start stays where it is, and what follows goes on from there.
+    late = step if spans[0][0] == 0 and step < 0 else 0.0
+    np.testing.assert_allclose(found.seconds, SENT + late * (SENT < 5.0), atol=0.2)
+
+
+@pytest.mark.parametrize("step", STEPS)
+def test_of_two_senders_of_utc_the_one_that_is_right_is_used(step):
+    wrong = (np.arange(600) % 2 == 1) & (SENT < 55.0)
+    found = Outcome(events(SENT + step * wrong, SENT + DELAY), utc=True)
+    assert set(found.numbers) == set(np.flatnonzero(~wrong))
+    assert found.stale + len(found.refused) == wrong.sum() and not found.moved
+
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_a_backlog_is_no_step_of_a_clock(order):
+    """An hour that was buffered comes within a second, in either order; then what is measured now."""
+    buffered, live = np.arange(0.0, HOUR, 1.0)[::order], HOUR + np.arange(1.0, 60.0)
+    arrival = np.concatenate((HOUR + np.linspace(0.0, 0.9, buffered.size), live + DELAY))
+    found = Outcome(events(np.concatenate((buffered, live)), arrival), utc=True)
+    assert not found.refused and not found.moved
+    assert set(range(3600, 3659)) <= set(found.numbers) and (order < 0 or found.stale == 0)
 
 
 @settings(max_examples=150, deadline=None, derandomize=True)
