@@ -50,24 +50,29 @@ INT_COLUMNS = ("group", "kind", "target", "row", "slot", "own_slot", "own_square
 
 tables_type = types.NamedTuple([I1 if name in INT_COLUMNS else F1 for name in Tables._fields], Tables)
 emit_signature = i64(
-    tables_type, I1, B1, F2, types.Array(types.int8, 2, "C"), i64, I1, B1, types.int32[::1], F2, I1, I1, I1
+    tables_type, I1, B1, F2, types.Array(types.int8, 2, "C"), i64, I1, B1, types.int32[::1], F2, I1, I1, I1, I1
 )
 
 
 @jit
 def _own_variance(tables, r, values, state, i):
-    """Return the noise variance of row r that frame i reports; NaN if it is not positive."""
+    """Return the noise variance of row r that frame i reports; NaN if it reports none, infinity if it is unknown.
+
+    Unknown is what is negative, as in messages of ROS, or beyond any variance.
+    """
     slot = tables.own_slot[r]
     own = tables.own_factor[r] * values[i, slot]
-    if state[i, slot] != PRESENT or not own > 0.0:
+    if state[i, slot] != PRESENT or np.isnan(own):
         return np.nan
+    if own < 0.0:
+        return np.inf
     if tables.own_squared[r] == 0:
         own *= own
-    return own if 0.0 < own <= LARGEST else np.nan
+    return np.inf if own > LARGEST else own if own > 0.0 else np.nan
 
 
 @jit
-def emit(tables, plan, skip, values, state, width, source, kind, channel, value, refused, cut, unreported):
+def emit(tables, plan, skip, values, state, width, source, kind, channel, value, refused, cut, unreported, unknown):
     """Write the events of each frame: inputs as one event, then measurements, then true states in blocks.
 
     Returns their number. A block begins with a known state and extends over the width of an event. Columns of `value`
@@ -117,7 +122,7 @@ def emit(tables, plan, skip, values, state, width, source, kind, channel, value,
                 elif tables.kind[c] == TRUTH:
                     truth_event = event
             if good:
-                vague = False
+                vague = lost = False
                 for r in range(tables.row[c], tables.row[c + 1]):
                     converted = tables.factor[r] * values[i, tables.slot[r]] + tables.shift[r]
                     column = r - tables.row[c]
@@ -129,10 +134,16 @@ def emit(tables, plan, skip, values, state, width, source, kind, channel, value,
                     value[event, column] = final if np.isfinite(final) else np.nan
                     if tables.own_slot[r] >= 0 and np.isfinite(final):
                         own = _own_variance(tables, r, values, state, i)
+                        if np.isinf(own):
+                            value[event, column] = own = np.nan
+                            lost = True
+                        else:
+                            vague = vague or np.isnan(own)
                         value[event, width + column] = own
-                        vague = vague or np.isnan(own)
                 if vague:
                     unreported[c] += 1
+                if lost:
+                    unknown[c] += 1
                 if tables.kind[c] == TRUTH and np.isnan(value[event, 0]):
                     n -= 1
                     truth_event = -1
@@ -204,7 +215,7 @@ class ChannelMapping:
         )
         self._columns = width + max((len(c.signals) for c in self._channels if c.accuracy is not None), default=0)
         # Kept, as a frame of a live bus is often alone: allocations would cost as much as its conversion.
-        self._counts = np.zeros((3, len(self._channels)), np.int64)
+        self._counts = np.zeros((4, len(self._channels)), np.int64)
         self._losses = tuple(self._counts)
         self._most = int(np.diff(self._tables.group).max(initial=0))
         # By sensor: a message with two ids has its channels twice here.
@@ -234,21 +245,19 @@ class ChannelMapping:
         source = np.empty(room, np.int64)
         kind, channel = np.empty(room, np.int8), np.empty(room, np.int32)
         value = np.empty((room, self._columns))
-        refused, cut, unreported = self._losses
-        n = emit(
-            self._tables, plan, skip, values, state, self._width, source, kind, channel, value, refused, cut, unreported
-        )
+        out = source, kind, channel, value
+        n = emit(self._tables, plan, skip, values, state, self._width, *out, *self._losses)
         if n < room:
             source, kind, channel, value = source[:n], kind[:n].copy(), channel[:n].copy(), value[:n].copy()
         batch = Events(t[source], arrival[source], kind, channel, value)
         if np.count_nonzero(self._counts):
-            self._report_losses(refused, cut, unreported)
+            self._report_losses(*self._losses)
             self._counts[:] = 0
         for item in self._positions.values():
             self._place(batch, item)
         return batch, source
 
-    def _report_losses(self, refused: np.ndarray, cut: np.ndarray, unreported: np.ndarray) -> None:
+    def _report_losses(self, refused: np.ndarray, cut: np.ndarray, unreported: np.ndarray, unknown: np.ndarray) -> None:
         for k, channel in enumerate(self._channels):
             name, own = channel.name, channel.accuracy
             rule = " and ".join(map(str, channel.where))
@@ -259,6 +268,7 @@ class ChannelMapping:
                 (refused[k], "condition", f"measurement rejected; it needs {rule}"),
                 (cut[k], "short frame", ends),
                 (unreported[k], "accuracy", f"{reported} has no positive {what} of a measurement; the tuned R is used"),
+                (unknown[k], "unknown accuracy", f"{reported} is negative or too large for a {what}; value is missing"),
             ):
                 for _ in range(count):
                     self._report(f"{key} {name}", f"{name}: {text}")

@@ -62,6 +62,11 @@ class AlertMessage(BaseModel):
     response: str = Field(description="response by the guide")
 
 
+def alert_schema() -> dict[str, Any]:
+    """Return the JSON Schema of an alert."""
+    return AlertMessage.model_json_schema()
+
+
 class Finding(NamedTuple):
     """A condition of a rule that holds."""
 

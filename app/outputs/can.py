@@ -27,6 +27,10 @@ if TYPE_CHECKING:
 FRAME = struct.Struct("<fBBB")
 """Value; counter (low four bits) and health; validity; age in steps of 10 ms, 255 for 2.55 s and more."""
 
+VERSION = "Nisus"
+WRITTEN = f'VERSION "{VERSION}"'
+"""Beginning of a DBC that Nisus wrote, and may write again."""
+
 COUNTERS = 16
 MEAN, STD = "mean", "std"
 
@@ -76,6 +80,10 @@ class CanOutput:
 
     def _write(self, path: Path) -> None:
         try:
+            if path.exists() and not path.read_text(encoding="utf-8", errors="replace").startswith(WRITTEN):
+                raise ConfigError(
+                    f"outputs.can.dbc: {path} is not written by Nisus, and is kept; choose another path, or move it"
+                )
             path.write_text(dbc_text(self._section, self._engine), encoding="utf-8")
         except OSError as error:
             raise ConfigError(f"outputs.can.dbc: {path} cannot be written ({error.strerror}); check the path") from None
@@ -193,4 +201,4 @@ def dbc_text(section: CanOutputSection, engine: Running) -> str:
             ]
             identifier = section.id + 2 * k + offset
             messages.append(Message(identifier, f"{name}_{own}", 8, signals, is_extended_frame=section.extended))
-    return str(Database(messages).as_dbc_string())
+    return str(Database(messages, version=VERSION).as_dbc_string())

@@ -26,7 +26,7 @@ from ..live.engine import STATUS_PERIOD_S
 from ..live.faults import catalogue_json
 from ..live.running_fold import Running
 from ..live.runs.refits import Refits
-from ..outputs.alerts import AlertMessage
+from ..outputs.alerts import alert_schema
 from ..present.drawing.colors import EITHER, THEMES
 from ..present.export.alarm_guide import alarms_text, as_html
 from ..present.result import plain
@@ -163,7 +163,7 @@ class PageServer:
             get("/api/openapi.json", self._openapi),
             Route("/api/state/stream", self._state_stream),
             get("/api/alerts", self._alerts),
-            get("/api/alerts/schema.json", AlertMessage.model_json_schema),
+            get("/api/alerts/schema.json", alert_schema),
             get("/api/model", self._model),
             get("/api/episodes", self._episodes),
             get("/api/why", self._why, refused=409, run=OneAtATime("attribution")),

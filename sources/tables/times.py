@@ -101,7 +101,7 @@ class TimeReader:
         return self._of_text(cell) is not None or _DATE.fullmatch(cell) is not None
 
     def _of_cells(self, cells: list[str]) -> tuple[np.ndarray, np.ndarray]:
-        if self._order is None:
+        if self._order is None and self._column.format is None:
             self._order = _day_and_month(self._column.name, cells)
         t = np.zeros(len(cells), np.int64)
         known, naive = np.zeros((2, len(cells)), np.bool_)

@@ -255,7 +255,8 @@ def test_the_names_of_a_dbc_are_those_of_c(serve, tmp_path, name, word):
     (tmp_path / f"{name}.yaml").write_text(text)
     page = serve()
     page.engine.twin = load_twin(tmp_path / f"{name}.yaml", overrides={"outputs": json.dumps({"can": section})})
-    Publisher(page.engine)
+    for _ in range(2):  # its own file is written again
+        Publisher(page.engine)
     database = cantools.database.load_file(tmp_path / "e.dbc")
     assert [message.name for message in database.messages][0] == f"{word}_temperature_mean"
 
@@ -268,6 +269,8 @@ def test_the_names_of_a_dbc_are_those_of_c(serve, tmp_path, name, word):
         ({"can": {"interface": "virtual", "channel": "x", "id": 2045, "dbc": "{}/e.dbc"}},
          "2 states need the identifiers 0x7fd to 0x800; the largest is 0x7ff"),
         ({"can": {"interface": "virtual", "channel": "x", "id": 1536, "dbc": "{}/none/e.dbc"}}, "cannot be written"),
+        ({"can": {"interface": "virtual", "channel": "x", "id": 1536, "dbc": "{}/plant.dbc"}},
+         "plant.dbc is not written by Nisus, and is kept; choose another path, or move it"),
         ({"opcua": {"host": "0.0.0.0"}}, "outputs.opcua.host is not this machine; give user and password_env too"),
         ({"opcua": {"user": "a"}}, "needs both user and password_env, or neither"),
     ],
@@ -280,6 +283,7 @@ def test_an_output_that_cannot_be_is_refused_in_one_line(serve, tmp_path, output
         page.engine.twin = load_twin("motor_winding", overrides=overrides)
         Publisher(page.engine)
     assert text in str(error.value) and "\n" not in str(error.value)
+    assert (tmp_path / "plant.dbc").read_text() == DBC
 
 
 def test_a_port_in_use_is_reported_and_delays_nothing(serve, tmp_path):

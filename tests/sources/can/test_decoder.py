@@ -249,7 +249,7 @@ def test_a_recording_decodes_as_cantools_does(data):
 
 
 def test_a_frame_brings_the_noise_of_its_reading(tmp_path):
-    """Squared, in columns of their own; one that is not positive or cut off leaves the tuned R, and is counted."""
+    """Squared, in columns of their own; zero or cut off it leaves the tuned R, negative the value out; both counted."""
     reports = Reports()
     accuracy = Accuracy(("Torque",), units=("cm",), scale=(0.5,))
     fix = Channel(
@@ -268,12 +268,14 @@ def test_a_frame_brings_the_noise_of_its_reading(tmp_path):
         batch.value,
         [
             [20.0, 800.0, nan, (0.01 * 300.0 * 0.5) ** 2, (0.01 * 300.0 * 0.5) ** 2],
-            *[[20.0, 800.0, nan, nan, nan]] * 3,
+            [20.0, 800.0, nan, nan, nan],
+            [nan, nan, nan, nan, nan],
+            [20.0, 800.0, nan, nan, nan],
             [0.0, nan, nan, nan, nan],
         ],
         rtol=1e-14,
     )
-    assert reports.counts == {"accuracy engine": 3}
+    assert reports.counts == {"accuracy engine": 2, "unknown accuracy engine": 1}
     assert reports.texts["accuracy engine"].startswith(
         "engine: Torque has no positive standard deviation of a measurement"
     )

@@ -383,6 +383,8 @@ def test_dates_are_recognised(cells, seconds):
 def test_a_date_that_may_be_two_needs_a_format():
     with pytest.raises(SourceError, match=r'"%d/%m/%Y %H:%M" or "%m/%d/%Y %H:%M"'):
         TimeReader(TimeColumn("t")).read(["01/02/2020 10:00", "03/02/2020 10:00"])
+    t, known = TimeReader(TimeColumn("t", format="%m/%d/%Y")).read(["01/02/1970", "01/12/1970"])
+    assert known.tolist() == [True, True] and t.tolist() == [86_400 * 10**9, 11 * 86_400 * 10**9]
     t, known = TimeReader(TimeColumn("t", format="%m/%d/%Y")).read(["01/02/1970", "13/01/1970"])
     assert known.tolist() == [True, False] and t[0] == 86_400 * 10**9
 
