@@ -39,8 +39,36 @@ _SAME = {
     "Deg C": "degC",
     "DegC": "degC",
     "degrees": "deg",
+    "PS": "metric_horsepower",
+    "As": "A*s",
+    "rev": "turn",
+    "Torr": "torr",
+    "cfm": "ft**3/min",
 }
 """Spellings with one meaning (1/min on a bus is a rotation)."""
+
+_ANY_CASE = {
+    word.lower(): word
+    for word in "rpm kph mph psi bar atm Hz kHz Pa hPa kPa kg kN kV kA kW kWh km h deg degC degF mmHg inHg".split()
+}
+"""Words that mean one thing in capitals, too: K and H are no prefixes of the SI, but M and m are two."""
+
+_REFUSED = (
+    (
+        re.compile(r"(?i:[NS]m(3|³|\^3|\*\*3)|nlpm|slpm|slm|sccm|scfm|scfh)(\W.*)?|N[lL](/.*)?"),
+        "is a volume of gas at normal or standard conditions, which are not known; give a volume or an amount under "
+        "`units`, and the factor as `scale`",
+    ),
+    (
+        re.compile(r"(?i:db(m|w|v|uv|µv|a|spl|i|c|fs|u)?|np)(/.*)?"),
+        "is a logarithm, which no factor converts; convert the column first",
+    ),
+    (re.compile(r"(?i:grad)(\W.*)?"), "may be a degree or a gon; give deg, degC or gon under `units`"),
+)
+"""Spellings that have several meanings, or are no multiple of another unit, and why they are refused."""
+
+FACTORS = 0.999e-9, 1.001e9
+"""Range of factors; others are of a spelling that was misunderstood rather than of a measurement."""
 
 _OTHERWISE = {"g": "standard_gravity", "C": "degC", "F": "degF"}
 """Second meaning of a spelling, if the first one (gram, coulomb, farad) has the wrong dimension."""
@@ -50,9 +78,30 @@ def _normal(unit: str) -> str:
     """Return one spelling of a unit: ASCII, with ** for powers."""
     text = unit.strip()
     text = _SAME.get(text, text)
-    for old, new in (("°C", "degC"), ("°F", "degF"), ("°", "deg"), ("·", "*"), ("²", "**2"), ("³", "**3"), ("^", "**")):
+    for old, new in (
+        ("Ohm", "ohm"),
+        ("°C", "degC"),
+        ("°F", "degF"),
+        ("°", "deg"),
+        ("·", "*"),
+        ("²", "**2"),
+        ("³", "**3"),
+        ("^", "**"),
+    ):
         text = text.replace(old, new)
+    text = re.sub(r"\b([kmMc]?)N(c?m)\b", r"(\1N*\2)", text)
     return re.sub(r"(?<=[A-Za-z])(?=\d)", "**", text) if "/" in text or text[-1:].isdigit() else text
+
+
+def _refusal(unit: str) -> str | None:
+    """Return why a unit is refused; None if it is not."""
+    return next((reason for pattern, reason in _REFUSED if pattern.fullmatch(unit.strip())), None)
+
+
+def _spellings(normal: str) -> dict[str, None]:
+    """Return a normal spelling, and what else it may mean."""
+    cased = re.sub(r"[A-Za-z]+", lambda match: _ANY_CASE.get(match[0].lower(), match[0]), normal)
+    return dict.fromkeys((normal, _OTHERWISE.get(normal, normal), cased))
 
 
 @lru_cache(maxsize=1)
@@ -86,8 +135,8 @@ def _turns(unit: str) -> bool | None:
         return None
     if found.dimensionality != _registry().Unit("Hz").dimensionality:
         return None
-    angles = {"radian", "degree", "turn", "revolution", "revolutions_per_minute", "revolutions_per_second"}
-    return any(name in angles for name in dict(_registry().Quantity(1.0, found).unit_items()))
+    angles = ("radian", "degree", "turn", "revolution", "revolutions_per_minute", "revolutions_per_second")
+    return any(name.endswith(angles) for name in dict(_registry().Quantity(1.0, found).unit_items()))
 
 
 def _refuse_turns(a: str, b: str, given: str, wanted: str, where: str) -> None:
@@ -119,6 +168,8 @@ def conversion(given: str | None, wanted: str, where: str) -> tuple[float, float
     a, b = _normal(given), _normal(wanted)
     if a == b:
         return 1.0, 0.0
+    if reason := _refusal(given):
+        raise SourceError(f"{where}: {given!r} {reason}")
     import pint
 
     _refuse_turns(a, b, given, wanted, where)
@@ -129,16 +180,23 @@ def conversion(given: str | None, wanted: str, where: str) -> tuple[float, float
         raise SourceError(
             f"{where}: the model's unit {wanted!r} is unknown, and {given!r} is not it; {remedy}"
         ) from None
-    for text in dict.fromkeys((a, _OTHERWISE.get(a, a), a.lower())):
+    for text in _spellings(a):
         try:
             source = _unit(text)
             at_zero = float(_registry().Quantity(0.0, source).to(target).magnitude)
             if at_zero == 0.0:
-                return float(_registry().Quantity(1.0, source).to(target).magnitude), 0.0
-            at_thousand = float(_registry().Quantity(1000.0, source).to(target).magnitude)
-            return round((at_thousand - at_zero) / 1000.0, 12), at_zero
+                factor = float(_registry().Quantity(1.0, source).to(target).magnitude)
+            else:
+                at_thousand = float(_registry().Quantity(1000.0, source).to(target).magnitude)
+                factor = round((at_thousand - at_zero) / 1000.0, 12)
         except (LookupError, pint.PintError):
             continue
+        if not FACTORS[0] <= abs(factor) <= FACTORS[1]:
+            raise SourceError(
+                f"{where}: {given!r} is {factor:.3g} of the model's {wanted!r}, which is hardly meant; if it is, give "
+                f"{wanted} under `units`, and the factor as `scale`"
+            )
+        return factor, at_zero
     try:
         _unit(a)
     except LookupError:
@@ -182,8 +240,9 @@ def heading_unit(name: object) -> str | None:
     if match is None or not re.search(r"[A-Za-z°%]", match[1]):
         return None
     text = match[1].strip()
-    normal = _normal(text)
-    for spelling in dict.fromkeys((normal, _OTHERWISE.get(normal, normal), normal.lower())):
+    if _refusal(text):
+        return text
+    for spelling in _spellings(_normal(text)):
         try:
             _unit(spelling)
         except LookupError:

@@ -1,11 +1,13 @@
 """Units convert by their definitions, in the spellings of DBC files; what does not convert is refused."""
 
+import csv
 import math
+from pathlib import Path
 
 import pytest
 
 from estimators.errors import SourceError
-from sources.units import conversion, declared_conversion
+from sources.units import conversion, declared_conversion, heading_unit
 
 
 @pytest.mark.parametrize(
@@ -41,6 +43,34 @@ from sources.units import conversion, declared_conversion
 def test_conversions(given, wanted, factor, offset):
     a, b = conversion(given, wanted, "x")
     assert a == pytest.approx(factor, rel=1e-9) and b == pytest.approx(offset, rel=1e-9, abs=1e-12)
+
+
+def test_spellings_of_plants_buses_and_files_convert_by_the_table_or_are_refused():
+    """units.csv has their factors by the definitions of the units; none is one that must be refused."""
+    wrong = []
+    with (Path(__file__).parent / "units.csv").open(encoding="utf-8") as file:
+        for line in csv.DictReader(file):
+            try:
+                found = conversion(line["given"], line["wanted"], "x")
+            except SourceError:
+                found = None
+            expected = (float(line["factor"]), float(line["offset"])) if line["factor"] else None
+            if (found and expected) is None and found == expected:
+                continue
+            if found is None or expected is None or found != pytest.approx(expected, rel=2e-9, abs=1e-12):
+                wrong.append((line, found))
+    assert wrong == []
+
+
+@pytest.mark.parametrize(
+    ("given", "reason"),
+    [("Nm3/h", "at normal or standard conditions"), ("dBm", "is a logarithm"), ("Grad", "a degree or a gon"),
+     ("pm", "is 1e-12 of the model's 'm'")],
+)  # fmt: skip
+def test_what_is_refused_says_why(given, reason):
+    with pytest.raises(SourceError, match=reason):
+        conversion(given, "m", "x")
+    assert heading_unit(f"Value [{given}]") == given
 
 
 @pytest.mark.parametrize(
