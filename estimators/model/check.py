@@ -152,8 +152,8 @@ def interpreted(function: Any) -> Any:
 
 def refuse_writing(
     model: StateSpaceModel, what: str, function: Callable, takes: str, *out: np.ndarray, more: Values | None = None
-) -> None:
-    """Refuse a function that changes its arguments, at the prior or away from it.
+) -> list[np.ndarray]:
+    """Refuse a function that changes its arguments, away from the prior or at it; return its results there.
 
     At the prior alone, a function that scales an entry that is zero there would pass. Away from it the function may
     fail, as not every state need have a result.
@@ -163,18 +163,20 @@ def refuse_writing(
     """
     prior = prior_values(model) | (more or {})
     python = interpreted(function)
-    for values in (prior, *_near_prior(model, prior)):
+    for values in (*_near_prior(model, prior), prior):
         names = takes.split(", ")
         given = [values[name] for name in names]
         copies = [item.copy() if isinstance(item, np.ndarray) else item for item in given]
+        results = [item.copy() for item in out]
         with suppress(Exception), np.errstate(all="ignore"):
-            python(*copies, *(item.copy() for item in out))
+            python(*copies, *results)
         for name, copy, item in zip(names, copies, given, strict=True):
             if not np.array_equal(copy, item, equal_nan=isinstance(item, np.ndarray)):
                 raise ModelError(
                     f"{place(function)}model {model.name}: {what} writes to its argument {name}, which is the "
                     "filter's own; copy what it changes, and fill out only"
                 )
+    return results
 
 
 def _call(
@@ -220,16 +222,21 @@ def probe(model: StateSpaceModel) -> None:
         out = np.full(shape, 0.0 if what == "Q" else np.nan)
         sizes = f"{n} states, {model.nu} inputs and {len(model.parameters)} parameters, out of shape {shape}"
         _call(model, what, function, takes, values, out, sizes=sizes)
+        named, again = f"{place(function)}model {model.name}: {what}", out
         if (_code(function), shape) not in known:
-            refuse_writing(model, what, function, takes, np.zeros(shape))
+            [again] = refuse_writing(model, what, function, takes, np.zeros(shape))
             known.add((_code(function), shape))
-        named = f"{place(function)}model {model.name}: {what}"
         bad = np.argwhere(~np.isfinite(out))
         if bad.size:
             at = f"x = {numbers(values['x'])}, u = {numbers(values['u'])}, p = {numbers(values['p'])}"
             raise ModelError(
                 f"{named} leaves {len(bad)} of {out.size} entries of out unset or not finite at the prior, the first "
                 f"of them out[{', '.join(map(str, bad[0]))}]; it must fill them all with finite numbers at {at}"
+            )
+        if not np.array_equal(out, again):
+            raise ModelError(
+                f"{named} returns another value for the same arguments when it is called again; it may depend on "
+                "nothing else: give what is random as process noise, and time or a count as an input or a state"
             )
         wrong = indefinite(out) if what == "Q" else None
         if wrong:

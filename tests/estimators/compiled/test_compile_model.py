@@ -1,5 +1,8 @@
 """A model that disagrees with its declaration is refused with one line that says what, where and how much."""
 
+import itertools
+import time
+
 import numpy as np
 import pytest
 
@@ -262,6 +265,34 @@ def walk(sensor=(), **changes):
         sensors=(Sensor("y", (Row("y", "m", 0.04),), **({"h": itself} | dict(sensor))),),
     )  # fmt: skip
     return StateSpaceModel(**(parts | changes))
+
+
+CALLS, DRAWS = itertools.count(), np.random.default_rng(0)
+
+
+def counted(x, u, p, dt, out):
+    out[0] = x[0] + next(CALLS)
+
+
+def timed(x, u, p, out):
+    out[0] = x[0] + time.perf_counter()
+
+
+def drawn(x, u, p, dt, out):
+    out[0, 0] = DRAWS.normal()
+
+
+def drawn_Q(x, u, p, q, dt, out):
+    out[0, 0] = DRAWS.uniform()
+
+
+@pytest.mark.parametrize(
+    ("changes", "what"),
+    [({"f": counted}, "f"), ({"sensor": {"h": timed}}, "h of sensor y"), ({"F": drawn}, "F"), ({"Q": drawn_Q}, "Q")],
+)
+def test_what_is_no_function_of_its_arguments_is_refused(changes, what):
+    with pytest.raises(ModelError, match=rf"test_compile_model.py:\d+: model walk: {what} returns another value for"):
+        compile_model(walk(**changes))
 
 
 @pytest.mark.parametrize(
