@@ -77,6 +77,9 @@ class RunScores:
                 assert run.track is not None
                 self._known[run.number] = self._scored(run, run.track)
                 self._final.add(run.number)
+            numbers = {run.number for run in self._engine.revisions.runs}
+            self._known = {number: known for number, known in self._known.items() if number in numbers}
+            self._final &= numbers
 
     def all(self) -> list[tuple[Revision, RunScore | None]]:
         """Return every revision with its score; None without rows."""
@@ -85,8 +88,6 @@ class RunScores:
             runs = self._engine.revisions.runs
             *_, running = runs
             self._look(running)
-            numbers = {run.number for run in runs}
-            self._known = {number: known for number, known in self._known.items() if number in numbers}
             return [(run, self._known.get(run.number)) for run in runs]
 
     def _look(self, running: Revision) -> None:

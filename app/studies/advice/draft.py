@@ -26,6 +26,8 @@ from .plan import OMITTED, YAML_NAME, DraftCheck, DraftPlan, Moves, Reads
 from .signals import Signal
 
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]*")
+MAX_NAME = 100
+"""Longest name of a twin: a file system takes 255 bytes, with the ending and what an archive adds."""
 
 
 @dataclass(frozen=True)
@@ -78,6 +80,8 @@ def check_new(name: str, folder: Path) -> None:
     """
     if not _NAME.fullmatch(name):
         raise ConfigError(f"the name {name!r} is not valid; use letters, digits, _ and -, and begin with a letter")
+    if len(name) > MAX_NAME:
+        raise ConfigError(f"the name of the twin has {len(name)} letters; choose one of at most {MAX_NAME}")
     if name in shipped():
         raise ConfigError(f"the name {name!r} is that of a bundled twin; choose another")
     if not folder.is_dir():

@@ -57,6 +57,10 @@ def test_a_bad_name_is_refused(name: str, tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
+def test_a_name_that_no_file_system_takes_is_refused(tmp_path: Path) -> None:
+    assert refused("x" * 300, tmp_path) == "the name of the twin has 300 letters; choose one of at most 100"
+
+
 def test_a_bundled_name_and_an_absent_folder_are_refused(tmp_path: Path) -> None:
     assert refused("motor_winding", tmp_path) == "the name 'motor_winding' is that of a bundled twin; choose another"
     absent = tmp_path / "absent"

@@ -11,6 +11,7 @@ from estimators.log import Log
 from estimators.track import HELD_OUT, USED
 from estimators.tuning import Tuning
 from tests.app.scripted import MODEL, Stepped, random_walk, readings
+from tests.waiting import wait_for
 
 FIRST = Tuning.of(MODEL)
 
@@ -73,6 +74,17 @@ def test_what_was_scored_stays_known_when_its_track_goes():
     twin.submit(commands.SetTuning("R.winding", 2.0))
     (run, known), *_ = scores.all()
     assert run.track is None and known is first
+
+
+def test_scores_of_runs_that_are_forgotten_go_though_nobody_asks(monkeypatch):
+    monkeypatch.setattr("app.live.revisions.MAX_REVISIONS", 5)
+    twin = Stepped(50)
+    scores = RunScores(twin.engine)
+    for k in range(12):
+        twin.submit(commands.SetTuning("Q.rate", 0.05 + 0.01 * k))
+    kept = {run.number for run in twin.engine.revisions.runs}
+    assert len(kept) == 5
+    wait_for(lambda: not scores._ended and scores._known.keys() | scores._final <= kept)
 
 
 def test_a_history_of_several_pieces_is_scored_whole():
