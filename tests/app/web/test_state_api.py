@@ -15,9 +15,8 @@ from prometheus_client.parser import text_string_to_metric_families
 from pydantic import ValidationError
 from starlette.routing import Route
 
-from app.outputs.alerts import AlertMessage
 from app.present.state_message import PublishedState, StateMessage, state_message, state_schema
-from app.web.http import get
+from app.web.http import ApiRoute
 from estimators import fuse
 from estimators.track import DEGRADED, DIVERGED, STALE, SUSPECT, WAITING
 from tests.app.scripted import pull_all, readings
@@ -247,8 +246,9 @@ def test_the_description_of_the_api_has_every_path_and_is_true(page):
     operations = [item for path in found["paths"].values() for item in path.values()]
     assert [item["operationId"] for item in operations if not item["summary"]] == []
     assert found["paths"]["/api/alerts/schema.json"]["get"]["parameters"] == []
-    with pytest.raises(TypeError, match="pydantic.main.BaseModel.model_json_schema may not be a route"):
-        get("/api/schema.json", AlertMessage.model_json_schema)
+    # What a client may give is declared by a function of our own.
+    works = [item.operation.work for item in page.server.application.routes if isinstance(item, ApiRoute)]
+    assert len(works) > 30 and all(work.__module__.startswith("app.") for work in works)
     for schema in [*models.values(), *(part["schema"] for item in operations for part in item.get("parameters", ()))]:
         check(schema)
     for name in re.findall(r'"#/components/schemas/([^"]+)"', json.dumps(found)):
