@@ -269,6 +269,12 @@ class Door:
         """Routes of its own."""
         return list(self._own.router.routes)
 
+    @property
+    def boot_without_twin(self) -> str:
+        """The same while no twin is shown, else "": a gallery at the address of a twin that came since reloads."""
+        shown = self._shown
+        return shown.boot if shown.application == self._no_twin else ""
+
     def add_gallery(self, routes: Sequence[BaseRoute], page: ASGIApp) -> None:
         """Add routes that are always served, and the page for when no twin runs; before the start."""
         self._own.router.routes.extend(routes)

@@ -59,11 +59,15 @@ class GalleryApi:
             post("/api/gallery/log/draft", self._logs.draft, status=202),
             post("/api/gallery/log/draft/stop", self._logs.stop_draft),
         ]
-        door.add_gallery(routes, Starlette(routes=[get("/", self._page)]))
+        door.add_gallery(routes, Starlette(routes=[get("/", self._page_at_once)]))
 
     def _page(self) -> Response:
         """Answer with the page of the gallery."""
         return page_file("gallery.html", {"boot": self._door.boot}, title="Gallery")
+
+    def _page_at_once(self) -> Response:
+        """Answer with the gallery where a twin's page will be."""
+        return page_file("gallery.html", {"boot": self._door.boot_without_twin}, title="Gallery")
 
     def state(self) -> dict[str, Any]:
         """Return the running twin, the start under way, and the last start that failed."""
