@@ -46,7 +46,7 @@ from .outputs import LogTail
 from .revisions import Revision
 from .running_fold import Running, StoredTwin
 
-FORMAT = 1
+FORMAT = 2
 APPLICATION_ID = 0x4E697375
 """Marks an SQLite file as a store, in its header."""
 
