@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from estimators.diagnostics.episodes import Episode
 from estimators.events.clocks import ClockGuard, Moved, Passed, Refused
 from estimators.events.maintenance import maintained
 from estimators.log import BEFORE, INPUT, READING, Events
@@ -79,6 +81,13 @@ class Ingest:
     def held(self) -> int:
         """Number of events held until the next one confirms their time."""
         return 0 if self._guard is None else self._guard.held
+
+    def came(self, events: Events) -> tuple[np.ndarray, np.ndarray]:
+        """Return the arrivals of events (n,) that have passed, and of all that are held, ns, as they came."""
+        guard = self._guard
+        return (
+            (events.arrival, events.arrival[:0]) if guard is None else (events.arrival - guard.set_back, guard.waiting)
+        )
 
     def state(self) -> dict[str, Any]:
         """Return a copy of the state for `restore`, of arrays, lists and numbers."""
@@ -157,6 +166,15 @@ class Ingest:
         if kind == READING:
             return self._model.sensors[channel].name
         return "the inputs" if kind == INPUT else "the true states"
+
+
+def dropped_episode(start: float, lost: int, taken: int) -> Episode:
+    """Return the episode of so many lost measurements of all that were taken since `start`, s."""
+    text = (
+        f"{100 * lost / taken:.3g} % of the measurements were dropped, {lost} of {taken}: too late, or with impossible "
+        "times; check the times of the source, or lengthen time.horizon"
+    )
+    return Episode(start, None, "twin", "dropped", lost / taken, math.nan, math.nan, "", text)
 
 
 def refusal(name: str, refused: Refused) -> str:

@@ -202,29 +202,33 @@ class Log:
         batch = admitted(batch, self.width, self.layout).widened(self.width)
         if not len(batch):
             return self.n, 0
-        # Ticks and marks carry no data of the asset, so no event is late relative to them.
-        times = np.where((batch.kind == TICK) | (batch.kind == MARK), self.newest, batch.t)
-        newest = np.maximum(np.maximum.accumulate(times), self.newest)
+        newest, late = self.lateness(batch, horizon, settled)
         self.newest = int(newest[-1])
-        stale = 0
-        if horizon is not None or batch.t.min() < self.floor:
-            oldest = np.full(len(batch), self.floor)
-            if horizon is not None:
-                oldest = np.maximum(newest - horizon, oldest)
-            if settled is not None:
-                oldest[settled] = self.floor
-            fresh = batch.t >= oldest
-            stale = int(fresh.size - fresh.sum())
-            if stale:
-                batch = batch.select(fresh)
-                if not len(batch):
-                    return self.n, stale
+        stale = int(np.count_nonzero(late))
+        if stale:
+            batch = batch.select(~late)
+            if not len(batch):
+                return self.n, stale
         if not in_order(batch):
             batch = batch.select(sorted_order(batch))
         self._reserve(len(batch), batch.value.shape[1])
         batch = batch.widened(self.value.shape[1])
         self.changes += 1
         return self._insert(batch), stale
+
+    def lateness(
+        self, batch: Events, horizon: int | None, settled: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the newest time when each event of a batch (N,) arrives, ns, and a mask of the stale: see `extend`."""
+        # Ticks and marks carry no data of the asset, so no event is late relative to them.
+        times = np.where((batch.kind == TICK) | (batch.kind == MARK), self.newest, batch.t)
+        newest = np.maximum(np.maximum.accumulate(times), self.newest)
+        oldest = np.full(len(batch), self.floor)
+        if horizon is not None:
+            oldest = np.maximum(newest - horizon, oldest)
+        if settled is not None:
+            oldest[settled] = self.floor
+        return newest, batch.t < oldest
 
     def _insert(self, batch: Events) -> int:
         """Merge an ordered batch and return the lowest index that changed."""

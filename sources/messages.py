@@ -21,7 +21,7 @@ from .tables.text import TextMatch, column_of
 from .tables.times import ns_of_iso
 
 ACCEPTED, DUPLICATE, REFUSED = "accepted", "duplicate", "refused"
-"""What became of a message."""
+"""Whether a message was taken."""
 
 FIELDS = ("time", "values", "source", "sequence")
 """Fields of a message."""
@@ -49,10 +49,11 @@ LATEST = 2**62
 
 
 class Answer(NamedTuple):
-    """What became of a message, and why it was refused."""
+    """Whether a message was taken, and why it was refused; its arrival, ns, which no other message has."""
 
     status: str
     reason: str = ""
+    arrival: int = 0
 
 
 FULL = Answer(REFUSED, "too many messages wait; send it again")
@@ -150,6 +151,7 @@ class Messages:
         """Messages that were accepted."""
         self.mark = 0
         """Of these, messages that were read."""
+        self._arrived = 0
         self._stores = False
         self.closed = False
         """Whether it takes no messages any more."""
@@ -157,24 +159,25 @@ class Messages:
 
     def send(self, messages: Sequence[Any]) -> list[Answer]:
         """Take messages in their order; return for each what became of it. Wrong ones do not hold up the others."""
-        arrival = time.time_ns()
+        now = time.time_ns()
         values = np.full((len(messages), len(self._columns)), np.nan)
         state = np.full(values.shape, ABSENT, np.int8)
-        t = np.full(len(messages), arrival, np.int64)
+        t = np.full(len(messages), now, np.int64)
         answers = []
         with self._sending:
+            behind = self._arrived - now
+            arrival = now + (behind + 1 if 0 <= behind < 10**9 else 0) + np.arange(len(messages))
+            self._arrived = int(arrival.max(initial=self._arrived))
             for row, message in enumerate(messages):
                 answer = CLOSED if self.closed else FULL if row >= self._room else None
                 answer = answer or self._take(message, t[row : row + 1], values[row], state[row])
                 answer = answer or self._number(message)
                 self.accepted += answer.status == ACCEPTED
-                answers.append(answer)
+                answers.append(answer._replace(arrival=int(arrival[row])))
             taken = np.array([answer.status == ACCEPTED for answer in answers], np.bool_)
             if taken.any():
                 names = [item[ASSET] if self._assets and ok else "" for item, ok in zip(messages, taken, strict=True)]
-                rows = Rows(
-                    t[taken], np.full(taken.sum(), arrival), values[taken], state[taken], np.array(names, object)[taken]
-                )
+                rows = Rows(t[taken], arrival[taken], values[taken], state[taken], np.array(names, object)[taken])
                 self._room -= rows.t.size
                 self._waiting.put(rows)
         return answers

@@ -43,6 +43,8 @@ def push(arguments: Arguments) -> int:
         for lines, messages in rows.batches():
             for item in twin.ask(messages)["items"]:
                 counts[item["status"]] += 1
+                if item.get("became") == "stale":
+                    counts["stale"] += 1
                 if "reason" in item:
                     shown += 1
                     if shown <= MAX_SHOWN:

@@ -33,6 +33,7 @@ from .changes import merged
 from .execute import execute
 from .feeder import Delivery, Feeder
 from .jobs import Job, Jobs, run_all
+from .outcomes import Outcomes
 from .outputs import LogTail, Status
 from .running_fold import Keeper, Records, Running, StoredTwin
 from .status import busy_status, past_status, status_of
@@ -102,6 +103,7 @@ class Engine(Running):
         self._workshop.report = lambda text: self.notices.say(text, level="warn")
         if self.twin.forced_baseline:
             self.notices.say(f"the baseline was accepted with --force: {self.twin.forced_baseline}", level="warn")
+        self.outcomes = Outcomes()
         self._feeder = Feeder(
             lambda: open_source(self.notices.report),
             self._inbox,
@@ -355,7 +357,11 @@ class Engine(Running):
             if self._horizon is not None and self.twin.late.inflate:
                 events, late = inflated(events, self._fold, self._log.newest, self._horizon)
                 self._late += late
+            newest, old = self._log.lateness(events, self._horizon, passed.settled)
             stale = self._take(events, self._horizon, passed.settled)
+            self.outcomes.note(self._mark, events, *self._intake.came(events), events.t < newest, old)
+            dropped = stale + len(passed.refused)
+            self._watchers.dropped.note(self._log.newest, len(events) + len(passed.refused), dropped)
             if np.count_nonzero((events.kind == READING) | (events.kind == INPUT)) > stale:
                 self._idle_ticks.broken(self._log.newest)
             if self._log.n:

@@ -113,11 +113,13 @@ def _severity(episode: Episode) -> tuple[int, float]:
 class EpisodeLog:
     """Episodes of one engine; any thread may read `summary`, which is replaced, never changed."""
 
-    def __init__(self, engine: Running, max_rows: int = MAX_ROWS) -> None:
-        """`max_rows`: see `EpisodeTracker`."""
+    def __init__(self, engine: Running, max_rows: int = MAX_ROWS, others: Sequence[TrackedEpisode] = ()) -> None:
+        """`max_rows`: see `EpisodeTracker`; `others` are episodes that no row shows, a sequence that grows."""
+        self._others = others
         self._engine, self._max_rows = engine, max_rows
         self._cursor = engine.cursor()
         self.tracker = self._new_tracker(engine.rows(0, 0))
+        self._entries: list[TrackedEpisode] = []
         self._health = WAITING
         self.summary = EpisodeSummary()
         self._earlier: tuple[TrackedEpisode, ...] = ()
@@ -162,7 +164,7 @@ class EpisodeLog:
             self._update()
 
     def _update(self) -> None:
-        before, again = self.tracker.entries, False
+        before, again = self._entries, False
         while True:
             log, passage = self._cursor.log, self._engine.notices.passage
             pull = self._engine.pull(self._cursor, PULLED_ROWS)
@@ -182,7 +184,8 @@ class EpisodeLog:
                 break
         tracker = self.tracker
         if tracker.n:
-            entries = _joined(self._earlier, tracker.entries)
+            self._entries = sorted([*tracker.entries, *self._others], key=lambda entry: entry.episode.start)
+            entries = _joined(self._earlier, self._entries)
             self.summary = EpisodeSummary(
                 tuple(entry.episode for entry in entries),
                 tuple(entry for entry in entries if entry.episode.end is None),
@@ -197,7 +200,7 @@ class EpisodeLog:
 
         A source that has begun again meanwhile, in another passage, has nothing to do with these rows.
         """
-        begun, over = _changes(before, self.tracker.entries, again)
+        begun, over = _changes(before, self._entries, again)
         say = partial(self._engine.notices.say, passage=passage)
         track, t = self.tracker.track, self.tracker.events.t
         health = int(track.health[-1])

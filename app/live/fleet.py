@@ -11,7 +11,7 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -20,12 +20,14 @@ from estimators.events.clocks import ClockGuard
 from estimators.fleet.table import FleetTable
 from estimators.log import BEFORE, READING, Events
 from estimators.track import STALE
+from sources.messages import Messages
 from sources.source import NO_ASSET, WRONG_TIME, Acknowledging, AssetEvents, Marked, Report, is_utc
 
 from ..ingest import CLOCK_MOVED, clock_moved, refusal
 from ..twin.fleet import FleetPlan
 from ..twin.twin import Twin
 from .fold_json import tuning_to_json
+from .outcomes import Outcomes
 from .silent_assets import SilentAssets
 from .store import RETRY_PERIOD_S, Store
 
@@ -74,6 +76,14 @@ class EventSink(Protocol):
 
     def stop(self) -> None:
         """End, with all events that were taken."""
+
+
+class Passing(NamedTuple):
+    """Events of messages that are not folded yet, the places of their assets (n,), and whether they are late (n,)."""
+
+    at: np.ndarray
+    events: Events
+    late: np.ndarray
 
 
 class RunningFleet:
@@ -129,6 +139,8 @@ class RunningFleet:
         self._shown: tuple[int, FleetTable] | None = None
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name="fleet", daemon=True)
+        self.outcomes = Outcomes()
+        self._passed: list[Passing] = []
         self._changed: set[int] = set()
         self._unarchived: list[tuple[np.ndarray, Events]] = []
         self.archive: EventSink | None = None
@@ -223,6 +235,8 @@ class RunningFleet:
             self._add(batch)
         if self._pending and (self.source.live or self._pending >= MAX_PENDING):
             self._fold()
+        elif isinstance(self.source, Messages):
+            self._tell(self.source.mark, (), {})
         if not self._pending:
             self._query(self._silence // TICKS_PER_DELAY)
             self._keep()
@@ -266,6 +280,8 @@ class RunningFleet:
             self.fleet.add_events(at, events)
         if self.archive is not None and at.size:
             self._unarchived.append((at, events))
+        if isinstance(self.source, Messages):
+            self._passed.append(Passing(at, events, events.t < self._last[at]))
         self._changed.update(np.unique(at // BLOCK).tolist())
         np.maximum.at(self._last, at, events.t)
         self._heard[at] = self.clock()
@@ -399,10 +415,30 @@ class RunningFleet:
 
     def _fold(self) -> None:
         if self._pending:
+            passed, self._passed = self._passed, []
+            assets = np.unique(np.concatenate([item[0] for item in passed])) if passed else np.zeros(0, np.int64)
             with self._lock:
+                before = self.fleet.stale[assets]
                 self.fleet.advance()
+                dropped = self.fleet.stale[assets] - before
                 self._pending = 0
                 self.version += 1
+            if isinstance(self.source, Messages):
+                self._tell(self.source.mark, passed, dict(zip(assets.tolist(), dropped.tolist(), strict=True)))
+
+    def _tell(self, mark: int, passed: Sequence[Passing], dropped: Mapping[int, int]) -> None:
+        """Note what became of messages; `dropped` are the events of each asset that were too old."""
+        events = Events.concat([item.events for item in passed], self.plan.twin.model.width)
+        none = np.zeros(0, np.int64)
+        at = np.concatenate([none, *(item.at for item in passed)])
+        late = np.concatenate([none, *(item.late for item in passed)]).astype(np.bool_)
+        stale = np.zeros(at.size, np.bool_)
+        for asset, count in dropped.items():  # of those that are folded at once the oldest
+            own = np.flatnonzero(at == asset) if count else none
+            stale[own[np.argsort(events.t[own], kind="stable")[:count]]] = True
+        guard = self._guard
+        waiting, back = (none, 0) if guard is None else (guard.waiting, guard.set_back)
+        self.outcomes.note(mark, events, events.arrival - back, waiting, late, stale)
 
     def _dated(self, table: FleetTable) -> FleetTable:
         """Date the health of silent assets by their silence: their state is put back before each query."""

@@ -29,6 +29,7 @@ from .commands import Command
 from .counts import RowCounts
 from .jobs import Jobs
 from .notices import Annotation, Annotations, Audit, AuditEntry, Notices
+from .outcomes import Outcomes
 from .outputs import AlertMute, Belief, Cursor, EventWindow, Here, LogTail, Pull, Status, event_window
 from .revisions import Revision, Revisions
 from .watchdog import Watchdog
@@ -116,6 +117,8 @@ class Running(ABC):
     grown: frozenset[Callable[[], object]] = frozenset()
     """Called on the engine's thread after each batch; they must return at once."""
     store: Keeper | None
+    outcomes: Outcomes
+    """What became of messages that were sent to it."""
 
     def __init__(
         self,

@@ -11,10 +11,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from estimators.diagnostics.clock_fit import ClockFit, LeastDelays
+from estimators.diagnostics.episodes import TrackedEpisode
 from estimators.log import INPUT, READING, Events
 from estimators.track import STALE, TRACKING, WAITING
 from sources.source import LOST_FRAMES, Source, controls_of
 
+from ..ingest import dropped_episode
 from .alerts import Alerts
 from .episode_log import EPISODES_PERIOD_S, EpisodeLog
 from .fault_monitors import LEVELS_PERIOD_S, ROOT_CAUSE_PERIOD_S, ProtectionMonitor, RootCause
@@ -35,7 +37,8 @@ class Watchers:
         self._jobs, self._notices = engine.jobs, notices
         self.latency = Latency()
         self.clock = HostClock(notices, section.horizon)
-        self.episode_log = EpisodeLog(engine)
+        self.dropped = DroppedShare()
+        self.episode_log = EpisodeLog(engine, others=self.dropped.entries)
         self.alerts = Alerts(notices, lambda: self.episode_log.summary.in_alarm)
         self.silence = SilentSource(notices, section.stale_after)
         self.integrity = ProtectionMonitor(engine.last_events, engine.policy.false_alarm_every)
@@ -129,7 +132,8 @@ class HostClock:
 
     def note(self, events: Events) -> None:
         """Note events that were accepted."""
-        stamped = (events.kind == READING) | (events.kind == INPUT)
+        # What was there before the twin, such as the history in a file, has no arrival of its own.
+        stamped = ((events.kind == READING) | (events.kind == INPUT)) & (events.arrival != events.t)
         if not stamped.any():
             return
         arrival = events.arrival[stamped]
@@ -157,6 +161,41 @@ class HostClock:
                 "machine's; synchronise them",
                 level="warn",
             )
+
+
+MAX_DROPPED_SHARE, MIN_DROPPED, DROPPED_PERIOD_S = 0.1, 10, 60.0
+"""Share of the measurements of so many seconds, and their number, beyond which there is an episode."""
+
+
+class DroppedShare:
+    """Episodes in which many measurements of a live source are too late for the log, or have impossible times."""
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        """`clock` returns seconds."""
+        self._clock = clock
+        self._recent: deque[tuple[float, int, int]] = deque()
+        self._taken = self._dropped = 0
+        self.entries: list[TrackedEpisode] = []
+
+    def note(self, newest: int, taken: int, dropped: int) -> None:
+        """Note measurements that were taken when the log's newest event was that of `newest`, ns; of these the dropped.
+
+        An episode ends when their share is half of that with which it begins.
+        """
+        now = self._clock()
+        self._recent.append((now, taken, dropped))
+        self._taken, self._dropped = self._taken + taken, self._dropped + dropped
+        while self._recent[0][0] <= now - DROPPED_PERIOD_S:
+            _, before, lost = self._recent.popleft()
+            self._taken, self._dropped = self._taken - before, self._dropped - lost
+        last = self.entries[-1].episode if self.entries else None
+        if last is not None and last.end is None:
+            if self._dropped < 0.5 * MAX_DROPPED_SHARE * self._taken:
+                over = last._replace(end=newest * 1e-9)
+                self.entries[-1:] = [self.entries[-1]._replace(until=newest, episode=over)]
+        elif self._dropped >= max(MIN_DROPPED, MAX_DROPPED_SHARE * self._taken):
+            episode = dropped_episode(newest * 1e-9, self._dropped, self._taken)
+            self.entries.append(TrackedEpisode(("dropped", "twin"), newest, newest, episode))
 
 
 MAX_LATENCIES = 4096

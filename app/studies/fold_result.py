@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
@@ -43,6 +42,7 @@ from estimators.tuning import SHARED_ENTRY_ROWS
 from sources.source import WRONG_TIME
 
 from ..format_time import counted, duration_text, format_time
+from ..ingest import dropped_episode
 from ..present.export.calibration_lines import COVERAGE_HEAD, calibration_lines, coverage_rows, health_shares
 from ..present.result import Figure, Topic, plain
 from ..present.series.columns import units_by_name
@@ -194,14 +194,9 @@ def dropped(counts: Mapping[str, int], fold: Fold) -> list[Episode]:
     """Return an episode if many measurements never reached the log."""
     lost = counts.get("stale", 0) + counts.get(WRONG_TIME, 0)
     kept = int(np.sum(fold.log.kind[: fold.n] == READING))
-    share = lost / max(1, lost + kept)
-    if share < MIN_DROPPED_SHARE:
+    if lost < MIN_DROPPED_SHARE * max(1, lost + kept):
         return []
-    text = (
-        f"{100 * share:.3g} % of the measurements were dropped, {lost} of {lost + kept}: too late, or with impossible "
-        "times; check the times of the source, or lengthen time.horizon"
-    )
-    return [Episode(float(fold.log.t[0]) * 1e-9, None, "twin", "dropped", share, math.nan, math.nan, "", text)]
+    return [dropped_episode(float(fold.log.t[0]) * 1e-9, lost, lost + kept)]
 
 
 def explained(fold: Fold, episodes: Sequence[Episode]) -> list[ExplainedEpisode]:

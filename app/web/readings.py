@@ -7,8 +7,10 @@ import json
 import struct
 import time
 from collections.abc import Callable, Mapping, Sequence
+from types import MappingProxyType
 from typing import Any, Protocol
 
+import numpy as np
 from starlette.requests import Request
 from starlette.responses import PlainTextResponse, Response
 from starlette.routing import BaseRoute, Route
@@ -16,6 +18,7 @@ from starlette.routing import BaseRoute, Route
 from estimators.errors import ConfigError, shown_name
 from sources.messages import ACCEPTED, CLOSED, DUPLICATE, REFUSED, Answer, Messages
 
+from ..live.outcomes import Outcomes
 from ..live.running_fold import Keeper
 from ..twin.twin import Twin
 from .http import Json, TooLarge, bounded_body, get, refusal
@@ -30,8 +33,8 @@ MAX_MESSAGES = 100_000
 RECORD_BATCH = 3
 """Type of an Arrow message with rows."""
 
-STORE_TIMEOUT_S, STORE_POLL_S = 2.0, 0.005
-"""Longest wait for the store, and the time between two looks at it."""
+STORE_TIMEOUT_S, OUTCOME_TIMEOUT_S, POLL_S = 2.0, 0.5, 0.005
+"""Longest wait for the store, and for the outcomes, and the time between two looks at them."""
 
 
 class Receiver(Protocol):
@@ -48,6 +51,10 @@ class Receiver(Protocol):
     @property
     def twin(self) -> Twin:
         """The twin."""
+
+    @property
+    def outcomes(self) -> Outcomes:
+        """What became of its messages."""
 
 
 def routes(engine: Receiver) -> list[BaseRoute]:
@@ -98,20 +105,36 @@ async def send_to(engine: Receiver, messages: Sequence[Any]) -> dict[str, Any]:
     """Send messages; return what became of each, the counts, and whether the store has them."""
     source = messages_of(engine)
     answers = await in_thread(lambda: source.send(messages))
-    kept = await stored(engine, source.accepted)
+    mark = source.accepted
+    became = await outcomes(engine, mark, answers)
+    kept = await stored(engine, mark)
     if source.closed and not kept:  # meanwhile: they are not folded, or their state is lost
-        answers = [CLOSED if item.status == ACCEPTED else item for item in answers]
-    return summary(answers) | {"stored": kept}
+        answers, became = [CLOSED if item.status == ACCEPTED else item for item in answers], {}
+    return summary(answers, became) | {"stored": kept}
 
 
-def summary(answers: Sequence[Answer]) -> dict[str, Any]:
-    """Return what became of each message, and the counts."""
+def summary(answers: Sequence[Answer], became: Mapping[int, str] = MappingProxyType({})) -> dict[str, Any]:
+    """Return the answers and their counts, with what `became` of accepted ones by arrival, as far as it is known."""
     counts = {status: sum(item.status == status for item in answers) for status in (ACCEPTED, DUPLICATE, REFUSED)}
     items = [
-        {"index": k, "status": item.status} | ({"reason": item.reason} if item.reason else {})
+        {"index": k, "status": item.status}
+        | ({"became": became[item.arrival]} if item.status == ACCEPTED and item.arrival in became else {})
+        | ({"reason": item.reason} if item.reason else {})
         for k, item in enumerate(answers)
     ]
     return counts | {"items": items}
+
+
+async def outcomes(engine: Receiver, mark: int, answers: Sequence[Answer]) -> dict[int, str]:
+    """Wait until messages up to a mark have been taken; return what became of each by its arrival, none if too long."""
+    arrivals = np.array([item.arrival for item in answers if item.status == ACCEPTED], np.int64)
+    end = time.monotonic() + OUTCOME_TIMEOUT_S
+    while arrivals.size and time.monotonic() < end:
+        found = engine.outcomes.of(mark, arrivals)
+        if found is not None:
+            return dict(zip(arrivals.tolist(), found, strict=True))
+        await asyncio.sleep(POLL_S)
+    return {}
 
 
 async def stored(engine: Receiver, mark: int) -> bool:
@@ -121,7 +144,7 @@ async def stored(engine: Receiver, mark: int) -> bool:
         if found or time.monotonic() > end:
             return found
         store.ask()
-        await asyncio.sleep(STORE_POLL_S)
+        await asyncio.sleep(POLL_S)
     return False
 
 

@@ -91,11 +91,10 @@ def _note(state, row, t, arrival, live, horizon):
             else:
                 state[k, GAP_FROM], state[k, GAP_TO] = state[k, LAST], t
             state[k, LAST] = t
-        passed = min(max(arrival - state[k, ARRIVED], 0), SECOND_NS)
-        state[k, OFFSET] = max(t - arrival, state[k, OFFSET] - passed // OFFSET_DECAY_TIME)
-        state[k, ARRIVED] = arrival
         if live:
-            state[k, LIVE] = 1
+            passed = min(max(arrival - state[k, ARRIVED], 0), SECOND_NS)
+            state[k, OFFSET] = max(t - arrival, state[k, OFFSET] - passed // OFFSET_DECAY_TIME)
+            state[k, ARRIVED], state[k, LIVE] = arrival, 1
 
 
 @jit_brief

@@ -79,7 +79,9 @@ class ClockGuard:
         self._state = np.zeros((sensors + 3, 11), np.int64)
         self._shift = np.zeros(sensors + 2, np.int64)
         self._steps: list[int] = []
-        self._arrived, self._set_back = BEFORE, 0  # newest arrival; ns by which this machine's clock was set back
+        self._arrived = BEFORE
+        self.set_back = 0
+        """Time by which this machine's clock was set back, ns, and arrivals are corrected."""
         self._runs: dict[int, HeldRun] = {}
         self._held = Events.empty(0)
         self._raw = np.zeros(0, np.int64)
@@ -90,6 +92,11 @@ class ClockGuard:
         """Number of held events."""
         return len(self._held)
 
+    @property
+    def waiting(self) -> np.ndarray:
+        """Arrivals of the held events as they came, ns, shape (held,)."""
+        return self._held.arrival - self.set_back
+
     def state(self) -> dict[str, Any]:
         """Return a copy of the state, of arrays, lists and numbers, for `restore`."""
         return {
@@ -97,7 +104,7 @@ class ClockGuard:
             "shift": self._shift.copy(),
             "steps": self._steps.copy(),
             "arrived": self._arrived,
-            "set_back": self._set_back,
+            "set_back": self.set_back,
             "runs": {row: vars(deepcopy(run)) for row, run in self._runs.items()},
             "held": tuple(self._held),
             "raw": self._raw,
@@ -113,7 +120,7 @@ class ClockGuard:
         if clocks.shape != self._state.shape or shift.shape != self._shift.shape:
             raise ValueError("it is of other sensors")
         self._state, self._shift, self._steps = clocks, shift, list(state["steps"])
-        self._arrived, self._set_back = int(state["arrived"]), int(state["set_back"])
+        self._arrived, self.set_back = int(state["arrived"]), int(state["set_back"])
         self._raw = np.array(state["raw"], np.int64)
         held = Events(*map(np.array, state["held"])) if self._raw.size else Events.empty(0)
         self._held = plain_events(held)
@@ -165,7 +172,7 @@ class ClockGuard:
         live = np.flatnonzero(np.logical_or(self._utc, batch.arrival != batch.t))
         if not live.size:
             return batch
-        arrival = batch.arrival[live] + self._set_back
+        arrival = batch.arrival[live] + self.set_back
         while True:
             before = np.maximum.accumulate(np.concatenate(([self._arrived], arrival)))[:-1]
             back = np.flatnonzero(arrival < before - max(MIN_STEP_BACK_NS, self._horizon))
@@ -173,9 +180,9 @@ class ClockGuard:
                 break
             step = int(before[back[0]] - arrival[back[0]])
             arrival[back[0] :] += step
-            self._set_back += step
+            self.set_back += step
         self._arrived = int(max(self._arrived, arrival.max()))
-        if not self._set_back:
+        if not self.set_back:
             return batch
         arrivals = batch.arrival.copy()
         arrivals[live] = arrival

@@ -496,6 +496,11 @@ class Fleet:
         at = int(self.positions(asset)[0])
         return [] if self._gates is None else self._gates.decisions(at)
 
+    @property
+    def stale(self) -> np.ndarray:
+        """View of the events of each asset that were dropped as too late, shape (assets,)."""
+        return self._head[:, STALE_EVENTS]
+
     def table(self) -> FleetTable:
         """Return the state of all assets as of their last event."""
         head = self._head

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import os
 import threading
+import time
 import zlib
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -56,6 +57,8 @@ class _File:
     head: int = 0
     seen: tuple[int, int] = (-1, -1)
     """Size and time of writing (ns) up to which nothing is left to read."""
+    found: int = -1
+    """Bytes that it had when it was found; when their rows came is not known."""
     format: CsvFormat | None = None
     times: TimeReader | None = None
     rows: Iterator[TableRows | None] | None = None
@@ -240,6 +243,8 @@ class FollowedTable:
             known = self._files.get(stat.st_ino)
             if known is None or not known.is_same(handle, stat.st_size):
                 known = self._files[stat.st_ino] = _File(stat.st_ino)
+            if known.found < 0:
+                known.found = stat.st_size
             events = self._piece(path, handle, known)
         except BaseException:
             handle.close()
@@ -269,7 +274,8 @@ class FollowedTable:
         lines = data[:end].decode(file.format.encoding, "replace").split("\n")[: None if cut else -1]
         if file.times is None:
             file.times = TimeReader(self._time)
-        events = self._events(path, lines, file.line, file.format, file.times)
+        came = None if self._ends or file.offset < file.found else time.time_ns()
+        events = self._events(path, lines, file.line, file.format, file.times, came)
         self._advance(handle, file, file.offset + end, file.line + len(lines))
         return events
 
@@ -341,8 +347,10 @@ class FollowedTable:
                 times = "no column" if name not in names else "more than one column"
                 raise SourceError(f"{path}: there is {times} {name!r}; {nearest(name, names)}")
 
-    def _events(self, path: Path, lines: list[str], before: int, kind: CsvFormat, times: TimeReader) -> Any:
-        """Return the events of the lines that follow so many lines of a file."""
+    def _events(
+        self, path: Path, lines: list[str], before: int, kind: CsvFormat, times: TimeReader, came: int | None
+    ) -> Any:
+        """Return the events of the lines that follow so many lines of a file, and `came` at that time, ns."""
         rows, numbers = [], []
         problems: list[tuple[str, int, str]] = []
         for number, line in enumerate(lines, start=before + 1):
@@ -363,10 +371,10 @@ class FollowedTable:
             found = dated(chunk, times, self._time, problems)
         for key, number, text in problems:
             self._report(key, f"{path.name}:{number}: {text}")
-        return self._nothing if found is None else self._batch(path, found)
+        return self._nothing if found is None else self._batch(path, found, came)
 
-    def _batch(self, path: Path, found: TableRows) -> Any:
-        """Return the events of rows."""
+    def _batch(self, path: Path, found: TableRows, came: int | None = None) -> Any:
+        """Return the events of rows, which `came` at that time, ns; None if it is not known, as of a recording."""
         for key, number, text in found.problems:
             self._report(key, f"{path.name}:{number}: {text}")
         t, known, width = found.t + self._shift, found.known, len(self._columns)
@@ -381,8 +389,8 @@ class FollowedTable:
             known = known & ~nameless
         state = np.where(blank, ABSENT, PRESENT).astype(np.int8)
         plan = np.zeros(t.size, np.int64)
-        # As those of a recording, rows that were written before the twin began have no time of arrival.
-        events, row = self._mapping.events(plan, t, t, values, state, (~known).astype(np.int8))
+        arrival = t if came is None else np.full(t.size, came)
+        events, row = self._mapping.events(plan, t, arrival, values, state, (~known).astype(np.int8))
         if self._asset is None:
             return events
         return AssetEvents(events, found.values[row, -1].astype(np.int64), found.words)

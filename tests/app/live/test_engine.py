@@ -138,6 +138,11 @@ def test_measurements_beyond_the_horizon_are_counted_and_dropped():
     stepped.put(readings([10.0, 7.9, 7.5, 8.1], [40, 41, 43, 42]))
     assert stepped.engine.notices.counts()["stale"] == 2
     np.testing.assert_array_equal(pull_all(stepped.engine).events.t, np.array([8.1, 10.0]) * SECOND)
+    for times in ([*(t - late for t in range(11, 61) for late in (0, 3)), 61], range(62, 1100)):
+        stepped.put(readings(times, [40.0] * len(times)))
+        stepped.engine._watchers.episode_log.update()
+    episode = next(item for item in stepped.engine.episodes() if item.cause == "dropped")
+    assert (episode.start, episode.end, episode.size) == (61 * SECOND * 1e-9, 1099 * SECOND * 1e-9, 52 / 105)
 
 
 @pytest.mark.parametrize(

@@ -90,6 +90,21 @@ def test_messages_have_the_asset_as_a_field_in_any_form(kind, tmp_path):
     fleet.stop()
 
 
+def test_what_became_of_messages_is_told_by_asset(tmp_path):
+    fleet, _ = running(tmp_path, {"type": "push"})
+    source = messages_of(fleet)
+    times = [[*range(100, 140)], [138, 140, 101, 102], [10**11]]
+    expected = [["used"] * 40, ["late", "used", "stale", "stale"], ["waiting"]]
+    for asset in ("a", "b"):
+        for at, became in zip(times, expected, strict=True):
+            answers = source.send([message(0, asset, 40.0) | {"time": BEGIN + t * SECOND // 100} for t in at])
+            assert fleet.outcomes.of(source.accepted, arrivals := np.array([item.arrival for item in answers])) is None
+            fleet.step()
+            assert fleet.outcomes.of(source.accepted, arrivals) == became
+    assert fleet.table()[2].stale.tolist() == [2, 2]
+    fleet.stop()
+
+
 def test_messages_without_the_name_of_an_asset_are_refused(tmp_path):
     fleet, said = running(tmp_path, {"type": "push"}, assets=["a"])
     source = messages_of(fleet)

@@ -2,6 +2,7 @@
 
 import io
 import json
+import time
 
 import numpy as np
 import pyarrow as pa
@@ -45,12 +46,16 @@ def message(k, value, **more):
     return {"time": BEGIN + k * SECOND, "values": {"winding": value}, **more}
 
 
+def accepted(index, became):
+    return {"index": index, "status": "accepted", "became": became}
+
+
 def test_the_published_state_is_that_of_the_fold_whatever_the_form(page):
     values = (40.0 + np.random.default_rng(1).normal(0.0, 2.0, 40)).tolist()
     assert sent(page, message(0, values[0])) == (
         200,
-        {"accepted": 1, "duplicate": 0, "refused": 0, "items": [{"index": 0, "status": "accepted"}], "stored": False},
-    )  # fmt: skip
+        {"accepted": 1, "duplicate": 0, "refused": 0, "items": [accepted(0, "used")], "stored": False},
+    )
     iso = [{"time": f"2026-01-01T01:00:{k:02d}+01:00", "values": {"winding": values[k]}} for k in range(1, 10)]
     assert sent(page, iso)[1]["accepted"] == 9
     lines = "\n".join(json.dumps(message(k, values[k])) for k in range(10, 20)).encode()
@@ -99,7 +104,7 @@ def test_each_message_has_its_answer_and_a_wrong_one_does_not_hold_up_the_others
     for k, (_, reason) in enumerate(wrong):
         item = found["items"][2 * k]
         assert item["status"] == "refused" and reason in item["reason"] and "\n" not in item["reason"]
-        assert found["items"][2 * k + 1] == {"index": 2 * k + 1, "status": "accepted"}
+        assert found["items"][2 * k + 1] == accepted(2 * k + 1, "used")
     wait_for(lambda: page.rows() == before + len(good))
 
 
@@ -117,8 +122,17 @@ def test_a_message_that_was_sent_before_is_taken_once(page):
 
 def test_null_is_a_dropout(page):
     before = page.get("/api/state")["sensors"][0]["dropouts"]
-    assert sent(page, message(107, None))[1]["accepted"] == 1
+    assert sent(page, message(107, None))[1]["items"] == [accepted(0, "unused")]
     wait_for(lambda: page.get("/api/state")["sensors"][0]["dropouts"] == before + 1)
+
+
+def test_an_answer_says_what_became_of_a_message(page):
+    horizon, ahead = page.engine.twin.config.time.horizon, {"time": time.time_ns() + 3600 * SECOND}
+    late, stale = (message(110 - factor * horizon, 42.0) for factor in (0.5, 2.0))
+    for item in (late, stale):
+        item["time"] = int(item["time"])
+    items = sent(page, [message(110, 42.0), late, stale, message(111, 42.0) | ahead])[1]["items"]
+    assert [item["became"] for item in items] == ["used", "late", "stale", "waiting"]
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 import io
 import os
+from types import SimpleNamespace
 
 import numpy as np
 import pyarrow
@@ -13,6 +14,7 @@ from app.web.running import OpenedTwin, RunningTwin
 from estimators.errors import NisusError
 from estimators.log import READING, Events, Log
 from sources.source import Channel
+from sources.tables import follow
 from sources.tables.follow import FollowedTable
 from sources.tables.table import Table
 from sources.tables.times import TimeColumn
@@ -70,7 +72,7 @@ def test_random_pieces_of_bytes_give_the_fold_of_the_whole_file(tmp_path, seed):
         at += step
         found.append(rest(source))
     expected = read_all(Table([whole], time_column="t", time_unit="s", channels=[CHANNEL], width=1))
-    assert_same(Events.concat(found, 1), expected)
+    assert_same(Events.concat(found, 1)._replace(arrival=expected.arrival), expected)
     assert any("wärmer" in text for text in said) and any("3 cells" in text for text in said)
     log = Log(1)
     for batch in found:
@@ -79,14 +81,18 @@ def test_random_pieces_of_bytes_give_the_fold_of_the_whole_file(tmp_path, seed):
     assert_same(folded("kf", model, log).track, folded("kf", model, as_log(expected)).track)
 
 
-def test_a_half_written_line_waits_for_its_end(tmp_path):
+def test_a_half_written_line_waits_for_its_end_and_what_comes_later_has_its_arrival(tmp_path, monkeypatch):
+    monkeypatch.setattr(follow, "time", SimpleNamespace(time_ns=lambda: 77))
     path, source = tmp_path / "a.csv", followed(tmp_path)
     path.write_text("t,w\n1,40\n2,4")
     assert times(rest(source)) == [1]
     with path.open("a") as file:
         file.write("1.5\n")
     events = rest(source)
-    assert times(events) == [2] and events.value[0, 0] == 41.5
+    assert times(events) == [2] and events.value[0, 0] == 41.5 and events.arrival[0] == events.t[0]
+    with path.open("a") as file:
+        file.write("3,42\n")
+    assert rest(source).arrival.tolist() == [77]
 
 
 def test_rotated_truncated_and_rewritten_files_are_read_once_to_their_end(tmp_path):
