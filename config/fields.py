@@ -63,6 +63,26 @@ def as_seconds(value: Any) -> Any:
 
 
 Duration = Annotated[Seconds, BeforeValidator(as_seconds, json_schema_input_type=Seconds | str)]
+
+
+def repeat_period(value: str) -> float | None:
+    """Return the seconds of `every 10 s`; 0 of `changes`, None of `keep`."""
+    word, _, duration = value.partition(" ")
+    return as_seconds(duration) if word == "every" else {"keep": None, "changes": 0.0}[value]
+
+
+def _repeats(value: str) -> str:
+    """Refuse what is no rule for repeats."""
+    try:
+        period = repeat_period(value)
+    except (KeyError, PydanticCustomError):
+        period = -1.0
+    if period is not None and not (value == "changes" or 0.0 < period <= MAX_DURATION_S):
+        raise refused("value", "give keep, changes, or every with a duration, as in every 10 s")
+    return value
+
+
+Repeats = Annotated[str, AfterValidator(_repeats)]
 Time = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-MAX_TIME_S, le=MAX_TIME_S)]
 Count = Annotated[int, Field(strict=True, ge=1)]
 

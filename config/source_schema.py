@@ -18,6 +18,7 @@ from .fields import (
     Number,
     Numbers,
     Positives,
+    Repeats,
     Seconds,
     Section,
     SomeSeconds,
@@ -83,6 +84,10 @@ class ChannelSection(Section):
     Default: null, no conversion."""
     origin: tuple[Number, Number] | None = None
     """Latitude and longitude of the local origin, degrees. Default: the first valid fix."""
+    repeats: Repeats = "keep"
+    """Rows of a sensor that repeat its value: keep takes each for a measurement; changes leaves out those whose value
+    equals the one before; `every 10 s` too, but for one every 10 s while the value stays, if the source repeats a
+    value for so long. `nisus log` finds it. Default: keep."""
     accuracy: AccuracySection | None = None
     """Noise that is reported with each measurement of a sensor, {std: SIGNAL}. Default: null, the tuned R."""
 

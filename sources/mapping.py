@@ -150,6 +150,19 @@ def emit(tables, plan, skip, values, state, width, source, kind, channel, value,
     return n
 
 
+MAX_HOLDS = 100_000  # Sensors of assets whose last value is known, for those with `repeats`
+MAX_PERIODS = 2**40  # Periods of one hold
+PERIOD_SLACK = 0.01  # Of a period, by which a row may be early
+
+
+class _Hold(NamedTuple):
+    """Last value of a sensor (1, rows), when it came first, ns, and the periods since then that have a measurement."""
+
+    value: np.ndarray
+    start: int
+    periods: int
+
+
 class ChannelMapping:
     """Maps rows of values to events.
 
@@ -221,6 +234,9 @@ class ChannelMapping:
         # By sensor: a message with two ids has its channels twice here.
         self._positions = {c.index: c for c in self._channels if c.convert == "east_north"}
         self._origins = {index: channel.origin for index, channel in self._positions.items()}
+        self._thinned = {c.index: c for c in self._channels if c.kind == READING and c.repeats is not None}
+        self._holds: dict[tuple[int, str], _Hold] = {}
+        self._said: set[int] = set()
 
     def events(
         self,
@@ -230,6 +246,7 @@ class ChannelMapping:
         values: np.ndarray,
         state: np.ndarray,
         skip: np.ndarray,
+        assets: np.ndarray | None = None,
     ) -> tuple[Events, np.ndarray]:
         """Return the events of rows of values, and the row of each.
 
@@ -240,6 +257,7 @@ class ChannelMapping:
             values: (n, most values of a group), NaN is missing.
             state: Same shape: PRESENT, ABSENT or SHORT.
             skip: (n,), nonzero for rows to leave out.
+            assets: Name of the asset of each row, (n,), for a fleet.
         """
         room = plan.size * self._most
         source = np.empty(room, np.int64)
@@ -253,6 +271,9 @@ class ChannelMapping:
         if np.count_nonzero(self._counts):
             self._report_losses(*self._losses)
             self._counts[:] = 0
+        for thinned in self._thinned.values():
+            new = self._new(batch, thinned, None if assets is None else assets[source])
+            batch, source = batch.select(new), source[new]
         for item in self._positions.values():
             self._place(batch, item)
         return batch, source
@@ -272,6 +293,53 @@ class ChannelMapping:
             ):
                 for _ in range(count):
                     self._report(f"{key} {name}", f"{name}: {text}")
+
+    def _new(self, batch: Events, channel: Channel, assets: np.ndarray | None) -> np.ndarray:
+        """Return the mask of all events but the repeats of a channel's values."""
+        new = np.ones(len(batch), np.bool_)
+        value = batch.value[:, : len(channel.signals)]
+        rows = np.flatnonzero((batch.kind == READING) & (batch.channel == channel.index) & ~np.isnan(value).all(axis=1))
+        for name in [""] if assets is None else set(assets[rows].tolist()):
+            own = rows if assets is None else rows[assets[rows] == name]
+            if own.size:
+                new[own] = self._first_of_hold((channel.index, name), channel.repeats or 0.0, batch.t[own], value[own])
+        left_out = int(new.size - np.count_nonzero(new))
+        for _ in range(left_out):
+            rule = f"every {channel.repeats:g} s" if channel.repeats else "changes"
+            text = "" if channel.index in self._said else f"{channel.name}: repeats are left out (repeats: {rule})"
+            self._said.add(channel.index)
+            self._report(f"repeats {channel.name}", text)
+        return new
+
+    def _first_of_hold(self, key: tuple[int, str], period: float, t: np.ndarray, value: np.ndarray) -> np.ndarray:
+        """Return which values are the first of a hold, or of a further period of it; NaN equals NaN.
+
+        Args:
+            key: Sensor and asset, whose last hold goes on.
+            period: Seconds; 0 for the first values only.
+            t: Times, ns, (n,), n > 0.
+            value: (n, rows).
+        """
+        last = self._holds.pop(key, None)
+        if last is not None:
+            t, value = np.append(last.start, t), np.vstack((last.value, value))
+        differs = np.any((value[1:] != value[:-1]) & ~(np.isnan(value[1:]) & np.isnan(value[:-1])), axis=1)
+        # A clock that was set back begins a hold.
+        first = np.append(True, differs | (t[1:] < t[:-1] - (period or 1.0) * 1e9))
+        start = t[np.maximum.accumulate(np.where(first, np.arange(t.size), 0))]
+        periods = np.zeros(t.size, np.int64)
+        if period:
+            periods = np.clip(np.floor((t - start) / (period * 1e9) + PERIOD_SLACK), 0, MAX_PERIODS - 1).astype(
+                np.int64
+            )
+        periods[0] = 0 if last is None else last.periods
+        hold = MAX_PERIODS * np.cumsum(first)
+        used = np.maximum.accumulate(hold + periods)
+        self._holds[key] = _Hold(value[-1:].copy(), int(start[-1]), int(used[-1] - hold[-1]))
+        if len(self._holds) > MAX_HOLDS:
+            self._holds.pop(next(iter(self._holds)))
+        new: np.ndarray = np.append(last is None, used[1:] > used[:-1])
+        return new if last is None else new[1:]
 
     def _place(self, batch: Events, channel: Channel) -> None:
         """Convert latitude and longitude to east and north in place; the first valid fix is the default origin."""

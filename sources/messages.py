@@ -270,7 +270,8 @@ class Messages:
             self._room += rows.t.size
             self.mark += rows.t.size
         plan, skip = np.zeros(rows.t.size, np.int64), np.zeros(rows.t.size, np.int8)
-        events, row = self._mapping.events(plan, rows.t, rows.arrival, rows.values, rows.state, skip)
+        assets = rows.asset if self._assets else None
+        events, row = self._mapping.events(plan, rows.t, rows.arrival, rows.values, rows.state, skip, assets)
         if not self._assets:
             return events
         codes: dict[str, int] = {}

@@ -165,6 +165,7 @@ class Channel:
     Where a condition of `where` fails, the value is missing; where one of `only` fails, the row or frame is ignored.
     With convert "east_north" the two signals are latitude and longitude in degrees and become metres east and north of
     `origin`, which is the first valid fix unless given. `accuracy` is reported with a sensor's measurements.
+    `repeats` None uses every row; 0 those whose value differs from the one before; else also one every so many seconds.
     """
 
     kind: int
@@ -181,6 +182,7 @@ class Channel:
     convert: str | None = None
     origin: tuple[float, float] | None = None
     accuracy: Accuracy | None = None
+    repeats: float | None = None
 
     def __post_init__(self) -> None:
         """Spread the defaults over the rows."""

@@ -58,15 +58,15 @@ class Notices:
     ) -> None:
         """Count under `key`, and add a line for now or the time `t` unless one of that key came within the last second.
 
-        The line has a level, "info", "warn" or "error", and stands for so many `times`. `counts` has the key unless it
-        is counted better elsewhere: then `counted` is False.
+        The line has a level, "info", "warn" or "error", and stands for so many `times`; without a text there is none.
+        `counts` has the key unless it is counted better elsewhere: then `counted` is False.
         """
         with self._lock:
             self._counts[key] += times
             if not counted:
                 self._elsewhere.add(key)
             when, at_count = self._last.get(key, (-LINE_PERIOD_S, 0))
-            if self._clock() - when < LINE_PERIOD_S:
+            if not text or self._clock() - when < LINE_PERIOD_S:
                 return
             more = self._counts[key] - at_count - times
             self._last[key] = (self._clock(), self._counts[key])

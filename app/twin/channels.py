@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from math import inf
 from typing import TYPE_CHECKING, Any
 
-from config.fields import ConditionSection
+from config.fields import ConditionSection, repeat_period
 from config.loader import Loaded
 from config.source_schema import ChannelSection, FaultSection, SignalSection
 from config.yaml_files import Key
@@ -71,6 +71,8 @@ def _channel(
     own = item.accuracy
     if own is not None and kind != READING:
         raise loaded.error((*key, "accuracy"), "is for sensors; leave it out")
+    if item.repeats != "keep" and kind != READING:
+        raise loaded.error((*key, "repeats"), "is for sensors; leave it out")
     word = "signals" if isinstance(item, SignalSection) else "columns"
     if len(names) != len(rows):
         row_names = ", ".join(row for row, _ in rows)
@@ -90,6 +92,7 @@ def _channel(
         convert=item.convert,
         origin=item.origin,
         accuracy=None if own is None else Accuracy(own.names, own.std is None, own.units or (None,), own.scale),
+        repeats=repeat_period(item.repeats),
     )
 
 

@@ -390,7 +390,10 @@ class FollowedTable:
         state = np.where(blank, ABSENT, PRESENT).astype(np.int8)
         plan = np.zeros(t.size, np.int64)
         arrival = t if came is None else np.full(t.size, came)
-        events, row = self._mapping.events(plan, t, arrival, values, state, (~known).astype(np.int8))
+        names = None
+        if self._asset is not None:
+            names = np.append(found.words, "")[np.where(known, found.values[:, -1], -1).astype(np.int64)]
+        events, row = self._mapping.events(plan, t, arrival, values, state, (~known).astype(np.int8), names)
         if self._asset is None:
             return events
         return AssetEvents(events, found.values[row, -1].astype(np.int64), found.words)
