@@ -17,6 +17,7 @@ from estimators.log import READING, Events
 from ..mapping import ABSENT, PRESENT, SHORT, ChannelMapping
 from ..source import Channel, Report, ignore
 from ..units import second_ns
+from .limits import Limits
 from .readers import EXTENDED, BusName, Raw
 from .signals import extract, ordered, tabulate, vectorises
 
@@ -38,7 +39,7 @@ class Decoder:
         databases: Database files, each with the bus that it describes (None: every one).
         channels: Signals that feed the model.
         width: Value columns of an event.
-        report: Receives frames that do not decode.
+        report: Receives frames that do not decode, and values that the DBC excludes.
 
     Raises:
         SourceError: If a database lacks a message or signal, or a unit does not convert.
@@ -75,6 +76,11 @@ class Decoder:
         self._messages = [message for message, *_ in self._plans]
         self._names = [[signal.name for signal in signals] for signals in needed]
         self._signals = tabulate(list(zip(self._messages, needed, strict=True)))
+        used = [
+            {s for c in own for s in (*c.signals, *(c.accuracy.signals if c.accuracy else ()))}
+            for *_, own in self._plans
+        ]
+        self._limits = Limits(list(zip(self._messages, needed, strict=True)), used, report)
         self._slow = np.array([not all(map(vectorises, signals)) for signals in needed], np.bool_)
         self._any_slow = bool(self._slow.any())
         self._most = max((len(signals) for signals in needed), default=1)
@@ -204,6 +210,7 @@ class Decoder:
                 self._by_cantools(frames, i, values, state, bad)
         if np.count_nonzero(bad):
             self._report_undecodable(frames, bad)
+        self._limits.apply(frames.plan, values)
         batch, _ = self._mapping.events(frames.plan, frames.t, frames.arrival, values, state, bad)
         if self._unfed and len(batch):
             self._unfed = {item for item in self._unfed if not _valued(batch, self.width, *item)}
@@ -334,6 +341,11 @@ def _load(path: Path, stamp: int) -> Any:
         logger.setLevel(level)
     if not isinstance(database, cantools.database.can.Database):
         raise SourceError(f"{path}: it describes no CAN messages; give a DBC")
+    if database.dbc is not None and "VFrameFormat" not in database.dbc.attribute_definitions:
+        protocol = database.dbc.attributes.get("ProtocolType")
+        for message in database.messages:
+            if protocol is not None and protocol.value == "J1939" and message.is_extended_frame:
+                message.protocol = "j1939"
     return database
 
 

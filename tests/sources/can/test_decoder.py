@@ -1,5 +1,8 @@
 """Decoding equals cantools' own, on random layouts and payloads; what does not decode is counted."""
 
+import csv
+from pathlib import Path
+
 import can
 import cantools
 import numpy as np
@@ -313,3 +316,19 @@ def test_an_accuracy_of_another_dimension_is_refused(tmp_path):
     fix = Channel(READING, 0, "engine", ("Temp",), "ENGINE", units=("m",), model_units=("m",), accuracy=accuracy)
     with pytest.raises(SourceError, match=r"engine: Torque: 'm' does not convert to the model's '\(m\)\*\*2'"):
         Decoder([(dbc(tmp_path), None)], [fix], width=1)
+
+
+@pytest.mark.parametrize("row", [*csv.DictReader(Path(__file__).with_name("limits.csv").open(), delimiter=";")])
+def test_values_that_the_dbc_or_j1939_excludes_are_missing_and_named(tmp_path, row):
+    lines = [f'BO_ 2147484160 A: 8 E\n SG_ S : 0|{row["layout"]} {row["limits"]} "" E']
+    lines += [f"VAL_ 2147484160 S {row['names']} ;"] * bool(row["names"])
+    lines += ['BA_DEF_ "ProtocolType" STRING ;', 'BA_ "ProtocolType" "J1939";'] * bool(row["j1939"])
+    path, reports = dbc(tmp_path, "\n".join(lines) + "\n"), Reports()
+    decoder = Decoder([(path, None)], [sensor(0, "A", "S")], width=1, report=reports)
+    data = int(row["raw"]).to_bytes(8, "little")
+    (value,) = decoder.decode(decoder.gather([frame(512, data, extended=True)], None)).value[:, 0]
+    np.testing.assert_equal(value, float(row["value"] or "nan"))
+    assert (reports.counts["no value A.S"], row["why"] in reports.texts.get("no value A.S", "")) == (
+        not row["value"],
+        True,
+    )
