@@ -17,6 +17,7 @@ import socket
 import threading
 import time
 import uuid
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
@@ -397,7 +398,7 @@ class BoundedProtocol(H11Protocol):
     """uvicorn's HTTP with a timeout for each request and a limit of connections, which uvicorn lacks."""
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """Take the connection; if there are too many, the one idle for longest is closed."""
+        """Take the connection; if there are too many, the address with most idle ones loses its oldest of them."""
         super().connection_made(transport)
         self._since = self.loop.time()
         self._deadline: asyncio.TimerHandle | None = None
@@ -405,7 +406,8 @@ class BoundedProtocol(H11Protocol):
         there = [other for other in self.connections if not other.transport.is_closing()]  # type: ignore[union-attr]
         if len(there) > MAX_CONNECTIONS:
             idle = [other for other in there if isinstance(other, BoundedProtocol) and other._idle(self)]
-            min(idle, key=lambda other: other._since, default=self).transport.abort()
+            crowd = Counter(other._address for other in idle)
+            min(idle, key=lambda other: (-crowd[other._address], other._since), default=self).transport.abort()
 
     def data_received(self, data: bytes) -> None:
         """Take bytes of a request."""
@@ -421,6 +423,10 @@ class BoundedProtocol(H11Protocol):
         """Expect the next request, the start of which may have arrived already."""
         self._since = self.loop.time()
         super().on_response_complete()
+
+    @property
+    def _address(self) -> str:
+        return self.client[0] if self.client else ""
 
     def _idle(self, newcomer: BoundedProtocol) -> bool:
         """Return whether no request of this connection is being answered, so that it may be closed."""

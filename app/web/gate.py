@@ -17,6 +17,7 @@ import os
 import re
 import stat
 import threading
+from collections import Counter
 from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -63,6 +64,13 @@ VIEW, FEED, TUNE, ADMIN = ROLES = ("view", "feed", "tune", "admin")
 READINGS = "/api/readings"
 
 MIN_TOKEN_CHARACTERS = 16
+
+MAX_REQUESTS = {VIEW: 64, FEED: 64, TUNE: 80, ADMIN: 88}
+"""Requests and streams of all users together with which one of a role is still taken: fewer than the connections of the
+port, so that there is room for roles that change things, and for health. A page holds up to eight."""
+
+MAX_REQUESTS_OF_USER = 24
+"""Requests and streams of a user who is no admin."""
 
 
 class Grant(NamedTuple):
@@ -202,6 +210,7 @@ class Gate:
         self._app, self._token, self._former = app, token, frozenset(former)
         self._grants = tuple(grants)
         self._addresses, self._public = addresses, public
+        self._open = Counter[str]()
         self._name = f"nisus_{port}"
         self.entered = threading.Event()
         """Set once a browser has shown the token."""
@@ -218,9 +227,27 @@ class Gate:
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Serve one request (ASGI)."""
         response = self._response(scope)
-        returns = response is None and scope["type"] == "http" and self._is_former(Headers(scope=scope))
-        answer = self._app if response is None else response
-        await answer(scope, receive, self._with_cookie(send) if returns else send)
+        counted = response is None and scope["path"] not in OPEN_PATHS
+        if counted:
+            response = self._crowded(scope[USER])
+        if response is not None or not counted:
+            await (response or self._app)(scope, receive, send)
+            return
+        returns = scope["type"] == "http" and self._is_former(Headers(scope=scope))
+        self._open[scope[USER].name] += 1
+        try:
+            await self._app(scope, receive, self._with_cookie(send) if returns else send)
+        finally:
+            self._open[scope[USER].name] -= 1
+
+    def _crowded(self, user: User) -> ASGIApp | None:
+        """Return the answer to a request of a user who has too many, or while there are too many."""
+        mine, all_open = self._open[user.name], self._open.total()
+        if mine >= MAX_REQUESTS_OF_USER and user.role != ADMIN:
+            return _refusal(f"Nisus: {user.name} has {mine} requests and streams open; close some pages.\n", 429)
+        if all_open >= MAX_REQUESTS.get(user.role, MAX_REQUESTS[VIEW]):
+            return _refusal(f"Nisus: {all_open} requests and streams are open; try again later.\n", 503)
+        return None
 
     def _response(self, scope: Scope) -> ASGIApp | None:
         """Return the answer to a request that does not pass."""
@@ -367,8 +394,8 @@ def _single(headers: Headers, name: str) -> str | None:
     return values[0] if len(values) == 1 else None
 
 
-def _refusal(line: str) -> ASGIApp:
-    return PlainTextResponse(line, 403, {"connection": "close"})
+def _refusal(line: str, status: int = 403) -> ASGIApp:
+    return PlainTextResponse(line, status, {"connection": "close"})
 
 
 def with_security_headers(app: ASGIApp, port: int, public: str | None = None) -> ASGIApp:

@@ -1,19 +1,24 @@
 """How much the page server takes from anybody: connections, the time for a request, its size, and nonsense."""
 
+import hashlib
 import json
 import math
 import random
 import socket
+from contextlib import ExitStack
 from pathlib import Path
+from select import select
 from urllib.parse import quote
 
 import numpy as np
 import pytest
+from starlette.responses import PlainTextResponse
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 from app.views.viser import guarded_server as private_viser
 from app.web import door
 from app.web.door import MAX_CONNECTIONS as CONNECTIONS
+from app.web.gate import Grant
 from app.web.http import MAX_BODY_BYTES as BODY
 from tests.app.scripted import Replayed, readings
 from tests.app.web.test_door import STREAM
@@ -113,6 +118,32 @@ def test_the_private_viser_server_is_not_crowded_out_either(monkeypatch, capfd):
             sock.close()
         server.stop()
     assert capfd.readouterr().err == ""
+
+
+@pytest.mark.parametrize("role, held", [("view", [24, 24, 16, 0]), ("tune", [24, 24, 24, 8]), ("admin", [88, 0, 0, 0])])
+def test_streams_of_some_users_leave_room_for_the_owner_and_for_health(role, held):
+    grants = [Grant(name, role, hashlib.sha256(name.encode()).hexdigest()) for name in "abcd"]
+    served = door.Door(0, grants)
+
+    async def hold(scope, receive, send):
+        while scope["path"] == "/stream" and (await receive())["type"] != "http.disconnect":
+            pass
+        await PlainTextResponse("here")(scope, receive, send)
+
+    def ask(path, token):
+        head = f"GET {path} HTTP/1.1\r\nHost: 127.0.0.1\r\nAuthorization: Bearer {token}\r\n\r\n"
+        return half_open(served.port, head.encode())
+
+    served.show(hold)
+    served.start()
+    with ExitStack() as crowd:
+        crowd.callback(served.stop)
+        for name, expected in zip("abcd", held, strict=True):
+            asked = [crowd.enter_context(ask("/stream", name)) for _ in range(CONNECTIONS)]
+            wait_for(lambda: CONNECTIONS - len(select(asked, [], [], 0)[0]) == expected)  # noqa: B023
+        with ask("/healthz", "") as health, ask("/api/state", served.token) as owner:
+            assert health.recv(15) == b"HTTP/1.1 200 OK"
+            assert owner.recv(12) == (b"HTTP/1.1 200" if role != "admin" else b"HTTP/1.1 503")
 
 
 # Sizes
