@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from datetime import date
 from typing import Annotated, Any, Literal
 from zoneinfo import ZoneInfo, ZoneInfoNotFoundError, available_timezones
 
@@ -329,17 +330,31 @@ def _known_zone(name: str) -> str:
     return name
 
 
+def _known_date(text: str) -> str:
+    try:
+        return date.fromisoformat(text).isoformat()
+    except ValueError:
+        raise refused("value", "is no date; write year, month and day: 2024-03-04") from None
+
+
 class TimeColumnSection(Section):
     """The column that holds the time."""
 
-    column: Text
-    """Its name."""
+    column: Annotated[
+        tuple[Text, ...],
+        Field(min_length=1, max_length=2),
+        BeforeValidator(as_list, json_schema_input_type=str | list[str]),
+    ]
+    """Its name; or, of a CSV, the columns of date and clock: [Date, Clock]."""
     unit: Literal["s", "ms", "us", "ns", "min", "h", "excel", "matlab"] = "s"
     """Its unit, if it holds numbers; excel and matlab count days, as serial dates do there. Default: s."""
     format: Text | None = None
     """Format of its dates, as in Python's strptime: "%m/%d/%Y %H:%M:%S". Default: null, detected."""
     zone: Annotated[str, AfterValidator(_known_zone)] | None = None
     """Time zone of dates without an offset: Europe/Berlin. Default: null, UTC."""
+    date: Annotated[str, AfterValidator(_known_date)] | None = None
+    """Date of the first row of each file, if the column holds clocks without one: 2024-03-04. Default: null, that in
+    the file's name, else 1970-01-01."""
     shift: Time = 0.0
     """Seconds added to it: -0.2 if a row describes the 0.2 s before it, so that an input holds for these and not for
     the next. Default: 0."""

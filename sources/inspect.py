@@ -23,7 +23,7 @@ from .source import UNDATED, Channel
 from .tables.order import Order, time_order
 from .tables.rows import TableRows, is_bag, is_text, names_of, rows_of
 from .tables.text import UNREADABLE, TextMatch, csv_format, open_text
-from .tables.times import TimeColumn, TimeReader
+from .tables.times import CLOCK, DAY, SKIPPED, TWICE, TimeColumn, TimeReader
 from .units import heading_unit, suffix_unit
 
 MAX_FRAME_BYTES = 64  # Bytes of the longest frame, of CAN FD
@@ -39,6 +39,8 @@ TIME_NAMES = (
 """Usual names of a time column; otherwise the first one of dates is taken, or the first that is named like one."""
 
 TIME_NAME = re.compile(r"^t[_ ]|time|epoch|zeit|datum", re.IGNORECASE)
+
+PROBED_ROWS = 20  # Rows that show which columns hold dates and clocks
 
 MAX_TEXTS = 50  # Different texts of a column that are counted
 
@@ -294,7 +296,8 @@ def _tables(files: list[Path], time: TimeColumn) -> RecordingContents:
         raise SourceError(
             f"{files[0]}: which column holds the time is not known; name it with --time, one of {', '.join(names[:12])}"
         )
-    time = time._replace(name=chosen)
+    time = _with_clock(files[0], names, time._replace(name=chosen))
+    chosen = time.name
     named = heading_unit(chosen) or chosen.rpartition("_")[2]
     if time.unit == "s" and named in ("ms", "us", "ns", "min", "h"):
         time = time._replace(unit=named)
@@ -304,23 +307,24 @@ def _tables(files: list[Path], time: TimeColumn) -> RecordingContents:
         raise SourceError(f"{files[0]}: there are {names.count(chosen)} columns {chosen!r}; give each its own name")
     if copies:
         faults.append(f"several columns are named {', '.join(copies)} and are left out; give each its own name")
-    columns = [name for name in dict.fromkeys(names_of(files[0], chosen)) if name != chosen and name not in copies]
-    if other := [name for name in dict.fromkeys(names) if name not in (chosen, *copies, *columns)]:
+    columns = [name for name in dict.fromkeys(names_of(files[0], chosen)) if name not in (*time.names, *copies)]
+    if other := [name for name in dict.fromkeys(names) if name not in (*time.names, *copies, *columns)]:
         shown = ", ".join(other[:3]) + (", ..." if len(other) > 3 else "")
         faults.append(
             f"{len(other)} columns have another number of rows than {chosen} and are left out: {shown}; name their "
             "own time column to read them"
         )
     times, values = [], []
-    undated: list[str] = []
-    order = Order(chosen, time.unit, HORIZON_NS, lambda key, text: None if text in faults else faults.append(text))
+    counted: dict[str, list[str]] = {UNDATED: [], TWICE: [], SKIPPED: []}
+    order = Order(time.label, time.unit, HORIZON_NS, lambda key, text: None if text in faults else faults.append(text))
     if is_bag(files[0]):
         return _bags(files, time, columns, order, faults)
     for path in files:
-        for rows in _rows(path, time, columns, faults, undated):
+        for rows in _rows(path, time, columns, faults, counted):
             times.append(rows.t[rows.known])
             values.append(rows.values[rows.known])
             order.look(path.name, rows.line[rows.known], times[-1])
+    undated = counted.pop(UNDATED)
     if not any(part.size for part in times):
         none = (
             f"no row has a time; {undated[0]}"
@@ -331,6 +335,7 @@ def _tables(files: list[Path], time: TimeColumn) -> RecordingContents:
     if undated:
         more = f"; so are {len(undated) - 1} more rows" if len(undated) > 1 else ""
         faults.append(undated[0] + more)
+    faults += [f"{len(rows)} rows in an {key}; the first is {rows[0]}" for key, rows in counted.items() if rows]
     t, v = np.concatenate(times), np.concatenate(values)
     texts = _texts(files, [name for name, column in zip(columns, v.T, strict=True) if not np.isfinite(column).any()])
     by, labels, source = _source_of(files, time, dict(zip(columns, v.T, strict=True)), texts, t)
@@ -355,7 +360,7 @@ def _bags(
     times = []
     cells: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {name: [] for name in columns}
     for path in files:
-        for rows in _rows(path, time, columns, faults, []):
+        for rows in _rows(path, time, columns, faults, {UNDATED: []}):
             times.append(rows.t)
             order.look(path.name, rows.line, rows.t)
             for k in np.flatnonzero(~rows.blank.all(axis=0)):
@@ -417,15 +422,15 @@ def _split(
 
 
 def _rows(
-    path: Path, time: TimeColumn, columns: list[str], faults: list[str], undated: list[str]
+    path: Path, time: TimeColumn, columns: list[str], faults: list[str], counted: dict[str, list[str]]
 ) -> Iterator[TableRows]:
-    """Yield the rows of one table as far as it can be read; texts of rows without a time are added to `undated`."""
+    """Yield the rows of one table as far as it can be read; problems of a key in `counted` are added there."""
     try:
         for rows in rows_of(path, time, columns, lambda: 1.0):
             if rows is not None:
                 for key, line, text in rows.problems:
                     if key != UNREADABLE:
-                        (undated if key == UNDATED else faults).append(f"{path.name}:{line}: {text}")
+                        counted.get(key, faults).append(f"{path.name}:{line}: {text}")
                 yield rows
     except SourceError as error:
         faults.append(str(error))
@@ -448,12 +453,26 @@ def _time_of(path: Path, names: Sequence[str], time: TimeColumn) -> str | None:
     if named is not None or not is_text(path):
         return named or like
     row = next(_cells(path), [])
-    for name, cell in zip(names, row, strict=False):
-        if not cell.strip().replace(",", "").replace(".", "").lstrip("+-").isdigit():
-            reader = TimeReader(time._replace(name=name))
-            if reader.is_date(cell.strip()):
+    for pattern in (None, CLOCK):
+        for name, cell in zip(names, map(str.strip, row), strict=False):
+            if cell.replace(",", "").replace(".", "").lstrip("+-").isdigit():
+                continue
+            if pattern.fullmatch(cell) if pattern else TimeReader(time._replace(name=name)).is_date(cell):
                 return name
     return like
+
+
+def _with_clock(path: Path, names: Sequence[str], time: TimeColumn) -> TimeColumn:
+    """Return the time column; both, if it is one of a CSV with dates in one column and clocks in another."""
+    rows = [[cell.strip() for cell in row] for row in islice(_cells(path), PROBED_ROWS)] if is_text(path) else []
+    days, clocks = (
+        [k for k in range(len(names)) if rows and all(pattern.fullmatch(row[k]) for row in rows)]
+        for pattern in (DAY, CLOCK)
+    )
+    chosen = names.index(time.name)
+    if time.clock is None and clocks and chosen in days:
+        return time._replace(clock=names[min(clocks, key=lambda k: abs(k - chosen))])
+    return time._replace(name=names[days[0]], clock=time.name) if days and chosen in clocks else time
 
 
 def _texts(files: list[Path], names: list[str]) -> dict[str, Counter[str]]:

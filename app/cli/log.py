@@ -116,7 +116,7 @@ def _topic(found: RecordingContents) -> Topic:
         ]
         if found.by:
             texts.append(f"{found.by} names the source of each row; a twin reads them with by: {found.by}")
-        return Topic(title, (*sentences, f"time: column {found.time.name}{zone}", *texts), ("column", *TIMES), rows)
+        return Topic(title, (*sentences, f"time: column {found.time.label}{zone}", *texts), ("column", *TIMES), rows)
     lines: list[tuple[Cell, ...]] = []
     for message in found.messages:
         bus = "" if message.bus is None else str(message.bus)

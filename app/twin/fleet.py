@@ -117,7 +117,7 @@ class FleetPlan:
         given = section.model_dump(mode="json", exclude_unset=True, by_alias=True)
         loaded, column = self.source.loaded, given.pop("asset")
         found = channels(loaded, section, KEY, self.twin.model)
-        columns = [section.time.column, column, *(column_of(name) for _, item in found for name in item.needed)]
+        columns = [*section.time.column, column, *(column_of(name) for _, item in found for name in item.needed)]
         files = [path for pattern in section.files for path in matching(loaded, section, pattern)]
         files = rows_of_asset(list(dict.fromkeys(files)), column, asset, list(dict.fromkeys(columns)), folder)
         given |= {"files": [str(path.absolute()) for path in files], "follow": False}

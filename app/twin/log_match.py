@@ -119,8 +119,8 @@ def _of_table(part: TableSection, named: list[Channel], header: LogHeader) -> tu
     texts = header.texts or {}
     names = [header.time, *columns]
     reason = None
-    if part.time.column not in names:
-        reason = f"its time column {part.time.column!r} is not in the table"
+    if part.time.column[0] not in names:
+        reason = f"its time column {part.time.column[0]!r} is not in the table"
 
     def lacks(channel: Channel) -> str | None:
         for name in channel.needed:

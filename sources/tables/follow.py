@@ -342,7 +342,7 @@ class FollowedTable:
         Raises:
             SourceError: Naming file and column.
         """
-        for name in (self._time.name, *map(column_of, self._read_columns)):
+        for name in (*self._time.names, *map(column_of, self._read_columns)):
             if names.count(name) != 1:
                 times = "no column" if name not in names else "more than one column"
                 raise SourceError(f"{path}: there is {times} {name!r}; {nearest(name, names)}")
@@ -367,7 +367,7 @@ class FollowedTable:
             found = None
         else:
             columns = self._read_columns
-            chunk = chunk_of(rows, numbers, kind, self._time.name, columns, lambda *item: problems.append(item))
+            chunk = chunk_of(rows, numbers, kind, self._time.names, columns, lambda *item: problems.append(item))
             found = dated(chunk, times, self._time, problems)
         for key, number, text in problems:
             self._report(key, f"{path.name}:{number}: {text}")

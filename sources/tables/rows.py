@@ -22,7 +22,7 @@ from .text import Chunk, Column, Problem, csv_format, read_csv
 from .times import TimeColumn, TimeReader
 
 _Names = Callable[[Path, str], list[str]]
-_Read = Callable[[Path, str, Sequence[Column], Problem], Generator[Chunk, None, None]]
+_Read = Callable[[Path, Any, Sequence[Column], Problem], Generator[Chunk, None, None]]
 
 _BINARY: dict[str, tuple[_Names, _Read]] = {
     ".db3": (bag_names, read_bag),
@@ -113,9 +113,12 @@ def read_rows(path: Path, time: TimeColumn, columns: Sequence[Column]) -> Iterat
         problems.clear()
         return found
 
-    read = read_csv if is_text(path) else _BINARY[suffix_of(path)][1]
-    times = TimeReader(time)
-    for chunk in read(path, time.name, columns, lambda *problem: problems.append(problem)):
+    text = is_text(path)
+    if time.clock is not None and not text:
+        raise SourceError(f"{path}: {time.label} are two columns, which only a CSV may have; give one column of times")
+    read: _Read = read_csv if text else _BINARY[suffix_of(path)][1]
+    times = TimeReader(time, path)
+    for chunk in read(path, time.names if text else time.name, columns, lambda *problem: problems.append(problem)):
         yield dated(chunk, times, time, problems)._replace(problems=taken())
     if problems:
         none = np.zeros(0, np.int64)
@@ -124,10 +127,12 @@ def read_rows(path: Path, time: TimeColumn, columns: Sequence[Column]) -> Iterat
 
 
 def dated(chunk: Chunk, times: TimeReader, time: TimeColumn, problems: list[tuple[str, int, str]]) -> TableRows:
-    """Return the rows of a chunk with their times; rows without one are appended to the problems."""
+    """Return the rows of a chunk with their times; rows without one, or with an assumed one, join the problems."""
     t, known = times.read(chunk.time)
     for row in np.flatnonzero(~known).tolist():
         problems.append((UNDATED, int(chunk.line[row]), _undated(time, chunk.time[row])))
+    problems += [(key, int(chunk.line[row]), text) for row, key, text in times.notes]
+    times.notes.clear()
     return TableRows(chunk.line, t, known, chunk.values, chunk.blank, (), chunk.words)
 
 
@@ -135,9 +140,9 @@ def _undated(time: TimeColumn, cell: Any) -> str:
     """Return why a row has no time, and the remedy."""
     text = "" if cell is None else str(cell).strip()
     if text in ("", "None", "nan", "NaT"):
-        return f"{time.name} is empty; the row is left out"
+        return f"{time.label} is empty; the row is left out"
     rule = f"is not of the format {time.format!r}" if time.format else f"is neither a time in {time.unit} nor a date"
-    return f"{time.name} is {quoted(text)}, which {rule}; the row is left out: correct it, or give its unit or format"
+    return f"{time.label} is {quoted(text)}, which {rule}; the row is left out: correct it, or give its unit or format"
 
 
 def _names(path: Path, time: str) -> Iterator[list[str]]:

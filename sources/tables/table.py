@@ -33,10 +33,11 @@ class Table:
 
     Args:
         files: Tables in their order.
-        time_column: The column that holds the time: numbers in `time_unit`, or dates.
+        time_column: Column of the time: numbers in `time_unit`, dates or clocks; or the columns of date and clock.
         time_unit: s, ms, us, ns, min or h; excel or matlab for the days of a serial date.
         time_format: Of dates, as in `datetime.strptime`; None detects it.
         time_zone: Of dates without an offset; None is UTC.
+        time_date: Date of the first row, ISO 8601, if the column holds clocks alone.
         time_shift: Seconds added to it.
         channels: What feeds the model.
         width: Value columns of an event.
@@ -54,10 +55,11 @@ class Table:
         self,
         files: Sequence[str | os.PathLike[str]],
         *,
-        time_column: str,
+        time_column: str | Sequence[str],
         time_unit: str,
         time_format: str | None = None,
         time_zone: str | None = None,
+        time_date: str | None = None,
         time_shift: float = 0.0,
         channels: Iterable[Channel],
         width: int,
@@ -71,12 +73,13 @@ class Table:
         if time_unit not in units:
             raise SourceError(f"table: the time unit is {time_unit!r}; choose from {', '.join(units)}")
         channels = list(channels)
-        self._time = TimeColumn(time_column, time_unit, time_format, time_zone)
+        name, *clock = [time_column] if isinstance(time_column, str) else time_column
+        self._time = TimeColumn(name, time_unit, time_format, time_zone, clock[0] if clock else None, time_date)
         self._width, self._report = width, report
         self._shift = round(time_shift * 1e9)
         self._columns = list(dict.fromkeys(name for channel in channels for name in channel.needed))
         for path in self._files:
-            _check(path, [time_column, *map(column_of, self._columns)])
+            _check(path, [*self._time.names, *map(column_of, self._columns)])
         self._channels = channels
         self._selectors = _selectors(channels, self._columns)
         self._valued: set[str | TextMatch] = set()
@@ -85,7 +88,7 @@ class Table:
         self._mapping = ChannelMapping(
             [(channels, self._columns, [heading_unit(name) for name in self._columns])], width=width, report=report
         )
-        self._order = Order(time_column, time_unit, None if horizon is None else round(horizon * 1e9), report)
+        self._order = Order(self._time.label, time_unit, None if horizon is None else round(horizon * 1e9), report)
         self._batches = self._all()
 
     def _all(self) -> Generator[Events, None, None]:

@@ -130,7 +130,9 @@ def has_rows(path: Path) -> bool:
     return True  # What is wrong with the file is reported when its rows are read.
 
 
-def read_csv(path: Path, time: str, columns: Sequence[Column], problem: Problem) -> Generator[Chunk, None, None]:
+def read_csv(
+    path: Path, time: Sequence[str], columns: Sequence[Column], problem: Problem
+) -> Generator[Chunk, None, None]:
     """Yield the rows of a CSV; a value that is not a number is missing and reported, as is a row cut short."""
     kind = csv_format(path)
     names, delimiter, _, encoding = kind
@@ -175,11 +177,11 @@ def chunk_of(
     rows: list[list[str]],
     lines: list[int],
     kind: CsvFormat,
-    time: str,
+    time: Sequence[str],
     columns: Sequence[Column],
     problem: Problem,
 ) -> Chunk:
-    """Return the cells of rows, at these lines of a CSV, as numbers."""
+    """Return the cells of rows, at these lines of a CSV, as numbers; `time` names its columns, one or two."""
     values = np.empty((len(rows), len(columns)))
     blank = np.zeros(values.shape, np.bool_)
     codes: dict[str, int] = {}
@@ -191,8 +193,9 @@ def chunk_of(
             blank[:, k] = [not cell for cell in cells]
             continue
         fill(name, [row[place] for row in rows], lines, values[:, k], blank[:, k], problem, kind.decimal)
-    at_time = kind.names.index(time)
-    times = [row[at_time].strip() for row in rows]
+    at_time = [kind.names.index(name) for name in time]
+    parts = ([row[place].strip() for place in at_time] for row in rows)
+    times = [" ".join(part) if all(part) else "" for part in parts]
     if kind.decimal == ",":
         times = [_with_point(cell) or cell for cell in times]
     return Chunk(np.array(lines), times, values, blank, tuple(codes))

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from decimal import Decimal
 from itertools import islice
+from pathlib import Path
 from typing import Any, NamedTuple
+from zoneinfo import ZoneInfo
 
 import numpy as np
 
@@ -37,6 +39,21 @@ _DATE = re.compile(
 )
 """25.10.2020 01:00:00, 10/25/2020 1:00 PM, 25-Oct-2020 01:00:00.250, 2020/10/25."""
 
+DAY = re.compile(r"(?:19|20)\d{6}|\d{4}-\d\d-\d\d|\d{1,4}([./ -])(?:\d{1,2}|[A-Za-z]{3})\1\d{2,4}")
+"""A date without a clock."""
+
+CLOCK = re.compile(r"(\d{1,2}):(\d{2})(?::(\d{2})(?:[.,](\d{1,9}))?)?(?:\s*([AaPp])\.?[Mm]\.?)?")
+"""A clock without a date: 13:05, 1:05:00.250 PM."""
+
+_NAMED_DAY = re.compile(r"(?<!\d)((?:19|20)\d\d)([-_.]?)(0[1-9]|1[0-2])\2(0[1-9]|[12]\d|3[01])(?!\d)")
+"""A date in the name of a file: 20240304, 2024-03-04."""
+
+MAX_CLOCK_STEP_BACK_NS = 3600 * 10**9  # By which a clock without a date goes back within one day
+TWICE, SKIPPED, ASSUMED = "hour that occurs twice", "hour that never occurs", "time assumed"
+"""Keys of rows whose time follows from the order of the rows, and of what was assumed once for all rows."""
+
+TAIL_ROWS = 256  # Rows before the clock is set from which the usual interval is taken
+
 MAX_DETECTION_CELLS = 4096  # Cells from which the order of day and month is taken
 
 
@@ -44,29 +61,54 @@ class TimeColumn(NamedTuple):
     """The column that holds the time.
 
     unit: Of numbers, a key of `UNITS` or `SERIAL_DAYS`. format: Of dates, as in `datetime.strptime`; None detects it.
-    zone: Time zone of dates without an offset, for example Europe/Berlin; None is UTC.
+    zone: Time zone of dates without an offset, for example Europe/Berlin; None is UTC. clock: Second column, of a CSV,
+    whose cells follow those of the first. date: ISO date of the first row if the cells are clocks without one.
     """
 
     name: str
     unit: str = "s"
     format: str | None = None
     zone: str | None = None
+    clock: str | None = None
+    date: str | None = None
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Its one or two columns."""
+        return (self.name,) if self.clock is None else (self.name, self.clock)
+
+    @property
+    def label(self) -> str:
+        """Its columns, for messages."""
+        return " and ".join(self.names)
 
 
 class TimeReader:
     """Converts a time column to nanoseconds, chunk by chunk.
 
+    A clock without a date begins at the column's `date`, or that in the name of the file `path`, and passes midnight
+    when it goes back by more than an hour. Without a file, it is no time. `notes` are rows of the last chunk whose time
+    was assumed: row, key, text.
+
     Raises:
         SourceError: If dates may be day/month as well as month/day, or the zone is unknown.
     """
 
-    def __init__(self, column: TimeColumn) -> None:
+    def __init__(self, column: TimeColumn, path: Path | None = None) -> None:
         self._column = column
+        self.notes: list[tuple[int, str, str]] = []
+        named = _NAMED_DAY.search(path.name) if path is not None else None
+        date = column.date or ("-".join(named.group(1, 3, 4)) if named else None)
+        alone = path is not None and column.clock is None
+        self._midnight = (ns_of_iso(date) or (0, True))[0] if date and alone else 0 if alone else None
+        self._undated, self._clock = date is None, 0
+        self._day: str | None = ""
+        """The last cell; None once a date without a clock has been noted."""
         days = SERIAL_DAYS.get(column.unit)
         self._factor = UNITS[column.unit] if days is None else DAY_NS
         self._origin = days or 0
         self._order: str | None = None
-        self._last = -MAX_TIME_NS
+        self._summer = _SummerTime(column, self.notes) if column.zone is not None else None
 
     def read(self, cells: Any) -> tuple[np.ndarray, np.ndarray]:
         """Return times (ns), and a mask of the rows that have one.
@@ -102,13 +144,19 @@ class TimeReader:
 
     def _of_cells(self, cells: list[str]) -> tuple[np.ndarray, np.ndarray]:
         if self._order is None and self._column.format is None:
-            self._order = _day_and_month(self._column.name, cells)
+            self._order = _day_and_month(self._column.label, cells)
         t = np.zeros(len(cells), np.int64)
         known, naive = np.zeros((2, len(cells)), np.bool_)
         for k, cell in enumerate(cells):
             found = self._of_text(cell)
             if found is not None and abs(found[0]) <= MAX_TIME_NS:
                 (t[k], naive[k]), known[k] = found, True
+            if cell == self._day and DAY.fullmatch(cell):
+                rule = "a date without a clock: they all have its midnight; name the clock's column too (time.column)"
+                self.notes.append((k, ASSUMED, f"{self._column.label} is {quoted(cell)} in several rows, {rule}"))
+                self._day = None
+            elif self._day is not None:
+                self._day = cell
         return self._local(t, naive), known
 
     def _of_text(self, text: str) -> tuple[int, bool] | None:
@@ -117,12 +165,18 @@ class TimeReader:
             return None  # 1_000 is a number in Python only.
         if self._column.format is not None:
             try:
-                return _since_epoch(datetime.strptime(text, self._column.format))
+                when = datetime.strptime(text, self._column.format)
             except ValueError:
                 return None
+            t, naive = _since_epoch(when)
+            alone = self._midnight is not None and (when.year, when.month, when.day) == (1900, 1, 1)
+            return self._of_clock(t % DAY_NS) if alone else (t, naive)
         try:
             number = float(text)
         except ValueError:
+            if CLOCK.fullmatch(text) and self._midnight is not None:
+                clock = self._of_date(f"1970/01/01 {text}")
+                return clock and self._of_clock(clock[0])
             return ns_of_iso(text) or self._of_date(text)
         if not np.isfinite(number):
             return None
@@ -151,31 +205,118 @@ class TimeReader:
         t, naive = _since_epoch(when)
         return t + int((fraction or "0").ljust(9, "0")), naive
 
-    def _local(self, t: np.ndarray, local: np.ndarray) -> np.ndarray:
-        """Return times in UTC; those in the mask `local` are of the zone.
+    def _of_clock(self, clock: int) -> tuple[int, bool]:
+        """Return a clock (ns) on the day on which it follows the rows before it."""
+        assert self._midnight is not None
+        if clock < self._clock - MAX_CLOCK_STEP_BACK_NS:
+            self._midnight += DAY_NS
+        self._clock = clock
+        if self._undated:
+            self._undated = False
+            text = f"{self._column.label} is a clock without a date, counted from 1970-01-01; give it in time.date"
+            self.notes.append((0, ASSUMED, text))
+        return self._midnight + clock, True
 
-        An hour that comes twice, when the clock is set back, is the first one until times would run backwards.
-        """
-        if self._column.zone is None or not local.any():
+    def _local(self, t: np.ndarray, local: np.ndarray) -> np.ndarray:
+        """Return times in UTC; those in the mask `local` are of the zone."""
+        if self._summer is None or not local.any():
             return t
+        t = t.copy()
+        rows = np.flatnonzero(local)
+        t[rows] = self._summer.to_utc(t[rows], rows)
+        return t
+
+
+class _SummerTime:
+    """Converts local times to UTC by the order of their rows.
+
+    - An hour that occurs twice, when the clock is set back, is the first one until times run backwards. In rows that
+      are sorted by local time each time has the rows of both hours, twice as many as usual: half are of the first.
+    - An hour that does not exist is of a clock that was not set forward, and so are the rows after it, if that
+      continues the interval of the rows before.
+    """
+
+    def __init__(self, column: TimeColumn, notes: list[tuple[int, str, str]]) -> None:
+        self._column, self._notes = column, notes
+        self._tail = np.zeros(0, np.int64)
+        """Local times of the last rows."""
+        self._last, self._inside = -MAX_TIME_NS, False
+        self._usual = self._interval = 0
+        """Rows of one time, 0 if that changes, and the interval, before the clock was set."""
+        self._sorted = False
+        self._fixed: int | None = None
+        """Offset (ns) of a clock that was not set forward."""
+        self._skipped: int | None = None
+        """Its offset, while the last row is in an hour that does not exist."""
+
+    def to_utc(self, naive: np.ndarray, rows: np.ndarray) -> np.ndarray:
+        """Return local times (ns) of rows of a chunk in UTC."""
         import pyarrow
         import pyarrow.compute
 
-        naive = pyarrow.array(t[local], pyarrow.timestamp("ns"))
+        local = pyarrow.array(naive, pyarrow.timestamp("ns"))
         first, second = (
-            pyarrow.compute.assume_timezone(naive, self._column.zone, ambiguous=which, nonexistent="earliest")
+            pyarrow.compute.assume_timezone(local, self._column.zone, ambiguous=which, nonexistent=which)
             .cast(pyarrow.int64())
             .to_numpy()
             for which in ("earliest", "latest")
         )
+        odd = first != second
+        start, whole = self._tail.size, np.concatenate((self._tail, naive))
+        self._tail = whole[-TAIL_ROWS:]
+        if not odd.any() and self._skipped is None:
+            found = first if self._fixed is None else naive - self._fixed
+            self._last, self._inside = int(found[-1]), False
+            return found
+        if not self._inside:
+            before = whole[: start + int(np.argmax(odd))]
+            steps = np.diff(before)
+            lengths = np.diff(np.append(np.flatnonzero(steps) + 1, before.size))[-3:]
+            self._usual = int(lengths[0]) if lengths.size == 3 and np.ptp(lengths) == 0 else 0
+            self._interval, self._sorted = int(np.median(steps[steps > 0])) if np.any(steps > 0) else 0, False
+        edges = np.flatnonzero(np.diff(whole, prepend=whole[0] - 1))
+        lengths = np.diff(np.append(edges, whole.size))
+        within = (np.arange(whole.size) - np.repeat(edges, lengths))[start:]
+        twice, doubled = np.isin(whole[edges], naive[odd]), lengths == 2 * self._usual
+        doubled[-1] = lengths[-1] > self._usual  # it may go on in the next chunk
+        doubled = doubled[twice & (doubled | (np.arange(edges.size) < edges.size - 1))]
+        in_order = not np.any(np.diff(naive[odd]) < 0)
+        self._sorted = in_order and (self._sorted if not doubled.size else self._usual > 0 and doubled.mean() > 0.8)
         found = first.copy()
-        for k in np.flatnonzero(first != second):
-            before = found[k - 1] if k else self._last
-            found[k] = first[k] if first[k] >= before else second[k]
-        self._last = int(found[-1])
-        t = t.copy()
-        t[local] = found
-        return t
+        for k in range(naive.size):
+            if odd[k] or self._skipped is not None:
+                self._last = self._choose(int(naive[k]), int(first[k]), int(second[k]), int(within[k]), int(rows[k]))
+            else:
+                self._last = int(first[k]) if self._fixed is None else int(naive[k]) - self._fixed
+            found[k] = self._last
+        self._inside = bool(odd[-1])
+        return found
+
+    def _choose(self, naive: int, first: int, second: int, within: int, row: int) -> int:
+        """Return the UTC of a row in, or after, an hour that occurs twice or never."""
+        shown = f"{self._column.label} {np.datetime64(naive // 10**9, 's')}"
+        if second - first == 1:  # the last moment before an hour that does not exist, and the first one after it
+            before = datetime.fromtimestamp(first // 10**9, ZoneInfo(str(self._column.zone))).utcoffset() or timedelta()
+            self._skipped = before // timedelta(seconds=1) * 10**9
+            text = f"{shown} does not exist in {self._column.zone}; taken for a clock that was not set forward"
+            self._notes.append((row, SKIPPED, text))
+            return naive - self._skipped
+        if self._skipped is not None:
+            offset, self._skipped = self._skipped, None
+            steps = [abs(t - self._last - self._interval) for t in (naive - offset, first)]
+            if self._fixed is None and steps[0] < steps[1]:
+                self._fixed = offset
+                zone = f"Etc/GMT{-offset // (3600 * 10**9):+d}"
+                text = f"from {shown} on the clock is taken to be never set forward; if so, give the time's zone {zone}"
+                self._notes.append((row, ASSUMED, text))
+        if self._fixed is not None:
+            return naive - self._fixed
+        if first == second:
+            return first
+        late = within >= self._usual if self._sorted else first < self._last
+        text = f"taken as the {'second' if late else 'first'} one by the order of the rows"
+        self._notes.append((row, TWICE, f"{shown} occurs twice in {self._column.zone}; {text}"))
+        return second if late else first
 
 
 def _since_epoch(when: datetime) -> tuple[int, bool]:

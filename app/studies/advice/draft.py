@@ -346,8 +346,13 @@ def _source(
                 where = "" if bus is None else f", channel: {bus if isinstance(bus, int) else _text(bus)}"
                 lines.append(f"  - {{file: {_text(_from(path, folder))}{where}}}")
         else:
-            keys = {"column": _text(part.time.name), "unit": part.time.unit}
-            keys |= {key: _text(value) for key in ("format", "zone") if (value := getattr(part.time, key)) is not None}
+            columns = ", ".join(map(_text, part.time.names))
+            keys = {"column": f"[{columns}]" if part.time.clock else columns, "unit": part.time.unit}
+            keys |= {
+                key: _text(value)
+                for key in ("format", "zone", "date")
+                if (value := getattr(part.time, key)) is not None
+            }
             lines.append(f"time: {{{', '.join(f'{key}: {value}' for key, value in keys.items())}}}")
         channels = [
             _channel(family.name, reads.signal, family) if family else _channel(reads.name, reads.signal)

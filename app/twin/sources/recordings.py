@@ -127,6 +127,7 @@ def _open_table(opening: Opening) -> Source:
             time_unit=section.time.unit,
             time_format=section.time.format,
             time_zone=section.time.zone,
+            time_date=section.time.date,
             time_shift=section.time.shift,
             channels=channels,
             width=opening.model.width,
@@ -151,7 +152,8 @@ def _follow(opening: Opening, section: TableSection) -> Source:
     time, width, report = section.time, opening.model.width, opening.report
 
     def table(channels: list[Channel]) -> FollowedTable:
-        column = TimeColumn(time.column, time.unit, time.format, time.zone)
+        name, *clock = time.column
+        column = TimeColumn(name, time.unit, time.format, time.zone, clock[0] if clock else None)
         return FollowedTable(
             files, time=column, time_shift=time.shift, channels=channels, width=width, report=report,
             asset=asset, ends=not section.follow,

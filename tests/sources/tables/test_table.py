@@ -1,5 +1,12 @@
 """Tables: columns to events, times exact, and every complaint with its file and line."""
 
+import csv
+import json
+from collections import Counter
+from datetime import UTC, datetime, timedelta, timezone
+from pathlib import Path
+from zoneinfo import ZoneInfo
+
 import numpy as np
 import pyarrow as pa
 import pyarrow.csv as pacsv
@@ -8,10 +15,11 @@ import pytest
 
 from estimators.errors import SourceError
 from estimators.log import INPUT, READING, TRUTH
-from sources.source import Channel, Condition
+from sources.inspect import inspect_recordings
+from sources.source import UNDATED, Channel, Condition
 from sources.tables.table import Table
 from sources.tables.text import TextMatch
-from sources.tables.times import TimeColumn, TimeReader
+from sources.tables.times import ASSUMED, SKIPPED, TWICE, TimeColumn, TimeReader
 from tests.sources.can.can_tools import Reports, same
 from tests.support import read_all
 
@@ -23,6 +31,7 @@ CHANNELS = (
 )
 HEADER = "t,temp,a,b,ok,power,x\n"
 NAN = float("nan")
+TIMES = Path(__file__).with_name("times.csv").open()
 
 
 def write(folder, text, name="drive.csv"):
@@ -152,23 +161,16 @@ def test_what_is_quoted_from_a_file_is_escaped_and_cut(tmp_path):
     assert text.startswith("drive.csv:2: temp is '\\x9b31m999") and text.isprintable() and len(text) < 150
 
 
-@pytest.mark.parametrize(
-    ("cells", "unit", "expected"),
-    [
-        (["1533226488.123456789", "0.1"], "s", [1533226488123456789, 100000000]),
-        (["1533226488123.4", "5"], "ms", [1533226488123400000, 5000000]),
-        (["1533226488123456789"], "ns", [1533226488123456789]),
-        (["1.5e3", "-2"], "us", [1500000, -2000]),
-        (["1.5"], "min", [90 * 10**9]),
-        (["0.5"], "h", [1800 * 10**9]),
-        (["2013-07-04 00:00:00", "2013-07-04T01:00:00.123456789Z"], "s", [1372896000 * 10**9, 1372899600123456789]),
-        (["2013-07-04T02:00:00+02:00"], "s", [1372896000 * 10**9]),
-        (["1969-12-31T23:59:59.5"], "s", [-500_000_000]),
-    ],
-)
-def test_times_are_exact(tmp_path, cells, unit, expected):
-    path = write(tmp_path, "t,x\n" + "".join(f"{cell},1\n" for cell in cells))
-    assert read_all(table(path, unit=unit, channels=X)).t.tolist() == expected
+@pytest.mark.parametrize("row", [*csv.DictReader(TIMES, delimiter="\t", quoting=csv.QUOTE_NONE)])
+def test_times_are_exact(tmp_path, row):
+    """2020-10-25T01:00Z is 1,603,587,600 s, and 2024-03-04 1,709,510,400 s (date -u +%s); a clock passes midnight."""
+    rows, expected, reports = row["rows"].split("|"), [int(t) for t in row["ns"].split()], Reports()
+    names = ["t", "u"][: rows[0].count(";") + 1]
+    path = write(tmp_path, "".join([";".join(names), ";x\n", *(f"{cells};1\n" for cells in rows)]), row["file"])
+    options = {"time_unit": "s", **json.loads(row["options"])}
+    got = read_all(Table([path], time_column=names, channels=X, width=1, report=reports, **options))
+    counts = {UNDATED: len(rows) - len(expected), ASSUMED: int(row["assumed"])}
+    assert (got.t.tolist(), reports.counts) == (expected, {key: count for key, count in counts.items() if count})
 
 
 @pytest.mark.parametrize(
@@ -200,10 +202,10 @@ def test_parquet_and_csv_of_one_table_agree(tmp_path):
     for k in range(n):
         cells = ["" if name == "temp" and blank[k] else repr(float(columns[name][k])) for name in columns]
         lines.append(",".join(cells) + "\n")
-    csv = write(tmp_path, "".join(lines))
+    plain = write(tmp_path, "".join(lines))
     arrays = {name: pa.array(values, mask=blank if name == "temp" else None) for name, values in columns.items()}
     pq.write_table(pa.table(arrays), tmp_path / "a.parquet")
-    a, b = read_all(table(csv)), read_all(table(tmp_path / "a.parquet"))
+    a, b = read_all(table(plain)), read_all(table(tmp_path / "a.parquet"))
     assert same(a, b)
     assert (a.channel[a.kind == READING] == 0).sum() == n - blank.sum()
 
@@ -364,22 +366,6 @@ def test_a_tag_that_never_comes_is_reported(tmp_path):
     assert "column 'tag' is never 'FT9' in 5 rows, so flow has no values" in str(reports.texts)
 
 
-@pytest.mark.parametrize(
-    ("cells", "seconds"),
-    [
-        (["25.10.2020 01:00:00", "25.10.2020 01:00:00,25", "26.10.2020"], [0.0, 0.25, 82_800.0]),
-        (["10/25/2020 1:00:00 AM", "10/25/2020 1:00:00 PM"], [0.0, 43_200.0]),
-        (["25/10/2020 01:00", "01/11/2020 01:00"], [0.0, 7 * 86_400.0]),
-        (["25-Oct-2020 01:00:00.5"], [0.5]),
-        (["2020/10/25 01:00:00", "2020-10-25T03:00:00+02:00"], [0.0, 0.0]),
-    ],
-)
-def test_dates_are_recognised(cells, seconds):
-    """25 October 2020, 01:00 UTC is 1,603,587,600 s of Unix time (date -u +%s)."""
-    t, known = TimeReader(TimeColumn("t")).read(cells)
-    assert known.all() and ((t - 1_603_587_600 * 10**9) * 1e-9).tolist() == seconds
-
-
 def test_a_date_that_may_be_two_needs_a_format():
     with pytest.raises(SourceError, match=r'"%d/%m/%Y %H:%M" or "%m/%d/%Y %H:%M"'):
         TimeReader(TimeColumn("t")).read(["01/02/2020 10:00", "03/02/2020 10:00"])
@@ -406,6 +392,32 @@ def test_local_times_go_on_when_the_clock_is_set_back(kind):
         cells = pa.array(np.array(cells, "datetime64[ns]"))
     t, known = reader.read(cells)
     assert known.all() and (t // 10**9 - 1_603_582_200).tolist() == [0, 3600, 5400, 7200, 9000]
+
+
+@pytest.mark.parametrize("rows", ["as they came", "sorted", "never set forward"])
+@pytest.mark.parametrize(("minutes", "tags"), [(10, 2), (15, 1), (60, 1), (1, 3)])
+def test_local_times_are_those_of_the_order_of_the_rows(rows, minutes, tags):
+    """zoneinfo gives the local times, of half a day; another chunk begins in the hour that occurs twice or never."""
+    start = (
+        datetime(2024, 3, 30, 19, tzinfo=UTC) if rows == "never set forward" else datetime(2024, 10, 26, 18, tzinfo=UTC)
+    )
+    utc = [start + k * timedelta(minutes=minutes) for k in range(720 // minutes) for _ in range(tags)]
+    zone = timezone(timedelta(hours=1)) if rows == "never set forward" else ZoneInfo("Europe/Berlin")
+    both = [(when.astimezone(zone).strftime("%Y-%m-%d %H:%M"), when) for when in utc]
+    if rows == "sorted":
+        both.sort(key=lambda one: one[0])
+    cells, expected = [cell for cell, _ in both], [when.timestamp() * 1e9 for _, when in both]
+    reader, half = TimeReader(TimeColumn("t", zone="Europe/Berlin")), len(cells) * 13 // 24 // tags * tags
+    t = np.concatenate([reader.read(part)[0] for part in (cells[:half], cells[half:])])
+    assert t.tolist() == expected
+    keys = Counter(key for _, key, _ in reader.notes)
+    spring = {SKIPPED: 60 // minutes * tags, ASSUMED: 1}
+    assert keys == (spring if rows == "never set forward" else {TWICE: 120 // minutes * tags})
+
+
+def test_the_clock_of_a_date_is_found(tmp_path):
+    path = write(tmp_path, "Kommentar,Time,Date,x\na,00:00,2024-03-04,1\nb,12:00,2024-03-04,2\n")
+    assert inspect_recordings([path]).time.names == ("Date", "Time")
 
 
 def test_what_only_python_takes_for_a_number_is_none(tmp_path):
