@@ -23,6 +23,7 @@ from estimators.late import inflated
 from estimators.log import INPUT, READING, TICK, Events
 from estimators.registry import find_estimator
 from estimators.snapshots import PERMANENT_SPACING, Base
+from sources.messages import Messages
 from sources.source import controls_of, is_utc, span_of
 
 from ..ingest import Ingest
@@ -357,9 +358,11 @@ class Engine(Running):
             if self._horizon is not None and self.twin.late.inflate:
                 events, late = inflated(events, self._fold, self._log.newest, self._horizon)
                 self._late += late
-            newest, old = self._log.lateness(events, self._horizon, passed.settled)
+            answers = isinstance(self.innermost, Messages)
+            newest, old = self._log.lateness(events, self._horizon, passed.settled) if answers else (events.t, events.t)
             stale = self._take(events, self._horizon, passed.settled)
-            self.outcomes.note(self._mark, events, *self._intake.came(events), events.t < newest, old)
+            if answers:
+                self.outcomes.note(self._mark, events, *self._intake.came(events), events.t < newest, old)
             dropped = stale + len(passed.refused)
             self._watchers.dropped.note(self._log.newest, len(events) + len(passed.refused), dropped)
             if np.count_nonzero((events.kind == READING) | (events.kind == INPUT)) > stale:
