@@ -23,8 +23,8 @@ from .conditions import dropouts, impoverished_particles, left_ranges, lost_esti
 from .episode import JOINED, Episode, FoundEpisode, JudgedRows, standardised, without_baseline
 from .sensors import ALARM_KEYS, LOSSES, OF_ALL_ROWS, UNKNOWN_EFFECTS, evidence, sensor_alarms
 
-MAX_ROWS = 65_536  # Rows kept at most; at least half of them once there were as many
-MAX_BYTES = 64 * 2**20  # Memory of the kept rows; rows of a large field are fewer
+MAX_ROWS = 16_384  # Rows kept at most; at least half of them once there were as many
+MAX_BYTES = 16 * 2**20  # Memory of the kept rows; rows of a large field are fewer
 
 CONDITIONS = (sensor_alarms, dropouts, left_ranges, impoverished_particles, lost_estimates, silent_gaps)
 
