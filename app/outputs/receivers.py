@@ -28,6 +28,7 @@ from urllib.error import HTTPError, URLError
 from urllib.request import HTTPHandler, HTTPRedirectHandler, HTTPSHandler, Request, build_opener
 
 from config.output_schema import CommandSection, EmailSection, WebhookSection
+from estimators.compiled.orphan import killed_with_parent
 from estimators.errors import printable
 
 from ..live.jobs import Job, Jobs
@@ -226,7 +227,12 @@ class CommandReceiver:
             # A file, not a pipe: what the program leaves running would hold that open.
             with tempfile.TemporaryFile() as said:
                 code = subprocess.run(
-                    self._command, input=text.encode(), stdout=subprocess.DEVNULL, stderr=said, timeout=self._timeout
+                    self._command,
+                    input=text.encode(),
+                    stdout=subprocess.DEVNULL,
+                    stderr=said,
+                    timeout=self._timeout,
+                    preexec_fn=killed_with_parent,
                 ).returncode
                 said.seek(max(0, said.tell() - 1000) if code else 0)
                 last = (said.read(1000).decode(errors="replace").strip().splitlines() or [""])[-1]

@@ -21,6 +21,7 @@ from collections.abc import Callable
 from importlib.metadata import version
 from pathlib import Path
 
+from estimators.compiled.orphan import killed_with_parent
 from estimators.errors import ConfigError
 
 FILES = ("re_viewer.js", "re_viewer_bg.wasm")
@@ -88,7 +89,12 @@ def _served_files(home: Path) -> dict[str, bytes]:
     ports = ["--bind", "127.0.0.1", "--port", str(grpc_port), "--web-viewer-port", str(web_port)]
     with (home / "log").open("wb") as log:
         process = subprocess.Popen(
-            [str(_program()), "--serve-web", *ports], stdout=log, stderr=log, stdin=subprocess.DEVNULL, env=settings
+            [str(_program()), "--serve-web", *ports],
+            stdout=log,
+            stderr=log,
+            stdin=subprocess.DEVNULL,
+            env=settings,
+            preexec_fn=killed_with_parent,
         )
         try:
             return {name: _fetch(f"http://127.0.0.1:{web_port}/{name}", process, home / "log") for name in FILES}

@@ -2,6 +2,10 @@
 
 import asyncio
 import gzip
+import os
+import subprocess
+import sys
+from pathlib import Path
 
 import pytest
 
@@ -11,8 +15,10 @@ from app.web.gate import USER, Gate, read_tokens
 from app.web.server import PageServer
 from app.web.viewer_assets import FILES, viewer_assets, viewer_version
 from estimators.errors import ConfigError
+from tests import ROOT
 from tests.app.scripted import Scripted, twin
 from tests.app.served import SECRET, Client
+from tests.waiting import wait_for
 
 
 @pytest.fixture(autouse=True)
@@ -243,6 +249,19 @@ def test_the_installed_viewer_is_unpacked_without_a_trace(tmp_path, monkeypatch,
     # From the cache the second time.
     monkeypatch.setattr(assets_module, "_served_files", None)
     assert viewer_assets(said.append) == folder and len(said) == 1
+
+
+def test_the_viewer_s_program_ends_with_a_process_that_is_killed(tmp_path):
+    program, number = tmp_path / "rerun", tmp_path / "number"
+    program.write_text(f"#!/bin/sh\necho $$ > {number}\nexec sleep 1000\n")
+    program.chmod(0o755)
+    code = f"from app.web import viewer_assets as it\nit._program = lambda: {str(program)!r}\nit.viewer_assets()"
+    environment = {**os.environ, "XDG_CACHE_HOME": str(tmp_path)}
+    with subprocess.Popen([sys.executable, "-c", code], cwd=ROOT, env=environment) as process:
+        wait_for(lambda: number.is_file() and number.read_text().endswith("\n"))
+        process.kill()
+    command = Path(f"/proc/{number.read_text().strip()}/cmdline")  # empty of one that nobody has waited for
+    wait_for(lambda: not command.exists() or not command.read_bytes())
 
 
 def test_a_viewer_that_does_not_start_is_one_line(tmp_path, monkeypatch):
