@@ -274,10 +274,11 @@ class TimeSection(Section):
     expected latency. Default: 2."""
     degraded_after: Seconds | None = None
     """Seconds without a used measurement after which health is degraded. Default: the slowest time constant
-    of the model at the prior, but at least 3 s and three periods of the slowest simulated sensor, and at most
-    stale_after; `nisus fold` prints where it comes from."""
+    of the model at the prior, but at least 3 s and three periods of the slowest sensor (simulated, or at the begin of
+    a recording), and at most stale_after if that is given; `nisus fold` prints where it comes from."""
     stale_after: Seconds = 15.0
-    """Seconds without a used measurement after which health is stale; not below degraded_after. Default: 15."""
+    """Seconds without a used measurement after which health is stale; not below degraded_after. Default: 15, or four
+    times a degraded_after that follows from a longer period."""
     paused_after: Seconds | None = None
     """Seconds without any event, measurement or input, after which the inputs of the pause count as unknown, as where a
     logger was off while the asset ran on: the states that inputs drive become as uncertain as at the start. A gap of

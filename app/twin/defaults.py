@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -28,6 +28,10 @@ MISSED_PERIODS = 3.0
 """Periods of the slowest sensor that must be missed, where they are known."""
 
 
+STALE_RATIO = 4.0
+"""Ratio of `stale_after` to a `degraded_after` that is longer than its default, where the YAML gives neither."""
+
+
 class DegradedAfter(NamedTuple):
     """Seconds without a reading after which the twin is degraded, and where they come from."""
 
@@ -35,16 +39,28 @@ class DegradedAfter(NamedTuple):
     reason: str
 
 
-def degraded_after(config: TwinSection, model: StateSpaceModel) -> DegradedAfter:
-    """Return the YAML's value; by default the slowest time constant of the model at its prior, within limits."""
+def stale_after(config: TwinSection, degraded: float) -> float:
+    """Return the YAML's value; by default that of the schema, but at least four times a longer `degraded`."""
+    stale = config.time.stale_after
+    return stale if "stale_after" in config.time.model_fields_set or degraded <= stale else STALE_RATIO * degraded
+
+
+def degraded_after(
+    config: TwinSection, model: StateSpaceModel, recorded: Callable[[], float | None] = lambda: None
+) -> DegradedAfter:
+    """Return the YAML's value; by default the slowest time constant of the model at its prior, within limits.
+
+    `recorded` returns the period (s) of the slowest sensor in a recording, None if it is not known.
+    """
     section = config.time
     if section.degraded_after is not None:
         return DegradedAfter(section.degraded_after, "time.degraded_after")
     slowest = _slowest(model)
-    period = sensor_period(config)
+    period = sensor_period(config) or recorded()
     least = MIN_DEGRADED_S if period is None else max(MIN_DEGRADED_S, MISSED_PERIODS * period)
     if slowest is None:
-        reason = "the model has no time constant (nothing in it decays), so the least that makes sense"
+        reason = "the model has no time constant (nothing in it decays), so "
+        reason += "the least that makes sense" if least == MIN_DEGRADED_S else "three periods of the slowest sensor"
         seconds = least
     else:
         reason = f"the slowest time constant of the model, {slowest:.4g} s"
@@ -53,8 +69,9 @@ def degraded_after(config: TwinSection, model: StateSpaceModel) -> DegradedAfter
             reason += f", is below {least:g} s" + (
                 "" if least == MIN_DEGRADED_S else ", three periods of the slowest sensor"
             )
-    if seconds > section.stale_after:
-        seconds, reason = section.stale_after, f"{reason}, and no later than time.stale_after"
+    limit = section.stale_after if "stale_after" in section.model_fields_set else max(section.stale_after, least)
+    if seconds > limit:
+        seconds, reason = limit, f"{reason}, and no later than time.stale_after"
     return DegradedAfter(float(seconds), reason)
 
 

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+import numpy as np
 
 from config.loader import Loaded
 from config.source_schema import AssetSection, CanLogSection, CanSection, RecordingSection, TableSection
 from config.yaml_files import Key
 from estimators.errors import SourceError
-from estimators.log import READING
+from estimators.log import READING, Events
 from estimators.model.state_space import StateSpaceModel
 
 from .channels import channels, read_faults
@@ -28,6 +31,8 @@ if TYPE_CHECKING:
     from sources.source import Report, Source
 
 KEY: Key = ("source",)
+
+FIRST_EVENTS_TIMEOUT_S = 5.0  # Seconds to wait for the first frames of a recording
 
 
 @dataclass(frozen=True)
@@ -55,6 +60,33 @@ class Plan:
         section = self.loaded.config.source
         live = section.type == "can" or (isinstance(section, TableSection) and section.follow)
         return SOURCES[section.type].takes_log and (not live or self.log_files is not None)
+
+    @cached_property
+    def period(self) -> float | None:
+        """Seconds between two measurements of the slowest sensor at the beginning of a recording; None if unknown."""
+        section, slowest = self.loaded.config.source, None
+        parts = SOURCES[section.type].sections(section, KEY) if self.recorded else {}
+        if len(parts) > 1 and self.log_files is not None:
+            return None
+        for key, part in parts.items():
+            opening = Opening(self.loaded, self.model, part, key, lambda *_: None, False, self.log_files)
+            try:
+                source = SOURCES[part.type].open(opening)
+            except SourceError:
+                return None  # reported when the source is opened to be read
+            try:
+                events = source.first() if hasattr(source, "first") else source.read(FIRST_EVENTS_TIMEOUT_S)
+            except SourceError:
+                events = None
+            finally:
+                source.close()
+            if not isinstance(events, Events):
+                continue
+            for sensor in self.fed:
+                t = np.unique(events.t[(events.kind == READING) & (events.channel == sensor)])
+                if t.size > 2:
+                    slowest = max(slowest or 0.0, float(np.median(np.diff(t))) * 1e-9)
+        return slowest
 
     def check_files(self) -> None:
         """Open the files of the source, and close them: it takes milliseconds, while its twin takes seconds to compile.

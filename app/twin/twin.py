@@ -28,7 +28,7 @@ from estimators.tuning import CHANGED_MARK, Tuning
 
 from ..ingest import Planned, UnknownInputs
 from .checks import check_named, check_outputs, check_refit, check_scene, commissioned
-from .defaults import DegradedAfter, Late, degraded_after, driven_states, late_policy, parameter_sections
+from .defaults import DegradedAfter, Late, degraded_after, driven_states, late_policy, parameter_sections, stale_after
 from .landmarks import expanded
 from .learned import correction_files
 from .model import configure, find_model, model_files
@@ -121,7 +121,7 @@ class Twin:
         """When the estimate may be trusted."""
         return HealthPolicy(
             degraded_after=self.degraded.seconds,
-            stale_after=self.config.time.stale_after,
+            stale_after=stale_after(self.config, self.degraded.seconds),
             diverged_nis=lost_from(commissioned(self.loaded, self.model)),
         )
 
@@ -133,7 +133,7 @@ class Twin:
     @cached_property
     def degraded(self) -> DegradedAfter:
         """After how long without a reading the twin is degraded, and why then."""
-        return degraded_after(self.config, self.model)
+        return degraded_after(self.config, self.model, lambda: self.plan.period)
 
     @property
     def expected(self) -> np.ndarray:

@@ -156,6 +156,10 @@ class Table:
         self._timeout = timeout
         return next(self._batches, None)
 
+    def first(self) -> Events | None:
+        """Return the events of the first rows as they were recorded, in place of `read`; None if there are none."""
+        return next((batch for path in self._files for batch in self._one(path) if len(batch)), None)
+
     def now(self) -> int | None:
         """Return None: a recording has no clock."""
         return None

@@ -33,11 +33,15 @@ def test_the_yaml_wins(tmp_path):
     assert twin.policy.degraded_after == 4.5 and twin.degraded.reason == "time.degraded_after"
 
 
-@pytest.mark.parametrize(("every", "seconds"), [(1, 6.0), (2, 12.0), (4, 15.0)])
-def test_three_periods_of_the_slowest_sensor_and_no_more_than_stale(tmp_path, every, seconds):
-    """The winding's rate is a random walk: nothing of it decays."""
-    twin = load_twin(made(tmp_path, every=every))
-    assert twin.policy.degraded_after == seconds
+@pytest.mark.parametrize(("every", "seconds", "stale"), [(1, 6.0, 15.0), (4, 24.0, 96.0)])
+def test_three_periods_of_the_slowest_sensor_and_no_more_than_stale(tmp_path, every, seconds, stale):
+    """The winding's rate is a random walk: nothing of it decays. A recording is as slow as its first rows."""
+    (tmp_path / "a.csv").write_text("".join(["t,T\n", *(f"{2 * every * k},20\n" for k in range(9))]))
+    table = "{type: table, files: a.csv, time: {column: t}, sensors: {winding: {columns: T}}}"
+    for overrides in ({}, {"source": table}):
+        policy = load_twin(made(tmp_path, every=every), overrides=overrides).policy
+        assert (policy.degraded_after, policy.stale_after) == (seconds, stale)
+    assert load_twin(made(tmp_path, "stale_after: 15", every=every)).policy.degraded_after == min(seconds, 15.0)
 
 
 def test_a_model_that_decays_gives_its_slowest_time_constant():
