@@ -1,5 +1,6 @@
 """Limits and ranges of validity as a twin's YAML says them: what they come to, what is refused, what is told of it."""
 
+import csv
 import json
 from pathlib import Path
 
@@ -20,6 +21,8 @@ from estimators.tuning import Tuning
 from tests.app.twin.written import refusal, twin_of
 
 pytestmark = pytest.mark.usefixtures("inside")
+
+WRONG = Path(__file__).with_name("limits.csv").open(encoding="utf-8")
 
 TWIN = """\
 model: motor_winding
@@ -64,53 +67,10 @@ def test_a_range_of_validity_takes_the_place_of_the_models() -> None:
     assert [state.fitted for state in model.states if state.name == "temperature"] == [(0.0, 150.0)]
 
 
-@pytest.mark.parametrize(
-    ("limits", "more", "said"),
-    [
-        ("range: [5, 1]", "", r"motor.yaml:6: sensors.winding.range is \[5, 1\]; the first must be below the second"),
-        ("range: [5]", "", r"motor.yaml:6: sensors.winding.range is \[5\]; give the least and the greatest value"),
-        ("range: [[1, 2], [1, 2]]", "", "motor.yaml:6: sensors.winding.range has 2 entries; give one, or 1"),
-        ("rate: -1", "", "motor.yaml:6: sensors.winding.rate is -1; it must be positive"),
-        ("stuck: {quantum: 0}", "", "motor.yaml:6: sensors.winding.stuck.quantum is 0; it must be positive"),
-        ("stuck: {readings: 1}", "", "motor.yaml:6: sensors.winding.stuck.readings is 1; it must be 2 or more"),
-        ("stuck: {readings: 3, seconds: 1}", "", "sensors.winding.stuck gives both readings and seconds; keep one"),
-        ("stuck: {}", "", "motor.yaml:6: sensors.winding.stuck gives neither readings, seconds nor quantum"),
-        ("duplicates: {within: -1}", "", "sensors.winding.duplicates.within is -1; it must be zero or positive"),
-        ("use: true", "valid: {temprature: {min: 0}}",
-            "valid.temprature is no state or input of motor_winding; .*temperature"),
-        ("use: true", "valid: {rate: {min: 1, max: 1}}",
-            r"valid.rate is \{min: 1, max: 1\}; its min \(1\) must be below its max \(1\)"),
-        ("use: true", "valid: {temperature: {}}", "motor.yaml:7: valid.temperature gives neither min nor max; add it"),
-        ("duplicates: {within: 50}", "",
-            "motor.yaml:6: sensors.winding.duplicates.within is 50 s; it must be below time.s"),
-        ("duplicates: {within: 1e30}", "", "sensors.winding.duplicates.within is 1e.30; it must be 1e"),
-        ("stuck: {seconds: 1e12}", "", "sensors.winding.stuck.seconds is 1000000000000.0; it must be 1e"),
-        ("range: [0, 50]\n    stuck: {quantum: 100}", "",
-            "motor.yaml:7: sensors.winding.stuck.quantum is 100 °C; it must be below what the sensor can say, 50 °C"),
-        ("stuck: {quantum: 100}", "",
-            "stuck.quantum is 100 °C, so coarse that noise of 0.5 °C never moves the reading"),
-        ("range: [0, 50]\n    saturation: [60, 90]", "",
-            "sensors.winding.saturation is 60 to 90 °C, and range is 0 to 50: no reading keeps both; let them overlap"),
-        ("range: [0, 50]\n    saturation: [50, 90]", "", "no reading keeps both"),
-        ("range: [20, 20.1]", "", "sensors.winding.range leaves 0.1 °C, less than the noise of the sensor .0.5 °C"),
-        ("saturation: [20, 20.1]", "", "sensors.winding.saturation leaves 0.1 °C"),
-        ("use: true", "gate: 0.05", "motor.yaml:7: gate is 0.05; it must be 0.5 or more"),
-        ("use: true", "gate: {probability: 0.99, reopen: 1e12}", "gate.reopen is 1000000000000.0; it must be 1e"),
-        ("use: true", "time: {horizon: 1e12}", "time.horizon is 1000000000000.0; it must be 1e"),
-        ("use: true", "time: {tick: 1e-9}", "time.tick is 1e-09; it must be 0.01 or more"),
-        ("use: true", "maintenance: [{at: 1e12, what: fan, states: [temperature]}]",
-            "maintenance.0..at is 1000000000000.0; it must be 9e"),
-        ("use: true", f"maintenance: [{{at: 1, what: {'a' * 201}, states: [temperature]}}]",
-            "it may have 200 characters"),
-        ("use: true", "faults: [{kind: stuck, sensor: winding, start: 1e12}]",
-            "faults.0..start is 1000000000000.0; it must"),
-        ("use: true", "faults: [{kind: stuk, sensor: winding}]",
-            "motor.yaml:7: faults.0..kind is 'stuk'; did you mean stuck"),
-    ],
-)  # fmt: skip
-def test_what_means_nothing_is_refused_with_its_place(limits, more, said) -> None:
-    with pytest.raises(ConfigError, match=said):
-        twin_of(limited(limits, more))
+@pytest.mark.parametrize("row", [*csv.DictReader(WRONG, delimiter="\t", quoting=csv.QUOTE_NONE)])
+def test_what_means_nothing_is_refused_with_its_place(row) -> None:
+    with pytest.raises(ConfigError, match=row["said"]):
+        twin_of(limited(row["limits"].replace(r"\n", "\n"), row["more"]))
 
 
 def test_a_quantum_says_nothing_of_a_sensor_without_noise() -> None:

@@ -116,6 +116,30 @@ def test_blank_says_nothing_and_what_is_no_number_is_missing_with_its_line(tmp_p
     assert reports.texts["unreadable value"] == "drive.csv:4: x is 'oops', which is not a number; the value is missing"
 
 
+def test_words_of_quality_are_missing_values_counted_by_word_and_where_is_proposed(tmp_path):
+    """One 'Good', and OPC's 192 for it, by OPC Data Access 3.00, section 6.8."""
+    words = (
+        "Bad",
+        "I/O Timeout",
+        "No Data",
+        "#N/A",
+        "[-11059] No Good Data For Calculation",
+        "Uncertain (last)",
+        "Bad",
+    )
+    rows = "".join(f"{k},{word},Bad,0\n" for k, word in enumerate(words))
+    path = write(tmp_path, f"t,x,Status,Quality\n{rows}7,1.5,Good,192\n8,badge,Good,192\n")
+    got, reports = read_reports(path, X)
+    np.testing.assert_array_equal(got.value[:, 0], [NAN] * 7 + [1.5, NAN])
+    assert reports.counts == {"unreadable value": 1, **{f"no value x: {w}": words.count(w) for w in words}}
+    status, quality, told = inspect_recordings([path]).faults
+    assert status == """Status is 'Bad' (rows: 7); to leave these rows out give where: {"Status": ["Good"]}"""
+    assert (
+        quality == """Quality is below 192 (rows: 7); to leave these rows out give where: {"Quality": {"min": 192}}"""
+    )
+    assert told.startswith("x is missing where it is 'Bad' (rows: 2, the first drive.csv:2), 'I/O Timeout' (rows: 1, ")
+
+
 def test_rows_without_a_time_or_with_missing_cells_are_left_out_and_counted(tmp_path):
     got, reports = read_reports(write(tmp_path, HEADER + "soon,1,1,2,1,1,1\n1,2,3\n2,20,1,2,1,3,7\n3,20,1"))
     assert set(got.t.tolist()) == {2 * 10**9}
