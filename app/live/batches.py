@@ -92,6 +92,10 @@ class Requests:
         """The log changed from an event (its absolute index) on."""
         self._open = {ticket: index if known is None else min(known, index) for ticket, known in self._open.items()}
 
+    def again(self, ticket: int) -> None:
+        """Go on with a request over the log as it is now."""
+        self._open[ticket] = None
+
     def look(self, ticket: int) -> tuple[bool, int | None]:
         """Return whether the log of a request is still the present one, and from where on that has changed."""
         return ticket in self._open, self._open.get(ticket)

@@ -10,6 +10,7 @@ import math
 import queue
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
@@ -23,6 +24,7 @@ from estimators.late import inflated
 from estimators.log import INPUT, READING, TICK, Events
 from estimators.registry import find_estimator
 from estimators.snapshots import PERMANENT_SPACING, Base
+from estimators.track import DEGRADED, DIVERGED, STALE, WAITING
 from sources.messages import Messages
 from sources.source import controls_of, is_utc, span_of
 
@@ -50,9 +52,16 @@ if TYPE_CHECKING:
     from sources.source import Source
 
     from ..twin.twin import Twin
+    from .counts import RowCounts
 
 REFOLD_REMEDY = "the running estimate goes on. Correct the model, or choose another tuning"
 """End of the line about a refold that does not return."""
+
+GESTURE_REFOLD_S = 1.0
+"""Seconds after which a refold ends for a newer one of the same gesture, which else might never show anything."""
+
+CATCH_UP_S = 0.1
+"""Seconds for which a refold catches up in the engine's thread, which does nothing else meanwhile."""
 
 STATUS_PERIOD_S = 0.1
 """Seconds for which a status is reused."""
@@ -90,6 +99,8 @@ class Engine(Running):
             NisusError: If the source cannot be opened or the model does not compile.
         """
         self._inbox: queue.SimpleQueue[Events | Delivery | Callable[[], Any]] = queue.SimpleQueue()
+        self._submitted: deque[Callable[[], Any]] = deque()
+        """Commands and reloads that wait in the inbox; a fold is left unfinished for them."""
         self._workshop = workshop or Workshop()
         super().__init__(twin, Watchdog(self._report_stalled), base, self._workshop.ready, stored)
         self._awaited = self.estimator if self._fold.idle else None
@@ -197,11 +208,15 @@ class Engine(Running):
 
     def submit(self, command: commands.Command) -> None:
         """Queue a command."""
-        self._inbox.put(partial(execute, command, self))
+        self._submit(partial(execute, command, self))
 
     def reload(self, twin: Twin, why: str, *, exact: bool = False) -> None:
         """Queue a change to another twin; see `Running.reload`."""
-        self._inbox.put(partial(self._reload, twin, why, exact))
+        self._submit(partial(self._reload, twin, why, exact))
+
+    def _submit(self, work: Callable[[], Any]) -> None:
+        self._submitted.append(work)
+        self._inbox.put(lambda: self._submitted.popleft()())
 
     @property
     def source(self) -> Source:
@@ -235,7 +250,7 @@ class Engine(Running):
         """Return the status."""
         last = self._status
         if last is not None and time.monotonic() - last[0] < STATUS_PERIOD_S:
-            return last[1]
+            return self._with_lag(last[1])
         with self._reading(np.inf if last is None else STATUS_TIMEOUT_S) as still:
             if still or last is None:
                 status = self._status_now()
@@ -244,7 +259,19 @@ class Engine(Running):
                 fields = self._known_fields(self._requests.waiting or last[1].revision != self._revision)
                 status = busy_status(last[1], fields, self._watchdog.busy)
         self._status = (time.monotonic(), status)
-        return status
+        return self._with_lag(status)
+
+    def _with_lag(self, status: Status) -> Status:
+        """Return a status, of a health that shows measurements which wait for longer than one may be missing."""
+        age = time.monotonic() - status.heard
+        waiting = self._behind or not self._inbox.empty()
+        if not (waiting and self._feeder.live and status.t is not None and age > self.policy.degraded_after):
+            return status
+        if status.health in (WAITING, DIVERGED, STALE):
+            return status
+        cause = f"the filter is behind: measurements of the last {age:.3g} s are not folded yet"
+        health = STALE if age > self.policy.stale_after else DEGRADED
+        return replace(status, health=health, since=status.t, cause=cause)
 
     def latest(self) -> Status:
         """See `Running`."""
@@ -255,7 +282,7 @@ class Engine(Running):
                 return status
             row, u = fold.track.select(slice(last, last + 1)).copy(), fold.u.copy()
             t, revision, heard = int(self._log.t[last]), self._revision, self._idle_ticks.since
-        return replace(
+        latest = replace(
             status,
             t=t,
             revision=revision,
@@ -267,6 +294,7 @@ class Engine(Running):
             inputs=u,
             withheld=withheld_reasons(self.model, row, u),
         )
+        return self._with_lag(latest)
 
     def _status_now(self) -> Status:
         """Return the status of a fold that does not change meanwhile."""
@@ -337,6 +365,7 @@ class Engine(Running):
             except queue.Empty:
                 item = None
         self._accept(batches, mark)
+        self._fold_on()
 
     def _accept(self, batches: list[Events], mark: int | None = None) -> None:
         if not batches:
@@ -366,7 +395,7 @@ class Engine(Running):
             dropped = stale + len(passed.refused)
             self._watchers.dropped.note(self._log.newest, len(events) + len(passed.refused), dropped)
             if np.count_nonzero((events.kind == READING) | (events.kind == INPUT)) > stale:
-                self._idle_ticks.broken(self._log.newest)
+                self._idle_ticks.arrived(events if self._feeder.live else None, self._log.newest)
             if self._log.n:
                 self._watchers.silence.broken()
         self._fold_on()
@@ -383,12 +412,15 @@ class Engine(Running):
         return stale
 
     def _fold_on(self) -> None:
-        """Fold the rest in batches, between which others may read, unless the twin is asked to stop."""
+        """Fold the rest in batches, between which others may read, until the twin is asked for something else."""
         while self._behind and not self._stopping.is_set():
             with self._moving():
                 before = self._fold.n
                 self._batches.advance(self._fold)
                 self._watchers.alerts.look(self._fold, before)
+            if self._submitted:
+                return
+        self._idle_ticks.folded()
 
     def _fold_stored(self) -> None:
         """Fold the stored events, in batches as `_fold_on`; nothing about them is reported again."""
@@ -421,6 +453,8 @@ class Engine(Running):
     def _finish(self) -> None:
         """The source has ended."""
         self._put(self._intake.finish())
+        while self._behind and not self._stopping.is_set():
+            self._fold_on()
         with self._moving():
             self._fold.finish()
         self._finished = True
@@ -484,20 +518,34 @@ class Engine(Running):
             self._workshop.ask(estimator, lambda name: self._inbox.put(partial(self._compiled, name)))
             return
         log, base = self._log.copy(), self._base
+        self._ask_refold(ticket, lambda: self._make_fold(estimator, tuning, log, base), gesture)
+
+    def _ask_refold(self, ticket: int, made: Callable[[], Fold], gesture: str, *progress: Any) -> None:
         self._refolds.run(
             "refold",
-            lambda job: self._refold(ticket, self._make_fold(estimator, tuning, log, base), gesture, job),
+            lambda job: self._refold(ticket, made(), gesture, job, *progress),
             stale=lambda: ticket != self._requests.newest,
             failed=lambda reason: self._inbox.put(partial(self._adopt, ticket, None, reason)),
         )
 
-    def _refold(self, ticket: int, fold: Fold, gesture: str, job: Job) -> None:
-        """Advance a new fold to its end, in a job."""
-        batches, self._refolding = BatchSizer(), ticket
+    def _caught_up(self, fold: Fold, *, hurried: bool) -> bool:
+        """Fold the events of meanwhile; return whether all are: not if a command waits, or if `hurried` for long."""
+        batches, end = BatchSizer(), time.monotonic() + (CATCH_UP_S if hurried else math.inf)
+        with self._watchdog.watched(fold):
+            while batches.advance(fold):
+                if self._stopping.is_set() or self._submitted or time.monotonic() > end:
+                    break
+        return fold.n == self._log.n
+
+    def _refold(self, ticket: int, fold: Fold, gesture: str, job: Job, *progress: Any) -> None:
+        """Advance a new fold to its end, in a job; a newer request ends it, one of the same gesture after a while."""
+        batches, self._refolding, begun = BatchSizer(), ticket, time.monotonic()
         with self._refold_watchdog.watched(fold):
-            while batches.advance(fold) and not job.cancelled:
-                pass
-        self._inbox.put(partial(self._adopt, ticket, fold, gesture=gesture))
+            while batches.advance(fold):
+                shown = gesture and gesture == self._gesture and time.monotonic() - begun < GESTURE_REFOLD_S
+                if job.cancelled or not (job.wanted or shown):
+                    return
+        self._inbox.put(partial(self._adopt, ticket, fold, "", gesture, *progress))
 
     def _give_up(self, text: str, level: str) -> None:
         """Leave a refold in a function that does not return; its answer, should it come, is no longer waited for."""
@@ -505,16 +553,33 @@ class Engine(Running):
             self._refolds.abandon()
             self._inbox.put(partial(self._adopt, self._refolding, None, text))
 
-    def _adopt(self, ticket: int, fold: Fold | None, error: str = "", gesture: str = "") -> None:
-        """Replace the running fold by a finished refold, after that has caught up with the log."""
+    def _adopt(
+        self,
+        ticket: int,
+        fold: Fold | None,
+        error: str = "",
+        gesture: str = "",
+        row_counts: RowCounts | None = None,
+        left: float = math.inf,
+    ) -> None:
+        """Replace the running fold by a finished refold, after that has caught up with the log.
+
+        If that takes long or a command waits, the refold continues as a job; `row_counts` are of the rows that it has
+        lost, and `left` is the number of events that it was behind then. One that falls behind even so ends here.
+        """
         wanted, changed_from = self._requests.look(ticket)
         again = False
-        row_counts = None
         if wanted and fold is not None:
             try:
                 # Nobody but this thread moves the log, and nobody sees this fold yet.
-                row_counts = self._caught_up(fold, changed_from, self._stopping)
+                row_counts = self._followed(fold, changed_from, row_counts)
                 again = row_counts is None
+                if not again and not self._caught_up(fold, hurried=self._log.n - fold.n <= left / 2):
+                    behind, left = fold, self._log.n - fold.n
+                    behind.follow(self._log.copy(), None)
+                    self._requests.again(ticket)
+                    self._ask_refold(ticket, lambda: behind, gesture, row_counts, left)
+                    return
             except NisusError as failure:
                 fold, error = None, str(failure)
         # Answered under the lock, and last, so that nobody sees the old fold without a refold that is waited for.

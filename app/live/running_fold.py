@@ -561,27 +561,20 @@ class Running(ABC):
         self._fold, self._row_counts = fold, row_counts
         self._count_up()
 
-    def _caught_up(self, fold: Fold, changed_from: int | None, stopping: threading.Event) -> RowCounts | None:
-        """Let a refold follow the log, and fold the events that came meanwhile; None if it no longer fits the log.
-
-        Its row counts include the rows that it loses here.
+    def _followed(self, fold: Fold, changed_from: int | None, row_counts: RowCounts | None) -> RowCounts | None:
+        """Let a refold follow the log; return counts of the rows that it lost before and here, None if it does not fit.
 
         Raises:
             NisusError: If an event does not fit the model.
         """
         log = self._log
         lost = max(0, log.first - fold.log.first)
-        row_counts = RowCounts(self.model)
+        row_counts = row_counts or RowCounts(self.model)
         row_counts.forget(fold.track.select(slice(0, lost)), fold.log.channel[:lost])
         try:
             fold.follow(log, changed_from)
         except EstimatorError:
             return None
-        batches = BatchSizer()
-        with self._watchdog.watched(fold):
-            while batches.advance(fold):
-                if stopping.is_set():
-                    return None
         return row_counts
 
     def _count_up(self) -> None:

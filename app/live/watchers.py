@@ -85,13 +85,27 @@ class IdleTicks:
         """`tick`: seconds without events before the first prediction."""
         self._tick = tick
         self.since = time.monotonic()
-        """Monotonic time of the last arrival of what was used, s."""
+        """Monotonic time of the last arrival of what was used and folded, s."""
         self._newest: int | None = None
+        self._begun = time.time_ns()
+        self._waiting: tuple[float, int] | None = None
 
     def broken(self, newest: int, ago: float = 0.0) -> None:
         """Note an arrival some seconds `ago`; `newest` is the time of the log's newest event, ns."""
         self.since = time.monotonic() - ago
         self._newest = newest
+
+    def arrived(self, events: Events | None, newest: int) -> None:
+        """Note events in the log, until `folded`; those of a live source arrived when they say, None now."""
+        now, ago = time.monotonic(), 0.0
+        if events is not None and (stamped := events.arrival[events.arrival >= self._begun]).size:
+            ago = max(0.0, (time.time_ns() - int(stamped.max())) * 1e-9)
+        self._waiting = max(self.since, now - ago), newest
+
+    def folded(self) -> None:
+        """Note that all events have been folded."""
+        if self._waiting is not None:
+            (self.since, self._newest), self._waiting = self._waiting, None
 
     def asks(self, source: Source, last: int) -> int | None:
         """Return the time (ns) to predict for, after the log's last event at `last`; None for not yet."""

@@ -5,6 +5,7 @@ Most tests drive an engine without threads (`Stepped`); those with `started` nee
 
 import itertools
 import re
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -14,12 +15,13 @@ from hypothesis import strategies as st
 
 from app.live import commands
 from app.live.alerts import Alerts
+from app.live.batches import BatchSizer
 from app.live.engine import Engine
 from app.live.notices import Notices
 from app.twin.twin import load_twin
 from estimators.fold import Fold, fold
 from estimators.log import READING, Events, Log
-from estimators.track import DIVERGED, FAILED, USED
+from estimators.track import DEGRADED, DIVERGED, FAILED, STALE, USABLE, USED
 from estimators.tuning import Tuning
 from tests.app.scripted import MODEL, Replayed, Scripted, Stepped, pull_all, readings, row_count, twin
 from tests.support import SECOND, as_log, assert_same
@@ -281,6 +283,63 @@ def test_a_late_measurement_between_two_requests_reaches_the_answer_of_the_first
     assert engine.status().refolding
     refolded(engine)()
     assert_same(pull_all(engine).track, reference(times, values, "kf", FIRST.set("Q.rate", 0.2)))
+
+
+@pytest.mark.parametrize(("gesture", "rows", "revision"), [("", 1, 1), ("drag", 100, 2)])
+def test_a_newer_edit_ends_an_earlier_refold_unless_both_are_one_drag(gesture, rows, revision, monkeypatch):
+    engine, folds = Stepped(100).engine, []
+
+    def advance(sizer, fold):
+        if fold not in folds:
+            folds.append(fold)
+            if len(folds) == 1:
+                engine.submit(commands.SetTuning("Q.rate", 0.2, gesture))
+                engine._round(0.0)
+        return fold.advance(1)
+
+    engine.edit("kf", FIRST.set("Q.rate", 0.1), gesture)
+    monkeypatch.setattr(BatchSizer, "advance", advance)
+    engine.settle()
+    assert [fold.n for fold in folds] == [rows, 100]
+    assert engine.folded_with()[0].get("Q.rate") == 0.2 and pull_all(engine).revision == revision
+
+
+@pytest.mark.parametrize("newer", [False, True])
+def test_a_refold_that_catches_up_for_long_or_while_an_edit_waits_gives_way(newer, monkeypatch):
+    times, values = series(400)
+    engine = Stepped().engine
+    engine._accept([readings(times[:100], values[:100])])
+    engine.retune("kf", FIRST.set("Q.rate", 0.1))
+    first = refolded(engine)
+    engine._accept([readings(np.delete(times[100:], 200), np.delete(values[100:], 200))])
+    if newer:
+        engine.submit(commands.SetTuning("Q.rate", 0.2))
+    else:
+        monkeypatch.setattr("app.live.engine.CATCH_UP_S", -1.0)
+    first()
+    assert engine.status().refolding and pull_all(engine).revision == 0
+    engine._accept([readings(times[[300]], values[[300]])])
+    engine.settle()
+    assert_same(pull_all(engine).track, reference(times, values, "kf", FIRST.set("Q.rate", 0.2 if newer else 0.1)))
+    assert pull_all(engine).revision == 1 and not engine._requests.waiting
+
+
+def test_measurements_that_wait_to_be_folded_are_age_and_health():
+    stepped = Stepped(100, source=Scripted(live=True))
+    engine, ticks = stepped.engine, stepped.engine._idle_ticks
+    assert stepped.status().health in USABLE
+    for age, health in ((6.0, DEGRADED), (31.0, STALE)):
+        ticks.since = time.monotonic() - age
+        engine._inbox.put(readings([11.0], [40.0]))
+        for status in (stepped.status(), engine.latest()):
+            assert status.health == health and status.cause.startswith("the filter is behind: measurements of the last")
+    engine.settle()
+    assert stepped.status().health in USABLE and time.monotonic() - ticks.since < 31.0
+    # One that arrived a while ago does not make the estimate younger than it is.
+    ticks.since, ticks._begun, events = ticks.since - 100.0, 0, readings([12.0], [40.0])
+    events.arrival[:] = time.time_ns() - 50 * SECOND
+    engine._accept([events])
+    assert time.monotonic() - ticks.since >= 50.0
 
 
 def test_a_source_that_begins_again_during_a_refold_gets_no_rows_of_the_old_log():
