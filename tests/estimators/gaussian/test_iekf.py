@@ -9,8 +9,8 @@ from estimators.log import READING
 from estimators.track import FAILED
 from estimators.tuning import Tuning
 from tests.estimators.gaussian.test_square_root import EVERYTHING
-from tests.estimators.interpreted.test_filterpy import P0, PENDULUM, X0, H_of, R, hx, log  # noqa: F401  the fixture
-from tests.models import level_model
+from tests.estimators.interpreted.test_filterpy import P0, PENDULUM, X0, log  # noqa: F401  the fixture
+from tests.models import complex_step, level_model
 from tests.support import assert_same, folded, log_of
 
 
@@ -27,14 +27,16 @@ def test_one_iteration_is_the_ekf_to_the_bit(log, options, joseph):  # noqa: F81
 def test_many_iterations_find_the_mode_and_count_the_reading_once(sensor, y):
     """The minimum of ½ |x - x̂|²_P⁻¹ + ½ |y - h(x)|²_R⁻¹ by scipy, and P = (P⁻¹ + Hᵀ R⁻¹ H)⁻¹ there."""
     readings = log_of(2, (0, READING, y, sensor))
-    finite = np.isfinite(y)
-    y, r = np.array(y)[finite], R[sensor][finite]
+    finite, rows, h = np.isfinite(y), PENDULUM.sensors[sensor].rows, PENDULUM.sensors[sensor].h
+    y, r = np.array(y)[finite], np.array([row.variance for row in rows])[finite]
 
     def residuals(x):
-        return np.concatenate(((x - X0) / np.sqrt(P0), (y - hx(sensor, x)[finite]) / np.sqrt(r)))
+        expected = np.empty(len(rows))
+        h(x, [], [], expected)
+        return np.concatenate(((x - X0) / np.sqrt(P0), (y - expected[finite]) / np.sqrt(r)))
 
     best = least_squares(residuals, X0, xtol=1e-15, ftol=1e-15, gtol=1e-15).x
-    H = H_of(sensor, best)[finite]
+    H = complex_step(lambda x, out: h(x, [], [], out), best, len(rows))[finite]
     mean, cov = folded("iekf", PENDULUM, readings, options={"iterations": 20}).moments()
     assert np.max(np.abs(best - fold("ekf", PENDULUM, Tuning.of(PENDULUM), readings).mean[0])) > 1e-2
     # scipy stops when its gradient is 1e-15 of its size at the start: the mode is good to about 1e-8.

@@ -127,6 +127,17 @@ def test_a_curved_model(name, values, log):
     close(theirs, ours)
 
 
+def test_cubature_points_are_those_of_a_centre_without_weight(log):
+    """Arasaratnam & Haykin (2009): x ± √n Lᵢ of equal weight, which FilterPy's UKF has with α = 1 and β = κ = 0."""
+    theirs = fold("filterpy-ukf", PENDULUM, Tuning.of(PENDULUM).with_options(dict(alpha=1, beta=0, kappa=0)), log)
+    ours = folded("ckf", PENDULUM, log)
+    close(theirs, ours.track)
+    mean, cov = ours.moments()
+    points = ours.points()
+    np.testing.assert_allclose(points.mean(axis=0), mean, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(np.cov(points.T, bias=True), cov, rtol=0, atol=1e-12)
+
+
 @pytest.mark.parametrize("name", ["ekf", "ukf"])
 def test_angles_turn_past_pi(name):
     rng = np.random.default_rng(2)
