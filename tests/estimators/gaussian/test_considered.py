@@ -139,27 +139,6 @@ def test_it_equals_the_equations_in_blocks(estimator, f, options):
     equal_to_the_equations(estimator, model, options)
 
 
-# Offsets leave the model linear, and all forms exact; scales multiply states, where the tangents are those of the EKF.
-OFFSETS = {
-    "power": Instrument(offset=(0.1,)),
-    "first": Instrument(offset=(0.0,)),
-    "both": Instrument(offset=(0.2, 0.0)),
-}
-SCALES = {"power": Instrument((0.1,), (0.9,)), "both": Instrument((0.2, 0.0), (1.0, 1.1))}
-
-
-@pytest.mark.parametrize(
-    ("estimator", "f", "instruments"),
-    [*((name, f, OFFSETS) for name in CONSIDERING), *((name, bilinear, SCALES) for name in ("ekf", "sr-ekf"))],
-)
-def test_offsets_and_scales_equal_the_equations_in_blocks(estimator, f, instruments):
-    own = with_instruments(physics(f), instruments)
-    widths = {item.name: JointParameter(0.05 + 0.02 * k, considered=True) for k, item in enumerate(own.parameters[3:])}
-    model = joint(own, CONSIDERED | widths, {("loss", own.parameters[3].name): 0.6})
-    assert model.considered == 2 + sum(len(values) for given in instruments.values() for values in given)
-    equal_to_the_equations(estimator, model, {})
-
-
 def equal_to_the_equations(estimator, model, options, written=None):
     log = log_of()
     fold = Fold(estimator, model, Tuning.of(model).with_options(options), log)
@@ -232,7 +211,7 @@ def test_impossible_widths_are_refused(estimated, correlations, rule):
 @pytest.mark.parametrize("estimator", ["ekf", "sr-ukf"])
 @pytest.mark.parametrize("options", [{"adapt": "Q"}, {"adapt": "R"}, {"robust": "huber"}, {"inflation": 2.0}])
 def test_options_leave_what_is_considered(estimator, options):
-    model = joint(physics(bilinear), CONSIDERED)
+    model = joint(physics(f), CONSIDERED)
     fold = folded(estimator, model, log_of(), options=options)
     mean, P = fold.moments()
     np.testing.assert_allclose(mean[2:], 0.0, atol=1e-13)  # sigma points leave rounding errors
