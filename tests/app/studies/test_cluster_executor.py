@@ -20,7 +20,6 @@ from app.studies.checklist import checklist
 from app.studies.cluster_executor import ClusterExecutor, executor_of, functions_of, packed, unpacked
 from app.twin.log_reader import read_log
 from app.twin.twin import load_twin, with_held
-from estimators.diagnostics.sensitivity import gramian
 from estimators.errors import ConfigError
 from estimators.fit.fit import fit
 from estimators.fit.objective import Cancelled
@@ -28,7 +27,6 @@ from estimators.fit.recording import Recording
 from estimators.log import Log
 from estimators.tuning import Tuning
 from tests import ROOT
-from tests.app.studies.test_processes import die_once
 from tests.estimators.fit.test_fit import MODEL, log_of, simulated
 from tests.waiting import LIMIT_S
 
@@ -74,13 +72,6 @@ def test_a_check_on_a_cluster_is_the_same_bits(scheduler, twin, log):
     assert len(found) > 8 and to_json(found) == to_json(checked(twin, log))
 
 
-def test_any_executor_does_for_a_model_of_functions_of_a_module():
-    ys = log_of(simulated(3, 300))
-    with ProcessPoolExecutor(2, get_context("spawn")) as executor:
-        found = fit("kf", Tuning.of(MODEL), [Recording(ys)], blocks=0, executor=executor)
-    assert bits(found) == bits(fit("kf", Tuning.of(MODEL), [Recording(ys)], blocks=0))
-
-
 def both_report() -> Log:
     log = log_of(simulated(3, 300))
     log.add("silent", np.arange(300) + 0.5, simulated(4, 300))
@@ -114,20 +105,6 @@ def test_judgement_and_widths_in_processes_are_the_same_bits():
     here = fit("kf", Tuning.of(MODEL), [Recording(both_report())], executor=None, **options)
     assert bits(found) == bits(here) and found.widths.envelope == here.widths.envelope
     assert found.widths.std.tobytes() == here.widths.std.tobytes()
-
-
-def test_a_gramian_in_processes_is_the_same_bits():
-    given = "kf", MODEL, Tuning.of(MODEL), log_of(simulated(3, 300))
-    with ProcessPoolExecutor(2, get_context("spawn")) as executor:
-        found = gramian(*given, executor=executor)
-    assert len(found.windows) == 8 and repr(found) == repr(gramian(*given, executor=None))
-
-
-def test_a_worker_that_dies_costs_a_retry(scheduler, twin, tmp_path):
-    with executor_of(scheduler, twin, with_held(twin), NAME, OVERRIDES) as executor:
-        assert isinstance(executor, Executor)
-        (found,) = executor.map(die_once, [str(tmp_path / "died")])  # no other worker has what was held
-    assert found != os.getpid() and (tmp_path / "died").exists()
 
 
 class Here:
