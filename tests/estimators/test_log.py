@@ -202,7 +202,7 @@ FILTERS = {
     "kf": {}, "ekf": {"adapt": "R"}, "iekf": {"inflation": 1.5}, "ukf": {"robust": "huber"}, "ckf": {"adapt": "Q"},
     "sr-kf": {}, "sr-ekf": {}, "sr-ukf": {"adapt": "Q", "robust": 2.0}, "pf": {"particles": 50},
     "apf": {"particles": 50}, "rbpf": {"particles": 20}, "enkf": {"members": 8}, "ensrf": {"members": 8},
-    "filterpy-kf": {}, "filterpy-ukf": {},
+    "filterpy-kf": {},
 }  # fmt: skip
 
 
