@@ -3,7 +3,6 @@ from pathlib import Path
 import pytest
 
 from config.loader import load_text
-from config.source_schema import CanLogSection, CanSection, MergedSection, TableSection
 from estimators.errors import ConfigError
 
 CAR = """\
@@ -44,44 +43,6 @@ def message(text: str) -> str:
     return str(caught.value)
 
 
-def test_a_car_with_two_buses_and_a_table_can_be_written() -> None:
-    source = load_text(CAR, Path("car.yaml")).config.source
-    assert isinstance(source, MergedSection)
-    log, table = source.parts
-    assert isinstance(log, CanLogSection) and isinstance(table, TableSection)
-    assert [(item.file, item.channel) for item in log.dbc] == [("gps.dbc", 2), ("obd.dbc", 1)]
-    assert log.files == ("a.MF4", "b*.MF4")
-    assert log.sensors["obd_speed"].units == ("km/h",)
-    gyro = log.sensors["gyro"]
-    assert gyro.scale == (-1.0,) and gyro.offset == (0.0,)
-    assert {name: (limit.min, limit.max) for name, limit in gyro.where.items()} == {
-        "ImuValid": (1, 1),
-        "Temp": (None, 80),
-    }
-    gnss = log.sensors["gnss"]
-    assert gnss.convert == "east_north" and gnss.origin == (55.6, 12.5)
-    assert gnss.where["PositionValid"].min == 1
-    assert table.time.unit == "s" and table.truth["speed"].columns == ("v",)
-
-
-def test_a_live_bus_can_be_written() -> None:
-    text = """\
-model: motor_drive
-source:
-  type: can
-  interface: virtual
-  channel: motor
-  dbc: ../dbc/motor_can.dbc
-  options: {receive_own_messages: false}
-  sensors: {winding: {message: THERMAL, signals: WindingTemp}}
-  asset: {step: 0.1, inputs: {i_q: {steps: [[0, 1], [5, 2]], repeat: 10}}}
-"""
-    source = load_text(text, Path("motor.yaml")).config.source
-    assert isinstance(source, CanSection)
-    assert source.dbc[0].file == "../dbc/motor_can.dbc" and source.dbc[0].channel is None
-    assert source.asset is not None and source.asset.inputs["i_q"][0].repeat == 10
-
-
 @pytest.mark.parametrize(
     ("old", "new", "expected"),
     [
@@ -106,12 +67,3 @@ source:
 def test_a_mistake_in_a_source_is_one_line(old: str, new: str, expected: str) -> None:
     assert old in CAR
     assert message(CAR.replace(old, new, 1)) == expected
-
-
-def test_a_receiver_that_knows_its_accuracy_can_be_written() -> None:
-    own = "convert: east_north\n          accuracy: {std: PositionAccuracy, units: cm, scale: 0.5}"
-    source = load_text(CAR.replace("convert: east_north", own), Path("car.yaml")).config.source
-    assert isinstance(source, MergedSection)
-    accuracy = source.parts[0].sensors["gnss"].accuracy
-    assert accuracy is not None and accuracy.std == ("PositionAccuracy",) and accuracy.variance is None
-    assert accuracy.units == ("cm",) and accuracy.scale == (0.5,)
