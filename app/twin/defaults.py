@@ -56,7 +56,7 @@ def degraded_after(
     if section.degraded_after is not None:
         return DegradedAfter(section.degraded_after, "time.degraded_after")
     slowest = _slowest(model)
-    period = sensor_period(config) or recorded()
+    period = sensor_period(config) or (recorded() if slowest is None else None)  # it may take seconds
     least = MIN_DEGRADED_S if period is None else max(MIN_DEGRADED_S, MISSED_PERIODS * period)
     if slowest is None:
         reason = "the model has no time constant (nothing in it decays), so "

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 KEY: Key = ("source",)
 
-FIRST_EVENTS_TIMEOUT_S = 5.0  # Seconds to wait for the first frames of a recording
+FIRST_EVENTS_S = 5.0  # Seconds between two looks for the first frames of a recording
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,9 @@ class Plan:
             except SourceError:
                 return None  # reported when the source is opened to be read
             try:
-                events = source.first() if hasattr(source, "first") else source.read(FIRST_EVENTS_TIMEOUT_S)
+                events = source.first() if hasattr(source, "first") else Events.empty(self.model.width)
+                while events is not None and not len(events):
+                    events = source.read(FIRST_EVENTS_S)
             except SourceError:
                 events = None
             finally:

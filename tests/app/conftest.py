@@ -2,6 +2,7 @@
 
 import asyncio
 import json
+import re
 import shutil
 import signal
 from collections.abc import Iterator
@@ -112,8 +113,9 @@ class CommandLine:
     def refuses(self, *arguments: object) -> str:
         """Run a command that is refused with status 2 and one line, and return the line."""
         done = self.run(*arguments)
-        # Beside it stands at most the status of work that took long.
-        lines = [line for line in done.err.splitlines() if not line.startswith("compil") and not line.endswith(" ...")]
+        # Beside it stands at most the progress of work that took long.
+        progress = re.compile(r"(?!nisus: ).*( \.\.\.|\b\d+ s(, .*)?)")
+        lines = [line for line in done.err.splitlines() if not progress.fullmatch(line)]
         assert done.status == 2 and len(lines) == 1 and lines[0].startswith("nisus: "), done
         return lines[0]
 
