@@ -109,6 +109,12 @@ def _read(
             continue
         try:
             signal = mdf.get("CAN_DataFrame", group=index)
+            zeros = signal.timestamps == 0  # of lost bytes
+            for name in ("ID", "DataLength"):
+                zeros &= signal.samples[f"CAN_DataFrame.{name}"] == 0
+            if zeros.any():
+                signal.samples, signal.timestamps = signal.samples[~zeros], signal.timestamps[~zeros]
+                fault = fault or f"{zeros.sum()} of {cycles} frames are zeros alone, from {zeros.argmax() + 1} on"
             parts.append(_columns(signal, start, wanted, longest))
         except MemoryError:
             raise
@@ -118,7 +124,8 @@ def _read(
             continue
         total += len(signal)
         if len(signal) < cycles:
-            fault = fault or f"{cycles - len(signal)} of {cycles} frames are missing"
+            marked = "marked invalid" if group.channel_group.invalidation_bytes_nr else "missing"
+            fault = fault or f"{cycles - len(signal)} of {cycles} frames are {marked}"
     fault = fault or lost_records(mdf, content.getvalue())
     if fault and not parts:
         raise unreadable(path, fault)

@@ -89,7 +89,8 @@ def read_messages(path: Path, wanted: frozenset[int] | None, longest: int) -> It
             except SourceError:
                 raise
             except Exception as error:  # noqa: BLE001  as above
-                fault = gist(error)
+                at = f" before byte {reader.file.tell()}" if isinstance(reader, can.BLFReader) else ""
+                fault = f"{gist(error)}{at}"
             count += len(chunk)
             errors += sum(message.is_error_frame for message in chunk)
             if chunk or block is None:
@@ -184,9 +185,14 @@ class _Lines:
         if self._empty:
             self._empty = False
             return "\n"
-        line = next(self._file)
-        self.number += 1
-        return line
+        for line in self._file:
+            self.number += 1
+            # python-can skips it silently, or reads what is left of it.
+            if not (zeros := line.count("\0")):
+                return line
+            self.refuse(f"{zeros} of its bytes are zero")
+            self._empty = False
+        raise StopIteration
 
     def refuse(self, error: object) -> None:
         """Count the last line as unreadable."""

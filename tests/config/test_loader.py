@@ -1,3 +1,4 @@
+import csv
 import os
 from pathlib import Path
 from typing import Annotated
@@ -12,6 +13,8 @@ from config.source_schema import CanSection, SimulatorSection
 from config.yaml_files import as_flow, as_section, parse
 from estimators.errors import ConfigError
 from estimators.tuning import REOPEN_S
+
+MISTAKES = Path(__file__).with_name("mistakes.csv").open()
 
 MOTOR = """\
 model: motor_winding
@@ -53,38 +56,11 @@ def test_values_are_read_and_defaults_filled_in() -> None:
     assert loaded.places.at(("source", "inputs", "torque", 1)) == "folder/motor.yaml:13"
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "expected"),
-    [
-        ("    std: 2", "    sdt: 2", "motor.yaml:6: sensors.winding.sdt is not known; did you mean std?"),
-        ("    std: 2", "    std: -0.1", "motor.yaml:6: sensors.winding.std is -0.1; it must be zero or positive"),
-        ("    std: 2", "    std: 1e200", "motor.yaml:6: sensors.winding.std is 1e+200; it must be 1e+50 at most"),
-        ("    std: 2", "    variance: -1", "motor.yaml:6: sensors.winding.variance is -1; it must be zero or positive"),
-        ("    std: 2", "    std: [1, -1]", "motor.yaml:6: sensors.winding.std[1] is -1; it must be zero or positive"),
-        ("    std: 2", "    std: .nan", "motor.yaml:6: sensors.winding.std is nan; it must be a finite number"),
-        ("    std: 2", "    std: []", "motor.yaml:6: sensors.winding.std is []; it needs 1 or more entries"),
-        ("    std: 2", "    std: 2\n    variance: 4",
-            "motor.yaml:6: sensors.winding gives both variance and std; keep one"),
-        ("{variance: 1e-3}", "{variance: -1e-3}",
-            "motor.yaml:3: noise.temperature.variance is -0.001; it must be zero or positive"),
-        ("{variance: 1e-3}", "{}", "motor.yaml:3: noise.temperature gives neither variance nor std; add it"),
-        ("gate: 0.9973", "gate: 99.73", "motor.yaml:8: gate is 99.73; it must be below 1"),
-        ("gate: 0.9973", "gates: 0.9973", "motor.yaml:8: gates is not known; did you mean gate?"),
-        ("duration: 120", "duration: no", "motor.yaml:11: source.duration is 'no'; it must be a number"),
-        ("duration: 120", "duration: true", "motor.yaml:11: source.duration is true; it must be a number"),
-        ("duration: 120", "duration: 1:30", "motor.yaml:11: source.duration is '1:30'; it must be a number"),
-        ("simulator", "simulater", "motor.yaml:10: source.type is 'simulater'; did you mean simulator?"),
-        ("model: motor_winding\n", "", "motor.yaml:1: model is missing; add it"),
-        ("motor_winding", "5", "motor.yaml:1: model is 5; it must be text; put it in quotes if it looks like a number"),
-        ("[5, 2]", "[0, 2]", "motor.yaml:13: source.inputs.torque[1].steps must have rising times; put them in order"),
-        ("[5, 2]", "[5]", "motor.yaml:13: source.inputs.torque[1].steps[1] is [5]; it needs 2 or more entries"),
-        ("estimator: kf", "estimator: {name: kf, options: {a: [b]}}",
-            "motor.yaml:7: estimator.options.a is ['b']; it must be a number"),
-    ],
-)  # fmt: skip
-def test_a_value_that_breaks_a_rule_is_one_line(old: str, new: str, expected: str) -> None:
+@pytest.mark.parametrize("row", [*csv.DictReader(MISTAKES, delimiter="\t", quoting=csv.QUOTE_NONE)])
+def test_a_value_that_breaks_a_rule_is_one_line(row: dict[str, str]) -> None:
+    old, new = (row[key].replace(r"\n", "\n") for key in ("old", "new"))
     assert old in MOTOR
-    assert message(MOTOR.replace(old, new, 1)) == expected
+    assert message(MOTOR.replace(old, new, 1)) == row["expected"]
 
 
 def test_a_missing_type_is_told_those_of_the_schema(monkeypatch: pytest.MonkeyPatch) -> None:

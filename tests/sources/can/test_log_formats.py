@@ -5,6 +5,7 @@ import struct
 import can
 import numpy as np
 import pytest
+from asammdf import MDF
 
 from estimators.errors import SourceError
 from sources.can.decoder import Decoder
@@ -164,6 +165,38 @@ def test_a_garbled_line_loses_only_itself(tmp_path, messages, suffix, capfd):  #
     assert reports.counts == {"truncated file": 1}
     assert f"the first line {place + 1}: " in reports.texts["truncated file"]
     assert not capfd.readouterr().err
+
+
+@pytest.mark.parametrize("suffix", [".asc", ".csv", ".log", ".trc", ".mf4"])
+@pytest.mark.parametrize("whole", [True, False])
+def test_a_block_of_zeros_is_counted_with_its_place(tmp_path, messages, suffix, whole):  # noqa: F811
+    """Of whole lines, of which python-can tells nothing in an ASC log, or from within one to within another."""
+    path = tmp_path / f"a{suffix}"
+    write(path, messages)
+    if suffix == ".mf4":
+        MDF(path).save(path, compression=0, overwrite=True)
+    data = bytearray(path.read_bytes())
+    begin = data.find(b"\n", len(data) // 2) + 1 if whole else len(data) // 2
+    end = data.find(b"\n", begin + 2000) if whole else begin + 2000
+    data[begin:end] = bytes(end - begin)
+    path.write_bytes(data)
+    text = read(path, decoder_of(tmp_path))[1].texts["truncated file"]
+    line = data[:begin].count(b"\n") + 1
+    lost = f"1 line cannot be read, the first line {line}: {end - begin} of its bytes are zero"
+    assert ("of 1000 frames are zeros alone, from " if suffix == ".mf4" else lost) in text
+
+
+@pytest.mark.parametrize("share", [0, 0.1])
+def test_frames_that_an_mf4_marks_invalid_are_missing_and_counted(tmp_path, messages, share):  # noqa: F811
+    write(tmp_path / "a.mf4", messages)
+    signal = MDF(tmp_path / "a.mf4").get("CAN_DataFrame", group=0)
+    signal.invalidation_bits = np.arange(1000) < 1000 * share
+    made = MDF()
+    made.append([signal], common_timebase=True)
+    made.save(tmp_path / "b.mf4")
+    got, reports = read(tmp_path / "b.mf4", decoder_of(tmp_path))
+    assert len(got) == sum(k % 3 != 2 for k in range(int(1000 * share), 1000))
+    assert ("100 of 1000 frames are marked invalid" in str(reports.texts)) == (share > 0)
 
 
 def test_a_candump_frame_that_ends_within_a_byte_is_left_out(tmp_path):
