@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import json
 import re
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
@@ -23,7 +22,7 @@ from .formats import CAN_LOGS, check_once, suffix_of
 from .source import UNDATED, Channel
 from .tables.order import Order, time_order
 from .tables.rows import TableRows, is_bag, is_text, names_of, rows_of
-from .tables.text import NO_VALUE, QUALITY_WORD, UNREADABLE, TextMatch, csv_format, open_text
+from .tables.text import NO_VALUE, UNREADABLE, TextMatch, csv_format, open_text
 from .tables.times import CLOCK, DAY, SKIPPED, TWICE, TimeColumn, TimeReader
 from .units import heading_unit, suffix_unit
 
@@ -42,11 +41,6 @@ TIME_NAMES = (
 TIME_NAME = re.compile(r"^t[_ ]|time|epoch|zeit|datum", re.IGNORECASE)
 
 PROBED_ROWS = 20  # Rows that show which columns hold dates and clocks
-
-QUALITY = re.compile(r"qual|valid|güte", re.IGNORECASE)
-GOOD_WORD = re.compile(r"good\b.*|ok|valid|normal|gut", re.IGNORECASE)
-OPC_GOOD = 192
-"""Names of columns of quality, its good words, and the least good number of OPC."""
 
 MAX_TEXTS = 50  # Different texts of a column that are counted
 
@@ -343,7 +337,7 @@ def _tables(files: list[Path], time: TimeColumn) -> RecordingContents:
         faults.append(undated[0] + more)
     t, v = np.concatenate(times), np.concatenate(values)
     texts = _texts(files, [name for name, column in zip(columns, v.T, strict=True) if not np.isfinite(column).any()])
-    faults += _qualities(dict(zip(columns, v.T, strict=True)), texts) + _counts(counted, texts)
+    faults += _counts(counted, texts)
     by, labels, source = _source_of(files, time, dict(zip(columns, v.T, strict=True)), texts, t)
     order.report_late(time_order(t, source, HORIZON_NS) is not None)
     rank = np.argsort(t, kind="stable")
@@ -481,24 +475,6 @@ def _counts(counted: dict[str, list[str]], texts: dict[str, Counter[str]]) -> li
             found.append(f"{len(rows)} rows in an {key}; the first is {rows[0]}")
     return found + [
         f"{name} is missing where it is {', '.join(told)}" for name, told in words.items() if name not in texts
-    ]
-
-
-def _qualities(columns: dict[str, np.ndarray], texts: dict[str, Counter[str]]) -> list[str]:
-    """Return the columns by which rows of bad quality can be left out, with the condition."""
-    found: list[tuple[str, str, int, object]] = []
-    for name, words in texts.items():
-        good = [word for word in words if GOOD_WORD.fullmatch(word)]
-        bad = [word for word in words if QUALITY_WORD.fullmatch(word) or (QUALITY.search(name) and word not in good)]
-        if good and bad:
-            found.append((name, ", ".join(map(quoted, bad[:3])), sum(words[word] for word in bad), good))
-    for name, values in columns.items():
-        if QUALITY.search(name) and np.all((values >= 0) & (values <= 255)) and values.min() < OPC_GOOD <= values.max():
-            found.append((name, f"below {OPC_GOOD}", int(np.sum(values < OPC_GOOD)), {"min": OPC_GOOD}))
-    return [
-        f"{name} is {what} (rows: {count}); to leave these rows out give where: "
-        + json.dumps({name: good}, ensure_ascii=False)
-        for name, what, count, good in found
     ]
 
 

@@ -27,8 +27,8 @@ class Limits:
 
     Limits of a DBC with max > min hold to half a step of the signal; those that are raw numbers, or beyond what its
     bits can express, were not made for it and are ignored. An unsigned signal of a J1939 message has the codes of SAE
-    J1939-71, tables 1 and 2: 0xFE "error" and 0xFF "not available" in its highest byte, or its two highest
-    values if it has 2 or 4 bits, unless the DBC names them otherwise.
+    J1939-71, tables 1 and 2: 0xFE "error" and 0xFF "not available" in its highest byte, or its two highest values if it
+    has 2 or 4 bits, unless the DBC names them otherwise.
 
     Args:
         messages: Messages (cantools), each with its signals in the order of the decoder's columns.
@@ -40,18 +40,16 @@ class Limits:
         self, messages: Sequence[tuple[Any, Sequence[Any]]], checked: Sequence[set[str]], report: Report
     ) -> None:
         self._messages, self._report = messages, report
-        self._rules = {
-            (m, j): list(_rules(message, signal))
-            for m, (message, signals) in enumerate(messages)
-            for j, signal in enumerate(signals)
-            if signal.name in checked[m]
-        }
-        found = {place: _merged([(low, high) for low, high, _ in rules]) for place, rules in self._rules.items()}
-        most = max((len(signals) for _, signals in messages), default=1)
-        self._low, self._high = np.full((2, max(map(len, found.values()), default=0), len(messages), most), np.nan)
-        for (m, j), intervals in found.items():
-            for k, (low, high) in enumerate(intervals):
-                self._low[k, m, j], self._high[k, m, j] = low, high
+        self._rules = [
+            [list(_rules(message, one)) if one.name in names else [] for one in signals]
+            for (message, signals), names in zip(messages, checked, strict=True)
+        ]
+        shape = (max((len(one) for own in self._rules for one in own), default=0), len(messages))
+        self._ends = np.full((2, *shape, max(map(len, self._rules), default=1)), np.nan)
+        for m, own in enumerate(self._rules):
+            for j, rules in enumerate(own):
+                for k, rule in enumerate(rules):
+                    self._ends[:, k, m, j] = rule[:2]
 
     def apply(self, plan: np.ndarray, values: np.ndarray) -> None:
         """Replace what is no measurement by NaN, and report it.
@@ -60,63 +58,43 @@ class Limits:
             plan: Message of each frame, (n,).
             values: Physical values, (n, signals of a message).
         """
-        if not len(self._low):
-            return
-        hit = np.zeros(values.shape, np.bool_)
-        for low, high in zip(self._low, self._high, strict=True):
-            hit |= (values >= low[plan]) & (values <= high[plan])
-        for i, j in np.argwhere(hit).tolist():
+        which = np.full(values.shape, -1)
+        for k, (low, high) in enumerate(zip(*self._ends, strict=True)):
+            which[(values >= low[plan]) & (values <= high[plan])] = k
+        for i, j in np.argwhere(which >= 0).tolist():
             message, signals = self._messages[plan[i]]
-            value, signal = float(values[i, j]), signals[j]
-            why = next(text for low, high, text in reversed(self._rules[int(plan[i]), j]) if low <= value <= high)
-            name = f"{message.name}.{signal.name}"
-            self._report(f"no value {name}", f"{name} is {value:.7g} {signal.unit or ''}".rstrip() + f", {why}")
-        values[hit] = np.nan
+            name = f"{message.name}.{signals[j].name}"
+            shown = f"{values[i, j]:.7g} {signals[j].unit or ''}".rstrip()
+            self._report(f"no value {name}", f"{name} is {shown}, {self._rules[plan[i]][j][which[i, j]][2]}")
+            values[i, j] = np.nan
 
 
 def _rules(message: Any, signal: Any) -> Iterator[tuple[float, float, str]]:
     """Yield intervals of missing values of a signal with their reasons; of those that overlap the last one counts."""
-    scale, offset = float(signal.conversion.scale), float(signal.conversion.offset)
+    scale, offset, bits = float(signal.conversion.scale), float(signal.conversion.offset), signal.length
     slack = 0.0 if signal.is_float else 0.5 * abs(scale)
 
     def interval(first: float, last: float) -> tuple[float, float]:
         low, high = sorted((first * scale + offset, last * scale + offset))
         return low - slack, high + slack
 
-    low, high = signal.minimum, signal.maximum
-    if low is not None and high is not None and high > low:
-        low, high = float(low), float(high)
-        top = 1 << (signal.length - signal.is_signed)
-        bits = (-top if signal.is_signed else 0, top - 1)
-        least, most = (-np.inf, np.inf) if signal.is_float else interval(*bits)
-        if least - slack <= low and high <= most + slack and ((low, high) != bits or (scale, offset) == (1.0, 0.0)):
-            text = f"outside {low:g} to {high:g}; the value is missing: correct the limits in the DBC if it is right"
-            yield -np.inf, float(np.nextafter(low - slack, -np.inf)), text
-            yield float(np.nextafter(high + slack, np.inf)), np.inf, text
-    if signal.length < 2:
-        return
-    names = {int(raw): str(name) for raw, name in (signal.conversion.choices or {}).items()}
-    words = {raw: re.sub(r"[^a-z]", "", name.lower()) for raw, name in names.items()}
-    codes = {
-        raw
-        for raw, word in words.items()
-        if NO_VALUE.fullmatch(word) or (ERROR.fullmatch(word) and len(names) < 2**signal.length)
-    }
-    if message.protocol == "j1939" and not (signal.is_signed or signal.is_float) and signal.length in J1939_LENGTHS:
-        size = 1 << max(0, signal.length - 8)
+    low, high = float(signal.minimum or 0.0), float(signal.maximum or 0.0)
+    raw = (-(1 << bits - 1), (1 << bits - 1) - 1) if signal.is_signed else (0, (1 << bits) - 1)
+    least, most = (-np.inf, np.inf) if signal.is_float else interval(*raw)
+    placeholder = (low, high) == raw and (scale, offset) != (1.0, 0.0)
+    if least - slack <= low < high <= most + slack and not placeholder:
+        text = f"outside {low:g} to {high:g}; the value is missing: correct the limits in the DBC if it is right"
+        yield -np.inf, float(np.nextafter(low - slack, -np.inf)), text
+        yield float(np.nextafter(high + slack, np.inf)), np.inf, text
+    names = {int(code): str(name) for code, name in (signal.conversion.choices or {}).items()} if bits > 1 else {}
+    words = {code: re.sub(r"[^a-z]", "", name.lower()) for code, name in names.items()}
+    errors = {code for code, word in words.items() if ERROR.fullmatch(word)}
+    codes = {code for code, word in words.items() if NO_VALUE.fullmatch(word)}
+    if message.protocol == "j1939" and not (signal.is_signed or signal.is_float) and bits in J1939_LENGTHS:
+        size = 1 << max(0, bits - 8)
         for back, text in ((2, "error"), (1, "not available")):
-            first = (1 << signal.length) - back * size
-            if all(ERROR.fullmatch(words[raw]) or raw in codes for raw in names if first <= raw < first + size):
+            first = (1 << bits) - back * size
+            if all(code in errors | codes for code in names if first <= code < first + size):
                 yield *interval(first, first + size - 1), f"reserved for {text!r} by J1939; the value is missing"
-    for raw in codes:
-        yield *interval(raw, raw), f"code {raw}, {names[raw]!r} in the DBC; the value is missing"
-
-
-def _merged(intervals: list[tuple[float, float]]) -> list[tuple[float, float]]:
-    """Return the union of intervals."""
-    found: list[tuple[float, float]] = []
-    for low, high in sorted(intervals):
-        if found and low <= found[-1][1]:
-            low, high = found[-1][0], max(high, found.pop()[1])
-        found.append((low, high))
-    return found
+    for code in codes | (errors if len(names) < 2**bits else set()):
+        yield *interval(code, code), f"code {code}, {names[code]!r} in the DBC; the value is missing"

@@ -19,7 +19,6 @@ from ..source import TRUNCATED
 
 CHUNK_ROWS = 4096  # Rows of a chunk, at most
 MAX_LINE_LENGTH = 2**20  # Characters of a line; a longer one is read as several
-MAX_WORD_LENGTH = 40  # Characters of a word under which missing values are counted
 HEAD_BYTES = 65_536  # Bytes from which the format of a CSV is detected
 UNREADABLE = "unreadable value"  # Key of values that are not numbers
 NO_VALUE = "no value "  # Begin of the key of words that stand for a missing value: no value TT1: Bad
@@ -276,8 +275,9 @@ def fill(
                 blank[k] = True
             elif cell.strip().lower() not in ("na", "n/a", "null", "none"):
                 if QUALITY_WORD.fullmatch(word := cell.strip()):
-                    key = f"{NO_VALUE}{name}: {word[:MAX_WORD_LENGTH]}"
-                    problem(key, lines[k], f"{name} is {quoted(word)}; the value is missing")
+                    problem(
+                        f"{NO_VALUE}{name}: {word[:40]}", lines[k], f"{name} is {quoted(word)}; the value is missing"
+                    )
                     continue
                 point = _with_point(cell)
                 why = "which is not a number" if point is None else f"with a decimal comma; write {point}"

@@ -39,11 +39,9 @@ _DATE = re.compile(
 )
 """25.10.2020 01:00:00, 10/25/2020 1:00 PM, 25-Oct-2020 01:00:00.250, 2020/10/25."""
 
-DAY = re.compile(r"(?:19|20)\d{6}|\d{4}-\d\d-\d\d|\d{1,4}([./ -])(?:\d{1,2}|[A-Za-z]{3})\1\d{2,4}")
-"""A date without a clock."""
-
+DAY = re.compile(r"(?:19|20)\d{6}|\d{1,4}([./ -])(?:\d{1,2}|[A-Za-z]{3})\1\d{2,4}")
 CLOCK = re.compile(r"(\d{1,2}):(\d{2})(?::(\d{2})(?:[.,](\d{1,9}))?)?(?:\s*([AaPp])\.?[Mm]\.?)?")
-"""A clock without a date: 13:05, 1:05:00.250 PM."""
+"""A date without a clock, and a clock without a date: 13:05, 1:05:00.250 PM."""
 
 _NAMED_DAY = re.compile(r"(?<!\d)((?:19|20)\d\d)([-_.]?)(0[1-9]|1[0-2])\2(0[1-9]|[12]\d|3[01])(?!\d)")
 """A date in the name of a file: 20240304, 2024-03-04."""
@@ -237,17 +235,11 @@ class _SummerTime:
     """
 
     def __init__(self, column: TimeColumn, notes: list[tuple[int, str, str]]) -> None:
-        self._column, self._notes = column, notes
-        self._tail = np.zeros(0, np.int64)
-        """Local times of the last rows."""
-        self._last, self._inside = -MAX_TIME_NS, False
-        self._usual = self._interval = 0
-        """Rows of one time, 0 if that changes, and the interval, before the clock was set."""
-        self._sorted = False
-        self._fixed: int | None = None
-        """Offset (ns) of a clock that was not set forward."""
-        self._skipped: int | None = None
-        """Its offset, while the last row is in an hour that does not exist."""
+        self._column, self._notes, self._sorted = column, notes, False
+        self._usual = self._interval = 0  # rows of one time, 0 if that changes, and ns from one to the next
+        self._at, self._run, self._last = -MAX_TIME_NS, 0, -MAX_TIME_NS  # last local time, its rows so far, and its UTC
+        self._fixed: int | None = None  # offset (ns) of a clock that was not set forward
+        self._skipped: int | None = None  # its offset, while the last row is in an hour that does not exist
 
     def to_utc(self, naive: np.ndarray, rows: np.ndarray) -> np.ndarray:
         """Return local times (ns) of rows of a chunk in UTC."""
@@ -261,61 +253,48 @@ class _SummerTime:
             .to_numpy()
             for which in ("earliest", "latest")
         )
-        odd = first != second
-        start, whole = self._tail.size, np.concatenate((self._tail, naive))
-        self._tail = whole[-TAIL_ROWS:]
-        if not odd.any() and self._skipped is None:
-            found = first if self._fixed is None else naive - self._fixed
-            self._last, self._inside = int(found[-1]), False
-            return found
-        if not self._inside:
-            before = whole[: start + int(np.argmax(odd))]
-            steps = np.diff(before)
-            lengths = np.diff(np.append(np.flatnonzero(steps) + 1, before.size))[-3:]
-            self._usual = int(lengths[0]) if lengths.size == 3 and np.ptp(lengths) == 0 else 0
-            self._interval, self._sorted = int(np.median(steps[steps > 0])) if np.any(steps > 0) else 0, False
-        edges = np.flatnonzero(np.diff(whole, prepend=whole[0] - 1))
-        lengths = np.diff(np.append(edges, whole.size))
-        within = (np.arange(whole.size) - np.repeat(edges, lengths))[start:]
-        twice, doubled = np.isin(whole[edges], naive[odd]), lengths == 2 * self._usual
-        doubled[-1] = lengths[-1] > self._usual  # it may go on in the next chunk
-        doubled = doubled[twice & (doubled | (np.arange(edges.size) < edges.size - 1))]
-        in_order = not np.any(np.diff(naive[odd]) < 0)
-        self._sorted = in_order and (self._sorted if not doubled.size else self._usual > 0 and doubled.mean() > 0.8)
-        found = first.copy()
-        for k in range(naive.size):
-            if odd[k] or self._skipped is not None:
-                self._last = self._choose(int(naive[k]), int(first[k]), int(second[k]), int(within[k]), int(rows[k]))
-            else:
-                self._last = int(first[k]) if self._fixed is None else int(naive[k]) - self._fixed
-            found[k] = self._last
-        self._inside = bool(odd[-1])
+        odd, twice = first != second, second - first > 1
+        regular = naive[: int(np.argmax(odd)) if odd.any() else None][-TAIL_ROWS:]
+        times, counts = np.unique(regular, return_counts=True)
+        if times.size > 3:  # the first and the last may be incomplete
+            self._usual = int(counts[1]) if np.ptp(counts[1:-1]) == 0 else 0
+            self._interval = int(np.median(np.diff(times)))
+        if twice.any():
+            counts = np.unique(naive[twice], return_counts=True)[1]
+            counts[0] += self._run if naive[0] == self._at else 0
+            doubled = np.append(counts[:-1] == 2 * self._usual, counts[-1] > self._usual)
+            in_order = self._usual > 0 and not np.any(np.diff(naive[twice]) < 0)
+            self._sorted = in_order and bool((self._sorted and odd[0]) or doubled.mean() >= 0.5)
+        found = first.copy() if self._fixed is None else naive - self._fixed
+        if odd.any() or self._skipped is not None:
+            for k, t in enumerate(naive.tolist()):
+                self._at, self._run = t, self._run + 1 if t == self._at else 1
+                found[k] = self._last = self._choose(t, int(first[k]), int(second[k]), int(rows[k]))
+        self._at, self._run, self._last = int(naive[-1]), int(np.sum(naive == naive[-1])), int(found[-1])
         return found
 
-    def _choose(self, naive: int, first: int, second: int, within: int, row: int) -> int:
-        """Return the UTC of a row in, or after, an hour that occurs twice or never."""
-        shown = f"{self._column.label} {np.datetime64(naive // 10**9, 's')}"
+    def _choose(self, t: int, first: int, second: int, row: int) -> int:
+        """Return the UTC of a local time that is one of two, or neither."""
+        zone, shown = self._column.zone, f"{self._column.label} {np.datetime64(t // 10**9, 's')}"
         if second - first == 1:  # the last moment before an hour that does not exist, and the first one after it
-            before = datetime.fromtimestamp(first // 10**9, ZoneInfo(str(self._column.zone))).utcoffset() or timedelta()
+            before = datetime.fromtimestamp(first // 10**9, ZoneInfo(str(zone))).utcoffset() or timedelta()
             self._skipped = before // timedelta(seconds=1) * 10**9
-            text = f"{shown} does not exist in {self._column.zone}; taken for a clock that was not set forward"
+            text = f"{shown} does not exist in {zone}; taken for a clock that was not set forward"
             self._notes.append((row, SKIPPED, text))
-            return naive - self._skipped
-        if self._skipped is not None:
-            offset, self._skipped = self._skipped, None
-            steps = [abs(t - self._last - self._interval) for t in (naive - offset, first)]
-            if self._fixed is None and steps[0] < steps[1]:
-                self._fixed = offset
-                zone = f"Etc/GMT{-offset // (3600 * 10**9):+d}"
-                text = f"from {shown} on the clock is taken to be never set forward; if so, give the time's zone {zone}"
+            return t - self._skipped
+        if self._skipped is not None and self._fixed is None:
+            steps = [abs(utc - self._last - self._interval) for utc in (t - self._skipped, first)]
+            if steps[0] < steps[1]:
+                self._fixed = self._skipped
+                text = f"give the time's zone Etc/GMT{-self._fixed // (3600 * 10**9):+d}"
+                text = f"from {shown} on the clock is taken to be never set forward; if so, {text}"
                 self._notes.append((row, ASSUMED, text))
-        if self._fixed is not None:
-            return naive - self._fixed
-        if first == second:
-            return first
-        late = within >= self._usual if self._sorted else first < self._last
+        self._skipped = None
+        if self._fixed is not None or first == second:
+            return first if self._fixed is None else t - self._fixed
+        late = self._run > self._usual if self._sorted else first < self._last
         text = f"taken as the {'second' if late else 'first'} one by the order of the rows"
-        self._notes.append((row, TWICE, f"{shown} occurs twice in {self._column.zone}; {text}"))
+        self._notes.append((row, TWICE, f"{shown} occurs twice in {zone}; {text}"))
         return second if late else first
 
 

@@ -70,6 +70,16 @@ def test_a_bus_that_a_database_is_not_for_stays_without_names(drive, nisus):
     assert [message["name"] for message in found["messages"]] == [None, None]
 
 
+def test_where_is_proposed_for_columns_of_quality(tmp_path, nisus):
+    """192 is good by OPC Data Access 3.00, section 6.8; a state that may be OK is no quality."""
+    rows = "0,1,Good,192,OK\n1,2,Bad,0,Run\n2,3,Uncertain,64,OK\n"
+    (tmp_path / "a.csv").write_text(f"t,x,Status,Quality,State\n{rows}")
+    text = " ".join(nisus("log", str(tmp_path / "a.csv")).out.split())
+    for condition in ('{"Status": ["Good"]}', '{"Quality": {"min": 192}}'):
+        assert f"(rows: 2); to leave these rows out give where: {condition}" in text
+    assert text.count(" where: ") == 2
+
+
 @pytest.mark.parametrize("ending", [".csv", ".parquet", ".npz", ".mat"])
 def test_a_table_is_listed(tmp_path, nisus, ending):
     path = tmp_path / f"a{ending}"

@@ -116,8 +116,7 @@ def test_blank_says_nothing_and_what_is_no_number_is_missing_with_its_line(tmp_p
     assert reports.texts["unreadable value"] == "drive.csv:4: x is 'oops', which is not a number; the value is missing"
 
 
-def test_words_of_quality_are_missing_values_counted_by_word_and_where_is_proposed(tmp_path):
-    """One 'Good', and OPC's 192 for it, by OPC Data Access 3.00, section 6.8."""
+def test_words_of_quality_are_missing_values_counted_by_word(tmp_path):
     words = (
         "Bad",
         "I/O Timeout",
@@ -127,16 +126,11 @@ def test_words_of_quality_are_missing_values_counted_by_word_and_where_is_propos
         "Uncertain (last)",
         "Bad",
     )
-    rows = "".join(f"{k},{word},Bad,0\n" for k, word in enumerate(words))
-    path = write(tmp_path, f"t,x,Status,Quality\n{rows}7,1.5,Good,192\n8,badge,Good,192\n")
+    path = write(tmp_path, "t,x\n" + "".join(f"{k},{word}\n" for k, word in enumerate((*words, "1.5", "badge"))))
     got, reports = read_reports(path, X)
     np.testing.assert_array_equal(got.value[:, 0], [NAN] * 7 + [1.5, NAN])
     assert reports.counts == {"unreadable value": 1, **{f"no value x: {w}": words.count(w) for w in words}}
-    status, quality, told = inspect_recordings([path]).faults
-    assert status == """Status is 'Bad' (rows: 7); to leave these rows out give where: {"Status": ["Good"]}"""
-    assert (
-        quality == """Quality is below 192 (rows: 7); to leave these rows out give where: {"Quality": {"min": 192}}"""
-    )
+    (told,) = inspect_recordings([path]).faults
     assert told.startswith("x is missing where it is 'Bad' (rows: 2, the first drive.csv:2), 'I/O Timeout' (rows: 1, ")
 
 
