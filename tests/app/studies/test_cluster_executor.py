@@ -58,7 +58,7 @@ def checked(twin, log, **options):
     return {key: value for key, value in told.items() if key not in ("dimension", "checklist")}
 
 
-@pytest.mark.parametrize("task", [1e-9, 0.1, 1e9], ids=["one call a task", "0.1 s", "one task a worker"])
+@pytest.mark.parametrize("task", [1e-9, 1e9], ids=["one call a task", "one task a worker"])
 def test_a_fit_on_a_cluster_is_the_same_bits(scheduler, twin, log, task, monkeypatch):
     monkeypatch.setattr(cluster_executor, "TASK_S", task)
     with executor_of(scheduler, twin, with_held(twin), NAME, OVERRIDES) as executor:
