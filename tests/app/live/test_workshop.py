@@ -273,16 +273,6 @@ def test_what_was_ended_from_outside_is_begun_once_more_and_said(shop, tmp_path)
     assert len(said) == 2 and "compiled where it is used" in said[1] and not paper(tmp_path, "done", first).exists()
 
 
-def test_a_killed_compiler_does_not_take_what_comes_after_for_done(shop, tmp_path):
-    workshop, told = shop(enkf=4), []
-    workshop.start()
-    workshop.ask("enkf", told.append)
-    killed(tmp_path, Piece("enkf", 0))
-    (tmp_path / "go").touch()
-    wait_for(lambda: told == ["enkf"])
-    assert all(paper(tmp_path, "done", Piece("enkf", place)).exists() for place in range(4))
-
-
 def test_the_engine_says_that_a_compiler_was_ended_and_folds_with_the_filter_all_the_same(started, tmp_path):
     engine, source = started(ukf=1)
     times, values = series(50)

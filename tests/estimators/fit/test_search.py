@@ -5,8 +5,7 @@ import pytest
 from scipy.optimize import minimize
 
 from estimators.fit.entries import entries_of
-from estimators.fit.fit import fit
-from estimators.fit.objective import FitProgress, Objective, maximise
+from estimators.fit.objective import Objective, maximise
 from estimators.fit.recording import Recording
 from estimators.fit.uncertainty import MAX_CORRELATION, curvature
 from estimators.log import Log
@@ -121,13 +120,6 @@ def arranged(objective: Objective, theirs: dict[str, tuple[np.ndarray, np.ndarra
     return best, H
 
 
-def test_the_search_ends_at_the_maximum_of_a_plain_kalman_likelihood(reached, theirs):
-    objective, x, _ = reached
-    best, H = arranged(objective, theirs)
-    # The search ends where its parabola promises less than 0.001 nats; the factor is for the error of that parabola.
-    assert 0.5 * (x - best) @ H @ (x - best) < 0.005
-
-
 def test_the_curvature_is_that_of_the_plain_likelihood_in_fewer_folds_than_all_pairs_take(reached, theirs):
     objective, x, folds = reached
     folds.clear()
@@ -144,22 +136,3 @@ def test_the_curvature_is_that_of_the_plain_likelihood_in_fewer_folds_than_all_p
     assert sum(folds) == 2 * (1 + 2 * 6) + 2 * 3
     # From the correlations at the same point it is the same.
     assert nearby.cov == pytest.approx(found.cov, rel=1e-9, abs=1e-12)
-
-
-def test_a_fit_gives_the_intervals_of_the_plain_likelihood(series, theirs):
-    log = Log.of(WALKS)
-    for k, (name, ys) in enumerate(series.items()):
-        log.add(name, np.arange(READINGS, dtype=float) + 0.1 * k, ys)
-    progress = FitProgress()
-    found = fit("kf", Tuning.of(WALKS), [Recording(log)], blocks=0, progress=progress)
-    for line in found.lines:
-        group, name = line.key.split(".")
-        best, H = theirs[name]
-        k = 0 if group == "Q" else 1
-        deviation = np.sqrt(np.linalg.inv(H)[k, k])
-        # Four digits are written, and the end of the search is within a twentieth of a deviation.
-        assert abs(np.log(line.after) - best[k]) < 0.1 * deviation
-        # The deviation may be widened by the correlation of the scores, by chance: forty batches know it to a ninth.
-        assert 0.97 * deviation < line.deviation < 1.4 * deviation
-    # A gradient of 7 folds, eight steps of a gradient and four points, curvature, intervals, two settings with sensors.
-    assert progress.folds < 7 + 8 * (6 + 4) + 19 + 12 + 2 * 4

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 from scipy.stats import multivariate_normal
-from statsmodels.tsa.statespace.mlemodel import MLEModel
 
 from estimators.compiled.model import compile_model
 from estimators.errors import ModelError
@@ -158,33 +157,6 @@ def test_a_step_is_that_of_the_exponential_of_a_matrix(a):
     np.testing.assert_allclose(F, whole[3:, 3:].T, rtol=1e-12, atol=1e-15)
     # Rounding of entries of order e^a times those of order one.
     np.testing.assert_allclose(noise, whole[3:, 3:].T @ whole[:3, 3:], rtol=1e-9, atol=1e-15 * np.exp(a))
-
-
-@pytest.mark.parametrize("dt", [0.01, 3.0, 900.0])
-@pytest.mark.parametrize("parts", [2, 7, 1000])
-def test_a_step_is_as_many_shorter_ones(parts, dt):
-    F, noise = discrete(BOTH, dt)
-    G, more = discrete(BOTH, dt / parts)
-    together, spread = np.eye(3), np.zeros((3, 3))
-    for _ in range(parts):
-        together, spread = G @ together, G @ spread @ G.T + more
-    np.testing.assert_allclose(together, F, rtol=1e-11, atol=1e-14)
-    np.testing.assert_allclose(spread, noise, rtol=1e-10, atol=1e-14)
-    np.testing.assert_array_equal(discrete(BOTH, 0.0)[1], 0.0)
-
-
-def test_statsmodels_finds_the_same_likelihood():
-    error = {"gauge": ColouredError((ERROR**2,), ERROR_TIME)}
-    model = coloured(WALK, errors=error)
-    y = 1.0 + np.cumsum(np.random.default_rng(1).normal(0.0, 0.7, 200))
-    kept = np.exp(-1.0 / ERROR_TIME)
-    other = MLEModel(y, k_states=2, k_posdef=2)
-    other["design"], other["obs_cov"] = np.array([[1.0, 1.0]]), np.array([[R]])
-    other["transition"], other["selection"] = np.diag([1.0, kept]), np.eye(2)
-    other["state_cov"] = np.diag([Q, ERROR**2 * (1.0 - kept**2)])
-    other.ssm.initialize_known(np.array([1.0, 0.0]), np.diag([STD**2, ERROR**2]))
-    track = fold("kf", model, Tuning.of(model), log_of(np.arange(200.0), y))
-    np.testing.assert_allclose(track.log_likelihood, other.ssm.filter().llf_obs, rtol=0, atol=1e-9)
 
 
 def test_a_steady_gain_is_that_of_the_kalman_filter_in_the_end():
