@@ -155,12 +155,37 @@ MAX_PERIODS = 2**40  # Periods of one hold
 PERIOD_SLACK = 0.01  # Of a period, by which a row may be early
 
 
-class _Hold(NamedTuple):
+class Hold(NamedTuple):
     """Last value of a sensor (1, rows), when it came first, ns, and the periods since then that have a measurement."""
 
     value: np.ndarray
     start: int
     periods: int
+
+
+def first_of_hold(t: np.ndarray, value: np.ndarray, period: float, last: Hold | None = None) -> tuple[np.ndarray, Hold]:
+    """Return which values are the first of a hold, or of a further period of it, and the last hold. NaN equals NaN.
+
+    Args:
+        t: Times, ns, (n,), n > 0.
+        value: (n, rows).
+        period: Seconds; 0 for the first values only.
+        last: Hold before the first value, which may go on.
+    """
+    if last is not None:
+        t, value = np.append(last.start, t), np.vstack((last.value, value))
+    differs = np.any((value[1:] != value[:-1]) & ~(np.isnan(value[1:]) & np.isnan(value[:-1])), axis=1)
+    # A clock that was set back begins a hold.
+    first = np.append(True, differs | (t[1:] < t[:-1] - (period or 1.0) * 1e9))
+    start = t[np.maximum.accumulate(np.where(first, np.arange(t.size), 0))]
+    periods = np.zeros(t.size, np.int64)
+    if period:
+        periods = np.clip(np.floor((t - start) / (period * 1e9) + PERIOD_SLACK), 0, MAX_PERIODS - 1).astype(np.int64)
+    periods[0] = 0 if last is None else last.periods
+    hold = MAX_PERIODS * np.cumsum(first)
+    used = np.maximum.accumulate(hold + periods)
+    new: np.ndarray = np.append(last is None, used[1:] > used[:-1])
+    return new[int(last is not None) :], Hold(value[-1:].copy(), int(start[-1]), int(used[-1] - hold[-1]))
 
 
 class ChannelMapping:
@@ -235,7 +260,7 @@ class ChannelMapping:
         self._positions = {c.index: c for c in self._channels if c.convert == "east_north"}
         self._origins = {index: channel.origin for index, channel in self._positions.items()}
         self._thinned = {c.index: c for c in self._channels if c.kind == READING and c.repeats is not None}
-        self._holds: dict[tuple[int, str], _Hold] = {}
+        self._holds: dict[tuple[int, str], Hold] = {}
         self._said: set[int] = set()
 
     def events(
@@ -302,7 +327,11 @@ class ChannelMapping:
         for name in [""] if assets is None else set(assets[rows].tolist()):
             own = rows if assets is None else rows[assets[rows] == name]
             if own.size:
-                new[own] = self._first_of_hold((channel.index, name), channel.repeats or 0.0, batch.t[own], value[own])
+                key = channel.index, name
+                last = self._holds.pop(key, None)
+                new[own], self._holds[key] = first_of_hold(batch.t[own], value[own], channel.repeats or 0.0, last)
+        while len(self._holds) > MAX_HOLDS:
+            self._holds.pop(next(iter(self._holds)))
         left_out = int(new.size - np.count_nonzero(new))
         for _ in range(left_out):
             rule = f"every {channel.repeats:g} s" if channel.repeats else "changes"
@@ -310,36 +339,6 @@ class ChannelMapping:
             self._said.add(channel.index)
             self._report(f"repeats {channel.name}", text)
         return new
-
-    def _first_of_hold(self, key: tuple[int, str], period: float, t: np.ndarray, value: np.ndarray) -> np.ndarray:
-        """Return which values are the first of a hold, or of a further period of it; NaN equals NaN.
-
-        Args:
-            key: Sensor and asset, whose last hold goes on.
-            period: Seconds; 0 for the first values only.
-            t: Times, ns, (n,), n > 0.
-            value: (n, rows).
-        """
-        last = self._holds.pop(key, None)
-        if last is not None:
-            t, value = np.append(last.start, t), np.vstack((last.value, value))
-        differs = np.any((value[1:] != value[:-1]) & ~(np.isnan(value[1:]) & np.isnan(value[:-1])), axis=1)
-        # A clock that was set back begins a hold.
-        first = np.append(True, differs | (t[1:] < t[:-1] - (period or 1.0) * 1e9))
-        start = t[np.maximum.accumulate(np.where(first, np.arange(t.size), 0))]
-        periods = np.zeros(t.size, np.int64)
-        if period:
-            periods = np.clip(np.floor((t - start) / (period * 1e9) + PERIOD_SLACK), 0, MAX_PERIODS - 1).astype(
-                np.int64
-            )
-        periods[0] = 0 if last is None else last.periods
-        hold = MAX_PERIODS * np.cumsum(first)
-        used = np.maximum.accumulate(hold + periods)
-        self._holds[key] = _Hold(value[-1:].copy(), int(start[-1]), int(used[-1] - hold[-1]))
-        if len(self._holds) > MAX_HOLDS:
-            self._holds.pop(next(iter(self._holds)))
-        new: np.ndarray = np.append(last is None, used[1:] > used[:-1])
-        return new if last is None else new[1:]
 
     def _place(self, batch: Events, channel: Channel) -> None:
         """Convert latitude and longitude to east and north in place; the first valid fix is the default origin."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import binom
+from scipy.special import bdtr, bdtrc
 
 HELD, STEPS, DEAD_BAND, LINEAR = "held", "held or set point", "dead band", "interpolated or computed"
 SINGLE, UNDECIDED = "", "undecided"
@@ -124,7 +124,7 @@ def _repeats(values: np.ndarray, d: np.ndarray, step: float) -> bool | None:
     if chosen.size < MIN_CHANGES:
         return None
     count = int(np.count_nonzero(d[chosen + 1] == 0.0))
-    return count >= MIN_REPEATED * chosen.size and bool(binom.sf(count - 1, chosen.size, REPEAT_NULL) < MAX_P)
+    return count >= MIN_REPEATED * chosen.size and bool(bdtrc(count - 1, chosen.size, REPEAT_NULL) < MAX_P)
 
 
 def _turns(changes: np.ndarray, step: float) -> np.ndarray:
@@ -177,7 +177,7 @@ def _period(place: np.ndarray, t: np.ndarray, *, every: bool) -> tuple[float, fl
             n = np.arange(1, int(min(lengths[-1], MAX_MULTIPLE * period)) + 1)
             null = float(np.max(np.cumsum(_multiples(n, period)[0] <= width) / n))
             agreed = int(np.sum(good & part))
-            if agreed >= MIN_PERIODIC * part.sum() and tests * binom.sf(agreed - 1, int(part.sum()), null) < MAX_P:
+            if agreed >= MIN_PERIODIC * part.sum() and tests * bdtrc(agreed - 1, int(part.sum()), null) < MAX_P:
                 seconds = np.diff(t)[good] * 1e-9
                 once = seconds[multiple[good] == 1.0]
                 row = float(np.median(np.diff(t) / runs)) * 1e-9
@@ -207,7 +207,7 @@ def _steps(values: np.ndarray, d: np.ndarray, step: float) -> Finding:
         # Of a density that falls on both sides of zero, [-x, x] holds at least half of [-2x, 2x].
         wide = size[size < np.quantile(size, q)]
         small = 0.5 * float(wide.max(initial=0.0))
-        if small >= MIN_SIZE * step and 4.0 * binom.cdf(int(np.sum(wide < small)), wide.size, 0.5) < MAX_P:
+        if small >= MIN_SIZE * step and 4.0 * bdtr(int(np.sum(wide < small)), wide.size, 0.5) < MAX_P:
             return Finding(DEAD_BAND, np.nan, np.nan, share, f"small changes are left out (dead band), {words}")
     return Finding(STEPS, np.nan, np.nan, share, f"held or set point, {words}")
 
@@ -224,7 +224,7 @@ def _line(t: np.ndarray, values: np.ndarray, d: np.ndarray, place: np.ndarray, s
     if bends.size < MIN_CHANGES:
         return None
     count = int(np.sum(e[bends + 1] <= tolerance))
-    if count < MIN_STRAIGHT * bends.size or binom.sf(count - 1, bends.size, LINE_NULL) >= MAX_P:
+    if count < MIN_STRAIGHT * bends.size or bdtrc(count - 1, bends.size, LINE_NULL) >= MAX_P:
         return None
     knots = np.flatnonzero(e >= BEND_SIZE * tolerance) + 1
     known = _period(place[knots], t[knots], every=False) or (np.nan, np.nan)

@@ -16,11 +16,13 @@ from sources.can.decoder import shown_id
 from sources.can.readers import EXTENDED, BusName
 from sources.formats import files_of
 from sources.inspect import Message, RecordingContents, SignalSeries, holes, inspect_recordings, is_table
+from sources.repeats import find_repeats
 from sources.tables.text import QUALITY_WORD
 from sources.tables.times import SERIAL_DAYS, UNITS, TimeColumn
 
 from ..format_time import FIRST_DATED_NS, duration_text, format_time
 from ..present.result import Cell, TableColumn, Topic, to_json, to_text
+from ..studies.advice.draft import undecided_lines
 from ..studies.advice.signals import signals
 from ..terminal import complain
 
@@ -114,7 +116,7 @@ def _topic(found: RecordingContents) -> Topic:
     gaps = [f"{_duration(b - a)} at {_duration(a - start)}" for a, b in found.holes[:MAX_LISTED]]
     more = f", and {len(found.holes) - MAX_LISTED} more" if len(found.holes) > MAX_LISTED else ""
     sentences = [f"{len(found.holes)} gaps: {', '.join(gaps)}{more}" if gaps else "no gaps of all signals together"]
-    sentences += _own_gaps(found)
+    sentences += _own_gaps(found) + _repeats(found)
     if found.kind == "table":
         rows = tuple((series.name, *_series_cells(series, start)) for series in found.columns)
         zone = f", local time of {found.time.zone}" if found.time.zone else ""
@@ -179,6 +181,14 @@ def _own_gaps(found: RecordingContents) -> list[str]:
             f"{_duration(begin - start)}"
         )
     return lines + ([f"and gaps of {len(longest) - MAX_LISTED} more groups of signals"] if longest[MAX_LISTED:] else [])
+
+
+def _repeats(found: RecordingContents) -> list[str]:
+    """Return the signals whose rows repeat or interpolate values, and those of which this cannot be decided."""
+    some = [(one.name, find_repeats(one.series.t, one.series.values)) for one in signals(found) if one.kind == "signal"]
+    lines = [f"{name}: {one.reason}" for name, one in some if one.found]
+    more = [f"and {len(lines) - MAX_LISTED} more signals with repeats"] * (len(lines) > MAX_LISTED)
+    return lines[:MAX_LISTED] + more + undecided_lines(some)
 
 
 def _duration(ns: int) -> str:
@@ -247,12 +257,13 @@ def _span(t: np.ndarray) -> dict[str, Any]:
 
 
 def _series(series: SignalSeries) -> dict[str, Any]:
-    known = series.values.size > 0
+    known, repeats = series.values.size > 0, find_repeats(series.t, series.values)
     return {
         "name": series.name,
         "unit": series.unit,
         **_span(series.t),
         "missing": series.missing,
+        "repeats": repeats._asdict() if repeats.found else None,
         "low": series.values.min() if known else None,
         "high": series.values.max() if known else None,
     }

@@ -25,11 +25,13 @@ from estimators.errors import NisusError
 from estimators.fold import Fold
 from estimators.log import READING, Log
 from estimators.model.state_space import StateSpaceModel
+from sources.repeats import Finding
 
 from ..present.export.calibration_lines import calibration_lines, health_shares
 from ..present.result import WORSE, Bar, Cell, Topic, plain
 from ..twin.twin import Twin
-from .advice.measured import Measured
+from .advice.draft import undecided_lines
+from .advice.measured import Measured, repeat_lines, repeats_of
 from .advice.questions import JUMPS, heavy
 from .compare import timed
 from .fold_result import calibration_json, calibration_of
@@ -80,6 +82,7 @@ class Checked:
     episodes: list[Episode]
     held_out: HeldOut
     jumps: str
+    repeats: dict[str, Finding]
 
     @property
     def health(self) -> dict[str, float]:
@@ -131,6 +134,7 @@ def check(twin: Twin, log: Log, counts: Counter[str], *, executor: Executor | st
         episodes=episodes(fold),
         held_out=held_out(twin.estimator, model, tuning, log),
         jumps=_jumps(measured),
+        repeats=repeats_of(model, log),
     )
 
 
@@ -294,6 +298,7 @@ def figures(checked: Checked, checklist: Sequence[ChecklistLine]) -> dict[str, A
                 "whiteness": {item.row: item for item in linearity.whiteness},
             },
             "dimension": checked.dimension,
+            "repeats": {name: one for name, one in checked.repeats.items() if one.found},
             "health": {
                 "share": checked.health,
                 "false_alarm_every": policy.false_alarm_every,
@@ -497,6 +502,7 @@ def _timing(checked: Checked) -> Topic:
             for item in checked.arrivals
         ],
         "" if known else "Lateness is not known: the log has only the time of measurement.",
+        *(f"{line}." for line in (*repeat_lines(checked.repeats), *undecided_lines(checked.repeats.items()))),
     )
 
 

@@ -157,7 +157,7 @@ def proposed_role(one: SignalRole) -> str:
     """Return the role of a signal on the page: that of a sensor is "state" if it has a state of its own."""
     if one.role == OMITTED:
         return ""
-    return STATE if one.role == SENSOR and one.reason == f"measures {one.name}" else one.role
+    return STATE if one.role == SENSOR and one.reason.partition("; ")[0] == f"measures {one.name}" else one.role
 
 
 @dataclass(frozen=True)

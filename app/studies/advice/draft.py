@@ -7,7 +7,7 @@ import math
 import os
 import re
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -19,6 +19,7 @@ from config.yaml_files import writing
 from estimators.errors import ConfigError
 from sources.can.readers import BusName
 from sources.inspect import RecordingContents
+from sources.repeats import SINGLE, UNDECIDED, Finding
 from sources.units import heading_unit
 
 from ...format_time import duration_text
@@ -361,7 +362,9 @@ def _source(
             for family in (families.get(reads.name),)
             if not family or family.first == reads.name
         ]
-        inputs = [_channel(each, one) for each, one in drafted.inputs if one.part == k]
+        inputs = [
+            _channel(each, one._replace(repeats=Finding(SINGLE))) for each, one in drafted.inputs if one.part == k
+        ]
         if channels:
             lines += ["sensors:", *channels]
         if inputs:
@@ -406,6 +409,7 @@ def _families(drafted: DraftPlan) -> dict[str, Family]:
     return found
 
 
+MAX_NAMES = 8  # Signals that a line names
 LINE_LENGTH = 112  # of comments in the YAML
 
 
@@ -450,7 +454,14 @@ def _comments(drafted: DraftPlan, name: str) -> list[str]:
 
 def hint_lines(drafted: DraftPlan) -> list[str]:
     """Return what the draft does not use of its signals, with the next step, a line each."""
-    lines = []
+    sensors = [reads.signal for item in drafted.states for reads in item.sensors]
+    lines = [
+        f"{_line(one.name)}: {one.repeats.reason}"
+        + f"; the draft has repeats: {one.repeats.key}" * bool(one.repeats.key)
+        for one in sensors
+        if one.repeats.found
+    ]
+    lines += undecided_lines((_line(one.name), one.repeats) for one in sensors)
     for name, one in drafted.inputs:
         if not any(name in item.inputs for item in drafted.states):
             rate = next((pair for pair in drafted.pairs if pair.rate and drafted.signals[pair.second] is one), None)
@@ -476,6 +487,19 @@ def hint_lines(drafted: DraftPlan) -> list[str]:
             "docs/twins.md, Cycles."
         )
     return lines
+
+
+def undecided_lines(found: Iterable[tuple[str, Finding]]) -> list[str]:
+    """Return of which signals it cannot be decided whether they repeat values, by the reason, a line each."""
+    reasons: dict[str, list[str]] = {}
+    for name, one in found:
+        if one.kind == UNDECIDED:
+            reasons.setdefault(one.reason, []).append(name)
+    return [
+        f"Whether each row is a measurement cannot be decided ({reason}): {', '.join(names[:MAX_NAMES])}"
+        + f" and {len(names) - MAX_NAMES} more" * (len(names) > MAX_NAMES)
+        for reason, names in reasons.items()
+    ]
 
 
 def omission_lines(drafted: DraftPlan) -> list[str]:
@@ -518,7 +542,10 @@ def _channel(name: str, one: Signal, family: Family | None = None) -> str:
     elif one.series.only is not None:
         by, label = one.series.only
         fields["only"] = f"{{{_text(by)}: {_id(label)}}}"
-    return f"  {name}: {{{', '.join(f'{key}: {value}' for key, value in fields.items())}}}"
+    if one.repeats.key:
+        fields["repeats"] = one.repeats.key
+    why = f"  # {one.repeats.reason}" if one.repeats.key else ""
+    return f"  {name}: {{{', '.join(f'{key}: {value}' for key, value in fields.items())}}}{why}"
 
 
 def _id(label: str) -> str:

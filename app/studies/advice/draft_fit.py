@@ -43,6 +43,9 @@ MAX_FIT_READINGS = 4000  # readings of a state and its sensors that are fitted, 
 WINDOWS = 4  # windows, if there are more readings
 ROUNDS = 2  # rounds of the optimiser
 MIN_START_SHARE = 1e-3  # of the power of the differences of a signal, where the fit of its noise begins
+MIN_FITTED = (
+    200  # readings of a state in the fitted parts, with less of which it is fitted again to all after the check
+)
 MARGIN = 10.0  # nats by which two filters on the first half are alike
 PRICE = 5.0  # nats that a further parameter must gain
 
@@ -282,7 +285,37 @@ def _fit_split(drafted: DraftPlan, split: Split, progress: FitProgress) -> Gener
         yield FitStep("checking on the parts left out" if split.alternate else "checking on the second half")
         with suppress(NisusError):
             fitted_plan = replace(fitted_plan, check=DraftFold(fitted_plan, best.model, split).check(span))
+            if fitted_plan.check is not None and _early(drafted.states, split) < MIN_FITTED and not progress.stop:
+                yield FitStep("fitting all of the short recording")
+                whole = Split((int(t.max()) + 1,))
+                again = [_again(item, fitted_plan, whole, span, files, progress) for item in fitted_plan.states]
+                check = fitted_plan.check._replace(refitted=True)
+                fitted_plan = replace(fitted_plan, states=tuple(again), check=check)
         return fitted_plan
+
+
+def _early(states: Iterable[Moves], split: Split) -> int:
+    """Return the fewest readings of a state in the fitted parts."""
+    return min(sum(int(split.fitted(one.signal.series.t).sum()) for one in item.sensors) for item in states)
+
+
+def _again(
+    item: Moves, drafted: DraftPlan, split: Split, span: float, files: ModelFiles, progress: FitProgress
+) -> Moves:
+    """Return a fitted state with the noises of the same structure fitted to other parts."""
+    inputs = [each for each in drafted.inputs if each[0] in item.inputs]
+    structure = Structure(item.smooth, item.over is not None, any(reads.error for reads in item.sensors))
+    found = _fit(
+        replace(item, over=None, sensors=tuple(replace(reads, error=None) for reads in item.sensors)),
+        files.model([item], inputs),
+        structure,
+        drafted.options,
+        inputs=inputs,
+        split=split,
+        span=span,
+        progress=progress,
+    )
+    return item if found is None else found.item
 
 
 def _scaled_on(item: Moves, split: Split) -> Moves:

@@ -22,7 +22,9 @@ from estimators.diagnostics.sensitivity.responses import digits, stand_in
 from estimators.errors import NisusError
 from estimators.fold import Fold
 from estimators.log import READING, Log
+from estimators.model.state_space import StateSpaceModel
 from estimators.registry import find_entry, unfit
+from sources.repeats import Finding, find_repeats
 
 from ...twin.twin import Twin
 
@@ -78,6 +80,27 @@ def without_faults(twin: Twin, log: Log, known: Sequence[Episode] | None = None)
                 clean.value[: log.n, column][left_out] = np.nan
                 found += listed
     return (clean, tuple(sorted(found, key=lambda item: (item.start, item.row)))) if found else (log, ())
+
+
+def repeats_of(model: StateSpaceModel, log: Log) -> dict[str, Finding]:
+    """Return how the measurements of each sensor row repeat."""
+    found = {}
+    for k, sensor in enumerate(model.sensors):
+        own = (log.kind[: log.n] == READING) & (log.channel[: log.n] == k)
+        for column, row in enumerate(sensor.rows):
+            known = own & np.isfinite(log.value[: log.n, column])
+            if known.any():
+                found[row.name] = find_repeats(log.t[: log.n][known], log.value[: log.n, column][known])
+    return found
+
+
+def repeat_lines(found: Mapping[str, Finding]) -> list[str]:
+    """Return the sensor rows whose measurements are repeats, with the remedy, a line each."""
+    lines = []
+    for name, one in found.items():
+        remedy = f"give its channel in `source` the key repeats: {one.key}" if one.key else "feed it what was measured"
+        lines += [f"{name}: {one.reason}; {remedy}, and tune again"] if one.found else []
+    return lines
 
 
 @dataclass

@@ -14,11 +14,12 @@ import numpy as np
 from estimators.diagnostics.intervals import Interval
 from estimators.errors import ConfigError, nearest
 from sources.inspect import RecordingContents
+from sources.repeats import LINEAR
 from sources.units import unit_scale
 
 from ...format_time import duration_text
 from .relations import Driven, Pair, driven, pairs, simulated
-from .signals import MIN_VALUES, Signal, cycle_of, noise_of, signals, walk_of
+from .signals import MIN_VALUES, Signal, cycle_of, noise_of, signals, thinned, walk_of
 
 MAX_SIGNALS = 6  # signals that are taken where none are named
 
@@ -126,7 +127,7 @@ class DraftCheck(NamedTuple):
     Of more than two `parts` every other one was fitted and the others checked; `start` is where the first one ends.
     `nis` is the mean NIS per degree of freedom, with the bounds `low` and `high` of `nisus fold`. `reason` says why it
     is not consistent; empty if it is. `said` is the NIS and its position in words. `wide`: the only reason is that
-    bands are wider than needed.
+    bands are wider than needed. `refitted`: a short recording is then fitted as a whole.
     """
 
     start: float
@@ -139,10 +140,15 @@ class DraftCheck(NamedTuple):
     said: str
     parts: int = 2
     wide: bool = False
+    refitted: bool = False
 
     @property
     def fitted_to(self) -> str:
         """The fitted and the checked parts in words."""
+        return f"{self._fitted_to}{', and fitted again to all of it' if self.refitted else ''}"
+
+    @property
+    def _fitted_to(self) -> str:
         if self.parts > 2:
             length = duration_text(self.end / self.parts)
             parts = f"every other of {self.parts} parts (about {length} each)"
@@ -196,10 +202,11 @@ def plan(found: RecordingContents, roles: Roles) -> DraftPlan:
             raise ConfigError(f"{part.files[0]}: its {part.t.size:,} times are all the same; {column}record it again")
     given = _given(roles, found, every)
     named = {id(one) for one, _ in given}
+    computed: dict[int, str] = {}
     free = (
         []
         if roles.sensors or roles.signals or roles.states
-        else _finest(found, [one for one in every if id(one) not in named])
+        else _finest(found, [one for one in every if id(one) not in named], computed)
     )
     # Of several sensors of one quantity the first is the state, so held-out signals come last.
     order = {STATE: 0, HELD_OUT: 2}
@@ -211,6 +218,13 @@ def plan(found: RecordingContents, roles: Roles) -> DraftPlan:
     if free:
         more = [one for one in every if id(one) not in named and not any(one is other for other in picked)]
         picked += _same_quantity(more, [one for k, one in enumerate(picked) if k not in inputs])
+    raw, few = picked, [one if k in inputs else thinned(one) for k, one in enumerate(picked)]
+    for one, (_, role) in zip(few, places, strict=False):
+        if interpolated(one) and role != INPUT:
+            raise ConfigError(
+                f"{one.name}: {one.repeats.reason}; a sensor needs the values themselves: record them without "
+                "interpolation, or give the signal as an input with --inputs"
+            )
     told = pairs(picked)
     told += _chained(told, picked)
     taken: set[str] = set()
@@ -229,6 +243,8 @@ def plan(found: RecordingContents, roles: Roles) -> DraftPlan:
     free_heads = [k for k in heads if k not in sensors and not groups[k] and picked[k].series.only is None]
     lags = _lags(picked, heads, sorted(inputs) or free_heads)
     used = sorted({k for lag in lags.values() for k in lag.drivers} | inputs)
+    # A driver holds between its rows, and what follows it is seen best in all of them.
+    picked = [one if k in used else few[k] for k, one in enumerate(picked)]
     states = []
     for k in groups:
         if k not in used:
@@ -242,7 +258,11 @@ def plan(found: RecordingContents, roles: Roles) -> DraftPlan:
                 f"quantity and no input drives it; hold out a redundant sensor, or give its inputs with --inputs"
             )
     rest = "has no role" if not free else f"not among the {MAX_SIGNALS} signals with most different values"
-    found_roles = [_role(one, picked, names, states, used, held_out, rest) for one in every]
+    known = {id(one): found for one, found in zip(raw, picked, strict=True)}
+    found_roles = [
+        _role(one, known.get(id(one)), picked, names, states, used, held_out, computed.get(id(one), rest))
+        for one in every
+    ]
     driving = tuple((names[k], picked[k]) for k in used)
     return DraftPlan(tuple(states), driving, tuple(picked), tuple(told), tuple(found_roles), held_out)
 
@@ -317,8 +337,14 @@ def _chained(told: Sequence[Pair], picked: Sequence[Signal]) -> list[Pair]:
     return found
 
 
+def interpolated(one: Signal) -> bool:
+    """Return whether most rows of a signal lie on lines between values that come at a known period."""
+    return one.repeats.kind == LINEAR and bool(np.isfinite(one.repeats.period))
+
+
 def _role(
     one: Signal,
+    used_as: Signal | None,
     picked: Sequence[Signal],
     names: Sequence[str],
     states: Sequence[Moves],
@@ -326,8 +352,11 @@ def _role(
     held_out: frozenset[str],
     rest: str,
 ) -> SignalRole:
-    """Return the role of a signal, and why it has it; `rest` is why signals that vary were not picked."""
-    k = next((k for k, other in enumerate(picked) if other is one), None)
+    """Return the role of a signal, and why it has it; `rest` is why signals that vary were not picked.
+
+    `used_as` is what the plan has of it, among `picked`; None if nothing.
+    """
+    k = next((k for k, other in enumerate(picked) if other is used_as), None)
     if k is None:
         return SignalRole(one, OMITTED, "", OMISSIONS.get(one.kind, rest))
     name = names[k]
@@ -339,7 +368,8 @@ def _role(
     if state is None:
         return SignalRole(one, OMITTED, "", "measures the same quantity as an input")
     rate = next(reads.rate for reads in state.sensors if reads.name == name)
-    reason = f"measures {'the rate of ' if rate else ''}{state.name}"
+    repeats = f"; {picked[k].repeats.reason}" if picked[k].repeats.found else ""
+    reason = f"measures {'the rate of ' if rate else ''}{state.name}{repeats}"
     return SignalRole(one, HELD_OUT if name in held_out else SENSOR, name, reason)
 
 
@@ -406,12 +436,22 @@ def reads_of(name: str, lead: Signal, one: Signal, pair: Pair) -> Reads:
     return Reads(name, one, r, pair.gain, pair.offset)
 
 
-def _finest(found: RecordingContents, every: Sequence[Signal]) -> list[Signal]:
-    """Those of the most levels, in the order of the recording."""
+def _finest(found: RecordingContents, every: Sequence[Signal], computed: dict[int, str]) -> list[Signal]:
+    """Those of the most levels, in the order of the recording; interpolated ones are `computed`, with the reason."""
     fine = [one for one in every if one.kind == "signal"] or [
         one for one in every if one.kind == "switch" and one.levels > 2
     ]
-    kept = sorted(range(len(fine)), key=lambda k: (-fine[k].levels, k))[:MAX_SIGNALS]
+    kept: list[int] = []
+    for k in sorted(range(len(fine)), key=lambda k: (-fine[k].levels, k)):
+        if len(kept) < MAX_SIGNALS:
+            one = thinned(fine[k])
+            if interpolated(one):
+                computed[id(fine[k])] = one.repeats.reason
+            else:
+                kept.append(k)
+    if not kept and computed:
+        reasons = ", ".join(f"{one.name}: {computed[id(one)]}" for one in fine)
+        raise ConfigError(f"{found.files[0]}: no signal has measurements; {reasons}")
     if not kept:
         longest = max((one.series.values.size for one in every), default=0)
         if longest < MIN_VALUES:

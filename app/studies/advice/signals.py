@@ -9,7 +9,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from config.fields import repeat_period
 from sources.inspect import RecordingContents, SignalSeries, holes
+from sources.mapping import first_of_hold
+from sources.repeats import SINGLE, Finding, find_repeats
 
 MIN_VALUES = 20  # values needed to estimate a noise
 
@@ -32,6 +35,7 @@ class Signal(NamedTuple):
     `kind` is "signal", "switch", "counter", "constant", or "short". `wraps`: an angle in degrees that jumps by a turn;
     its series is in radians, and goes on where the angle jumps. `unit` is that of the recording. `valid` is a flag of
     the same message or table; the series has the values where it is 1. `part` counts the recordings of a merged one.
+    `repeats` is how its rows repeat, by `thinned`.
     """
 
     name: str
@@ -48,6 +52,7 @@ class Signal(NamedTuple):
     unit: str = ""
     valid: str = ""
     part: int = 0
+    repeats: Finding = Finding(SINGLE)
 
 
 VALID = re.compile(r"valid$|^valid", re.IGNORECASE)
@@ -111,6 +116,16 @@ def signal(message: str | None, series: SignalSeries) -> Signal:
         wraps,
         unit,
     )
+
+
+def thinned(one: Signal) -> Signal:
+    """Return a signal with those of its values that are measurements, and how its rows repeat."""
+    series, found = one.series, find_repeats(one.series.t, one.series.values)
+    if not found.key:
+        return one._replace(repeats=found)
+    new, _ = first_of_hold(series.t, series.values[:, None], repeat_period(found.key) or 0.0)
+    few = signal(one.message, replace(series, t=series.t[new], values=series.values[new]))
+    return one._replace(series=few.series, rate=few.rate, noise=few.noise, repeats=found)
 
 
 def _kind(series: SignalSeries, levels: np.ndarray) -> str:

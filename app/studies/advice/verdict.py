@@ -30,7 +30,7 @@ from ...format_time import counted, format_time
 from ...present.result import plain
 from ...twin.twin import Twin
 from .coloured_noise import COLOURED, lasting
-from .measured import NO, UNTOLD, YES, Claim, Exclusion, Measured, digits
+from .measured import NO, UNTOLD, YES, Claim, Exclusion, Measured, digits, repeat_lines, repeats_of
 from .questions import (
     PREFERRED,
     QUESTIONS,
@@ -118,7 +118,7 @@ class Advice:
 
     `because` are the keys of the claims that led to this filter and not to the one before it in the tree. `remedies`
     are other actions; `sections` are entries of the YAML, by key, that declare coloured noise; `excluded` are the
-    readings in faults, on which nothing is based.
+    readings in faults, on which nothing is based. `repeats` are lines on sensors whose measurements are repeats.
     """
 
     estimator: str = ""
@@ -127,6 +127,7 @@ class Advice:
     because: tuple[str, ...] = ()
     sections: Mapping[str, dict[str, object]] = field(default_factory=dict)
     excluded: tuple[Exclusion, ...] = ()
+    repeats: tuple[str, ...] = ()
 
     def claim(self, key: str) -> Claim | None:
         """The claim of that key, if it was asked."""
@@ -145,7 +146,7 @@ class Advice:
     @property
     def remedies(self) -> list[str]:
         """Other actions."""
-        return [claim.remedy for claim in self.claims if claim.remedy]
+        return [*self.repeats, *(claim.remedy for claim in self.claims if claim.remedy)]
 
 
 def advise(measured: Measured) -> Advice:
@@ -154,7 +155,8 @@ def advise(measured: Measured) -> Advice:
     Raises:
         NisusError: If no filter applies, or none runs.
     """
-    told = Advice(excluded=measured.excluded)
+    repeats = repeat_lines(repeats_of(measured.twin.model, measured.log))
+    told = Advice(excluded=measured.excluded, repeats=tuple(repeats))
     measured.progress.expected = sum(UNITS_OF_WORK.values())
     size = _ask(told, measured, "size", small)
     if size.answer == NO:

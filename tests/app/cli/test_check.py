@@ -12,7 +12,18 @@ from app.present.result import Bar, Topic, to_html
 from estimators.diagnostics.sensitivity.responses import Nudge
 
 REQUIRED = {"checklist", "observability", "smallest_visible", "integrity", "held_out", "open_loop"}
-MORE = {"twin", "estimator", "span", "timing", "calibration", "posterior", "linearity", "dimension", "health"}
+MORE = {
+    "twin",
+    "estimator",
+    "span",
+    "timing",
+    "calibration",
+    "posterior",
+    "linearity",
+    "dimension",
+    "repeats",
+    "health",
+}
 
 QUESTIONS = ["linearity", "dimension", "posterior", "observability", "timing", "health", "tuning", "change"]
 
