@@ -337,7 +337,12 @@ def _tables(files: list[Path], time: TimeColumn) -> RecordingContents:
         faults.append(undated[0] + more)
     t, v = np.concatenate(times), np.concatenate(values)
     texts = _texts(files, [name for name, column in zip(columns, v.T, strict=True) if not np.isfinite(column).any()])
-    faults += _counts(counted, texts)
+    words = {key: key.removeprefix(NO_VALUE).partition(": ")[0] for key, rows in counted.items() if rows}
+    faults += [
+        f"{key} (rows: {len(counted[key])}, the first {counted[key][0]})"
+        for key, name in words.items()
+        if name not in texts
+    ]
     by, labels, source = _source_of(files, time, dict(zip(columns, v.T, strict=True)), texts, t)
     order.report_late(time_order(t, source, HORIZON_NS) is not None)
     rank = np.argsort(t, kind="stable")
@@ -462,20 +467,6 @@ def _time_of(path: Path, names: Sequence[str], time: TimeColumn) -> str | None:
             if pattern.fullmatch(cell) if pattern else TimeReader(time._replace(name=name)).is_date(cell):
                 return name
     return like
-
-
-def _counts(counted: dict[str, list[str]], texts: dict[str, Counter[str]]) -> list[str]:
-    """Return the numbers of rows by problem; words are none in columns of text."""
-    found, words = [], defaultdict[str, list[str]](list)
-    for key, rows in counted.items():
-        name, _, word = key.removeprefix(NO_VALUE).partition(": ")
-        if word:
-            words[name].append(f"{quoted(word)} (rows: {len(rows)}, the first {rows[0]})")
-        elif rows:
-            found.append(f"{len(rows)} rows in an {key}; the first is {rows[0]}")
-    return found + [
-        f"{name} is missing where it is {', '.join(told)}" for name, told in words.items() if name not in texts
-    ]
 
 
 def _with_clock(path: Path, names: Sequence[str], time: TimeColumn) -> TimeColumn:

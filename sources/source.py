@@ -196,10 +196,14 @@ class Channel:
             object.__setattr__(self, "accuracy", self.accuracy.spread(count))
 
     @property
+    def measured(self) -> tuple[str, ...]:
+        """The signals and those of the accuracy."""
+        return (*self.signals, *(self.accuracy.signals if self.accuracy is not None else ()))
+
+    @property
     def needed(self) -> tuple[Any, ...]:
         """The signals, those of the conditions and of the accuracy, each once."""
-        own = self.accuracy.signals if self.accuracy is not None else ()
-        return tuple(dict.fromkeys((*self.signals, *(item.signal for item in (*self.where, *self.only)), *own)))
+        return tuple(dict.fromkeys((*self.measured, *(item.signal for item in (*self.where, *self.only)))))
 
 
 def ignore(key: str, text: str) -> None:

@@ -76,11 +76,7 @@ class Decoder:
         self._messages = [message for message, *_ in self._plans]
         self._names = [[signal.name for signal in signals] for signals in needed]
         self._signals = tabulate(list(zip(self._messages, needed, strict=True)))
-        used = [
-            {s for c in own for s in (*c.signals, *(c.accuracy.signals if c.accuracy else ()))}
-            for *_, own in self._plans
-        ]
-        self._limits = Limits(list(zip(self._messages, needed, strict=True)), used, report)
+        self._limits = Limits(list(zip(self._messages, needed, strict=True)), [own for *_, own in self._plans], report)
         self._slow = np.array([not all(map(vectorises, signals)) for signals in needed], np.bool_)
         self._any_slow = bool(self._slow.any())
         self._most = max((len(signals) for signals in needed), default=1)
@@ -341,11 +337,10 @@ def _load(path: Path, stamp: int) -> Any:
         logger.setLevel(level)
     if not isinstance(database, cantools.database.can.Database):
         raise SourceError(f"{path}: it describes no CAN messages; give a DBC")
-    if database.dbc is not None and "VFrameFormat" not in database.dbc.attribute_definitions:
-        protocol = database.dbc.attributes.get("ProtocolType")
-        for message in database.messages:
-            if protocol is not None and protocol.value == "J1939" and message.is_extended_frame:
-                message.protocol = "j1939"
+    protocol = database.dbc.attributes.get("ProtocolType") if database.dbc is not None else None
+    if protocol is not None and protocol.value == "J1939" and "VFrameFormat" not in database.dbc.attribute_definitions:
+        for message in filter(lambda message: message.is_extended_frame, database.messages):
+            message.protocol = "j1939"
     return database
 
 

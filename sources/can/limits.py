@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 
-from ..source import Report
+from ..source import Channel, Report
 
 NO_VALUE = re.compile(
     r"(signal|sensor|value|data)*(sna|snv|na|(not|un)(available|valid|defined)|invalid|no(value|data|signal))"
@@ -30,21 +30,17 @@ class Limits:
     J1939-71, tables 1 and 2: 0xFE "error" and 0xFF "not available" in its highest byte, or its two highest values if it
     has 2 or 4 bits, unless the DBC names them otherwise.
 
-    Args:
-        messages: Messages (cantools), each with its signals in the order of the decoder's columns.
-        checked: Names of the signals of each message that are used as values; signals of conditions keep theirs.
-        report: Receives each missing value.
+    `plans` are messages (cantools) with their signals in the order of the decoder's columns, and `channels` what they
+    feed; signals of conditions keep their values. `report` receives each missing value.
     """
 
-    def __init__(
-        self, messages: Sequence[tuple[Any, Sequence[Any]]], checked: Sequence[set[str]], report: Report
-    ) -> None:
-        self._messages, self._report = messages, report
+    def __init__(self, plans: list[tuple[Any, list[Any]]], channels: list[list[Channel]], report: Report) -> None:
+        self._messages, self._report = plans, report
         self._rules = [
-            [list(_rules(message, one)) if one.name in names else [] for one in signals]
-            for (message, signals), names in zip(messages, checked, strict=True)
+            [list(_rules(message, one)) if any(one.name in c.measured for c in own) else [] for one in signals]
+            for (message, signals), own in zip(plans, channels, strict=True)
         ]
-        shape = (max((len(one) for own in self._rules for one in own), default=0), len(messages))
+        shape = (max((len(one) for own in self._rules for one in own), default=0), len(plans))
         self._ends = np.full((2, *shape, max(map(len, self._rules), default=1)), np.nan)
         for m, own in enumerate(self._rules):
             for j, rules in enumerate(own):
@@ -52,12 +48,7 @@ class Limits:
                     self._ends[:, k, m, j] = rule[:2]
 
     def apply(self, plan: np.ndarray, values: np.ndarray) -> None:
-        """Replace what is no measurement by NaN, and report it.
-
-        Args:
-            plan: Message of each frame, (n,).
-            values: Physical values, (n, signals of a message).
-        """
+        """Replace what is no measurement in `values` (n, signals of a message) by NaN; `plan` (n,) is the message."""
         which = np.full(values.shape, -1)
         for k, (low, high) in enumerate(zip(*self._ends, strict=True)):
             which[(values >= low[plan]) & (values <= high[plan])] = k

@@ -109,9 +109,8 @@ def _read(
             continue
         try:
             signal = mdf.get("CAN_DataFrame", group=index)
-            zeros = signal.timestamps == 0  # of lost bytes
-            for name in ("ID", "DataLength"):
-                zeros &= signal.samples[f"CAN_DataFrame.{name}"] == 0
+            ids, lengths = (signal.samples[f"CAN_DataFrame.{name}"] for name in ("ID", "DataLength"))
+            zeros = (signal.timestamps == 0) & (ids == 0) & (lengths == 0)  # of lost bytes
             if zeros.any():
                 signal.samples, signal.timestamps = signal.samples[~zeros], signal.timestamps[~zeros]
                 fault = fault or f"{zeros.sum()} of {cycles} frames are zeros alone, from {zeros.argmax() + 1} on"

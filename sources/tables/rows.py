@@ -5,7 +5,7 @@ Text is read in this process; other formats in a process of their own, since the
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -22,7 +22,7 @@ from .text import Chunk, Column, Problem, csv_format, read_csv
 from .times import TimeColumn, TimeReader
 
 _Names = Callable[[Path, str], list[str]]
-_Read = Callable[[Path, Any, Sequence[Column], Problem], Generator[Chunk, None, None]]
+_Read = Callable[[Path, Any, Sequence[Column], Problem], Iterator[Chunk]]
 
 _BINARY: dict[str, tuple[_Names, _Read]] = {
     ".db3": (bag_names, read_bag),

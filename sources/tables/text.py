@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import re
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple, TextIO
@@ -140,9 +140,7 @@ def has_rows(path: Path) -> bool:
     return True  # What is wrong with the file is reported when its rows are read.
 
 
-def read_csv(
-    path: Path, time: Sequence[str], columns: Sequence[Column], problem: Problem
-) -> Generator[Chunk, None, None]:
+def read_csv(path: Path, time: Sequence[str], columns: Sequence[Column], problem: Problem) -> Iterator[Chunk]:
     """Yield the rows of a CSV; a value that is not a number is missing and reported, as is a row cut short."""
     kind = csv_format(path)
     names, delimiter, _, encoding = kind
