@@ -40,8 +40,6 @@ TIME_NAMES = (
 
 TIME_NAME = re.compile(r"^t[_ ]|time|epoch|zeit|datum", re.IGNORECASE)
 
-PROBED_ROWS = 20  # Rows that show which columns hold dates and clocks
-
 MAX_TEXTS = 50  # Different texts of a column that are counted
 
 TAG = re.compile(
@@ -471,7 +469,7 @@ def _time_of(path: Path, names: Sequence[str], time: TimeColumn) -> str | None:
 
 def _with_clock(path: Path, names: Sequence[str], time: TimeColumn) -> TimeColumn:
     """Return the time column; both, if it is one of a CSV with dates in one column and clocks in another."""
-    rows = [[cell.strip() for cell in row] for row in islice(_cells(path), PROBED_ROWS)] if is_text(path) else []
+    rows = [[cell.strip() for cell in row] for row in islice(_cells(path), MAX_TEXTS)] if is_text(path) else []
     days, clocks = (
         [k for k in range(len(names)) if rows and all(pattern.fullmatch(row[k]) for row in rows)]
         for pattern in (DAY, CLOCK)

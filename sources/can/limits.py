@@ -14,12 +14,9 @@ NO_VALUE = re.compile(
     r"(signal|sensor|value|data)*(sna|snv|na|(not|un)(available|valid|defined)|invalid|no(value|data|signal))"
     r"(value|signal|data)?(or.*)?"
 )
-"""Names of codes that say that there is no value, in lower case and of letters alone."""
-
 ERROR = re.compile(r"(signal|sensor|value|data)*(err|error|faulty?|failure)(indicator|code|value|signal|state)?(or.*)?")
-"""Names of codes of an error; a signal all of whose values are named may have such a state."""
-
-J1939_LENGTHS = (2, 4, 8, 16, 24, 32)
+"""Names, in lower case and of letters alone, of codes that say that there is no value, and of errors, which a signal
+may have as a state if all of its values are named."""
 
 
 class Limits:
@@ -81,7 +78,7 @@ def _rules(message: Any, signal: Any) -> Iterator[tuple[float, float, str]]:
     words = {code: re.sub(r"[^a-z]", "", name.lower()) for code, name in names.items()}
     errors = {code for code, word in words.items() if ERROR.fullmatch(word)}
     codes = {code for code, word in words.items() if NO_VALUE.fullmatch(word)}
-    if message.protocol == "j1939" and not (signal.is_signed or signal.is_float) and bits in J1939_LENGTHS:
+    if message.protocol == "j1939" and not (signal.is_signed or signal.is_float) and bits in (2, 4, 8, 16, 24, 32):
         size = 1 << max(0, bits - 8)
         for back, text in ((2, "error"), (1, "not available")):
             first = (1 << bits) - back * size

@@ -89,8 +89,9 @@ def read_messages(path: Path, wanted: frozenset[int] | None, longest: int) -> It
             except SourceError:
                 raise
             except Exception as error:  # noqa: BLE001  as above
-                at = f" before byte {reader.file.tell()}" if isinstance(reader, can.BLFReader) else ""
-                fault = f"{gist(error)}{at}"
+                fault = gist(error) + (
+                    f" before byte {reader.file.tell()}" if isinstance(reader, can.BLFReader) else ""
+                )
             count += len(chunk)
             errors += sum(message.is_error_frame for message in chunk)
             if chunk or block is None:
@@ -187,8 +188,7 @@ class _Lines:
             return "\n"
         for line in self._file:
             self.number += 1
-            # python-can skips it silently, or reads what is left of it.
-            if not (zeros := line.count("\0")):
+            if not (zeros := line.count("\0")):  # python-can skips such a line, or reads what is left of it
                 return line
             self.refuse(f"{zeros} of its bytes are zero")
             self._empty = False

@@ -41,15 +41,12 @@ _DATE = re.compile(
 
 DAY = re.compile(r"(?:19|20)\d{6}|\d{1,4}([./ -])(?:\d{1,2}|[A-Za-z]{3})\1\d{2,4}")
 CLOCK = re.compile(r"(\d{1,2}):(\d{2})(?::(\d{2})(?:[.,](\d{1,9}))?)?(?:\s*([AaPp])\.?[Mm]\.?)?")
-"""A date without a clock, and a clock without a date: 13:05, 1:05:00.250 PM."""
-
 _NAMED_DAY = re.compile(r"(?<!\d)((?:19|20)\d\d)([-_.]?)(0[1-9]|1[0-2])\2(0[1-9]|[12]\d|3[01])(?!\d)")
-"""A date in the name of a file: 20240304, 2024-03-04."""
+"""A date without a clock, a clock without a date (13:05, 1:05:00.250 PM), and a date in the name of a file."""
 
 MAX_CLOCK_STEP_BACK_NS = 3600 * 10**9  # By which a clock without a date goes back within one day
 TWICE, SKIPPED, ASSUMED = "hour that occurs twice", "hour that never occurs", "time assumed"
 """Keys of rows whose time follows from the order of the rows, and of what was assumed once for all rows."""
-
 TAIL_ROWS = 256  # Rows before the clock is set from which the usual interval is taken
 
 MAX_DETECTION_CELLS = 4096  # Cells from which the order of day and month is taken
@@ -100,8 +97,7 @@ class TimeReader:
         alone = path is not None and column.clock is None
         self._midnight = (ns_of_iso(date) or (0, True))[0] if date and alone else 0 if alone else None
         self._undated, self._clock = date is None, 0
-        self._day: str | None = ""
-        """The last cell; None once a date without a clock has been noted."""
+        self._day: str | None = ""  # the last cell; None once a date without a clock has been noted
         days = SERIAL_DAYS.get(column.unit)
         self._factor = UNITS[column.unit] if days is None else DAY_NS
         self._origin = days or 0
@@ -279,8 +275,8 @@ class _SummerTime:
         if second - first == 1:  # the last moment before an hour that does not exist, and the first one after it
             before = datetime.fromtimestamp(first // 10**9, ZoneInfo(str(zone))).utcoffset() or timedelta()
             self._skipped = before // timedelta(seconds=1) * 10**9
-            text = f"{shown} does not exist in {zone}; taken for a clock that was not set forward"
-            self._notes.append((row, SKIPPED, text))
+            rule = "taken for a clock that was not set forward"
+            self._notes.append((row, SKIPPED, f"{shown} does not exist in {zone}; {rule}"))
             return t - self._skipped
         if self._skipped is not None and self._fixed is None:
             steps = [abs(utc - self._last - self._interval) for utc in (t - self._skipped, first)]
