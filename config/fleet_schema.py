@@ -104,7 +104,8 @@ class FleetSection(Section):
     its source, outputs and faults are not used."""
     assets: Texts | Count | None = None
     """Names of the assets, from which others are refused; or how many there may be, named by the source in the order of
-    their first measurements. Default: as many as the source names."""
+    their first measurements. One more takes the place of an asset that sent a single message, else it is refused.
+    Default: 100,000 that senders name, and as many as tables do."""
     tunings: AssetTuningsSection | None = None
     """Values of the tuning by asset: {file, asset, values}. Assets that are named here are listed from the start.
     Default: the twin's for all."""

@@ -226,7 +226,7 @@ class MqttSource:
             subscribed: Filters to subscribe to in place of those of `topics`, of which each is a part.
             by_hand: Acknowledge messages once they have been stored, see `Acknowledging`; connect after `restore`.
         """
-        self._messages, self._qos, self._report = messages, qos, report
+        self.messages, self._qos, self._report = messages, qos, report
         self._subscribed_to = [*topics] if subscribed is None else [*subscribed]
         self._place, self._section = f"{section.host}:{section.port}", section
         self._client = mqtt_client(
@@ -306,11 +306,11 @@ class MqttSource:
                 found.append(self._waiting.get_nowait())
         decoded = [item for item in found if self._is_new(item[1])]
         pairs = [(packet, message) for topic, packet in decoded if (message := self._decoded(topic, packet))]
-        answers = self._messages.send([message for _, message in pairs]) if pairs else []
+        answers = self.messages.send([message for _, message in pairs]) if pairs else []
         for (packet, _), answer in zip(pairs, answers, strict=True):
             if answer.status == REFUSED:
                 self._refuse(packet, answer.reason)
-        return self._messages.read(0.0)
+        return self.messages.read(0.0)
 
     def _is_new(self, packet: Any) -> bool:
         """Return whether a packet is used; one that was stored before is acknowledged again."""
@@ -339,16 +339,16 @@ class MqttSource:
     @property
     def mark(self) -> int:
         """Messages that were accepted and read."""
-        return self._messages.mark
+        return self.messages.mark
 
     def numbers(self, mark: int) -> dict[str, Any]:
         """See `Marked`."""
-        numbers = self._messages.numbers(mark)
+        numbers = self.messages.numbers(mark)
         return {"senders": numbers, "packets": self._packets.state()} if self._by_hand else numbers
 
     def restore(self, numbers: Mapping[str, Any]) -> None:
         """See `Marked`."""
-        self._messages.restore(numbers.get("senders", {}) if self._by_hand else numbers)
+        self.messages.restore(numbers.get("senders", {}) if self._by_hand else numbers)
         if self._by_hand:
             self._packets.restore(numbers.get("packets", ""))
             self._connect()
@@ -366,7 +366,7 @@ class MqttSource:
 
     def now(self) -> int | None:
         """Return the present time by the clock of the senders, ns."""
-        return self._messages.now()
+        return self.messages.now()
 
     def close(self) -> None:
         """Disconnect."""

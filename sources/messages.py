@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 import queue
 import threading
 import time
 from bisect import bisect_right
 from collections import OrderedDict, deque
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -31,6 +32,8 @@ ASSET = "asset"
 
 MAX_NAME = 200
 """Longest name of a sender or an asset."""
+
+FORGOTTEN = "asset forgotten"  # Key of assets that made room for others, after one message
 
 MAX_WAITING = 200_000
 """Messages that may wait to be read; further ones are refused, so that the sender repeats them."""
@@ -57,6 +60,7 @@ class Answer(NamedTuple):
 
 
 FULL = Answer(REFUSED, "too many messages wait; send it again")
+NO_ROOM = Answer(REFUSED, "the fleet has as many assets as it may have; enlarge assets in its YAML")
 CLOSED = Answer(REFUSED, "nothing is folded any more; send it again after a restart")
 
 
@@ -156,6 +160,10 @@ class Messages:
         self.closed = False
         """Whether it takes no messages any more."""
         self._sending = threading.Lock()
+        self.room: Callable[[str], float] = lambda asset: math.inf
+        """Return how many assets a fleet can still take; infinity for the name of one that it has."""
+        self._coming: set[str] = set()
+        """New assets whose first messages wait to be read."""
 
     def send(self, messages: Sequence[Any]) -> list[Answer]:
         """Take messages in their order; return for each what became of it. Wrong ones do not hold up the others."""
@@ -171,6 +179,7 @@ class Messages:
             for row, message in enumerate(messages):
                 answer = CLOSED if self.closed else FULL if row >= self._room else None
                 answer = answer or self._take(message, t[row : row + 1], values[row], state[row])
+                answer = answer or (self._asset_room(message[ASSET]) if self._assets else None)
                 answer = answer or self._number(message)
                 self.accepted += answer.status == ACCEPTED
                 answers.append(answer._replace(arrival=int(arrival[row])))
@@ -232,6 +241,16 @@ class Messages:
                 )
         return None
 
+    def _asset_room(self, asset: str) -> Answer | None:
+        """Return the answer to a message of a new asset for which there is no room, and note one for which there is."""
+        room = self.room(asset)
+        if room == math.inf or asset in self._coming:
+            return None
+        if len(self._coming) >= room:
+            return NO_ROOM
+        self._coming.add(asset)
+        return None
+
     def _number(self, message: Mapping[str, Any]) -> Answer:
         """Remember the sequence number of a message; tell whether it is a duplicate."""
         number, sender = message.get("sequence"), message.get("source", "")
@@ -275,6 +294,8 @@ class Messages:
         if not self._assets:
             return events
         codes: dict[str, int] = {}
+        with self._sending:
+            self._coming.difference_update(rows.asset)
         code = np.array([codes.setdefault(name, len(codes)) for name in rows.asset.tolist()], np.int64)
         return AssetEvents(events, code[row], tuple(codes))
 

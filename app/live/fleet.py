@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import json
+import math
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from importlib.metadata import version
@@ -20,7 +21,7 @@ from estimators.events.clocks import ClockGuard
 from estimators.fleet.table import FleetTable
 from estimators.log import BEFORE, READING, Events
 from estimators.track import STALE
-from sources.messages import Messages
+from sources.messages import FORGOTTEN, Messages
 from sources.source import NO_ASSET, WRONG_TIME, Acknowledging, AssetEvents, Marked, Report, is_utc
 
 from ..ingest import CLOCK_MOVED, clock_moved, refusal
@@ -36,6 +37,9 @@ if TYPE_CHECKING:
 
 FIRST_ROOM = 256
 """Assets for which there is room at the start, unless their number is given; it is doubled as they come."""
+
+MAX_ASSETS = 100_000
+"""Assets that senders may name, unless the YAML has their number: 1 GB, depending on the model."""
 
 MAX_PENDING = 500_000
 """Events that are folded at once while a table is read to its end."""
@@ -115,10 +119,16 @@ class RunningFleet:
         """Reports by key."""
         self._given = frozenset(given) if isinstance(given, tuple) else None
         self.names: list[str] = list(plan.values.names)
-        """Names of the assets; only appended to."""
+        """Names of the assets; appended to, and changed where an asset is forgotten."""
         self._places = {name: k for k, name in enumerate(self.names)}
-        self._most = given if isinstance(given, int) else len(self.names) if self._given is not None else None
-        self.fleet = plan.fleet(self._most or max(FIRST_ROOM, len(self.names)), threads)
+        senders = None if plan.reads_files else max(MAX_ASSETS, len(self.names))
+        self._most = given if isinstance(given, int) else senders if self._given is None else len(self.names)
+        self._once: dict[int, None] = {}
+        """Places of assets that sent one message, the oldest first: they are forgotten for others."""
+        self._unused = b""
+        """State of an asset before its first event."""
+        room = max(FIRST_ROOM, len(self.names)) if given is None else self._most
+        self.fleet = plan.fleet(room or FIRST_ROOM, threads)
         self._silent = SilentAssets(self.fleet)
         self._last = np.full(len(self.fleet.assets), BEFORE, np.int64)
         self._heard = self._last.copy()
@@ -153,6 +163,9 @@ class RunningFleet:
         self._store = None if store is None else Store(store)
         try:
             self.source = plan.open(self.note, stored=store is not None)
+            messages = getattr(self.source, "messages", self.source)
+            if isinstance(messages, Messages) and self._given is None:
+                messages.room = self._room
             horizon = round(plan.twin.config.time.horizon * 1e9)
             self._guard = ClockGuard(self._last.size, horizon, True) if is_utc(self.source) else None
             if self._store is not None:
@@ -244,10 +257,21 @@ class RunningFleet:
 
     def _add(self, batch: AssetEvents) -> None:
         """Add the events of the assets that are known or new."""
-        used = np.unique(batch.code)
-        places = np.full(len(batch.names), UNKNOWN)
-        for code in used.tolist():
-            places[code] = self._place(batch.names[code])
+        used, names = np.unique(batch.code).tolist(), batch.names
+        places = np.array([self._places.get(name, UNKNOWN) for name in names], np.int64)
+        new = [code for code in used if places[code] == UNKNOWN]
+        if self._once:
+            for code in used:
+                self._once.pop(int(places[code]), None)
+        if new:
+            spare = self._spare()
+            for code in new:
+                places[code] = self._place(names[code], spare)
+            first, last = np.full(len(names), np.iinfo(np.int64).max), np.full(len(names), BEFORE)
+            np.minimum.at(first, batch.code, batch.events.t)
+            np.maximum.at(last, batch.code, batch.events.t)
+            self._once.update((int(places[code]), None) for code in new if first[code] == last[code])
+            self._once.pop(UNKNOWN, None)
         at, events = places[batch.code], batch.events
         known = at != UNKNOWN
         if not known.all():
@@ -286,15 +310,42 @@ class RunningFleet:
         np.maximum.at(self._last, at, events.t)
         self._heard[at] = self.clock()
 
-    def _place(self, name: str) -> int:
-        """Return the position of an asset, a new one for a new name; UNKNOWN if it is refused."""
-        place = self._places.get(name)
-        if place is not None:
-            return place
+    def _room(self, name: str) -> float:
+        """Return how many assets can still come, from any thread; infinity for one that is there."""
+        known = self._most is None or name in self._places
+        return math.inf if known else (self._most or 0) - len(self.names) + len(self._once)
+
+    def _spare(self) -> Iterator[int]:
+        """Forget the asset whose only message is the oldest, and yield its place, as often as one is asked for.
+
+        Those are kept whose events wait for the archive, which knows them by their place.
+        """
+        waiting = {place for at, _ in self._unarchived for place in at.tolist()}
+        for place in [place for place in self._once if place not in waiting]:
+            self._fold()
+            with self._lock:
+                self._silent.forget(place, self._unused)
+            if self._guard is not None:
+                self._guard.forget(place)
+            name = self.names[place]
+            del self._once[place], self._places[name]
+            self._last[place] = self._heard[place] = BEFORE
+            self._changed.add(place // BLOCK)
+            text = f"{self.plan.path.name}: asset {quoted(name)} is forgotten after its only message, to make room"
+            self.note(FORGOTTEN, f"{text}; enlarge assets")
+            yield place
+
+    def _place(self, name: str, spare: Iterator[int] | None = None) -> int:
+        """Return the position of an asset with a new name, also one of the `spare` ones; UNKNOWN if it is refused."""
         if is_blank(name):
             self.note(NO_ASSET, f"{self.plan.path.name}: asset {quoted(name)} is blank; name it in the source")
             return UNKNOWN
         if self._most is not None and len(self.names) >= self._most:
+            place = None if spare is None else next(spare, None)
+            if place is not None:
+                self.names[place] = name
+                self._places[name] = place
+                return place
             rule = f"is beyond {self._most}" if self._given is None else "is not among assets"
             self.note(NO_ASSET, f"{self.plan.path.name}: asset {quoted(name)} {rule}; add it to assets")
             return UNKNOWN
@@ -308,6 +359,7 @@ class RunningFleet:
                 self._guard.extend(self._last.size)
         place = self._places[name] = len(self.names)
         self.names.append(name)
+        self._unused = self._unused or self.fleet.state(slice(place, place + 1))
         return place
 
     def _query(self, period: int) -> None:
@@ -354,6 +406,7 @@ class RunningFleet:
             return
         self._asked = False
         state = self._identity() | {"newest": self._newest, "counts": self.counts, "names": self.names}
+        state["once"] = [*self._once]
         state["source"] = source.numbers(mark) if isinstance(source, Marked) else {}
         blocks: dict[tuple[str, int], bytes] = {}
         for number in sorted(self._changed):
@@ -409,6 +462,7 @@ class RunningFleet:
                 at = np.flatnonzero(self._last > BEFORE)
                 self._guard.continue_from(at, self._last[at], self._heard[at])
             self._newest, self.archived = state["newest"], state.get("archive")
+            self._once = dict.fromkeys(state.get("once", ()))
             self.counts.update(state["counts"])
         if isinstance(self.source, Marked):
             self.source.restore(state.get("source", {}))

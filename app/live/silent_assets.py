@@ -42,6 +42,11 @@ class SilentAssets:
         self._fleet.add_events(places, Events(times, times, np.full(places.size, TICK, np.int8), none, missing))
         self._fleet.advance()
 
+    def forget(self, place: int, state: bytes) -> None:
+        """Give an asset another state, such as that before its first event."""
+        self._states.pop(place, None)
+        self._fleet.restore(place, state)
+
     def put_back(self, places: np.ndarray) -> None:
         """Put back the state of those of some assets that are silent: they have new events."""
         if self._states:

@@ -50,7 +50,7 @@ class FleetArchive:
         Args:
             plan: Folder, and the limits of its files.
             model: Model of the assets.
-            names: Names of the assets by position; may grow.
+            names: Names of the assets by position; may grow, and have another one when an asset is forgotten.
             report: Called as report(key, text) for what cannot be written, also from the thread of the archive.
             stored: What the store had of `written`; empty or None without it.
         """
@@ -58,7 +58,8 @@ class FleetArchive:
         self._model, self._names, self._report = model, names, report
         self._stored: dict[str, Any] = {"store": os.urandom(8).hex(), "number": 0, "end": 0} | dict(stored or {})
         """Id of the store, number of the journal that was written with it last, and its length."""
-        self._waiting: list[tuple[np.ndarray, Events]] = []
+        self._waiting: list[tuple[Sequence[str], np.ndarray, Events]] = []
+        """Names of assets, the place of each event's among these, and the events."""
         self._count = self._dropped = 0
         self._lock = threading.Lock()
         self._journal: Journal | None = None
@@ -76,8 +77,12 @@ class FleetArchive:
             full = self._count + len(events) > MAX_WAITING
             self._dropped += full * len(events)
             if not full:
-                self._waiting.append((at, events))
+                self._waiting.append(self._named(at, events))
                 self._count += len(events)
+
+    def _named(self, at: np.ndarray, events: Events) -> tuple[Sequence[str], np.ndarray, Events]:
+        used, code = np.unique(at, return_inverse=True)
+        return [self._names[k] for k in used.tolist()], code, events
 
     def start(self) -> None:
         """Begin to write."""
@@ -106,7 +111,7 @@ class FleetArchive:
             try:
                 self._begin()
                 if rows:
-                    journal = self._append(rows, self._stored["store"])
+                    journal = self._append([self._named(*row) for row in rows], self._stored["store"])
                     self._stored |= {"number": journal.number, "end": journal.size}
             except Exception as error:  # noqa: BLE001  as in `look`
                 self._fail(error)
@@ -158,11 +163,14 @@ class FleetArchive:
             self._append(rows, "")
             with self._lock:
                 del self._waiting[: len(rows)]
-                self._count -= sum(len(events) for _, events in rows)
+                self._count -= sum(len(events) for *_, events in rows)
 
-    def _append(self, rows: Sequence[tuple[np.ndarray, Events]], store: str) -> Journal:
+    def _append(self, rows: Sequence[tuple[Sequence[str], np.ndarray, Events]], store: str) -> Journal:
         """Write rows to the journal of a store, or of none; that of a new day or of another store is a new one."""
-        at, events = np.concatenate([at for at, _ in rows]), Events.concat([e for _, e in rows], self._model.width)
+        names = [name for row in rows for name in row[0]]
+        firsts = np.cumsum([0, *(len(row[0]) for row in rows)])
+        at = np.concatenate([code + first for (_, code, _), first in zip(rows, firsts, strict=False)])
+        events = Events.concat([row[2] for row in rows], self._model.width)
         day = int(events.t.max()) // DAY_NS
         known = self._journal
         if known is not None and (known.store != store or (self._split.daily and day > known.day)):
@@ -170,7 +178,7 @@ class FleetArchive:
         if self._journal is None:
             self._journal = Journal(self._folder, day, store, self._stored["number"])
         try:
-            self._journal.write(rows_of(self._model, self._names, at, events))
+            self._journal.write(rows_of(self._model, names, at, events))
         except BaseException:
             self._journal.abandon()
             self._ended.append(self._journal.path)

@@ -14,6 +14,7 @@ from estimators.fold import Fold
 from estimators.late import inflated
 from estimators.log import TRUTH, Log
 from sources.brokers import NO_BROKER, REFUSED_MESSAGE, REFUSED_TOPIC
+from sources.messages import FORGOTTEN
 from sources.source import LOST_FRAMES, NEVER, NO_ASSET, TRUNCATED, UNASSIGNED, UNDATED, WRONG_TIME, is_endless
 from sources.tables.order import REMARKS as ORDER
 from sources.tables.text import UNREADABLE
@@ -29,7 +30,7 @@ REMARKS = (*ORDER, NEVER, TRUNCATED, CLOCK_MOVED)
 
 BROKERS = (NO_BROKER, REFUSED_MESSAGE, REFUSED_TOPIC)
 
-ONCE_PRINTED_KEYS = (WRONG_TIME, LOST_FRAMES, UNDATED, UNREADABLE, UNASSIGNED, NO_ASSET, *BROKERS)
+ONCE_PRINTED_KEYS = (WRONG_TIME, LOST_FRAMES, UNDATED, UNREADABLE, UNASSIGNED, NO_ASSET, FORGOTTEN, *BROKERS)
 """Warnings printed once, since there may be one per row, or one with another share every few seconds."""
 
 
@@ -88,7 +89,8 @@ def read_log(twin: Twin, duration: float | None, *, blind: bool = False) -> tupl
     horizon = round(twin.config.time.horizon * 1e9)
     # What a late reading is inflated by is asked of the estimate when it comes.
     beside = Fold(twin.estimator, twin.model, twin.tuning, log) if twin.late.inflate else None
-    intake = Ingest(twin.model, horizon, remark, twin.maintenance, twin.unknown_inputs)
+    gap = round(twin.degraded.seconds * 1e9)
+    intake = Ingest(twin.model, horizon, remark, twin.maintenance, twin.unknown_inputs, gap=gap)
     try:
         while (batch := source.read(1.0)) is not None:
             put(intake.take(batch))

@@ -16,7 +16,7 @@ from starlette.responses import PlainTextResponse, Response
 from starlette.routing import BaseRoute, Route
 
 from estimators.errors import ConfigError, shown_name
-from sources.messages import ACCEPTED, CLOSED, DUPLICATE, REFUSED, Answer, Messages
+from sources.messages import ACCEPTED, CLOSED, DUPLICATE, NO_ROOM, REFUSED, Answer, Messages
 
 from ..live.outcomes import Outcomes
 from ..live.running_fold import Keeper
@@ -78,7 +78,10 @@ def routes(engine: Receiver) -> list[BaseRoute]:
             body = await bounded_body(request, MAX_BYTES)
             messages = await in_thread(lambda: READERS[kind](body, source.fields))
             _check_count(len(messages))
-            return Json(await send_to(engine, messages))
+            found = await send_to(engine, messages)
+            if found["items"] and all(item.get("reason") == NO_ROOM.reason for item in found["items"]):
+                return Json(found | {"error": NO_ROOM.reason}, 429)
+            return Json(found)
         except TooLarge:
             bounds = f"{MAX_BYTES // 2**20} MB and {MAX_MESSAGES:,} messages"
             return PlainTextResponse(f"Nisus: a body may have {bounds}; send fewer messages at once.\n", 413)

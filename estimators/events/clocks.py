@@ -133,6 +133,14 @@ class ClockGuard:
         self._shift = np.insert(self._shift, [self._sensors] * more, 0)
         self._sensors, self._everything = sensors, sensors + 2
 
+    def forget(self, sensor: int) -> None:
+        """Take a sensor as one without events from now on; those of it that are held are dropped."""
+        if sensor in self._runs:
+            work = self._work(Events.empty(self._held.value.shape[1]))
+            self._end(sensor)
+            self._leave(work)
+        self._state[sensor] = self._shift[sensor] = 0
+
     def continue_from(self, sensors: np.ndarray, t: np.ndarray, arrival: np.ndarray) -> None:
         """Take the last event of each of some sensors as before a restart, at times and arrivals of that shape, ns."""
         self._state[sensors, SEEN] = self._state[sensors, LIVE] = 1

@@ -14,19 +14,22 @@ from types import MappingProxyType, SimpleNamespace
 import numpy as np
 import pyarrow as pa
 import pytest
+from starlette.applications import Starlette
 
 import app.live.fleet as live
 from app.live.fleet import RunningFleet
 from app.twin.fleet import load_fleet
 from app.twin.twin import load_twin
 from app.web.fleet import FleetApi
-from app.web.readings import READERS, messages_of, send_to, summary
+from app.web.readings import READERS, messages_of, routes, send_to, summary
 from estimators import Log
 from estimators.errors import NisusError, SourceError
 from estimators.fold import Fold
 from estimators.log import Events
 from estimators.track import HEALTH_NAMES, STALE, USABLE
 from sources.brokers import TopicMap
+from sources.messages import FORGOTTEN
+from sources.source import NO_ASSET
 from tests import ROOT
 from tests.app.cli.test_fleet import FLEET, write
 from tests.app.outputs.broker import Broker, Listener
@@ -131,6 +134,45 @@ class Watch:
 
     def __call__(self):
         return self.ns
+
+
+def test_one_more_asset_takes_the_place_of_one_with_a_single_message_or_is_refused(tmp_path):
+    fleet, said = running(tmp_path, {"type": "push"}, assets=3)
+    source = messages_of(fleet)
+
+    def send(*assets, k=0):
+        body = json.dumps([message(k, asset, 40.0) for asset in assets]).encode()
+        sent, scope = [], {"type": "http", "method": "POST", "path": "/api/readings", "query_string": b""}
+        scope["headers"] = [(b"content-type", b"application/json")]
+
+        async def receive():
+            return {"type": "http.request", "body": body}
+
+        async def collect(part):
+            sent.append(part)
+
+        asyncio.run(Starlette(routes=routes(fleet))(scope, receive, collect))
+        while fleet.step() and source.accepted > source.mark:
+            pass
+        return sent[0]["status"], json.loads(sent[1]["body"])
+
+    assert send("a", "b", "c")[0] == 200 and fleet.names == ["a", "b", "c"]
+    assert send("b", k=1)[0] == 200
+    # The clock of one is ahead, so its message is held.
+    for name, k in (("d", 2), ("ahead", 10**9), ("e", 3), ("g", 4)):
+        assert send(name, k=k)[0] == 200
+    assert fleet.names == ["e", "b", "g"] and fleet.counts[FORGOTTEN] == 4 and "'a' is forgotten" in said[0]
+    assert fleet._guard.held == 0 and running(tmp_path, {"type": "push"})[0]._most == 100_000
+    table = fleet.table()[2]
+    np.testing.assert_array_equal(table.mean, [folded([40.0] * count).mean for count in (1, 2, 1)])
+    assert table.events.tolist() == [1, 2, 1]
+    # Once each has a second message, none makes room; a batch that has others is not repeated for one refused.
+    send("e", "g", k=5)
+    status, answer = send("f", k=6)
+    assert status == 429 and "as many assets as it may have" in answer["error"] and answer["refused"] == 1
+    status, answer = send("b", "f", k=7)
+    assert status == 200 and (answer["accepted"], answer["refused"]) == (1, 1)
+    assert fleet.names == ["e", "b", "g"] and NO_ASSET not in fleet.counts
 
 
 def test_an_asset_that_is_silent_becomes_stale_by_the_clock_of_the_receiver(tmp_path, monkeypatch):
