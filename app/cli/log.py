@@ -11,12 +11,12 @@ from zoneinfo import available_timezones
 
 import numpy as np
 
+from estimators.diagnostics.repeats import find_repeats
 from estimators.errors import ConfigError, nearest, quoted
 from sources.can.decoder import shown_id
 from sources.can.readers import EXTENDED, BusName
 from sources.formats import files_of
 from sources.inspect import Message, RecordingContents, SignalSeries, holes, inspect_recordings, is_table
-from sources.repeats import find_repeats
 from sources.tables.text import QUALITY_WORD
 from sources.tables.times import SERIAL_DAYS, UNITS, TimeColumn
 

@@ -13,6 +13,7 @@ import numpy as np
 from config.source_schema import CanLogSection, CanSection, MergedSection
 from estimators.diagnostics.calibration import BANDS, Calibration
 from estimators.diagnostics.episodes import Episode, episode_json, episodes
+from estimators.diagnostics.repeats import Finding
 from estimators.diagnostics.score import health_of
 from estimators.diagnostics.sensitivity import Gramian, GramianView, Sensitivity, bounds_of, sensitivities, worse_faults
 from estimators.diagnostics.sensitivity.checklist import Arrivals, Dimension, Linearity, arrivals, dimension
@@ -25,7 +26,6 @@ from estimators.errors import NisusError
 from estimators.fold import Fold
 from estimators.log import READING, Log
 from estimators.model.state_space import StateSpaceModel
-from sources.repeats import Finding
 
 from ..present.export.calibration_lines import calibration_lines, health_shares
 from ..present.result import WORSE, Bar, Cell, Topic, plain

@@ -16,10 +16,10 @@ import numpy as np
 
 from config.loader import shipped
 from config.yaml_files import writing
+from estimators.diagnostics.repeats import SINGLE, UNDECIDED, Finding
 from estimators.errors import ConfigError
 from sources.can.readers import BusName
 from sources.inspect import RecordingContents
-from sources.repeats import SINGLE, UNDECIDED, Finding
 from sources.units import heading_unit
 
 from ...format_time import duration_text

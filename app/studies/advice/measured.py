@@ -14,6 +14,7 @@ import numpy as np
 
 from estimators.diagnostics.detectors import detector_of
 from estimators.diagnostics.episodes import Episode, episodes
+from estimators.diagnostics.repeats import Finding, find_repeats
 from estimators.diagnostics.score import score
 from estimators.diagnostics.sensitivity import Gramian, gramian
 from estimators.diagnostics.sensitivity.checklist import MIN_DIFFERENCE, Linearity, linearity
@@ -24,7 +25,6 @@ from estimators.fold import Fold
 from estimators.log import READING, Log
 from estimators.model.state_space import StateSpaceModel
 from estimators.registry import find_entry, unfit
-from sources.repeats import Finding, find_repeats
 
 from ...twin.twin import Twin
 

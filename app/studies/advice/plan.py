@@ -12,9 +12,9 @@ from typing import NamedTuple
 import numpy as np
 
 from estimators.diagnostics.intervals import Interval
+from estimators.diagnostics.repeats import LINEAR
 from estimators.errors import ConfigError, nearest
 from sources.inspect import RecordingContents
-from sources.repeats import LINEAR
 from sources.units import unit_scale
 
 from ...format_time import duration_text

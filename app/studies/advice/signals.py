@@ -10,9 +10,9 @@ from typing import NamedTuple
 import numpy as np
 
 from config.fields import repeat_period
+from estimators.diagnostics.repeats import SINGLE, Finding, find_repeats
 from sources.inspect import RecordingContents, SignalSeries, holes
 from sources.mapping import first_of_hold
-from sources.repeats import SINGLE, Finding, find_repeats
 
 MIN_VALUES = 20  # values needed to estimate a noise
 

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
+from estimators.diagnostics.repeats import DEAD_BAND, HELD, LINEAR, SINGLE, STEPS, UNDECIDED, Finding, find_repeats
 from estimators.log import READING
 from sources.mapping import PRESENT, ChannelMapping
 from sources.messages import Messages
-from sources.repeats import DEAD_BAND, HELD, LINEAR, SINGLE, STEPS, UNDECIDED, Finding, find_repeats
 from sources.source import Channel
 
 SEEDS = range(10)
