@@ -12,18 +12,7 @@ from app.present.result import Bar, Topic, to_html
 from estimators.diagnostics.sensitivity.responses import Nudge
 
 REQUIRED = {"checklist", "observability", "smallest_visible", "integrity", "held_out", "open_loop"}
-MORE = {
-    "twin",
-    "estimator",
-    "span",
-    "timing",
-    "calibration",
-    "posterior",
-    "linearity",
-    "dimension",
-    "repeats",
-    "health",
-}
+MORE = set("twin estimator span timing calibration posterior linearity dimension repeats health".split())
 
 QUESTIONS = ["linearity", "dimension", "posterior", "observability", "timing", "health", "tuning", "change"]
 
