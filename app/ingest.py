@@ -1,4 +1,4 @@
-"""Check the times of events between a source and the log; add planned maintenance, and pauses of unknown inputs."""
+"""Check the times of events between a source and the log; add planned maintenance, pauses and predictions in gaps."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 from estimators.diagnostics.episodes import Episode
 from estimators.events.clocks import ClockGuard, Moved, Passed, Refused
 from estimators.events.maintenance import maintained
-from estimators.log import BEFORE, INPUT, READING, Events
+from estimators.log import BEFORE, INPUT, READING, TICK, Events
 from estimators.model.state_space import StateSpaceModel
 from sources.source import WRONG_TIME, Report
 
@@ -20,6 +20,8 @@ CLOCK_MOVED = "clock moved"  # key of jumps of a source's clock
 MAINTENANCE = "maintenance"  # key of maintenance
 PAUSED = "paused"  # key of pauses of a source, over which inputs are unknown
 PAUSE_PERIODS = 3.0  # median periods of a source beyond which a gap may be a pause: some log once a minute
+GAP_PERIODS = 10.0  # the same beyond which predictions are shown in a gap of a recording
+GAP_QUERIES = 20  # predictions in a gap
 PERIODS = 20  # latest periods of which the median is taken
 
 
@@ -59,6 +61,7 @@ class Ingest:
         planned: Sequence[Planned] = (),
         unknown: UnknownInputs | None = None,
         utc: bool = False,
+        gap: int | None = None,
     ) -> None:
         """Prepare for a source of this model.
 
@@ -69,11 +72,14 @@ class Ingest:
             planned: Maintenance by the YAML; a recording's log contains it already.
             unknown: Pauses over which the inputs are unknown, by the YAML; a recording's log contains them already.
             utc: See `ClockGuard`.
+            gap: Time without any event after which the predictions of meanwhile are shown, ns, None for never: a
+                recording's log contains them already, and those of a live source come as time goes by.
         """
         self._model, self._report = model, report
         self._guard = None if horizon is None else ClockGuard(len(model.sensors), horizon, utc)
         self._planned = [] if horizon is None else sorted(planned, key=lambda item: item.at)
         self._unknown = None if horizon is None else unknown
+        self._gap = None if horizon is None else gap
         self._newest = BEFORE
         self._periods = deque[int](maxlen=PERIODS)
 
@@ -128,10 +134,11 @@ class Ingest:
             item = self._planned.pop(0)
             self._report(MAINTENANCE, maintenance_text(item.what, item.states, self._model))
             passed = self._restart(passed, item.at, item.states)
-        return passed if self._unknown is None else self._paused(passed, self._unknown)
+        return passed if self._unknown is None and self._gap is None else self._paused(passed)
 
-    def _paused(self, passed: Passed, unknown: UnknownInputs) -> Passed:
-        """Return the events with a restart of the driven states at the end of each pause."""
+    def _paused(self, passed: Passed) -> Passed:
+        """Return the events with queries in each gap, and a restart of the driven states at the end of each pause."""
+        unknown = self._unknown
         t = passed.events.t[np.isin(passed.events.kind, (READING, INPUT))]
         newest = np.maximum.accumulate(np.concatenate(([self._newest], t)))
         self._newest = int(newest[-1])
@@ -141,9 +148,16 @@ class Ingest:
         before = [*self._periods, *periods[regular].tolist()]
         places = len(self._periods) + np.searchsorted(regular, np.arange(t.size))
         self._periods.extend(before[-PERIODS:])
-        for k in np.flatnonzero(periods > unknown.after).tolist():
-            usual = before[max(0, places[k] - PERIODS) : places[k]]
-            if usual and periods[k] <= PAUSE_PERIODS * np.median(usual):
+        after = [] if self._gap is None else [self._gap]
+        after += [] if unknown is None else [unknown.after]
+        for k in np.flatnonzero(periods > min(after)).tolist():
+            recent = before[max(0, places[k] - PERIODS) : places[k]]
+            usual = float(np.median(recent)) if recent else 0.0
+            if self._gap is not None and periods[k] > max(self._gap, GAP_PERIODS * (usual or np.inf)):
+                shares = np.linspace(0.0, 1.0, GAP_QUERIES + 1)[1:] ** 2  # denser where the variance grows fastest
+                times = newest[k] + (shares * (periods[k] - 1)).astype(np.int64)
+                passed = self._with(passed, queries(times, self._model.width))
+            if unknown is None or periods[k] <= max(unknown.after, PAUSE_PERIODS * usual):
                 continue
             length = periods[k] * 1e-9
             self._report(
@@ -157,10 +171,12 @@ class Ingest:
 
     def _restart(self, passed: Passed, t: int, states: Sequence[int]) -> Passed:
         """Return the events with some whose states restart at t (ns)."""
-        model = self._model
-        events = maintained(t, t, states, model.width)
+        return self._with(passed, maintained(t, t, states, self._model.width))
+
+    def _with(self, passed: Passed, events: Events) -> Passed:
+        """Return the events with others, to which no horizon applies."""
         settled = np.concatenate((passed.settled, np.ones(len(events), np.bool_)))
-        return passed._replace(events=Events.concat([passed.events, events], model.width), settled=settled)
+        return passed._replace(events=Events.concat([passed.events, events], self._model.width), settled=settled)
 
     def _named(self, kind: int, channel: int) -> str:
         if kind == READING:
@@ -175,6 +191,12 @@ def dropped_episode(start: float, lost: int, taken: int) -> Episode:
         "times; check the times of the source, or lengthen time.horizon"
     )
     return Episode(start, None, "twin", "dropped", lost / taken, math.nan, math.nan, "", text)
+
+
+def queries(times: np.ndarray, width: int) -> Events:
+    """Return queries at times (n,), ns, for a log of so many value columns."""
+    kinds, none = np.full(times.size, TICK, np.int8), np.zeros(times.size, np.int32)
+    return Events(times, times, kinds, none, np.full((times.size, width), np.nan))
 
 
 def refusal(name: str, refused: Refused) -> str:

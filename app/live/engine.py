@@ -155,6 +155,7 @@ class Engine(Running):
             twin.maintenance,
             twin.unknown_inputs,
             is_utc(self._feeder.source),
+            None if self._feeder.live else round(twin.degraded.seconds * 1e9),
         )
 
     def _go_on_from(self, tail: LogTail) -> None:

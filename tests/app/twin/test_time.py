@@ -12,7 +12,10 @@ from app.twin.log_reader import read_log
 from app.twin.twin import load_twin
 from estimators.errors import ConfigError
 from estimators.fold import Fold
-from estimators.log import MAINTENANCE
+from estimators.log import MAINTENANCE, TICK
+from estimators.track import STALE
+from tests.app.scripted import Stepped, pull_all, readings
+from tests.support import as_log
 
 TWIN = """
 model: motor_winding
@@ -144,6 +147,43 @@ def test_a_logger_of_one_row_a_minute_does_not_pause_all_the_time(tmp_path):
     assert [text.split(",")[0] for key, text in said if key == "paused"] == [
         "no event for 61 s until 61 s", "no event for 461 s until 2230 s",
     ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("gap", "degraded", "ticks"), [(400, 30, 20), (9, 3, 0), (120, 130, 0)], ids=["gap", "few periods", "not degraded"]
+)
+@pytest.mark.parametrize("estimator", ["kf", "ukf"])
+def test_a_gap_has_rows_of_the_prediction_and_changes_no_other(tmp_path, gap, degraded, ticks, estimator):
+    times = [*range(40), *range(39 + gap, 79 + gap)]
+    (tmp_path / "log.csv").write_text("\n".join(["t,y", *(f"{t},{40 + 0.01 * t + t % 3}" for t in times)]))
+    path = tmp_path / "twin.yaml"
+    path.write_text(
+        f"model: motor_winding\nestimator: {estimator}\ntime: {{degraded_after: {degraded}, stale_after: 300}}\n"
+        "source: {type: table, files: log.csv, time: {column: t}, sensors: {winding: {columns: y}}}\n"
+    )
+    twin = load_twin(path)
+    log, _ = read_log(twin, None)
+    replayed = Stepped()  # degraded after 5 s
+    replayed.put(readings(times, np.full(len(times), 40.0)))
+    assert (pull_all(replayed.engine).events.kind == TICK).sum() == (20 if gap > 10 else 0)
+    fold = Fold(twin.estimator, twin.model, twin.tuning, log, policy=twin.policy)
+    fold.advance()
+    rows = log.kind[: log.n] == TICK
+    assert rows.sum() == ticks and log.n == len(times) + ticks
+    alone = Fold(twin.estimator, twin.model, twin.tuning, as_log(log.events.select(~rows)), policy=twin.policy)
+    alone.advance()
+    for name in ("mean", "std", "nis", "innovation", "whitened"):
+        np.testing.assert_array_equal(getattr(fold.track, name)[~rows], getattr(alone.track, name), err_msg=name)
+    if ticks:
+        # The innovation after the gap is y - H x, and its variance H P H + R, of the prediction at its end.
+        first, last = np.flatnonzero(rows)[[0, -1]]
+        t = log.t[first - 1 : last + 2] * 1e-9
+        assert np.all(np.diff(t[:-1], 2) > 0.0) and t[-2] == pytest.approx(t[-1], abs=1e-8)
+        predicted = log.value[last + 1, 0] - alone.track.innovation[40, 0]
+        variance = alone.track.innovation_std[40, 0] ** 2 - twin.tuning.get("R.winding")
+        assert fold.track.mean[last, 0] == pytest.approx(predicted, rel=1e-9)
+        assert fold.track.std[last, 0] ** 2 == pytest.approx(variance, rel=1e-6)
+        assert {fold.track.health[row] for row in (first, last)} == {fold.track.health[first - 1], STALE}
 
 
 def test_a_pause_of_a_model_without_inputs_is_refused(tmp_path):
