@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import json
 import re
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
@@ -22,7 +23,7 @@ from .formats import CAN_LOGS, check_once, suffix_of
 from .source import UNDATED, Channel
 from .tables.order import Order, time_order
 from .tables.rows import TableRows, is_bag, is_text, names_of, rows_of
-from .tables.text import NO_VALUE, UNREADABLE, TextMatch, csv_format, open_text
+from .tables.text import NO_VALUE, QUALITY_WORD, UNREADABLE, TextMatch, csv_format, open_text
 from .tables.times import CLOCK, DAY, SKIPPED, TWICE, TimeColumn, TimeReader
 from .units import heading_unit, suffix_unit
 
@@ -39,6 +40,11 @@ TIME_NAMES = (
 """Usual names of a time column; otherwise the first one of dates is taken, or the first that is named like one."""
 
 TIME_NAME = re.compile(r"^t[_ ]|time|epoch|zeit|datum", re.IGNORECASE)
+
+QUALITY = re.compile(r"qual|valid|güte", re.IGNORECASE)
+GOOD_WORD = re.compile(r"good\b.*|ok|valid|normal|gut", re.IGNORECASE)
+OPC_GOOD = 192
+"""Names of columns of quality, its good words, and the least good number of OPC."""
 
 MAX_TEXTS = 50  # Different texts of a column that are counted
 
@@ -491,3 +497,22 @@ def _texts(files: list[Path], names: list[str]) -> dict[str, Counter[str]]:
                     if text and (text in counts or len(counts) < MAX_TEXTS):
                         counts[text] += 1
     return {name: counts for name, counts in found.items() if counts}
+
+
+def quality_conditions(found: RecordingContents) -> list[str]:
+    """Return the columns by which rows of bad quality can be left out, with the condition."""
+    lines: list[tuple[str, str, int, object]] = []
+    for name, words in found.texts.items():
+        good = [word for word in words if GOOD_WORD.fullmatch(word)]
+        bad = [word for word in words if QUALITY_WORD.fullmatch(word) or (QUALITY.search(name) and word not in good)]
+        if good and bad:
+            lines.append((name, ", ".join(map(quoted, bad[:3])), sum(words[word] for word in bad), good))
+    for one in found.columns:
+        if QUALITY.search(one.name) and one.values.size and 0 <= one.values.min() < OPC_GOOD <= one.values.max() < 256:
+            below = int(np.sum(one.values < OPC_GOOD))
+            lines.append((one.name, f"below {OPC_GOOD}", below, {"min": OPC_GOOD}))
+    return [
+        f"{name} is {what} (rows: {count}); to leave these rows out give where: "
+        + json.dumps({name: good}, ensure_ascii=False)
+        for name, what, count, good in lines
+    ]

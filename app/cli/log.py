@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json
 import math
-import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from zoneinfo import available_timezones
@@ -16,8 +14,15 @@ from estimators.errors import ConfigError, nearest, quoted
 from sources.can.decoder import shown_id
 from sources.can.readers import EXTENDED, BusName
 from sources.formats import files_of
-from sources.inspect import Message, RecordingContents, SignalSeries, holes, inspect_recordings, is_table
-from sources.tables.text import QUALITY_WORD
+from sources.inspect import (
+    Message,
+    RecordingContents,
+    SignalSeries,
+    holes,
+    inspect_recordings,
+    is_table,
+    quality_conditions,
+)
 from sources.tables.times import SERIAL_DAYS, UNITS, TimeColumn
 
 from ..format_time import FIRST_DATED_NS, duration_text, format_time
@@ -33,11 +38,6 @@ if TYPE_CHECKING:
 MAX_LISTED = 5  # gaps and faults that are listed; the others are counted
 
 MAX_TEXTS_SHOWN = 8
-
-QUALITY = re.compile(r"qual|valid|güte", re.IGNORECASE)
-GOOD_WORD = re.compile(r"good\b.*|ok|valid|normal|gut", re.IGNORECASE)
-OPC_GOOD = 192
-"""Names of columns of quality, its good words, and the least good number of OPC."""
 
 MIN_LONG_NS = 7_200_000_000_000  # Time from which on hours and days are shown
 
@@ -126,7 +126,7 @@ def _topic(found: RecordingContents) -> Topic:
         ]
         if found.by:
             texts.append(f"{found.by} names the source of each row; a twin reads them with by: {found.by}")
-        texts += _qualities(found)
+        texts += quality_conditions(found)
         return Topic(title, (*sentences, f"time: column {found.time.label}{zone}", *texts), ("column", *TIMES), rows)
     lines: list[tuple[Cell, ...]] = []
     for message in found.messages:
@@ -139,25 +139,6 @@ def _topic(found: RecordingContents) -> Topic:
             lines.append(("", "", f"  {empty} signals without a value", "", *[None] * len(TIMES)))
     columns = ("bus", "id", "message, signals", "unit", TableColumn("number", absent=""), *TIMES[1:])
     return Topic(title, tuple(sentences), columns, tuple(lines))
-
-
-def _qualities(found: RecordingContents) -> list[str]:
-    """Return the columns by which rows of bad quality can be left out, with the condition."""
-    lines: list[tuple[str, str, int, object]] = []
-    for name, words in found.texts.items():
-        good = [word for word in words if GOOD_WORD.fullmatch(word)]
-        bad = [word for word in words if QUALITY_WORD.fullmatch(word) or (QUALITY.search(name) and word not in good)]
-        if good and bad:
-            lines.append((name, ", ".join(map(quoted, bad[:3])), sum(words[word] for word in bad), good))
-    for one in found.columns:
-        if QUALITY.search(one.name) and one.values.size and 0 <= one.values.min() < OPC_GOOD <= one.values.max() < 256:
-            below = int(np.sum(one.values < OPC_GOOD))
-            lines.append((one.name, f"below {OPC_GOOD}", below, {"min": OPC_GOOD}))
-    return [
-        f"{name} is {what} (rows: {count}); to leave these rows out give where: "
-        + json.dumps({name: good}, ensure_ascii=False)
-        for name, what, count, good in lines
-    ]
 
 
 def _own_gaps(found: RecordingContents) -> list[str]:

@@ -149,9 +149,7 @@ def test_a_logger_of_one_row_a_minute_does_not_pause_all_the_time(tmp_path):
     ]  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    ("gap", "degraded", "ticks"), [(400, 30, 20), (9, 3, 0), (120, 130, 0)], ids=["gap", "few periods", "not degraded"]
-)
+@pytest.mark.parametrize(("gap", "degraded", "ticks"), [(400, 30, 20), (9, 3, 0), (120, 130, 0)])
 @pytest.mark.parametrize("estimator", ["kf", "ukf"])
 def test_a_gap_has_rows_of_the_prediction_and_changes_no_other(tmp_path, gap, degraded, ticks, estimator):
     times = [*range(40), *range(39 + gap, 79 + gap)]

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from estimators.diagnostics.repeats import DEAD_BAND, HELD, LINEAR, SINGLE, STEPS, UNDECIDED, Finding, find_repeats
+from estimators.diagnostics.repeats import DEAD_BAND, HELD, LINEAR, SINGLE, STEPS, UNDECIDED, find_repeats
 from estimators.log import READING
 from sources.mapping import PRESENT, ChannelMapping
 from sources.messages import Messages
@@ -12,20 +12,20 @@ from sources.source import Channel
 SEEDS = range(10)
 
 
-def walk(rng: np.random.Generator, n: int, q: float, step: float) -> np.ndarray:
+def walk(rng, n, q, step: float):
     """Measurements with a noise of 1 of a random walk, rounded to multiples of `step`."""
     y = 20.0 + np.cumsum(rng.normal(0.0, np.sqrt(q), n)) + rng.normal(0.0, 1.0, n)
     return np.round(y / step) * step if step else y
 
 
-def found(y: np.ndarray, dt: float = 1.0) -> Finding:
+def found(y, dt=1.0):
     return find_repeats((np.arange(y.size) * dt * 1e9).astype(np.int64), y)
 
 
 @pytest.mark.parametrize("q", [0.002, 0.2])
 @pytest.mark.parametrize("step", [0.0, 0.1, 0.5, 1.0, 2.0])
 @pytest.mark.parametrize("period", [2.0, 2.5, 5.0, 10.0, 10.3, 60.0])
-def test_held_values_have_the_period_at_which_they_change(period: float, step: float, q: float) -> None:
+def test_held_values_have_the_period_at_which_they_change(period, step, q: float):
     named = 0
     for seed in SEEDS:
         rng = np.random.default_rng(seed)
@@ -40,7 +40,7 @@ def test_held_values_have_the_period_at_which_they_change(period: float, step: f
     assert named == len(SEEDS) or (period == 2.5 and step >= 1.0)
 
 
-def smooth(rng: np.random.Generator, step: float) -> np.ndarray:
+def smooth(rng, step: float):
     """Band-limited noise without any of its rows."""
     power = np.fft.rfft(rng.normal(0.0, 1.0, 3000))
     y = np.fft.irfft(np.where(np.arange(power.size) < 250, power, 0.0))
@@ -48,7 +48,7 @@ def smooth(rng: np.random.Generator, step: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize("step", [0.0, 0.1, 0.5, 1.0, 2.0, 4.0])
-def test_no_measurement_is_taken_for_a_repeat(step: float) -> None:
+def test_no_measurement_is_taken_for_a_repeat(step: float):
     rows = np.arange(3000)
     for seed in SEEDS:
         rng = np.random.default_rng(seed)
@@ -59,8 +59,6 @@ def test_no_measurement_is_taken_for_a_repeat(step: float) -> None:
             "rest": walk(rng, 3000, 0.0, step) * 0.3,
             "sine": np.round(10.0 * np.sin(rows / 9.1) / max(step, 0.01)) * max(step, 0.01),
             "stops": np.round(10.0 * np.sin(moves / 13.7) / max(step, 0.01)) * max(step, 0.01),
-            "ramp": np.floor(rows / 17.0),
-            "toggle": np.floor(rows / 10.0) % 2,
             "smooth": smooth(rng, step),
             "spikes": np.where(rng.uniform(size=3000) < 0.02, 50.0, np.round(rng.normal(0.0, 0.1, 3000))),
             "code": np.round(np.round(20.0 + rng.normal(0.0, 0.4, 3000)) * 0.0977, 3),
@@ -71,7 +69,7 @@ def test_no_measurement_is_taken_for_a_repeat(step: float) -> None:
             assert found(courses["walk"]).kind == SINGLE, "decided"
 
 
-def test_constant_steps_dead_bands_and_lines_have_their_names() -> None:
+def test_constant_steps_dead_bands_and_lines_have_their_names():
     for seed in SEEDS:
         rng = np.random.default_rng(seed)
         assert found(np.repeat(walk(rng, 200, 0.2, 0.1), rng.geometric(0.1, 200) + 1)).kind == STEPS
@@ -84,9 +82,7 @@ def test_constant_steps_dead_bands_and_lines_have_their_names() -> None:
         assert (line.kind, round(line.period, 6)) == (LINEAR, 10.0)
 
 
-def test_the_words_of_a_finding() -> None:
-    held = found(np.repeat(np.random.default_rng(1).normal(0.0, 1.0, 100), 10))
-    assert (held.reason, held.key) == ("new value every 10 s, repeated in 90 % of rows", "every 10 s")
+def test_few_changes_are_undecided():
     assert found(np.repeat([0.0, 1.0, 5.0], 100)).reason == "fewer than 15 changes"
 
 
@@ -96,7 +92,7 @@ RULES = {None: [0, 1, 2, 3, 4, 5, 6, 7, 8], 0.0: [0, 2, 4, 6, 8], 2.0: [0, 2, 4,
 
 @pytest.mark.parametrize("period", list(RULES))
 @pytest.mark.parametrize("sizes", [[9], [1] * 9, [2, 4, 3], [5, 1, 3]])
-def test_pieces_of_any_size_keep_the_same_rows(period: float | None, sizes: list[int]) -> None:
+def test_pieces_of_any_size_keep_the_same_rows(period, sizes: list[int]):
     counts: dict[str, int] = {}
     mapping = ChannelMapping(
         [([Channel(READING, 0, "T", ("T",), repeats=period)], ["T"], [None])],
@@ -118,7 +114,7 @@ def test_pieces_of_any_size_keep_the_same_rows(period: float | None, sizes: list
     assert counts == ({} if period is None else {"repeats T": 9 - len(kept)})
 
 
-def test_assets_of_a_fleet_have_holds_of_their_own() -> None:
+def test_assets_of_a_fleet_have_holds_of_their_own():
     messages = Messages([Channel(READING, 0, "T", ("T",), repeats=0.0)], width=1, assets=True)
     sent = [("a", 1.0), ("b", 2.0), ("a", 1.0), ("b", 1.0), ("a", 3.0), ("b", 1.0)]
     messages.send([{"asset": asset, "values": {"T": value}} for asset, value in sent])
