@@ -44,6 +44,8 @@ _SAME = {
     "rev": "turn",
     "Torr": "torr",
     "cfm": "ft**3/min",
+    "kmph": "km/h",
+    "centigrade": "degC",
 }
 """Spellings with one meaning (1/min on a bus is a rotation)."""
 
@@ -60,10 +62,14 @@ _REFUSED = (
         "`units`, and the factor as `scale`",
     ),
     (
-        re.compile(r"(?i:db(m|w|v|uv|µv|a|spl|i|c|fs|u)?|np)(/.*)?"),
+        re.compile(r"(?i:db[ (]*(m|w|v|uv|µv|a|b|spl|i|c|fs|u)?\)?|np)(/.*)?"),
         "is a logarithm, which no factor converts; convert the column first",
     ),
     (re.compile(r"(?i:grad)(\W.*)?"), "may be a degree or a gon; give deg, degC or gon under `units`"),
+    (
+        re.compile(r"(bbl|mt|tons?|gr|Gs|degs|fc|MBtu)(\W.*)?"),
+        "has several meanings; give its full name under `units`, such as oil_barrel, metric_ton, grain or gauss",
+    ),
 )
 """Spellings that have several meanings, or are no multiple of another unit, and why they are refused."""
 

@@ -6,6 +6,7 @@ import re
 from collections.abc import Sequence
 from typing import Any
 
+from starlette.convertors import IntegerConvertor, register_url_convertor
 from starlette.requests import Request
 from starlette.responses import HTMLResponse, PlainTextResponse, Response, StreamingResponse
 from starlette.routing import Route
@@ -37,6 +38,15 @@ MAX_ERRORS = 6
 """States whose error the report gives for each run."""
 
 
+class RunNumber(IntegerConvertor):
+    """Number of a run in a path; Python refuses to convert thousands of digits."""
+
+    regex = "[0-9]{1,18}"
+
+
+register_url_convertor("run", RunNumber())
+
+
 class RunsApi:
     """Routes for runs and tuning versions. Scores and sweeps are computed on request."""
 
@@ -50,8 +60,8 @@ class RunsApi:
         copying = OneAtATime("export")
         return [
             get("/api/runs", self._runs),
-            get("/api/runs/{number:int}.yaml", self._yaml, refused=404),
-            get("/api/runs/{number:int}/against/{other:int}", self._difference, refused=404),
+            get("/api/runs/{number:run}.yaml", self._yaml, refused=404),
+            get("/api/runs/{number:run}/against/{other:run}", self._difference, refused=404),
             get("/api/around", self._around),
             get("/api/noise", self._noise),
             get("/api/tunings", self._tunings),

@@ -252,7 +252,8 @@ def test_what_is_acknowledged_survives_a_kill_and_is_taken_once(tmp_path, monkey
     after.kill()
     twin, source = pushed()
     last = Session(path, source, twin)
-    assert last.engine.innermost.send([message(5), message(0)]) == [("accepted", ""), ("duplicate", "")]
+    answers = last.engine.innermost.send([message(5), message(0)])
+    assert [item.status for item in answers] == ["accepted", "duplicate"]
     last.engine.settle()
     np.testing.assert_array_equal(pull_all(last.engine).events.value[:, 0], 40.0 + np.arange(6))
     last.running.stop()
