@@ -168,7 +168,7 @@ def silent_gaps(judged: JudgedRows) -> Iterator[FoundEpisode]:
 def _lost(judged: JudgedRows, code: int, run: AlarmRun) -> FoundEpisode:
     t, cause = judged.events.t, HEALTH_NAMES[code]
     start = run.start(t) - (float(judged.track.age[run.begin]) if code == STALE else 0.0)
-    size = (t[run.end - 1] - t[run.begin]) * 1e-9
+    size = float(t[run.end - 1]) * 1e-9 - start
     off = contradicting_sensors(judged, run.end) if code == DIVERGED else ()
     facts = TwinFacts(name="twin", cause=cause, start=start, size=size, off=off, sensors=len(judged.model.sensors))
     found = _found("twin", facts, run.over(t), np.nan, np.nan, run, t)
