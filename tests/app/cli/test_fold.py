@@ -3,7 +3,6 @@
 import json
 import re
 import textwrap
-from pathlib import Path
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -23,7 +22,6 @@ from estimators.log import Log
 from estimators.models import MODELS
 from estimators.track import HEALTH_NAMES
 from estimators.tuning import Tuning
-from tests.app.conftest import CommandLine
 from tests.app.present.export.test_report import data_of
 
 DRIVE = """\
@@ -39,14 +37,14 @@ BARE = DRIVE[: DRIVE.index("  truth")]  # without true states
 ROWS = "t,y,temperature,rate\n0,40,41,0.5\n1,40,,0.25\n2,41,42,\n"
 
 
-def drive(folder: Path, rows: str = ROWS, text: str = DRIVE) -> Path:
+def drive(folder, rows=ROWS, text=DRIVE):
     """A recording and its twin."""
     (folder / "drive.csv").write_text(rows)
     (folder / "drive.yaml").write_text(text)
     return folder / "drive.yaml"
 
 
-def test_true_states_have_columns_of_their_own(tmp_path: Path, nisus: CommandLine) -> None:
+def test_true_states_have_columns_of_their_own(tmp_path, nisus):
     path = drive(tmp_path)
     out = tmp_path / "track.parquet"
     nisus("fold", path, "--out", out, "--json")
@@ -62,7 +60,7 @@ def test_true_states_have_columns_of_their_own(tmp_path: Path, nisus: CommandLin
     np.testing.assert_array_equal(table["value_1"].to_numpy(), log.events.value[:, 1])
 
 
-def test_an_estimate_with_too_wide_a_band_is_withheld(tmp_path: Path, nisus: CommandLine) -> None:
+def test_an_estimate_with_too_wide_a_band_is_withheld(tmp_path, nisus):
     """The file has no value of it, and its band; so has no other state."""
     out = tmp_path / "track.parquet"
     nisus("fold", drive(tmp_path), "--out", out, "--json")
@@ -87,7 +85,7 @@ def test_an_estimate_with_too_wide_a_band_is_withheld(tmp_path: Path, nisus: Com
     assert all(sum(state["share"].values()) == pytest.approx(1.0) for state in states.values())
 
 
-def test_the_reason_of_a_withheld_estimate_names_what_left_the_fitted_range(tmp_path: Path, nisus: CommandLine) -> None:
+def test_the_reason_of_a_withheld_estimate_names_what_left_the_fitted_range(tmp_path, nisus):
     limits = "withhold: {rate: 1e-3}\nvalid: {temperature: {min: -10, max: 20}}\n"
     path = drive(tmp_path, text=DRIVE + limits)
     found = nisus("fold", path, "--json").json
@@ -102,9 +100,7 @@ def test_the_reason_of_a_withheld_estimate_names_what_left_the_fitted_range(tmp_
 
 
 @pytest.mark.parametrize("back", [3600.0, 1234.0])
-def test_a_clock_that_steps_back_is_bridged_or_its_rows_are_sorted(
-    tmp_path: Path, nisus: CommandLine, back: float
-) -> None:
+def test_a_clock_that_steps_back_is_bridged_or_its_rows_are_sorted(tmp_path, nisus, back):
     """One line names it. Daylight saving time is bridged; any other step before the first row is files reversed."""
     y = 40.0 + np.random.default_rng(5).normal(0, 2, 200)
     rows = [f"{k - back * (k >= 100)},{value}\n" for k, value in enumerate(y)]
@@ -138,7 +134,7 @@ source: {type: simulator, seed: 3, step: 1, duration: 200, sensors: {winding: {e
 
 
 @pytest.mark.parametrize("text", [DRIVE, PARTS, SIMULATED], ids=["table", "merged", "simulator"])
-def test_a_blind_fold_ignores_the_truth_of_every_source(text: str, tmp_path: Path, nisus: CommandLine) -> None:
+def test_a_blind_fold_ignores_the_truth_of_every_source(text, tmp_path, nisus):
     """The truth is 30 °C off, which figures report; nothing else changes without it, least of all health."""
     rng = np.random.default_rng(5)
     rows = "".join(f"{k},{40 + rng.normal(0, 2)},{70 if k > 5 else ''},\n" for k in range(100))
@@ -157,7 +153,7 @@ def test_a_blind_fold_ignores_the_truth_of_every_source(text: str, tmp_path: Pat
         np.testing.assert_array_equal(seen[column], blind_table[column])
 
 
-def test_the_nees_is_that_of_the_python_interface(tmp_path: Path, nisus: CommandLine) -> None:
+def test_the_nees_is_that_of_the_python_interface(tmp_path, nisus):
     path = tmp_path / "drive.yaml"
     path.write_text(SIMULATED)
     log, _ = read_log(load_twin(path), None)
@@ -175,14 +171,14 @@ def test_the_nees_is_that_of_the_python_interface(tmp_path: Path, nisus: Command
     assert wrong["mean"] > 3.0 * wrong["high"] and wrong["inside"] < 0.5
 
 
-def stuck_drive(tmp_path: Path) -> Path:
+def stuck_drive(tmp_path):
     """200 readings, one a second, of which the last 100 are equal."""
     y = 40.0 + np.random.default_rng(5).normal(0, 2, 200)
     y[100:] = 41.5
     return drive(tmp_path, "t,y\n" + "".join(f"{k},{value}\n" for k, value in enumerate(y)), BARE)
 
 
-def test_episodes_are_printed_told_to_scripts_and_kept(tmp_path: Path, nisus: CommandLine) -> None:
+def test_episodes_are_printed_told_to_scripts_and_kept(tmp_path, nisus):
     twin, out = str(stuck_drive(tmp_path)), tmp_path / "track.parquet"
     lines = nisus("fold", twin, "--out", out).out.splitlines()
     assert any(line.startswith("1 episode(s); docs/alarms.md") for line in lines)
@@ -203,7 +199,7 @@ def test_episodes_are_printed_told_to_scripts_and_kept(tmp_path: Path, nisus: Co
     assert table["flags"].to_pylist() == [None] * 200
 
 
-def test_of_many_episodes_the_first_are_printed() -> None:
+def test_of_many_episodes_the_first_are_printed():
     one = Episode(1.0, 2.5, "winding", "narrow", 2.0, 1.9, 2.1, "×", "bands of winding are too narrow")
     lines = to_text([episodes_topic([ExplainedEpisode(one, ())] * 25)])
     assert lines[1] == "  narrow, for 1.5 s: bands of winding are too narrow."
@@ -237,7 +233,7 @@ source: {type: table, files: drive.csv, time: {column: t, unit: s}, sensors: {ga
 """
 
 
-def test_what_a_black_box_failed_with_is_told(tmp_path: Path, nisus: CommandLine) -> None:
+def test_what_a_black_box_failed_with_is_told(tmp_path, nisus):
     """Of readings at 0, 1, 2, 4 and 5 s the last two are more than 1.5 s behind the last state that f reached."""
     (tmp_path / "drive.csv").write_text("t,y\n0,40\n1,40\n2,41\n4,41\n5,40\n")
     (tmp_path / "box.py").write_text(BOX)
@@ -256,7 +252,7 @@ def test_what_a_black_box_failed_with_is_told(tmp_path: Path, nisus: CommandLine
     assert row.failure.startswith(said)
 
 
-def test_the_calibration_is_printed(tmp_path: Path, nisus: CommandLine) -> None:
+def test_the_calibration_is_printed(tmp_path, nisus):
     """R as declared is 4; readings of a deviation of 3, and an estimate that is told to be 10 °C off at the end."""
     rng = np.random.default_rng(4)
     lines = [f"{t},{40 + 6 * rng.standard_normal()},{50 if t > 30 else ''}," for t in range(200)]
@@ -266,7 +262,7 @@ def test_the_calibration_is_printed(tmp_path: Path, nisus: CommandLine) -> None:
     assert re.search(r"^  temperature: truth in its 95 % band \d\.?\d* % \(\S+ to \S+\) of the time$", said[0], re.M)
 
 
-def test_what_of_the_model_made_a_reading_fail_is_told(tmp_path: Path, nisus: CommandLine) -> None:
+def test_what_of_the_model_made_a_reading_fail_is_told(tmp_path, nisus):
     """h ends at 42 m, beyond which the level rises: √ of a negative number."""
     box = """\
         import numpy as np
@@ -292,7 +288,7 @@ def test_what_of_the_model_made_a_reading_fail_is_told(tmp_path: Path, nisus: Co
     assert re.search(said, nisus("fold", tmp_path / "box.yaml", "--json").json["failure"])
 
 
-def test_the_json_says_what_a_script_needs(tmp_path: Path, nisus: CommandLine) -> None:
+def test_the_json_says_what_a_script_needs(tmp_path, nisus):
     """Beside figures that are found from the events and the estimates in the table of `--out`."""
     rng = np.random.default_rng(2)
     t = np.arange(400) + 0.0
@@ -368,7 +364,7 @@ def test_the_json_says_what_a_script_needs(tmp_path: Path, nisus: CommandLine) -
     assert winding["role"] == "held out" and winding["coverage"]["95"]["value"] == inside.mean()
 
 
-def test_what_was_dropped_is_said_if_it_was_much() -> None:
+def test_what_was_dropped_is_said_if_it_was_much():
     model = MODELS["motor_winding"]
     log = Log.of(model)
     log.add("winding", np.arange(10.0), np.full(10, 35.0))
@@ -380,7 +376,7 @@ def test_what_was_dropped_is_said_if_it_was_much() -> None:
     assert episode.text.startswith("90 % of the measurements were dropped, 90 of 100:")
 
 
-def test_what_is_smoothed_stands_beside_the_filter(tmp_path: Path, nisus: CommandLine) -> None:
+def test_what_is_smoothed_stands_beside_the_filter(tmp_path, nisus):
     path = drive(tmp_path)
     out = tmp_path / "track.csv"
     said = nisus("fold", path, "--out", out, "--smooth", "--json").json
@@ -397,7 +393,7 @@ def test_what_is_smoothed_stands_beside_the_filter(tmp_path: Path, nisus: Comman
     )
 
 
-def smoothed_lines(path: Path) -> np.ndarray:
+def smoothed_lines(path):
     """Of a recording, (n, 3): the smoothed temperature, and the edges of its band, in the order of time."""
     rows = []
     for chunk in RrdReader(str(path)).stream():
@@ -408,7 +404,7 @@ def smoothed_lines(path: Path) -> np.ndarray:
     return np.array([values for _, values in sorted(rows, key=lambda row: row[0])])
 
 
-def test_what_is_smoothed_is_drawn_in_recording_and_report(tmp_path: Path, nisus: CommandLine) -> None:
+def test_what_is_smoothed_is_drawn_in_recording_and_report(tmp_path, nisus):
     name = drive(tmp_path)
     table_file, out, html = (tmp_path / f"run.{end}" for end in ("csv", "rrd", "html"))
     nisus("fold", name, "--out", table_file, "--smooth")
@@ -442,7 +438,7 @@ def test_what_is_smoothed_is_drawn_in_recording_and_report(tmp_path: Path, nisus
     assert set(data_of(text)[0]["streams"]) == {"live"} and "smoothed states" not in text
 
 
-def test_a_part_of_the_log_is_scored_by_the_filter_that_ran_from_the_start(tmp_path: Path, nisus: CommandLine) -> None:
+def test_a_part_of_the_log_is_scored_by_the_filter_that_ran_from_the_start(tmp_path, nisus):
     """Scores, counts, episodes, report and their times are of the part; the oracle is the table of all rows."""
     rng = np.random.default_rng(4)
     t = np.arange(400.0)
@@ -485,5 +481,5 @@ def test_a_part_of_the_log_is_scored_by_the_filter_that_ran_from_the_start(tmp_p
         ("--since 10min", "--since 10min: there is no measurement in this part; the log is from 0 s to 2 s"),
     ],
 )
-def test_a_part_without_measurements_is_one_line(option, text, tmp_path: Path, nisus: CommandLine) -> None:
+def test_a_part_without_measurements_is_one_line(option, text, tmp_path, nisus):
     assert text in nisus.refuses("fold", drive(tmp_path), *option.split())

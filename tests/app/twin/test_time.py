@@ -167,11 +167,11 @@ def test_a_gap_has_rows_of_the_prediction_and_changes_no_other(tmp_path, gap, de
     fold = Fold(twin.estimator, twin.model, twin.tuning, log, policy=twin.policy)
     fold.advance()
     rows = log.kind[: log.n] == TICK
-    assert rows.sum() == ticks
+    assert rows.sum() == ticks and log.n == len(times) + ticks
     alone = Fold(twin.estimator, twin.model, twin.tuning, as_log(log.events.select(~rows)), policy=twin.policy)
     alone.advance()
     for name in ("mean", "std", "nis", "innovation", "whitened"):
-        np.testing.assert_array_equal(getattr(fold.track, name)[~rows], getattr(alone.track, name))
+        np.testing.assert_array_equal(getattr(fold.track, name)[~rows], getattr(alone.track, name), err_msg=name)
     if ticks:
         # The innovation after the gap is y - H x, and its variance H P H + R, of the prediction at its end.
         first, last = np.flatnonzero(rows)[[0, -1]]
