@@ -264,14 +264,16 @@ class Engine(Running):
 
     def _with_lag(self, status: Status) -> Status:
         """Return a status, of a health that shows measurements which wait for longer than one may be missing."""
-        age = time.monotonic() - status.heard
-        waiting = self._behind or not self._inbox.empty()
-        if not (waiting and self._feeder.live and status.t is not None and age > self.policy.degraded_after):
+        age, late = time.monotonic() - status.heard, self._idle_ticks.late
+        if not self._feeder.live or age <= self.policy.degraded_after or status.health in (WAITING, DIVERGED, STALE):
             return status
-        if status.health in (WAITING, DIVERGED, STALE):
+        if self._behind or not self._inbox.empty():
+            cause = f"the filter is behind: measurements of the last {age:.3g} s are not folded yet"
+        elif late > self.policy.degraded_after:
+            cause = f"measurements are {late:.3g} s old when they arrive"
+        else:
             return status
-        cause = f"the filter is behind: measurements of the last {age:.3g} s are not folded yet"
-        health = STALE if age > self.policy.stale_after else DEGRADED
+        health = STALE if age - late > self.policy.stale_after else DEGRADED
         return replace(status, health=health, since=status.t, cause=cause)
 
     def latest(self) -> Status:
@@ -282,7 +284,7 @@ class Engine(Running):
             if not still or last < 0:
                 return status
             row, u = fold.track.select(slice(last, last + 1)).copy(), fold.u.copy()
-            t, revision, heard = int(self._log.t[last]), self._revision, self._idle_ticks.since
+            t, revision, heard = int(self._log.t[last]), self._revision, self._idle_ticks.heard
         latest = replace(
             status,
             t=t,
@@ -322,7 +324,7 @@ class Engine(Running):
             "speed": paced.speed if paced is not None else None,
             "seekable": paced is not None,
             "span": span_of(self.source),
-            "heard": self._idle_ticks.since,
+            "heard": self._idle_ticks.heard,
         }
 
     # On the engine's own thread
@@ -349,11 +351,8 @@ class Engine(Running):
         mark = self._mark
         while item is not None:
             if isinstance(item, Delivery):
-                batches.append(item.events)
-                mark = item.mark
-                if self._feeder.waits:
-                    self._feeder.taken()
-            elif isinstance(item, Events):
+                item, mark = item
+            if isinstance(item, Events):
                 batches.append(item)
                 if self._feeder.waits:
                     self._feeder.taken()
@@ -396,7 +395,7 @@ class Engine(Running):
             dropped = stale + len(passed.refused)
             self._watchers.dropped.note(self._log.newest, len(events) + len(passed.refused), dropped)
             if np.count_nonzero((events.kind == READING) | (events.kind == INPUT)) > stale:
-                self._idle_ticks.arrived(events if self._feeder.live else None, self._log.newest)
+                self._idle_ticks.arrived(self._feeder.source, events, self._log.newest)
             if self._log.n:
                 self._watchers.silence.broken()
         self._fold_on()

@@ -14,7 +14,7 @@ from estimators.diagnostics.clock_fit import ClockFit, LeastDelays
 from estimators.diagnostics.episodes import TrackedEpisode
 from estimators.log import INPUT, READING, Events
 from estimators.track import STALE, TRACKING, WAITING
-from sources.source import LOST_FRAMES, Source, controls_of
+from sources.source import LOST_FRAMES, Source, controls_of, is_utc
 
 from ..ingest import dropped_episode
 from .alerts import Alerts
@@ -86,7 +86,10 @@ class IdleTicks:
         self._tick = tick
         self.since = time.monotonic()
         """Monotonic time of the last arrival of what was used and folded, s."""
+        self.late = 0.0
+        """Age of the newest measurement when it arrived, s, of a source whose times are UTC."""
         self._newest: int | None = None
+        self._measured = 0
         self._begun = time.time_ns()
         self._waiting: tuple[float, int] | None = None
 
@@ -95,11 +98,19 @@ class IdleTicks:
         self.since = time.monotonic() - ago
         self._newest = newest
 
-    def arrived(self, events: Events | None, newest: int) -> None:
-        """Note events in the log, until `folded`; those of a live source arrived when they say, None now."""
+    @property
+    def heard(self) -> float:
+        """Monotonic time of the newest measurement that was used and folded, s; of its arrival if not in UTC."""
+        return self.since - self.late
+
+    def arrived(self, source: Source, events: Events, newest: int) -> None:
+        """Note events in the log, until `folded`; those of a live source arrived when they say, others now."""
         now, ago = time.monotonic(), 0.0
-        if events is not None and (stamped := events.arrival[events.arrival >= self._begun]).size:
+        if source.live and (stamped := events.arrival[events.arrival >= self._begun]).size:
             ago = max(0.0, (time.time_ns() - int(stamped.max())) * 1e-9)
+            if is_utc(source):
+                self._measured = max(self._measured, int(events.t.max()))
+                self.late = max(0.0, (int(stamped.max()) - self._measured) * 1e-9)
         self._waiting = max(self.since, now - ago), newest
 
     def folded(self) -> None:

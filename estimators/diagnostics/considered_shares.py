@@ -21,6 +21,10 @@ def considered_labels(model: StateSpaceModel) -> list[str]:
     return [known.get(name, name) for name in names]
 
 
+def _considers(model: StateSpaceModel, cov: np.ndarray) -> bool:
+    return model.considered > 0 and cov.shape[0] == model.nx and bool(np.isfinite(cov).all())
+
+
 def variance_shares(model: StateSpaceModel, cov: np.ndarray) -> dict[str, dict[str, float]]:
     """Return for each estimated state the share of its variance by considered parameter, largest first, and `NOISE`.
 
@@ -38,7 +42,7 @@ def variance_shares(model: StateSpaceModel, cov: np.ndarray) -> dict[str, dict[s
         Nothing for a model without considered states; of a state only those with a positive, finite variance.
     """
     n = model.nx - model.considered
-    if model.considered == 0 or cov.shape[0] != model.nx or not np.all(np.isfinite(cov)):
+    if not _considers(model, cov):
         return {}
     C, cross = cov[n:, n:], cov[:n, n:]
     # In units of the deviations, so that small ones do not drown; members fewer than parameters leave C singular.
@@ -68,7 +72,7 @@ def known_stds(model: StateSpaceModel, cov: np.ndarray) -> dict[str, dict[str, f
         Nothing for a model without considered states; of a state only those with a positive, finite variance.
     """
     n = model.nx - model.considered
-    if model.considered == 0 or cov.shape[0] != model.nx or not np.all(np.isfinite(cov)):
+    if not _considers(model, cov):
         return {}
     variance, labels = np.diag(cov), considered_labels(model)
     gained = np.divide(cov[:n, n:] ** 2, variance[n:], out=np.zeros((n, model.considered)), where=variance[n:] > 0.0)

@@ -46,15 +46,18 @@ def _reach(state, row, horizon, live):
 
 
 @inlined
-def _judge(state, row, t, arrival, live, horizon, utc):
+def _judge(state, row, t, raw, arrival, live, horizon, utc):
     """Return whether a time fits its channel's clock, or is far ahead or back."""
     everything = state.shape[0] - 1
     if state[row, SEEN] and t < state[row, LAST] - horizon:
         return BACK
     if utc:
-        # What was buffered, or is history, comes late by any time, but a clock that is right is never ahead.
-        offset = max(0, state[row, OFFSET]) if state[row, SEEN] else 0
-        return FITS if t - arrival <= offset + max(horizon // 2, MIN_OFFSET_TOLERANCE_NS) else AHEAD
+        # What was buffered, or is history, comes late by any time, but a clock that is right is never ahead; and one
+        # that was corrected is right again if it is late.
+        tolerance = max(min(horizon // 2, SECOND_NS), SECOND_NS // 10)
+        if t != raw and t - arrival < state[row, OFFSET] - tolerance:
+            return BACK
+        return FITS if t - arrival <= tolerance else AHEAD
     if not state[everything, SEEN]:
         return FITS
     live = live or state[row, LIVE] > 0
@@ -104,7 +107,7 @@ def _scan(state, t, raw, arrival, rows, start, horizon, utc):
         row = rows[i]
         if row >= 0:
             live = utc or raw[i] != arrival[i]
-            if state[row, HOLDING] or _judge(state, row, t[i], arrival[i], live, horizon, utc) != FITS:
+            if state[row, HOLDING] or _judge(state, row, t[i], raw[i], arrival[i], live, horizon, utc) != FITS:
                 return i
             _note(state, row, t[i], arrival[i], live, horizon)
     return t.size
@@ -115,7 +118,7 @@ def compiled() -> tuple[Any, Any, Any, Any]:
     """Return the functions, compiled for their only signatures."""
     one = (I2, i64, i64, i64, types.boolean, i64)
     _reach.compile((I2, i64, i64, types.boolean))
-    _judge.compile((*one, types.boolean))
+    _judge.compile((*one[:2], *one[1:], types.boolean))
     _note.compile(one)
     _scan.compile((I2, I1, I1, I1, I1, i64, i64, types.boolean))
     return _reach, _judge, _note, _scan

@@ -16,6 +16,10 @@ the step of the largest t - arrival, since delays only reduce that; otherwise th
 clock that returns to an earlier offset, or to the offset of another channel, gets exactly that offset, so that errors
 of the delay do not accumulate.
 
+A clock that is set to UTC is ahead if it is later than the arrival by more than a second (less if the horizon is
+short), however late what it sends may come; it is then corrected to this machine's. If it is right again, what was
+corrected is late by more than that, and is held like what goes back.
+
 With known arrivals, held events do not pass merely because time has reached them: a clock slightly farther ahead than
 the horizon would be accepted after a while, and the events of all other clocks would be stale from then on. An event
 that fits but was measured before the held ones arrived does not contradict them.
@@ -229,7 +233,7 @@ class ClockGuard:
         return np.select(cases, [batch.channel, self._sensors, self._sensors + 1], -1).astype(np.int64)
 
     def _verdict(self, work: Work, i: int) -> int:
-        given = work.rows[i], work.t[i], work.arrival[i], work.live[i]
+        given = work.rows[i], work.t[i], work.raw[i], work.arrival[i], work.live[i]
         return int(self._judge(self._state, *given, self._horizon, self._utc))
 
     def _let_in(self, work: Work, i: int) -> None:
@@ -355,6 +359,9 @@ class ClockGuard:
         if run.live:
             known = row if state[SEEN] else self._everything
             step = int(self._state[known, OFFSET]) - run.top
+            if self._utc:
+                # As this machine's, or as late as before.
+                step = min(step, -run.top)
         elif not run.ahead:
             step = self._step_back(run, row)
         elif now > run.begin:
@@ -397,7 +404,9 @@ class ClockGuard:
         run = self._end(row)
         gone = [i for i in run.at if i not in set(rest)] if rest else run.at
         if not run.ahead:
-            work.emit(gone)
+            for i in gone:
+                # What came within the horizon is not late for having been held.
+                work.emit([i], settled=work.t[i] >= run.begin - self._horizon)
             return
         for i in gone:
             stamp, shift = int(work.raw[i]), int(self._shift[row])

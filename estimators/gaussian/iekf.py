@@ -7,32 +7,18 @@ Source: Bell & Cathey (1993), doi:10.1109/9.250476.
 
 from __future__ import annotations
 
-from ..estimator import Estimator, Option
-from .ekf import predict, tune, update, work_size
-from .robust import JOSEPH_OPTION, OPTIONS, memory
-from .shared import describe, moments, no_points, start, state_size
+from dataclasses import replace
 
-IEKF = Estimator(
+from ..estimator import Option
+from .ekf import EKF
+
+IEKF = replace(
+    EKF,
     name="iekf",
     title="Iterated extended Kalman filter",
-    family="Gaussian",
     assumes="differentiable f and h; h may curve within the spread, if the posterior has one peak",
     model_runs="1, and h once an iteration; each and its derivatives (nx by complex step)",
     fails_when="Gauss-Newton overshoots or two peaks fit; f's curvature makes it overconfident like the EKF",
     source="Bell & Cathey (1993), doi:10.1109/9.250476",
-    functions=(start, predict, update, describe),
-    runs=lambda options, nx: nx + 1,
-    state_size=state_size,
-    work_size=work_size,
-    moments=moments,
-    points=no_points,
-    options=(
-        Option("iterations", 3, 1, 100, "", "linearisations per measurement; 1 is the EKF"),
-        JOSEPH_OPTION,
-        *OPTIONS,
-    ),
-    tune=tune,
-    memory=memory,
-    considers=True,
-    singular=True,
+    options=(Option("iterations", 3, 1, 100, "", "linearisations per measurement; 1 is the EKF"), *EKF.options),
 )

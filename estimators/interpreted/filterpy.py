@@ -60,6 +60,12 @@ def moments_of(view: View, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return state[:n], state[n:].reshape(n, n)
 
 
+def _at(filter_: Any, view: View, state: np.ndarray) -> tuple[Any, np.ndarray, np.ndarray]:
+    """Return a filter that was given the mean and covariance of a state, and these."""
+    filter_.x, filter_.P = x, P = moments_of(view, state.copy())
+    return filter_, x, P
+
+
 def start(view: View, mean: np.ndarray, cov: np.ndarray, state: np.ndarray) -> None:
     """Set the state to N(mean, cov), with angles within ±π and a covariance that is symmetric to the last bit."""
     state[: view.nx] = wrapped(mean, view.circular)
@@ -76,10 +82,8 @@ def describe(view: View, state: np.ndarray, mean: np.ndarray, std: np.ndarray, c
 
 def predict_kf(view: View, u: np.ndarray, dt: float, index: int, state: np.ndarray, work: np.ndarray) -> None:
     """x ← F x + c, P ← F P Fᵀ + Q, with c what f adds to F x: inputs, offsets."""
-    x, P = moments_of(view, state)
+    filter_, x, _ = _at(objects().KalmanFilter(dim_x=view.nx, dim_z=1, dim_u=1), view, state)
     F = view.F(view.prior()[0], u, dt)
-    filter_ = objects().KalmanFilter(dim_x=view.nx, dim_z=1, dim_u=1)
-    filter_.x, filter_.P = x.copy(), P.copy()
     offset = view.f(x[None], u, dt)[0] - F @ x
     filter_.predict(u=np.ones(1), B=offset[:, None], F=F, Q=view.Q(x, u, dt))
     start(view, filter_.x, filter_.P, state)
@@ -89,9 +93,7 @@ def update_kf(view: View, u: np.ndarray, sensor: int, y: np.ndarray, *rest: Any)
     """Condition on z = y - h(x) + H x, which removes inputs, offsets and turns of angles."""
 
     def step(state: np.ndarray, rows: np.ndarray, R: np.ndarray) -> Any:
-        x, P = moments_of(view, state.copy())
-        filter_ = objects().KalmanFilter(dim_x=view.nx, dim_z=rows.size)
-        filter_.x, filter_.P = x, P
+        filter_, x, _ = _at(objects().KalmanFilter(dim_x=view.nx, dim_z=rows.size), view, state)
         H = view.H(sensor, x, u)[rows]
         nu = wrapped(y[rows] - view.h(sensor, x[None], u)[0, rows], view.circular_rows(sensor)[rows])
         filter_.update(H @ x + nu, R=R, H=H)
@@ -102,9 +104,7 @@ def update_kf(view: View, u: np.ndarray, sensor: int, y: np.ndarray, *rest: Any)
 
 def predict_ekf(view: View, u: np.ndarray, dt: float, index: int, state: np.ndarray, work: np.ndarray) -> None:
     """x ← f(x, u), P ← F P Fᵀ + Q."""
-    x, P = moments_of(view, state)
-    filter_ = objects().Extended(dim_x=view.nx, dim_z=1)
-    filter_.x, filter_.P = x.copy(), P.copy()
+    filter_, x, _ = _at(objects().Extended(dim_x=view.nx, dim_z=1), view, state)
     filter_.F, filter_.Q = view.F(x, u, dt), view.Q(x, u, dt)
     filter_.forward = view.f(x[None], u, dt)[0]
     filter_.predict()
@@ -115,9 +115,7 @@ def update_ekf(view: View, u: np.ndarray, sensor: int, y: np.ndarray, *rest: Any
     """Condition on a measurement, linearised at the prediction."""
 
     def step(state: np.ndarray, rows: np.ndarray, R: np.ndarray) -> Any:
-        x, P = moments_of(view, state.copy())
-        filter_ = objects().Extended(dim_x=view.nx, dim_z=rows.size)
-        filter_.x, filter_.P = x, P
+        filter_, *_ = _at(objects().Extended(dim_x=view.nx, dim_z=rows.size), view, state)
         angles = view.circular_rows(sensor)[rows]
         filter_.update(
             y[rows],
@@ -161,9 +159,8 @@ def _unscented(view: View, angles: np.ndarray) -> Any:
 
 def predict_ukf(view: View, u: np.ndarray, dt: float, index: int, state: np.ndarray, work: np.ndarray) -> None:
     """x, P ← mean and covariance of the propagated sigma points, plus Q; NaN where P has no factor."""
-    x, P = moments_of(view, state)
-    filter_ = _unscented(view, np.zeros(0, bool))
-    filter_.x, filter_.P, filter_.Q = x.copy(), P.copy(), view.Q(x, u, dt)
+    filter_, x, P = _at(_unscented(view, np.zeros(0, bool)), view, state)
+    filter_.Q = view.Q(x, u, dt)
     try:
         block = view.f(filter_.points_fn.sigma_points(x, P), u, dt)
         filter_.predict(dt=dt, fx=in_turn(block))
@@ -177,9 +174,7 @@ def update_ukf(view: View, u: np.ndarray, sensor: int, y: np.ndarray, *rest: Any
     """Condition on a measurement, with sigma points drawn again from the prediction."""
 
     def step(state: np.ndarray, rows: np.ndarray, R: np.ndarray) -> Any:
-        x, P = moments_of(view, state.copy())
-        filter_ = _unscented(view, view.circular_rows(sensor)[rows])
-        filter_.x, filter_.P = x, P
+        filter_, x, P = _at(_unscented(view, view.circular_rows(sensor)[rows]), view, state)
         filter_.sigmas_f = filter_.points_fn.sigma_points(x, P)
         block = np.ascontiguousarray(view.h(sensor, filter_.sigmas_f, u)[:, rows])
         filter_.update(y[rows], R=R, hx=in_turn(block))

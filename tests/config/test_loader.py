@@ -33,13 +33,13 @@ source:
 """
 
 
-def message(text: str, overrides: dict[str, str] | None = None) -> str:
+def message(text, overrides=None):
     with pytest.raises(ConfigError) as caught:
         load_text(text, Path("motor.yaml"), overrides)
     return str(caught.value)
 
 
-def test_values_are_read_and_defaults_filled_in() -> None:
+def test_values_are_read_and_defaults_filled_in():
     loaded = load_text(MOTOR, Path("folder/motor.yaml"))
     config = loaded.config
     assert config.name == "motor"
@@ -57,13 +57,13 @@ def test_values_are_read_and_defaults_filled_in() -> None:
 
 
 @pytest.mark.parametrize("row", [*csv.DictReader(MISTAKES, delimiter="\t", quoting=csv.QUOTE_NONE)])
-def test_a_value_that_breaks_a_rule_is_one_line(row: dict[str, str]) -> None:
+def test_a_value_that_breaks_a_rule_is_one_line(row):
     old, new = (row[key].replace(r"\n", "\n") for key in ("old", "new"))
     assert old in MOTOR
     assert message(MOTOR.replace(old, new, 1)) == row["expected"]
 
 
-def test_a_missing_type_is_told_those_of_the_schema(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_type_is_told_those_of_the_schema(monkeypatch):
     untyped = MOTOR.replace("  type: simulator\n", "")
     known = "motor.yaml:9: source.type is missing; it must be one of simulator, can"
     assert message(untyped).startswith(f"{known}, can_log, table")
@@ -94,7 +94,7 @@ def test_a_missing_type_is_told_those_of_the_schema(monkeypatch: pytest.MonkeyPa
             "indentation, quotes and brackets"),
     ],
 )  # fmt: skip
-def test_what_is_not_a_twin_at_all_is_one_line(text: str, expected: str) -> None:
+def test_what_is_not_a_twin_at_all_is_one_line(text, expected):
     assert message(text) == expected
 
 
@@ -111,19 +111,19 @@ def test_what_is_not_a_twin_at_all_is_one_line(text: str, expected: str) -> None
         ("prior: {a: {std: -1}}", "motor.yaml:14: prior.a.std is -1; it must be zero or positive"),
     ],
 )  # fmt: skip
-def test_settings_that_contradict_each_other_are_one_line(more: str, expected: str) -> None:
+def test_settings_that_contradict_each_other_are_one_line(more, expected):
     assert message(MOTOR + more) == expected
 
 
 @pytest.mark.parametrize("repeat", ["{steps: [[0, 1], [5, 2]], repeat: 5}", "{constant: 1, repeat: 5}"])
-def test_a_profile_that_cannot_repeat_is_one_line(repeat: str) -> None:
+def test_a_profile_that_cannot_repeat_is_one_line(repeat):
     text = MOTOR.replace("{steps: [[0, 1], [5, 2]]}", repeat)
     assert message(text) == (
         "motor.yaml:13: source.inputs.torque[1].repeat is 5.0 s; it needs steps that all begin before it"
     )
 
 
-def test_one_mistake_is_one_line_though_it_breaks_several_rules() -> None:
+def test_one_mistake_is_one_line_though_it_breaks_several_rules():
     text = MOTOR.replace("    std: 2", "    std: [-1]").replace("[1, {steps: [[0, 1], [5, 2]]}]", "{a: 1}")
     assert message(text).splitlines() == [
         "motor.yaml:6: sensors.winding.std[0] is -1; it must be zero or positive",
@@ -133,14 +133,14 @@ def test_one_mistake_is_one_line_though_it_breaks_several_rules() -> None:
     assert message(text) == "motor.yaml:2: source.channel is [1]; it must be a whole number"
 
 
-def test_nested_aliases_cannot_ask_for_billions_of_values() -> None:
+def test_nested_aliases_cannot_ask_for_billions_of_values():
     text = "a: &a [x, x, x, x, x, x, x, x, x, x]\n"
     for old, new in zip("abcdefghi", "bcdefghij", strict=True):
         text += f"{new}: &{new} [{', '.join([f'*{old}'] * 10)}]\n"
     assert message(text).endswith("it holds more than 100000 values; are its aliases (*name) meant?")
 
 
-def test_several_problems_are_a_line_each_and_no_more_than_five() -> None:
+def test_several_problems_are_a_line_each_and_no_more_than_five():
     text = MOTOR.replace("    std: 2", "    std: -2").replace("gate: 0.9973", "gate: 2")
     assert message(text).splitlines() == [
         "motor.yaml:6: sensors.winding.std is -2; it must be zero or positive",
@@ -151,7 +151,7 @@ def test_several_problems_are_a_line_each_and_no_more_than_five() -> None:
     assert len(lines) == 6 and lines[-1] == "motor.yaml: and 3 more"
 
 
-def test_words_that_yaml_1_1_takes_for_booleans_are_names() -> None:
+def test_words_that_yaml_1_1_takes_for_booleans_are_names():
     text = MOTOR.replace("  winding:", "  no: {use: false}\n  on:")
     assert list(load_text(text, Path("motor.yaml")).config.sensors) == ["no", "on"]
 
@@ -159,16 +159,16 @@ def test_words_that_yaml_1_1_takes_for_booleans_are_names() -> None:
 @pytest.mark.parametrize(
     ("text", "value"), [("1e-3", 1e-3), ("010", 10.0), (".5", 0.5), ("2_000", 2000.0), ("5.", 5.0)]
 )
-def test_numbers_are_read_as_people_write_them(text: str, value: float) -> None:
+def test_numbers_are_read_as_people_write_them(text, value):
     assert load_text(MOTOR.replace("120", text), Path("motor.yaml")).config.source.duration == value
 
 
-def test_a_section_left_empty_means_its_defaults() -> None:
+def test_a_section_left_empty_means_its_defaults():
     text = MOTOR + "time:\n  # tick: 1\nview:\n"
     assert load_text(text, Path("motor.yaml")).config.time.tick == 0.5
 
 
-def test_overrides_replace_values_and_errors_name_the_option() -> None:
+def test_overrides_replace_values_and_errors_name_the_option():
     loaded = load_text(MOTOR, Path("motor.yaml"), {"source.duration": "5", "time.tick": "1e-1", "gate": "null"})
     assert loaded.config.source.duration == 5.0 and loaded.config.time.tick == 0.1 and loaded.config.gate is None
     for key, value, said in (
@@ -183,7 +183,7 @@ def test_overrides_replace_values_and_errors_name_the_option() -> None:
     assert said.startswith("--set time.tock.x=5: time.tock is not known; did you mean tick?")
 
 
-def test_files_that_cannot_be_read_are_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_files_that_cannot_be_read_are_one_line(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "folder.yaml").mkdir()
     (tmp_path / "binary.yaml").write_bytes(b"a: 1\n\x89PNG\xff")
@@ -209,7 +209,7 @@ def test_a_pipe_is_refused_and_never_waited_for(tmp_path):
         load(str(tmp_path / "pipe.yaml"))
 
 
-def test_a_byte_order_mark_and_windows_line_ends_are_read(tmp_path: Path) -> None:
+def test_a_byte_order_mark_and_windows_line_ends_are_read(tmp_path):
     path = tmp_path / "motor.yaml"
     path.write_bytes(b"\xef\xbb\xbf" + MOTOR.replace("\n", "\r\n").encode())
     loaded = load(path)
@@ -217,7 +217,7 @@ def test_a_byte_order_mark_and_windows_line_ends_are_read(tmp_path: Path) -> Non
     assert loaded.places.at(("gate",)).endswith("motor.yaml:8")
 
 
-def test_every_twin_that_ships_loads_by_name() -> None:
+def test_every_twin_that_ships_loads_by_name():
     assert "motor_winding" in shipped()
     for name in shipped():
         loaded = load(name)

@@ -30,7 +30,7 @@ def two(x, u, p, out):
     out[1] = x[1]
 
 
-def model(a: Limits | None = None, b: Limits | None = None) -> StateSpaceModel:
+def model(a=None, b=None):
     """Two states that walk at random, a sensor of one row and one of two, with a standard deviation of 1/4 each."""
     return StateSpaceModel(
         name="walk",
@@ -46,16 +46,16 @@ def model(a: Limits | None = None, b: Limits | None = None) -> StateSpaceModel:
     )
 
 
-def events(rows: list[tuple[int, int, tuple[float, ...]]], width: int) -> Events:
+def events(rows, width):
     """Readings from (time in beats, sensor, values)."""
     return Events.concat([Events.one(t * BEAT, t * BEAT, READING, s, y, width) for t, s, y in rows], width)
 
 
-def entry(values: tuple, k: int):
+def entry(values, k):
     return values[k] if len(values) > 1 else values[0]
 
 
-def plain_screen(limits: list[Limits | None], rows: list[tuple[int, int, tuple[float, ...]]]) -> list[list[int]]:
+def plain_screen(limits, rows):
     """The rules as they are written in Limits and Stuck, over whole lists: what came before is looked up each time."""
     verdicts: list[list[int]] = []
     for n, (t, s, y) in enumerate(rows):
@@ -88,7 +88,7 @@ def plain_screen(limits: list[Limits | None], rows: list[tuple[int, int, tuple[f
     return verdicts
 
 
-def repeats(stuck: Stuck, k: int, t: int, value: float, before: list) -> bool:
+def repeats(stuck, k, t, value, before):
     """Whether the run of equal values that ends with this one is too long."""
     told = [(then, y[k]) for then, _, y in before if y[k] == y[k]]
     half = 0.5 * entry(stuck.quantum, k) if stuck.quantum else 0.0
@@ -137,7 +137,7 @@ reading = st.one_of(
 @given(
     st.one_of(st.none(), single), st.one_of(st.none(), limits), st.lists(reading, min_size=1, max_size=60), st.data()
 )
-def test_the_kernel_finds_what_the_rules_say_however_it_is_cut(a, b, rows, data) -> None:
+def test_the_kernel_finds_what_the_rules_say_however_it_is_cut(a, b, rows, data):
     walk = model(a, b)
     log = as_log(events(rows, walk.width))
     ordered = [(int(t) // BEAT, int(s), tuple(y[: s + 1])) for t, s, y in zip(log.t, log.channel, log.value[: log.n])]
@@ -155,7 +155,7 @@ STRICT = Limits(
 )
 
 
-def stream(rng: np.random.Generator, walk: StateSpaceModel, n: int) -> Events:
+def stream(rng, walk, n):
     """Two sensors of a walk, with spikes, runs of one value, copies, and rows that are missing."""
     t = np.cumsum(rng.integers(1, SECOND // 2, n))
     channel = rng.integers(0, 2, n).astype(np.int32)
@@ -178,7 +178,7 @@ FILTERS = ["kf", "ukf", "pf", "enkf", "filterpy-kf"]
 
 
 @pytest.mark.parametrize("name", FILTERS)
-def test_a_screened_row_is_to_the_filter_a_row_that_is_missing(name) -> None:
+def test_a_screened_row_is_to_the_filter_a_row_that_is_missing(name):
     strict, free = model(STRICT, STRICT), model()
     log = as_log(stream(np.random.default_rng(3), strict, 300))
     found = fold(name, strict, Tuning.of(strict), log)
@@ -197,7 +197,7 @@ def test_a_screened_row_is_to_the_filter_a_row_that_is_missing(name) -> None:
     assert np.any((lost > 0) & (found.verdict == USED))
 
 
-def test_a_fold_from_a_base_knows_what_came_before_it() -> None:
+def test_a_fold_from_a_base_knows_what_came_before_it():
     walk = model(STRICT, STRICT)
     log = as_log(stream(np.random.default_rng(5), walk, 3000))
     whole = folded("kf", walk, log)
@@ -211,7 +211,7 @@ def test_a_fold_from_a_base_knows_what_came_before_it() -> None:
     np.testing.assert_array_equal(again.track.mean, whole.track.mean[at:])
 
 
-def repeated(times: int, seconds: float) -> Events:
+def repeated(times, seconds):
     """Readings of sensor a, once a second, each of them `times` times within `seconds`."""
     rng = np.random.default_rng(11)
     t = np.arange(400) * SECOND
@@ -222,7 +222,7 @@ def repeated(times: int, seconds: float) -> Events:
 
 
 @pytest.mark.parametrize(("seconds", "limit"), [(0.0, None), (0.05, Limits(duplicates=0.05))])
-def test_a_gateway_that_repeats_everything_makes_the_band_no_narrower(seconds, limit) -> None:
+def test_a_gateway_that_repeats_everything_makes_the_band_no_narrower(seconds, limit):
     walk = model(limit)
     ends = {}
     for times in (1, 5):
@@ -246,7 +246,7 @@ def test_a_gateway_that_repeats_everything_makes_the_band_no_narrower(seconds, l
         assert believed == pytest.approx(math.sqrt(of_five / of_one), rel=0.03)
 
 
-def test_a_quantum_alone_speaks_less_than_once_a_day_and_soon_when_stuck() -> None:
+def test_a_quantum_alone_speaks_less_than_once_a_day_and_soon_when_stuck():
     sigma, quantum, days = 0.25, 0.25, 8
     walk = model(Limits(stuck=Stuck(quantum=(quantum,))))
     n = days * 86400
@@ -266,7 +266,7 @@ def test_a_quantum_alone_speaks_less_than_once_a_day_and_soon_when_stuck() -> No
     assert begins[-1] <= n - 60 + needed and found[-1] == n - 1 and needed < 40
 
 
-def test_a_sensor_that_is_always_refused_is_lost_and_said_to_be() -> None:
+def test_a_sensor_that_is_always_refused_is_lost_and_said_to_be():
     walk = model(Limits(range=((-5.0, 5.0),)))
     log = Log.of(walk)
     t = np.arange(200) * 0.5
@@ -279,14 +279,14 @@ def test_a_sensor_that_is_always_refused_is_lost_and_said_to_be() -> None:
     assert track.alarms[of_a][-1, 0] & REFUSED and not np.any(track.alarms[~of_a] & REFUSED)
 
 
-def test_copies_are_no_stuck_sensor() -> None:
+def test_copies_are_no_stuck_sensor():
     walk = model(Limits(duplicates=0.05))
     log = as_log(repeated(5, 0.05))
     assert not np.any(fold("kf", walk, Tuning.of(walk), log).alarms & STUCK)
 
 
 @pytest.mark.parametrize("celsius", [0.0, 25.0])
-def test_a_battery_outside_the_range_of_its_fit_says_so(celsius) -> None:
+def test_a_battery_outside_the_range_of_its_fit_says_so(celsius):
     cell = MODELS["battery_cell"]
     log = Log.of(cell)
     t = np.arange(600.0)
@@ -316,12 +316,12 @@ def test_a_battery_outside_the_range_of_its_fit_says_so(celsius) -> None:
         ),
     ],
 )
-def test_limits_that_mean_nothing_are_refused(make, said) -> None:
+def test_limits_that_mean_nothing_are_refused(make, said):
     with pytest.raises(ModelError, match=said):
         make()
 
 
-def test_a_sensor_whose_readings_all_break_their_limits_is_an_episode_of_its_own() -> None:
+def test_a_sensor_whose_readings_all_break_their_limits_is_an_episode_of_its_own():
     """Named with the limit and the share, from the first reading that broke it; not as one of a wrong R."""
     walk = model(Limits(range=((-30.0, 30.0),)))
     # As the model has it: of an asset that stands still Q would be too large, which is an episode, too.

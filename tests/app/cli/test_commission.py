@@ -18,7 +18,6 @@ from estimators.diagnostics.episodes.baseline import Normal, baseline_of, lost_f
 from estimators.errors import ConfigError
 from estimators.fold import fold
 from estimators.track import DIVERGED
-from estimators.tuning import Tuning
 
 TWIN = """\
 # A drive.
@@ -44,7 +43,7 @@ view:
 """
 
 
-def drive(folder: Path, text: str = TWIN) -> str:
+def drive(folder, text=TWIN):
     """A recording of 300 readings, noisier than the model believes, and its twin."""
     y = 40.0 + np.random.default_rng(1).normal(0.0, 2.8, 300)
     (folder / "drive.csv").write_text("t,y\n" + "".join(f"{k},{value:.3f}\n" for k, value in enumerate(y)))
@@ -53,7 +52,7 @@ def drive(folder: Path, text: str = TWIN) -> str:
     return str(path)
 
 
-def test_what_is_printed_is_what_is_read_again(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+def test_what_is_printed_is_what_is_read_again(tmp_path, capsys):
     path = drive(tmp_path)
     assert load_twin(path).tuning.baseline is None
     assert commission_twin(CommissionCommand(path)) == 0
@@ -67,7 +66,7 @@ def test_what_is_printed_is_what_is_read_again(tmp_path: Path, capsys: pytest.Ca
     assert capsys.readouterr().out == printed
 
 
-def test_every_figure_comes_back(tmp_path: Path) -> None:
+def test_every_figure_comes_back(tmp_path):
     normals = {"winding": Normal(-0.25, 1.75, -0.125, {"narrow": 12.5, "shifted up": 3.0, "stuck": 100.0}, 12.5)}
     twin = load_twin(drive(tmp_path, TWIN + lines(normals)))
     np.testing.assert_array_equal(twin.tuning.baseline, baseline_of(twin.model, normals))
@@ -80,7 +79,7 @@ def test_every_figure_comes_back(tmp_path: Path) -> None:
     [TWIN, TWIN + SECTION, TWIN + SECTION + REST, SECTION + TWIN, TWIN + SECTION.rstrip("\n"), TWIN + "\n" + SECTION],
     ids=["none", "last", "amidst", "first", "unended", "apart"],
 )
-def test_the_rest_of_the_file_stays(tmp_path: Path, text: str, end: str) -> None:
+def test_the_rest_of_the_file_stays(tmp_path, text, end):
     """Byte for byte, with line ends as they are; and written again it is the same."""
     path = Path(drive(tmp_path, text.replace("\n", end)))
     assert commission_twin(CommissionCommand(str(path), write=True)) == 0
@@ -99,7 +98,7 @@ def test_the_rest_of_the_file_stays(tmp_path: Path, text: str, end: str) -> None
     assert path.read_bytes() == written
 
 
-def test_too_little_is_one_line(tmp_path: Path) -> None:
+def test_too_little_is_one_line(tmp_path):
     path = drive(tmp_path)
     with pytest.raises(ConfigError) as problem:
         commission_twin(CommissionCommand(path, duration=20.0, write=True))
@@ -107,7 +106,7 @@ def test_too_little_is_one_line(tmp_path: Path) -> None:
     assert Path(path).read_text() == TWIN
 
 
-def test_a_file_that_cannot_be_written_is_one_line(tmp_path: Path) -> None:
+def test_a_file_that_cannot_be_written_is_one_line(tmp_path):
     with pytest.raises(ConfigError, match=r"absent\.yaml: cannot be written: No such file or directory; "):
         write_section(tmp_path / "absent.yaml", "commissioned", "commissioned: {}\n")
 
@@ -123,14 +122,14 @@ def test_a_file_that_cannot_be_written_is_one_line(tmp_path: Path) -> None:
         ("  winding: {correlation: 1}\n", "drive.yaml:10: commissioned.winding.correlation"),
     ],
 )  # fmt: skip
-def test_a_wrong_section_is_one_line(tmp_path: Path, section: str, said: str) -> None:
+def test_a_wrong_section_is_one_line(tmp_path, section, said):
     path = drive(tmp_path, TWIN + "commissioned:\n" + section)
     with pytest.raises(ConfigError) as problem:
         load_twin(path)
     assert said in str(problem.value) and "\n" not in str(problem.value)
 
 
-def test_a_twin_is_commissioned_against_white_innovations_whatever_was_normal_before(tmp_path: Path) -> None:
+def test_a_twin_is_commissioned_against_white_innovations_whatever_was_normal_before(tmp_path):
     """Readings twenty times as noisy as R says are no longer diverged once that was normal; they are if told anew."""
     path = drive(tmp_path, TWIN + "commissioned:\n  winding: {scale: 50}\n")
     y = 40.0 + np.random.default_rng(1).normal(0.0, 40.0, 300)
@@ -138,7 +137,7 @@ def test_a_twin_is_commissioned_against_white_innovations_whatever_was_normal_be
     twin = load_twin(path)
     log, _ = read_log(twin, None)
 
-    def lost(tuning: Tuning) -> float:
+    def lost(tuning):
         return float(np.mean(fold(twin.estimator, twin.model, tuning, log, policy=twin.policy).health == DIVERGED))
 
     assert lost(twin.tuning) == 0.0 and lost(replace(twin.tuning, baseline=None)) > 0.5
@@ -146,9 +145,7 @@ def test_a_twin_is_commissioned_against_white_innovations_whatever_was_normal_be
         commission_twin(CommissionCommand(path))
 
 
-def test_a_log_that_its_own_detectors_contradict_is_rejected_and_a_forced_one_is_marked(
-    tmp_path: Path, capsys: pytest.CaptureFixture
-) -> None:
+def test_a_log_that_its_own_detectors_contradict_is_rejected_and_a_forced_one_is_marked(tmp_path, capsys):
     path = drive(tmp_path)
     noise = np.random.default_rng(1).normal(0.0, 1.0, (2, 300))
     for y, said in (

@@ -19,7 +19,7 @@ from estimators.track import USED
 from tests.support import as_log, read_all
 
 
-def test_the_pair_that_new_writes_loads_as_it_stands(tmp_path: Path) -> None:
+def test_the_pair_that_new_writes_loads_as_it_stands(tmp_path):
     yaml_path, python_path = write_twin("my-pump", tmp_path)
     assert (yaml_path.name, python_path.name) == ("my-pump.yaml", "my-pump.py")
     twin = load_twin(yaml_path)
@@ -31,7 +31,7 @@ def test_the_pair_that_new_writes_loads_as_it_stands(tmp_path: Path) -> None:
     assert sorted(path.name for path in tmp_path.iterdir()) == ["my-pump.py", "my-pump.yaml"], "no leftovers"
 
 
-def test_a_twin_in_the_root_of_a_checkout_loads(tmp_path: Path) -> None:
+def test_a_twin_in_the_root_of_a_checkout_loads(tmp_path):
     """As the guide of the first hour has it: the packages of Nisus beside the model are not the user's files."""
     _, written = write_twin("my-pump", tmp_path)
     place = Path(estimators.__file__).resolve().parents[1] / "model_in_the_root.py"
@@ -44,38 +44,38 @@ def test_a_twin_in_the_root_of_a_checkout_loads(tmp_path: Path) -> None:
         place.unlink()
 
 
-def refused(name: str, folder: Path) -> str:
+def refused(name, folder):
     with pytest.raises(ConfigError) as caught:
         write_twin(name, folder)
     return str(caught.value)
 
 
 @pytest.mark.parametrize("name", ["", "1pump", "../pump", "pump.yaml", "pu mp", "-pump", "pümp"])
-def test_a_bad_name_is_refused(name: str, tmp_path: Path) -> None:
+def test_a_bad_name_is_refused(name, tmp_path):
     said = refused(name, tmp_path)
     assert f"the name {name!r} is not valid; use letters, digits, _ and -" in said and "begin with a letter" in said
     assert not list(tmp_path.iterdir())
 
 
-def test_a_name_that_no_file_system_takes_is_refused(tmp_path: Path) -> None:
+def test_a_name_that_no_file_system_takes_is_refused(tmp_path):
     assert refused("x" * 300, tmp_path) == "the name of the twin has 300 letters; choose one of at most 100"
 
 
-def test_a_bundled_name_and_an_absent_folder_are_refused(tmp_path: Path) -> None:
+def test_a_bundled_name_and_an_absent_folder_are_refused(tmp_path):
     assert refused("motor_winding", tmp_path) == "the name 'motor_winding' is that of a bundled twin; choose another"
     absent = tmp_path / "absent"
     assert refused("pump", absent) == f"{absent}: there is no such folder; create it first"
 
 
 @pytest.mark.parametrize("there", ["pump.yaml", "pump.py"])
-def test_nothing_is_overwritten(there: str, tmp_path: Path) -> None:
+def test_nothing_is_overwritten(there, tmp_path):
     (tmp_path / there).write_text("mine")
     said = f"{tmp_path / there}: already exists and is not overwritten; choose another name"
     assert refused("pump", tmp_path) == said
     assert [path.name for path in tmp_path.iterdir()] == [there] and (tmp_path / there).read_text() == "mine"
 
 
-def test_the_pair_folds_and_does_what_its_text_promises(tmp_path: Path) -> None:
+def test_the_pair_folds_and_does_what_its_text_promises(tmp_path):
     twin = load_twin(write_twin("pump", tmp_path)[0])
     source = twin.open_source(lambda key, text: None, live=False)
     log = as_log(read_all(source))

@@ -5,10 +5,8 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Iterator
 from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
-from pathlib import Path
 
 import numba
 import pytest
@@ -24,21 +22,21 @@ from tests.waiting import wait_for
 _begun: list[int] = []
 
 
-def begin(number: int) -> None:
+def begin(number):
     """What a process does first."""
     _begun.append(number)
 
 
-def double(number: int) -> tuple[int, int, list[int]]:
+def double(number):
     return 2 * number, numba.get_num_threads(), list(_begun)
 
 
-def sleep(marker: str) -> None:
+def sleep(marker):
     open(marker, "w").close()
     time.sleep(600)
 
 
-def interrupt(marker: str) -> None:
+def interrupt(marker):
     """Send Ctrl-C to the parent in the first call, which leaves its process id; take ten minutes in each."""
     with suppress(FileExistsError):
         with open(marker, "x") as file:
@@ -47,11 +45,11 @@ def interrupt(marker: str) -> None:
     time.sleep(600)
 
 
-def handled() -> bool:
+def handled():
     return signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, ())
 
 
-def die_once(marker: str) -> int:
+def die_once(marker):
     if not os.path.exists(marker):
         open(marker, "w").close()
         os._exit(1)
@@ -59,14 +57,14 @@ def die_once(marker: str) -> int:
 
 
 @pytest.mark.parametrize("jobs", [1, 2])
-def test_every_call_is_answered_once(jobs: int) -> None:
+def test_every_call_is_answered_once(jobs):
     before, _begun[:] = numba.get_num_threads(), []
     found = dict(results(double, [(1,), (2,), (3,)], jobs=jobs, begin=begin, given=(7,)))
     assert found == {k: (2 * k + 2, 1, [7]) for k in range(3)}
     assert numba.get_num_threads() == before
 
 
-def test_what_is_given_up_ends(tmp_path, interruptible) -> None:
+def test_what_is_given_up_ends(tmp_path, interruptible):
     """Without a wait for work that has begun: the ten minutes would be over before the test."""
     marker = tmp_path / "begun"
     running = results(interrupt, [(str(marker),)] * 3, jobs=2)
@@ -79,7 +77,7 @@ def test_what_is_given_up_ends(tmp_path, interruptible) -> None:
     wait_for(lambda: all(map(_gone, pids)))
 
 
-def _gone(pid: int) -> bool:
+def _gone(pid):
     """By the system: which thread of the pool has heard of it does not matter."""
     try:
         os.kill(pid, 0)
@@ -88,61 +86,61 @@ def _gone(pid: int) -> bool:
     return False
 
 
-def test_ctrl_c_is_for_the_parent_alone() -> None:
+def test_ctrl_c_is_for_the_parent_alone():
     assert dict(results(handled, [(), ()], jobs=2)) == {0: True, 1: True}
     assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, ())
 
 
-def test_no_process_is_no_number_of_processes() -> None:
+def test_no_process_is_no_number_of_processes():
     assert jobs_of(3, 2) == 2 and jobs_of(None, 1) == 1
     with pytest.raises(ConfigError, match="--jobs 0: must be 1 or more"):
         jobs_of(0, 2)
 
 
-def test_a_cluster_answers_every_call_in_one_thread_of_each_worker(scheduler) -> None:
+def test_a_cluster_answers_every_call_in_one_thread_of_each_worker(scheduler):
     for given in (7, 8, 9):  # of two workers, one at least works for two of the commands
         found = dict(results(double, [(k,) for k in range(8)], cluster=scheduler, begin=begin, given=(given,)))
         assert [found[k][:2] for k in range(8)] == [(2 * k, 1) for k in range(8)]
         assert {found[k][2][-1] for k in range(8)} == {given}
 
 
-def test_calls_of_a_worker_that_dies_are_made_again(scheduler, tmp_path) -> None:
+def test_calls_of_a_worker_that_dies_are_made_again(scheduler, tmp_path):
     found = dict(results(die_once, [(str(tmp_path / "died"),)], cluster=scheduler))  # no other worker has what was held
     assert list(found) == [0] and found[0] != os.getpid() and (tmp_path / "died").exists()
 
 
-def die(*_: object) -> None:
+def die(*_):
     os._exit(1)
 
 
-def missing(*_: object) -> None:
+def missing(*_):
     raise ConfigError("pump.yaml: there is no such file")
 
 
-def lacks(name: str) -> str:
+def lacks(name):
     """As `version`, with Nisus where the tests run alone."""
     if "dask_worker" in sys.argv[0]:
         raise PackageNotFoundError(name)
     return version(name)
 
 
-def test_relative_paths_are_those_of_the_command(scheduler) -> None:
+def test_relative_paths_are_those_of_the_command(scheduler):
     assert dict(results(os.getcwd, [()], cluster=scheduler)) == {0: os.getcwd()}
 
 
-def test_a_worker_without_the_files_of_the_twin_is_one_line(scheduler) -> None:
+def test_a_worker_without_the_files_of_the_twin_is_one_line(scheduler):
     text = "a worker of .* fails: pump.yaml: there is no such file; workers need the files of the twin at the same path"
     with pytest.raises(ConfigError, match=text):
         list(results(handled, [()], cluster=scheduler, begin=missing))
 
 
-def test_a_worker_without_nisus_is_one_line(scheduler, monkeypatch) -> None:
+def test_a_worker_without_nisus_is_one_line(scheduler, monkeypatch):
     monkeypatch.setattr(processes, "version", lacks)
     with pytest.raises(ConfigError, match=f"the worker tcp://.* has no Nisus; install {version('nisus')} there"):
         list(results(handled, [()], cluster=scheduler))
 
 
-def test_a_cluster_that_has_no_worker_left_is_one_line(tmp_path, monkeypatch) -> None:
+def test_a_cluster_that_has_no_worker_left_is_one_line(tmp_path, monkeypatch):
     monkeypatch.setattr(processes, "WATCH_S", 0.1)
     text = "has had no worker for 0.5 s; .* start one with `dask worker tcp://"
     with started(tmp_path, 1) as (address, (_, worker)), pytest.raises(ConfigError, match=text):
@@ -151,7 +149,7 @@ def test_a_cluster_that_has_no_worker_left_is_one_line(tmp_path, monkeypatch) ->
             worker.kill()
 
 
-def test_a_scheduler_that_is_lost_is_one_line(tmp_path, capfd) -> None:
+def test_a_scheduler_that_is_lost_is_one_line(tmp_path, capfd):
     with started(tmp_path, 1) as (address, (scheduler, _)):
         with pytest.raises(ConfigError, match=f"--cluster {address}: the connection to the scheduler is lost"):
             for _ in lost(address, tmp_path / "begun"):
@@ -159,7 +157,7 @@ def test_a_scheduler_that_is_lost_is_one_line(tmp_path, capfd) -> None:
     assert capfd.readouterr().err == ""  # nor does Dask add its own
 
 
-def lost(address: str, marker: Path) -> Iterator[None]:
+def lost(address, marker):
     """Yield when a call of ten minutes has begun, and wait for it then."""
     with processes.dask(address, handled, ()) as cluster:
         future = cluster.submit(sleep, str(marker))
@@ -168,13 +166,13 @@ def lost(address: str, marker: Path) -> Iterator[None]:
         future.result()
 
 
-def test_a_call_that_kills_workers_is_one_line(tmp_path) -> None:
+def test_a_call_that_kills_workers_is_one_line(tmp_path):
     with started(tmp_path, 1, DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES="0") as (address, _):
         with pytest.raises(ConfigError, match="1 workers died in one call; is their memory enough"):
             list(results(die, [()], cluster=address))
 
 
-def test_trials_of_a_cluster_are_those_of_this_process(scheduler) -> None:
+def test_trials_of_a_cluster_are_those_of_this_process(scheduler):
     twin = load_twin("motor_winding")
     chosen = [item for item in enumerate(Trials(twin, 60.0).mistakes) if item[1].name in ("R x10", "winding +5 σ")]
     given = "motor_winding", {}, (), 60.0, chosen, ("kf", "ukf"), 1
@@ -184,7 +182,7 @@ def test_trials_of_a_cluster_are_those_of_this_process(scheduler) -> None:
     assert repr(sorted(all_trials(*given, cluster=scheduler))) == repr(sorted(here.items()))
 
 
-def test_a_cluster_of_ones_own_ends_with_the_command() -> None:
+def test_a_cluster_of_ones_own_ends_with_the_command():
     before = set(multiprocessing.active_children())
     found = dict(results(double, [(k,) for k in range(4)], cluster="local:2", begin=begin, given=(7,)))
     assert found == {k: (2 * k, 1, [7]) for k in range(4)}
@@ -201,6 +199,6 @@ def test_a_cluster_of_ones_own_ends_with_the_command() -> None:
         ({"cluster": "local:2", "jobs": 2}, "--jobs: counts processes of this command"),
     ],
 )  # fmt: skip
-def test_a_wrong_cluster_is_one_line(options, text) -> None:
+def test_a_wrong_cluster_is_one_line(options, text):
     with pytest.raises(ConfigError, match=text):
         list(results(handled, [(), ()], **options))

@@ -25,7 +25,7 @@ source: {type: simulator, seed: 1, step: 1.0, duration: 4000}
 """
 
 
-def test_states_parameters_and_noises_are_appended() -> None:
+def test_states_parameters_and_noises_are_appended():
     model = twin_of(LASTING).model
     assert [(state.name, state.unit) for state in model.states[2:]] == [
         ("temperature_disturbance", "°C/s"),
@@ -43,7 +43,7 @@ def test_states_parameters_and_noises_are_appended() -> None:
     assert model.linear
 
 
-def test_what_is_appended_may_be_named_wherever_a_state_or_a_parameter_may() -> None:
+def test_what_is_appended_may_be_named_wherever_a_state_or_a_parameter_may():
     text = LASTING + (
         "prior: {winding_error: {mean: 1, std: 3}}\nestimate: {winding_error_time: {std: 50}}\n"
         "valid: {winding_error: {min: -9, max: 9}}\nview: {pairs: [[temperature, winding_error]]}\n"
@@ -59,7 +59,7 @@ def test_what_is_appended_may_be_named_wherever_a_state_or_a_parameter_may() -> 
 @pytest.mark.parametrize(
     ("given", "seconds"), [("40", 40), ("40 s", 40), ("2.5 min", 150), ("1 h", 3600), ("500 ms", 0.5), ("1e-1 d", 8640)]
 )
-def test_a_time_may_have_a_unit(given: str, seconds: float) -> None:
+def test_a_time_may_have_a_unit(given, seconds):
     assert twin_of(LASTING.replace("40 s", given)).model.parameters[0].value == pytest.approx(seconds)
 
 
@@ -83,11 +83,11 @@ def test_a_time_may_have_a_unit(given: str, seconds: float) -> None:
         ("std: 2,", "std: [1, 2],", "motor.yaml:6: sensors.winding.error.std has 2 entries; give one, or 1: winding"),
     ],
 )  # fmt: skip
-def test_what_cannot_last_is_one_line_with_its_place(old: str, new: str, words: str) -> None:
+def test_what_cannot_last_is_one_line_with_its_place(old, new, words):
     assert refusal(LASTING.replace(old, new)) == words
 
 
-def test_a_field_has_no_lasting_error() -> None:
+def test_a_field_has_no_lasting_error():
     field = "model: thermal_field\nnoise: {temperature: {std: 1, over: 9}}\nsource: {type: simulator}\n"
     assert refusal(field) == (
         "motor.yaml:2: noise.temperature.over: model thermal_field is a field, whose noise cannot have a "
@@ -95,7 +95,7 @@ def test_a_field_has_no_lasting_error() -> None:
     )
 
 
-def test_the_schema_tells_editors_of_it() -> None:
+def test_the_schema_tells_editors_of_it():
     parts = json_schema()["$defs"]
     assert "Correlation time" in parts["NoiseSection"]["properties"]["over"]["description"]
     assert parts["ErrorSection"]["required"] == ["over"]
@@ -103,7 +103,7 @@ def test_the_schema_tells_editors_of_it() -> None:
     assert kinds == {"number", "string"}
 
 
-def test_a_simulation_whose_time_is_known_is_white_with_it_and_not_without() -> None:
+def test_a_simulation_whose_time_is_known_is_white_with_it_and_not_without():
     twin = twin_of(LASTING)
     log, _ = read_log(twin, None)
     rows, truth = truth_of(log.events, 2)
@@ -132,7 +132,7 @@ def test_a_simulation_whose_time_is_known_is_white_with_it_and_not_without() -> 
     assert result.log_likelihood > blind.log_likelihood.sum() + 100.0
 
 
-def test_a_forecast_goes_on_from_what_lasts() -> None:
+def test_a_forecast_goes_on_from_what_lasts():
     """What a disturbance of now adds until then is τ (1 - e⁻ᵃ) of it."""
     twin = twin_of(LASTING)
     log, _ = read_log(twin, 100.0)

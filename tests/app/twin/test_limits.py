@@ -41,7 +41,7 @@ source:
 """
 
 
-def limited(limits: str, more: str = "") -> str:
+def limited(limits, more=""):
     return TWIN.format(limits=limits, more=more)
 
 
@@ -58,27 +58,27 @@ def limited(limits: str, more: str = "") -> str:
         ("use: true", None),
     ],
 )
-def test_limits_reach_the_sensor(limits, expected) -> None:
+def test_limits_reach_the_sensor(limits, expected):
     assert twin_of(limited(limits)).model.sensors[0].limits == expected
 
 
-def test_a_range_of_validity_takes_the_place_of_the_models() -> None:
+def test_a_range_of_validity_takes_the_place_of_the_models():
     model = twin_of(limited("use: true", "valid: {temperature: {min: 0, max: 150}}")).model
     assert [state.fitted for state in model.states if state.name == "temperature"] == [(0.0, 150.0)]
 
 
 @pytest.mark.parametrize("row", [*csv.DictReader(WRONG, delimiter="\t", quoting=csv.QUOTE_NONE)])
-def test_what_means_nothing_is_refused_with_its_place(row) -> None:
+def test_what_means_nothing_is_refused_with_its_place(row):
     with pytest.raises(ConfigError, match=row["said"]):
         twin_of(limited(row["limits"].replace(r"\n", "\n"), row["more"]))
 
 
-def test_a_quantum_says_nothing_of_a_sensor_without_noise() -> None:
+def test_a_quantum_says_nothing_of_a_sensor_without_noise():
     text = limited("stuck: {quantum: 0.1}").replace("std: 0.5", "std: 0")
     assert "gives a quantum alone, which needs a sensor with noise" in refusal(text)
 
 
-def log_with_faults() -> None:
+def log_with_faults():
     """A log of 60 s: 10 of them not valid, three out of range, of which one is written twice, and a jump."""
     rng = np.random.default_rng(1)
     values = 30 + rng.normal(0, 0.5, 60)
@@ -89,7 +89,7 @@ def log_with_faults() -> None:
     Path("log.csv").write_text("\n".join(["t,T,ok", *rows]) + "\n")
 
 
-def test_what_was_refused_is_counted_told_and_kept(capsys) -> None:
+def test_what_was_refused_is_counted_told_and_kept(capsys):
     log_with_faults()
     path, out = "motor.yaml", Path("out.parquet")
     twin_of(limited("range: [-40, 180]\n    rate: 5"))
@@ -111,7 +111,7 @@ def test_what_was_refused_is_counted_told_and_kept(capsys) -> None:
 REASON_SECONDS = {"duplicate": 1, "range": 2, "rate": 3}
 
 
-def test_counts_and_lines_name_sensor_value_and_rule() -> None:
+def test_counts_and_lines_name_sensor_value_and_rule():
     twin = twin_of(limited("range: [-40, 180]\n    rate: 5"))
     log = Log.of(twin.model)
     log.add("winding", [0, 1, 1, 2, 3], [30, 30, 30, 500, 60])
@@ -130,7 +130,7 @@ def test_counts_and_lines_name_sensor_value_and_rule() -> None:
     assert (found["duplicate winding"], found["range winding"], found["rate winding"]) == (1, 1, 2)
 
 
-def test_a_base_keeps_what_the_screen_remembers() -> None:
+def test_a_base_keeps_what_the_screen_remembers():
     twin = twin_of(limited("rate: 5"))
     log = Log.of(twin.model)
     log.add("winding", np.arange(100.0), np.full(100, 30.0))
@@ -142,7 +142,7 @@ def test_a_base_keeps_what_the_screen_remembers() -> None:
     assert again.edge.tobytes() == base.edge.tobytes() and base.edge.any()
 
 
-def test_copies_closer_than_a_simulated_sensors_period() -> None:
+def test_copies_closer_than_a_simulated_sensors_period():
     """The asset tells its period: 4 steps of half a second."""
     text = """\
 model: motor_winding

@@ -68,15 +68,15 @@ source:
 
 
 @pytest.fixture(autouse=True)
-def _pair(inside: None) -> None:
+def _pair(inside):
     Path("pair.py").write_text(PAIR)
 
 
-def correlated(matrix: str) -> str:
+def correlated(matrix):
     return ROVER.replace("[1, 2]}", f"[1, 2], correlation: {matrix}}}")
 
 
-def test_correlated_rows_make_a_full_r() -> None:
+def test_correlated_rows_make_a_full_r():
     """The first posterior of a prior N(m, P) at R = [[1, 1], [1, 4]], by the equations of the Kalman filter."""
     twin = twin_of(correlated("[[1, 0.5], [0.5, 1]]"))
     log = Log.of(twin.model, start=0.0)
@@ -88,7 +88,7 @@ def test_correlated_rows_make_a_full_r() -> None:
     np.testing.assert_allclose(track.std[-1], np.sqrt(np.diag(P - K @ P)), rtol=1e-12)
 
 
-def test_the_simulated_sensor_is_correlated_too() -> None:
+def test_the_simulated_sensor_is_correlated_too():
     """What is said less what is true, of 400 readings: the correlation within 5 standard errors, (1 - c²) / √n."""
     log, _ = read_log(twin_of(correlated("[[1, -0.9], [-0.9, 1]]")), None)
     events = log.events
@@ -109,27 +109,27 @@ def test_the_simulated_sensor_is_correlated_too() -> None:
         ("[[1, 1], [1, 1]]", "is not positive definite (smallest eigenvalue 0); leave out rows that repeat others"),
     ],
 )  # fmt: skip
-def test_a_correlation_that_is_none_is_one_line(matrix: str, expected: str) -> None:
+def test_a_correlation_that_is_none_is_one_line(matrix, expected):
     assert refusal(correlated(matrix)) == f"motor.yaml:3: sensors.fix.correlation {expected}"
 
 
-def test_a_correlation_must_be_rows_of_numbers() -> None:
+def test_a_correlation_must_be_rows_of_numbers():
     with pytest.raises(ConfigError) as caught:
         twin_of(correlated("[1, 0.5]"))
     place = "motor.yaml:3: sensors.fix.correlation"
     assert str(caught.value) == f"{place}[0] is 1; it must be a list\n{place}[1] is 0.5; it must be a list"
 
 
-def test_localisation_needs_rows_that_have_places_of_their_own() -> None:
+def test_localisation_needs_rows_that_have_places_of_their_own():
     text = correlated("[[1, 0.5], [0.5, 1]]").replace("estimator: kf", "estimator: {name: enkf, options: {radius: 1}}")
     assert refusal(text).startswith("motor.yaml:6: estimator enkf: radius is 1, but the rows of pair's sensor fix are")
 
 
-def test_the_identity_correlates_nothing() -> None:
+def test_the_identity_correlates_nothing():
     assert twin_of(correlated("[[1, 0], [0, 1]]").replace("estimator: kf", "estimator: pf")).model.correlated is None
 
 
-def test_a_sensor_without_noise_and_a_state_that_is_certain() -> None:
+def test_a_sensor_without_noise_and_a_state_that_is_certain():
     """x is known to be 1 at first and stays so, as it is not driven; y is what the sensor reads, exactly."""
     text = ROVER.replace("[1, 2]", "[1, 0]").replace("std: 2}", "std: 0}") + "noise:\n  x: {std: 0}\n"
     twin = twin_of(text)
@@ -145,7 +145,7 @@ def test_a_sensor_without_noise_and_a_state_that_is_certain() -> None:
     ("[1, 2]", "[1, 0]", "fix.north reads without noise"),
     ("std: 2}", "std: 0}", "x is certain at first"),
 ])  # fmt: skip
-def test_a_filter_that_cannot_bear_certainty_says_what_can(old: str, new: str, what: str) -> None:
+def test_a_filter_that_cannot_bear_certainty_says_what_can(old, new, what):
     text = ROVER.replace(old, new).replace("estimator: kf", "estimator: ukf")
     assert refusal(text) == (
         f"motor.yaml:6: estimator ukf does not apply: in pair {what}, and ukf takes no singular covariance; give it a "
@@ -153,7 +153,7 @@ def test_a_filter_that_cannot_bear_certainty_says_what_can(old: str, new: str, w
     )
 
 
-def test_a_simulated_sensor_may_be_exact() -> None:
+def test_a_simulated_sensor_may_be_exact():
     """The asset's own noise is 0, the estimator's is not."""
     twin = twin_of(ROVER + "  sensors: {fix: {std: 0}}\n")
     log, _ = read_log(twin, None)
@@ -162,7 +162,7 @@ def test_a_simulated_sensor_may_be_exact() -> None:
     assert twin.tuning.get("R.fix.east") == 1.0
 
 
-def test_a_field_must_be_uncertain() -> None:
+def test_a_field_must_be_uncertain():
     name = MODELS["field_era5"].states.name
     text = (
         f"model: field_era5\nestimator: enkf\nprior:\n  {name}: {{std: 0}}\nsource: {{type: simulator, duration: 1}}\n"
@@ -172,7 +172,7 @@ def test_a_field_must_be_uncertain() -> None:
     )
 
 
-def test_a_log_likelihood_is_not_asked_about_readings_without_noise() -> None:
+def test_a_log_likelihood_is_not_asked_about_readings_without_noise():
     """Only particle filters use it, and they refuse such a sensor; √0 in its denominator is nobody's fault."""
     likely = "def likely(y, x, u, p, r):\n    return -0.5 * (y[0] - x[0]) ** 2 / r[0]\n\n\n"
     pair = PAIR.replace("def Pair", likely + "def Pair").replace("h=h)", "h=h, log_likelihood=likely)")
@@ -183,7 +183,7 @@ def test_a_log_likelihood_is_not_asked_about_readings_without_noise() -> None:
     assert fold("kf", twin.model, twin.tuning, log).mean[-1, 0] == pytest.approx(3.0)
 
 
-def test_a_reading_brings_its_own_noise_from_a_table() -> None:
+def test_a_reading_brings_its_own_noise_from_a_table():
     """As if a script had added each with its variance; 0 or none leaves the tuned R, an unknown one the value out."""
     accuracy = ["0.5", "", "3", "0", "-1", "1", "1.7e308", "inf"]
     t, w = np.arange(1.0, 9.0), [21.0, 22.0, 20.0, 25.0, 24.0, 23.0, 90.0, 90.0]
@@ -208,12 +208,12 @@ def test_a_reading_brings_its_own_noise_from_a_table() -> None:
     ("estimator: kf", "estimator: {name: kf, options: {adapt: R}}", "motor.yaml:2: estimator kf: readings bring their own variance, but adapt learns one R of each sensor; set adapt to off or Q"),  # noqa: E501
     ("  sensors:\n    winding: ", "  sensors: {winding: {columns: w}}\n  truth:\n    temperature: ", "motor.yaml:11: source.truth.temperature.accuracy is for sensors; leave it out"),  # noqa: E501
 ])  # fmt: skip
-def test_an_accuracy_that_cannot_be_used_is_one_line(old: str, new: str, expected: str) -> None:
+def test_an_accuracy_that_cannot_be_used_is_one_line(old, new, expected):
     assert old in TABLE
     assert refusal(TABLE.replace(old, new)) == expected
 
 
-def test_what_readings_bring_is_recorded_and_folded_again() -> None:
+def test_what_readings_bring_is_recorded_and_folded_again():
     """A recording has the variances; the fold of them is the one that was recorded, and not that of the tuned R."""
     Path("run.csv").write_text("t,w,a\n1,40,0.5\n2,42,\n3,41,3\n")
     Path("motor.yaml").write_text(TABLE)
@@ -233,7 +233,7 @@ def test_what_readings_bring_is_recorded_and_folded_again() -> None:
     assert again.std[0, 0] == pytest.approx(np.sqrt(25 * 0.25 / 25.25), rel=1e-12)
 
 
-def test_a_filter_of_one_r_is_refused_before_readings_bring_theirs() -> None:
+def test_a_filter_of_one_r_is_refused_before_readings_bring_theirs():
     """On the page too, where the first of them may be yet to come; then the twin would stand still."""
     twin = twin_of(TABLE)
     engine: Any = SimpleNamespace(
@@ -249,7 +249,7 @@ def test_a_filter_of_one_r_is_refused_before_readings_bring_theirs() -> None:
 
 
 @pytest.mark.parametrize("word", ["stratified", "2"])
-def test_options_that_are_choices_may_be_words(word: str) -> None:
+def test_options_that_are_choices_may_be_words(word):
     from estimators import ESTIMATORS
 
     option = next(item for item in ESTIMATORS["pf"].options if item.name == "resampling")
@@ -262,7 +262,7 @@ def test_options_that_are_choices_may_be_words(word: str) -> None:
     assert over.tuning.options == {"resampling": code}
 
 
-def test_a_word_that_is_no_choice_is_one_line() -> None:
+def test_a_word_that_is_no_choice_is_one_line():
     text = ROVER.replace("estimator: kf", "estimator: {name: kf, options: {adapt: sometimes}}")
     assert refusal(text) == "motor.yaml:6: estimator kf: adapt is 'sometimes'; it must be one of off, R, Q"
     # YAML's own words of a switch: off is one of the choices.

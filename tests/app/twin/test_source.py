@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from app.twin.log_reader import read_log
-from app.twin.twin import Twin
-from estimators.errors import ConfigError, NisusError, SourceError
+from estimators.errors import ConfigError, SourceError
 from estimators.log import INPUT, READING, TRUTH, Events
 from estimators.models import MODELS
 from tests.app.twin.written import refusal, twin_of
@@ -52,7 +51,7 @@ CSV = "t_ms,temp_f,rate\n0,32,60\n500,212,30\n1000,,0\n"
 
 
 @pytest.fixture(autouse=True)
-def _recordings(inside: None) -> None:
+def _recordings(inside):
     Path("data").mkdir()
     Path("data/thermal.dbc").write_text(DBC)
     Path("data/drive.log").write_text(
@@ -60,7 +59,7 @@ def _recordings(inside: None) -> None:
     )
 
 
-def events(twin: Twin, *, live: bool = False) -> Events:
+def events(twin, *, live=False):
     reports: list[tuple[str, str]] = []
     source = twin.open_source(lambda key, text: reports.append((key, text)), live=live)
     events = read_all(source)
@@ -68,23 +67,23 @@ def events(twin: Twin, *, live: bool = False) -> Events:
     return events
 
 
-def of(batch: Events, kind: int) -> Events:
+def of(batch, kind):
     return batch.select(batch.kind == kind)
 
 
-def message(text: str, kind: type[NisusError], **options: object) -> str:
+def message(text, kind, **options):
     with pytest.raises(kind) as caught:
         events(twin_of(text, **options))
     return str(caught.value)
 
 
-def test_a_can_log_is_read_through_its_dbc_and_conditions() -> None:
+def test_a_can_log_is_read_through_its_dbc_and_conditions():
     batch = of(events(twin_of(LOG)), READING)
     np.testing.assert_array_equal(batch.t, [1_000_000_000, 1_500_000_000, 2_000_000_000])
     np.testing.assert_allclose(batch.value[:, 0], [30.0, np.nan, 40.4], rtol=1e-12)
 
 
-def test_a_table_is_read_in_the_models_units() -> None:
+def test_a_table_is_read_in_the_models_units():
     Path("a1.csv").write_text(CSV)
     batch = events(twin_of(TABLE))
     readings, truth = of(batch, READING), of(batch, TRUTH)
@@ -94,24 +93,24 @@ def test_a_table_is_read_in_the_models_units() -> None:
     np.testing.assert_allclose(truth.value[:, 0], [1.0, 0.5, 0.0], rtol=1e-12)
 
 
-def test_nisus_data_replaces_the_folder(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nisus_data_replaces_the_folder(monkeypatch):
     Path("data").rename("elsewhere")
     monkeypatch.setenv("NISUS_DATA", "elsewhere")
     assert len(of(events(twin_of(LOG)), READING)) == 3
 
 
-def test_nisus_data_leaves_a_twin_without_folder_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nisus_data_leaves_a_twin_without_folder_alone(monkeypatch):
     Path("a1.csv").write_text(CSV)
     monkeypatch.setenv("NISUS_DATA", "elsewhere")
     assert len(of(events(twin_of(TABLE)), READING)) == 2
 
 
-def test_log_files_replace_the_recording() -> None:
+def test_log_files_replace_the_recording():
     Path("other.log").write_text("(5.000000) can0 100#401F0100\n")
     assert of(events(twin_of(LOG, log_files=["other.log"])), READING).t.tolist() == [5_000_000_000]
 
 
-def test_a_recording_stands_in_for_a_bus() -> None:
+def test_a_recording_stands_in_for_a_bus():
     bus = LOG.replace("can_log", "can\n  interface: virtual\n  channel: x\n  recording: data/drive.log")
     bus = bus.replace("  folder: data\n  files: drive.log\n  get: ask the test bench\n", "").replace(
         "dbc: t", "dbc: data/t"
@@ -135,7 +134,7 @@ def test_a_recording_stands_in_for_a_bus() -> None:
         ("  sensors:\n", "  inputs:\n", ConfigError, "motor.yaml:9: source.inputs.winding is no input of motor_winding; there are none to choose from"),
     ],
 )  # fmt: skip
-def test_a_source_that_cannot_be_opened_is_one_line(old: str, new: str, kind: type[NisusError], expected: str) -> None:
+def test_a_source_that_cannot_be_opened_is_one_line(old, new, kind, expected):
     assert old in LOG
     assert message(LOG.replace(old, new, 1), kind) == expected
 
@@ -150,7 +149,7 @@ def test_a_source_that_cannot_be_opened_is_one_line(old: str, new: str, kind: ty
         ("where:", "units: furlong2x\n      where:", "motor.yaml:9: source.sensors.winding: ", ["furlong2x"]),
     ],
 )  # fmt: skip
-def test_what_the_dbc_lacks_is_one_line_at_the_mapping(old: str, new: str, place: str, words: list[str]) -> None:
+def test_what_the_dbc_lacks_is_one_line_at_the_mapping(old, new, place, words):
     assert old in LOG
     text = message(LOG.replace(old, new, 1), SourceError)
     assert text.startswith(place) and "\n" not in text
@@ -162,7 +161,7 @@ def test_what_the_dbc_lacks_is_one_line_at_the_mapping(old: str, new: str, place
     ("old", "new", "words"),
     [("columns: temp_f", "columns: temp_c", ["temp_c", "temp_f"]), ("units: degF", "units: m/s", ["m/s", "°C"])],
 )
-def test_what_a_table_lacks_is_one_line_at_the_mapping(old: str, new: str, words: list[str]) -> None:
+def test_what_a_table_lacks_is_one_line_at_the_mapping(old, new, words):
     Path("a1.csv").write_text(CSV)
     text = message(TABLE.replace(old, new, 1), SourceError)
     assert text.startswith("motor.yaml:7: source.sensors.winding: ") and "\n" not in text
@@ -170,7 +169,7 @@ def test_what_a_table_lacks_is_one_line_at_the_mapping(old: str, new: str, words
         assert word in text
 
 
-def test_what_is_no_channels_fault_is_not_blamed_on_one() -> None:
+def test_what_is_no_channels_fault_is_not_blamed_on_one():
     Path("a1.csv").write_text(CSV)
     text = message(TABLE.replace("t_ms", "t_s"), SourceError)
     assert text.startswith("motor.yaml:2: source: ") and "t_s" in text and "did you mean t_ms?" in text
@@ -182,7 +181,7 @@ def test_what_is_no_channels_fault_is_not_blamed_on_one() -> None:
     assert text.startswith("motor.yaml:5: source.files: ") and "thermal.dbc" in text and "\n" not in text
 
 
-def test_log_files_that_fit_nothing_are_one_line() -> None:
+def test_log_files_that_fit_nothing_are_one_line():
     assert message(LOG, SourceError, log_files=["."]) == "--log .: it is a folder; name the files in it"
     assert (
         message(LOG, SourceError, log_files=["absent.blf"]) == "--log absent.blf: there is no such file; check the path"
@@ -196,7 +195,7 @@ def test_log_files_that_fit_nothing_are_one_line() -> None:
     )
 
 
-def test_merged_recordings_and_their_replacements() -> None:
+def test_merged_recordings_and_their_replacements():
     Path("a1.csv").write_text(CSV)
     indent = lambda text: "".join("      " + line + "\n" for line in text.split("source:\n")[1].splitlines())  # noqa: E731
     part = lambda text: "    - " + indent(text).replace("        ", "      ").lstrip()  # noqa: E731
@@ -225,7 +224,7 @@ def test_merged_recordings_and_their_replacements() -> None:
     assert len(of(events(twin_of(two, log_files=["new/b7.csv"])), READING)) == 2
 
 
-def test_a_simulators_inputs_and_plans_reach_it() -> None:
+def test_a_simulators_inputs_and_plans_reach_it():
     text = """\
 model: motor_drive
 source:
@@ -261,7 +260,7 @@ source:
 """
 
 
-def test_a_true_parameter_may_be_one_that_the_twin_estimates() -> None:
+def test_a_true_parameter_may_be_one_that_the_twin_estimates():
     found = events(twin_of(JOINT.replace("TRUTH", "truth: {parameters: {yoke_coolant: 0.04, tooth_yoke: 0.05}}")))
     # The same asset, said by its state and noise.
     spelled = (
@@ -272,14 +271,14 @@ def test_a_true_parameter_may_be_one_that_the_twin_estimates() -> None:
     np.testing.assert_array_equal(truth.value[:, 4], 0.04)
 
 
-def test_a_true_parameter_that_drifts_begins_at_its_value() -> None:
+def test_a_true_parameter_that_drifts_begins_at_its_value():
     drifting = "truth: {parameters: {yoke_coolant: 0.04}, noise: {yoke_coolant: {variance: 1e-8}}}"
     found = of(events(twin_of(JOINT.replace("TRUTH", drifting))), TRUTH).value[:, 4]
     assert 0.0 < np.std(found) < 6e-4  # a random walk: √(1e-8 · 5 s) = 2.2e-4 at its end
     np.testing.assert_allclose(found, 0.04, atol=1.1e-3)
 
 
-def test_a_true_parameter_is_given_once() -> None:
+def test_a_true_parameter_is_given_once():
     both = "initial: {yoke_coolant: 0.03}\n  truth: {parameters: {yoke_coolant: 0.04}}"
     assert refusal(JOINT.replace("TRUTH", both)) == (
         "motor.yaml:7: source.initial.yoke_coolant is in source.truth too; give it in one place"
@@ -307,13 +306,13 @@ source:
         ("1e9", "null", "motor.yaml:4: source.step is 1e+09 s; the simulator would make RUNS steps of f in 1e+09 s, and may make 1e+08; shorten it"),
     ],
 )  # fmt: skip
-def test_a_simulation_that_would_never_end_is_one_line(step: str, duration: str, expected: str) -> None:
+def test_a_simulation_that_would_never_end_is_one_line(step, duration, expected):
     runs = f"{1e9 / MODELS['motor_drive'].max_step:.3g}"
     text = LENGTHY.replace("STEP", step).replace("DURATION", duration)
     assert refusal(text) == expected.replace("RUNS", runs)
 
 
-def test_a_long_simulation_may_be_as_long_as_said() -> None:
+def test_a_long_simulation_may_be_as_long_as_said():
     # 3 sensors · 2 a second: 1e8 events take 16.7 million seconds.
     twin_of(LENGTHY.replace("STEP", "0.5").replace("DURATION", "16600000"))
     with pytest.raises(ConfigError):
@@ -332,7 +331,7 @@ source:
 """
 
 
-def test_a_virtual_bus_plays_its_own_asset() -> None:
+def test_a_virtual_bus_plays_its_own_asset():
     source = twin_of(BUS.replace("CHANNEL", "test-played")).open_source(lambda key, text: None)
     assert source.live
     batches: list[Events] = []
@@ -358,13 +357,13 @@ def test_a_virtual_bus_plays_its_own_asset() -> None:
         (BUS[: BUS.index("  asset")], "motor.yaml:2: source has no asset to play; describe one under source.asset"),
     ],
 )
-def test_what_has_no_asset_cannot_play_one(text: str, expected: str) -> None:
+def test_what_has_no_asset_cannot_play_one(text, expected):
     with pytest.raises(SourceError) as caught:
         twin_of(text).plan.player(lambda key, text: None)
     assert str(caught.value) == expected
 
 
-def test_a_truth_of_another_model_must_fit() -> None:
+def test_a_truth_of_another_model_must_fit():
     Path("other.py").write_text("from estimators.models import MODELS\nOther = MODELS['motor_drive']\n")
     text = "model: motor_winding\nsource:\n  type: simulator\n  duration: 2\n  truth:\n    model: ./other.py:Other\n"
     assert message(text, ConfigError) == (
@@ -385,7 +384,7 @@ source:
 """
 
 
-def test_scale_offset_and_origin_reach_the_source() -> None:
+def test_scale_offset_and_origin_reach_the_source():
     Path("car.csv").write_text("t,lat,lon,compass\n0,55.0,12.0,90\n1,55.001,12.0,0\n")
     batch = of(events(twin_of(CAR)), READING)
     twin = twin_of(CAR)
@@ -398,7 +397,7 @@ def test_scale_offset_and_origin_reach_the_source() -> None:
     np.testing.assert_allclose(moved.value[0, :2], [0.0, -111.34], atol=0.02)
 
 
-def test_conversions_that_make_no_sense_are_one_line() -> None:
+def test_conversions_that_make_no_sense_are_one_line():
     inputs = CAR + "  inputs:\n    accel: {columns: a, convert: east_north}\n"
     assert message(inputs, ConfigError) == (
         "motor.yaml:10: source.inputs.accel.convert is east_north; it needs two values, latitude and longitude, and 1 are named"
@@ -430,7 +429,7 @@ source:
 )
 
 
-def stepped(seconds: np.ndarray, how: str) -> np.ndarray:
+def stepped(seconds, how):
     """Times of a recording whose rows are out of order, or whose clock was set."""
     late = seconds >= 200.0
     return {
@@ -443,7 +442,7 @@ def stepped(seconds: np.ndarray, how: str) -> np.ndarray:
 
 
 @pytest.mark.parametrize("how", ["blocks", "newest first", "overlap", "set back an hour", "set ahead for a while"])
-def test_disorder_in_one_file_of_a_merged_source_alters_no_other(how: str) -> None:
+def test_disorder_in_one_file_of_a_merged_source_alters_no_other(how):
     """The oracle is the recording itself: all rows of the other files at their times, and none of its own lost."""
     seconds = np.arange(0.0, 600.0, 0.5)
     for name in ("winding", "tooth", "yoke"):

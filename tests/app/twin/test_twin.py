@@ -8,7 +8,7 @@ import pytest
 from app.live.tunings.tuning_yaml import tuning_yaml
 from app.twin.twin import load_twin, restore_twin
 from estimators.compiled.model import compile_model
-from estimators.errors import ConfigError, ModelError, NisusError
+from estimators.errors import ConfigError, ModelError
 from tests.app.twin.written import refusal, twin_of
 
 pytestmark = pytest.mark.usefixtures("inside")
@@ -51,7 +51,7 @@ def Pump():
 """
 
 
-def test_the_yaml_sets_the_model_and_the_tuning_up() -> None:
+def test_the_yaml_sets_the_model_and_the_tuning_up():
     twin = twin_of(MOTOR + "title: My motor\n")
     assert [(state.mean, state.std) for state in twin.model.states] == [(30.0, 4.0), (0.0, 1.0)]
     np.testing.assert_allclose(twin.tuning.q, [0.01, 0.01])
@@ -61,11 +61,11 @@ def test_the_yaml_sets_the_model_and_the_tuning_up() -> None:
     assert twin.pairs.tolist() == [[1, 0]]
 
 
-def test_a_sensor_that_is_not_used_is_held_out() -> None:
+def test_a_sensor_that_is_not_used_is_held_out():
     assert twin_of(MOTOR.replace("{std: 3}", "{use: false}")).tuning.used.tolist() == [False]
 
 
-def test_overrides_set_the_tuning_and_the_yaml() -> None:
+def test_overrides_set_the_tuning_and_the_yaml():
     twin = twin_of(
         MOTOR,
         overrides={
@@ -94,11 +94,11 @@ def test_overrides_set_the_tuning_and_the_yaml() -> None:
         ("source.duration", "-1", "--set source.duration=-1: source.duration is -1; it must be positive"),
     ],
 )
-def test_an_override_that_breaks_a_rule_is_one_line(key: str, value: str, expected: str) -> None:
+def test_an_override_that_breaks_a_rule_is_one_line(key, value, expected):
     assert refusal(MOTOR, overrides={key: value}) == expected
 
 
-def test_an_unknown_override_names_what_is_near() -> None:
+def test_an_unknown_override_names_what_is_near():
     text = refusal(MOTOR, overrides={"Q.temprature": "1"})
     said = "Q.temprature is not a tuning key of motor_winding; did you mean Q.temperature"
     assert text.startswith(f"--set Q.temprature=1: {said}")
@@ -126,13 +126,13 @@ def test_an_unknown_override_names_what_is_near() -> None:
         ("model: motor_winding", "model: motor_winding\nparameters: {r: 1}", "motor.yaml:2: parameters.r is no parameter of motor_winding; there are none to choose from"),
     ],
 )  # fmt: skip
-def test_what_the_model_lacks_is_one_line_with_what_is_near(old: str, new: str, expected: str) -> None:
+def test_what_the_model_lacks_is_one_line_with_what_is_near(old, new, expected):
     assert old in MOTOR
     text = refusal(MOTOR.replace(old, new, 1))
     assert text.startswith(expected) if expected.endswith(" ") else text == expected
 
 
-def test_a_parameter_out_of_its_range_is_one_line() -> None:
+def test_a_parameter_out_of_its_range_is_one_line():
     text = PUMP.replace("Noise, Row", "Noise, Parameter, Row")
     Path("pump.py").write_text(
         text.replace("f=f,", 'f=f, parameters=(Parameter("area", "m²", 1.0, low=0.5, high=2.0),),')
@@ -141,7 +141,7 @@ def test_a_parameter_out_of_its_range_is_one_line() -> None:
     assert refusal(yaml) == "motor.yaml:3: parameters.area is 3 m²; it must lie between 0.5 and 2"
 
 
-def test_a_model_from_a_file_beside_the_yaml(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_model_from_a_file_beside_the_yaml(monkeypatch):
     monkeypatch.setattr("sys.dont_write_bytecode", False)
     Path("twins").mkdir()
     Path("twins/pump.py").write_text(PUMP)
@@ -175,15 +175,13 @@ def test_a_model_from_a_file_beside_the_yaml(monkeypatch: pytest.MonkeyPatch) ->
         (PUMP.replace("0.01", "-1.0"), "./pump.py:Pump", ModelError, "pump.py:13: model pump: sensor level.level has variance -1.0; it must be positive, or zero of a row without noise"),
     ],
 )  # fmt: skip
-def test_a_model_file_that_fails_is_one_line_in_the_users_code(
-    python: str, reference: str, kind: type[NisusError], expected: str
-) -> None:
+def test_a_model_file_that_fails_is_one_line_in_the_users_code(python, reference, kind, expected):
     Path("pump.py").write_text(python)
     text = refusal(f"model: {reference}\nsource: {{type: simulator}}\n", kind)
     assert text.startswith(expected) if expected.endswith(" ") else text == expected
 
 
-def test_a_model_whose_shapes_disagree_is_refused_when_compiled() -> None:
+def test_a_model_whose_shapes_disagree_is_refused_when_compiled():
     Path("pump.py").write_text(PUMP.replace("out[0] = 0.9 * x[0]", "out[0] = x[0] + x[1]"))
     twin = twin_of("model: ./pump.py:Pump\nsource: {type: simulator}\n")
     with pytest.raises(ModelError) as caught:
@@ -191,7 +189,7 @@ def test_a_model_whose_shapes_disagree_is_refused_when_compiled() -> None:
     assert str(caught.value).startswith("pump.py:5: model pump: ") and "\n" not in str(caught.value)
 
 
-def test_a_twin_is_restored_from_its_text_alone() -> None:
+def test_a_twin_is_restored_from_its_text_alone():
     Path("pump.py").write_text(PUMP)
     text = "model: ./pump.py:Pump\nsensors: {level: {std: 0.5}}\nsource: {type: simulator}\n"
     twin = restore_twin(text, "gone.yaml", {"Q.level": "0.3"})
@@ -199,7 +197,7 @@ def test_a_twin_is_restored_from_its_text_alone() -> None:
     assert twin.name == "gone" and twin.text == text
 
 
-def test_a_parameter_to_estimate_becomes_a_state_that_the_yaml_may_name() -> None:
+def test_a_parameter_to_estimate_becomes_a_state_that_the_yaml_may_name():
     text = (
         "model: motor_drive\nparameters: {yoke_coolant: 0.04}\nestimate:\n  yoke_coolant: {std: 0.01, drift: 0.001}\n"
         "prior: {yoke_coolant: {std: 0.02}}\nview: {pairs: [[yoke, yoke_coolant]]}\n"
@@ -222,7 +220,7 @@ def test_a_filter_given_by_name_takes_options(tmp_path):
         assert made.estimator == given.get("estimator", load_twin(name).estimator)
 
 
-def test_a_filter_named_anew_keeps_what_the_yaml_gives_it() -> None:
+def test_a_filter_named_anew_keeps_what_the_yaml_gives_it():
     """Its own one named again runs with its options; another takes its place, and finds them when it comes back."""
     text = MOTOR.replace(
         "estimator: kf\n", "estimator: {name: ukf, options: {alpha: 0.5}}\nfilters: {ukf: {beta: 1}}\n"
@@ -241,7 +239,7 @@ def test_a_filter_named_anew_keeps_what_the_yaml_gives_it() -> None:
         twin_of(text.replace("alpha: 0.5", "alpha: 90"), overrides={"estimator": "iekf"})
 
 
-def test_the_prior_of_what_is_considered_is_that_of_the_parameter() -> None:
+def test_the_prior_of_what_is_considered_is_that_of_the_parameter():
     text = "model: motor_drive\nparameters: {yoke_coolant: {std: 10 %}}\nsource: {type: simulator}\n"
     twin = twin_of(text)
     assert twin.model.states[-1].name == "yoke_coolant_deviation"
@@ -269,25 +267,25 @@ def test_the_prior_of_what_is_considered_is_that_of_the_parameter() -> None:
         ),
     ],
 )  # fmt: skip
-def test_a_width_is_given_once_and_as_a_number_or_share(parameters: str, said: str) -> None:
+def test_a_width_is_given_once_and_as_a_number_or_share(parameters, said):
     assert said in refusal(f"model: motor_drive\nparameters: {parameters}\nsource: {{type: simulator}}\n")
 
 
 @pytest.mark.parametrize("given", ["parameters: {forcing: {std: 10 %}}", "estimate: {forcing: {std: 0.1}}"])
-def test_the_parameters_of_a_field_are_held(given: str) -> None:
+def test_the_parameters_of_a_field_are_held(given):
     assert "is uncertain, and lorenz96 is a field" in refusal(
         f"model: lorenz96\n{given}\nsource: {{type: simulator}}\n"
     )
 
 
-def test_a_width_is_added_to_a_parameter_given_as_a_number() -> None:
+def test_a_width_is_added_to_a_parameter_given_as_a_number():
     text = "model: motor_drive\nparameters: {yoke_coolant: 0.04}\nsource: {type: simulator}\n"
     twin = twin_of(text, overrides={"parameters.yoke_coolant.std": "10 %"})
     assert twin.model.state_names[-1] == "yoke_coolant_deviation" and twin.model.considered == 1
     assert twin.model.prior_std[-1] == pytest.approx(0.1 * 0.04, rel=1e-12)
 
 
-def test_offsets_and_scales_are_parameters_of_the_instruments() -> None:
+def test_offsets_and_scales_are_parameters_of_the_instruments():
     drive = MOTOR.replace("motor_winding", "motor_drive").replace("estimator: kf\n", "")
     drive = drive[: drive.index("prior:")] + (
         "sensors:\n  winding: {offset: {std: 0.5}, scale: {value: 1.01, std: 0.2 %}}\n  tooth: {offset: 0.3}\n"
@@ -306,7 +304,7 @@ def test_offsets_and_scales_are_parameters_of_the_instruments() -> None:
     }
 
 
-def test_an_offset_leaves_a_linear_model_to_the_kalman_filter() -> None:
+def test_an_offset_leaves_a_linear_model_to_the_kalman_filter():
     assert twin_of(MOTOR.replace("{std: 3}", "{std: 3, offset: {std: 0.5}}")).model.linear
     scale = MOTOR.replace("{std: 3}", "{std: 3, scale: {std: 1 %}}")
     assert "not linear once winding_scale_deviation are considered" in refusal(scale)
@@ -324,5 +322,5 @@ def test_an_offset_leaves_a_linear_model_to_the_kalman_filter() -> None:
          "prior.winding_offset_deviation is considered, so its prior is the `std` of the parameter"),
     ],
 )  # fmt: skip
-def test_impossible_offsets_are_refused(section: str, message: str) -> None:
+def test_impossible_offsets_are_refused(section, message):
     assert message in refusal(f"model: motor_winding\n{section}\nsource: {{type: simulator}}\n")

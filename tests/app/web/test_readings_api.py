@@ -135,6 +135,17 @@ def test_an_answer_says_what_became_of_a_message(page):
     assert [item["became"] for item in items] == ["used", "late", "stale", "waiting"]
 
 
+def test_measurements_that_are_old_when_they_arrive_have_their_age(damaged_page):
+    begin = time.time_ns() - 3600 * SECOND
+    sent(damaged_page, [{"time": begin + k * SECOND, "values": {"winding": 40.0}} for k in range(40)])
+    found = wait_for(lambda: (state := damaged_page.get("/api/state"))["time_ns"] == begin + 39 * SECOND and state)
+    assert 3561 <= found["age_s"] < 4000 and found["health"] == "degraded" and found["estimate_valid"]
+    assert found["cause"].endswith("s old when they arrive")
+    sent(damaged_page, {"values": {"winding": 40.0}})
+    found = wait_for(lambda: (state := damaged_page.get("/api/state"))["time_ns"] > begin + 3600 * SECOND and state)
+    assert found["age_s"] < 400 and "old when" not in found["cause"]
+
+
 @pytest.mark.parametrize(
     ("body", "kind", "status", "text"),
     [

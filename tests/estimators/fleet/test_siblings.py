@@ -9,7 +9,7 @@ from estimators.fleet.siblings import siblings
 from tests.benchmarks.siblings import planted_fleet
 
 
-def test_mean_and_spread_are_those_of_the_true_values() -> None:
+def test_mean_and_spread_are_those_of_the_true_values():
     """With deviations of their own; the standard error of a median of n is 1.2533, of a MAD 1.1664, σ / sqrt(n)."""
     rng, n = np.random.default_rng(1), 40_000
     s = rng.uniform(0.5, 2.0, n)
@@ -21,7 +21,7 @@ def test_mean_and_spread_are_those_of_the_true_values() -> None:
     assert found.std == pytest.approx(1.5, rel=3 * 1.1664 / np.sqrt(n) * (1 + (2.0 / 1.5) ** 2))
 
 
-def test_equal_deviations_have_the_closed_form() -> None:
+def test_equal_deviations_have_the_closed_form():
     x = np.array([1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 109.0])
     found = siblings(x, np.full(9, 0.5))
     # The median is 5 and the median deviation 2, of which 0.5 is the estimates' own.
@@ -30,14 +30,14 @@ def test_equal_deviations_have_the_closed_form() -> None:
     assert found.differs.tolist() == [False] * 8 + [True]
 
 
-def test_estimates_that_agree_have_no_spread() -> None:
+def test_estimates_that_agree_have_no_spread():
     found = siblings(np.linspace(-0.1, 0.1, 21), np.ones(21))
     assert found.std == 0.0 and not found.differs.any()
     exact = siblings(np.full(9, 3.0), np.zeros(9))
     assert (exact.mean, exact.std) == (3.0, 0.0) and np.all(exact.rate == 1.0)
 
 
-def test_the_rate_of_false_discoveries_is_the_one_asked_for() -> None:
+def test_the_rate_of_false_discoveries_is_the_one_asked_for():
     """Over 200 fleets of 1,000 assets with 50 that differ, by Benjamini and Hochberg's bound for those that do not."""
     rng, shares = np.random.default_rng(2), []
     for _ in range(200):
@@ -50,7 +50,7 @@ def test_the_rate_of_false_discoveries_is_the_one_asked_for() -> None:
     assert 0.05 < np.mean(shares) < 0.1 * 950 / 1000 + 3 * error
 
 
-def test_faults_of_a_fleet_are_found() -> None:
+def test_faults_of_a_fleet_are_found():
     """10,000 assets whose true levels differ by 0.5, of which 50 are off by 3.5, estimated from 30 measurements."""
     table, wrong = planted_fleet(3.5)
     count = len(table.mean)
@@ -75,12 +75,12 @@ def test_faults_of_a_fleet_are_found() -> None:
         (np.full(9, np.nan), np.ones(9), 0.05, "0 assets have an estimate; 8 are needed"),
     ],
 )
-def test_what_is_wrong_is_one_line(mean, std, rate, text) -> None:
+def test_what_is_wrong_is_one_line(mean, std, rate, text):
     with pytest.raises(EstimatorError, match=text):
         siblings(mean, std, rate=rate)
 
 
-def test_assets_without_an_estimate_are_left_out() -> None:
+def test_assets_without_an_estimate_are_left_out():
     x, s = np.arange(10.0), np.full(10, 0.1)
     x[3] = np.nan
     found = siblings(x, s)

@@ -24,11 +24,11 @@ CAR = coloured(ROAD_CAR, errors={"gnss_position": ColouredError((1.0, 1.0), 100.
 """As its twins have it: the error of a fix lasts."""
 
 
-def defaults(model: StateSpaceModel, **changed: float) -> np.ndarray:
+def defaults(model, **changed):
     return np.array([changed.get(item.name, item.value) for item in model.parameters], float)
 
 
-def stepped(model: StateSpaceModel, x: np.ndarray, u: np.ndarray, p: np.ndarray, dt: float, steps: int) -> np.ndarray:
+def stepped(model, x, u, p, dt, steps):
     f = compile_model(model).f
     x, out = np.array(x, float), np.empty(model.nx)
     for _ in range(steps):
@@ -37,7 +37,7 @@ def stepped(model: StateSpaceModel, x: np.ndarray, u: np.ndarray, p: np.ndarray,
     return x
 
 
-def drive(i_d: float = -80.0, i_q: float = 150.0, speed: float = 400.0) -> np.ndarray:
+def drive(i_d=-80.0, i_q=150.0, speed=400.0):
     return np.array([i_d, i_q, speed, 60.0, 25.0])
 
 
@@ -46,7 +46,7 @@ def drive(i_d: float = -80.0, i_q: float = 150.0, speed: float = 400.0) -> np.nd
 
 # The corridor's beams step at corners: test_corridor.py.
 @pytest.mark.parametrize("name", [name for name in MODELS if name != "agv_corridor"])
-def test_jacobians_match_central_differences_at_random_states(name: str) -> None:
+def test_jacobians_match_central_differences_at_random_states(name):
     model = MODELS[name]
     compiled = compile_model(model)
     if model.shape is not None:
@@ -61,7 +61,7 @@ def test_jacobians_match_central_differences_at_random_states(name: str) -> None
     p = defaults(model)
     dt = min(0.5, model.max_step)
 
-    def of_h(k: int) -> Callable:
+    def of_h(k):
         return lambda x, u, out: compiled.h[k](x, u, p, out)
 
     calls: list[tuple[Callable, int]] = [(lambda x, u, out: compiled.f(x, u, p, dt, out), model.nx)]
@@ -85,7 +85,7 @@ def test_jacobians_match_central_differences_at_random_states(name: str) -> None
 # The motor
 
 
-def losses(x: np.ndarray, u: np.ndarray, p: np.ndarray) -> tuple[float, float]:
+def losses(x, u, p):
     """Copper and iron loss, W."""
     theta = 1.0 + COPPER * (x[0] - 20.0)
     ohmic = 1.5 * p[P["copper_resistance"]] * np.hypot(u[0], u[1]) ** 2
@@ -93,7 +93,7 @@ def losses(x: np.ndarray, u: np.ndarray, p: np.ndarray) -> tuple[float, float]:
     return copper, p[P["iron_linear"]] * abs(u[2]) + p[P["iron_square"]] * u[2] ** 2
 
 
-def test_motor_keeps_energy_what_the_nodes_pass_on_to_each_other_cancels() -> None:
+def test_motor_keeps_energy_what_the_nodes_pass_on_to_each_other_cancels():
     rng = np.random.default_rng(2)
     capacity = defaults(MOTOR_DRIVE)[:4]
     for _ in range(20):
@@ -109,7 +109,7 @@ def test_motor_keeps_energy_what_the_nodes_pass_on_to_each_other_cancels() -> No
         assert stored == pytest.approx(sum(losses(x, u, p)) - out, abs=0.5)
 
 
-def test_motor_comes_to_rest_where_a_linear_solve_says() -> None:
+def test_motor_comes_to_rest_where_a_linear_solve_says():
     p = defaults(MOTOR_DRIVE, copper_eddy=0.0)  # then the loss is linear in the winding's temperature
     u = drive()
     A, b = np.zeros((4, 4)), np.zeros(4)
@@ -131,7 +131,7 @@ def test_motor_comes_to_rest_where_a_linear_solve_says() -> None:
     np.testing.assert_allclose(stepped(MOTOR_DRIVE, np.full(4, 20.0), u, p, 1.0, 20_000), rest, atol=1e-8)
 
 
-def test_motor_copper_loss_follows_resistivity() -> None:
+def test_motor_copper_loss_follows_resistivity():
     p = defaults(MOTOR_DRIVE, copper_eddy=0.0)
     for T in (20.0, 120.0):  # everything as warm as its surroundings: the winding warms by its loss alone
         u = np.array([0.0, 100.0, 0.0, T, T])
@@ -143,7 +143,7 @@ def test_motor_copper_loss_follows_resistivity() -> None:
     np.testing.assert_array_equal(there, back)
 
 
-def test_motor_integrates_to_fourth_order_and_one_second_is_enough() -> None:
+def test_motor_integrates_to_fourth_order_and_one_second_is_enough():
     x, u = np.array([120.0, 80.0, 60.0, 40.0]), drive()
     p = defaults(MOTOR_DRIVE)
     fine = stepped(MOTOR_DRIVE, x, u, p, 0.1, 10)
@@ -158,7 +158,7 @@ def test_motor_integrates_to_fourth_order_and_one_second_is_enough() -> None:
     assert errors[0] > 1e-6 and 12.0 < errors[0] / errors[1] < 20.0  # 2^4, less what the next order adds
 
 
-def test_motor_is_stable_at_the_worst_that_the_sliders_allow() -> None:
+def test_motor_is_stable_at_the_worst_that_the_sliders_allow():
     low = np.array([item.low for item in MOTOR_DRIVE.parameters])
     u = np.array([0.0, 0.0, 0.0, 30.0, 30.0])
     x = np.array([200.0, 0.0, 200.0, 0.0])
@@ -169,12 +169,12 @@ def test_motor_is_stable_at_the_worst_that_the_sliders_allow() -> None:
 # The car
 
 
-def car(heading: float = 0.0, speed: float = 0.0, **other: float) -> np.ndarray:
+def car(heading=0.0, speed=0.0, **other):
     values = {"heading": heading, "speed": speed, "wheel_scale": 1.0, **other}
     return np.array([values.get(name, 0.0) for name in CAR.state_names])
 
 
-def test_car_drives_a_circle_to_the_left() -> None:
+def test_car_drives_a_circle_to_the_left():
     speed, turn, dt = 15.0, 2.0 * np.pi / 60.0, 0.1
     p = defaults(CAR)
     u = np.array([0.3, turn + 0.02])  # the biases take off what is too much
@@ -188,12 +188,12 @@ def test_car_drives_a_circle_to_the_left() -> None:
         assert x[2] == pytest.approx(angle, abs=1e-12) and x[3] == pytest.approx(speed, abs=1e-12)
 
 
-def test_car_gains_speed_as_a_falling_stone_does() -> None:
+def test_car_gains_speed_as_a_falling_stone_does():
     x = stepped(CAR, car(heading=np.pi / 2, speed=3.0), np.array([2.0, 0.0]), defaults(CAR), 0.1, 50)
     np.testing.assert_allclose(x[:4], [0.0, 3.0 * 5.0 + 0.5 * 2.0 * 5.0**2, np.pi / 2, 13.0], atol=1e-12)
 
 
-def test_car_sensors_say_where_it_was() -> None:
+def test_car_sensors_say_where_it_was():
     compiled = compile_model(CAR)
     p = defaults(CAR, gnss_delay=0.4)
     u = np.array([1.5, 0.0])
@@ -213,12 +213,12 @@ def test_car_sensors_say_where_it_was() -> None:
     np.testing.assert_allclose(readings["wheel_speed"], 12.0 * 1.02)
 
 
-def test_car_noise_does_not_depend_on_how_time_is_cut() -> None:
+def test_car_noise_does_not_depend_on_how_time_is_cut():
     compiled = compile_model(CAR)
     p, u, x = defaults(CAR), np.zeros(2), car()
     q = np.array([noise.variance for noise in CAR.noises])
 
-    def after(dt: float, steps: int) -> np.ndarray:
+    def after(dt, steps):
         variance = np.zeros(CAR.nx)
         for _ in range(steps):
             Q = np.zeros((CAR.nx, CAR.nx))
@@ -238,22 +238,22 @@ def test_car_noise_does_not_depend_on_how_time_is_cut() -> None:
 class Run:
     """A filter over the recording of a bundled twin."""
 
-    def __init__(self, name: str, estimator: str) -> None:
+    def __init__(self, name, estimator):
         twin, log = recorded(name)
         self.model, self.events = twin.model, log.events
         self.track = fold(estimator, twin.model, twin.tuning, log)
 
-    def of(self, sensor: str) -> np.ndarray:
+    def of(self, sensor):
         """Rows of the readings of a sensor that hold a value."""
         rows = (self.events.kind == READING) & (self.events.channel == self.model.sensor_names.index(sensor))
         return np.flatnonzero(rows & np.isfinite(self.events.value[:, 0]))
 
-    def final(self, state: str) -> float:
+    def final(self, state):
         return float(self.track.mean[-1, self.model.state_names.index(state)])
 
 
 @pytest.mark.parametrize("estimator", ["ekf", "ukf"])
-def test_car_finds_the_scale_of_its_wheels_and_its_heading(estimator: str) -> None:
+def test_car_finds_the_scale_of_its_wheels_and_its_heading(estimator):
     result = Run("road_car", estimator)
     # The scale of the wheels is what comparing both sensors directly gives.
     t = result.events.t
@@ -268,7 +268,7 @@ def test_car_finds_the_scale_of_its_wheels_and_its_heading(estimator: str) -> No
 
 
 @pytest.mark.parametrize("estimator", ["ekf", "ukf"])
-def test_rav4_finds_the_error_of_its_gyroscope(estimator: str) -> None:
+def test_rav4_finds_the_error_of_its_gyroscope(estimator):
     result = Run("road_car_rav4", estimator)
     # The gyroscope's error is the rate it shows on average, less the little that the course turned.
     inputs = (result.events.kind == INPUT) & np.isfinite(result.events.value[:, 1])
@@ -280,7 +280,7 @@ def test_rav4_finds_the_error_of_its_gyroscope(estimator: str) -> None:
     assert result.final("yaw_rate_bias") == pytest.approx(rate, abs=np.radians(0.05))
 
 
-def test_drive_s_own_jacobian_is_the_complex_step_of_its_step() -> None:
+def test_drive_s_own_jacobian_is_the_complex_step_of_its_step():
     model = MODELS["motor_drive"]
     rng = np.random.default_rng(4)
     p = defaults(model)

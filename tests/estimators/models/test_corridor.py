@@ -18,17 +18,17 @@ ROOMS = ((-24, 24, -1.5, 1.5), (-12, -10, -3, -1.5), (10, 12, 1.5, 3), (-5.2, -4
 STEP = 4e-3
 
 
-def scanned(x: np.ndarray) -> np.ndarray:
+def scanned(x):
     out = np.empty(4)
     compile_model(AGV_CORRIDOR).h[0](np.asarray(x, float), np.zeros(2), np.zeros(0), out)
     return out
 
 
-def turned(x: np.ndarray) -> np.ndarray:
+def turned(x):
     return np.array([-x[0], -x[1], x[2] + np.pi])
 
 
-def marched(x: np.ndarray) -> np.ndarray:
+def marched(x):
     """How far each beam gets before it leaves all rooms, found step by step."""
     along = np.arange(0.0, 60.0, STEP)
     found = []
@@ -42,7 +42,7 @@ def marched(x: np.ndarray) -> np.ndarray:
     return np.array(found)
 
 
-def test_beams_end_where_a_march_leaves_the_rooms() -> None:
+def test_beams_end_where_a_march_leaves_the_rooms():
     """A march may step over a corner by at most its step, so only beams that graze one may differ: hardly any."""
     rng = np.random.default_rng(2)
     x = np.column_stack((rng.uniform(-24, 24, 150), rng.uniform(-1.5, 1.5, 150), rng.uniform(-np.pi, np.pi, 150)))
@@ -52,13 +52,13 @@ def test_beams_end_where_a_march_leaves_the_rooms() -> None:
     assert np.median(miss) < STEP
 
 
-def test_walls_are_parallel_to_the_axes_and_close_the_building() -> None:
+def test_walls_are_parallel_to_the_axes_and_close_the_building():
     assert len(WALLS) == len(OUTLINE)
     assert np.all((WALLS[:, 0] == WALLS[:, 2]) != (WALLS[:, 1] == WALLS[:, 3]))
     np.testing.assert_array_equal(WALLS[:, 2:], np.roll(WALLS[:, :2], -1, axis=0))
 
 
-def test_half_a_turn_is_seen_at_the_door_and_nowhere_else() -> None:
+def test_half_a_turn_is_seen_at_the_door_and_nowhere_else():
     """Beams across the corridor, from places where none meets the door or the place that faces it half a turn on."""
     rng = np.random.default_rng(3)
     for east in (*rng.uniform(-23, -6, 20), *rng.uniform(-3, 3, 20), *rng.uniform(6, 23, 20)):
@@ -68,7 +68,7 @@ def test_half_a_turn_is_seen_at_the_door_and_nowhere_else() -> None:
     np.testing.assert_allclose(scanned(door) - scanned(turned(door)), [0, 0, 0, 1.5], atol=1e-9)
 
 
-def test_slopes_of_beams_match_central_differences() -> None:
+def test_slopes_of_beams_match_central_differences():
     slopes = AGV_CORRIDOR.sensors[0].H
     rng = np.random.default_rng(4)
     step = 1e-6
@@ -93,7 +93,7 @@ def drive():
     return twin, log
 
 
-def unasked(log: Log) -> Log:
+def unasked(log):
     """The log without its truths: queries, which change nothing and cost a copy and a prediction of all particles."""
     events = log.events
     other = Log(log.width, log.n)
@@ -101,7 +101,7 @@ def unasked(log: Log) -> Log:
     return other
 
 
-def places(fold: Fold, seconds: float) -> dict[int, float]:
+def places(fold, seconds):
     """Weight of the peaks by the side of the building, east 1 and west -1, after so many seconds."""
     events = fold.log.events
     fold.advance(int(np.searchsorted(events.t - events.t[0], seconds * 1e9, side="right")) - fold.n)
@@ -112,7 +112,7 @@ def places(fold: Fold, seconds: float) -> dict[int, float]:
 
 
 @pytest.mark.parametrize("estimator", ["pf", "pf-reg"])
-def test_particles_keep_both_peaks_until_the_door_and_then_settle(drive, estimator) -> None:
+def test_particles_keep_both_peaks_until_the_door_and_then_settle(drive, estimator):
     """Until 18 s, when the turned vehicle passes the place where it would see the door, both peaks are as good.
 
     Resampling moves weight between equal peaks at random, first of all where few of the prior's particles fit the first
@@ -131,13 +131,13 @@ def test_particles_keep_both_peaks_until_the_door_and_then_settle(drive, estimat
     assert (miss < 4 * np.sqrt(np.diag(mode.cov))).all(), f"{mode.mean} and {truth}"
 
 
-def narrow(**overrides: str):
+def narrow(**overrides):
     twin = load_twin("agv_corridor", overrides=overrides)
     log, _ = read_log(twin, None)
     return twin, log
 
 
-def test_told_roughly_where_it_heads_the_ekf_chooses_that_peak_and_is_sure() -> None:
+def test_told_roughly_where_it_heads_the_ekf_chooses_that_peak_and_is_sure():
     """The heading is believed to be 0 ± 0.3, which is the other peak's: the door comes and goes, and it stays."""
     twin, log = narrow(**{"prior.heading.mean": "0.0", "prior.heading.std": "0.3"})
     fold = folded("ekf", twin.model, log)
