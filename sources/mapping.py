@@ -58,13 +58,13 @@ emit_signature = i64(
 def _own_variance(tables, r, values, state, i):
     """Return the noise variance of row r that frame i reports; NaN if it reports none, infinity if it is unknown.
 
-    Unknown is what is negative, as in messages of ROS, or beyond any variance.
+    Unknown is what is no number, is negative, as in messages of ROS, or is beyond any variance.
     """
     slot = tables.own_slot[r]
     own = tables.own_factor[r] * values[i, slot]
-    if state[i, slot] != PRESENT or np.isnan(own):
+    if state[i, slot] != PRESENT:
         return np.nan
-    if own < 0.0:
+    if not own >= 0.0:
         return np.inf
     if tables.own_squared[r] == 0:
         own *= own
@@ -314,7 +314,11 @@ class ChannelMapping:
                 (refused[k], "condition", f"measurement rejected; it needs {rule}"),
                 (cut[k], "short frame", ends),
                 (unreported[k], "accuracy", f"{reported} has no positive {what} of a measurement; the tuned R is used"),
-                (unknown[k], "unknown accuracy", f"{reported} is negative or too large for a {what}; value is missing"),
+                (
+                    unknown[k],
+                    "unknown accuracy",
+                    f"{reported} is no number, negative or too large for a {what}; value is missing",
+                ),
             ):
                 for _ in range(count):
                     self._report(f"{key} {name}", f"{name}: {text}")

@@ -185,16 +185,16 @@ def test_a_log_likelihood_is_not_asked_about_readings_without_noise():
 
 def test_a_reading_brings_its_own_noise_from_a_table():
     """As if a script had added each with its variance; 0 or none leaves the tuned R, an unknown one the value out."""
-    accuracy = ["0.5", "", "3", "0", "-1", "1", "1.7e308", "inf"]
-    t, w = np.arange(1.0, 9.0), [21.0, 22.0, 20.0, 25.0, 24.0, 23.0, 90.0, 90.0]
+    accuracy = ["0.5", "", "3", "0", "-1", "1", "1.7e308", "inf", "bad", "NaN"]
+    t, w = np.arange(1.0, 11.0), [21.0, 22.0, 20.0, 25.0, 24.0, 23.0, *[90.0] * 4]
     rows = "\n".join(f"{a:g},{b:g},{c}" for a, b, c in zip(t, w, accuracy, strict=True))
     Path("run.csv").write_text(f"t,w,a\n{rows}\n")
     twin = twin_of(TABLE)
     log, counts = read_log(twin, None)
-    assert (counts["accuracy winding"], counts["unknown accuracy winding"]) == (2, 3)
+    assert (counts["accuracy winding"], counts["unknown accuracy winding"]) == (2, 5)
     oracle = Log.of(twin.model)
-    missing = [*w[:4], np.nan, w[5], np.nan, np.nan]
-    oracle.add("winding", t, missing, variance=[0.25, np.nan, 9.0, np.nan, np.nan, 1.0, np.nan, np.nan])
+    missing = [*w[:4], np.nan, w[5], *[np.nan] * 4]
+    oracle.add("winding", t, missing, variance=[0.25, np.nan, 9.0, np.nan, np.nan, 1.0, *[np.nan] * 4])
     ours, theirs = (fold("kf", twin.model, twin.tuning, each) for each in (log, oracle))
     rows = log.events.kind == READING
     np.testing.assert_array_equal(ours.mean[rows], theirs.mean)
