@@ -118,7 +118,7 @@ def test_invalid_fixes_and_unknown_quantities_are_missing(tmp_path):
     events = read_all(table([write_mcap(tmp_path / "a.mcap", messages)], channels))
     nan = np.nan
     found = {k: events.value[events.channel == k] for k in range(6)}
-    np.testing.assert_array_equal(found[0], [[0, 0, 4, 9], [nan, nan, nan, nan], [0, 0, nan, nan]])
+    np.testing.assert_array_equal(found[0], [[0, 0, 4, 9], [nan, nan, nan, nan], [nan, nan, nan, nan]])
     np.testing.assert_array_equal(found[1][:, 0], [0.3, 0.4])
     # scipy is the oracle of the angles; both round to a few units in the last place.
     for k, angle in enumerate((0.1, -0.2, 2.5)):
