@@ -9,19 +9,21 @@ break where P⁺ is nearly singular, are replaced by one triangularisation of re
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from ..compiled.context import circular_rows, circular_states, estimated, expect_points, row_count, transition_points
-from ..estimator import Estimator, Options
+from ..estimator import Options
 from ..numerics.jit import by_address, inlined
 from ..numerics.linalg import remove, triangularise
 from ..numerics.simd_ir import padded
 from ..numerics.simd_rows import spread_points
 from ..numerics.workspace import declare_layout, size_of, start_of
-from .robust import growth, memory
+from .robust import growth
 from .shared import moments_of, state_size
 from .square_root import condition, conditioning, describe, moments, noise_root, settle, start
-from .ukf import UKF, deviations, tune, weights, weights_of
+from .ukf import UKF, deviations, weights, weights_of
 
 
 def points(values: Options, state: np.ndarray, nx: int) -> np.ndarray:
@@ -139,24 +141,18 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     )
 
 
-SR_UKF = Estimator(
+SR_UKF = replace(
+    UKF,
     name="sr-ukf",
     title="Square-root unscented Kalman filter",
-    family="Gaussian",
     assumes="f and h smooth within the spread; posterior well described by mean and covariance; any conditioning",
-    model_runs="2 nx + 1",
     fails_when="a negative central weight outweighs the others, or the posterior has several peaks",
     source="van der Merwe & Wan (2001), doi:10.1109/ICASSP.2001.940586",
     functions=(start, predict, update, describe),
-    runs=lambda options, nx: 2 * nx + 1,
     state_size=state_size,
     work_size=work_size,
     moments=moments,
     points=points,
-    options=UKF.options,
-    tune=tune,
-    memory=memory,
-    considers=True,
-    refuses=UKF.refuses,
+    needs_factor=False,
     singular=True,
 )

@@ -202,6 +202,17 @@ def _call(
         ) from None
 
 
+def _draws(function: Any, depth: int = 4) -> bool:
+    """Return whether a function that can be compiled, or one that it calls, draws random numbers anywhere."""
+    code = _code(function)
+    if code is None or depth == 0:
+        return False
+    called = map(getattr(plain(function), "__globals__", {}).get, code.co_names)
+    return "random" in code.co_names or any(
+        hasattr(getattr(item, "__self__", None), "seed") or _draws(item, depth - 1) for item in called
+    )
+
+
 def probe(model: StateSpaceModel) -> None:
     """Run the plain functions with arrays of the declared sizes, so that an index out of range is an error."""
     values, n = prior_values(model), model.nx
@@ -233,7 +244,7 @@ def probe(model: StateSpaceModel) -> None:
                 f"{named} leaves {len(bad)} of {out.size} entries of out unset or not finite at the prior, the first "
                 f"of them out[{', '.join(map(str, bad[0]))}]; it must fill them all with finite numbers at {at}"
             )
-        if not np.array_equal(out, again):
+        if not np.array_equal(out, again) or _draws(function):
             raise ModelError(
                 f"{named} returns another value for the same arguments when it is called again; it may depend on "
                 "nothing else: give what is random as process noise, and time or a count as an input or a state"

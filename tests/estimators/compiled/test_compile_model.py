@@ -2,6 +2,7 @@
 
 import itertools
 import time
+from random import gauss
 
 import numpy as np
 import pytest
@@ -286,9 +287,23 @@ def drawn_Q(x, u, p, q, dt, out):
     out[0, 0] = DRAWS.uniform()
 
 
+def shaken(x):
+    return x + gauss(0.0, 1.0) if x > 1e6 else x
+
+
+def drawn_far_away(x, u, p, dt, out):
+    out[0] = shaken(x[0])
+
+
 @pytest.mark.parametrize(
     ("changes", "what"),
-    [({"f": counted}, "f"), ({"sensor": {"h": timed}}, "h of sensor y"), ({"F": drawn}, "F"), ({"Q": drawn_Q}, "Q")],
+    [
+        ({"f": counted}, "f"),
+        ({"f": drawn_far_away}, "f"),
+        ({"sensor": {"h": timed}}, "h of sensor y"),
+        ({"F": drawn}, "F"),
+        ({"Q": drawn_Q}, "Q"),
+    ],
 )
 def test_what_is_no_function_of_its_arguments_is_refused(changes, what):
     with pytest.raises(ModelError, match=rf"test_compile_model.py:\d+: model walk: {what} returns another value for"):
