@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from estimators.errors import NisusError
 from sources.source import controls_of
 
+from .jobs import join
+
 if TYPE_CHECKING:
     from estimators.log import Events
     from sources.source import Source
@@ -73,8 +75,7 @@ class Feeder:
         """Stop reading and close the source."""
         self._stop.set()
         self._room.release()
-        if self._thread.is_alive():
-            self._thread.join(timeout=2.0)
+        join(self._thread, 2.0)
         self.source.close()
 
     def taken(self) -> None:

@@ -28,6 +28,7 @@ from ..ingest import CLOCK_MOVED, clock_moved, refusal
 from ..twin.fleet import FleetPlan
 from ..twin.twin import Twin
 from .fold_json import tuning_to_json
+from .jobs import join
 from .outcomes import Outcomes
 from .silent_assets import SilentAssets
 from .store import RETRY_PERIOD_S, Store
@@ -218,8 +219,7 @@ class RunningFleet:
     def stop(self) -> None:
         """Stop, and close the source."""
         self._stopping.set()
-        if self._thread.is_alive():
-            self._thread.join()
+        join(self._thread, 30.0)
         self.source.close()
         if self._store is not None:
             self._store.close()

@@ -275,6 +275,12 @@ class Jobs:
             self._put(job, again)
 
 
+def join(thread: threading.Thread, seconds: float) -> None:
+    """Wait for the end of a thread, if it was started, and no longer than so many seconds."""
+    if thread.is_alive():
+        thread.join(seconds)
+
+
 def run_all(*works: Callable[[], Any]) -> None:
     """Run callables concurrently, the first in this thread, and wait for all.
 

@@ -16,7 +16,7 @@ from estimators.pieces import LOOP, Piece
 from sources.pieces import KERNELS, is_made, make, needs, pieces_of
 
 from .compilers import MAX_COMPILERS, Compiler
-from .jobs import LOWEST_PRIORITY
+from .jobs import LOWEST_PRIORITY, join
 
 POLL_PERIOD_S = 0.2
 """Seconds between two looks for new requests."""
@@ -73,8 +73,7 @@ class Workshop:
         with self._wake:
             self._stopping = True
             self._wake.notify()
-        if self._thread.is_alive():
-            self._thread.join(timeout=2.0)
+        join(self._thread, 2.0)
 
     def ready(self, name: str) -> bool:
         """Return whether a filter or decoder is in the cache."""

@@ -17,7 +17,7 @@ import numpy as np
 from config.output_schema import AlertSection
 from estimators.errors import NisusError
 
-from ..live.jobs import Jobs
+from ..live.jobs import Jobs, join
 from ..live.outputs import OutputLink
 from ..present.state_message import StateMessage, state_message
 from ..twin.secrets import secrets_of
@@ -100,8 +100,7 @@ class Publisher:
         self._stopping.set()
         self._grown.set()
         self._engine.grown -= {self._grown.set}
-        if self._thread.is_alive():
-            self._thread.join(2.0)
+        join(self._thread, 2.0)
         self._end()
         self._store.close(self._parts.rules, self._parts.deliveries)
 

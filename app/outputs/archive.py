@@ -18,6 +18,7 @@ from estimators.events.batch import MAINTENANCE
 from estimators.interface.table import table_of
 
 from ..live.history_copy import last_written
+from ..live.jobs import join
 from ..live.outputs import Pull
 from .parts import DAY_NS, GROUP_ROWS, ArchivePlan, Part, parts_of, remove_surplus
 
@@ -58,8 +59,7 @@ class Archive:
         self._stopping.set()
         self._grown.set()
         self._engine.grown -= {self._grown.set}
-        if self._thread.is_alive():
-            self._thread.join(timeout=10.0)
+        join(self._thread, 10.0)
         self._engine.release(self._cursor)
 
     def _run(self) -> None:

@@ -12,7 +12,7 @@ from config.fleet_schema import FleetAlertSection
 from estimators.fleet.table import FleetTable
 from estimators.track import HEALTH_NAMES
 
-from ..live.jobs import Jobs
+from ..live.jobs import Jobs, join
 from ..live.notices import Notices
 from ..present.fleet_state import ChangedAssets, asset_message
 from ..terminal import print_line
@@ -82,8 +82,7 @@ class FleetPublisher:
     def stop(self) -> None:
         """Disconnect."""
         self._stopping.set()
-        if self._thread.is_alive():
-            self._thread.join(2.0)
+        join(self._thread, 2.0)
         self._jobs.stop()
         self._store.close(self._rules, self._deliveries)
         if self._mqtt is not None:

@@ -21,6 +21,7 @@ from estimators.errors import SourceError
 from estimators.events.batch import KIND_NAMES, READING, Events
 from sources.source import Report
 
+from ..live.jobs import join
 from .archive_journal import JOURNAL, Journal, complete_journal, complete_journals, read_journal
 from .parts import DAY_NS, ArchivePlan, number_of, parts_of, remove_surplus
 
@@ -91,8 +92,7 @@ class FleetArchive:
     def stop(self) -> None:
         """Write the rest, and complete the file."""
         self._stopping.set()
-        if self._thread.is_alive():
-            self._thread.join(timeout=10.0)
+        join(self._thread, 10.0)
 
     def _run(self) -> None:
         pause = 0.0

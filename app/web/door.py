@@ -35,6 +35,7 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from estimators.errors import ConfigError
 
+from ..live.jobs import join
 from .gate import SESSION, USER, Gate, Grant, User, changes, with_security_headers
 from .http import MAX_BODY_BYTES
 
@@ -307,8 +308,7 @@ class Door:
     def stop(self) -> None:
         """Close all connections, and the port."""
         self._server.end()
-        if self._thread.is_alive():
-            self._thread.join(timeout=5.0)
+        join(self._thread, 5.0)
         for listener in self.sockets:
             listener.close()
 

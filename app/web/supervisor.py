@@ -16,6 +16,7 @@ from typing import Any
 
 from estimators.track import HEALTH_NAMES
 
+from ..live.jobs import join
 from ..terminal import print_line
 
 STARTING, RUNNING, STOPPED, FAILED = "starting", "running", "stopped", "failed"
@@ -170,8 +171,7 @@ class Supervisor:
     def stop(self) -> None:
         """Stop all processes, concurrently."""
         self._stopping.set()
-        if self._thread.is_alive():
-            self._thread.join(5.0)
+        join(self._thread, 5.0)
         for twin in self.twins.values():
             self.ask_to_stop(twin)
         end = time.monotonic() + STOP_TIMEOUT_S

@@ -20,6 +20,7 @@ from estimators.diagnostics.health import MAX_ROWS_PER_READING
 from estimators.errors import NisusError, SourceError
 
 from ...format_time import counted
+from ...live.jobs import join
 from ...live.notices import Notice
 from ...live.outputs import Cursor, Pull
 from .rrd_file import DATE, NEVER, Disk, Split, part_path, surplus_parts
@@ -105,8 +106,7 @@ class Recorder:
         """Finish the file and end the thread."""
         self._stopping = True
         self.record(None)
-        if self._thread.is_alive():
-            self._thread.join(timeout=10.0)
+        join(self._thread, 10.0)
 
     def _run(self) -> None:
         while True:

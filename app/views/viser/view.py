@@ -11,6 +11,7 @@ from urllib.parse import parse_qs
 
 from estimators.diagnostics.references import shown_track
 
+from ...live.jobs import join
 from ...live.running_fold import Running
 from ...present.drawing.colors import THEMES
 from .guarded_server import addresses, guarded_server, unprinted, when_connected
@@ -66,8 +67,7 @@ class ViserView:
         """Stop drawing and the server."""
         self._stop = True
         self._come.set()
-        if self._thread.is_alive():
-            self._thread.join()
+        join(self._thread, 30.0)
         self._rest()
         with unprinted():
             self.server.stop()

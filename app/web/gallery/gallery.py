@@ -15,6 +15,7 @@ from config.tunings import OWN_VALUES
 from estimators.errors import ConfigError, NisusError, nearest, quoted
 
 from ...live.changes import obstacle
+from ...live.jobs import join
 from ...twin.twin import VERSION, Twin, with_version
 from ..running import OpenedTwin, RunningTwin, Stamp, stamp_of
 from ..session import Session
@@ -193,8 +194,7 @@ class SavedFiles:
     def stop(self) -> None:
         """End."""
         self._stopping.set()
-        if self._thread.is_alive():
-            self._thread.join(timeout=2.0)
+        join(self._thread, 2.0)
 
     def look(self) -> None:
         """Look once; reload when a file has changed since it was read, but not since the last look."""
