@@ -20,6 +20,7 @@ WHITE_NOISE = {
     "sensors.voltage": "{std: 0.06}",
     "sensors.temperature": "{std: 0.06}",
     "noise.temperature": "{variance: 1e-4}",
+    "source.sensors.temperature.repeats": "keep",
 }
 """The battery without errors that last, as whoever has not found them would set it."""
 

@@ -271,6 +271,7 @@ def test_a_wrong_belief_over_a_recording_is_foretold_by_what_follows(data):
         "sensors.voltage": "{std: 0.06}",
         "sensors.temperature": "{std: 0.06}",
         "noise.temperature": "{variance: 1e-4}",
+        "source.sensors.temperature.repeats": "keep",
         "commissioned": """{voltage: {bias: 0.002, scale: 0.372, correlation: 0.609,
           reached: {narrow: 295.4, wide: 3524.3, shifted up: 211.4, shifted down: 229.5, correlated: 997.6,
           alternating: 522.3, spiky: 2106.5, stuck: 237.6}},
