@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 OPTIONS_OF_TWIN = ("record", "store", "archive", "log", "set", "estimator", "tuning")  # of a twin that is named
 
-MAX_FAILURES = 5  # failures that a run without a page prints at its end
+MAX_FAILURES = 5  # failures of the source that a run without a page prints at its end; errors are printed at once
 
 
 def page_of(arguments: PageOptions) -> Page:
@@ -98,7 +98,7 @@ def run_twin(arguments: RunCommand, workers: Sequence[Compiler] = ()) -> int:
             print(to_json({"counts": status.counts, "failures": list(failures), "refits": refits}))
         else:
             print(", ".join(f"{name} {count}" for name, count in status.counts.items() if count or name == "readings"))
-        for text in list(failures)[:MAX_FAILURES]:
+        for text in list(dict.fromkeys(failed))[:MAX_FAILURES]:
             complain(text)
         for k, text in enumerate(refits):
             if "adopted" in text or k >= len(refits) - MAX_FAILURES:

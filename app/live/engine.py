@@ -443,7 +443,8 @@ class Engine(Running):
 
     def _report_stalled(self, text: str, level: str) -> None:
         self.notices.say(text, level=level)
-        complain(text)
+        if level != "error":  # which is printed as a notice
+            complain(text)
 
     def _compiled(self, estimator: str) -> None:
         """The filter that was waited for can be had."""

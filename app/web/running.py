@@ -97,7 +97,7 @@ class RunningTwin:
             door: Behind which the page shows it, once it is started; None for no page.
             split: Into what parts to split a recording.
             recordings: Folder of recordings made on the page; None is the working directory.
-            printed: Whether the notices are printed on standard error.
+            printed: Whether all notices are printed on standard error, not errors alone.
 
         Raises:
             NisusError: If the source cannot be opened.
@@ -131,9 +131,8 @@ class RunningTwin:
             self.engine.annotations.restore(opening.annotations)
         for level, text in remarks:
             self.engine.notices.say(text, level=level)
-        self._next_line: int | None = 0 if printed else None
-        if printed:
-            self.engine.jobs.run("lines", lambda job: self._print_notices(), every=PRINT_PERIOD_S)
+        self._next_line, self._printed = 0, printed
+        self.engine.jobs.run("lines", lambda job: self._print_notices(), every=PRINT_PERIOD_S)
         self.recorder = Recorder(self.engine, self._draw_into, split, recordings or Path())
         self.engine.recorder = self.recorder
         self.refits = Refits(self.engine)
@@ -192,7 +191,7 @@ class RunningTwin:
         self.engine.start()
         if self.publisher is not None:
             self.publisher.start()
-            if self.publisher.problem and self._next_line is None:
+            if self.publisher.problem and not self._printed:
                 complain(self.publisher.problem)
         if self.store is not None:
             self.store.start()
@@ -208,10 +207,13 @@ class RunningTwin:
         run_all(self._close_log, *shown)
 
     def _print_notices(self) -> None:
-        for line in self.engine.notices.since(self._next_line or 0):
-            fields = {"twin": self.engine.twin.name, "t": line.t, "revision": line.revision}
-            print_line(line.level, line.text, **fields)
+        for line in self.engine.notices.since(self._next_line):
             self._next_line = line.number + 1
+            if self._printed:
+                fields = {"twin": self.engine.twin.name, "t": line.t, "revision": line.revision}
+                print_line(line.level, line.text, **fields)
+            elif line.level == "error" and self.opening.review is None:
+                complain(line.text)
 
     def _close_log(self) -> None:
         if self.publisher is not None:
@@ -222,5 +224,4 @@ class RunningTwin:
         if self.archive is not None:
             self.archive.stop()
         self.recorder.stop()
-        if self._next_line is not None:
-            self._print_notices()
+        self._print_notices()

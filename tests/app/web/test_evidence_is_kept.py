@@ -90,3 +90,13 @@ def test_notes_are_there_again_when_the_twin_is_started_again():
             assert session.engine.annotations.notes == kept
     finally:
         session.stop()
+
+
+def test_errors_are_printed_while_a_twin_runs(capsys):
+    twin = load_twin("motor_winding", overrides={"source": "{type: push}"})
+    session = Session(OpenedTwin(twin, twin.open_source), page=None)
+    session.start()
+    for level in ("error", "warn"):
+        session.engine.notices.say(f"{level}: the disk is full", level)
+    session.stop()
+    assert capsys.readouterr().err == "nisus: error: the disk is full\n"
