@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from ..compiled.context import transition
-from ..estimator import Estimator, Options
+from ..estimator import Options
 from ..numerics.jit import by_address
 from ..numerics.workspace import size_of, start_of
 from . import sr_ekf
-from .kf import applies, constant_jacobian, kept, kept_in
-from .robust import OPTIONS, memory
-from .shared import moments_of, no_points, state_size
+from .kf import KF, constant_jacobian, kept, kept_in
+from .robust import OPTIONS
+from .shared import moments_of
 from .square_root import describe, moments, start
 from .sr_ekf import advance, predicting
 
@@ -34,23 +36,15 @@ def predict(context, u, dt, index, state, work):
     advance(context, u, dt, state, own, constant.F)
 
 
-SR_KF = Estimator(
+SR_KF = replace(
+    KF,
     name="sr-kf",
     title="Square-root Kalman filter",
-    family="Gaussian",
     assumes="linear f and h, Gaussian noise; then exact, at any conditioning",
-    model_runs="1",
-    fails_when="the model is wrong: the NIS leaves its bounds",
     source="Kailath, Sayed & Hassibi (2000), Linear Estimation, chapter 12",
     functions=(start, predict, sr_ekf.update, describe),
-    state_size=state_size,
     work_size=work_size,
     moments=moments,
-    points=no_points,
     options=OPTIONS,
     tune=sr_ekf.tune,
-    memory=memory,
-    considers=True,
-    singular=True,
-    applies=applies,
 )
