@@ -47,17 +47,16 @@ def _reach(state, row, horizon, live):
 
 @inlined
 def _judge(state, row, t, raw, arrival, live, horizon, utc):
-    """Return whether a time fits its channel's clock, or is far ahead or back."""
+    """Return whether a time fits its channel's clock, or is far ahead or back; `utc` as of the guard."""
     everything = state.shape[0] - 1
     if state[row, SEEN] and t < state[row, LAST] - horizon:
         return BACK
-    if utc:
+    if utc > 0:
         # What was buffered, or is history, comes late by any time, but a clock that is right is never ahead; and one
-        # that was corrected is right again if it is late.
-        tolerance = max(min(horizon // 2, SECOND_NS), SECOND_NS // 10)
-        if t != raw and t - arrival < state[row, OFFSET] - tolerance:
+        # that was corrected is another if it is late.
+        if t != raw and t - arrival < -utc:
             return BACK
-        return FITS if t - arrival <= tolerance else AHEAD
+        return FITS if t - arrival <= utc else AHEAD
     if not state[everything, SEEN]:
         return FITS
     live = live or state[row, LIVE] > 0
@@ -106,7 +105,7 @@ def _scan(state, t, raw, arrival, rows, start, horizon, utc):
     for i in range(start, t.size):
         row = rows[i]
         if row >= 0:
-            live = utc or raw[i] != arrival[i]
+            live = utc > 0 or raw[i] != arrival[i]
             if state[row, HOLDING] or _judge(state, row, t[i], raw[i], arrival[i], live, horizon, utc) != FITS:
                 return i
             _note(state, row, t[i], arrival[i], live, horizon)
@@ -118,7 +117,7 @@ def compiled() -> tuple[Any, Any, Any, Any]:
     """Return the functions, compiled for their only signatures."""
     one = (I2, i64, i64, i64, types.boolean, i64)
     _reach.compile((I2, i64, i64, types.boolean))
-    _judge.compile((*one[:2], *one[1:], types.boolean))
+    _judge.compile((*one[:2], *one[1:], i64))
     _note.compile(one)
-    _scan.compile((I2, I1, I1, I1, I1, i64, i64, types.boolean))
+    _scan.compile((I2, I1, I1, I1, I1, i64, i64, i64))
     return _reach, _judge, _note, _scan

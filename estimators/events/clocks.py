@@ -17,8 +17,8 @@ clock that returns to an earlier offset, or to the offset of another channel, ge
 of the delay do not accumulate.
 
 A clock that is set to UTC is ahead if it is later than the arrival by more than a second (less if the horizon is
-short), however late what it sends may come; it is then corrected to this machine's. If it is right again, what was
-corrected is late by more than that, and is held like what goes back.
+short), however late what it sends may come; it is then corrected to this machine's. A time that is near its arrival is
+right, and is never corrected. What was corrected and is late by more than that is held like what goes back.
 
 With known arrivals, held events do not pass merely because time has reached them: a clock slightly farther ahead than
 the horizon would be accepted after a while, and the events of all other clocks would be stale from then on. An event
@@ -75,10 +75,11 @@ class ClockGuard:
         `horizon` is the log's, ns. `utc`: the arrivals of all events are known, and their times are those of clocks
         that are set to UTC, as this machine's.
         """
-        self._sensors, self._horizon, self._utc = sensors, horizon, utc
+        self._sensors, self._horizon = sensors, horizon
+        self._utc = max(min(horizon // 2, SECOND_NS), SECOND_NS // 10) if utc else -1
         self._agree = min(max(SECOND_NS // 2, horizon // 2), SETTLING_TIME_NS)
         self._settled = max(SETTLING_TIME_NS, 2 * self._agree)
-        self._spread = horizon + self._agree
+        self._spread = self._agree + (0 if utc else horizon)
         self._everything = sensors + 2
         self._state = np.zeros((sensors + 3, 11), np.int64)
         self._shift = np.zeros(sensors + 2, np.int64)
@@ -181,7 +182,7 @@ class ClockGuard:
 
         A step of the source's clock shows in t - arrival, where a step of both does not.
         """
-        live = np.flatnonzero(np.logical_or(self._utc, batch.arrival != batch.t))
+        live = np.flatnonzero((batch.arrival != batch.t) | (self._utc > 0))
         if not live.size:
             return batch
         arrival = batch.arrival[live] + self.set_back
@@ -221,7 +222,8 @@ class ClockGuard:
         """Return the held events and a batch whose times are shifted by the steps so far."""
         batch = plain_events(batch)
         rows = self._rows_of(batch)
-        moved = batch._replace(t=batch.t + np.where(rows >= 0, self._shift[rows], 0))
+        wrong = (rows >= 0) & (np.abs(batch.t - batch.arrival) > self._utc)
+        moved = batch._replace(t=batch.t + np.where(wrong, self._shift[rows], 0))
         events = Events.concat([self._held, moved], batch.value.shape[1]) if self._runs else moved
         rows = np.concatenate((self._rows_of(self._held), rows))
         return Work(events, rows, np.concatenate((self._raw, batch.t)), len(self._held), self._utc)
@@ -267,7 +269,7 @@ class ClockGuard:
             return
         if run is None:
             live = work.live[i] or self._state[row, LIVE] > 0
-            begin = int(self._state[row if self._utc and self._state[row, SEEN] else self._everything, LAST])
+            begin = int(self._state[row if self._utc > 0 and self._state[row, SEEN] else self._everything, LAST])
             run = self._runs[row] = HeldRun(
                 verdict == AHEAD, live, begin, self._agree, MAX_HELD_LIVE if live else MAX_HELD
             )
@@ -358,10 +360,7 @@ class ClockGuard:
         step = 0
         if run.live:
             known = row if state[SEEN] else self._everything
-            step = int(self._state[known, OFFSET]) - run.top
-            if self._utc:
-                # As this machine's, or as late as before.
-                step = min(step, -run.top)
+            step = (0 if self._utc > 0 else int(self._state[known, OFFSET])) - run.top
         elif not run.ahead:
             step = self._step_back(run, row)
         elif now > run.begin:
@@ -527,12 +526,13 @@ class HeldRun:
 class Work:
     """Held events followed by a batch, and the decisions on them."""
 
-    def __init__(self, events: Events, rows: np.ndarray, raw: np.ndarray, begin: int, utc: bool) -> None:
+    def __init__(self, events: Events, rows: np.ndarray, raw: np.ndarray, begin: int, utc: int) -> None:
         """`rows` (n,) of the state, timestamps `raw` (n,), the number `begin` of held events; `utc` of the guard."""
         self._events = events
         self.t, self.arrival, self.kind, self.channel = events[:4]
         self.rows, self.raw, self.begin = rows, raw, begin
-        self.live = np.logical_or(utc, self.raw != self.arrival)
+        self._wrong = np.abs(raw - self.arrival) > utc
+        self.live = (raw != self.arrival) | (utc > 0)
         self.order: list[int] = []
         self.settled: list[bool] = []
         self.refused: list[Refused] = []
@@ -545,7 +545,7 @@ class Work:
 
     def shift(self, row: int, held: list[int], step: int) -> None:
         """Shift the held and the following times of a row."""
-        later = np.flatnonzero(self.rows == row)
+        later = np.flatnonzero((self.rows == row) & self._wrong)
         self.t[held] += step
         self.t[later[later > held[-1]]] += step
 

@@ -61,15 +61,13 @@ GAPS = st.one_of(st.integers(0, 4), st.integers(0, 4), st.sampled_from([0, 1, 1,
 KINDS = st.sampled_from([READING] * 12 + [TRUTH, TICK, RESET, MAINTENANCE, MARK])
 
 
-def told(
-    delays: st.SearchStrategy[int], wrong: st.SearchStrategy[int], least: int = 1
-) -> st.SearchStrategy[list[Told]]:
+def told(delays, wrong, least=1):
     """Streams of events."""
     one = st.builds(Told, GAPS, KINDS, st.integers(0, 1), st.tuples(VALUES, VALUES), delays, st.integers(0, 2), wrong)
     return st.lists(one, min_size=least, max_size=60)
 
 
-def stream(items: list[Told]) -> Events:
+def stream(items):
     """The events in the order of arrival; a clock that is wrong by w beats stays so until another w is told."""
     rows, now = [], 40
     for item in items:
@@ -88,14 +86,14 @@ def stream(items: list[Told]) -> Events:
 class Twin:
     """Ingest, log and fold, as the engine has them."""
 
-    def __init__(self, estimator: str = "kf", gate: str = "hard") -> None:
+    def __init__(self, estimator="kf", gate="hard"):
         self.counts: Counter[str] = Counter()
         self.stale = 0
         self.log = Log.of(MODEL, capacity=8)
         self.intake = Ingest(MODEL, HORIZON * BEAT, lambda key, text: self.counts.update([key]))
         self.fold = folded(estimator, gate, self.log)
 
-    def take(self, events: Events, cuts: list[int]) -> None:
+    def take(self, events, cuts):
         """Events in batches that end at these places, and the source's end; the moments are looked at after each."""
         bounds = [0, *sorted(min(cut, len(events)) for cut in cuts), len(events)]
         for a, b in zip(bounds, bounds[1:], strict=False):
@@ -104,14 +102,14 @@ class Twin:
         self._put(self.intake.finish())
         is_covariance(self.fold)
 
-    def _put(self, passed) -> None:
+    def _put(self, passed):
         first, stale = self.log.extend(passed.events, HORIZON * BEAT, passed.settled)
         self.stale += stale
         self.fold.rewind(first)
         self.fold.advance()
 
 
-def folded(estimator: str, gate: str, log: Log) -> Fold:
+def folded(estimator, gate, log):
     """A fold of what the log holds; a refused sensor is judged, and believed after 5 s."""
     share, kind = GATES[gate]
     tuning = Tuning.of(MODEL).set("gate", share).set("gate.kind", kind).set("gate.reopen", 5.0)
@@ -120,7 +118,7 @@ def folded(estimator: str, gate: str, log: Log) -> Fold:
     return fold
 
 
-def is_covariance(fold: Fold) -> None:
+def is_covariance(fold):
     """Finite, symmetric, and no eigenvalue below zero but for what rounding leaves.
 
     The eigenvalues are exact to some ulp of the largest, and an update rounds by no more than that: with two states and
@@ -132,7 +130,7 @@ def is_covariance(fold: Fold) -> None:
     assert np.linalg.eigvalsh(P).min() >= -1e-12 * np.trace(P)
 
 
-def in_order(events: Events) -> Log:
+def in_order(events):
     """A log to which these events came in the order of measured time."""
     log = Log.of(MODEL)
     log.extend(events.select(sorted_order(events)))
@@ -157,7 +155,7 @@ def test_what_comes_within_the_horizon_is_folded_as_if_it_had_come_in_order(esti
     assert_same_numbers(twin.fold, expected)
 
 
-def assert_same_numbers(a: Fold, b: Fold) -> None:
+def assert_same_numbers(a, b):
     """The same state of filter and bank, bit for bit."""
     for left, right in zip((*a.moments(), a.evidence), (*b.moments(), b.evidence), strict=True):
         np.testing.assert_array_equal(left, right)
@@ -182,12 +180,12 @@ def test_whatever_clocks_say_nothing_is_lost_uncounted(estimator, items, cuts, o
     assert (twin.stale, noticed(twin)) == (cut_otherwise.stale, noticed(cut_otherwise))
 
 
-def noticed(twin: Twin) -> dict[str, int]:
+def noticed(twin):
     """The counts of notices. Channels whose clocks make one step share a notice if they do so in one batch."""
     return {key: min(count, 1) if key == CLOCK_MOVED else count for key, count in twin.counts.items()}
 
 
-def said_of(events: Events) -> Counter[tuple[int, int, int, bytes]]:
+def said_of(events):
     """What was said, whatever time it was stamped with: that of a clock that was set is moved."""
     rows = zip(events.arrival, events.kind, events.channel, events.value, strict=True)
     return Counter((int(at), int(kind), int(channel), value.tobytes()) for at, kind, channel, value in rows)

@@ -1,5 +1,3 @@
-from typing import Any
-
 import jsonschema
 import pytest
 
@@ -10,17 +8,17 @@ from config.yaml_files import parse
 VALIDATOR = jsonschema.Draft202012Validator(json_schema())
 
 
-def data_of(text: str) -> Any:
+def data_of(text):
     return parse(text, "twin.yaml")[0]
 
 
-def test_the_schema_is_a_json_schema() -> None:
+def test_the_schema_is_a_json_schema():
     jsonschema.Draft202012Validator.check_schema(json_schema())
     assert json_schema_text().endswith("}\n")
 
 
 @pytest.mark.parametrize("name", shipped())
-def test_every_twin_that_ships_satisfies_it(name: str) -> None:
+def test_every_twin_that_ships_satisfies_it(name):
     assert [error.message for error in VALIDATOR.iter_errors(data_of(load(name).text))] == []
 
 
@@ -35,7 +33,7 @@ def test_every_twin_that_ships_satisfies_it(name: str) -> None:
         "model: a\nsource: {type: simulator}\nsensors: {s: {std: [1, 2]}}\nview: {pairs: [[a, b]]}",
     ],
 )
-def test_short_forms_satisfy_it(text: str) -> None:
+def test_short_forms_satisfy_it(text):
     assert [error.message for error in VALIDATOR.iter_errors(data_of(text))] == []
 
 
@@ -49,15 +47,15 @@ def test_short_forms_satisfy_it(text: str) -> None:
         "model: a\nsource: {type: simulator, dbc: a.dbc}",
     ],
 )
-def test_mistakes_do_not(text: str) -> None:
+def test_mistakes_do_not(text):
     assert list(VALIDATOR.iter_errors(data_of(text)))
 
 
-def test_every_key_is_described() -> None:
+def test_every_key_is_described():
     """An editor shows the description under the cursor; a key without one is undocumented."""
     schema = json_schema()
 
-    def described(value: dict[str, Any]) -> bool:
+    def described(value):
         section = schema["$defs"].get(value.get("$ref", "").rpartition("/")[2], {})
         return bool(value.get("description") or section.get("description"))
 

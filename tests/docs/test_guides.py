@@ -19,12 +19,12 @@ GUIDES = sorted([ROOT / "README.md", *(ROOT / "docs").glob("*.md")])
 PATH_OF_NISUS = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")])
 
 
-def blocks(path: Path, language: str) -> list[str]:
+def blocks(path, language):
     """Return the fenced code blocks of one language."""
     return re.findall(rf"^```{language}\n(.*?)^```$", path.read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE)
 
 
-def name(path: Path) -> str:
+def name(path):
     return path.name
 
 
@@ -43,7 +43,7 @@ WRITES = (">", "--out", "--html", "--record", "--archive")
 """What stands before the file that a command writes."""
 
 
-def commands(path: Path) -> list[str]:
+def commands(path):
     """Return the console commands of a page."""
     lines = "".join(blocks(path, "console")).splitlines()
     return [line.removeprefix("$ ") for line in lines if line.startswith("$ ")]

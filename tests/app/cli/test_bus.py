@@ -1,5 +1,4 @@
 from collections import Counter
-from pathlib import Path
 from typing import Any
 
 import can
@@ -10,31 +9,31 @@ from app.cli import bus
 from app.cli.arguments import BusCommand
 from app.twin.sources.asset import make_asset
 from app.twin.twin import load_twin
-from estimators.log import INPUT, READING, TRUTH, Events, truth_of
+from estimators.log import INPUT, READING, TRUTH, truth_of
 from tests.support import read_all
 
 
 class Clock:
     """Nanoseconds that jump to whatever is waited for, so that an hour is played at once."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         self.now = 0
 
-    def __call__(self) -> int:
+    def __call__(self):
         return self.now
 
-    def wait(self, seconds: float) -> bool:
+    def wait(self, seconds):
         self.now += round(seconds * 1e9)
         return False
 
 
-def play_at_once(player: Any, duration: float | None) -> None:
+def play_at_once(player, duration):
     clock = Clock()
     player._clock, player._stop.wait = clock, clock.wait
     player.run()
 
 
-def events(*, log: Path) -> Events:
+def events(*, log):
     source = load_twin("motor_can", log_files=[log]).open_source(lambda key, text: None, live=False)
     events = read_all(source)
     source.close()
@@ -42,7 +41,7 @@ def events(*, log: Path) -> Events:
 
 
 @pytest.mark.parametrize("suffix", bus.FORMATS)
-def test_what_is_recorded_is_what_the_asset_said(suffix: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_recorded_is_what_the_asset_said(suffix, tmp_path, monkeypatch):
     monkeypatch.setattr(bus, "_play", play_at_once)
     file = tmp_path / f"drive{suffix}"
     settings = ("source.asset.duration=12",)
@@ -64,7 +63,7 @@ def test_what_is_recorded_is_what_the_asset_said(suffix: str, tmp_path: Path, mo
     assert dict(Counter(pulled.tolist())).keys() == {60.0, 160.0}, "the cycle's first step of i_q is at 8 s"
 
 
-def test_listeners_hear_what_the_bus_took(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_listeners_hear_what_the_bus_took(monkeypatch):
     twin = load_twin("motor_can", overrides={"source.asset.duration": "1"})
     player = twin.plan.player(lambda key, text: None, interface="virtual", channel="test-listeners")
     ear = can.Bus(interface="virtual", channel="test-listeners")
@@ -90,7 +89,7 @@ def test_listeners_hear_what_the_bus_took(monkeypatch: pytest.MonkeyPatch) -> No
         ("vector", "1", 1),
     ],
 )
-def test_the_channel(interface: str, channel: str | None, expected: str | int) -> None:
+def test_the_channel(interface, channel, expected):
     assert (
         bus._channel(BusCommand("motor_can", interface=interface, channel=channel), load_twin("motor_can")) == expected
     )

@@ -8,12 +8,11 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from app.studies.compare import Outcome, able, draws, outcome_of, timed, within, without_marks
+from app.studies.compare import able, draws, outcome_of, timed, within, without_marks
 from app.studies.scores import COST, SPAN, read_scores, spread
 from app.twin.log_reader import read_log
-from app.twin.twin import Twin, load_twin
+from app.twin.twin import load_twin
 from config.loader import shipped
-from estimators.log import Events
 from estimators.registry import ESTIMATORS, unfit
 from tests.skips import recorded
 
@@ -48,40 +47,40 @@ class ScoreCell(NamedTuple):
     rounding: float
 
 
-def read_cell(line: dict[str, str], title: str) -> ScoreCell:
+def read_cell(line, title):
     if not line[title]:
         return ScoreCell(np.nan, np.nan, np.nan)
     decimals = len(line[title].partition(".")[2])
     return ScoreCell(float(line[title]), float(line[spread(title)] or "nan"), 0.5 * 10.0**-decimals)
 
 
-def read_span(line: dict[str, str]) -> float | None:
+def read_span(line):
     """The seconds of the log that a row covers; None means all."""
     return float(line[SPAN]) if line[SPAN] else None
 
 
 @lru_cache(maxsize=1)
-def twin_and_events(name: str) -> tuple[Twin, Events]:
+def twin_and_events(name):
     twin, log = recorded(name)
     return twin, without_marks(log.events)
 
 
-def quick(estimator: str, cells: dict[str, str], events: Events) -> bool:
+def quick(estimator, cells, events):
     entry = ESTIMATORS[estimator]
     seconds = 1e-6 * float(cells[COST]) * len(within(events, read_span(cells)))
     return seconds < SECONDS or not (draws(entry) or entry.interpreted)
 
 
-def figures(outcome: Outcome) -> dict[str, float]:
+def figures(outcome):
     found = {f"RMSE [{unit}]": value for unit, value in outcome.rmse.items()}
     return {**found, "mean NIS": outcome.nis, "in band [%]": 100.0 * outcome.coverage}
 
 
-def scores_of(twin: Twin) -> dict[str, dict[str, str]]:
+def scores_of(twin):
     return {cells["filter"]: cells for cells in read_scores(twin.path)}
 
 
-def mismatches(twin: Twin, events: Events, rows: dict[str, dict[str, str]]) -> list[str]:
+def mismatches(twin, events, rows):
     """Figures of the quick filters that are not those of a new fold."""
     wrong = []
     for estimator, cells in rows.items():
@@ -107,7 +106,7 @@ def mismatches(twin: Twin, events: Events, rows: dict[str, dict[str, str]]) -> l
 
 
 @pytest.mark.parametrize("name", shipped())
-def test_every_filter_that_applies_has_a_row(name: str) -> None:
+def test_every_filter_that_applies_has_a_row(name):
     twin = load_twin(name)
     rows = scores_of(twin)
     assert list(rows) == [key for key, entry in ESTIMATORS.items() if unfit(entry, able(twin, key).model) is None]
@@ -119,7 +118,7 @@ def test_every_filter_that_applies_has_a_row(name: str) -> None:
 @pytest.mark.parametrize(
     "name", [pytest.param(name, marks=pytest.mark.release if name in HUGE else ()) for name in shipped()]
 )
-def test_the_scores_say_what_the_filters_do(name: str) -> None:
+def test_the_scores_say_what_the_filters_do(name):
     """To the last printed digit, or for filters that draw, as near as another seed comes."""
     twin, events = twin_and_events(name)
     rows = scores_of(twin)
@@ -129,7 +128,7 @@ def test_the_scores_say_what_the_filters_do(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", [name for name in shipped() if "Over 20 logs" in load_twin(name).text])
-def test_other_logs_are_as_the_head_says(name: str) -> None:
+def test_other_logs_are_as_the_head_says(name):
     """Two logs of the simulator that are not among the twenty, folded by the twin's own filter."""
     text = load_twin(name).text
     said = re.search(r"Over 20 logs \(seeds (\d+) to (\d+), ([\w-]+)\): mean NIS (\S+), in band (\S+) %", text)
@@ -143,7 +142,7 @@ def test_other_logs_are_as_the_head_says(name: str) -> None:
         assert abs(100.0 * outcome.coverage - band[0]) < SIGMA * max(band[1], LEAST)
 
 
-def test_scores_that_are_no_longer_true_are_found() -> None:
+def test_scores_that_are_no_longer_true_are_found():
     twin, events = twin_and_events("motor_winding")
     rows = scores_of(twin)
     for estimator in ("kf", "etkf"):

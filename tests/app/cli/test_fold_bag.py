@@ -1,19 +1,16 @@
 """Twins fed by a bag of ROS 2, and estimates written as one: the same numbers as from and in a table."""
 
 import sys
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow.parquet as pq
-import pytest
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 
 from app.twin.log_reader import read_log
 from app.twin.twin import load_twin
 from estimators.fold import Fold
-from tests.app.conftest import CommandLine
 from tests.sources.tables.bags import joints, odometry, write_folder, write_mcap
 
 START = 1_700_000_000 * 10**9
@@ -29,7 +26,7 @@ source:
 """
 
 
-def twins(folder: Path, n: int = 200) -> tuple[Path, Path, Path]:
+def twins(folder, n=200):
     """Twins of an MCAP, of a folder of SQLite, and of a CSV of the same numbers."""
     rng = np.random.default_rng(4)
     y, truth, variance = 40 + rng.normal(size=n), 40 + rng.normal(size=n), rng.uniform(0.1, 4, n)
@@ -59,7 +56,7 @@ def twins(folder: Path, n: int = 200) -> tuple[Path, Path, Path]:
     return found[0], found[1], found[2]
 
 
-def test_a_bag_folds_to_the_bits_of_a_table(tmp_path: Path, nisus: CommandLine) -> None:
+def test_a_bag_folds_to_the_bits_of_a_table(tmp_path, nisus):
     mcap, folder, csv = twins(tmp_path)
     tables = []
     for k, twin in enumerate((mcap, folder, csv)):
@@ -72,7 +69,7 @@ def test_a_bag_folds_to_the_bits_of_a_table(tmp_path: Path, nisus: CommandLine) 
     assert same_bits(pq.read_table(tmp_path / "3.parquet"), tables[2])
 
 
-def same_bits(a: Any, b: Any) -> bool:
+def same_bits(a, b):
     """Whether all columns are equal, NaN to NaN, but the number of the tuning, which counts those of the process."""
     assert a.column_names == b.column_names
     for name in set(a.column_names) - {"tuning_version"}:
@@ -84,7 +81,7 @@ def same_bits(a: Any, b: Any) -> bool:
     return True
 
 
-def test_an_estimate_is_written_as_a_bag(tmp_path: Path, nisus: CommandLine) -> None:
+def test_an_estimate_is_written_as_a_bag(tmp_path, nisus):
     """The reader of rosbags, which did not write the container, is the oracle, and a fold with all covariances."""
     twin, *_ = twins(tmp_path)
     out = tmp_path / "estimate.mcap"
@@ -129,9 +126,7 @@ def test_an_estimate_is_written_as_a_bag(tmp_path: Path, nisus: CommandLine) -> 
     np.testing.assert_array_equal(read.events.value[:, loaded.model.width], table["temperature_std"].to_numpy() ** 2)
 
 
-def test_packages_are_missed_before_anything_is_folded(
-    tmp_path: Path, nisus: CommandLine, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_packages_are_missed_before_anything_is_folded(tmp_path, nisus, monkeypatch):
     monkeypatch.setitem(sys.modules, "mcap.writer", None)
     said = nisus.refuses("fold", "motor_winding", "--out", tmp_path / "e.mcap")
     assert said == f"nisus: --out {tmp_path}/e.mcap: needs mcap and rosbags: pip install 'nisus[robotics]'"

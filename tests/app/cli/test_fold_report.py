@@ -14,7 +14,7 @@ RIGHT = Interval(1.0, 0.95, 1.05)
 MODEL = level_model({"wall": 1.0, "grid": {f"g{k}": 1.0 for k in range(16)}}, 0.1, state="air")
 
 
-def entry(subject: str, role: str, share: float, words: tuple[str, ...] = ()) -> Calibration:
+def entry(subject, role, share, words=()):
     coverage = tuple(Interval(one, one, one) for one in (0.5, 0.9, share))
     none = Interval(0.0, -0.1, 0.1)
     shown = UNKNOWN if role == "truth" else none
@@ -42,7 +42,7 @@ def test_many_rows_of_one_sensor_are_one_line():
     ]
 
 
-def test_fold_prints_the_probability_and_its_brier_score(capsys) -> None:
+def test_fold_prints_the_probability_and_its_brier_score(capsys):
     assert fold_twin(FoldCommand("gripper_contact", duration=0.5)) == 0
     lines = capsys.readouterr().out.splitlines()
     (line,) = [line for line in lines if "probability of contact" in line]
@@ -51,7 +51,7 @@ def test_fold_prints_the_probability_and_its_brier_score(capsys) -> None:
     assert not any("RMSE contact" in line for line in lines)
 
 
-def test_only_a_mode_of_two_values_is_a_probability() -> None:
+def test_only_a_mode_of_two_values_is_a_probability():
     model = load_twin("gripper_contact").model
     assert [model.label(name) for name in model.state_names[:2]] == ["probability of contact", "depth"]
     assert load_twin("motor_winding").model.label("temperature") == "temperature"
@@ -60,7 +60,7 @@ def test_only_a_mode_of_two_values_is_a_probability() -> None:
 def test_the_rows_with_the_lowest_coverage_name_where_it_is_lowest():
     """A band counts as too narrow from 88.3 % on, 2 Φ(1.96 / 1.25) - 1; times count from the first of all."""
 
-    def part(subject: str, by: str, low: float, value: float, high: float) -> CoverageBin:
+    def part(subject, by, low, value, high):
         return CoverageBin(subject, "used", by, low, low + 60.0, 100, Interval(value, value - 0.05, high), 0.95, 1.4)
 
     found = [part(f"g{k}", "whole log", 1000.0, 0.95 - 0.01 * k, 0.99) for k in range(14)]

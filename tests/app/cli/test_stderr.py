@@ -1,7 +1,5 @@
 """What a command says on standard error: with file and line, and nothing that a terminal would obey."""
 
-from pathlib import Path
-
 import pytest
 
 import app.cli.open_twin
@@ -13,13 +11,13 @@ from tests.app.cli.test_fold import DRIVE, ROWS
 
 
 @pytest.fixture
-def drive(tmp_path: Path) -> Path:
+def drive(tmp_path):
     (tmp_path / "drive.csv").write_text(ROWS)
     (tmp_path / "drive.yaml").write_text(DRIVE)
     return tmp_path
 
 
-def said(capsys: pytest.CaptureFixture[str], *arguments: str) -> list[str]:
+def said(capsys, *arguments):
     """The complaints of a command; beside them stands at most that it compiled, if that took long."""
     code = main(arguments)
     lines = capsys.readouterr().err.splitlines()
@@ -30,13 +28,13 @@ def said(capsys: pytest.CaptureFixture[str], *arguments: str) -> list[str]:
     return lines
 
 
-def test_only_what_is_shown_as_it_is_passes() -> None:
+def test_only_what_is_shown_as_it_is_passes():
     assert printable("Wärme µ ² → ok\nnext") == "Wärme µ ² → ok\nnext"
     assert printable("\x1b[31m\x00\x9b\r\u202e\udcff") == r"\x1b[31m\x00\x9b\r\u202e\udcff"
 
 
 @pytest.mark.parametrize("way", ["log", "yaml", "name"])
-def test_raw_bytes_of_a_file_stay_in_it(drive: Path, way: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_raw_bytes_of_a_file_stay_in_it(drive, way, capsys):
     raw = b"\x1b]0;title\x07\x1b[2J" + bytes(range(256)) * 20
     if way == "log":
         (drive / "raw.csv").write_bytes(raw)
@@ -52,9 +50,7 @@ def test_raw_bytes_of_a_file_stay_in_it(drive: Path, way: str, capsys: pytest.Ca
     assert len(line) < 600
 
 
-def test_a_recording_without_rows_is_named_and_so_is_one_that_feeds_nothing(
-    drive: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_recording_without_rows_is_named_and_so_is_one_that_feeds_nothing(drive, capsys):
     (drive / "drive.csv").write_text(ROWS.splitlines()[0] + "\n")
     (line,) = said(capsys, "fold", str(drive / "drive.yaml"))
     assert "drive.yaml:2: source: " in line and line.endswith("drive.csv: it has a header and no rows; record it again")
@@ -67,9 +63,7 @@ def test_a_recording_without_rows_is_named_and_so_is_one_that_feeds_nothing(
 
 
 @pytest.mark.parametrize("arguments", [["fold"], ["run", "--headless", "--speed", "inf"]])
-def test_times_that_run_backwards_are_said_once(
-    drive: Path, arguments: list[str], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_times_that_run_backwards_are_said_once(drive, arguments, capsys):
     rows = "".join(f"{60 - k},40,20,0\n" for k in range(60))
     (drive / "drive.csv").write_text("t,y,temperature,rate\n" + rows)
     assert main([arguments[0], str(drive / "drive.yaml"), *arguments[1:]]) == 0
@@ -78,10 +72,8 @@ def test_times_that_run_backwards_are_said_once(
 
 
 @pytest.mark.parametrize("options", [[], ["--headless"]])
-def test_files_of_a_source_are_looked_at_before_anything_is_compiled(
-    drive: Path, options: list[str], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def too_late(*_: object) -> None:
+def test_files_of_a_source_are_looked_at_before_anything_is_compiled(drive, options, capsys, monkeypatch):
+    def too_late(*_):
         raise AssertionError("it went on")
 
     monkeypatch.setattr(app.cli.open_twin, "begin_to_compile", lambda *_: Workshop())

@@ -24,7 +24,6 @@ from estimators.errors import ConfigError
 from estimators.fit.fit import fit
 from estimators.fit.objective import Cancelled
 from estimators.fit.recording import Recording
-from estimators.log import Log
 from estimators.tuning import Tuning
 from tests import ROOT
 from tests.estimators.fit.test_fit import MODEL, log_of, simulated
@@ -72,7 +71,7 @@ def test_a_check_on_a_cluster_is_the_same_bits(scheduler, twin, log):
     assert len(found) > 8 and to_json(found) == to_json(checked(twin, log))
 
 
-def both_report() -> Log:
+def both_report():
     log = log_of(simulated(3, 300))
     log.add("silent", np.arange(300) + 0.5, simulated(4, 300))
     return log
@@ -81,7 +80,7 @@ def both_report() -> Log:
 class Counting(Executor):
     """Makes calls here, and counts them."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         self.calls = 0
 
     def map(self, fn, *iterables, timeout=None, chunksize=1):
@@ -110,7 +109,7 @@ def test_judgement_and_widths_in_processes_are_the_same_bits():
 class Here:
     """A cluster of one worker that is this process and begins no call by itself."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         self.futures: list[Future] = []
         self.sent: list[bytes] = []
 
@@ -156,7 +155,7 @@ def test_the_first_call_tells_how_many_make_a_task():
     assert items == [(k, 3) for k in range(31, 40)]
 
 
-def draws(seed: int) -> np.ndarray:
+def draws(seed):
     return np.random.default_rng(seed).normal(size=10_001)
 
 

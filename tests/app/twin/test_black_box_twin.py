@@ -3,7 +3,6 @@
 import os
 import pickle
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,7 +12,6 @@ from estimators.errors import ModelError
 from estimators.fold import fold
 from estimators.log import READING, Events, Log
 from estimators.model.user_file import portable
-from estimators.track import Track
 
 PHYSICS = "PULL = 0.7\n"
 BOX = """\
@@ -54,7 +52,7 @@ source: {type: table, files: drive.csv, time: {column: t, unit: s}, sensors: {he
 """
 
 
-def run(folder: Path, text: str, last: float = 2.0) -> Track:
+def run(folder, text, last=2.0):
     (folder / "physics.py").write_text(PHYSICS)
     (folder / "box.py").write_text(text)
     (folder / "box.yaml").write_text(YAML)
@@ -67,16 +65,16 @@ def run(folder: Path, text: str, last: float = 2.0) -> Track:
     return fold(twin.estimator, twin.model, twin.tuning, log)
 
 
-def same(a: Track, b: Track) -> None:
+def same(a, b):
     for name, one, other in zip(a._fields, a, b, strict=True):
         np.testing.assert_array_equal(one, other, err_msg=name)
 
 
-def pids(folder: Path) -> set[str]:
+def pids(folder):
     return {path.stem for path in folder.glob("*.pid")}
 
 
-def test_processes_run_the_models_file_and_give_the_bits_of_threads(tmp_path: Path) -> None:
+def test_processes_run_the_models_file_and_give_the_bits_of_threads(tmp_path):
     tracks = {}
     for executor in ("threads", "processes"):
         folder = tmp_path / executor
@@ -103,7 +101,7 @@ def test_processes_run_the_models_file_and_give_the_bits_of_threads(tmp_path: Pa
 
 @pytest.mark.parametrize("call", ["os._exit(3)", "os.abort()", "sys.exit(3)"])
 @pytest.mark.parametrize("executor", ["threads", "processes"])
-def test_a_model_that_would_end_the_program_is_one_line(tmp_path: Path, call: str, executor: str) -> None:
+def test_a_model_that_would_end_the_program_is_one_line(tmp_path, call, executor):
     text = BOX.replace('raise ValueError("the step is too long")', f"import sys; {call}")
     line = BOX.splitlines().index('        raise ValueError("the step is too long")') + 1
     with pytest.raises(ModelError, match=rf"box.py:{line}: model box: f fails on .*(would end the program|SystemExit)"):
@@ -111,7 +109,7 @@ def test_a_model_that_would_end_the_program_is_one_line(tmp_path: Path, call: st
 
 
 @pytest.mark.parametrize("f", ["lambda X, u, p, dt: X", "Called().f"])
-def test_what_has_no_name_in_the_file_is_refused(tmp_path: Path, f: str) -> None:
+def test_what_has_no_name_in_the_file_is_refused(tmp_path, f):
     called = "class Called:\n    def f(self, X, u, p, dt):\n        return X\n\n\nFACTOR"
     text = (
         BOX.replace("EXECUTOR", "'processes'").replace(" f=f,", f" f={f},").replace("FACTOR = 1.0\n", called + " = 1\n")
@@ -122,7 +120,7 @@ def test_what_has_no_name_in_the_file_is_refused(tmp_path: Path, f: str) -> None
         run(tmp_path, text)
 
 
-def test_a_partial_finds_its_function_in_the_file_too(tmp_path: Path) -> None:
+def test_a_partial_finds_its_function_in_the_file_too(tmp_path):
     """In a process that has not run the file yet, which this one is once it has forgotten the module."""
     run(tmp_path, BOX.replace("EXECUTOR", "None"))
     model = load_twin(str(tmp_path / "box.yaml")).model
@@ -131,7 +129,7 @@ def test_a_partial_finds_its_function_in_the_file_too(tmp_path: Path) -> None:
     np.testing.assert_array_equal(pickle.loads(sent)(np.array([[0.0, 0.0]]), None, None), [[2.0]])
 
 
-def test_functions_that_python_finds_go_by_name_alone() -> None:
+def test_functions_that_python_finds_go_by_name_alone():
     assert portable(load_twin) is load_twin
     assert portable(np.sin) is np.sin
     assert pickle.loads(pickle.dumps(portable(same))) is same

@@ -16,7 +16,7 @@ from tests.support import SECOND, as_log, read_all
 
 
 @lru_cache(maxsize=1)
-def folded(name: str) -> Fold:
+def folded(name):
     """Return the fold of a twin's own log, as the twin runs."""
     twin, log = recorded(name)
     fold = Fold(twin.estimator, twin.model, twin.tuning, log, policy=twin.policy, expected=twin.expected)
@@ -28,7 +28,7 @@ HUGE = ("thermal_field_large",)
 """Twins whose fold takes minutes; their first readings are folded."""
 
 
-def test_a_million_cells_fold() -> None:
+def test_a_million_cells_fold():
     for name in HUGE:
         twin = load_twin(name, overrides={"source.duration": "2"})
         source = twin.open_source(lambda key, text: None)
@@ -40,12 +40,12 @@ def test_a_million_cells_fold() -> None:
 
 
 @pytest.fixture(scope="module", params=[name for name in shipped() if name not in HUGE])
-def run(request: pytest.FixtureRequest) -> Fold:
+def run(request):
     """The tests of a twin follow each other, and share its fold."""
     return folded(request.param)
 
 
-def test_it_opens_and_folds(run: Fold) -> None:
+def test_it_opens_and_folds(run):
     events, track = run.log.events, run.track
     readings = events.kind == READING
     assert readings.sum() > 100
@@ -56,7 +56,7 @@ def test_it_opens_and_folds(run: Fold) -> None:
     assert np.isfinite(track.mean).all() and (uncertain > 0).all() and (track.std >= 0).all()
 
 
-def test_no_sensor_drops_out_in_the_first_minute(run: Fold, request: pytest.FixtureRequest) -> None:
+def test_no_sensor_drops_out_in_the_first_minute(run, request):
     twin = load_twin(request.node.callspec.params["run"])
     injected = {fault.sensor for fault in twin.plan.scheduled}
     judged = judged_rows(run)
@@ -66,7 +66,7 @@ def test_no_sensor_drops_out_in_the_first_minute(run: Fold, request: pytest.Fixt
     assert not causes & {"silent", "never heard", "stale", "diverged"}
 
 
-def test_the_motor_on_the_bus_finds_its_magnet() -> None:
+def test_the_motor_on_the_bus_finds_its_magnet():
     events, track = (fold := folded("motor_can")).log.events, fold.track
     assert (TWINS.parent / "logs" / "motor_can.blf").stat().st_size < 1_000_000
     seconds = (events.t - events.t[0]) * 1e-9
@@ -79,8 +79,8 @@ def test_the_motor_on_the_bus_finds_its_magnet() -> None:
     assert track.std[magnet, 3][-1] < 3
 
 
-def test_what_was_learned_of_the_magnet_holds_where_it_was_not_learned() -> None:
-    def last(name: str) -> float:
+def test_what_was_learned_of_the_magnet_holds_where_it_was_not_learned():
+    def last(name):
         events, track = (fold := folded(name)).log.events, fold.track
         rows, values = truth_of(events, 3)
         rows, values = rows[(late := events.t[rows] >= events.t[0] + 1_200_000_000_000)], values[late]

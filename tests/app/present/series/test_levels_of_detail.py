@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from app.present.series.levels_of_detail import FIRST, Groups, Pyramid, coarser, grouped
+from app.present.series.levels_of_detail import FIRST, Pyramid, coarser, grouped
 
 
-def by_hand(size: int, first: int, t: np.ndarray, values: np.ndarray) -> dict[int, tuple]:
+def by_hand(size, first, t, values):
     """Number → times of the ends, and extremes of each column, by Python's own min and max."""
     rows: dict[int, list[int]] = {}
     for k in range(len(t)):
@@ -19,7 +19,7 @@ def by_hand(size: int, first: int, t: np.ndarray, values: np.ndarray) -> dict[in
     return found
 
 
-def same(groups: Groups, wanted: dict[int, tuple]) -> None:
+def same(groups, wanted):
     assert list(range(groups.start, groups.start + groups.n)) == list(wanted)
     for k, (first, last, low, high) in enumerate(wanted.values()):
         assert (groups.first[k], groups.last[k]) == (first, last)
@@ -27,7 +27,7 @@ def same(groups: Groups, wanted: dict[int, tuple]) -> None:
         np.testing.assert_array_equal(groups.high[k], high)
 
 
-def rows(n: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+def rows(n, seed=0):
     rng = np.random.default_rng(seed)
     values = rng.normal(size=(n, 3))
     values[rng.random((n, 3)) < 0.3] = np.nan
@@ -35,17 +35,17 @@ def rows(n: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize(("size", "first"), [(1, 0), (4, 0), (4, 3), (5, 7), (12, 0), (16, 15), (16, 16), (64, 1000)])
-def test_groups_hold_the_extremes(size: int, first: int) -> None:
+def test_groups_hold_the_extremes(size, first):
     t, values = rows(333)
     same(grouped(size, first, t, values), by_hand(size, first, t, values))
 
 
-def test_coarser_groups_are_those_of_the_rows() -> None:
+def test_coarser_groups_are_those_of_the_rows():
     t, values = rows(1000)
     same(coarser(grouped(16, 40, t, values)), by_hand(64, 40, t, values))
 
 
-def test_levels_are_the_same_in_whatever_pieces_the_rows_come() -> None:
+def test_levels_are_the_same_in_whatever_pieces_the_rows_come():
     """Appended in pieces, and rewritten from an earlier row on, as after a late reading."""
     t, values = rows(5000)
     rng = np.random.default_rng(1)
@@ -60,7 +60,7 @@ def test_levels_are_the_same_in_whatever_pieces_the_rows_come() -> None:
         same(pyramid.level(size), by_hand(size, 0, t, values))
 
 
-def test_fewer_rows_than_before() -> None:
+def test_fewer_rows_than_before():
     t, values = rows(500)
     pyramid = Pyramid(3)
     pyramid.update(0, t, values)
@@ -69,7 +69,7 @@ def test_fewer_rows_than_before() -> None:
     same(pyramid.level(64), by_hand(64, 0, t[:200], values[:200]))
 
 
-def test_what_is_dropped_is_forgotten() -> None:
+def test_what_is_dropped_is_forgotten():
     t, values = rows(5000)
     pyramid = Pyramid(3)
     pyramid.update(0, t, values)
