@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from ..compiled.context import estimated, expect, row_count, transition
 from ..compiled.jacobians import scratch_size, sensor_jacobian, state_jacobian
-from ..estimator import Estimator, Options
+from ..estimator import Options
 from ..numerics.jit import by_address, inlined, part
 from ..numerics.linalg import triangularise
 from ..numerics.workspace import declare_layout, size_of, start_of, take_matrix
-from .ekf import tune
-from .robust import OPTIONS, growth, memory
-from .shared import moments_of, move_to, no_points, state_size
+from .ekf import EKF
+from .robust import OPTIONS, growth
+from .shared import moments_of, move_to, state_size
 from .square_root import condition, conditioning, describe, moments, noise_root, settle, start
 
 Predicting, predicting = declare_layout(
@@ -135,23 +137,15 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     )  # fmt: skip
 
 
-SR_EKF = Estimator(
+SR_EKF = replace(
+    EKF,
     name="sr-ekf",
     title="Square-root extended Kalman filter",
-    family="Gaussian",
     assumes="differentiable f and h, nearly straight within the spread of the estimate; any conditioning",
-    model_runs="1 and its derivatives (nx by complex step)",
-    fails_when="curvature makes it overconfident, so that it neglects the sensors",
     source="Kailath, Sayed & Hassibi (2000), Linear Estimation, chapter 12",
     functions=(start, predict, update, describe),
-    runs=lambda options, nx: nx + 1,
     state_size=state_size,
     work_size=work_size,
     moments=moments,
-    points=no_points,
     options=OPTIONS,
-    tune=tune,
-    memory=memory,
-    considers=True,
-    singular=True,
 )

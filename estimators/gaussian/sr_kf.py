@@ -46,5 +46,4 @@ SR_KF = replace(
     work_size=work_size,
     moments=moments,
     options=OPTIONS,
-    tune=sr_ekf.tune,
 )

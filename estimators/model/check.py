@@ -5,6 +5,7 @@ Functions are called at the prior and near it; declared properties (mode, linear
 
 from __future__ import annotations
 
+import random
 import re
 import traceback
 from collections.abc import Callable, Iterator, Sequence
@@ -207,9 +208,13 @@ def _draws(function: Any, depth: int = 4) -> bool:
     code = _code(function)
     if code is None or depth == 0:
         return False
-    called = map(getattr(plain(function), "__globals__", {}).get, code.co_names)
-    return "random" in code.co_names or any(
-        hasattr(getattr(item, "__self__", None), "seed") or _draws(item, depth - 1) for item in called
+    return any(
+        item is random
+        or item is np.random
+        or (item is np and "random" in code.co_names)
+        or hasattr(getattr(item, "__self__", None), "seed")
+        or _draws(item, depth - 1)
+        for item in map(getattr(plain(function), "__globals__", {}).get, code.co_names)
     )
 
 

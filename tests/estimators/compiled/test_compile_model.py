@@ -1,6 +1,7 @@
 """A model that disagrees with its declaration is refused with one line that says what, where and how much."""
 
 import itertools
+import random as other
 import time
 from random import gauss
 
@@ -295,11 +296,19 @@ def drawn_far_away(x, u, p, dt, out):
     out[0] = shaken(x[0])
 
 
+random = 0.5
+
+
+def drawn_by_alias(x, u, p, out):
+    out[0] = x[0] if x[0] < 1e6 else other.gauss(random, 1.0)
+
+
 @pytest.mark.parametrize(
     ("changes", "what"),
     [
         ({"f": counted}, "f"),
         ({"f": drawn_far_away}, "f"),
+        ({"sensor": {"h": drawn_by_alias}}, "h of sensor y"),
         ({"sensor": {"h": timed}}, "h of sensor y"),
         ({"F": drawn}, "F"),
         ({"Q": drawn_Q}, "Q"),
