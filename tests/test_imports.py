@@ -15,6 +15,7 @@ IMPURE_HERE = {
     "numerics/cache.py": {"os"},  # where the compile cache is
     "numerics/cache_entries.py": {"os"},  # reads and writes the compile cache
     "numerics/jit.py": {"os"},  # whether the user says where, and how threads wait
+    "model/check.py": {"random"},  # to know what it refuses
     "model/user_file.py": {"os"},  # a model that would end the program
     "compiled/orphan.py": {"os", "threading"},  # a worker that ends with its parent
 }
