@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.special import bdtr, bdtrc
+from scipy.stats import rankdata
 
 HELD, STEPS, DEAD_BAND, LINEAR = "held", "held or set point", "dead band", "interpolated or computed"
 SINGLE, UNDECIDED = "", "undecided"
@@ -33,6 +34,8 @@ MIN_EXACT = 0.9  # Share of the runs of coarse values within such a deviation, a
 MAX_MULTIPLE = 20.0  # Periods of the longest run that is looked at
 MAX_HELD = 0.99  # Share of the holds of one period within the longest one
 MAX_CANDIDATES = 5  # Commonest run lengths that are tried as a period
+MIN_Z, MIN_HELD = 7.0, 0.98  # Of coarse lines: z of the phase of their knots, and share of the rows on their chords
+MAX_APART, MAX_RANKED = 100, 30_000  # Rows between such knots, and rows in which they are searched
 
 
 class Finding(NamedTuple):
@@ -219,16 +222,45 @@ def _line(t: np.ndarray, values: np.ndarray, d: np.ndarray, place: np.ndarray, s
     e = np.abs(values[1:-1] - chord)
     tolerance = max(step, EQUAL * float(np.max(np.abs(values))))
     bends = np.flatnonzero(e[:-1] >= BEND_SIZE * tolerance)
-    steep = np.minimum(np.abs(d[bends + 1]), np.abs(d[bends + 2])) > 2.0 * tolerance
-    bends = bends[steep]
-    if bends.size < MIN_CHANGES:
-        return None
+    bends = bends[np.minimum(np.abs(d[bends + 1]), np.abs(d[bends + 2])) > 2.0 * tolerance]
     count = int(np.sum(e[bends + 1] <= tolerance))
-    if count < MIN_STRAIGHT * bends.size or bdtrc(count - 1, bends.size, LINE_NULL) >= MAX_P:
+    if (
+        bends.size < MIN_CHANGES
+        or count < MIN_STRAIGHT * bends.size
+        or bdtrc(count - 1, bends.size, LINE_NULL) >= MAX_P
+    ):
+        rows = _knots_apart(values, d, e, tolerance)
+        known = (rows * float(np.median(h)) * 1e-9, np.nan) if rows else None
+    else:
+        knots = np.flatnonzero(e >= BEND_SIZE * tolerance) + 1
+        known = _period(place[knots], t[knots], every=False) or (np.nan, np.nan)
+    if known is None:
         return None
-    knots = np.flatnonzero(e >= BEND_SIZE * tolerance) + 1
-    known = _period(place[knots], t[knots], every=False) or (np.nan, np.nan)
     share = float(np.mean(e <= tolerance))
     words = f"interpolated or computed in {100.0 * share:.0f} % of rows"
     each = f", straight between values every {known[0]:.4g} s" if np.isfinite(known[0]) else ""
     return Finding(LINEAR, *known, share, words + each)
+
+
+def _knots_apart(values: np.ndarray, d: np.ndarray, e: np.ndarray, tolerance: float) -> int:
+    """Return every how many rows lines between coarse values have a knot; 0 without such lines.
+
+    There the ranks of `e` are higher on average (the phase of largest z), and the chords of these rows hold the others.
+    """
+    rank = rankdata(e[:MAX_RANKED])
+    rank = (rank - rank.mean()) / max(float(rank.std()), 1e-9)
+    found: list[tuple[float, int, int]] = []
+    for rows in range(2, min(MAX_APART, rank.size // MIN_CHANGES) + 1):
+        m = rank.size // rows
+        z = rank[: m * rows].reshape(m, rows).mean(axis=0) * np.sqrt(m)
+        found.append((float(z.max()), rows, int(z.argmax())))
+    found = [item for item in sorted(found, reverse=True)[:MAX_CANDIDATES] if item[0] >= MIN_Z]
+    if not found or np.unique(values).size <= MAX_LEVELS or _has_pattern(np.diff(d)):
+        return 0
+    for _, rows, first in found:
+        knots = np.arange(first + 1, values.size, rows)
+        within = slice(knots[0], knots[-1] + 1)
+        chord = np.interp(np.arange(values.size)[within], knots, values[knots])
+        if np.mean(np.abs(values[within] - chord) <= tolerance * (1.0 + 1e-6)) >= MIN_HELD:
+            return rows
+    return 0

@@ -20,7 +20,7 @@ for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
 
 def main() -> None:
     """Run the sections; no figure makes it fail."""
-    from . import buses, cluster, eigen, false_alarms, filters, folds, page, recovery, sampling, siblings
+    from . import buses, cluster, eigen, false_alarms, filters, folds, page, recovery, repeats, sampling, siblings
     from .timing import Section, run_sections
 
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -62,6 +62,7 @@ def main() -> None:
         cluster.searches,
         siblings.found_siblings,
         false_alarms.false_alarms,
+        repeats.repeats,
         page.page,
     ]
     if given.names:

@@ -4,17 +4,12 @@ Each recording is folded with a parameter held at its initial value, moved into 
 fitted window by window as a running twin with `refit` does (dual; a window's result counts from its end on). All are
 scored on the rows after the first window: RMSE of the withheld state and share in its 95 % band, log density of a
 measurement before it was used, the parameter at the end with its 95 % interval, and processor seconds.
-
-The last two tables are of wear over fifty discharges of one cell, each starting from the parameters of the one before:
-as recorded (by its counter it did not fade), and with voltages of a simulated cell under the same currents, whose
-resistance grows by half and whose capacity shrinks by a fifth.
 """
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
 from functools import partial, update_wrapper
 from typing import NamedTuple
 
@@ -27,7 +22,7 @@ from estimators.fit.dual import WindowFit, walk
 from estimators.fit.fit import EntryFit, Fitted
 from estimators.fit.judge import Z
 from estimators.fold import Fold
-from estimators.log import INPUT, READING, TICK, TRUTH, Events, Log, truth_of
+from estimators.log import TICK, TRUTH, Log, truth_of
 from estimators.track import USED, Track
 from estimators.tuning import Tuning
 
@@ -217,132 +212,11 @@ def recording(case: Case) -> Iterator[BenchmarkRow]:
 
 
 HELD, JOINT, HALF, DUAL = "held", "joint", "joint, half the drift", "dual"
-N_CYCLES = 50
-PARAMETERS = ("r0", "capacity")
-SPREAD = {"r0": (0.005, 3e-5), "capacity": (0.15, 2e-4)}
-"""Initial deviation of each in joint estimation, and its drift in √s: at least the wear of the capacity in a cycle."""
-
-WORN = {"r0": 1.5, "capacity": 0.8}  # Value of each after the last cycle, as a share of the initial one
-
-
-def one_cycle(number: int, parameters: Sequence[str], drift: float = 1.0) -> tuple[Twin, Log]:
-    """Return one discharge of the cell; `parameters` are states, with that share of their drift."""
-    column = f"rw_data({number + 1})"
-    flow = ", ".join(f"{name}: {{std: {SPREAD[name][0]}, drift: {drift * SPREAD[name][1]}}}" for name in parameters)
-    twin = load_twin(
-        "battery_dmegc",
-        overrides={
-            "tuning": "held",
-            "estimate": f"{{{flow}}}",
-            "view": "{}",
-            "source.time": f"{{column: {column}.t, unit: s}}",
-            "source.inputs.current": f"{{columns: {column}.I}}",
-            "source.sensors": f"{{voltage: {{columns: {column}.V}}, temperature: {{columns: {column}.T}}}}",
-            "source.truth.soc": f"{{columns: {column}.Q, scale: -1.00937e-4, offset: 1}}",
-        },
-    )
-    return twin, read_log(twin, None)[0]
-
-
-def worn(twin: Twin, log: Log, number: int) -> tuple[Log, dict[str, float]]:
-    """Return the same currents through a simulated worn cell with the twin's noises, and its true parameters."""
-    model, tuning, rng = twin.model, twin.tuning, np.random.default_rng(number)
-    share = number / (N_CYCLES - 1)
-    true = {name: float(tuning.get(f"p.{name}") or 0.0) * (1 + share * (WORN[name] - 1)) for name in PARAMETERS}
-    p = tuning.p.copy()
-    for name, true_value in true.items():
-        p[[item.name for item in model.parameters].index(name)] = true_value
-    x, u = np.array([1.0, 0.0, 25.0]), np.array([item.default for item in model.inputs], float)
-    out, clock, scale = np.empty(3), int(log.t[0]), np.sqrt(tuning.q)
-    events = log.events
-    values = events.value.copy()
-    for time, kind, channel, value in zip(events.t.tolist(), events.kind, events.channel, values, strict=True):
-        while clock < time:
-            dt = min(model.max_step, (time - clock) * 1e-9)
-            model.f(x, u, p, dt, out)
-            x, clock = out + scale * np.sqrt(dt) * rng.normal(size=3), min(time, clock + round(dt * 1e9))
-        if kind == INPUT:
-            u = np.where(np.isfinite(value[: u.size]), value[: u.size], u)
-        elif kind == READING:
-            model.sensors[channel].h(x, u, p, value)
-            value[0] += np.sqrt(tuning.r[model.row_start[channel]]) * rng.normal()
-        else:
-            value[:] = np.nan
-            value[: x.size] = x
-    again = Log.of(model, capacity=log.n)
-    again.extend(Events(events.t, events.arrival, events.kind, events.channel, values))
-    return again, true
-
-
-def carried(twin: Twin, log: Log, before: Fold | None) -> Fold:
-    """Fold one cycle with a prior from the last estimate of the parameters."""
-    mean, cov = twin.model.prior_mean.copy(), np.diag(twin.model.prior_std**2)
-    if before is not None:
-        own = [twin.model.state_names.index(name) for name in PARAMETERS]
-        left, spread = before.moments()
-        mean[own], cov[np.ix_(own, own)] = left[own], spread[np.ix_(own, own)]
-    fold = Fold(twin.estimator, twin.model, twin.tuning, log, prior=(mean, cov))
-    fold.advance()
-    return fold
-
-
-def cycles(simulated: bool) -> Iterator[BenchmarkRow]:
-    """Return the parameters of every tenth discharge, and the scores of each way over all of them."""
-    found: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {HELD: [], JOINT: [], HALF: [], DUAL: []}
-    spent, inside = dict.fromkeys(found, 0.0), {name: [0, 0] for name in found}
-    left: dict[str, Fold] = {}
-    tuning: Tuning | None = None
-    for number in range(N_CYCLES):
-        single, log = one_cycle(number, ())
-        true = dict.fromkeys(PARAMETERS, np.nan)
-        if simulated:
-            log, true = worn(single, log, number)
-        outcome, took = timed(partial(folded, single, log, PARAMETERS))
-        spent[HELD] += took
-        found[HELD].append(errors(single, log, outcome.track, "soc", 0))
-        values = {}
-        for way, drift in ((JOINT, 1.0), (HALF, 0.5)):
-            together, _ = one_cycle(number, PARAMETERS, drift)
-            same = Log.of(together.model, capacity=log.n)
-            same.extend(log.events)
-            left[way], took = timed(partial(carried, together, same, left.get(way)))
-            spent[way] += took
-            values[way] = states_at_end(left[way], PARAMETERS)
-            found[way].append(errors(together, same, left[way].track, "soc", 0))
-        tuning = single.tuning if tuning is None else replace(tuning, model=single.model)
-        found_windows = windows(single, tuning, without_truth(log), PARAMETERS, 1e6, 1e6)
-        refit, took = timed(partial(next, found_windows))
-        spent[DUAL] += took
-        if refit.fitted is not None and refit.proposed:
-            tuning = refit.fitted.setting.tuning
-        lines = {name: line_of(refit.fitted, name) for name in PARAMETERS}
-        values[DUAL] = {
-            name: Interval(np.nan) if line is None or line.alone else Interval(line.after, line.low, line.high)
-            for name, line in lines.items()
-        }
-        found[DUAL].append(errors(single, log, refit.lived, "soc", 0))
-        for way, values_of in values.items():
-            for name, value in values_of.items():
-                inside[way][0] += bool(value.low <= true[name] <= value.high)
-                inside[way][1] += bool(np.isfinite(value.low))
-        if number % 10 == 9 or number == 0:
-            text = "; ".join(f"{name} joint {values[JOINT][name]}, dual {values[DUAL][name]}" for name in PARAMETERS)
-            text += "" if refit.proposed else ", not adopted"
-            figures = {f"true {name}": value for name, value in true.items()}
-            yield BenchmarkRow(
-                f"cycle {number + 1}", figures, remark=text + ("" if refit.proposed else ", not adopted")
-            )
-    for way, pairs in found.items():
-        error, std = (np.concatenate([pair[k] for pair in pairs]) for k in (0, 1))
-        held, count = inside[way]
-        remark = f"{held} of {count} intervals hold the true parameter" if count and simulated else ""
-        yield row(f"{way}, soc", error, std, spent[way], remark)
 
 
 def main() -> None:
     """Print the tables whose title has one of the words on the command line; all without any."""
     tables = [(f"{case.title}; {case.note}", partial(recording, case)) for case in CASES]
-    tables += [("cycles recorded", partial(cycles, False)), ("cycles simulated", partial(cycles, True))]
     sections = []
     for title, table in tables:
         if not sys.argv[1:] or any(word in title for word in sys.argv[1:]):

@@ -80,8 +80,9 @@ def test_constant_steps_dead_bands_and_lines_have_their_names():
             sent.append(value if abs(value - sent[-1]) >= 3.0 else sent[-1])
         assert found(np.array(sent)).kind == DEAD_BAND
         knots = walk(rng, 150, 0.2, 0.1)
-        line = found(np.round(np.interp(np.arange(1491) / 10.0, np.arange(150), knots), 4))
-        assert (line.kind, round(line.period, 6)) == (LINEAR, 10.0)
+        for decimals in (4, 1):
+            line = found(np.round(np.interp(np.arange(1491) / 10.0, np.arange(150), knots), decimals))
+            assert (line.kind, round(line.period, 6)) == (LINEAR, 10.0)
 
 
 def test_few_changes_are_undecided():
