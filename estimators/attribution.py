@@ -15,6 +15,7 @@ import numpy as np
 
 from .errors import EstimatorError
 from .log import INPUT, MAINTENANCE, MARK, READING, RESET, TICK, TRUTH
+from .numerics.linalg import wrapped
 
 if TYPE_CHECKING:
     from .fold import Fold
@@ -77,12 +78,9 @@ def attribution(fold: Fold, since: int, until: int) -> Attribution:
         raise EstimatorError(f"the span has {end - first:,} events; choose one with at most {MAX_EVENTS:,}")
     while fold.n < first and fold.advance(first - fold.n):
         pass
-    circular = model.circular[model.shown].astype(bool)
 
     def difference(new: np.ndarray, old: np.ndarray) -> np.ndarray:
-        change = new - old
-        change[circular] = np.remainder(change[circular] + np.pi, 2 * np.pi) - np.pi
-        return change
+        return wrapped(new - old, model.circular[model.shown])
 
     n, defaults = len(model.shown), model.default_inputs
     own, restarts = np.zeros(n), np.zeros(n)

@@ -22,6 +22,7 @@ from .errors import EstimatorError
 from .fold import Fold
 from .log import INPUT, Events, Log
 from .model.state_space import LARGE, StateSpaceModel
+from .numerics.linalg import wrapped
 from .snapshots import Base
 from .tuning import Tuning
 
@@ -166,9 +167,7 @@ def _future(model: StateSpaceModel, base: Base, instants: np.ndarray, inputs: Ev
 
 def _quantiles(points: np.ndarray, mean: np.ndarray, model: StateSpaceModel) -> np.ndarray:
     """Return quantiles (4, shown) of members (k, shown) at `SIGMAS`, about their mean (shown,); angles are wrapped."""
-    off = points - mean
-    turns = np.array([state.circular for state in model.shown_states], bool)
-    off[:, turns] = (off[:, turns] + np.pi) % (2.0 * np.pi) - np.pi
+    off = wrapped(points - mean, [state.circular for state in model.shown_states])
     found: np.ndarray = mean + np.quantile(off, ndtr(SIGMAS), axis=0)
     return found
 

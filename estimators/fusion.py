@@ -14,6 +14,7 @@ from typing import Any, Literal
 import numpy as np
 
 from .errors import EstimatorError, nearest
+from .numerics.linalg import wrapped
 
 BISECTIONS = 60
 """Halvings of the interval of the weight: to the last bit."""
@@ -165,23 +166,18 @@ def fuse(
             "equal time_ns, or give a larger `within`"
         )
     turning = np.array([name in circular for name in pairs])
-    difference = np.where(turning, _turn(x1 - x2), x1 - x2)
+    difference = wrapped(x1 - x2, turning)
     mean, cov, weight = covariance_intersection(np.stack((x2 + difference, x2)), np.stack((P1, P2)), minimise)
     return Fused(
         time_ns=max(a.time_ns, b.time_ns),
         states=tuple(pairs),
         units=tuple(a.unit(name) for name in pairs),
-        mean=np.where(turning, _turn(mean), mean),
+        mean=wrapped(mean, turning),
         cov=cov,
         weight=weight,
         difference=difference,
         bound=2.0 * (np.sqrt(np.diag(P1)) + np.sqrt(np.diag(P2))),
     )
-
-
-def _turn(angle: np.ndarray) -> np.ndarray:
-    """Return angles within ±π."""
-    return np.remainder(angle + np.pi, 2.0 * np.pi) - np.pi
 
 
 class _Message:

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from .events.batch import MARK, READING, TICK, Events
+from .numerics.linalg import wrapped
 
 if TYPE_CHECKING:
     from .fold import Fold
@@ -51,8 +52,7 @@ def moved_variance(fold: Fold, sensor: int, delay: float) -> np.ndarray:
     now = made.h_block(sensor, X, u, p)[0]
     circular = np.array([row.circular for row in model.sensors[sensor].rows])
     then = made.h_block(sensor, made.f_block(X, u, p, dt), u, p)[0]
-    shift = _apart(then, now, circular)
-    moved = (shift * (delay / dt)) ** 2
+    moved = (wrapped(then - now, circular) * (delay / dt)) ** 2
     if model.nx <= MAX_NOISE_STATES and made.box is None:
         Q = np.zeros((model.nx, model.nx))
         made.Q(X[0], u, p, np.asarray(fold.tuning.q, float), dt, Q)
@@ -100,9 +100,3 @@ def inflated(events: Events, fold: Fold, newest: int, horizon: int) -> tuple[Eve
         if not queries[i]:
             newest = max(newest, int(t[i]))
     return wide._replace(t=t, value=value), count
-
-
-def _apart(a: np.ndarray, b: np.ndarray, circular: np.ndarray) -> np.ndarray:
-    """Return a - b, wrapped to ±π for angles."""
-    apart = a - b
-    return np.where(circular, (apart + np.pi) % (2.0 * np.pi) - np.pi, apart)

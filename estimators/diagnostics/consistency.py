@@ -10,11 +10,11 @@ import numpy as np
 from ..errors import EstimatorError
 from ..events.batch import TRUTH, Events, truth_of
 from ..model.state_space import StateSpaceModel
+from ..numerics.linalg import wrapped
 from ..numerics.quantiles import chi_square_quantile
 from ..track import Track
 from .health import PROBABILITY
 from .intervals import scale_interval
-from .references import wrapped
 
 MIN_DECIMALS, MAX_DECIMALS = 2, 7  # decimals of a NIS per degree of freedom in words
 MAX_DECIMAL_NIS = 1e6  # NIS per degree of freedom from which on it is written with an exponent
@@ -172,9 +172,7 @@ def nees(
     for k, j in enumerate(chosen):
         told, values = truth_of(events, j)
         error[k, np.searchsorted(last, told)] = values  # of two values for one time the later counts
-        error[k] -= track.mean[last, column[j]]
-        if model.circular[j]:
-            error[k] = wrapped(error[k])
+        error[k] = wrapped(error[k] - track.mean[last, column[j]], model.circular[j])
     known = np.isfinite(error)
     dof = known.sum(axis=0)
     if not dof.any():

@@ -7,8 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..events.batch import READING, Events, truth_of
+from ..events.batch import Events, truth_of
 from ..model.state_space import Input, State, StateSpaceModel
+from ..numerics.linalg import wrapped
 from ..track import HEALTH_NAMES, HELD_OUT, WAITING, Track
 
 
@@ -37,24 +38,19 @@ class Reference(NamedTuple):
         return self._replace(rows=self.rows[kept], error=self.error[kept], std=self.std[kept])
 
 
-def wrapped(angle: np.ndarray) -> np.ndarray:
-    """Return angles within ±π."""
-    return (angle + np.pi) % (2.0 * np.pi) - np.pi
-
-
 def true_states(model: StateSpaceModel, events: Events, track: Track) -> Iterator[Reference]:
     """Yield the shown states with a known truth at the rows of a track."""
     for column, (j, state) in enumerate(zip(model.shown, model.shown_states, strict=True)):
         rows, true = truth_of(events, int(j))
         if rows.size:
-            error = true - track.mean[rows, column]
-            error = wrapped(error) if state.circular else error
+            error = wrapped(true - track.mean[rows, column], state.circular)
             yield Reference(state.name, state.unit, True, rows, error, track.std[rows, column])
 
 
 def held_out_references(model: StateSpaceModel, events: Events, track: Track, s: int) -> Iterator[Reference]:
     """Yield the rows of sensor s, where a fold held it out."""
-    own = np.flatnonzero((events.kind == READING) & (events.channel == s) & (track.verdict == HELD_OUT))
+    own = events.of_sensor(s)
+    own = own[track.verdict[own] == HELD_OUT]
     for k, row in enumerate(model.sensors[s].rows):
         name = model.row_names[model.row_start[s] + k]
         yield Reference(name, row.unit, False, own, track.innovation[own, k], track.innovation_std[own, k])

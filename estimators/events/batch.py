@@ -83,6 +83,10 @@ class Events(NamedTuple):
         """Return the events that a mask, slice or index array selects."""
         return Events(*(column[index] for column in self))
 
+    def of_sensor(self, sensor: int) -> np.ndarray:
+        """Return the indices of the measurements of a sensor."""
+        return np.flatnonzero((self.kind == READING) & (self.channel == sensor))
+
     def __len__(self) -> int:
         """Return the number of events (not of columns)."""
         return self.t.size

@@ -91,10 +91,10 @@ def without_stuck(estimator: str, tuning: Tuning, log: Log, base: Base | None = 
     `RUN_PROBABILITY`, and if the detector of the running twin (diagnostics/detector_tests.py) is in alarm in it: an
     asset at rest repeats itself, too. A sensor that never changes is left as it is: its R is not fitted in any case.
     """
-    model, kind = tuning.model, log.kind[: log.n]
+    model = tuning.model
     kept, counts, fold = np.ones(log.n, bool), {}, None
     for s, sensor in enumerate(model.sensors):
-        own = np.flatnonzero((kind == READING) & (log.channel[: log.n] == s))
+        own = log.events.of_sensor(s)
         first = model.row_start[s]
         rows = [
             repeated(log.value[own, k], math.sqrt(tuning.r[first + k]))

@@ -164,12 +164,13 @@ def swapped(fold: ReopeningFold, start: int, stop: int, sensor: int) -> str:
     """
     model, log = fold.model, fold.log
     track = fold.track.select(slice(start, stop))
-    kind, channel = log.kind[start:stop], log.channel[start:stop]
+    events = log.events.select(slice(start, stop))
 
     def series(s: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Return times, values, predictions and their variances of a sensor of which most measurements are rejected."""
         m = len(model.sensors[s].rows)
-        rows = np.flatnonzero((kind == READING) & (channel == s) & np.isin(track.verdict, (GATED, USED)))
+        rows = events.of_sensor(s)
+        rows = rows[np.isin(track.verdict[rows], (GATED, USED))]
         if rows.size < MIN_RUN or np.mean(track.verdict[rows] == GATED) <= 0.5:
             rows = rows[:0]
         y = log.value[start + rows, :m]
@@ -201,9 +202,8 @@ def _exchanged(one: tuple[np.ndarray, ...], other: tuple[np.ndarray, ...]) -> fl
 def _first_refused(fold: ReopeningFold, row: int, sensor: int, since: int) -> int:
     """Return the first rejected measurement of a sensor from row `since` on, within reach before `row`."""
     log, begin = fold.log, max(since, row - MAX_COMPARED_EVENTS, 0)
-    verdict, channel = fold.track.verdict[begin : row + 1], log.channel[begin : row + 1]
-    mine = (log.kind[begin : row + 1] == READING) & (channel == sensor) & np.isin(verdict, (GATED, USED))
-    return begin + int(np.flatnonzero(mine)[0])
+    mine = begin + log.events.select(slice(begin, row + 1)).of_sensor(sensor)
+    return int(mine[np.isin(fold.track.verdict[mine], (GATED, USED))][0])
 
 
 DECISION_NATS = float(np.log(1000.0))

@@ -33,7 +33,7 @@ from ..diagnostics.score import Score, score
 from ..errors import ConfigError, EstimatorError
 from ..fold import Fold
 from ..fold import fold as fold_track
-from ..log import READING, Events, Log
+from ..log import Events, Log
 from ..model.state_space import StateSpaceModel
 from ..registry import checked, find_estimator
 from ..smoothing.smooth import check_smooth, smooth
@@ -361,8 +361,7 @@ class Estimates:
             raise EstimatorError(
                 f"{self.model.name} has no sensor {sensor!r}; it has {', '.join(self.model.sensor_names)}"
             )
-        channel = self.model.sensor_names.index(sensor)
-        return np.flatnonzero((self.events.kind == READING) & (self.events.channel == channel))
+        return self.events.of_sensor(self.model.sensor_names.index(sensor))
 
     def table(self) -> Any:
         """Return a pyarrow.Table, one row per event, for `.to_pandas()`; `table_of` lists the columns."""

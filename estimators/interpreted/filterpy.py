@@ -33,8 +33,9 @@ from ..estimator import Estimator, Option
 from ..gaussian import kf, ukf
 from ..gaussian import shared as gaussian
 from ..gaussian.ukf import only_rounding
+from ..numerics.linalg import wrapped
 from ..track import FAILED, MISSING, USED
-from .view import View, wrapped
+from .view import View
 
 PROCESS, START, PERTURB = range(3)
 """Streams of randomness."""

@@ -20,6 +20,7 @@ from ..estimator import Code, Estimator, Options
 from ..gaussian.shared import admit
 from ..model.parts import covariance_of
 from ..model.state_space import StateSpaceModel
+from ..numerics.linalg import wrapped
 from ..track import FAILED
 from ..tuning import Tuning
 
@@ -152,14 +153,6 @@ class View:
             return FAILED
         U = np.zeros_like(S)
         return int(admit(self.context, sensor, nu.size, nu.copy(), np.ascontiguousarray(S), U, score))
-
-
-def wrapped(difference: np.ndarray, circular: np.ndarray) -> np.ndarray:
-    """Return differences (…, k) with those of angles wrapped to ±π."""
-    if not np.any(circular):
-        return difference
-    turned: np.ndarray = np.where(circular, (difference + np.pi) % (2.0 * np.pi) - np.pi, difference)
-    return turned
 
 
 def driven(entry: Estimator) -> Code:

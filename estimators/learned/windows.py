@@ -16,11 +16,11 @@ import numpy as np
 
 from ..compiled.context import steps_of
 from ..compiled.model import compile_model
-from ..diagnostics.references import wrapped
 from ..fold import Fold
 from ..log import INPUT, READING, RESET, Log, truth_of
 from ..model.hybrid import gathered, places
 from ..model.state_space import StateSpaceModel
+from ..numerics.linalg import wrapped
 from ..smoothing.smooth import smooth
 
 MIN_LENGTH_SHARE = 0.5  # Shortest window, as a share of the length; the inverse is the longest
@@ -155,8 +155,7 @@ def _rates(
                     f(x, u[i], p, dt / steps, out)
                     x[:] = out
                     x[target] += rates * dt / steps
-        off = known[-1][target] - x[target]
-        return np.where(turned, wrapped(off), off)
+        return wrapped(known[-1][target] - x[target], turned)
 
     off = missed(np.zeros(target.size))
     slopes = np.array([(off - missed(rates)) / rates[c] for c, rates in enumerate(np.diag(little))]).T

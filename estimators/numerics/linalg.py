@@ -7,6 +7,8 @@ reordering sums; so results are the same bits on every run.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from .jit import embedded, inlined, jit, part
@@ -278,6 +280,12 @@ def mirror(P):
     for i in range(P.shape[0]):
         for j in range(i):
             P[j, i] = P[i, j]
+
+
+def wrapped(angle: np.ndarray, circular: Any = True) -> np.ndarray:
+    """Return numbers of which those that are `circular` are brought to [-π, π)."""
+    with np.errstate(invalid="ignore"):  # of numbers that are not finite
+        return np.where(circular, (angle + np.pi) % (2.0 * np.pi) - np.pi, angle)
 
 
 @jit

@@ -15,6 +15,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from .linalg import wrapped
+
 MAX_DENSITY_POINTS = 400
 """Points of the kernel density; its cost grows with their square."""
 
@@ -164,7 +166,5 @@ def _peak(points: np.ndarray, circular: np.ndarray, weight: float) -> Peak:
     mean = points.mean(axis=0)
     for j in np.flatnonzero(circular):
         mean[j] = np.arctan2(np.sin(points[:, j]).mean(), np.cos(points[:, j]).mean())
-    deviations = points - mean
-    for j in np.flatnonzero(circular):
-        deviations[:, j] = (deviations[:, j] + np.pi) % (2.0 * np.pi) - np.pi
+    deviations = wrapped(points - mean, circular)
     return Peak(weight, mean, deviations.T @ deviations / len(points))

@@ -9,11 +9,11 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from ..diagnostics.references import wrapped
 from ..errors import EstimatorError
 from ..estimator import Estimator
 from ..fold import Fold
 from ..model.state_space import StateSpaceModel
+from ..numerics.linalg import wrapped
 from ..track import Track
 from .moments_back import MomentsBack
 from .recorder import CONSTANT, COVARIANCE, FACTOR, MEMBERS, POINTS, TANGENT, SmoothingRule
@@ -90,9 +90,7 @@ def consistency(track: Track, smoothed: Smoothed, model: StateSpaceModel) -> dic
     later measurements has the covariance that they remove, Cov(x - xˢ) = P - Pˢ, so the mean is 1. Far above 1 the
     filter is overconfident: f bends within the spread, or Q is too small; the smoother may be worse than the filter.
     """
-    moved = track.mean - smoothed.mean
-    circular = np.array([state.circular for state in model.shown_states], bool)
-    moved[:, circular] = wrapped(moved[:, circular])
+    moved = wrapped(track.mean - smoothed.mean, [state.circular for state in model.shown_states])
     before = track.std**2
     taken = before - smoothed.std**2
     informed = taken > MIN_REMOVED_SHARE * before

@@ -15,13 +15,13 @@ from __future__ import annotations
 import numpy as np
 
 from ..compiled.context import add_process_noise, steps_of, transition_points
-from ..diagnostics.references import wrapped
 from ..errors import EstimatorError
 from ..estimator import call_predict
 from ..fold import Fold
 from ..interpreted.fold_loop import MAX_PREDICT_STEPS, UNSET
 from ..log import INPUT, RESET
 from ..numerics.jit import jit
+from ..numerics.linalg import wrapped
 from ..particle.cloud import weights_of
 from ..snapshots import Snapshot
 from .walk import QUERIES, Smoothed, StateJump, Stretch
@@ -167,8 +167,7 @@ class TrajectoriesBack:
         log_det = np.linalg.slogdet(Qs)[1]
         found = np.empty((len(at), len(X)))
         for k, x in enumerate(at):
-            off = x - forward
-            off[:, self._circular] = wrapped(off[:, self._circular])
+            off = wrapped(x - forward, self._circular)
             found[k] = np.einsum("ni,nij,nj->n", off, np.broadcast_to(inverse, (len(X), *inverse.shape[1:])), off)
         return found + log_det
 
@@ -189,10 +188,8 @@ class TrajectoriesBack:
 
     def _tell(self, i: int, at: np.ndarray) -> None:
         """Fill a row."""
-        off = at - at[0]
-        off[:, self._circular] = wrapped(off[:, self._circular])
-        mean = at[0] + off.mean(axis=0)
-        mean[self._circular] = wrapped(mean[self._circular])
+        off = wrapped(at - at[0], self._circular)
+        mean = wrapped(at[0] + off.mean(axis=0), self._circular)
         cov = np.atleast_2d(np.cov(off.T))
         self._out.mean[i], self._out.std[i] = mean[self._shown], np.sqrt(np.diag(cov))[self._shown]
         first, second = self._fold.pairs.T

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ...fold import Fold
-from ...log import READING, RESET
+from ...log import RESET
 from ...model.state_space import StateSpaceModel
 from ...track import FAILED, GATED, USED
 from ..detector_state import gate_log_ratios, no_baseline, threshold_of
@@ -119,18 +119,18 @@ class RowSeries(NamedTuple):
 
 def _series(fold: Fold) -> Iterator[RowSeries]:
     """Yield the rows that have enough measurements for a baseline."""
-    model, log, track = fold.model, fold.log, fold.track
+    rows_of_fold, model, track = judged_rows(fold), fold.model, fold.track
     for s, sensor in enumerate(model.sensors):
-        rows = np.flatnonzero((log.kind[: fold.n] == READING) & (log.channel[: fold.n] == s))
+        rows = rows_of_fold.events.of_sensor(s)
         verdict = track.verdict[rows]
         judged = np.isin(verdict, (USED, GATED, FAILED))
         refused = np.where(judged, (verdict != USED).astype(np.int8), np.int8(-1))
         for k in range(len(sensor.rows)):
-            e = standardised(judged_rows(fold), rows, k)
+            e = standardised(rows_of_fold, rows, k)
             index = model.row_start[s] + k
             if np.isfinite(e).sum() >= MIN_MEASUREMENTS:
                 yield RowSeries(
-                    model, index, threshold_of(model, fold.evidence, s), e, refused, log.value[rows, k],
+                    model, index, threshold_of(model, fold.evidence, s), e, refused, rows_of_fold.events.value[rows, k],
                     track.innovation[rows, k], track.innovation_std[rows, k], float(fold.tuning.r[index]),
                     gate_log_ratios(fold.tuning.gate),
                 )  # fmt: skip

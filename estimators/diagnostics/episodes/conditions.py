@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from ...log import INPUT, READING
+from ...log import INPUT
 from ...model.state_space import Input, State
 from ...track import DIVERGED, GATED, HEALTH_NAMES, SCREENED, STALE, WAITING
 from ..detectors import (
@@ -28,7 +28,7 @@ CONTRADICTING = REFUSED | STUCK | SHIFTED_UP | SHIFTED_DOWN  # Alarms of a senso
 
 
 def _found(
-    kind: str, facts: TwinFacts, end: float | None, low: float, high: float, run: AlarmRun, t: np.ndarray
+    kind: str, facts: TwinFacts | SensorFacts, end: float | None, low: float, high: float, run: AlarmRun, t: np.ndarray
 ) -> FoundEpisode:
     """Return the episode of these facts; `t`: times of the rows to which the run belongs, ns."""
     row = detector_of(facts.cause)
@@ -47,8 +47,8 @@ def dropouts(judged: JudgedRows) -> Iterator[FoundEpisode]:
     own_bits = len(model.sensors) if len(model.sensors) <= SENSOR_FLAGS else SENSOR_FLAGS - 1
     shared = flags >> (SENSOR_FLAGS - 1) & 1 != 0
     last_sensor = len(model.sensors) if shared.any() else own_bits
-    for s, sensor in enumerate(model.sensors[:last_sensor]):
-        heard = np.flatnonzero((events.kind == READING) & (events.channel == s))
+    for s in range(last_sensor):
+        heard = events.of_sensor(s)
         earlier = 0 if judged.last_heard is None else int(judged.last_heard[s])
         for run in runs(flags >> s & 1 != 0 if s < own_bits else shared & _in_gap(t, heard)):
             before = heard[heard < run.begin]
@@ -59,10 +59,7 @@ def dropouts(judged: JudgedRows) -> Iterator[FoundEpisode]:
             facts = SensorFacts(
                 model=model, s=s, cause=cause, start=start, size=size, lasted=None if run.lasts else size
             )
-            row = detector_of(cause)
-            episode = Episode(start, over, sensor.name, cause, size, np.nan, np.nan, "s", row.text(facts), row.grade)
-            at, until = int(t[run.begin]), int(t[run.end - 1])
-            yield FoundEpisode(("silence", sensor.name), run.begin, at, until, episode)
+            yield _found("silence", facts, over, np.nan, np.nan, run, t)
 
 
 def _in_gap(t: np.ndarray, heard: np.ndarray) -> np.ndarray:
@@ -134,10 +131,10 @@ def impoverished_particles(judged: JudgedRows) -> Iterator[FoundEpisode]:
 
 def contradicting_sensors(judged: JudgedRows, end: int) -> tuple[str, ...]:
     """Return the used sensors whose last measurement before row `end` was rejected, shifted or repeated."""
-    channel, track = judged.events.channel, judged.track
+    events, track = judged.events.select(slice(0, end)), judged.track
     off = []
     for s, sensor in enumerate(judged.model.sensors):
-        rows = np.flatnonzero((judged.events.kind[:end] == READING) & (channel[:end] == s))
+        rows = events.of_sensor(s)
         if not rows.size or not judged.tuning.used[s]:
             continue
         last = rows[-1]

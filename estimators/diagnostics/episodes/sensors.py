@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ...gate.isolation import maintained
-from ...log import READING, RESET
+from ...log import RESET
 from ...track import GATED, REASONS, SCREENED, USED
 from ..detectors import (
     ADVISORY_ALARM,
@@ -74,7 +74,7 @@ def sensor_alarms(judged: JudgedRows) -> Iterator[FoundEpisode]:
     if not track.alarms.any():
         return
     for s, sensor in enumerate(model.sensors):
-        rows = np.flatnonzero((events.kind == READING) & (events.channel == s))
+        rows = events.of_sensor(s)
         alarms = track.alarms[rows, : len(sensor.rows)]
         masks = alarms & KNOWN_EFFECTS
         found = [

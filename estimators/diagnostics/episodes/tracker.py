@@ -82,7 +82,8 @@ class DroppedRows(NamedTuple):
         """Return the summary after further rows; `at`: time of the first alarm, ns."""
         events = judged.events
         s = judged.model.sensor_names.index(key[1])
-        rows = np.flatnonzero((events.kind == READING) & (events.channel == s) & (events.t * 1e-9 >= episode.start))
+        rows = events.of_sensor(s)
+        rows = rows[events.t[rows] * 1e-9 >= episode.start]
         alarms = np.flatnonzero((judged.track.alarms[rows] & ALARM_KEYS[key[0]] != 0).any(axis=1))
         quiet = rows.size - 1 - int(alarms[-1]) if alarms.size else self.quiet + int(np.sum(events.t[rows] > at))
         e, kind = _effect_series(judged, s, rows, episode)

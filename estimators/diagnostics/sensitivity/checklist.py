@@ -9,13 +9,13 @@ import numpy as np
 from ...fold import Fold
 from ...log import READING, Log
 from ...model.state_space import LARGE, StateSpaceModel
+from ...numerics.linalg import wrapped
 from ...registry import find_entry, unfit
 from ...track import GATED, USED, Track
 from ...tuning import Tuning
 from ..calibration import LIMITS, standardised
 from ..innovations import ljung_box
 from ..intervals import Interval, correlation_interval
-from ..references import wrapped
 from .responses import MAX_STATES, digits, each
 
 SPREAD_TOLERANCE = 0.1  # Relative Monte Carlo error of the standard deviations of an ensemble
@@ -100,13 +100,12 @@ class Arrivals(NamedTuple):
 
 def arrivals(model: StateSpaceModel, log: Log) -> tuple[Arrivals, ...]:
     """Return the arrivals of every sensor; n = 0 for sensors that never report."""
-    t, kind, channel = log.t[: log.n], log.kind[: log.n], log.channel[: log.n]
-    reading = kind == READING
+    t, reading = log.t[: log.n], log.kind[: log.n] == READING
     # Files hold times of measurement only, so arrival equals time there.
     known = bool(np.any(log.arrival[: log.n][reading] != t[reading]))
     found = []
     for s, sensor in enumerate(model.sensors):
-        own = np.flatnonzero(reading & (channel == s))
+        own = log.events.of_sensor(s)
         there = np.isfinite(log.value[own, : len(sensor.rows)]).any(axis=1)
         times = np.unique(t[own[there]])
         apart = np.diff(times) * 1e-9
@@ -218,9 +217,7 @@ def _curvature(name: str, apart: np.ndarray) -> Curvature:
 
 
 def _apart(one: np.ndarray, other: np.ndarray, std: np.ndarray, circular: bool) -> np.ndarray:
-    difference = one - other
-    if circular:
-        difference = wrapped(difference)
+    difference = wrapped(one - other, circular)
     with np.errstate(all="ignore"):
         share = np.abs(difference) / std
     lost = np.isfinite(other) & ~np.isfinite(one)
@@ -241,7 +238,7 @@ def _rows(straight: Fold, curved: Fold) -> tuple[tuple[Curvature, ...], tuple[Wh
     model, log = straight.model, straight.log
     found, whiteness = [], []
     for s, sensor in enumerate(model.sensors):
-        own = np.flatnonzero((log.kind[: log.n] == READING) & (log.channel[: log.n] == s))
+        own = log.events.of_sensor(s)
         if not own.size:
             continue
         one, other = straight.track.select(own), curved.track.select(own)

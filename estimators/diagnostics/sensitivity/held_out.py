@@ -116,9 +116,8 @@ def _score(fold: Fold) -> Score:
 def _predictions(fold: Fold, s: int, floor: dict[str, Fit]) -> list[HeldOutPrediction]:
     """Return the predictions of the rows of sensor s, which this fold holds out."""
     model, log = fold.model, fold.log
-    own = np.flatnonzero(
-        (log.kind[: log.n] == READING) & (log.channel[: log.n] == s) & (fold.track.verdict == HELD_OUT)
-    )
+    own = log.events.of_sensor(s)
+    own = own[fold.track.verdict[own] == HELD_OUT]
     events, track = log.events.select(own), fold.track.select(own)
     fits = score(track, events, model).held_out
     found = calibrations(model, events, track, marginal=fold.marginal)

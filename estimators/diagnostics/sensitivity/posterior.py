@@ -14,6 +14,7 @@ import numpy as np
 from ...fold import Fold
 from ...log import READING, Log
 from ...model.state_space import StateSpaceModel
+from ...numerics.linalg import wrapped
 from ...numerics.peaks import Peak
 from ...registry import find_entry, unfit
 from ...track import GATED, USED, Track
@@ -130,18 +131,13 @@ def _confirmed(found: list[Peak], points: np.ndarray, circular: np.ndarray) -> i
 
 def _apart(one: Peak, other: Peak, points: np.ndarray, circular: np.ndarray) -> bool:
     spread = np.sqrt(np.maximum(np.diag(one.cov), np.diag(other.cov)))
-    middle = one.mean + 0.5 * _less(other.mean, one.mean, circular)
+    middle = one.mean + 0.5 * wrapped(other.mean - one.mean, circular)
 
     def share(centre: np.ndarray) -> float:
-        return float(np.mean(np.all(np.abs(_less(points, centre, circular)) <= NEAR_SIGMA * spread, axis=1)))
+        return float(np.mean(np.all(np.abs(wrapped(points - centre, circular)) <= NEAR_SIGMA * spread, axis=1)))
 
     ends = min(share(one.mean), share(other.mean))
     return ends >= MIN_PEAK_WEIGHT and share(middle) < PEAK_DIP * ends
-
-
-def _less(one: np.ndarray, other: np.ndarray, circular: np.ndarray) -> np.ndarray:
-    """Return the difference, of angles by the shorter way."""
-    return np.where(circular, (one - other + np.pi) % (2.0 * np.pi) - np.pi, one - other)
 
 
 def tails(model: StateSpaceModel, log: Log, track: Track, *, marginal: bool) -> tuple[Tail, ...]:

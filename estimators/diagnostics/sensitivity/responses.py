@@ -15,11 +15,11 @@ from ...errors import digits as digits
 from ...fold import Fold
 from ...log import INPUT, READING, Log
 from ...model.state_space import StateSpaceModel
+from ...numerics.linalg import wrapped
 from ...registry import find_entry, find_estimator, unfit
 from ...snapshots import Base
 from ...track import DIVERGED, MISSING, NONE, USED, Track
 from ...tuning import Tuning
-from ..references import wrapped
 
 DETERMINISTIC_FILTERS = ("ekf", "ukf", "kf")
 """Deterministic filters that replace a Monte Carlo one, the first that applies."""
@@ -91,12 +91,11 @@ class Start(NamedTuple):
         if nudge.kind in (STUCK, INPUT_STUCK):
             of_input = nudge.kind == INPUT_STUCK
             k = (model.input_names if of_input else model.sensor_names).index(nudge.name)
-            what = INPUT if of_input else READING
-            own = np.flatnonzero((kind == what) & ((what == INPUT) | (other.channel[: other.n] == k)))
-            columns = [k] if what == INPUT else range(len(model.sensors[k].rows))
+            own = np.flatnonzero(kind == INPUT) if of_input else other.events.of_sensor(k)
+            columns = [k] if of_input else range(len(model.sensors[k].rows))
             for column in columns:
                 there = own[np.isfinite(value[own, column])]
-                value[there, column] = value[there[:1], column] if what == READING else self.base.u[column]
+                value[there, column] = self.base.u[column] if of_input else value[there[:1], column]
             return self.refold(log=other)
         if nudge.kind == SWAP:
             names = nudge.name.split(SWAPPED)
@@ -117,7 +116,7 @@ class Start(NamedTuple):
             return self.refold(log=other)
         row = model.row_names.index(nudge.name)
         sensor = int(np.searchsorted(model.row_start, row, side="right")) - 1
-        own = np.flatnonzero((kind == READING) & (other.channel[: other.n] == sensor))
+        own = other.events.of_sensor(sensor)
         column = row - model.row_start[sensor]
         if nudge.kind == SCALE:
             own, _, predicted = self._predicted(model.sensor_names[sensor])
@@ -138,7 +137,7 @@ class Start(NamedTuple):
         """
         model, log = self.tuning.model, self.log
         s = model.sensor_names.index(name)
-        own = np.flatnonzero((log.kind[: log.n] == READING) & (log.channel[: log.n] == s))
+        own = log.events.of_sensor(s)
         count = len(model.sensors[s].rows)
         own = own[np.isfinite(log.value[own, :count] - self.track.innovation[own, :count]).all(axis=1)]
         predicted = np.zeros((own.size, count))
@@ -155,20 +154,17 @@ class Start(NamedTuple):
         """Subtract a track from another, by default that of the fold without nudge; angles by the shorter way."""
         model, log, old = self.tuning.model, self.log, old or self.track
         innovation, states = new.innovation - old.innovation, new.mean - old.mean
-        reading, channel = log.kind[: log.n] == READING, log.channel[: log.n]
         whitened = new.whitened - old.whitened
         for s, sensor in enumerate(model.sensors):
-            own = reading & (channel == s)
+            own = log.events.of_sensor(s)
             for k, row in enumerate(sensor.rows):
-                if row.circular:
-                    innovation[own, k] = wrapped(innovation[own, k])
+                innovation[own, k] = wrapped(innovation[own, k], row.circular)
             # By the S of the fold without nudge, where its square root is known. A change of S also changes the
             # whitened innovations, by less than its effect on their distribution.
             if len(sensor.rows) == 1 or not np.isfinite(whitened[own]).any():
                 whitened[own] = innovation[own] / self.track.innovation_std[own]
         for j, state in enumerate(model.shown_states):
-            if state.circular:
-                states[:, j] = wrapped(states[:, j])
+            states[:, j] = wrapped(states[:, j], state.circular)
         return Response(innovation, whitened, states)
 
     def respond(self, nudge: Nudge) -> Response:
@@ -425,14 +421,14 @@ def nudges_of(
     found, others = [], []
     seconds = float(log.t[log.n - 1] - log.t[0]) * 1e-9 if log.n else 0.0
     units = [row.unit for sensor in model.sensors for row in sensor.rows]
-    kind, channel = log.kind[: log.n], log.channel[: log.n]
-    reporting = tuning.used & np.isin(np.arange(len(model.sensors)), channel[kind == READING])
+    kind = log.kind[: log.n]
+    reporting = tuning.used & np.isin(np.arange(len(model.sensors)), log.channel[: log.n][kind == READING])
     in_use = np.repeat(reporting, [len(sensor.rows) for sensor in model.sensors])
     for row, (name, unit, variance, used) in enumerate(zip(model.row_names, units, tuning.r, in_use, strict=True)):
         if used:
             scale = float(np.sqrt(variance)) or 1.0
             s = int(np.searchsorted(model.row_start, row, side="right")) - 1
-            values = log.value[: log.n][(kind == READING) & (channel == s), row - model.row_start[s]]
+            values = log.value[log.events.of_sensor(s), row - model.row_start[s]]
             values = values[np.isfinite(values)]
             extent = float(max(MAX_SCALE * np.abs(values).max(), np.ptp(values))) if values.size else 0.0
             most = max(MAX_OFFSET_SIGMAS * scale, extent)
@@ -461,7 +457,7 @@ def nudges_of(
             found.append(Nudge(PARAMETER, parameter.name, parameter.unit, STEP * scale, low, high, scale, value))
     sensors = [sensor for sensor, used in zip(model.sensors, reporting, strict=True) if used]
     for k, sensor in enumerate(sensors):
-        times = log.t[: log.n][(kind == READING) & (channel == model.sensor_names.index(sensor.name))]
+        times = log.t[log.events.of_sensor(model.sensor_names.index(sensor.name))]
         others.append(Nudge(STUCK, sensor.name, "", STEP, 0.0, 1.0, 1.0))
         period = float(np.median(np.diff(times))) * 1e-9 if times.size > 1 else 0.0
         most = min(max(MAX_DELAY_S, MAX_DELAY_PERIODS * period), MAX_DELAY_SHARE * seconds)

@@ -24,7 +24,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...log import READING, Log
+from ...log import Log
 from ...model.state_space import StateSpaceModel
 from ...numerics.jit import jit
 from ...numerics.quantiles import normal_quantile
@@ -125,13 +125,12 @@ def fault_tests(
     watch = detector_context(
         model, tuning.gate, False, no_baseline(model) if tuning.baseline is None else tuning.baseline
     )
-    t, kind, channel = log.t[: log.n], log.kind[: log.n], log.channel[: log.n]
     used = track.verdict == USED
     h, places, columns = [], [], []
     for s, sensor in enumerate(model.sensors):
-        own = np.flatnonzero((kind == READING) & (channel == s))
+        own = log.events.of_sensor(s)
         mine = own[used[own]]
-        period = float(t[own[-1]] - t[own[0]]) * 1e-9 / (own.size - 1) if own.size > 1 else every
+        period = float(log.t[own[-1]] - log.t[own[0]]) * 1e-9 / (own.size - 1) if own.size > 1 else every
         for k in range(len(sensor.rows)):
             h.append(threshold(every / max(period, 1e-3), watch["n_tests"]))
             places.append(mine)
