@@ -68,7 +68,7 @@ def attribution(fold: Fold, since: int, until: int) -> Attribution:
         EstimatorError: If there is no event between the two, or too many.
     """
     model, log = fold.model, fold.log
-    t = log.t[: log.n]
+    t = log.events.t
     first, end = (int(np.searchsorted(t, time, side="right")) for time in (since, until))
     if first == 0 and end:
         first = 1  # before the first event there is no estimate

@@ -170,16 +170,12 @@ class Estimator:
 
     def _number(self, option: Option, given: float | str) -> float:
         """Return the value of an option; for a word its position among the choices."""
-        if isinstance(given, str):
-            if given in option.choices:
-                return float(option.choices.index(given))
-            wanted = f"one of {', '.join(option.choices)}" if option.choices else "a number"
-            raise EstimatorError(f"estimator {self.name}: {option.name} is {quoted(given)}; it must be {wanted}")
         try:
-            return float(given)
+            return float(option.choices.index(given) if isinstance(given, str) else given)
         except (TypeError, ValueError):
             wanted = f"one of {', '.join(option.choices)}" if option.choices else "a number"
-            raise EstimatorError(f"estimator {self.name}: {option.name} is {given!r}; it must be {wanted}") from None
+            shown = quoted(given) if isinstance(given, str) else repr(given)
+            raise EstimatorError(f"estimator {self.name}: {option.name} is {shown}; it must be {wanted}") from None
 
     def complete_for(self, model: StateSpaceModel, options: Mapping[str, float | str]) -> dict[str, float]:
         """Return the given options and the defaults of the others, for a model.

@@ -83,8 +83,7 @@ class Fold:
         prior = None if prior is None else check_prior(prior, model, self.estimator)
         self.policy = policy or HealthPolicy()
         self.options = self.estimator.complete_for(model, tuning.options)
-        if tuning.gate is not None and tuning.gate_kind == "soft":
-            check_soft(self.estimator, self.options)
+        check_soft(tuning, self.estimator, self.options)
         self.n, self._checked = 0, -1
         self._check_log()
         self._machine = Machine(
@@ -295,8 +294,7 @@ class Fold:
 
     def go_on_with(self, story: Story) -> None:
         """Adopt the state at the end of a story."""
-        now, end = self._now, story.end
-        now.clock[:], now.u[:], now.state[:] = end.clock, end.u, end.state
+        self._now.put(story.end, 3)
         self._asked = -1
 
     def _run_events(self, start: int, stop: int, blanks: Sequence[Blank] = ()) -> int:

@@ -147,19 +147,14 @@ def _check_sizes(what: str, mean: np.ndarray, cov: np.ndarray, model: StateSpace
         raise EstimatorError(f"{what}: cov has shape {cov.shape}; for {model.name} it must be {wanted[0]}")
 
 
-def check_soft(entry: Estimator, options: Options) -> None:
+def check_soft(tuning: Tuning, entry: Estimator, options: Options) -> None:
     """Refuse a soft gate, which inflates R, for a filter with a fixed or adapted R.
 
     Raises:
         EstimatorError: With the remedy.
     """
-    if entry.fixed_r:
-        raise EstimatorError(f"estimator {entry.name}: a soft gate inflates R, but its gain is for one R; use kf")
-    if options.get("adapt") == ADAPT_R:
-        raise EstimatorError(
-            f"estimator {entry.name}: a soft gate inflates R, but adapt learns one R of each sensor; set adapt to off "
-            "or Q, or gate.kind to hard"
-        )
+    if tuning.gate is not None and tuning.gate_kind == "soft":
+        _check_other_r(entry, options, "a soft gate inflates R", ", or gate.kind to hard")
 
 
 def check_variances(entry: Estimator, options: Options) -> None:
@@ -168,12 +163,12 @@ def check_variances(entry: Estimator, options: Options) -> None:
     Raises:
         EstimatorError: With the remedy.
     """
+    _check_other_r(entry, options, "readings bring their own variance")
+
+
+def _check_other_r(entry: Estimator, options: Options, why: str, remedy: str = "") -> None:
     if entry.fixed_r:
-        raise EstimatorError(
-            f"estimator {entry.name}: readings bring their own variance, but its gain is for one R; use kf"
-        )
+        raise EstimatorError(f"estimator {entry.name}: {why}, but its gain is for one R; use kf")
     if options.get("adapt") == ADAPT_R:
-        raise EstimatorError(
-            f"estimator {entry.name}: readings bring their own variance, but adapt learns one R of each sensor; set "
-            "adapt to off or Q"
-        )
+        learns = "adapt learns one R of each sensor; set adapt to off or Q"
+        raise EstimatorError(f"estimator {entry.name}: {why}, but {learns}{remedy}")

@@ -106,7 +106,7 @@ def forecast(
     instants = now + np.rint(np.linspace(0.0, 1e9 * horizon, fine + 1)).astype(np.int64)
     fold = Fold(estimator, model, tuning, _future(model, base, instants, inputs), base=base)
     by_members = fold.estimator.blocks is not None and model.nx <= LARGE
-    rows = np.searchsorted(fold.log.t[: fold.log.n], instants, side="right")
+    rows = np.searchsorted(fold.log.events.t, instants, side="right")
     each = fine // times
     apart = np.unique(np.linspace(0, each, min(SAMPLES_PER_TIME, each) + 1).astype(int))[1:]
     watch = _Watch(model, limits or {}, columns)

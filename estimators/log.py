@@ -320,5 +320,5 @@ def sorted_order(events: Events) -> np.ndarray:
 
 def model_version_at(log: Log, t: int) -> int:
     """Return the version of the model at time t, ns."""
-    times = np.unique(log.t[: log.n][log.kind[: log.n] == MAINTENANCE])
+    times = np.unique(log.events.t[log.events.kind == MAINTENANCE])
     return log.version + int(np.searchsorted(times, t, side="right"))

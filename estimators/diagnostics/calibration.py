@@ -20,13 +20,13 @@ from __future__ import annotations
 from bisect import bisect_left, insort
 from collections import deque
 from collections.abc import Iterator, Sequence
-from itertools import islice
+from itertools import chain, islice
 from typing import NamedTuple
 
 import numpy as np
 from scipy.special import ndtr
 
-from ..events.batch import INPUT, READING, Events
+from ..events.batch import INPUT, Events
 from ..model.state_space import StateSpaceModel
 from ..numerics.quantiles import chi_square_quantile, normal_quantile
 from ..track import GATED, HELD_OUT, USED, Track
@@ -100,21 +100,13 @@ def calibrations(
         limits: Effect sizes to report.
     """
     found = []
-    judged = (track.verdict == USED) | (track.verdict == GATED)
     limit = chi_square_quantile(gate, np.arange(1, model.width + 1)) if gate is not None else None
-    for i, (sensor, start) in enumerate(zip(model.sensors, model.row_start, strict=True)):
-        own = (events.kind == READING) & (events.channel == i)
-        for k in range(len(sensor.rows)):
-            e = standardised(track, k, marginal)
-            there = own & np.isfinite(e)
-            rows = np.flatnonzero(there & judged)
-            if rows.size:
-                edge = np.full(rows.size, np.inf) if limit is None else np.sqrt(limit[track.dof[rows] - 1])
-                refused = (track.verdict[rows] == GATED).astype(bool)
-                found.append(_of_row(model.row_names[start + k], events.t[rows], e[rows], edge, refused, limits))
-            rows = np.flatnonzero(there & (track.verdict == HELD_OUT))
-            if rows.size:
-                found.append(_held_out(model.row_names[start + k], events.t[rows], e[rows], limits))
+    for name, role, rows, e in _sensor_rows(model, events, track, marginal):
+        if role == "used":
+            edge = np.full(rows.size, np.inf) if limit is None else np.sqrt(limit[track.dof[rows] - 1])
+            found.append(_of_row(name, events.t[rows], e, edge, track.verdict[rows] == GATED, limits))
+        else:
+            found.append(_held_out(name, events.t[rows], e, limits))
     return found
 
 
@@ -126,18 +118,12 @@ def truth_calibration(
     `ratio` is the state's NEES. Args: see `calibrations`.
     """
     found = []
-    for item in true_states(model, events, track):
-        with np.errstate(all="ignore"):
-            e = item.error / item.std
-        known = np.isfinite(e)
-        if (model.jump and item.name == model.jump.state) or not known.any():
-            continue
-        e, name = e[known], item.name
+    for name, role, rows, e in _true_states(model, events, track):
         coverage, verdicts = _coverage(e, limits)
         ratio, bias = scale_interval(e**2), mean_interval(e)
         said = truth_words(name, verdicts, bias, limits)
-        window = _window(events.t[item.rows[known]])
-        found.append(Calibration(name, "truth", *window, ratio, _root(ratio), bias, UNKNOWN, UNKNOWN, coverage, said))
+        window = _window(events.t[rows])
+        found.append(Calibration(name, role, *window, ratio, _root(ratio), bias, UNKNOWN, UNKNOWN, coverage, said))
     return found
 
 
@@ -343,7 +329,8 @@ def coverage_bins(
     points = {state.name: track.mean[before, k] for k, state in enumerate(model.shown_states[:MAX_OPERATING])}
     points |= {item.name: inputs[:, k] for k, item in enumerate(model.inputs[:MAX_OPERATING])}
     found: list[CoverageBin] = []
-    for subject, role, rows, e in islice(_subjects(model, events, track, marginal), MAX_SUBJECTS):
+    subjects = chain(_sensor_rows(model, events, track, marginal), _true_states(model, events, track))
+    for subject, role, rows, e in islice(subjects, MAX_SUBJECTS):
         step = -(-rows.size // most)
         rows, e = rows[::step], e[::step]
         seconds = events.t[rows] * 1e-9
@@ -364,18 +351,24 @@ def coverage_bins(
     return found
 
 
-def _subjects(
-    model: StateSpaceModel, events: Events, track: Track, marginal: bool
-) -> Iterator[tuple[str, str, np.ndarray, np.ndarray]]:
-    """Yield name, role, rows (m,) and e (m,) of each sensor row, used and held out, and of each true state."""
+Subject = tuple[str, str, np.ndarray, np.ndarray]
+"""Name, role, rows (m,) and e (m,) of what has a band."""
+
+
+def _sensor_rows(model: StateSpaceModel, events: Events, track: Track, marginal: bool) -> Iterator[Subject]:
+    """Yield each sensor row, used and held out."""
     for i, (sensor, start) in enumerate(zip(model.sensors, model.row_start, strict=True)):
-        own = (events.kind == READING) & (events.channel == i)
+        own = events.of_sensor(i)
         for k in range(len(sensor.rows)):
-            e = standardised(track, k, marginal)
+            e = standardised(track, k, marginal)[own]
             for role, verdicts in (("used", (USED, GATED)), ("held out", (HELD_OUT,))):
-                rows = np.flatnonzero(own & np.isfinite(e) & np.isin(track.verdict, verdicts))
-                if rows.size:
-                    yield model.row_names[start + k], role, rows, e[rows]
+                there = np.isfinite(e) & np.isin(track.verdict[own], verdicts)
+                if there.any():
+                    yield model.row_names[start + k], role, own[there], e[there]
+
+
+def _true_states(model: StateSpaceModel, events: Events, track: Track) -> Iterator[Subject]:
+    """Yield each state with a known truth, except a discrete mode."""
     for item in true_states(model, events, track):
         with np.errstate(all="ignore"):
             e = item.error / item.std

@@ -198,7 +198,7 @@ def sensors_in_turn(setting: Setting, recordings: list[Recording]) -> list[int]:
     found: set[int] = set()
     for record in recordings:
         log = record.log
-        found |= set(np.unique(log.channel[: log.n][log.kind[: log.n] == READING]).tolist())
+        found |= set(np.unique(log.events.channel[log.events.kind == READING]).tolist())
     sensors = sorted(int(s) for s in found if setting.tuning.used[s])
     return sensors if len(sensors) > 1 else []
 

@@ -99,7 +99,7 @@ def walk(
     for key in wanted:
         check_key(estimator, tuning, key)
     span, stride = round(window * 1e9), round(step * 1e9)
-    t = log.t[: log.n]
+    t = log.events.t
     fold, done = Fold(estimator, tuning.model, tuning, log), 0
     last = int(t[-1])
     end = int(t[0]) + span

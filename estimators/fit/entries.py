@@ -251,7 +251,7 @@ def _against(item: TuningEntry, tuning: Tuning, logs: Sequence[Log], references:
     own = np.unique(np.searchsorted(tuning.model.row_start, tuning.rows_of(item.key), side="right") - 1)
     if not tuning.used[own].any() and not references:
         return "belongs to a held-out sensor"
-    values = [log.value[: log.n][(log.kind[: log.n] == READING) & np.isin(log.channel[: log.n], own)] for log in logs]
+    values = [log.events.value[(log.events.kind == READING) & np.isin(log.events.channel, own)] for log in logs]
     if not any(len(item) for item in values):
         return "belongs to a sensor without readings here"
     if all(np.all((item == item[:1]) | np.isnan(item)) for item in values):

@@ -150,7 +150,7 @@ def fit(
         return go(done)
 
     for item in recordings:
-        if not np.any(item.log.kind[: item.log.n] == READING):
+        if not np.any(item.log.events.kind == READING):
             raise EstimatorError("a recording has no reading; there is nothing to fit to")
     references = aim == WITNESSES
     entries, skipped = entries_of(

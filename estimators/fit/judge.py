@@ -224,7 +224,7 @@ def _part(setting: Setting, folded: list[tuple[Recording, Track]], aim: Aim, hel
     for record, track in folded:
         log = record.log
         part = record.held_out == held_out
-        reading, truth = log.kind[: log.n] == READING, log.kind[: log.n] == TRUTH
+        reading, truth = log.events.kind == READING, log.events.kind == TRUTH
         terms.append(densities(track, gate)[part & reading])
         aimed.append(aim.fold_terms(log, track, setting)[part & (reading | truth)])
         used = part & (track.verdict == USED)
@@ -267,7 +267,7 @@ def _correlations(setting: Setting, folded: list[tuple[Recording, Track]], held_
             series = []
             for record, track in folded:
                 own = (track.verdict == USED) & (record.held_out == held_out)
-                own &= record.log.channel[: record.log.n] == s
+                own &= record.log.events.channel == s
                 e = track.innovation[own, k] / track.innovation_std[own, k]
                 e = e[np.isfinite(e)]
                 if e.size >= MIN_CORRELATED and np.ptp(e) > 0.0:

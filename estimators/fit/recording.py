@@ -50,7 +50,7 @@ def held_out_rows(log: Log, blocks: int = BLOCKS) -> np.ndarray:
 
     All blocks have the same number of readings, so that each carries about as much information.
     """
-    reading = log.kind[: log.n] == READING
+    reading = log.events.kind == READING
     count = int(reading.sum())
     if not blocks or count < blocks:
         return np.zeros(log.n, bool)
@@ -75,7 +75,7 @@ def without_queries(log: Log, *, truth: bool = False) -> Log:
 
     The first event always stays: the prior holds at its time.
     """
-    kept = np.isin(log.kind[: log.n], (READING, INPUT, RESET, MAINTENANCE, *((TRUTH,) if truth else ())))
+    kept = np.isin(log.events.kind, (READING, INPUT, RESET, MAINTENANCE, *((TRUTH,) if truth else ())))
     if not kept.any():
         return log
     kept[0] = True

@@ -355,7 +355,7 @@ def _residuals(setting: Setting, record: Recording, track: Track, aim: Aim) -> t
     model, log = setting.tuning.model, record.log
     errors, stds = [], []
     for s, sensor in enumerate(model.sensors):
-        own = (track.verdict == USED) & ~held & (log.channel[: log.n] == s)
+        own = (track.verdict == USED) & ~held & (log.events.channel == s)
         rows = slice(0, len(sensor.rows))
         errors.append(np.where(own[:, None], track.innovation[:, rows], np.nan))
         stds.append(track.innovation_std[:, rows])
@@ -387,7 +387,7 @@ def _ranges(record: Recording, track: Track, setting: Setting) -> dict[str, tupl
     held = record.held_out if record.held_out.size else np.zeros(record.log.n, bool)
     model, log = setting.tuning.model, record.log
     series = {state.name: track.mean[~held, k] for k, state in enumerate(model.shown_states)}
-    inputs = log.value[: log.n][(log.kind[: log.n] == INPUT) & ~held]
+    inputs = log.events.value[(log.events.kind == INPUT) & ~held]
     series |= {item.name: inputs[:, k] for k, item in enumerate(model.inputs)}
     finite = {name: column[np.isfinite(column)] for name, column in series.items()}
     return {name: (float(column.min()), float(column.max())) for name, column in finite.items() if column.size}

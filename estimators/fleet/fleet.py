@@ -147,8 +147,7 @@ class Fleet:
                 f"fleet: gate.reopen is {tuning.reopen:g} s, and recent is 0; decisions on a rejected sensor need "
                 "snapshots: make recent positive, or set gate.reopen to null"
             )
-        if tuning.gate is not None and tuning.gate_kind == "soft":
-            check_soft(self.estimator, options)
+        check_soft(tuning, self.estimator, options)
         pairs = check_pairs(None, self.model)
         return Machine(
             self.estimator, options, self.model, tuning, pairs, self.policy, prior=prior, expected=self._expected

@@ -45,8 +45,7 @@ class AssetFold:
 
     def go_on_with(self, story: Story) -> None:
         """See `Fold.go_on_with`."""
-        now, end = self._now, story.end
-        now.clock[:], now.u[:], now.state[:] = end.clock, end.u, end.state
+        self._now.put(story.end, 3)
 
 
 class _Sizes(NamedTuple):

@@ -113,7 +113,7 @@ def decide(fold: ReopeningFold, row: int, doubt: np.ndarray, reopen: float) -> t
     story = fold.second_story(start, row + 1, sensor, every=most)
     evidence = weigh(first, story.track, kind, channel, sensor, fold.gate_limits, every=most)
     never, asked = own[EVER] == 0.0, own[ASKED] != 0.0
-    changed_asset = maintained(log.kind[: log.n], start)
+    changed_asset = maintained(log.events.kind, start)
     outcome = decided(evidence, never or changed_asset, now >= begun + reopen * 1e9)
     own[ASKED] = 1.0
     changed = outcome in (REOPENED, BELIEVED)

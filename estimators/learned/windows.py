@@ -64,7 +64,7 @@ def known_states(fold: Fold, physics: StateSpaceModel) -> np.ndarray:
     """
     log = fold.log
     known = np.array(smooth(fold).mean[:, : physics.nx])
-    t = log.t[: log.n].astype(float)
+    t = log.events.t.astype(float)
     for j in range(physics.nx):
         rows, values = truth_of(log.events, j)
         if rows.size and not physics.circular[j]:
@@ -88,7 +88,7 @@ def windows(
         seconds: Length of a window.
         stretches: Number of stretches of time (`Windows.block`).
     """
-    t = log.t[: log.n]
+    t = log.events.t
     u = _inputs(physics, log)
     target, place = places(physics, corrects), places(physics, features)
     values = gathered(known, u, place)
@@ -121,7 +121,7 @@ def windows(
 def _inputs(model: StateSpaceModel, log: Log) -> np.ndarray:
     """Return the inputs that hold from each event on (events, nu)."""
     u = np.full((log.n, model.nu), np.nan)
-    given = log.kind[: log.n] == INPUT
+    given = log.events.kind == INPUT
     u[given] = log.value[: log.n, : model.nu][given]
     row = np.arange(log.n)
     for j, item in enumerate(model.inputs):

@@ -100,9 +100,9 @@ class Arrivals(NamedTuple):
 
 def arrivals(model: StateSpaceModel, log: Log) -> tuple[Arrivals, ...]:
     """Return the arrivals of every sensor; n = 0 for sensors that never report."""
-    t, reading = log.t[: log.n], log.kind[: log.n] == READING
+    t, reading = log.events.t, log.events.kind == READING
     # Files hold times of measurement only, so arrival equals time there.
-    known = bool(np.any(log.arrival[: log.n][reading] != t[reading]))
+    known = bool(np.any(log.events.arrival[reading] != t[reading]))
     found = []
     for s, sensor in enumerate(model.sensors):
         own = log.events.of_sensor(s)

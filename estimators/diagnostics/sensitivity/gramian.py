@@ -144,7 +144,7 @@ def gramian(
     if name != estimator:
         tuning = tuning.with_options({})
     fold = Fold(name, model, tuning, log, base=base)
-    t = log.t[: log.n]
+    t = log.events.t
     begin = max(0, log.n - (most or max_events(model, 2 * model.nx)))
     cuts = np.searchsorted(t, np.linspace(t[begin], t[-1], windows + 1)[1:-1])
     begins = [begin, *(int(k) for k in cuts)]

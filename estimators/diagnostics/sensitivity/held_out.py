@@ -86,7 +86,7 @@ def held_out(estimator: str, model: StateSpaceModel, tuning: Tuning, log: Log) -
         EstimatorError: As `Fold`.
         ModelError: As `Fold`.
     """
-    kind, channel = log.kind[: log.n], log.channel[: log.n]
+    kind, channel = log.events.kind, log.events.channel
     reporting = [int(s) for s in np.unique(channel[kind == READING])]
     none = tuning
     for name in model.sensor_names:

@@ -80,7 +80,7 @@ class Start(NamedTuple):
             mean[model.state_names.index(nudge.name)] += size
             return self.refold(base=self.base._replace(mean=mean, state=None))
         other = self.log.copy()
-        kind, value = other.kind[: other.n], other.value[: other.n]
+        kind, value = other.events.kind, other.events.value
         if nudge.kind in (INPUT_, INPUT_SCALE):
             k = model.input_names.index(nudge.name)
             factor, offset = (1.0 + size, 0.0) if nudge.kind == INPUT_SCALE else (1.0, size)
@@ -421,8 +421,8 @@ def nudges_of(
     found, others = [], []
     seconds = float(log.t[log.n - 1] - log.t[0]) * 1e-9 if log.n else 0.0
     units = [row.unit for sensor in model.sensors for row in sensor.rows]
-    kind = log.kind[: log.n]
-    reporting = tuning.used & np.isin(np.arange(len(model.sensors)), log.channel[: log.n][kind == READING])
+    kind = log.events.kind
+    reporting = tuning.used & np.isin(np.arange(len(model.sensors)), log.events.channel[kind == READING])
     in_use = np.repeat(reporting, [len(sensor.rows) for sensor in model.sensors])
     for row, (name, unit, variance, used) in enumerate(zip(model.row_names, units, tuning.r, in_use, strict=True)):
         if used:
@@ -440,7 +440,7 @@ def nudges_of(
             if seconds > 0.0:
                 rate = scale / seconds
                 others.append(Nudge(DRIFT, name, f"{unit}/s", STEP * rate, -np.inf, np.inf, rate))
-    given = log.value[: log.n][kind == INPUT]
+    given = log.events.value[kind == INPUT]
     for k, item in enumerate(model.inputs):
         values = given[np.isfinite(given[:, k]), k]
         values = values if values.size else np.array([item.default])
@@ -494,7 +494,7 @@ def reason_against(model: StateSpaceModel, log: Log) -> str:
     """Return why sensitivities are not computed, or ""."""
     if model.grid is not None or model.nx > MAX_STATES:
         return f"{model.name} has {model.nx:,} states; sensitivities are computed up to {MAX_STATES}"
-    if not (log.kind[: log.n] == READING).any():
+    if not (log.events.kind == READING).any():
         return "the log has no measurement"
     return ""
 

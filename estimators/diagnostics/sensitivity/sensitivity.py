@@ -224,7 +224,7 @@ def sensitivity(
         reason="",
         note="; ".join(filter(None, notes)),
         first=begun.first,
-        t=begun.log.t[: begun.log.n].copy(),
+        t=begun.log.events.t.copy(),
         std=track.std.copy(),
         faults=tuple(faults),
         fisher=information([fault.response.whitened[used] for fault in faults[:constant]]),
@@ -271,7 +271,7 @@ def sensitivities(
     third = max(1, min(window, log.n // 3))
     earlier = log.copy()
     earlier.n = log.n - third
-    late = [one for one in (log, earlier) if np.any(one.kind[: one.n] == READING)]
+    late = [one for one in (log, earlier) if np.any(one.events.kind == READING)]
     return of(PRIOR, window), *(of(NOW, third, one) for one in late)
 
 
@@ -327,11 +327,11 @@ def _alarmed(begun: Start, track: Track) -> bool:
     alarm has an exponential tail. Where health reports something without the fault, too, nobody sees the change.
     """
     log, calm = begun.log, begun.track
-    sensor = np.where(log.kind[: log.n] == READING, log.channel[: log.n], -1)
+    sensor = np.where(log.events.kind == READING, log.events.channel, -1)
     raised = np.zeros_like(calm.alarms)
     for s in np.unique(sensor):
         raised[sensor == s] = np.bitwise_or.reduce(calm.alarms[sensor == s], axis=0)
-    soon = log.t[: log.n] <= log.t[0] + DETECTION_SHARE * (log.t[log.n - 1] - log.t[0])
+    soon = log.events.t <= log.t[0] + DETECTION_SHARE * (log.t[log.n - 1] - log.t[0])
     new = np.any(track.alarms & ~raised, axis=1) | ((track.flags != 0) & (calm.flags == 0))
     seen = (calm.health == TRACKING) & (track.health != TRACKING)
     return bool(np.any(new & soon & seen))

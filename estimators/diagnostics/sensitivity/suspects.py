@@ -107,7 +107,7 @@ def suspects(
         Every sensor row, input and parameter by log Λ; none where nudges do not apply (see `sensitivity`), or where a
         filter that would stand in was lost before that time.
     """
-    first = int(np.searchsorted(log.t[: log.n], round(since * 1e9)))
+    first = int(np.searchsorted(log.events.t, round(since * 1e9)))
     cut = log.copy()
     cut.n = min(log.n, first + MAX_EVENTS)
     if first >= cut.n or reason_against(model, cut):
