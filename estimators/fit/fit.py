@@ -268,9 +268,8 @@ def _resettable(
     loose = np.flatnonzero(~identified)
     if not loose.size:
         return []
-    low, high = np.array(objective.limits).T
     # All others follow along the parabola; the terms there give an upper bound of the cost.
-    points = [np.clip(x + (objective.start[i] - x[i]) * shape.lines[i], low, high) for i in loose]
+    points = [objective.within(x + (objective.start[i] - x[i]) * shape.lines[i]) for i in loose]
     found = objective.all_terms(points)
     costs = [value - terms.sum() + objective.penalty(p) for p, terms in zip(points, found, strict=True)]
     return [int(i) for i, cost in zip(loose, costs, strict=True) if cost <= MAX_COST * shape.widened[i] ** 2]
@@ -291,13 +290,10 @@ def _lines(
     if chosen.power < 1.0:
         # Of the tempered likelihood, which discounts correlated errors.
         deviation = np.sqrt(np.diag(chosen.cov))
-        low, high = np.array(kept.limits).T[:, :, None]
-        ends = np.clip(np.stack([chosen.x - Z * deviation, chosen.x + Z * deviation], axis=1), low, high)
     elif x.size and not kept.progress.stop:
         ends, profiled = intervals(kept, x, value, shape)
-    elif x.size:
-        low, high = np.array(kept.limits).T[:, :, None]
-        ends = np.clip(np.stack([x - Z * deviation, x + Z * deviation], axis=1), low, high)
+    if x.size and not ends.size:
+        ends = np.stack([kept.within(chosen.x + side * Z * deviation) for side in (-1.0, 1.0)], axis=1)
     place = {item.key: i for i, item in enumerate(kept.entries)} if x.size else {}
     # To first order, from the maximum of the likelihood on the parabola.
     pulls = -shape.cov @ (kept.precision * (chosen.x - kept.start)) if x.size and kept.penalised else np.zeros(x.size)

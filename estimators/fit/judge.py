@@ -441,8 +441,7 @@ def at_power(
     H = np.linalg.inv(shape.cov)
     start = objective.start
     cov = np.linalg.inv(power * H + (1.0 - power) * np.diag(objective.precision))
-    low, high = np.array(objective.limits).T
-    return np.clip(start + cov @ (power * H @ (x - start)), low, high), cov
+    return objective.within(start + cov @ (power * H @ (x - start))), cov
 
 
 def _largest_harmless(others: Sequence[Worth], gains: Sequence[float], harmless: Callable[[int], bool]) -> int:

@@ -178,9 +178,18 @@ class Objective:
         return np.array([item.inward(item.start) for item in self.entries])
 
     @property
-    def limits(self) -> list[tuple[float, float]]:
-        """Range of every entry, on its scale."""
-        return [(item.inward(item.low), item.inward(item.high)) for item in self.entries]
+    def limits(self) -> np.ndarray:
+        """Ends of the range of every entry, on its scale, (2, k)."""
+        return np.array([(item.inward(item.low), item.inward(item.high)) for item in self.entries]).reshape(-1, 2).T
+
+    @property
+    def unit(self) -> np.ndarray:
+        """Natural step of every entry, on its scale, (k,)."""
+        return np.array([1.0 if item.log else item.deviation for item in self.entries])
+
+    def within(self, x: np.ndarray) -> np.ndarray:
+        """Return a point (k,), or the nearest in the ranges."""
+        return np.clip(x, *self.limits)
 
     @property
     def precision(self) -> np.ndarray:
@@ -245,10 +254,8 @@ class Objective:
         known = self.recent.get(x.tobytes())
         if known is not None:
             return known
-        steps = np.array([STEP * (1.0 if item.log else item.deviation) for item in self.entries])
-        for k, (_, high) in enumerate(self.limits):
-            if x[k] + steps[k] > high:
-                steps[k] = -steps[k]
+        steps = STEP * self.unit
+        steps[x + steps > self.limits[1]] *= -1.0
         points = [x + step * unit for step, unit in zip(steps, np.eye(x.size), strict=True)]
         if here is None:
             here, *moved = self.all_terms([x, *points])
@@ -312,7 +319,7 @@ def scaled_rounds(objective: Objective, x: np.ndarray, *, rounds: int = MAX_ROUN
     """Return the same by rounds of L-BFGS-B, each with deviations by the scores as units."""
     from scipy.optimize import minimize  # 15 MB, imported with the first fit
 
-    low, high = np.array(objective.limits).T
+    low, high = objective.limits
     value, best = -np.inf, _BestPoint(objective, x)
     progress, folds = objective.progress, (ROUND_STEPS + 1) * (x.size + 1) * objective.folds
     for _ in range(rounds):
@@ -321,7 +328,7 @@ def scaled_rounds(objective: Objective, x: np.ndarray, *, rounds: int = MAX_ROUN
         unit = 1.0 / np.sqrt(np.sum(slopes**2, axis=1) + objective.precision)
 
         def loss(z: np.ndarray, x: np.ndarray = x, unit: np.ndarray = unit) -> tuple[float, np.ndarray]:
-            point = np.clip(x + unit * z, low, high)
+            point = objective.within(x + unit * z)
             found, gradient = objective.gradient(point)
             best.add(point, found)
             return -found, -gradient * unit
@@ -338,7 +345,7 @@ def scaled_rounds(objective: Objective, x: np.ndarray, *, rounds: int = MAX_ROUN
         except _StopSearch:
             break
         gained, value = -found.fun - value, float(-found.fun)
-        x = np.clip(x + unit * found.x, low, high)
+        x = objective.within(x + unit * found.x)
         if gained < RESOLUTION or found.status == 0:
             break
     return best.x, best.value
@@ -354,8 +361,7 @@ def quasi_newton(
     fresh = H is None  # whether the curvature is that of the scores here
     if H is None:
         H = _outer(objective, scores)
-    unit = np.array([1.0 if item.log else item.deviation for item in objective.entries])
-    low, high = np.array(objective.limits).T
+    unit, (low, high) = objective.unit, objective.limits
     ended, scale = 0, 1.0
     for _ in range(steps):
         if objective.progress.stop:
@@ -408,8 +414,7 @@ class _Tried(NamedTuple):
 
 def _along(objective: Objective, x: np.ndarray, step: np.ndarray, shares: Sequence[float]) -> list[_Tried]:
     """Return the objective at shares of a step (k,), within the ranges."""
-    low, high = np.array(objective.limits).T
-    points = [np.clip(x + share * step, low, high) for share in shares]
+    points = [objective.within(x + share * step) for share in shares]
     terms = objective.all_terms(points)
     return [_Tried(at, own, float(own.sum()) - objective.penalty(at)) for at, own in zip(points, terms, strict=True)]
 
@@ -424,8 +429,7 @@ def polished(objective: Objective, x: np.ndarray, cov: np.ndarray) -> np.ndarray
         x: Start (k,).
         cov: Inverse of the curvature there, (k, k).
     """
-    low, high = np.array(objective.limits).T
-    unit = np.array([STEP * (1.0 if item.log else item.deviation) for item in objective.entries])
+    unit, (low, high) = STEP * objective.unit, objective.limits
     H, deviation, value = np.linalg.inv(cov), np.sqrt(np.diag(cov)), objective.value(x)
     before: tuple[np.ndarray, np.ndarray] | None = None
     for _ in range(POLISH_STEPS):
@@ -439,7 +443,7 @@ def polished(objective: Objective, x: np.ndarray, cov: np.ndarray) -> np.ndarray
         if before is not None:
             H = _updated(H, x - before[0], before[1] - slope)
         step = _step(H, slope, low - x, high - x)
-        ahead = np.clip(x + step, low, high)
+        ahead = objective.within(x + step)
         reached = objective.value(ahead)
         if reached < value:
             break
@@ -490,12 +494,11 @@ def search(objective: Objective, x: np.ndarray) -> tuple[np.ndarray, float]:
     """Return the same without derivatives, for a filter that draws; the first step is one logarithm or deviation."""
     from scipy.optimize import minimize  # 15 MB, imported with the first fit
 
-    low, high = np.array(objective.limits).T
-    unit = np.array([1.0 if item.log else item.deviation for item in objective.entries])
+    unit, (low, high) = objective.unit, objective.limits
     best = _BestPoint(objective, x)
 
     def loss(z: np.ndarray) -> float:
-        point = np.clip(x + unit * z, low, high)
+        point = objective.within(x + unit * z)
         value = objective.value(point)
         best.add(point, value)
         return -value

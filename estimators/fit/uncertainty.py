@@ -120,7 +120,7 @@ def curvature(objective: Objective, x: np.ndarray, known: np.ndarray | None = No
     if objective.progress.stop:
         rough: np.ndarray = np.linalg.inv(outer)
         return LikelihoodCurvature(rough, _widened(rough, scores, precision))
-    low, high = np.array(objective.limits).T
+    low, high = objective.limits
     # The points stay within the range: at its edge they are about a point inside.
     steps = np.minimum(1.0 / np.sqrt(np.diag(outer)), (high - low) / 4.0)
     centre = np.clip(x, low + steps, high - steps)
@@ -193,11 +193,11 @@ def intervals(
         value: Its value there.
         shape: Its curvature there.
     """
-    low, high = np.array(objective.limits).T
+    low, high = objective.limits
     deviation = shape.deviation
     found = np.stack([x - Z * deviation, x + Z * deviation], axis=1)
     ends = [(i, side) for i in range(x.size) for side in (0, 1)]
-    points = [np.clip(x + (found[i, side] - x[i]) * shape.lines[i], low, high) for i, side in ends]
+    points = [objective.within(x + (found[i, side] - x[i]) * shape.lines[i]) for i, side in ends]
     dropped = [value - terms.sum() + objective.penalty(p) for p, terms in zip(points, objective.all_terms(points))]
     profiled = np.zeros(x.size, bool)
     loose = deviation > MIN_LOOSENESS * np.array([item.deviation for item in objective.entries])
@@ -219,7 +219,7 @@ def _profile_end(
     objective: Objective, x: np.ndarray, value: float, shape: LikelihoodCurvature, H: np.ndarray, i: int, t: float
 ) -> float:
     """Return where the profile of entry i has dropped, on the side of t."""
-    low, high = objective.limits[i]
+    low, high = objective.limits[:, i]
     t = float(np.clip(t, low, high))
     before, root_before = float(x[i]), 0.0
     for _ in range(MAX_SECANTS):
@@ -239,7 +239,7 @@ def _profile_end(
 
 def _profile(objective: Objective, x: np.ndarray, H: np.ndarray, i: int, t: float) -> float:
     """Return the maximum with entry i at t."""
-    low, high = np.delete(np.array(objective.limits), i, axis=0).T
+    low, high = np.delete(objective.limits, i, axis=1)
     others = np.delete(np.arange(x.size), i)
     rest = objective.pinned([i], np.where(np.arange(x.size) == i, t, x))
     penalty = 0.5 * float(objective.precision[i] * (t - objective.start[i]) ** 2)
