@@ -37,7 +37,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from functools import lru_cache
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -178,7 +178,7 @@ def joint(
         for item in model.parameters
     )
     low, high = (tuple(float(getattr(item, end)) for item in model.parameters) for end in ("low", "high"))
-    layout = (model.nx, place, low, high, _distances(model, widened, estimated))
+    layout = JointLayout(model.nx, place, low, high, _distances(model, widened, estimated))
     noises = tuple(Noise(item.name, f"{squared(item.unit)}/s", estimated[item.name].drift ** 2) for item in moved)
     beyond = {name for item in widened for name in estimated[item.name].widened}
     found = replace(
@@ -192,14 +192,14 @@ def joint(
         ),
         parameters=tuple(kept),
         noises=(*model.noises, *noises),
-        f=_step(model.f, *layout),
-        F=_slopes(model.f, *layout),
-        Q=None if model.Q is None else _noise(model.Q, len(model.noises), len(moved), *layout),
+        f=_step(model.f, layout),
+        F=_slopes(model.f, layout, model.nx),
+        Q=None if model.Q is None else _noise(model.Q, len(model.noises), len(moved), layout),
         sensors=tuple(
-            replace(sensor, h=_sensor(sensor.h, *layout), H=_sensor_slopes(sensor.h, len(sensor.rows), *layout))
+            replace(sensor, h=_sensor(sensor.h, layout), H=_sensor_slopes(sensor.h, len(sensor.rows), layout))
             for sensor in model.sensors
         ),
-        jump=None if model.jump is None else replace(model.jump, chances=_chances(model.jump.chances, *layout)),
+        jump=None if model.jump is None else replace(model.jump, chances=_chances(model.jump.chances, layout)),
         linear=False,
         considered=len(considered) + len(widened),
     )
@@ -246,6 +246,21 @@ def outside(parameter: str) -> str:
 Distances = tuple[tuple[int, int, float, float, float], ...]
 """Parameter, place of a state or input (index in x, or -1 less that in u), low and high end of its range, and the
 standard deviation that a unit of distance adds."""
+
+
+class JointLayout(NamedTuple):
+    """States n of the model within; of each of its parameters the places in θ and δ, p and η, and its range."""
+
+    n: int
+    place: tuple[tuple[int, int, int], ...]
+    low: tuple[float, ...]
+    high: tuple[float, ...]
+    distances: Distances
+
+    def tables(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the layout as arrays, which compiled code reads faster than tuples."""
+        ends = np.array([self.low, self.high], float).T.copy()
+        return np.array(self.place, np.int64), ends, np.array(self.distances, float).reshape(-1, 5)
 
 
 def _distances(model: StateSpaceModel, widened: Sequence[Parameter], given: Mapping[str, JointParameter]) -> Distances:
@@ -346,19 +361,12 @@ def _free(x, u, p, n, k, place, ends, distances):
     return STEP if ends[k, 0] <= value <= ends[k, 1] else 0.0
 
 
-def _tables(place: Any, low: Any, high: Any, distances: Distances) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the layout as arrays, which compiled code reads faster than tuples."""
-    return np.array(place, np.int64), np.array([low, high], float).T.copy(), np.array(distances, float).reshape(-1, 5)
-
-
 @lru_cache(maxsize=64)
-def _step(function: Callable, n: int, place: Any, low: Any, high: Any, distances: Distances) -> Callable:
-    inner, (at, ends, reach) = as_inner(function), _tables(place, low, high, distances)
+def _step(function: Callable, layout: JointLayout) -> Callable:
+    inner, n = as_inner(_chances(function, layout)), layout.n
 
     def f(x, u, p, dt, out):  # noqa: ANN001, ANN202
-        full = stack_vector(x[0], place)
-        _fill(full, x, u, p, n, at, ends, reach)
-        inner(x[:n], u, full, dt, out[:n])
+        inner(x, u, p, dt, out[:n])
         for j in range(n, x.size):
             out[j] = x[j]
 
@@ -370,37 +378,37 @@ STEP = 1e-20
 
 
 @lru_cache(maxsize=64)
-def _slopes(function: Callable, n: int, place: Any, low: Any, high: Any, distances: Distances) -> Callable:
-    """Return df/d(x, θ, δ, η) by complex step; the parameters are filled once for all columns."""
-    inner, states = as_inner(function), (0,) * n
-    at, ends, reach = _tables(place, low, high, distances)
+def _slopes(function: Callable, layout: JointLayout, rows: int) -> Callable:
+    """Return d(f or h)/d(x, θ, δ, η) by complex step; the parameters are filled once for all columns."""
+    inner, n, place = as_inner(function), layout.n, layout.place
+    states, images, (at, ends, reach) = (0,) * n, (0,) * rows, layout.tables()
 
     def F(x, u, p, dt, out):  # noqa: ANN001, ANN202
-        z, forward, full = stack_vector(1j, states), stack_vector(1j, states), stack_vector(1j, place)
+        z, image, full = stack_vector(1j, states), stack_vector(1j, images), stack_vector(1j, place)
         for j in range(n):
             z[j] = x[j]
         _fill(full, x, u, p, n, at, ends, reach)
         for j in range(n):
             z[j] = complex(x[j], STEP)
-            inner(z, u, full, dt, forward)
+            inner(z, u, full, dt, image)
             z[j] = x[j]
-            for i in range(n):
-                out[i, j] = forward[i].imag / STEP
+            for i in range(rows):
+                out[i, j] = image[i].imag / STEP
         for k in range(at.shape[0]):
             j, outside = at[k, 0], at[k, 2]
             if j < 0 and outside < 0:
                 continue
             full[k] = complex(full[k].real, _free(x, u, p, n, k, at, ends, reach))
-            inner(z, u, full, dt, forward)
+            inner(z, u, full, dt, image)
             full[k] = full[k].real
             width = _width(k, x, u, reach) if outside >= 0 else 0.0
-            for i in range(n):
-                slope = forward[i].imag / STEP
+            for i in range(rows):
+                slope = image[i].imag / STEP
                 if j >= 0:
                     out[i, n + j] = slope
                 if outside >= 0:
                     out[i, n + outside] = width * slope
-        for i in range(n, x.size):
+        for i in range(rows, out.shape[0]):
             for j in range(x.size):
                 out[i, j] = 1.0 if i == j else 0.0
 
@@ -408,45 +416,24 @@ def _slopes(function: Callable, n: int, place: Any, low: Any, high: Any, distanc
 
 
 @lru_cache(maxsize=256)
-def _sensor_slopes(
-    function: Callable, rows: int, n: int, place: Any, low: Any, high: Any, distances: Distances
-) -> Callable:
-    """Return dh/d(x, θ, δ, η) by complex step; the parameters are filled once for all columns."""
-    inner, states, measured = as_inner(function), (0,) * n, (0,) * rows
-    at, ends, reach = _tables(place, low, high, distances)
+def _sensor_slopes(function: Callable, rows: int, layout: JointLayout) -> Callable:
+    """Return dh/d(x, θ, δ, η)."""
+    h = as_inner(function)
+
+    def timed(x, u, p, dt, out):  # noqa: ANN001, ANN202
+        h(x, u, p, out)
+
+    slopes = as_inner(_slopes(timed, layout, rows))
 
     def H(x, u, p, out):  # noqa: ANN001, ANN202
-        z, expected, full = stack_vector(1j, states), stack_vector(1j, measured), stack_vector(1j, place)
-        for j in range(n):
-            z[j] = x[j]
-        _fill(full, x, u, p, n, at, ends, reach)
-        for j in range(n):
-            z[j] = complex(x[j], STEP)
-            inner(z, u, full, expected)
-            z[j] = x[j]
-            for i in range(rows):
-                out[i, j] = expected[i].imag / STEP
-        for k in range(at.shape[0]):
-            j, outside = at[k, 0], at[k, 2]
-            if j < 0 and outside < 0:
-                continue
-            full[k] = complex(full[k].real, _free(x, u, p, n, k, at, ends, reach))
-            inner(z, u, full, expected)
-            full[k] = full[k].real
-            width = _width(k, x, u, reach) if outside >= 0 else 0.0
-            for i in range(rows):
-                slope = expected[i].imag / STEP
-                if j >= 0:
-                    out[i, n + j] = slope
-                if outside >= 0:
-                    out[i, n + outside] = width * slope
+        slopes(x, u, p, 0.0, out)
 
     return derived(H)
 
 
 @lru_cache(maxsize=64)
-def _chances(function: Callable, n: int, place: Any, low: Any, high: Any, distances: Distances) -> Callable:
-    inner, (at, ends, reach) = as_inner(function), _tables(place, low, high, distances)
+def _chances(function: Callable, layout: JointLayout) -> Callable:
+    inner, n, place, (at, ends, reach) = as_inner(function), layout.n, layout.place, layout.tables()
 
     def chances(x, u, p, dt, out):  # noqa: ANN001, ANN202
         full = stack_vector(x[0], place)
@@ -457,8 +444,8 @@ def _chances(function: Callable, n: int, place: Any, low: Any, high: Any, distan
 
 
 @lru_cache(maxsize=256)
-def _sensor(function: Callable, n: int, place: Any, low: Any, high: Any, distances: Distances) -> Callable:
-    inner, (at, ends, reach) = as_inner(function), _tables(place, low, high, distances)
+def _sensor(function: Callable, layout: JointLayout) -> Callable:
+    inner, n, place, (at, ends, reach) = as_inner(function), layout.n, layout.place, layout.tables()
 
     def h(x, u, p, out):  # noqa: ANN001, ANN202
         full = stack_vector(x[0], place)
@@ -469,10 +456,8 @@ def _sensor(function: Callable, n: int, place: Any, low: Any, high: Any, distanc
 
 
 @lru_cache(maxsize=64)
-def _noise(
-    function: Callable, nw: int, moved: int, n: int, place: Any, low: Any, high: Any, distances: Distances
-) -> Callable:
-    inner, (at, ends, reach) = as_inner(function), _tables(place, low, high, distances)
+def _noise(function: Callable, nw: int, moved: int, layout: JointLayout) -> Callable:
+    inner, n, place, (at, ends, reach) = as_inner(function), layout.n, layout.place, layout.tables()
 
     def Q(x, u, p, q, dt, out):  # noqa: ANN001, ANN202
         full = stack_vector(x[0], place)
