@@ -20,29 +20,31 @@ from ..errors import ModelError
 from ..model.check import place
 from ..model.state_space import StateSpaceModel
 from ..model.user_file import portable
-from ..numerics.jit import floats
+from ..numerics.jit import floats, inlined
 from .orphan import leave_with_parent
 
 ANSWER = 2
 """Numbers appended to the parameters: the addresses of the members and of their answers."""
 
 
-def answered_f(x, u, p, dt, out):
-    """out = the answer for the member at the address of x."""
+@inlined
+def _answer(x, p, out):
+    """Fill out with the answer for the member at the address of x."""
     k = p.size - ANSWER
     member = (x.ctypes.data - int(p[k])) // (8 * x.size)
     answer = floats(int(p[k + 1]) + 8 * member * out.size, out.size)
     for j in range(out.size):
         out[j] = answer[j]
+
+
+def answered_f(x, u, p, dt, out):
+    """out = the answer of f."""
+    _answer(x, p, out)
 
 
 def answered_h(x, u, p, out):
-    """out = the answer for the member at the address of x."""
-    k = p.size - ANSWER
-    member = (x.ctypes.data - int(p[k])) // (8 * x.size)
-    answer = floats(int(p[k + 1]) + 8 * member * out.size, out.size)
-    for j in range(out.size):
-        out[j] = answer[j]
+    """out = the answer of h."""
+    _answer(x, p, out)
 
 
 class BlackBox:

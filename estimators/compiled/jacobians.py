@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from ..numerics.jit import complexes, floats, ints, linkable
+from ..numerics.jit import complexes, floats, ints, linkable, part
 from ..numerics.linalg import wrap
 from ..numerics.workspace import layout
 from .context import (
@@ -96,6 +96,41 @@ def constant_rows(
     return H, mode, made
 
 
+@part
+def _central(context, sensor, x, u, dt, J, scratch):
+    """Fill J (m, nx) with df/dx, or of a sensor from 0 on with dh/dx, by central differences."""
+    m, n = J.shape
+    z = scratch[:n]
+    high = scratch[n : n + m]
+    low = scratch[n + m : n + 2 * m]
+    circular = circular_rows(context, sensor) if sensor >= 0 else circular_states(context)
+    for i in range(n):
+        z[i] = x[i]
+    for j in range(n):
+        step = _CENTRAL_STEP * max(1.0, abs(x[j]))
+        z[j] = x[j] + step
+        above = z[j]
+        _image(context, sensor, z, u, dt, high)
+        z[j] = x[j] - step
+        below = z[j]
+        _image(context, sensor, z, u, dt, low)
+        z[j] = x[j]
+        for i in range(m):
+            difference = high[i] - low[i]
+            # An angle may jump by 2π between the two: a model that wraps, atan2 on its cut.
+            if circular[i] != 0:
+                difference = wrap(difference)
+            J[i, j] = difference / (above - below)
+
+
+@part
+def _image(context, sensor, x, u, dt, out):
+    if sensor >= 0:
+        expect(context, sensor, x, u, out)
+    else:
+        transition(context, x, u, dt, out)
+
+
 @linkable
 def state_jacobian(context, x, u, dt, F, scratch):
     """Fill F (nx, nx) with df/dx at x; `scratch` has `scratch_size` numbers."""
@@ -104,28 +139,7 @@ def state_jacobian(context, x, u, dt, F, scratch):
     elif context.F_mode == COMPLEX_STEP:
         complex_step_f(context.f_complex, x, u, parameters(context), dt, F, scratch)
     else:
-        n = x.size
-        z = scratch[:n]
-        high = scratch[n : 2 * n]
-        low = scratch[2 * n : 3 * n]
-        circular = circular_states(context)
-        for i in range(n):
-            z[i] = x[i]
-        for j in range(n):
-            step = _CENTRAL_STEP * max(1.0, abs(x[j]))
-            z[j] = x[j] + step
-            above = z[j]
-            transition(context, z, u, dt, high)
-            z[j] = x[j] - step
-            below = z[j]
-            transition(context, z, u, dt, low)
-            z[j] = x[j]
-            for i in range(n):
-                difference = high[i] - low[i]
-                # An angle may jump by 2π between the two: a model that wraps, atan2 on its cut.
-                if circular[i] != 0:
-                    difference = wrap(difference)
-                F[i, j] = difference / (above - below)
+        _central(context, -1, x, u, dt, F, scratch)
 
 
 @linkable
@@ -143,24 +157,4 @@ def sensor_jacobian(context, sensor, x, u, H, scratch):
         target = ints(context.h_complex, context.n_sensors)[sensor]
         complex_step_h(target, x, u, parameters(context), H, scratch)
     else:
-        m, n = H.shape
-        z = scratch[:n]
-        high = scratch[n : n + m]
-        low = scratch[n + m : n + 2 * m]
-        circular = circular_rows(context, sensor)
-        for i in range(n):
-            z[i] = x[i]
-        for j in range(n):
-            step = _CENTRAL_STEP * max(1.0, abs(x[j]))
-            z[j] = x[j] + step
-            above = z[j]
-            expect(context, sensor, z, u, high)
-            z[j] = x[j] - step
-            below = z[j]
-            expect(context, sensor, z, u, low)
-            z[j] = x[j]
-            for i in range(m):
-                difference = high[i] - low[i]
-                if circular[i] != 0:
-                    difference = wrap(difference)
-                H[i, j] = difference / (above - below)
+        _central(context, sensor, x, u, 0.0, H, scratch)

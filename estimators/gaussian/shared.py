@@ -12,7 +12,7 @@ from ..compiled.context import circular_rows, circular_states, shown_states
 from ..compiled.noise import has_correlated_rows, independent_rows
 from ..compiled.verdict import verdict_of
 from ..estimator import Options
-from ..numerics.jit import by_address, inlined, ints, part
+from ..numerics.jit import by_address, inlined, ints, linkable_embedded, part
 from ..numerics.linalg import EPSILON, cholesky, mirror, solve_transposed, solve_unit, solve_upper, wrap
 from ..numerics.simd import add_scaled, scaled
 from ..numerics.simd_ir import LANES, padded
@@ -57,10 +57,9 @@ def start(context, mean, cov, state):
     forget(context, state)
 
 
-@by_address
-def describe(context, state, mean, std, cross):
-    """Fill mean, standard deviation and the configured covariances."""
-    x, P = moments_of(state, context.nx)
+@linkable_embedded
+def tell(context, x, P, mean, std, cross):
+    """Fill mean, standard deviation and the configured covariances of a row of the track."""
     shown = shown_states(context)
     for k in range(mean.size):
         i = shown[k]
@@ -69,6 +68,13 @@ def describe(context, state, mean, std, cross):
     pairs = ints(context.pairs, 2 * context.n_pairs)
     for k in range(cross.size):
         cross[k] = P[pairs[2 * k], pairs[2 * k + 1]]
+
+
+@by_address
+def describe(context, state, mean, std, cross):
+    """Fill mean, standard deviation and the configured covariances."""
+    x, P = moments_of(state, context.nx)
+    tell(context, x, P, mean, std, cross)
 
 
 @inlined

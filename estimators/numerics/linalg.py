@@ -19,6 +19,16 @@ EPSILON = float(np.finfo(float).eps)
 
 
 @inlined
+def _take_upper(A, U, n):
+    """Fill the leading n rows of U with the upper triangle of A, which may be U."""
+    for i in range(n):
+        for j in range(i):
+            U[i, j] = 0.0
+        for j in range(i, n):
+            U[i, j] = A[i, j]
+
+
+@inlined
 def cholesky(A, U, n):
     """Upper U with Uᵀ U = A for the leading n rows; False if A is not positive definite. A and U may be one.
 
@@ -26,11 +36,7 @@ def cholesky(A, U, n):
 
     Source: Golub & Van Loan, Matrix Computations, 4th ed., algorithm 4.2.2 (outer product form).
     """
-    for i in range(n):
-        for j in range(i):
-            U[i, j] = 0.0
-        for j in range(i, n):
-            U[i, j] = A[i, j]
+    _take_upper(A, U, n)
     for k in range(n):
         pivot = U[k, k]
         if not (pivot > 0.0 and pivot < np.inf):
@@ -55,11 +61,7 @@ def root(A, U, n):
 
     Source: Higham (2002), Accuracy and Stability of Numerical Algorithms, 2nd edition, 10.3.
     """
-    for i in range(n):
-        for j in range(i):
-            U[i, j] = 0.0
-        for j in range(i, n):
-            U[i, j] = A[i, j]
+    _take_upper(A, U, n)
     for k in range(n):
         # What is left of the diagonal entry that the column's Σ U² made up.
         pivot = U[k, k]

@@ -14,13 +14,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import types
 
-from ..compiled.context import context_type, shown_states
+from ..compiled.context import context_type
 from ..estimator import code_type, describe_signature, predict_signature, start_signature, update_signature
 from ..fold import Fold
 from ..fold_kernel import advance_to, asks
+from ..gaussian.shared import tell
 from ..interpreted.fold_loop import UNSET
 from ..log import INPUT, RESET
-from ..numerics.jit import B1, F1, F2, I1, borrowed, i64, inlined, ints, jit
+from ..numerics.jit import B1, F1, F2, I1, borrowed, i64, inlined, jit
 from ..numerics.workspace import size_of
 from ..snapshots import Snapshot
 from .notes import STAYED, StepNote, changed, copy, cut, join_moments, step_at, step_back, step_layout, widened
@@ -111,19 +112,6 @@ def note_queries(code, context, first, t, kind, value, clock, u, after, holds, s
             for j in range(u.size):
                 if np.isfinite(value[i, j]):
                     u[j] = value[i, j]
-
-
-@jit
-def tell(context, x, P, mean, std, cross):
-    """Fill mean, standard deviation and the configured covariances of a row of the track."""
-    shown = shown_states(context)
-    for k in range(mean.size):
-        i = shown[k]
-        mean[k] = x[i]
-        std[k] = np.sqrt(P[i, i]) if P[i, i] >= 0.0 else np.nan
-    pairs = ints(context.pairs, 2 * context.n_pairs)
-    for k in range(cross.size):
-        cross[k] = P[pairs[2 * k], pairs[2 * k + 1]]
 
 
 @jit
